@@ -33,9 +33,9 @@ def main(address: str, seconds: float) -> None:
     with Client(address, role="agent", name="policy", devices=("target",)) as client:
         (lease,) = client.acquire()  # no name: the assignment policy of the session chooses
         robot = lease.target
-        if not client.wait_for(lambda c: c.tip_pose(robot) is not None):
+        if not client.wait_for(lambda c: c.scene.tip_pose(robot) is not None):
             raise SystemExit("no state came within 5 s")
-        tip = client.tip_pose(robot)
+        tip = client.scene.tip_pose(robot)
         assert tip is not None
         (x, y, z), q = tip
         period_ns = 1_000_000_000 // 60
@@ -49,7 +49,7 @@ def main(address: str, seconds: float) -> None:
             client.sleep((due - client.session_now_ns()) * 1e-9)
         feedback = client.feedback.get(robot)
         rejected = dict(feedback.rejected) if feedback is not None else {}
-        moved = client.tip_pose(robot)
+        moved = client.scene.tip_pose(robot)
         assert moved is not None
         print(f"{robot}: tip moved {1e3 * math.dist(moved[0], (x, y, z)):.0f} mm, rejected samples: {rejected}")
 

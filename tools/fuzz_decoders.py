@@ -17,7 +17,7 @@ import numpy as np
 from msgspec import inspect
 
 from iris_session.client.address import Address
-from iris_session.client.discovery import plausible
+from iris_session.client.discovery import is_plausible
 from iris_session.client.errors import ClientError
 from iris_session.link import messages as link
 from iris_session.link.config import Ports, SceneInfo
@@ -361,11 +361,11 @@ def take_address(data: bytes) -> None:
 def take_introduction(data: bytes) -> None:
     introduction = codec.decode_introduction(data)
     if introduction is not None:
-        plausible(introduction.beacon)
+        is_plausible(introduction.beacon)
 
 
 def take_beacon(data: bytes) -> None:
-    plausible(codec.decode_beacon(data))
+    is_plausible(codec.decode_beacon(data))
 
 
 def _of_this_version(rng: Random, kind: Any) -> Any:

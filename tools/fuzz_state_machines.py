@@ -33,12 +33,11 @@ from fuzz_decoders import (
     server_messages,
 )
 
-from iris_session.client.asset_loading import WINDOW_BYTES, WINDOW_REQUESTS, Ask, AssetLoader
-from iris_session.client.connection import Connection
+from iris_session.client.core.asset_loader import WINDOW_BYTES, WINDOW_REQUESTS, AssetLoader, ChunkRequest
+from iris_session.client.core.connection import MAX_INBOX, ClientConnection
+from iris_session.client.core.state_stream import StateStream
+from iris_session.client.core.status import ConnectionPhase
 from iris_session.client.identity import Identity
-from iris_session.client.limits import MAX_INBOX
-from iris_session.client.state_stream import StateStream
-from iris_session.client.status import Phase
 from iris_session.link import FrontLimits
 from iris_session.protocol import codec
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, AssetChunk, AssetRefused, AssetRequest
@@ -67,7 +66,7 @@ sys.path.insert(0, str(ROOT))  # the harness and the random entries are those of
 MS: Final = 1_000_000
 
 
-class ClientConnection:
+class HostileSession:
     """A client that a hostile session talks to: after an honest welcome now and then, anything."""
 
     def __init__(self, rng: Random) -> None:
@@ -79,16 +78,16 @@ class ClientConnection:
     def make(self) -> bytes:
         if not self._left:
             self._left = self._rng.choice((20, 300))
-            self.connection = Connection(Hello("operator", "Ann"), Identity(b"s" * 16))
+            self.connection = ClientConnection(Hello("operator", "Ann"), Identity(b"s" * 16))
             self.connection.open(self._now_ns)
         self._left -= 1
         rng, connection = self._rng, self.connection
-        if connection.phase is Phase.JOINING and rng.random() < 0.3:
+        if connection.phase is ConnectionPhase.JOINING and rng.random() < 0.3:
             welcome = Welcome(
                 "s", "lab", "live", "p1", 7, "operator", b"t" * 16, False, 0, 500 * MS, 2 * MS, 16 * MS, Endpoints(1, 2)
             )
             return encode_server(ServerEnvelope(PROTOCOL_VERSION, 7, welcome))
-        if connection.joined and rng.random() < 0.05:
+        if connection.is_joined and rng.random() < 0.05:
             return encode_server(ServerEnvelope(PROTOCOL_VERSION, 7, ClockPong(self._now_ns - MS, 0, 0)))
         return self._corpus.damaged()
 
@@ -100,7 +99,7 @@ class ClientConnection:
         self._now_ns += rng.choice((0, 1, 20, 3000)) * MS
         connection.tick(self._now_ns)
         assert connection.next_deadline_ns(self._now_ns) > 0
-        if rng.random() < 0.1 and connection.joined:
+        if rng.random() < 0.1 and connection.is_joined:
             connection.send(Sample("head", "pose", 1, 0, 0, 0, 0, pose=IDENTITY))
             connection.request(Marker(0, "x"))
         while (waiting := connection.peek_outgoing()) is not None:
@@ -457,7 +456,7 @@ class LoaderMachine:
     def __init__(self, rng: Random) -> None:
         self._rng = rng
         self._loader = AssetLoader()
-        self._asks: list[Ask] = []
+        self._asks: list[ChunkRequest] = []
         self._unstored = 0
         self._now_ns = 0
 
@@ -478,16 +477,16 @@ class LoaderMachine:
             taken = self._answer(data)
         except ProtocolError:
             taken = False
-        loader.want(rng.choice("abcdefgh"))
-        for address in list(loader.to_look()):
-            loader.missing(address, rng.choice((0, 0, 7)))
+        loader.add(rng.choice("abcdefgh"))
+        for address in list(loader.next_lookups()):
+            loader.on_missing(address, rng.choice((0, 0, 7)))
         if rng.random() < 0.01:
-            rng.choice((loader.cut_off, lambda: loader.broke_off(self._now_ns)))()
+            rng.choice((loader.on_link_closed, lambda: loader.on_link_lost(self._now_ns)))()
             self._asks.clear()
-        asks = list(loader.requests(self._now_ns))
+        asks = list(loader.next_requests(self._now_ns))
         self._asks += asks
         if rng.random() < 0.5:
-            loader.stored(self._unstored)
+            loader.on_stored(self._unstored)
             self._unstored = 0
         assert sum(ask.length for ask in self._asks) + self._unstored <= WINDOW_BYTES + WINDOW_BYTES // 2
         assert len(self._asks) <= WINDOW_REQUESTS
@@ -500,17 +499,17 @@ class LoaderMachine:
         except ProtocolError:
             chunk = codec.decode_asset_chunk(data, 0)
             size = min(rng.choice((0, 5, 524_288)), max(0, chunk.total - chunk.offset))
-            outcome = loader.chunk(chunk, size, self._now_ns)
+            outcome = loader.process_chunk(chunk, size, self._now_ns)
             self._answered(chunk.request_id, fits=outcome is not False)
             if outcome is True:
                 self._unstored += size
-                if loader.whole(chunk.address):
-                    loader.again(chunk.address) if rng.random() < 0.5 else loader.drop(chunk.address)
+                if loader.is_complete(chunk.address):
+                    loader.restart_asset(chunk.address) if rng.random() < 0.5 else loader.remove(chunk.address)
             return outcome is True
-        outcome_ = loader.refused(refused, self._now_ns)
+        outcome_ = loader.process_refusal(refused, self._now_ns)
         self._answered(refused.request_id, fits=True)
         if isinstance(outcome_, str) and outcome_:
-            loader.missing(outcome_, 0)
+            loader.on_missing(outcome_, 0)
         return outcome_ == ""
 
     def _answered(self, number: int, *, fits: bool) -> None:
@@ -640,7 +639,7 @@ class FrontAssets(FrontControl):
 
 
 MACHINES: Final[dict[str, Callable[[Random], Any]]] = {
-    "connection": ClientConnection,
+    "connection": HostileSession,
     "state-stream": ClientState,
     "front": FrontControl,
     "front-tcp": FrontTcp,

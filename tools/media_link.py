@@ -55,7 +55,7 @@ def row(port: int, proxy: ImpairmentProcess, profile: Path, options: argparse.Na
     classes: dict[str, float] = {}
     proxy.execute("profile lan")
     with Client(f"{LINK}:{port}", role="observer", name="viewer", alignment="not_needed") as client:
-        feed = client.media("cloud")
+        feed = client.media.subscribe("cloud")
         client.sleep(3.0)  # it learns what is usual on its link
         proxy.execute(f"profile {profile}")
         client.sleep(options.settle)

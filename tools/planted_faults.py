@@ -141,13 +141,13 @@ def wrong_subnet(lab: Lab) -> Iterator[Visit]:
         yield from_client(lab)
 
 
-@fault("the server's firewall drops every TCP port", "tcp", "no answer", "a firewall", "let TCP 7721 in")
+@fault("the server's firewall drops every TCP port", "tcp", "no answer", "a firewall", "allow TCP 7721")
 def firewall(lab: Lab) -> Iterator[Visit]:
     with lab.server.firewall("tcp dport 7720-7726"):
         yield from_client(lab)
 
 
-@fault("it drops TCP 7722 alone", "state", "no answer", "port 7722 (state)", "let TCP 7722 in")
+@fault("it drops TCP 7722 alone", "state", "no answer", "port 7722 (state)", "allow TCP 7722")
 def firewall_state_only(lab: Lab) -> Iterator[Visit]:
     with lab.server.firewall("tcp dport 7722"):
         yield from_client(lab)
@@ -159,7 +159,7 @@ def broadcasts_blocked(lab: Lab) -> Iterator[Visit]:
         yield from_client(lab)
 
 
-@fault("broadcasts are blocked, and the session is sought by name", "beacon", "'lab-1'", "give its address")
+@fault("broadcasts are blocked, and the session is given by name", "beacon", "'lab-1'", "give its address")
 def by_name_without_broadcasts(lab: Lab) -> Iterator[Visit]:
     with lab.client.firewall("udp dport 7720"):
         yield Visit(lab.client, ("--session", "lab-1"))
@@ -192,7 +192,7 @@ def expired_code(lab: Lab) -> Iterator[Visit]:
     yield from_client(lab, "--code", code, keys="stranger")
 
 
-@fault("`keys revoke` after the user had joined", "key", "let in before", "taken off", "iris-session pair")
+@fault("`keys revoke` after the user had joined", "key", "admitted before", "revoked", "iris-session pair")
 def revoked(lab: Lab) -> Iterator[Visit]:
     joined = lab.client.iris("doctor", lab.server.address, "--code", lab.code("--name", "quest-3"), keys="loser")
     if joined.returncode:
@@ -232,10 +232,10 @@ def emulate(lab: Lab, says: str, *people: str, orders: bool = False) -> Abstract
 
 
 @fault(
-    "a headset that has seen no sheet of the session",
+    "a headset that has observed no sheet of the session",
     "alignment",
     "ann has no alignment",
-    "none of a sheet of this session",
+    "none usable of a sheet of this session",
     "session: table",
 )
 def no_alignment(lab: Lab) -> Iterator[Visit]:
@@ -243,15 +243,15 @@ def no_alignment(lab: Lab) -> Iterator[Visit]:
         yield from_client(lab)
 
 
-@fault("a headset was recentred", "alignment", "ann has no alignment (lost", "jumped", "look at the sheet")
+@fault("a headset was recentred", "alignment", "ann has no alignment (lost", "jumped", "bring the sheet into view")
 def recentred(lab: Lab) -> Iterator[Visit]:
     with lab.client.doing(sys.executable, "-c", RECENTRED, lab.server.address, says="recentred"):
         yield from_client(lab)
 
 
 @fault(
-    "a headset was bumped, and nobody measures its alignment anew", "alarm", "ann: the tracking frame jumped",
-    "mm", "look at a sheet", follows=("alignment",),
+    "a headset was bumped while its alignment run is stopped", "alarm", "ann: the tracking frame jumped",
+    "mm", "bring a sheet into view", follows=("alignment",),
 )  # fmt: skip
 def bumped(lab: Lab) -> Iterator[Visit]:
     with emulate(lab, r"ann +work", BUMPED, orders=True) as ann:
@@ -262,7 +262,14 @@ def bumped(lab: Lab) -> Iterator[Visit]:
         yield from_client(lab)
 
 
-@fault("both robots are somebody else's", "leases", "carl has no robot", "left: ann", "right: bob", state=WARNING)
+@fault(
+    "both robots are held by other participants",
+    "leases",
+    "carl has no robot",
+    "left: ann",
+    "right: bob",
+    state=WARNING,
+)
 def robot_held(lab: Lab) -> Iterator[Visit]:
     here = ("name=ann,behaviour=idle,robot=left", "name=bob,behaviour=idle,robot=right")
     both, wants = r"ann +work[\s\S]*bob +work|bob +work[\s\S]*ann +work", r"carl +\w+ +samples [1-9]"
@@ -282,7 +289,7 @@ def people(lab: Lab) -> list[dict[str, Any]]:
     return participants
 
 
-@fault("a client's program stands still", "clients", "ann:", "silent", "is the app in front")
+@fault("a client's program is stopped", "clients", "ann:", "silent", "is the app in front")
 def frozen_client(lab: Lab) -> Iterator[Visit]:
     with emulate(lab, r"ann +look +samples [1-9]", "name=ann,behaviour=observer") as ann:
         system("kill", "-STOP", str(ann.pid))
@@ -294,14 +301,20 @@ def frozen_client(lab: Lab) -> Iterator[Visit]:
     "a link of 100 ms each way (`tools/impair.py`)",
     "clock",
     "round trips are long",
-    "look at the network",
+    "check the network",
     state=WARNING,
 )
 def slow_link(lab: Lab) -> Iterator[Visit]:
     yield from behind(lab, "100ms")
 
 
-@fault("a link of 400 ms each way", "join", "introduces itself", "a link that is very slow", "look at the network")
+@fault(
+    "a link of 400 ms each way",
+    "join",
+    "answers with an introduction",
+    "a very slow or lossy link",
+    "check the network",
+)
 def very_slow_link(lab: Lab) -> Iterator[Visit]:
     yield from behind(lab, "400ms")
 
@@ -332,7 +345,7 @@ def full_disk(lab: Lab) -> Iterator[Visit]:
         yield Visit(lab.server, ("127.0.0.1:7731",))
 
 
-@fault("the session's program is stopped", "session", "stands still", "look at that program", follows=("join",))
+@fault("the session's program is stopped", "session", "has not taken a step", "check that program", follows=("join",))
 def session_stopped(lab: Lab) -> Iterator[Visit]:
     [session] = lab.server.running[:1]
     system("kill", "-STOP", str(session.pid))

@@ -275,7 +275,7 @@ class Soak:
             self.result.rss.setdefault(name, []).append((now, process.memory_info().rss / 2**20))
 
     def _everybody_works(self) -> bool:
-        mirror, state = self.director.mirror, self.director.state
+        mirror, state = self.director.mirror, self.director.scene.state
         if state is None:
             return False
         connected = {p.name: p.id for p in mirror.participants.values() if p.connected}

@@ -12,7 +12,7 @@ Any number of processes and threads may share a folder. Above `max_bytes` the fi
 removed, but none that a process holds and none used within `GRACE_S`. Other files below the root are never touched.
 
 Sessions and clients have separate default folders. Nothing but verified content could get from a client into the
-folder of a session, so they may share one (`client.asset_cache = AssetStore()`), and an asset then lies on disk once.
+folder of a session, so they may share one (`client.assets.cache = AssetStore()`), and an asset then lies on disk once.
 It is not the default because a hostile session that a client joins could fill the shared folder, so that assets this
 machine's own session does not hold at the moment are removed and have to be built again, and could find out which
 assets are there by watching what the client does not fetch.
@@ -60,7 +60,7 @@ _PART: Final = re.compile(r"([0-9a-f]{64})(\.\w[\w-]*)?\.part")
 _HALF_MADE_HOLD: Final = re.compile(r"(tmp\w+\.new)(\.hold\.lock)?")
 _INDEX: Final = "index"
 _HOLDS: Final = "holds"
-_ADVICE: Final = "use another folder (client.asset_cache = AssetStore(folder)), or set XDG_CACHE_HOME"
+_ADVICE: Final = "use another folder (client.assets.cache = AssetStore(folder)), or set XDG_CACHE_HOME"
 
 
 def default_root(name: str = "assets") -> Path:

@@ -52,7 +52,7 @@ class DeformableClient:
             alignment="not_needed",
             curve=curve,
         )
-        self.feed = self.client.media(job.stream)
+        self.feed = self.client.media.subscribe(job.stream)
         self._decoder = DeformableDecoder(DeformableTopology.from_bytes(Path(job.topology).read_bytes()))
         self.frames: list[MediaFrame] = []
         self.handed_ns: list[int] = []
@@ -62,7 +62,7 @@ class DeformableClient:
 
     def decode_newest(self, recording: bool) -> None:
         """Decodes the newest frame, as an application does before it draws."""
-        frame = self.feed.take()
+        frame = self.feed.pop_newest()
         if frame is None:
             return
         began_ns = time.thread_time_ns()
@@ -91,7 +91,7 @@ class DeformableClient:
             "sizes": np.array([len(f.data) for f in self.frames], np.int64),
             "payloads": np.frombuffer(b"".join(f.data for f in self.frames), np.uint8),
             "counts": np.array(
-                [self.feed.superseded, self.feed.dropped, self.client.media_malformed, self.overflow, heads], np.int64
+                [self.feed.superseded, self.feed.dropped, self.client.media.malformed, self.overflow, heads], np.int64
             ),
         }
 

@@ -60,15 +60,15 @@ def join(job: JoinJob) -> JoinResult:
     """One client, from nothing to a whole scene. Raises what the client raises."""
     begin_ns, cpu_s = time.monotonic_ns(), time.process_time()
     with Client(job.address, role="observer", name="joiner", alignment="not_needed") as client:
-        client.asset_cache = AssetStore(job.cache)
+        client.assets.cache = AssetStore(job.cache)
         scene = client.connection.mirror.scene_hash
-        first = client.fetch_assets([scene], decode=lambda _, data: decode_scene(data))
+        first = client.assets.fetch([scene], decode=lambda _, data: decode_scene(data))
         client.wait_for(lambda _: first.done, JOIN_S)
         first.check()
         spec: SceneSpec = first.decoded[scene]
         sizes, decode = asset_addresses(spec), _make_decoder(spec)
         shapes = {mesh.levels[-1].address for mesh in spec.meshes} | {field.address for field in spec.hfields}
-        rest = client.fetch_assets(sizes, decode=decode)
+        rest = client.assets.fetch(sizes, decode=decode)
         client.wait_for(lambda _: shapes.isdisjoint(rest.pending), JOIN_S)
         picture_ns = time.monotonic_ns()
         client.wait_for(lambda _: rest.done, JOIN_S)

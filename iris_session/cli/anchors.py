@@ -31,7 +31,6 @@ from iris_session.cli.common import (
 )
 
 if TYPE_CHECKING:
-    pass
     from anchors.camera import CameraModel
     from anchors.detection import SheetDetection
     from anchors.pose import PoseTuple
@@ -39,11 +38,11 @@ if TYPE_CHECKING:
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command `anchors`."""
     parser = commands.add_parser(
         "anchors",
         help="print anchor sheets, align headsets, calibrate cameras",
-        description="Sheets that headsets and cameras find in the room, how well headsets are aligned to them, and "
-        "where cameras stand.",
+        description="Print sheets that headsets and cameras detect, align headsets to them, and calibrate cameras.",
         epilog="examples:\n"
         "  iris-session anchors print --size 160mm --id table --out table.pdf\n"
         "  iris-session anchors example > anchors.toml\n"
@@ -66,11 +65,16 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
 
 def _register_print(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the action `print`."""
     one = actions.add_parser(
         "print",
         help="write a sheet as PDF or SVG",
-        description="Writes a sheet of exact size: a QR code with the anchor's id between four markers that cameras "
-        "find from afar, and a ruler that shows whether the printer kept the size.",
+        description="Write a sheet of exact size: a QR code with the anchor's id between four markers that cameras "
+        "detect from a distance, and a ruler to check the printed size.",
+        epilog="examples:\n"
+        "  iris-session anchors print --size 160mm --id table --out table.pdf\n"
+        "  iris-session anchors print --id door --paper a3 --size 200mm",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     one.add_argument("--size", type=parse_length, default=0.160, metavar="LENGTH", help="edge of the QR code (160mm)")
     one.add_argument("--id", default="table", metavar="NAME", help="id of the anchor (%(default)s)")
@@ -81,10 +85,11 @@ def _register_print(actions: argparse._SubParsersAction[argparse.ArgumentParser]
 
 
 def _register_example(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the action `example`."""
     one = actions.add_parser(
         "example",
         help="an anchors file to edit, for `serve --anchors`",
-        description="Prints the anchors of a scene as a file ready to edit. Pass it as `serve --anchors FILE`.",
+        description="Print the anchors of a scene as a file to edit. Pass it as `serve --anchors FILE`.",
         epilog="examples:\n  iris-session anchors example > anchors.toml\n  iris-session anchors example handover",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -92,13 +97,14 @@ def _register_example(actions: argparse._SubParsersAction[argparse.ArgumentParse
         "scene",
         nargs="?",
         default="",
-        help="name of a scene (see `iris-session serve --help`); default: the usual sheet",
+        help="name of a scene (see `iris-session serve --help`); default: one sheet, `table`",
     )
     add_json_option(one)
     one.set_defaults(run=run_example)
 
 
 def run_print(arguments: argparse.Namespace) -> int:
+    """Write the sheet, and print its size."""
     from anchors.sheet import Sheet, SheetError
     from anchors.sheet_print import to_pdf, to_svg
 
@@ -132,7 +138,7 @@ def run_print(arguments: argparse.Namespace) -> int:
 
 
 def run_example(arguments: argparse.Namespace) -> int:
-    """Prints what the scene has, in the form that `serve --anchors` reads."""
+    """Print the anchors of a scene in the format of `serve --anchors`."""
     from iris_session.session.anchors_file import dump_anchors
     from iris_session.session.config import SessionConfig
 
@@ -158,7 +164,7 @@ COLUMNS: Final = ("image", "x", "y", "z", "qw", "qx", "qy", "qz")
 
 @dataclass(frozen=True)
 class Picture:
-    """One picture, and what was found in it. `camera_name`: the folder it lies in."""
+    """One picture and the sheets detected in it. `camera_name`: name of its folder."""
 
     path: Path
     camera_name: str
@@ -167,8 +173,12 @@ class Picture:
 
 
 def calibrate_cameras(arguments: argparse.Namespace) -> dict[str, Any]:
-    """The result as it is printed with `--json`. Raises `CommandError`, and `CalibrationError` where the pictures do
-    not determine a result."""
+    """Calibrate cameras from pictures. Return the object that `--json` prints.
+
+    Raises:
+        CommandError: The options or files are unusable.
+        CalibrationError: The pictures do not determine a result.
+    """
     sheets = _parse_sheets(arguments)
     _check_options(arguments, sheets)
     if arguments.at:
@@ -188,31 +198,32 @@ def _parse_sheets(arguments: argparse.Namespace) -> list[Sheet]:
     except SheetError as error:
         raise CommandError(str(error)) from error
     if len({sheet.anchor_id for sheet in sheets}) != len(sheets):
-        raise CommandError("--sheet names the same sheet twice")
+        raise CommandError("--sheet: the same sheet is given twice")
     return sheets
 
 
 def _check_options(arguments: argparse.Namespace, sheets: list[Sheet]) -> None:
     if (arguments.poses is None) == (not arguments.at):
-        raise CommandError("give --poses CSV (the robot's hand moves) or --at ID=POSE (sheets of known place)")
+        raise CommandError("give --poses CSV (the robot's hand moves) or --at ID=POSE (sheets at known poses)")
     if arguments.at and (arguments.in_hand or arguments.camera_on_hand):
-        raise CommandError("--in-hand and --camera-on-hand belong to --poses")
+        raise CommandError("--in-hand and --camera-on-hand need --poses, not --at")
     if arguments.in_hand and arguments.camera_on_hand:
-        raise CommandError("--in-hand is the place of the sheet on the hand: not with --camera-on-hand")
+        raise CommandError("--in-hand cannot be combined with --camera-on-hand: it is the pose of a sheet on the hand")
     if arguments.poses is not None and len(sheets) != 1:
         raise CommandError(
-            "with --poses exactly one --sheet: the one on the hand, or with --camera-on-hand in the room"
+            f"{len(sheets)} sheets with --poses: give exactly one --sheet, on the hand, or with "
+            "--camera-on-hand in the room"
         )
     unknown = {name for name, _ in arguments.at} - {sheet.anchor_id for sheet in sheets}
     if unknown:
-        raise CommandError(f"--at {sorted(unknown)[0]}: its size is missing, add --sheet {sorted(unknown)[0]}=160mm")
+        raise CommandError(f"--at {sorted(unknown)[0]}: no size is given, add --sheet {sorted(unknown)[0]}=160mm")
 
 
 # --- input ------------------------------------------------------------------------------------------------------------
 
 
 def read_poses(path: Path) -> dict[str, PoseTuple]:
-    """`T_base_ee` by the name of the picture."""
+    """Read `T_base_ee` by name of the picture."""
     try:
         rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines(), skipinitialspace=True))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -229,7 +240,7 @@ def read_poses(path: Path) -> dict[str, PoseTuple]:
             q = []
         if len(q) != 4 or not all(map(math.isfinite, (x, y, z, *q))) or abs(math.hypot(*q) - 1.0) > 0.01:
             raise CommandError(
-                f"{path}, line {number}: wanted are the name of a picture, x,y,z in metres, and a unit quaternion "
+                f"{path}, line {number}: must be the name of a picture, x,y,z in metres, and a unit quaternion "
                 "with w first"
             )
         if name in poses:
@@ -240,13 +251,13 @@ def read_poses(path: Path) -> dict[str, PoseTuple]:
 
 
 def _read_pictures(folder: Path, intrinsics: Path | None, sheets: list[Sheet]) -> list[Picture]:
-    """Every picture of the folder, or of the folders in it, looked through for sheets."""
+    """Read the pictures of the folder, or of its subfolders, and detect sheets in them."""
     if not folder.is_dir():
         raise CommandError(f"{folder} is not a folder")
     folders = [folder] if _list_pictures(folder) else [inner for inner in sorted(folder.iterdir()) if inner.is_dir()]
     found = [picture for one in folders for picture in _read_camera_folder(one, intrinsics, sheets)]
     if not found:
-        raise CommandError(f"no pictures in {folder}: files that end in {', '.join(PICTURES)}")
+        raise CommandError(f"no pictures in {folder}: they must end in {', '.join(PICTURES)}")
     return found
 
 
@@ -264,7 +275,7 @@ def _read_camera_folder(folder: Path, intrinsics: Path | None, sheets: list[Shee
     for path in _list_pictures(folder):
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         if image is None:
-            raise CommandError(f"{path} is not a picture that can be read")
+            raise CommandError(f"{path} is not a readable picture")
         height, width = image.shape
         if (width, height) not in detectors:
             detectors[width, height] = SheetDetector(sheets, _read_camera(folder, intrinsics, width, height))
@@ -283,8 +294,8 @@ def _read_camera(folder: Path, intrinsics: Path | None, width: int, height: int)
     path = next((place for place in places if place.is_file()), None)
     if path is None:
         raise CommandError(
-            f"no intrinsics at {places[0]}: a TOML file with width, height, fx, fy, cx, cy [pixels] and distortion, "
-            "from the maker of the camera or a calibration; name it with --intrinsics"
+            f"no intrinsics at {places[0]}: give with --intrinsics a TOML file with width, height, fx, fy, cx, cy "
+            "[pixels] and distortion, from the maker of the camera or a calibration"
         )
     try:
         return parse_camera(path.read_text(encoding="utf-8"), width, height)
@@ -303,7 +314,7 @@ def _solve_from_robot_poses(
 
     missing = [picture.path.name for picture in pictures if picture.path.name not in poses]
     if missing:
-        raise CommandError(f"{arguments.poses} has no line for {missing[0]} ({len(missing)} pictures without a pose)")
+        raise CommandError(f"{arguments.poses} has no line for {missing[0]} ({len(missing)} pictures have no pose)")
     seen = [picture for picture in pictures if picture.sightings]
     if not seen:
         raise CalibrationError(_format_no_sheet_found(len(pictures)))
@@ -339,7 +350,7 @@ def _solve_from_robot_poses(
 def _solve_with_known_hand_pose(
     pictures: list[Picture], seen: list[Picture], robot: list[PoseTuple], T_ee_sheet: PoseTuple
 ) -> dict[str, Any]:
-    """The place of the sheet on the hand is known, so in every picture it is a sheet of known place."""
+    """Solve with a known pose of the sheet on the hand: its pose is then known in every picture."""
     from anchors.camera_rig import SheetView, solve_rig
     from anchors.pose import compose, inverse
 
@@ -401,13 +412,13 @@ def _format_no_sheet_found(n: int) -> str:
     return f"no sheet was found in {n} picture{'s' * (n != 1)}: {_NO_SHEET_HINT}"
 
 
-# --- what is said -----------------------------------------------------------------------------------------------------
+# --- output -----------------------------------------------------------------------------------------------------------
 
 
 def _compute_residuals(
     pictures: list[Picture], expected: dict[Path, list[PoseTuple]], left_out: set[str]
 ) -> list[dict[str, Any]]:
-    """Per picture and sheet: how far the sheet is seen from where the result puts it, in space and in the picture."""
+    """Return per picture and sheet the residual between detection and result, in space and in the picture."""
     import numpy as np
 
     from anchors.pose import distance, quat_angle
@@ -447,7 +458,7 @@ def _summarize_fit(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _estimate_error(covariance: tuple[float, ...], at: PoseTuple) -> dict[str, float]:
-    """95 % bound of the position, standard deviation of the rotation, from what the pictures scatter."""
+    """Return the 95 % bound of the position and the standard deviation of the rotation."""
     from anchors.alignment import position_error_p95
 
     turn = math.sqrt(covariance[21] + covariance[28] + covariance[35])
@@ -455,20 +466,20 @@ def _estimate_error(covariance: tuple[float, ...], at: PoseTuple) -> dict[str, f
 
 
 def format_calibration(result: dict[str, Any]) -> list[str]:
-    """The result for people."""
+    """Return the result as lines of text."""
     lines = []
     for row in result["pictures"]:
         name = row["file"] if row["camera"] in ("", row["file"]) else f"{row['camera']}/{row['file']}"
         if not row["found"]:
             lines.append(f"{name}  no sheet found")
             continue
-        note = "" if row["used"] else "  LEFT OUT: contradicts the others"
+        note = "" if row["used"] else "  EXCLUDED: contradicts the others"
         lines.append(
             f"{name}  {row['sheet']}  {row['residual_mm']:.2f} mm  {row['residual_deg']:.3f} deg  "
             f"{row['residual_px']:.2f} px{note}"
         )
     lines.append(
-        f"{result['used']} used, {result['left_out']} left out; residual rms {result['residual_mm_rms']:.2f} mm, "
+        f"{result['used']} used, {result['left_out']} excluded; residual rms {result['residual_mm_rms']:.2f} mm, "
         f"{result['residual_deg_rms']:.3f} deg, {result['residual_px_rms']:.2f} px"
     )
     for name, value in _list_poses(result):
@@ -477,8 +488,8 @@ def format_calibration(result: dict[str, Any]) -> list[str]:
         lines.append(f"{name}  p = [{place}] m  q = [{', '.join(f'{v:.6f}' for v in q)}]")
     for name, part in [("", result), *result.get("cameras", {}).items()]:
         if "error_mm_p95" in part:
-            said = f"stated error {part['error_mm_p95']:.2f} mm (95 %), {part['sigma_deg']:.3f} deg (sigma)"
-            lines.append(f"{name + ': ' if name else ''}{said}")
+            text = f"stated error {part['error_mm_p95']:.2f} mm (95 %), {part['sigma_deg']:.3f} deg (sigma)"
+            lines.append(f"{name + ': ' if name else ''}{text}")
     return lines
 
 
@@ -491,7 +502,7 @@ def _list_poses(result: dict[str, Any]) -> list[tuple[str, dict[str, list[float]
 
 
 def calibration_to_toml(result: dict[str, Any]) -> str:
-    """The result as a file: poses with their names, and how well they fit."""
+    """Return the result as TOML: named poses and residuals."""
     lines = ["# Written by iris-session anchors calibrate-camera. Metres; quaternions w first."]
     lines += [f'mode = "{result["mode"]}"']
     lines += [f"{key} = {result[key]!r}" for key in ("residual_mm_rms", "residual_deg_rms", "residual_px_rms")]
@@ -513,25 +524,30 @@ def _format_toml_pose(value: dict[str, list[float]]) -> list[str]:
 
 
 def register_calibrate(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the action `calibrate-camera`."""
     one = actions.add_parser(
         "calibrate-camera",
-        help="find out where a camera stands",
-        description="T_base_camera from pictures: of a sheet on the robot's hand while the hand moves (--poses), or of "
-        "sheets of known place (--at). Says how well it fits, and refuses what does not determine the result.",
+        help="calibrate the pose of a camera",
+        description="Compute T_base_camera from pictures: of a sheet on the robot's hand while the hand moves "
+        "(--poses), or of sheets at known poses (--at). Prints residuals, and refuses pictures that do not "
+        "determine the result.",
         epilog="poses.csv, metres and unit quaternions, one line per picture:\n"
         "  image,x,y,z,qw,qx,qy,qz\n"
         "  0001.png,0.412,0.031,0.388,0.0012,0.9998,0.0131,0.0021\n\n"
-        "Several cameras at once: one folder each below FOLDER, with its own intrinsics.toml.",
+        "Several cameras at once: one folder each below FOLDER, with its own intrinsics.toml.\n\n"
+        "examples:\n"
+        "  iris-session anchors calibrate-camera pictures --sheet table=160mm --poses poses.csv\n"
+        "  iris-session anchors calibrate-camera pictures --sheet table=160mm --at table=0,-0.45,0,1,0,0,0",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    one.add_argument("folder", type=Path, metavar="FOLDER", help="with the pictures")
+    one.add_argument("folder", type=Path, metavar="FOLDER", help="folder of the pictures")
     one.add_argument(
         "--sheet",
         type=_parse_named_length,
         action="append",
         required=True,
         metavar="ID=LENGTH",
-        help="a sheet that may be seen and the edge of its code, as printed: table=160mm; repeatable",
+        help="id of a sheet and the printed edge of its code: table=160mm; repeatable",
     )
     one.add_argument(
         "--intrinsics",
@@ -542,13 +558,13 @@ def register_calibrate(actions: argparse._SubParsersAction[argparse.ArgumentPars
     )
     one.add_argument("--poses", type=Path, metavar="CSV", help="T_base_ee, pose of the robot's hand, per picture")
     one.add_argument(
-        "--camera-on-hand", action="store_true", help="with --poses: the hand carries the camera, the sheet lies still"
+        "--camera-on-hand", action="store_true", help="with --poses: the camera is on the hand, the sheet does not move"
     )
     one.add_argument(
         "--in-hand",
         type=parse_pose,
         metavar="X,Y,Z,QW,QX,QY,QZ",
-        help="with --poses: the place of the sheet on the hand is known, T_ee_sheet; one picture is enough",
+        help="with --poses: known pose of the sheet on the hand, T_ee_sheet; one picture is enough",
     )
     one.add_argument(
         "--at",
@@ -556,7 +572,7 @@ def register_calibrate(actions: argparse._SubParsersAction[argparse.ArgumentPars
         action="append",
         default=[],
         metavar="ID=X,Y,Z,QW,QX,QY,QZ",
-        help="the place of a sheet is known, T_base_sheet; repeatable",
+        help="known pose of a sheet, T_base_sheet; repeatable",
     )
     one.add_argument("--out", type=Path, metavar="FILE", help="also write the result as TOML")
     add_json_option(one)
@@ -580,19 +596,20 @@ def _check_sheet_id(name: str, text: str) -> str:
 
 
 def run_calibrate(arguments: argparse.Namespace) -> int:
+    """Calibrate, print the result, and write it to `--out`. Exit status 1 if the pictures do not determine it."""
     from anchors.robot_world import CalibrationError
 
     try:
-        told = calibrate_cameras(arguments)
+        result = calibrate_cameras(arguments)
     except CalibrationError as error:
         raise CommandError(str(error), status=1) from error
     if arguments.out is not None:
         try:
-            arguments.out.write_text(calibration_to_toml(told), encoding="utf-8")
+            arguments.out.write_text(calibration_to_toml(result), encoding="utf-8")
         except OSError as error:
             raise CommandError(f"{arguments.out} cannot be written: {error.strerror}") from error
     if arguments.json:
-        print_json(told)
+        print_json(result)
     else:
-        print("\n".join(format_calibration(told)))
+        print("\n".join(format_calibration(result)))
     return 0

@@ -36,16 +36,17 @@ if TYPE_CHECKING:
 
 
 ALL_PARTICIPANTS: Final = "all"
-#: Sheets that are told of per headset, those seen last first.
+#: Sheets listed per headset, most recently observed first.
 MAX_LISTED_SHEETS: Final = 8
 
 
 def register_status(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the action `status`."""
     one = actions.add_parser(
         "status",
         help="how well the headsets of a running session are aligned",
-        description="Joins as an observer, asks, and prints for every headset what its alignment rests on, then the "
-        "anchors, and how far apart pairs of headsets put the same thing.",
+        description="Join as an observer and print for every headset the basis of its alignment, then the anchors, and "
+        "the cross-checks between pairs of headsets.",
         epilog="examples:\n"
         "  iris-session anchors status\n"
         "  iris-session anchors status 192.168.1.20 --watch\n"
@@ -59,13 +60,14 @@ def register_status(actions: argparse._SubParsersAction[argparse.ArgumentParser]
 
 
 def register_align(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the action `align`."""
     one = actions.add_parser(
         "align",
         help="start or stop measuring the alignment of headsets",
-        description="`start` measures anew, from nothing; `stop` keeps what is in force, whatever is seen from then "
-        "on. Until there is a better one the present alignment stays. Joins as a director.",
+        description="`start` discards earlier observations and measures again; `stop` keeps the alignment in force and "
+        "ignores later observations. The present alignment stays until there is a better one. Joins as a director.",
         epilog="examples:\n"
-        "  iris-session anchors align start                   everybody with a headset\n"
+        "  iris-session anchors align start                   every participant with a headset\n"
         "  iris-session anchors align start ann\n"
         "  iris-session anchors align stop p3 --address 192.168.1.20",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -84,11 +86,12 @@ def register_align(actions: argparse._SubParsersAction[argparse.ArgumentParser])
 
 
 def register_place(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the action `place`."""
     one = actions.add_parser(
         "place",
         help="align a headset by hand",
-        description="Says where the tracking frame of a headset is, T_world_tracking, or with --offset by how much the "
-        "measured one is to be moved, which voids its stated error. Joins as a director.",
+        description="Set the pose of the tracking frame of a headset, T_world_tracking, or with --offset an offset to "
+        "the measured alignment, which voids its stated error. Joins as a director.",
         epilog="examples:\n"
         "  iris-session anchors place ann --pose 0.4,0,0,1,0,0,0\n"
         "  iris-session anchors place ann --offset --pose -0.01,0,0,1,0,0,0",
@@ -96,18 +99,19 @@ def register_place(actions: argparse._SubParsersAction[argparse.ArgumentParser])
     )
     one.add_argument("participant", metavar="PARTICIPANT", help="name or id")
     add_pose_option(one, "T_world_tracking, or the offset in the world")
-    one.add_argument("--offset", action="store_true", help="on top of the measured alignment")
+    one.add_argument("--offset", action="store_true", help="the pose is an offset to the measured alignment")
     add_address_options(one, option=True)
     add_json_option(one)
     one.set_defaults(run=run_place)
 
 
 def register_move(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the action `move`."""
     one = actions.add_parser(
         "move",
-        help="say where an anchor of the session is",
-        description="Changes T_world_anchor: the shared scene moves for everybody who is aligned to that anchor by "
-        "what is measured. Further than 5 m only with --force. Joins as a director.",
+        help="set the pose of an anchor of the session",
+        description="Change T_world_anchor: the shared scene moves for every headset whose measured alignment uses "
+        "that anchor. Further than 5 m only with --force. Joins as a director.",
         epilog="examples:\n"
         "  iris-session anchors move table --pose 0,-0.45,0,1,0,0,0\n"
         "  iris-session anchors move table --pose -0.2,0.1,0,0.7071068,0,0,0.7071068",
@@ -115,18 +119,18 @@ def register_move(actions: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     one.add_argument("anchor", metavar="ANCHOR", help="id of the anchor, see `anchors status`")
     add_pose_option(one, "T_world_anchor")
-    one.add_argument("--force", action="store_true", help="also further than 5 m from where it is")
+    one.add_argument("--force", action="store_true", help="allow more than 5 m from the present position")
     add_address_options(one, option=True)
     add_json_option(one)
     one.set_defaults(run=run_move)
 
 
-# --- what a director says ---------------------------------------------------------------------------------------------
+# --- align, place, move -----------------------------------------------------------------------------------------------
 
 
 @contextmanager
 def join_as_director(arguments: argparse.Namespace) -> Iterator[Client]:
-    """A director in the session that is meant."""
+    """Join the session as a director."""
     from iris_session.client import Client
 
     check_session_reachable(arguments)
@@ -142,7 +146,7 @@ def join_as_director(arguments: argparse.Namespace) -> Iterator[Client]:
 
 
 def run_align(arguments: argparse.Namespace) -> int:
-    """Exit status 1 when it was denied for one of several."""
+    """Start or stop runs. Exit status 1 if one of several participants was denied."""
     from iris_session.client import DeniedError
 
     done: list[dict[str, Any]] = []
@@ -161,13 +165,16 @@ def run_align(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json({"ok": ok, "action": arguments.what, "participants": done})
         return 0 if ok else 1
-    word = "started: look at the sheets" if arguments.what == AlignAction.START else "stopped: the alignment stays"
+    outcome = (
+        "started: bring the sheets into view" if arguments.what == AlignAction.START else "stopped: alignment kept"
+    )
     for one in done:
-        print(to_printable(f"{one['name']} ({one['id']}): {one['denied'] or word}"))
+        print(to_printable(f"{one['name']} ({one['id']}): {one['denied'] or outcome}"))
     return 0 if ok else 1
 
 
 def run_place(arguments: argparse.Namespace) -> int:
+    """Place the alignment of one participant."""
     with join_as_director(arguments) as client:
         (one,) = select_participants(client, arguments.participant, allow_all=False)
         client.place_alignment(one.id, arguments.pose, offset=arguments.offset)
@@ -179,13 +186,13 @@ def run_place(arguments: argparse.Namespace) -> int:
 
 
 def run_move(arguments: argparse.Namespace) -> int:
-    """Whoever is not measured, or no more, is told of: their alignments stay."""
+    """Move an anchor, and list the alignments that follow it and those that do not."""
     from anchors.pose import distance
 
     with join_as_director(arguments) as client:
         report = client.status()
         was = next((one.T_world_anchor.p for one in report.anchors if one.anchor_id == arguments.anchor), None)
-        away_m = 0.0 if was is None else distance(was, arguments.pose[0])  # one that is not known is denied
+        moved_m = 0.0 if was is None else distance(was, arguments.pose[0])  # the session denies an unknown anchor
         client.move_anchor(arguments.anchor, arguments.pose, force=arguments.force)
     aligned = [p for p in list_headsets(report) if p.alignment in (AlignmentKind.MEASURED, AlignmentKind.PLACED)]
     stay = {
@@ -194,51 +201,55 @@ def run_move(arguments: argparse.Namespace) -> int:
     follow = [p for p in aligned if p.id not in stay]
     if arguments.json:
         ids = {"follow": [p.id for p in follow], "stay": list(stay)}
-        print_json({"ok": True, "anchor": arguments.anchor, "moved_m": away_m, **ids})
+        print_json({"ok": True, "anchor": arguments.anchor, "moved_m": moved_m, **ids})
         return 0
-    by = "turned" if away_m == 0.0 else f"moved by {away_m * 1e3:.0f} mm"
-    print(to_printable(f"anchor '{arguments.anchor}' {by}: alignments that are measured to it follow ({len(follow)})"))
+    by = "rotated" if moved_m == 0.0 else f"moved by {moved_m * 1e3:.0f} mm"
+    print(to_printable(f"anchor '{arguments.anchor}' {by}: {len(follow)} alignments measured to it follow"))
     for line in stay.values():
-        print(to_printable(f"    not that of {line}"))
+        print(to_printable(f"    unchanged: {line}"))
     return 0
 
 
 def explain_unaffected_alignment(p: ParticipantReport, anchor: str) -> str:
-    """Why an alignment does not follow an anchor that is moved; empty: it does."""
+    """Return why an alignment does not follow a moved anchor; empty if it does."""
     r = p.alignment_report
     if r is not None and not r.running:
-        return f"its run is stopped; `iris-session anchors align start {p.id}`"
+        return f"its run is stopped; start it with `iris-session anchors align start {p.id}`"
     if p.alignment == AlignmentKind.PLACED:
-        return f"a director placed it; `iris-session anchors align start {p.id}` measures it"
+        return f"a director placed it; measure it with `iris-session anchors align start {p.id}`"
     if r is None or not p.connected or anchor not in {one.anchor_id for one in r.seen}:
-        return f"it has not looked at '{anchor}' since it came; it follows when it does"
+        return f"it has not observed '{anchor}' since it joined; it follows when it does"
     return ""
 
 
 def select_participants(client: Client, name: str, *, allow_all: bool = True) -> list[ParticipantInfo]:
-    """Who is meant by an id, a name, or `all`. Raises `CommandError` that lists who could be."""
+    """Return the participants with an id or name, or all with a headset for `all`.
+
+    Raises:
+        CommandError: No participant, or more than one, has that name. The text lists the candidates.
+    """
     people = sorted(client.mirror.participants.values(), key=lambda one: (len(one.id), one.id))
     headsets = [one for one in people if one.alignment is None or one.alignment.kind != AlignmentKind.NOT_NEEDED]
-    there = ", ".join(f"{one.name} ({one.id})" for one in headsets) or "nobody"
+    candidates = ", ".join(f"{one.name} ({one.id})" for one in headsets) or "none"
     found = [one for one in people if one.id == name] or [one for one in people if one.name == name]
     if not found and name == ALL_PARTICIPANTS and allow_all:
         found = [one for one in headsets if one.connected]
         if not found:
-            raise CommandError("nobody in this session has a headset that is aligned", status=1)
+            raise CommandError("no participant of this session has a headset that is aligned", status=1)
         return found
     if not found:
-        raise CommandError(to_printable(f"no participant is called '{name}'; with a headset: {there}"))
+        raise CommandError(to_printable(f"no participant is called '{name}'; with a headset: {candidates}"))
     if len(found) > 1:
-        ids = ", ".join(f"{one.id} ({one.role}{'' if one.connected else ', lost'})" for one in found)
+        ids = ", ".join(f"{one.id} ({one.role}{'' if one.connected else ', disconnected'})" for one in found)
         raise CommandError(to_printable(f"{len(found)} participants are called '{name}', give an id: {ids}"))
     return found
 
 
-# --- how it stands ----------------------------------------------------------------------------------------------------
+# --- status -----------------------------------------------------------------------------------------------------------
 
 
 def run_status(arguments: argparse.Namespace) -> int:
-    """Prints the alignment of everybody; with --watch until Ctrl-C."""
+    """Print the alignment of every headset; with --watch until Ctrl-C."""
     with open_status(arguments) as (client, report):
         if arguments.watch:
             return watch_status(client, arguments.period, print_alignment_status, as_json=arguments.json)
@@ -247,6 +258,7 @@ def run_status(arguments: argparse.Namespace) -> int:
 
 
 def print_alignment_status(report: StatusReport, *, as_json: bool) -> None:
+    """Print one report as text or JSON."""
     if as_json:
         print_json(to_dict(report))
     else:
@@ -254,12 +266,12 @@ def print_alignment_status(report: StatusReport, *, as_json: bool) -> None:
 
 
 def list_headsets(report: StatusReport) -> list[ParticipantReport]:
-    """Those who are, or are to be, aligned."""
+    """Return the participants that are aligned, or can be."""
     return [p for p in report.participants if p.alignment != AlignmentKind.NOT_NEEDED]
 
 
 def to_dict(report: StatusReport) -> dict[str, Any]:
-    """For `--json`: fields as in `StatusReport`."""
+    """Return the object that `--json` prints; fields as in `StatusReport`."""
     import msgspec
 
     kept = ("id", "name", "role", "connected", "tracking_epoch", "alignment", "alignment_age_ns", "alignment_void_ns")
@@ -278,18 +290,18 @@ def to_dict(report: StatusReport) -> dict[str, Any]:
 
 
 def format_alignment_status(report: StatusReport) -> list[str]:
-    """One screen of printable lines."""
+    """Return one screen of printable lines."""
     return [to_printable(line) for line in _format_lines(report)]
 
 
 def _format_lines(report: StatusReport) -> Iterator[str]:
     people = list_headsets(report)
-    still = f"  STANDS STILL since {report.authority_silent_ns * 1e-9:.1f} s" if report.stalled else ""
+    still = f"  STALLED for {report.authority_silent_ns * 1e-9:.1f} s" if report.stalled else ""
     yield f"session '{report.session_name}'  {len(people)} headsets  {len(report.anchors)} anchors{still}"
     yield ""
     yield (
         f"{'headset':20s} {'alignment':16s} {'version':>7s} {'age':>6s} {'at sheet':>9s} {'at robot':>9s} "
-        f"{'looks':>6s} {'places':>6s} {'tilt':>8s}  correction"
+        f"{'obs.':>6s} {'places':>6s} {'tilt':>8s}  correction"
     )
     for p in people:
         yield from _format_headset(p)
@@ -298,7 +310,7 @@ def _format_lines(report: StatusReport) -> Iterator[str]:
         x, y, z = anchor.T_world_anchor.p
         q = ",".join(f"{c:.5g}" for c in anchor.T_world_anchor.q)
         size = f", {anchor.size_m * 1e3:.0f} mm" if anchor.size_m > 0.0 else ""
-        yield f"anchor '{anchor.anchor_id}': at {x:.4f}, {y:.4f}, {z:.4f} m, turned {q}{size}"
+        yield f"anchor '{anchor.anchor_id}': at {x:.4f}, {y:.4f}, {z:.4f} m, rotation {q}{size}"
     if not report.anchors:
         yield "this session has no anchors"
     names = {p.id: p.name for p in report.participants}
@@ -308,7 +320,7 @@ def _format_lines(report: StatusReport) -> Iterator[str]:
 
 def _format_headset(p: ParticipantReport) -> Iterator[str]:
     r = p.alignment_report
-    name = f"{p.name} ({p.id})" if p.connected else f"{p.name} LOST {p.lost}"
+    name = f"{p.name} ({p.id})" if p.connected else f"{p.name} OFFLINE {p.lost}"
     if r is None:
         yield f"{name:20.20s} {p.alignment:16.16s}"
         return
@@ -325,15 +337,15 @@ def _format_headset(p: ParticipantReport) -> Iterator[str]:
         yield f"    void for {format_duration(p.alignment_void_ns)}: the tracking frame jumped"
     seen = sorted(r.seen, key=lambda one: one.age_ns)
     if seen:
-        told = [
+        sheets = [
             f"{one.anchor_id} {one.observations} times, {format_duration(one.age_ns)} ago"
             for one in seen[:MAX_LISTED_SHEETS]
         ]
         more = f"; {len(seen) - MAX_LISTED_SHEETS} more" if len(seen) > MAX_LISTED_SHEETS else ""
-        unusable = f"; {r.unusable} of no use" if r.unusable else ""
-        yield f"    saw {'; '.join(told)}{more}{unusable}"
+        unusable = f"; {r.unusable} unusable" if r.unusable else ""
+        yield f"    saw {'; '.join(sheets)}{more}{unusable}"
     elif r.unusable:
-        yield f"    saw nothing of use, {r.unusable} times"
+        yield f"    observed nothing usable, {r.unusable} times"
     if r.alarm:
         yield f"    ALARM {r.alarm}: off by {r.alarm_size_m * 1e3:.0f} mm, {format_duration(r.alarm_ns)} ago"
     if r.advice:
@@ -341,7 +353,7 @@ def _format_headset(p: ParticipantReport) -> Iterator[str]:
 
 
 def format_pending_correction(r: AlignmentReport) -> str:
-    """A correction that waits or slides in."""
+    """Return the rest of a correction that is not yet in force."""
     if not (r.pending_m > 0.0 or r.pending_rad > 0.0):
         return "-"
     return f"{r.pending_m * 1e3:.1f} mm, {degrees(r.pending_rad):.2f} deg to go"
@@ -352,13 +364,13 @@ def _format_cross_check(check: CrossCheckReport, names: dict[str, str]) -> str:
     verdict = "" if is_consistent(check) else "  TOO FAR APART"
     return (
         f"{a} - {b}: {check.error_m * 1e3:.1f} mm, {degrees(check.error_rad):.2f} deg apart at '{check.anchor_id}', "
-        f"95 % expected below {check.expected_p95_m * 1e3:.1f} mm; {check.n} looks, "
+        f"95 % expected below {check.expected_p95_m * 1e3:.1f} mm; {check.n} observations, "
         f"{format_duration(check.age_ns)} ago{verdict}"
     )
 
 
 def format_duration(duration_ns: int) -> str:
-    """How long ago, as people say it."""
+    """Return a duration as seconds or minutes."""
     seconds = duration_ns * 1e-9
     if seconds < 0.0:
         return "never"
@@ -368,17 +380,19 @@ def format_duration(duration_ns: int) -> str:
 # --- solve ------------------------------------------------------------------------------------------------------------
 
 
-#: Lines about alignments and outliers per tracking frame; `--json` has all.
+#: Printed alignments and outliers per tracking frame; `--json` has all.
 MAX_LISTED: Final = 12
 
 
 def register_solve(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the action `solve`."""
     one = actions.add_parser(
         "solve",
-        help="solve the alignments of a recording again, and where its sheets lie",
-        description="Reads every observation of a recording and solves alignments again, with what was seen before and "
-        "after each moment: how far off was each alignment that was in force, which looks contradict it, which sheets "
-        "were moved. With two or more sheets also where they lie to each other, as a file for `serve --anchors`.",
+        help="solve the alignments of a recording again, and the poses of its sheets",
+        description="Read every observation of a recording and solve alignments again, with the observations before "
+        "and after each moment. Prints the error of each alignment that was in force, observations that contradict it, "
+        "and sheets that were moved. With two or more sheets it also solves their relative poses, as a file for "
+        "`serve --anchors`.",
         epilog="examples:\n"
         "  iris-session anchors solve sessions/20261121T093000.000000Z-lab/session.rrd\n"
         "  iris-session anchors solve session.rrd --anchors anchors.toml --json\n"
@@ -389,15 +403,15 @@ def register_solve(actions: argparse._SubParsersAction[argparse.ArgumentParser])
         "recording", type=Path, metavar="RECORDING", help="a .rrd file; later parts are found by their names"
     )
     one.add_argument(
-        "--anchors", type=Path, metavar="TOML", help="where the anchors really were (default: as the session had them)"
+        "--anchors", type=Path, metavar="TOML", help="true poses of the anchors (default: those of the session)"
     )
-    one.add_argument("--out", type=Path, metavar="FILE", help="write where the sheets lie, for `serve --anchors`")
+    one.add_argument("--out", type=Path, metavar="FILE", help="write the poses of the sheets, for `serve --anchors`")
     add_json_option(one)
     one.set_defaults(run=run_solve)
 
 
 def run_solve(arguments: argparse.Namespace) -> int:
-    """Exit status 1 when `--out` was asked for and nothing can be written."""
+    """Solve a recording and print the result. Exit status 1 if `--out` is given and there is nothing to write."""
     from iris_session.alignment.resolve import solve_relative_poses
     from iris_session.alignment.smoother import AnchorHistory
     from iris_session.recording import Recording, read_alignment_history
@@ -420,13 +434,13 @@ def run_solve(arguments: argparse.Namespace) -> int:
             print(to_printable(line))
         if written:
             print(f"written: {written}    use it: iris-session serve SCENE --anchors {written}")
-    if wanted and not written:  # after what was found out all the same
+    if wanted and not written:  # the results are printed nevertheless
         raise CommandError(f"{arguments.out} is not written: {relative.advice}", status=1)
     return 0
 
 
 def make_progress_printer(what: str) -> Callable[[int, int], None] | None:
-    """Shows how far it is, on a terminal."""
+    """Return a function that prints progress, or None if standard error is not a terminal."""
     if not sys.stderr.isatty():
         return None
 
@@ -438,7 +452,7 @@ def make_progress_printer(what: str) -> Callable[[int, int], None] | None:
 
 
 def _load_reference_anchors(recording: Recording, given: Constellation | None) -> Constellation:
-    """Where the anchors ought to be: the file, else as the session had them when it began."""
+    """Return the expected poses of the anchors: from the file, or else those at the start of the session."""
     from anchors.constellation import Constellation
 
     if given is not None:
@@ -475,7 +489,7 @@ def _resolve_frames(looks: AlignmentHistory, anchors: Any, sizes: dict[str, floa
 
 
 def _write_constellation(path: Path, relative: RelativePoses) -> str:
-    """The constellation as a file for `serve --anchors`."""
+    """Write the constellation as a file for `serve --anchors`. Return its path."""
     assert relative.solved is not None
     try:
         path.write_text(relative.solved.constellation.to_toml(), encoding="utf-8")
@@ -484,16 +498,16 @@ def _write_constellation(path: Path, relative: RelativePoses) -> str:
     return str(path)
 
 
-# --- as text ----------------------------------------------------------------------------------------------------------
+# --- solve: text ------------------------------------------------------------------------------------------------------
 
 
 def format_solution(
     looks: AlignmentHistory, results: list[FrameResult], relative: RelativePoses, damage: list[str]
 ) -> Iterator[str]:
-    """Everybody who was to be aligned, then the sheets, then what could not be read."""
+    """Return lines about every headset, then the sheets, then damage."""
     wearers = [one for one in looks.participants.values() if one.aligned]
     if not wearers:
-        yield "nobody in this recording had a headset to be aligned"
+        yield "no participant of this recording had a headset to align"
     for person in wearers:
         own = [one for one in results if one.frame.participant == person.id]
         if not own:
@@ -502,9 +516,9 @@ def format_solution(
             yield from _format_frame(person, result)
     yield from _format_sheets(relative)
     if looks.unowned:
-        yield f"{looks.unowned} observations over connections whose join is not in this recording"
+        yield f"{looks.unowned} observations of connections whose join is not in this recording"
     if looks.unreadable:
-        yield f"{looks.unreadable} recorded messages do not decode"
+        yield f"{looks.unreadable} recorded messages cannot be decoded"
     yield from (f"damaged: {line}" for line in damage)
 
 
@@ -514,24 +528,24 @@ def _format_frame(person: RecordedParticipant, r: FrameResult) -> Iterator[str]:
     sheets = ", ".join(f"{name} {n}" for name, n in sorted(r.sheets.items()))
     unused = "".join(f"; {n} {why}" for why, n in r.unused.items())
     yield (
-        f"{person.name} ({person.id}), tracking epoch {r.frame.tracking_epoch}{run}: {r.looks} looks from "
-        f"{r.viewpoints} places, {r.first_ns * 1e-9:.1f} to {r.last_ns * 1e-9:.1f} s ({sheets}){unused}"
+        f"{person.name} ({person.id}), tracking epoch {r.frame.tracking_epoch}{run}: {r.looks} observations "
+        f"from {r.viewpoints} places, {r.first_ns * 1e-9:.1f} to {r.last_ns * 1e-9:.1f} s ({sheets}){unused}"
     )
     if r.last.refused:
-        yield f"    solved again: refused, {r.last.advice}"
+        yield f"    re-solved: refused, {r.last.advice}"
     else:
         tilt = math.degrees(r.last.residual_tilt_rad)
         advice = f"; {r.last.advice}" if r.last.advice else ""
         yield (
-            f"    solved again: {_format_mm(r.last.error_at_anchor_m)} at the sheet (95 %), tilt {tilt:.1f} deg{advice}"
+            f"    re-solved: {_format_mm(r.last.error_at_anchor_m)} at the sheet (95 %), tilt {tilt:.1f} deg{advice}"
         )
     if 2 * r.unused.get("against gravity", 0) > r.looks:
-        yield "    most looks contradict the vertical: the sheet does not lie as configured (on the table, on a wall?)"
+        yield "    most observations contradict gravity: the sheet is not oriented as configured (table or wall?)"
     yield from _limit_lines(
         [_format_comparison(one) for one in _select_worst(r.compared)], len(r.compared), "alignments"
     )
     told = [
-        f"    outlier: '{o.anchor_id}' from place {o.viewpoint_id} at {o.at_ns * 1e-9:.1f} s, {o.looks} looks: "
+        f"    outlier: '{o.anchor_id}' from place {o.viewpoint_id} at {o.at_ns * 1e-9:.1f} s, {o.looks} observations: "
         f"{_format_mm(o.off_m)}, {math.degrees(o.off_rad):.1f} deg off, "
         f"95 % expected below {_format_mm(o.expected_p95_m)}"
         for o in r.outliers
@@ -540,7 +554,7 @@ def _format_frame(person: RecordedParticipant, r: FrameResult) -> Iterator[str]:
 
 
 def _select_worst(compared: list[LiveComparison]) -> list[LiveComparison]:
-    """The worst of them, in order of time."""
+    """Return the alignments with the largest errors, in order of time."""
     kept = sorted(compared, key=lambda one: -max(one.off_m or 0.0, one.off_end_m or 0.0))[:MAX_LISTED]
     return sorted(kept, key=lambda one: one.live.since_ns)
 
@@ -548,7 +562,7 @@ def _select_worst(compared: list[LiveComparison]) -> list[LiveComparison]:
 def _limit_lines(shown: list[str], of: int, what: str) -> Iterator[str]:
     yield from shown
     if of > len(shown):
-        yield f"    ... {of - len(shown)} more {what}, which --json lists"
+        yield f"    ... {of - len(shown)} more {what}, listed by --json"
 
 
 def _format_comparison(one: LiveComparison) -> str:
@@ -557,17 +571,17 @@ def _format_comparison(one: LiveComparison) -> str:
     kind = a.kind + (" with offset" if a.offset else "")
     head = f"    version {a.version} ({kind}), {one.live.since_ns * 1e-9:.1f} s to {end}"
     if one.off_m is None or one.off_rad is None:
-        return f"{head}: nothing to compare with"
-    stated = "nothing stated" if one.stated_m is None else f"stated {_format_mm(one.stated_m)}"
+        return f"{head}: no observations to compare with"
+    stated = "no error stated" if one.stated_m is None else f"stated {_format_mm(one.stated_m)}"
     at_end = "" if one.off_end_m is None else f", {_format_mm(one.off_end_m)} at its end"
-    solved = "" if one.solved_m is None else f", solved again {_format_mm(one.solved_m)}"
-    beyond = "  BEYOND WHAT WAS STATED" if one.is_beyond_stated else ""
+    solved = "" if one.solved_m is None else f", re-solved {_format_mm(one.solved_m)}"
+    beyond = "  EXCEEDS THE STATED ERROR" if one.is_beyond_stated else ""
     return f"{head}: {_format_mm(one.off_m)}, {math.degrees(one.off_rad):.2f} deg off{at_end}; {stated}{solved}{beyond}"
 
 
 def _format_sheets(relative: RelativePoses) -> Iterator[str]:
     if relative.solved is None:
-        yield f"sheets to each other: {relative.advice}"
+        yield f"relative poses of sheets: {relative.advice}"
         return
     c = relative.solved.constellation
     for name in sorted(c.anchors):
@@ -576,17 +590,17 @@ def _format_sheets(relative: RelativePoses) -> Iterator[str]:
         residual = relative.solved.residuals_m.get(name, 0.0)
         turned = ",".join(f"{v:.5g}" for v in q)
         yield (
-            f"sheet '{name}': at {x:.4f}, {y:.4f}, {z:.4f} m, turned {turned}; {what}, "
-            f"looks scatter {_format_mm(residual)}"
+            f"sheet '{name}': at {x:.4f}, {y:.4f}, {z:.4f} m, rotation {turned}; {what}, "
+            f"observations scatter {_format_mm(residual)}"
         )
     for headset, epoch, viewpoint, name in relative.solved.rejected:
         participant = headset.split(" ")[0]
-        yield f"left out: '{name}' as {participant} saw it from place {viewpoint} in epoch {epoch}, it fits nowhere"
+        yield f"excluded: '{name}' as observed by {participant} from place {viewpoint} in epoch {epoch}: inconsistent"
     for moved in relative.moved:
         yield (
             f"MOVED: sheet '{moved.anchor_id}' lies {_format_mm(moved.distance_m)}, "
             f"{math.degrees(moved.angle_rad):.1f} deg "
-            "from where it ought to, as seen from the others"
+            "from its expected pose, relative to the others"
         )
     if relative.moved_advice:
         yield f"moved sheets: {relative.moved_advice}"
@@ -596,7 +610,7 @@ def _format_mm(metres: float) -> str:
     return f"{metres * 1e3:.1f} mm"
 
 
-# --- as JSON ----------------------------------------------------------------------------------------------------------
+# --- solve: JSON ------------------------------------------------------------------------------------------------------
 
 
 def solution_to_dict(
@@ -607,7 +621,7 @@ def solution_to_dict(
     damage: list[str],
     written: str,
 ) -> dict[str, Any]:
-    """For `--json`."""
+    """Return the object that `--json` prints."""
     people = [
         {
             "id": one.id,

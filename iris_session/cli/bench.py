@@ -1,4 +1,4 @@
-"""`iris-session bench NAME`: measures one thing with separate processes and prints it against its bars."""
+"""`iris-session bench NAME`: run one benchmark with separate client processes and compare it with its bars."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ if TYPE_CHECKING:
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command `bench`."""
     parser = commands.add_parser(
         "bench",
-        help="measure against the bars",
-        description="Measures with separate client processes. Exit status 1 with --check when a bar is missed.",
+        help="run a benchmark and compare it with its bars",
+        description="Measure with separate client processes. With --check, exit status 1 if a bar is missed.",
         epilog="examples:\n"
         "  iris-session bench state --check\n"
         "  iris-session bench state --curve --json\n"
@@ -31,38 +32,45 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     parser.add_argument("bench", choices=("state", "input", "slow-client", "alignment", "deformable", "join"))
     parser.add_argument(
-        "--clients", type=int, help="state, slow-client, deformable, join: how many (default: 16; the last two: 4)"
+        "--clients",
+        type=int,
+        help="state, slow-client, deformable, join: number of clients (default: 16; the last two: 4)",
     )
     parser.add_argument(
         "--bodies", type=int, default=300, help="state, slow-client: moving bodies (default: %(default)s)"
     )
-    parser.add_argument("--operators", type=int, default=8, help="input: people who drive (default: %(default)s)")
+    parser.add_argument("--operators", type=int, default=8, help="input: operators (default: %(default)s)")
     parser.add_argument("--robots", type=int, default=8, help="input: seven-joint arms (default: %(default)s)")
-    parser.add_argument("--observers", type=int, default=8, help="input: people who look (default: %(default)s)")
+    parser.add_argument("--observers", type=int, default=8, help="input: observers (default: %(default)s)")
     parser.add_argument("--pairs", type=int, default=2000, help="alignment: pairs of headsets (default: %(default)s)")
     parser.add_argument(
-        "--vertices", type=int, default=10_000, help="deformable: of the cloth, a square number (default: %(default)s)"
+        "--vertices",
+        type=int,
+        default=10_000,
+        help="deformable: vertices of the cloth, a square number (default: %(default)s)",
     )
     parser.add_argument("--objects", type=int, default=300, help="join: bodies with meshes (default: %(default)s)")
-    parser.add_argument("--assets-mb", type=float, default=200.0, help="join: MB after compression (default: 200)")
+    parser.add_argument(
+        "--assets-mb", type=float, default=200.0, help="join: size of the assets after compression (default: 200)"
+    )
     parser.add_argument("--seconds", type=parse_seconds, help="measured part (default: 20; slow-client: 50)")
     parser.add_argument(
         "--profile",
         default="",
         metavar="NAME",
-        help="everybody joins over a link like this (docs/evidence/links.md); no bars then",
+        help="link profile of every client (docs/evidence/links.md); bars do not apply then",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of everything random (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="random seed (default: %(default)s)")
     crypto = parser.add_mutually_exclusive_group()
     crypto.add_argument("--curve", action="store_true", help="encrypted and authenticated")
     crypto.add_argument("--plain", action="store_true", help="unencrypted loopback (default)")
-    parser.add_argument("--check", action="store_true", help="exit status 1 when a bar is missed")
+    parser.add_argument("--check", action="store_true", help="exit status 1 if a bar is missed")
     add_json_option(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Runs one benchmark and prints its report."""
+    """Run one benchmark and print its report."""
 
     from iris_session.netsim.profiles import load_profile
 
@@ -75,9 +83,9 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.clients = 4 if arguments.bench in ("deformable", "join") else 16
     _check_sizes(arguments)
     if arguments.bench == "slow-client" and arguments.clients < 3:
-        raise CommandError(f"--clients {arguments.clients}: slow-client needs two that are slow and one other, so 3")
+        raise CommandError(f"--clients {arguments.clients}: bench slow-client needs 3 or more, two of which are slow")
     if arguments.profile:
-        load_profile(arguments.profile)  # before anything is started
+        load_profile(arguments.profile)  # fails before anything is started
     try:
         report = _run_benchmark(arguments, progress)
     except BenchError as error:
@@ -90,7 +98,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _check_sizes(arguments: argparse.Namespace) -> None:
-    """Numbers that a scene or a session cannot have."""
+    """Raise `CommandError` for numbers that a scene or a session cannot have."""
     limits = {"clients": (1, 64), "bodies": (1, 2000)}
     if arguments.bench == "input":
         limits = {"robots": (1, 12), "operators": (1, arguments.robots), "observers": (0, 64)}
@@ -101,7 +109,9 @@ def _check_sizes(arguments: argparse.Namespace) -> None:
     elif arguments.bench == "join":
         limits = {"clients": (1, 64), "objects": (1, 2000), "assets_mb": (1, 2000)}
         if arguments.curve or arguments.profile:
-            raise CommandError("bench join runs on plain loopback: its bars are stated for that")
+            raise CommandError(
+                "bench join cannot be combined with --curve or --profile: its bars are for plain loopback"
+            )
     for name, (low, high) in limits.items():
         if not low <= (value := getattr(arguments, name)) <= high:
             per = ", one robot each" if name == "operators" else ""

@@ -1,4 +1,4 @@
-"""What commands share: options of a session, one-line errors, printing one JSON object."""
+"""Shared parts of the commands: errors, option types, common options, output."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from iris_session.demo.named_scenes import Scene
 
 
-#: Whatever is there has taken a connection by then.
+#: Timeout of the test whether a session is reachable [s].
 CONNECT_S: Final = 2.0
 
 
 class CommandError(Exception):
-    """The command cannot go on; the text is one line that says what would be right."""
+    """The command cannot continue. The text is one line: what is wrong, and what would be right."""
 
     def __init__(self, text: str, status: int = 2) -> None:
         super().__init__(text)
@@ -34,7 +34,7 @@ class CommandError(Exception):
 
 
 def list_expected_errors() -> tuple[type[Exception], ...]:
-    """Errors whose text is made for the user. Anything else is a defect and keeps its traceback."""
+    """Return the errors whose text is meant for the user. Any other error is a defect and keeps its traceback."""
     from iris_session.assets.errors import AssetStoreError
     from iris_session.client import ClientError
     from iris_session.control import ControlError
@@ -63,7 +63,7 @@ def list_expected_errors() -> tuple[type[Exception], ...]:
 
 
 def parse_seconds(text: str) -> float:
-    """Type of options that take a duration [s]."""
+    """Parse the duration of an option [s]."""
     try:
         seconds = float(text)
     except ValueError:
@@ -74,13 +74,14 @@ def parse_seconds(text: str) -> float:
 
 
 def parse_port_base(text: str) -> int:
-    """Type of `--port-base`."""
+    """Parse `--port-base`."""
     if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= 65529:
-        raise argparse.ArgumentTypeError(f"{text!r} is not the first of seven ports: 1 to 65529, for example 7730")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a base of seven ports: give 1 to 65529, for example 7730")
     return int(text)
 
 
 def add_json_option(parser: argparse.ArgumentParser) -> None:
+    """Add `--json`."""
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
 
 
@@ -88,35 +89,42 @@ def add_address_options(
     parser: argparse.ArgumentParser,
     *,
     option: bool = False,
-    code: str = "join code, for the first time at an encrypted session",
+    code: str = "join code, needed the first time at an encrypted session",
 ) -> None:
-    """How a command of a client finds the session: `address`, `session`, `code`. `option`: `--address`, where other
-    words stand at its place."""
+    """Add the options by which a client finds a session: `address`, `--session`, `--code`.
+
+    Args:
+        parser: Parser of the command.
+        option: Add the address as `--address` because the command has other positional arguments.
+        code: Help text of `--code`.
+    """
     text = "HOST:PORT or iris://... (default: 127.0.0.1:7721)"
     if option:
         parser.add_argument("--address", default="", metavar="ADDR", help=text)
     else:
         parser.add_argument("address", nargs="?", default="", help=text)
-    parser.add_argument("--session", default="", metavar="NAME", help="a session by its name instead of an address")
+    parser.add_argument("--session", default="", metavar="NAME", help="name of the session, instead of an address")
     parser.add_argument("--code", default="", help=code)
 
 
 def check_session_reachable(arguments: argparse.Namespace) -> None:
-    """Raises `CommandError` within `CONNECT_S` where nothing listens at the address that was given: a client would wait
-    for it to begin. A session by its name has no address yet."""
+    """Raise `CommandError` within `CONNECT_S` if nothing listens at the given address.
+
+    A client would wait for the session to start. A session given by name is not checked: it has no address yet.
+    """
     from iris_session.client.address import Address
-    from iris_session.client.joining import LOCAL
-    from iris_session.client.resolving import resolve
+    from iris_session.client.endpoint_resolver import LOCAL_ADDRESS
+    from iris_session.client.host_lookup import resolve_host
 
     if arguments.session:
         return
-    address = Address.parse(arguments.address or LOCAL)
+    address = Address.parse(arguments.address or LOCAL_ADDRESS)
     until_s = time.monotonic() + CONNECT_S
-    looking = resolve(address.host, until_s)
+    resolving = resolve_host(address.host, until_s)
     try:
         while True:
             try:
-                next(looking)
+                next(resolving)
             except StopIteration as found:
                 socket.create_connection((found.value, address.port), max(0.1, until_s - time.monotonic())).close()
                 return
@@ -130,7 +138,7 @@ def check_session_reachable(arguments: argparse.Namespace) -> None:
 
 
 def describe_own_sessions() -> str:
-    """Where the encrypted sessions of this user are, for who has typed no address."""
+    """Return the addresses of this user's encrypted sessions, for errors of commands without an address."""
     from iris_session.security import KeyHome, KeysError
 
     try:
@@ -138,11 +146,11 @@ def describe_own_sessions() -> str:
     except KeysError:
         notes = []
     yours = (f"; your session {one.name!r} is at {one.hosts[0]}:{one.control}" for one in notes if one.hosts)
-    return "".join(yours) or "; for one on another machine, give its address or --session NAME"
+    return "".join(yours) or "; for a session on another machine, give its address or --session NAME"
 
 
 def add_session_options(parser: argparse.ArgumentParser) -> None:
-    """Options that every command which opens a session takes."""
+    """Add the options of commands that open a session."""
     group = parser.add_argument_group("session")
     group.add_argument("--name", default=None, help="name of the session (default: that of the scene)")
     group.add_argument(
@@ -159,7 +167,10 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
         help="network to listen on instead of --host: a name like eth0, or an address; repeatable",
     )
     group.add_argument(
-        "--advertise", default="", metavar="ADDR", help="address that others are told, behind a router that forwards"
+        "--advertise",
+        default="",
+        metavar="ADDR",
+        help="address announced to clients, behind a router that forwards ports",
     )
     group.add_argument(
         "--port-base",
@@ -168,28 +179,30 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="block of ports: introduction N, control N+1, state N+2, ... N+6 (default: 7720)",
     )
-    group.add_argument("--no-beacon", action="store_true", help="do not tell the network that this session is here")
-    group.add_argument("--control-port", type=int, default=None, metavar="PORT", help="0: any free one")
-    group.add_argument("--state-port", type=int, default=None, metavar="PORT", help="0: any free one")
-    group.add_argument("--curve", action="store_true", help="encrypt on loopback too, and let listed keys in only")
+    group.add_argument("--no-beacon", action="store_true", help="do not announce the session on the network")
+    group.add_argument("--control-port", type=int, default=None, metavar="PORT", help="0: any free port")
+    group.add_argument("--state-port", type=int, default=None, metavar="PORT", help="0: any free port")
+    group.add_argument("--curve", action="store_true", help="encrypt on loopback too, and admit listed keys only")
     group.add_argument(
-        "--curve-key", default="", metavar="FILE", help="another CURVE secret key of the server than the user's"
+        "--curve-key", default="", metavar="FILE", help="CURVE secret key of the server (default: the user's)"
     )
     group.add_argument(
         "--record", default=None, metavar="FILE", help="path of the recording (default: below sessions/)"
     )
     group.add_argument(
-        "--curve-clients", default="", metavar="DIR", help="public certificates to let in instead of the allow-list"
+        "--curve-clients", default="", metavar="DIR", help="public certificates to admit, instead of the allow-list"
     )
     group.add_argument("--no-record", action="store_true", help="record nothing")
-    group.add_argument("--sites", action="store_true", help="clients are told of the model's sites too")
-    group.add_argument("--tendons", action="store_true", help="and of its spatial tendons")
-    group.add_argument("--assignment", choices=sorted(AssignmentPolicy.ALL), default=None, help="who gets which robot")
+    group.add_argument("--sites", action="store_true", help="send the model's sites to clients")
+    group.add_argument("--tendons", action="store_true", help="send the model's spatial tendons to clients")
+    group.add_argument(
+        "--assignment", choices=sorted(AssignmentPolicy.ALL), default=None, help="how robots are assigned"
+    )
     group.add_argument("--mode", choices=sorted(LeaseMode.ALL), default=None, help="lease mode of every robot")
 
 
 def open_scene(scene: str) -> Scene:
-    """The scene of that name, or in that file; a file or folder in the way of a name is no scene."""
+    """Return the scene of that name, or load it from a file."""
     from iris_session.demo.named_scenes import Scene, scene_by_name
     from iris_session.physics import load_model
 
@@ -200,7 +213,7 @@ def open_scene(scene: str) -> Scene:
 
 
 def format_scene_names() -> str:
-    """The scenes that can be named, a line each."""
+    """Return the named scenes, one per line."""
     from iris_session.demo.scene_names import SCENE_NAMES
 
     width = max(map(len, SCENE_NAMES))
@@ -208,34 +221,34 @@ def format_scene_names() -> str:
 
 
 def explain_no_robots(model: mujoco.MjModel) -> str:
-    """One line about a model in which no robot was found: why, and what helps."""
+    """Return one line that says why no robot was found in a model, and what a robot needs."""
     from iris_session.physics.robots import MIN_JOINTS
 
     has = f"the model has {model.nu} actuators and {model.njnt} joints" if model.nu else "the model has no actuators"
     return (
-        f"no robots found, so people can only look and take objects: a robot is a chain of at least {MIN_JOINTS} "
-        f"actuated joints, and {has}"
+        f"no robots found, so participants can only watch and take objects: a robot is a chain of at least "
+        f"{MIN_JOINTS} actuated joints, and {has}"
     )
 
 
 def to_printable(text: str) -> str:
-    """`text` without anything that a terminal obeys: names and notes are strangers' words."""
+    """Replace characters that control a terminal: names and notes come from other users."""
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
 def print_json(value: dict[str, Any]) -> None:
-    """Exactly one JSON object on standard output."""
+    """Print one JSON object to standard output."""
     print(json.dumps(value, allow_nan=False), flush=True)
 
 
 _UNITS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 POSE_FORMAT: Final = "X,Y,Z,QW,QX,QY,QZ"
-#: Numbers with a comma between them, the first negative: no option looks like that.
+#: Comma-separated numbers, the first negative: no option has this form.
 _BEGINS_WITH_MINUS: Final = re.compile(r"-[0-9.][^,]*(,[^,]*)+")
 
 
 def parse_pose(text: str) -> PoseTuple:
-    """Type of poses: position [m] and unit quaternion, w first."""
+    """Parse a pose: position [m] and unit quaternion, w first."""
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:
@@ -255,8 +268,7 @@ def pose_to_dict(T: PoseTuple) -> dict[str, list[float]]:
 
 
 def join_negative_poses(arguments: Sequence[str]) -> list[str]:
-    """Words of a command line, where a pose that begins with a minus is joined to its option: alone it would be read as
-    an option itself."""
+    """Join a pose that begins with a minus to its option, as `--pose=-1,...`: argparse would read it as an option."""
     out: list[str] = []
     for word in arguments:
         if _BEGINS_WITH_MINUS.fullmatch(word) and out and out[-1].startswith("--") and "=" not in out[-1]:
@@ -267,7 +279,7 @@ def join_negative_poses(arguments: Sequence[str]) -> list[str]:
 
 
 def add_pose_option(parser: argparse.ArgumentParser, description: str) -> None:
-    """`--pose`, which must be given."""
+    """Add the required option `--pose`."""
     parser.add_argument(
         "--pose",
         type=parse_pose,
@@ -278,8 +290,8 @@ def add_pose_option(parser: argparse.ArgumentParser, description: str) -> None:
 
 
 def parse_length(text: str) -> float:
-    """Type of lengths, with their unit so that nobody prints a sheet of 160 m: metres."""
-    found = re.fullmatch(r"([0-9]*\.?[0-9]+)\s*(mm|cm|m)", text.strip())
-    if not found:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a length: a number with its unit, for example 160mm")
-    return float(found[1]) * _UNITS[found[2]]
+    """Parse a length with its unit [m]. The unit is required, so that 160 cannot mean 160 m."""
+    match = re.fullmatch(r"([0-9]*\.?[0-9]+)\s*(mm|cm|m)", text.strip())
+    if not match:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a length: give a number with its unit, for example 160mm")
+    return float(match[1]) * _UNITS[match[2]]

@@ -1,4 +1,4 @@
-"""`iris-session demo NAME`: a whole session on this machine, with emulated people, recorded and verified."""
+"""`iris-session demo NAME`: a whole session on this machine with emulated operators, recorded and verified."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ if TYPE_CHECKING:
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command `demo`."""
     parser = commands.add_parser(
         "demo",
-        help="emulated operators hand things over, fold a cloth, or stow soft bodies",
-        description="Runs a whole session with emulated people in other processes. Exit status 0 only if every object "
-        "really changed hands by contact alone (or was folded, or stowed) and the recording verifies bit for bit.\n\n"
-        "  handover   arms drawn from primitives hand a hammer over; needs no data\n"
+        help="emulated operators hand over objects, fold a cloth, or stow soft bodies",
+        description="Run a whole session with emulated operators in other processes. Exit status 0 only if every "
+        "object changed hands by contact alone (or was folded, or stowed) and the recording verifies bit for bit.\n\n"
+        "  handover   arms made of primitives hand over a hammer; needs no data\n"
         "  iiwa       the same with KUKA iiwa 14 arms\n"
-        "  aloha      two ALOHA stations: two people with two arms each exchange a red and a blue board\n"
-        "  cloth      two people fold a cloth: each takes a corner\n"
-        "  soft       two people stow a soft body each in one box\n\n"
-        "The models of iiwa and aloha come from the folder that IRIS_DATA names.",
+        "  aloha      two ALOHA stations: two operators with two arms each exchange a red and a blue board\n"
+        "  cloth      two operators fold a cloth: each takes a corner\n"
+        "  soft       two operators stow a soft body each in one box\n\n"
+        "The models of iiwa and aloha are read from the folder in IRIS_DATA.",
         epilog="examples:\n  iris-session demo handover\n  iris-session demo handover --seed 7 --json\n"
         "  iris-session demo handover --operators 8 --observers 8\n  iris-session demo aloha --profile busy-wifi\n"
         "  iris-session demo iiwa --latency 40",
@@ -35,27 +36,25 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     parser.add_argument("demo", choices=("handover", "iiwa", "aloha", "cloth", "soft"))
     parser.add_argument(
-        "--operators", type=int, default=2, metavar="N", help="people who drive, in pairs; 2 to 8 (default: 2)"
+        "--operators", type=int, default=2, metavar="N", help="operators, in pairs; 2 to 8 (default: 2)"
     )
+    parser.add_argument("--observers", type=int, default=0, metavar="N", help="observers; 0 to 16 (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of the emulated operators")
     parser.add_argument(
-        "--observers", type=int, default=0, metavar="N", help="people who only look; 0 to 16 (default: 0)"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of everything random in the emulated people")
-    parser.add_argument(
-        "--timeout", type=parse_seconds, default=150.0, metavar="S", help="give up after this many seconds"
+        "--timeout", type=parse_seconds, default=150.0, metavar="S", help="stop after this many seconds"
     )
     link = parser.add_mutually_exclusive_group()
     link.add_argument(
         "--profile",
         default="",
         metavar="NAME",
-        help="links of the operators (docs/evidence/links.md), e.g. busy-wifi",
+        help="link profile of every operator (docs/evidence/links.md), e.g. busy-wifi",
     )
     link.add_argument(
         "--latency",
         type=parse_milliseconds,
         metavar="MS",
-        help="people join over links that delay by this much each way",
+        help="delay of every operator's link, each way",
     )
     add_session_options(parser)
     add_json_option(parser)
@@ -63,7 +62,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
 
 def parse_milliseconds(text: str) -> float:
-    """Type of an option that takes a delay [ms]."""
+    """Parse the delay of an option [ms]."""
     try:
         delay = float(text)
     except ValueError:
@@ -74,7 +73,7 @@ def parse_milliseconds(text: str) -> float:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Runs one demo and prints its summary."""
+    """Run one demo and print its summary."""
     import msgspec
 
     from iris_session.cli.live import LiveView
@@ -85,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     profile = arguments.profile if arguments.latency is None else f"{arguments.latency:f}ms"
     if profile:
-        load_profile(profile)  # before anything is started
+        load_profile(profile)  # fails before anything is started
     play = make_play(arguments.demo, arguments.operators, arguments.observers, arguments.seed)
     config = make_session_config(arguments, arguments.demo)
     out = sys.stderr if arguments.json else sys.stdout
@@ -102,7 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def format_summary(result: DemoResult) -> str:
-    """The result as a few lines of text."""
+    """Return the result as a few lines of text."""
     outcome = "ok" if result.ok else "interrupted" if result.interrupted else "FAILED"
     lines = [f"demo {result.demo}: {outcome} after {result.seconds:.1f} s"]
     lines += [

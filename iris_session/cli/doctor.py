@@ -1,4 +1,4 @@
-"""`iris-session doctor`: what is wrong, why, and what to do. On a client's machine, or on the server's."""
+"""`iris-session doctor`: find out what is wrong, why, and what to do, on a client's machine or on the server's."""
 
 from __future__ import annotations
 
@@ -19,32 +19,35 @@ MARKS: Final = {"ok": "ok     ", "warning": "WARNING", "failed": "FAILED ", "ski
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command `doctor`."""
     parser = commands.add_parser(
         "doctor",
         help="what is wrong, why, and what to do",
-        description="Looks at the way to a session, at keys and joining, and at what the session says of itself: one "
-        "check after the other. Exit status 1 when a check failed. It joins for two seconds, as an observer.",
+        description="Check the route to a session, keys and joining, and the status of the session, one check after "
+        "the other. Exit status 1 if a check failed. It joins for two seconds, as an observer.",
         epilog="examples:\n"
         "  iris-session doctor                      the session on this machine\n"
         "  iris-session doctor 192.168.1.20         from a client's machine\n"
         "  iris-session doctor --session lab-1 --code 7KQ2-M4XD-9PTR\n"
-        "  iris-session doctor --server             the machine that is to serve",
+        "  iris-session doctor --server             the machine that serves, or will serve",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_address_options(parser, code="a join code to try; it is used up")
     parser.add_argument(
         "--role", choices=sorted(Role.ALL), default=Role.OBSERVER, help="role to try (default: %(default)s)"
     )
-    parser.add_argument("--server", action="store_true", help="look at this machine as one that serves")
-    parser.add_argument("--identity", default="", metavar="DIR", help="home of keys (default: as for every command)")
-    parser.add_argument("--record", type=Path, default=Path("sessions"), metavar="DIR", help="--server: of recordings")
-    parser.add_argument("--all", action="store_true", help="also print the checks that were not possible")
+    parser.add_argument("--server", action="store_true", help="check this machine as a server")
+    parser.add_argument("--identity", default="", metavar="DIR", help="folder of keys (default: as for every command)")
+    parser.add_argument(
+        "--record", type=Path, default=Path("sessions"), metavar="DIR", help="--server: folder of recordings"
+    )
+    parser.add_argument("--all", action="store_true", help="also print skipped checks")
     add_json_option(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Examines, prints one screen (or one JSON object); exit status 1 when a check failed."""
+    """Run the checks and print one screen, or one JSON object. Exit status 1 if a check failed."""
     import os
 
     from iris_session.doctor.runner import DoctorReport, run_checks, run_host_checks
@@ -53,16 +56,20 @@ def run(arguments: argparse.Namespace) -> int:
         os.environ["IRIS_HOME"] = arguments.identity
     progress = sys.stderr.isatty() and not arguments.json
 
-    def told(what: str) -> None:
+    def show_progress(what: str) -> None:
         if progress:
             print(f"... {what}", file=sys.stderr, flush=True)
 
     result: DoctorReport
     if arguments.server:
-        result = run_host_checks(arguments.address, arguments.record, on_progress=told)
+        result = run_host_checks(arguments.address, arguments.record, on_progress=show_progress)
     else:
         result = run_checks(
-            arguments.address, session=arguments.session, code=arguments.code, role=arguments.role, on_progress=told
+            arguments.address,
+            session=arguments.session,
+            code=arguments.code,
+            role=arguments.role,
+            on_progress=show_progress,
         )
     if arguments.json:
         print_json(result.as_dict())
@@ -73,7 +80,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def format_findings(findings: Iterable[Finding], *, show_skipped: bool = False) -> list[str]:
-    """One line per check; why and what to do below those that are not well. Printable: texts hold strangers' names."""
+    """Return one line per check, with cause and advice below warnings and failures. Lines are printable: they hold
+    names that other users chose."""
     found = []
     for one in findings:
         if one.state == "skipped" and not show_skipped:
@@ -89,10 +97,10 @@ def format_findings(findings: Iterable[Finding], *, show_skipped: bool = False) 
 
 
 def format_verdict(findings: Iterable[Finding]) -> str:
-    """The last line: which checks to read above."""
+    """Return the last line: which checks to read above."""
     failed, warned, skipped = ([one.check for one in findings if one.state == state] for state in PROBLEM_STATES)
-    look = f"to look at: {', '.join(warned)}" if warned else ""
+    warnings = f"warnings: {', '.join(warned)}" if warned else ""
     if failed:
-        left = f"{len(skipped)} not possible" if skipped else ""
-        return "; ".join(text for text in (f"FAILED: {', '.join(failed)}", look, left) if text)
-    return f"nothing failed; {look}" if warned else "all well"
+        left = f"{len(skipped)} skipped" if skipped else ""
+        return "; ".join(text for text in (f"FAILED: {', '.join(failed)}", warnings, left) if text)
+    return f"nothing failed; {warnings}" if warned else "all well"

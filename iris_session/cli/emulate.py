@@ -1,4 +1,4 @@
-"""`iris-session emulate`: emulated people with headsets join a session, as real network clients."""
+"""`iris-session emulate`: emulated headsets join a session as real network clients."""
 
 from __future__ import annotations
 
@@ -10,55 +10,64 @@ from iris_session.cli.common import CommandError, add_address_options, check_ses
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command `emulate`."""
     parser = commands.add_parser(
         "emulate",
         help="join with emulated headsets",
-        description="Emulated people join a session: each has a tracking frame of its own, looks at the sheet until "
-        "aligned, takes a robot and works. Ends when everyone with a task is done, or after --seconds.",
+        description="Emulated operators join a session: each has its own tracking frame, observes the sheet until it "
+        "is aligned, acquires a robot and works. Ends when every operator with a task is done, or after --seconds.",
         epilog="examples:\n"
-        "  iris-session emulate                                   one person who moves a robot about\n"
-        "  iris-session emulate --behaviour observer --count 3    three people who only look\n"
+        "  iris-session emulate                                   one operator who moves a robot\n"
+        "  iris-session emulate --behaviour observer --count 3    three observers\n"
         "  iris-session emulate 192.168.0.10 --code 7KQ2-M4XD-9PTR     the first time at a session in the lab\n"
         "  iris-session emulate --session lab-1                   later, by its name\n"
         "  iris-session emulate --headset name=ann,behaviour=giver,robot=left "
         "--headset name=bob,behaviour=receiver,robot=right\n"
-        "  iris-session emulate --drift 30 --bump-at 20 --glance-every 5   a headset that loses its place",
+        "  iris-session emulate --drift 30 --bump-at 20 --glance-every 5   a headset that drifts and is bumped",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    add_address_options(parser, code="join code of `iris-session pair`, the first time")
+    add_address_options(parser, code="join code of `iris-session pair`, needed the first time")
     parser.add_argument("--behaviour", default="wander", help="giver, receiver, wander, idle or observer")
-    parser.add_argument("--robot", default="", help="robot to take (default: the policy of the session chooses)")
-    parser.add_argument("--count", type=int, default=1, help="how many people with --behaviour")
-    parser.add_argument("--seed", type=int, default=0, help="of everything random: frames, noise, motion")
-    parser.add_argument("--drift", type=float, metavar="MM", help="drift of their tracking frames, mm per minute (1)")
+    parser.add_argument("--robot", default="", help="robot to acquire (default: the session assigns one)")
+    parser.add_argument("--count", type=int, default=1, help="number of headsets with --behaviour")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of frames, noise and motion")
+    parser.add_argument("--drift", type=float, metavar="MM", help="drift of the tracking frames, mm per minute (1)")
     parser.add_argument(
         "--bump-at", type=float, action="append", default=[], metavar="S",
-        help="after so many seconds their tracking frames jump by 50 mm, and the headsets do not notice",
+        help="after this many seconds the tracking frames jump by 50 mm, unnoticed by the headsets; repeatable",
     )  # fmt: skip
     parser.add_argument(
-        "--glance-every", type=float, default=0.0, metavar="S", help="while working they go and look at the sheet"
+        "--glance-every",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="observe the sheet again every S seconds while working",
     )
-    parser.add_argument("--headset", action="append", default=[], metavar="KEY=VALUE,...", help="one person in detail")
-    parser.add_argument("--seconds", type=parse_seconds, help="at most this long")
+    parser.add_argument("--headset", action="append", default=[], metavar="KEY=VALUE,...", help="one headset in detail")
+    parser.add_argument("--seconds", type=parse_seconds, help="stop after this many seconds")
     parser.add_argument(
-        "--join-timeout", type=float, default=15.0, metavar="S", help="give up when no session lets us in (%(default)s)"
+        "--join-timeout",
+        type=float,
+        default=15.0,
+        metavar="S",
+        help="stop if no session admits us within this time (%(default)s)",
     )
     parser.add_argument("--curve-server", default="", metavar="FILE", help="the session's public CURVE key (*.key)")
-    parser.add_argument("--curve-key", default="", metavar="FILE", help="our own CURVE secret key (*.key_secret)")
+    parser.add_argument("--curve-key", default="", metavar="FILE", help="CURVE secret key of the client (*.key_secret)")
     parser.add_argument(
-        "--orders", action="store_true", help="lines on standard input: bump, recentre, drift or steady NAME"
+        "--orders", action="store_true", help="read orders from standard input: bump, recentre, drift or steady NAME"
     )
     parser.add_argument("--json", action="store_true", help="one JSON object per line")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Runs the people in this process; exit status 0 when nobody failed."""
+    """Run the emulated headsets in this process. Exit status 0 if none failed."""
     from iris_session.emulator.__main__ import main
 
     if arguments.headset and (arguments.drift is not None or arguments.bump_at or arguments.glance_every):
         raise CommandError(
-            "--drift, --bump-at and --glance-every are for people without --headset; with it write, for example, "
+            "--drift, --bump-at and --glance-every cannot be combined with --headset; use its fields, for example "
             "--headset name=ann,model.drift_m_per_min=0.03,bump_at_s=20,glance_every_s=5"
         )
     headsets = arguments.headset or [
@@ -77,14 +86,16 @@ def run(arguments: argparse.Namespace) -> int:
     status = main(options, "iris-session")
     if status == 1:
         try:
-            check_session_reachable(arguments)  # it may have begun while they waited: asked only now, to say more
+            check_session_reachable(
+                arguments
+            )  # checked only now, for a better message: the session may have started meanwhile
         except CommandError as error:
             print(f"iris-session: {error}", file=sys.stderr)
     return status
 
 
 def _headset_options(arguments: argparse.Namespace) -> str:
-    """What all headsets of `--count` have in common, as fields of `--headset`."""
+    """Return the common options of all headsets of `--count`, as fields of `--headset`."""
     text = f",glance_every_s={arguments.glance_every}"
     if arguments.bump_at:
         text += ",bump_at_s=" + "/".join(map(str, arguments.bump_at))

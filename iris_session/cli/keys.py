@@ -1,4 +1,4 @@
-"""`iris-session keys`: who may join the sessions of this user, and the fingerprints to compare."""
+"""`iris-session keys`: the allow-list of this user's sessions, and fingerprints to compare."""
 
 from __future__ import annotations
 
@@ -11,49 +11,79 @@ from iris_session.cli.pair import add_role_option, parse_roles
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command `keys`."""
     parser = commands.add_parser(
         "keys",
         help="list, allow and revoke the keys that may join",
-        description="The keys that may join encrypted sessions of this user, and the user's own. Sessions that run "
-        "take over every change within half a second: a revoked key loses control and picture at once.",
+        description="Manage the keys that may join encrypted sessions of this user, and show the user's own keys. "
+        "Running sessions apply changes within half a second: a revoked key is disconnected at once.",
         epilog="examples:\n"
         "  iris-session keys list\n"
         "  iris-session keys revoke quest-3\n"
-        "  iris-session keys allow ann ann.key --role operator    a key that came by another way than a join code\n"
-        "  iris-session keys allow me                             this user, on the machine that serves\n"
+        "  iris-session keys allow ann ann.key --role operator    a key received without a join code\n"
+        "  iris-session keys allow me                             this user, on the server's machine\n"
         "  iris-session keys show                                 fingerprints of this user",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    one = actions.add_parser("list", help="keys that may join", description="Lists the keys that may join.")
+    one = actions.add_parser(
+        "list",
+        help="keys that may join",
+        description="List the keys that may join.",
+        epilog="example:\n  iris-session keys list --json",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     add_json_option(one)
     one.set_defaults(run=run_list)
-    one = actions.add_parser("allow", help="let a key in", description="Puts a key on the list, or changes its roles.")
-    one.add_argument("name", help="under which it is listed")
+    one = actions.add_parser(
+        "allow",
+        help="allow a key",
+        description="Add a key to the list, or change its roles.",
+        epilog="examples:\n"
+        "  iris-session keys allow ann ann.key --role operator\n"
+        "  iris-session keys allow me --role any",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    one.add_argument("name", help="name of the key in the list")
     one.add_argument(
         "key",
         nargs="?",
         default="",
-        help="ZeroMQ certificate (*.key), or the public key itself: 40 characters of Z85 (default: this user's own)",
+        help="ZeroMQ certificate (*.key), or the public key as 40 characters of Z85 (default: this user's own)",
     )
     add_role_option(one)
     one.set_defaults(run=run_allow)
     one = actions.add_parser(
-        "revoke", help="let a key in no more", description="Takes a key off the list; whoever uses it now is out."
+        "revoke",
+        help="revoke a key",
+        description="Remove a key from the list; participants who use it are disconnected.",
+        epilog="example:\n  iris-session keys revoke quest-3",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     one.add_argument("name", help="name or fingerprint in the list")
     one.set_defaults(run=run_revoke)
-    one = actions.add_parser("show", help="own fingerprints", description="Shows where keys are, and whose they are.")
+    one = actions.add_parser(
+        "show",
+        help="own fingerprints",
+        description="Show the folder of keys, and the user's own keys.",
+        epilog="example:\n  iris-session keys show",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     add_json_option(one)
     one.set_defaults(run=run_show)
     one = actions.add_parser(
-        "forget", help="trust an address anew", description="Forgets the key that was stored for a session's address."
+        "forget",
+        help="forget the key of a server",
+        description="Remove the stored key of a session's address, so that a new key can be trusted.",
+        epilog="example:\n  iris-session keys forget 192.168.1.20:7721",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    one.add_argument("address", help="HOST:PORT as it was joined")
+    one.add_argument("address", help="HOST:PORT as used to join")
     one.set_defaults(run=run_forget)
 
 
 def run_list(arguments: argparse.Namespace) -> int:
+    """Print the allow-list."""
     from iris_session.security import KeyHome
 
     keys = KeyHome().clients.read()
@@ -72,42 +102,46 @@ def run_list(arguments: argparse.Namespace) -> int:
         print_json({"keys": rows})
         return 0
     if not keys:
-        print("nobody may join yet: `iris-session pair` lets a new device in")
+        print("no keys are allowed yet: `iris-session pair` adds a new device")
     width = max((len(one.name) for one in keys.values()), default=0)
     for mark, one in keys.items():
         roles, seen = ", ".join(one.roles) or "any role", one.last_seen or "never"
-        print(f"{one.name:{width}}  {mark}  {roles}  added {one.added or 'by hand'}  last here {seen}")
+        print(f"{one.name:{width}}  {mark}  {roles}  added {one.added or 'manually'}  last seen {seen}")
     return 0
 
 
 def run_allow(arguments: argparse.Namespace) -> int:
+    """Add a key to the allow-list."""
     from iris_session.security import KeyHome, load_public
 
     home = KeyHome()
     given = arguments.key or home.load_identity().public
     key = load_public(given) if _is_key_file(given) else given
     entry = home.clients.allow_key(arguments.name, key, parse_roles(arguments.role))
-    print(f"{entry.name} may join ({entry.fingerprint}) as {', '.join(entry.roles) or 'anything'}")
+    print(f"{entry.name} may join ({entry.fingerprint}) as {', '.join(entry.roles) or 'any role'}")
     return 0
 
 
 def _is_key_file(text: str) -> bool:
+    """Return whether the text names a file rather than being a key."""
     return os.path.exists(text) or Path(text).suffix in (".key", ".key_secret")
 
 
 def run_revoke(arguments: argparse.Namespace) -> int:
+    """Remove a key from the allow-list."""
     from iris_session.security import KeyHome
 
     clients = KeyHome().clients
     entry = clients.revoke_key(arguments.name)
     if entry is None:
-        names = ", ".join(one.name for one in clients.read().values()) or "nobody"
-        raise CommandError(f"no key {arguments.name!r} on the list, there are: {names}")
-    print(f"{entry.name} may not join any more ({entry.fingerprint})")
+        names = ", ".join(one.name for one in clients.read().values()) or "none"
+        raise CommandError(f"no key {arguments.name!r} on the list; listed: {names}")
+    print(f"{entry.name} is revoked ({entry.fingerprint})")
     return 0
 
 
 def run_show(arguments: argparse.Namespace) -> int:
+    """Print the user's own keys, without secrets."""
     from iris_session.security import KeyHome
 
     home = KeyHome()
@@ -121,19 +155,20 @@ def run_show(arguments: argparse.Namespace) -> int:
             }
         )
         return 0
-    print(f"home of keys      {home.path}")
-    print(f"sessions you run  {server.fingerprint}    public key {server.public}")
+    print(f"folder of keys    {home.path}")
+    print(f"your sessions     {server.fingerprint}    public key {server.public}")
     print(f"you as a client   {own.fingerprint}    public key {own.public}")
     return 0
 
 
 def run_forget(arguments: argparse.Namespace) -> int:
+    """Remove the stored key of a server."""
     from iris_session.security import KeyHome
 
     servers = KeyHome().known_servers
-    gone = servers.remove(arguments.address)
-    if gone is None:
+    removed = servers.remove(arguments.address)
+    if removed is None:
         known = ", ".join(one.address for one in servers.read()) or "none"
-        raise CommandError(f"no key is stored for {arguments.address!r}, stored are: {known}")
-    print(f"the key of {gone.address} ({gone.fingerprint}) is forgotten")
+        raise CommandError(f"no key is stored for {arguments.address!r}; stored: {known}")
+    print(f"the key of {removed.address} ({removed.fingerprint}) is removed")
     return 0

@@ -1,4 +1,4 @@
-"""Shows a running session in the terminal, from a process of its own so that drawing never delays a tick.
+"""Live view of a running session in the terminal, in a process of its own so that drawing never delays a tick.
 
 `LiveView` (in the authority's process) writes one JSON line per refresh into a pipe, without ever blocking;
 `python -m iris_session.cli.live` reads them and draws: a live table on a terminal, one line per event elsewhere.
@@ -29,24 +29,26 @@ if TYPE_CHECKING:
 
 #: Refresh of the display [s].
 REFRESH_S: Final = 0.5
-#: Longest wait for the display at the end [s].
+#: Longest wait for the display at the end of the session [s].
 END_S: Final = 3.0
-#: Event bodies that come in great numbers and say little to a person.
+#: Frequent events that tell a user little.
 HIDDEN_EVENTS: Final = frozenset({"engagement_changed", "samples_rejected"})
 
 
 def round_floats(value: Any) -> Any:
-    """Floats, also within lists, to four digits; below a tenth of a thousandth they are nothing."""
+    """Round floats, also within lists, to four digits; values below 1e-4 become 0."""
     if isinstance(value, float):
         return float(f"{value:.4g}") if abs(value) >= 1e-4 else 0.0
     return [round_floats(one) for one in value] if isinstance(value, list | tuple) else value
 
 
 class EventFilter:
-    """Which events are worth a line on a screen; the recording has them all."""
+    """Select the events that are worth a line on the screen. The recording has all events."""
 
     def __init__(self) -> None:
-        self._agreed: dict[tuple[str, str], bool] = {}  # by pair of headsets: whether they did
+        self._agreed: dict[
+            tuple[str, str], bool
+        ] = {}  # by pair of headsets: whether the last cross-check was as expected
 
     def __call__(self, event: Event) -> bool:
         from iris_session.doctor.headset_checks import MAX_ERROR_RATIO
@@ -65,7 +67,7 @@ class EventFilter:
 
 
 def format_event(event: Event) -> str:
-    """One event as one line of printable text."""
+    """Return one event as one line of printable text."""
     body = msgspec.to_builtins(event.body)
     kind = body.pop("event")
     info = body.pop("participant", None)
@@ -85,8 +87,11 @@ def format_event(event: Event) -> str:
 
 
 class LiveView:
-    """Call `update()` often from the session's loop; it sends at most every `REFRESH_S`. `skipped`: refreshes that
-    the display was too slow for."""
+    """Sender of refreshes to the display process.
+
+    Call `update()` often from the session's loop; it sends at most every `REFRESH_S`. `skipped` counts the refreshes
+    for which the display was too slow.
+    """
 
     def __init__(self, session: Owner, out: TextIO, title: str) -> None:
         self._session = session
@@ -96,12 +101,12 @@ class LiveView:
         self._seen = 0
         self._noteworthy = EventFilter()
         self._pipe = -1
-        self._pending = b""  # of a refresh that did not fit into the pipe: its rest goes out before any other
+        self._pending = b""  # rest of a refresh that did not fit into the pipe: it is sent before the next
         self.skipped = 0
 
     @contextmanager
     def open(self) -> Iterator[Callable[[], None]]:
-        """Starts the display, gives `update`, ends it after the last line."""
+        """Start the display, yield `update`, and stop the display after the last line."""
         self._out.flush()
         child = ChildProcess("iris_session.cli.live", [self._title], stdout=self._out)
         self._pipe = child.stdin_fd
@@ -118,7 +123,7 @@ class LiveView:
             child.close(exit_s=END_S)  # a terminal that reads nothing must not delay the end of the session
 
     def update(self, force: bool = False) -> None:
-        """Sends what is new to the display."""
+        """Send status and new events to the display."""
         now = time.monotonic()
         if now < self._next_s and not force:
             return
@@ -129,14 +134,14 @@ class LiveView:
         fresh = [e for e in self._session.recent_events() if e.event_seq > self._seen]
         lines = [format_event(e) for e in fresh if self._noteworthy(e)]
         status = self._session.status().as_dict()
-        status["handovers"] = len(status.get("handovers", ()))  # the list grows as long as the session lasts
+        status["handovers"] = len(status.get("handovers", ()))  # the list grows with the session
         self._pending = json.dumps({"status": status, "events": lines}).encode() + b"\n"
         self._send()
         if fresh:
             self._seen = fresh[-1].event_seq
 
     def _send(self) -> bool:
-        """Writes what the pipe takes; True when nothing is left."""
+        """Write as much as the pipe accepts. Return True if nothing is pending."""
         try:
             while self._pending:
                 self._pending = self._pending[os.write(self._pipe, self._pending) :]
@@ -157,9 +162,9 @@ def _render_table(title: str, status: dict[str, Any], events: list[str]) -> Rend
     for row in status["participants"]:
         error = "" if row["alignment_mm"] is None else f" {row['alignment_mm']:.1f} mm"
         delays = [f"{status['input_to_ctrl_ms'][r]:.0f} ms" for r in row["robots"] if r in status["input_to_ctrl_ms"]]
-        name = f"{row['name']} ({row['id']})" + ("" if row["connected"] else " [lost]")
+        name = f"{row['name']} ({row['id']})" + ("" if row["connected"] else " [offline]")
         cells = (name, row["role"], ", ".join(row["robots"]), row["alignment"] + error, ", ".join(delays))
-        table.add_row(*(Text(to_printable(cell)) for cell in cells))  # names are people's words, never markup
+        table.add_row(*(Text(to_printable(cell)) for cell in cells))  # names are user input, never markup
     late = status["lateness"]
     state = "E-STOP" if status["estop"] else "paused" if status["paused"] else "running"
     footer = (
@@ -180,7 +185,7 @@ def _parse_refreshes(lines: Iterator[str]) -> Iterator[dict[str, Any]]:
 
 
 def main(title: str) -> int:
-    """The display process: draws until its standard input ends."""
+    """Draw refreshes until standard input ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session's process decides when this ends
     refreshes = _parse_refreshes(iter(sys.stdin))
     if sys.stdout.isatty():

@@ -1,4 +1,4 @@
-"""Entry point of the `iris-session` command: parses, dispatches, turns every expected error into one line."""
+"""Entry point of the command `iris-session`: parse, dispatch, and turn expected errors into one line."""
 
 from __future__ import annotations
 
@@ -26,27 +26,27 @@ from iris_session.cli import (
 from iris_session.cli.common import CommandError, join_negative_poses, list_expected_errors
 
 _EPILOG = """examples:
-  iris-session demo handover                 two emulated operators hand a hammer over
+  iris-session demo handover                 two emulated operators hand over a hammer
   iris-session serve scene.xml               share a MuJoCo scene on this machine
   iris-session pair                          a join code and a QR code for one new device
-  iris-session keys list                     who may join
-  iris-session sessions                      what can be joined on this network
+  iris-session keys list                     the keys that may join
+  iris-session sessions                      the sessions on this network
   iris-session robots scene.xml              the robots found in a model, as TOML to edit
-  iris-session scene inspect scene.xml       what headsets are given of it, and what is heavy
+  iris-session scene inspect scene.xml       what clients receive of a scene, and what is heavy
   iris-session anchors print --size 160mm    a sheet for headsets and cameras, as PDF
   iris-session emulate --behaviour wander    one emulated headset joins the session on this machine
-  iris-session status --watch                people, robots, ages, late ticks, recorder of a session
+  iris-session status --watch                participants, robots, ages, late ticks, recorder of a session
   iris-session doctor 192.168.1.20           what is wrong, why, and what to do
   iris-session verify sessions/*/session.rrd re-simulate a recording and compare it bit for bit
-  iris-session bench state --check           measure the state stream against its bars
+  iris-session bench state --check           measure the state stream and compare it with its bars
 """
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The whole command line."""
+    """Return the parser of the whole command line."""
     parser = argparse.ArgumentParser(
         prog="iris-session",
-        description="One robot scene, several people in XR headsets.",
+        description="Share one robot scene between several people in XR headsets.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -58,7 +58,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs one command; returns the exit status."""
+    """Run one command. Return the exit status."""
     arguments = build_parser().parse_args(join_negative_poses(sys.argv[1:] if argv is None else argv))
     os.environ.setdefault("MUJOCO_GL", "disable")  # no command draws: MuJoCo need not load OpenGL, in no process
     from iris_session.physics import AmbiguousModelError
@@ -66,9 +66,9 @@ def main(argv: list[str] | None = None) -> int:
     try:
         status: int = arguments.run(arguments)
     except KeyboardInterrupt:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # one more must not interrupt the interpreter's own end
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C must not interrupt the interpreter's shutdown
         return 130
-    except BrokenPipeError:  # the reader of a pipe has gone (`| head`)
+    except BrokenPipeError:  # the reader of the pipe has closed it (`| head`)
         sys.stderr.close()
         return 1
     except CommandError as error:
@@ -83,7 +83,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _format_option_hint(error: Exception) -> str:
-    """What the library says without naming options, which a script does not have."""
+    """Return the options that help with an error. The library does not name them: a script has no options."""
     in_use = str(error).startswith("port ") and "is in use" in str(error)
     return " (here: --port-base 7730, or --control-port 0 --state-port 0)" if in_use else ""
 

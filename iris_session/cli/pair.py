@@ -1,4 +1,4 @@
-"""`iris-session pair`: makes a join code, shows it as a QR code, and waits until somebody has used it."""
+"""`iris-session pair`: create a join code, show it as a QR code, and wait until a device has used it."""
 
 from __future__ import annotations
 
@@ -19,36 +19,41 @@ if TYPE_CHECKING:
 ANY_ROLE: Final = "any"
 POLL_S: Final = 0.2
 MAX_MINUTES: Final = 24 * 60.0
-#: By the reason why nobody has paired.
+#: Text by reason why no device has paired.
 FAILURE_TEXTS: Final = {
-    "void": "void after five wrong attempts: make another code",
-    "expired": "expired: nobody used it",
-    "not_listed": "used, but the key is not on the list: see the session's terminal, and make another code",
+    "void": "void after five wrong attempts: create another code",
+    "expired": "expired: the code was not used",
+    "not_listed": "used, but the key is not on the list: see the session's terminal, and create another code",
 }
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command `pair`."""
     parser = commands.add_parser(
         "pair",
-        help="let a new device into the session on this machine",
-        description="Makes a join code for one new device and shows it, with address and key of the session, as a QR "
-        "code. It is good for ten minutes, one device, and five wrong attempts. Waits until it is used; Ctrl-C "
+        help="pair a new device with the session on this machine",
+        description="Create a join code for one new device and show it, with address and key of the session, as a QR "
+        "code. It is valid for ten minutes, one device, and five wrong attempts. Waits until it is used; Ctrl-C "
         "makes it void.",
         epilog="examples:\n"
-        "  iris-session pair                               scan it, or type the code\n"
+        "  iris-session pair                               scan the code, or type it\n"
         "  iris-session pair --role director --name ann    a key that may direct\n"
-        "  iris-session pair --png code.png --no-wait      for a screen elsewhere\n"
-        "  iris-session pair --address 10.0.0.5:7721       as others reach this machine",
+        "  iris-session pair --png code.png --no-wait      to show on another screen\n"
+        "  iris-session pair --address 10.0.0.5:7721       address at which others reach this machine",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_role_option(parser)
+    parser.add_argument("--minutes", type=_parse_minutes, default=10.0, metavar="M", help="validity in minutes (10)")
+    parser.add_argument("--name", default="", help="name of the device in the list (default: as the device sends it)")
     parser.add_argument(
-        "--minutes", type=_parse_minutes, default=10.0, metavar="M", help="how long it is good for (10)"
+        "--session", default="", metavar="NAME", help="name of the session, if several run on this machine"
     )
-    parser.add_argument("--name", default="", help="name of the device in the list (default: what it says itself)")
-    parser.add_argument("--session", default="", metavar="NAME", help="which session, when several run here")
-    parser.add_argument("--address", default="", metavar="HOST[:PORT]", help="where others reach the session")
-    parser.add_argument("--curve-key", default="", metavar="FILE", help="the session's secret key, if not the user's")
+    parser.add_argument(
+        "--address", default="", metavar="HOST[:PORT]", help="address at which others reach the session"
+    )
+    parser.add_argument(
+        "--curve-key", default="", metavar="FILE", help="secret key of the session (default: the user's)"
+    )
     parser.add_argument("--png", type=Path, metavar="FILE", help="also write the QR code as an image")
     parser.add_argument("--no-wait", action="store_true", help="do not wait until the code is used")
     add_json_option(parser)
@@ -56,23 +61,23 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
 
 def add_role_option(parser: argparse.ArgumentParser) -> None:
-    """`--role`, for `pair` and `keys allow`."""
+    """Add `--role`, for `pair` and `keys allow`."""
     parser.add_argument(
         "--role",
         action="append",
         choices=[*sorted(Role.ALL), ANY_ROLE],
         metavar="ROLE",
-        help=f"what the key may join as, repeatable (default: {', '.join(DEFAULT_ROLES)}); {ANY_ROLE}: every role",
+        help=f"role of the key, repeatable (default: {', '.join(DEFAULT_ROLES)}); {ANY_ROLE}: every role",
     )
 
 
 def parse_roles(names: list[str] | None) -> tuple[str, ...]:
-    """Roles for the allow-list: empty for any."""
+    """Return the roles for the allow-list: empty for any role."""
     return DEFAULT_ROLES if names is None else () if ANY_ROLE in names else tuple(names)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Exit status 1 when the code was not used."""
+    """Create a code, print it, and wait. Exit status 1 if the code was not used."""
     from iris_session.client.address import pairing_uri
     from iris_session.security import KeyHome, load_secret
 
@@ -83,7 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
     code, made = home.join_codes.create(key, minutes=arguments.minutes, roles=roles, name=arguments.name)
     try:
         uri = pairing_uri(*places[0], key.public, code, session)
-        told = {
+        invitation = {
             "code": code,
             "uri": uri,
             "session": session,
@@ -92,10 +97,10 @@ def run(arguments: argparse.Namespace) -> int:
             "roles": list(roles),
             "expires": made.expires,
         }
-        _print_invitation(arguments, told)
+        _print_invitation(arguments, invitation)
         return 0 if arguments.no_wait else _wait_until_used(home, made, arguments)
     except BaseException:
-        home.join_codes.cancel(made.id)  # who asked for it does not see any more what becomes of it
+        home.join_codes.cancel(made.id)  # no process waits for the code any more
         raise
 
 
@@ -105,12 +110,14 @@ def _parse_minutes(text: str) -> float:
     except ValueError:
         minutes = 0.0
     if not 0.0 < minutes <= MAX_MINUTES:
-        raise argparse.ArgumentTypeError(f"{text!r} is no time: more than 0 and at most {MAX_MINUTES:g} minutes")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a time: give more than 0 and at most {MAX_MINUTES:g} minutes"
+        )
     return minutes
 
 
 def _find_addresses(arguments: argparse.Namespace, home: KeyHome, key: KeyPair) -> tuple[str, list[tuple[str, int]]]:
-    """Name of the session, and host and port where others reach it, best first."""
+    """Return the name of the session, and hosts and ports at which others reach it, best first."""
     from iris_session.client.address import Address
 
     if arguments.address:
@@ -127,11 +134,11 @@ def _format_session_choice(name: str, here: list[RegisteredSession], found: list
     if not here:
         return (
             "no encrypted session of yours runs on this machine: start one with `iris-session serve SCENE "
-            "--host 0.0.0.0`, or say where it is with --address HOST:PORT"
+            "--host 0.0.0.0`, or give its address with --address HOST:PORT"
         )
     names = ", ".join(sorted(note.name for note in here))
     if not found:
-        return f"no session {name!r} runs here, there are: {names}"
+        return f"no session {name!r} runs here; running: {names}"
     return f"{len(found)} sessions run here ({names}): choose with --session NAME or --address HOST:PORT"
 
 
@@ -163,7 +170,7 @@ def _print_invitation(arguments: argparse.Namespace, invitation: dict[str, Any])
 
 
 def _wait_until_used(home: KeyHome, made: JoinCode, arguments: argparse.Namespace) -> int:
-    """Until the code is used, void or expired."""
+    """Wait until the code is used, void or expired, and print the outcome."""
     seen: object = None
     while True:
         if home.join_codes.signature != seen:
@@ -171,7 +178,7 @@ def _wait_until_used(home: KeyHome, made: JoinCode, arguments: argparse.Namespac
             try:
                 with home.folder.lock():  # held from the use of a code until the key is on the list
                     now = home.join_codes.find_code(made.id)
-            except KeysBusyError:  # whoever holds it has a slow disk: the code is good all the same
+            except KeysBusyError:  # another process holds the lock, on a slow disk: the code is still valid
                 seen, now = None, made
             if now is None or now.paired or not now.is_open(time.time()):
                 break
@@ -182,21 +189,25 @@ def _wait_until_used(home: KeyHome, made: JoinCode, arguments: argparse.Namespac
     entry = None if now is None else now.paired
     listed = entry is not None and entry.fingerprint in home.clients.read()
     if entry is not None and listed:
-        told: dict[str, Any] = {"paired": entry.name, "fingerprint": entry.fingerprint, "roles": list(entry.roles)}
+        invitation: dict[str, Any] = {
+            "paired": entry.name,
+            "fingerprint": entry.fingerprint,
+            "roles": list(entry.roles),
+        }
         text = f"paired: {entry.name} ({entry.fingerprint})"
     else:
         reason = _find_failure_reason(now)
-        told = {"paired": None, "reason": reason}
+        invitation = {"paired": None, "reason": reason}
         text = FAILURE_TEXTS[reason]
     if arguments.json:
-        print_json(told)
+        print_json(invitation)
     else:
         print(text, flush=True)
     return 0 if listed else 1
 
 
 def _find_failure_reason(code: JoinCode | None) -> str:
-    """Why nobody has paired."""
+    """Return why no device has paired."""
     if code is not None and code.attempts_left == 0:
         return "void"
     used = code is not None and (code.paired is not None or (not code.secret and time.time() < code.expires))

@@ -1,4 +1,4 @@
-"""`iris-session robots`: shows the robots found in a model, as a TOML file ready to edit."""
+"""`iris-session robots`: show the robots found in a model, as a TOML file to edit."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from iris_session.cli.common import add_json_option, explain_no_robots, open_sce
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command `robots`."""
     parser = commands.add_parser(
         "robots",
         help="show the robots found in a model, as TOML to edit",
-        description="Prints the robots found in a model. Edit the output and pass it as `serve --robots FILE`.",
+        description="Print the robots found in a model. Edit the output and pass it as `serve --robots FILE`.",
         epilog="examples:\n  iris-session robots scene.xml > robots.toml\n  iris-session robots handover",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -22,7 +23,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Prints what `find_robots` sees; an ambiguous model is an error that carries the same TOML."""
+    """Print the result of `find_robots`. An ambiguous model is an error that carries the same TOML."""
     import msgspec
 
     from iris_session.physics import dump_robots_toml, find_objects, find_robots

@@ -1,4 +1,8 @@
-"""`iris-session scene inspect`, `scene export`: what clients are given of a scene, and a file for viewers."""
+"""`iris-session scene inspect` and `scene export`: show what clients receive of a scene, write it as GLB.
+
+Also the scene arguments that `serve` shares: MuJoCo reads MJCF, MJB and named scenes; every other file is composed
+without it (`SceneBuilder`).
+"""
 
 from __future__ import annotations
 
@@ -19,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class _ParsedScene(NamedTuple):
-    """A scene. `skipped`: what clients will not see. `notes`: what looks like a mistake."""
+    """Scene for inspection. `skipped`: what clients will not see. `notes`: probable mistakes."""
 
     spec: SceneSpec
     scene_hash: str
@@ -28,9 +32,11 @@ class _ParsedScene(NamedTuple):
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command `scene`."""
     parser = commands.add_parser(
         "scene",
-        help="what clients are given of a scene, what is heavy in it; export to GLB",
+        help="inspect what clients receive of a scene, or export it to GLB",
+        description="Inspect what clients receive of a scene, or export it to GLB.",
         epilog="examples:\n  iris-session scene inspect scene.xml\n  iris-session scene inspect arm.urdf\n"
         "  iris-session scene inspect part.stl --scale 0.001    (a part in millimetres)\n"
         "  iris-session scene export handover handover.glb",
@@ -39,8 +45,11 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     inspect = actions.add_parser(
         "inspect",
-        help="tree, extent, sizes, what is heavy and why, what a headset will struggle with",
-        description="Shows what clients are given of a scene, what is heavy in it, what a Quest 3 will struggle with.",
+        help="tree, extent, sizes, heavy parts, warnings for headsets",
+        description="Show what clients receive of a scene, which parts are heavy, and what is too much for a Quest 3.",
+        epilog="examples:\n  iris-session scene inspect scene.xml\n"
+        "  iris-session scene inspect part.stl --scale 0.001    (a part in millimetres)",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     _add_scene_arguments(inspect)
     add_json_option(inspect)
@@ -48,7 +57,9 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     export = actions.add_parser(
         "export",
         help="write the scene as a GLB file",
-        description="Writes the scene as it stands at first as GLB (glTF 2.0): meshes, textures and colours, y up.",
+        description="Write the initial scene as GLB (glTF 2.0): meshes, textures and colours, y up.",
+        epilog="example:\n  iris-session scene export handover handover.glb",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     _add_scene_arguments(export)
     export.add_argument("out", type=Path, metavar="OUT.glb", help="file to write")
@@ -65,12 +76,12 @@ def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_file_options(parser)
     parser.add_argument(
-        "--assets", default=None, metavar="DIR", help="where assets are kept (default: ~/.cache/iris-session/assets)"
+        "--assets", default=None, metavar="DIR", help="folder of assets (default: ~/.cache/iris-session/assets)"
     )
 
 
 def run_inspect(arguments: argparse.Namespace) -> int:
-    """Prints the report; status 0 whatever it says."""
+    """Print the report of a scene."""
     import msgspec
 
     from iris_session.scene.extent import extent_of
@@ -112,17 +123,17 @@ def _print_report(spec: SceneSpec, found: SceneReport, notes: tuple[str, ...]) -
     for heavy in found.heavy:
         print(f"  {heavy.kind} {heavy.name}: {heavy.why}; {_format_size(heavy.bytes)}, {heavy.levels} levels")
     for text in found.skipped:
-        print(f"left out: {text}")
+        print(f"skipped: {text}")
     for text in found.simplified:
         print(f"in recordings and GLB: {text}")
     for text in found.struggles:
         print(f"headset: {text}")
     if not found.struggles:
-        print("headset: nothing here that a Quest 3 would struggle with")
+        print("headset: nothing is too much for a Quest 3")
 
 
 def run_export(arguments: argparse.Namespace) -> int:
-    """Writes the file and says how large it is, and what is not in it."""
+    """Write the file, and print its size and what it does not contain."""
     from iris_session.assets.errors import AssetStoreError
     from iris_session.scene import SceneBuildError
     from iris_session.scene.glb import write_glb
@@ -131,13 +142,13 @@ def run_export(arguments: argparse.Namespace) -> int:
 
     out = expand_path(arguments.out)
     if out.suffix.lower() != ".glb":
-        raise CommandError(f"{out} does not end in .glb: GLB is the only format of `scene export`")
+        raise CommandError(f"{out}: the file must end in .glb, the only format of `scene export`")
     if _is_same_file(expand_path(arguments.scene), out):
-        raise CommandError(f"{out} is the file that is read: name another one to write")
+        raise CommandError(f"{out} is the input file: give another output file")
     with files_read() as files:
         parsed, store = _parse_scene(arguments)
     if any(_is_same_file(path, out) for path in (*files, *_list_model_files(arguments.scene))):
-        raise CommandError(f"{out} is a file that {arguments.scene} is made of: name another one to write")
+        raise CommandError(f"{out} is part of {arguments.scene}: give another output file")
     try:
         size = write_glb(parsed.spec, store, out)
     except (SceneBuildError, AssetStoreError) as error:
@@ -152,7 +163,7 @@ def run_export(arguments: argparse.Namespace) -> int:
     for text in parsed.notes:
         print(f"note: {text}", file=sys.stderr)
     for text in parsed.skipped:
-        print(f"left out: {text}", file=sys.stderr)
+        print(f"skipped: {text}", file=sys.stderr)
     for text in simplified:
         print(f"in the GLB: {text}", file=sys.stderr)
     print(f"{out}: {_format_size(size)}")
@@ -160,7 +171,7 @@ def run_export(arguments: argparse.Namespace) -> int:
 
 
 def _list_model_files(scene: str) -> list[Path]:
-    """What an MJCF file refers to."""
+    """Return the files that an MJCF file refers to."""
     path = expand_path(scene)
     if path.suffix.lower() not in (".xml", ".mjcf") or not path.is_file():
         return []
@@ -171,7 +182,7 @@ def _list_model_files(scene: str) -> list[Path]:
 
 
 def _is_same_file(a: Path, b: Path) -> bool:
-    """Whether both are one file, also by a link, or in another spelling."""
+    """Return whether both paths are one file, also by a link or in another spelling."""
     try:
         return a.samefile(b)
     except OSError:
@@ -179,7 +190,7 @@ def _is_same_file(a: Path, b: Path) -> bool:
 
 
 def _parse_scene(arguments: argparse.Namespace) -> tuple[_ParsedScene, AssetStore]:
-    """The scene, with its assets in a store."""
+    """Return the scene, and the store of its assets."""
     from iris_session.protocol.scene import SceneError
     from iris_session.scene import AssetStore
 
@@ -189,8 +200,8 @@ def _parse_scene(arguments: argparse.Namespace) -> tuple[_ParsedScene, AssetStor
         store = AssetStore(arguments.assets)
         return _parse_model(arguments.scene, store) if path is None else _compose_file(path, arguments, store), store
     except OSError as error:
-        raise CommandError(f"assets cannot be kept: {error} (another place: --assets DIR)") from None
-    except SceneError as error:  # more than clients read
+        raise CommandError(f"assets cannot be stored: {error} (choose another folder with --assets DIR)") from None
+    except SceneError as error:  # the scene exceeds the limits of clients
         raise CommandError(str(error)) from None
 
 
@@ -199,7 +210,9 @@ def _parse_model(scene: str, store: AssetStore) -> _ParsedScene:
     from iris_session.scene.mujoco_scene import parse_mujoco
 
     model = open_scene(scene).model
-    beginning = World(model, (), ()).initial_data()  # as a session begins: in the keyframe `home`, if there is one
+    beginning = World(
+        model, (), ()
+    ).initial_data()  # the initial state of a session: the keyframe `home`, if there is one
     parsed = parse_mujoco(model, store, data=beginning, name=Path(scene).stem)
     return _ParsedScene(parsed.spec, parsed.scene_hash, parsed.skipped, check_model_units(parsed.spec))
 
@@ -219,12 +232,12 @@ def _format_size(n_bytes: int) -> str:
     return f"{n_bytes / 1e6:.1f} MB" if n_bytes >= 100_000 else f"{n_bytes / 1e3:.1f} kB"
 
 
-#: Endings of files that MuJoCo simulates; any other file is composed, and shown as it is.
+#: Suffixes of files that MuJoCo simulates; any other file is composed and shown as it is.
 SIMULATED: Final = (".xml", ".mjcf", ".mjb")
 _ROBOT: Final = ".urdf"
-#: How meshes in a model that are too large or too small are mended.
+#: Advice for meshes of a model that are too large or too small.
 _MESH_SCALE_ADVICE: Final = 'scale="{factor} {factor} {factor}" at its <mesh>, times the one that it has,'
-#: From when on it is told that something takes its time: about a second.
+#: Limits above which work takes longer than about a second and progress is printed.
 _LARGE_FILE_BYTES: Final = 5_000_000
 _MANY_TRIANGLES: Final = 100_000
 
@@ -235,14 +248,14 @@ def add_file_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="DIR",
-        help="folder of packages that the file refers to by package://, or may refer into; may be repeated",
+        help="folder of packages that the file refers to by package://, or may refer into; repeatable",
     )
     parser.add_argument(
         "--scale",
         type=_parse_factor,
         default=None,
         metavar="FACTOR",
-        help="how large the file is drawn: 0.001 for one in millimetres; not of MJCF and MJB, which are simulated",
+        help="scale of the file: 0.001 for millimetres; not for MJCF and MJB, which are simulated",
     )
 
 
@@ -252,22 +265,25 @@ def _parse_factor(text: str) -> float:
     except ValueError:
         factor = math.nan
     if not (math.isfinite(factor) and factor > 0.0):
-        raise argparse.ArgumentTypeError(f"{text!r} is no factor: a number above 0, 0.001 for a file in millimetres")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a factor: give a number above 0, for example 0.001 for a file in millimetres"
+        )
     return factor
 
 
 def expand_path(text: str | Path) -> Path:
-    """A path that may begin with `~`."""
+    """Return a path with `~` expanded."""
     try:
         return Path(text).expanduser()
-    except RuntimeError:  # of a user who is not there
-        raise CommandError(f"{text}: there is no such home folder") from None
+    except RuntimeError:  # an unknown user
+        raise CommandError(f"{text}: no such home folder") from None
 
 
 def find_scene_file(scene: str) -> Path | None:
-    """The file that is meant, if MuJoCo does not read it; else `None`, and others say what is wrong.
+    """Return the file to show, or `None` if the scene is for MuJoCo: a model, or a name.
 
-    Raises `CommandError` for a folder, a file that is not there, and endings that nobody reads.
+    Raises:
+        CommandError: It is a folder, or a file that does not exist or has an unknown suffix.
     """
     from iris_session.scene import SceneBuildError
     from iris_session.scene.importers.files import ENDINGS, present, xacro_advice
@@ -285,34 +301,34 @@ def find_scene_file(scene: str) -> Path | None:
     if kind == ".xacro":
         raise CommandError(f"{path.name}: {xacro_advice(path)}")
     if kind.lstrip(".") not in ENDINGS:
-        what = f"files that end in {kind} are not read" if kind else "a file without an ending"
-        raise CommandError(f"{path.name}: {what}. These are: {', '.join(ENDINGS)}")
+        what = f"files that end in {kind} cannot be read" if kind else "a file without a suffix cannot be read"
+        raise CommandError(f"{path.name}: {what}; supported are {', '.join(ENDINGS)}")
     return path
 
 
 def _is_scene_name(scene: str) -> bool:
-    """Whether a scene is called so: a folder of that name is not in its way."""
+    """Return whether a scene has this name. A folder of the same name does not hide it."""
     from iris_session.demo.scene_names import SCENE_NAMES
 
     return scene.rstrip("0123456789") in SCENE_NAMES
 
 
 def check_file_options(arguments: argparse.Namespace, path: Path | None) -> None:
-    """Raises `CommandError` for options that make no sense. `path`: see `file_of`."""
+    """Raise `CommandError` for options that do not apply. `path`: from `find_scene_file`."""
     for folder in arguments.package_dir:
         if not os.path.isdir(os.path.expanduser(folder)):
             raise CommandError(f"--package-dir {folder}: no such folder")
     if path is None and arguments.package_dir:
-        raise CommandError("--package-dir goes with a file to show: MuJoCo's files say themselves where theirs lie")
+        raise CommandError("--package-dir applies to files to show only: MuJoCo's models name their folders themselves")
     if path is None and arguments.scale is not None:
         raise CommandError(
-            f"--scale: MuJoCo simulates {arguments.scene or 'the scene'}, and in another size it would move otherwise; "
-            "a mesh is scaled in the file, by <mesh scale=...>"
+            f"--scale cannot be used with {arguments.scene or 'the scene'}: MuJoCo simulates it, and its dynamics "
+            "depend on its size; scale meshes in the file, by <mesh scale=...>"
         )
 
 
 def make_builder(path: Path, name: str, arguments: argparse.Namespace) -> SceneBuilder:
-    """A scene called `name` with what is in a file that MuJoCo does not read."""
+    """Return a scene called `name` with the content of a file that MuJoCo does not read."""
     from iris_session.scene import SceneBuildError
     from iris_session.scene.builder import SceneBuilder
 
@@ -328,21 +344,19 @@ def make_builder(path: Path, name: str, arguments: argparse.Namespace) -> SceneB
         advice = " (here: --package-dir DIR)" if "package_dirs" in str(error) else ""
         raise CommandError(f"{error}{advice}") from None
     if builder.triangles > _MANY_TRIANGLES:
-        _print_progress(
-            f"preparing meshes of {path.name} ({builder.triangles:,} triangles; the next time they are there)"
-        )
+        _print_progress(f"preparing meshes of {path.name} ({builder.triangles:,} triangles; cached for the next time)")
     return builder
 
 
 def _print_progress(text: str) -> None:
-    """What keeps people waiting, at once, and not among what is read by programs."""
+    """Print what is being done to standard error, at once."""
     print(text, file=sys.stderr, flush=True)
 
 
 def check_model_units(spec: SceneSpec) -> tuple[str, ...]:
-    """What is to be done where lengths of a model of MuJoCo seem to be no metres; nothing where they do not.
+    """Return a note if the meshes of a MuJoCo model do not seem to be in metres.
 
-    Its largest mesh is judged: its places are in metres, and halls may be large.
+    Only the largest mesh is considered: poses are in metres, and a hall may be large.
     """
     from iris_session.scene.extent import largest_mesh, unit_hint
 

@@ -1,4 +1,4 @@
-"""`iris-session serve`: shares any MuJoCo scene, or shows any file with geometry, until Ctrl-C."""
+"""`iris-session serve`: share a MuJoCo scene, or show a file with geometry, until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -30,12 +30,13 @@ if TYPE_CHECKING:
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command `serve`."""
     parser = commands.add_parser(
         "serve",
         help="share a MuJoCo scene, or show a file",
-        description="Shares a MuJoCo scene in real time until Ctrl-C. Robots are found in the model, or named. Files "
-        "of other kinds (GLB, STL, OBJ, ...) are shown as they are, a URDF with its joints at rest.",
-        epilog=f"scenes with a name (iiwa and aloha need the folder that IRIS_DATA names):\n{format_scene_names()}\n\n"
+        description="Share a MuJoCo scene in real time until Ctrl-C. Robots are found in the model, or given by name. "
+        "Other files (GLB, STL, OBJ, ...) are shown as they are, a URDF in its zero configuration.",
+        epilog=f"named scenes (iiwa and aloha need the folder in IRIS_DATA):\n{format_scene_names()}\n\n"
         "examples:\n"
         "  iris-session serve scene.xml\n"
         "  iris-session serve scene.xml --robots robots.toml --assignment nearest --mode request\n"
@@ -44,18 +45,18 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iris-session serve aloha --seconds 30\n"
         "  iris-session serve handover --interface wlan0 --name lab-1\n"
         "  iris-session serve handover --port-base 7730    (a second session on this machine)\n"
-        "  iris-session serve part.glb    (shown, nothing moves)\n"
+        "  iris-session serve part.glb    (shown; nothing moves)\n"
         "  iris-session serve part.stl --scale 0.001    (a part in millimetres)\n"
-        "  iris-session serve --resume sessions/20261121T093000.000000Z-handover    (go on where it ended)",
+        "  iris-session serve --resume sessions/20261121T093000.000000Z-handover    (continue where it ended)",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("scene", nargs="?", help="MJCF or MJB file, a file to show, or the name of a scene, see below")
-    parser.add_argument("--robots", type=Path, metavar="TOML", help="robots by name; see `iris-session robots`")
+    parser.add_argument("--robots", type=Path, metavar="TOML", help="robots of the model; see `iris-session robots`")
     parser.add_argument(
         "--anchors",
         type=Path,
         metavar="TOML",
-        help="where sheets and other anchors are, in place of the scene's; see `iris-session anchors example`",
+        help="poses of sheets and other anchors, instead of the scene's; see `iris-session anchors example`",
     )
     parser.add_argument(
         "--assign",
@@ -68,7 +69,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "--resume",
         type=Path,
         metavar="RECORDING",
-        help="go on from the end of a recording (a .rrd or its folder): same session, people, leases, scene",
+        help="continue at the end of a recording (a .rrd or its folder): same session, participants, leases, scene",
     )
     add_file_options(parser)
     parser.add_argument("--seconds", type=parse_seconds, help="stop after this many seconds")
@@ -78,7 +79,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
 
 def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConfig:
-    """`SessionConfig` from the options of `add_session_options`."""
+    """Return the `SessionConfig` for the options of `add_session_options`."""
     import msgspec
 
     from iris_session.authority import AuthorityConfig
@@ -88,14 +89,14 @@ def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConf
     assigned = parse_assignments(getattr(arguments, "assign", []))
     policy = arguments.assignment or (AssignmentPolicy.CONFIG if assigned else None)
     if assigned and policy != AssignmentPolicy.CONFIG:
-        raise CommandError(f"--assign goes with --assignment {AssignmentPolicy.CONFIG}, not with {policy}")
+        raise CommandError(f"--assignment {policy}: --assign needs --assignment {AssignmentPolicy.CONFIG}")
     changes = {"policy": policy, "default_mode": arguments.mode, "assignments": assigned or None}
     authority = msgspec.structs.replace(AuthorityConfig(), **{k: v for k, v in changes.items() if v is not None})
     if arguments.interface and arguments.host != defaults.host:
-        raise CommandError("--interface and --host both say where to listen: give one of them")
+        raise CommandError("--interface and --host both set where to listen: give one of them")
     base = arguments.port_base
     if base is not None and (arguments.control_port or arguments.state_port):
-        raise CommandError("--port-base names all ports: give it without --control-port and --state-port")
+        raise CommandError("--port-base sets all ports: give it without --control-port and --state-port")
     control, state = (defaults.control_port, defaults.state_port) if base is None else (base + 1, base + 2)
     return SessionConfig(
         name=arguments.name or name,
@@ -116,7 +117,7 @@ def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConf
 
 
 def parse_assignments(options: list[str]) -> dict[str, tuple[str, ...]]:
-    """Participant name -> robots, from `NAME=ROBOT[,ROBOT]`; a name given twice has the robots of both."""
+    """Parse `NAME=ROBOT[,ROBOT]` into robots by participant; a name given twice gets the robots of both."""
     found: dict[str, tuple[str, ...]] = {}
     for text in options:
         name, _, robots = text.partition("=")
@@ -128,17 +129,17 @@ def parse_assignments(options: list[str]) -> dict[str, tuple[str, ...]]:
 
 
 def make_session_name(path: Path) -> str:
-    """Default name of a session: that of its scene, with what a name cannot hold replaced."""
+    """Return the default name of a session: that of its scene, with invalid characters replaced."""
     return re.sub(r"[^A-Za-z0-9._-]+", "-", path.stem).strip("._-")[:48] or "session"
 
 
 def create_session(arguments: argparse.Namespace) -> Session:
-    """A session that begins."""
+    """Return a new session of a MuJoCo scene."""
     from iris_session.physics import load_robots_toml
     from iris_session.session.session import Session
 
     if arguments.scene is None:
-        raise CommandError("which scene? give an MJCF or MJB file, the name of a scene, or --resume RECORDING")
+        raise CommandError("no scene is given: give an MJCF or MJB file, the name of a scene, or --resume RECORDING")
     scene = open_scene(arguments.scene)
     robots = None if arguments.robots is None else load_robots_toml(arguments.robots, scene.model)
     config = make_session_config(arguments, make_session_name(Path(arguments.scene)))
@@ -148,25 +149,25 @@ def create_session(arguments: argparse.Namespace) -> Session:
 
 
 def create_publisher(arguments: argparse.Namespace, path: Path) -> ScenePublisher:
-    """A session in which everybody sees a file, and nothing moves."""
+    """Return a publisher that shows a file in which nothing moves."""
     from iris_session.session.scene_publisher import ScenePublisher
 
     drives = ("robots", "assign", "assignment", "mode")
     if given := [f"--{name}" for name in drives if getattr(arguments, name)]:
-        raise CommandError(f"{', '.join(given)}: nobody drives what is in {path.name}, it is shown as it is")
+        raise CommandError(f"{', '.join(given)}: {path.name} has no robots, it is shown as it is")
     scene = make_builder(path, path.name, arguments)
     config = apply_anchors_file(make_session_config(arguments, make_session_name(path)), arguments.anchors)
     return ScenePublisher(scene, config)
 
 
 def resume_session(arguments: argparse.Namespace) -> Session:
-    """A session that goes on from its recording."""
+    """Return a session that continues a recording."""
     from iris_session.session.session import Session
 
     had = ("robots", "assign", "assignment", "mode", "record", "no_record")
     given = [f"--{name.replace('_', '-')}" for name in had if getattr(arguments, name)]
     if given:
-        raise CommandError(f"{', '.join(given)} cannot be given with --resume: the recording has them")
+        raise CommandError(f"{', '.join(given)} cannot be combined with --resume: the recording defines them")
     model = None if arguments.scene is None else open_scene(arguments.scene).model
     config = dataclasses.replace(make_session_config(arguments, "session"), resume=arguments.resume)
     config = apply_anchors_file(config, arguments.anchors)
@@ -174,7 +175,7 @@ def resume_session(arguments: argparse.Namespace) -> Session:
 
 
 def apply_anchors_file(config: SessionConfig, path: Path | None) -> SessionConfig:
-    """The anchors of a file, where one was given."""
+    """Return the configuration with the anchors of a file, if one is given."""
     from iris_session.session.anchors_file import load_anchors
 
     if path is None:
@@ -184,7 +185,7 @@ def apply_anchors_file(config: SessionConfig, path: Path | None) -> SessionConfi
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Serves until the end that was asked for; prints where to join and, at the end, what happened."""
+    """Serve until Ctrl-C or `--seconds`; print where to join and, at the end, the result."""
     shown = None if arguments.resume is not None or arguments.scene is None else find_scene_file(arguments.scene)
     check_file_options(arguments, shown)
     if shown is not None:
@@ -194,24 +195,24 @@ def run(arguments: argparse.Namespace) -> int:
     session = resume_session(arguments) if arguments.resume is not None else create_session(arguments)
     hint = ""
     if not session.robots:
-        tip = f"see `iris-session robots {arguments.scene}`, or name them with --robots FILE"
+        tip = f"see `iris-session robots {arguments.scene}`, or give them with --robots FILE"
         hint = f"{explain_no_robots(session.model)}; {tip}"
     return _serve(arguments, session, lambda _: hint, ", ".join(robot.name for robot in session.robots))
 
 
 def _describe_shown_file(session: Session | ScenePublisher, path: Path) -> str:
-    """What is shown, how large it is, and which of its meshes are better simplified."""
+    """Return what is shown, its extent, and the meshes that should be simplified."""
     from iris_session.scene import AssetStore, SceneBuildError
     from iris_session.scene.extent import extent_of, size_text
     from iris_session.scene.report import large_meshes
 
-    spec, what = session.scene, f"showing {path.name}, which nobody drives"
+    spec, what = session.scene, f"showing {path.name}, without robots"
     if spec is None:
         return what
     where = session.config.assets
     try:
         extent = extent_of(spec, AssetStore(None if isinstance(where, bool) else where))
-    except (OSError, SceneBuildError):  # the session tells of a store that loses its files
+    except (OSError, SceneBuildError):  # the session reports a damaged store
         extent = None
     if extent is not None:
         what += f"; its extent is {size_text(extent)}"
@@ -224,7 +225,7 @@ def _serve(
     make_hint: Callable[[Session | ScenePublisher], str],
     robots: str = "",
 ) -> int:
-    """`hint_of`: what is said of the session once it runs; empty for nothing."""
+    """Run a session. `make_hint` returns a text to print once it runs; empty: none."""
     with session.signals(), session:
         out = sys.stderr if arguments.json else sys.stdout
         print(f"session '{session.name}' on {session.address}, robots: {robots or 'none'}", file=out, flush=True)

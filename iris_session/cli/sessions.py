@@ -1,4 +1,4 @@
-"""`iris-session sessions`: what can be joined on this network."""
+"""`iris-session sessions`: list the sessions on this network."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from iris_session.cli.common import add_json_option, parse_seconds, print_json
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command `sessions`."""
     parser = commands.add_parser(
         "sessions",
         help="list the sessions on this network",
-        description="Lists the sessions that tell of themselves on the networks of this machine. Where an access point "
-        "blocks broadcasts nothing is heard: type the address of the session, or scan the code of `iris-session pair`.",
+        description="List the sessions that announce themselves on the networks of this machine. If an access point "
+        "blocks broadcasts, none is heard: type the address of the session, or scan the code of `iris-session pair`.",
         epilog="examples:\n  iris-session sessions\n  iris-session sessions --seconds 3 --json",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -22,9 +23,9 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Exit status 0 when any was heard, 1 when none was."""
+    """Listen for beacons and print the sessions. Exit status 1 if none was heard."""
     from iris_session.client import find_sessions
-    from iris_session.client.known_servers import known_fingerprints
+    from iris_session.client.endpoint_resolver import known_fingerprints
 
     known = known_fingerprints()
     found = find_sessions(arguments.seconds)
@@ -47,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     for row in rows:
         print(f"{row['name']:<24} {row['address']:<24} {row['kind']:<8} {_format_key(row)}")
     if not rows:
-        print("no session was heard: type the address of one, or scan its code (docs/network.md)")
+        print("no session was heard: type the address of a session, or scan its code (docs/network.md)")
     return 0 if rows else 1
 
 

@@ -1,4 +1,4 @@
-"""`iris-session status`: how a session does, on one screen, as JSON, or as metrics for Prometheus."""
+"""`iris-session status`: the status of a session on one screen, as JSON, or as metrics for Prometheus."""
 
 from __future__ import annotations
 
@@ -25,17 +25,18 @@ if TYPE_CHECKING:
     from iris_session.client import Client
     from iris_session.protocol.status import ParticipantReport, Quantiles, StatusReport
 
-#: Without having been let in by then, the session is asked all the same.
+#: Time to be admitted; afterwards the session is asked nevertheless.
 JOIN_S: Final = 4.0
-#: Clients report once a second: a report before that says less.
+#: Clients report once a second: an earlier status has less.
 FIRST_REPORT_S: Final = 1.2
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command `status`."""
     parser = commands.add_parser(
         "status",
-        help="how a session does: people, robots, ages, late ticks, recorder",
-        description="Joins as the observer `status`, asks, prints, and leaves.",
+        help="status of a session: participants, robots, ages, late ticks, recorder",
+        description="Join as the observer `status`, print the status of the session, and leave.",
         epilog="examples:\n"
         "  iris-session status\n"
         "  iris-session status 192.168.1.20 --watch\n"
@@ -46,24 +47,28 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     add_address_options(parser)
     form = parser.add_mutually_exclusive_group()
     add_watch_options(form, parser)
-    form.add_argument("--prometheus", action="store_true", help="text exposition format of Prometheus, once")
+    form.add_argument("--prometheus", action="store_true", help="print metrics in the text format of Prometheus, once")
     form.add_argument(
-        "--metrics-port", type=int, default=None, metavar="PORT", help="serve that on 127.0.0.1 over HTTP"
+        "--metrics-port", type=int, default=None, metavar="PORT", help="serve the metrics on 127.0.0.1 over HTTP"
     )
     add_json_option(parser)
     parser.set_defaults(run=run)
 
 
 def add_watch_options(group: argparse._ActionsContainer, parser: argparse.ArgumentParser) -> None:
-    """The options of `watch`; `form`: where `--watch` goes."""
-    group.add_argument("--watch", action="store_true", help="go on until Ctrl-C")
+    """Add `--watch` to `group`, and `--period` to `parser`."""
+    group.add_argument("--watch", action="store_true", help="repeat until Ctrl-C")
     parser.add_argument(
-        "--period", type=parse_seconds, default=1.0, metavar="S", help="--watch: refresh (default: %(default)s)"
+        "--period",
+        type=parse_seconds,
+        default=1.0,
+        metavar="S",
+        help="--watch: seconds between two reports (default: %(default)s)",
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Prints the status; with --watch or --metrics-port until Ctrl-C."""
+    """Print the status; with --watch or --metrics-port until Ctrl-C."""
     from iris_session.cli.metrics import format_metrics
 
     with open_status(arguments) as (client, report):
@@ -80,8 +85,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 @contextmanager
 def open_status(arguments: argparse.Namespace) -> Iterator[tuple[Client, StatusReport]]:
-    """An observer of the session that is meant, and its status. A session that stands still lets nobody in, but tells
-    how it does."""
+    """Join a session as an observer. Yield the client and the status.
+
+    A stalled session admits no participant, but answers a request for its status.
+    """
     from iris_session.client import Client, NotConnectedError, RequestTimeoutError
 
     check_session_reachable(arguments)
@@ -100,7 +107,7 @@ def open_status(arguments: argparse.Namespace) -> Iterator[tuple[Client, StatusR
         try:
             report = client.status()
         except (NotConnectedError, RequestTimeoutError) as error:
-            why = str(error) if client.ready else f"no session answers at {client.why_not_in('now')}"
+            why = str(error) if client.ready else f"no session answers at {client.describe_failure('now')}"
             raise CommandError(why) from None
         yield client, report
     finally:
@@ -108,12 +115,13 @@ def open_status(arguments: argparse.Namespace) -> Iterator[tuple[Client, StatusR
 
 
 class ReportPrinter(Protocol):
-    """Prints one report."""
+    """Function that prints one report."""
 
     def __call__(self, report: StatusReport, *, as_json: bool) -> None: ...
 
 
 def print_status(report: StatusReport, *, as_json: bool) -> None:
+    """Print one report as text or JSON."""
     import msgspec
 
     if as_json:
@@ -123,7 +131,7 @@ def print_status(report: StatusReport, *, as_json: bool) -> None:
 
 
 def watch_status(client: Client, period_s: float, print_report: ReportPrinter, *, as_json: bool) -> int:
-    """Until Ctrl-C. A session that goes away is waited for."""
+    """Print reports until Ctrl-C. If the session ends, wait for it to return."""
     from iris_session.client import NotConnectedError, RequestTimeoutError
 
     clear = "\x1b[2J\x1b[H" if sys.stdout.isatty() and not as_json else ""
@@ -140,12 +148,12 @@ def watch_status(client: Client, period_s: float, print_report: ReportPrinter, *
 
 
 def _serve_metrics(client: Client, port: int) -> int:
-    """Answers scrapes on loopback until Ctrl-C."""
+    """Answer HTTP requests for metrics on loopback until Ctrl-C."""
     from iris_session.cli.metrics import CONTENT_TYPE, format_metrics
     from iris_session.client import ClientError
 
     client.start()
-    asking = threading.Lock()  # one scrape at a time: answers are not told apart
+    lock = threading.Lock()  # one request at a time: the client does not match answers to threads
 
     class Scrape(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -153,7 +161,7 @@ def _serve_metrics(client: Client, port: int) -> int:
                 self.send_error(404, "metrics are at /metrics")
                 return
             try:
-                with asking:
+                with lock:
                     body = format_metrics(client.status()).encode()
             except ClientError as error:
                 self.send_error(503, to_printable(str(error)))
@@ -165,7 +173,7 @@ def _serve_metrics(client: Client, port: int) -> int:
             self.wfile.write(body)
 
         def log_message(self, format: str, *args: object) -> None:
-            """Scrapes are not worth a line."""
+            """Requests are not logged."""
 
     try:
         server = ThreadingHTTPServer(("127.0.0.1", port), Scrape)
@@ -178,7 +186,7 @@ def _serve_metrics(client: Client, port: int) -> int:
 
 
 def format_status(report: StatusReport) -> list[str]:
-    """One screen of printable lines."""
+    """Return one screen of printable lines."""
     return [to_printable(line) for line in _format_lines(report)]
 
 
@@ -190,9 +198,9 @@ def _format_lines(report: StatusReport) -> Iterator[str]:
     going = silent.partition(":")[0].replace(NOT_PUBLISHED, "silent for", 1) or "running"
     state = "E-STOP" if report.estop else "paused" if report.paused else going
     if report.stalled:
-        state = f"STANDS STILL since {report.authority_silent_ns * 1e-9:.1f} s"
+        state = f"STALLED for {report.authority_silent_ns * 1e-9:.1f} s"
     elif report.authority_silent_ns < 0:
-        state = "HAS NOT TAKEN A STEP YET"
+        state = "NOT STARTED"
     yield (
         f"session '{report.session_name}'  {state}  tick {report.tick}  {report.session_time * 1e-9:.1f} s  "
         f"{report.connections} connections  {report.entries_per_s:.0f} entries/s"
@@ -217,12 +225,12 @@ def _format_lines(report: StatusReport) -> Iterator[str]:
     yield from _format_assets(report)
     yield ""
     took = measure_stages(report.participants, report)
-    yield "data age, p99 of the worst: " + (
+    yield "data age, p99 of the slowest: " + (
         ", ".join(f"{stage} {ms:.1f} ms" + (f" ({who})" if who else "") for stage, (ms, who) in took.items()) or "-"
     )
     causes = ", ".join(f"{cause} {n}" for cause, n in report.late_causes.items()) or "none"
     yield (
-        f"late ticks: {report.late_share:.2%} of the last ten seconds, {report.late_share_total:.2%} in all; "
+        f"late ticks: {report.late_share:.2%} of the last ten seconds, {report.late_share_total:.2%} in total; "
         f"lateness p50/p99 {_format_quantiles(report.lateness)} ms; causes: {causes}; "
         f"scheduling {report.scheduling or '-'}"
     )
@@ -242,7 +250,7 @@ def _format_lines(report: StatusReport) -> Iterator[str]:
     yield "drops: " + (", ".join(f"{reason} {n}" for reason, n in most) or "none")
     restarts = ", ".join(f"{name} {n}" for name, n in report.restarts.items() if n)
     if restarts:
-        yield f"started again: {restarts}"
+        yield f"restarted: {restarts}"
     yield from (f"warning: {text}" for text in report.warnings)
 
 
@@ -252,7 +260,7 @@ def _format_participant(p: ParticipantReport) -> str:
         aligned += f" {p.alignment_error_m * 1e3:.0f} mm, {p.alignment_age_ns * 1e-9:.0f} s"
     elif p.alignment_void_ns >= 0:
         aligned = f"void for {p.alignment_void_ns * 1e-9:.0f} s"
-    name = f"{p.name} ({p.id})" if p.connected else f"{p.name} LOST {p.lost}"
+    name = f"{p.name} ({p.id})" if p.connected else f"{p.name} OFFLINE {p.lost}"
     age = _format_quantiles(p.state_age) if p.reported else "-"
     waits = f" waits: {', '.join(p.waits_for)}" if p.waits_for else ""
     return (
@@ -262,25 +270,26 @@ def _format_participant(p: ParticipantReport) -> str:
 
 
 def _format_media(report: StatusReport) -> Iterator[str]:
-    """Every stream, and who gets what of it."""
+    """Return a line per stream with its subscribers."""
     if report.media:
         yield ""
     for one in report.media:
-        gets = []
+        subscribers = []
         for p in report.participants:
             for budget in p.media:
                 if budget.stream == one.stream:
-                    gets.append(f"{p.name} ({p.id}) {budget.budget_class}" + _format_dropped(p.media_drops))
+                    subscribers.append(f"{p.name} ({p.id}) {budget.budget_class}" + _format_dropped(p.media_drops))
         source = f" from {one.source}" if one.source else ""
-        yield f"media {one.stream}: {one.hz:.0f} Hz, {one.mbit_per_s:.1f} Mbit/s{source}; {', '.join(gets) or 'nobody'}"
+        receivers = ", ".join(subscribers) or "no subscribers"
+        yield f"media {one.stream}: {one.hz:.0f} Hz, {one.mbit_per_s:.1f} Mbit/s{source}; {receivers}"
 
 
 def _format_assets(report: StatusReport) -> Iterator[str]:
-    """What of the scene's meshes and textures was fetched."""
+    """Return a line about the assets that clients fetched."""
     one = report.assets
     if one is not None and (one.served or one.requests):
         refused = f", {one.refusals} refused" if one.refusals else ""
-        waiting = f"; {one.waiting} clients wait for some" if one.waiting else ""
+        waiting = f"; {one.waiting} clients waiting" if one.waiting else ""
         yield f"assets: {one.served} served, {one.bytes_sent / 1e6:.1f} MB sent{refused}{waiting}"
 
 

@@ -1,4 +1,4 @@
-"""`iris-session verify`: re-simulates recordings and compares every step bit for bit."""
+"""`iris-session verify`: re-simulate recordings and compare every step bit for bit."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from iris_session.cli.common import add_json_option, print_json
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command `verify`."""
     parser = commands.add_parser(
         "verify",
         help="re-simulate a recording and compare it bit for bit",
-        description="Re-simulates recordings. Exit status 0 only if every step of every file is identical.",
+        description="Re-simulate recordings. Exit status 0 only if every step of every file is identical.",
         epilog="example:\n  iris-session verify sessions/*/session.rrd",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -23,7 +24,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Verifies each file; the first problem of each is named with its step and entry."""
+    """Verify each file; the first problem of each is named with its step and entry."""
     from iris_session.recording import Problem, RecordingError, VerifyReport
     from iris_session.session.verification import verify_recording
 
@@ -36,7 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         try:
             report = verify_recording(path, show if progress else None)
-        except RecordingError as error:  # one file that is none must not hide the others
+        except RecordingError as error:  # an unusable file must not hide the others
             report = VerifyReport(str(path), problems=[Problem(-1, "unreadable", "file", str(error))])
             print(f"iris-session: {error}", file=sys.stderr)
         else:

@@ -5,8 +5,10 @@ A sans-I/O core (`connection`, `session_state`, `state_stream`, `clock`, `interp
 """
 
 from iris_session.assets.store import AssetStore
-from iris_session.client.asset_fetch import AssetFetch
+from iris_session.client.assets import AssetFetch
 from iris_session.client.client import Client
+from iris_session.client.core.interpolation import PoseBuffer, ShownPoses
+from iris_session.client.core.state_stream import SceneState
 from iris_session.client.discovery import FoundSession, find_sessions
 from iris_session.client.errors import (
     AssetError,
@@ -21,11 +23,9 @@ from iris_session.client.errors import (
     TrustError,
     VersionError,
 )
+from iris_session.client.group import ClientGroup, poll_all, wait_any
 from iris_session.client.identity import Identity
-from iris_session.client.interpolation import PoseBuffer, Shown
 from iris_session.client.sockets import CurveKeys
-from iris_session.client.state_stream import SceneState
-from iris_session.client.waiting import ClientGroup, poll_all, wait_any
 from iris_session.protocol.session_mirror import SessionMirror
 
 __all__ = [
@@ -39,7 +39,7 @@ __all__ = [
     "PoseBuffer",
     "SceneState",
     "SessionMirror",
-    "Shown",
+    "ShownPoses",
     "find_sessions",
     "poll_all",
     "wait_any",

@@ -25,7 +25,7 @@ WAKE_NS: Final = 5_000_000
 Decode = Callable[[str, memoryview], Any]
 
 
-class Found(NamedTuple):
+class AssetFound(NamedTuple):
     """An asset is in the cache. `decoded`: functions, with what each made of it, or the `AssetError` that it ended
     with. `fetched`: it was stored just now."""
 
@@ -35,34 +35,34 @@ class Found(NamedTuple):
     fetched: bool
 
 
-class Missing(NamedTuple):
+class AssetMissing(NamedTuple):
     """Its first `offset` bytes are there."""
 
     address: str
     offset: int
 
 
-class Stored(NamedTuple):
+class BytesStored(NamedTuple):
     """So many bytes were taken over."""
 
     size: int
 
 
-class Wrong(NamedTuple):
+class HashMismatch(NamedTuple):
     """The bytes that came are not those of the address; they are thrown away. `size`: how many they were."""
 
     address: str
     size: int
 
 
-class Broken(NamedTuple):
+class AssetFailed(NamedTuple):
     """The asset will not come."""
 
     error: AssetError
     address: str
 
 
-Result = Found | Missing | Stored | Wrong | Broken
+Result = AssetFound | AssetMissing | BytesStored | HashMismatch | AssetFailed
 _Job = tuple[str, Callable[[], Result], int]
 
 
@@ -84,20 +84,20 @@ class AssetWorkers:
         for thread in self._threads:
             thread.start()
 
-    def results(self) -> Iterator[Result]:
+    def poll_results(self) -> Iterator[Result]:
         """What was done since the last time."""
         while not self._results.empty():
             yield self._results.get_nowait()
 
-    def look(self, address: str, decodes: Iterable[Decode]) -> None:
+    def look_up(self, address: str, decodes: Iterable[Decode]) -> None:
         """`Found` or `Missing`."""
 
         def work() -> Result:
             view = self.cache.find(address)
             if view is not None:
-                return _found(address, view, decodes, fetched=False)
+                return _decode_found(address, view, decodes, fetched=False)
             part = self._parts[address] = self.cache.open_part(address)
-            return Missing(address, part.offset)
+            return AssetMissing(address, part.offset)
 
         self._submit(address, work)
 
@@ -108,7 +108,7 @@ class AssetWorkers:
             part = self._parts.get(address)
             if part is not None:
                 part.append(data)
-            return Stored(len(data))
+            return BytesStored(len(data))
 
         self._submit(address, work, len(data))
 
@@ -119,9 +119,9 @@ class AssetWorkers:
             part = self._parts[address]
             size = part.offset
             if not part.finish():
-                return Wrong(address, size)
+                return HashMismatch(address, size)
             del self._parts[address]
-            return _found(address, self.cache.view(address), decodes, fetched=True)
+            return _decode_found(address, self.cache.view(address), decodes, fetched=True)
 
         self._submit(address, work)
 
@@ -130,16 +130,16 @@ class AssetWorkers:
 
         def work() -> Result:
             self._parts[address].restart()
-            return Missing(address, 0)
+            return AssetMissing(address, 0)
 
         self._submit(address, work)
 
-    def leave(self, address: str) -> None:
+    def release(self, address: str) -> None:
         """It is not wanted any more; what is there stays for another time."""
 
         def work() -> Result:
             self._close(address)
-            return Stored(0)
+            return BytesStored(0)
 
         self._submit(address, work)
 
@@ -162,16 +162,16 @@ class AssetWorkers:
             address, work, size = job
             if self._closing and not size:
                 continue  # only bytes are worth it
-            result = self._done(address, work, size)
+            result = self._run_job(address, work, size)
             self._results.put(result)
             untold += size
             now_ns = time.monotonic_ns()
-            news = untold >= WAKE_BYTES or (not isinstance(result, Stored) and now_ns - woken_ns >= WAKE_NS)
+            news = untold >= WAKE_BYTES or (not isinstance(result, BytesStored) and now_ns - woken_ns >= WAKE_NS)
             if news or jobs.empty():
                 untold, woken_ns = 0, now_ns
                 self._wake()
 
-    def _done(self, address: str, work: Callable[[], Result], size: int) -> Result:
+    def _run_job(self, address: str, work: Callable[[], Result], size: int) -> Result:
         try:
             return work()
         except AssetError as error:
@@ -184,8 +184,8 @@ class AssetWorkers:
             failure.__cause__ = error
         self._close(address)
         if size:
-            self._results.put(Stored(size))
-        return Broken(failure, address)
+            self._results.put(BytesStored(size))
+        return AssetFailed(failure, address)
 
     def _close(self, address: str) -> None:
         part = self._parts.pop(address, None)
@@ -196,7 +196,7 @@ class AssetWorkers:
         self._jobs[int(address[:8], 16) % THREADS].put((address, work, size))
 
 
-def _found(address: str, view: memoryview, decodes: Iterable[Decode], *, fetched: bool) -> Result:
+def _decode_found(address: str, view: memoryview, decodes: Iterable[Decode], *, fetched: bool) -> Result:
     decoded: list[tuple[Decode, Any]] = []
     for decode in decodes:
         try:
@@ -206,4 +206,4 @@ def _found(address: str, view: memoryview, decodes: Iterable[Decode], *, fetched
             failure = AssetError(address, "decode", text)
             failure.__cause__ = error
             decoded.append((decode, failure))
-    return Found(address, len(view), tuple(decoded), fetched)
+    return AssetFound(address, len(view), tuple(decoded), fetched)

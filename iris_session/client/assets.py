@@ -1,20 +1,28 @@
-"""Assets of a client: fetched from the session by address, in order, into a cache that outlives sessions."""
+"""`client.assets`: assets fetched from the session by address, in order, into a cache that outlives sessions."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from typing import Final
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Final
 
+from iris_session.assets.errors import AssetStoreError
 from iris_session.assets.store import AssetStore, default_root
-from iris_session.client.asset_fetch import AssetFetch
-from iris_session.client.asset_loading import AssetLoader, Failed
-from iris_session.client.asset_workers import AssetWorkers, Broken, Decode, Found, Missing, Result, Stored
-from iris_session.client.connection import Connection
+from iris_session.client.asset_workers import (
+    AssetFailed,
+    AssetFound,
+    AssetMissing,
+    AssetWorkers,
+    BytesStored,
+    Decode,
+    Result,
+)
+from iris_session.client.core.asset_loader import AssetLoader, FailedAsset
+from iris_session.client.core.connection import ClientConnection
+from iris_session.client.core.status import ConnectionPhase
 from iris_session.client.errors import AssetError, InvalidMessageError, NotConnectedError
 from iris_session.client.sockets import ClientSockets
-from iris_session.client.status import Phase
 from iris_session.protocol.assets import AssetRequest, is_address
 from iris_session.protocol.codec import decode_asset_chunk, decode_asset_refused, encode_asset_request
 from iris_session.protocol.errors import ProtocolError
@@ -23,98 +31,250 @@ from iris_session.protocol.names import PROTOCOL_VERSION
 _CHUNK_FRAMES: Final = 2
 
 
-class Assets:
-    """Part of `Client`. `asset_cache`: where assets are kept; set another one before the first is fetched."""
+class AssetFetch:
+    """Assets in the order in which they are wanted, and their progress; made by `client.assets.fetch`.
 
-    connection: Connection
-    _sockets: ClientSockets
-    _lock: threading.RLock
-    asset_cache: AssetStore
+    Attributes:
+        addresses: Content hashes of the assets, each once.
+        pending: Addresses that are still to come.
+        failed: Errors of those that will not come, by address.
+        decoded: Results of `decode`, by address.
+        bytes_received: Bytes of these assets that came over the network.
+        cached: Number of assets that were in the cache.
+        refusal: Why the session does not answer requests yet, in its words; empty while it does.
+    """
 
-    def _init_assets(self) -> None:
-        self.asset_cache = AssetStore(default_root("client-assets"))
+    def __init__(
+        self,
+        cache: AssetStore,
+        addresses: Iterable[str],
+        sizes: Mapping[str, int],
+        on_progress: Callable[[AssetFetch], None] | None,
+        decode: Decode | None,
+    ) -> None:
+        self.addresses = tuple(dict.fromkeys(addresses))
+        self.on_progress = on_progress
+        self.decode = decode
+        self.pending = dict.fromkeys(self.addresses)
+        self.failed: dict[str, AssetError] = {}
+        self.decoded: dict[str, Any] = {}
+        self.refusal = ""
+        self.bytes_received = 0
+        self.cached = 0
+        self._cache = cache
+        self._sizes = {address: sizes[address] for address in self.addresses if address in sizes}
+        self._done: dict[str, int] = {}
+
+    @property
+    def done(self) -> bool:
+        """True when nothing is to come any more; `failed` has what did not."""
+        return not self.pending
+
+    @property
+    def bytes_done(self) -> int:
+        """Bytes of these assets that are here."""
+        return sum(self._done.values())
+
+    @property
+    def bytes_total(self) -> int:
+        """Bytes of all these assets, as far as their sizes are known."""
+        return sum(self._sizes.values())
+
+    def read(self, address: str) -> bytes:
+        """Read an asset that is here.
+
+        Args:
+            address: Content hash, one of `addresses`.
+
+        Returns:
+            Its bytes.
+
+        Raises:
+            AssetError: It has not come yet, or will not.
+        """
+        return bytes(self.view(address))
+
+    def view(self, address: str) -> memoryview:
+        """Map an asset that is here, without a copy: only the parts that are used are read.
+
+        Args:
+            address: Content hash, one of `addresses`.
+
+        Returns:
+            Its bytes, read-only.
+
+        Raises:
+            AssetError: It has not come yet, or will not.
+        """
+        self._check_here(address)
+        try:
+            return self._cache.view(address)
+        except AssetStoreError as error:
+            raise AssetError.from_store(error) from error
+
+    def check(self) -> None:
+        """Raise the first error of `failed`, if there is one.
+
+        Raises:
+            AssetError: An asset will not come.
+        """
+        for error in self.failed.values():
+            raise error
+
+    def _check_here(self, address: str) -> None:
+        if address in self.failed:
+            raise self.failed[address]
+        if address in self.pending:
+            raise AssetError(address, "gone", f"asset {address} has not come yet")
+
+    # --- for the client ----------------------------------------------------------------------------------------------
+
+    def on_bytes(self, address: str, size: int, total: int, received: int = 0) -> None:
+        """Note that `size` of `total` bytes of an asset are here."""
+        if address in self.pending:
+            self._done[address], self._sizes[address] = size, total
+            self.bytes_received += received
+
+    def on_found(self, address: str, size: int, decoded: Sequence[tuple[Decode, Any]], *, fetched: bool) -> None:
+        """Note that an asset is here, with the results of decode functions. It stays pending without that of ours."""
+        if address not in self.pending:
+            return
+        value: Any = None
+        if self.decode is not None:
+            results = [result for decode, result in decoded if decode == self.decode]
+            if not results:
+                return
+            value = results[0]
+        if isinstance(value, AssetError):
+            self.fail(address, value)
+            return
+        self._done[address] = self._sizes[address] = size
+        self.cached += not fetched
+        if self.decode is not None:
+            self.decoded[address] = value
+        del self.pending[address]
+
+    def fail(self, address: str, error: AssetError) -> None:
+        """Note that an asset will not come."""
+        if address in self.pending:
+            del self.pending[address]
+            self.failed[address] = error
+
+
+class ClientAssets:
+    """Fetches assets for a client; `Client.poll` continues it, over any number of connections.
+
+    Attributes:
+        cache: Where assets are kept; set another one before the first fetch.
+        malformed: Messages on the assets channel that do not fit the protocol, or answer no request of ours.
+    """
+
+    def __init__(self, connection: ClientConnection, sockets: ClientSockets, lock: threading.RLock) -> None:
+        self.cache = AssetStore(default_root("client-assets"))
+        self.malformed = 0
+        self._connection = connection
+        self._sockets = sockets
+        self._lock = lock
         self._loader = AssetLoader()
         self._workers: AssetWorkers | None = None
         self._fetches: list[AssetFetch] = []
-        self._asset_generation = -1
-        self._news: list[AssetFetch] = []
-        #: Messages on the assets channel that do not fit the protocol, or that nobody here asked for.
-        self.assets_malformed = 0
+        self._generation = -1
+        self._progressed: list[AssetFetch] = []
 
-    def fetch_assets(
+    def fetch(
         self,
         addresses: Sequence[str] | Mapping[str, int],
         on_progress: Callable[[AssetFetch], None] | None = None,
         decode: Decode | None = None,
     ) -> AssetFetch:
-        """Fetches assets in this order; what the cache has is not asked for. `poll` goes on with it, over any number
-        of connections. With sizes (a mapping), `bytes_total` is known from the beginning.
+        """Start to fetch assets in this order, without waiting; those in the cache are not requested.
 
-        `on_progress(fetch)`: called from `poll` when something has come. `decode(address, bytes)`: called in another
-        thread with every asset when it is there (once for one function, however many fetches have it); what it returns
-        is in `AssetFetch.decoded`, what it raises is an `AssetError`. Raises `InvalidMessageError` for what is no
-        address, `AssetError` when `asset_cache` was exchanged while something was on its way.
-
-            fetch = client.fetch_assets([scene_hash])
+            fetch = client.assets.fetch([scene_hash])
             client.wait_for(lambda c: fetch.done, 30.0)
             data = fetch.read(scene_hash)
+
+        Args:
+            addresses: Content hashes (64 digits 0-9, a-f). As a mapping to sizes [bytes], `bytes_total` is known from
+                the beginning.
+            on_progress: Called from `poll` with the fetch when bytes have come.
+            decode: `decode(address, bytes)` is called in another thread with every asset when it is here, once for one
+                function, however many fetches have it. Its result is in `AssetFetch.decoded`; an exception becomes an
+                `AssetError`.
+
+        Returns:
+            The fetch; look at `done`.
+
+        Raises:
+            InvalidMessageError: One of `addresses` is not an address.
+            AssetError: `cache` was exchanged while assets were on their way into another.
+            NotConnectedError: The client was closed.
         """
         for address in addresses:
             if not is_address(address):
                 raise InvalidMessageError(f"{address[:80]!r} is no address of an asset: 64 digits 0-9, a-f")
         sizes = addresses if isinstance(addresses, Mapping) else {}
         with self._lock:
-            if self.connection.phase is Phase.CLOSED:
-                raise NotConnectedError(self.connection.describe())
-            if self._workers is None or self._workers.cache is not self.asset_cache:
+            if self._connection.phase is ConnectionPhase.CLOSED:
+                raise NotConnectedError(self._connection.describe())
+            if self._workers is None or self._workers.cache is not self.cache:
                 if any(fetch.pending for fetch in self._fetches):
                     raise AssetError(
-                        "", "cache", "asset_cache was exchanged while assets were on their way into another"
+                        "", "cache", "assets.cache was exchanged while assets were on their way into another"
                     )
-                self._end_workers()
-                self._workers = AssetWorkers(self.asset_cache, self._sockets.wake)
-                self._sockets.wake_anybody()
-            fetch = AssetFetch(self.asset_cache, addresses, sizes, on_progress, decode)
+                self._close_workers()
+                self._workers = AssetWorkers(self.cache, self._sockets.wake)
+                self._sockets.enable_wake_registration()
+            fetch = AssetFetch(self.cache, addresses, sizes, on_progress, decode)
             self._fetches.append(fetch)
             for address in fetch.addresses:
-                self._loader.want(address, sizes.get(address, -1))
+                self._loader.add(address, sizes.get(address, -1))
             self._sockets.wake()
             return fetch
 
-    def cancel_assets(self, fetch: AssetFetch) -> None:
-        """What `fetch` still waits for is not wanted any more: it has `failed`, as `cancelled`. What has come of it
-        stays in the cache, to be gone on with. Does nothing when it is done."""
+    def cancel(self, fetch: AssetFetch) -> None:
+        """Cancel what a fetch still waits for: it has `failed` with reason `cancelled`.
+
+        Bytes that have come stay in the cache, for a later fetch.
+
+        Args:
+            fetch: The fetch; one that is done is left as it is.
+        """
         with self._lock:
             for address in list(fetch.pending):
-                error = AssetError(address, "cancelled", f"asset {address} was not waited for")
-                fetch.fail(address, error)
+                fetch.fail(address, AssetError(address, "cancelled", f"the fetch of asset {address} was cancelled"))
                 if not any(address in other.pending for other in self._fetches):
-                    self._loader.drop(address)
+                    self._loader.remove(address)
                     if self._workers is not None:
-                        self._workers.leave(address)
+                        self._workers.release(address)
             self._sockets.wake()
 
+    # --- for the client, which holds the lock ----------------------------------------------------------------------
+
     @property
-    def _loads_assets(self) -> bool:
+    def is_loading(self) -> bool:
+        """True while assets are wanted."""
         return not self._loader.idle
 
-    # --- inside -------------------------------------------------------------------------------------------------------
+    @property
+    def has_workers(self) -> bool:
+        """True since the first fetch."""
+        return self._workers is not None
 
-    def _tend_assets(self) -> bool:
-        """Takes what the workers have done and what has come, and asks for more. True when there was something."""
+    def poll(self) -> bool:
+        """Take results of the workers and chunks that came, and request more. True when there was something."""
         workers, loader = self._workers, self._loader
         if workers is None:
             return False
-        if self._asset_generation != self.connection.generation:
-            self._asset_generation = self.connection.generation
-            self._drop_asset_link()
+        if self._generation != self._connection.generation:
+            self._generation = self._connection.generation
+            self._close_link()
         progressed = False
-        for result in workers.results():
-            self._take_result(result)
+        for result in workers.poll_results():
+            self._process_result(result)
             progressed = True
-        for address in loader.to_look():
-            workers.look(address, self._decodes_of(address))
-        if loader.needs_link and self.connection.joined:
+        for address in loader.next_lookups():
+            workers.look_up(address, self._pending_decodes(address))
+        if loader.needs_link and self._connection.is_joined:
             progressed |= self._exchange(workers)
         elif not loader.needs_link:
             self._sockets.close_assets()
@@ -122,125 +282,18 @@ class Assets:
             self._fetches.remove(fetch)
         return progressed
 
-    def _exchange(self, workers: AssetWorkers) -> bool:
-        """What has come, then what is to be asked for: credit comes back with what was stored."""
-        welcome = self.connection.welcome
-        assert welcome is not None
-        if not welcome.endpoints.assets:
-            error = AssetError("", "no_channel", "this session has no channel for assets")
-            for address in {address for fetch in self._fetches for address in fetch.pending}:
-                self._fail(address, error)
-            return True
-        now_ns = time.monotonic_ns()
-        if self._loader.pauses(now_ns) and not self._sockets.has_assets:
-            return False
-        self._sockets.open_assets(welcome.endpoints.assets)
-        ended = self._sockets.assets_ended()  # before the last that it has brought is taken
-        messages = self._sockets.drain_assets()
-        for frames in messages:
-            try:
-                self._take_message(workers, frames, now_ns)
-            except ProtocolError:
-                self.assets_malformed += 1
-        if ended:
-            self._sockets.close_assets()
-            self._loader.broke_off(now_ns)
-            return True
-        if self._loader.overdue(now_ns):
-            self._drop_asset_link()
-            return True
-        for ask in self._loader.requests(now_ns):
-            request = AssetRequest(PROTOCOL_VERSION, welcome.connection_epoch, *ask)
-            if not self._sockets.send_assets(encode_asset_request(request)):
-                self._drop_asset_link()  # it takes nothing, though little was asked for: it is not there
-                break
-        return bool(messages)
-
-    def _take_message(self, workers: AssetWorkers, frames: list[memoryview], now_ns: int) -> None:
-        loader = self._loader
-        if len(frames) != _CHUNK_FRAMES:
-            outcome = loader.refused(decode_asset_refused(frames[0]), now_ns)
-            for fetch in self._fetches:
-                fetch.put_off = loader.put_off
-            if isinstance(outcome, Failed):
-                self._fail(outcome.address, AssetError(*outcome))
-            elif outcome:
-                workers.restart(outcome)
-            return
-        head, data = frames
-        chunk = decode_asset_chunk(head, len(data))
-        taken = loader.chunk(chunk, len(data), now_ns)
-        if isinstance(taken, Failed):
-            self._fail(taken.address, AssetError(*taken))
-            return
-        if not taken:
-            self.assets_malformed += taken is False
-            return
-        workers.write(chunk.address, data)
-        for fetch in self._fetches:
-            fetch.put_off = ""
-            fetch.has(chunk.address, chunk.offset + len(data), chunk.total, len(data))
-        self._tell(chunk.address)
-        if loader.whole(chunk.address):
-            workers.finish(chunk.address, self._decodes_of(chunk.address))
-
-    def _take_result(self, result: Result) -> None:
-        loader = self._loader
-        if isinstance(result, Stored):
-            loader.stored(result.size)
-        elif isinstance(result, Found):
-            loader.drop(result.address)
-            self._tell(result.address)
-            for fetch in self._fetches:
-                fetch.found(result.address, result.size, result.decoded, fetched=result.fetched)
-            if any(result.address in fetch.pending for fetch in self._fetches):
-                loader.want(result.address, result.size)  # somebody came meanwhile who wants it decoded otherwise
-        elif isinstance(result, Missing):
-            loader.missing(result.address, result.offset)
-        elif isinstance(result, Broken):
-            self._fail(result.address, result.error)
-        elif not loader.again(result.address):
-            text = f"the session sent other bytes than those of asset {result.address}, twice"
-            self._fail(result.address, AssetError(result.address, "hash", text))
-
-    def _fail(self, address: str, error: AssetError) -> None:
-        self._loader.drop(address)
-        if self._workers is not None:
-            self._workers.leave(address)
-        self._tell(address)
-        for fetch in self._fetches:
-            fetch.fail(address, error)
-
-    def _tell(self, address: str) -> None:
-        self._news += [fetch for fetch in self._fetches if address in fetch.pending and fetch not in self._news]
-
-    def _decodes_of(self, address: str) -> list[Decode]:
-        """What the fetches that wait for an asset want to be made of it, each once."""
-        found: list[Decode] = []
-        for fetch in self._fetches:
-            if address in fetch.pending and fetch.decode is not None and fetch.decode not in found:
-                found.append(fetch.decode)
-        return found
-
-    def _drop_asset_link(self) -> None:
-        self._sockets.close_assets()
-        self._loader.cut_off()
-
-    def _call_back_assets(self) -> None:
-        """Without the lock."""
-        news, self._news = self._news, []
-        for fetch in news:
+    def call_back(self) -> None:
+        """Call `on_progress` of the fetches that progressed. Without the lock."""
+        progressed, self._progressed = self._progressed, []
+        for fetch in progressed:
             if fetch.on_progress is not None:
                 fetch.on_progress(fetch)
 
-    def _end_workers(self) -> None:
-        if self._workers is not None:
-            self._workers.close()
-            self._workers = None
+    def close(self) -> AssetWorkers | None:
+        """Fail what has not come: the client is closed.
 
-    def _end_assets(self) -> AssetWorkers | None:
-        """The client is closed: what has not come will not. The workers, to be closed without the lock: what they
-        decode with may wait for it."""
+        Returns the workers, to be closed without the lock: their decode functions may wait for it.
+        """
         workers, self._workers = self._workers, None
         error = AssetError("", "closed", "the client was closed")
         for fetch in self._fetches:
@@ -248,3 +301,113 @@ class Assets:
                 fetch.fail(address, error)
         self._fetches.clear()
         return workers
+
+    def _exchange(self, workers: AssetWorkers) -> bool:
+        """Process what has come, then send requests: credit comes back with what was stored."""
+        welcome = self._connection.welcome
+        assert welcome is not None
+        if not welcome.endpoints.assets:
+            error = AssetError("", "no_channel", "this session has no channel for assets")
+            for address in {address for fetch in self._fetches for address in fetch.pending}:
+                self._fail(address, error)
+            return True
+        now_ns = time.monotonic_ns()
+        if self._loader.is_paused(now_ns) and not self._sockets.has_assets:
+            return False
+        self._sockets.open_assets(welcome.endpoints.assets)
+        ended = self._sockets.poll_assets_disconnect()  # before the last messages of that connection are read
+        messages = self._sockets.drain_assets()
+        for frames in messages:
+            try:
+                self._process_message(workers, frames, now_ns)
+            except ProtocolError:
+                self.malformed += 1
+        if ended:
+            self._sockets.close_assets()
+            self._loader.on_link_lost(now_ns)
+            return True
+        if self._loader.is_overdue(now_ns):
+            self._close_link()
+            return True
+        for chunk in self._loader.next_requests(now_ns):
+            request = AssetRequest(PROTOCOL_VERSION, welcome.connection_epoch, *chunk)
+            if not self._sockets.send_assets(encode_asset_request(request)):
+                self._close_link()  # it takes nothing, though little was requested: it is not there
+                break
+        return bool(messages)
+
+    def _process_message(self, workers: AssetWorkers, frames: list[memoryview], now_ns: int) -> None:
+        loader = self._loader
+        if len(frames) != _CHUNK_FRAMES:
+            outcome = loader.process_refusal(decode_asset_refused(frames[0]), now_ns)
+            for fetch in self._fetches:
+                fetch.refusal = loader.refusal
+            if isinstance(outcome, FailedAsset):
+                self._fail(outcome.address, AssetError(*outcome))
+            elif outcome:
+                workers.restart(outcome)
+            return
+        head, data = frames
+        chunk = decode_asset_chunk(head, len(data))
+        accepted = loader.process_chunk(chunk, len(data), now_ns)
+        if isinstance(accepted, FailedAsset):
+            self._fail(accepted.address, AssetError(*accepted))
+            return
+        if not accepted:
+            self.malformed += accepted is False
+            return
+        workers.write(chunk.address, data)
+        for fetch in self._fetches:
+            fetch.refusal = ""
+            fetch.on_bytes(chunk.address, chunk.offset + len(data), chunk.total, len(data))
+        self._note_progress(chunk.address)
+        if loader.is_complete(chunk.address):
+            workers.finish(chunk.address, self._pending_decodes(chunk.address))
+
+    def _process_result(self, result: Result) -> None:
+        loader = self._loader
+        if isinstance(result, BytesStored):
+            loader.on_stored(result.size)
+        elif isinstance(result, AssetFound):
+            loader.remove(result.address)
+            self._note_progress(result.address)
+            for fetch in self._fetches:
+                fetch.on_found(result.address, result.size, result.decoded, fetched=result.fetched)
+            if any(result.address in fetch.pending for fetch in self._fetches):
+                loader.add(result.address, result.size)  # a fetch came meanwhile that decodes it otherwise
+        elif isinstance(result, AssetMissing):
+            loader.on_missing(result.address, result.offset)
+        elif isinstance(result, AssetFailed):
+            self._fail(result.address, result.error)
+        elif not loader.restart_asset(result.address):
+            text = f"the session sent other bytes than those of asset {result.address}, twice"
+            self._fail(result.address, AssetError(result.address, "hash", text))
+
+    def _fail(self, address: str, error: AssetError) -> None:
+        self._loader.remove(address)
+        if self._workers is not None:
+            self._workers.release(address)
+        self._note_progress(address)
+        for fetch in self._fetches:
+            fetch.fail(address, error)
+
+    def _note_progress(self, address: str) -> None:
+        new = [fetch for fetch in self._fetches if address in fetch.pending and fetch not in self._progressed]
+        self._progressed += new
+
+    def _pending_decodes(self, address: str) -> list[Decode]:
+        """Return the decode functions of the fetches that wait for an asset, each once."""
+        found: list[Decode] = []
+        for fetch in self._fetches:
+            if address in fetch.pending and fetch.decode is not None and fetch.decode not in found:
+                found.append(fetch.decode)
+        return found
+
+    def _close_link(self) -> None:
+        self._sockets.close_assets()
+        self._loader.on_link_closed()
+
+    def _close_workers(self) -> None:
+        if self._workers is not None:
+            self._workers.close()
+            self._workers = None

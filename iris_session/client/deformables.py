@@ -3,7 +3,7 @@
 shapes = Deformables(client)
 while True:
     client.poll(0.01)
-    for name in shapes.tend():
+    for name in shapes.update():
         corners = shapes.vertices[name][shapes.meshes[name].faces]  # p_world (m, 3, 3) [m]; of a rope: edges (k, 2, 3)
 """
 
@@ -11,23 +11,23 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.client.asset_fetch import AssetFetch
+from iris_session.client.assets import AssetFetch
 from iris_session.client.client import Client
-from iris_session.client.deformable_mesh import DeformableMesh, read_mesh
 from iris_session.client.errors import ClientError
 from iris_session.client.media import MediaFeed
 from iris_session.protocol.assets import is_address
 from iris_session.protocol.names import ArrayKind, ArrayName, MediaEncoding
 from iris_session.protocol.scene import Deformable, decode_scene
-from iris_session.scene.arrays import decode_arrays
+from iris_session.scene.arrays import decode_arrays, require
 from iris_session.scene.errors import AssetDecodeError
 from iris_session.streams.deformable import DeformableDecoder
-from iris_session.streams.deformable_topology import DeformableTopology
+from iris_session.streams.deformable_topology import MAX_FACES, MAX_VERTICES, DeformableTopology
 from iris_session.streams.errors import StreamError
 
 #: A scene whose assets did not come is asked for again after so long [s], then after twice that, at most the second.
@@ -35,6 +35,61 @@ FIRST_PAUSE_S: Final = 0.02
 LONGEST_PAUSE_S: Final = 2.5
 #: Largest asset of a deformable in memory, about twice what the largest mesh has: it is read where the client polls.
 MAX_ASSET_BYTES: Final = 128 << 20
+
+
+#: `Deformable.dim` of what is drawn as lines.
+ROPE: Final = 1
+
+
+@dataclass(frozen=True)
+class DeformableMesh:
+    """Of the deformable `name`, whose vertices are `Deformables.vertices[name]`. Arrays are read-only.
+
+    `faces` (m, 3): triangles, counter-clockwise from outside where it has an outside; `edges` (k, 2): lines of a rope,
+    drawn as cylinders. One of the two is empty. Both name rows of the vertices, and none that is not a number.
+    `uv` (m, 3, 2) or `None`: of every triangle's corners; u to the right, v down from the upper left of the image.
+    `rows` (n,): rows of the vertices that are drawn. A soft body's others are inside of it: they do not
+    travel, and are not a number (NaN), so that rows are the numbers of its vertices in the model.
+    `look`: what the specification says: `dim` (1 rope, 2 cloth, 3 soft body), `group`, `rgba`, `material` (a place in
+    `FetchedScene.spec.materials`, -1: none), `radius` (half the thickness [m]), `flat` (one normal per triangle).
+    """
+
+    faces: NDArray[np.int32]
+    edges: NDArray[np.int32]
+    uv: NDArray[np.float32] | None
+    rows: NDArray[np.int32]
+    look: Deformable
+
+    def with_look(self, look: Deformable) -> DeformableMesh:
+        """The same with another look."""
+        return self if look == self.look else replace(self, look=look)
+
+
+def read_mesh(spec: Deformable, arrays: Mapping[str, NDArray[Any]], n_vertices: int) -> DeformableMesh:
+    """`arrays`: of its asset. `n_vertices`: how many its stream has. Raises `AssetDecodeError` or `ValueError`."""
+    corners = 2 if spec.dim == ROPE else 3
+    rows = np.arange(n_vertices, dtype=np.int32)
+    if ArrayName.VERTEX in arrays:
+        numbers = require(arrays, ArrayName.VERTEX, "u2 u4", (n_vertices,))
+        if int(numbers.max(initial=0)) >= MAX_VERTICES:
+            raise ValueError(f"deformable {spec.name!r} numbers its vertices beyond {MAX_VERTICES}")
+        rows = numbers.astype(np.int32)
+    places = require(arrays, ArrayName.ELEMENTS, "u2 u4", (None, corners))
+    if len(places) > MAX_FACES or int(places.max(initial=0)) >= n_vertices:
+        raise ValueError(
+            f"deformable {spec.name!r} has {len(places)} elements up to vertex {int(places.max(initial=0))}: "
+            f"at most {MAX_FACES}, of {n_vertices} vertices"
+        )
+    elements, none = rows[places], np.empty((0, 5 - corners), np.int32)
+    uv = None
+    if ArrayName.UV in arrays:
+        # A copy: no view of the asset.
+        uv = require(arrays, ArrayName.UV, "f4", (len(places), corners, 2)).astype(np.float32)
+    faces, edges = (none, elements) if corners == 2 else (elements, none)
+    for array in (faces, edges, rows, uv):
+        if array is not None:
+            array.setflags(write=False)
+    return DeformableMesh(faces, edges, uv, rows, spec)
 
 
 class _Mesh:
@@ -52,7 +107,7 @@ class _Mesh:
         self.seq = -1
         self.fault = ""
 
-    def placed(self, p_world: NDArray[np.float32]) -> NDArray[np.float32]:
+    def place_vertices(self, p_world: NDArray[np.float32]) -> NDArray[np.float32]:
         """By number in the model; what is inside of a solid is not a number."""
         if not self.numbered:
             return p_world
@@ -95,9 +150,9 @@ class Deformables:
     def fault(self) -> str:
         return self._fault or next((mesh.fault for mesh in self._meshes if mesh.fault), "")
 
-    def tend(self) -> list[str]:
+    def update(self) -> list[str]:
         """Follows the scene and takes the newest frames. Names of those that have moved since the last call."""
-        now = self._client.scene_now  # the thread of `start` may be about to hear of another
+        now = self._client.scene.version  # the thread of `start` may be about to hear of another
         if now is None:  # it has heard of one, and not yet of which
             return []
         if self._client.ready:
@@ -130,14 +185,14 @@ class Deformables:
 
     def _begin(self) -> None:
         if is_address(self._asked):
-            self._fetch = self._client.fetch_assets([self._asked])
+            self._fetch = self._client.assets.fetch([self._asked])
         else:
             self._use([], self._asked)
             self._fault = "this session shares no specification of its scene"
 
     def _cancel(self) -> None:
         if self._fetch is not None:
-            self._client.cancel_assets(self._fetch)
+            self._client.assets.cancel(self._fetch)
         self._fetch = self._parts = None
 
     def _take(self, fetch: AssetFetch) -> None:
@@ -148,9 +203,9 @@ class Deformables:
             if self._parts is None:
                 self._parts = decode_scene(fetch.view(self._asked)).deformables
                 here = {_identity(mesh.key, mesh) for mesh in self._meshes}
-                named = zip(keys(self._parts), self._parts, strict=True)
+                named = zip(deformable_keys(self._parts), self._parts, strict=True)
                 if new := [part.address for key, part in named if _identity(key, part) not in here]:
-                    self._fetch = self._client.fetch_assets(new)
+                    self._fetch = self._client.assets.fetch(new)
                     return
             self._use(self._made(self._parts, fetch), self._asked)
         except (ClientError, AssetDecodeError, StreamError, KeyError, ValueError) as error:
@@ -161,11 +216,11 @@ class Deformables:
         """The meshes of a scene: of those that are here already, the very same."""
         here = {_identity(mesh.key, mesh): mesh for mesh in self._meshes}
         found = []
-        for key, part in zip(keys(parts), parts, strict=True):
+        for key, part in zip(deformable_keys(parts), parts, strict=True):
             mesh = here.get(_identity(key, part))
             found.append(_Mesh(key, part, fetch.view(part.address)) if mesh is None else mesh)
         for mesh, part in zip(found, parts, strict=True):  # nothing of it has failed
-            mesh.shape = mesh.shape.looking(part)
+            mesh.shape = mesh.shape.with_look(part)
         return found
 
     def _use(self, meshes: list[_Mesh], scene_hash: str) -> None:
@@ -173,13 +228,13 @@ class Deformables:
         kept = [mesh for mesh in self._meshes if mesh in meshes]
         gone = [mesh for mesh in self._meshes if mesh not in meshes]
         for stream in {mesh.stream for mesh in gone} - {mesh.stream for mesh in kept}:
-            self._client.drop_media(stream)
+            self._client.media.unsubscribe(stream)
         for mesh in gone:
             self.vertices.pop(mesh.key, None)
             self.capture_ns.pop(mesh.key, None)
         for mesh in meshes:
             if mesh not in kept:
-                mesh.feed = self._client.media(mesh.stream)
+                mesh.feed = self._client.media.subscribe(mesh.stream)
         self._meshes, self.scene_hash = meshes, scene_hash
         self._parked, self._fault = False, ""
 
@@ -201,7 +256,7 @@ class Deformables:
             return False
         mesh.seq = frame.header.seq
         try:
-            self.vertices[mesh.key] = mesh.placed(mesh.decoder.decode(frame.data))
+            self.vertices[mesh.key] = mesh.place_vertices(mesh.decoder.decode(frame.data))
         except StreamError as error:
             mesh.fault = str(error)
             return False
@@ -215,7 +270,7 @@ def _identity(key: str, part: Deformable | _Mesh) -> tuple[str, str, str]:
     return key, part.stream, part.address
 
 
-def keys(parts: Sequence[Deformable]) -> list[str]:
+def deformable_keys(parts: Sequence[Deformable]) -> list[str]:
     """What tells deformables apart: the name of each, where it has one that no other has; else its stream."""
     names = [part.name for part in parts]
     found: list[str] = []

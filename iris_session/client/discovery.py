@@ -17,7 +17,7 @@ from typing import Final, Self
 
 from iris_session.client.address import host_port, is_host
 from iris_session.client.errors import ClientError
-from iris_session.client.resolving import resolve
+from iris_session.client.host_lookup import resolve_host
 from iris_session.protocol.codec import INTRODUCTION_PREFIX, decode_beacon, decode_introduction
 from iris_session.protocol.discovery import DISCOVERY_PORT, INTRODUCTION_OFFSET, Beacon, Introduction
 from iris_session.protocol.errors import ProtocolError, VersionError
@@ -80,14 +80,14 @@ class BeaconListener:
     def close(self) -> None:
         self._socket.close()
 
-    def sessions(self) -> list[FoundSession]:
+    def poll_sessions(self) -> list[FoundSession]:
         """Those heard so far, by name."""
         for _ in range(MAX_DRAIN):
             try:
                 data, sender = self._socket.recvfrom(MAX_BEACON_BYTES + 1)
             except OSError:
                 break
-            self._take(data, str(sender[0]))
+            self._process_datagram(data, str(sender[0]))
         return sorted(self._found.values(), key=lambda found: (found.name, found.session_id))
 
     def wait(self, timeout_s: float) -> None:
@@ -96,33 +96,33 @@ class BeaconListener:
             selector.register(self._socket, selectors.EVENT_READ)
             selector.select(max(0.0, timeout_s))
 
-    def _take(self, data: bytes, sender: str) -> None:
+    def _process_datagram(self, data: bytes, sender: str) -> None:
         try:
             beacon = decode_beacon(data)
         except ProtocolError as error:
-            self._ignore("other_version" if isinstance(error, VersionError) else "malformed")
+            self._count_ignored("other_version" if isinstance(error, VersionError) else "malformed")
             return
-        if not plausible(beacon):
-            self._ignore("malformed")
+        if not is_plausible(beacon):
+            self._count_ignored("malformed")
         elif _is_loopback(beacon.host) and not _is_loopback(sender):
-            self._ignore("foreign_loopback")  # somebody else must not send us to a port of our own
+            self._count_ignored("foreign_loopback")  # somebody else must not send us to a port of our own
         elif beacon.session_id in self._found:
-            self._again(beacon)
+            self._add_address(beacon)
         elif len(self._found) >= MAX_SESSIONS:
-            self._ignore("too_many")
+            self._count_ignored("too_many")
         else:
             address = host_port(beacon.host, beacon.control)
             self._found[beacon.session_id] = FoundSession(
                 beacon.session_name, address, beacon.session_id, beacon.kind, beacon.key_fingerprint, (address,)
             )
 
-    def _again(self, beacon: Beacon) -> None:
+    def _add_address(self, beacon: Beacon) -> None:
         """By another network, or once more."""
         known, address = self._found[beacon.session_id], host_port(beacon.host, beacon.control)
         if address not in known.addresses and len(known.addresses) < MAX_ADDRESSES:
             self._found[beacon.session_id] = replace(known, addresses=(*known.addresses, address))
 
-    def _ignore(self, reason: str) -> None:
+    def _count_ignored(self, reason: str) -> None:
         self.ignored[reason] = self.ignored.get(reason, 0) + 1
 
 
@@ -135,17 +135,17 @@ def find_sessions(timeout_s: float = LISTEN_S, *, port: int = DISCOVERY_PORT) ->
     with BeaconListener(port) as listener:
         while (left := end - time.monotonic()) > 0.0:
             listener.wait(left)
-            listener.sessions()
-        return listener.sessions()
+            listener.poll_sessions()
+        return listener.poll_sessions()
 
 
-def ask_introduction(host: str, control_port: int, timeout_s: float) -> Generator[None, None, Introduction]:
+def request_introduction(host: str, control_port: int, timeout_s: float) -> Generator[None, None, Introduction]:
     """Steps towards the introduction of the session at an address; yields wherever it would wait.
 
     Raises `OSError` (nobody there, no answer) or `ProtocolError` (no introduction, or another protocol version).
     """
     until = time.monotonic() + timeout_s
-    target = yield from resolve(host, until)
+    target = yield from resolve_host(host, until)
     family = socket.AF_INET6 if ":" in target else socket.AF_INET
     data = b""
     with socket.socket(family, socket.SOCK_STREAM) as asking:
@@ -168,7 +168,7 @@ def ask_introduction(host: str, control_port: int, timeout_s: float) -> Generato
     return introduction
 
 
-def plausible(beacon: Beacon) -> bool:
+def is_plausible(beacon: Beacon) -> bool:
     """Whether its texts may be shown in a terminal, and its address can be one. They come from anybody."""
     texts = (beacon.session_id, beacon.session_name, beacon.kind, beacon.key_fingerprint)
     return (

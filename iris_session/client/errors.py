@@ -26,7 +26,7 @@ class ClientError(Exception):
     """Base of all errors of the client."""
 
 
-def joined(*parts: str) -> str:
+def join_parts(*parts: str) -> str:
     """Those that say something, as one line."""
     return "; ".join(part for part in parts if part)
 
@@ -39,7 +39,7 @@ class RefusedError(ClientError):
     """The session refused `hello`. `code` is a `RefusalCode` or a `DenialReason`."""
 
     def __init__(self, refused: Refused) -> None:
-        super().__init__(f"refused ({refused.code}): {joined(refused.message, refused.advice)}")
+        super().__init__(f"refused ({refused.code}): {join_parts(refused.message, refused.advice)}")
         self.code = refused.code
         self.message = refused.message
         self.advice = refused.advice
@@ -59,7 +59,7 @@ class DeniedError(ClientError):
     def __init__(self, denial: Denial) -> None:
         name = denial.holder_name or denial.holder
         who = "" if not name or name in denial.message.split() else f"held by {name}"
-        super().__init__(f"denied ({denial.reason}): {joined(denial.message, who, denial.advice)}")
+        super().__init__(f"denied ({denial.reason}): {join_parts(denial.message, who, denial.advice)}")
         self.denial = denial
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
-from iris_session.client.asset_fetch import AssetFetch
+from iris_session.client.assets import AssetFetch
 from iris_session.client.client import Client
 from iris_session.client.errors import AssetError, ClientError, NotConnectedError
 from iris_session.protocol.assets import is_address
@@ -75,7 +75,7 @@ def fetch_scene(
             "Budget(triangles=100_000)"
         )
     until = time.monotonic() + timeout_s
-    refused = _Refused()
+    refused = _RefusalRetry()
     whole: tuple[int, float] | None = None  # scene epoch of the first that was here, and when it was
     made: Mapping[str, MeshArrays | Pixels] = {}
     while True:
@@ -85,7 +85,7 @@ def fetch_scene(
         except ClientError as error:
             now = time.monotonic()
             replaced = client.mirror.scene_hash != scene_hash
-            if now >= until or not (replaced or refused.again(error, scene_hash, now)):
+            if now >= until or not (replaced or refused.should_retry(error, scene_hash, now)):
                 raise
             if not replaced:
                 client.wait_for(_named_another(scene_hash), min(refused.pause_s, until - now))
@@ -98,7 +98,7 @@ def fetch_scene(
             return scene
 
 
-class _Refused:
+class _RefusalRetry:
     """Refusals of one specification: a session may name it moments before it serves it. `pause_s`: until it is asked
     for again."""
 
@@ -107,7 +107,7 @@ class _Refused:
         self._scene_hash = ""
         self._until = 0.0
 
-    def again(self, error: ClientError, scene_hash: str, now: float) -> bool:
+    def should_retry(self, error: ClientError, scene_hash: str, now: float) -> bool:
         """Whether to ask again, after one more."""
         if not isinstance(error, AssetError) or error.reason != AssetRefusal.UNKNOWN:
             return False
@@ -142,7 +142,7 @@ def _fetch(
 
     sizes = {one.address: one.bytes for one in meshes} | {one.address: one.bytes for one in textures}
     missing = {address: size for address, size in sizes.items() if address not in before}
-    fetch = _wait(client, client.fetch_assets(missing, on_progress, decode), until)
+    fetch = _wait(client, client.assets.fetch(missing, on_progress, decode), until)
     made = {address: before[address] for address in sizes if address in before} | fetch.decoded
     scene = FetchedScene(
         scene_hash,
@@ -158,7 +158,7 @@ def _fetch(
 def _specification(client: Client, scene_hash: str, until: float) -> SceneSpec:
     if not is_address(scene_hash):  # that of a model, of which nothing but bodies and poses is shared
         raise NotConnectedError("this session shares no specification of its scene, only bodies and poses")
-    fetch = _wait(client, client.fetch_assets([scene_hash]), until)
+    fetch = _wait(client, client.assets.fetch([scene_hash]), until)
     try:
         return decode_scene(fetch.view(scene_hash))
     except SceneError as error:
@@ -167,9 +167,9 @@ def _specification(client: Client, scene_hash: str, until: float) -> SceneSpec:
 
 def _wait(client: Client, fetch: AssetFetch, until: float) -> AssetFetch:
     if not client.wait_for(lambda _: fetch.done, max(0.0, until - time.monotonic())):
-        client.cancel_assets(fetch)
+        client.assets.cancel(fetch)
         megabytes = (fetch.bytes_done * 1e-6, fetch.bytes_total * 1e-6)
-        said = f"; the session says {fetch.put_off}" if fetch.put_off else ""
+        said = f"; the session says {fetch.refusal}" if fetch.refusal else ""
         raise NotConnectedError(
             f"the scene has not come in time: {megabytes[0]:.1f} of {megabytes[1]:.1f} MB are here{said}"
         )

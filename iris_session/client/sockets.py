@@ -9,17 +9,18 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final, TypeGuard
 
 import zmq
 
-from iris_session.client.asset_context import asset_context
 from iris_session.client.errors import IdentityError
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES
 from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID
 from iris_session.security import KeysError, load_public, load_secret
+from iris_session.system.priority import run_at_low_priority
 
 STATE_HWM: Final = 2
 #: Small on purpose: what a stalled client finds when it comes back is at most this old, not seconds old.
@@ -59,6 +60,11 @@ class CurveKeys:
         return cls(server_public.encode(), own.public.encode(), own.secret.encode())
 
 
+def to_milliseconds(nanoseconds: int) -> int:
+    """Convert to milliseconds, rounded up: rounded down, the last millisecond of a wait would be a busy loop."""
+    return max(0, -(-nanoseconds // 1_000_000))
+
+
 class ClientSockets:
     """Opens, drains and closes. All methods but `wake` belong to one thread."""
 
@@ -82,7 +88,7 @@ class ClientSockets:
         self._wake_out.setblocking(False)
         self._wake_in.setblocking(False)
 
-    def aim(self, host: str, control_port: int, curve: CurveKeys | None) -> None:
+    def set_target(self, host: str, control_port: int, curve: CurveKeys | None) -> None:
         """Where the sockets that are opened from now on go, and with which keys."""
         self._host = f"[{host}]" if ":" in host else host
         self._control_port = control_port
@@ -205,9 +211,9 @@ class ClientSockets:
             messages.append([frame.buffer for frame in self._assets.recv_multipart(_NOBLOCK, copy=False)])
         return messages
 
-    def assets_ended(self) -> bool:
+    def poll_assets_disconnect(self) -> bool:
         """True once after the assets channel lost its peer, and with it what it had been asked."""
-        return _told(self._assets_monitor)
+        return _poll_monitor(self._assets_monitor)
 
     def close_assets(self) -> None:
         """Ends the connection to the assets channel, and what was asked by it."""
@@ -243,13 +249,13 @@ class ClientSockets:
         return _drain(self._state)
 
     @property
-    def state_waits(self) -> bool:
+    def has_state(self) -> bool:
         """Whether something came on the state channel."""
         return _readable(self._state)
 
-    def disconnected(self) -> bool:
+    def poll_disconnect(self) -> bool:
         """True once after the control socket lost its peer."""
-        return _told(self._monitor)
+        return _poll_monitor(self._monitor)
 
     def register(self, poller: zmq.Poller, *, sending: bool) -> zmq.Socket[bytes] | None:
         """Adds the sockets that peers can wake to `poller`; `sending`: also that the control socket takes more.
@@ -269,7 +275,7 @@ class ClientSockets:
         """Adds what `wake` wakes to `poller`."""
         poller.register(self._wake_in.fileno(), zmq.POLLIN)
 
-    def wake_anybody(self) -> None:
+    def enable_wake_registration(self) -> None:
         """From now on `wake` wakes whoever waits for our sockets, not only our own `poll`."""
         self._wakes_anybody = True
         self.version += 1
@@ -285,7 +291,7 @@ class ClientSockets:
             while self._wake_in.recv(4096):
                 pass
 
-    def hang_up(self) -> None:
+    def disconnect(self) -> None:
         """Disconnects, after a session has sent us away: libzmq would knock at its door for ever."""
         if self._control is not None or self._state is not None:
             self.version += 1
@@ -333,7 +339,7 @@ def _readable(sock: zmq.Socket[bytes] | None) -> TypeGuard[zmq.Socket[bytes]]:
     return sock is not None and bool(sock.get(_EVENTS) & _POLLIN)  # type: ignore[operator]
 
 
-def _told(monitor: zmq.Socket[bytes] | None) -> bool:
+def _poll_monitor(monitor: zmq.Socket[bytes] | None) -> bool:
     """Whether a monitor has told something since the last look."""
     told = False
     while _readable(monitor):
@@ -364,3 +370,22 @@ def _receive(sock: zmq.Socket[bytes]) -> list[bytes]:
         frame = sock.recv(_NOBLOCK, copy=False)
         frames.append(frame.bytes)
     return frames
+
+
+_lock = threading.Lock()
+_context: tuple[int, zmq.Context[zmq.Socket[bytes]]] | None = None
+
+
+def asset_context() -> zmq.Context[zmq.Socket[bytes]]:
+    """One per process; a forked child gets its own."""
+    global _context  # noqa: PLW0603
+    with _lock:
+        if _context is None or _context[0] != os.getpid():
+            _context = os.getpid(), run_at_low_priority(_opened)
+        return _context[1]
+
+
+def _opened() -> zmq.Context[zmq.Socket[bytes]]:
+    made: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    made.socket(zmq.DEALER).close(linger=0)  # with the first socket libzmq starts its threads
+    return made

@@ -1,5 +1,6 @@
-"""Finding out in a minute why a headset shows nothing: one small check after the other, each with what to do.
+"""`iris-session doctor`: find out why a headset shows nothing. Small checks in order, each with a cause and advice.
 
-`findings` holds what a check says, `reach` the way to a session, `door` keys and joining, `condition` what the session
-reports of itself, `machine` the server's machine. `examination` puts them in order.
+`findings` holds the result of a check. `network_checks` check the route to a session, `join_checks` keys and
+joining, `session_checks` and `headset_checks` at the `StatusReport` of the session, `host_checks` at the machine that
+serves. `runner` runs them in order. Printing is in `iris_session.cli.doctor`; nothing here changes a session.
 """

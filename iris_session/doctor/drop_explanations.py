@@ -1,65 +1,65 @@
-"""What the reasons of drops mean, for people. Pure."""
+"""Explanations of the reasons of drops. Pure."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Final
 
-#: Of those that are most, how many are told.
+#: Listed are the most frequent reasons, at most this many.
 MAX_LISTED: Final = 6
-_SLOW: Final = "to who did not read in time"
-_FAST: Final = "from who sends faster than the session takes it"
+_SLOW: Final = "the receiver did not read in time"
+_FAST: Final = "the sender is faster than the session accepts"
 _DISK: Final = "not recorded: the recorder did not keep up"
 _PAIRING: Final = "pairing refused, see the session's terminal"
-_ODD: Final = "from who breaks the protocol"
+_ODD: Final = "protocol violation"
 EXPLANATIONS: Final[Mapping[str, str]] = {
-    "send_queue_full": f"answers and events {_SLOW}",
-    "media_superseded": f"frames of media {_SLOW}, newer ones took their place",
-    "state_superseded": "states that the front was too late for, newer ones went out",
-    "state_to_front": "states that the front did not take",
-    "state_of_other_scene": "states that came as the scene changed",
+    "send_queue_full": f"answers and events: {_SLOW}",
+    "media_superseded": f"media frames replaced by newer ones: {_SLOW}",
+    "state_superseded": "states replaced by newer ones: the front was late",
+    "state_to_front": "states that the front did not accept",
+    "state_of_other_scene": "states received during a change of the scene",
     "samples_pending": _FAST,
     "devices_pending": _FAST,
     "messages_pending": _FAST,
     "urgent_pending": _FAST,
     "rate": _FAST,
-    "flood": "connections that sent far too much, refused",
-    "flood_cut": "connections that sent far too much, closed",
-    "audit_lost": "records of who was let in or refused",
+    "flood": "connections refused because they sent far too much",
+    "flood_cut": "connections closed because they sent far too much",
+    "audit_lost": "audit records of admissions and refusals",
     "malformed": _ODD,
     "too_large": _ODD,
     "report_not_finite": _ODD,
-    "decision_invalid": "too large for any client",
-    "unversioned_peer": "connections that are no client: a browser, a port scan",
+    "decision_invalid": "decisions too large for any client",
+    "unversioned_peer": "connections of other programs: a browser, a port scan",
     "unknown_key": "connections with a key that is not on the list",
-    "unpaired": "from keys that are not on the list",
-    "not_admitted": "from who was not let in yet",
+    "unpaired": "messages from keys that are not on the list",
+    "not_admitted": "messages of participants that were not admitted yet",
     "pair_refused": _PAIRING,
     "pair_rate": _PAIRING,
     "pair_shut_out": _PAIRING,
-    "pair_busy": "pairing put off, it is asked for again",
-    "observation_before_jump": "anchors seen before a headset's frame jumped",
-    "observation_unusable": "anchors seen too far away, or that the session does not know",
-    "alarms_repeated": "alarms of headsets that were told already",
-    "beacon_unsent": "the network takes no broadcasts here",
-    "allow_list_unreadable": "the list of keys cannot be read: the one before counts",
+    "pair_busy": "pairing postponed; the client asks again",
+    "observation_before_jump": "observations from before a jump of the tracking frame",
+    "observation_unusable": "observations of anchors that are too far away or unknown to the session",
+    "alarms_repeated": "repeated alarms of headsets",
+    "beacon_unsent": "the network does not send broadcasts",
+    "allow_list_unreadable": "the list of keys cannot be read; the previous list is used",
     "certificate_unusable": "a key file cannot be used",
-    "close_failed": "connections that the system did not close",
-    "memory": "connections closed, as the front's memory ran short",
-    "memory_elsewhere": "media held back, as the front's memory ran short",
+    "close_failed": "connections that the operating system did not close",
+    "memory": "connections closed because the front's memory limit was reached",
+    "memory_elsewhere": "media not sent because the front's memory limit was reached",
     "recorder_queue_full": _DISK,
     "journal_rows": _DISK,
     "recorded_items": _DISK,
-    "recorded_vertices": "frames of what bends that the recording is without",
+    "recorded_vertices": "frames of deformables that are missing in the recording",
 }
 
-#: Why a request for a piece of the scene was not answered: the reasons are those of the protocol.
+#: Prefix of refused asset requests; what follows is a reason of the protocol.
 _ASSET_PREFIX: Final = "assets_"
-_ASSETS: Final = "requests for pieces of the scene that were refused"
+_ASSETS: Final = "refused requests for assets"
 
 
 def explain_drops(drops: Mapping[str, int]) -> str:
-    """The most frequent ones with what they mean; empty for none."""
+    """Return the most frequent reasons with their explanations; empty for no drops."""
     most = sorted(((n, reason) for reason, n in drops.items() if n), reverse=True)[:MAX_LISTED]
     return ", ".join(f"{reason} {n}{_explain_reason(reason)}" for n, reason in most)
 

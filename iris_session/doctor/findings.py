@@ -1,4 +1,4 @@
-"""What the checks of a doctor say. Plain values."""
+"""Results of the doctor's checks: plain values."""
 
 from __future__ import annotations
 
@@ -10,14 +10,19 @@ import msgspec
 OK: Final = "ok"
 WARNING: Final = "warning"
 FAILED: Final = "failed"
-#: Could not be looked at, because an earlier check failed.
+#: Not checked, because an earlier check failed.
 SKIPPED: Final = "skipped"
 
 
 class Finding(msgspec.Struct, frozen=True):
-    """Result of one check. `check`: its id, which scripts can rely on. `text`: what is so, in one line.
+    """Result of one check.
 
-    `why`: where that comes from; `advice`: what to do. Both are empty when all is well.
+    Attributes:
+        check: Id of the check. Scripts can rely on it.
+        state: `OK`, `WARNING`, `FAILED` or `SKIPPED`.
+        text: What was found, in one line.
+        why: The cause; empty when all is well.
+        advice: What to do; empty when all is well.
     """
 
     check: str
@@ -32,36 +37,40 @@ class Finding(msgspec.Struct, frozen=True):
 
 
 def ok(check: str, text: str) -> Finding:
+    """Return a finding in state `OK`."""
     return Finding(check, OK, text)
 
 
 def warning(check: str, text: str, why: str = "", advice: str = "") -> Finding:
+    """Return a finding in state `WARNING`."""
     return Finding(check, WARNING, text, why, advice)
 
 
 def failed(check: str, text: str, why: str = "", advice: str = "") -> Finding:
+    """Return a finding in state `FAILED`."""
     return Finding(check, FAILED, text, why, advice)
 
 
 class Findings:
-    """All findings of one examination, in order. At most one per check: a later one replaces an earlier one."""
+    """All findings of one run, in order. At most one per check: a later finding replaces an earlier one."""
 
     def __init__(self) -> None:
         self._by_check: dict[str, Finding] = {}
 
     def add(self, *findings: Finding) -> None:
+        """Append findings."""
         for finding in findings:
             self._by_check.pop(finding.check, None)
             self._by_check[finding.check] = finding
 
     def skip(self, *checks: str) -> None:
-        """Those that nothing can be said about."""
+        """Mark checks that have no finding yet as skipped."""
         for check in checks:
             if check not in self._by_check:
-                self.add(Finding(check, SKIPPED, "not looked at: an earlier check failed"))
+                self.add(Finding(check, SKIPPED, "not checked: an earlier check failed"))
 
     def sort(self, order: Sequence[str]) -> None:
-        """In the order of `order`; what is not in it comes last."""
+        """Sort by `order`; checks that are not in it come last."""
         rank = {check: i for i, check in enumerate(order)}
         self._by_check = dict(sorted(self._by_check.items(), key=lambda item: rank.get(item[0], len(rank))))
 
@@ -73,8 +82,9 @@ class Findings:
 
     @property
     def ok(self) -> bool:
-        """No check failed; warnings may be there."""
+        """True if no check failed. Warnings may exist."""
         return not any(finding.failed for finding in self._by_check.values())
 
     def as_list(self) -> list[dict[str, Any]]:
+        """Return the findings as JSON objects."""
         return [msgspec.to_builtins(finding) for finding in self._by_check.values()]

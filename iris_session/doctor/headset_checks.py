@@ -1,4 +1,4 @@
-"""What a `StatusReport` says of the alignment of headsets once they have one, and of their media. Pure."""
+"""Checks of a `StatusReport`: alignments of headsets that have one, and media. Pure."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from iris_session.protocol.common import Nanoseconds
 from iris_session.protocol.names import AlarmKind, AlignmentKind, BudgetClass
 from iris_session.protocol.status import CrossCheckReport, ParticipantReport, StatusReport
 
-#: Tracking frames drift by millimetres a minute: after so long without a sheet the stated error is no longer true.
+#: Tracking frames drift by millimetres a minute: after this time without a sheet the stated error is no longer true.
 STALE_NS: Final = 600_000_000_000
-#: Beyond the 95 % bound by this factor it is not chance, as in `anchors.cross_check`.
+#: An error above the 95 % bound by this factor is not chance, as in `anchors.cross_check`.
 MAX_ERROR_RATIO: Final = 2.0
-#: An older comparison says nothing about now.
+#: Older cross-checks say nothing about the present.
 MAX_CROSS_CHECK_AGE_NS: Final = 600_000_000_000
-#: Fewer frames are lost while the budget of a link is being found: a second of a camera.
+#: Fewer drops are normal while the budget of a link is being found: one second of a camera.
 MEDIA_DROPS: Final = 30
 ALARMS: Final = {
     AlarmKind.JUMP: "the tracking frame jumped",
@@ -26,7 +26,7 @@ ALARMS: Final = {
 
 
 def check_headsets(people: tuple[ParticipantReport, ...], report: StatusReport) -> list[Finding]:
-    """All findings about alignments that there are. `people`: without the doctor."""
+    """Return the findings about existing alignments. `people`: the participants without the doctor."""
     here = tuple(p for p in people if p.connected and p.alignment != AlignmentKind.NOT_NEEDED)
     return [
         check_alarms(here),
@@ -38,7 +38,7 @@ def check_headsets(people: tuple[ParticipantReport, ...], report: StatusReport) 
 
 
 def check_alarms(people: tuple[ParticipantReport, ...]) -> Finding:
-    """Alignments that were found wrong, and that no new one has answered."""
+    """Report alarms that no new alignment has answered."""
     texts, worst = [], warning
     for p in people:
         r = p.alignment_report
@@ -47,16 +47,18 @@ def check_alarms(people: tuple[ParticipantReport, ...]) -> Finding:
         what = ALARMS.get(r.alarm, r.alarm)
         texts.append(f"{p.name}: {what}, by {r.alarm_size_m * 1e3:.0f} mm, {_format_age(r.alarm_ns)} ago")
         if r.alarm == AlarmKind.JUMP:
-            worst = failed  # it has voided the alignment: nothing that p holds moves
+            worst = failed  # it has voided the alignment: no robot that `p` holds moves
     if not texts:
         return ok("alarm", "no alignment was found wrong")
     why = "the headset was bumped, recentred or lost its tracking, or a sheet was moved"
-    advice = "look at a sheet that nobody moved; if one was moved, put it back or `iris-session anchors move`"
+    advice = (
+        "bring a sheet into view that was not moved; if one was moved, put it back or use `iris-session anchors move`"
+    )
     return worst("alarm", "; ".join(texts), why, advice)
 
 
 def check_staleness(people: tuple[ParticipantReport, ...]) -> Finding:
-    """Alignments that nothing has confirmed for long."""
+    """Report measured alignments that no observation has confirmed for ten minutes."""
     texts = []
     for p in people:
         r = p.alignment_report
@@ -67,58 +69,58 @@ def check_staleness(people: tuple[ParticipantReport, ...]) -> Finding:
             texts.append(f"{p.name} has seen no sheet for {_format_age(seen_ns)}")
     if not texts:
         return ok("stale", "measured alignments were confirmed within ten minutes")
-    why = "tracking frames drift by millimetres a minute, and the stated error does not know it"
+    why = "tracking frames drift by millimetres a minute, which the stated error does not include"
     return warning("stale", "; ".join(texts), why, "glance at a sheet now and then")
 
 
 def check_runs(people: tuple[ParticipantReport, ...]) -> Finding:
-    """Alignments that are no longer measured because somebody stopped that."""
+    """Report alignments whose measurement a director stopped."""
     stopped = [p.name for p in people if p.alignment_report is not None and not p.alignment_report.running]
     if not stopped:
         return ok("align_run", "every headset may correct its alignment")
-    text = f"stopped for {', '.join(stopped)}: what they see of the sheets corrects nothing"
-    return warning("align_run", text, "somebody stopped the run", "start it: `iris-session anchors align start`")
+    text = f"stopped for {', '.join(stopped)}: observations of sheets do not correct the alignment"
+    return warning("align_run", text, "a director stopped the run", "start it: `iris-session anchors align start`")
 
 
 def check_corrections(people: tuple[ParticipantReport, ...]) -> Finding:
-    """Corrections that are not in force yet."""
+    """Report corrections that are not in force yet."""
     texts = []
     for p in people:
         r = p.alignment_report
         if r is not None and (r.pending_m > 0.0 or r.pending_rad > 0.0):
             texts.append(f"{p.name}: {r.pending_m * 1e3:.0f} mm, {math.degrees(r.pending_rad):.1f} deg to go")
     if not texts:
-        return ok("correction", "no correction of an alignment waits")
-    why = "it slides in, is announced, or waits until the clutch is open"
+        return ok("correction", "no correction of an alignment is pending")
+    why = "corrections are applied gradually, are announced, or wait until the clutch is open"
     return warning("correction", "; ".join(texts), why, "open the clutch for some seconds")
 
 
 def is_consistent(check: CrossCheckReport) -> bool:
-    """Whether chance explains how far apart two headsets put the same thing."""
+    """Return whether chance explains the difference between two headsets in a cross-check."""
     return check.error_m <= MAX_ERROR_RATIO * check.expected_p95_m
 
 
 def check_agreement(people: tuple[ParticipantReport, ...], checks: tuple[CrossCheckReport, ...]) -> Finding:
-    """Pairs of headsets that put the same thing further apart than their stated errors allow."""
+    """Report pairs of headsets whose difference exceeds their stated errors."""
     names = {p.id: p.name for p in people}
     recent = [one for one in checks if one.age_ns <= MAX_CROSS_CHECK_AGE_NS]
     apart = [one for one in recent if not is_consistent(one)]
     if apart:
         texts = [
             f"{names.get(one.a, one.a)} and {names.get(one.b, one.b)} put '{one.anchor_id}' {one.error_m * 1e3:.0f} mm "
-            f"apart, below {one.expected_p95_m * 1e3:.0f} mm was stated"
+            f"apart, expected is below {one.expected_p95_m * 1e3:.0f} mm"
             for one in apart
         ]
-        why = "one of the two is aligned wrongly, or a sheet is not where the session has it"
-        return warning("agreement", "; ".join(texts), why, "let both look at the same sheet from two sides")
+        why = "one of the two is aligned wrongly, or a sheet is not at the configured place"
+        return warning("agreement", "; ".join(texts), why, "let both headsets observe the same sheet from two sides")
     if not recent:
-        return ok("agreement", "no two headsets have seen the same thing of late")
+        return ok("agreement", "no two headsets have observed the same anchor in the last ten minutes")
     worst = max(recent, key=lambda one: one.error_m)
-    return ok("agreement", f"{len(recent)} pairs compared, at most {worst.error_m * 1e3:.0f} mm apart, as stated")
+    return ok("agreement", f"{len(recent)} pairs compared, at most {worst.error_m * 1e3:.0f} mm apart, as expected")
 
 
 def check_media(people: tuple[ParticipantReport, ...]) -> Finding:
-    """Who gets less of clouds, cameras and deformables than there is."""
+    """Report participants that receive less of clouds, cameras and deformables than is published."""
     texts = []
     for p in people:
         cut = [f"{one.stream} in class {one.budget_class}" for one in p.media if one.budget_class != BudgetClass.FULL]
@@ -127,8 +129,8 @@ def check_media(people: tuple[ParticipantReport, ...]) -> Finding:
             texts.append(f"{p.name}: {', '.join([*cut, *([lost] if lost else [])])}")
     if not texts:
         wanted = any(p.media for p in people)
-        return ok("media", "everybody gets all they asked for" if wanted else "nobody has asked for media")
-    why = "their link does not carry more; state and control come first"
+        return ok("media", "every subscriber gets full streams" if wanted else "no participant subscribes to media")
+    why = "their link has no more capacity; state and control have priority"
     advice = "a better network for them, or fewer and smaller streams; docs/evidence/links.md"
     return warning("media", "; ".join(texts), why, advice)
 

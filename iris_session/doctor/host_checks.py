@@ -1,4 +1,4 @@
-"""The machine that a session runs on, or is to run on: scheduling, processors, disk, keys, ports, addresses, clock."""
+"""Checks of the machine that serves a session: scheduling, processors, disk, keys, ports, addresses, clock."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SLOW_CLOCKS: Final = frozenset({"hpet", "acpi_pm", "jiffies", "pit"})
 
 
 def check_host(folder: Path, control_port: int = CONTROL_PORT) -> list[Finding]:
-    """All findings. `folder`: where recordings go."""
+    """Return all findings about this machine. `folder`: of recordings."""
     return [
         check_scheduling(),
         check_processors(),
@@ -45,21 +45,21 @@ def check_host(folder: Path, control_port: int = CONTROL_PORT) -> list[Finding]:
 
 
 def check_scheduling() -> Finding:
-    """Whether the tick loop may run before other work."""
+    """Check whether the tick loop may run with real-time priority."""
     from iris_session.system.priority import tick_priority
 
     with tick_priority() as reached:
         pass
     if reached == "realtime":
-        return ok("scheduling", "real-time priority is permitted: other programs do not make ticks late")
+        return ok("scheduling", "real-time priority is permitted: other programs do not delay ticks")
     if len(os.sched_getaffinity(0)) < 2:
-        return warning("scheduling", "one processor only: no real-time priority, it would starve the network")
-    advice = "a line `@realtime - rtprio 20` in /etc/security/limits.d, see docs/network.md"
-    return warning("scheduling", "no real-time priority: other programs can make ticks late", "", advice)
+        return warning("scheduling", "one processor only: no real-time priority, which would starve the network")
+    advice = "add a line `@realtime - rtprio 20` to /etc/security/limits.d, see docs/network.md"
+    return warning("scheduling", "no real-time priority: other programs can delay ticks", "", advice)
 
 
 def check_processors() -> Finding:
-    """How many, and how busy."""
+    """Check number and load of the processors."""
     count, load = os.cpu_count() or 1, os.getloadavg()[0]
     busy = sorted(
         ((p.info["cpu_percent"] or 0.0, p.info["name"], p.pid) for p in _sample_processes(0.3)),
@@ -76,40 +76,40 @@ def check_processors() -> Finding:
 
 
 def _sample_processes(interval_s: float) -> list[psutil.Process]:
-    """All processes, with their share of a processor over `interval_s`."""
+    """Return all processes, with their share of a processor over `interval_s`."""
     for process in psutil.process_iter(["cpu_percent"]):
-        del process  # the first look begins the measurement
+        del process  # the first call begins the measurement
     psutil.cpu_percent(interval_s)
     return list(psutil.process_iter(["cpu_percent", "name"]))
 
 
 def check_memory() -> Finding:
-    """What is left of it."""
+    """Check the free memory."""
     left = psutil.virtual_memory().available
     text = f"{left / 1e9:.1f} GB of memory are free"
     if left < 500e6:
-        return warning("memory", text, "a session that is swapped out stands still", "end other programs")
+        return warning("memory", text, "a session that is swapped out does not step", "end other programs")
     return ok("memory", text)
 
 
 def check_disk_space(folder: Path) -> Finding:
-    """Room for recordings in `folder`, or where it will be made."""
-    there = next(one for one in (folder, *folder.absolute().parents) if one.exists())
-    free = psutil.disk_usage(str(there)).free
-    text = f"{free / 1e9:.1f} GB free at {there}"
-    if not os.access(there, os.W_OK):
-        return failed("disk", f"{there} cannot be written", "", "record elsewhere (--record), or mend its permissions")
+    """Check the space for recordings in `folder`, or in the existing folder above it."""
+    existing = next(one for one in (folder, *folder.absolute().parents) if one.exists())
+    free = psutil.disk_usage(str(existing)).free
+    text = f"{free / 1e9:.1f} GB free at {existing}"
+    if not os.access(existing, os.W_OK):
+        return failed("disk", f"{existing} is not writable", "", "record elsewhere (--record), or change permissions")
     if free < FULL_DISK:
-        return failed("disk", text, "no room for recordings", "make room, or record elsewhere (--record)")
+        return failed("disk", text, "no space for recordings", "make room, or record elsewhere (--record)")
     return warning("disk", text, "", "make room") if free < LOW_DISK else ok("disk", text)
 
 
 def check_key_home() -> Finding:
-    """Whether the home of keys can be read by its owner only, and is not damaged."""
+    """Check that the folder of keys is readable by its owner only, and not damaged."""
     home = KeyHome()
     folder = home.path
     if not folder.exists():
-        return ok("key_home", f"{folder} is made with the first encrypted session")
+        return ok("key_home", f"{folder} does not exist yet: the first encrypted session creates it")
     loose = [path.name for path in (folder, *sorted(folder.iterdir())) if stat.S_IMODE(path.lstat().st_mode) & 0o077]
     if loose:
         advice = f"chmod -R go= {folder}"
@@ -117,12 +117,12 @@ def check_key_home() -> Finding:
     try:
         clients, codes = home.clients.read(), home.join_codes.read()
     except KeysError as error:
-        return failed("key_home", str(error), "", "mend or remove that file; removing it takes its entries away")
+        return failed("key_home", str(error), "", "repair or remove that file; removing it deletes its entries")
     return ok("key_home", f"{folder}: {len(clients)} keys on the list, {len(codes)} join codes")
 
 
 def check_ports(control: int) -> Finding:
-    """Whether the ports of a session are free, and who has them."""
+    """Check that the ports of a session are free, and name the programs that use them."""
     wanted = {control + offset: name for offset, name in PORT_OFFSETS.items()}
     taken: dict[int, str] = {}
     for port in wanted:
@@ -138,9 +138,9 @@ def check_ports(control: int) -> Finding:
         for who in dict.fromkeys(taken[port] for port in sorted(taken))
     )
     if all("iris_session.front" in who for who in taken.values()):
-        return ok("ports", f"a session has {text}; another one here needs --port-base")
+        return ok("ports", f"used by a session: {text}; a second session on this machine needs --port-base")
     advice = "end that program, or start the session with --port-base"
-    return warning("ports", f"in use: {text}", "another program has ports of a session", advice)
+    return warning("ports", f"in use: {text}", "another program uses ports of a session", advice)
 
 
 def _is_port_in_use(port: int) -> bool:
@@ -171,7 +171,7 @@ def _describe_process(pid: int | None) -> str:
 
 
 def check_interfaces() -> Finding:
-    """The addresses that others can type."""
+    """List the addresses at which other machines reach this one."""
     from iris_session.doctor.network_checks import list_own_networks
 
     up = psutil.net_if_stats()
@@ -182,18 +182,20 @@ def check_interfaces() -> Finding:
         if one.family == socket.AF_INET and not one.address.startswith("127.") and (name not in up or up[name].isup)
     ]
     if not typed and not list_own_networks():
-        return warning("interfaces", "this machine is in no network", "", "connect it: only its own programs can join")
-    return ok("interfaces", f"others type one of: {', '.join(typed) or 'IPv6 only'}")
+        return warning(
+            "interfaces", "no network: only programs of this machine can join", "", "connect it to a network"
+        )
+    return ok("interfaces", f"addresses for other machines: {', '.join(typed) or 'IPv6 only'}")
 
 
 def check_clock_source() -> Finding:
-    """Whether reading the clock is quick: a tick does so a dozen times."""
+    """Check that reading the clock is fast: a tick reads it a dozen times."""
     try:
         source = CLOCK_SOURCE.read_text().strip()
     except OSError:
-        return ok("clock_source", "the clock source is not told by this system")
+        return ok("clock_source", "this system does not report its clock source")
     if source in SLOW_CLOCKS:
         return warning(
-            "clock_source", f"the clock source is {source}", "reading it takes microseconds", "tsc, if it is stable"
+            "clock_source", f"the clock source is {source}", "reading it takes microseconds", "use tsc, if it is stable"
         )
     return ok("clock_source", f"the clock source is {source}")

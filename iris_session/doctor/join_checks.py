@@ -1,5 +1,4 @@
-"""Keys, codes, roles and joining: knocks as a client does, and says what stands in the way. Then looks at the state
-that comes."""
+"""Checks of keys, join codes, roles and joining, and of the state stream: join as a client does, explain failures."""
 
 from __future__ import annotations
 
@@ -10,8 +9,8 @@ from typing import Final
 
 from iris_session.client import Client, ClientError, RefusedError, VersionError
 from iris_session.client.address import Address
+from iris_session.client.core.state_stream import SceneState
 from iris_session.client.errors import NotConnectedError, RequestTimeoutError, SessionNameError, TrustError
-from iris_session.client.state_stream import SceneState
 from iris_session.doctor import network_checks
 from iris_session.doctor.findings import Finding, failed, ok, warning
 from iris_session.protocol.discovery import Introduction
@@ -22,10 +21,10 @@ from iris_session.security import KeyHome, KeysError, compute_fingerprint, decod
 
 JOIN_S: Final = 4.0
 STATE_S: Final = 3.0
-#: A report of ours is a second old at most by then, and those of all others are there.
+#: Time in which state is observed. Our own report is at most a second old afterwards, and all others have arrived.
 SAMPLE_S: Final = 1.5
 ANSWER_S: Final = 2.0
-#: Ages of the state at the doctor's own place [ms]: above it, this machine or its link is slow.
+#: Ages of the state at the doctor [ms]: above it, this machine or its link is slow.
 OLD_MS: Final = 100.0
 UNSURE_CLOCK_MS: Final = 20.0
 NAME: Final = "doctor"
@@ -36,7 +35,7 @@ NEW_CODE_ADVICE: Final = "ask for a new one, on the server's machine: iris-sessi
 
 @dataclass
 class JoinAttempt:
-    """What knocking gave. `report`: of the session, if anybody answered."""
+    """Result of an attempt to join. `report`: status of the session, if it answered. `own_id`: our participant id."""
 
     findings: list[Finding] = field(default_factory=list)
     report: StatusReport | None = None
@@ -44,17 +43,17 @@ class JoinAttempt:
 
 
 def check_server_key(address: Address, introduction: Introduction | None) -> Finding:
-    """Whether the key that the session introduces itself with is the one known for this address."""
+    """Check whether the key in the introduction is the one known for this address."""
     home = KeyHome()
     try:
         known, own = home.known_servers.find_by_address(str(address)), {note.server for note in home.sessions.read()}
     except KeysError as error:
-        return failed("server_key", str(error), "", "mend or remove that file")
+        return failed("server_key", str(error), "", "repair or remove that file")
     stored = address.server_key or ("" if known is None else known.key)
     if introduction is None:
-        return Finding("server_key", "skipped", "not known: there was no introduction")
+        return Finding("server_key", "skipped", "not known: no introduction")
     if not introduction.server_key:
-        return ok("server_key", "not encrypted, which is for one machine only")
+        return ok("server_key", "not encrypted: for clients of the same machine only")
     mark = compute_fingerprint(decode_key(introduction.server_key))
     if not stored and mark in own:
         return ok("server_key", f"its key {mark} is this user's own")
@@ -65,14 +64,22 @@ def check_server_key(address: Address, introduction: Introduction | None) -> Fin
         return failed(
             "server_key",
             f"its key is {mark}, but {compute_fingerprint(decode_key(stored))} is known for {address}",
-            "somebody else answers there, or the session's keys were made anew",
-            f"ask who runs it; if they are new: iris-session keys forget {address}, then pair again",
+            "another server answers there, or the session has new keys",
+            f"ask its owner; if the keys are new: iris-session keys forget {address}, then pair again",
         )
     return ok("server_key", f"its key {mark} is the known one")
 
 
 def attempt_join(target: Address, typed: str, code: str, role: str, introduction: Introduction | None) -> JoinAttempt:
-    """Joins as `doctor` at the address as it was `typed`, looks around, and leaves. `said`: as it introduced itself."""
+    """Join as participant `doctor`, observe state and status, and leave.
+
+    Args:
+        target: Address of the session.
+        typed: Address as the user gave it; keys of servers are stored by it.
+        code: Join code; empty: none.
+        role: Role to join in.
+        introduction: Introduction of the session, if it was received.
+    """
     visit = JoinAttempt()
     states: list[SceneState] = []
     try:
@@ -106,15 +113,13 @@ def _explain_failed_join(
         except ClientError:
             pass
         else:
-            text = "the session listens, but lets nobody in: it does not step"
-            attempt.findings.append(failed("join", text, "see the check `session`", "look at the program that owns it"))
+            text = "the session listens, but admits no participant: it does not step"
+            attempt.findings.append(failed("join", text, "see the check `session`", "check the program that owns it"))
             return
     if isinstance(error, NotConnectedError) and introduction is not None:
-        text = f"the session introduces itself, but did not let us in within {JOIN_S:g} s"
-        why = f"a link that is very slow or loses much, or a session that stands still ({error})"
-        attempt.findings.append(
-            failed("join", text, why, "look at the network, and at the program that owns the session")
-        )
+        text = f"the session answers with an introduction, but did not admit us within {JOIN_S:g} s"
+        why = f"a very slow or lossy link, or a session that does not step ({error})"
+        attempt.findings.append(failed("join", text, why, "check the network, and the program that owns the session"))
     elif isinstance(error, RefusedError) and error.code == RefusalCode.UNPAIRED:
         attempt.findings.append(explain_unpaired_key(target, introduction))
     else:
@@ -122,7 +127,7 @@ def _explain_failed_join(
 
 
 def explain_unpaired_key(target: Address, introduction: Introduction | None) -> Finding:
-    """Our key is not on the list: of a session of our own, of one that has let us in before, or of one that is new."""
+    """Explain that our key is not on the list of a session: our own, one that admitted us before, or a new one."""
     pair = PAIR_ADVICE.format(target)
     try:
         home = KeyHome()
@@ -132,43 +137,43 @@ def explain_unpaired_key(target: Address, introduction: Introduction | None) -> 
             else ""
         )
         if any(note.server == mark for note in home.sessions.read()):
-            why = "the session is this user's own; even so this user's key must be let in once"
+            why = "the session belongs to this user; nevertheless the user's key must be allowed once"
             return failed("key", NOT_LISTED, why, "iris-session keys allow me")
         before = home.known_servers.find_by_address(str(target)) is not None
     except KeysError as error:
         return failed("key", NOT_LISTED, str(error), pair)
-    why = "it was let in before, and has been taken off since (`iris-session keys revoke`)" if before else ""
-    return failed("key", NOT_LISTED, why, f"ask who runs the session; {pair}" if before else pair)
+    why = "it was admitted before, and revoked since (`iris-session keys revoke`)" if before else ""
+    return failed("key", NOT_LISTED, why, f"ask the owner of the session; {pair}" if before else pair)
 
 
 def explain_refusal(error: ClientError) -> Finding:
-    """Why joining failed, under the check that it belongs to."""
+    """Return why joining failed, as a finding of the check that the error belongs to."""
     text = str(error)
     if isinstance(error, VersionError):
         return network_checks.check_version(max(error.supported_versions, default=0))
     if isinstance(error, TrustError):
-        return failed("server_key", text, "", "ask who runs the session; see docs/security.md")
+        return failed("server_key", text, "", "ask the owner of the session; see docs/security.md")
     if isinstance(error, SessionNameError):
-        return failed("beacon", text, "", "give the address of the one you mean")
+        return failed("beacon", text, "", "give the address of the session")
     if isinstance(error, RefusedError):
         if error.code == RefusalCode.UNPAIRED:
             return failed("key", NOT_LISTED, "", PAIR_ADVICE.format("ADDRESS"))
         if error.code == RefusalCode.CODE:
-            why = "codes work once, and expire after ten minutes unless `pair --minutes` said otherwise"
+            why = "a code works once, and expires after ten minutes unless `pair --minutes` sets another time"
             advice = f"{error.advice}; else {NEW_CODE_ADVICE}" if error.advice else NEW_CODE_ADVICE
-            return failed("code", f"the join code was not taken: {error.message}", why, advice)
+            return failed("code", f"the join code was refused: {error.message}", why, advice)
         if error.code == DenialReason.ROLE:
             advice = (
-                "join in another role, or let the key have this one, on the server's machine: iris-session keys allow"
+                "join in another role, or allow this one for the key, on the server's machine: iris-session keys allow"
             )
             return failed("role", f"this key may not join in this role: {error.message}", error.advice, advice)
         return failed("join", f"refused ({error.code}): {error.message}", "", error.advice)
     if isinstance(error, NotConnectedError):
         return failed(
             "join",
-            "somebody takes the connection there, but nobody answers as a session",
+            "the port accepts connections, but no session answers",
             text,
-            "is it another program's port? a firewall that takes every connection? the wrong key of the server?",
+            "is it the port of another program? a firewall that accepts every connection? the wrong server key?",
         )
     return failed("join", text)
 
@@ -178,18 +183,18 @@ def _inspect_joined_session(
 ) -> None:
     attempt.own_id = client.participant_id
     attempt.findings += [
-        ok("role", f"let in as {role}"),
-        ok("join", f"joined as {client.participant_id}, and leaves again"),
+        ok("role", f"admitted as {role}"),
+        ok("join", f"joined as {client.participant_id}"),
     ]
     if coded:
-        attempt.findings.append(ok("code", "the join code was taken, or not needed"))
+        attempt.findings.append(ok("code", "the join code was accepted, or not needed"))
     try:
         client.wait_for(lambda _: bool(states), STATE_S)
         states.clear()
         client.sleep(SAMPLE_S)
         attempt.report = client.status(ANSWER_S)
     except (RequestTimeoutError, NotConnectedError) as error:
-        attempt.findings.append(failed("join", f"the connection did not last: {error}", "", "look at the network"))
+        attempt.findings.append(failed("join", f"the connection did not last: {error}", "", "check the network"))
     attempt.findings += [_check_clock(client), _check_state(client, states)]
 
 
@@ -197,41 +202,41 @@ def _check_clock(client: Client) -> Finding:
     bound_ms, rtt_ms = client.clock_error_ns() * 1e-6, client.connection.clock.rtt_ns * 1e-6
     text = f"session time is known to {bound_ms:.1f} ms, round trip {rtt_ms:.1f} ms"
     if bound_ms > UNSURE_CLOCK_MS:
-        return warning("clock", text, "round trips are long or differ much", "look at the network: Wi-Fi, power saving")
+        return warning("clock", text, "round trips are long or vary much", "check the network: Wi-Fi, power saving")
     return ok("clock", text)
 
 
 def _check_state(client: Client, states: list[SceneState]) -> Finding:
-    """State at our own place."""
+    """Check the state that we received, or why none arrived."""
     welcome = client.connection.welcome
     if not states:
         port = 0 if welcome is None else welcome.endpoints.state
         address = Address.parse(client.address)
-        client.close()  # the next takes seconds, in which we would say nothing and be kept as somebody who was lost
+        client.close()  # the next check takes seconds without heartbeats: we would be reported as disconnected
         try:
             finding = network_checks.check_tcp(
                 address, network_checks.check_address(address)[1], port, "state", "state"
             )
         except OSError as error:
-            return failed("state", f"no state comes: {error}")
+            return failed("state", f"no state arrives: {error}")
         if finding.failed:
             return finding
-        return failed("state", f"no state comes though port {port} takes connections", "the session does not step?")
+        return failed("state", f"no state arrives, but port {port} accepts connections", "the session does not step?")
     return check_state_age(states, client.connection.stream.counters.queued_old)
 
 
 def check_state_age(states: Sequence[SceneState], missed: int) -> Finding:
-    """How old state is that came in `LOOK_S`; `missed`: frames that waited too long."""
-    text = f"state comes at {len(states) / SAMPLE_S:.0f} Hz"
+    """Check the age of the states received within `SAMPLE_S`. `missed`: frames that waited too long in a queue."""
+    text = f"state arrives at {len(states) / SAMPLE_S:.0f} Hz"
     new = [b for a, b in pairwise(states) if b.header.session_time != a.header.session_time]
-    if len(states) > 1 and not new:  # one state, sent again and again
+    if len(states) > 1 and not new:  # one state, sent repeatedly
         age_s = states[-1].age_ns * 1e-9
         why = "nothing new is published"
-        return warning("state", f"{text}, all as it was {age_s:.1f} s ago", why, "look at the program that publishes")
+        return warning("state", f"{text}, always the one of {age_s:.1f} s ago", why, "check the program that publishes")
     ages = quantiles(state.age_ns for state in new or states)
     assert ages is not None
     text = f"{text}, age p50 {ages.p50:.1f} ms, p99 {ages.p99:.1f} ms"
     if ages.p99 > OLD_MS:
         why = f"{missed} frames waited too long in a queue" if missed else "see the check `age`"
-        return warning("state", text, why, "look at this machine's network and load")
+        return warning("state", text, why, "check network and load of this machine")
     return ok("state", text)

@@ -1,4 +1,4 @@
-"""The way to a session: beacon, address, network, TCP, introduction. Nothing here needs a key."""
+"""Checks of the route to a session: beacon, address, network, TCP, introduction. Nothing here needs a key."""
 
 from __future__ import annotations
 
@@ -11,31 +11,39 @@ from typing import Final
 import psutil
 
 from iris_session.client.address import Address
-from iris_session.client.discovery import BeaconListener, FoundSession, ask_introduction
+from iris_session.client.discovery import BeaconListener, FoundSession, request_introduction
 from iris_session.client.errors import ClientError
 from iris_session.doctor.findings import Finding, failed, ok, warning
 from iris_session.protocol.discovery import DISCOVERY_PORT, Introduction
 from iris_session.protocol.errors import ProtocolError, VersionError
 from iris_session.protocol.names import PROTOCOL_VERSION
 
-#: The system takes 3 s to find that a network has no machine of an address; a firewall is silent for longer.
+#: The system needs 3 s to find that no machine of the network has an address; a firewall is silent for longer.
 CONNECT_S: Final = 4.0
 LISTEN_S: Final = 1.2
-#: For what a port that takes connections says at once, if it is the base of a block.
+#: Timeout of the introduction one port above, which shows whether a port is the base of a block.
 PORT_BASE_TIMEOUT_S: Final = 1.0
 _UNREACHABLE: Final = frozenset({errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EHOSTDOWN})
 
 
 def check_beacon(session: str, address: Address | None) -> tuple[Finding, list[FoundSession]]:
-    """Whether sessions are heard on the network, and the wanted one among them."""
+    """Listen for beacons: is any session, or the wanted one, heard on the network?
+
+    Args:
+        session: Name of the wanted session; empty if it is given by address.
+        address: Address of the wanted session, if it is known.
+
+    Returns:
+        The finding, and the sessions that were heard.
+    """
     try:
         with BeaconListener() as listener:
             until = time.monotonic() + LISTEN_S
             while (left := until - time.monotonic()) > 0.0:
                 listener.wait(left)
-                if str(address) in {one.address for one in listener.sessions()}:
-                    break  # what is looked for tells of itself; by name there may be two
-            found, ignored = listener.sessions(), dict(listener.ignored)
+                if str(address) in {one.address for one in listener.poll_sessions()}:
+                    break  # the wanted session is heard; a search by name goes on, as two may have the name
+            found, ignored = listener.poll_sessions(), dict(listener.ignored)
     except ClientError as error:
         return warning("beacon", str(error)), []
     heard = ", ".join(f"{one.name} ({one.address})" for one in found) or "none"
@@ -52,7 +60,7 @@ def check_beacon(session: str, address: Address | None) -> tuple[Finding, list[F
             "beacon",
             f"no session {session!r} is heard; heard: {heard}",
             f"no beacon on UDP port {DISCOVERY_PORT}: none runs, it is in another network, or broadcasts are blocked",
-            "give its address, which `iris-session serve` prints, or scan the code of `iris-session pair`",
+            "give its address as `iris-session serve` prints it, or scan the code of `iris-session pair`",
         ), found
     if found:
         return ok("beacon", f"sessions heard: {heard}"), found
@@ -60,20 +68,20 @@ def check_beacon(session: str, address: Address | None) -> tuple[Finding, list[F
     if "other_version" in ignored:
         return warning(
             "beacon",
-            "sessions are heard that speak another protocol version",
+            "the sessions that are heard speak another protocol version",
             f"this is version {PROTOCOL_VERSION}",
-            "update the older of the two",
+            "update the older side",
         ), found
     return warning(
         "beacon",
         f"no session is heard on UDP port {DISCOVERY_PORT}{others}",
         "none runs in this network, or the access point blocks broadcasts" if address is not None else "",
-        "no harm while you type or scan the address",
+        "not needed if you type or scan the address",
     ), found
 
 
 def mention_heard_sessions(finding: Finding, target: Address, found: list[FoundSession]) -> Finding:
-    """A failed `finding` about `target`, with the sessions that are heard at other addresses: one may be meant."""
+    """Add the sessions heard at other addresses to the advice of a failed finding: one of them may be meant."""
     others = ", ".join(f"{one.name} ({one.address})" for one in found if one.address != str(target))
     if not finding.failed or not others:
         return finding
@@ -81,18 +89,18 @@ def mention_heard_sessions(finding: Finding, target: Address, found: list[FoundS
 
 
 def check_address(address: Address) -> tuple[Finding, str]:
-    """The address, and the IP address it stands for (empty when there is none)."""
+    """Resolve the address. Return the finding and the IP address, which is empty if there is none."""
     try:
         ip = str(socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)[0][4][0])
-    except (OSError, UnicodeError) as error:  # UnicodeError: what cannot be a name, such as `a..b`
-        why = error.strerror or error if isinstance(error, OSError) else "it cannot be a name"
-        text = f"{address.host!r} is the name of no machine that is known here ({why})"
-        return failed("address", text, "", "type the numbers that `iris-session serve` prints"), ""
+    except (OSError, UnicodeError) as error:  # UnicodeError: not a host name, such as `a..b`
+        why = error.strerror or error if isinstance(error, OSError) else "not a host name"
+        text = f"the host name {address.host!r} cannot be resolved ({why})"
+        return failed("address", text, "", "type the IP address that `iris-session serve` prints"), ""
     return ok("address", f"{address}" + ("" if ip == address.host else f" is {ip}")), ip
 
 
 def check_subnet(ip: str) -> Finding:
-    """Whether a network of this machine holds the address."""
+    """Check whether the IP address is in a network of this machine."""
     target = ipaddress.ip_address(ip)
     networks = list_own_networks()
     listed = ", ".join(f"{network} ({name})" for name, network in networks) or "none"
@@ -105,14 +113,14 @@ def check_subnet(ip: str) -> Finding:
     advice = "connect both machines to the same network, or use the address that the server has in this one"
     with socket.socket(socket.AF_INET6 if target.version == 6 else socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect((ip, 9))  # sends nothing: asks the system for a way
+            probe.connect((ip, 9))  # sends nothing: asks the system for a route
         except OSError as error:
-            return failed("subnet", f"{text}, and there is no way to it ({error.strerror})", "", advice)
-    return warning("subnet", text, "what you send goes through a router, which may not let it pass", advice)
+            return failed("subnet", f"{text}, and there is no route to it ({error.strerror})", "", advice)
+    return warning("subnet", text, "packets go through a router, which may block them", advice)
 
 
 def list_own_networks() -> list[tuple[str, ipaddress.IPv4Network | ipaddress.IPv6Network]]:
-    """Interface names and networks of this machine that are up, without loopback and IPv6 link-local ones."""
+    """Return names and networks of the interfaces that are up, without loopback and IPv6 link-local ones."""
     up = psutil.net_if_stats()
     found = []
     for name, addresses in sorted(psutil.net_if_addrs().items()):
@@ -131,12 +139,20 @@ def list_own_networks() -> list[tuple[str, ipaddress.IPv4Network | ipaddress.IPv
 
 
 def check_tcp(address: Address, ip: str, port: int = 0, check: str = "tcp", port_name: str = "control") -> Finding:
-    """Whether somebody takes a connection there. Tells a closed port from a firewall. `ip`: from `resolved`."""
+    """Check whether a TCP port accepts connections, and distinguish a closed port from a firewall.
+
+    Args:
+        address: Address of the session.
+        ip: From `check_address`.
+        port: Port to try; 0: that of `address`.
+        check: Id of the finding.
+        port_name: Name of the port in the texts.
+    """
     port = port or address.port
     try:
         ipaddress.ip_address(ip)
-    except ValueError:  # to the system, an empty address would be this machine's own
-        return failed(check, f"{address.host!r} stands for no address to connect to", "", "type the numbers instead")
+    except ValueError:  # the system takes an empty address for this machine's own
+        return failed(check, f"{address.host!r} has no address to connect to", "", "type the IP address instead")
     family = socket.AF_INET6 if ":" in ip else socket.AF_INET
     began = time.monotonic()
     with socket.socket(family, socket.SOCK_STREAM) as probe:
@@ -147,8 +163,8 @@ def check_tcp(address: Address, ip: str, port: int = 0, check: str = "tcp", port
             return failed(
                 check,
                 f"no answer from {ip} port {port} ({port_name}) within {CONNECT_S:g} s",
-                "packets are thrown away: a firewall, the wrong machine, or a network that keeps its guests apart",
-                f"on the server's machine let TCP {port} in (docs/network.md), and try from that machine itself",
+                "packets are dropped: a firewall, the wrong machine, or a network that isolates its clients",
+                f"on the server's machine allow TCP {port} (docs/network.md), and try from that machine itself",
             )
         except OSError as error:
             if error.errno == errno.ECONNREFUSED:
@@ -157,30 +173,32 @@ def check_tcp(address: Address, ip: str, port: int = 0, check: str = "tcp", port
                     f"nothing listens at {ip} port {port} ({port_name})",
                     "the machine answers, but no program has this port: no session runs, it has another port, "
                     "or it listens on another address (127.0.0.1 is for its own machine only)",
-                    "look at the address that `iris-session serve` prints; for other machines it needs --interface",
+                    "compare with the address that `iris-session serve` prints; for other machines it needs "
+                    "--interface",
                 )
             if error.errno in _UNREACHABLE:
                 text = f"{ip} cannot be reached ({error.strerror})"
-                why = "no machine of this network has that address, it is switched off, or its cable or Wi-Fi is"
-                return failed(check, text, why, "look at the address that `iris-session serve` prints, and the cable")
+                why = "no machine of this network has that address, it is switched off, or it is disconnected"
+                advice = "compare with the address that `iris-session serve` prints, and check cable or Wi-Fi"
+                return failed(check, text, why, advice)
             return failed(check, f"no connection to {ip} port {port} ({port_name}): {error.strerror or error}")
-    return ok(check, f"{ip} port {port} ({port_name}) takes connections ({(time.monotonic() - began) * 1e3:.1f} ms)")
+    return ok(check, f"{ip} port {port} ({port_name}) accepts connections ({(time.monotonic() - began) * 1e3:.1f} ms)")
 
 
 def check_introduction(address: Address) -> tuple[Finding, Finding, Introduction | None]:
-    """What the session says of itself, and whether it speaks our version: checks `introduction` and `version`."""
+    """Request the introduction of the session: checks `introduction` and `version`, and the introduction itself."""
     unknown = Finding("version", "skipped", "not known: there was no introduction")
     try:
         said = _request_introduction(address, CONNECT_S)
     except VersionError as error:
         return ok("introduction", f"a session of protocol version {error.version}"), check_version(error.version), None
     except ProtocolError as error:
-        text = f"what introduces itself at port {address.port - 1} is no session: {error}"
-        return failed("introduction", text, "", "look at the port"), unknown, None
+        text = f"the program at port {address.port - 1} is not a session: {error}"
+        return failed("introduction", text, "", "check the port"), unknown, None
     except OSError as error:
         text = f"no introduction on TCP port {address.port - 1} ({error.strerror or error})"
-        why = "a firewall lets only the control port pass, or what listens there is not of this version"
-        return warning("introduction", text, why, "let that port in too: keys are told by it"), unknown, None
+        why = "a firewall allows only the control port, or the program there is not of this version"
+        return warning("introduction", text, why, "allow that port too: it announces keys"), unknown, None
     one = said.beacon
     here = f"{said.participants} participants" + (", a join code is open" if said.pairing else "")
     text = f"session {one.session_name!r} ({one.kind}), {here}"
@@ -188,14 +206,14 @@ def check_introduction(address: Address) -> tuple[Finding, Finding, Introduction
 
 
 def check_port_base(address: Address) -> Finding | None:
-    """That `address` is the first of a session's block of ports, where it introduces itself, not the one to join."""
+    """Return a failed finding if the port is the base of a session's block of ports and not its control port."""
     joined = Address(address.host, address.port + 1)
     said = _try_introduction(joined, PORT_BASE_TIMEOUT_S)
     if said is None or said.beacon.control != joined.port:
         return None
     name = f"session {said.beacon.session_name!r}"
-    text = f"port {address.port} is the base of the ports of {name}, which is joined at {joined}"
-    return failed("introduction", text, "`serve --port-base N` is joined at port N + 1", f"use {joined}")
+    text = f"port {address.port} is the base of the ports of {name}, whose control port is {joined}"
+    return failed("introduction", text, "the control port of `serve --port-base N` is N + 1", f"use {joined}")
 
 
 def _try_introduction(address: Address, patience_s: float) -> Introduction | None:
@@ -206,8 +224,8 @@ def _try_introduction(address: Address, patience_s: float) -> Introduction | Non
 
 
 def _request_introduction(address: Address, patience_s: float) -> Introduction:
-    """Raises what `ask_introduction` raises."""
-    steps = ask_introduction(address.host, address.port, patience_s)
+    """Request the introduction, blocking. Raises what `request_introduction` raises."""
+    steps = request_introduction(address.host, address.port, patience_s)
     while True:
         try:
             next(steps)
@@ -218,7 +236,7 @@ def _request_introduction(address: Address, patience_s: float) -> Introduction:
 
 
 def check_version(theirs: int) -> Finding:
-    """Whether a session of protocol version `theirs` can be talked to."""
+    """Compare the protocol version of the session, `theirs`, with ours."""
     if theirs == PROTOCOL_VERSION:
         return ok("version", f"both speak protocol version {PROTOCOL_VERSION}")
     older = "the session" if theirs < PROTOCOL_VERSION else "this machine"

@@ -1,4 +1,4 @@
-"""All checks in their order: the way, the door, then what the session says of itself."""
+"""Run all checks in order: network, joining, then the status of the session."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import psutil
 
 from iris_session.client.address import Address
 from iris_session.client.discovery import FoundSession
+from iris_session.client.endpoint_resolver import is_loopback
 from iris_session.client.errors import ClientError
-from iris_session.client.meeting import is_loopback
 from iris_session.doctor import join_checks, network_checks, session_checks
 from iris_session.doctor.findings import OK, Findings, failed, ok
 from iris_session.doctor.host_checks import check_host
@@ -29,7 +29,7 @@ SESSION_CHECKS: Final = (
     "age", "ticks", "media", "recorder", "disk", "drops",
 )  # fmt: skip
 
-#: As a person asks: is there a way, am I let in, does anything come, how is the session?
+#: As a user asks: is there a route, am I admitted, does state arrive, how is the session?
 ORDER: Final = (
     "beacon",
     "address",
@@ -49,7 +49,7 @@ ORDER: Final = (
 
 @dataclass
 class DoctorReport:
-    """`address`: what was looked at, as far as it is known. `report`: what the session said, if it did."""
+    """Findings about one session. `address`: of the session, as far as known. `report`: its status, if it answered."""
 
     address: str = ""
     findings: Findings = field(default_factory=Findings)
@@ -57,10 +57,11 @@ class DoctorReport:
 
     @property
     def ok(self) -> bool:
+        """True if no check failed."""
         return self.findings.ok
 
     def as_dict(self) -> dict[str, object]:
-        """For `--json`."""
+        """Return the object that `--json` prints."""
         return {
             "ok": self.ok,
             "address": self.address,
@@ -77,9 +78,16 @@ def run_checks(
     role: str = Role.OBSERVER,
     on_progress: Callable[[str], None] = lambda _: None,
 ) -> DoctorReport:
-    """Looks at the session at `address` (or called `session`; neither: that of this user, see `here`). Takes seconds.
+    """Check a session from a client's machine. Takes seconds.
 
-    `told` hears what is done next. Nothing is changed there: it joins as `doctor`, and leaves. A `code` is used up.
+    Joins as participant `doctor` and leaves; nothing else is changed in the session.
+
+    Args:
+        address: Address of the session; empty: see `find_default_address`.
+        session: Name of the session, instead of an address.
+        code: Join code to try; it is used up.
+        role: Role to join in.
+        on_progress: Called with a short text before each part.
     """
     result = DoctorReport()
     findings = result.findings
@@ -100,7 +108,7 @@ def run_checks(
         )
         return result
     result.address = str(target)
-    on_progress(f"looking for {target}")
+    on_progress(f"connecting to {target}")
     if not _check_network(target, findings, found):
         findings.skip("introduction", "version", *JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS)
         return result
@@ -109,11 +117,11 @@ def run_checks(
 
 
 def find_default_address() -> str:
-    """Address of the encrypted session that this user serves on this machine, if it is the only one; else that of a
-    session on loopback at the usual port."""
+    """Return the address of the only encrypted session that this user serves on this machine, or else the default
+    address on loopback."""
     try:
         notes = KeyHome().sessions.read()
-    except KeysError:  # the check `key_home` tells
+    except KeysError:  # reported by the check `key_home`
         notes = []
     return str(Address(notes[0].hosts[0], notes[0].control)) if len(notes) == 1 and notes[0].hosts else LOCAL
 
@@ -153,7 +161,7 @@ def _check_join(
     findings.add(*visit.findings)
     if any(one.check == "join" and not one.failed for one in visit.findings):
         plain = is_loopback(target.host) and not (said is not None and said.server_key)
-        text = "none is needed on the session's own machine" if plain else "this machine's key is on the session's list"
+        text = "not needed on the session's own machine" if plain else "this machine's key is on the session's list"
         findings.add(ok("key", text))
     result.report = visit.report
     if visit.report is not None:
@@ -165,11 +173,15 @@ def _check_join(
 def run_host_checks(
     address: str, recordings: Path, *, on_progress: Callable[[str], None] = lambda _: None
 ) -> DoctorReport:
-    """Looks at this machine, and at the session that runs on it, if one does. `recordings`: the folder for them.
+    """Check this machine as a server, and the session that runs on it, if there is one.
 
-    `address`: of that session; empty: that of this user, see `here`, else the first that tells of itself from here.
+    Args:
+        address: Address of the session; empty: see `find_default_address`, or else the first one of this machine whose
+            beacon is heard.
+        recordings: Folder of recordings.
+        on_progress: Called with a short text before each part.
     """
-    on_progress("looking at this machine")
+    on_progress("checking this machine")
     target = Address.parse(address or find_default_address())
     result = DoctorReport(str(target))
     result.findings.add(*check_host(recordings, target.port))

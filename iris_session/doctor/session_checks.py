@@ -1,4 +1,4 @@
-"""What a `StatusReport` says about the session, its people, its robots and its recording. Pure."""
+"""Checks of a `StatusReport`: the session, its participants, its robots and its recording. Pure."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from iris_session.protocol.common import Nanoseconds
 from iris_session.protocol.names import AlignmentKind, CommandKind, HoldReason, LateCause, Role
 from iris_session.protocol.status import ParticipantReport, RobotReport, StatusReport
 
-#: Who wants a robot, and an alignment if they have a headset. A director may do without.
+#: Roles that need a robot, and an alignment if they have a headset. Directors need neither.
 DRIVERS: Final = Role.DRIVING - {Role.DIRECTOR}
 SILENT_NS: Final = 1_000_000_000
-#: The front calls a session stalled after a fifth of it, which a busy machine can make happen.
+#: The front calls a session stalled after a fifth of this, which a busy machine can cause.
 STALLED_NS: Final = 500_000_000
 MISSED_SHARE: Final = 0.2
 OLD_MS: Final = 150.0
@@ -24,7 +24,7 @@ VERY_LATE_SHARE: Final = 0.05
 LOW_DISK: Final = 2 << 30
 FULL_DISK: Final = 200 << 20
 LOW_DISK_S: Final = 1800.0
-#: Stages of the data's way and how long each may take (99th percentile) [ms].
+#: Stages of the data path with the limit of their 99th percentile [ms] and the cause of a longer one.
 STAGES: Final = {
     "device -> front": (60.0, "the network between the headset and the session, or the headset's clock"),
     "front -> authority": (20.0, "the session's steps come late: see the check `ticks`"),
@@ -40,25 +40,29 @@ LATE_CAUSES: Final = {
     LateCause.CONTROL: ("inverse kinematics and control take too long", "fewer robots per session, or a longer tick"),
     LateCause.AUTHORITY: ("leases and samples take too long", "fewer participants, or a lower sample rate"),
     LateCause.OUTPUT: ("sending state or recording takes too long", "a faster disk, fewer bodies, or --no-record"),
-    LateCause.SUPERVISION: ("a process was started anew", "see restarts, and the messages of the session"),
-    LateCause.OWNER: ("the program that owns the session spends its time", "less work in the loop of that program"),
-    "skipped": ("the session stood still for more than a second", "look at the program that owns it"),
+    LateCause.SUPERVISION: ("a process was restarted", "see restarts, and the messages of the session"),
+    LateCause.OWNER: ("the program that owns the session takes the time", "less work in the loop of that program"),
+    "skipped": ("the session stood still for more than a second", "check the program that owns it"),
 }
-#: Why a robot that somebody has holds still without them wanting it.
+#: Advice by reason why a robot holds still although its holder does not want that.
 HOLD_ADVICE: Final = {
-    HoldReason.NO_SAMPLE: "no sample has counted yet: does the app send samples that name this robot?",
-    HoldReason.STALE: "no counted sample for 150 ms: a slow network, or the app stopped sending",
+    HoldReason.NO_SAMPLE: "no sample was accepted yet: does the app send samples that name this robot?",
+    HoldReason.STALE: "no accepted sample for 150 ms: the network is slow, or the app stopped sending",
     HoldReason.UNTRACKED: "the device is not tracked: bring it into view",
-    HoldReason.UNALIGNED: "no alignment, or its error here is too large: look at the sheet",
+    HoldReason.UNALIGNED: "no alignment, or its error here is too large: bring the sheet into view",
     HoldReason.REJECTED: "a sample was rejected: see `rejected`; open and close the clutch",
-    HoldReason.DISCONNECTED: "its holder's connection is lost; the lease waits for them",
+    HoldReason.DISCONNECTED: "its holder is disconnected; the lease is kept for a grace period",
 }
 
 
 def check_session_report(report: StatusReport, own_id: str = "") -> list[Finding]:
-    """All findings of a report, in the order of a person's questions. `own_id`: the doctor itself, left out.
+    """Return all findings of a report, in the order of a user's questions.
 
-    Of a session that stands still only what does not change meanwhile: nobody keeps up with it.
+    A session that does not step is checked only for what does not change meanwhile: no client keeps up with it.
+
+    Args:
+        report: As the session sent it.
+        own_id: Participant id of the doctor itself, which is left out.
     """
     people = tuple(p for p in report.participants if p.id != own_id)
     stepping = [
@@ -83,46 +87,54 @@ def check_session_report(report: StatusReport, own_id: str = "") -> list[Finding
 
 
 def check_stepping(report: StatusReport) -> Finding:
-    """Whether it steps, is paused, or stopped."""
+    """Check whether the session steps, is paused, or is stopped."""
     silent_s = report.authority_silent_ns * 1e-9
     if report.authority_silent_ns < 0:
         return failed(
             "session",
             "the session has not taken a step yet",
-            "the program that owns it opened it, but does not run it",
+            "the program that owns the session opened it, but does not run it",
             "call run(), or begin_tick() and end_tick()",
         )
     if report.authority_silent_ns > STALLED_NS:
         return failed(
             "session",
-            f"the session stands still, for {silent_s:.1f} s now: robots hold",
-            "the process that owns it does not step: stopped, in a debugger, or busy with something else",
-            "look at that program; if it is gone for good, end it and start the session again",
+            f"the session has not taken a step for {silent_s:.1f} s: robots hold",
+            "the program that owns it does not step: it is stopped, in a debugger, or busy with something else",
+            "check that program; if it does not recover, end it and restart the session",
         )
     if report.estop:
-        return failed("session", "somebody stopped everything (e-stop)", "", "look, then let a director clear it")
+        return failed(
+            "session", "the emergency stop is active", "", "check that it is safe, then let a director clear it"
+        )
     if report.paused:
         return warning("session", "physics is paused", "", "a director resumes it")
     if report.lateness is not None:
         return ok("session", f"steps: tick {report.tick}, {1e9 / max(1, report.tick_period_ns):.0f} Hz")
     if not report.tick:
-        return ok("session", "steps, and nothing has moved so far: no tick was taken, no pose published")
-    return ok("session", f"steps: tick {report.tick}, at the pace of the program that owns it")
+        return ok("session", "steps, but no tick was taken and no pose published yet")
+    return ok("session", f"steps: tick {report.tick}, paced by the program that owns the session")
 
 
 def check_alignment(people: tuple[ParticipantReport, ...], sheets: str = "", *, driven: bool = True) -> Finding:
-    """Who cannot drive, or sees the scene in the wrong place, for want of an alignment. `sheets`: of the session.
-    `driven`: there are robots; where none is, only headsets that look for a sheet, or have lost it, want one."""
+    """Report participants that cannot drive, or see the scene at the wrong place, because they have no alignment.
+
+    Args:
+        people: Participants without the doctor.
+        sheets: Ids of the anchors of the session, for the advice.
+        driven: True if the session has robots. Without robots, only headsets that have observed a sheet, or have lost
+            their alignment, need one.
+    """
     void = [p for p in people if p.connected and p.alignment == AlignmentKind.NONE and (driven or _has_seen_sheet(p))]
     texts = [f"{p.name} has no alignment{_explain_unaligned(p)}" for p in void]
     measured = [p for p in people if p.alignment == AlignmentKind.MEASURED]
     fine = ", ".join(f"{p.name} {p.alignment_error_m * 1e3:.0f} mm" for p in measured)
     if not texts:
         return ok(
-            "alignment", f"stated error at the robot: {fine}" if fine else "nobody here needs one, or all have it"
+            "alignment", f"stated error at the robot: {fine}" if fine else "no participant needs one, or all have one"
         )
-    why = "the headset has not seen an anchor well enough since it joined or since its tracking frame jumped"
-    advice = "look at the sheet, nearer or from a second place" + (
+    why = "the headset has not observed an anchor well enough since it joined or since its tracking frame jumped"
+    advice = "bring the sheet into view, nearer or from a second place" + (
         f"; sheets of this session: {sheets}" if sheets else ""
     )
     say = failed if driven and any(p.role in DRIVERS for p in void) else warning
@@ -130,25 +142,23 @@ def check_alignment(people: tuple[ParticipantReport, ...], sheets: str = "", *, 
 
 
 def _has_seen_sheet(p: ParticipantReport) -> bool:
-    """Whether it has seen a sheet, or what may be one: a screen sees none."""
+    """Return whether the participant has observed a sheet, or something like one. A desktop client observes none."""
     seen = p.alignment_report
     return p.alignment_void_ns >= 0 or (seen is not None and bool(seen.seen or seen.unusable))
 
 
 def _explain_unaligned(p: ParticipantReport) -> str:
-    """Why it has none, as far as can be told."""
+    """Return why a participant has no alignment, as far as the report shows it."""
     seen = p.alignment_report
     if p.alignment_void_ns >= 0:
         return f" (lost {_format_seconds(p.alignment_void_ns)} ago: its tracking frame jumped)"
     if seen is None or seen.seen:
         return ""
-    return (
-        f" ({seen.unusable} observations, none of a sheet of this session that could be used)" if seen.unusable else ""
-    )
+    return f" ({seen.unusable} observations, none usable of a sheet of this session)" if seen.unusable else ""
 
 
 def check_leases(people: tuple[ParticipantReport, ...], all_robots: tuple[RobotReport, ...]) -> Finding:
-    """Who has which robot, and who has none."""
+    """Report the holder of each robot, and participants without one."""
     held = ", ".join(f"{r.name}: {r.holder_name or r.holder or 'free'}" for r in all_robots) or "no robots here"
     without = [p for p in people if p.connected and p.role in DRIVERS and not p.holds]
     if not without or not all_robots:
@@ -158,25 +168,32 @@ def check_leases(people: tuple[ParticipantReport, ...], all_robots: tuple[RobotR
         waits = f", waits for {', '.join(p.waits_for)}" if p.waits_for else ""
         texts.append(f"{p.name} has no robot{waits}")
     free = [r.name for r in all_robots if not r.holder]
-    gone = {p.id: p.name for p in people if not p.connected}
-    kept = [f"{gone[r.holder]} is gone, {r.name} is kept for them" for r in all_robots if r.holder in gone]
+    disconnected = {p.id: p.name for p in people if not p.connected}
+    kept = [
+        f"{disconnected[r.holder]} is disconnected, {r.name} is kept for a grace period"
+        for r in all_robots
+        if r.holder in disconnected
+    ]
     why = "; ".join([held, *kept])
     if free:
         return warning("leases", "; ".join(texts), why, f"acquire one: {', '.join(free)} is free")
     return warning(
-        "leases", "; ".join(texts), why, "ask the holder, wait for it (acquire with `wait`), or a director assigns"
+        "leases",
+        "; ".join(texts),
+        why,
+        "ask the holder, wait for it (acquire with `wait`), or let a director assign it",
     )
 
 
 def check_robots(all_robots: tuple[RobotReport, ...], people: tuple[ParticipantReport, ...]) -> Finding:
-    """Robots that somebody has and that hold still unwillingly."""
+    """Report robots that have a holder and hold still for another reason than an open clutch."""
     rejected = {p.id: p.rejected for p in people}
     texts, reasons = [], []
     for r in all_robots:
         if r.holder and r.state == CommandKind.HOLD and r.hold_reason in HOLD_ADVICE:
             counts = rejected.get(r.holder) or {}
-            some = ", ".join(f"{reason} {n}" for reason, n in sorted(counts.items(), key=lambda item: -item[1])[:3])
-            texts.append(f"{r.name} ({r.holder_name}) holds: {r.hold_reason}" + (f", rejected: {some}" if some else ""))
+            top = ", ".join(f"{reason} {n}" for reason, n in sorted(counts.items(), key=lambda item: -item[1])[:3])
+            texts.append(f"{r.name} ({r.holder_name}) holds: {r.hold_reason}" + (f", rejected: {top}" if top else ""))
             reasons.append(HOLD_ADVICE[r.hold_reason])
     if texts:
         return warning("robots", "; ".join(texts), "", "; ".join(dict.fromkeys(reasons)))
@@ -185,49 +202,51 @@ def check_robots(all_robots: tuple[RobotReport, ...], people: tuple[ParticipantR
 
 
 def check_clients(people: tuple[ParticipantReport, ...]) -> Finding:
-    """Who does not keep up, or has gone."""
+    """Report clients that do not keep up or are disconnected."""
     bad: list[str] = []
     worst: list[str] = []
     for p in people:
-        trouble = list(_list_client_problems(p))
-        if trouble:
-            (worst if not p.connected or p.heard_ns > SILENT_NS else bad).append(f"{p.name}: {', '.join(trouble)}")
+        problems = list(_list_client_problems(p))
+        if problems:
+            (worst if not p.connected or p.heard_ns > SILENT_NS else bad).append(f"{p.name}: {', '.join(problems)}")
     if not bad and not worst:
-        return ok("clients", f"{len(people)} here, all keep up" if people else "nobody else is here")
-    why = "their application stands still or is too slow, or their network is"
-    advice = "look at that headset: is the app in front, is it worn, how good is its Wi-Fi?"
+        return ok("clients", f"{len(people)} connected, all keep up" if people else "no other participants")
+    why = "the application is stopped or too slow, or its network is"
+    advice = "check that headset: is the app in front, is it worn, how good is its Wi-Fi?"
     return (failed if worst else warning)("clients", "; ".join(worst + bad), why, advice)
 
 
 def _list_client_problems(p: ParticipantReport) -> Iterator[str]:
     if not p.connected:
-        yield f"connection lost ({p.lost or 'unknown'})"
+        yield f"disconnected ({p.lost or 'unknown'})"
         return
     if p.heard_ns > SILENT_NS:
         yield f"silent for {_format_seconds(p.heard_ns)}"
     if p.reported and p.state_age is None:
-        yield "gets no state: is its state port open?"
+        yield "receives no state: is its state port open?"
     if p.missed_share > MISSED_SHARE:
         yield f"misses {p.missed_share:.0%} of the frames"
     if p.state_age is not None and p.state_age.p50 > OLD_MS:
-        yield f"sees data of {p.state_age.p50:.0f} ms ago"
+        yield f"sees data that is {p.state_age.p50:.0f} ms old"
 
 
 def check_data_age(people: tuple[ParticipantReport, ...], report: StatusReport) -> Finding:
-    """How old the data is by stage of its way, and which stage is to blame."""
+    """Check the age of data by stage of its path, and name the slow stage."""
     took = measure_stages(people, report)
     if not took:
-        return ok("age", "nothing moves along its way now")
+        return ok("age", "no data is on its way")
     text = ", ".join(f"{stage} {ms:.1f} ms" + (f" ({who})" if who else "") for stage, (ms, who) in took.items())
     over = {stage: ms / STAGES[stage][0] for stage, (ms, _) in took.items()}
-    guilty = max(over, key=over.__getitem__)
-    if over[guilty] <= 1.0:
+    slowest = max(over, key=over.__getitem__)
+    if over[slowest] <= 1.0:
         return ok("age", f"p99: {text}")
-    return warning("age", f"{guilty} is slow; p99: {text}", STAGES[guilty][1], "see docs/troubleshooting.md, Old data")
+    return warning(
+        "age", f"{slowest} is slow; p99: {text}", STAGES[slowest][1], "see docs/troubleshooting.md, Old data"
+    )
 
 
 def measure_stages(people: tuple[ParticipantReport, ...], report: StatusReport) -> dict[str, tuple[float, str]]:
-    """99th percentile [ms] of the worst one, and who that is, per stage that was measured."""
+    """Return, per measured stage, the 99th percentile [ms] of the slowest participant or robot, and its name."""
     took: dict[str, tuple[float, str]] = {}
     devices = [(p.capture_to_receive.p99, p.name) for p in people if p.capture_to_receive is not None]
     waits = [(r.receive_to_step.p99, r.name) for r in report.robots if r.receive_to_step is not None]
@@ -246,9 +265,9 @@ def measure_stages(people: tuple[ParticipantReport, ...], report: StatusReport) 
 
 
 def check_ticks(report: StatusReport) -> Finding:
-    """Late ticks, and what they are late for."""
+    """Check for late ticks, and name their main cause."""
     if report.lateness is None:
-        return ok("ticks", "the owner's loop sets the pace: nothing is late")
+        return ok("ticks", "the user loop sets the pace: no tick is late")
     text = (
         f"{report.late_share:.2%} late in the last ten seconds, {report.late_share_total:.2%} in all; "
         f"lateness p99 {report.lateness.p99:.2f} ms; scheduling {report.scheduling}, "
@@ -266,7 +285,7 @@ def check_ticks(report: StatusReport) -> Finding:
 
 
 def check_recorder(report: StatusReport) -> Finding:
-    """Whether the recording goes on."""
+    """Check that the recorder runs and has lost nothing."""
     one = report.recorder
     if one is None or one.state == "off":
         return ok("recorder", "nothing is recorded")
@@ -274,21 +293,21 @@ def check_recorder(report: StatusReport) -> Finding:
     lost = f", {one.lost_rows} rows lost" if one.lost_rows else ""
     waiting = f", {one.spilled_bytes / 1e6:.1f} MB wait on the disk" if one.spilled_bytes else ""
     if one.state == "hangs":
-        why = "it has taken nothing for five seconds: its disk or network drive does not answer"
-        return failed("recorder", f"the recorder hangs; {text}{waiting}{lost}", why, "look at that disk")
+        why = "it has accepted nothing for five seconds: its disk or network drive does not answer"
+        return failed("recorder", f"the recorder hangs; {text}{waiting}{lost}", why, "check that disk")
     if one.state in ("dead", "failed"):
         text = f"the recorder ended, nothing is written now; {text}{waiting}{lost}"
-        return failed("recorder", text, one.text, "mend that; it is started again by itself")
+        return failed("recorder", text, one.text, "fix the cause; the recorder restarts by itself")
     if one.lost_rows:
         return warning("recorder", f"{text}{lost}", one.text, "verification goes on after the gap")
     return ok("recorder", f"{text}{waiting}")
 
 
 def check_disk(report: StatusReport) -> Finding:
-    """Room for the recording."""
+    """Check that the disk has room for the recording."""
     one = report.recorder
     if one is None or one.state == "off" or not one.disk_free_bytes:
-        return ok("disk", "nothing is recorded, or its room is not known")
+        return ok("disk", "nothing is recorded, or the free space is not known")
     free = one.disk_free_bytes
     rate = one.bytes_written / max(1.0, report.session_time * 1e-9)
     left_s = free / rate if rate > 0.0 else float("inf")
@@ -302,12 +321,12 @@ def check_disk(report: StatusReport) -> Finding:
 
 
 def check_drops(report: StatusReport) -> Finding:
-    """What was thrown away, and front or recorder that had to be started again."""
+    """Report drops, and restarts of front and recorder."""
     restarts = ", ".join(f"{name} {n} times" for name, n in sorted(report.restarts.items()) if n)
     text = explain_drops(report.drops)
     if restarts:
         return warning(
-            "drops", f"started again: {restarts}; dropped: {text or 'nothing'}", "", "see the session's terminal"
+            "drops", f"restarted: {restarts}; dropped: {text or 'nothing'}", "", "see the session's terminal"
         )
     return ok("drops", f"dropped so far: {text or 'nothing'}")
 

@@ -13,8 +13,7 @@ from typing import Any, Final
 import msgspec
 
 from iris_session.client import ClientError
-from iris_session.client.joining import wanted
-from iris_session.client.meeting import Wanted, settle
+from iris_session.client.endpoint_resolver import ConnectRequest, parse_connect_request, resolve_blocking
 from iris_session.emulator.equipment import behaviour_of, curve_of
 from iris_session.emulator.orders import Orders
 from iris_session.emulator.runner import JOIN_TIMEOUT_S, run_headsets
@@ -30,7 +29,7 @@ def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
     options = _parser().parse_args(argv)
     try:
         specs = _specs(options)
-        sought = wanted(options.address, options.session, None, options.code)
+        sought = parse_connect_request(options.address, options.session, None, options.code)
         for spec in specs:
             behaviour_of(spec, spec.robot)
             curve_of(spec)
@@ -40,7 +39,7 @@ def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
     try:
         if sought.address is None or sought.join_code or sought.address.join_code:
             # Everybody here has the key of this user: it is paired once, not by each of them.
-            sought = Wanted(settle(sought, options.join_timeout).address)
+            sought = ConnectRequest(resolve_blocking(sought, options.join_timeout).address)
     except ClientError as error:
         print(f"{prog}: {error}", file=sys.stderr)
         return 1

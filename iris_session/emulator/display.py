@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anchors.pose import PoseTuple, Vec3, compose
-from iris_session.client import Client, PoseBuffer, SceneState, Shown
-from iris_session.client.scene_view import pose_at
+from iris_session.client import Client, PoseBuffer, SceneState, ShownPoses
+from iris_session.client.core.scene_follower import pose_at
 
 
 class Display:
@@ -21,7 +21,7 @@ class Display:
         #: A behaviour has asked for a vertex: somebody must tell where they are.
         self.wants_vertices = False
         self._epoch = 0
-        self._shown: Shown | None = None
+        self._shown: ShownPoses | None = None
         self._now_ns = 0
 
     def take(self, state: SceneState) -> None:
@@ -40,7 +40,7 @@ class Display:
     def refresh(self, session_ns: int) -> None:
         """The next picture."""
         self._now_ns = max(self._now_ns, session_ns)
-        self._shown = self.buffer.show(self._now_ns)
+        self._shown = self.buffer.poses_at(self._now_ns)
 
     @property
     def ready(self) -> bool:

@@ -114,7 +114,7 @@ class Person:
         """One round of the loop, after `client.poll`."""
         self._now_ns = now_ns
         if self.display.wants_vertices:
-            for name in self._deformables.tend():
+            for name in self._deformables.update():
                 shapes = self._deformables
                 self.display.take_vertices(name, shapes.vertices[name], shapes.capture_ns[name])
         for samples, seen in self._uplink.pop(now_ns):

@@ -85,7 +85,7 @@ def _give_up_joining(people: Sequence[Person], timeout_s: float, now_ns: int) ->
     for person in people:
         waited_s = (now_ns - person.started_ns) * 1e-9
         if person.report.phase == "join" and waited_s >= timeout_s:
-            text = person.client.why_not_in(f"within {waited_s:.1f} s")
+            text = person.client.describe_failure(f"within {waited_s:.1f} s")
             person.fail(f"no session let us in at {text}", now_ns)
 
 

@@ -35,9 +35,11 @@ class Neighbours:
             return name
         while (left := self._until - time.monotonic()) > 0.0:
             self._listener.wait(left)
-            self._listener.sessions()
+            self._listener.poll_sessions()
         heard = {
-            session.name: session.address for session in self._listener.sessions() if session.session_id != session_id
+            session.name: session.address
+            for session in self._listener.poll_sessions()
+            if session.session_id != session_id
         }
         if name not in heard:
             return name

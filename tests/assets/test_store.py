@@ -570,7 +570,7 @@ def test_a_folder_that_cannot_be_used_says_so(tmp_path: Path) -> None:
     with pytest.raises(AssetStoreError, match="cannot be used") as caught:
         AssetStore(tmp_path / "file").open_part(ADDRESS)
     assert caught.value.reason == "cache"
-    assert "client.asset_cache = AssetStore(folder)" in str(caught.value), "how to name another one"
+    assert "client.assets.cache = AssetStore(folder)" in str(caught.value), "how to name another one"
     assert "XDG_CACHE_HOME" in str(caught.value)
     with pytest.raises(ValueError, match="no address"):
         AssetStore(tmp_path).path("../../etc/passwd")

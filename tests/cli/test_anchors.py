@@ -165,7 +165,7 @@ def test_sheet_on_the_hand(folder: Path, tmp_path: Path, capsys: pytest.CaptureF
     assert [row["used"] for row in told["pictures"]] == [True] * 5
     assert tomllib.loads(out.read_text())["T_base_camera"]["position_m"] == told["T_base_camera"]["position_m"]
     assert main(["anchors", "calibrate-camera", str(folder), *SHEET, "--poses", str(poses)]) == 0
-    assert "5 used, 0 left out; residual rms" in capsys.readouterr().out
+    assert "5 used, 0 excluded; residual rms" in capsys.readouterr().out
 
 
 def test_one_picture_is_enough_where_the_hand_is_known(
@@ -234,7 +234,7 @@ def test_unusable_input_is_one_line(folder: Path, tmp_path: Path, capsys: pytest
     )
     assert "the picture is 64 x 48, the intrinsics are for 640 x 480" in error
     (tmp_path / "small" / "0000.png").write_bytes(b"no picture")
-    assert "is not a picture" in _refused(capsys, 2, tmp_path / "small", *SHEET, "--poses", poses)
+    assert "0000.png is not a readable picture" in _refused(capsys, 2, tmp_path / "small", *SHEET, "--poses", poses)
 
 
 @pytest.mark.parametrize(
@@ -242,9 +242,9 @@ def test_unusable_input_is_one_line(folder: Path, tmp_path: Path, capsys: pytest
     [
         ("x,y,z\n", "the first line must be image,x,y,z,qw,qx,qy,qz"),
         ("", "the first line must be"),
-        (f"{HEADER}\na.png,0,0,0,1,1,0,0\n", "line 2: wanted are the name of a picture"),
-        (f"{HEADER}\na.png,0,0,nan,1,0,0,0\n", "line 2: wanted"),
-        (f"{HEADER}\na.png,0,0\n", "line 2: wanted"),
+        (f"{HEADER}\na.png,0,0,0,1,1,0,0\n", "line 2: must be the name of a picture"),
+        (f"{HEADER}\na.png,0,0,nan,1,0,0,0\n", "line 2: must be"),
+        (f"{HEADER}\na.png,0,0\n", "line 2: must be"),
         (f"{HEADER}\n\na.png,0,0,0,1,0,0,0\na.png,0,0,0,1,0,0,0\n", "line 4: a second pose for a.png"),
     ],
 )

@@ -92,16 +92,16 @@ def test_the_screen_says_what_every_alignment_rests_on() -> None:
     text = "\n".join(format_alignment_status(REPORT))
     ann = next(line for line in format_alignment_status(REPORT) if "ann" in line)
     assert " ".join(ann.split()).endswith("(p1) measured 7 61 s 2.1 mm 4.4 mm 210 3 0.2 deg -")
-    assert "saw door 90 times, 4 s ago; table 120 times, 5 min ago; 2 of no use" in text
+    assert "saw door 90 times, 4 s ago; table 120 times, 5 min ago; 2 unusable" in text
     assert "none STOPPED" in text
     assert "12.0 mm, 0.00 deg to go" in text
     assert "void for 4 s" in text
     assert "ALARM jump: off by 120 mm, 5 s ago" in text
     assert "advice: step closer" in text
-    assert "anchor 'table': at 0.0000, -0.4500, 0.0000 m, turned 1,0,0,0, 160 mm" in text
-    assert "anchor 'door': at 0.0000, 0.0000, 0.0000 m, turned 1,0,0,0" in text
+    assert "anchor 'table': at 0.0000, -0.4500, 0.0000 m, rotation 1,0,0,0, 160 mm" in text
+    assert "anchor 'door': at 0.0000, 0.0000, 0.0000 m, rotation 1,0,0,0" in text
     pair, other = (line for line in format_alignment_status(REPORT) if " apart at " in line)
-    assert "bob (p2): 31.0 mm, 0.57 deg apart at 'table', 95 % expected below 8.2 mm; 40 looks, 4 s ago" in pair
+    assert "bob (p2): 31.0 mm, 0.57 deg apart at 'table', 95 % expected below 8.2 mm; 40 observations, 4 s ago" in pair
     assert pair.endswith("TOO FAR APART")
     assert " - gone: 3.0 mm" in other
     assert not other.endswith("TOO FAR APART")
@@ -201,7 +201,7 @@ def test_participants_are_meant_by_id_or_name(session: Any) -> None:
 
 def test_nobody_to_align(monkeypatch: pytest.MonkeyPatch) -> None:
     empty: Any = Session()
-    with pytest.raises(CommandError, match="nobody in this session has a headset") as caught:
+    with pytest.raises(CommandError, match="no participant of this session has a headset") as caught:
         select_participants(empty, "all")
     assert caught.value.status == 1
 
@@ -211,7 +211,7 @@ def test_runs_are_started_and_stopped(session: Session, capsys: pytest.CaptureFi
     assert main(["anchors", "align", "stop", "ann", "--json"]) == 0
     assert session.asked == [("start", "p1"), ("start", "p2"), ("stop", "p1")]
     out = capsys.readouterr().out.splitlines()
-    assert out[0] == "ann (p1): started: look at the sheets"
+    assert out[0] == "ann (p1): started: bring the sheets into view"
     assert json.loads(out[2]) == {
         "ok": True,
         "action": "stop",
@@ -255,12 +255,12 @@ def test_a_moved_anchor_tells_whose_alignments_follow(session: Session, capsys: 
     session.report = msgspec.structs.replace(REPORT, participants=(ANN, BOB, DESK, *others))
     assert main(["anchors", "move", "table", "--pose", "0,-0.4,0,1,0,0,0"]) == 0
     first, *stay = capsys.readouterr().out.splitlines()
-    assert first == "anchor 'table' moved by 50 mm: alignments that are measured to it follow (1)"
+    assert first == "anchor 'table' moved by 50 mm: 1 alignments measured to it follow"
     assert [line.strip() for line in stay] == [
-        "not that of cay (p4): its run is stopped; `iris-session anchors align start p4`",
-        "not that of dan (p5): a director placed it; `iris-session anchors align start p5` measures it",
-        "not that of eve (p6): it has not looked at 'table' since it came; it follows when it does",
-        "not that of fay (p7): it has not looked at 'table' since it came; it follows when it does",
+        "unchanged: cay (p4): its run is stopped; start it with `iris-session anchors align start p4`",
+        "unchanged: dan (p5): a director placed it; measure it with `iris-session anchors align start p5`",
+        "unchanged: eve (p6): it has not observed 'table' since it joined; it follows when it does",
+        "unchanged: fay (p7): it has not observed 'table' since it joined; it follows when it does",
     ]
 
 
@@ -449,8 +449,8 @@ def test_the_text_says_it_too(recording: Path, tmp_path: Path, capsys: Capture) 
     shown = capsys.readouterr().out
     lines = shown.splitlines()
     assert all(line.isprintable() for line in lines)
-    assert any("120 looks from 6 places" in line and "table 60" in line for line in lines)
-    (beyond,) = [line for line in lines if "BEYOND WHAT WAS STATED" in line]
+    assert any("120 observations from 6 places" in line and "table 60" in line for line in lines)
+    (beyond,) = [line for line in lines if "EXCEEDS THE STATED ERROR" in line]
     assert beyond.lstrip().startswith("version 2 (measured), 10.0 s to the end: 2")
     assert "stated 3.0 mm" in beyond
     assert "carl (p3): no observations" in lines
@@ -516,7 +516,7 @@ def test_a_sheet_on_the_wall_is_told_to_be_none_that_lies(tmp_path: Path, capsys
     assert main(["anchors", "solve", str(played.write(tmp_path / "session.rrd"))]) == 0
     shown = capsys.readouterr().out
     assert "8 against gravity" in shown
-    assert "most looks contradict the vertical: the sheet does not lie as configured" in shown
+    assert "most observations contradict gravity" in shown
     assert "1 sheet was seen" in shown
 
 
@@ -533,7 +533,7 @@ def test_recordings_without_headsets_or_with_one_sheet(tmp_path: Path, capsys: C
     played = Played({"table": TRUE["table"]})
     empty = str(played.write(tmp_path / "empty.rrd"))
     assert main(["anchors", "solve", empty]) == 0
-    assert "nobody in this recording had a headset" in capsys.readouterr().out
+    assert "no participant of this recording had a headset" in capsys.readouterr().out
     assert main(["anchors", "solve", empty, "--out", str(tmp_path / "x.toml")]) == 1
     assert capsys.readouterr().err.endswith(
         "is not written: 0 sheets were seen: 2 are needed to say where they lie to each other\n"

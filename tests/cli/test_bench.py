@@ -18,7 +18,7 @@ from iris_session.cli.main import main
         (["alignment", "--pairs", "3"], "--pairs 3: bench alignment takes 10 to 100000"),
         (["slow-client", "--clients", "2"], "slow-client needs"),
         (["join", "--assets-mb", "0.5"], "--assets-mb 0.5: bench join takes 1 to 2000"),
-        (["join", "--curve"], "bench join runs on plain loopback"),
+        (["join", "--curve"], "--curve"),
     ],
 )
 def test_numbers_that_cannot_be(options: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -42,7 +42,7 @@ def lab(home: KeyHome) -> KeyHome:
 
 def test_allow_list_revoke(home: KeyHome, tmp_path: Path, capsys: Capture) -> None:
     assert main(["keys", "list"]) == 0
-    assert "nobody may join yet" in capsys.readouterr().out
+    assert "no keys are allowed yet" in capsys.readouterr().out
     certificate, _ = create_certificates(tmp_path, "ann")
     bob = KeyPair.generate()
     assert main(["keys", "allow", "ann", str(certificate), "--role", "director", "--role", "operator"]) == 0
@@ -59,7 +59,7 @@ def test_allow_list_revoke(home: KeyHome, tmp_path: Path, capsys: Capture) -> No
     assert "any role" in capsys.readouterr().out
     assert main(["keys", "revoke", "ann"]) == 0
     assert main(["keys", "revoke", "ann"]) == 2
-    assert "no key 'ann' on the list, there are: bob" in capsys.readouterr().err
+    assert "no key 'ann' on the list; listed: bob" in capsys.readouterr().err
     assert list(home.clients.read()) == [bob.fingerprint]
 
 
@@ -98,7 +98,7 @@ def test_who_types_no_address_is_told_where_their_session_is(home: KeyHome) -> N
     [
         (["keys", "allow", "eve", "short"], "'short' is not a CURVE key"),
         (["keys", "allow", "eve", "missing.key"], "missing.key cannot be used"),
-        (["keys", "forget", "10.0.0.9:7721"], "no key is stored for '10.0.0.9:7721', stored are: none"),
+        (["keys", "forget", "10.0.0.9:7721"], "no key is stored for '10.0.0.9:7721'; stored: none"),
         (["pair"], "no encrypted session of yours runs on this machine"),
         (["pair", "--address", "lab:99999", "--no-wait"], "not HOST:PORT"),
     ],
@@ -160,7 +160,7 @@ def test_of_several_sessions_one_is_chosen(lab: KeyHome, capsys: Capture) -> Non
     assert main(["pair", "--no-wait"]) == 2
     assert "2 sessions run here (lab-1, lab-2): choose with --session NAME" in capsys.readouterr().err
     assert main(["pair", "--no-wait", "--session", "lab-3"]) == 2
-    assert "there are: lab-1, lab-2" in capsys.readouterr().err
+    assert "running: lab-1, lab-2" in capsys.readouterr().err
     assert main(["pair", "--no-wait", "--session", "lab-2", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["addresses"] == ["10.0.0.5:7741"]
 
@@ -169,7 +169,7 @@ def test_a_code_that_nobody_uses_fails_and_an_interrupted_one_is_void(
     lab: KeyHome, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert main(["pair", "--minutes", "0.002"]) == 1
-    assert "expired: nobody used it" in capsys.readouterr().out
+    assert "expired: the code was not used" in capsys.readouterr().out
 
     def interrupt(_seconds: float) -> None:
         raise KeyboardInterrupt
@@ -197,7 +197,7 @@ def test_pair_waits_on_while_another_process_holds_the_list(
     assert main(["pair", "--minutes", "0.02"]) == 1
     assert next(busy, None) is None
     said = capsys.readouterr()
-    assert "expired: nobody used it" in said.out
+    assert "expired: the code was not used" in said.out
     assert said.err == ""
 
 

@@ -78,7 +78,7 @@ def test_the_table_says_who_is_lost_and_that_everything_stopped() -> None:
     console.print(_render_table("lab", STATUS, ["something happened"]))
     assert isinstance(console.file, io.StringIO)
     text = console.file.getvalue()
-    for part in ("ann (p1) [lost]", "4.2 mm", "21 ms", "E-STOP", "late 0.10 %", "drops 3", "something happened"):
+    for part in ("ann (p1) [offline]", "4.2 mm", "21 ms", "E-STOP", "late 0.10 %", "drops 3", "something happened"):
         assert part in text
 
 

@@ -72,7 +72,7 @@ def test_one_screen_says_it_all() -> None:
     shown = format_status(REPORT)
     text = "\n".join(shown)
     assert len(shown) < 25
-    for words in ("lab", "measured 4 mm, 3 s", "1.5/4.0", "LOST silent", "void for 4 s", "no_lease", "physics 9"):
+    for words in ("lab", "measured 4 mm, 3 s", "1.5/4.0", "OFFLINE silent", "void for 4 s", "no_lease", "physics 9"):
         assert words in text
     assert "device -> front 20.0 ms" in text
     assert "front 1" in text
@@ -82,7 +82,7 @@ def test_one_screen_says_it_all() -> None:
 def test_assets_are_shown_where_there_are_some() -> None:
     assert "assets:" not in format_status(msgspec.structs.replace(REPORT, assets=AssetsReport()))
     report = msgspec.structs.replace(REPORT, assets=AssetsReport(183, 17_500_000, 400, 3, 2))
-    assert "assets: 183 served, 17.5 MB sent, 3 refused; 2 clients wait for some" in format_status(report)
+    assert "assets: 183 served, 17.5 MB sent, 3 refused; 2 clients waiting" in format_status(report)
     assert "iris_session_assets_bytes_total 17500000" in format_metrics(report)
 
 
@@ -94,7 +94,7 @@ def test_media_are_shown_with_who_gets_what() -> None:
     streams = (MediaStreamReport("cloud", 30.0, 20.0, "cam-1", 2), MediaStreamReport("cloth", 60.0, 2.0))
     text = format_status(msgspec.structs.replace(REPORT, participants=(ann, bob), media=streams))
     assert "media cloud: 30 Hz, 20.0 Mbit/s from cam-1; ann (p1) full, bob (p2) quarter, 7 dropped" in text
-    assert "media cloth: 60 Hz, 2.0 Mbit/s; nobody" in text
+    assert "media cloth: 60 Hz, 2.0 Mbit/s; no subscribers" in text
 
 
 def test_names_of_strangers_move_no_cursor() -> None:
@@ -104,8 +104,8 @@ def test_names_of_strangers_move_no_cursor() -> None:
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"stalled": True, "authority_silent_ns": 2_500_000_000}, "STANDS STILL since 2.5 s"),
-        ({"authority_silent_ns": -1}, "HAS NOT TAKEN A STEP YET"),
+        ({"stalled": True, "authority_silent_ns": 2_500_000_000}, "STALLED for 2.5 s"),
+        ({"authority_silent_ns": -1}, "NOT STARTED"),
         ({"estop": True}, "E-STOP"),
         ({"paused": True}, "paused"),
         ({}, "running"),
@@ -163,9 +163,9 @@ def test_lines_of_the_doctor() -> None:
     shown = format_findings(found)
     assert [line.split()[0] for line in shown] == ["ok", "WARNING", "why:", "do:", "FAILED", "do:"]
     assert all(line.isprintable() for line in shown)
-    assert format_verdict(found) == "FAILED: key; to look at: age; 1 not possible"
+    assert format_verdict(found) == "FAILED: key; warnings: age; 1 skipped"
     assert len(format_findings(found, show_skipped=True)) == len(shown) + 1
-    assert format_verdict(found[:2]) == "nothing failed; to look at: age"
+    assert format_verdict(found[:2]) == "nothing failed; warnings: age"
     assert format_verdict(found[:1]) == "all well"
 
 

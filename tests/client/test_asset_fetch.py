@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from iris_session.client import AssetError, AssetStore
-from iris_session.client.asset_fetch import AssetFetch
+from iris_session.client.assets import AssetFetch
 from tests.assets.test_store import stored
 
 LOST, WAITED = "0" * 64, "1" * 64
@@ -18,7 +18,7 @@ def test_what_is_here_can_be_read_or_looked_at_where_it_lies(tmp_path: Path) -> 
     cache = AssetStore(tmp_path)
     here = stored(cache, b"bytes of an asset")
     fetch = AssetFetch(cache, [here, LOST, WAITED], {here: 17}, None, None)
-    fetch.found(here, 17, (), fetched=True)
+    fetch.on_found(here, 17, (), fetched=True)
     fetch.fail(LOST, AssetError(LOST, "unknown", "nobody has it"))
     assert fetch.read(here) == fetch.view(here) == b"bytes of an asset"
     assert isinstance(fetch.view(here).obj, mmap.mmap), "a large one is not in memory twice"

@@ -13,7 +13,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from iris_session.client import AssetStore, Client, asset_loading
+from iris_session.client import AssetStore, Client
+from iris_session.client.core import asset_loader as asset_loading
 from iris_session.protocol.assets import AssetRequest
 from tests.client.harness import LiveSession
 from tests.client.test_assets import Liar, chunk
@@ -94,7 +95,7 @@ def test_a_connection_that_ends_costs_what_was_under_way_and_no_time(
     monkeypatch.setattr(asset_loading, "PATIENCE_NS", 10**18)  # whatever helps, it is not that one
     addresses, n_cuts = live.front.scene.assets, len(cuts)
     client = Client(live.address, role="observer", alignment="not_needed")
-    client.asset_cache = AssetStore(tmp_path / "cache")
+    client.assets.cache = AssetStore(tmp_path / "cache")
     client.connect(DEADLINE_S)
     welcome = client.connection.welcome
     assert welcome is not None
@@ -102,7 +103,7 @@ def test_a_connection_that_ends_costs_what_was_under_way_and_no_time(
     endpoints = msgspec.structs.replace(welcome.endpoints, assets=relay.port)
     client.connection.welcome = msgspec.structs.replace(welcome, endpoints=endpoints)
     try:
-        fetch = client.fetch_assets(addresses)
+        fetch = client.assets.fetch(addresses)
         done = client.wait_for(lambda _: fetch.done or relay.came > 200 * MIB, DEADLINE_S)
         assert done, (fetch.bytes_done, relay.came)
         fetch.check()
@@ -118,7 +119,7 @@ def test_a_connection_that_ends_costs_what_was_under_way_and_no_time(
 
 def test_a_function_that_decodes_may_use_the_client_until_it_is_closed(live: LiveSession, tmp_path: Path) -> None:
     client = Client(live.address, role="observer", alignment="not_needed")
-    client.asset_cache = AssetStore(tmp_path / "cache")
+    client.assets.cache = AssetStore(tmp_path / "cache")
     client.connect(DEADLINE_S)
     address = live.front.scene.assets[1]
     begun, lets_go, seen = threading.Event(), threading.Event(), []
@@ -126,9 +127,9 @@ def test_a_function_that_decodes_may_use_the_client_until_it_is_closed(live: Liv
     def decode(_address: str, data: memoryview) -> None:
         begun.set()
         assert lets_go.wait(DEADLINE_S)
-        seen.append((len(data), client.presence))
+        seen.append((len(data), client.scene.presence))
 
-    fetch = client.fetch_assets([address], decode=decode)
+    fetch = client.assets.fetch([address], decode=decode)
     assert client.wait_for(lambda _: begun.is_set(), DEADLINE_S)
     closing = threading.Thread(target=client.close, daemon=True)
     closing.start()
@@ -153,14 +154,14 @@ def test_a_connection_without_answers_is_made_anew(
         return [chunk(request, len(data), data)] if len(asked) > 1 else []
 
     client = Client(live.address, role="observer", alignment="not_needed")
-    client.asset_cache = AssetStore(tmp_path / "cache")
+    client.assets.cache = AssetStore(tmp_path / "cache")
     client.connect(DEADLINE_S)
     other, welcome = Liar(answers), client.connection.welcome
     assert welcome is not None
     endpoints = msgspec.structs.replace(welcome.endpoints, assets=other.port)
     client.connection.welcome = msgspec.structs.replace(welcome, endpoints=endpoints)
     try:
-        fetch = client.fetch_assets([hashlib.sha256(data).hexdigest()])
+        fetch = client.assets.fetch([hashlib.sha256(data).hexdigest()])
         assert client.wait_for(lambda _: fetch.done, DEADLINE_S)
         fetch.check()
         assert len(asked) > 1

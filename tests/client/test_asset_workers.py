@@ -6,7 +6,7 @@ import threading
 from pathlib import Path
 
 from iris_session.client import AssetStore
-from iris_session.client.asset_workers import AssetWorkers, Broken, Missing, Result, Stored
+from iris_session.client.asset_workers import AssetFailed, AssetMissing, AssetWorkers, BytesStored, Result
 from tests.assets.test_store import ADDRESS, DATA
 
 
@@ -19,12 +19,12 @@ def test_bytes_that_cannot_be_stored_are_let_go_of_before_it_is_told_why(tmp_pat
         while not any(isinstance(one, kind) for one in found):
             assert news.wait(30.0)
             news.clear()
-            found.extend(workers.results())
+            found.extend(workers.poll_results())
 
-    workers.look(ADDRESS, ())
-    until(Missing)
+    workers.look_up(ADDRESS, ())
+    until(AssetMissing)
     workers.write(ADDRESS, memoryview(DATA))  # more than twice what the cache may hold
-    until(Broken)
+    until(AssetFailed)
     workers.close()
-    assert [type(one) for one in found] == [Missing, Stored, Broken]
-    assert found[1] == Stored(len(DATA))
+    assert [type(one) for one in found] == [AssetMissing, BytesStored, AssetFailed]
+    assert found[1] == BytesStored(len(DATA))

@@ -12,16 +12,9 @@ import msgspec
 import pytest
 import zmq
 
-from iris_session.client import (
-    AssetError,
-    AssetFetch,
-    AssetStore,
-    Client,
-    InvalidMessageError,
-    NotConnectedError,
-    asset_loading,
-)
-from iris_session.client.waiting import ClientGroup
+from iris_session.client import AssetError, AssetFetch, AssetStore, Client, InvalidMessageError, NotConnectedError
+from iris_session.client.core import asset_loader as asset_loading
+from iris_session.client.group import ClientGroup
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, AssetChunk, AssetRequest
 from iris_session.protocol.codec import decode_asset_request, encode_asset_header
 from iris_session.protocol.names import AssetRefusal
@@ -71,7 +64,7 @@ def join(live: LiveSession, tmp_path: Path) -> Iterator[Callable[..., Client]]:
 
     def make(name: str = "ann", cache: str = "cache") -> Client:
         client = Client(live.address, name=name, role="observer", alignment="not_needed")
-        client.asset_cache = AssetStore(tmp_path / cache)
+        client.assets.cache = AssetStore(tmp_path / cache)
         clients.append(client)
         return client.connect(DEADLINE_S)
 
@@ -92,7 +85,7 @@ def test_everything_comes_and_a_second_time_nothing(store: Store, join: Callable
         return len(data)
 
     sizes = {address: len(data) for address, data in store.data.items()}
-    fetch = client.fetch_assets(sizes, lambda f: seen.append(f.bytes_done), decode)
+    fetch = client.assets.fetch(sizes, lambda f: seen.append(f.bytes_done), decode)
     assert fetch.bytes_total == store.bytes
     until_done(client, fetch)
     assert fetch.failed == {}
@@ -102,10 +95,10 @@ def test_everything_comes_and_a_second_time_nothing(store: Store, join: Callable
     assert fetch.cached == 0
     assert seen == sorted(seen)
     assert seen[-1] == store.bytes
-    assert client.assets_malformed == 0
+    assert client.assets.malformed == 0
     client.close()
     again = join("bob")
-    second = again.fetch_assets(store.addresses, decode=decode)
+    second = again.assets.fetch(store.addresses, decode=decode)
     until_done(again, second)
     assert (second.bytes_received, second.cached, second.decoded) == (0, len(sizes), sizes)
     report = again.status(DEADLINE_S).assets
@@ -125,7 +118,7 @@ def test_a_front_that_is_killed_costs_no_byte_twice(
             killed.append(fetch.bytes_done)
             os.kill(live.front.pid, signal.SIGKILL)
 
-    fetch = client.fetch_assets(store.addresses, kill)
+    fetch = client.assets.fetch(store.addresses, kill)
     until_done(client, fetch)
     fetch.check()
     assert 0 < killed[0] < store.bytes
@@ -137,12 +130,12 @@ def test_a_front_that_is_killed_costs_no_byte_twice(
 def test_a_client_that_comes_back_goes_on_where_it_was(store: Store, join: Callable[..., Client]) -> None:
     large = store.addresses[1]
     first = join()
-    begun = first.fetch_assets([large])
+    begun = first.assets.fetch([large])
     assert first.wait_for(lambda _: begun.bytes_done >= 2 * MIB, DEADLINE_S)
     first.close()
     assert begun.failed[large].reason == "closed"
     second = join()
-    fetch = second.fetch_assets([large])
+    fetch = second.assets.fetch([large])
     until_done(second, fetch)
     assert fetch.read(large) == store.data[large]
     assert 0 < fetch.bytes_received <= len(store.data[large]) - 2 * MIB
@@ -159,7 +152,7 @@ def test_what_will_not_come_says_why_and_the_rest_comes(store: Store, join: Call
             raise ZeroDivisionError("of the application")
 
     wanted = ["f" * 64, "0" * 64, damaged, store.addresses[4], good]
-    fetch = client.fetch_assets(wanted, decode=decode)
+    fetch = client.assets.fetch(wanted, decode=decode)
     until_done(client, fetch)
     assert {address: error.reason for address, error in fetch.failed.items()} == {
         "f" * 64: AssetRefusal.UNKNOWN,
@@ -174,20 +167,20 @@ def test_what_will_not_come_says_why_and_the_rest_comes(store: Store, join: Call
     with pytest.raises(AssetError, match="refused"):
         fetch.check()
     with pytest.raises(InvalidMessageError, match="no address"):
-        client.fetch_assets(["../../etc/passwd"])
+        client.assets.fetch(["../../etc/passwd"])
     path.write_bytes(store.data[damaged])
-    folder = client.asset_cache.root
+    folder = client.assets.cache.root
     assert client.wait_for(lambda _: not list(folder.glob("??/*.part")), DEADLINE_S), "of those nothing is kept open"
     client.close()
     with pytest.raises(NotConnectedError):
-        client.fetch_assets([good])
+        client.assets.fetch([good])
 
 
 def test_several_at_once_by_thread_and_by_group(store: Store, join: Callable[..., Client]) -> None:
     """One with a thread of its own, two in one loop, of which one shares the cache of the first."""
     threaded, ann, bob = join("eve"), join("ann"), join("bob", "another")
     threaded.start()
-    fetches = [client.fetch_assets(store.addresses) for client in (threaded, ann, bob)]
+    fetches = [client.assets.fetch(store.addresses) for client in (threaded, ann, bob)]
     group = ClientGroup([ann, bob])
     assert threaded.wait_for(lambda _: (group.poll(0.05), all(f.done for f in fetches))[1], DEADLINE_S)
     for fetch in fetches:
@@ -200,12 +193,12 @@ def test_a_session_without_assets_refuses_and_a_cache_that_cannot_be_used_says_s
 ) -> None:
     client = join()
     (tmp_path / "file").write_bytes(b"")
-    client.asset_cache = AssetStore(tmp_path / "file")
-    fetch = client.fetch_assets(store.addresses[:2])
+    client.assets.cache = AssetStore(tmp_path / "file")
+    fetch = client.assets.fetch(store.addresses[:2])
     until_done(client, fetch)
     assert {error.reason for error in fetch.failed.values()} == {"cache"}
-    client.asset_cache = AssetStore(tmp_path / "folder")
-    fetch = client.fetch_assets(store.addresses[:2])
+    client.assets.cache = AssetStore(tmp_path / "folder")
+    fetch = client.assets.fetch(store.addresses[:2])
     until_done(client, fetch)
     fetch.check()
 
@@ -213,29 +206,29 @@ def test_a_session_without_assets_refuses_and_a_cache_that_cannot_be_used_says_s
 def test_what_is_cancelled_is_not_fetched_any_more_and_goes_on_later(store: Store, join: Callable[..., Client]) -> None:
     client = join()
     large, small = store.addresses[1], store.addresses[0]
-    fetch = client.fetch_assets([large, small])
-    shared = client.fetch_assets([small])
+    fetch = client.assets.fetch([large, small])
+    shared = client.assets.fetch([small])
     assert client.wait_for(lambda _: fetch.bytes_done >= MIB, DEADLINE_S)
-    client.cancel_assets(fetch)
+    client.assets.cancel(fetch)
     assert fetch.done
     assert fetch.failed[large].reason == "cancelled"
     until_done(client, shared)
     assert shared.read(small) == store.data[small], "another still waits for it"
-    again = client.fetch_assets([large])
+    again = client.assets.fetch([large])
     until_done(client, again)
     assert again.read(large) == store.data[large]
     assert 0 < again.bytes_received <= len(store.data[large]) - MIB
-    client.cancel_assets(again)
+    client.assets.cancel(again)
     assert again.failed == {}
-    assert client.assets_malformed == 0
+    assert client.assets.malformed == 0
 
 
 def test_what_another_still_waits_for_is_not_cancelled_with_it(store: Store, join: Callable[..., Client]) -> None:
     client = join()
     large = store.addresses[1]
-    fetch, other = client.fetch_assets([large]), client.fetch_assets([large])
+    fetch, other = client.assets.fetch([large]), client.assets.fetch([large])
     assert client.wait_for(lambda _: fetch.bytes_done >= MIB, DEADLINE_S)
-    client.cancel_assets(fetch)
+    client.assets.cancel(fetch)
     until_done(client, other)
     assert other.read(large) == store.data[large]
     assert other.bytes_received == len(store.data[large])
@@ -257,9 +250,9 @@ def test_each_fetch_gets_what_its_own_function_makes_of_an_asset(store: Store, j
         return len(data)
 
     waited = threading.Event()
-    fetches = [client.fetch_assets([address], decode=d) for d in (slow, lambda *_: "b", failing, None)]
+    fetches = [client.assets.fetch([address], decode=d) for d in (slow, lambda *_: "b", failing, None)]
     assert client.wait_for(lambda _: begun.is_set(), DEADLINE_S)
-    late.append(client.fetch_assets([address], decode=lambda *_: "late"))
+    late.append(client.assets.fetch([address], decode=lambda *_: "late"))
     waited.set()
     for fetch in (*fetches, *late):
         until_done(client, fetch)
@@ -271,10 +264,10 @@ def test_the_cache_is_not_exchanged_under_what_is_on_its_way(
     store: Store, join: Callable[..., Client], tmp_path: Path
 ) -> None:
     client = join()
-    fetch = client.fetch_assets(store.addresses)
-    client.asset_cache = AssetStore(tmp_path / "another")
+    fetch = client.assets.fetch(store.addresses)
+    client.assets.cache = AssetStore(tmp_path / "another")
     with pytest.raises(AssetError, match="exchanged"):
-        client.fetch_assets(store.addresses[:1])
+        client.assets.fetch(store.addresses[:1])
     until_done(client, fetch)
     fetch.check()
     assert {address: fetch.read(address) for address in store.addresses} == store.data
@@ -357,12 +350,12 @@ def test_lies_end_with_a_reason_and_leave_nothing_under_a_name(
 ) -> None:
     client, _ = turn_to(answers)
     address = store.addresses[0]
-    fetch = client.fetch_assets([address])
+    fetch = client.assets.fetch([address])
     until_done(client, fetch)
     assert fetch.failed[address].reason == reason
-    assert client.asset_cache.find(address) is None
+    assert client.assets.cache.find(address) is None
     honest = join("bob")
-    again = honest.fetch_assets([address])
+    again = honest.assets.fetch([address])
     until_done(honest, again)
     assert again.read(address) == store.data[address], "what the liar left in the cache does no harm"
 
@@ -380,9 +373,9 @@ def test_a_frame_larger_than_any_is_not_taken_into_memory(
         return [chunk(request, len(large), large) if len(told) == 1 else chunk(request, len(data), data)]
 
     client, _ = turn_to(answers)
-    fetch = client.fetch_assets([address])
+    fetch = client.assets.fetch([address])
     assert client.wait_for(lambda _: len(told) == 1, DEADLINE_S)
-    client._drop_asset_link()  # as after `PATIENCE_NS`
+    client.assets._close_link()  # as after `PATIENCE_NS`
     until_done(client, fetch)
     assert told == [0, 0]
-    assert (fetch.read(address), fetch.bytes_received, client.assets_malformed) == (data, len(data), 0)
+    assert (fetch.read(address), fetch.bytes_received, client.assets.malformed) == (data, len(data), 0)

@@ -24,7 +24,7 @@ from iris_session.client import (
     poll_all,
 )
 from iris_session.client.address import Address
-from iris_session.client.status import Phase
+from iris_session.client.core.status import ConnectionPhase
 from iris_session.protocol.client_messages import Acquire, EStop, Sample
 from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.names import DenialReason, Device, HoldReason
@@ -36,7 +36,7 @@ HERE = ((0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0))
 
 
 def has_state(client: Client) -> bool:
-    return client.state is not None
+    return client.scene.state is not None
 
 
 def test_joins_and_sees_the_session(session: LiveSession, join: Join) -> None:
@@ -70,12 +70,12 @@ def test_state_is_fresh_decoded_and_aged_where_it_is_handed_over(session: LiveSe
         assert np.abs(state.poses[:, 0] - moved).max() < 2e-3
         assert -20_000_000 < state.age_ns < 2_000_000_000  # less than nothing only by the error of the clock
     assert all(a.header.state_seq < b.header.state_seq for a, b in itertools.pairwise(states))
-    tip, body = ann.tip_pose("left"), ann.body_pose("left/hand")
+    tip, body = ann.scene.tip_pose("left"), ann.scene.body_pose("left/hand")
     assert tip is not None
     assert body is not None
     assert tip[0][2] == pytest.approx(body[0][2] + 0.1)
-    assert ann.tip_pose("nobody") is None
-    assert ann.body_pose("nothing") is None
+    assert ann.scene.tip_pose("nobody") is None
+    assert ann.scene.body_pose("nothing") is None
 
 
 def test_leases_pass_between_two_people(session: LiveSession, join: Join) -> None:
@@ -137,7 +137,7 @@ def test_reset_changes_the_epoch_and_state_goes_on(session: LiveSession, join: J
     ann.wait_for(has_state)
     session.reset()
     assert ann.wait_for(lambda c: c.mirror.scene_epoch == 2)
-    assert ann.wait_for(lambda c: c.state is not None and c.state.header.scene_epoch == 2)
+    assert ann.wait_for(lambda c: c.scene.state is not None and c.scene.state.header.scene_epoch == 2)
     assert ann.counters()["control"]["snapshots"] == 1
 
 
@@ -172,8 +172,8 @@ def test_killed_front_comes_back_with_everything_kept(session: LiveSession, join
     assert ann.connection.welcome is not None
     assert ann.connection.welcome.resumed
     assert (ann.lease_version("left") or 0) > lease.lease_version  # same holder, new fencing token
-    seen = ann.state
-    assert ann.wait_for(lambda c: c.state is not seen)
+    seen = ann.scene.state
+    assert ann.wait_for(lambda c: c.scene.state is not seen)
 
 
 def test_restarted_process_resumes_with_its_identity_file(session: LiveSession, join: Join, tmp_path: Path) -> None:
@@ -296,14 +296,14 @@ def test_a_stop_during_a_restart_of_the_front_arrives(session: LiveSession, join
     assert ann.wait_for(lambda c: not c.ready)
     ann.estop("while nobody listens")
     assert ann.wait_for(lambda c: c.ready and c.mirror.estop, 10.0)
-    assert ann.connection.stop.message is None
+    assert ann.connection.pending_estop.message is None
 
 
 def test_a_stop_into_a_connection_that_is_cut_arrives_after_it(session: LiveSession, join: Join) -> None:
     ann = join()
     ann._sockets._close_control(linger_ms=0)  # the network is gone, and nobody has noticed
     ann.estop("into the void")
-    ann.connection.lost(time.monotonic_ns())
+    ann.connection.handle_disconnect(time.monotonic_ns())
     assert ann.wait_for(lambda c: c.mirror.estop)
 
 
@@ -311,9 +311,9 @@ def test_who_comes_back_reads_state_by_a_new_socket(session: LiveSession, join: 
     ann = join()
     assert ann.wait_for(has_state)
     half_open = ann._sockets._state
-    ann.connection.lost(time.monotonic_ns())
-    seen = ann.state
-    assert ann.wait_for(lambda c: c.ready and c.state is not seen)
+    ann.connection.handle_disconnect(time.monotonic_ns())
+    seen = ann.scene.state
+    assert ann.wait_for(lambda c: c.ready and c.scene.state is not seen)
     assert ann._sockets._state is not half_open
 
 
@@ -321,15 +321,15 @@ def test_a_client_that_cannot_join_leaves_nothing_open(session: LiveSession) -> 
     chef = Client(session.address, role="chef")
     with pytest.raises(RefusedError), chef:
         pass
-    assert chef.connection.phase is Phase.CLOSED
+    assert chef.connection.phase is ConnectionPhase.CLOSED
 
 
 def test_presence_shows_only_who_is_here(session: LiveSession, join: Join) -> None:
     ann = join()
     ghost = PresenceItem("p99", "head", IDENTITY)
     ann.connection.stream._presence["p99", "head"] = ghost
-    assert ann.presence == {}
-    assert ann.presence is not ann.presence
+    assert ann.scene.presence == {}
+    assert ann.scene.presence is not ann.scene.presence
 
 
 def test_closing_wakes_a_client_in_its_thread(session: LiveSession, join: Join) -> None:

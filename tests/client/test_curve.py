@@ -22,7 +22,7 @@ def test_listed_keys_join_and_see_and_others_do_not(tmp_path: Path) -> None:
     session = LiveSession(curve_secret_file=server_secret, curve_clients_dir=str(allowed))
     try:
         with Client(session.address, name="ann", curve=CurveKeys.from_files(server_public, ann_secret)) as ann:
-            assert ann.wait_for(lambda c: c.state is not None)
+            assert ann.wait_for(lambda c: c.scene.state is not None)
         eve = Client(session.address, name="eve", curve=CurveKeys.from_files(server_public, eve_secret))
         plain = Client(session.address, name="plain")
         for stranger in (eve, plain):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from iris_session.client import Client
-from iris_session.client.deformables import FIRST_PAUSE_S, MAX_ASSET_BYTES, Deformables, _Mesh, keys
+from iris_session.client.deformables import FIRST_PAUSE_S, MAX_ASSET_BYTES, Deformables, _Mesh, deformable_keys
 from iris_session.protocol.names import ArrayKind, MediaEncoding
 from iris_session.protocol.scene import Deformable, SceneSpec, asset_addresses, encode_scene
 from iris_session.scene import AssetDecodeError, AssetStore
@@ -64,7 +64,7 @@ def joined(tmp_path: Path) -> Iterator[list[Client]]:
 
 def watch(live: LiveSession, joined: list[Client], cache: Path) -> tuple[Client, Deformables]:
     client = Client(live.address, role="observer", alignment="not_needed")
-    client.asset_cache = AssetStore(cache)
+    client.assets.cache = AssetStore(cache)
     joined.append(client)
     return client.connect(DEADLINE_S), Deformables(client)
 
@@ -83,7 +83,7 @@ def test_deformables_of_one_name_or_none_are_told_apart(shared: Shared, joined: 
                 frames = encoder.encode(rest)
                 assert frames is not None
                 live.front.publish_media(stream, frames, live.now_ns, 1, MediaEncoding.DEFORMABLE)
-            shapes.tend()
+            shapes.update()
             assert not shapes.fault
             return len(shapes.vertices) == len(parts)
 
@@ -100,7 +100,7 @@ def test_what_is_drawn_of_each_comes_with_it(shared: Shared, joined: list[Client
     live = shared.begin(list(parts))
     try:
         client, shapes = watch(live, joined, tmp_path / "cache")
-        assert client.wait_for(lambda _: (shapes.tend(), shapes.scene_hash)[1] != "", DEADLINE_S), shapes.fault
+        assert client.wait_for(lambda _: (shapes.update(), shapes.scene_hash)[1] != "", DEADLINE_S), shapes.fault
         assert {name: mesh.look for name, mesh in shapes.meshes.items()} == {part.name: part for part in parts}
         rests = {part.name: (part.stream, *shared.rest(part)) for part in parts}
 
@@ -110,7 +110,7 @@ def test_what_is_drawn_of_each_comes_with_it(shared: Shared, joined: list[Client
                 frames = encoder.encode(rest)
                 assert frames is not None
                 live.front.publish_media(stream, frames, live.now_ns, 1, MediaEncoding.DEFORMABLE)
-            shapes.tend()
+            shapes.update()
             return len(shapes.vertices) == len(parts)
 
         assert client.wait_for(told, DEADLINE_S), shapes.fault
@@ -180,7 +180,7 @@ class Play:
             frames = encoder.encode(rest + np.array((0.0, 0.0, self._height)))
             assert frames is not None
             self.live.front.publish_media(stream, frames, self.live.now_ns, self.epoch, MediaEncoding.DEFORMABLE)
-        moved = self.shapes.tend()
+        moved = self.shapes.update()
         self.faults.add(self.shapes.fault)
         return moved
 
@@ -213,9 +213,9 @@ def play(shared: Shared, joined: list[Client], tmp_path: Path) -> Iterator[Play]
 
 
 def test_after_a_patch_all_go_on_and_what_is_the_same_is_not_begun_anew(play: Play, shared: Shared) -> None:
-    first, second, third = keys(play.parts)
+    first, second, third = deformable_keys(play.parts)
     play.until_moved({first, second, third})
-    feeds = {part.stream: play.client.media(part.stream) for part in play.parts}
+    feeds = {part.stream: play.client.media.subscribe(part.stream) for part in play.parts}
     kept = {mesh.key: mesh for mesh in play.shapes._meshes}
     renamed = msgspec.structs.replace(play.parts[1], name="other")
     recoloured = msgspec.structs.replace(play.parts[0], rgba=(0.5, 0.0, 1.0, 1.0))
@@ -235,13 +235,13 @@ def test_after_a_patch_all_go_on_and_what_is_the_same_is_not_begun_anew(play: Pl
     play.until_moved({first, "other"})
     assert [mesh is kept.get(mesh.key) for mesh in play.shapes._meshes] == [True, False]
     assert {name: mesh.look for name, mesh in play.shapes.meshes.items()} == {first: recoloured, "other": renamed}
-    assert play.client.media(play.parts[0].stream) is feeds[play.parts[0].stream]
-    assert play.client._feeds.keys() == {part.stream for part in play.parts[:2]}
+    assert play.client.media.subscribe(play.parts[0].stream) is feeds[play.parts[0].stream]
+    assert play.client.media._feeds.keys() == {part.stream for part in play.parts[:2]}
     assert play.faults == {""}
 
 
 def test_while_a_patched_scene_does_not_come_all_go_on_and_it_is_taken_when_it_does(play: Play, shared: Shared) -> None:
-    names = set(keys(play.parts))
+    names = set(deformable_keys(play.parts))
     play.until_moved(names)
     address, assets = shared.of(play.parts, "patched")
     play.live.show(address, assets[1:])
@@ -255,7 +255,7 @@ def test_while_a_patched_scene_does_not_come_all_go_on_and_it_is_taken_when_it_d
 
 
 def test_patches_that_come_faster_than_their_assets_stop_nothing(play: Play, shared: Shared) -> None:
-    names = set(keys(play.parts))
+    names = set(deformable_keys(play.parts))
     play.until_moved(names)
     for number in range(5):  # none of them is served
         address = f"{number:064x}"
@@ -271,17 +271,17 @@ def test_patches_that_come_faster_than_their_assets_stop_nothing(play: Play, sha
 
 def test_of_another_scene_nothing_is_shown_before_it_is_known(play: Play, shared: Shared) -> None:
     """Nor frames of the scene before, whatever comes first."""
-    first, second, third = keys(play.parts)
+    first, second, third = deformable_keys(play.parts)
     play.until_moved({first, second, third})
     address, assets = shared.of(play.parts[:2], "another")
     play.live.show(address, assets[1:], "new_scene")
     play.until(lambda: play.client.mirror.synced and play.client.mirror.scene_epoch == 2)
     play.until(lambda: "unknown_asset" in play.shapes.fault)
     assert (play.shapes.vertices, play.shapes.capture_ns, play.shapes.meshes) == ({}, {}, {})
-    assert not play.client._feeds
+    assert not play.client.media._feeds
     play.live.show(address, assets, "")
     play.until(lambda: play.shapes.scene_hash == address)
-    feed = play.client.media(play.parts[0].stream)
+    feed = play.client.media.subscribe(play.parts[0].stream)
     had = feed.received
     play.until(lambda: feed.received > had + 5)
     assert play.shapes.vertices == {}, "all that came was of the epoch before"
@@ -294,10 +294,12 @@ def test_names_that_are_names_stay() -> None:
     def part(name: str, stream: str) -> Deformable:
         return Deformable(name, 2, 0, 1, 1, 0.0, False, -1, (1.0, 1.0, 1.0, 1.0), stream, "0" * 64, 1)
 
-    assert keys([part("cloth", "flex-0"), part("rope", "flex-1")]) == ["cloth", "rope"]
-    assert keys([part("", "a"), part("", "b"), part("x", "c"), part("x", "d")]) == ["a", "b", "c", "d"]
-    assert keys([part("", "x"), part("x", "y")]) == ["x'", "x"], "somebody is called like the stream of another"
-    assert keys([part("", "x"), part("", "x")]) == ["x", "x'"]
+    assert deformable_keys([part("cloth", "flex-0"), part("rope", "flex-1")]) == ["cloth", "rope"]
+    assert deformable_keys([part("", "a"), part("", "b"), part("x", "c"), part("x", "d")]) == ["a", "b", "c", "d"]
+    assert deformable_keys([part("", "x"), part("x", "y")]) == ["x'", "x"], (
+        "somebody is called like the stream of another"
+    )
+    assert deformable_keys([part("", "x"), part("", "x")]) == ["x", "x'"]
 
 
 @pytest.mark.parametrize(
@@ -315,9 +317,9 @@ def test_numbers_of_vertices_that_cannot_be_are_a_fault(
     live = shared.begin([good, msgspec.structs.replace(good, address=shared.store.put(bad), bytes=len(bad))])
     try:
         client, shapes = watch(live, joined, tmp_path / "cache")
-        assert client.wait_for(lambda _: (shapes.tend(), bool(shapes.fault))[1], DEADLINE_S)
+        assert client.wait_for(lambda _: (shapes.update(), bool(shapes.fault))[1], DEADLINE_S)
         assert "vertex" in shapes.fault or "vertices" in shapes.fault
-        assert not client._feeds, "nothing of it is subscribed to"
+        assert not client.media._feeds, "nothing of it is subscribed to"
     finally:
         live.close()
 
@@ -354,18 +356,18 @@ def test_what_stays_of_two_on_one_stream_goes_on(tmp_path: Path) -> None:
     shapes = Deformables(client)
     both = [_Mesh(key, part, memoryview(store.get(part.address))) for key in ("one", "two")]
     shapes._use(both, "1" * 64)
-    feed = client.media(part.stream)
+    feed = client.media.subscribe(part.stream)
     shapes._use(both[:1], "2" * 64)
-    assert client._feeds == {part.stream: feed}
+    assert client.media._feeds == {part.stream: feed}
     assert both[0].feed is feed
     shapes._use([], "3" * 64)
-    assert client._feeds == {}
+    assert client.media._feeds == {}
     client.close()
 
 
 def test_a_scene_that_comes_back_is_shown_and_one_that_failed_is_asked_for_after_a_pause(tmp_path: Path) -> None:
     client = Client("127.0.0.1:1", role="observer", name="screen")
-    client.asset_cache = AssetStore(tmp_path)
+    client.assets.cache = AssetStore(tmp_path)
     shapes, (one, two, three) = Deformables(client), ("1" * 64, "2" * 64, "3" * 64)
     shapes._use([], one)
     shapes._follow(one, ("a", 1))

@@ -14,7 +14,7 @@ import msgspec
 import pytest
 
 from iris_session.client import ClientError, FoundSession, find_sessions
-from iris_session.client.discovery import MAX_ADDRESSES, MAX_SESSIONS, BeaconListener, ask_introduction
+from iris_session.client.discovery import MAX_ADDRESSES, MAX_SESSIONS, BeaconListener, request_introduction
 from iris_session.protocol.codec import encode_beacon, encode_introduction
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.errors import ProtocolError
@@ -41,7 +41,7 @@ def test_sessions_are_told_apart_by_id_not_by_name(air: tuple[BeaconListener, Ca
     send(other(host="10.0.0.5"))
     send(other(session_id="s2", host="10.0.0.6"))
     send(other(session_id="s0", session_name="z"))
-    assert listener.sessions() == [
+    assert listener.poll_sessions() == [
         FoundSession("lab-1", "127.0.0.1:7721", "s1", "live", "mark", ("127.0.0.1:7721", "10.0.0.5:7721")),
         FoundSession("lab-1", "10.0.0.6:7721", "s2", "live", "mark", ("10.0.0.6:7721",)),
         FoundSession("z", "127.0.0.1:7721", "s0", "live", "mark", ("127.0.0.1:7721",)),
@@ -58,10 +58,10 @@ def test_what_anybody_can_send_is_bounded_and_counted(air: tuple[BeaconListener,
         send(data)
     for number in range(MAX_SESSIONS + 7):
         send(other(session_id=f"x{number}"))
-        listener.sessions()
+        listener.poll_sessions()
     for number in range(MAX_ADDRESSES + 3):
         send(other(session_id="x0", host=f"10.0.0.{number}"))
-    found = listener.sessions()
+    found = listener.poll_sessions()
     assert len(found) == MAX_SESSIONS
     assert max(len(one.addresses) for one in found) == MAX_ADDRESSES
     assert listener.ignored == {"malformed": 12, "other_version": 1, "too_many": 7}
@@ -69,9 +69,9 @@ def test_what_anybody_can_send_is_bounded_and_counted(air: tuple[BeaconListener,
 
 def test_somebody_else_cannot_send_us_to_a_port_of_our_own() -> None:
     with BeaconListener(0) as listener:
-        listener._take(other(host="127.0.0.1"), "10.0.0.9")
-        listener._take(other(host="::1"), "10.0.0.9")
-        assert listener.sessions() == []
+        listener._process_datagram(other(host="127.0.0.1"), "10.0.0.9")
+        listener._process_datagram(other(host="::1"), "10.0.0.9")
+        assert listener.poll_sessions() == []
         assert listener.ignored == {"foreign_loopback": 2}
 
 
@@ -87,7 +87,7 @@ def test_sessions_are_found_by_a_process_with_a_thousand_open_files() -> None:
         listener._socket = socket.socket(fileno=high)
         sender.sendto(other(), ("127.0.0.1", port))
         listener.wait(30.0)
-        assert [one.name for one in listener.sessions()] == ["lab-1"]
+        assert [one.name for one in listener.poll_sessions()] == ["lab-1"]
     resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
@@ -128,7 +128,7 @@ class Host:
 
 
 def ask(host: str, port: int, timeout_s: float = 5.0) -> Introduction:
-    steps = ask_introduction(host, port, timeout_s)
+    steps = request_introduction(host, port, timeout_s)
     while True:
         try:
             next(steps)

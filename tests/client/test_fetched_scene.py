@@ -12,7 +12,7 @@ import mujoco
 import pytest
 
 from iris_session.client import AssetError, Client, ClientError, NotConnectedError, fetched_scene
-from iris_session.client.asset_fetch import AssetFetch
+from iris_session.client.assets import AssetFetch
 from iris_session.client.fetched_scene import fetch_scene
 from iris_session.protocol.assets import AssetRefused, AssetRequest
 from iris_session.protocol.codec import encode_asset_header
@@ -63,7 +63,7 @@ def join(tmp_path: Path, store: AssetStore, sessions: list[LiveSession]) -> Iter
         opened.append(live)
         sessions.append(live)
         client = Client(live.address, name="ann", role="observer", alignment="not_needed")
-        client.asset_cache = AssetStore(tmp_path / "cache")
+        client.assets.cache = AssetStore(tmp_path / "cache")
         opened.append(client)
         return client.connect(30.0)
 
@@ -199,7 +199,7 @@ def test_a_scene_that_is_patched_without_end_comes_and_one_that_is_replaced_does
 
 def test_what_did_not_come_in_time_is_not_fetched_any_more(join: Callable[..., Client]) -> None:
     client = join("1" * 64)
-    fetch = client.fetch_assets(["2" * 64])
+    fetch = client.assets.fetch(["2" * 64])
     with pytest.raises(NotConnectedError, match="has not come in time"):
         fetched_scene._wait(client, fetch, time.monotonic() - 1.0)
     assert fetch.failed["2" * 64].reason == "cancelled"

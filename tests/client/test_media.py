@@ -32,19 +32,19 @@ def cloud(session: LiveSession) -> Iterator[threading.Event]:
 @pytest.mark.usefixtures("cloud")
 def test_the_newest_frame_is_taken_once(join: Callable[..., Client]) -> None:
     ann = join()
-    feed = ann.media("cloud")
-    assert ann.media("cloud") is feed
+    feed = ann.media.subscribe("cloud")
+    assert ann.media.subscribe("cloud") is feed
     assert ann.wait_for(lambda _: feed.received >= 3, DEADLINE_S)
-    frame = feed.take()
+    frame = feed.pop_newest()
     assert frame is not None
     assert (frame.data, frame.header.stream, feed.budget_class) == (b"points", "cloud", "full")
     assert frame is feed.newest
     assert 0 < frame.age_ns < DEADLINE_S * 1e9
-    assert feed.take() is None
-    assert ann.wait_for(lambda _: feed.take() is not None, DEADLINE_S)
-    assert ann.wait_for(lambda one: bool(one.delivery and one.delivery.streams), DEADLINE_S)
-    ann.drop_media("cloud")
-    assert ann.media("cloud") is not feed
+    assert feed.pop_newest() is None
+    assert ann.wait_for(lambda _: feed.pop_newest() is not None, DEADLINE_S)
+    assert ann.wait_for(lambda one: bool(one.media.delivery and one.media.delivery.streams), DEADLINE_S)
+    ann.media.unsubscribe("cloud")
+    assert ann.media.subscribe("cloud") is not feed
 
 
 @pytest.mark.usefixtures("cloud")
@@ -66,9 +66,9 @@ def test_only_the_thread_that_polls_touches_the_socket(
     for name in real:
         monkeypatch.setattr(sockets, name, watched(name))
     ann.start()
-    cloud, depth = ann.media("cloud"), ann.media("depth")
+    cloud, depth = ann.media.subscribe("cloud"), ann.media.subscribe("depth")
     assert ann.wait_for(lambda _: cloud.received >= 1, DEADLINE_S)
-    ann.drop_media("depth")
+    ann.media.unsubscribe("depth")
     assert ann.wait_for(lambda _: "unsubscribe_media" in dict(touched), DEADLINE_S)
     assert {thread for _, thread in touched} == {ann._thread}
     assert depth.newest is None
@@ -77,7 +77,7 @@ def test_only_the_thread_that_polls_touches_the_socket(
 @pytest.mark.usefixtures("cloud")
 def test_subscriptions_outlive_the_front(session: LiveSession, join: Callable[..., Client]) -> None:
     ann = join()
-    feed = ann.media("cloud")
+    feed = ann.media.subscribe("cloud")
     assert ann.wait_for(lambda _: feed.received >= 1, DEADLINE_S)
     generation, newest = ann.connection.generation, feed.newest
     assert newest is not None
@@ -92,32 +92,32 @@ def test_subscriptions_outlive_the_front(session: LiveSession, join: Callable[..
 @pytest.mark.usefixtures("cloud")
 def test_a_limit_of_the_client_holds(join: Callable[..., Client]) -> None:
     ann = join()
-    feed = ann.media("cloud")
+    feed = ann.media.subscribe("cloud")
     assert ann.wait_for(lambda _: feed.received >= 1, DEADLINE_S)
-    ann.media_limit_mbit_per_s = 0.0001
+    ann.media.limit_mbit_per_s = 0.0001
     assert ann.wait_for(lambda _: feed.budget_class == "none", DEADLINE_S)
-    assert ann.delivery is not None
-    assert ann.delivery.reason == "the client asked for no more"
+    assert ann.media.delivery is not None
+    assert ann.media.delivery.reason == "the client asked for no more"
 
 
 def test_names_that_cannot_be(join: Callable[..., Client]) -> None:
     ann = join(connect=False)
     for name in ("", "a/b", "-a", "x" * 49, "ä"):
         with pytest.raises(InvalidMessageError, match="cannot be the name of a media stream"):
-            ann.media(name)
+            ann.media.subscribe(name)
     with pytest.raises(NotConnectedError):
-        ann.publish_media("cloud", b"")
+        ann.media.publish("cloud", b"")
     ann.connect()
     with pytest.raises(InvalidMessageError, match="has class 'full'"):
-        ann.publish_media("cloud", {"half": b""})
+        ann.media.publish("cloud", {"half": b""})
 
 
 def test_a_source_hands_in_frames(join: Callable[..., Client]) -> None:
     camera, ann = join("cam", role="camera"), join("ann")
-    feed = ann.media("depth")
+    feed = ann.media.subscribe("depth")
 
     def comes(_: Client) -> bool:
-        camera.publish_media("depth", {"full": b"all", "half": b"less"}, capture_ns=5)
+        camera.media.publish("depth", {"full": b"all", "half": b"less"}, capture_ns=5)
         camera.poll()
         return feed.received > 0
 
@@ -129,10 +129,10 @@ def test_a_source_hands_in_frames(join: Callable[..., Client]) -> None:
 @pytest.mark.usefixtures("cloud")
 def test_frames_of_a_stream_that_was_dropped_are_late_and_not_malformed(join: Callable[..., Client]) -> None:
     ann = join()
-    feed = ann.media("cloud")
+    feed = ann.media.subscribe("cloud")
     assert ann.wait_for(lambda _: feed.received >= 3, DEADLINE_S)
     assert ann._sockets._media is not None
     assert ann._sockets._media.poll(30_000)  # one is there already
-    ann.drop_media("cloud")
-    assert ann.wait_for(lambda one: one.media_late > 0, DEADLINE_S)
-    assert ann.media_malformed == 0
+    ann.media.unsubscribe("cloud")
+    assert ann.wait_for(lambda one: one.media.late > 0, DEADLINE_S)
+    assert ann.media.malformed == 0

@@ -12,8 +12,9 @@ import pytest
 
 from anchors.pose import PoseTuple
 from iris_session.client import Client, ClientError, DeniedError, InvalidMessageError
+from iris_session.client.arguments import to_names, to_numbers, to_pose, to_text
+from iris_session.client.core.outbox import encode_checked
 from iris_session.client.fetched_scene import fetch_scene
-from iris_session.client.values import checked_bytes, names_of, numbers, pose_of, text_of
 from iris_session.protocol.client_messages import Acquire, Control, EStop, Marker, Observation, PlaceAlignment, Sample
 from iris_session.protocol.codec import decode_client
 from iris_session.protocol.common import Denial, Pose
@@ -32,7 +33,7 @@ class Unspeakable:
 
 @pytest.mark.parametrize("reason", [5, None, "x" * 5000, "\ud800", "\U0001f6d1" * 600, Unspeakable(), ["a", 1]])
 def test_an_estop_fits_the_protocol_whatever_its_reason_is(reason: object) -> None:
-    message = decode_client(checked_bytes(EStop(text_of(reason)))).message
+    message = decode_client(encode_checked(EStop(to_text(reason)))).message
     assert isinstance(message, EStop)
     assert len(message.reason) <= 512
 
@@ -131,24 +132,26 @@ def test_one_name_is_one_name_and_what_is_not_ours_is_counted(session: LiveSessi
     ann.acquire("left")
     assert [t.name for t in ann.make_sample("target", HERE, robots="left").targets] == ["left"]
     assert ann.counters()["control"]["samples_without_lease"] == 1
-    assert names_of("robots", "left") == ("left",)
-    assert names_of("robots", (n for n in ("a", "b"))) == ("a", "b")
+    assert to_names("robots", "left") == ("left",)
+    assert to_names("robots", (n for n in ("a", "b"))) == ("a", "b")
 
 
 def test_a_fault_ends_the_wait_for_an_answer(session: LiveSession, join: Join) -> None:
     ann = join()
     session.pause_steps(True)  # no answer comes
-    ann.connection.not_taken = ProtocolFault(FaultCode.MALFORMED, "an older one")
+    ann.connection.last_protocol_fault = ProtocolFault(FaultCode.MALFORMED, "an older one")
     told: list[bool] = []
 
     def tell(_: Client) -> bool:
         if not told:
             told.append(True)
-            ann.connection._fault(ProtocolFault(FaultCode.MALFORMED, "acquire: robots is wrong"), time.monotonic_ns())
+            ann.connection._process_fault(
+                ProtocolFault(FaultCode.MALFORMED, "acquire: robots is wrong"), time.monotonic_ns()
+            )
         return False
 
     polling, ann.poll = ann.poll, lambda timeout_s=0.0: tell(ann) or polling(min(timeout_s, 0.01))  # type: ignore[method-assign]
-    with pytest.raises(InvalidMessageError, match="Acquire was not taken: acquire: robots is wrong"):
+    with pytest.raises(InvalidMessageError, match="Acquire: acquire: robots is wrong"):
         ann.request(Acquire(0, ("left",)), timeout_s=30.0)
     session.pause_steps(False)
 
@@ -156,25 +159,25 @@ def test_a_fault_ends_the_wait_for_an_answer(session: LiveSession, join: Join) -
 def test_a_session_that_stands_or_is_dead_is_visible(session: LiveSession, join: Join) -> None:
     ann = join(role="agent", devices="target")
     ann.acquire("left")
-    assert ann.wait_for(lambda c: c.state is not None and "left" in c.feedback)
-    assert ann.wait_for(lambda c: (c.data_age_ns() or 0) < 100_000_000)
+    assert ann.wait_for(lambda c: c.scene.state is not None and "left" in c.feedback)
+    assert ann.wait_for(lambda c: (c.scene.data_age_ns() or 0) < 100_000_000)
     session.pause_steps(True)
-    assert ann.wait_for(lambda c: (c.data_age_ns() or 0) > 400_000_000)
+    assert ann.wait_for(lambda c: (c.scene.data_age_ns() or 0) > 400_000_000)
     assert ann.ready
     os.kill(session.front.pid, signal.SIGKILL)
     assert ann.wait_for(lambda c: not c.ready)
     assert ann.feedback == {}
-    before = ann.data_age_ns()
+    before = ann.scene.data_age_ns()
     assert before is not None
     ann.sleep(0.05)
-    assert (ann.data_age_ns() or 0) >= before + 50_000_000
+    assert (ann.scene.data_age_ns() or 0) >= before + 50_000_000
     session.pause_steps(False)
     assert ann.wait_for(lambda c: c.ready and "left" in c.feedback, 10.0)
-    assert ann.wait_for(lambda c: (c.data_age_ns() or 10**9) < 200_000_000)
+    assert ann.wait_for(lambda c: (c.scene.data_age_ns() or 10**9) < 200_000_000)
 
 
 def test_there_is_no_age_before_the_first_scene(session: LiveSession, join: Join) -> None:
-    assert join(connect=False).data_age_ns() is None
+    assert join(connect=False).scene.data_age_ns() is None
 
 
 @pytest.mark.parametrize("threaded", [False, True])
@@ -182,7 +185,7 @@ def test_sleep_polls_for_the_whole_time(session: LiveSession, join: Join, thread
     states: list[object] = []
     ann = join(on_state=states.append)
     ann.start() if threaded else None
-    assert ann.wait_for(lambda c: c.state is not None)
+    assert ann.wait_for(lambda c: c.scene.state is not None)
     states.clear()
     started = time.monotonic()
     ann.sleep(0.3)
@@ -221,11 +224,11 @@ def test_a_hello_that_cannot_be_sent_raises_when_the_client_is_made() -> None:
 
 def test_a_message_reads_back_as_what_was_said() -> None:
     for message in (Acquire(1, ("left",)), Control(2, "pause"), Marker(3, "x"), PlaceAlignment(4, "p1", Pose(*HERE))):
-        envelope = decode_client(checked_bytes(message, 7))
+        envelope = decode_client(encode_checked(message, 7))
         assert (envelope.message, envelope.connection_epoch) == (message, 7)
-    observation = Observation("table", "qr", pose_of("T", [list(HERE[0]), list(HERE[1])]), 1, 0)
-    assert decode_client(checked_bytes(observation)).message == observation
-    assert numbers("q", range(3)) == (0.0, 1.0, 2.0)
+    observation = Observation("table", "qr", to_pose("T", [list(HERE[0]), list(HERE[1])]), 1, 0)
+    assert decode_client(encode_checked(observation)).message == observation
+    assert to_numbers("q", range(3)) == (0.0, 1.0, 2.0)
 
 
 @pytest.mark.parametrize("budget", ["QUEST_3", 100_000, None])

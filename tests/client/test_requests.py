@@ -165,12 +165,12 @@ def test_people_see_each_other(session: LiveSession, join: Join) -> None:
     def seen(_: Client) -> bool:
         ann.send_sample(Device.HEAD, HERE)
         poll_all([ann, bob], 0.005)
-        return (ann.participant_id, Device.HEAD) in bob.presence
+        return (ann.participant_id, Device.HEAD) in bob.scene.presence
 
     assert bob.wait_for(seen)
-    assert bob.presence[ann.participant_id, Device.HEAD].pose.p == HERE[0]
+    assert bob.scene.presence[ann.participant_id, Device.HEAD].pose.p == HERE[0]
     ann.close()
-    assert bob.wait_for(lambda c: not c.presence)
+    assert bob.wait_for(lambda c: not c.scene.presence)
 
 
 def test_worn_and_observations_are_told(join: Join) -> None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from iris_session.client.core.status import ConnectionPhase
 from iris_session.client.errors import NotConnectedError
-from iris_session.client.status import Phase
 from iris_session.protocol.client_messages import Acquire, ClearEStop, ClockPing, EStop, Hello, Release
 from iris_session.protocol.server_messages import ClockPong, EStopChanged, Event
-from tests.client.test_connection import MS, SAMPLE, SECOND, Wire
+from tests.client.core.test_connection import MS, SAMPLE, SECOND, Wire
 
 STOP = EStop("now")
 
@@ -26,7 +26,7 @@ def stops(wire: Wire) -> int:
 
 def test_a_stop_that_died_with_its_connection_goes_behind_the_next_hello_and_after_the_welcome(wire: Wire) -> None:
     assert wire.connection.send(STOP)
-    wire.connection.lost(2 * SECOND)
+    wire.connection.handle_disconnect(2 * SECOND)
     first, second = wire.sent()
     assert isinstance(first, Hello)
     assert second == STOP
@@ -34,13 +34,13 @@ def test_a_stop_that_died_with_its_connection_goes_behind_the_next_hello_and_aft
     assert stops(wire) == 1
     wire.snapshot(3 * SECOND)
     wire.get(Event(1, 0, 0, EStopChanged(True, "p1")), 3 * SECOND)
-    wire.connection.lost(6 * SECOND)
+    wire.connection.handle_disconnect(6 * SECOND)
     assert stops(wire) == 0, "the session has it"
 
 
 def test_a_stop_without_connection_is_kept_and_says_so(wire: Wire) -> None:
-    wire.connection.lost(MS)
-    assert wire.connection.phase is Phase.WAITING
+    wire.connection.handle_disconnect(MS)
+    assert wire.connection.phase is ConnectionPhase.WAITING
     assert not wire.connection.send(STOP)
     wire.connection.tick(5 * SECOND)
     assert [type(message) for message in wire.sent()] == [Hello, EStop]
@@ -52,7 +52,7 @@ def test_a_stop_that_was_withdrawn_does_not_come_back(wire: Wire) -> None:
     wire.connection.send(STOP)
     wire.connection.request(ClearEStop(0))
     wire.sent()
-    wire.connection.lost(2 * SECOND)
+    wire.connection.handle_disconnect(2 * SECOND)
     assert stops(wire) == 0
 
 
@@ -60,11 +60,11 @@ def test_in_a_stopped_session_the_answer_to_a_later_ping_proves_that_it_came(wir
     wire.get(Event(1, 0, 0, EStopChanged(True, "p2")), MS)
     wire.connection.send(STOP)
     wire.get(ClockPong(0, MS, MS), 2 * MS)  # of a ping that was sent before
-    assert wire.connection.stop.message == STOP
+    assert wire.connection.pending_estop.message == STOP
     wire.connection.tick(SECOND)
     (ping,) = (message for message in wire.sent() if isinstance(message, ClockPing))
     wire.get(ClockPong(ping.t0_ns, SECOND, SECOND), SECOND + MS)
-    assert wire.connection.stop.message is None
+    assert wire.connection.pending_estop.message is None
 
 
 def test_who_never_opened_or_was_closed_is_told() -> None:

@@ -46,7 +46,7 @@ def test_headsets_that_are_well() -> None:
 @pytest.mark.parametrize(("kind", "state"), [("jump", "failed"), ("differs", "warning"), ("changed", "warning")])
 def test_alarms(kind: str, state: str) -> None:
     report = with_ann(alarm=kind, alarm_size_m=0.12, alarm_ns=4 * S)
-    only(report, "alarm", state, f"ann: {ALARMS[kind]}, by 120 mm, 4.0 s ago", "look at a sheet")
+    only(report, "alarm", state, f"ann: {ALARMS[kind]}, by 120 mm, 4.0 s ago", "bring a sheet into view")
 
 
 def test_every_alarm_is_explained() -> None:
@@ -83,7 +83,7 @@ def test_headsets_that_disagree() -> None:
         change(with_ann(), cross_checks=(AGREES, apart)),
         "agreement",
         "warning",
-        "ann and bob put 'table' 30 mm apart, below 8 mm was stated",
+        "ann and bob put 'table' 30 mm apart, expected is below 8 mm",
     )
 
 

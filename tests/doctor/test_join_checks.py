@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from iris_session.client.address import Address
+from iris_session.client.core.state_stream import SceneState
 from iris_session.client.errors import NotConnectedError, RefusedError, SessionNameError, TrustError, VersionError
-from iris_session.client.state_stream import SceneState
 from iris_session.doctor.join_checks import (
     attempt_join,
     check_server_key,
@@ -95,7 +95,7 @@ def test_who_was_let_in_before_is_told_so(home: KeyHome) -> None:
     assert f"iris-session doctor {ADDRESS} --code" in new.advice
     key = KeyPair.generate().public
     home.known_servers.pin(str(ADDRESS), "lab", key)
-    assert "let in before" in explain_unpaired_key(ADDRESS, said(key)).why
+    assert "admitted before" in explain_unpaired_key(ADDRESS, said(key)).why
 
 
 def test_who_serves_the_session_lets_in_themselves(home: KeyHome) -> None:
@@ -124,7 +124,7 @@ def test_old_state_is_blamed_on_the_link_only_when_something_new_comes() -> None
     assert (slow.state, slow.why) == ("warning", "7 frames waited too long in a queue")
     silent = check_state_age([state(5, 9000 + 250 * n) for n in range(6)], 0)
     assert silent.state == "warning"
-    assert silent.text == "state comes at 4 Hz, all as it was 10.2 s ago"
+    assert silent.text == "state arrives at 4 Hz, always the one of 10.2 s ago"
     assert silent.why == "nothing new is published"
     assert check_state_age([state(5, 9000), *(state(6 + n, 3) for n in range(80))], 0).state == "ok", "it goes on"
     assert check_state_age([state(5, 3)], 0).state == "ok", "of one alone nobody can say"

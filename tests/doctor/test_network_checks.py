@@ -97,7 +97,7 @@ def test_the_base_of_a_block_of_ports_is_told_from_its_control_port() -> None:
         found = network_checks.check_port_base(base)
     assert found is not None
     assert found.failed
-    assert f"port {base.port} is the base of the ports of session 'lab', which is joined at {above}" in found.text
+    assert f"port {base.port} is the base of the ports of session 'lab', whose control port is {above}" in found.text
     assert found.advice == f"use {above}"
 
 

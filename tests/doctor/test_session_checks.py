@@ -107,10 +107,10 @@ def test_the_doctor_is_not_a_patient() -> None:
 @pytest.mark.parametrize(
     ("fields", "state", "text"),
     [
-        ({"stalled": True, "authority_silent_ns": 3 * S}, "failed", "stands still, for 3.0 s"),
-        ({"authority_silent_ns": 2 * S}, "failed", "stands still, for 2.0 s"),
+        ({"stalled": True, "authority_silent_ns": 3 * S}, "failed", "not taken a step for 3.0 s"),
+        ({"authority_silent_ns": 2 * S}, "failed", "not taken a step for 2.0 s"),
         ({"authority_silent_ns": -1}, "failed", "has not taken a step yet"),
-        ({"estop": True}, "failed", "e-stop"),
+        ({"estop": True}, "failed", "emergency stop"),
         ({"paused": True}, "warning", "paused"),
     ],
 )
@@ -129,15 +129,21 @@ def test_a_step_that_comes_late_is_no_standstill() -> None:
 
 
 def test_who_drives_needs_an_alignment() -> None:
-    only(with_ann(alignment="none"), "alignment", "failed", "ann has no alignment", "look at the sheet")
+    only(with_ann(alignment="none"), "alignment", "failed", "ann has no alignment", "bring the sheet into view")
 
 
 def test_who_looks_at_another_sheet_is_told_which_there_are() -> None:
     elsewhere = with_ann(alignment="none", alignment_report=AlignmentReport(unusable=12))
     report = change(elsewhere, anchors=(AnchorReport("table", ORIGIN), AnchorReport("shelf", ORIGIN)))
-    only(report, "alignment", "failed", "12 observations, none of a sheet of this session", "session: table, shelf")
+    only(
+        report,
+        "alignment",
+        "failed",
+        "12 observations, none usable of a sheet of this session",
+        "session: table, shelf",
+    )
     seen = AlignmentReport(unusable=12, seen=(AnchorSeen("table", 3, S),))
-    assert "none of" not in troubles(with_ann(alignment="none", alignment_report=seen))["alignment"].text
+    assert "none usable" not in troubles(with_ann(alignment="none", alignment_report=seen))["alignment"].text
 
 
 def test_an_alignment_that_was_lost_is_told_apart() -> None:
@@ -176,7 +182,7 @@ def test_a_robot_kept_for_somebody_who_is_gone() -> None:
     gone = change(ANN, connected=False, lost="silent")
     bob = change(ANN, id="p2", name="bob", holds=())
     found = troubles(change(WELL, participants=(gone, bob), robots=(LEFT,)))
-    assert "ann is gone, left is kept for them" in found["leases"].why
+    assert "ann is disconnected, left is kept" in found["leases"].why
 
 
 def test_directors_need_no_robot() -> None:
@@ -199,10 +205,10 @@ def test_an_open_clutch_is_no_fault() -> None:
 @pytest.mark.parametrize(
     ("fields", "state", "text"),
     [
-        ({"connected": False, "lost": "silent"}, "failed", "connection lost (silent)"),
+        ({"connected": False, "lost": "silent"}, "failed", "disconnected (silent)"),
         ({"heard_ns": 3 * S // 2}, "failed", "silent for 1.5 s"),
         ({"missed_share": 0.5}, "warning", "misses 50% of the frames"),
-        ({"state_age": None}, "warning", "gets no state"),
+        ({"state_age": None}, "warning", "receives no state"),
     ],
 )
 def test_slow_clients(fields: dict[str, object], state: str, text: str) -> None:
@@ -281,8 +287,10 @@ def test_what_drops_mean_is_told() -> None:
         for one in check_session_report(change(WELL, drops={"send_queue_full": 2, "odd": 1}), "p9")
         if one.check == "drops"
     )
-    assert found.text == "dropped so far: send_queue_full 2 (answers and events to who did not read in time), odd 1"
-    meaning = "requests for pieces of the scene that were refused"
+    assert (
+        found.text == "dropped so far: send_queue_full 2 (answers and events: the receiver did not read in time), odd 1"
+    )
+    meaning = "refused requests for assets"
     assert explain_drops({"assets_unknown_asset": 3}) == f"assets_unknown_asset 3 ({meaning})"
 
 
@@ -304,8 +312,8 @@ def test_every_reason_that_the_front_counts_is_explained() -> None:
 @pytest.mark.parametrize(
     ("tick", "text"),
     [
-        (0, "steps, and nothing has moved so far: no tick was taken, no pose published"),
-        (7, "steps: tick 7, at the pace of the program that owns it"),
+        (0, "steps, but no tick was taken and no pose published yet"),
+        (7, "steps: tick 7, paced by the program that owns the session"),
     ],
 )
 def test_a_pace_that_is_not_ours_is_not_told(tick: int, text: str) -> None:

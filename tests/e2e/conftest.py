@@ -211,7 +211,7 @@ class Hand:
 
     @property
     def tip(self) -> PoseTuple:
-        tip = self.client.tip_pose(self.robot)
+        tip = self.client.scene.tip_pose(self.robot)
         assert tip is not None
         return tip
 
@@ -248,7 +248,7 @@ class Stage:
 
     def hand(self, client: Client, robot: str) -> Hand:
         """Somebody's right hand, who sees the robot."""
-        self.run(lambda: client.tip_pose(robot) is not None, f"{client.name} sees {robot}")
+        self.run(lambda: client.scene.tip_pose(robot) is not None, f"{client.name} sees {robot}")
         hand = Hand(client, robot)
         self.hands.append(hand)
         return hand
@@ -268,7 +268,7 @@ class Stage:
         self.run(clutched, f"{hand.robot} follows {hand.client.name}")
 
     def following(self, hand: Hand) -> bool:
-        state = hand.client.state
+        state = hand.client.scene.state
         mine = hand.client.connection.participant_id
         return state is not None and any(
             a.robot == hand.robot and a.participant == mine and state.header.session_time - a.step_ns < 100_000_000
@@ -298,7 +298,7 @@ class Stage:
     def height(self, name: str, body: str) -> float:
         """Where `name` sees a body [m]; 0 before the first picture."""
         watcher = next(client for client in self.clients if client.name == name)
-        state = watcher.state
+        state = watcher.scene.state
         return 0.0 if state is None else float(state.poses[watcher.mirror.body_index[body]][2])
 
     def bodies(self, name: str) -> list[str]:

@@ -75,16 +75,16 @@ class Table:
 
     @property
     def now_ns(self) -> int:
-        return 0 if self.watcher.state is None else self.watcher.state.header.session_time
+        return 0 if self.watcher.scene.state is None else self.watcher.scene.state.header.session_time
 
     def _note_tips(self) -> None:
-        state = self.watcher.state
+        state = self.watcher.scene.state
         if state is None or (self.tips["arm1"][-1:] and self.tips["arm1"][-1][0] == state.header.session_time):
             return
         now = state.header.session_time
         driven = {a.robot for a in state.header.applied if now - a.step_ns < 100_000_000}
         for robot, seen in self.tips.items():
-            tip = self.watcher.tip_pose(robot)
+            tip = self.watcher.scene.tip_pose(robot)
             if tip is not None:
                 seen.append(Moment(now, state.header.sim_time, tip, robot in driven))
 
@@ -93,7 +93,7 @@ class Table:
 
     def agreed(self) -> bool:
         """Whether everybody sees the hammer at the same place, within what they state."""
-        hammer = self.watcher.body_pose("object1")
+        hammer = self.watcher.scene.body_pose("object1")
         seen = None if hammer is None else views(list(self.crew.values()), self.watcher, hammer[0])
         return seen is not None and agree(differences(seen))
 
@@ -179,7 +179,7 @@ def test_who_saw_no_sheet_is_told_and_moves_nothing(seat: Callable[..., Table]) 
     stage.clients.append(eve)
     eve.connect(DEADLINE_S)
     eve.acquire(["arm5"])
-    before = eve.tip_pose("arm5")
+    before = eve.scene.tip_pose("arm5")
     assert before is not None
     hand = stage.hand(eve, "arm5")
     hand.velocity = (0.1, 0.0, 0.0)
@@ -198,7 +198,7 @@ def test_who_saw_no_sheet_is_told_and_moves_nothing(seat: Callable[..., Table]) 
     table.run(refused, "eve's samples do not count")
     table.run(lambda: told(Notice, text="look at"), "eve is told what to do")
     stage.seconds(1.0)
-    after = eve.tip_pose("arm5")
+    after = eve.scene.tip_pose("arm5")
     assert after is not None
     assert distance(before[0], after[0]) < 5e-4
     hand.sending = False

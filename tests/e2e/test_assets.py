@@ -38,7 +38,7 @@ def serving(tmp_path: Path, data: dict[str, bytes]) -> Iterator[Stage]:
 
 def watcher(stage: Stage, name: str, address: str, cache: Path) -> Client:
     client = Client(address, role="observer", name=name, alignment="not_needed")
-    client.asset_cache = AssetStore(cache)
+    client.assets.cache = AssetStore(cache)
     stage.clients.append(client)
     return client.connect(DEADLINE_S)
 
@@ -58,9 +58,9 @@ def test_a_slow_link_that_breaks_and_a_front_that_is_killed(
     with ImpairmentProcess({LINK: "lan"}, ports) as proxy:
         eve = watcher(stage, "eve", f"{LINK}:{port}", tmp_path / "eve")
         proxy.execute(f"profile {slow}")
-        fetch = eve.fetch_assets(list(data))
+        fetch = eve.assets.fetch(list(data))
         stage.run(lambda: fetch.bytes_done > size // 8, "eve gets something")
-        others = ann.fetch_assets(list(data))
+        others = ann.assets.fetch(list(data))
         stage.run(lambda: others.done, "ann has everything")
         assert not fetch.done
         proxy.execute("cut")
@@ -71,7 +71,7 @@ def test_a_slow_link_that_breaks_and_a_front_that_is_killed(
         for one in (fetch, others):
             whole(one, data)
         stage.run(lambda: ann.ready and eve.ready, "both are back")
-    again = ann.fetch_assets(list(data))
+    again = ann.assets.fetch(list(data))
     stage.run(lambda: again.done, "ann has it still")
     assert (again.bytes_received, again.cached) == (0, len(data))
 

@@ -62,7 +62,7 @@ def test_somebody_listens_who_never_answers() -> None:
         listener.bind(("127.0.0.1", 0))
         listener.listen(16)
         found = doctor(f"127.0.0.1:{listener.getsockname()[1]}")
-    found.named("join", "nobody answers as a session")
+    found.named("join", "no session answers")
     assert found.checks["tcp"]["state"] == "ok"
 
 
@@ -247,7 +247,7 @@ def test_no_alignment_no_lease_and_a_stopped_client(plain: Server) -> None:
         )
         carl.send_signal(signal.SIGSTOP)
         found = doctor(plain.address)
-        found.named("alignment", "bob has no alignment", "look at the sheet")
+        found.named("alignment", "bob has no alignment", "bring the sheet into view")
         found.named("leases", "bob has no robot", "left: ann", "right: carl", state="warning")
         found.named("clients", "carl")
         assert found.failed() == {"alignment", "clients"}, found.troubles()
@@ -317,7 +317,7 @@ def test_session_that_somebody_stopped(plain: Server) -> None:
         director = join("dora", role="director", alignment="not_needed")
         director.estop("look out")
         wait(lambda: director.mirror.estop, "the stop")
-        doctor(plain.address).named("session", "e-stop")
+        doctor(plain.address).named("session", "emergency stop")
         director.clear_estop()
 
 
@@ -337,5 +337,5 @@ def test_session_that_stands_still(plain: Server) -> None:
         found = doctor(plain.address)
     finally:
         plain.process.send_signal(signal.SIGCONT)
-    found.named("session", "stands still")
+    found.named("session", "has not taken a step")
     assert {"session", "join"} <= found.failed()

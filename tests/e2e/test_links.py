@@ -44,7 +44,7 @@ class Linked:
 
     def _timed_step(self) -> None:
         self._step()
-        now_s, state = time.monotonic(), self.watcher.state
+        now_s, state = time.monotonic(), self.watcher.scene.state
         if state is not None and state.header.state_seq != self._seq:
             self._seq, self._seen_s = state.header.state_seq, now_s
         self.longest_s = max(self.longest_s, now_s - self._stepped_s, now_s - self._seen_s)
@@ -98,8 +98,8 @@ class Linked:
 
     def last_applied_ns(self, robot: str) -> int:
         """When the newest sample that drives `robot` was received, as the watcher has it."""
-        assert self.watcher.state is not None
-        return max((a.receive_ns for a in self.watcher.state.header.applied if a.robot == robot), default=0)
+        assert self.watcher.scene.state is not None
+        return max((a.receive_ns for a in self.watcher.scene.state.header.applied if a.robot == robot), default=0)
 
     def close(self) -> None:
         self._stack.close()
@@ -133,7 +133,7 @@ def test_blackout_of_five_seconds(linked: Linked) -> None:
     assert held_ns - linked.last_applied_ns("left") <= (170 + 1000 * linked.longest_s) * MS, "150 ms"
     assert reason in ("stale", "no_sample")
     stage.seconds(1.0)
-    resting = watcher.tip_pose("left")
+    resting = watcher.scene.tip_pose("left")
     assert resting is not None
     bobs_heard: list[int] = []
 
@@ -144,19 +144,21 @@ def test_blackout_of_five_seconds(linked: Linked) -> None:
     stage.run(five_seconds, "five seconds pass")
     assert max(b - a for a, b in itertools.pairwise(bobs_heard)) < (150 + 1000 * linked.longest_s) * MS
     linked.undisturbed("right")
-    now = watcher.tip_pose("left")
+    now = watcher.scene.tip_pose("left")
     assert now is not None
     assert distance(resting[0], now[0]) < 5e-4
     assert not watcher.mirror.participants[me].connected
     assert watcher.mirror.leases["left"].holder == me, "in grace"
     proxy.execute("resume")
     resumed_ns = watcher.session_now_ns()
-    stage.run(lambda: ann.ready and ann.state is not None and ann.state.received_ns > resumed_ns, "ann is back")
+    stage.run(
+        lambda: ann.ready and ann.scene.state is not None and ann.scene.state.received_ns > resumed_ns, "ann is back"
+    )
     assert ann.participant_id == me
     stage.run(lambda: watcher.mirror.leases["left"].lease_version > before.lease_version, "ann's lease is resumed")
     assert watcher.mirror.leases["left"].holder == me
     stage.seconds(0.3)  # the clutch is still closed: nothing may move by that
-    now = watcher.tip_pose("left")
+    now = watcher.scene.tip_pose("left")
     assert now is not None
     assert distance(resting[0], now[0]) < 5e-4
     anns.velocity = (0.0, 0.0, 0.0)
@@ -178,17 +180,17 @@ def test_cut_off_in_the_middle_of_a_snapshot(linked: Linked, tmp_path: Path, how
 
     def in_the_middle() -> bool:
         assert not late.ready, "the snapshot must not be there yet"
-        return late.connection.joined and bytes_down() > begun + 500
+        return late.connection.is_joined and bytes_down() > begun + 500
 
     for _ in range(3):
         begun = bytes_down()
         stage.run(in_the_middle, "a part of the snapshot is under way")
         snapshots = late.connection.counters.snapshots
         proxy.execute(how)
-        stage.run(lambda: not late.connection.joined, "late notices")
+        stage.run(lambda: not late.connection.is_joined, "late notices")
         assert late.connection.counters.snapshots == snapshots == 0
     proxy.execute("profile good-wifi")
-    stage.run(lambda: late.ready and late.state is not None, "late has joined")
+    stage.run(lambda: late.ready and late.scene.state is not None, "late has joined")
     stage.run(lambda: late.mirror.mirror_hash() == watcher.mirror.mirror_hash(), "late knows what the watcher knows")
     assert [p.name for p in watcher.mirror.participants.values() if p.connected].count("late") == 1
     linked.undisturbed("right")
@@ -203,13 +205,15 @@ def test_another_network(linked: Linked) -> None:
     ann = hand.client
     me, before = ann.participant_id, watcher.mirror.leases["left"]
     proxy.execute("roam 127.0.0.9")
-    stage.run(lambda: not ann.connection.joined, "ann notices")
+    stage.run(lambda: not ann.connection.is_joined, "ann notices")
     stage.run(lambda: ann.ready, "ann is back")
     assert ann.participant_id == me
     stage.run(lambda: watcher.mirror.leases["left"].lease_version > before.lease_version, "the lease is resumed")
     assert watcher.mirror.leases["left"].holder == me
     begun_ns = watcher.session_now_ns()
-    stage.run(lambda: ann.state is not None and ann.state.received_ns > begun_ns, "ann sees the scene again")
+    stage.run(
+        lambda: ann.scene.state is not None and ann.scene.state.received_ns > begun_ns, "ann sees the scene again"
+    )
     hand.velocity = (0.0, 0.0, 0.0)
     stage.engage(hand)
     stage.run(lambda: watcher.session_now_ns() - begun_ns > 2_500 * MS, "the dead connection's silence is noticed")
@@ -235,6 +239,6 @@ def test_latency_and_jitter_within_bounds_do_not_disengage(linked: Linked, tmp_p
         return True
 
     assert any(four_seconds() for _ in range(5)), log
-    assert hand.client.state is not None
-    assert hand.client.state.age_ns > 10 * MS
+    assert hand.client.scene.state is not None
+    assert hand.client.scene.state.age_ns > 10 * MS
     stage.server.finish()

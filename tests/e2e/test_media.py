@@ -49,7 +49,7 @@ class Watcher:
         )
         stage.clients.append(self.client)
         self.client.connect(DEADLINE_S)
-        self.feed = self.client.media("cloud")
+        self.feed = self.client.media.subscribe("cloud")
 
     @property
     def level(self) -> str:
@@ -73,7 +73,7 @@ def test_a_slow_link_gets_fewer_media_and_fresh_state(publishing: Stage, tmp_pat
 
         proxy.execute(f"profile {slow}")
         stage.run(lambda: eve.level in (BudgetClass.QUARTER, BudgetClass.NONE), "eve gets less")
-        told = eve.client.delivery
+        told = eve.client.media.delivery
         assert told is not None
         assert told.reason
         assert told.mbit_per_s < 20.0

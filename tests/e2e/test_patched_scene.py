@@ -84,14 +84,14 @@ def opened() -> Iterator[list[Client]]:
 
 def joined(session: Session | ScenePublisher, opened: list[Client], cache: Path) -> Client:
     client = Client(session.address, role="observer", name=cache.name, alignment="not_needed")
-    client.asset_cache = AssetStore(cache)
+    client.assets.cache = AssetStore(cache)
     opened.append(client)
     return client.connect(DEADLINE_S)
 
 
 def fetched_at_once(client: Client, address: str) -> None:
     """Asks one time."""
-    fetch = client.fetch_assets([address])
+    fetch = client.assets.fetch([address])
     assert client.wait_for(lambda _: fetch.done, DEADLINE_S)
     fetch.check()
     assert fetch.bytes_received > 0
@@ -122,14 +122,14 @@ def test_a_cloth_goes_on_while_the_scene_is_patched_all_the_time(
     ann = joined(world.session, opened, tmp_path / "ann")
     shapes = Deformables(ann)
     world.restless.set()
-    assert ann.wait_for(lambda _: bool(shapes.tend()), DEADLINE_S), "also who comes while it is"
-    feed = ann.media(shapes._meshes[0].stream)
+    assert ann.wait_for(lambda _: bool(shapes.update()), DEADLINE_S), "also who comes while it is"
+    feed = ann.media.subscribe(shapes._meshes[0].stream)
     looks, drawn = {ann.mirror.scene_hash}, {shapes.scene_hash}
     moved = 0
 
     def goes_on(client: Client) -> bool:
         nonlocal moved
-        moved += len(shapes.tend())
+        moved += len(shapes.update())
         assert shapes.vertices.keys() == {"cloth"}
         assert shapes.fault == ""
         looks.add(client.mirror.scene_hash)
@@ -144,7 +144,7 @@ def test_a_cloth_goes_on_while_the_scene_is_patched_all_the_time(
         return shapes.scene_hash == client.mirror.scene_hash
 
     assert ann.wait_for(newest, DEADLINE_S)
-    assert ann.media(feed.stream) is feed, "it is the same subscription"
+    assert ann.media.subscribe(feed.stream) is feed, "it is the same subscription"
     assert shapes.capture_ns["cloth"] > 0
     assert np.isfinite(shapes.vertices["cloth"]).all()
 

@@ -77,10 +77,10 @@ def test_killed_while_holding_then_resumes(
     ann = watcher.mirror.participants[lease.holder]
     assert not ann.connected
     stage.seconds(0.5)
-    resting = watcher.tip_pose("left")
+    resting = watcher.scene.tip_pose("left")
     assert resting is not None
     stage.seconds(0.5)
-    now = watcher.tip_pose("left")
+    now = watcher.scene.tip_pose("left")
     assert now is not None
     assert _moved(resting, now) < 5e-4
     emulate(stage.server.address, headset)
@@ -92,7 +92,7 @@ def test_killed_while_holding_then_resumes(
 
 
 def _applied_since(client: Client, robot: str) -> bool:
-    state = client.state
+    state = client.scene.state
     return state is not None and any(
         a.robot == robot and state.header.session_time - a.step_ns < 100_000_000 for a in state.header.applied
     )
@@ -116,7 +116,7 @@ def test_late_joiner_has_the_same_state(stage: Stage) -> None:
     assert late.mirror.episode is not None
 
     def poses_agree() -> bool:
-        states = [c.state for c in (ann, late)]
+        states = [c.scene.state for c in (ann, late)]
         if any(s is None for s in states):
             return False
         return all(
@@ -140,7 +140,7 @@ def test_recentring_in_motion_does_not_move_the_robot(
         for event in stage.events["watcher"]:
             if isinstance(event.body, AlignmentChanged) and event.body.alignment.kind == "measured":
                 epochs.add(event.body.alignment.tracking_epoch)
-        tip, state = watcher.tip_pose("left"), watcher.state
+        tip, state = watcher.scene.tip_pose("left"), watcher.scene.state
         if tip is not None and state is not None and (not tips or tips[-1][0] != state.header.tick):
             tips.append((state.header.tick, tip))
         return len(epochs) >= 2 and _applied_since(watcher, "left")
@@ -250,15 +250,19 @@ def _estop_and_clear(stage: Stage, hand: Hand, director: Client) -> None:
 def _pause_and_resume(stage: Stage, hand: Hand, director: Client) -> None:
     director.control("pause")
     stage.run(lambda: hand.client.mirror.paused, "paused")
-    assert director.state is not None
+    assert director.scene.state is not None
     stage.seconds(0.2)
-    tick = director.state.header.tick
+    tick = director.scene.state.header.tick
     stage.seconds(0.3)
-    assert director.state.header.tick == tick
+    assert director.scene.state.header.tick == tick
     director.control("step", 5)
-    stage.run(lambda: director.state is not None and director.state.header.tick == tick + 5, "five single steps")
+    stage.run(
+        lambda: director.scene.state is not None and director.scene.state.header.tick == tick + 5, "five single steps"
+    )
     director.control("resume")
-    stage.run(lambda: director.state is not None and director.state.header.tick > tick + 50, "running again")
+    stage.run(
+        lambda: director.scene.state is not None and director.scene.state.header.tick > tick + 50, "running again"
+    )
 
 
 def _reset(stage: Stage, hand: Hand, director: Client) -> None:

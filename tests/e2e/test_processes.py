@@ -40,7 +40,7 @@ def test_a_killed_front_is_replaced_and_everyone_comes_back(stage: Stage, drivin
     me, before = ann.participant_id, ann.mirror.leases["left"]
     front = stage.server.children()["front.main"]
     front.kill()
-    stage.run(lambda: not ann.connection.joined, "ann notices")
+    stage.run(lambda: not ann.connection.is_joined, "ann notices")
     stage.run(lambda: ann.ready and watcher.ready, "everyone is back")
     driving.velocity = (0.0, 0.3, 0.0)  # the hand goes on, clutch closed
     assert ann.participant_id == me
@@ -67,9 +67,9 @@ def test_a_killed_recorder_goes_on_in_a_next_part(stage: Stage, driving: Hand) -
     stage.server.children()["recording.process"].kill()
 
     def replaced() -> bool:
-        assert watcher.state is not None
-        if not ticks or ticks[-1] != watcher.state.header.tick:
-            ticks.append(watcher.state.header.tick)
+        assert watcher.scene.state is not None
+        if not ticks or ticks[-1] != watcher.scene.state.header.tick:
+            ticks.append(watcher.scene.state.header.tick)
         return "recorder ended" in _markers(stage, "watcher") and "recording.process" in stage.server.children()
 
     stage.run(replaced, "it is replaced")
@@ -86,14 +86,14 @@ def test_a_killed_recorder_goes_on_in_a_next_part(stage: Stage, driving: Hand) -
 def test_a_killed_authority_leaves_a_whole_recording_and_no_process(stage: Stage, driving: Hand) -> None:
     """The front tells the clients and ends, the recorder finishes the file, which verifies up to the end."""
     stage.seconds(1.0)
-    assert driving.client.state is not None
-    tick = driving.client.state.header.tick
+    assert driving.client.scene.state is not None
+    tick = driving.client.scene.state.header.tick
     children = relatives(stage.server.process.pid)
     assert len(children) >= 2
     stage.server.process.kill()
     stage.server.process.wait()
     driving.sending = False
-    stage.run(lambda: not driving.client.connection.joined, "ann knows that the session is gone")
+    stage.run(lambda: not driving.client.connection.is_joined, "ann knows that the session is gone")
     none_left(children)
     assert "session_ended" in driving.client.connection.counters.faults
     report = stage.server.verify()
@@ -133,7 +133,7 @@ def test_a_signal_ends_everything_in_order(serve: Callable[..., Server], number:
     wait(lambda: server.process.poll() is not None, "the session ends")
     assert server.process.wait() == 0, server.output
     none_left(children)
-    stage.run(lambda: not ann.connection.joined, "ann is told")
+    stage.run(lambda: not ann.connection.is_joined, "ann is told")
     stage.close()
     assert server.verify()["finished"]
 
@@ -141,7 +141,7 @@ def test_a_signal_ends_everything_in_order(serve: Callable[..., Server], number:
 def test_a_hard_killed_front_and_recorder_at_once(stage: Stage, driving: Hand) -> None:
     for child in stage.server.children().values():
         child.kill()
-    stage.run(lambda: not driving.client.connection.joined, "ann notices")
+    stage.run(lambda: not driving.client.connection.is_joined, "ann notices")
     stage.run(lambda: driving.client.ready, "ann is back")
     stage.engage(driving)
     assert stage.server.finish()["parts"] == 2

@@ -46,20 +46,20 @@ class Watcher:
     def __init__(self, stage: Stage, name: str, stream: str) -> None:
         self.client = stage.join(name, role="observer")
         self.shapes = Deformables(self.client)
-        self.feed = self.client.media(stream)
+        self.feed = self.client.media.subscribe(stream)
         self.poses = self.vertices = 0
         self._time_of: dict[int, float] = {}  # session time -> time of the world
         self._seen = -1
 
     def look(self) -> None:
-        state = self.client.state
+        state = self.client.scene.state
         if state is not None and state.header.state_seq != self._seen:
             self._seen = state.header.state_seq
             self._time_of[state.header.session_time] = state.header.sim_time
             if state.header.sim_time > 0.0:
                 self._check_poses(state.poses, state.header.sim_time)
                 self.poses += 1
-        moved = self.shapes.tend()
+        moved = self.shapes.update()
         assert self.shapes.fault == ""
         frame = self.feed.newest
         if moved and frame is not None and self._time_of.get(frame.header.capture_ns, 0.0) > 0.0:
@@ -105,13 +105,13 @@ def test_everybody_sees_a_world_that_mujoco_does_not_know(stage: Stage, tmp_path
     looks(stage, [ann, late])
 
     client = late.client
-    client.asset_cache = AssetStore(tmp_path / "cache")
+    client.assets.cache = AssetStore(tmp_path / "cache")
     assert client.mirror.scene_hash == composed.scene_hash, "the scene is the builder's"
-    fetch = client.fetch_assets([composed.scene_hash])
+    fetch = client.assets.fetch([composed.scene_hash])
     stage.run(lambda: fetch.done, "the specification has come")
     spec = decode_scene(fetch.read(composed.scene_hash))
     assert spec == composed.spec
-    rest = client.fetch_assets(asset_addresses(spec))
+    rest = client.assets.fetch(asset_addresses(spec))
     stage.run(lambda: rest.done, "its assets have come")
     rest.check()
     assert tuple(body.name for body in client.mirror.bodies) == publisher.NAMES
@@ -125,7 +125,7 @@ def test_everybody_sees_a_world_that_mujoco_does_not_know(stage: Stage, tmp_path
     children = relatives(stage.server.process.pid)
     stage.server.process.kill()
     stage.server.process.wait()
-    stage.run(lambda: not any(c.connection.joined for c in stage.clients), "both know that the session is gone")
+    stage.run(lambda: not any(c.connection.is_joined for c in stage.clients), "both know that the session is gone")
     assert all("session_ended" in c.connection.counters.faults for c in stage.clients)
     none_left(children)
     report = stage.server.verify()
@@ -142,13 +142,13 @@ def test_a_file_is_shown_to_everybody_as_it_is(tmp_path: Path, serve: Callable[.
     stage = Stage(server)
     try:
         ann: Client = stage.join("ann", role="observer")
-        stage.run(lambda: ann.state is not None, "she sees the scene")
-        fetch = ann.fetch_assets([ann.mirror.scene_hash])
+        stage.run(lambda: ann.scene.state is not None, "she sees the scene")
+        fetch = ann.assets.fetch([ann.mirror.scene_hash])
         stage.run(lambda: fetch.done, "the specification has come")
         (visual,) = decode_scene(fetch.read(ann.mirror.scene_hash)).visuals
         assert visual.geometry.kind == "mesh"
-        assert ann.state is not None
-        assert ann.state.poses.shape == (0, 7), "nothing moves"
+        assert ann.scene.state is not None
+        assert ann.scene.state.poses.shape == (0, 7), "nothing moves"
         assert "nobody drives" in server.output
         assert server.finish()["ok"]
     finally:

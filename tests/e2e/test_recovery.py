@@ -18,7 +18,7 @@ import pytest
 
 from anchors.pose import distance
 from iris_session.client import Client, DeniedError
-from iris_session.client.status import Phase
+from iris_session.client.core.status import ConnectionPhase
 from iris_session.protocol.names import DenialReason
 from iris_session.protocol.server_messages import EngagementChanged, ParticipantJoined, ParticipantLeft
 from tests.e2e.conftest import Hand, Server, Stage, none_left, relatives, verify, wait
@@ -103,7 +103,7 @@ def test_a_headset_that_hangs_in_its_join_does_not_keep_others_out(
         bob = stage.join("bob")
         assert bob.ready
         assert stage.following(driving)
-        stage.run(lambda: bob.state is not None, "bob sees the scene")
+        stage.run(lambda: bob.scene.state is not None, "bob sees the scene")
     finally:
         people.send_signal(signal.SIGCONT)
     eve = next(p for p in bob.mirror.participants.values() if p.name == "eve")
@@ -121,7 +121,7 @@ def test_a_headset_that_sleeps_and_wakes(stage: Stage, emulate: Callable[..., su
     people = emulate(stage.server.address, "name=ann,behaviour=wander,robot=left")
 
     def driven() -> bool:
-        state = watcher.state
+        state = watcher.scene.state
         return state is not None and any(
             a.robot == "left" and watcher.session_now_ns() - a.step_ns < 100_000_000 for a in state.header.applied
         )
@@ -183,8 +183,8 @@ def test_an_app_that_hangs_keeps_an_exclusive_robot(stage: Stage, driving: Hand)
     assert denied.value.denial.holder_name == "ann"
 
 
-@pytest.mark.parametrize("phase", [Phase.JOINING, Phase.SYNCING])
-def test_killed_in_mid_transfer_again_and_again(stage: Stage, phase: Phase) -> None:
+@pytest.mark.parametrize("phase", [ConnectionPhase.JOINING, ConnectionPhase.SYNCING])
+def test_killed_in_mid_transfer_again_and_again(stage: Stage, phase: ConnectionPhase) -> None:
     """Its hello, or its first picture, is on the way when it dies; it comes back as who it was, with its robot."""
     watcher = stage.join("watcher", "observer")
     identity = str(stage.server.folder / f"ann-{phase}.identity")
@@ -268,7 +268,7 @@ def test_nonsense_on_every_port_disturbs_nobody(stage: Stage, driving: Hand, noi
         stage.engage(driving)
     assert driving.client.connection.counters.reconnects == 0
     late = stage.join("late", "observer")
-    stage.run(lambda: late.state is not None, "who joins now sees the scene")
+    stage.run(lambda: late.scene.state is not None, "who joins now sees the scene")
     assert stage.server.children()["front.main"].pid == front
 
 

@@ -50,7 +50,7 @@ def came_back(stage: Stage, server: Server, *clients: Client) -> None:
     """Waits until everyone is in the session that `server` resumed, and sees it move on."""
 
     def back(client: Client) -> bool:
-        state = client.state
+        state = client.scene.state
         fresh = state is not None and client.session_now_ns() - state.header.session_time < 200_000_000
         return client.ready and fresh and f"name={client.name} " in server.output
 

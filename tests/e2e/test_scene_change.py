@@ -45,7 +45,7 @@ def order(stage: Stage, scene: str, answer: str = "loaded") -> None:
 
 def in_epoch(stage: Stage, epoch: int) -> None:
     def there() -> bool:
-        states = [client.state for client in stage.clients]
+        states = [client.scene.state for client in stage.clients]
         return all(s is not None and s.header.scene_epoch == epoch for s in states) and all(
             client.mirror.synced for client in stage.clients
         )
@@ -55,7 +55,7 @@ def in_epoch(stage: Stage, epoch: int) -> None:
 
 def test_operators_go_on_in_another_scene_and_it_replays(stage: Stage) -> None:
     ann, bob = stage.join("ann"), stage.join("bob")
-    assert {client.tick_period_ns for client in stage.clients} == {2_000_000}
+    assert {client.scene.tick_period_ns for client in stage.clients} == {2_000_000}
     ann.acquire(["left"])
     bob.acquire(["right"])
     hand = stage.hand(ann, "left")
@@ -83,7 +83,7 @@ def test_operators_go_on_in_another_scene_and_it_replays(stage: Stage) -> None:
 
     stage.run(driven, "she drives on")
 
-    assert {client.tick_period_ns for client in stage.clients} == {1_000_000}
+    assert {client.scene.tick_period_ns for client in stage.clients} == {1_000_000}
     order(stage, "slow", "ConfigError: the model has a timestep of 0.25 s")
     order(stage, "missing", "does not exist")
     hand.sending = False  # her robot is about to be gone
@@ -93,9 +93,9 @@ def test_operators_go_on_in_another_scene_and_it_replays(stage: Stage) -> None:
     in_epoch(stage, 3)
     assert sorted(late.mirror.robots) == ["arm1", "arm2", "arm3"]
     for client in stage.clients:
-        state = client.state
+        state = client.scene.state
         assert state is not None
-        assert client.tick_period_ns == client.mirror.tick_period_ns == 4_000_000
+        assert client.scene.tick_period_ns == client.mirror.tick_period_ns == 4_000_000
         assert state.header.sim_time == pytest.approx(4e-3 * state.header.tick)
     welcome = late.connection.welcome
     assert welcome is not None
@@ -161,7 +161,7 @@ def test_a_session_that_was_killed_in_its_second_scene_goes_on_there(stage: Stag
         stage.run(lambda: ann.ready and "name=ann " in resumed.output, "she is back")
         stage.engage(hand)
         assert ann.mirror.leases["arm3"].holder == ann.participant_id
-        assert ann.tick_period_ns == 4_000_000
+        assert ann.scene.tick_period_ns == 4_000_000
         assert resumed.finish()["ok"]
     finally:
         end_all([resumed])
@@ -170,7 +170,7 @@ def test_a_session_that_was_killed_in_its_second_scene_goes_on_there(stage: Stag
 def spec_of(stage: Stage, client: Client) -> SceneSpec:
     """The scene as a client that comes now gets it."""
     address = client.mirror.scene_hash
-    fetch = client.fetch_assets([address])
+    fetch = client.assets.fetch([address])
     stage.run(lambda: fetch.done, "the specification has come")
     return decode_scene(fetch.read(address))
 

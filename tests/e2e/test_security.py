@@ -151,7 +151,7 @@ def test_a_device_pairs_by_code_joins_in_its_role_and_the_code_is_used_up(
     assert png.read_bytes().startswith(b"\x89PNG")
     monkeypatch.setenv("IRIS_HOME", str(tmp_path / "tablet-home"))
     with Client(lab.server.address, role="observer", name="Tab", join_code=told["code"].lower()) as tablet:
-        assert tablet.wait_for(lambda c: c.state is not None)
+        assert tablet.wait_for(lambda c: c.scene.state is not None)
     assert ended(process, told)[0] == 0
     (entry,) = [one for one in lab.home.clients.read().values() if one.name == "tablet"]
     assert entry.roles == ("observer",)
@@ -208,22 +208,22 @@ def test_a_revoked_key_loses_everything_at_once_and_nobody_else_does(lab: Lab) -
         _both(lab, ann, refused)
     out_after = time.monotonic() - revoked_at
     assert error.value.code == FaultCode.REVOKED
-    assert ann.client.state is not None
-    last = ann.client.state.header.state_seq
+    assert ann.client.scene.state is not None
+    last = ann.client.scene.state.header.state_seq
     lab.run(lambda: "left" in _free(bob), "her robot is free, without grace")
-    resting = bob.client.tip_pose("left")
+    resting = bob.client.scene.tip_pose("left")
     lab.run(lambda: gap.look() and time.monotonic() - revoked_at > 2.0, "two seconds of state")
     # Half a second and one second, on a machine with time to spare: printed, because others may have none.
     print(f"out after {out_after:.3f} s, longest gap of the others {gap.longest:.3f} s")
     lab.engage(bob)  # on a busy machine a sample may have come too late
     assert bob.client.lease_version("right") == version
-    now = bob.client.tip_pose("left")
+    now = bob.client.scene.tip_pose("left")
     assert resting is not None
     assert now is not None
     assert distance(resting[0], now[0]) < 0.05  # it decelerates
     with pytest.raises(RefusedError):
         ann.client.poll(0.1)
-    assert ann.client.state.header.state_seq - last < 60, "no state for a revoked key"
+    assert ann.client.scene.state.header.state_seq - last < 60, "no state for a revoked key"
     assert lab.audits("bob", AuditKind.KEY_REFUSED) == [], "who was sent away does not knock for ever"
     with pytest.raises(RefusedError) as again:
         lab.enter("ann2", pair=ann_key)
@@ -245,7 +245,7 @@ class Gap:
 
     def look(self) -> bool:
         """Call often. True."""
-        state = self._client.state
+        state = self._client.scene.state
         now = time.monotonic()
         if state is not None and state.header.state_seq != self._seq:
             self.longest = max(self.longest, now - self._at)
@@ -258,7 +258,7 @@ def _both(lab: Lab, ann: Hand, until: Callable[[], bool]) -> None:
     deadline = time.monotonic() + DEADLINE_S
     while not until():
         assert time.monotonic() < deadline, "ann is told"
-        if ann.client.connection.joined:
+        if ann.client.connection.is_joined:
             ann.step()
         ann.client.poll(0.0)
         lab.step()

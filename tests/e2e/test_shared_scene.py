@@ -46,12 +46,12 @@ def stage(tmp_path: Path, serve: Callable[..., Server]) -> Iterator[Stage]:
 
 def fetched(stage: Stage, client: Client, cache: Path) -> SceneSpec:
     """The scene that the session says is the present one, and all its assets in `cache`."""
-    client.asset_cache = AssetStore(cache)
+    client.assets.cache = AssetStore(cache)
     address = client.mirror.scene_hash
-    fetch = client.fetch_assets([address])
+    fetch = client.assets.fetch([address])
     stage.run(lambda: fetch.done, "the specification has come")
     spec = decode_scene(fetch.read(address))
-    rest = client.fetch_assets(asset_addresses(spec))
+    rest = client.assets.fetch(asset_addresses(spec))
     stage.run(lambda: rest.done, "the assets have come")
     rest.check()
     return spec
@@ -64,7 +64,7 @@ def test_a_client_draws_what_the_session_has(stage: Stage, tmp_path: Path) -> No
     balls = [v.geometry.mesh for v in spec.visuals if v.geometry.kind == "mesh"]
     assert balls == [0, 0], "one mesh, drawn twice"
     level = spec.meshes[0].levels[0]
-    mesh = decode_mesh(ann.asset_cache.read(level.address))
+    mesh = decode_mesh(ann.assets.cache.read(level.address))
     assert np.linalg.norm(mesh.position, axis=1) == pytest.approx(1.0, abs=0.05)
 
     scene = fetch_scene(ann, timeout_s=30.0)
@@ -72,11 +72,11 @@ def test_a_client_draws_what_the_session_has(stage: Stage, tmp_path: Path) -> No
     assert np.array_equal(scene.meshes[0].position, mesh.position)
 
     (cloth,) = spec.deformables
-    arrays = decode_arrays(ann.asset_cache.read(cloth.address), ArrayKind.DEFORMABLE)
+    arrays = decode_arrays(ann.assets.cache.read(cloth.address), ArrayKind.DEFORMABLE)
     shapes = Deformables(ann)
 
     def falls() -> bool:
-        shapes.tend()
+        shapes.update()
         assert shapes.fault == ""
         return "cloth" in shapes.vertices and shapes.vertices["cloth"][:, 2].min() < 1.2
 
@@ -96,15 +96,15 @@ def test_a_client_draws_what_the_session_has(stage: Stage, tmp_path: Path) -> No
 def test_who_comes_again_or_late_needs_nothing_anew(stage: Stage, tmp_path: Path) -> None:
     ann, bob = stage.join("ann", role="observer"), stage.join("bob", role="observer")
     spec = fetched(stage, ann, tmp_path / "cache")
-    bob.asset_cache = AssetStore(tmp_path / "cache")
-    again = bob.fetch_assets([bob.mirror.scene_hash, *asset_addresses(spec)])
+    bob.assets.cache = AssetStore(tmp_path / "cache")
+    again = bob.assets.fetch([bob.mirror.scene_hash, *asset_addresses(spec)])
     stage.run(lambda: again.done, "all of it is there")
     assert (again.bytes_received, again.cached) == (0, len(again.addresses))
     stage.server.children()["front.main"].kill()
     stage.run(lambda: not ann.ready, "the front is gone")
     stage.run(lambda: ann.ready and bob.ready, "another one is there")
-    bob.asset_cache = AssetStore(tmp_path / "other")
-    late = bob.fetch_assets(asset_addresses(spec))
+    bob.assets.cache = AssetStore(tmp_path / "other")
+    late = bob.assets.fetch(asset_addresses(spec))
     stage.run(lambda: late.done, "the front that replaced it serves the scene too")
     late.check()
     assert late.bytes_received == late.bytes_total

@@ -37,7 +37,7 @@ def test_status_of_a_session_that_stands_still(house: Server) -> None:
     finally:
         house.process.send_signal(signal.SIGCONT)
     assert done.returncode == 0, done.stderr
-    assert "STANDS STILL since" in done.stdout.splitlines()[0]
+    assert "STALLED for" in done.stdout.splitlines()[0]
 
 
 def test_status_of_nothing(tmp_path: Path) -> None:

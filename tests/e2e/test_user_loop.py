@@ -170,8 +170,8 @@ def test_an_attached_script(script: Callable[[str], Stage]) -> None:
     stage = script(ATTACH)
     _drive(stage)
     director = stage.join("director", "director")
-    stage.run(lambda: director.state is not None, "a first picture")
-    state = director.state
+    stage.run(lambda: director.scene.state is not None, "a first picture")
+    state = director.scene.state
     assert state is not None
     assert state.header.tick == round(state.header.sim_time / 0.002)
     _end(stage)
@@ -199,16 +199,18 @@ def test_a_loop_that_blocks_for_five_seconds(script: Callable[[str], Stage], bod
     stage.run(lambda: _resting(stage, hand), "the robot has come to rest")
     _order(stage, "block")
     stage.run(lambda: _standing(stage, director), "the loop stands still")
-    before, tick = hand.tip, director.state.header.tick  # type: ignore[union-attr]
+    before, tick = hand.tip, director.scene.state.header.tick  # type: ignore[union-attr]
     director.acquire(["right"])
     assert ann.lease_version("right") is None
     ann.estop("while the script sleeps")
     stage.run(lambda: director.mirror.estop, "the e-stop is known")
     director.clear_estop()
     hand.velocity = (0.0, 0.2, 0.0)  # the hand goes on, clutch closed
-    assert director.state is not None
-    assert director.state.header.tick == tick, "the loop still stands"
-    stage.run(lambda: director.state is not None and director.state.header.tick > tick + 100, "the loop goes on")
+    assert director.scene.state is not None
+    assert director.scene.state.header.tick == tick, "the loop still stands"
+    stage.run(
+        lambda: director.scene.state is not None and director.scene.state.header.tick > tick + 100, "the loop goes on"
+    )
     assert distance(before[0], hand.tip[0]) < 2e-3
     feedback = ann.feedback["left"]
     assert feedback.state == CommandKind.HOLD
@@ -234,17 +236,17 @@ def _standing(stage: Stage, client: object) -> bool:
     from iris_session.client import Client
 
     assert isinstance(client, Client)
-    tick = client.state.header.tick if client.state is not None else -1
+    tick = client.scene.state.header.tick if client.scene.state is not None else -1
     stage.seconds(0.3)
-    return client.state is not None and client.state.header.tick == tick
+    return client.scene.state is not None and client.scene.state.header.tick == tick
 
 
 def test_a_reset_by_the_script_is_a_new_epoch(script: Callable[[str], Stage]) -> None:
     """The robot holds where the reset put it; old samples do not count; clutching again drives."""
     stage = script(TICKS)
     watcher = stage.join("watcher", "observer")
-    stage.run(lambda: watcher.tip_pose("left") is not None, "a first picture")
-    start = watcher.tip_pose("left")
+    stage.run(lambda: watcher.scene.tip_pose("left") is not None, "a first picture")
+    start = watcher.scene.tip_pose("left")
     assert start is not None
     _drive(stage)
     (hand,) = stage.hands
@@ -254,7 +256,10 @@ def test_a_reset_by_the_script_is_a_new_epoch(script: Callable[[str], Stage]) ->
     stage.run(lambda: watcher.mirror.scene_epoch == epoch + 1, "a new scene epoch")
     causes = [e.body.cause for e in stage.events["watcher"] if isinstance(e.body, SceneChanged)]
     assert causes == ["external"]
-    stage.run(lambda: watcher.state is not None and watcher.state.header.scene_epoch == epoch + 1, "its first picture")
+    stage.run(
+        lambda: watcher.scene.state is not None and watcher.scene.state.header.scene_epoch == epoch + 1,
+        "its first picture",
+    )
     stage.seconds(1.0)
     assert distance(start[0], hand.tip[0]) < 2e-3, "the robot must stay where the reset put it"
     hand.sending, hand.velocity = True, (0.0, 0.0, 0.0)

@@ -141,14 +141,14 @@ def test_a_leader_robot_that_starts_apart_ramps_and_then_leads(serve: Callable[.
     try:
         client = stage.join("teacher", "leader")
         client.acquire(["left"])
-        stage.run(lambda: client.tip_pose("left") is not None, "a first picture")
+        stage.run(lambda: client.scene.tip_pose("left") is not None, "a first picture")
         leader = Leader(client)
         leader.offset[0] = 0.5
         stage.hands.append(leader)  # type: ignore[arg-type]
         tips: list[tuple[int, PoseTuple]] = []
 
         def note() -> None:
-            state, tip = client.state, client.tip_pose("left")
+            state, tip = client.scene.state, client.scene.tip_pose("left")
             if state is not None and tip is not None and (not tips or tips[-1][0] != state.header.tick):
                 tips.append((state.header.tick, tip))
 
@@ -157,7 +157,7 @@ def test_a_leader_robot_that_starts_apart_ramps_and_then_leads(serve: Callable[.
         def hold_on() -> None:
             """Closes the clutch; again, as people do, when no sample counted while it was open."""
             nonlocal closed_at
-            followed = client.state is not None and bool(client.state.header.applied)
+            followed = client.scene.state is not None and bool(client.scene.state.header.applied)
             if not followed and time.monotonic() > closed_at + 3.0:
                 leader.clutch = False
                 stage.seconds(0.3)

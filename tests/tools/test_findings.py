@@ -9,7 +9,7 @@ import pytest
 import zmq
 
 from iris_session.client.address import Address
-from iris_session.client.connection import Connection
+from iris_session.client.core.connection import ClientConnection
 from iris_session.client.errors import ClientError
 from iris_session.client.identity import Identity
 from iris_session.front.state_publisher import StatePublisher
@@ -97,8 +97,8 @@ def test_damaged_certificates_are_one_kind_of_error(tmp_path: Path, line: bytes)
         load_public(path)
 
 
-def joined(heartbeat_ns: int) -> Connection:
-    connection = Connection(Hello("operator", "Ann"), Identity(b"s" * 16))
+def joined(heartbeat_ns: int) -> ClientConnection:
+    connection = ClientConnection(Hello("operator", "Ann"), Identity(b"s" * 16))
     connection.open(10**12)
     tell(
         connection,
@@ -107,7 +107,7 @@ def joined(heartbeat_ns: int) -> Connection:
     return connection
 
 
-def tell(connection: Connection, message: Message) -> None:
+def tell(connection: ClientConnection, message: Message) -> None:
     connection.receive([encode_server(ServerEnvelope(1, 7, message))], 10**12)  # type: ignore[arg-type]
 
 
@@ -140,7 +140,7 @@ def test_what_a_session_says_does_not_pile_up_in_a_client() -> None:
         tell(connection, Reply(0, True, leases=(Lease(f"robot{i}", "robot", "exclusive", "p1", 1),)))
     assert len(connection.counters.faults) <= 65
     assert sum(connection.counters.faults.values()) == 6000
-    assert len(connection.answers._granted) <= 4096
+    assert len(connection.requests._granted) <= 4096
 
 
 def test_frames_of_bodies_that_are_not_are_refused_unchanged() -> None:

@@ -33,7 +33,7 @@ def test_every_fault_has_a_check_and_can_be_named_or_missed(one: Fault) -> None:
     status = int(one.state == "failed")
     assert judge(one, [told(one)], status) == ""
     assert judge(one, [ok(one.check, "; ".join(one.says))], 0)
-    assert f"| {one.planted} |" in (ROOT / "docs" / "doctor.md").read_text()
+    assert f"| {one.planted} |" in (ROOT / "docs" / "evidence" / "doctor.md").read_text()
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,82 @@
+"""What people pass to the client, as what the protocol takes: names, numbers, poses, and bytes that were checked.
+
+Whatever cannot be converted raises `InvalidMessageError` at once, in one line that names the field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.client.errors import InvalidMessageError
+from iris_session.protocol.common import MAX_TEXT, Pose
+
+Numbers = Sequence[float] | NDArray[Any]
+#: `((x, y, z) [m], (w, x, y, z))` of tuples, lists or arrays, or a `Pose`.
+PoseLike = Pose | tuple[Numbers, Numbers]
+POSE_FORM: Final = "((x, y, z), (w, x, y, z))"
+
+
+def to_text(value: object) -> str:
+    """Any value as a `Text`: what stops robots must not fail for want of a good reason."""
+    try:
+        text = str(value)
+    except Exception:  # whatever the object's own conversion raises
+        text = type(value).__name__
+    return text.encode("utf-8", "replace").decode("utf-8")[:MAX_TEXT]
+
+
+def to_names(field: str, names: str | Iterable[str]) -> tuple[str, ...]:
+    """Names as a tuple; a bare string is one name."""
+    if isinstance(names, str):
+        return (names,)
+    found = tuple(names) if isinstance(names, Iterable) else (names,)
+    for name in found:
+        if not isinstance(name, str):
+            raise InvalidMessageError(f"{field}: expected names, got {str(name)[:40]} of type {type(name).__name__}")
+    return found
+
+
+def to_numbers(field: str, values: Iterable[float], length: int | None = None) -> tuple[float, ...]:
+    """Numbers, or an array (n,), as floats."""
+    try:
+        found = tuple(v if type(v) is float else _to_float(v) for v in values)
+    except (TypeError, ValueError):
+        found = None
+    if found is None or (length is not None and len(found) != length):
+        wanted = "numbers" if length is None else f"{length} numbers"
+        raise InvalidMessageError(f"{field}: expected {wanted}, got {_short_repr(values)}")
+    return found
+
+
+def _to_float(value: Any) -> float:
+    if isinstance(value, str | bytes) or np.ndim(value):
+        raise TypeError
+    return float(value)
+
+
+def to_pose(field: str, pose: PoseLike) -> Pose:
+    """`((x, y, z), (w, x, y, z))` of tuples, lists or arrays, or a `Pose`."""
+    if isinstance(pose, Pose):
+        return pose
+    try:
+        p, q = pose
+        return Pose(to_numbers(field, p, 3), to_numbers(field, q, 4))  # type: ignore[arg-type]  # lengths are checked
+    except (TypeError, ValueError):  # InvalidMessageError is one too
+        raise InvalidMessageError(f"{field}: expected {POSE_FORM}, got {_short_repr(pose)}") from None
+
+
+def to_python_scalar(value: Any) -> Any:
+    """A NumPy scalar as the number or truth value that it is."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _short_repr(value: Any) -> str:
+    size = f" of shape {value.shape}" if isinstance(value, np.ndarray) else ""
+    if not size and isinstance(value, list | tuple):
+        size = f" of length {len(value)}"
+    text = " ".join(repr(value).split())
+    return f"{type(value).__name__}{size}: {text if len(text) <= 100 else text[:97] + '...'}"

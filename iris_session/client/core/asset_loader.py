@@ -1,0 +1,274 @@
+"""What is to be asked for next, of assets that are wanted in an order. Pure: no socket, file, clock or thread.
+
+    wanted --to_look--> looked up in the cache --missing(offset)--> asked for in chunks --whole--> hashed --again, drop
+                                               `--drop
+
+Answers come in the order of the requests, so of one asset the bytes come in order too, and a request whose successor is
+answered was lost: it went with a TCP connection that ended, and is made again. Whatever does not continue what is there
+is passed over. A window bounds what was asked for and is not stored yet. Chunks are as large as the link is fast.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+from iris_session.protocol.assets import (
+    MAX_ASSET_BYTES,
+    MAX_ASSET_CHUNK_BYTES,
+    MAX_ASSET_REQUESTS,
+    AssetChunk,
+    AssetRefused,
+)
+from iris_session.protocol.names import AssetRefusal
+
+CHUNK_BYTES: Final = 512 << 10
+#: What a chunk may become. A whole window in less time than `FAST_NS` doubles it: each costs as much work, whatever its
+#: size. One that takes longer than `SLOW_NS` halves it, so that what is lost with a connection is little.
+MIN_CHUNK_BYTES: Final = 64 << 10
+MAX_CHUNK_BYTES: Final = MAX_ASSET_CHUNK_BYTES
+FAST_NS: Final = 100_000_000
+SLOW_NS: Final = 2_000_000_000
+#: Less than a session allows: enough for 400 Mbit/s and 100 ms.
+WINDOW_BYTES: Final = 6 << 20
+WINDOW_REQUESTS: Final = MAX_ASSET_REQUESTS // 2
+#: Assets that are looked up, received or hashed at once: small ones must not wait for each other's round trips.
+AT_ONCE: Final = 32
+#: After a refusal that passes, and after a connection that ended; doubled each time, until a chunk comes.
+FIRST_PAUSE_NS: Final = 50_000_000
+LONGEST_PAUSE_NS: Final = 2_000_000_000
+#: A request without an answer for so long, while nothing else comes either: the connection is made anew.
+PATIENCE_NS: Final = 15_000_000_000
+
+
+class ChunkRequest(NamedTuple):
+    """One request to be sent."""
+
+    request_id: int
+    address: str
+    offset: int
+    length: int
+
+
+class FailedAsset(NamedTuple):
+    """An asset that will not come."""
+
+    address: str
+    reason: str
+    text: str
+
+
+class _Item:
+    """One asset. `got`: bytes that came; `asked`: bytes that came or were asked for; `total` -1: not known yet. `told`:
+    what whoever wants it takes for its size, -1 if nothing: it decides how much is asked for first."""
+
+    __slots__ = ("address", "anew", "asked", "got", "told", "total")
+
+    def __init__(self, address: str, got: int, told: int) -> None:
+        self.address = address
+        self.got = self.asked = got
+        self.told = told
+        self.total = -1
+        self.anew = False
+
+    def next_bytes(self, most: int) -> int:
+        """How much to ask for next."""
+        if self.total >= 0:
+            return min(most, self.total - self.asked)
+        return min(most, self.told - self.asked) if self.told > self.asked else most
+
+    @property
+    def open(self) -> bool:
+        """Whether there is more to ask for now: of an unknown size only a first chunk."""
+        return self.asked == self.got if self.total < 0 else self.asked < self.total
+
+
+class AssetLoader:
+    """`now_ns` are of one monotonic clock."""
+
+    def __init__(self) -> None:
+        #: Why the session puts requests off, in its words; empty while bytes come.
+        self.refusal = ""
+        self._wanted: dict[str, int] = {}  # not looked up yet; sizes as in `want`
+        self._busy: dict[str, int] = {}  # in the hands of the workers
+        self._items: dict[str, _Item] = {}  # of which bytes are to come, in their order
+        self._anew: set[str] = set()  # whose part was thrown away because the session has less: once
+        self._asked: dict[int, tuple[ChunkRequest, int]] = {}  # with the time
+        self._chunk_bytes = CHUNK_BYTES
+        self._unstored = 0
+        self._next_id = 0
+        self._pause_ns = self._paused_until_ns = 0
+        self._progress_ns = 0
+
+    @property
+    def idle(self) -> bool:
+        """Nothing is wanted."""
+        return not (self._wanted or self._busy or self._items)
+
+    @property
+    def needs_link(self) -> bool:
+        """Whether bytes are to come over the network."""
+        return bool(self._items)
+
+    def add(self, address: str, size: int = -1) -> bool:
+        """Adds an asset at the end of the order; its size, if that is known. False: it is on its way already."""
+        if address in self._wanted or address in self._busy or address in self._items:
+            return False
+        self._wanted[address] = size
+        return True
+
+    def next_lookups(self) -> Iterator[str]:
+        """Assets to be looked up in the cache now."""
+        while self._wanted and len(self._busy) + len(self._items) < AT_ONCE:
+            address = next(iter(self._wanted))
+            self._busy[address] = self._wanted.pop(address)
+            yield address
+
+    def on_missing(self, address: str, offset: int) -> None:
+        """It is not in the cache, but its first `offset` bytes are."""
+        if address in self._busy:
+            item = self._items[address] = _Item(address, offset, self._busy.pop(address))
+            item.anew = address in self._anew
+
+    def restart_asset(self, address: str) -> bool:
+        """The bytes that came were not those of the asset: from the beginning. False: that was the second time. Does
+        nothing for one that was let go of meanwhile."""
+        item = self._items.get(address)
+        if item is None:
+            return True
+        if item.anew:
+            self.remove(address)
+            return False
+        fresh = self._items[address] = _Item(address, 0, -1)
+        fresh.anew = True
+        return True
+
+    def remove(self, address: str) -> None:
+        """It is there, or will not come."""
+        for table in (self._wanted, self._busy, self._items):
+            table.pop(address, None)
+        self._anew.discard(address)
+
+    def next_requests(self, now_ns: int) -> Iterator[ChunkRequest]:
+        """What is to be asked now, in the order of the assets. What was yielded counts as asked."""
+        if self.is_paused(now_ns):
+            return
+        for item in list(self._items.values()):
+            while item.open:
+                length = item.next_bytes(self._chunk_bytes)
+                if len(self._asked) >= WINDOW_REQUESTS or self._outstanding + length > WINDOW_BYTES:
+                    return
+                if not self._asked:
+                    self._progress_ns = now_ns
+                self._next_id += 1
+                ask = ChunkRequest(self._next_id, item.address, item.asked, length)
+                self._asked[self._next_id] = ask, now_ns
+                item.asked += length
+                yield ask
+
+    @property
+    def _outstanding(self) -> int:
+        return self._unstored + sum(ask.length for ask, _ in self._asked.values())
+
+    def process_chunk(self, chunk: AssetChunk, size: int, now_ns: int) -> bool | FailedAsset | None:
+        """`size` bytes came. True: they are the next ones, to be stored (then call `stored`). None: they are of no use
+        any more. False: nobody asked for them."""
+        ask, asked_ns = self._asked.pop(chunk.request_id, (None, 0))
+        if ask is None or ask.offset != chunk.offset or ask.address != chunk.address:
+            return False
+        self._restore_lost_requests(ask.request_id)
+        self._progress_ns, self._pause_ns, self.refusal = now_ns, 0, ""
+        self._adapt_chunk_size(ask, size, now_ns - asked_ns)
+        item = self._items.get(ask.address)
+        if item is None or chunk.offset != item.got:
+            return None
+        expected = min(ask.length, chunk.total - chunk.offset)
+        if item.total not in (-1, chunk.total) or size > ask.length or (size == 0 and expected):
+            self.remove(ask.address)
+            return FailedAsset(ask.address, "protocol", f"the session contradicts itself about asset {ask.address}")
+        if chunk.total > MAX_ASSET_BYTES:
+            self.remove(ask.address)
+            text = f"asset {ask.address} is said to have {chunk.total} bytes: at most {MAX_ASSET_BYTES} are fetched"
+            return FailedAsset(ask.address, "protocol", text)
+        item.total = chunk.total
+        item.got += size
+        if size < expected:
+            item.asked = item.got
+        item.asked = max(item.got, min(item.asked, item.total))
+        self._unstored += size
+        return True
+
+    def _restore_lost_requests(self, request_id: int) -> None:
+        """This request was answered: those before it will not be, and are made again."""
+        for lost in [earlier for earlier in self._asked if earlier < request_id]:
+            ask, _ = self._asked.pop(lost)
+            item = self._items.get(ask.address)
+            if item is not None:
+                item.asked = max(item.got, min(item.asked, ask.offset))
+
+    def _adapt_chunk_size(self, ask: ChunkRequest, size: int, took_ns: int) -> None:
+        """Larger chunks for a fast link, smaller ones for a slow one: whole chunks tell."""
+        if size != self._chunk_bytes or size != ask.length:
+            return
+        if took_ns < FAST_NS:
+            self._chunk_bytes = min(2 * size, MAX_CHUNK_BYTES)
+        elif took_ns > SLOW_NS:
+            self._chunk_bytes = max(size // 2, MIN_CHUNK_BYTES)
+
+    def is_complete(self, address: str) -> bool:
+        """Whether all its bytes came."""
+        item = self._items.get(address)
+        return item is not None and item.got == item.total
+
+    def on_stored(self, size: int) -> None:
+        """These bytes are in the cache, or thrown away: they fill the window no more."""
+        self._unstored -= size
+
+    def process_refusal(self, refused: AssetRefused, now_ns: int) -> FailedAsset | str:
+        """A request was refused. A `Failed` when the asset will not come; an address when it is to begin anew, after
+        its part was thrown away (then call `missing` with 0); else empty: it is asked for again after a pause."""
+        ask, _ = self._asked.pop(refused.request_id, (None, 0))
+        if ask is None:
+            return ""
+        self._restore_lost_requests(ask.request_id)
+        self._progress_ns = now_ns
+        item = self._items.get(ask.address)
+        if item is None:
+            return ""
+        if refused.reason in AssetRefusal.PASSING:
+            self.refusal = f"{refused.reason}: {refused.advice}"
+            self._pause(now_ns, self._pause_ns)
+            item.asked = max(item.got, min(item.asked, ask.offset))
+            return ""
+        self.remove(ask.address)
+        if refused.reason == AssetRefusal.BAD_RANGE and item.got and not item.anew:
+            self._busy[ask.address] = -1  # our part is longer than the asset: it was of something else
+            self._anew.add(ask.address)
+            return ask.address
+        text = f"asset {ask.address} was refused ({refused.reason}): {refused.advice}"
+        return FailedAsset(ask.address, refused.reason, text)
+
+    def is_paused(self, now_ns: int) -> bool:
+        """Whether nothing is to be asked for now."""
+        return now_ns < self._paused_until_ns
+
+    def on_link_lost(self, now_ns: int) -> None:
+        """As `cut_off`, of a connection that the other end or the network ended: the next one is made after a pause."""
+        before_ns = self._pause_ns
+        self.on_link_closed()
+        self._pause(now_ns, before_ns)
+
+    def _pause(self, now_ns: int, before_ns: int) -> None:
+        self._pause_ns = min(max(FIRST_PAUSE_NS, 2 * before_ns), LONGEST_PAUSE_NS)
+        self._paused_until_ns = now_ns + self._pause_ns
+
+    def on_link_closed(self) -> None:
+        """We ended the connection: what was asked by it will not come, what came stays."""
+        self._asked.clear()
+        self._pause_ns = self._paused_until_ns = 0
+        for item in self._items.values():
+            item.asked = item.got
+
+    def is_overdue(self, now_ns: int) -> bool:
+        """Whether answers have not come for too long."""
+        return bool(self._asked) and now_ns - self._progress_ns > PATIENCE_NS

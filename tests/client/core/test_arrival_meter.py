@@ -1,0 +1,131 @@
+"""What a client tells of itself, and what it can ask."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+import pytest
+
+from iris_session.client import Client, NotConnectedError
+from iris_session.client.core.arrival_meter import MAX_AGES, PERIOD_NS, ArrivalMeter
+from iris_session.client.core.connection import ClientConnection
+from iris_session.client.core.state_stream import SceneState
+from iris_session.client.core.status import ConnectionPhase
+from iris_session.client.identity import Identity
+from iris_session.protocol.client_messages import Hello
+from iris_session.protocol.server_messages import StateHeader
+from iris_session.protocol.status import ClientReport
+from tests.client.harness import LiveSession
+
+MS = 1_000_000
+
+
+@pytest.fixture
+def connection() -> ClientConnection:
+    """Of a client that is in."""
+    connection = ClientConnection(Hello("observer", "ann"), Identity.in_memory())
+    connection.phase = ConnectionPhase.READY
+    return connection
+
+
+def frame(seq: int, age_ns: int) -> SceneState:
+    return SceneState(StateHeader(1, 0, 0, 0.0, seq * MS, 0, seq, 0), np.zeros((0, 7)), age_ns, age_ns)
+
+
+def test_one_report_a_second(connection: ClientConnection) -> None:
+    meter = ArrivalMeter()
+    assert meter.poll_report(connection, 0) is None
+    for n, seq in enumerate((1, 2, 5, 6)):
+        meter.record(frame(seq, (n + 1) * MS))
+    connection.stream.counters.bytes_received = 4000
+    assert meter.poll_report(connection, PERIOD_NS - 1) is None
+    report = meter.poll_report(connection, 2 * PERIOD_NS)
+    assert report == ClientReport(3.0, 4.0, 4, 2, 0.0, 2000.0), "the first may have been sent before"
+    assert meter.poll_report(connection, 2 * PERIOD_NS) is None
+    assert meter.poll_report(connection, 3 * PERIOD_NS) == ClientReport(0.0, 0.0, 0, 0, 0.0, 0.0)
+
+
+def test_states_that_are_sent_again_say_nothing_of_their_way(connection: ClientConnection) -> None:
+    """Their source is silent, and they are as old as that: no reason to give this client less, or to blame its link."""
+    meter = ArrivalMeter()
+    meter.poll_report(connection, 0)
+    again = frame(2, 0).header
+    meter.record(frame(1, 2 * MS))
+    meter.record(frame(2, 2 * MS))
+    for second in range(1, 5):
+        meter.record(
+            SceneState(msgspec.structs.replace(again, state_seq=2 + second), np.zeros((0, 7)), 0, second * 10**9)
+        )
+        report = meter.poll_report(connection, second * PERIOD_NS)
+        assert report is not None
+        assert (report.age_ms_p50, report.age_ms_p99, report.missed) == (2.0, 2.0, 0)
+        assert report.delivered
+    meter.record(frame(9, 7 * MS))
+    report = meter.poll_report(connection, 6 * PERIOD_NS)
+    assert report is not None
+    assert report.age_ms_p50 == 7.0
+
+
+def test_who_joins_while_the_source_is_silent_has_no_slow_link(connection: ClientConnection) -> None:
+    meter = ArrivalMeter()
+    meter.poll_report(connection, 0)
+    for seq in range(4):
+        header = msgspec.structs.replace(frame(1, 0).header, state_seq=seq + 1)
+        meter.record(SceneState(header, np.zeros((0, 7)), 0, 4 * 10**9))
+    report = meter.poll_report(connection, PERIOD_NS)
+    assert report is not None
+    assert (report.age_ms_p50, report.age_ms_p99, report.delivered) == (0.0, 0.0, 4)
+
+
+def test_another_session_numbers_its_frames_anew(connection: ClientConnection) -> None:
+    meter = ArrivalMeter()
+    meter.record(frame(900, MS))
+    connection.phase = ConnectionPhase.WAITING
+    assert meter.poll_report(connection, 0) is None
+    connection.phase = ConnectionPhase.READY
+    meter.poll_report(connection, 0)
+    meter.record(frame(2000, MS))
+    report = meter.poll_report(connection, PERIOD_NS)
+    assert report is not None
+    assert report.missed == 0
+
+
+def test_memory_is_bounded(connection: ClientConnection) -> None:
+    meter = ArrivalMeter()
+    meter.poll_report(connection, 0)
+    for seq in range(3 * MAX_AGES):
+        meter.record(frame(seq, MS))
+    assert len(meter._ages_ns) == MAX_AGES
+    report = meter.poll_report(connection, PERIOD_NS)
+    assert report is not None
+    assert report.delivered == 3 * MAX_AGES
+
+
+def test_status_of_a_session(session: LiveSession, join: Callable[..., Client]) -> None:
+    client = join("ann")
+    report = client.status()
+    assert report.session_id == "s1"
+    assert report.connections == 1
+    client.start()
+    assert client.status().session_time > report.session_time
+
+
+def test_status_while_the_session_stands_still(session: LiveSession, join: Callable[..., Client]) -> None:
+    join("bob")
+    session.pause_steps(True)
+    client = join("ann", connect=False)
+    client.open()
+    report = client.status()
+    assert not client.ready
+    assert report.authority_silent_ns > 0
+
+
+def test_status_without_a_session() -> None:
+    client = Client("127.0.0.1:1", role="observer")
+    try:
+        with pytest.raises(NotConnectedError):
+            client.status(0.2)
+    finally:
+        client.close()

@@ -1,0 +1,350 @@
+"""What is asked for, in which order and how much at once, against a session of plain values; and what it does wrong."""
+
+from __future__ import annotations
+
+from random import Random
+
+import pytest
+
+from iris_session.client.core.asset_loader import (
+    AT_ONCE,
+    CHUNK_BYTES,
+    FAST_NS,
+    FIRST_PAUSE_NS,
+    MAX_CHUNK_BYTES,
+    MIN_CHUNK_BYTES,
+    PATIENCE_NS,
+    SLOW_NS,
+    WINDOW_BYTES,
+    WINDOW_REQUESTS,
+    AssetLoader,
+    ChunkRequest,
+    FailedAsset,
+)
+from iris_session.protocol.assets import MAX_ASSET_BYTES, AssetChunk, AssetRefused
+from iris_session.protocol.names import AssetRefusal
+
+
+def started(*addresses: str, offset: int = 0) -> AssetLoader:
+    loader = AssetLoader()
+    for address in addresses:
+        assert loader.add(address)
+    for address in loader.next_lookups():
+        loader.on_missing(address, offset)
+    return loader
+
+
+def answer(
+    loader: AssetLoader, ask: ChunkRequest, total: int, size: int = -1, now_ns: int = FAST_NS
+) -> bool | FailedAsset | None:
+    """By default as fast as leaves the size of chunks as it is."""
+    size = max(0, min(ask.length, total - ask.offset)) if size < 0 else size
+    return loader.process_chunk(AssetChunk(1, ask.request_id, ask.address, ask.offset, total), size, now_ns)
+
+
+def refuse(loader: AssetLoader, ask: ChunkRequest, reason: str, now_ns: int = 0) -> FailedAsset | str:
+    return loader.process_refusal(AssetRefused(1, ask.request_id, ask.address, reason, "advice"), now_ns)
+
+
+def test_first_a_chunk_of_each_then_the_rest_in_order() -> None:
+    loader = started("a", "b", "c")
+    first = list(loader.next_requests(0))
+    assert [(ask.address, ask.offset, ask.length) for ask in first] == [(name, 0, CHUNK_BYTES) for name in "abc"]
+    total = 2 * CHUNK_BYTES + 10
+    assert answer(loader, first[0], total) is True
+    assert [(ask.address, ask.offset, ask.length) for ask in loader.next_requests(0)] == [
+        ("a", CHUNK_BYTES, CHUNK_BYTES),
+        ("a", 2 * CHUNK_BYTES, 10),
+    ]
+    assert answer(loader, first[1], 7) is True
+    assert loader.is_complete("b")
+    assert not loader.is_complete("a")
+
+
+def test_the_window_is_of_bytes_that_are_not_stored_yet() -> None:
+    loader = started("a")
+    (ask,) = loader.next_requests(0)
+    assert answer(loader, ask, 100 * WINDOW_BYTES) is True
+    asks = list(loader.next_requests(0))
+    assert len(asks) == WINDOW_BYTES // CHUNK_BYTES - 1
+    for ask in asks:
+        assert answer(loader, ask, 100 * WINDOW_BYTES) is True
+    assert list(loader.next_requests(0)) == []
+    loader.on_stored(CHUNK_BYTES)
+    assert len(list(loader.next_requests(0))) == 1
+
+
+def test_chunks_are_as_large_as_the_link_is_fast() -> None:
+    loader = started("a")
+    now_ns, lengths = 0, []
+    for took_ns in (1, 1, FAST_NS, *[SLOW_NS + 1] * 6, 1):
+        ask = next(iter(loader.next_requests(now_ns)))
+        lengths.append(ask.length)
+        now_ns += took_ns
+        assert answer(loader, ask, 100 * WINDOW_BYTES, now_ns=now_ns) is True
+        loader.on_stored(ask.length)
+        loader.on_link_closed()
+    assert lengths[:4] == [CHUNK_BYTES, MAX_CHUNK_BYTES, MAX_CHUNK_BYTES, MAX_CHUNK_BYTES]
+    assert lengths[4:8] == [MAX_CHUNK_BYTES >> n for n in range(1, 5)]
+    assert lengths[8:] == [MIN_CHUNK_BYTES] * 2
+    (ask,) = list(loader.next_requests(now_ns))[:1]
+    assert ask.length == 2 * MIN_CHUNK_BYTES
+
+
+def test_known_sizes_are_all_that_is_asked_for() -> None:
+    loader = AssetLoader()
+    for name in "abc":
+        loader.add(name, 1000)
+    for name in loader.next_lookups():
+        loader.on_missing(name, 400 if name == "b" else 2000 if name == "c" else 0)
+    a, b, c = loader.next_requests(0)
+    assert [(ask.offset, ask.length) for ask in (a, b)] == [(0, 1000), (400, 600)]
+    assert (c.offset, c.length) == (2000, CHUNK_BYTES), "it was said to have less than is here: the session decides"
+    assert answer(loader, a, 3000, 1000) is True, "so does it where there is more"
+    (rest,) = loader.next_requests(0)
+    assert (rest.offset, rest.length) == (1000, 2000)
+
+
+def test_an_asset_larger_than_any_is_not_begun() -> None:
+    loader = started("a", "b")
+    a, b = loader.next_requests(0)
+    failed = answer(loader, a, MAX_ASSET_BYTES + 1)
+    assert isinstance(failed, FailedAsset)
+    assert failed.reason == "protocol"
+    assert answer(loader, b, MAX_ASSET_BYTES) is True
+
+
+def test_requests_that_went_with_a_connection_are_made_again() -> None:
+    """libzmq connects anew, and sends what it had not sent: the answers to those tell that the others are lost."""
+    total = 6 * CHUNK_BYTES
+    loader = started("a", "b")
+    first, other = loader.next_requests(0)
+    answer(loader, first, total)
+    asks = list(loader.next_requests(0))
+    assert [ask.offset for ask in asks] == [n * CHUNK_BYTES for n in range(1, 6)]
+    assert answer(loader, asks[3], total) is None, "what is before it did not come"
+    again = list(loader.next_requests(0))
+    assert [(ask.address, ask.offset) for ask in again] == [*[("a", ask.offset) for ask in asks], ("b", 0)]
+    assert answer(loader, asks[4], total) is None
+    assert [answer(loader, ask, total) for ask in (*asks[:3], other)] == [False] * 4
+    assert [answer(loader, ask, total) for ask in again[:5]] == [True] * 5
+    assert loader.is_complete("a")
+    assert list(loader.next_requests(0)) == [], "each was made again once"
+    assert refuse(loader, again[5], AssetRefusal.UNKNOWN) != ""
+
+
+def test_a_refusal_tells_too_that_what_was_asked_before_is_lost() -> None:
+    loader = started("a", "b")
+    _, other = loader.next_requests(0)
+    assert isinstance(refuse(loader, other, AssetRefusal.UNKNOWN), FailedAsset)
+    assert [(ask.address, ask.offset) for ask in loader.next_requests(0)] == [("a", 0)]
+
+
+def test_small_ones_are_bounded_by_number() -> None:
+    loader = AssetLoader()
+    names = [f"{i}" for i in range(AT_ONCE + 10)]
+    for name in names:
+        loader.add(name)
+    looked = list(loader.next_lookups())
+    assert looked == names[:AT_ONCE]
+    loader.remove(looked[0])  # it was in the cache
+    assert list(loader.next_lookups()) == [names[AT_ONCE]]
+    for name in looked[1:]:
+        loader.on_missing(name, 0)
+    asks = list(loader.next_requests(0))
+    assert len(asks) == min(WINDOW_REQUESTS, WINDOW_BYTES // CHUNK_BYTES)
+
+
+def test_a_connection_that_ends_costs_nothing_that_came() -> None:
+    loader = started("a", offset=1000)
+    (ask,) = loader.next_requests(0)
+    assert ask.offset == 1000
+    assert answer(loader, ask, 3 * CHUNK_BYTES) is True
+    pending = list(loader.next_requests(0))
+    loader.on_link_closed()
+    assert answer(loader, pending[0], 3 * CHUNK_BYTES) is False  # of the connection before
+    assert [ask.offset for ask in loader.next_requests(0)] == [ask.offset for ask in pending]
+
+
+def test_refusals_that_pass_are_waited_out_longer_and_longer() -> None:
+    loader, now_ns = started("a"), 0
+    for pause_ns in (FIRST_PAUSE_NS, 2 * FIRST_PAUSE_NS, 4 * FIRST_PAUSE_NS):
+        (ask,) = loader.next_requests(now_ns)
+        assert refuse(loader, ask, AssetRefusal.BUSY, now_ns) == ""
+        assert loader.refusal == "busy: advice"
+        assert list(loader.next_requests(now_ns + pause_ns - 1)) == []
+        now_ns += pause_ns
+    (ask,) = loader.next_requests(now_ns)
+    assert answer(loader, ask, CHUNK_BYTES + 5) is True
+    assert loader.refusal == "", "it comes"
+    (ask,) = loader.next_requests(now_ns)
+    assert refuse(loader, ask, AssetRefusal.BUSY, now_ns) == ""
+    (ask,) = loader.next_requests(now_ns + FIRST_PAUSE_NS)  # the short pause again, after something came
+    assert answer(loader, ask, CHUNK_BYTES + 5) is True
+    assert loader.is_complete("a")
+
+
+def test_a_new_connection_does_not_wait_out_a_refusal_of_the_one_before() -> None:
+    loader = started("a")
+    (ask,) = loader.next_requests(0)
+    assert refuse(loader, ask, AssetRefusal.BUSY) == ""
+    assert list(loader.next_requests(0)) == []
+    loader.on_link_closed()
+    assert [again.offset for again in loader.next_requests(0)] == [0]
+
+
+def test_one_refusal_in_the_middle_leaves_no_gap() -> None:
+    loader = started("a")
+    (ask,) = loader.next_requests(0)
+    answer(loader, ask, 4 * CHUNK_BYTES)
+    first, second, third = loader.next_requests(0)
+    assert answer(loader, first, 4 * CHUNK_BYTES) is True
+    assert refuse(loader, second, AssetRefusal.RATE) == ""
+    assert answer(loader, third, 4 * CHUNK_BYTES) is None  # there is a gap before it
+    again = list(loader.next_requests(FIRST_PAUSE_NS))
+    assert [ask.offset for ask in again] == [second.offset, third.offset]
+    assert [answer(loader, ask, 4 * CHUNK_BYTES) for ask in again] == [True, True]
+    assert loader.is_complete("a")
+
+
+def test_a_chunk_that_is_shorter_than_asked_leaves_no_gap() -> None:
+    loader = started("a")
+    (ask,) = loader.next_requests(0)
+    answer(loader, ask, 3 * CHUNK_BYTES)
+    first, second = loader.next_requests(0)
+    assert answer(loader, first, 3 * CHUNK_BYTES, 10) is True
+    assert answer(loader, second, 3 * CHUNK_BYTES) is None
+    assert next(iter(loader.next_requests(0))).offset == CHUNK_BYTES + 10
+
+
+@pytest.mark.parametrize("reason", [AssetRefusal.UNKNOWN, AssetRefusal.VERSION, "of a later version"])
+def test_refusals_that_do_not_pass_end_it(reason: str) -> None:
+    loader = started("a", "b")
+    asks = list(loader.next_requests(0))
+    failed = refuse(loader, asks[0], reason)
+    assert isinstance(failed, FailedAsset)
+    assert (failed.address, failed.reason) == ("a", reason)
+    assert answer(loader, asks[1], 5) is True
+    loader.remove("b")
+    assert loader.idle
+
+
+def test_a_part_of_something_else_is_thrown_away_once() -> None:
+    loader = started("a", offset=1000)
+    (ask,) = loader.next_requests(0)
+    assert refuse(loader, ask, AssetRefusal.BAD_RANGE) == "a"
+    loader.on_missing("a", 0)
+    (ask,) = loader.next_requests(0)
+    assert ask.offset == 0
+    assert isinstance(refuse(loader, ask, AssetRefusal.BAD_RANGE), FailedAsset)
+
+
+def test_wrong_bytes_are_asked_for_once_more() -> None:
+    loader = started("a")
+    for expected in (True, False):
+        (ask,) = loader.next_requests(0)
+        assert answer(loader, ask, 5) is True
+        assert loader.is_complete("a")
+        loader.on_stored(5)
+        assert loader.restart_asset("a") is expected
+    assert loader.idle
+
+
+def test_a_part_is_thrown_away_once_whatever_comes_then() -> None:
+    """A session that gives something and then says that there is less, for as long as somebody believes it."""
+    loader = started("a", offset=1000)
+    (ask,) = loader.next_requests(0)
+    assert refuse(loader, ask, AssetRefusal.BAD_RANGE) == "a"
+    loader.on_missing("a", 0)
+    (ask,) = loader.next_requests(0)
+    assert answer(loader, ask, 10**9, 1000) is True
+    failed = refuse(loader, next(iter(loader.next_requests(0))), AssetRefusal.BAD_RANGE)
+    assert isinstance(failed, FailedAsset)
+    assert failed.reason == AssetRefusal.BAD_RANGE
+    assert loader.add("a"), "who asks anew begins anew"
+    assert list(loader.next_lookups()) == ["a"]
+    loader.on_missing("a", 1000)
+    (ask,) = loader.next_requests(0)
+    assert refuse(loader, ask, AssetRefusal.BAD_RANGE) == "a"
+
+
+def test_wrong_bytes_of_what_was_let_go_of_are_not_asked_for_again() -> None:
+    loader = started("a")
+    (ask,) = loader.next_requests(0)
+    assert answer(loader, ask, 5) is True
+    loader.remove("a")  # cancelled while it is hashed
+    assert loader.restart_asset("a")
+    assert loader.idle
+    assert list(loader.next_requests(0)) == []
+    loader.add("a")
+    assert list(loader.next_lookups()) == ["a"]
+    assert loader.restart_asset("a"), "the one before"
+    assert list(loader.next_requests(0)) == [], "how much of it is there is still looked for"
+    loader.on_missing("a", 3)
+    assert [ask.offset for ask in loader.next_requests(0)] == [3]
+
+
+def test_a_session_that_contradicts_itself() -> None:
+    loader = started("a", "b", "c")
+    a, b, c = loader.next_requests(0)
+    answer(loader, a, 4 * CHUNK_BYTES)
+    a2 = next(iter(loader.next_requests(0)))
+    assert isinstance(answer(loader, b, 100, size=0), FailedAsset)  # nothing, where there is something
+    assert isinstance(answer(loader, c, 2**40, size=CHUNK_BYTES + 1), FailedAsset)  # more than was asked for
+    assert isinstance(answer(loader, a2, 5 * CHUNK_BYTES), FailedAsset)  # another size than before
+    assert loader.idle
+    assert answer(loader, c, 5) is False
+    assert loader.process_refusal(AssetRefused(1, 999, "", AssetRefusal.UNKNOWN), 0) == ""
+
+
+def test_nothing_for_long_is_overdue() -> None:
+    loader = started("a", "b")
+    asks = list(loader.next_requests(1000))
+    assert not loader.is_overdue(1000 + PATIENCE_NS)
+    answer(loader, asks[0], 5, now_ns=5000)
+    assert not loader.is_overdue(2000 + PATIENCE_NS)
+    assert loader.is_overdue(5001 + PATIENCE_NS)
+    loader.on_link_closed()
+    assert not loader.is_overdue(5001 + PATIENCE_NS)
+
+
+def test_whatever_happens_in_the_end_everything_is_there() -> None:
+    """A session that refuses, cuts off, sends less than was asked for, and a cache that is slow."""
+    for seed in range(20):
+        rng = Random(seed)
+        sizes = {f"{i}": rng.choice((0, 5, CHUNK_BYTES, 3 * CHUNK_BYTES + 1, 2 * WINDOW_BYTES)) for i in range(40)}
+        loader = AssetLoader()
+        for address in sizes:
+            loader.add(address)
+        got = dict.fromkeys(sizes, 0)
+        asks: list[ChunkRequest] = []
+        unstored: list[int] = []
+        for now_ns in range(0, 10**15, 20_000_000):
+            for address in loader.next_lookups():
+                loader.on_missing(address, 0)
+            asks += loader.next_requests(now_ns)
+            assert sum(ask.length for ask in asks) + sum(unstored) <= WINDOW_BYTES
+            assert len(asks) <= WINDOW_REQUESTS
+            for _ in range(rng.randrange(6)):
+                if not asks:
+                    break
+                ask = asks.pop(0)
+                there = min(ask.length, sizes[ask.address] - ask.offset)
+                if rng.random() < 0.1:
+                    assert refuse(loader, ask, AssetRefusal.TOO_MANY, now_ns) == ""
+                    continue
+                size = there if rng.random() < 0.8 else min(there, 1 + rng.randrange(CHUNK_BYTES))
+                if answer(loader, ask, sizes[ask.address], size, now_ns) is True:
+                    assert ask.offset == got[ask.address]
+                    got[ask.address] += size
+                    unstored.append(size)
+                    if loader.is_complete(ask.address):
+                        loader.remove(ask.address)
+            if rng.random() < 0.02:
+                loader.on_link_closed()
+                asks.clear()
+            while unstored and rng.random() < 0.7:
+                loader.on_stored(unstored.pop())
+            if loader.idle:
+                break
+        assert got == sizes

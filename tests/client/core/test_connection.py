@@ -1,0 +1,483 @@
+"""The sans-I/O core: every path through joining, losing and resuming, as plain bytes and numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from iris_session.client.core.clock import SETTLED
+from iris_session.client.core.connection import (
+    BACKOFF_MAX_NS,
+    HELLO_TIMEOUT_MAX_NS,
+    HELLO_TIMEOUT_NS,
+    MAX_INBOX,
+    ClientConnection,
+)
+from iris_session.client.core.outbox import MAX_OUTGOING, MAX_PENDING
+from iris_session.client.core.status import ConnectionPhase
+from iris_session.client.errors import IdentityError, NotConnectedError, VersionError
+from iris_session.client.identity import Identity
+from iris_session.protocol.client_messages import (
+    Acquire,
+    Bye,
+    ClientMessage,
+    ClockPing,
+    EStop,
+    GetSnapshot,
+    Heartbeat,
+    Hello,
+    Marker,
+    Sample,
+    TrackingEpoch,
+)
+from iris_session.protocol.codec import decode_client, encode_server
+from iris_session.protocol.common import Denial, Lease
+from iris_session.protocol.names import PROTOCOL_VERSION, DenialReason, RefusalCode
+from iris_session.protocol.server_messages import (
+    BodyInfo,
+    ClockPong,
+    Endpoints,
+    Event,
+    Notice,
+    ProtocolFault,
+    Refused,
+    Reply,
+    ServerEnvelope,
+    ServerMessage,
+    Snapshot,
+    Welcome,
+)
+from iris_session.protocol.session_mirror import MissedEvents
+
+MS = 1_000_000
+SECOND = 1000 * MS
+SAMPLE = Sample("head", "pose", 1, 0, 1, 0, 0)
+
+
+class Wire:
+    """A connection and what it sent."""
+
+    def __init__(self) -> None:
+        self.connection = ClientConnection(Hello("operator", "ann"), Identity(b"s" * 16))
+        self.epoch = 0
+
+    def sent(self) -> list[ClientMessage]:
+        """Everything queued since the last call."""
+        messages = []
+        while (item := self.connection.peek_outgoing()) is not None:
+            self.connection.pop_outgoing(sent=True)
+            messages.append(decode_client(item[1]).message)
+        return messages
+
+    def get(self, message: ServerMessage, now_ns: int, *bulk: bytes, epoch: int | None = None) -> None:
+        envelope = ServerEnvelope(PROTOCOL_VERSION, self.epoch if epoch is None else epoch, message)
+        self.connection.receive([encode_server(envelope), *bulk], now_ns)
+
+    def welcome(self, now_ns: int, token: bytes = b"token", session: str = "s1") -> None:
+        self.epoch += 1
+        ports = Endpoints(state=1)
+        self.get(
+            Welcome(session, "lab", "live", "p1", self.epoch, "operator", token, False, 0, SECOND, MS, MS, ports),
+            now_ns,
+        )
+
+    def snapshot(self, now_ns: int, event_seq: int = 0, bodies: int = 2, data: bytes | None = None) -> None:
+        infos = tuple(BodyInfo(i, f"b{i}", True) for i in range(bodies))
+        poses = np.zeros((bodies, 7))
+        poses[:, 3] = 1.0
+        snapshot = Snapshot(0, event_seq, 1, 0, "hash", 0, 0.0, 0, (), (), bodies=infos)
+        self.get(snapshot, now_ns, poses.tobytes() if data is None else data)
+
+    def clock(self, now_ns: int) -> None:
+        for _ in range(SETTLED):
+            self.get(ClockPong(now_ns, now_ns, now_ns), now_ns)
+
+    def join(self, now_ns: int = 0) -> None:
+        self.connection.open(now_ns)
+        self.welcome(now_ns)
+        self.clock(now_ns)
+        self.snapshot(now_ns)
+        self.sent()
+        assert self.connection.phase is ConnectionPhase.READY
+
+
+@pytest.fixture
+def wire() -> Wire:
+    return Wire()
+
+
+def test_join_says_hello_then_asks_for_clock_and_snapshot(wire: Wire) -> None:
+    assert wire.connection.phase is ConnectionPhase.IDLE
+    wire.connection.open(0)
+    (hello,) = wire.sent()
+    assert isinstance(hello, Hello)
+    assert hello.secret == b"s" * 16
+    wire.welcome(10 * MS)
+    assert wire.connection.identity.resume_token == b"token"
+    assert {type(m) for m in wire.sent()} == {ClockPing, GetSnapshot}
+    wire.snapshot(20 * MS)
+    assert wire.connection.phase is ConnectionPhase.SYNCING  # no clock yet
+    wire.clock(20 * MS)
+    assert wire.connection.phase is ConnectionPhase.READY
+
+
+def test_hello_without_answer_is_said_again_on_a_fresh_socket_with_back_off(wire: Wire) -> None:
+    wire.connection.open(0)
+    hellos, now = [0], 0
+    while now < 60 * SECOND:
+        generation = wire.connection.generation
+        now = max(now + MS, wire.connection.next_deadline_ns(now))
+        wire.connection.tick(now)
+        if wire.connection.generation != generation:
+            hellos.append(now)
+            assert [type(m) for m in wire.sent()] == [Hello]
+    gaps = np.diff(hellos)
+    assert (np.diff(gaps) >= 0).all()
+    assert gaps[0] < HELLO_TIMEOUT_NS + 200 * MS
+    assert gaps[-1] == HELLO_TIMEOUT_MAX_NS + BACKOFF_MAX_NS
+
+
+def test_over_a_slow_link_an_answer_is_waited_for_longer_until_the_connection_is_lost(wire: Wire) -> None:
+    """Five ways there and back of 600 ms: the first two hellos are given up too early, the third is not."""
+    wire.connection.open(0)
+    said, now = 0, 0
+    while not wire.connection.is_joined:
+        assert now < 60 * SECOND
+        generation = wire.connection.generation
+        now = wire.connection.next_deadline_ns(now)
+        if now > said + 3 * SECOND:
+            now = said + 3 * SECOND
+            wire.welcome(now)
+            break
+        wire.connection.tick(now)
+        if wire.connection.generation != generation:
+            said = now
+    assert wire.connection.generation == 3
+    wire.connection.handle_disconnect(now + 10 * SECOND)
+    assert wire.connection.next_deadline_ns(now + 10 * SECOND) == now + 10 * SECOND + HELLO_TIMEOUT_NS
+
+
+def test_timers_keep_a_quiet_connection_alive(wire: Wire) -> None:
+    wire.join()
+    kinds: list[type] = []
+    now = 0
+    while now < 10 * SECOND:
+        now = max(now + MS, wire.connection.next_deadline_ns(now))
+        wire.connection.tick(now)
+        for message in wire.sent():
+            kinds.append(type(message))
+            if isinstance(message, ClockPing):
+                wire.get(ClockPong(message.t0_ns, now, now), now)
+    assert wire.connection.phase is ConnectionPhase.READY
+    assert kinds.count(Heartbeat) >= 19
+    assert 15 <= kinds.count(ClockPing) <= 35
+
+
+def test_silence_ends_the_connection_and_the_token_resumes_it(wire: Wire) -> None:
+    wire.join()
+    now = 0
+    while wire.connection.is_joined:
+        now = max(now + MS, wire.connection.next_deadline_ns(now))
+        wire.connection.tick(now)
+    assert 3 * SECOND <= now <= 5 * SECOND
+    assert wire.connection.counters.reconnects == 1
+    hello = wire.sent()[-1]
+    assert isinstance(hello, Hello)
+    assert hello.resume_token == b"token"
+
+
+def test_who_stood_still_first_reads_what_was_said_meanwhile(wire: Wire) -> None:
+    wire.join()
+    wire.connection.tick(60 * SECOND)
+    assert wire.connection.phase is ConnectionPhase.READY
+    assert {type(message) for message in wire.sent()} == {ClockPing, Heartbeat}
+    wire.connection.tick(60 * SECOND + 500 * MS)
+    wire.get(ProtocolFault("hello", "say hello"), 60 * SECOND + 600 * MS)
+    assert [type(message) for message in wire.sent()][-1] is Hello
+
+
+def test_a_connection_that_breaks_at_once_is_retried_with_back_off(wire: Wire) -> None:
+    wire.connection.open(0)
+    now, waits = 0, []
+    for _ in range(6):
+        wire.welcome(now)
+        wire.connection.handle_disconnect(now + MS)
+        assert wire.connection.phase is ConnectionPhase.WAITING
+        waits.append(wire.connection.next_deadline_ns(now) - now)
+        now = wire.connection.next_deadline_ns(now)
+        wire.connection.tick(now)
+    assert waits == sorted(waits)
+    assert waits[-1] > 1.9 * SECOND
+
+
+def test_used_token_is_dropped_and_hello_said_again(wire: Wire) -> None:
+    wire.connection.identity.resume_token = b"old"
+    wire.connection.open(0)
+    wire.sent()
+    wire.get(Refused(RefusalCode.RESUME_TOKEN, "used"), MS, epoch=0)
+    (hello,) = wire.sent()
+    assert isinstance(hello, Hello)
+    assert hello.resume_token == b""
+    assert wire.connection.generation == 2
+
+
+def test_refusals_end_it_unless_they_pass(wire: Wire) -> None:
+    wire.join()
+    wire.connection.handle_disconnect(SECOND)
+    wire.get(Refused(DenialReason.SESSION_FULL, "full"), 2 * SECOND, epoch=0)
+    assert wire.connection.phase is ConnectionPhase.WAITING
+    wire.connection.tick(5 * SECOND)
+    wire.get(Refused(RefusalCode.VERSION, "other version", supported_versions=(7, 8)), 5 * SECOND, epoch=0)
+    assert wire.connection.phase is ConnectionPhase.REFUSED
+    assert isinstance(wire.connection.failure, VersionError)
+    assert wire.connection.failure.supported_versions == (7, 8)
+    wire.connection.open(6 * SECOND)
+    assert wire.connection.phase is ConnectionPhase.JOINING
+    assert wire.connection.failure is None
+
+
+def test_a_first_hello_that_is_one_of_too_many_is_said_again_with_back_off(wire: Wire) -> None:
+    wire.connection.open(0)
+    now, waits = 0, []
+    for _ in range(8):
+        wire.sent()
+        wire.get(Refused(RefusalCode.RATE, "too many hellos at once", "try again in a second"), now, epoch=0)
+        assert wire.connection.phase is ConnectionPhase.WAITING
+        assert "too many hellos" in wire.connection.describe()
+        waits.append(wire.connection.next_deadline_ns(now) - now)
+        now = wire.connection.next_deadline_ns(now)
+        wire.connection.tick(now)
+    assert waits == sorted(waits)
+    assert waits[-1] == BACKOFF_MAX_NS
+    wire.welcome(now)
+    assert wire.connection.retryable_refusal is None
+    assert wire.connection.failure is None
+
+
+@pytest.mark.parametrize(
+    ("code", "phase"),
+    [
+        ("session_ended", ConnectionPhase.WAITING),
+        ("dropped", ConnectionPhase.JOINING),
+        ("hello", ConnectionPhase.JOINING),
+    ],
+)
+def test_faults_that_end_the_connection(wire: Wire, code: str, phase: ConnectionPhase) -> None:
+    wire.join()
+    wire.get(ProtocolFault(code, "the session let this connection go: heartbeat"), SECOND)
+    assert wire.connection.phase is phase
+    assert wire.connection.counters.faults == {code: 1}
+
+
+def test_another_session_makes_everything_anew_but_keeps_the_tracking_epoch(wire: Wire) -> None:
+    wire.join()
+    wire.connection.tracking_epoch = 3
+    wire.get(Event(1, 0, 0, Notice("info", "x")), MS)
+    assert wire.connection.mirror.event_seq == 1
+    wire.connection.handle_disconnect(SECOND)
+    wire.sent()
+    wire.welcome(2 * SECOND, session="s2")
+    assert not wire.connection.clock.synced
+    assert wire.connection.mirror.event_seq == 0
+    assert TrackingEpoch(3) in wire.sent()
+
+
+def test_samples_are_never_kept_for_later_and_other_messages_raise(wire: Wire) -> None:
+    assert not wire.connection.send(SAMPLE)
+    with pytest.raises(NotConnectedError):
+        wire.connection.send(EStop())
+    with pytest.raises(NotConnectedError):
+        wire.connection.request(Acquire(0))
+    wire.join()
+    wire.connection.send(SAMPLE)
+    wire.connection.handle_disconnect(SECOND)
+    assert [type(message) for message in wire.sent()] == [Hello]
+    assert not wire.connection.send(SAMPLE)
+    assert wire.connection.counters.samples_not_sent == 2
+
+
+def test_urgent_messages_overtake_and_the_queue_is_bounded(wire: Wire) -> None:
+    wire.join()
+    for _ in range(2 * MAX_OUTGOING):
+        wire.connection.send(SAMPLE)
+    wire.connection.send(EStop("now"))
+    sent = wire.sent()
+    assert sent[0] == EStop("now")
+    assert len(sent) == MAX_OUTGOING
+    assert wire.connection.counters.samples_not_sent == MAX_OUTGOING + 1
+
+
+def test_replies_reach_who_asked_and_leases_count_at_once(wire: Wire) -> None:
+    wire.join()
+    number = wire.connection.request(Acquire(0, ("left",)))
+    assert wire.sent() == [Acquire(number, ("left",))]
+    lease = Lease("left", "robot", "exclusive", "p1", 4)
+    wire.get(Reply(number, True, leases=(lease,)), MS)
+    wire.get(Reply(number, True), MS)
+    assert wire.connection.counters.unexpected_replies == 1
+    reply = wire.connection.requests.pop_reply(number)
+    assert reply is not None
+    assert reply.ok
+    assert wire.connection.requests.pop_reply(number) is None
+    assert wire.connection.lease_version("left") == 4
+    wire.connection.handle_disconnect(SECOND)
+    assert wire.connection.lease_version("left") is None
+
+
+def test_messages_for_an_earlier_connection_are_counted_not_applied(wire: Wire) -> None:
+    wire.join()
+    wire.get(Event(1, 0, 0, Notice("info", "x")), MS, epoch=99)
+    assert wire.connection.mirror.event_seq == 0
+    assert wire.connection.counters.other_connection == 1
+
+
+def test_gap_in_events_asks_for_a_snapshot_again_until_it_comes(wire: Wire) -> None:
+    wire.join()
+    wire.get(Event(1, 0, 0, Notice("info", "x")), MS)
+    wire.get(Event(3, 0, 0, Notice("info", "y")), MS)
+    now, asked = MS, 0
+    while now < 3 * SECOND:
+        now = max(now + MS, wire.connection.next_deadline_ns(now))
+        wire.connection.tick(now)
+        for message in wire.sent():
+            asked += isinstance(message, GetSnapshot)
+            if isinstance(message, ClockPing):
+                wire.get(ClockPong(message.t0_ns, now, now), now)
+    assert 4 <= asked <= 7
+    wire.snapshot(now, event_seq=2)
+    assert wire.connection.mirror.event_seq == 3
+    told = [
+        e if isinstance(e, MissedEvents) else e.event_seq
+        for e in wire.connection.inbox
+        if isinstance(e, Event | MissedEvents)
+    ]
+    assert told == [1, MissedEvents(2, 2), 3]
+
+
+def test_a_snapshot_that_runs_ahead_says_which_events_are_missed(wire: Wire) -> None:
+    """The link took nothing for a while, and the snapshot is the first thing that came through."""
+    wire.join()
+    wire.get(Event(1, 0, 0, Notice("info", "x")), MS)
+    wire.snapshot(2 * MS, event_seq=1)
+    assert not [m for m in wire.connection.inbox if isinstance(m, MissedEvents)], "none is missed"
+    wire.snapshot(3 * MS, event_seq=7)
+    wire.get(Event(8, 0, 0, Notice("info", "y")), 4 * MS)
+    assert wire.connection.mirror.gaps == 0
+    told = [
+        e if isinstance(e, MissedEvents) else e.event_seq
+        for e in wire.connection.inbox
+        if isinstance(e, Event | MissedEvents)
+    ]
+    assert told == [1, MissedEvents(2, 7), 8]
+
+
+def test_inbox_is_bounded_and_says_what_it_dropped(wire: Wire) -> None:
+    wire.join()
+    for i in range(MAX_INBOX + 10):
+        wire.get(Event(i + 1, 0, 0, Notice("info", "x")), MS)
+    assert len(wire.connection.inbox) == MAX_INBOX
+    assert wire.connection.counters.inbox_dropped == 11
+    first, second = wire.connection.inbox[0], wire.connection.inbox[1]
+    assert first == MissedEvents(1, 11), "and the application is told"
+    assert isinstance(second, Event)
+    assert second.event_seq == 12
+
+
+def test_events_held_while_a_snapshot_came_are_handed_out_and_not_told_as_missed(wire: Wire) -> None:
+    wire.join()
+    for seq in (1, 3, 5, 6):
+        wire.get(Event(seq, 0, 0, Notice("info", "x")), MS)
+    wire.snapshot(2 * MS, event_seq=5)
+    told = [
+        e if isinstance(e, MissedEvents) else e.event_seq
+        for e in wire.connection.inbox
+        if isinstance(e, Event | MissedEvents)
+    ]
+    assert told == [1, MissedEvents(2, 2), 3, MissedEvents(4, 4), 5, 6]
+
+
+@pytest.mark.parametrize("data", [b"", b"12345678", b"\0" * (3 * 56)])
+def test_snapshot_with_poses_of_another_size_is_malformed(wire: Wire, data: bytes) -> None:
+    wire.connection.open(0)
+    wire.welcome(0)
+    wire.snapshot(MS, data=data)
+    assert wire.connection.counters.malformed == 1
+    assert not wire.connection.mirror.synced
+
+
+def test_close_says_bye_and_forgets_the_token(wire: Wire) -> None:
+    wire.join()
+    wire.connection.send(Marker(0, "note"))
+    wire.connection.close()
+    assert isinstance(wire.sent()[-1], Bye)
+    assert wire.connection.identity.resume_token == b""
+    with pytest.raises(NotConnectedError, match="closed"):
+        wire.connection.send(EStop())
+
+
+def test_a_client_whose_identity_was_taken_over_leaves_the_token_to_the_other(wire: Wire) -> None:
+    wire.join()
+    wire.get(ProtocolFault("dropped", "let go", "replaced"), MS)
+    assert wire.connection.phase is ConnectionPhase.REFUSED
+    wire.connection.close()
+    assert wire.connection.identity.resume_token == b"token"
+
+
+def test_answers_that_nobody_fetches_are_bounded(wire: Wire) -> None:
+    wire.join()
+    ids = []
+    for _ in range(MAX_PENDING + 5):
+        ids.append(wire.connection.request(Acquire(0)))
+        wire.get(Reply(ids[-1], True), MS)
+    assert wire.connection.counters.inbox_dropped == 5
+    assert wire.connection.requests.pop_reply(ids[4]) is None
+    assert wire.connection.requests.pop_reply(ids[5]) == Reply(ids[5], True)
+
+
+@given(st.lists(st.lists(st.binary(max_size=80), max_size=3), max_size=20))
+@settings(max_examples=150, deadline=None)
+def test_any_bytes_from_a_server_are_counted_and_harm_nothing(messages: list[list[bytes]]) -> None:
+    wire = Wire()
+    wire.join()
+    for frames in messages:
+        wire.connection.receive(frames, MS)
+    assert wire.connection.phase is ConnectionPhase.READY
+    assert wire.connection.counters.malformed == len(messages)
+
+
+def test_a_request_that_cannot_be_queued_raises(wire: Wire) -> None:
+    wire.join()
+    for _ in range(MAX_OUTGOING):
+        wire.connection.send(Marker(0, "x"))
+    with pytest.raises(NotConnectedError, match="queue full"):
+        wire.connection.request(Acquire(0))
+
+
+def test_a_denial_that_nobody_waits_for_is_handed_out(wire: Wire) -> None:
+    wire.join()
+    denied = Reply(0, False, Denial(DenialReason.UNALIGNED, "no"))
+    wire.get(denied, MS)
+    assert list(wire.connection.inbox) == [denied]
+    assert wire.connection.counters.unasked_denials == 1
+
+
+def test_a_full_disk_ends_neither_joining_nor_closing(
+    wire: Wire, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full() -> None:
+        raise IdentityError("no space left on device")
+
+    wire.connection.identity.path = Path("identity")
+    monkeypatch.setattr(wire.connection.identity, "_write", full)
+    wire.join()
+    assert wire.connection.identity.resume_token == b"token"
+    wire.connection.handle_disconnect(2 * SECOND)
+    wire.get(Refused(RefusalCode.RESUME_TOKEN, "used"), 2 * SECOND, epoch=0)
+    wire.welcome(3 * SECOND, b"next")
+    wire.connection.close()
+    assert wire.connection.counters.identity_unwritten == 4
+    assert len(caplog.records) == 1

@@ -1,0 +1,277 @@
+"""State channel: newest of a drain, keyframes and deltas, freshness after a stall, hostile bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from iris_session.client.core.state_stream import PRESENCE_WAITING, SceneState, StateStream
+from iris_session.protocol.codec import encode_presence, encode_state_header
+from iris_session.protocol.common import IDENTITY
+from iris_session.protocol.server_messages import (
+    TOPIC_PRESENCE,
+    TOPIC_RIGID,
+    Presence,
+    PresenceItem,
+    StateHeader,
+)
+from iris_session.streams.rigid import WINDOW, RigidEncoder
+
+MS = 1_000_000
+LOCAL = 86_400_000 * MS  # our clock minus session time
+N = 4
+
+
+class Server:
+    """Encodes states as the front does."""
+
+    def __init__(self) -> None:
+        self.encoder = RigidEncoder(N)
+        self.poses = np.zeros((N, 7))
+        self.poses[:, 3] = 1.0
+
+    def frame(self, now_ns: int, epoch: int = 1) -> list[bytes]:
+        """A frame in which everybody has moved."""
+        self.poses[:, 0] += 0.001
+        return self.rest(now_ns, epoch)
+
+    def rest(self, now_ns: int, epoch: int = 1) -> list[bytes]:
+        """A frame as things stand."""
+        encoded = self.encoder.encode(self.poses, epoch)
+        header = StateHeader(epoch, 0, 0, 0.0, now_ns - MS, now_ns, encoded.state_seq, encoded.base_seq)
+        return [TOPIC_RIGID, encode_state_header(header), encoded.payload]
+
+    def join(self, stream: StateStream, epoch: int = 1) -> None:
+        stream.scene_epoch = epoch
+        stream.load_keyframe(*self.encoder.keyframe())
+
+
+def drain(stream: StateStream, messages: Sequence[Sequence[bytes]], now_ns: int) -> SceneState | None:
+    """At session time `now_ns`; this client's own clock shows something else."""
+    return stream.drain(messages, now_ns, now_ns + LOCAL)
+
+
+@pytest.fixture
+def server() -> Server:
+    return Server()
+
+
+def test_newest_of_a_drain_is_decoded_and_the_rest_counted(server: Server) -> None:
+    stream = StateStream()
+    server.frame(0)
+    server.join(stream)
+    state = drain(stream, [server.frame(10 * MS), server.frame(20 * MS), server.frame(30 * MS)], 31 * MS)
+    assert state is not None
+    assert state.age_ns == 2 * MS
+    assert np.abs(state.poses - server.poses).max() < 1e-4
+    assert not state.poses.flags.writeable
+    assert (stream.counters.delivered, stream.counters.superseded) == (1, 2)
+
+
+def test_frames_before_the_snapshot_and_of_the_past_are_counted(server: Server) -> None:
+    stream = StateStream()
+    old = server.frame(0)
+    assert drain(stream, [old], MS) is None
+    assert stream.counters.before_snapshot == 1
+    server.frame(MS)
+    server.join(stream)
+    assert drain(stream, [old], 2 * MS) is None
+    assert stream.counters.out_of_order == 1
+
+
+def test_losing_more_than_the_window_asks_for_a_snapshot(server: Server) -> None:
+    stream = StateStream()
+    for i in range(40):
+        server.frame(i)
+    server.join(stream)
+    server.poses[:, 1] += 1.0  # everybody moves, unseen by this client, and rests from then on
+    for _ in range(WINDOW + 2):
+        server.rest(0)
+    assert drain(stream, [server.rest(MS)], MS) is None
+    assert stream.counters.undecodable == 1
+    assert stream.wants_snapshot
+    server.join(stream)
+    assert not stream.wants_snapshot
+    assert drain(stream, [server.rest(2 * MS)], 2 * MS) is not None
+
+
+def test_a_new_epoch_is_handed_out_once_the_session_has_told_of_it(server: Server) -> None:
+    stream = StateStream()
+    server.frame(0)
+    server.join(stream)
+    assert drain(stream, [server.frame(MS, epoch=2)], MS) is None
+    assert stream.counters.other_epoch == 1
+    stream.scene_epoch = 2
+    state = drain(stream, [server.frame(2 * MS, epoch=2)], 3 * MS)
+    assert state is not None
+    assert np.abs(state.poses - server.poses).max() < 1e-4
+
+
+def test_after_standing_still_the_first_frame_handed_out_is_fresh(server: Server) -> None:
+    stream = StateStream()
+    server.frame(0)
+    server.join(stream)
+    assert drain(stream, [server.frame(MS)], MS) is not None
+    waiting = [server.frame(17 * MS * i) for i in range(1, 4)]
+    now = 3000 * MS
+    assert drain(stream, waiting, now) is None
+    assert stream.counters.queued_old == 1
+    state = drain(stream, [server.frame(now + 10 * MS)], now + 11 * MS)
+    assert state is not None
+    assert state.age_ns == 2 * MS
+
+
+def test_on_a_slow_link_old_is_the_newest_there_is(server: Server) -> None:
+    stream = StateStream()
+    server.frame(0)
+    server.join(stream)
+    assert drain(stream, [server.frame(0)], 0) is not None
+    handed = [drain(stream, [server.frame(t - 300 * MS)], t) for t in range(1000 * MS, 1400 * MS, 40 * MS)]
+    assert handed[0] is None
+    assert handed[-1] is not None
+
+
+@pytest.mark.parametrize("period", [66 * MS, 100 * MS, 400 * MS])
+def test_a_slow_link_with_few_frames_shows_a_scene_to_who_looks_rarely(server: Server, period: int) -> None:
+    stream = StateStream()
+    server.frame(0)
+    server.join(stream)
+    handed = [drain(stream, [server.frame(t - 90 * MS)], t) for t in range(0, 10_000 * MS, period)]
+    assert all(state is not None for state in handed[len(handed) // 2 :])
+
+
+def test_few_frames_on_a_slow_link_are_all_handed_out(server: Server) -> None:
+    stream = StateStream()
+    server.frame(0)
+    server.join(stream)
+    for t in range(0, 1000 * MS, 100 * MS):
+        assert drain(stream, [server.frame(t - 90 * MS)], t) is not None
+
+
+@pytest.mark.parametrize("looks", [True, False])
+def test_a_stall_is_noticed_whoever_stood_still(server: Server, looks: bool) -> None:
+    """The link stood still while the client went on looking, or the client while it waited in a poll for frames."""
+    stream = StateStream()
+    server.frame(0)
+    server.join(stream)
+    assert drain(stream, [server.frame(MS)], MS) is not None
+    for t in range(20 * MS, 3000 * MS, 20 * MS) if looks else ():
+        assert drain(stream, [], t) is None
+    assert drain(stream, [server.frame(20 * MS)], 3000 * MS) is None
+    assert drain(stream, [server.frame(40 * MS)], 3001 * MS) is None
+    assert drain(stream, [server.frame(3000 * MS)], 3002 * MS) is not None
+    assert stream.counters.queued_old == 2
+
+
+def test_a_frame_in_hand_when_the_client_stood_still_is_not_handed_out(server: Server) -> None:
+    """It was taken from the socket, then the process was stopped for three seconds."""
+    stream = StateStream()
+    server.frame(0)
+    server.join(stream)
+    assert drain(stream, [server.frame(MS)], MS) is not None
+    assert stream.check_fresh(2 * MS + LOCAL)
+    assert drain(stream, [server.frame(17 * MS)], 17 * MS) is not None
+    assert not stream.check_fresh(3000 * MS + LOCAL)
+    assert drain(stream, [server.frame(33 * MS)], 3001 * MS) is None  # nor what waited meanwhile
+    assert drain(stream, [server.frame(3002 * MS)], 3003 * MS) is not None
+    assert stream.check_fresh(3004 * MS + LOCAL)
+    assert (stream.counters.delivered, stream.counters.queued_old) == (2, 2)
+
+
+def test_who_is_slow_with_every_frame_is_handed_them_all_but_the_first(server: Server) -> None:
+    stream = StateStream()
+    server.frame(0)
+    server.join(stream)
+    kept = []
+    for t in range(100 * MS, 1100 * MS, 100 * MS):
+        assert drain(stream, [server.frame(t - MS)], t) is not None
+        kept.append(stream.check_fresh(t + 80 * MS + LOCAL))
+    assert kept == [False] + [True] * 9
+
+
+def test_a_link_that_became_slow_shows_what_there_is(server: Server) -> None:
+    """Frames a second old, four a second: nothing for a moment, then all of them."""
+    stream = StateStream()
+    server.frame(0)
+    server.join(stream)
+    assert drain(stream, [server.frame(MS)], MS) is not None
+    handed = [drain(stream, [server.frame(t - 1000 * MS)], t) for t in range(1250 * MS, 4000 * MS, 250 * MS)]
+    assert handed[0] is None
+    assert all(state is not None for state in handed[1:])
+
+
+def test_a_late_frame_without_a_stall_is_handed_out(server: Server) -> None:
+    """Jitter: frames go on coming, some are late."""
+    stream = StateStream()
+    server.frame(0)
+    server.join(stream)
+    for i in range(20):
+        t = i * 20 * MS
+        assert drain(stream, [server.frame(t - (100 if i % 7 == 3 else 5) * MS)], t) is not None
+
+
+def test_a_jump_of_session_time_is_not_standing_still(server: Server) -> None:
+    stream = StateStream()
+    server.frame(0)
+    server.join(stream)
+    assert stream.drain([server.frame(-90 * MS)], 0, 5) is not None
+    assert stream.drain([server.frame(3600_000 * MS)], 3600_090 * MS, MS) is not None
+
+
+def test_another_session_has_no_stall_to_make_up_for(server: Server) -> None:
+    stream = StateStream()
+    server.join(stream)
+    server.frame(0)
+    drain(stream, [server.frame(0)], 0)
+    stream.reset()
+    server.frame(0)
+    server.join(stream)
+    assert drain(stream, [server.frame(2900 * MS)], 3001 * MS) is not None
+
+
+def test_presence_of_who_is_not_here_is_not_kept() -> None:
+    stream = StateStream()
+    items = (PresenceItem("p1", "head", IDENTITY), PresenceItem("p2", "head", IDENTITY))
+    drain(stream, [[TOPIC_PRESENCE, encode_presence(Presence(10, 11, items))]], 12)
+    stream.retain_presence({"p2"})
+    assert set(stream.presence) == {("p2", "head")}
+
+
+def test_presence_keeps_the_latest_per_device_and_forgets_who_left() -> None:
+    stream = StateStream()
+    items = (PresenceItem("p1", "head", IDENTITY), PresenceItem("p2", "head", IDENTITY))
+    drain(stream, [[TOPIC_PRESENCE, encode_presence(Presence(10, 11, items))]], 12)
+    drain(stream, [[TOPIC_PRESENCE, encode_presence(Presence(9, 11, items[:1]))]], 12)  # older
+    assert set(stream.presence) == {("p1", "head"), ("p2", "head")}
+    assert stream.counters.out_of_order == 1
+    stream.remove_presence("p1")
+    assert set(stream.presence) == {("p2", "head")}
+
+
+def test_presence_that_nobody_looks_at_does_not_pile_up() -> None:
+    stream = StateStream()
+    message = [TOPIC_PRESENCE, encode_presence(Presence(10, 11, (PresenceItem("p1", "head", IDENTITY),)))]
+    for _ in range(2 * PRESENCE_WAITING - 1):
+        drain(stream, [message], 12)
+    assert stream.counters.presence == PRESENCE_WAITING
+    assert set(stream.presence) == {("p1", "head")}
+    assert stream.counters.presence == 2 * PRESENCE_WAITING - 1
+
+
+@given(
+    st.lists(st.lists(st.binary(max_size=60) | st.sampled_from([TOPIC_RIGID, TOPIC_PRESENCE]), min_size=1, max_size=4))
+)
+@settings(max_examples=200, deadline=None)
+def test_any_bytes_are_counted_and_harm_nothing(messages: list[list[bytes]]) -> None:
+    server, stream = Server(), StateStream()
+    server.frame(0)
+    server.join(stream)
+    drain(stream, messages, MS)
+    assert stream.presence == {}
+    counted = stream.counters
+    assert counted.malformed + counted.unknown_topic + counted.superseded + counted.presence >= len(messages) - 1
+    assert drain(stream, [server.frame(2 * MS)], 3 * MS) is not None

@@ -1,0 +1,266 @@
+"""From an address, a name or a code to a session that lets us in: against a real front with keys of its own."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+from collections import deque
+from collections.abc import Callable, Generator, Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+import zmq
+
+from iris_session.client import Client, ClientError, NotConnectedError, RefusedError, SessionNameError, TrustError
+from iris_session.client import endpoint_resolver as meeting_module
+from iris_session.client import endpoint_resolver as resolver_module
+from iris_session.client.address import Address, pairing_uri
+from iris_session.client.discovery import request_introduction
+from iris_session.client.endpoint_resolver import pair_key, parse_connect_request, resolve_blocking
+from iris_session.protocol import pairing
+from iris_session.protocol.codec import encode_server
+from iris_session.protocol.discovery import DISCOVERY_PORT, Introduction
+from iris_session.protocol.names import RefusalCode
+from iris_session.protocol.server_messages import Paired, Refused, ServerEnvelope
+from iris_session.security import KeyHome, KeyPair
+from tests.client.harness import LiveSession
+
+
+class Lab:
+    """A session with keys, and the home of keys of somebody new."""
+
+    def __init__(self, folder: Path) -> None:
+        self.server = KeyHome(folder / "server")
+        self.mine = KeyHome(folder / "mine")
+        self.name = f"lab-{secrets.token_hex(4)}"
+        self.session = LiveSession(
+            curve=True,
+            key_home=str(folder / "server"),
+            session_name=self.name,
+            session_id=self.name,
+            beacon_port=DISCOVERY_PORT,
+        )
+        self.address = self.session.address
+
+    def code(self) -> str:
+        return self.server.join_codes.create(self.server.load_server_key())[0]
+
+    def join(self, address: str = "", **options: str) -> Client:
+        client = Client(address, name="ann", **options)  # type: ignore[arg-type]
+        try:
+            return client.connect(10.0)
+        finally:
+            if not client.ready:
+                client.close()
+
+
+@pytest.fixture
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Lab]:
+    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "mine"))
+    lab = Lab(tmp_path)
+    yield lab
+    lab.session.close()
+
+
+def test_a_code_is_needed_once(lab: Lab) -> None:
+    with pytest.raises(RefusedError, match="iris-session pair") as refused:
+        lab.join(lab.address)
+    assert refused.value.code == RefusalCode.UNPAIRED
+    code = lab.code()
+    lab.join(lab.address, join_code=code.lower()).close()
+    (stored,) = lab.mine.known_servers.read()
+    assert (stored.address, stored.session, stored.key) == (lab.address, lab.name, lab.server.load_server_key().public)
+    assert [entry.key for entry in lab.server.clients.read().values()] == [lab.mine.load_identity().public]
+    lab.join(lab.address).close()
+    lab.join(lab.address, join_code=code).close()  # the same command again: its code is not needed any more
+
+
+def test_a_uri_has_all_of_it_and_a_name_finds_it(lab: Lab) -> None:
+    host = Address.parse(lab.address)
+    lab.join(pairing_uri(host.host, host.port, lab.server.load_server_key().public, lab.code(), lab.name)).close()
+    client = lab.join(session=lab.name)
+    assert client.address == lab.address
+    client.close()
+
+
+def test_a_key_that_was_taken_off_the_list_pairs_again_with_a_new_code_only(lab: Lab) -> None:
+    lab.join(lab.address, join_code=lab.code()).close()
+    lab.server.clients.revoke_key(lab.mine.load_identity().fingerprint)
+    with pytest.raises(RefusedError) as refused:
+        lab.join(lab.address)
+    assert refused.value.code == RefusalCode.UNPAIRED
+    lab.join(lab.address, join_code=lab.code()).close()
+
+
+def test_a_wrong_code_stores_nothing(lab: Lab) -> None:
+    lab.code()
+    with pytest.raises(RefusedError) as refused:
+        lab.join(lab.address, join_code="0000-0000-0000")
+    assert refused.value.code == RefusalCode.CODE
+    assert lab.mine.known_servers.read() == []
+    with pytest.raises(ClientError, match="not a join code"):
+        Client(lab.address, join_code="ABC")
+
+
+def test_another_key_than_the_stored_one_is_an_error(lab: Lab) -> None:
+    other = KeyPair.generate().public
+    lab.mine.known_servers.pin(lab.address, lab.name, other)
+    for options in ({}, {"join_code": lab.code()}):
+        with pytest.raises(TrustError, match="keys forget"):
+            lab.join(lab.address, **options)
+    with pytest.raises(TrustError, match="keys forget"):
+        lab.join(session=lab.name)
+    assert [one.key for one in lab.mine.known_servers.read()] == [other]
+    lab.mine.known_servers.remove(lab.address)
+    host = Address.parse(lab.address)
+    with pytest.raises(TrustError, match="known with the key"):
+        lab.join(pairing_uri(host.host, host.port, other, lab.code()))
+
+
+def test_an_impostor_with_a_known_name_needs_a_code(lab: Lab) -> None:
+    lab.mine.known_servers.pin("10.0.0.7:7721", lab.name, KeyPair.generate().public)
+    with pytest.raises(TrustError, match="another key"):
+        lab.join(session=lab.name)
+    lab.join(session=lab.name, join_code=lab.code()).close()
+
+
+def test_two_sessions_of_one_name_are_told_by_address(lab: Lab) -> None:
+    twin = LiveSession(session_name=lab.name, session_id=f"twin of {lab.name}", beacon_port=DISCOVERY_PORT)
+    try:
+        with pytest.raises(SessionNameError) as error:
+            lab.join(session=lab.name)
+        assert lab.address in str(error.value)
+        assert twin.address in str(error.value)
+    finally:
+        twin.close()
+
+
+def test_a_name_that_nobody_has_lists_those_that_were_heard(lab: Lab) -> None:
+    with pytest.raises(NotConnectedError, match=rf"'no-such' was not heard.*{lab.name} \({lab.address}\)"):
+        resolve_blocking(parse_connect_request("", "no-such", None, ""), 0.6)
+    client = Client(session="no-such")
+    with pytest.raises(NotConnectedError, match="was not heard"):
+        client.connect(0.3)
+    client.close()
+
+
+Ask = Callable[[str, int, float], Generator[None, None, Introduction]]
+
+
+def introduced_as(change: Callable[[Introduction], Introduction]) -> Ask:
+    """`ask_introduction` with another answer: somebody else on the port below the control port."""
+
+    def ask(host: str, port: int, timeout_s: float) -> Generator[None, None, Introduction]:
+        return change((yield from request_introduction(host, port, timeout_s)))
+
+    return ask
+
+
+def test_who_lets_us_in_must_be_who_introduced_himself(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.join(lab.address, join_code=lab.code()).close()
+
+    def other_id(said: Introduction) -> Introduction:
+        return msgspec.structs.replace(said, beacon=msgspec.structs.replace(said.beacon, session_id="other"))
+
+    monkeypatch.setattr(meeting_module, "request_introduction", introduced_as(other_id))
+    with pytest.raises(SessionNameError, match="where another introduced itself"):
+        lab.join(lab.address)
+    with pytest.raises(SessionNameError, match="heard there"):
+        lab.join(session=lab.name)
+
+
+def test_the_introduction_of_a_neighbouring_port_is_not_taken(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.join(lab.address, join_code=lab.code()).close()
+
+    def other_port(said: Introduction) -> Introduction:
+        beacon = msgspec.structs.replace(said.beacon, control=said.beacon.control + 1, session_id="other")
+        return Introduction(beacon, KeyPair.generate().public)
+
+    monkeypatch.setattr(meeting_module, "request_introduction", introduced_as(other_port))
+    lab.join(lab.address).close()  # by the stored key
+
+
+def test_the_session_must_prove_the_code_too(tmp_path: Path) -> None:
+    server, own = KeyPair.generate(), KeyPair.generate()
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    impostor = context.socket(zmq.ROUTER)
+    impostor.curve_server = True
+    impostor.curve_publickey, impostor.curve_secretkey = server.public.encode(), server.secret.encode()
+    port = impostor.bind_to_random_port("tcp://127.0.0.1")
+
+    def say_yes() -> None:
+        route, _ = impostor.recv_multipart()
+        impostor.send_multipart([route, encode_server(ServerEnvelope(1, 0, Paired(bytes(32))))])
+
+    thread = threading.Thread(target=say_yes)
+    thread.start()
+    steps = pair_key(Address("127.0.0.1", port), server.public, own, "7KQ2-M4XD-9PTR", "ann")
+    with pytest.raises(TrustError, match="does not know the join code"):
+        deque(steps, maxlen=0)
+    thread.join()
+    context.destroy(linger=0)
+
+
+def test_a_session_where_many_pair_at_once_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As when a class puts on its headsets: nobody has to type the code again."""
+    monkeypatch.setattr(resolver_module, "PAIR_RETRY_S", 0.01)
+    monkeypatch.setattr(resolver_module, "ANSWER_S", 1.0)
+    monkeypatch.setattr(pairing, "ITERATIONS", 1)
+    server, own, code = KeyPair.generate(), KeyPair.generate(), "7KQ2-M4XD-9PTR"
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    session = context.socket(zmq.ROUTER)
+    session.curve_server = True
+    session.curve_publickey, session.curve_secretkey = server.public.encode(), server.secret.encode()
+    port = session.bind_to_random_port("tcp://127.0.0.1")
+    proof = pairing.server_proof(pairing.stretch(code, server.raw_public), server.raw_public, own.raw_public)
+    busy, yes = Refused(RefusalCode.RATE, "many pair at once", "try again in a second"), Paired(proof)
+    asked: list[bytes] = []
+
+    def answer() -> None:
+        for said in (busy, None, busy, yes):
+            route, request = session.recv_multipart()
+            asked.append(request)
+            if said is not None:
+                session.send_multipart([route, encode_server(ServerEnvelope(1, 0, said))])
+
+    thread = threading.Thread(target=answer, daemon=True)
+    thread.start()
+    deque(pair_key(Address("127.0.0.1", port), server.public, own, code, "ann"), maxlen=0)
+    thread.join()
+    assert len(asked) == 4
+    assert len(set(asked)) == 1
+    context.destroy(linger=0)
+
+
+def test_a_session_of_this_machine_needs_no_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "mine"))
+    plain = LiveSession()
+    try:
+        with Client(plain.address, name="ann", join_code="7KQ2-M4XD-9PTR"):
+            pass
+    finally:
+        plain.close()
+    assert not (tmp_path / "mine").exists()
+
+
+def test_a_client_may_come_before_its_session(lab: Lab) -> None:
+    lab.join(lab.address, join_code=lab.code()).close()
+    port = Address.parse(lab.address).port
+    lab.session.close()
+    client = Client(lab.address, name="ann")
+    try:
+        client.open()
+        client.wait_for(lambda c: False, 0.5)
+        assert not client.ready
+        lab.session = LiveSession(
+            curve=True, key_home=str(lab.server.path), control_port=port, session_name="later", session_id="s2"
+        )
+        assert client.wait_for(lambda c: c.ready, 10.0)
+    finally:
+        client.close()
+
+
+def test_what_does_not_go_together_is_told() -> None:
+    with pytest.raises(ClientError, match="not both"):
+        Client("127.0.0.1:1", session="lab")

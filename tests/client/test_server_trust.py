@@ -1,0 +1,94 @@
+"""Which key is trusted: every combination of what was given, stored and offered."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from zmq.utils import z85
+
+from iris_session.client import TrustError
+from iris_session.client.address import Address
+from iris_session.client.endpoint_resolver import ServerTrust, known_fingerprints
+from iris_session.security import KeyHome
+
+A, B = (z85.encode(bytes([first] * 32)).decode() for first in (1, 2))
+LAB = Address("10.0.0.5", 7721)
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> KeyHome:
+    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "home"))
+    return KeyHome()
+
+
+@pytest.mark.parametrize(
+    ("given", "stored", "offered", "loopback", "used"),
+    [
+        ("", "", A, False, A),  # at first sight
+        ("", A, A, False, A),
+        (A, "", A, False, A),
+        (A, A, A, False, A),
+        ("", "", None, False, None),  # nothing known, nothing said: wait
+        ("", A, None, False, A),  # its introduction may be blocked by a firewall
+        (A, "", None, False, A),
+        ("", "", None, True, ""),
+        ("", "", "", True, ""),
+        ("", A, "", True, ""),  # encrypted yesterday, a plain session of this machine today
+        ("", "", A, True, A),
+    ],
+)
+def test_the_key_that_is_used(
+    home: KeyHome, given: str, stored: str, offered: str | None, loopback: bool, used: str | None
+) -> None:
+    if stored:
+        home.known_servers.pin(str(LAB), "lab-1", stored)
+    address = Address(LAB.host, LAB.port, given)
+    assert ServerTrust(home, address).select_key(offered, loopback=loopback) == used
+
+
+@pytest.mark.parametrize(
+    ("given", "stored", "offered", "loopback"),
+    [
+        ("", A, B, False),  # somebody else answers
+        ("", A, B, True),
+        (A, "", B, False),
+        (A, B, A, False),  # the code belongs to another session than the one that is known
+        (A, B, None, False),
+        ("", "", "", False),  # not encrypted over a network
+        ("", A, "", False),
+        (A, "", "", True),
+    ],
+)
+def test_another_key_is_an_error_and_never_stored(
+    home: KeyHome, given: str, stored: str, offered: str | None, loopback: bool
+) -> None:
+    if stored:
+        home.known_servers.pin(str(LAB), "lab-1", stored)
+    trust = ServerTrust(home, Address(LAB.host, LAB.port, given))
+    with pytest.raises(TrustError, match=r"10\.0\.0\.5:7721"):
+        trust.select_key(offered, loopback=loopback)
+    if stored:
+        with pytest.raises(TrustError, match="iris-session keys forget"):
+            trust.store("lab-1", A if stored == B else B)
+    assert [one.key for one in home.known_servers.read()] == ([stored] if stored else [])
+
+
+def test_a_name_that_is_known_with_another_key_is_not_taken_at_first_sight(home: KeyHome) -> None:
+    home.known_servers.pin("10.0.0.7:7721", "lab-1", A)
+    ServerTrust(home, LAB, "lab-1").check_name(A)  # the machine has another address today
+    ServerTrust(home, LAB, "lab-2").check_name(B)
+    ServerTrust(home, LAB).check_name(B)  # not asked for by name
+    with pytest.raises(TrustError, match="another key"):
+        ServerTrust(home, LAB, "lab-1").check_name(B)
+
+
+def test_known_by_whatever_address(home: KeyHome) -> None:
+    assert known_fingerprints() == frozenset()
+    stored = home.known_servers.pin("10.0.0.7:7721", "lab-1", A)
+    trust = ServerTrust(home, LAB)
+    assert (trust.stored, trust.is_known(A), trust.is_known(B)) == ("", True, False)
+    assert known_fingerprints() == {stored.fingerprint}
+    (home.path / "known_servers.json").write_text("[")
+    with pytest.raises(TrustError, match="damaged"):
+        known_fingerprints()
