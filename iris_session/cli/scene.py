@@ -84,12 +84,12 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     """Print the report of a scene."""
     import msgspec
 
-    from iris_session.scene.extent import extent_of
-    from iris_session.scene.report import report
+    from iris_session.scene.extent import compute_extent
+    from iris_session.scene.report import build_report
 
     parsed, store = _parse_scene(arguments)
-    extent = extent_of(parsed.spec, store)
-    found = report(parsed.spec, parsed.scene_hash, parsed.skipped, extent)
+    extent = compute_extent(parsed.spec, store)
+    found = build_report(parsed.spec, parsed.scene_hash, parsed.skipped, extent)
     if arguments.json:
         print_json({**msgspec.to_builtins(found), "notes": parsed.notes})
     else:
@@ -98,10 +98,10 @@ def run_inspect(arguments: argparse.Namespace) -> int:
 
 
 def _print_report(spec: SceneSpec, found: SceneReport, notes: tuple[str, ...]) -> None:
-    from iris_session.scene.extent import coordinates, size_text
-    from iris_session.scene.report import tree
+    from iris_session.scene.extent import format_coordinates, format_size
+    from iris_session.scene.report import format_tree
 
-    for line in tree(spec):
+    for line in format_tree(spec):
         print(line)
     totals = found.totals
     print(
@@ -110,8 +110,8 @@ def _print_report(spec: SceneSpec, found: SceneReport, notes: tuple[str, ...]) -
     )
     if found.extent is not None:
         box = found.extent
-        low, high = (", ".join(coordinates(box, corner)) for corner in (box.low, box.high))
-        print(f"extent: {size_text(box)} along x, y, z, from ({low}) to ({high}), planes not counted")
+        low, high = (", ".join(format_coordinates(box, corner)) for corner in (box.low, box.high))
+        print(f"extent: {format_size(box)} along x, y, z, from ({low}) to ({high}), planes not counted")
     for text in notes:
         print(f"note: {text}")
     print(
@@ -138,7 +138,7 @@ def run_export(arguments: argparse.Namespace) -> int:
     from iris_session.scene import SceneBuildError
     from iris_session.scene.glb import write_glb
     from iris_session.scene.importers.references import files_read
-    from iris_session.scene.report import not_in_glb
+    from iris_session.scene.report import list_glb_differences
 
     out = expand_path(arguments.out)
     if out.suffix.lower() != ".glb":
@@ -155,7 +155,7 @@ def run_export(arguments: argparse.Namespace) -> int:
         raise CommandError(str(error)) from None
     except OSError as error:
         raise CommandError(f"{out} cannot be written: {error.strerror or error}") from None
-    simplified = not_in_glb(parsed.spec)
+    simplified = list_glb_differences(parsed.spec)
     if arguments.json:
         lists = {"skipped": parsed.skipped, "simplified": simplified, "notes": parsed.notes}
         print_json({"file": str(out), "bytes": size, "scene_hash": parsed.scene_hash, **lists})
@@ -358,7 +358,7 @@ def check_model_units(spec: SceneSpec) -> tuple[str, ...]:
 
     Only the largest mesh is considered: poses are in metres, and a hall may be large.
     """
-    from iris_session.scene.extent import largest_mesh, unit_hint
+    from iris_session.scene.extent import format_unit_hint, largest_mesh_side
 
-    hint = unit_hint(largest_mesh(spec), _MESH_SCALE_ADVICE)
+    hint = format_unit_hint(largest_mesh_side(spec), _MESH_SCALE_ADVICE)
     return (f"its largest mesh is {hint}",) if hint else ()

@@ -203,20 +203,20 @@ def run(arguments: argparse.Namespace) -> int:
 def _describe_shown_file(session: Session | ScenePublisher, path: Path) -> str:
     """Return what is shown, its extent, and the meshes that should be simplified."""
     from iris_session.scene import AssetStore, SceneBuildError
-    from iris_session.scene.extent import extent_of, size_text
-    from iris_session.scene.report import large_meshes
+    from iris_session.scene.extent import compute_extent, format_size
+    from iris_session.scene.report import list_large_meshes
 
     spec, what = session.scene, f"showing {path.name}, without robots"
     if spec is None:
         return what
     where = session.config.assets
     try:
-        extent = extent_of(spec, AssetStore(None if isinstance(where, bool) else where))
+        extent = compute_extent(spec, AssetStore(None if isinstance(where, bool) else where))
     except (OSError, SceneBuildError):  # the session reports a damaged store
         extent = None
     if extent is not None:
-        what += f"; its extent is {size_text(extent)}"
-    return "\n".join((what, *large_meshes(spec)))
+        what += f"; its extent is {format_size(extent)}"
+    return "\n".join((what, *list_large_meshes(spec)))
 
 
 def _serve(

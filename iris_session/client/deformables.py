@@ -24,7 +24,7 @@ from iris_session.client.media import MediaFeed
 from iris_session.protocol.assets import is_address
 from iris_session.protocol.names import ArrayKind, ArrayName, MediaEncoding
 from iris_session.protocol.scene import Deformable, decode_scene
-from iris_session.scene.arrays import decode_arrays, require
+from iris_session.scene.arrays import decode_arrays, require_array
 from iris_session.scene.errors import AssetDecodeError
 from iris_session.streams.deformable import DeformableDecoder
 from iris_session.streams.deformable_topology import MAX_FACES, MAX_VERTICES, DeformableTopology
@@ -70,11 +70,11 @@ def read_mesh(spec: Deformable, arrays: Mapping[str, NDArray[Any]], n_vertices: 
     corners = 2 if spec.dim == ROPE else 3
     rows = np.arange(n_vertices, dtype=np.int32)
     if ArrayName.VERTEX in arrays:
-        numbers = require(arrays, ArrayName.VERTEX, "u2 u4", (n_vertices,))
+        numbers = require_array(arrays, ArrayName.VERTEX, "u2 u4", (n_vertices,))
         if int(numbers.max(initial=0)) >= MAX_VERTICES:
             raise ValueError(f"deformable {spec.name!r} numbers its vertices beyond {MAX_VERTICES}")
         rows = numbers.astype(np.int32)
-    places = require(arrays, ArrayName.ELEMENTS, "u2 u4", (None, corners))
+    places = require_array(arrays, ArrayName.ELEMENTS, "u2 u4", (None, corners))
     if len(places) > MAX_FACES or int(places.max(initial=0)) >= n_vertices:
         raise ValueError(
             f"deformable {spec.name!r} has {len(places)} elements up to vertex {int(places.max(initial=0))}: "
@@ -84,7 +84,7 @@ def read_mesh(spec: Deformable, arrays: Mapping[str, NDArray[Any]], n_vertices: 
     uv = None
     if ArrayName.UV in arrays:
         # A copy: no view of the asset.
-        uv = require(arrays, ArrayName.UV, "f4", (len(places), corners, 2)).astype(np.float32)
+        uv = require_array(arrays, ArrayName.UV, "f4", (len(places), corners, 2)).astype(np.float32)
     faces, edges = (none, elements) if corners == 2 else (elements, none)
     for array in (faces, edges, rows, uv):
         if array is not None:

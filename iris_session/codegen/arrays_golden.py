@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.assets import ARRAYS_MAGIC, ArrayHeader, ArrayInfo
 from iris_session.protocol.names import ArrayCodec, ArrayFilter, ArrayKind
-from iris_session.scene.arrays import Stored, decode_arrays, encode_arrays
+from iris_session.scene.arrays import StoredArray, decode_arrays, encode_arrays
 from iris_session.scene.meshes import MeshArrays, encode_mesh, encode_mesh_quantised
 
 #: Of one name, told by their content.
@@ -32,14 +32,14 @@ def vectors() -> Iterator[tuple[str, str, bytes]]:
     """Name, kind and bytes of every asset."""
     for filter_kind in (ArrayFilter.NONE, ArrayFilter.SHUFFLE, ArrayFilter.DELTA, ArrayFilter.UP):
         arrays = [
-            Stored(dtype, values, filter_kind)
+            StoredArray(dtype, values, filter_kind)
             for dtype, values in _of_every_dtype().items()
             if dtype != "f4" or filter_kind != ArrayFilter.DELTA
         ]
         yield f"{filter_kind}: every dtype", ArrayKind.MESH, encode_arrays(ArrayKind.MESH, arrays)
     ramp = np.add.outer(np.arange(32), np.arange(24)).astype(np.uint8)[:, :, None].repeat(3, axis=2)
     for filter_kind in (ArrayFilter.NONE, ArrayFilter.UP):
-        image = encode_arrays(ArrayKind.IMAGE, [Stored("pixels", ramp, filter_kind)])
+        image = encode_arrays(ArrayKind.IMAGE, [StoredArray("pixels", ramp, filter_kind)])
         yield f"{filter_kind}: an image, packed", ArrayKind.IMAGE, image
     mesh = _mesh()
     yield "a mesh, exact", ArrayKind.MESH, encode_mesh(mesh)
@@ -48,8 +48,8 @@ def vectors() -> Iterator[tuple[str, str, bytes]]:
     yield "a mesh with colours at its corners, exact", ArrayKind.MESH, encode_mesh(coloured)
     yield "a mesh with colours at its corners, quantised", ArrayKind.MESH, encode_mesh_quantised(coloured)[0]
     empty = [
-        Stored("index", np.zeros((0, 3), np.uint16), ArrayFilter.DELTA),
-        Stored("position", np.zeros((0, 3), "f4")),
+        StoredArray("index", np.zeros((0, 3), np.uint16), ArrayFilter.DELTA),
+        StoredArray("position", np.zeros((0, 3), "f4")),
     ]
     yield "arrays of nothing", ArrayKind.MESH, encode_arrays(ArrayKind.MESH, empty)
     yield "no arrays", ArrayKind.MESH, encode_arrays(ArrayKind.MESH, [])
@@ -57,7 +57,7 @@ def vectors() -> Iterator[tuple[str, str, bytes]]:
 
 def malformed() -> Iterator[tuple[str, bytes]]:
     """Name and bytes of what no reader may take for an asset of kind `mesh`."""
-    good = encode_arrays(ArrayKind.MESH, [Stored("a", np.zeros(200, np.uint8))])
+    good = encode_arrays(ArrayKind.MESH, [StoredArray("a", np.zeros(200, np.uint8))])
     yield "empty", b""
     yield "another magic", b"IRA2" + good[4:]
     yield "truncated", good[:-1]

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from iris_session.protocol.scene import Deformable
 from iris_session.recording.scene_geometry import WORLD, Pixels, Rgba8, to_rgba8
 from iris_session.scene import AssetDecodeError
-from iris_session.scene.arrays import require
-from iris_session.scene.mesh_processing import unit
+from iris_session.scene.arrays import require_array
+from iris_session.scene.mesh_processing import normalise
 from iris_session.streams.deformable import DeformableDecoder
 from iris_session.streams.deformable_topology import DeformableTopology
 from iris_session.streams.errors import StreamError
@@ -37,12 +37,12 @@ class DrawnDeformable:
     ) -> None:
         corners = 2 if deformable.dim == 1 else 3
         self.entity = entity
-        self._rest: Floats = require(arrays, "position", "f4", (None, 3))
-        elements = require(arrays, "elements", "u2 u4", (None, corners)).astype(np.int64)
+        self._rest: Floats = require_array(arrays, "position", "f4", (None, 3))
+        elements = require_array(arrays, "elements", "u2 u4", (None, corners)).astype(np.int64)
         if elements.size and int(elements.max()) >= len(self._rest):
             raise AssetDecodeError(f"deformable {deformable.name!r} has no vertex {int(elements.max())}")
         try:
-            topology = DeformableTopology.from_bytes(require(arrays, "plan", "u1", (None,)).tobytes())
+            topology = DeformableTopology.from_bytes(require_array(arrays, "plan", "u1", (None,)).tobytes())
         except StreamError as error:
             raise AssetDecodeError(f"deformable {deformable.name!r}: {error}") from error
         if topology.n_vertices != len(self._rest):
@@ -54,7 +54,7 @@ class DrawnDeformable:
         if deformable.dim == 1:
             self._form = _Lines(elements)
         else:
-            uv = require(arrays, "uv", "f4", (len(elements), 3, 2)) if "uv" in arrays else None
+            uv = require_array(arrays, "uv", "f4", (len(elements), 3, 2)) if "uv" in arrays else None
             self._form = _Surface(elements, uv, texture)
 
     def build_components(self) -> list[Any]:
@@ -136,4 +136,4 @@ class _Surface:
             a, b, c = (vertices[self._corners[:, k]] for k in range(3))
             across = np.cross(b - a, c - a)
             normal[self._owners] = np.add.reduceat(across[self._order // 3], self._starts, axis=0)
-        return unit(normal).astype(np.float32)
+        return normalise(normal).astype(np.float32)

@@ -23,8 +23,13 @@ from iris_session.protocol.server_messages import BodyInfo
 from iris_session.recording.journal import unpack_model
 from iris_session.recording.messages import SceneAssets
 from iris_session.scene import AssetStore, EncodeOptions, MeshArrays, decode_arrays, decode_image, decode_mesh
-from iris_session.scene.cube_maps import Atlas, Cubes, baked, direction_scale
-from iris_session.scene.shapes import height_field, on_deformable, primitive, with_coordinates
+from iris_session.scene.cube_maps import Atlas, CubeMapReader, bake_cube_map, direction_scale
+from iris_session.scene.shapes import (
+    add_texture_coordinates,
+    build_height_field,
+    build_primitive,
+    repeat_texture_coordinates,
+)
 
 WORLD: Final = "world"
 #: Half edge [m] at which an infinite plane is drawn, and half its drawn thickness.
@@ -112,7 +117,7 @@ class SceneReader:
         self._places = place_bodies(spec, bodies)
         self._meshes: dict[tuple[int, int], MeshArrays] = {}
         self._textures: dict[int, Pixels | None] = {}
-        self._cubes = Cubes(spec, store, CUBE_SIDE)
+        self._cubes = CubeMapReader(spec, store, CUBE_SIDE)
         self._baked: dict[tuple[Geometry, int], MeshArrays] = {}
 
     def is_shown(self, thing: Visual | Deformable) -> bool:
@@ -127,14 +132,14 @@ class SceneReader:
     def read_shape(self, visual: Visual) -> VisualShape:
         """Shape and surface."""
         geometry = visual.geometry
-        cube = self._cubes.worn(visual.material, geometry)
+        cube = self._cubes.find(visual.material, geometry)
         atlas, tint = (None, _WHITE) if cube is None else (cube.atlas, cube.tint)
         texture = self.read_texture(visual.material) if atlas is None else _with_colours(atlas.pixels)
         mesh = self._mesh(geometry)
         if atlas is not None and mesh is not None and mesh.triangles > MOST_BAKED:
             return VisualShape(MESH, mesh=mesh, tint=_mean_colour(atlas.pixels))
         if mesh is None and texture is not None:
-            mesh = primitive(_ended(geometry))
+            mesh = build_primitive(_ended(geometry))
         if mesh is None:
             return VisualShape(_FORMS.get(geometry.kind, BOX), _half_sizes(geometry), tint=tint)
         if texture is None:
@@ -142,14 +147,14 @@ class SceneReader:
         if atlas is not None:
             mesh = self._with_atlas(mesh, visual, atlas)
         else:
-            mesh = with_coordinates(mesh, geometry, self._spec.materials[visual.material])
+            mesh = add_texture_coordinates(mesh, geometry, self._spec.materials[visual.material])
         return VisualShape(MESH, mesh=mesh, uv=mesh.uv, texture=texture)
 
     def _with_atlas(self, mesh: MeshArrays, visual: Visual, atlas: Atlas) -> MeshArrays:
         key = visual.geometry, visual.material
         if key not in self._baked:
             scale = direction_scale(self._spec, visual.geometry, visual.material)
-            self._baked[key] = baked(mesh, visual.geometry, scale, atlas)
+            self._baked[key] = bake_cube_map(mesh, visual.geometry, scale, atlas)
         return self._baked[key]
 
     def read_texture(self, material: int) -> Pixels | None:
@@ -165,7 +170,7 @@ class SceneReader:
         """The asset of a deformable, with texture coordinates as its material repeats them."""
         arrays = decode_arrays(self._store.get(deformable.address), ArrayKind.DEFORMABLE)
         worn = None if deformable.material < 0 else self._spec.materials[deformable.material]
-        uv = on_deformable(arrays.get("uv"), worn)
+        uv = repeat_texture_coordinates(arrays.get("uv"), worn)
         return arrays if uv is None else {**arrays, "uv": uv}
 
     def _mesh(self, geometry: Geometry) -> MeshArrays | None:
@@ -180,7 +185,7 @@ class SceneReader:
         if mesh >= 0:
             return decode_mesh(self._store.get(self._spec.meshes[mesh].levels[0].address))
         field = self._spec.hfields[hfield]
-        return height_field(field, decode_arrays(self._store.get(field.address), ArrayKind.GRID)["elevation"])
+        return build_height_field(field, decode_arrays(self._store.get(field.address), ArrayKind.GRID)["elevation"])
 
     def _texture(self, index: int) -> Pixels | None:
         texture = self._spec.textures[index]

@@ -8,7 +8,7 @@
 from iris_session.assets.errors import AssetMissingError
 from iris_session.assets.store import AssetStore, Hold, default_root
 from iris_session.scene.arrays import decode_arrays, encode_arrays
-from iris_session.scene.asset_builder import Builder, EncodeOptions
+from iris_session.scene.asset_builder import AssetBuilder, EncodeOptions
 from iris_session.scene.errors import AssetDecodeError, SceneBuildError
 from iris_session.scene.images import decode_image, encode_image
 from iris_session.scene.meshes import MeshArrays, decode_mesh, encode_mesh, encode_mesh_quantised
@@ -17,7 +17,7 @@ __all__ = [
     "AssetStore",
     "Hold",
     "default_root",
-    "Builder",
+    "AssetBuilder",
     "EncodeOptions",
     "MeshArrays",
     "encode_mesh",

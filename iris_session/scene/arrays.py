@@ -37,7 +37,7 @@ LEVEL: Final = 1
 
 
 @dataclass(frozen=True)
-class Stored:
+class StoredArray:
     """One array as it is stored. `scale`, `offset`: of quantised values, see `ArrayInfo`."""
 
     name: str
@@ -47,12 +47,12 @@ class Stored:
     offset: tuple[float, ...] = ()
 
 
-def encode_arrays(kind: str, arrays: Sequence[Stored], max_error: float = 0.0) -> bytes:
+def encode_arrays(kind: str, arrays: Sequence[StoredArray], max_error: float = 0.0) -> bytes:
     """The asset. Arrays that do not shrink are stored as they are."""
     infos, bodies = [], []
     for array in arrays:
         values = np.ascontiguousarray(array.values)
-        plain = filtered(values, array.filter)
+        plain = apply_filter(values, array.filter)
         packed: bytes | memoryview = zstandard.ZstdCompressor(level=LEVEL).compress(plain)
         codec = ArrayCodec.ZSTD
         if len(packed) >= len(plain):
@@ -73,12 +73,14 @@ def decode_arrays(
     header, start = read_header(data)
     if header.kind != kind:
         raise AssetDecodeError(f"an asset of kind {header.kind!r}, where {kind!r} is expected")
-    total = sum(_size(info) * (_SCALED // _DTYPES[info.dtype].itemsize if info.scale else 1) for info in header.arrays)
+    total = sum(
+        _stated_bytes(info) * (_SCALED // _DTYPES[info.dtype].itemsize if info.scale else 1) for info in header.arrays
+    )
     if total > max_bytes:
         raise AssetDecodeError(f"arrays of {total} bytes, at most {max_bytes} are read")
     view, found = memoryview(data), {}
     for info in header.arrays:
-        found[info.name] = _scaled(info, _decode_one(info, view[start : start + info.bytes]))
+        found[info.name] = _apply_scale(info, _decode_array(info, view[start : start + info.bytes]))
         start += info.bytes
     return found
 
@@ -106,7 +108,7 @@ def read_header(data: bytes | bytearray | memoryview) -> tuple[ArrayHeader, int]
     return header, start
 
 
-def require(arrays: Mapping[str, Array], name: str, dtypes: str, shape: Sequence[int | None]) -> Array:
+def require_array(arrays: Mapping[str, Array], name: str, dtypes: str, shape: Sequence[int | None]) -> Array:
     """The array `name`, whose dtype is one of `dtypes` (`u2 u4`) and whose shape fits (`None`: any length)."""
     array = arrays.get(name)
     if array is None:
@@ -122,28 +124,28 @@ def require(arrays: Mapping[str, Array], name: str, dtypes: str, shape: Sequence
 # --- filters ---------------------------------------------------------------------------------------------------------
 
 
-def filtered(values: Array, kind: str) -> memoryview:
+def apply_filter(values: Array, kind: str) -> memoryview:
     """The bytes that are compressed, of an array in C order."""
     if kind == ArrayFilter.NONE or not values.size:
-        return _bytes(values)
+        return _encode_bytes(values)
     if kind == ArrayFilter.UP:
         rows = values.reshape(values.shape[0], -1).view(np.uint8)
         up = rows.copy()
         np.subtract(rows[1:], rows[:-1], up[1:])
-        return _bytes(up)
+        return _encode_bytes(up)
     flat = values.reshape(-1)
     if kind == ArrayFilter.DELTA:
         delta = flat.copy()
         np.subtract(flat[1:], flat[:-1], delta[1:])
         flat = delta
-    return _bytes(np.ascontiguousarray(flat.view(np.uint8).reshape(-1, values.dtype.itemsize).T))
+    return _encode_bytes(np.ascontiguousarray(flat.view(np.uint8).reshape(-1, values.dtype.itemsize).T))
 
 
-def _bytes(values: Array) -> memoryview:
+def _encode_bytes(values: Array) -> memoryview:
     return values.reshape(-1).view(np.uint8).data
 
 
-def _unfiltered(info: ArrayInfo, plain: bytes | memoryview) -> Array:
+def _undo_filter(info: ArrayInfo, plain: bytes | memoryview) -> Array:
     dtype = _DTYPES[info.dtype]
     if info.filter == ArrayFilter.NONE:
         return np.frombuffer(plain, dtype).reshape(info.shape)
@@ -165,7 +167,7 @@ def _unfiltered(info: ArrayInfo, plain: bytes | memoryview) -> Array:
     return flat.reshape(info.shape)
 
 
-def _size(info: ArrayInfo) -> int:
+def _stated_bytes(info: ArrayInfo) -> int:
     if info.dtype not in _DTYPES:
         raise AssetDecodeError(f"unknown dtype {info.dtype!r}, known: {', '.join(_DTYPES)}")
     size = math.prod(info.shape)
@@ -176,12 +178,12 @@ def _size(info: ArrayInfo) -> int:
     return size * _DTYPES[info.dtype].itemsize
 
 
-def _decode_one(info: ArrayInfo, packed: memoryview) -> Array:
+def _decode_array(info: ArrayInfo, packed: memoryview) -> Array:
     if info.filter not in (ArrayFilter.NONE, ArrayFilter.SHUFFLE, ArrayFilter.DELTA, ArrayFilter.UP):
         raise AssetDecodeError(f"unknown filter {info.filter!r}")
     if info.filter == ArrayFilter.DELTA and info.dtype == "f4":
         raise AssetDecodeError("differences of float32 are not exact")
-    size = _size(info)
+    size = _stated_bytes(info)
     plain: bytes | memoryview
     if info.codec == ArrayCodec.ZSTD:
         plain = _decompress(packed, size)
@@ -193,7 +195,7 @@ def _decode_one(info: ArrayInfo, packed: memoryview) -> Array:
         raise AssetDecodeError(f"array {info.name!r} has {len(plain)} bytes, its shape and dtype need {size}")
     if not size:
         return np.zeros(info.shape, _DTYPES[info.dtype])
-    return _unfiltered(info, plain)
+    return _undo_filter(info, plain)
 
 
 def _decompress(packed: memoryview, size: int) -> bytes:
@@ -206,7 +208,7 @@ def _decompress(packed: memoryview, size: int) -> bytes:
         raise AssetDecodeError(f"damaged Zstandard frame: {error}") from None
 
 
-def _scaled(info: ArrayInfo, stored: Array) -> Array:
+def _apply_scale(info: ArrayInfo, stored: Array) -> Array:
     if not info.scale:
         return stored
     last = info.shape[-1]
@@ -222,7 +224,7 @@ def _scaled(info: ArrayInfo, stored: Array) -> Array:
     return values
 
 
-def array_of(values: Any, what: str) -> NDArray[Any]:
+def to_array(values: Any, what: str) -> NDArray[Any]:
     """What a caller gave, as an array. Raises `SceneBuildError` for what is none, as rows of different lengths."""
     try:
         return np.asarray(values)

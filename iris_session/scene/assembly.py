@@ -37,27 +37,27 @@ from iris_session.protocol.scene import (
     check_scene,
     encode_scene,
 )
-from iris_session.scene.asset_builder import Builder, EncodeOptions, MeshNote, Work
-from iris_session.scene.budget import with_totals
+from iris_session.scene.asset_builder import AssetBuilder, EncodeOptions, MeshNote, Work
+from iris_session.scene.budget import add_totals
 from iris_session.scene.composed import Articulation, ComposedScene, DeformableSource
 from iris_session.scene.elements import (
     MAX_TRIANGLES,
-    Item,
-    Loaded,
-    Look,
+    Appearance,
+    DrawnItem,
+    LoadedFile,
     Matrix,
-    Picture,
-    composed,
-    matrix_of,
-    pose_of,
-    rigid_and_rest,
-    solid,
-    vec3,
+    TextureImage,
+    compose_poses,
+    is_solid,
+    split_rigid,
+    to_matrix,
+    to_pose,
+    to_vec3,
 )
 from iris_session.scene.errors import SceneBuildError
-from iris_session.scene.extent import box_extent
+from iris_session.scene.extent import compute_box_extent
 from iris_session.scene.importers.urdf import Robot
-from iris_session.scene.mesh_processing import scaled
+from iris_session.scene.mesh_processing import scale_mesh
 from iris_session.scene.meshes import MeshArrays, encode_deformable
 from iris_session.streams.deformable_topology import DeformableTopology
 
@@ -69,16 +69,16 @@ _FACES: Final = 6
 MAX_COORDINATE_M: Final = 1e6
 
 
-def assemble(
-    world: World, environment: Environment | None, store: AssetStore, options: EncodeOptions | None, threads: int
+def assemble_scene(
+    world: SceneContent, environment: Environment | None, store: AssetStore, options: EncodeOptions | None, threads: int
 ) -> ComposedScene:
     """Builds it all. Raises `SceneBuildError`."""
-    builder = Builder(store, options, threads)
-    ids, bodies = _bodies(world)
-    placed = [rigid_and_rest(item.matrix) for item in world.items]
-    meshes, worn_mesh = _meshes(world.items, [rest for _, rest in placed], builder)
-    looks = [*(item.look for item in world.items), *(flexible.look for flexible in world.flexibles)]
-    textures, materials, worn_look, skybox = _looks(looks, world.skybox, builder)
+    builder = AssetBuilder(store, options, threads)
+    ids, bodies = _build_bodies(world)
+    placed = [split_rigid(item.matrix) for item in world.items]
+    meshes, worn_mesh = _build_meshes(world.items, [rest for _, rest in placed], builder)
+    looks = [*(item.appearance for item in world.items), *(flexible.look for flexible in world.deformables)]
+    textures, materials, worn_look, skybox = _build_materials(looks, world.skybox, builder)
     visuals = tuple(
         Visual(
             id=k,
@@ -86,14 +86,14 @@ def assemble(
             name=item.name,
             T_body_visual=placed[k][0],
             group=0,
-            geometry=_geometry(item, worn_mesh[k], meshes),
+            geometry=_build_geometry(item, worn_mesh[k], meshes),
             material=worn_look[k],
-            rgba=item.look.rgba,
+            rgba=item.appearance.rgba,
         )
         for k, item in enumerate(world.items)
     )
-    deformables, sources = _deformables(world.flexibles, worn_look[len(visuals) :], builder)
-    spec = with_totals(
+    deformables, sources = _build_deformables(world.deformables, worn_look[len(visuals) :], builder)
+    spec = add_totals(
         SceneSpec(
             name=world.name,
             source="composed",
@@ -107,13 +107,13 @@ def assemble(
             deformables=deformables,
         )
     )
-    surroundings = environment or _surroundings(spec, sources)
+    surroundings = environment or _default_environment(spec, sources)
     if skybox >= 0:
         surroundings = msgspec.structs.replace(surroundings, skybox=skybox)
     spec = msgspec.structs.replace(spec, environment=surroundings)
     return ComposedScene(
         spec=spec,
-        scene_hash=store.put(_readable(spec)),
+        scene_hash=store.put(_encode_checked(spec)),
         moving=tuple(body.name for body in bodies if body.moving),
         poses=tuple(body.T_world_body for body in bodies if body.moving),
         articulations=dict(world.articulations),
@@ -125,7 +125,7 @@ def assemble(
     )
 
 
-def _readable(spec: SceneSpec) -> bytes:
+def _encode_checked(spec: SceneSpec) -> bytes:
     """The bytes of the specification. Raises `SceneBuildError` for one that no client would read, or draw."""
     try:
         check_scene(spec)
@@ -141,14 +141,14 @@ def _readable(spec: SceneSpec) -> bytes:
     return encoded
 
 
-def _bodies(world: World) -> tuple[dict[int, int], tuple[Body, ...]]:
+def _build_bodies(world: SceneContent) -> tuple[dict[int, int], tuple[Body, ...]]:
     """Ids by the places of things (-1: the world), and the bodies: moving ones first."""
-    order = sorted(range(len(world.things)), key=lambda k: not world.things[k].moving)
+    order = sorted(range(len(world.bodies)), key=lambda k: not world.bodies[k].moving)
     ids = {-1: 0, **{place: number for number, place in enumerate(order, start=1)}}
     bodies = [Body(0, "world", -1, IDENTITY, IDENTITY, moving=False)]
     for place in order:
-        thing = world.things[place]
-        above = world.things[thing.parent].pose if thing.parent >= 0 else IDENTITY
+        thing = world.bodies[place]
+        above = world.bodies[thing.parent].pose if thing.parent >= 0 else IDENTITY
         T_parent_body = thing.pose
         if thing.parent >= 0:
             T_parent_body = Pose(*compose(inverse((above.p, above.q)), (thing.pose.p, thing.pose.q)))
@@ -159,8 +159,8 @@ def _bodies(world: World) -> tuple[dict[int, int], tuple[Body, ...]]:
 # --- meshes -----------------------------------------------------------------------------------------------------------
 
 
-def _meshes(
-    items: Sequence[Item], rests: Sequence[Matrix | None], builder: Builder
+def _build_meshes(
+    items: Sequence[DrawnItem], rests: Sequence[Matrix | None], builder: AssetBuilder
 ) -> tuple[tuple[Mesh, ...], list[int]]:
     """Meshes, and for every item which of them it wears, -1 for a shape. What is equal to the bit is one."""
     pieces: dict[tuple[object, ...], tuple[str, MeshArrays, Matrix | None]] = {}
@@ -169,7 +169,7 @@ def _meshes(
         if item.mesh is None:
             keys.append(None)
             continue
-        mapped = item.mesh.uv is not None and bool(item.look.pictures)
+        mapped = item.mesh.uv is not None and bool(item.appearance.images)
         key: tuple[object, ...] = (id(item.mesh), None if rest is None else rest.tobytes(), mapped)
         mesh = item.mesh if mapped else replace(item.mesh, uv=None)  # coordinates of nothing would keep levels out
         pieces.setdefault(key, (item.name, mesh, rest))
@@ -204,14 +204,14 @@ def _check_copies(pieces: Iterable[tuple[str, MeshArrays, Matrix | None]]) -> No
             )
 
 
-def _mesh_work(builder: Builder, mesh: MeshArrays, rest: Matrix | None) -> Work[MeshNote]:
+def _mesh_work(builder: AssetBuilder, mesh: MeshArrays, rest: Matrix | None) -> Work[MeshNote]:
     marks = np.array([mesh.uv is not None, mesh.color is not None, rest is not None], np.uint8)
     given = (mesh.position, mesh.normal, mesh.index, mesh.uv, mesh.color, rest)
     raw: list[NDArray[Any]] = [marks, *(array for array in given if array is not None)]
-    return builder.mesh(raw, lambda: _within_reach(scaled(mesh, rest)))
+    return builder.mesh_work(raw, lambda: _check_reach(scale_mesh(mesh, rest)))
 
 
-def _within_reach(mesh: MeshArrays) -> MeshArrays:
+def _check_reach(mesh: MeshArrays) -> MeshArrays:
     """Raises `SceneBuildError` for coordinates that nobody can draw."""
     if not np.abs(mesh.position).max(initial=0.0) <= MAX_COORDINATE_M:  # NaN is not
         raise SceneBuildError(
@@ -220,7 +220,7 @@ def _within_reach(mesh: MeshArrays) -> MeshArrays:
     return mesh
 
 
-def _geometry(item: Item, mesh: int, meshes: Sequence[Mesh]) -> Geometry:
+def _build_geometry(item: DrawnItem, mesh: int, meshes: Sequence[Mesh]) -> Geometry:
     if mesh < 0:
         return Geometry(item.kind, item.size)
     low, high = meshes[mesh].low, meshes[mesh].high
@@ -231,14 +231,14 @@ def _geometry(item: Item, mesh: int, meshes: Sequence[Mesh]) -> Geometry:
 # --- looks ------------------------------------------------------------------------------------------------------------
 
 
-def _looks(
-    looks: Sequence[Look], skybox: Picture | None, builder: Builder
+def _build_materials(
+    looks: Sequence[Appearance], skybox: TextureImage | None, builder: AssetBuilder
 ) -> tuple[tuple[Texture, ...], tuple[Material, ...], list[int], int]:
     """Textures, materials, for every look its material (-1: its colour says all), and the texture of the skybox."""
-    pictures: dict[int, Picture] = {id(picture): picture for look in looks for _, picture in look.pictures}
+    pictures: dict[int, TextureImage] = {id(picture): picture for look in looks for _, picture in look.images}
     if skybox is not None:
         pictures[id(skybox)] = skybox
-    notes = builder.run([builder.texture(picture.pixels, picture.kind) for picture in pictures.values()])
+    notes = builder.run([builder.texture_work(picture.pixels, picture.kind) for picture in pictures.values()])
     found: dict[tuple[str, str, str], int] = {}
     textures: list[Texture] = []
     places: dict[int, int] = {}
@@ -255,12 +255,12 @@ def _looks(
     materials: dict[Material, int] = {}
     worn = []
     for look in looks:
-        uses = tuple(TextureUse(role, places[id(picture)]) for role, picture in look.pictures)
-        worn.append(-1 if look.plain else materials.setdefault(_material(look, uses), len(materials)))
+        uses = tuple(TextureUse(role, places[id(picture)]) for role, picture in look.images)
+        worn.append(-1 if look.is_plain_color else materials.setdefault(_to_material(look, uses), len(materials)))
     return tuple(textures), tuple(materials), worn, -1 if skybox is None else places[id(skybox)]
 
 
-def _material(look: Look, uses: tuple[TextureUse, ...]) -> Material:
+def _to_material(look: Appearance, uses: tuple[TextureUse, ...]) -> Material:
     return Material(
         name=look.name,
         rgba=look.rgba,
@@ -278,8 +278,8 @@ def _material(look: Look, uses: tuple[TextureUse, ...]) -> Material:
 # --- what bends, and what is around -----------------------------------------------------------------------------------
 
 
-def _deformables(
-    flexibles: Sequence[Flexible], materials: Sequence[int], builder: Builder
+def _build_deformables(
+    flexibles: Sequence[ComposedDeformable], materials: Sequence[int], builder: AssetBuilder
 ) -> tuple[tuple[Deformable, ...], list[DeformableSource]]:
     sources, works = [], []
     for k, one in enumerate(flexibles):
@@ -291,7 +291,7 @@ def _deformables(
         sources.append(DeformableSource(one.name, f"deformable-{k}", topology, one.vertices))
         uv = None if one.uv is None or one.elements.shape[1] == 2 else one.uv[one.elements]
         raw: list[bytes | NDArray[Any]] = [b"deformable", one.elements, one.vertices]
-        works.append(builder.blob([*raw, *([] if uv is None else [uv])], _encoder(one, uv, topology)))
+        works.append(builder.blob_work([*raw, *([] if uv is None else [uv])], _deformable_encoder(one, uv, topology)))
     notes = builder.run(works)
     listed = tuple(
         Deformable(
@@ -313,13 +313,15 @@ def _deformables(
     return listed, sources
 
 
-def _encoder(one: Flexible, uv: NDArray[np.float32] | None, topology: DeformableTopology) -> Callable[[], bytes]:
+def _deformable_encoder(
+    one: ComposedDeformable, uv: NDArray[np.float32] | None, topology: DeformableTopology
+) -> Callable[[], bytes]:
     return lambda: encode_deformable(one.elements, uv, one.vertices, topology)
 
 
-def _surroundings(spec: SceneSpec, sources: Sequence[DeformableSource]) -> Environment:
+def _default_environment(spec: SceneSpec, sources: Sequence[DeformableSource]) -> Environment:
     """Centre and extent of what is there at first, without planes; everything of it is near enough to be drawn."""
-    box = box_extent(spec, (source.vertices for source in sources))
+    box = compute_box_extent(spec, (source.vertices for source in sources))
     if box is None:
         return Environment()
     x, y, z = (0.5 * (low + high) for low, high in zip(box.low, box.high, strict=True))
@@ -331,7 +333,7 @@ def _surroundings(spec: SceneSpec, sources: Sequence[DeformableSource]) -> Envir
 
 
 @dataclass(frozen=True)
-class Thing:
+class ComposedBody:
     """A body to be. `parent`: an earlier thing by its place, -1 for the world. `pose`: T_world_body at first."""
 
     name: str
@@ -341,7 +343,7 @@ class Thing:
 
 
 @dataclass(frozen=True, eq=False)
-class Flexible:
+class ComposedDeformable:
     """A deformable to be; `uv` (n, 2) of the vertices."""
 
     name: str
@@ -350,29 +352,29 @@ class Flexible:
     uv: NDArray[np.float32] | None
     radius: float
     flat: bool
-    look: Look
+    look: Appearance
 
 
 @dataclass
-class World:
+class SceneContent:
     """All that was added. `names`: those that are taken. Bodies of `items`, `lights`, `cameras`: places in `things`."""
 
     name: str
-    things: list[Thing] = field(default_factory=list)
-    items: list[Item] = field(default_factory=list)
+    bodies: list[ComposedBody] = field(default_factory=list)
+    items: list[DrawnItem] = field(default_factory=list)
     lights: list[tuple[int, Light]] = field(default_factory=list)
     cameras: list[tuple[int, Camera]] = field(default_factory=list)
-    flexibles: list[Flexible] = field(default_factory=list)
+    deformables: list[ComposedDeformable] = field(default_factory=list)
     articulations: dict[str, Articulation] = field(default_factory=dict)
-    skybox: Picture | None = None
+    skybox: TextureImage | None = None
     names: set[str] = field(default_factory=set)
     skipped: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     @contextmanager
-    def whole(self) -> Iterator[None]:
+    def atomic(self) -> Iterator[None]:
         """What is added within is added whole, or, where something is raised, not at all."""
-        lists: tuple[list[Any], ...] = (self.things, self.items, self.lights, self.cameras, self.skipped, self.notes)
+        lists: tuple[list[Any], ...] = (self.bodies, self.items, self.lights, self.cameras, self.skipped, self.notes)
         lengths, names = [len(one) for one in lists], self.names.copy()
         try:
             yield
@@ -382,47 +384,51 @@ class World:
             self.names = names
             raise
 
-    def skip(self, texts: tuple[str, ...]) -> None:
+    def add_skipped(self, texts: tuple[str, ...]) -> None:
         """What clients will not see, each line once."""
         self.skipped += dict.fromkeys(text for text in texts if text not in self.skipped)
 
-    def note(self, texts: tuple[str, ...]) -> None:
+    def add_notes(self, texts: tuple[str, ...]) -> None:
         """What looks like a mistake, each line once."""
         self.notes += dict.fromkeys(text for text in texts if text not in self.notes)
 
     def add_robot(self, robot: Robot) -> None:
         """An articulation with its bodies, at rest."""
         articulation = robot.articulation
-        first = len(self.things)
-        for name, pose in articulation.poses({}).items():
-            self.things.append(Thing(name, -1, composed(articulation.T_world_root, pose), moving=True))
+        first = len(self.bodies)
+        for name, pose in articulation.compute_poses({}).items():
+            self.bodies.append(ComposedBody(name, -1, compose_poses(articulation.T_world_root, pose), moving=True))
         self.items += [replace(item, body=first + item.body) for item in robot.items]
         self.articulations[articulation.name] = articulation
         self.names.update((articulation.name, *articulation.bodies))
-        self.skip(robot.skipped)
-        self.note(robot.notes)
+        self.add_skipped(robot.skipped)
+        self.add_notes(robot.notes)
 
-    def add_nodes(self, loaded: Loaded, body: int, T_body_file: Matrix, look: Look | None, *, flat: bool) -> None:
+    def add_nodes(
+        self, loaded: LoadedFile, body: int, T_body_file: Matrix, look: Appearance | None, *, flat: bool
+    ) -> None:
         """A file on `body`. `flat`: everything on that one, else nodes with something on or below them become bodies.
 
         `look`, if there is one, replaces those of the file, and colours at vertices.
         """
-        self.skip(loaded.skipped)
+        self.add_skipped(loaded.skipped)
         bare: dict[int, MeshArrays] = {}
         places = [body] * len(loaded.nodes)
-        T_world_body = matrix_of(self.things[body].pose) if body >= 0 else np.eye(4)
-        used = _with_content(loaded)
+        T_world_body = to_matrix(self.bodies[body].pose) if body >= 0 else np.eye(4)
+        used = _nodes_with_content(loaded)
         several = len(used) > 1
         for k, node in enumerate(loaded.nodes):
             matrix = T_body_file @ node.matrix
-            if k in used and not solid(matrix):
-                self.skip((f"{self.things[body].name}: node {node.name!r} is scaled to nothing",))
+            if k in used and not is_solid(matrix):
+                self.add_skipped((f"{self.bodies[body].name}: node {node.name!r} is scaled to nothing",))
                 used.discard(k)
                 continue
             if not flat and several and k in used:
-                pose, rest = rigid_and_rest(T_world_body @ matrix)
-                self.things.append(Thing(node.name, places[node.parent] if node.parent >= 0 else body, pose, False))
-                places[k] = len(self.things) - 1
+                pose, rest = split_rigid(T_world_body @ matrix)
+                self.bodies.append(
+                    ComposedBody(node.name, places[node.parent] if node.parent >= 0 else body, pose, False)
+                )
+                places[k] = len(self.bodies) - 1
                 matrix = np.eye(4)
                 if rest is not None:
                     matrix[:3, :3] = rest
@@ -430,17 +436,19 @@ class World:
                 mesh = surface.mesh
                 if look is not None and mesh.color is not None:
                     mesh = bare.setdefault(id(mesh), replace(mesh, color=None))
-                self.items.append(Item(places[k], surface.name, matrix, look or surface.look or Look(), mesh))
-            self.lights += [(places[k], _light_at(matrix, light)) for light in node.lights]
+                self.items.append(
+                    DrawnItem(places[k], surface.name, matrix, look or surface.appearance or Appearance(), mesh)
+                )
+            self.lights += [(places[k], _place_light(matrix, light)) for light in node.lights]
             if node.cameras:
-                T = _looking(matrix)
+                T = _camera_pose(matrix)
                 self.cameras += [
-                    (places[k], msgspec.structs.replace(camera, T_body_camera=composed(T, camera.T_body_camera)))
+                    (places[k], msgspec.structs.replace(camera, T_body_camera=compose_poses(T, camera.T_body_camera)))
                     for camera in node.cameras
                 ]
 
 
-def _with_content(loaded: Loaded) -> set[int]:
+def _nodes_with_content(loaded: LoadedFile) -> set[int]:
     """Nodes with something on or below them, by their places."""
     used: set[int] = set()
     for k, node in enumerate(loaded.nodes):
@@ -451,17 +459,17 @@ def _with_content(loaded: Loaded) -> set[int]:
     return used
 
 
-def _light_at(matrix: Matrix, light: Light) -> Light:
+def _place_light(matrix: Matrix, light: Light) -> Light:
     """A light in the frame of its body, which `matrix` leads to. It shines where that turns it, mirrored or not."""
     p = matrix @ [*light.p_body, 1.0]
     along = matrix[:3, :3] @ light.direction_body
     along /= np.linalg.norm(along)
-    return msgspec.structs.replace(light, p_body=vec3(p), direction_body=vec3(along))
+    return msgspec.structs.replace(light, p_body=to_vec3(p), direction_body=to_vec3(along))
 
 
-def _looking(matrix: Matrix) -> Pose:
+def _camera_pose(matrix: Matrix) -> Pose:
     """T_body_camera of a camera that `matrix` leads from: it looks along its -z with its y up, mirrored or not."""
     back, up = matrix[:3, 2] / np.linalg.norm(matrix[:3, 2]), matrix[:3, 1]
     up = up - (up @ back) * back
     up /= np.linalg.norm(up)
-    return pose_of(np.stack([np.cross(up, back), up, back], axis=1), matrix[:3, 3])
+    return to_pose(np.stack([np.cross(up, back), up, back], axis=1), matrix[:3, 3])

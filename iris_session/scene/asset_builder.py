@@ -23,8 +23,8 @@ from iris_session.assets.store import AssetStore
 from iris_session.protocol.common import Vec3
 from iris_session.protocol.names import AssetEncoding, TextureKind
 from iris_session.protocol.scene import MeshLevel, TextureLevel
-from iris_session.scene.images import Pixels, encode_image, halved
-from iris_session.scene.mesh_processing import simplified
+from iris_session.scene.images import Pixels, encode_image, halve
+from iris_session.scene.mesh_processing import simplify_mesh
 from iris_session.scene.meshes import MeshArrays, encode_mesh, encode_mesh_quantised
 
 #: Raised whenever the same content gives other assets.
@@ -84,7 +84,7 @@ class Work(Generic[Note]):
     make: Callable[[], Note]
 
 
-class Builder:
+class AssetBuilder:
     """Builds into `store`. `built`, `recalled`: pieces of work that were done, and that the store remembered."""
 
     def __init__(self, store: AssetStore, options: EncodeOptions | None = None, threads: int = 0) -> None:
@@ -99,25 +99,27 @@ class Builder:
     def run(self, pieces: Sequence[Work[Note]]) -> list[Note]:
         """Results in the order of `pieces`. Equal content is built once."""
         with ThreadPoolExecutor(self._threads) as pool:
-            keys = list(pool.map(self._key, pieces))
+            keys = list(pool.map(self._index_key, pieces))
             first = dict(zip(keys, pieces, strict=True))
-            done = dict(zip(first, pool.map(self._one, first.items()), strict=True))
+            done = dict(zip(first, pool.map(self._run_one, first.items()), strict=True))
         recalled = [was for _, was in done.values()].count(True)
         self.recalled += recalled
         self.built += len(done) - recalled
         return [done[key][0] for key in keys]
 
-    def mesh(self, raw: Sequence[NDArray[Any]], arrays: Callable[[], MeshArrays]) -> Work[MeshNote]:
+    def mesh_work(self, raw: Sequence[NDArray[Any]], arrays: Callable[[], MeshArrays]) -> Work[MeshNote]:
         """`raw`: what `arrays` is computed from."""
-        return Work(MeshNote, raw, lambda: self._mesh(arrays()))
+        return Work(MeshNote, raw, lambda: self._encode_mesh(arrays()))
 
-    def texture(self, pixels: Pixels, kind: str) -> Work[TextureNote]:
+    def texture_work(self, pixels: Pixels, kind: str) -> Work[TextureNote]:
         """`pixels` (height, width, channels); cube and skybox have six square faces below each other."""
         return Work(
-            TextureNote, (kind.encode(), repr(pixels.shape).encode(), pixels), lambda: self._texture(pixels, kind)
+            TextureNote,
+            (kind.encode(), repr(pixels.shape).encode(), pixels),
+            lambda: self._encode_texture(pixels, kind),
         )
 
-    def blob(self, raw: Sequence[bytes | NDArray[Any]], encode: Callable[[], bytes]) -> Work[BlobNote]:
+    def blob_work(self, raw: Sequence[bytes | NDArray[Any]], encode: Callable[[], bytes]) -> Work[BlobNote]:
         """One asset, whose bytes `encode` gives."""
 
         def make() -> BlobNote:
@@ -128,7 +130,7 @@ class Builder:
 
     # --- inside -------------------------------------------------------------------------------------------------------
 
-    def _key(self, piece: Work[Note]) -> str:
+    def _index_key(self, piece: Work[Note]) -> str:
         digest = hashlib.sha256(self._salt + piece.kind.__name__.encode())
         for part in piece.raw:
             content = np.ascontiguousarray(part).data if isinstance(part, np.ndarray) else memoryview(part)
@@ -137,9 +139,9 @@ class Builder:
             digest.update(content.cast("B") if content.nbytes else b"")
         return digest.hexdigest()
 
-    def _one(self, item: tuple[str, Work[Note]]) -> tuple[Note, bool]:
+    def _run_one(self, item: tuple[str, Work[Note]]) -> tuple[Note, bool]:
         key, piece = item
-        note = self._recall(key, piece.kind)
+        note = self._read_note(key, piece.kind)
         if note is not None:
             return note, True
         if sum(part.nbytes for part in piece.raw if not isinstance(part, bytes)) > ALONE_BYTES:
@@ -150,7 +152,7 @@ class Builder:
         self.store.write_index(key, msgspec.msgpack.encode(note))
         return note, False
 
-    def _recall(self, key: str, kind: type[Note]) -> Note | None:
+    def _read_note(self, key: str, kind: type[Note]) -> Note | None:
         remembered = self.store.read_index(key)
         if remembered is None:
             return None
@@ -161,43 +163,43 @@ class Builder:
         assets = (note,) if isinstance(note, BlobNote) else note.levels
         return note if all(self.store.mark_used(asset.address, asset.bytes) for asset in assets) else None
 
-    def _mesh(self, mesh: MeshArrays) -> MeshNote:
-        levels = [self._mesh_level(mesh, encode_mesh(mesh), 0.0)]
+    def _encode_mesh(self, mesh: MeshArrays) -> MeshNote:
+        levels = [self._store_mesh_level(mesh, encode_mesh(mesh), 0.0)]
         target = mesh.triangles // _COARSER
         while self.options.levels and target >= _FEWEST_TRIANGLES:
-            coarse = simplified(mesh, target)
+            coarse = simplify_mesh(mesh, target)
             if coarse is None:
                 break
             target //= _COARSER
             data, rounding = encode_mesh_quantised(coarse[0])
             finer = levels[-1]
             if coarse[0].triangles <= _SAVED * finer.triangles and len(data) <= _SAVED * finer.bytes:
-                levels.append(self._mesh_level(coarse[0], data, coarse[1] + rounding))
-        low, high = _box(mesh)
+                levels.append(self._store_mesh_level(coarse[0], data, coarse[1] + rounding))
+        low, high = _bounding_box(mesh)
         return MeshNote(low, high, tuple(levels))
 
-    def _mesh_level(self, mesh: MeshArrays, data: bytes, error: float) -> MeshLevel:
+    def _store_mesh_level(self, mesh: MeshArrays, data: bytes, error: float) -> MeshLevel:
         return MeshLevel(self.store.put(data), len(data), AssetEncoding.ARRAYS, mesh.vertices, mesh.triangles, error)
 
-    def _texture(self, pixels: Pixels, kind: str) -> TextureNote:
-        if pixels.shape[2] not in (1, 3, 4) or _own_form(pixels):
+    def _encode_texture(self, pixels: Pixels, kind: str) -> TextureNote:
+        if pixels.shape[2] not in (1, 3, 4) or _is_container(pixels):
             data = pixels.tobytes()
             level = TextureLevel(
                 self.store.put(data), len(data), AssetEncoding.OPAQUE, pixels.shape[1], pixels.shape[0]
             )
             return TextureNote((level,))
         faces = 1 if kind == TextureKind.IMAGE else 6
-        levels = [self._texture_level(pixels, faces)]
+        levels = [self._store_texture_level(pixels, faces)]
         while (
             self.options.levels
             and min(pixels.shape[0] // faces, pixels.shape[1]) >= 2 * _SMALLEST_SIDE
             and (faces == 1 or pixels.shape[1] % 2 == 0)
         ):
-            pixels = halved(pixels)
-            levels.append(self._texture_level(pixels, faces))
+            pixels = halve(pixels)
+            levels.append(self._store_texture_level(pixels, faces))
         return TextureNote(tuple(levels))
 
-    def _texture_level(self, pixels: Pixels, faces: int) -> TextureLevel:
+    def _store_texture_level(self, pixels: Pixels, faces: int) -> TextureLevel:
         encoding = self.options.texture_encoding
         if encoding == AssetEncoding.JPEG and pixels.shape[2] == 4:
             encoding = AssetEncoding.PNG
@@ -206,11 +208,11 @@ class Builder:
         return TextureLevel(self.store.put(image.data), len(image.data), image.encoding, width, height, image.max_error)
 
 
-def _own_form(pixels: Pixels) -> bool:
+def _is_container(pixels: Pixels) -> bool:
     return pixels.shape[0] == pixels.shape[2] == 1 and pixels[0, :12].tobytes().startswith(_OWN_FORMS)
 
 
-def _box(mesh: MeshArrays) -> tuple[Vec3, Vec3]:
+def _bounding_box(mesh: MeshArrays) -> tuple[Vec3, Vec3]:
     if not mesh.vertices:
         return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     low, high = mesh.position.min(axis=0).tolist(), mesh.position.max(axis=0).tolist()

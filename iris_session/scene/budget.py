@@ -36,7 +36,7 @@ class Budget(msgspec.Struct, frozen=True):
 QUEST_3: Final = Budget(QUEST_TRIANGLES, QUEST_TEXTURE_BYTES, QUEST_OBJECTS)
 
 
-class Choice(NamedTuple):
+class LevelChoice(NamedTuple):
     """`mesh_levels`, `texture_levels`: one per mesh and texture. `hidden`: ids of visuals to leave out, the smallest.
 
     `triangles`, `texture_bytes`, `objects`: what remains. `fits`: false when even the coarsest levels exceed it.
@@ -51,76 +51,82 @@ class Choice(NamedTuple):
     fits: bool
 
 
-def choose_levels(spec: SceneSpec, budget: Budget) -> Choice:
+def choose_levels(spec: SceneSpec, budget: Budget) -> LevelChoice:
     """Finest levels that fit: coarsened first is what loses least detail, relative to its size, per triangle saved.
 
     Deformables have no levels and are never left out.
     """
-    n_bending, bending_triangles = bending(spec)
+    n_bending, bending_triangles = count_deformables(spec)
     drawn = [i for i, v in enumerate(spec.visuals) if v.rgba[3] > 0 and v.group in spec.groups_shown]
-    hidden = _hidden(spec, drawn, max(1, budget.objects - n_bending) if budget.objects else 0)
+    hidden = _select_hidden(spec, drawn, max(1, budget.objects - n_bending) if budget.objects else 0)
     kept = [i for i in drawn if spec.visuals[i].id not in hidden]
-    meshes, n_triangles = _mesh_levels(spec, kept, budget.triangles, bending_triangles)
-    textures, memory = _texture_levels(spec, budget.texture_bytes)
+    meshes, n_triangles = _choose_mesh_levels(spec, kept, budget.triangles, bending_triangles)
+    textures, memory = _choose_texture_levels(spec, budget.texture_bytes)
     objects = len(kept) + n_bending
     spent = ((n_triangles, budget.triangles), (memory, budget.texture_bytes), (objects, budget.objects))
     fits = all(not limit or used <= limit for used, limit in spent)
-    return Choice(meshes, textures, hidden, n_triangles, memory, objects, fits)
+    return LevelChoice(meshes, textures, hidden, n_triangles, memory, objects, fits)
 
 
-def _hidden(spec: SceneSpec, drawn: list[int], objects: int) -> frozenset[int]:
+def _select_hidden(spec: SceneSpec, drawn: list[int], objects: int) -> frozenset[int]:
     if not objects or len(drawn) <= objects:
         return frozenset()
-    smallest = sorted(drawn, key=lambda i: _extent(spec, i))[: len(drawn) - objects]
+    smallest = sorted(drawn, key=lambda i: _visual_size(spec, i))[: len(drawn) - objects]
     return frozenset(spec.visuals[i].id for i in smallest)
 
 
-def _extent(spec: SceneSpec, visual: int) -> float:
+def _visual_size(spec: SceneSpec, visual: int) -> float:
     """Largest side [m]; planes are never too small."""
     geometry = spec.visuals[visual].geometry
     if geometry.kind == GeometryKind.PLANE:
         return float("inf")
     if geometry.mesh >= 0:
-        return _side(spec.meshes[geometry.mesh])
+        return _longest_side(spec.meshes[geometry.mesh])
     caps = geometry.size[0] if geometry.kind == GeometryKind.CAPSULE else 0.0
     return 2 * (max(geometry.size) + caps)
 
 
-def _side(mesh: Mesh) -> float:
+def _longest_side(mesh: Mesh) -> float:
     return max(high - low for low, high in zip(mesh.low, mesh.high, strict=True))
 
 
-def _mesh_levels(spec: SceneSpec, kept: list[int], limit: int, besides: int) -> tuple[tuple[int, ...], int]:
+def _choose_mesh_levels(spec: SceneSpec, kept: list[int], limit: int, besides: int) -> tuple[tuple[int, ...], int]:
     """`besides`: triangles of what has no levels."""
     levels = [0] * len(spec.meshes)
     uses = [0] * len(spec.meshes)
     for i in kept:
         if spec.visuals[i].geometry.mesh >= 0:
             uses[spec.visuals[i].geometry.mesh] += 1
-    total = besides + sum(triangles(spec, i) for i in kept)
-    queue = [(_loss(spec.meshes[m], 1, uses[m]), m) for m in range(len(levels)) if _loss(spec.meshes[m], 1, uses[m])]
+    total = besides + sum(count_triangles(spec, i) for i in kept)
+    queue = [
+        (_relative_loss(spec.meshes[m], 1, uses[m]), m)
+        for m in range(len(levels))
+        if _relative_loss(spec.meshes[m], 1, uses[m])
+    ]
     heapq.heapify(queue)
     while limit and total > limit and queue:
         _, m = heapq.heappop(queue)
         mesh, level = spec.meshes[m], levels[m]
         total -= uses[m] * (mesh.levels[level].triangles - mesh.levels[level + 1].triangles)
         levels[m] += 1
-        if loss := _loss(mesh, level + 2, uses[m]):
+        if loss := _relative_loss(mesh, level + 2, uses[m]):
             heapq.heappush(queue, (loss, m))
     return tuple(levels), total
 
 
-def _loss(mesh: Mesh, level: int, uses: int) -> float:
+def _relative_loss(mesh: Mesh, level: int, uses: int) -> float:
     """Error relative to the size, per triangle that going to `level` saves; 0 where there is nothing to save."""
     if level >= len(mesh.levels) or not uses:
         return 0.0
     saved = mesh.levels[level - 1].triangles - mesh.levels[level].triangles
-    return (mesh.levels[level].max_error_m + 1e-9) / max(_side(mesh), 1e-6) / (uses * saved) if saved > 0 else 0.0
+    return (
+        (mesh.levels[level].max_error_m + 1e-9) / max(_longest_side(mesh), 1e-6) / (uses * saved) if saved > 0 else 0.0
+    )
 
 
-def _texture_levels(spec: SceneSpec, limit: int) -> tuple[tuple[int, ...], int]:
+def _choose_texture_levels(spec: SceneSpec, limit: int) -> tuple[tuple[int, ...], int]:
     levels = [0] * len(spec.textures)
-    sizes = [[texture_memory(texture, level) for level in texture.levels] for texture in spec.textures]
+    sizes = [[texture_memory_bytes(texture, level) for level in texture.levels] for texture in spec.textures]
     total = sum(size[0] for size in sizes)
     queue = [(-size[0], t) for t, size in enumerate(sizes) if len(size) > 1]
     heapq.heapify(queue)
@@ -136,30 +142,30 @@ def _texture_levels(spec: SceneSpec, limit: int) -> tuple[tuple[int, ...], int]:
 # --- costs ------------------------------------------------------------------------------------------------------------
 
 
-def with_totals(spec: SceneSpec) -> SceneSpec:
+def add_totals(spec: SceneSpec) -> SceneSpec:
     """`spec` with its `totals`."""
     level_bytes = {level.address: level.bytes for mesh in spec.meshes for level in mesh.levels[:1]}
     image_bytes = {level.address: level.bytes for texture in spec.textures for level in texture.levels[:1]}
     drawn = [i for i, v in enumerate(spec.visuals) if v.rgba[3] > 0 and v.group in spec.groups_shown]
-    n_bending, bending_triangles = bending(spec)
+    n_bending, bending_triangles = count_deformables(spec)
     totals = Totals(
         objects=len(drawn) + n_bending,
-        triangles=sum(triangles(spec, i) for i in drawn) + bending_triangles,
+        triangles=sum(count_triangles(spec, i) for i in drawn) + bending_triangles,
         mesh_bytes=sum(level_bytes.values()),
         texture_bytes=sum(image_bytes.values()),
-        texture_memory=sum(texture_memory(texture, texture.levels[0]) for texture in spec.textures),
+        texture_memory=sum(texture_memory_bytes(texture, texture.levels[0]) for texture in spec.textures),
         asset_bytes=sum(asset_addresses(spec).values()),
     )
     return msgspec.structs.replace(spec, totals=totals)
 
 
-def bending(spec: SceneSpec) -> tuple[int, int]:
+def count_deformables(spec: SceneSpec) -> tuple[int, int]:
     """How many deformables are drawn at first, and their triangles; ropes are lines."""
     shown = [part for part in spec.deformables if part.rgba[3] > 0 and part.group in spec.groups_shown]
     return len(shown), sum(part.elements for part in shown if part.dim > 1)
 
 
-def triangles(spec: SceneSpec, visual: int, level: int = 0) -> int:
+def count_triangles(spec: SceneSpec, visual: int, level: int = 0) -> int:
     """Triangles of one visual, by its position in `spec.visuals`."""
     geometry = spec.visuals[visual].geometry
     if geometry.mesh >= 0:
@@ -171,7 +177,7 @@ def triangles(spec: SceneSpec, visual: int, level: int = 0) -> int:
     return PRIMITIVE_TRIANGLES.get(geometry.kind, 0)
 
 
-def texture_memory(texture: Texture, level: TextureLevel) -> int:
+def texture_memory_bytes(texture: Texture, level: TextureLevel) -> int:
     """Bytes on a graphics card: four a pixel, and a third more for its smaller copies."""
     faces = 1 if texture.kind == TextureKind.IMAGE else 6
     return level.width * level.height * 4 * faces * 4 // 3

@@ -1,6 +1,7 @@
-"""`SceneBuilder`: scenes without MuJoCo, from shapes, arrays and files. Metres, world frame right-handed, z up.
+"""`SceneBuilder`: compose scenes without MuJoCo from shapes, arrays and files.
 
-Nothing is encoded before `build`; files are read when they are added, so that their faults show there.
+Lengths are metres; the world frame is right-handed with z up. Nothing is encoded before `build`; files are read when
+they are added, so that their errors show there.
 """
 
 from __future__ import annotations
@@ -8,122 +9,335 @@ from __future__ import annotations
 import reprlib
 from collections.abc import Sequence
 from os import PathLike
-from typing import Any, Final, Unpack
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from iris_session.assets.store import AssetStore
 from iris_session.protocol.common import IDENTITY, Vec3
 from iris_session.protocol.media import MAX_STREAMS
 from iris_session.protocol.names import GeometryKind, LightKind, TextureKind
 from iris_session.protocol.scene import Camera, Environment, Light, Rgb
-from iris_session.scene.arrays import array_of
-from iris_session.scene.assembly import Flexible, Thing, World, assemble
+from iris_session.scene.arrays import to_array
+from iris_session.scene.assembly import ComposedBody, ComposedDeformable, SceneContent, assemble_scene
 from iris_session.scene.asset_builder import EncodeOptions
 from iris_session.scene.composed import ComposedScene
-from iris_session.scene.elements import Item, Look, Matrix, Picture, cut, matrix_of
+from iris_session.scene.elements import GREY, Appearance, DrawnItem, Matrix, TextureImage, to_matrix, truncate_name
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.importers.files import load_file
 from iris_session.scene.importers.units import file_question, side_of
 from iris_session.scene.importers.urdf import read_urdf
 from iris_session.scene.validation import (
-    Looks,
-    checked_pose,
-    given_mesh,
-    given_vertices,
-    look_of,
-    number,
-    numbers,
-    path_of,
-    takes,
-    texture_of,
-    triangles_of,
+    check_mesh,
+    check_number,
+    check_numbers,
+    check_path,
+    check_pose,
+    check_texture,
+    check_triangles,
+    check_vertices,
+    parse_appearance,
 )
 from iris_session.streams.deformable_topology import MAX_VERTICES
 
-#: Turns what has y up: 90 degrees around x.
+#: Rotation of a file with y up: 90 degrees around x.
 _FROM_Y_UP: Final = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-#: As long as names of bodies in the state stream may be.
+#: Longest name of a body in the state stream.
 _MAX_NAME: Final = 64
-#: Taken by the root of every scene, also in recordings.
+#: Name of the root of every scene, also in recordings.
 _WORLD: Final = "world"
 
 
-class Options(Looks, total=False):
-    """What every `add_` of a shape or mesh takes besides its own: how it looks (`Looks`), and where it is.
-
-    `position` [m], `quaternion` `[w, x, y, z]`: in the world, or in the frame of the thing `on`. `movable`: it is
-    addressed by its name and its pose is published; else it stands still. `on`: name of a movable thing or of a body
-    of an articulation, which it is fixed to.
-    """
-
-    position: Sequence[float]
-    quaternion: Sequence[float]
-    movable: bool
-    on: str
-
-
 class SceneBuilder:
-    """Collects things and builds a scene of them. `name`: of the scene. `environment`: what surrounds it; as it is,
-    lights that shine along the view, no fog, and distances taken from what is there.
+    """Composer of a scene.
 
-    Methods return the name of what they added. Movable things, articulations and deformables need one of their own;
-    things that stand still may have any or none. Every refusal is a `SceneBuildError` that says what would be right;
-    a keyword that a method does not have is a `TypeError`.
+    Methods return the name of what they added. Movable bodies, articulations and deformables need unique names; static
+    content may have any name or none. A wrong argument raises `SceneBuildError`, whose message says what would be
+    right, and adds nothing.
+
+    Placement, arguments of methods that add shapes, meshes and files:
+
+        position: Position [m] in the world, or in the frame of `on`.
+        quaternion: Orientation `(w, x, y, z)`, likewise.
+        movable: Publish its pose under its name; otherwise it is static.
+        on: Name of a movable body or of a body of an articulation to fix it to.
+
+    Appearance, arguments of the same methods and of `add_deformable`, as in `protocol.scene.Material`:
+
+        rgba: Colour, 3 or 4 numbers from 0 to 1.
+        texture: Path of an image, or pixels (height, width, 1, 3 or 4) uint8, first row on top; multiplied with
+            the colour.
+        metallic: From 0 to 1, as the following three unless stated otherwise.
+        roughness: 0 is a mirror.
+        emission: Light it gives off, 0 or more.
+        specular: Strength of highlights.
+        shininess: Sharpness of highlights; by default `1 - roughness`.
+        repeat: Repetitions of the texture over the shape, or per metre with `uniform`.
+        uniform: Let `repeat` count per metre.
+
+    Attributes:
+        environment: Fog, headlight and viewing distances; by default derived from the content of the scene.
     """
 
     def __init__(self, name: str = "scene") -> None:
+        """Create an empty scene.
+
+        Args:
+            name: Name of the scene.
+        """
         self.environment: Environment | None = None
-        self._world = World(cut(name))
+        self._content = SceneContent(truncate_name(name))
 
     @property
     def triangles(self) -> int:
-        """Of all meshes that were added: preparing them takes some seconds for each million, once."""
-        return sum(item.mesh.triangles for item in self._world.items if item.mesh is not None)
+        """Number of triangles of all meshes so far. Encoding takes some seconds per million, once."""
+        return sum(item.mesh.triangles for item in self._content.items if item.mesh is not None)
 
     @property
     def names(self) -> frozenset[str]:
-        """What moves or bends so far, links of articulations too."""
-        return frozenset(self._world.names)
+        """Names of movable bodies, articulations with their links, and deformables so far."""
+        return frozenset(self._content.names)
 
     # --- shapes -------------------------------------------------------------------------------------------------------
 
-    @takes(Options)
-    def add_box(self, name: str = "", *, half_size: Sequence[float], **options: Unpack[Options]) -> str:
-        """A box of half lengths x, y, z."""
-        return self._shape(GeometryKind.BOX, name, numbers("half_size", half_size, 3, above=0.0), options)
+    def add_box(
+        self,
+        name: str = "",
+        *,
+        half_size: Sequence[float],
+        position: Sequence[float] = IDENTITY.p,
+        quaternion: Sequence[float] = IDENTITY.q,
+        movable: bool = False,
+        on: str = "",
+        rgba: Sequence[float] | None = None,
+        texture: str | PathLike[str] | NDArray[np.uint8] | None = None,
+        metallic: float | None = None,
+        roughness: float | None = None,
+        emission: float | None = None,
+        specular: float | None = None,
+        shininess: float | None = None,
+        repeat: Sequence[float] = (1.0, 1.0),
+        uniform: bool = False,
+    ) -> str:
+        """Add a box centred on its frame.
 
-    @takes(Options)
-    def add_sphere(self, name: str = "", *, radius: float, **options: Unpack[Options]) -> str:
-        """A sphere."""
-        return self._shape(GeometryKind.SPHERE, name, number("radius", radius, above=0.0) * 3, options)
+        Args:
+            name: Name; a movable body needs a unique one.
+            half_size: Half lengths along x, y, z [m].
+            position, quaternion, movable, on: Placement; see the class.
+            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform: Appearance; see the
+                class.
 
-    @takes(Options)
-    def add_ellipsoid(self, name: str = "", *, half_size: Sequence[float], **options: Unpack[Options]) -> str:
-        """An ellipsoid of half axes x, y, z."""
-        return self._shape(GeometryKind.ELLIPSOID, name, numbers("half_size", half_size, 3, above=0.0), options)
+        Raises:
+            SceneBuildError: An argument is wrong; the message names it and says what would be right. Nothing is added.
+        """
+        size = check_numbers("half_size", half_size, 3, above=0.0)
+        appearance = parse_appearance(
+            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform=uniform
+        )
+        return self._add_shape(GeometryKind.BOX, name, size, appearance, position, quaternion, movable=movable, on=on)
 
-    @takes(Options)
-    def add_capsule(self, name: str = "", *, radius: float, half_length: float, **options: Unpack[Options]) -> str:
-        """A capsule along z: two half spheres beyond the half length."""
-        size = numbers("radius and half_length", [radius, radius, half_length], 3, above=0.0)
-        return self._shape(GeometryKind.CAPSULE, name, size, options)
+    def add_sphere(
+        self,
+        name: str = "",
+        *,
+        radius: float,
+        position: Sequence[float] = IDENTITY.p,
+        quaternion: Sequence[float] = IDENTITY.q,
+        movable: bool = False,
+        on: str = "",
+        rgba: Sequence[float] | None = None,
+        texture: str | PathLike[str] | NDArray[np.uint8] | None = None,
+        metallic: float | None = None,
+        roughness: float | None = None,
+        emission: float | None = None,
+        specular: float | None = None,
+        shininess: float | None = None,
+        repeat: Sequence[float] = (1.0, 1.0),
+        uniform: bool = False,
+    ) -> str:
+        """Add a sphere.
 
-    @takes(Options)
-    def add_cylinder(self, name: str = "", *, radius: float, half_length: float, **options: Unpack[Options]) -> str:
-        """A cylinder along z."""
-        size = numbers("radius and half_length", [radius, radius, half_length], 3, above=0.0)
-        return self._shape(GeometryKind.CYLINDER, name, size, options)
+        Args:
+            name: Name; a movable body needs a unique one.
+            radius: Radius [m].
+            position, quaternion, movable, on: Placement; see the class.
+            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform: Appearance; see the
+                class.
 
-    @takes(Options)
-    def add_plane(self, name: str = "", *, half_size: Sequence[float] = (0.0, 0.0), **options: Unpack[Options]) -> str:
-        """A rectangle in z = 0 that is seen from +z; a half length of 0 is without end."""
-        x, y = numbers("half_size", half_size, 2)
+        Raises:
+            SceneBuildError: An argument is wrong; the message names it and says what would be right. Nothing is added.
+        """
+        size = check_number("radius", radius, above=0.0) * 3
+        appearance = parse_appearance(
+            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform=uniform
+        )
+        return self._add_shape(
+            GeometryKind.SPHERE, name, size, appearance, position, quaternion, movable=movable, on=on
+        )
+
+    def add_ellipsoid(
+        self,
+        name: str = "",
+        *,
+        half_size: Sequence[float],
+        position: Sequence[float] = IDENTITY.p,
+        quaternion: Sequence[float] = IDENTITY.q,
+        movable: bool = False,
+        on: str = "",
+        rgba: Sequence[float] | None = None,
+        texture: str | PathLike[str] | NDArray[np.uint8] | None = None,
+        metallic: float | None = None,
+        roughness: float | None = None,
+        emission: float | None = None,
+        specular: float | None = None,
+        shininess: float | None = None,
+        repeat: Sequence[float] = (1.0, 1.0),
+        uniform: bool = False,
+    ) -> str:
+        """Add an ellipsoid.
+
+        Args:
+            name: Name; a movable body needs a unique one.
+            half_size: Half axes along x, y, z [m].
+            position, quaternion, movable, on: Placement; see the class.
+            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform: Appearance; see the
+                class.
+
+        Raises:
+            SceneBuildError: An argument is wrong; the message names it and says what would be right. Nothing is added.
+        """
+        size = check_numbers("half_size", half_size, 3, above=0.0)
+        appearance = parse_appearance(
+            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform=uniform
+        )
+        return self._add_shape(
+            GeometryKind.ELLIPSOID, name, size, appearance, position, quaternion, movable=movable, on=on
+        )
+
+    def add_capsule(
+        self,
+        name: str = "",
+        *,
+        radius: float,
+        half_length: float,
+        position: Sequence[float] = IDENTITY.p,
+        quaternion: Sequence[float] = IDENTITY.q,
+        movable: bool = False,
+        on: str = "",
+        rgba: Sequence[float] | None = None,
+        texture: str | PathLike[str] | NDArray[np.uint8] | None = None,
+        metallic: float | None = None,
+        roughness: float | None = None,
+        emission: float | None = None,
+        specular: float | None = None,
+        shininess: float | None = None,
+        repeat: Sequence[float] = (1.0, 1.0),
+        uniform: bool = False,
+    ) -> str:
+        """Add a capsule along z: a cylinder with half spheres beyond its ends.
+
+        Args:
+            name: Name; a movable body needs a unique one.
+            radius: Radius [m].
+            half_length: Half length of the cylinder [m].
+            position, quaternion, movable, on: Placement; see the class.
+            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform: Appearance; see the
+                class.
+
+        Raises:
+            SceneBuildError: An argument is wrong; the message names it and says what would be right. Nothing is added.
+        """
+        size = check_numbers("radius and half_length", [radius, radius, half_length], 3, above=0.0)
+        appearance = parse_appearance(
+            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform=uniform
+        )
+        return self._add_shape(
+            GeometryKind.CAPSULE, name, size, appearance, position, quaternion, movable=movable, on=on
+        )
+
+    def add_cylinder(
+        self,
+        name: str = "",
+        *,
+        radius: float,
+        half_length: float,
+        position: Sequence[float] = IDENTITY.p,
+        quaternion: Sequence[float] = IDENTITY.q,
+        movable: bool = False,
+        on: str = "",
+        rgba: Sequence[float] | None = None,
+        texture: str | PathLike[str] | NDArray[np.uint8] | None = None,
+        metallic: float | None = None,
+        roughness: float | None = None,
+        emission: float | None = None,
+        specular: float | None = None,
+        shininess: float | None = None,
+        repeat: Sequence[float] = (1.0, 1.0),
+        uniform: bool = False,
+    ) -> str:
+        """Add a cylinder along z.
+
+        Args:
+            name: Name; a movable body needs a unique one.
+            radius: Radius [m].
+            half_length: Half length [m].
+            position, quaternion, movable, on: Placement; see the class.
+            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform: Appearance; see the
+                class.
+
+        Raises:
+            SceneBuildError: An argument is wrong; the message names it and says what would be right. Nothing is added.
+        """
+        size = check_numbers("radius and half_length", [radius, radius, half_length], 3, above=0.0)
+        appearance = parse_appearance(
+            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform=uniform
+        )
+        return self._add_shape(
+            GeometryKind.CYLINDER, name, size, appearance, position, quaternion, movable=movable, on=on
+        )
+
+    def add_plane(
+        self,
+        name: str = "",
+        *,
+        half_size: Sequence[float] = (0.0, 0.0),
+        position: Sequence[float] = IDENTITY.p,
+        quaternion: Sequence[float] = IDENTITY.q,
+        movable: bool = False,
+        on: str = "",
+        rgba: Sequence[float] | None = None,
+        texture: str | PathLike[str] | NDArray[np.uint8] | None = None,
+        metallic: float | None = None,
+        roughness: float | None = None,
+        emission: float | None = None,
+        specular: float | None = None,
+        shininess: float | None = None,
+        repeat: Sequence[float] = (1.0, 1.0),
+        uniform: bool = False,
+    ) -> str:
+        """Add a rectangle in the plane z = 0, visible from +z.
+
+        Args:
+            name: Name; a movable body needs a unique one.
+            half_size: Half lengths along x, y [m]; 0 is endless.
+            position, quaternion, movable, on: Placement; see the class.
+            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform: Appearance; see the
+                class.
+
+        Raises:
+            SceneBuildError: An argument is wrong; the message names it and says what would be right. Nothing is added.
+        """
+        x, y = check_numbers("half_size", half_size, 2)
         if x < 0 or y < 0:
-            raise SceneBuildError(f"half_size of a plane is {tuple(half_size)}: lengths, or 0 for no end")
-        return self._shape(GeometryKind.PLANE, name, (x, y, 1.0), options)
+            raise SceneBuildError(f"half_size of a plane is {tuple(half_size)}: expected lengths, or 0 for endless")
+        size = (x, y, 1.0)
+        appearance = parse_appearance(
+            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform=uniform
+        )
+        return self._add_shape(GeometryKind.PLANE, name, size, appearance, position, quaternion, movable=movable, on=on)
 
-    @takes(Options)
     def add_mesh(
         self,
         name: str = "",
@@ -133,20 +347,46 @@ class SceneBuilder:
         normals: Any = None,
         uvs: Any = None,
         colors: Any = None,
-        **options: Unpack[Options],
+        position: Sequence[float] = IDENTITY.p,
+        quaternion: Sequence[float] = IDENTITY.q,
+        movable: bool = False,
+        on: str = "",
+        rgba: Sequence[float] | None = None,
+        texture: str | PathLike[str] | NDArray[np.uint8] | None = None,
+        metallic: float | None = None,
+        roughness: float | None = None,
+        emission: float | None = None,
+        specular: float | None = None,
+        shininess: float | None = None,
+        repeat: Sequence[float] = (1.0, 1.0),
+        uniform: bool = False,
     ) -> str:
-        """`vertices` (n, 3) [m], `triangles` (m, 3), counter-clockwise seen from outside; of the vertices `normals`
-        (n, 3), texture coordinates `uvs` (n, 2; v down), `colors` (n, 3 or 4) uint8. Without normals they are made.
+        """Add a mesh given as arrays.
+
+        Args:
+            name: Name; a movable body needs a unique one.
+            vertices: Shape (n, 3) [m].
+            triangles: Shape (m, 3), vertex numbers, counter-clockwise seen from outside.
+            normals: Shape (n, 3); computed by default.
+            uvs: Texture coordinates, shape (n, 2), v down.
+            colors: Vertex colours, shape (n, 3 or 4), uint8.
+            position, quaternion, movable, on: Placement; see the class.
+            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform: Appearance; see the
+                class.
+
+        Raises:
+            SceneBuildError: An argument is wrong; the message names it and says what would be right. Nothing is added.
         """
-        mesh = given_mesh(f"mesh {reprlib.repr(name)}", vertices, triangles, normals, uvs, colors)
-        look = look_of(options) or Look(rgba=(1.0, 1.0, 1.0, 1.0) if colors is not None else Look().rgba)
-        body, matrix = self._place(name, options)
-        self._world.items.append(Item(body, cut(name), matrix, look, mesh))
+        mesh = check_mesh(f"mesh {reprlib.repr(name)}", vertices, triangles, normals, uvs, colors)
+        appearance = parse_appearance(
+            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform=uniform
+        ) or Appearance(rgba=(1.0, 1.0, 1.0, 1.0) if colors is not None else GREY)
+        body, matrix = self._place(name, position, quaternion, movable=movable, on=on)
+        self._content.items.append(DrawnItem(body, truncate_name(name), matrix, appearance, mesh))
         return name
 
     # --- files --------------------------------------------------------------------------------------------------------
 
-    @takes(Options)
     def add_file(
         self,
         path: str | PathLike[str],
@@ -155,39 +395,69 @@ class SceneBuilder:
         up: str | None = None,
         package_dirs: Sequence[str | PathLike[str]] = (),
         name: str = "",
-        **options: Unpack[Options],
+        position: Sequence[float] = IDENTITY.p,
+        quaternion: Sequence[float] = IDENTITY.q,
+        movable: bool = False,
+        on: str = "",
+        rgba: Sequence[float] | None = None,
+        texture: str | PathLike[str] | NDArray[np.uint8] | None = None,
+        metallic: float | None = None,
+        roughness: float | None = None,
+        emission: float | None = None,
+        specular: float | None = None,
+        shininess: float | None = None,
+        repeat: Sequence[float] = (1.0, 1.0),
+        uniform: bool = False,
     ) -> str:
-        """A glTF or GLB, OBJ, STL, PLY, OFF, DAE, 3MF file. Without a name it is called as the file.
+        """Add a glTF, GLB, OBJ, STL, PLY, OFF, DAE or 3MF file.
 
-        `scale`: of one of its lengths [m]. `up`: its axis that is up, `y` or `z`; as it is, that of the format, y for
-        glTF and DAE that say nothing else. A look, if one is given, takes the place of all in the file. Nodes of what
-        stands still are bodies of the scene; what is movable is one. `package_dirs`: folders it may refer into.
+        Nodes of a static file become bodies of the scene; a movable file is one body. If any argument of appearance is
+        given, it replaces all materials of the file.
+
+        Args:
+            path: The file.
+            scale: One unit of the file [m]; one number, or three for x, y, z.
+            up: Axis of the file that points up, "y" or "z"; by default that of the format: y for glTF, and for DAE
+                unless the file says otherwise.
+            package_dirs: Folders that the file may refer into.
+            name: Name; by default the stem of the file name.
+            position, quaternion, movable, on: Placement; see the class.
+            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform: Appearance; see the
+                class.
+
+        Returns:
+            The name.
+
+        Raises:
+            SceneBuildError: The file cannot be read, or an argument is wrong. Nothing is added.
         """
-        where = path_of(path)
+        where = check_path(path)
         if not isinstance(name, str):
             raise SceneBuildError(f"name is {name!r}: text is expected, '' for that of the file")
         name = name or where.stem[:_MAX_NAME]
         loaded = load_file(where, package_dirs, name)
-        turn = up or loaded.up
-        if turn not in ("y", "z"):
-            said = f"{where.name} says that {turn} is up" if up is None else f"up is {up!r}"
-            raise SceneBuildError(f"{said}: give up='y' or up='z', or None for what the format means")
-        one = array_of(scale, "scale").ndim == 0
-        if one:
-            (factor,) = number("scale", scale, "a number, or three, is needed")
-        factors = (factor,) * 3 if one else numbers("scale", scale, 3)
+        up_axis = up or loaded.up
+        if up_axis not in ("y", "z"):
+            wrong = f"{where.name} says that {up_axis} is up" if up is None else f"up is {up!r}"
+            raise SceneBuildError(f"{wrong}: give up='y' or up='z', or None for what the format means")
+        uniform_scale = to_array(scale, "scale").ndim == 0
+        if uniform_scale:
+            (factor,) = check_number("scale", scale, "a number, or three, is needed")
+        factors = (factor,) * 3 if uniform_scale else check_numbers("scale", scale, 3)
         if 0.0 in factors:
             raise SceneBuildError("scale is 0: give one of the file's lengths in metres")
-        T_thing_file = np.diag([*(loaded.unit * f for f in factors), 1.0]) @ (_FROM_Y_UP if turn == "y" else np.eye(4))
-        look = look_of(options)
-        with self._world.whole(), np.errstate(all="ignore"):  # places that are not finite are refused
-            body, T_body_thing = self._place(name, options, named=True)
-            self._world.add_nodes(loaded, body, T_body_thing @ T_thing_file, look, flat=self._moves(body))
-            placed = [(one.mesh, T_thing_file @ node.matrix) for node in loaded.nodes for one in node.surfaces]
-            self._world.note(file_question(where.name, side_of(placed), factors))
+        T_up_file = _FROM_Y_UP if up_axis == "y" else np.eye(4)
+        T_body_file = np.diag([*(loaded.unit * f for f in factors), 1.0]) @ T_up_file
+        appearance = parse_appearance(
+            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform=uniform
+        )
+        with self._content.atomic(), np.errstate(all="ignore"):  # poses that are not finite are refused
+            body, T_parent_body = self._place(name, position, quaternion, movable=movable, on=on, named=True)
+            self._content.add_nodes(loaded, body, T_parent_body @ T_body_file, appearance, flat=self._is_moving(body))
+            placed = [(surface.mesh, T_body_file @ node.matrix) for node in loaded.nodes for surface in node.surfaces]
+            self._content.add_notes(file_question(where.name, side_of(placed), factors))
         return name
 
-    @takes()
     def add_urdf(
         self,
         path: str | PathLike[str],
@@ -199,26 +469,36 @@ class SceneBuilder:
         collisions: bool = False,
         scale: float = 1.0,
     ) -> str:
-        """An articulation: links that joints move are bodies called `name/link`, its root among them.
+        """Add a URDF robot as an articulation; its links become bodies called `name/link`.
 
-        Without a name it is called as the file. `package_dirs`: folders of the packages it refers to; folders above the
-        file are searched too. `collisions`: draw its collision shapes in place of visuals. `scale`: how large it is
-        drawn; positions of its joints stay those of the robot, also where they slide.
+        Args:
+            path: The file.
+            name: Name of the articulation; by default the stem of the file name.
+            position: Position of the root link in the world [m].
+            quaternion: Orientation of the root link in the world, `(w, x, y, z)`.
+            package_dirs: Folders of packages that it refers to; folders above the file are searched too.
+            collisions: Draw collision shapes in place of visuals.
+            scale: Factor on all drawn lengths; joint positions stay those of the robot, also of prismatic joints.
+
+        Returns:
+            The name.
+
+        Raises:
+            SceneBuildError: The file cannot be read, or an argument is wrong. Nothing is added.
         """
-        where = path_of(path)
+        where = check_path(path)
         name = name or where.stem[:_MAX_NAME]
-        self._new_name(name)
-        T_world_root = checked_pose(position, quaternion)
-        (factor,) = number("scale", scale, above=0.0)
+        self._check_new_name(name)
+        T_world_root = check_pose(position, quaternion)
+        (factor,) = check_number("scale", scale, above=0.0)
         robot = read_urdf(where, name, T_world_root, package_dirs, collisions=collisions, scale=factor)
         for body in robot.articulation.bodies:
-            self._new_name(body)
-        self._world.add_robot(robot)
+            self._check_new_name(body)
+        self._content.add_robot(robot)
         return name
 
-    # --- what bends, shines and looks ---------------------------------------------------------------------------------
+    # --- deformables, lights, cameras ---------------------------------------------------------------------------------
 
-    @takes(Looks)
     def add_deformable(
         self,
         name: str,
@@ -229,34 +509,58 @@ class SceneBuilder:
         uvs: Any = None,
         radius: float = 0.005,
         flat: bool = False,
-        **looks: Unpack[Looks],
+        rgba: Sequence[float] | None = None,
+        texture: str | PathLike[str] | NDArray[np.uint8] | None = None,
+        metallic: float | None = None,
+        roughness: float | None = None,
+        emission: float | None = None,
+        specular: float | None = None,
+        shininess: float | None = None,
+        repeat: Sequence[float] = (1.0, 1.0),
+        uniform: bool = False,
     ) -> str:
-        """A mesh whose vertices are published: a cloth or a surface of `triangles` (m, 3), or ropes of `edges` (m, 2)
-        and `radius` [m]. `vertices` (n, 3) [m]: the first ones, world frame. `uvs` (n, 2). `flat`: a normal per face.
+        """Add a mesh whose vertices are published: a surface of triangles, or ropes of edges.
+
+        Args:
+            name: Unique name.
+            vertices: First vertices, shape (n, 3) [m], world frame.
+            triangles: Shape (m, 3), vertex numbers. Exactly one of `triangles` and `edges` is needed.
+            edges: Shape (m, 2), vertex numbers.
+            uvs: Texture coordinates, shape (n, 2), v down.
+            radius: Radius of ropes [m].
+            flat: Draw one normal per face.
+            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform: Appearance; see the
+                class.
+
+        Raises:
+            SceneBuildError: An argument is wrong; the message names it and says what would be right. Nothing is added.
         """
-        self._new_name(name)
-        if len(self._world.flexibles) >= MAX_STREAMS:
+        self._check_new_name(name)
+        if len(self._content.deformables) >= MAX_STREAMS:
             raise SceneBuildError(
                 f"deformable {name!r} is one too many: {MAX_STREAMS} are streamed, join some into one mesh"
             )
         if (triangles is None) == (edges is None):
             raise SceneBuildError(f"deformable {name!r} needs triangles (m, 3) or edges (m, 2): one of them")
         whose = f"deformable {name!r}"
-        points = given_vertices(f"vertices of {whose}", vertices)
+        points = check_vertices(f"vertices of {whose}", vertices)
         if len(points) > MAX_VERTICES:
             raise SceneBuildError(
                 f"deformable {name!r} has {len(points):,} vertices, at most {MAX_VERTICES:,}: make it coarser"
             )
         what, given, width = ("triangles", triangles, 3) if edges is None else ("edges", edges, 2)
-        elements = triangles_of(f"{what} of {whose}", given, len(points), width)
-        (half,) = number("radius", radius, above=0.0)
-        look = look_of(looks) or Look()
-        coordinates = None if uvs is None else given_vertices(f"uvs of {whose}", uvs, 2, len(points))
-        self._world.flexibles.append(Flexible(name, points, elements, coordinates, half, flat, look))
-        self._world.names.add(name)
+        elements = check_triangles(f"{what} of {whose}", given, len(points), width)
+        (half,) = check_number("radius", radius, above=0.0)
+        appearance = parse_appearance(
+            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform=uniform
+        )
+        uv = None if uvs is None else check_vertices(f"uvs of {whose}", uvs, 2, len(points))
+        self._content.deformables.append(
+            ComposedDeformable(name, points, elements, uv, half, flat, appearance or Appearance())
+        )
+        self._content.names.add(name)
         return name
 
-    @takes()
     def add_light(
         self,
         name: str = "",
@@ -271,15 +575,34 @@ class SceneBuilder:
         castshadow: bool = True,
         on: str = "",
     ) -> str:
-        """A light; `kind`: directional, spot or point. In the frame of the thing `on`, or in the world."""
+        """Add a light.
+
+        Args:
+            name: Name; need not be unique.
+            kind: "directional", "spot" or "point".
+            position: Position [m] in the world, or in the frame of `on`.
+            direction: Direction it shines along, of any length, likewise.
+            diffuse: Red, green, blue from 0 to 1; likewise `ambient` and `specular`.
+            ambient: Light on surfaces that it does not reach.
+            specular: Light of highlights.
+            cutoff: Half angle of a spot light [degrees].
+            castshadow: Let it cast shadows.
+            on: Name of a movable body or of a body of an articulation that it moves with.
+
+        Returns:
+            `name`.
+
+        Raises:
+            SceneBuildError: An argument is wrong. Nothing is added.
+        """
         if kind not in (LightKind.DIRECTIONAL, LightKind.SPOT, LightKind.POINT):
-            raise SceneBuildError(f"a light of kind {kind!r}: directional, spot or point")
-        along = np.array(numbers("direction", direction, 3))
+            raise SceneBuildError(f"kind is {kind!r}: a light is directional, spot or point")
+        along = np.array(check_numbers("direction", direction, 3))
         length = float(np.linalg.norm(along))
         if length < 1e-9:
             raise SceneBuildError("direction of a light is 0 0 0: it shines along one")
         light = Light(
-            name=cut(name),
+            name=truncate_name(name),
             kind=kind,
             body=0,
             p_body=_three("position", position),
@@ -287,13 +610,12 @@ class SceneBuilder:
             ambient=_three("ambient", ambient),
             diffuse=_three("diffuse", diffuse),
             specular=_three("specular", specular),
-            cutoff=numbers("cutoff", [cutoff], 1)[0],
+            cutoff=check_numbers("cutoff", [cutoff], 1)[0],
             castshadow=castshadow,
         )
-        self._world.lights.append((self._body_named(on), light))
+        self._content.lights.append((self._find_movable(on), light))
         return name
 
-    @takes()
     def add_camera(
         self,
         name: str = "",
@@ -304,77 +626,140 @@ class SceneBuilder:
         resolution: tuple[int, int] = (1, 1),
         on: str = "",
     ) -> str:
-        """A camera that looks along -z of its frame, y up, with a vertical field of view of `fovy` degrees."""
-        (angle,) = number("fovy", fovy, above=0.0)
+        """Add a camera that looks along -z of its frame, with y up.
+
+        Args:
+            name: Name; need not be unique.
+            position: Position [m] in the world, or in the frame of `on`.
+            quaternion: Orientation `(w, x, y, z)`, likewise.
+            fovy: Vertical field of view [degrees].
+            resolution: Width and height [pixels].
+            on: Name of a movable body or of a body of an articulation that it moves with.
+
+        Returns:
+            `name`.
+
+        Raises:
+            SceneBuildError: An argument is wrong. Nothing is added.
+        """
+        (angle,) = check_number("fovy", fovy, above=0.0)
         if angle >= 180.0:
             raise SceneBuildError(f"fovy is {fovy}: degrees below 180")
-        camera = Camera(cut(name), 0, checked_pose(position, quaternion), angle, resolution=resolution)
-        self._world.cameras.append((self._body_named(on), camera))
+        camera = Camera(truncate_name(name), 0, check_pose(position, quaternion), angle, resolution=resolution)
+        self._content.cameras.append((self._find_movable(on), camera))
         return name
 
     def set_skybox(self, pixels: Any) -> None:
-        """Around everything: six square faces below one another, (6 n, n, 3) uint8 or the path of such a picture, in
-        the order of docs/scene.md."""
-        faces = texture_of(pixels, "skybox")
+        """Set the image around the scene.
+
+        Args:
+            pixels: Six square faces below one another in the order of docs/scene.md: shape (6 n, n, 3) uint8, or the
+                path of such an image.
+
+        Raises:
+            SceneBuildError: The pixels are of another shape, or cannot be read.
+        """
+        faces = check_texture(pixels, "skybox")
         if faces.shape[0] != 6 * faces.shape[1]:
             raise SceneBuildError(f"a skybox of {faces.shape[1]} x {faces.shape[0]}: six squares below one another")
-        self._world.skybox = Picture(faces, "skybox", TextureKind.SKYBOX)
+        self._content.skybox = TextureImage(faces, "skybox", TextureKind.SKYBOX)
 
     def build(self, store: AssetStore, *, options: EncodeOptions | None = None, threads: int = 0) -> ComposedScene:
-        """The scene as it stands; its assets are in `store` afterwards. The same things give the same hash anywhere."""
-        return assemble(self._world, self.environment, store, options, threads)
+        """Build the scene as composed so far, and put its assets into a store.
 
-    # --- inside -------------------------------------------------------------------------------------------------------
+        The same content gives the same `scene_hash` in every process.
 
-    def _shape(self, kind: str, name: str, size: tuple[float, ...], options: Options) -> str:
-        look = look_of(options) or Look()
-        body, matrix = self._place(name, options)
-        self._world.items.append(Item(body, cut(name), matrix, look, kind=kind, size=(size[0], size[1], size[2])))
+        Args:
+            store: Store of the session that serves the scene.
+            options: Encoding of meshes and textures.
+            threads: Number of threads; 0 is one per processor, at most 8.
+
+        Returns:
+            The specification, its bodies, articulations and deformables.
+
+        Raises:
+            SceneBuildError: The scene is too large, or something in it cannot be drawn.
+            OSError: The store cannot be written.
+        """
+        return assemble_scene(self._content, self.environment, store, options, threads)
+
+    # --- internal -----------------------------------------------------------------------------------------------------
+
+    def _add_shape(
+        self,
+        kind: str,
+        name: str,
+        size: tuple[float, ...],
+        appearance: Appearance | None,
+        position: Sequence[float],
+        quaternion: Sequence[float],
+        *,
+        movable: bool,
+        on: str,
+    ) -> str:
+        body, matrix = self._place(name, position, quaternion, movable=movable, on=on)
+        item = DrawnItem(
+            body,
+            truncate_name(name),
+            matrix,
+            appearance or Appearance(),
+            kind=kind,
+            size=(size[0], size[1], size[2]),
+        )
+        self._content.items.append(item)
         return name
 
-    def _place(self, name: str, options: Options, *, named: bool = False) -> tuple[int, Matrix]:
-        """The body that something is added to, made for it where it is movable or `named`, and T_body_thing."""
+    def _place(
+        self,
+        name: str,
+        position: Sequence[float],
+        quaternion: Sequence[float],
+        *,
+        movable: bool,
+        on: str,
+        named: bool = False,
+    ) -> tuple[int, Matrix]:
+        """Return the index of the body to add to (-1: the world), created if movable or `named`, and T_body_item."""
         if not isinstance(name, str):
             raise SceneBuildError(f"name is {name!r}: text is expected, '' for no name")
-        T = checked_pose(options.get("position", IDENTITY.p), options.get("quaternion", IDENTITY.q))
-        on, movable = options.get("on", ""), options.get("movable", False)
+        T = check_pose(position, quaternion)
         if on and movable:
             raise SceneBuildError(f"{name!r} is to be movable and on {on!r}: one of both")
         if on:
-            return self._body_named(on), matrix_of(T)
+            return self._find_movable(on), to_matrix(T)
         if movable:
-            self._new_name(name)
+            self._check_new_name(name)
             if name == _WORLD:
                 raise SceneBuildError(f"name is {name!r}: that is the frame that all is in, give name= another one")
-            self._world.names.add(name)
+            self._content.names.add(name)
         if movable or named:
-            self._world.things.append(Thing(cut(name), -1, T, movable))
-            return len(self._world.things) - 1, np.eye(4)
-        return -1, matrix_of(T)
+            self._content.bodies.append(ComposedBody(truncate_name(name), -1, T, movable))
+            return len(self._content.bodies) - 1, np.eye(4)
+        return -1, to_matrix(T)
 
-    def _moves(self, body: int) -> bool:
-        return body >= 0 and self._world.things[body].moving
+    def _is_moving(self, body: int) -> bool:
+        return body >= 0 and self._content.bodies[body].moving
 
-    def _body_named(self, on: str) -> int:
-        """Place of the movable body `on`, -1 for none."""
+    def _find_movable(self, on: str) -> int:
+        """Return the index of the movable body `on`, -1 for none."""
         if not on:
             return -1
-        for place, thing in enumerate(self._world.things):
-            if thing.moving and thing.name == on:
-                return place
-        names = ", ".join(thing.name for thing in self._world.things if thing.moving) or "none"
-        raise SceneBuildError(f"on={on!r}: no movable body is called so. Movable: {names}")
+        for index, body in enumerate(self._content.bodies):
+            if body.moving and body.name == on:
+                return index
+        names = ", ".join(body.name for body in self._content.bodies if body.moving) or "none"
+        raise SceneBuildError(f"on={on!r}: no movable body has this name. Movable: {names}")
 
-    def _new_name(self, name: str) -> None:
-        if not isinstance(name, str) or not name or len(name) > _MAX_NAME or cut(name) != name:
+    def _check_new_name(self, name: str) -> None:
+        if not isinstance(name, str) or not name or len(name) > _MAX_NAME or truncate_name(name) != name:
             raise SceneBuildError(
-                f"name is {reprlib.repr(name)}: what moves needs one of 1 to {_MAX_NAME} characters, by which it is "
-                "addressed"
+                f"name is {reprlib.repr(name)}: movable bodies, articulations, deformables need 1 to {_MAX_NAME} "
+                "characters"
             )
-        if name in self._world.names:
-            raise SceneBuildError(f"there is a {name!r} already: what moves needs a name of its own")
+        if name in self._content.names:
+            raise SceneBuildError(f"there is a {name!r} already: choose another name")
 
 
 def _three(what: str, values: Any) -> Vec3:
-    x, y, z = numbers(what, values, 3)
+    x, y, z = check_numbers(what, values, 3)
     return x, y, z

@@ -83,7 +83,7 @@ class Joint(NamedTuple):
     rest: float
 
 
-class Part(NamedTuple):
+class ArticulatedBody(NamedTuple):
     """One moving body on its joint. `parent`: an earlier part by its place, -1 for the root, which is part 0.
 
     `T_parent_joint`: of the joint in the parent's frame; at position 0 the body's frame is there. `axis`: unit vector
@@ -112,7 +112,7 @@ class Articulation:
 
     name: str
     T_world_root: Pose
-    parts: tuple[Part, ...]
+    parts: tuple[ArticulatedBody, ...]
     joints: tuple[Joint, ...]
     mimics: Mapping[str, str]
     loose: Mapping[str, str] = field(default_factory=dict)
@@ -122,31 +122,33 @@ class Articulation:
         """Names of the moving bodies, the root's first."""
         return tuple(part.body for part in self.parts)
 
-    def poses(self, q: Mapping[str, float]) -> dict[str, Pose]:
+    def compute_poses(self, q: Mapping[str, float]) -> dict[str, Pose]:
         """T_articulation_body of every body, for positions of joints by name [rad] or [m].
 
         Joints that are not in `q` are at rest. Raises `SceneBuildError` for names that cannot be set, and for
         positions that are no finite numbers.
         """
-        return self.placed(IDENTITY, q)
+        return self.compute_world_poses(IDENTITY, q)
 
-    def placed(self, T_world_root: Pose, q: Mapping[str, float], loose: Mapping[str, Pose] = _NONE) -> dict[str, Pose]:
+    def compute_world_poses(
+        self, T_world_root: Pose, q: Mapping[str, float], loose: Mapping[str, Pose] = _NONE
+    ) -> dict[str, Pose]:
         """T_world_body of every body, as `poses`. `loose`: T_world_body of bodies on floating and planar joints, by
         name; what is below moves with them, whatever is above."""
-        self.check(q)
+        self.check_positions(q)
         at = [float(q.get(joint.name, joint.rest)) for joint in self.joints]
         placed: list[tuple[Vec3, tuple[float, float, float, float]]] = []
         for part in self.parts:
             above = placed[part.parent] if part.parent >= 0 else (T_world_root.p, T_world_root.q)
             T_world_body = compose(above, (part.T_parent_joint.p, part.T_parent_joint.q))
             if part.joint >= 0:
-                T_world_body = compose(T_world_body, _moved(part, at[part.joint]))
+                T_world_body = compose(T_world_body, _joint_motion(part, at[part.joint]))
             elif part.body in loose:
                 T_world_body = (loose[part.body].p, loose[part.body].q)
             placed.append(T_world_body)
         return {part.body: Pose(*T) for part, T in zip(self.parts, placed, strict=True)}
 
-    def check(self, q: Mapping[str, float]) -> None:
+    def check_positions(self, q: Mapping[str, float]) -> None:
         """Raises `SceneBuildError` unless every name is one of `joints` with a finite position."""
         known = {joint.name for joint in self.joints}
         for name, value in q.items():
@@ -168,7 +170,7 @@ class Articulation:
                 raise SceneBuildError(f"joint {name!r} of {self.name!r} at {value!r}: a finite number is needed")
 
 
-def _moved(part: Part, position: float) -> tuple[Vec3, tuple[float, float, float, float]]:
+def _joint_motion(part: ArticulatedBody, position: float) -> tuple[Vec3, tuple[float, float, float, float]]:
     """T_joint_body."""
     along = part.multiplier * position + part.offset
     x, y, z = part.axis

@@ -16,8 +16,8 @@ from iris_session.assets.store import AssetStore
 from iris_session.protocol.names import AssetEncoding, GeometryKind, TextureKind
 from iris_session.protocol.scene import Geometry, SceneSpec, Texture
 from iris_session.scene.errors import AssetDecodeError
-from iris_session.scene.images import Pixels, decode_image, halved
-from iris_session.scene.mesh_processing import unit
+from iris_session.scene.images import Pixels, decode_image, halve
+from iris_session.scene.mesh_processing import normalise
 from iris_session.scene.meshes import MeshArrays, index_corners
 
 #: Longest side of a face in an exported file [pixels]: six in one picture are then no more than headsets take.
@@ -48,16 +48,16 @@ class Atlas(NamedTuple):
     pixels: Pixels
     side: int
     border: int
-    plain: bool
+    single_colors: bool
 
-    def uv(self, face: NDArray[np.int64], on_face: Floats) -> Floats:
+    def to_uv(self, face: NDArray[np.int64], on_face: Floats) -> Floats:
         """Coordinates in the picture of those on faces, 0..1 (..., 2)."""
         cell = self.side + 2 * self.border
         corner = np.stack([face % 3, face // 3], axis=-1) * cell + self.border
         return (corner + np.clip(on_face, 0.0, 1.0) * self.side) / [3 * cell, 2 * cell]
 
 
-class Cube(NamedTuple):
+class CubeMap(NamedTuple):
     """What a visual wears: one colour (0..1), or an atlas. `address`: of the asset that it is made of. `encoding`: that
     suits it, PNG or JPEG."""
 
@@ -67,7 +67,7 @@ class Cube(NamedTuple):
     atlas: Atlas | None = None
 
 
-class Cubes:
+class CubeMapReader:
     """The cube textures of a specification, each read once. `max_side`: of a face [pixels]; finer ones are taken in a
     coarser level. Raises `SceneBuildError` for what the store lacks or what is damaged."""
 
@@ -75,16 +75,16 @@ class Cubes:
         self._spec = spec
         self._store = store
         self._max_side = max_side
-        self._read: dict[str, Cube] = {}
+        self._read: dict[str, CubeMap] = {}
 
-    def worn(self, material: int, geometry: Geometry) -> Cube | None:
+    def find(self, material: int, geometry: Geometry) -> CubeMap | None:
         """What a visual wears; `None` where it has no cube texture, or a mesh has coordinates of its own: MuJoCo draws
         no cube there."""
-        index = cube_texture(self._spec, material)
+        index = find_cube_texture(self._spec, material)
         textured = geometry.mesh >= 0 and self._spec.meshes[geometry.mesh].textured
-        return None if index < 0 or textured else self._cube(self._spec.textures[index])
+        return None if index < 0 or textured else self._read_texture(self._spec.textures[index])
 
-    def _cube(self, texture: Texture) -> Cube | None:
+    def _read_texture(self, texture: Texture) -> CubeMap | None:
         levels = [level for level in texture.levels if level.encoding != AssetEncoding.OPAQUE]
         if not levels:
             return None
@@ -92,17 +92,19 @@ class Cubes:
         if level.address not in self._read:
             pixels = decode_image(self._store.get(level.address), level.encoding)
             encoding = AssetEncoding.JPEG if level.encoding == AssetEncoding.JPEG else AssetEncoding.PNG
-            self._read[level.address] = _cube_of(Cube(level.address, encoding), faces_of(pixels), self._max_side)
+            self._read[level.address] = _with_atlas(
+                CubeMap(level.address, encoding), split_faces(pixels), self._max_side
+            )
         return self._read[level.address]
 
 
-def cube_texture(spec: SceneSpec, material: int) -> int:
+def find_cube_texture(spec: SceneSpec, material: int) -> int:
     """The cube texture of a material's colour; -1 where there is none."""
     index = -1 if material < 0 else spec.materials[material].texture()
     return -1 if index < 0 or spec.textures[index].kind == TextureKind.IMAGE else index
 
 
-def faces_of(pixels: Pixels) -> Pixels:
+def split_faces(pixels: Pixels) -> Pixels:
     """(6, side, side, channels) of six faces below one another. Raises `AssetDecodeError` where they are not."""
     if not len(pixels) == _FACES * pixels.shape[1] > 0:
         raise AssetDecodeError(
@@ -111,26 +113,26 @@ def faces_of(pixels: Pixels) -> Pixels:
     return pixels.reshape(_FACES, len(pixels) // _FACES, *pixels.shape[1:])
 
 
-def _cube_of(cube: Cube, faces: Pixels, max_side: int) -> Cube:
+def _with_atlas(cube: CubeMap, faces: Pixels, max_side: int) -> CubeMap:
     plain = bool((faces == faces[:, :1, :1]).all())
     if plain and bool((faces == faces[:1]).all()) and (faces.shape[3] < 4 or faces[0, 0, 0, 3] == 255):
         red, green, blue = np.resize(faces[0, 0, 0, : 3 if faces.shape[3] >= 3 else 1] / 255.0, 3).tolist()
         return cube._replace(tint=(red, green, blue))
     if plain and 0.5 / faces.shape[2] <= TOLERANCE:  # else what is mixed at edges is to be seen
         cells = np.broadcast_to(faces[:, :1, :1], (_FACES, 5, 5, faces.shape[3]))
-        return cube._replace(atlas=Atlas(_rows(cells), side=1, border=2, plain=True))
+        return cube._replace(atlas=Atlas(_join_cells(cells), side=1, border=2, single_colors=True))
     while faces.shape[2] > max_side:
-        faces = np.stack([halved(face) for face in faces])
+        faces = np.stack([halve(face) for face in faces])
     side = faces.shape[2]
     border = max(2, side // 16)
-    return cube._replace(atlas=Atlas(_rows(_bordered(faces, border)), side, border, plain=False))
+    return cube._replace(atlas=Atlas(_join_cells(_add_borders(faces, border)), side, border, single_colors=False))
 
 
-def _rows(cells: Pixels) -> Pixels:
+def _join_cells(cells: Pixels) -> Pixels:
     return np.concatenate([np.concatenate(list(cells[k : k + 3]), axis=1) for k in (0, 3)])
 
 
-def _bordered(faces: Pixels, border: int) -> Pixels:
+def _add_borders(faces: Pixels, border: int) -> Pixels:
     """Faces with what directions beyond their edges see, which are on other faces."""
     side = faces.shape[1]
     cells = np.pad(faces, ((0, 0), (border, border), (border, border), (0, 0)))
@@ -141,8 +143,8 @@ def _bordered(faces: Pixels, border: int) -> Pixels:
         direction[:, 0, lead] = sign
         direction[:, 0, u] = u_sign * at[right]
         direction[:, 0, v] = v_sign * at[down]
-        face = np.stack([_inside(direction, k).min(axis=(1, 2)) for k in range(_FACES)], axis=1).argmax(axis=1)
-        x, y = np.clip((_on_face(direction, face)[0][:, 0] * side).astype(int), 0, side - 1).T
+        face = np.stack([_face_distances(direction, k).min(axis=(1, 2)) for k in range(_FACES)], axis=1).argmax(axis=1)
+        x, y = np.clip((_face_coordinates(direction, face)[0][:, 0] * side).astype(int), 0, side - 1).T
         cell[down, right] = faces[face, y, x]
     return cells
 
@@ -163,23 +165,23 @@ def direction_scale(spec: SceneSpec, geometry: Geometry, material: int) -> tuple
     return (1 / x if x else 1.0, 1 / y if y else 1.0, 1 / z if z else 1.0)
 
 
-def baked(mesh: MeshArrays, geometry: Geometry, scale: tuple[float, float, float], atlas: Atlas) -> MeshArrays:
+def bake_cube_map(mesh: MeshArrays, geometry: Geometry, scale: tuple[float, float, float], atlas: Atlas) -> MeshArrays:
     """`mesh` cut and split, with coordinates in `atlas`. `scale`: of `direction_scale`."""
     columns = np.concatenate([mesh.position, mesh.normal, *([] if mesh.color is None else [mesh.color])], axis=1)
     rest = columns[mesh.index].astype(np.float64)
     direction = rest[:, :, :3] * scale
     if geometry.kind == GeometryKind.CAPSULE:
-        direction = _on_capsule(rest[:, :, :3], direction, geometry.size)
-    corners, face = _cut(np.concatenate([direction, rest], axis=2))
-    corners, face, on_face = _split(corners, face, np.inf if atlas.plain else TOLERANCE)
-    position, normal, color = corners[:, :, 3:6], unit(corners[:, :, 6:9]), None
+        direction = _capsule_directions(rest[:, :, :3], direction, geometry.size)
+    corners, face = _cut_at_faces(np.concatenate([direction, rest], axis=2))
+    corners, face, on_face = _split_triangles(corners, face, np.inf if atlas.single_colors else TOLERANCE)
+    position, normal, color = corners[:, :, 3:6], normalise(corners[:, :, 6:9]), None
     if mesh.color is not None:
         color = np.rint(corners[:, :, 9:13]).astype(np.uint8)
-    uv = atlas.uv(np.repeat(face[:, None], 3, axis=1), on_face)
+    uv = atlas.to_uv(np.repeat(face[:, None], 3, axis=1), on_face)
     return index_corners(position.astype(np.float32), normal.astype(np.float32), uv.astype(np.float32), color)
 
 
-def _on_capsule(position: Floats, direction: Floats, size: tuple[float, float, float]) -> Floats:
+def _capsule_directions(position: Floats, direction: Floats, size: tuple[float, float, float]) -> Floats:
     """Caps are looked up as if cylinder and half spheres all had a half length of 1; `uniform` stretches them alike."""
     radius, _, half = size
     middle = position[:, :, 2].mean(axis=1)
@@ -191,19 +193,19 @@ def _on_capsule(position: Floats, direction: Floats, size: tuple[float, float, f
     return found
 
 
-def _cut(corners: Floats) -> tuple[Floats, NDArray[np.int64]]:
+def _cut_at_faces(corners: Floats) -> tuple[Floats, NDArray[np.int64]]:
     """Triangles that look at one face of the cube each, and which. The first three columns are directions."""
     length = np.abs(corners[:, :, :3]).max(axis=(1, 2))
-    margin = np.stack([_inside(corners, k).min(axis=(1, 2)) for k in range(_FACES)], axis=1)
+    margin = np.stack([_face_distances(corners, k).min(axis=(1, 2)) for k in range(_FACES)], axis=1)
     face = margin.argmax(axis=1)
     whole = margin.max(axis=1) >= -_EDGE * length
     found, faces = [corners[whole]], [face[whole]]
     for k in range(_FACES):
         part, count = corners[~whole], np.full(int((~whole).sum()), 3)
         for side in range(4):
-            distance = _inside(part, k)[:, :, side]
+            distance = _face_distances(part, k)[:, :, side]
             distance[np.abs(distance) < _EDGE * length[~whole][:, None]] = 0.0
-            part, count = _half(part, count, distance)
+            part, count = _clip_polygons(part, count, distance)
         for last in range(2, part.shape[1]):
             fan = part[count > last][:, [0, last - 1, last]]
             found.append(fan)
@@ -211,7 +213,7 @@ def _cut(corners: Floats) -> tuple[Floats, NDArray[np.int64]]:
     return np.concatenate(found), np.concatenate(faces)
 
 
-def _inside(corners: Floats, face: int) -> Floats:
+def _face_distances(corners: Floats, face: int) -> Floats:
     """How far directions are on the inside of the four planes that bound those of a face (..., 4)."""
     lead, sign, right, _, down, _ = _AXES[face]
     ahead = sign * corners[..., lead]
@@ -219,7 +221,7 @@ def _inside(corners: Floats, face: int) -> Floats:
     return np.stack([ahead - a, ahead + a, ahead - b, ahead + b], axis=-1)
 
 
-def _half(polygon: Floats, count: NDArray[np.int64], distance: Floats) -> tuple[Floats, NDArray[np.int64]]:
+def _clip_polygons(polygon: Floats, count: NDArray[np.int64], distance: Floats) -> tuple[Floats, NDArray[np.int64]]:
     """The part of convex polygons (n, m, columns) that has no negative distance. `count`: how many of the m corners
     each polygon has."""
     m = polygon.shape[1]
@@ -235,7 +237,7 @@ def _half(polygon: Floats, count: NDArray[np.int64], distance: Floats) -> tuple[
     return np.take_along_axis(points, order[:, :, None], 1), used.sum(axis=1)
 
 
-def _on_face(direction: Floats, face: NDArray[np.int64]) -> tuple[Floats, NDArray[np.bool_]]:
+def _face_coordinates(direction: Floats, face: NDArray[np.int64]) -> tuple[Floats, NDArray[np.bool_]]:
     """Coordinates on their faces (n, k, 2), 0..1 right and down, and where there are any: the centre has none."""
     lead, sign, right, right_sign, down, down_sign = np.array(_AXES)[face].T
     row = np.arange(len(face))
@@ -246,14 +248,16 @@ def _on_face(direction: Floats, face: NDArray[np.int64]) -> tuple[Floats, NDArra
     return (np.stack([u, v], axis=2) + 1) / 2, there
 
 
-def _split(corners: Floats, face: NDArray[np.int64], tolerance: float) -> tuple[Floats, NDArray[np.int64], Floats]:
+def _split_triangles(
+    corners: Floats, face: NDArray[np.int64], tolerance: float
+) -> tuple[Floats, NDArray[np.int64], Floats]:
     """Triangles in whose edges' middles the coordinates are within `tolerance` of exact ones; with their faces, and the
     coordinates of their corners. Judged by the edge alone, as its other triangle does."""
     done: list[tuple[Floats, NDArray[np.int64], Floats]] = []
     for depth in range(_DEPTH + 1):
-        on_face, there = _on_face(corners[:, :, :3], face)
+        on_face, there = _face_coordinates(corners[:, :, :3], face)
         middles = (corners + corners[:, [1, 2, 0]]) / 2
-        exact, _ = _on_face(middles[:, :, :3], face)
+        exact, _ = _face_coordinates(middles[:, :, :3], face)
         following, known = on_face[:, [1, 2, 0]], there & there[:, [1, 2, 0]]
         error = np.abs(exact - (on_face + following) / 2).max(axis=2)
         # A corner at the centre takes the mean of the others: these may then not be far from each other.
@@ -266,7 +270,7 @@ def _split(corners: Floats, face: NDArray[np.int64], tolerance: float) -> tuple[
         done.append((corners[stay], face[stay], uv[stay]))
         if bool(stay.all()):
             break
-        corners, which = _quarters(corners[~stay], middles[~stay], cut[~stay])
+        corners, which = _split_edges(corners[~stay], middles[~stay], cut[~stay])
         face = face[~stay][which]
     return (
         np.concatenate([part[0] for part in done]),
@@ -275,7 +279,7 @@ def _split(corners: Floats, face: NDArray[np.int64], tolerance: float) -> tuple[
     )
 
 
-def _quarters(corners: Floats, middles: Floats, cut: NDArray[np.bool_]) -> tuple[Floats, NDArray[np.int64]]:
+def _split_edges(corners: Floats, middles: Floats, cut: NDArray[np.bool_]) -> tuple[Floats, NDArray[np.int64]]:
     """Triangles split at the middles of their cut edges (0-1, 1-2, 2-0), and of which one each is a part."""
     n_cut = cut.sum(axis=1)
     # Turned so that of one cut edge it is the first, of two the last is whole.

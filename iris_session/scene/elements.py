@@ -37,7 +37,7 @@ Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class TextureImage:
     """A texture to be. `pixels` (height, width, channels), 1, 3 or 4 of them; six faces below each other of a cube."""
 
     pixels: Pixels
@@ -47,7 +47,7 @@ class Picture:
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class Appearance:
     """How a surface looks: fields as in `Material`, which it becomes unless it is a colour only.
 
     `pictures`: (role, picture) pairs.
@@ -60,15 +60,15 @@ class Look:
     shininess: float = 0.5
     metallic: float = -1.0
     roughness: float = -1.0
-    pictures: tuple[tuple[str, Picture], ...] = ()
+    images: tuple[tuple[str, TextureImage], ...] = ()
     repeat: Vec2 = (1.0, 1.0)
     uniform: bool = False
 
     @property
-    def plain(self) -> bool:
+    def is_plain_color(self) -> bool:
         """Whether the colour says all."""
         defaults = (0.0, 0.5, 0.5, -1.0, -1.0)
-        return not self.pictures and defaults == (
+        return not self.images and defaults == (
             self.emission,
             self.specular,
             self.shininess,
@@ -82,7 +82,7 @@ class Surface:
     """Triangles with one look."""
 
     mesh: MeshArrays
-    look: Look | None = None
+    appearance: Appearance | None = None
     name: str = ""
 
 
@@ -102,21 +102,21 @@ class Node:
 
 
 @dataclass(eq=False)
-class Item:
+class DrawnItem:
     """Something drawn on body `body` (its place in a list of bodies, -1 for the world): a `mesh`, or a shape of `kind`
     and `size` as in `Geometry`. `matrix` (4, 4): T_body_item, of meshes with scale."""
 
     body: int
     name: str
     matrix: Matrix
-    look: Look
+    appearance: Appearance
     mesh: MeshArrays | None = None
     kind: str = GeometryKind.MESH
     size: Vec3 = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
-class Loaded:
+class LoadedFile:
     """A file as it was read: nodes, parents first. `up`: the axis that it says is up, `y` or `z`.
 
     `unit`: one of its lengths in metres. `skipped`: what it has and the specification does not, a line each.
@@ -128,11 +128,11 @@ class Loaded:
     skipped: tuple[str, ...] = ()
 
 
-def rigid_and_rest(matrix: Matrix) -> tuple[Pose, Matrix | None]:
+def split_rigid(matrix: Matrix) -> tuple[Pose, Matrix | None]:
     """`matrix` (4, 4) as a pose and what is left of its turning part (3, 3), to be applied before it: scale, shear,
     reflection; `None` where nothing is left. Raises `SceneBuildError` for one that flattens or is not finite.
     """
-    if not solid(matrix):
+    if not is_solid(matrix):
         raise SceneBuildError("a scale is 0: give every axis one")
     turn = np.asarray(matrix[:3, :3], np.float64)
     U, scale, Vt = np.linalg.svd(turn)
@@ -142,10 +142,10 @@ def rigid_and_rest(matrix: Matrix) -> tuple[Pose, Matrix | None]:
     digits = _DIGITS - math.floor(math.log10(float(scale[0])))
     rest = np.round(R.T @ turn, digits) + 0.0  # so that one scale is the same at every angle, and its mesh is one
     rigid = bool(np.abs(rest - np.eye(3)).max() <= _RIGID)
-    return pose_of(R, matrix[:3, 3]), None if rigid else rest
+    return to_pose(R, matrix[:3, 3]), None if rigid else rest
 
 
-def solid(matrix: Matrix) -> bool:
+def is_solid(matrix: Matrix) -> bool:
     """Whether something is left of what is placed by `matrix`. Raises `SceneBuildError` for one that is not finite."""
     if not np.isfinite(matrix).all():
         raise SceneBuildError("a place in the file is not finite")
@@ -153,19 +153,19 @@ def solid(matrix: Matrix) -> bool:
     return bool(scale[-1] > 1e-12 * max(1.0, float(scale[0])))
 
 
-def pose_of(R: NDArray[np.float64], p: Any) -> Pose:
+def to_pose(R: NDArray[np.float64], p: Any) -> Pose:
     """A pose of a rotation matrix (3, 3) and a position."""
     w, i, j, k = quat_from_matrix(np.asarray(R, np.float64)).tolist()
-    return Pose(vec3(p), (w, i, j, k))
+    return Pose(to_vec3(p), (w, i, j, k))
 
 
-def vec3(p: Any) -> Vec3:
+def to_vec3(p: Any) -> Vec3:
     """The first three of an array."""
     x, y, z = (float(v) for v in p[:3])
     return x, y, z
 
 
-def matrix_of(pose: Pose) -> Matrix:
+def to_matrix(pose: Pose) -> Matrix:
     """(4, 4) of a pose."""
     matrix = np.eye(4)
     matrix[:3, :3] = quat_to_matrix(np.array(pose.q))
@@ -173,11 +173,11 @@ def matrix_of(pose: Pose) -> Matrix:
     return matrix
 
 
-def cut(name: object) -> str:
+def truncate_name(name: object) -> str:
     """A name as the wire holds it: not longer, and of characters that can be sent (JSON may hold halves of some)."""
     return str(name)[:MAX_TEXT].encode("utf-8", "replace").decode() if name is not None else ""
 
 
-def composed(a: Pose, b: Pose) -> Pose:
+def compose_poses(a: Pose, b: Pose) -> Pose:
     """T_a_c of T_a_b and T_b_c."""
     return Pose(*compose((a.p, a.q), (b.p, b.q)))

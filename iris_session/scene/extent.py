@@ -17,7 +17,7 @@ from iris_session.protocol.common import Vec3
 from iris_session.protocol.names import ArrayKind, GeometryKind
 from iris_session.protocol.scene import Geometry, SceneSpec, Visual
 from iris_session.scene.arrays import decode_arrays
-from iris_session.scene.elements import matrix_of, vec3
+from iris_session.scene.elements import to_matrix, to_vec3
 from iris_session.scene.meshes import decode_mesh
 
 #: No part and no robot is larger, few rooms are; a part of a centimetre whose file counts in millimetres is.
@@ -35,7 +35,7 @@ class Extent(msgspec.Struct, frozen=True):
     size: Vec3
 
 
-def extent_of(spec: SceneSpec, store: AssetStore) -> Extent | None:
+def compute_extent(spec: SceneSpec, store: AssetStore) -> Extent | None:
     """Of what is drawn at first, by the vertices of its meshes; `None` where nothing is, planes apart.
 
     Raises `AssetMissingError` when the store lacks an asset of the scene.
@@ -46,29 +46,29 @@ def extent_of(spec: SceneSpec, store: AssetStore) -> Extent | None:
         for part in spec.deformables
         if part.rgba[3] > 0 and part.group in spec.groups_shown
     )
-    return bounds(
+    return compute_bounds(
         spec, shown, lambda mesh: decode_mesh(store.get(spec.meshes[mesh].levels[0].address)).position, bending
     )
 
 
-def box_extent(spec: SceneSpec, more: Iterable[Points] = ()) -> Extent | None:
+def compute_box_extent(spec: SceneSpec, more: Iterable[Points] = ()) -> Extent | None:
     """Of everything, meshes by the boxes around them: no asset is read, and what is turned counts as up to 1.7 times as
     large. `more`: further points (n, 3) [m]."""
-    return bounds(spec, spec.visuals, lambda k: _corners(spec.meshes[k].low, spec.meshes[k].high), more)
+    return compute_bounds(spec, spec.visuals, lambda k: _box_corners(spec.meshes[k].low, spec.meshes[k].high), more)
 
 
 @np.errstate(all="ignore")  # a length that is not finite is refused with the specification
-def bounds(
+def compute_bounds(
     spec: SceneSpec, visuals: Iterable[Visual], points_of: Callable[[int], Points], more: Iterable[Points] = ()
 ) -> Extent | None:
     """Box of `visuals` in the world, of meshes by `points_of` their number (n, 3), and of `more` points (n, 3)."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    T_world_body = {body.id: matrix_of(body.T_world_body) for body in spec.bodies}
+    T_world_body = {body.id: to_matrix(body.T_world_body) for body in spec.bodies}
     mesh, points = -1, np.empty((0, 3))
     for visual in sorted(visuals, key=lambda v: v.geometry.mesh):  # one mesh in memory at a time
         if visual.geometry.kind == GeometryKind.PLANE:
             continue
-        T = T_world_body[visual.body] @ matrix_of(visual.T_body_visual)
+        T = T_world_body[visual.body] @ to_matrix(visual.T_body_visual)
         if visual.geometry.mesh >= 0:
             if visual.geometry.mesh != mesh:
                 mesh = visual.geometry.mesh
@@ -77,22 +77,22 @@ def bounds(
         elif visual.geometry.hfield >= 0:
             placed = _field_corners(spec, visual.geometry) @ T[:3, :3].T + T[:3, 3]
         else:
-            reach = _reach(visual.geometry, T[:3, :3])
+            reach = _shape_reach(visual.geometry, T[:3, :3])
             placed = np.stack([T[:3, 3] - reach, T[:3, 3] + reach])
-        low, high = _with(placed, low, high)
+        low, high = _extend_bounds(placed, low, high)
     for vertices in more:
-        low, high = _with(np.asarray(vertices, np.float64), low, high)
-    return Extent(vec3(low), vec3(high), vec3(high - low)) if bool((low <= high).all()) else None
+        low, high = _extend_bounds(np.asarray(vertices, np.float64), low, high)
+    return Extent(to_vec3(low), to_vec3(high), to_vec3(high - low)) if bool((low <= high).all()) else None
 
 
-def largest_mesh(spec: SceneSpec) -> float:
+def largest_mesh_side(spec: SceneSpec) -> float:
     """Longest side of a mesh that is drawn, in its own frame [m]; 0 without meshes."""
     worn = {v.geometry.mesh for v in spec.visuals if v.rgba[3] > 0 and v.geometry.mesh >= 0}
     boxes = (spec.meshes[mesh] for mesh in worn)
     return max((b - a for box in boxes for a, b in zip(box.low, box.high, strict=True)), default=0.0)
 
 
-def unit_mistake(side_m: float) -> tuple[float, str] | None:
+def find_unit_mistake(side_m: float) -> tuple[float, str] | None:
     """What is likely wrong with something whose longest side this is: the factor that mends it, and in words; `None`
     where nothing is."""
     if side_m > LARGEST_M:
@@ -102,38 +102,39 @@ def unit_mistake(side_m: float) -> tuple[float, str] | None:
     return None
 
 
-def unit_hint(side_m: float, remedy: str) -> str:
+def format_unit_hint(side_m: float, remedy: str) -> str:
     """The same as a line, empty where nothing is wrong. `remedy`: what to do, with `{factor}` where that stands."""
-    mistake = unit_mistake(side_m)
+    mistake = find_unit_mistake(side_m)
     if mistake is None:
         return ""
     factor, what = mistake
-    return f"{length(side_m)} large: {what} {remedy.format(factor=f'{factor:g}')} makes it {length(side_m * factor)}"
+    remedied = remedy.format(factor=f"{factor:g}")
+    return f"{format_length(side_m)} large: {what} {remedied} makes it {format_length(side_m * factor)}"
 
 
-def size_text(extent: Extent) -> str:
+def format_size(extent: Extent) -> str:
     """Its sides for people."""
-    return " x ".join(coordinates(extent, extent.size)) + " m"
+    return " x ".join(format_coordinates(extent, extent.size)) + " m"
 
 
-def coordinates(extent: Extent, values: Vec3) -> list[str]:
+def format_coordinates(extent: Extent, values: Vec3) -> list[str]:
     """Lengths of a box for people [m]: what is nothing beside its sides is rounding of its places, and 0."""
     least = 1e-9 * max(map(abs, (*extent.low, *extent.high)))
     return [f"{0.0 if abs(v) < least else v:.3g}" for v in values]
 
 
-def length(metres: float) -> str:
+def format_length(metres: float) -> str:
     """A length for people."""
     value, unit = (metres, "m") if metres >= 0.1 else (1e3 * metres, "mm")
     return f"{value:,.0f} {unit}" if value >= 1e4 else f"{value:.4g} {unit}"
 
 
-def _corners(low: Vec3, high: Vec3) -> Points:
+def _box_corners(low: Vec3, high: Vec3) -> Points:
     """The eight corners of a box, (8, 3)."""
     return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
 
 
-def _with(points: Points, low: Points, high: Points) -> tuple[Points, Points]:
+def _extend_bounds(points: Points, low: Points, high: Points) -> tuple[Points, Points]:
     if not len(points):
         return low, high
     return np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
@@ -142,10 +143,10 @@ def _with(points: Points, low: Points, high: Points) -> tuple[Points, Points]:
 def _field_corners(spec: SceneSpec, geometry: Geometry) -> Points:
     """Of the box around a height field: its highest elevation is 1."""
     half_x, half_y, top, base = spec.hfields[geometry.hfield].size
-    return _corners((-half_x, -half_y, -base), (half_x, half_y, top))
+    return _box_corners((-half_x, -half_y, -base), (half_x, half_y, top))
 
 
-def _reach(geometry: Geometry, R_world_visual: Points) -> Points:
+def _shape_reach(geometry: Geometry, R_world_visual: Points) -> Points:
     """How far a shape reaches from its centre along the axes of the world, (3,) [m]."""
     R, size = np.abs(R_world_visual), np.array(geometry.size)
     match geometry.kind:

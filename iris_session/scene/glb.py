@@ -27,13 +27,18 @@ from iris_session.protocol.common import Pose, Quat, Vec3
 from iris_session.protocol.names import ArrayKind, AssetEncoding, Follow, LightKind, TextureKind, TextureRole
 from iris_session.protocol.scene import Body, Camera, Light, SceneSpec, Visual
 from iris_session.scene.arrays import decode_arrays
-from iris_session.scene.cube_maps import CUBE_SIDE, Cube, Cubes, baked, direction_scale
-from iris_session.scene.elements import composed, vec3
+from iris_session.scene.cube_maps import CUBE_SIDE, CubeMap, CubeMapReader, bake_cube_map, direction_scale
+from iris_session.scene.elements import compose_poses, to_vec3
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import decode_image, encode_image
-from iris_session.scene.mesh_processing import unit
+from iris_session.scene.mesh_processing import normalise
 from iris_session.scene.meshes import MeshArrays, decode_mesh, index_corners
-from iris_session.scene.shapes import height_field, on_deformable, primitive, with_coordinates
+from iris_session.scene.shapes import (
+    add_texture_coordinates,
+    build_height_field,
+    build_primitive,
+    repeat_texture_coordinates,
+)
 from iris_session.system.files import write_atomic
 
 _FLOAT, _UINT = 5126, 5125
@@ -59,7 +64,7 @@ _WIDEST: Final = math.pi / 2
 def write_glb(spec: SceneSpec, store: AssetStore, path: Path) -> int:
     """Writes the file, whole or not at all; returns its size. Raises `AssetMissingError` when the store lacks an asset
     of the scene, `SceneBuildError` for a scene that is too large, and `OSError`."""
-    data = _Glb(spec, store).finish()
+    data = _GlbWriter(spec, store).encode()
     target = Path(os.path.realpath(path))  # a link stays one
     if target.exists() and not target.is_file():  # a pipe or a device, or a folder, which says so
         target.write_bytes(data)
@@ -68,7 +73,7 @@ def write_glb(spec: SceneSpec, store: AssetStore, path: Path) -> int:
     return len(data)
 
 
-class _Glb:
+class _GlbWriter:
     def __init__(self, spec: SceneSpec, store: AssetStore) -> None:
         self._spec = spec
         self._store = store
@@ -84,35 +89,37 @@ class _Glb:
         self._meshes: dict[tuple[object, ...], int | None] = {}
         self._materials: dict[tuple[object, ...], int] = {}
         self._textures: dict[str, int] = {}  # by the address of the asset
-        self._cubes = Cubes(spec, store, CUBE_SIDE)
+        self._cubes = CubeMapReader(spec, store, CUBE_SIDE)
         self._accessors: dict[tuple[object, ...], int] = {}
         self._shared: dict[tuple[object, ...], dict[str, Any]] = {}
         self._see_through: set[tuple[object, ...]] = set()  # of those, by the alpha of their vertices
 
-    def finish(self) -> bytes:
+    def encode(self) -> bytes:
         T_world = {body.id: body.T_world_body for body in self._spec.bodies}
         nodes = {
-            body.id: self._node(body.name or f"body_{body.id}", _as_it_stands(body, T_world.get(body.parent)))
+            body.id: self._add_node(body.name or f"body_{body.id}", _initial_pose(body, T_world.get(body.parent)))
             for body in self._spec.bodies
         }
         for body in self._spec.bodies:
-            self._children(nodes.get(body.parent, 0)).append(nodes[body.id])
+            self._children_of(nodes.get(body.parent, 0)).append(nodes[body.id])
         for visual in self._spec.visuals:
             if visual.rgba[3] > 0 and visual.group in self._spec.groups_shown:
-                mesh = self._mesh_of(visual)
+                mesh = self._add_visual_mesh(visual)
                 if mesh is not None:
-                    node = self._node(visual.name or f"visual_{visual.id}", visual.T_body_visual)
+                    node = self._add_node(visual.name or f"visual_{visual.id}", visual.T_body_visual)
                     self._json["nodes"][node]["mesh"] = mesh
-                    self._children(nodes[visual.body]).append(node)
+                    self._children_of(nodes[visual.body]).append(node)
         for index, deformable in enumerate(self._spec.deformables):
             if deformable.rgba[3] > 0 and deformable.group in self._spec.groups_shown:
-                node = self._node(deformable.name or f"deformable_{index}", Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
-                self._json["nodes"][node]["mesh"] = self._deformable(index)
-                self._children(0).append(node)
+                node = self._add_node(
+                    deformable.name or f"deformable_{index}", Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+                )
+                self._json["nodes"][node]["mesh"] = self._add_deformable(index)
+                self._children_of(0).append(node)
         add_viewpoints(self._json, self._spec, nodes)
-        return self._packed()
+        return self._pack()
 
-    def _packed(self) -> bytes:
+    def _pack(self) -> bytes:
         self._json["buffers"] = [{"byteLength": len(self._blob)}]
         self._json["samplers"] = [{"wrapS": _REPEAT, "wrapT": _REPEAT, "magFilter": _LINEAR, "minFilter": _MIPMAPS}]
         document = {key: value for key, value in self._json.items() if value != []}
@@ -133,11 +140,11 @@ class _Glb:
             chunks += struct.pack("<I4s", len(body), b"BIN\0") + body
         return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
-    def _children(self, node: int) -> list[int]:
+    def _children_of(self, node: int) -> list[int]:
         children: list[int] = self._json["nodes"][node].setdefault("children", [])
         return children
 
-    def _node(self, name: str, pose: Pose) -> int:
+    def _add_node(self, name: str, pose: Pose) -> int:
         w, x, y, z = pose.q
         length = float(np.linalg.norm(pose.q)) or 1.0
         turn = [x / length, y / length, z / length, w / length]
@@ -149,41 +156,41 @@ class _Glb:
 
     # --- geometry -----------------------------------------------------------------------------------------------------
 
-    def _mesh_of(self, visual: Visual) -> int | None:
+    def _add_visual_mesh(self, visual: Visual) -> int | None:
         """One glTF mesh per shape and look, however many visuals have it."""
         key = (visual.geometry, visual.material, visual.rgba)
         if key not in self._meshes:
-            primitives = self._primitive(visual)
+            primitives = self._build_primitive(visual)
             self._meshes[key] = None if primitives is None else self._add("meshes", {"primitives": [primitives]})
         return self._meshes[key]
 
-    def _primitive(self, visual: Visual) -> dict[str, Any] | None:
+    def _build_primitive(self, visual: Visual) -> dict[str, Any] | None:
         geometry = visual.geometry
-        cube = self._cubes.worn(visual.material, geometry)
-        mapped = self._mapping(visual, cube)
+        cube = self._cubes.find(visual.material, geometry)
+        mapped = self._mapping_key(visual, cube)
         key = (geometry, mapped)
         if key not in self._shared:
-            arrays = self._arrays(visual)
+            arrays = self._read_arrays(visual)
             if arrays is None or not arrays.triangles:
                 return None
             if cube is not None and cube.atlas is not None:
                 scale = direction_scale(self._spec, geometry, visual.material)
-                arrays = baked(arrays, geometry, scale, cube.atlas)
+                arrays = bake_cube_map(arrays, geometry, scale, cube.atlas)
             elif mapped is not None:
-                arrays = with_coordinates(arrays, geometry, self._spec.materials[visual.material])
-            self._shared[key] = self._attributes(arrays, arrays.uv)
+                arrays = add_texture_coordinates(arrays, geometry, self._spec.materials[visual.material])
+            self._shared[key] = self._add_attributes(arrays, arrays.uv)
             if arrays.color is not None and bool((arrays.color[:, 3] < 255).any()):
                 self._see_through.add(key)
         uv = "TEXCOORD_0" in self._shared[key]["attributes"]
         see_through = key in self._see_through
-        material = self._material(visual.material, visual.rgba, mapped=uv, blended=see_through, cube=cube)
+        material = self._add_material(visual.material, visual.rgba, mapped=uv, blended=see_through, cube=cube)
         return {**self._shared[key], "material": material}
 
-    def _mapping(self, visual: Visual, cube: Cube | None) -> tuple[object, ...] | None:
+    def _mapping_key(self, visual: Visual, cube: CubeMap | None) -> tuple[object, ...] | None:
         """What texture coordinates depend on, `None` where there is no texture, or those of a mesh are as they are."""
         if cube is not None:
             scale = direction_scale(self._spec, visual.geometry, visual.material)
-            return None if cube.atlas is None else ("cube", scale, cube.atlas.side, cube.atlas.plain)
+            return None if cube.atlas is None else ("cube", scale, cube.atlas.side, cube.atlas.single_colors)
         material = None if visual.material < 0 else self._spec.materials[visual.material]
         worn = -1 if material is None else material.texture()
         if material is None or worn < 0 or self._spec.textures[worn].kind != TextureKind.IMAGE:
@@ -192,60 +199,64 @@ class _Glb:
         as_it_is = mesh >= 0 and self._spec.meshes[mesh].textured and material.repeat == (1.0, 1.0)
         return None if as_it_is and not material.uniform else (material.repeat, material.uniform)
 
-    def _arrays(self, visual: Visual) -> MeshArrays | None:
+    def _read_arrays(self, visual: Visual) -> MeshArrays | None:
         geometry = visual.geometry
         if geometry.mesh >= 0:
             return decode_mesh(self._store.get(self._spec.meshes[geometry.mesh].levels[0].address))
         if geometry.hfield >= 0:
             field = self._spec.hfields[geometry.hfield]
-            return height_field(field, decode_arrays(self._store.get(field.address), ArrayKind.GRID)["elevation"])
-        return primitive(geometry)
+            return build_height_field(field, decode_arrays(self._store.get(field.address), ArrayKind.GRID)["elevation"])
+        return build_primitive(geometry)
 
-    def _deformable(self, index: int) -> int:
+    def _add_deformable(self, index: int) -> int:
         """The rest shape: surfaces, of cloths from both sides; ropes as lines."""
         deformable = self._spec.deformables[index]
         arrays = decode_arrays(self._store.get(deformable.address), ArrayKind.DEFORMABLE)
         both_sides, mapped = deformable.dim == 2, deformable.dim > 1 and "uv" in arrays
-        look = self._material(deformable.material, deformable.rgba, mapped=mapped, both_sides=both_sides)
+        look = self._add_material(deformable.material, deformable.rgba, mapped=mapped, both_sides=both_sides)
         if deformable.dim == 1:
-            attributes = {"POSITION": self._accessor(arrays["position"], "VEC3", bounds=True)}
-            rope = {"attributes": attributes, "indices": self._indices(arrays["elements"]), "mode": _LINES}
+            attributes = {"POSITION": self._add_accessor(arrays["position"], "VEC3", bounds=True)}
+            rope = {"attributes": attributes, "indices": self._add_indices(arrays["elements"]), "mode": _LINES}
             return self._add("meshes", {"primitives": [{**rope, "material": look}]})
         corners = arrays["position"][arrays["elements"]]
-        normal = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+        normal = normalise(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
         worn = None if deformable.material < 0 else self._spec.materials[deformable.material]
-        mesh = index_corners(corners, np.repeat(normal[:, None], 3, axis=1), on_deformable(arrays.get("uv"), worn))
-        return self._add("meshes", {"primitives": [{**self._attributes(mesh, mesh.uv), "material": look}]})
+        mesh = index_corners(
+            corners, np.repeat(normal[:, None], 3, axis=1), repeat_texture_coordinates(arrays.get("uv"), worn)
+        )
+        return self._add("meshes", {"primitives": [{**self._add_attributes(mesh, mesh.uv), "material": look}]})
 
-    def _attributes(self, mesh: MeshArrays, uv: NDArray[np.float32] | None) -> dict[str, Any]:
+    def _add_attributes(self, mesh: MeshArrays, uv: NDArray[np.float32] | None) -> dict[str, Any]:
         attributes = {
-            "POSITION": self._accessor(mesh.position, "VEC3", bounds=True),
-            "NORMAL": self._accessor(_normals(mesh.normal), "VEC3"),
+            "POSITION": self._add_accessor(mesh.position, "VEC3", bounds=True),
+            "NORMAL": self._add_accessor(_normalise(mesh.normal), "VEC3"),
         }
         if uv is not None:
-            attributes["TEXCOORD_0"] = self._accessor(uv, "VEC2")
+            attributes["TEXCOORD_0"] = self._add_accessor(uv, "VEC2")
         if mesh.color is not None:
-            attributes["COLOR_0"] = self._accessor(_linear_colors(mesh.color), "VEC4")
-        return {"attributes": attributes, "indices": self._indices(mesh.index)}
+            attributes["COLOR_0"] = self._add_accessor(_to_linear_colors(mesh.color), "VEC4")
+        return {"attributes": attributes, "indices": self._add_indices(mesh.index)}
 
-    def _indices(self, index: NDArray[Any]) -> int:
+    def _add_indices(self, index: NDArray[Any]) -> int:
         data = np.ascontiguousarray(index, "<u4")
-        return self._once(data.tobytes(), _INDICES, {"componentType": _UINT, "count": data.size, "type": "SCALAR"})
+        return self._add_accessor_once(
+            data.tobytes(), _INDICES, {"componentType": _UINT, "count": data.size, "type": "SCALAR"}
+        )
 
-    def _accessor(self, values: NDArray[np.float32], kind: str, *, bounds: bool = False) -> int:
+    def _add_accessor(self, values: NDArray[np.float32], kind: str, *, bounds: bool = False) -> int:
         accessor: dict[str, Any] = {"componentType": _FLOAT, "count": len(values), "type": kind}
         if bounds:
             accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
-        return self._once(values.astype("<f4").tobytes(), _VERTICES, accessor)
+        return self._add_accessor_once(values.astype("<f4").tobytes(), _VERTICES, accessor)
 
-    def _once(self, data: bytes, target: int, accessor: dict[str, Any]) -> int:
+    def _add_accessor_once(self, data: bytes, target: int, accessor: dict[str, Any]) -> int:
         """An accessor of its own for `data`, however often it is asked for: two may not share a view."""
         key = (hashlib.sha256(data).digest(), target, accessor["type"], "min" in accessor)
         if key not in self._accessors:
-            self._accessors[key] = self._add("accessors", {"bufferView": self._view(data, target), **accessor})
+            self._accessors[key] = self._add("accessors", {"bufferView": self._add_view(data, target), **accessor})
         return self._accessors[key]
 
-    def _view(self, data: bytes, target: int = 0) -> int:
+    def _add_view(self, data: bytes, target: int = 0) -> int:
         self._blob += b"\0" * (-len(self._blob) % 4)
         view: dict[str, Any] = {"buffer": 0, "byteOffset": len(self._blob), "byteLength": len(data)}
         if target:
@@ -255,7 +266,7 @@ class _Glb:
 
     # --- looks --------------------------------------------------------------------------------------------------------
 
-    def _material(
+    def _add_material(
         self,
         index: int,
         rgba: Sequence[float],
@@ -263,20 +274,22 @@ class _Glb:
         mapped: bool,
         both_sides: bool = False,
         blended: bool = False,
-        cube: Cube | None = None,
+        cube: CubeMap | None = None,
     ) -> int:
         """`mapped`: what wears it has texture coordinates, without which it wears no texture. `blended`: it is not
         opaque, besides its own colour and textures. `cube`: worn by it; without one a material's cube is not drawn."""
         key = (index, tuple(rgba), mapped, both_sides, blended, cube is not None)
         if key not in self._materials:
-            look = self._look(index, rgba, mapped=mapped, cube=cube)
+            look = self._build_material(index, rgba, mapped=mapped, cube=cube)
             look["doubleSided"] = both_sides
             if blended:
                 look["alphaMode"] = "BLEND"
             self._materials[key] = self._add("materials", look)
         return self._materials[key]
 
-    def _look(self, index: int, rgba: Sequence[float], *, mapped: bool, cube: Cube | None) -> dict[str, Any]:
+    def _build_material(
+        self, index: int, rgba: Sequence[float], *, mapped: bool, cube: CubeMap | None
+    ) -> dict[str, Any]:
         tint = (1.0, 1.0, 1.0) if cube is None else cube.tint
         colour = [float(v) * part for v, part in zip(rgba, tint, strict=False)]
         look: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
@@ -291,24 +304,28 @@ class _Glb:
             if mapped and worn >= 0 and self._spec.textures[worn].channels == 4:
                 found["alphaMode"] = "BLEND"
             for where, key, texture in (
-                (look, "baseColorTexture", self._texture(worn) if cube is None else self._atlas(cube)),
-                (look, "metallicRoughnessTexture", self._texture(material.texture(TextureRole.ORM))),
-                (found, "occlusionTexture", self._texture(material.texture(TextureRole.ORM, TextureRole.OCCLUSION))),
-                (found, "normalTexture", self._texture(material.texture(TextureRole.NORMAL))),
-                (found, "emissiveTexture", self._texture(material.texture(TextureRole.EMISSIVE))),
+                (look, "baseColorTexture", self._add_texture(worn) if cube is None else self._add_atlas(cube)),
+                (look, "metallicRoughnessTexture", self._add_texture(material.texture(TextureRole.ORM))),
+                (
+                    found,
+                    "occlusionTexture",
+                    self._add_texture(material.texture(TextureRole.ORM, TextureRole.OCCLUSION)),
+                ),
+                (found, "normalTexture", self._add_texture(material.texture(TextureRole.NORMAL))),
+                (found, "emissiveTexture", self._add_texture(material.texture(TextureRole.EMISSIVE))),
             ):
                 if mapped and texture is not None:
                     where[key] = {"index": texture}
             if material.emission > 0:  # of what is seen, texture and all
-                found["emissiveFactor"] = [_linear(material.emission * v) for v in colour]
+                found["emissiveFactor"] = [_to_linear(material.emission * v) for v in colour]
                 if "baseColorTexture" in look:
                     found.setdefault("emissiveTexture", look["baseColorTexture"])
-        look["baseColorFactor"] = [*map(_linear, colour), min(max(float(rgba[3]), 0.0), 1.0)]
+        look["baseColorFactor"] = [*map(_to_linear, colour), min(max(float(rgba[3]), 0.0), 1.0)]
         if rgba[3] < 1:
             found["alphaMode"] = "BLEND"
         return found
 
-    def _texture(self, index: int) -> int | None:
+    def _add_texture(self, index: int) -> int | None:
         if index < 0 or self._spec.textures[index].kind != TextureKind.IMAGE:
             return None
         level = self._spec.textures[index].levels[0]
@@ -318,31 +335,31 @@ class _Glb:
             data, encoding = self._store.get(level.address), level.encoding
             if encoding == AssetEncoding.ARRAYS:
                 data, encoding, _ = encode_image(decode_image(data, encoding), AssetEncoding.PNG)
-            self._textures[level.address] = self._picture(data, encoding)
+            self._textures[level.address] = self._add_image(data, encoding)
         return self._textures[level.address]
 
-    def _atlas(self, cube: Cube) -> int | None:
+    def _add_atlas(self, cube: CubeMap) -> int | None:
         if cube.atlas is None:
             return None
         if cube.address not in self._textures:
             data, encoding, _ = encode_image(cube.atlas.pixels, cube.encoding)
-            self._textures[cube.address] = self._picture(data, encoding)
+            self._textures[cube.address] = self._add_image(data, encoding)
         return self._textures[cube.address]
 
-    def _picture(self, data: bytes, encoding: str) -> int:
-        image = self._add("images", {"bufferView": self._view(data), "mimeType": f"image/{encoding}"})
+    def _add_image(self, data: bytes, encoding: str) -> int:
+        image = self._add("images", {"bufferView": self._add_view(data), "mimeType": f"image/{encoding}"})
         return self._add("textures", {"source": image, "sampler": 0})
 
 
-def _normals(normal: NDArray[np.float32]) -> NDArray[np.float32]:
+def _normalise(normal: NDArray[np.float32]) -> NDArray[np.float32]:
     """Unit vectors; those that are as near to it as float32 gets stay as they are to the bit."""
     off = np.abs(np.linalg.norm(normal, axis=1) - 1.0) > 1e-6
     kept = normal.copy()
-    kept[off] = unit(normal[off])
+    kept[off] = normalise(normal[off])
     return kept
 
 
-def _linear_colors(color: NDArray[np.uint8]) -> NDArray[np.float32]:
+def _to_linear_colors(color: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Colours of vertices as they are seen, in bytes, to linear ones; alpha as it is."""
     v = color.astype(np.float64) / 255
     shone = np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
@@ -350,19 +367,19 @@ def _linear_colors(color: NDArray[np.uint8]) -> NDArray[np.float32]:
     return shone.astype(np.float32)
 
 
-def _as_it_stands(body: Body, T_world_parent: Pose | None) -> Pose:
+def _initial_pose(body: Body, T_world_parent: Pose | None) -> Pose:
     """In its parent, as the scene begins: joints need not be at zero then."""
     T_world_body = body.T_world_body
     if T_world_parent is None:
         return T_world_body
-    at_zero = composed(T_world_parent, body.T_parent_body)
+    at_zero = compose_poses(T_world_parent, body.T_parent_body)
     if np.allclose((*at_zero.p, *at_zero.q), (*T_world_body.p, *T_world_body.q), rtol=0, atol=1e-9):
         return body.T_parent_body  # to the bit
     T_parent_world = inverse((T_world_parent.p, T_world_parent.q))
     return Pose(*compose(T_parent_world, (T_world_body.p, T_world_body.q)))
 
 
-def _linear(value: float) -> float:
+def _to_linear(value: float) -> float:
     """A colour as it is seen (sRGB) to glTF's linear factor."""
     v = min(max(float(value), 0.0), 1.0)
     return v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4
@@ -374,31 +391,31 @@ def _linear(value: float) -> float:
 def add_viewpoints(document: dict[str, Any], spec: SceneSpec, nodes: Mapping[int, int]) -> None:
     """Adds them below the nodes of their bodies; `nodes`: of bodies, by their ids."""
     for k, camera in enumerate(spec.cameras):
-        document["cameras"].append(_lens(camera))
+        document["cameras"].append(_build_camera(camera))
         p, (w, x, y, z) = camera.T_body_camera.p, _seeing(camera, spec)
         node = {"name": camera.name or f"camera_{k}", "translation": list(p), "rotation": [x, y, z, w], "camera": k}
-        _hang(document, nodes[camera.body], node)
+        _add_child_node(document, nodes[camera.body], node)
     lights = [light for light in spec.lights if light.active and light.kind in _LIGHTS]
     if not lights:
         return
     document["extensionsUsed"] = [_EXTENSION]
-    document["extensions"] = {_EXTENSION: {"lights": [_lamp(light) for light in lights]}}
+    document["extensions"] = {_EXTENSION: {"lights": [_build_light(light) for light in lights]}}
     for k, light in enumerate(lights):
         node = {
             "name": light.name or f"light_{k}",
             "translation": list(light.p_body),
-            "rotation": _looking(light, spec),
+            "rotation": _look_at(light, spec),
             "extensions": {_EXTENSION: {"light": k}},
         }
-        _hang(document, nodes[light.body], node)
+        _add_child_node(document, nodes[light.body], node)
 
 
-def _hang(document: dict[str, Any], parent: int, node: dict[str, Any]) -> None:
+def _add_child_node(document: dict[str, Any], parent: int, node: dict[str, Any]) -> None:
     document["nodes"].append(node)
     document["nodes"][parent].setdefault("children", []).append(len(document["nodes"]) - 1)
 
 
-def _lens(camera: Camera) -> dict[str, Any]:
+def _build_camera(camera: Camera) -> dict[str, Any]:
     width, height = camera.resolution
     aspect = width / height if (width, height) != (1, 1) and height else _ASPECT
     if camera.focal[0] > 0 and camera.focal[1] > 0:  # of pixels that are no squares
@@ -412,7 +429,7 @@ def _lens(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _lamp(light: Light) -> dict[str, Any]:
+def _build_light(light: Light) -> dict[str, Any]:
     """As bright as it is drawn: intensity 1 where the scene does not say, and the colour (sRGB) as a linear one."""
     color = [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in np.clip(light.diffuse, 0, 1).tolist()]
     lamp: dict[str, Any] = {"type": _LIGHTS[light.kind], "color": color, "intensity": light.intensity or 1.0}
@@ -449,11 +466,11 @@ def _place(body: int, spec: SceneSpec) -> PoseTuple:
     return pose.p, pose.q
 
 
-def _looking(light: Light, spec: SceneSpec) -> list[float]:
+def _look_at(light: Light, spec: SceneSpec) -> list[float]:
     """`[x, y, z, w]` of a frame whose -z is the light's direction, in that of its body."""
     T_world_body = _place(light.body, spec)
     to_target = _to_target(light, apply(T_world_body, light.p_body), spec)
-    watched = quat_rotate(quat_conj(T_world_body[1]), vec3(to_target))
+    watched = quat_rotate(quat_conj(T_world_body[1]), to_vec3(to_target))
     back = -np.array(watched if to_target.any() else light.direction_body, np.float64)
     back /= np.linalg.norm(back) or 1.0
     side = np.cross([0.0, 1.0, 0.0] if abs(back[1]) < 0.9 else [1.0, 0.0, 0.0], back)

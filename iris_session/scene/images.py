@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.assets import MAX_ARRAY_BYTES
 from iris_session.protocol.names import ArrayFilter, ArrayKind, ArrayName, AssetEncoding
-from iris_session.scene.arrays import Stored, array_of, decode_arrays, encode_arrays, filtered, require
+from iris_session.scene.arrays import StoredArray, apply_filter, decode_arrays, encode_arrays, require_array, to_array
 from iris_session.scene.errors import AssetDecodeError, SceneBuildError
 
 Pixels = NDArray[np.uint8]
@@ -38,10 +38,10 @@ class EncodedImage(NamedTuple):
 def encode_image(pixels: Pixels, encoding: str = AssetEncoding.ARRAYS, quality: int = 92) -> EncodedImage:
     """`pixels`: (height, width, channels), first row on top. `quality`: of JPEG, 1..100."""
     if encoding == AssetEncoding.ARRAYS:
-        stored = Stored(ArrayName.PIXELS, pixels, _filter(pixels))
+        stored = StoredArray(ArrayName.PIXELS, pixels, _choose_filter(pixels))
         return EncodedImage(encode_arrays(ArrayKind.IMAGE, [stored]), encoding)
-    cv2 = _opencv()
-    swapped = _swapped(pixels)
+    cv2 = _import_opencv()
+    swapped = _swap_red_blue(pixels)
     if encoding == AssetEncoding.PNG:
         ok, data = cv2.imencode(".png", swapped, [cv2.IMWRITE_PNG_COMPRESSION, 6])
     elif encoding == AssetEncoding.JPEG:
@@ -67,13 +67,13 @@ def decode_image(data: bytes | bytearray | memoryview, encoding: str, max_bytes:
     """
     if encoding == AssetEncoding.ARRAYS:
         arrays = decode_arrays(data, ArrayKind.IMAGE, max_bytes)
-        return require(arrays, ArrayName.PIXELS, "u1", (None, None, None))
+        return require_array(arrays, ArrayName.PIXELS, "u1", (None, None, None))
     if encoding not in (AssetEncoding.PNG, AssetEncoding.JPEG):
         raise AssetDecodeError(f"unknown encoding {encoding!r} of an image: arrays, png or jpeg")
-    width, height = _stated_size(bytes(data[:65_536]), encoding)
+    width, height = _read_stated_size(bytes(data[:65_536]), encoding)
     if width * height * 4 > max_bytes:
         raise AssetDecodeError(f"an image of {width} x {height} pixels, at most {max_bytes} bytes are read")
-    cv2 = _opencv()
+    cv2 = _import_opencv()
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -84,10 +84,10 @@ def decode_image(data: bytes | bytearray | memoryview, encoding: str, max_bytes:
         raise AssetDecodeError(
             f"damaged {encoding}: {image.shape[1]} x {image.shape[0]} pixels, stated {width} x {height}"
         )
-    return _swapped(image if image.ndim == 3 else image[:, :, None])
+    return _swap_red_blue(image if image.ndim == 3 else image[:, :, None])
 
 
-def halved(pixels: Pixels) -> Pixels:
+def halve(pixels: Pixels) -> Pixels:
     """Half the width and height, at least one pixel each: means of two by two; an odd last row or column is lost."""
     height, width = (max(1, n // 2) for n in pixels.shape[:2])
     tall = pixels if pixels.shape[0] > 1 else np.repeat(pixels, 2, axis=0)
@@ -97,20 +97,20 @@ def halved(pixels: Pixels) -> Pixels:
     return ((total + 2) // 4).astype(np.uint8)
 
 
-def _filter(pixels: Pixels) -> str:
+def _choose_filter(pixels: Pixels) -> str:
     """`up` suits pictures, none what is drawn in flat colours: whichever makes a middle part smaller."""
     middle = max(0, len(pixels) // 2 - _SAMPLE_ROWS // 2)
     sample = np.ascontiguousarray(pixels[middle : middle + _SAMPLE_ROWS])
     import zstandard
 
     sizes = {
-        kind: len(zstandard.ZstdCompressor(level=1).compress(filtered(sample, kind)))
+        kind: len(zstandard.ZstdCompressor(level=1).compress(apply_filter(sample, kind)))
         for kind in (ArrayFilter.NONE, ArrayFilter.UP)
     }
     return min(sizes, key=lambda kind: sizes[kind])
 
 
-def _stated_size(head: bytes, encoding: str) -> tuple[int, int]:
+def _read_stated_size(head: bytes, encoding: str) -> tuple[int, int]:
     """Width and height as the file says, before anything is decoded."""
     if encoding == AssetEncoding.PNG:
         if head[:8] != _PNG or len(head) < 24:
@@ -134,7 +134,7 @@ def _stated_size(head: bytes, encoding: str) -> tuple[int, int]:
     raise AssetDecodeError("a JPEG without a size in its first 64 KiB")
 
 
-def _swapped(pixels: Pixels) -> Pixels:
+def _swap_red_blue(pixels: Pixels) -> Pixels:
     """Red and blue exchanged: OpenCV's order to ours, and back."""
     order = {1: [0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}.get(pixels.shape[2])
     if order is None:
@@ -142,7 +142,7 @@ def _swapped(pixels: Pixels) -> Pixels:
     return np.ascontiguousarray(pixels[:, :, order])
 
 
-def _opencv() -> Any:
+def _import_opencv() -> Any:
     try:
         import cv2
     except ImportError:
@@ -172,14 +172,14 @@ class PixelBudget:
 
 def read_pixels(data: bytes, what: str) -> Pixels:
     """(height, width, 1, 3 or 4), first row on top. Raises `SceneBuildError` with `what` in it."""
-    image_module = _pillow()
+    image_module = _import_pillow()
     try:
-        return pixels_of(image_module.open(io.BytesIO(data), formats=FORMATS), what)
+        return to_pixels(image_module.open(io.BytesIO(data), formats=FORMATS), what)
     except (OSError, ValueError, SyntaxError, EOFError, image_module.DecompressionBombError) as error:
         raise SceneBuildError(f"{what} is no image that can be read: {error}") from None
 
 
-def pixels_of(image: Any, what: str) -> Pixels:
+def to_pixels(image: Any, what: str) -> Pixels:
     """Pixels of a Pillow image, 8 bits a channel; alpha only where something is not opaque. Raises `SceneBuildError`
     for too many, before they are decoded."""
     if image.format not in (None, *FORMATS, _JPEGS):  # None: made in memory
@@ -194,19 +194,19 @@ def pixels_of(image: Any, what: str) -> Pixels:
     if image.mode in ("1", "L"):
         return np.ascontiguousarray(np.asarray(image.convert("L"), np.uint8)[:, :, None])
     see_through = "A" in image.mode or "a" in image.mode or "transparency" in image.info
-    return without_alpha(np.ascontiguousarray(np.asarray(image.convert("RGBA" if see_through else "RGB"), np.uint8)))
+    return drop_alpha(np.ascontiguousarray(np.asarray(image.convert("RGBA" if see_through else "RGB"), np.uint8)))
 
 
-def without_alpha(pixels: Pixels, *, always: bool = False) -> Pixels:
+def drop_alpha(pixels: Pixels, *, always: bool = False) -> Pixels:
     """`pixels` with three channels when their alpha says nothing, or is not wanted."""
     if pixels.shape[2] == 4 and (always or bool((pixels[:, :, 3] == 255).all())):
         return np.ascontiguousarray(pixels[:, :, :3])
     return pixels
 
 
-def checked_pixels(pixels: Any, what: str) -> Pixels:
+def check_pixels(pixels: Any, what: str) -> Pixels:
     """A texture that a caller gave as an array. Raises `SceneBuildError` for what is none."""
-    array = array_of(pixels, what)
+    array = to_array(pixels, what)
     if array.ndim == 2:
         array = array[:, :, None]
     if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] not in (1, 3, 4) or not array.size:
@@ -219,7 +219,7 @@ def checked_pixels(pixels: Any, what: str) -> Pixels:
     return np.array(array)
 
 
-def _pillow() -> Any:
+def _import_pillow() -> Any:
     try:
         from PIL import Image
     except ImportError:

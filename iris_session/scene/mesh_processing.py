@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.scene import Rgba
 from iris_session.scene.elements import Matrix
-from iris_session.scene.meshes import MeshArrays, index_corners, unique_rows
+from iris_session.scene.meshes import MeshArrays, find_unique_rows, index_corners
 
 #: A corner whose smooth normal is farther than this (cosine) from the face's gets the face's: MuJoCo's rule for meshes.
 CREASE: Final = 0.8
@@ -28,30 +28,30 @@ Doubles = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-def simplified(mesh: MeshArrays, triangles: int) -> tuple[MeshArrays, float] | None:
+def simplify_mesh(mesh: MeshArrays, triangles: int) -> tuple[MeshArrays, float] | None:
     """A mesh of about `triangles`, and how far its points lie from `mesh` at most [m].
 
     `None` where that would gain less than a quarter, and when `mesh` is textured or coloured.
     """
     if mesh.uv is not None or mesh.color is not None or triangles <= 0 or mesh.triangles <= triangles:
         return None
-    first, inverse = sorted_rows(mesh.position)
+    first, inverse = sort_rows(mesh.position)
     points = mesh.position[first].astype(np.float64)
     index = inverse[mesh.index]
-    area = float(np.linalg.norm(_across(points[index]), axis=1).sum())
+    area = float(np.linalg.norm(_face_vectors(points[index]), axis=1).sum())
     cell = np.sqrt(max(area, 1e-18) / triangles)  # a cell of surface is about two triangles; `area` is twice the area
     best: tuple[Doubles, Ints, float] | None = None
     for _ in range(_TRIES):
-        found = _clustered(points, index, float(cell))
+        found = _cluster(points, index, float(cell))
         if len(found[1]) and (best is None or abs(len(found[1]) - triangles) < abs(len(best[1]) - triangles)):
             best = found
         cell *= np.clip(np.sqrt(max(1, len(found[1])) / triangles), 0.5, 2.0)
     if best is None or len(best[1]) > 0.75 * mesh.triangles:
         return None
-    return smooth_mesh(best[0], best[1]), best[2]
+    return build_smooth_mesh(best[0], best[1]), best[2]
 
 
-def _clustered(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, Ints, float]:
+def _cluster(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, Ints, float]:
     """Points that stay, triangles between them, and the longest way that a point moved.
 
     What is long and thin, as rods and legs of tables, would be gone where its width fits into a cell: it is clustered
@@ -59,7 +59,7 @@ def _clustered(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, Ints
     """
     found, faces, n_points, longest = [], [], 0, 0.0
     for finer in range(_FINER + 1):
-        some, between, lost, moved = _once(points, index, cell / (1 << finer))
+        some, between, lost, moved = _cluster_once(points, index, cell / (1 << finer))
         found.append(some)
         faces.append(between + n_points)
         n_points, longest, index = n_points + len(some), max(longest, moved), lost
@@ -71,12 +71,12 @@ def _clustered(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, Ints
     return np.concatenate(found), np.concatenate(faces), longest
 
 
-def _once(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, Ints, Ints, float]:
+def _cluster_once(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, Ints, Ints, float]:
     """As `_clustered`, for one size of cells; before the way the triangles that are lost."""
     used, index = _compact(index, len(points))
     points = points[used]
     cells = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
-    _, cluster = sorted_rows(cells)
+    _, cluster = sort_rows(cells)
     count = np.bincount(cluster)
     mean = np.stack([np.bincount(cluster, points[:, k]) for k in range(3)], axis=1) / count[:, None]
     off = np.linalg.norm(points - mean[cluster], axis=1)
@@ -85,13 +85,13 @@ def _once(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, Ints, Int
     faces = cluster[index]
     whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     moved = float(np.linalg.norm(points - points[keep][cluster], axis=1).max(initial=0.0))
-    lost = used[_lost(points, index[~whole], faces[~whole], faces[whole], 2 * moved)]
+    lost = used[_find_lost(points, index[~whole], faces[~whole], faces[whole], 2 * moved)]
     faces = faces[whole]
-    turned_over = np.einsum("fc,fc->f", _across(points[index[whole]]), _across(points[keep][faces])) < 0
+    turned_over = np.einsum("fc,fc->f", _face_vectors(points[index[whole]]), _face_vectors(points[keep][faces])) < 0
     faces[turned_over] = faces[turned_over][:, ::-1]
     turned = np.argmin(faces, axis=1)[:, None] + np.arange(3)
     faces = np.take_along_axis(faces, turned % 3, axis=1)
-    faces = faces[sorted_rows(faces)[0]]
+    faces = faces[sort_rows(faces)[0]]
     stay, faces = np.unique(faces, return_inverse=True)
     return points[keep[stay]], faces.reshape(-1, 3), lost, moved
 
@@ -103,7 +103,7 @@ def _compact(index: Ints, n_points: int) -> tuple[Ints, Ints]:
     return np.flatnonzero(has), (np.cumsum(has) - 1)[index]
 
 
-def _lost(points: Doubles, flat: Ints, ends: Ints, faces: Ints, small: float) -> Ints:
+def _find_lost(points: Doubles, flat: Ints, ends: Ints, faces: Ints, small: float) -> Ints:
     """Of the triangles `flat`, which became lines or points between the clusters `ends`, those of parts larger than
     `small` [m] of which nothing is left: no edge or corner of `faces` lies where they were."""
     low, high = ends.min(axis=1), ends.max(axis=1)
@@ -114,7 +114,7 @@ def _lost(points: Doubles, flat: Ints, ends: Ints, faces: Ints, small: float) ->
     gone: Ints = flat[~np.isin(low * n + high, there)]
     if not len(gone):
         return gone
-    part = _parts(gone, len(points))
+    part = _connected_parts(gone, len(points))
     which = np.repeat(part, 3)
     at = points[gone.reshape(-1)]
     box = np.zeros((2, int(part.max()) + 1, 3))
@@ -125,7 +125,7 @@ def _lost(points: Doubles, flat: Ints, ends: Ints, faces: Ints, small: float) ->
     return large
 
 
-def _parts(faces: Ints, n_points: int) -> Ints:
+def _connected_parts(faces: Ints, n_points: int) -> Ints:
     """Of each triangle the part that it belongs to, with all that share corners: the least number of these."""
     least = np.arange(n_points)
     while True:
@@ -140,7 +140,7 @@ def _parts(faces: Ints, n_points: int) -> Ints:
         least = lower
 
 
-def sorted_rows(rows: NDArray[Any]) -> tuple[Ints, Ints]:
+def sort_rows(rows: NDArray[Any]) -> tuple[Ints, Ints]:
     """Of the different rows (n, 3), ordered by their columns: where each stands first; and for every row which of them
     it is. As `np.unique` over an axis, which takes several times as long on large meshes."""
     order = np.lexsort(rows.T[::-1])
@@ -152,31 +152,31 @@ def sorted_rows(rows: NDArray[Any]) -> tuple[Ints, Ints]:
     return order[new], which
 
 
-def smooth_mesh(points: Doubles, faces: Ints) -> MeshArrays:
+def build_smooth_mesh(points: Doubles, faces: Ints) -> MeshArrays:
     """Corners with area-weighted normals, creased by `CREASE`."""
     corners = points[faces]
-    return index_corners(corners.astype(np.float32), creased_normals(points, faces).astype(np.float32), None)
+    return index_corners(corners.astype(np.float32), compute_creased_normals(points, faces).astype(np.float32), None)
 
 
-def creased_normals(points: Doubles, faces: Ints) -> Doubles:
+def compute_creased_normals(points: Doubles, faces: Ints) -> Doubles:
     """Normals at the corners of faces, (m, 3, 3): area-weighted, those of the face itself across a crease."""
-    face_normal = _across(points[faces])
+    face_normal = _face_vectors(points[faces])
     around, each = faces.T.reshape(-1), np.tile(face_normal, (3, 1))
     vertex_normal = np.stack([np.bincount(around, each[:, k], len(points)) for k in range(3)], axis=1)
-    face_normal = unit(face_normal)
-    normal = unit(vertex_normal)[faces]
+    face_normal = normalise(face_normal)
+    normal = normalise(vertex_normal)[faces]
     creased = np.einsum("fkc,fc->fk", normal, face_normal) < CREASE
     normal[creased] = np.broadcast_to(face_normal[:, None], normal.shape)[creased]
     return normal
 
 
-def _across(corners: Doubles) -> Doubles:
+def _face_vectors(corners: Doubles) -> Doubles:
     """Normals of triangles (n, 3, 3), as long as twice the area."""
     normals: Doubles = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return normals
 
 
-def unit(vectors: NDArray[Any]) -> NDArray[Any]:
+def normalise(vectors: NDArray[Any]) -> NDArray[Any]:
     """Vectors of length 1; those without length become +z, as MuJoCo's renderer has it."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.where(length > 1e-15, vectors / np.maximum(length, 1e-15), np.array([0, 0, 1], vectors.dtype))
@@ -186,13 +186,13 @@ def unit(vectors: NDArray[Any]) -> NDArray[Any]:
 
 
 @np.errstate(all="ignore")  # what gets out of reach is refused by its coordinates
-def scaled(mesh: MeshArrays, scale: Matrix | None) -> MeshArrays:
+def scale_mesh(mesh: MeshArrays, scale: Matrix | None) -> MeshArrays:
     """`mesh` with the matrix (3, 3) in its vertices; the triangles are turned over where that mirrors."""
     if scale is None:
         return mesh
     across = np.linalg.inv(scale)  # normals go with the inverse's transpose
     position = (mesh.position.astype(np.float64) @ scale.T).astype(np.float32)
-    normal = unit(mesh.normal.astype(np.float64) @ across).astype(np.float32)
+    normal = normalise(mesh.normal.astype(np.float64) @ across).astype(np.float32)
     if np.linalg.det(scale) > 0:
         return replace(mesh, position=position, normal=normal)
     index = mesh.index[:, [0, 2, 1]]  # and with it the order in which corners are used, by which they are numbered
@@ -201,18 +201,18 @@ def scaled(mesh: MeshArrays, scale: Matrix | None) -> MeshArrays:
     return index_corners(position[index], normal[index], uv, color)
 
 
-def closed(mesh: MeshArrays) -> bool:
+def is_closed(mesh: MeshArrays) -> bool:
     """Whether every edge has its triangles on both sides, so that nobody sees the inside."""
-    _, vertex = unique_rows(np.ascontiguousarray(mesh.position + np.float32(0.0)))  # -0 is 0
+    _, vertex = find_unique_rows(np.ascontiguousarray(mesh.position + np.float32(0.0)))  # -0 is 0
     corner = vertex[mesh.index].astype(np.int64)
     start, end = corner.reshape(-1), corner[:, [1, 2, 0]].reshape(-1)
     count = int(corner.max(initial=0)) + 1
     return bool(np.array_equal(np.sort(start * count + end), np.sort(end * count + start)))
 
 
-def both_sides(mesh: MeshArrays) -> MeshArrays:
+def add_back_sides(mesh: MeshArrays) -> MeshArrays:
     """`mesh` with every triangle from behind too, unless it is closed."""
-    if closed(mesh):
+    if is_closed(mesh):
         return mesh
     n = np.uint32(mesh.vertices)
 
@@ -228,7 +228,7 @@ def both_sides(mesh: MeshArrays) -> MeshArrays:
     )
 
 
-def recoloured(mesh: MeshArrays, rgba: Rgba) -> tuple[MeshArrays, Rgba]:
+def merge_vertex_color(mesh: MeshArrays, rgba: Rgba) -> tuple[MeshArrays, Rgba]:
     """A mesh whose corners all have one colour, without them and with that colour in `rgba`."""
     if mesh.color is None or not len(mesh.color) or bool((mesh.color != mesh.color[0]).any()):
         return mesh, rgba

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.assets import MAX_ARRAY_BYTES
 from iris_session.protocol.names import ArrayFilter, ArrayKind, ArrayName
-from iris_session.scene.arrays import Stored, decode_arrays, encode_arrays, require
+from iris_session.scene.arrays import StoredArray, decode_arrays, encode_arrays, require_array
 from iris_session.scene.errors import AssetDecodeError
 from iris_session.streams.deformable_topology import DeformableTopology
 
@@ -58,7 +58,7 @@ def index_corners(position: Floats, normal: Floats, uv: Floats | None, color: By
     if color is not None:  # its four bytes as one more column: rows are compared by bits
         parts.append(np.ascontiguousarray(color).reshape(-1, 4).view(np.float32))
     rows = np.ascontiguousarray(np.concatenate(parts, axis=1), np.float32)
-    first, inverse = unique_rows(rows)
+    first, inverse = find_unique_rows(rows)
     order = np.argsort(first)
     rank = np.empty(len(first), np.uint32)
     rank[order] = np.arange(len(first), dtype=np.uint32)
@@ -72,7 +72,7 @@ def index_corners(position: Floats, normal: Floats, uv: Floats | None, color: By
     )
 
 
-def unique_rows(rows: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def find_unique_rows(rows: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """First occurrence of each different row, and for every row which of these it is. By bits."""
     bits = rows.view(np.uint32)
     key = np.zeros(len(rows), np.uint64)
@@ -89,25 +89,25 @@ def unique_rows(rows: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 def encode_mesh(mesh: MeshArrays) -> bytes:
     """The asset, exact to the bit."""
     arrays = [
-        Stored(ArrayName.INDEX, _narrow(mesh.index, mesh.vertices), ArrayFilter.DELTA),
-        Stored(ArrayName.POSITION, mesh.position, ArrayFilter.SHUFFLE),
-        Stored(ArrayName.NORMAL, mesh.normal, ArrayFilter.SHUFFLE),
+        StoredArray(ArrayName.INDEX, _narrow_index(mesh.index, mesh.vertices), ArrayFilter.DELTA),
+        StoredArray(ArrayName.POSITION, mesh.position, ArrayFilter.SHUFFLE),
+        StoredArray(ArrayName.NORMAL, mesh.normal, ArrayFilter.SHUFFLE),
     ]
     if mesh.uv is not None:
-        arrays.append(Stored(ArrayName.UV, mesh.uv, ArrayFilter.SHUFFLE))
+        arrays.append(StoredArray(ArrayName.UV, mesh.uv, ArrayFilter.SHUFFLE))
     if mesh.color is not None:
-        arrays.append(Stored(ArrayName.COLOR, mesh.color))
+        arrays.append(StoredArray(ArrayName.COLOR, mesh.color))
     return encode_arrays(ArrayKind.MESH, arrays)
 
 
 def encode_mesh_quantised(mesh: MeshArrays) -> tuple[bytes, float]:
     """A third of the size, and the bound on the position error [m]: 16 bits a coordinate, 8 a normal's component."""
     low, step = _lattice(mesh.position)
-    error = float(np.linalg.norm(step)) / 2 + _rounding(mesh.position)
+    error = float(np.linalg.norm(step)) / 2 + _rounding_error(mesh.position)
     arrays = [
-        Stored(ArrayName.INDEX, _narrow(mesh.index, mesh.vertices), ArrayFilter.DELTA),
-        _quantised(ArrayName.POSITION, mesh.position, low, step),
-        Stored(
+        StoredArray(ArrayName.INDEX, _narrow_index(mesh.index, mesh.vertices), ArrayFilter.DELTA),
+        _quantise(ArrayName.POSITION, mesh.position, low, step),
+        StoredArray(
             ArrayName.NORMAL,
             np.rint(np.clip(mesh.normal, -1, 1) * _NORMAL_STEPS).astype(np.int8),
             ArrayFilter.SHUFFLE,
@@ -116,20 +116,20 @@ def encode_mesh_quantised(mesh: MeshArrays) -> tuple[bytes, float]:
         ),
     ]
     if mesh.uv is not None:
-        arrays.append(_quantised(ArrayName.UV, mesh.uv, *_lattice(mesh.uv)))
+        arrays.append(_quantise(ArrayName.UV, mesh.uv, *_lattice(mesh.uv)))
     if mesh.color is not None:
-        arrays.append(Stored(ArrayName.COLOR, mesh.color))
+        arrays.append(StoredArray(ArrayName.COLOR, mesh.color))
     return encode_arrays(ArrayKind.MESH, arrays, error), error
 
 
 def decode_mesh(data: bytes | bytearray | memoryview, max_bytes: int = MAX_ARRAY_BYTES) -> MeshArrays:
     """Inverse of `encode_mesh` and `encode_mesh_quantised`. Raises `AssetDecodeError` for bytes that are no mesh."""
     arrays = decode_arrays(data, ArrayKind.MESH, max_bytes)
-    position = require(arrays, ArrayName.POSITION, "f4", (None, 3))
-    normal = require(arrays, ArrayName.NORMAL, "f4", (len(position), 3))
-    uv = require(arrays, ArrayName.UV, "f4", (len(position), 2)) if ArrayName.UV in arrays else None
-    color = require(arrays, ArrayName.COLOR, "u1", (len(position), 4)) if ArrayName.COLOR in arrays else None
-    index = require(arrays, ArrayName.INDEX, "u2 u4", (None, 3)).astype(np.uint32)
+    position = require_array(arrays, ArrayName.POSITION, "f4", (None, 3))
+    normal = require_array(arrays, ArrayName.NORMAL, "f4", (len(position), 3))
+    uv = require_array(arrays, ArrayName.UV, "f4", (len(position), 2)) if ArrayName.UV in arrays else None
+    color = require_array(arrays, ArrayName.COLOR, "u1", (len(position), 4)) if ArrayName.COLOR in arrays else None
+    index = require_array(arrays, ArrayName.INDEX, "u2 u4", (None, 3)).astype(np.uint32)
     if index.size and int(index.max()) >= len(position):
         raise AssetDecodeError(f"a triangle has the corner {int(index.max())}, but there are {len(position)}")
     if not np.isfinite(position).all():
@@ -137,7 +137,7 @@ def decode_mesh(data: bytes | bytearray | memoryview, max_bytes: int = MAX_ARRAY
     return MeshArrays(position, normal, uv, index, color)
 
 
-def _narrow(index: NDArray[np.uint32], vertices: int) -> NDArray[np.uint32] | NDArray[np.uint16]:
+def _narrow_index(index: NDArray[np.uint32], vertices: int) -> NDArray[np.uint32] | NDArray[np.uint16]:
     return index.astype(np.uint16) if vertices <= 1 << 16 else index
 
 
@@ -150,14 +150,14 @@ def _lattice(values: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return low, np.where(step > 0, step, 1e-12)
 
 
-def _rounding(values: Floats) -> float:
+def _rounding_error(values: Floats) -> float:
     """What float32 arithmetic in the decoder may add, over three axes."""
     return float(np.abs(values).max(initial=0.0)) * 2.0**-22
 
 
-def _quantised(name: str, values: Floats, low: NDArray[np.float64], step: NDArray[np.float64]) -> Stored:
+def _quantise(name: str, values: Floats, low: NDArray[np.float64], step: NDArray[np.float64]) -> StoredArray:
     stored = np.clip(np.rint((values - low) / step), 0, _POSITION_STEPS).astype(np.uint16)
-    return Stored(name, stored, ArrayFilter.SHUFFLE, tuple(step.tolist()), tuple(low.tolist()))
+    return StoredArray(name, stored, ArrayFilter.SHUFFLE, tuple(step.tolist()), tuple(low.tolist()))
 
 
 # --- deformables ------------------------------------------------------------------------------------------------------
@@ -176,12 +176,12 @@ def encode_deformable(
     """
     narrow = elements.astype(np.uint16) if len(rest) <= _SHORT else elements
     arrays = [
-        Stored(ArrayName.ELEMENTS, narrow, ArrayFilter.DELTA),
-        Stored(ArrayName.POSITION, rest, ArrayFilter.SHUFFLE),
-        Stored(ArrayName.PLAN, np.frombuffer(topology.to_bytes(), np.uint8)),
+        StoredArray(ArrayName.ELEMENTS, narrow, ArrayFilter.DELTA),
+        StoredArray(ArrayName.POSITION, rest, ArrayFilter.SHUFFLE),
+        StoredArray(ArrayName.PLAN, np.frombuffer(topology.to_bytes(), np.uint8)),
     ]
     if numbers is not None:
-        arrays.append(Stored(ArrayName.VERTEX, numbers.astype(np.uint32), ArrayFilter.DELTA))
+        arrays.append(StoredArray(ArrayName.VERTEX, numbers.astype(np.uint32), ArrayFilter.DELTA))
     if uv is not None:
-        arrays.append(Stored(ArrayName.UV, uv, ArrayFilter.SHUFFLE))
+        arrays.append(StoredArray(ArrayName.UV, uv, ArrayFilter.SHUFFLE))
     return encode_arrays(ArrayKind.DEFORMABLE, arrays)

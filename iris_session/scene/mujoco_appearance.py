@@ -42,44 +42,44 @@ _TYPES: Final = {
 }
 
 
-def rgb(values: Any) -> Rgb:
+def to_rgb(values: Any) -> Rgb:
     red, green, blue = (float(v) for v in values)
     return red, green, blue
 
 
-def rgba(values: Any) -> Rgba:
+def to_rgba(values: Any) -> Rgba:
     red, green, blue, alpha = (float(v) for v in values)
     return red, green, blue, alpha
 
 
-def vec3(values: Any) -> Vec3:
+def to_vec3(values: Any) -> Vec3:
     x, y, z = (float(v) for v in values)
     return x, y, z
 
 
-def pose(position: Any, quaternion: Any) -> Pose:
+def to_pose(position: Any, quaternion: Any) -> Pose:
     w, x, y, z = (float(v) for v in quaternion)
-    return Pose(vec3(position), (w, x, y, z))
+    return Pose(to_vec3(position), (w, x, y, z))
 
 
-def drawn_rgba(model: mujoco.MjModel, own: Any, material: int) -> Rgba:
+def resolve_rgba(model: mujoco.MjModel, own: Any, material: int) -> Rgba:
     """The colour that MuJoCo draws: its own, unless that is the default and there is a material."""
-    color = rgba(own)
-    return rgba(model.mat_rgba[material]) if material >= 0 and color == _DEFAULT_RGBA else color
+    color = to_rgba(own)
+    return to_rgba(model.mat_rgba[material]) if material >= 0 and color == _DEFAULT_RGBA else color
 
 
-def materials(model: mujoco.MjModel) -> tuple[Material, ...]:
+def read_materials(model: mujoco.MjModel) -> tuple[Material, ...]:
     """All materials, by id."""
     return tuple(
         Material(
-            name=label(model, "material", i),
-            rgba=rgba(model.mat_rgba[i]),
+            name=read_name(model, "material", i),
+            rgba=to_rgba(model.mat_rgba[i]),
             emission=float(model.mat_emission[i]),
             specular=float(model.mat_specular[i]),
             shininess=float(model.mat_shininess[i]),
             reflectance=float(model.mat_reflectance[i]),
-            metallic=_optional(model, "mat_metallic", i, -1.0),
-            roughness=_optional(model, "mat_roughness", i, -1.0),
+            metallic=_read_optional(model, "mat_metallic", i, -1.0),
+            roughness=_read_optional(model, "mat_roughness", i, -1.0),
             textures=tuple(
                 TextureUse(_ROLES.get(role, str(role)), int(texture))
                 for role, texture in enumerate(model.mat_texid[i])
@@ -92,7 +92,7 @@ def materials(model: mujoco.MjModel) -> tuple[Material, ...]:
     )
 
 
-def tracked(model: mujoco.MjModel, data: Any) -> Any | None:
+def compute_tracked(model: mujoco.MjModel, data: Any) -> Any | None:
     """A copy of `data` with places of lights and cameras, if any moves with its body and does not turn with it: where
     such a one stands in its body's frame depends on the state. `None`: all stand as the model says."""
     if data is None or not {*model.light_mode.tolist(), *model.cam_mode.tolist()} & _TRACKING:
@@ -104,7 +104,7 @@ def tracked(model: mujoco.MjModel, data: Any) -> Any | None:
     return own
 
 
-def _into_body(at: Any, body: int, v_world: Any) -> Any:
+def _to_body_frame(at: Any, body: int, v_world: Any) -> Any:
     """A vector of the world in the frame of a body."""
     q_body_world, v_body = np.zeros(4), np.zeros(3)
     mujoco.mju_negQuat(q_body_world, at.xquat[body])
@@ -114,49 +114,49 @@ def _into_body(at: Any, body: int, v_world: Any) -> Any:
 
 def _light_place(model: mujoco.MjModel, i: int, at: Any | None) -> tuple[Vec3, Vec3]:
     """Place and direction in the frame of its body. `at`: of `tracked`."""
-    rigid = vec3(model.light_pos[i]), vec3(model.light_dir[i])
+    rigid = to_vec3(model.light_pos[i]), to_vec3(model.light_dir[i])
     if at is None or int(model.light_mode[i]) not in _TRACKING:
         return rigid
     body = int(model.light_bodyid[i])
-    p_body = _into_body(at, body, at.light_xpos[i] - at.xpos[body])
-    found = vec3(p_body), vec3(_into_body(at, body, at.light_xdir[i]))
+    p_body = _to_body_frame(at, body, at.light_xpos[i] - at.xpos[body])
+    found = to_vec3(p_body), to_vec3(_to_body_frame(at, body, at.light_xdir[i]))
     return rigid if np.allclose(rigid, found, rtol=0, atol=_SAME) else found
 
 
 def _camera_place(model: mujoco.MjModel, i: int, at: Any | None) -> Pose:
     """T_body_camera. `at`: of `tracked`."""
-    rigid = pose(model.cam_pos[i], model.cam_quat[i])
+    rigid = to_pose(model.cam_pos[i], model.cam_quat[i])
     if at is None or int(model.cam_mode[i]) not in _TRACKING:
         return rigid
     body, q_world, q_body_world, q_body = int(model.cam_bodyid[i]), np.zeros(4), np.zeros(4), np.zeros(4)
     mujoco.mju_mat2Quat(q_world, at.cam_xmat[i])
     mujoco.mju_negQuat(q_body_world, at.xquat[body])
     mujoco.mju_mulQuat(q_body, q_body_world, q_world)
-    found = pose(_into_body(at, body, at.cam_xpos[i] - at.xpos[body]), q_body)
+    found = to_pose(_to_body_frame(at, body, at.cam_xpos[i] - at.xpos[body]), q_body)
     near = abs(np.dot(rigid.q, found.q)) >= 1.0 - _SAME**2 and np.allclose(rigid.p, found.p, rtol=0, atol=_SAME)
     return rigid if near else found
 
 
-def lights(model: mujoco.MjModel, at: Any | None = None) -> tuple[Light, ...]:
+def read_lights(model: mujoco.MjModel, at: Any | None = None) -> tuple[Light, ...]:
     """All lights, by id. `at`: of `tracked`."""
     places = [_light_place(model, i, at) for i in range(model.nlight)]
     return tuple(
         Light(
-            name=label(model, "light", i),
+            name=read_name(model, "light", i),
             kind=_light_kind(model, i),
             body=int(model.light_bodyid[i]),
             p_body=places[i][0],
             direction_body=places[i][1],
-            ambient=rgb(model.light_ambient[i]),
-            diffuse=rgb(model.light_diffuse[i]),
-            specular=rgb(model.light_specular[i]),
-            attenuation=vec3(model.light_attenuation[i]),
+            ambient=to_rgb(model.light_ambient[i]),
+            diffuse=to_rgb(model.light_diffuse[i]),
+            specular=to_rgb(model.light_specular[i]),
+            attenuation=to_vec3(model.light_attenuation[i]),
             cutoff=float(model.light_cutoff[i]),
             exponent=float(model.light_exponent[i]),
-            range=_optional(model, "light_range", i, 0.0),
-            intensity=_optional(model, "light_intensity", i, 0.0),
-            bulb_radius=_optional(model, "light_bulbradius", i, 0.0),
-            texture=int(_optional(model, "light_texid", i, -1)),
+            range=_read_optional(model, "light_range", i, 0.0),
+            intensity=_read_optional(model, "light_intensity", i, 0.0),
+            bulb_radius=_read_optional(model, "light_bulbradius", i, 0.0),
+            texture=int(_read_optional(model, "light_texid", i, -1)),
             castshadow=bool(model.light_castshadow[i]),
             active=bool(model.light_active[i]),
             follow=_FOLLOW.get(int(model.light_mode[i]), Follow.FIXED),
@@ -172,7 +172,7 @@ def _light_kind(model: mujoco.MjModel, index: int) -> str:
     return LightKind.DIRECTIONAL if model.light_directional[index] else LightKind.SPOT  # before MuJoCo 3.3.3
 
 
-def cameras(model: mujoco.MjModel, at: Any | None = None) -> tuple[Camera, ...]:
+def read_cameras(model: mujoco.MjModel, at: Any | None = None) -> tuple[Camera, ...]:
     """All cameras, by id. `at`: of `tracked`."""
     found = []
     for i in range(model.ncam):
@@ -186,7 +186,7 @@ def cameras(model: mujoco.MjModel, at: Any | None = None) -> tuple[Camera, ...]:
             principal = (c_x * per_metre[0], c_y * per_metre[1])
         found.append(
             Camera(
-                name=label(model, "camera", i),
+                name=read_name(model, "camera", i),
                 body=int(model.cam_bodyid[i]),
                 T_body_camera=_camera_place(model, i, at),
                 fovy=float(model.cam_fovy[i]),
@@ -207,35 +207,35 @@ def _projection(model: mujoco.MjModel, index: int) -> int:
     return int(model.cam_orthographic[index])
 
 
-def environment(model: mujoco.MjModel, textures: Sequence[Texture]) -> Environment:
+def read_environment(model: mujoco.MjModel, textures: Sequence[Texture]) -> Environment:
     """What surrounds the scene; MuJoCo draws the first texture of kind skybox."""
     extent = float(model.stat.extent)
     headlight, scale = model.vis.headlight, model.vis.map
     skyboxes = [i for i, texture in enumerate(textures) if texture.kind == TextureKind.SKYBOX]
     return Environment(
         headlight=Headlight(
-            bool(headlight.active), rgb(headlight.ambient), rgb(headlight.diffuse), rgb(headlight.specular)
+            bool(headlight.active), to_rgb(headlight.ambient), to_rgb(headlight.diffuse), to_rgb(headlight.specular)
         ),
         skybox=skyboxes[0] if skyboxes else -1,
-        haze_rgba=rgba(model.vis.rgba.haze),
+        haze_rgba=to_rgba(model.vis.rgba.haze),
         haze=float(scale.haze),
-        fog_rgba=rgba(model.vis.rgba.fog),
+        fog_rgba=to_rgba(model.vis.rgba.fog),
         fog_start=float(scale.fogstart) * extent,
         fog_end=float(scale.fogend) * extent,
         znear=float(scale.znear) * extent,
         zfar=float(scale.zfar) * extent,
         extent=extent,
-        center=vec3(model.stat.center),
+        center=to_vec3(model.stat.center),
     )
 
 
-def _optional(model: mujoco.MjModel, field: str, index: int, default: float) -> float:
+def _read_optional(model: mujoco.MjModel, field: str, index: int, default: float) -> float:
     return float(getattr(model, field)[index]) if hasattr(model, field) else default
 
 
 # --- names ------------------------------------------------------------------------------------------------------------
 
 
-def label(model: mujoco.MjModel, kind: str, index: int) -> str:
+def read_name(model: mujoco.MjModel, kind: str, index: int) -> str:
     """The name, or an empty text."""
     return (mujoco.mj_id2name(model, _TYPES[kind], index) or "")[:MAX_TEXT]

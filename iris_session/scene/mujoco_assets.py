@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.names import ArrayFilter, ArrayKind, ArrayName, ColorSpace, TextureKind
 from iris_session.protocol.scene import Deformable, HeightField, Mesh, Texture
-from iris_session.scene.arrays import Stored, encode_arrays
-from iris_session.scene.asset_builder import Builder, MeshNote, Work
-from iris_session.scene.mesh_processing import CREASE, unit
+from iris_session.scene.arrays import StoredArray, encode_arrays
+from iris_session.scene.asset_builder import AssetBuilder, MeshNote, Work
+from iris_session.scene.mesh_processing import CREASE, normalise
 from iris_session.scene.meshes import MeshArrays, encode_deformable, index_corners
-from iris_session.scene.mujoco_appearance import drawn_rgba, label
+from iris_session.scene.mujoco_appearance import read_name, resolve_rgba
 from iris_session.streams.deformable_topology import DeformableTopology, used_vertices
 
 _KINDS: Final = {
@@ -33,21 +33,21 @@ _SPACES: Final = {0: ColorSpace.AUTO, 1: ColorSpace.LINEAR, 2: ColorSpace.SRGB}
 _FACES: Final = 6
 
 
-def meshes(model: mujoco.MjModel, builder: Builder) -> tuple[Mesh, ...]:
+def read_meshes(model: mujoco.MjModel, builder: AssetBuilder) -> tuple[Mesh, ...]:
     """All meshes, by id."""
     notes = builder.run([_mesh_work(model, builder, i) for i in range(model.nmesh)])
     return tuple(
-        Mesh(label(model, "mesh", i), note.low, note.high, int(model.mesh_texcoordadr[i]) >= 0, note.levels)
+        Mesh(read_name(model, "mesh", i), note.low, note.high, int(model.mesh_texcoordadr[i]) >= 0, note.levels)
         for i, note in enumerate(notes)
     )
 
 
-def _mesh_work(model: mujoco.MjModel, builder: Builder, index: int) -> Work[MeshNote]:
+def _mesh_work(model: mujoco.MjModel, builder: AssetBuilder, index: int) -> Work[MeshNote]:
     vertex, normal, texcoord, face, face_normal, face_texcoord = _mesh_views(model, index)
     raw = [vertex, normal, face, face_normal]
     if texcoord is not None and face_texcoord is not None:
         raw += [texcoord, face_texcoord]
-    return builder.mesh(raw, lambda: mesh_corners(model, index))
+    return builder.mesh_work(raw, lambda: read_mesh_corners(model, index))
 
 
 def _mesh_views(model: mujoco.MjModel, index: int) -> tuple[Any, ...]:
@@ -62,27 +62,27 @@ def _mesh_views(model: mujoco.MjModel, index: int) -> tuple[Any, ...]:
     return vertex, normal, texcoord, model.mesh_face[faces], model.mesh_facenormal[faces], face_texcoord
 
 
-def mesh_corners(model: mujoco.MjModel, index: int) -> MeshArrays:
+def read_mesh_corners(model: mujoco.MjModel, index: int) -> MeshArrays:
     """One mesh with a normal and a texture coordinate at every corner, as it is drawn."""
     vertex, normals, texcoord, face, face_normal, face_texcoord = _mesh_views(model, index)
     position = vertex[face]
     normal = normals[face_normal].copy()
     if texcoord is not None:
         return index_corners(position, normal, texcoord[face_texcoord])
-    flat = unit(np.cross(position[:, 1] - position[:, 0], position[:, 2] - position[:, 0]))
+    flat = normalise(np.cross(position[:, 1] - position[:, 0], position[:, 2] - position[:, 0]))
     creased = np.einsum("fkc,fc->fk", normal, flat) < CREASE
     normal[creased] = np.broadcast_to(flat[:, None], normal.shape)[creased]
     return index_corners(position, normal, None)
 
 
-def textures(model: mujoco.MjModel, builder: Builder) -> tuple[Texture, ...]:
+def read_textures(model: mujoco.MjModel, builder: AssetBuilder) -> tuple[Texture, ...]:
     """All textures, by id."""
     kinds = [_KINDS.get(int(kind), TextureKind.IMAGE) for kind in model.tex_type]
-    images = [_pixels(model, i, kind) for i, kind in enumerate(kinds)]
-    notes = builder.run([builder.texture(image, kind) for image, kind in zip(images, kinds, strict=True)])
+    images = [_read_pixels(model, i, kind) for i, kind in enumerate(kinds)]
+    notes = builder.run([builder.texture_work(image, kind) for image, kind in zip(images, kinds, strict=True)])
     return tuple(
         Texture(
-            name=label(model, "texture", i),
+            name=read_name(model, "texture", i),
             kind=kind,
             width=image.shape[1],
             height=image.shape[0] // (1 if kind == TextureKind.IMAGE else _FACES),
@@ -100,7 +100,7 @@ def _color_space(model: mujoco.MjModel, index: int) -> str:
     return _SPACES.get(int(model.tex_colorspace[index]), ColorSpace.AUTO)
 
 
-def _pixels(model: mujoco.MjModel, index: int, kind: str) -> NDArray[np.uint8]:
+def _read_pixels(model: mujoco.MjModel, index: int, kind: str) -> NDArray[np.uint8]:
     """(height, width, channels); of cubes six faces. A cube that is one square wears it on every face."""
     shape = tuple(int(getattr(model, f"tex_{side}")[index]) for side in ("height", "width", "nchannel"))
     start = int(model.tex_adr[index])
@@ -111,16 +111,16 @@ def _pixels(model: mujoco.MjModel, index: int, kind: str) -> NDArray[np.uint8]:
     return image
 
 
-def hfields(model: mujoco.MjModel, builder: Builder) -> tuple[HeightField, ...]:
+def read_hfields(model: mujoco.MjModel, builder: AssetBuilder) -> tuple[HeightField, ...]:
     """All height fields, by id."""
     grids = []
     for i in range(model.nhfield):
         rows, columns, start = (int(getattr(model, f"hfield_{name}")[i]) for name in ("nrow", "ncol", "adr"))
         grids.append(model.hfield_data[start : start + rows * columns].reshape(rows, columns))
-    notes = builder.run([builder.blob([b"hfield", grid], _encode_grid(grid)) for grid in grids])
+    notes = builder.run([builder.blob_work([b"hfield", grid], _encode_grid(grid)) for grid in grids])
     return tuple(
         HeightField(
-            name=label(model, "hfield", i),
+            name=read_name(model, "hfield", i),
             rows=grid.shape[0],
             columns=grid.shape[1],
             size=tuple(model.hfield_size[i].tolist()),
@@ -132,7 +132,7 @@ def hfields(model: mujoco.MjModel, builder: Builder) -> tuple[HeightField, ...]:
 
 
 def _encode_grid(grid: NDArray[np.float32]) -> Callable[[], bytes]:
-    return lambda: encode_arrays(ArrayKind.GRID, [Stored(ArrayName.ELEVATION, grid, ArrayFilter.SHUFFLE)])
+    return lambda: encode_arrays(ArrayKind.GRID, [StoredArray(ArrayName.ELEVATION, grid, ArrayFilter.SHUFFLE)])
 
 
 # --- deformables ------------------------------------------------------------------------------------------------------
@@ -143,27 +143,27 @@ def stream_name(index: int) -> str:
     return f"flex-{index}"
 
 
-def deformables(model: mujoco.MjModel, data: Any, builder: Builder) -> tuple[Deformable, ...]:
+def read_deformables(model: mujoco.MjModel, data: Any, builder: AssetBuilder) -> tuple[Deformable, ...]:
     """All flexes, by id; `data` has the initial state, with kinematics."""
-    parts = [flex_mesh(model, i) for i in range(model.nflex)]
+    parts = [read_flex_mesh(model, i) for i in range(model.nflex)]
     rest = [np.array(data.flexvert_xpos[part.vertices], np.float32) for part in parts]
     notes = builder.run(
         [
-            builder.blob([b"flex", *part.raw, vertices], part.encode(vertices))
+            builder.blob_work([b"flex", *part.raw, vertices], part.encode(vertices))
             for part, vertices in zip(parts, rest, strict=True)
         ]
     )
     return tuple(
         Deformable(
-            name=label(model, "flex", i),
+            name=read_name(model, "flex", i),
             dim=int(model.flex_dim[i]),
             group=int(model.flex_group[i]),
             vertices=len(rest[i]),
             elements=len(parts[i].elements),
             radius=float(model.flex_radius[i]),
             flat=bool(model.flex_flatskin[i]),
-            material=_material(model, i),
-            rgba=drawn_rgba(model, model.flex_rgba[i], _material(model, i)),
+            material=_flex_material(model, i),
+            rgba=resolve_rgba(model, model.flex_rgba[i], _flex_material(model, i)),
             stream=stream_name(i),
             address=note.address,
             bytes=note.bytes,
@@ -172,7 +172,7 @@ def deformables(model: mujoco.MjModel, data: Any, builder: Builder) -> tuple[Def
     )
 
 
-def _material(model: mujoco.MjModel, index: int) -> int:
+def _flex_material(model: mujoco.MjModel, index: int) -> int:
     """Since MuJoCo 4 every element has one: that of the first, as models give it to a flex."""
     by_element = len(model.flex_matid) == model.nflexelem
     return int(model.flex_matid[int(model.flex_elemadr[index]) if by_element else index])
@@ -205,7 +205,7 @@ class FlexMesh:
         return lambda: encode_deformable(self.elements, self.uv, rest, self.topology, numbers)
 
 
-def flex_mesh(model: mujoco.MjModel, index: int) -> FlexMesh:
+def read_flex_mesh(model: mujoco.MjModel, index: int) -> FlexMesh:
     """The mesh of one flex, by its id."""
     dim = int(model.flex_dim[index])
     if dim == 3:

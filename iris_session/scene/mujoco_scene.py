@@ -26,19 +26,19 @@ from iris_session.protocol.scene import (
     asset_addresses,
     encode_scene,
 )
-from iris_session.scene.asset_builder import Builder, EncodeOptions
-from iris_session.scene.budget import with_totals
+from iris_session.scene.asset_builder import AssetBuilder, EncodeOptions
+from iris_session.scene.budget import add_totals
 from iris_session.scene.mujoco_appearance import (
-    cameras,
-    drawn_rgba,
-    environment,
-    label,
-    lights,
-    materials,
-    pose,
-    tracked,
+    compute_tracked,
+    read_cameras,
+    read_environment,
+    read_lights,
+    read_materials,
+    read_name,
+    resolve_rgba,
+    to_pose,
 )
-from iris_session.scene.mujoco_assets import deformables, hfields, meshes, textures
+from iris_session.scene.mujoco_assets import read_deformables, read_hfields, read_meshes, read_textures
 
 _KINDS: Final = {
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")): kind
@@ -48,7 +48,7 @@ _WRAP_SITE: Final = int(mujoco.mjtWrap.mjWRAP_SITE)
 
 
 @dataclass(frozen=True)
-class Parsed:
+class ParsedScene:
     """A scene whose assets, the specification among them, are in the store.
 
     `scene_hash`: address of the specification. `skipped`: what the model has and the specification does not, in words
@@ -77,45 +77,45 @@ def parse_mujoco(
     sites: bool = False,
     tendons: bool = False,
     threads: int = 0,
-) -> Parsed:
+) -> ParsedScene:
     """The specification of `model`; its assets are in `store` afterwards.
 
     `data`: the initial state, with kinematics; else the model's default one. `sites`, `tendons`: list them too (tendons
     bring the sites they run through).
     """
-    at = tracked(model, data)
+    at = compute_tracked(model, data)
     if data is None:
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         if model.nflex:
             mujoco.mj_comPos(model, data)
             mujoco.mj_flex(model, data)
-    builder = Builder(store, options, threads)
-    found_textures = textures(model, builder)
-    cables = _tendons(model) if tendons else ()
+    builder = AssetBuilder(store, options, threads)
+    found_textures = read_textures(model, builder)
+    cables = _read_tendons(model) if tendons else ()
     needed = {site for cable in cables for site in cable.sites}
     spec = SceneSpec(
         name=name[:MAX_TEXT],
         source=f"MuJoCo {mujoco.__version__}",
-        bodies=_bodies(model, data),
-        visuals=tuple(_visual(model, i) for i in range(model.ngeom)),
-        materials=materials(model),
+        bodies=_read_bodies(model, data),
+        visuals=tuple(_read_visual(model, i) for i in range(model.ngeom)),
+        materials=read_materials(model),
         textures=found_textures,
-        meshes=meshes(model, builder),
-        hfields=hfields(model, builder),
-        lights=lights(model, at),
-        cameras=cameras(model, at),
-        sites=tuple(_site(model, i) for i in range(model.nsite) if sites or i in needed),
+        meshes=read_meshes(model, builder),
+        hfields=read_hfields(model, builder),
+        lights=read_lights(model, at),
+        cameras=read_cameras(model, at),
+        sites=tuple(_read_site(model, i) for i in range(model.nsite) if sites or i in needed),
         tendons=cables,
-        deformables=deformables(model, data, builder),
-        environment=environment(model, found_textures),
+        deformables=read_deformables(model, data, builder),
+        environment=read_environment(model, found_textures),
     )
-    spec = with_totals(spec)
-    skipped = (*_skipped(model), *_unasked(model, sites=sites, tendons=tendons), *_own_forms(spec))
-    return Parsed(spec, store.put(encode_scene(spec)), skipped, builder.built, builder.recalled)
+    spec = add_totals(spec)
+    skipped = (*_list_skipped(model), *_list_unrequested(model, sites=sites, tendons=tendons), *_list_containers(spec))
+    return ParsedScene(spec, store.put(encode_scene(spec)), skipped, builder.built, builder.recalled)
 
 
-def _bodies(model: mujoco.MjModel, data: Any) -> tuple[Body, ...]:
+def _read_bodies(model: mujoco.MjModel, data: Any) -> tuple[Body, ...]:
     """All bodies but those that MuJoCo made for vertices of flexes, by id; the world is 0."""
     vertices = _flex_vertex_bodies(model)
     weld = model.body_weldid.tolist()
@@ -127,10 +127,10 @@ def _bodies(model: mujoco.MjModel, data: Any) -> tuple[Body, ...]:
     return tuple(
         Body(
             id=i,
-            name=label(model, "body", i),
+            name=read_name(model, "body", i),
             parent=int(model.body_parentid[i]) if i else -1,
-            T_parent_body=pose(model.body_pos[i], model.body_quat[i]),
-            T_world_body=pose(data.xpos[i], data.xquat[i]),
+            T_parent_body=to_pose(model.body_pos[i], model.body_quat[i]),
+            T_world_body=to_pose(data.xpos[i], data.xquat[i]),
             moving=moving[i],
         )
         for i in range(model.nbody)
@@ -160,46 +160,48 @@ def _flex_vertex_bodies(model: mujoco.MjModel) -> frozenset[int]:
         and body not in used
         and int(model.body_geomnum[body]) == 0
         and 1 <= int(model.body_jntnum[body]) <= 3
-        and _slides(model, body)
+        and _has_only_slides(model, body)
     )
 
 
-def _slides(model: mujoco.MjModel, body: int) -> bool:
+def _has_only_slides(model: mujoco.MjModel, body: int) -> bool:
     """Whether all joints of a body are slides."""
     first, n = int(model.body_jntadr[body]), int(model.body_jntnum[body])
     return bool((model.jnt_type[first : first + n] == mujoco.mjtJoint.mjJNT_SLIDE).all())
 
 
-def _visual(model: mujoco.MjModel, index: int) -> Visual:
+def _read_visual(model: mujoco.MjModel, index: int) -> Visual:
     material = int(model.geom_matid[index])
     return Visual(
         id=index,
         body=int(model.geom_bodyid[index]),
-        name=label(model, "geom", index),
-        T_body_visual=pose(model.geom_pos[index], model.geom_quat[index]),
+        name=read_name(model, "geom", index),
+        T_body_visual=to_pose(model.geom_pos[index], model.geom_quat[index]),
         group=int(model.geom_group[index]),
-        geometry=_geometry(model, int(model.geom_type[index]), model.geom_size[index], int(model.geom_dataid[index])),
+        geometry=_read_geometry(
+            model, int(model.geom_type[index]), model.geom_size[index], int(model.geom_dataid[index])
+        ),
         material=material,
-        rgba=drawn_rgba(model, model.geom_rgba[index], material),
+        rgba=resolve_rgba(model, model.geom_rgba[index], material),
     )
 
 
-def _site(model: mujoco.MjModel, index: int) -> Site:
+def _read_site(model: mujoco.MjModel, index: int) -> Site:
     material = int(model.site_matid[index])
     mesh = int(model.site_dataid[index]) if hasattr(model, "site_dataid") else -1
     return Site(
         id=index,
         body=int(model.site_bodyid[index]),
-        name=label(model, "site", index),
-        T_body_site=pose(model.site_pos[index], model.site_quat[index]),
+        name=read_name(model, "site", index),
+        T_body_site=to_pose(model.site_pos[index], model.site_quat[index]),
         group=int(model.site_group[index]),
-        geometry=_geometry(model, int(model.site_type[index]), model.site_size[index], mesh),
+        geometry=_read_geometry(model, int(model.site_type[index]), model.site_size[index], mesh),
         material=material,
-        rgba=drawn_rgba(model, model.site_rgba[index], material),
+        rgba=resolve_rgba(model, model.site_rgba[index], material),
     )
 
 
-def _geometry(model: mujoco.MjModel, kind: int, size: Any, asset: int) -> Geometry:
+def _read_geometry(model: mujoco.MjModel, kind: int, size: Any, asset: int) -> Geometry:
     shape = _KINDS.get(kind, GeometryKind.BOX)
     a, b, c = (float(v) for v in size)
     full: Vec3 = (a, b, c)
@@ -218,7 +220,7 @@ def _geometry(model: mujoco.MjModel, kind: int, size: Any, asset: int) -> Geomet
     return Geometry(shape, full, mesh, hfield)
 
 
-def _tendons(model: mujoco.MjModel) -> tuple[Tendon, ...]:
+def _read_tendons(model: mujoco.MjModel) -> tuple[Tendon, ...]:
     """Spatial tendons: those that run through at least two sites."""
     found = []
     for i in range(model.ntendon):
@@ -228,18 +230,18 @@ def _tendons(model: mujoco.MjModel) -> tuple[Tendon, ...]:
         if len(through) >= 2:
             found.append(
                 Tendon(
-                    name=label(model, "tendon", i),
+                    name=read_name(model, "tendon", i),
                     group=int(model.tendon_group[i]),
                     width=float(model.tendon_width[i]),
                     sites=through,
                     material=material,
-                    rgba=drawn_rgba(model, model.tendon_rgba[i], material),
+                    rgba=resolve_rgba(model, model.tendon_rgba[i], material),
                 )
             )
     return tuple(found)
 
 
-def _skipped(model: mujoco.MjModel) -> tuple[str, ...]:
+def _list_skipped(model: mujoco.MjModel) -> tuple[str, ...]:
     found = []
     if model.nskin:
         found.append(f"{model.nskin} skins: only bodies, shapes and flexes are shared; use a flex")
@@ -248,19 +250,19 @@ def _skipped(model: mujoco.MjModel) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _unasked(model: mujoco.MjModel, *, sites: bool, tendons: bool) -> Iterator[str]:
+def _list_unrequested(model: mujoco.MjModel, *, sites: bool, tendons: bool) -> Iterator[str]:
     """Sites and tendons that MuJoCo shows and that nobody asked for."""
     shown = SceneSpec().groups_shown
     if not sites:
-        marks = (_site(model, i) for i in range(model.nsite))
+        marks = (_read_site(model, i) for i in range(model.nsite))
         if n := sum(mark.group in shown and mark.rgba[3] > 0 for mark in marks):
             yield f"{n} sites: serve --sites, or SessionConfig(sites=True), shares them"
     if not tendons:
-        cables = (cable for cable in _tendons(model) if cable.group in shown)
+        cables = (cable for cable in _read_tendons(model) if cable.group in shown)
         if n := sum(cable.width > 0 and cable.rgba[3] > 0 for cable in cables):
             yield f"{n} tendons: serve --tendons, or SessionConfig(tendons=True), shares them"
 
 
-def _own_forms(spec: SceneSpec) -> Iterator[str]:
+def _list_containers(spec: SceneSpec) -> Iterator[str]:
     if n := sum(texture.levels[0].encoding == AssetEncoding.OPAQUE for texture in spec.textures):
         yield f"{n} textures in a form of their own (KTX) where that is not read: PNG is everywhere"

@@ -10,8 +10,8 @@ import msgspec
 
 from iris_session.protocol.names import AssetEncoding, GeometryKind, LightKind
 from iris_session.protocol.scene import Body, SceneSpec, Totals
-from iris_session.scene.budget import QUEST_3, Choice, choose_levels, texture_memory, triangles
-from iris_session.scene.cube_maps import CUBE_SIDE, cube_texture
+from iris_session.scene.budget import QUEST_3, LevelChoice, choose_levels, count_triangles, texture_memory_bytes
+from iris_session.scene.cube_maps import CUBE_SIDE, find_cube_texture
 from iris_session.scene.extent import Extent
 from iris_session.scene.shapes import ENDLESS
 
@@ -22,7 +22,7 @@ LARGE_MESH: Final = 250_000
 _MIB: Final = 1 << 20
 
 
-class Heavy(msgspec.Struct, frozen=True):
+class HeavyAsset(msgspec.Struct, frozen=True):
     """One mesh or texture that costs much. `uses`: visuals that draw it. `why`: in words."""
 
     kind: str
@@ -47,19 +47,21 @@ class SceneReport(msgspec.Struct, frozen=True):
     bodies: int
     moving: int
     kinds: dict[str, int]
-    heavy: tuple[Heavy, ...]
+    heavy: tuple[HeavyAsset, ...]
     struggles: tuple[str, ...]
     for_headset: dict[str, int]
     skipped: tuple[str, ...]
     simplified: tuple[str, ...]
 
 
-def report(
+def build_report(
     spec: SceneSpec, scene_hash: str, skipped: tuple[str, ...] = (), extent: Extent | None = None
 ) -> SceneReport:
     """The report of a scene."""
     choice = choose_levels(spec, QUEST_3)
-    heavy = sorted((*_meshes(spec), *_textures(spec)), key=lambda h: -(h.memory + 40 * h.triangles * h.uses))
+    heavy = sorted(
+        (*_heavy_meshes(spec), *_heavy_textures(spec)), key=lambda h: -(h.memory + 40 * h.triangles * h.uses)
+    )
     return SceneReport(
         scene_hash=scene_hash,
         totals=spec.totals,
@@ -68,7 +70,7 @@ def report(
         moving=sum(body.moving for body in spec.bodies),
         kinds=dict(Counter(visual.geometry.kind for visual in spec.visuals if visual.rgba[3] > 0)),
         heavy=tuple(heavy[:HEAVIEST]),
-        struggles=tuple(_struggles(spec, choice)),
+        struggles=tuple(_list_struggles(spec, choice)),
         for_headset={
             "triangles": choice.triangles,
             "texture_bytes": choice.texture_bytes,
@@ -76,11 +78,11 @@ def report(
             "hidden": len(choice.hidden),
         },
         skipped=skipped,
-        simplified=simplified(spec),
+        simplified=list_simplified(spec),
     )
 
 
-def large_meshes(spec: SceneSpec) -> tuple[str, ...]:
+def list_large_meshes(spec: SceneSpec) -> tuple[str, ...]:
     """Advice on meshes that are better simplified before they are shared; a line each."""
     return tuple(
         f"mesh {mesh.name} has {mesh.levels[0].triangles:,} triangles: over {LARGE_MESH:,}, simplify it in a program "
@@ -90,7 +92,7 @@ def large_meshes(spec: SceneSpec) -> tuple[str, ...]:
     )
 
 
-def simplified(spec: SceneSpec) -> tuple[str, ...]:
+def list_simplified(spec: SceneSpec) -> tuple[str, ...]:
     """What clients draw, and pictures of recordings and GLB files do not, or otherwise; a line each."""
     found = []
     if spec.environment.skybox >= 0:
@@ -100,11 +102,11 @@ def simplified(spec: SceneSpec) -> tuple[str, ...]:
     return tuple(found)
 
 
-def not_in_glb(spec: SceneSpec) -> tuple[str, ...]:
+def list_glb_differences(spec: SceneSpec) -> tuple[str, ...]:
     """What is not in the GLB file of a scene, or otherwise; a line each."""
     opaque = sum(texture.levels[0].encoding == AssetEncoding.OPAQUE for texture in spec.textures)
     found = [f"{opaque} textures in a form of their own (KTX): left out"] if opaque else []
-    worn = {cube_texture(spec, k) for k in range(len(spec.materials))} - {-1}
+    worn = {find_cube_texture(spec, k) for k in range(len(spec.materials))} - {-1}
     fine = sum(spec.textures[k].width > CUBE_SIDE for k in worn)
     if fine:
         found.append(f"{fine} cube textures of more than {CUBE_SIDE} pixels a face: they are there in a smaller size")
@@ -112,10 +114,10 @@ def not_in_glb(spec: SceneSpec) -> tuple[str, ...]:
         found.append("ropes: lines without thickness")
     if any(v.geometry.kind == GeometryKind.PLANE and 0.0 in v.geometry.size[:2] for v in spec.visuals):
         found.append(f"planes without end: they end after {2 * ENDLESS:.0f} m")
-    return (*simplified(spec), *found)
+    return (*list_simplified(spec), *found)
 
 
-def tree(spec: SceneSpec) -> Iterator[str]:
+def format_tree(spec: SceneSpec) -> Iterator[str]:
     """One line per body, indented by depth: what it draws."""
     children: dict[int, list[Body]] = {}
     for body in spec.bodies:
@@ -129,14 +131,14 @@ def tree(spec: SceneSpec) -> Iterator[str]:
         shapes = drawn.get(body.id, [])
         kinds = Counter(spec.visuals[i].geometry.kind for i in shapes if spec.visuals[i].rgba[3] > 0)
         what = ", ".join(f"{n} {kind}" if n > 1 else kind for kind, n in kinds.items()) or "-"
-        count = sum(triangles(spec, i) for i in shapes if spec.visuals[i].rgba[3] > 0)
+        count = sum(count_triangles(spec, i) for i in shapes if spec.visuals[i].rgba[3] > 0)
         name = body.name or f"(body {body.id})"
         mark = "" if body.moving or not body.id else "  static"
         yield f"{'  ' * depth}{name}: {what}{f', {count:,} triangles' if count else ''}{mark}"
         stack += [(child, depth + 1) for child in reversed(children.get(body.id, []))]
 
 
-def _meshes(spec: SceneSpec) -> Iterator[Heavy]:
+def _heavy_meshes(spec: SceneSpec) -> Iterator[HeavyAsset]:
     uses = Counter(visual.geometry.mesh for visual in spec.visuals if visual.rgba[3] > 0)
     for i, mesh in enumerate(spec.meshes):
         level = mesh.levels[0]
@@ -145,26 +147,28 @@ def _meshes(spec: SceneSpec) -> Iterator[Heavy]:
             why += f", drawn {uses[i]} times"
         if len(mesh.levels) == 1 and level.triangles > 5_000:
             why += ", no coarser level: it has texture coordinates or colours, or it would save little"
-        yield Heavy("mesh", mesh.name or f"mesh {i}", uses[i], level.bytes, level.triangles, 0, len(mesh.levels), why)
+        yield HeavyAsset(
+            "mesh", mesh.name or f"mesh {i}", uses[i], level.bytes, level.triangles, 0, len(mesh.levels), why
+        )
 
 
-def _textures(spec: SceneSpec) -> Iterator[Heavy]:
+def _heavy_textures(spec: SceneSpec) -> Iterator[HeavyAsset]:
     uses: Counter[int] = Counter()
     for visual in spec.visuals:
         if visual.material >= 0:
             uses.update(use.texture for use in spec.materials[visual.material].textures)
     uses.update(texture for texture in (spec.environment.skybox, *(light.texture for light in spec.lights)))
     for i, texture in enumerate(spec.textures):
-        level, memory = texture.levels[0], texture_memory(texture, texture.levels[0])
+        level, memory = texture.levels[0], texture_memory_bytes(texture, texture.levels[0])
         why = f"{level.width} x {level.height} {texture.kind}: {memory / _MIB:.1f} MiB on a graphics card"
-        yield Heavy(
+        yield HeavyAsset(
             "texture", texture.name or f"texture {i}", uses[i], level.bytes, 0, memory, len(texture.levels), why
         )
 
 
-def _struggles(spec: SceneSpec, choice: Choice) -> Iterator[str]:
+def _list_struggles(spec: SceneSpec, choice: LevelChoice) -> Iterator[str]:
     totals = spec.totals
-    yield from large_meshes(spec)
+    yield from list_large_meshes(spec)
     if totals.objects > QUEST_3.objects:
         yield (
             f"{totals.objects} objects, about {QUEST_3.objects} is what a Quest 3 draws: join static shapes into one "

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.names import GeometryKind
 from iris_session.protocol.scene import Geometry, HeightField, Material
-from iris_session.scene.mesh_processing import unit
+from iris_session.scene.mesh_processing import normalise
 from iris_session.scene.meshes import MeshArrays, index_corners
 
 SLICES: Final = 28
@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 _POLE: Final = 1e-6
 
 
-def primitive(geometry: Geometry) -> MeshArrays | None:
+def build_primitive(geometry: Geometry) -> MeshArrays | None:
     """A shape that needs no asset, without texture coordinates; `None` for meshes, height fields, unknown kinds."""
     x, y, z = geometry.size
     size = np.array(geometry.size)
@@ -38,20 +38,20 @@ def primitive(geometry: Geometry) -> MeshArrays | None:
         case GeometryKind.BOX:
             return _flat(_quads(_BOX * size))
         case GeometryKind.SPHERE | GeometryKind.ELLIPSOID:
-            return _turned(_arc(STACKS + 1, -1.0, 1.0), _arc(STACKS + 1, -1.0, 1.0), size)
+            return _revolve(_arc(STACKS + 1, -1.0, 1.0), _arc(STACKS + 1, -1.0, 1.0), size)
         case GeometryKind.CYLINDER:
             profile = np.array([[0, -1], [1, -1], [1, -1], [1, 1], [1, 1], [0, 1]], float)
             normal = np.array([[0, -1], [0, -1], [1, 0], [1, 0], [0, 1], [0, 1]], float)
-            return _turned(profile, normal, size)
+            return _revolve(profile, normal, size)
         case GeometryKind.CAPSULE:
             low, high = _arc(STACKS // 2 + 1, -1.0, 0.0), _arc(STACKS // 2 + 1, 0.0, 1.0)
             middle = np.array([0.0, z / x if x else 0.0])
             profile = np.concatenate([low - middle, high + middle])
-            return _turned(profile, np.concatenate([low, high]), np.array([x, x, x]))
+            return _revolve(profile, np.concatenate([low, high]), np.array([x, x, x]))
     return None
 
 
-def height_field(field: HeightField, elevation: NDArray[np.float32]) -> MeshArrays:
+def build_height_field(field: HeightField, elevation: NDArray[np.float32]) -> MeshArrays:
     """The surface, four walls and a floor. Two triangles a cell, split along the diagonal that MuJoCo takes."""
     half_x, half_y, top, base = field.size
     rows, columns = elevation.shape
@@ -88,7 +88,7 @@ def _quads(corners: Floats) -> Floats:
 
 
 def _flat(triangles: Floats) -> MeshArrays:
-    normal = unit(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]))
+    normal = normalise(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]))
     return _mesh(triangles, np.repeat(normal[:, None], 3, axis=1))
 
 
@@ -98,7 +98,7 @@ def _arc(points: int, low: float, high: float) -> Floats:
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def _turned(profile: Floats, normals: Floats, size: Floats) -> MeshArrays:
+def _revolve(profile: Floats, normals: Floats, size: Floats) -> MeshArrays:
     """A profile (distance, height), from below, turned around z and stretched by `size`; `normals` before that."""
     angle = np.linspace(0, 2 * np.pi, SLICES + 1)
     angle[-1] = 0.0  # meets itself exactly
@@ -108,7 +108,7 @@ def _turned(profile: Floats, normals: Floats, size: Floats) -> MeshArrays:
         ring = values[:, None, :1] * turn[None]
         return np.concatenate([ring, np.broadcast_to(values[:, None, 1:], (*ring.shape[:2], 1))], axis=2)
 
-    points, across = around(profile) * size, unit(around(normals) / size)
+    points, across = around(profile) * size, normalise(around(normals) / size)
 
     def corners(values: Floats) -> Floats:
         a, b, c, d = values[:-1, :-1], values[:-1, 1:], values[1:, 1:], values[1:, :-1]
@@ -127,50 +127,50 @@ def _mesh(position: Floats, normal: Floats) -> MeshArrays:
 # --- texture coordinates ----------------------------------------------------------------------------------------------
 
 
-def with_coordinates(mesh: MeshArrays, geometry: Geometry, material: Material) -> MeshArrays:
+def add_texture_coordinates(mesh: MeshArrays, geometry: Geometry, material: Material) -> MeshArrays:
     """`mesh`, which is that of `geometry`, with the coordinates that `material` gives it."""
     times = np.array(material.repeat) * (geometry.size[:2] if material.uniform else 1.0)
     if mesh.uv is not None:
         return mesh if (times == 1.0).all() else replace(mesh, uv=(mesh.uv * times).astype(np.float32))
     if geometry.mesh >= 0 or geometry.hfield >= 0:
-        return replace(mesh, uv=_from_above(mesh.position, geometry, material).astype(np.float32))
+        return replace(mesh, uv=_project_along_z(mesh.position, geometry, material).astype(np.float32))
     position, normal = mesh.position[mesh.index], mesh.normal[mesh.index]
-    uv = _on_shape(position.astype(np.float64), normal, geometry) * times
+    uv = _shape_coordinates(position.astype(np.float64), normal, geometry) * times
     if geometry.kind == GeometryKind.PLANE:  # along which it has no end
         endless = np.array(geometry.size[:2]) <= 0
-        uv[..., endless] = _from_above(position, geometry, material)[..., endless]
+        uv[..., endless] = _project_along_z(position, geometry, material)[..., endless]
     return index_corners(position, normal, uv.astype(np.float32))
 
 
-def on_deformable(uv: NDArray[np.float32] | None, material: Material | None) -> NDArray[np.float32] | None:
+def repeat_texture_coordinates(uv: NDArray[np.float32] | None, material: Material | None) -> NDArray[np.float32] | None:
     """Coordinates that what bends has itself, as `material` repeats them; it has no size that `uniform` could mean."""
     return uv if uv is None or material is None else (uv * np.array(material.repeat)).astype(np.float32)
 
 
-def _from_above(position: NDArray[np.float32], geometry: Geometry, material: Material) -> Floats:
+def _project_along_z(position: NDArray[np.float32], geometry: Geometry, material: Material) -> Floats:
     """Laid over it along z."""
     size = np.array(geometry.size[:2])
     per_metre = material.repeat / np.where(material.uniform | (size <= 0), 1.0, size)
     return position[..., :2] * per_metre * [0.5, -0.5] - 0.5
 
 
-def _on_shape(position: Floats, normal: NDArray[np.float32], geometry: Geometry) -> Floats:
+def _shape_coordinates(position: Floats, normal: NDArray[np.float32], geometry: Geometry) -> Floats:
     """Where corners of triangles (n, 3, 3) are on the surface: 0..1 to the right and down."""
     size = np.array(geometry.size)
     p = position / np.where(size > 0, size, 1.0)
     match geometry.kind:
         case GeometryKind.SPHERE | GeometryKind.ELLIPSOID:
-            return np.stack([_around(p), 0.5 - _latitude(p[..., 2])], axis=-1)
+            return np.stack([_angles_around_z(p), 0.5 - _latitude(p[..., 2])], axis=-1)
         case GeometryKind.CYLINDER:
             lid = np.abs(normal[..., 2:]) > 0.5
-            side = np.stack([_around(p), 0.5 - p[..., 2] / 2], axis=-1)
+            side = np.stack([_angles_around_z(p), 0.5 - p[..., 2] / 2], axis=-1)
             return np.where(lid, (p[..., :2] + 1) / 2, side)
         case GeometryKind.CAPSULE:
             radius, _, half = geometry.size
             middle = position[..., 2].mean(axis=1, keepdims=True)
             end = np.sign(middle) * (np.abs(middle) > half)
             cap = (end > 0) - 2 * _latitude((position[..., 2] - end * half) / radius)
-            return np.stack([_around(p), np.where(end == 0, 0.5 - p[..., 2] / 2, cap)], axis=-1)
+            return np.stack([_angles_around_z(p), np.where(end == 0, 0.5 - p[..., 2] / 2, cap)], axis=-1)
     across = np.abs(normal).argmax(axis=-1)[..., None]  # of boxes and planes: the axis that a side looks along
     right = np.take_along_axis(p, np.where(across == 0, 1, 0), axis=-1)
     up = np.take_along_axis(p, np.where(across == 2, 1, 2), axis=-1)
@@ -182,7 +182,7 @@ def _latitude(height: Floats) -> Floats:
     return np.arcsin(np.clip(height, -1.0, 1.0)) / np.pi
 
 
-def _around(p: Floats) -> Floats:
+def _angles_around_z(p: Floats) -> Floats:
     """Angles around z from x, in turns: triangles that reach over the seam go on beyond 1, at poles lies the mean."""
     turns = (np.arctan2(p[..., 1], p[..., 0]) / (2 * np.pi)) % 1.0
     there = np.hypot(p[..., 0], p[..., 1]) > _POLE

@@ -1,170 +1,108 @@
-"""What callers give as arrays and numbers, checked: every refusal says what would be right."""
+"""Checks of the arguments of `SceneBuilder`: numbers, arrays, meshes, poses and appearance.
+
+Every `SceneBuildError` names the argument and says what would be right.
+"""
 
 from __future__ import annotations
 
-import difflib
-import functools
-import inspect
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final, TypedDict, TypeVar, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.protocol.common import IDENTITY, Pose, Quat, Vec3
 from iris_session.protocol.names import TextureRole
-from iris_session.scene.arrays import array_of
-from iris_session.scene.elements import GREY, MAX_TRIANGLES, Look, Picture
+from iris_session.protocol.scene import Rgba
+from iris_session.scene.arrays import to_array
+from iris_session.scene.elements import GREY, MAX_TRIANGLES, Appearance, TextureImage
 from iris_session.scene.errors import SceneBuildError
-from iris_session.scene.images import checked_pixels, read_pixels
+from iris_session.scene.images import check_pixels, read_pixels
 from iris_session.scene.importers.references import read_bounded
-from iris_session.scene.mesh_processing import creased_normals, unit
+from iris_session.scene.mesh_processing import compute_creased_normals, normalise
 from iris_session.scene.meshes import MeshArrays, index_corners
 
-_NUMBERS: Final = ("emission", "specular", "shininess", "metallic", "roughness")
 
+def parse_appearance(
+    rgba: Sequence[float] | None,
+    texture: str | PathLike[str] | NDArray[np.uint8] | None,
+    metallic: float | None,
+    roughness: float | None,
+    emission: float | None,
+    specular: float | None,
+    shininess: float | None,
+    repeat: Sequence[float],
+    *,
+    uniform: bool,
+) -> Appearance | None:
+    """Return the appearance that arguments of `SceneBuilder` describe, `None` when all are left out.
 
-class Looks(TypedDict, total=False):
-    """How something looks. `rgba`: 0..1. `texture`: a path, or pixels (height, width, 1, 3 or 4) uint8, first row on
-    top, which the colour multiplies. `metallic`, `roughness`, `emission`, `specular`, `shininess`: as in `Material`.
-    `repeat`: how often the texture lies on a shape, or on a metre where `uniform`.
+    Raises:
+        SceneBuildError: A value is out of its range, or the texture cannot be read.
     """
-
-    rgba: Sequence[float]
-    texture: str | PathLike[str] | NDArray[np.uint8]
-    metallic: float
-    roughness: float
-    emission: float
-    specular: float
-    shininess: float
-    repeat: Sequence[float]
-    uniform: bool
-
-
-#: What other libraries call an option.
-_ELSEWHERE: Final = {
-    "color": "rgba",
-    "colour": "rgba",
-    "pos": "position",
-    "translation": "position",
-    "xyz": "position",
-    "quat": "quaternion",
-    "orientation": "quaternion",
-    "rotation": "quaternion",
-    "parent": "on",
-    "size": "half_size",
-}
-
-
-class _UntilGiven:
-    """What `help` shows of a keyword without a value of its own."""
-
-    def __repr__(self) -> str:
-        return "..."
-
-
-_UNTIL_GIVEN: Final = _UntilGiven()
-Method = TypeVar("Method", bound=Callable[..., Any])
-
-
-def takes(options: type[Any] | None = None) -> Callable[[Method], Method]:
-    """Of a method, with `**options` or without: a keyword that it does not have, nor the dictionary type `options`, is
-    a `TypeError` that names the nearest one; what it was to do would be left undone. `help` shows them one by one."""
-
-    def wrap(method: Method) -> Method:
-        signature = inspect.signature(method)
-        own = [one for one in signature.parameters.values() if one.kind is not one.VAR_KEYWORD]
-        given = [
-            inspect.Parameter(
-                name,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=_UNTIL_GIVEN,
-                annotation=getattr(kind, "__forward_arg__", kind),
-            )
-            for name, kind in (options.__annotations__ if options else {}).items()
-        ]
-        known = [one.name for one in (*own, *given) if one.name != "self"]
-
-        @functools.wraps(method)
-        def checked(*values: Any, **named: Any) -> Any:
-            for name in named:
-                if name not in known:
-                    raise TypeError(f"{method.__name__}() has no keyword {name}: {_meant(name, known)}")
-            return method(*values, **named)
-
-        checked.__signature__ = signature.replace(parameters=[*own, *given])  # type: ignore[attr-defined]
-        return cast(Method, checked)
-
-    return wrap
-
-
-def _meant(name: str, known: Sequence[str]) -> str:
-    same = _ELSEWHERE.get(name)
-    near = [same] if same in known else difflib.get_close_matches(name, known, n=1)
-    return f"{near[0]} is meant" if near else f"there are {', '.join(sorted(known))}"
-
-
-def look_of(options: Mapping[str, Any]) -> Look | None:
-    """The look that the options ask for, `None` where they ask for none."""
-    if not options.keys() & Looks.__annotations__.keys():
+    across, down = check_numbers("repeat", repeat, 2)
+    given = {
+        "emission": emission,
+        "specular": specular,
+        "shininess": shininess,
+        "metallic": metallic,
+        "roughness": roughness,
+    }
+    values: dict[str, Any] = {name: check_number(name, value)[0] for name, value in given.items() if value is not None}
+    if rgba is None and texture is None and not values and (across, down) == (1.0, 1.0) and not uniform:
         return None
-    default = (1.0, 1.0, 1.0, 1.0) if "texture" in options else GREY
-    given = options.get("rgba", default)
-    short = hasattr(given, "__len__") and len(given) == 3
-    try:
-        red, green, blue, alpha = (*numbers("rgba", given, 3 if short else 4), 1.0)[:4]
-    except SceneBuildError:
-        red = green = blue = alpha = -1.0
-    if not all(0.0 <= v <= 1.0 for v in (red, green, blue, alpha)):
-        raise SceneBuildError(f"rgba is {given!r}: red, green, blue, alpha from 0 to 1 are needed; (1, 0, 0, 1) is red")
-    across, down = numbers("repeat", options.get("repeat", (1.0, 1.0)), 2)
-    pictures: tuple[tuple[str, Picture], ...] = ()
-    if "texture" in options:
-        pixels = texture_of(options["texture"], "texture")
-        pictures = ((TextureRole.RGBA if pixels.shape[2] == 4 else TextureRole.RGB, Picture(pixels)),)
-    values: dict[str, Any] = {name: number(name, options[name])[0] for name in _NUMBERS if name in options}
+    color = (GREY if texture is None else (1.0, 1.0, 1.0, 1.0)) if rgba is None else _check_rgba(rgba)
+    images: tuple[tuple[str, TextureImage], ...] = ()
+    if texture is not None:
+        pixels = check_texture(texture, "texture")
+        images = ((TextureRole.RGBA if pixels.shape[2] == 4 else TextureRole.RGB, TextureImage(pixels)),)
     for name, value in values.items():
         if value < 0.0 or (value > 1.0 and name != "emission"):
             raise SceneBuildError(f"{name} is {value:g}: {'0 or more' if name == 'emission' else 'from 0 to 1'}")
     if "roughness" in values and "shininess" not in values:  # for clients that do not draw by roughness
         values["shininess"] = min(max(1.0 - values["roughness"], 0.0), 1.0)
-    plain = Look(
-        rgba=(red, green, blue, alpha),
-        pictures=pictures,
-        repeat=(across, down),
-        uniform=bool(options.get("uniform", False)),
-    )
-    return replace(plain, **values)
+    return replace(Appearance(rgba=color, images=images, repeat=(across, down), uniform=bool(uniform)), **values)
 
 
-def texture_of(given: Any, what: str) -> NDArray[np.uint8]:
-    """Pixels, or those of the picture whose path is given."""
+def _check_rgba(rgba: Any) -> Rgba:
+    short = hasattr(rgba, "__len__") and len(rgba) == 3
+    try:
+        red, green, blue, alpha = (*check_numbers("rgba", rgba, 3 if short else 4), 1.0)[:4]
+    except SceneBuildError:
+        red = green = blue = alpha = -1.0
+    if not all(0.0 <= v <= 1.0 for v in (red, green, blue, alpha)):
+        raise SceneBuildError(f"rgba is {rgba!r}: red, green, blue, alpha from 0 to 1 are needed; (1, 0, 0, 1) is red")
+    return red, green, blue, alpha
+
+
+def check_texture(given: Any, what: str) -> NDArray[np.uint8]:
+    """Return the pixels given, or those of the image whose path is given."""
     if isinstance(given, str | PathLike):
-        path = path_of(given)
+        path = check_path(given)
         if path.is_dir():
             raise SceneBuildError(f"{what} is {str(path)!r}, a folder: the path of a picture is needed, or pixels")
         return read_pixels(read_bounded(path), str(path))
-    return checked_pixels(given, what)
+    return check_pixels(given, what)
 
 
-def path_of(path: Any) -> Path:
-    """Where a file is."""
+def check_path(path: Any) -> Path:
+    """Return the path of a file."""
     try:
         return Path(os.fsdecode(path))
     except TypeError:
         raise SceneBuildError(f"path is {path!r}: the path of a file is needed, as text or a Path") from None
 
 
-def numbers(what: str, values: Any, count: int, *, above: float | None = None) -> tuple[float, ...]:
-    """As many finite numbers, greater than `above`."""
+def check_numbers(what: str, values: Any, count: int, *, above: float | None = None) -> tuple[float, ...]:
+    """Return `count` finite numbers, greater than `above`."""
     try:
         texts = isinstance(values, str | bytes)  # whose digits would be taken for numbers
-        found = tuple(float(_no_text(v)) for v in ((None,) if texts else values))
+        found = tuple(float(_reject_text(v)) for v in ((None,) if texts else values))
     except (TypeError, ValueError, OverflowError):
         raise SceneBuildError(f"{what} is {values!r}: {count} numbers are needed") from None
     if len(found) != count or not np.isfinite(found).all():
@@ -174,10 +112,12 @@ def numbers(what: str, values: Any, count: int, *, above: float | None = None) -
     return found
 
 
-def number(what: str, value: Any, needed: str = "a number is needed", *, above: float | None = None) -> tuple[float]:
-    """One finite number, greater than `above`."""
+def check_number(
+    what: str, value: Any, needed: str = "a number is needed", *, above: float | None = None
+) -> tuple[float]:
+    """Return one finite number, greater than `above`, as a tuple."""
     try:
-        found = float(_no_text(value))
+        found = float(_reject_text(value))
     except (TypeError, ValueError, OverflowError):
         raise SceneBuildError(f"{what} is {value!r}: {needed}") from None
     if not np.isfinite(found):
@@ -187,12 +127,12 @@ def number(what: str, value: Any, needed: str = "a number is needed", *, above: 
     return (found,)
 
 
-def _no_text(value: Any) -> Any:
+def _reject_text(value: Any) -> Any:
     return None if isinstance(value, str | bytes) else value
 
 
-def given_vertices(what: str, values: Any, width: int = 3, count: int | None = None) -> NDArray[np.float32]:
-    """Rows of finite float32, read-only."""
+def check_vertices(what: str, values: Any, width: int = 3, count: int | None = None) -> NDArray[np.float32]:
+    """Return rows of finite float32, read-only."""
     needed = f"finite numbers of shape (n, {width}) are needed"
     try:
         given = np.asarray(values)
@@ -211,9 +151,9 @@ def given_vertices(what: str, values: Any, width: int = 3, count: int | None = N
     return array
 
 
-def triangles_of(what: str, values: Any, vertices: int, width: int = 3) -> NDArray[np.uint32]:
-    """Rows of vertex numbers."""
-    array = array_of(values, what)
+def check_triangles(what: str, values: Any, vertices: int, width: int = 3) -> NDArray[np.uint32]:
+    """Return rows of vertex numbers."""
+    array = to_array(values, what)
     if array.ndim != 2 or array.shape[1] != width or not len(array) or array.dtype.kind not in "iu":
         raise SceneBuildError(
             f"{what}: an array {array.shape} of {array.dtype}: whole numbers of shape (m, {width}) are needed, at "
@@ -228,18 +168,20 @@ def triangles_of(what: str, values: Any, vertices: int, width: int = 3) -> NDArr
     return np.ascontiguousarray(array, np.uint32)
 
 
-def given_mesh(whose: str, vertices: Any, triangles: Any, normals: Any, uvs: Any, colors: Any) -> MeshArrays:
-    """A mesh of arrays per vertex; `whose` they are, for error texts."""
-    points = given_vertices(f"vertices of {whose}", vertices)
-    index = triangles_of(f"triangles of {whose}", triangles, len(points)).astype(np.int64)
+def check_mesh(whose: str, vertices: Any, triangles: Any, normals: Any, uvs: Any, colors: Any) -> MeshArrays:
+    """Return a mesh of arrays per vertex. `whose`: its name in messages."""
+    points = check_vertices(f"vertices of {whose}", vertices)
+    index = check_triangles(f"triangles of {whose}", triangles, len(points)).astype(np.int64)
     if normals is None:
-        across = creased_normals(points.astype(np.float64), index).astype(np.float32)
+        across = compute_creased_normals(points.astype(np.float64), index).astype(np.float32)
     else:
-        across = np.asarray(unit(given_vertices(f"normals of {whose}", normals, 3, len(points)))[index], np.float32)
-    uv = None if uvs is None else given_vertices(f"uvs of {whose}", uvs, 2, len(points))[index]
+        across = np.asarray(
+            normalise(check_vertices(f"normals of {whose}", normals, 3, len(points)))[index], np.float32
+        )
+    uv = None if uvs is None else check_vertices(f"uvs of {whose}", uvs, 2, len(points))[index]
     color = None
     if colors is not None:
-        array = array_of(colors, f"colors of {whose}")
+        array = to_array(colors, f"colors of {whose}")
         if array.dtype != np.uint8 or array.ndim != 2 or array.shape[1] not in (3, 4) or len(array) != len(points):
             raise SceneBuildError(
                 f"colors of {whose}: {array.shape} of {array.dtype}: ({len(points)}, 3 or 4) of uint8"
@@ -250,11 +192,11 @@ def given_mesh(whose: str, vertices: Any, triangles: Any, normals: Any, uvs: Any
     return index_corners(points[index], across, uv, color)
 
 
-def checked_pose(position: Any, quaternion: Any) -> Pose:
-    """A pose of what a caller gave; the quaternion is normalised. Raises `SceneBuildError` for what is none."""
-    x, y, z = _finite("position", position, 3, "(x, y, z) [m]")
+def check_pose(position: Any, quaternion: Any) -> Pose:
+    """Return a pose with the quaternion normalised. Raises `SceneBuildError`."""
+    x, y, z = _check_finite("position", position, 3, "(x, y, z) [m]")
     p: Vec3 = (x, y, z)
-    q = _finite("quaternion", quaternion, 4, "(w, x, y, z)")
+    q = _check_finite("quaternion", quaternion, 4, "(w, x, y, z)")
     length = math.hypot(*q)
     if not 1e-9 <= length < math.inf:
         raise SceneBuildError(
@@ -264,7 +206,7 @@ def checked_pose(position: Any, quaternion: Any) -> Pose:
     return IDENTITY if (p, unit) == (IDENTITY.p, IDENTITY.q) else Pose(p, unit)
 
 
-def _finite(what: str, values: Any, count: int, names: str) -> list[float]:
+def _check_finite(what: str, values: Any, count: int, names: str) -> list[float]:
     try:
         found = [float(v) for v in ([] if isinstance(values, str | bytes) else values)]  # digits are no numbers
     except (TypeError, ValueError):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from iris_session.physics import World
 from iris_session.protocol.names import MediaEncoding
-from iris_session.scene.mujoco_assets import flex_mesh, stream_name
+from iris_session.scene.mujoco_assets import read_flex_mesh, stream_name
 from iris_session.streams.deformable import DeformableEncoder
 from iris_session.streams.deformable_topology import DeformableTopology
 
@@ -78,7 +78,7 @@ class DeformableStreams:
 
 def flexes(world: World) -> list[Bending]:
     """The flexes of a world."""
-    meshes = [flex_mesh(world.model, index) for index in range(world.model.nflex)]
+    meshes = [read_flex_mesh(world.model, index) for index in range(world.model.nflex)]
     return [Bending(stream_name(index), mesh.topology, _of(world, mesh.vertices)) for index, mesh in enumerate(meshes)]
 
 

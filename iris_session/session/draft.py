@@ -116,7 +116,7 @@ class SceneDraft:
             example = {joint.name: joint.rest for joint in articulation.joints}
             raise PublishError(f"set_joints({name!r}): positions by name of the joint are expected, as {example}")
         try:
-            articulation.check(positions)
+            articulation.check_positions(positions)
             given = {joint: float(position) for joint, position in positions.items()}
         except (SceneBuildError, TypeError, OverflowError) as error:
             raise PublishError(f"set_joints({name!r}): {error}") from error
@@ -170,7 +170,7 @@ class SceneDraft:
     ) -> Mapping[str, Pose]:
         """The bodies of an articulation. Raises `PublishError`: finite joints may put one where nothing can be."""
         try:
-            placed = self._scene.articulations[name].placed(root, joints, moved)
+            placed = self._scene.articulations[name].compute_world_poses(root, joints, moved)
         except ValueError:  # farther, or turned more often, than floats can tell
             placed = {}
         if not placed or not all(abs(v) <= FARTHEST_M for one in placed.values() for v in one.p):  # NaN is not

@@ -15,7 +15,7 @@ from iris_session.client.deformables import FIRST_PAUSE_S, MAX_ASSET_BYTES, Defo
 from iris_session.protocol.names import ArrayKind, MediaEncoding
 from iris_session.protocol.scene import Deformable, SceneSpec, asset_addresses, encode_scene
 from iris_session.scene import AssetDecodeError, AssetStore
-from iris_session.scene.arrays import Stored, decode_arrays, encode_arrays
+from iris_session.scene.arrays import StoredArray, decode_arrays, encode_arrays
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.streams.deformable import DeformableEncoder
 from iris_session.streams.deformable_topology import DeformableTopology
@@ -155,8 +155,8 @@ def test_triangles_that_cannot_be_are_refused(tmp_path: Path, name: str, values:
     store = AssetStore(tmp_path)
     part = parse_mujoco(flexes(), store).spec.deformables[0]
     arrays = decode_arrays(store.get(part.address), ArrayKind.DEFORMABLE)
-    kept = [Stored(key, array) for key, array in arrays.items() if key != name]
-    bad = encode_arrays(ArrayKind.DEFORMABLE, kept if values is None else [*kept, Stored(name, values)])
+    kept = [StoredArray(key, array) for key, array in arrays.items() if key != name]
+    bad = encode_arrays(ArrayKind.DEFORMABLE, kept if values is None else [*kept, StoredArray(name, values)])
     with pytest.raises((AssetDecodeError, ValueError), match=f"{name}|vertices"):
         _Mesh("cloth", part, memoryview(bad))
 
@@ -312,8 +312,8 @@ def test_numbers_of_vertices_that_cannot_be_are_a_fault(
 ) -> None:
     good = shared.spec.deformables[0]
     arrays = decode_arrays(shared.store.get(good.address), ArrayKind.DEFORMABLE)
-    kept = [Stored(name, values) for name, values in arrays.items() if name != "vertex"]
-    bad = encode_arrays(ArrayKind.DEFORMABLE, [*kept, Stored("vertex", numbers[: max(3, good.vertices)])])
+    kept = [StoredArray(name, values) for name, values in arrays.items() if name != "vertex"]
+    bad = encode_arrays(ArrayKind.DEFORMABLE, [*kept, StoredArray("vertex", numbers[: max(3, good.vertices)])])
     live = shared.begin([good, msgspec.structs.replace(good, address=shared.store.put(bad), bytes=len(bad))])
     try:
         client, shapes = watch(live, joined, tmp_path / "cache")
@@ -329,8 +329,8 @@ def test_a_small_asset_that_becomes_large_is_refused(tmp_path: Path) -> None:
     store = AssetStore(tmp_path)
     part = parse_mujoco(flexes(), store).spec.deformables[0]
     arrays = decode_arrays(store.get(part.address), ArrayKind.DEFORMABLE)
-    padding = Stored("padding", np.zeros(MAX_ASSET_BYTES, np.uint8))
-    bomb = encode_arrays(ArrayKind.DEFORMABLE, [*(Stored(*item) for item in arrays.items()), padding])
+    padding = StoredArray("padding", np.zeros(MAX_ASSET_BYTES, np.uint8))
+    bomb = encode_arrays(ArrayKind.DEFORMABLE, [*(StoredArray(*item) for item in arrays.items()), padding])
     assert len(bomb) < 100_000
     with pytest.raises(AssetDecodeError, match=f"at most {MAX_ASSET_BYTES}"):
         _Mesh("a", part, memoryview(bomb))

@@ -17,7 +17,7 @@ from iris_session.recording.deformables import DrawnDeformable
 from iris_session.recording.messages import Batch, SceneAssets, SceneModel, VertexFrame
 from iris_session.recording.writer import MAX_PENDING_VERTICES, RrdWriter
 from iris_session.scene import AssetDecodeError, AssetStore, decode_arrays
-from iris_session.scene.mujoco_assets import flex_mesh
+from iris_session.scene.mujoco_assets import read_flex_mesh
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.streams.deformable import DeformableEncoder
 from tests.recording.support import column, read
@@ -35,7 +35,7 @@ class World:
         self.model = flexes()
         self.data = mujoco.MjData(self.model)
         mujoco.mj_forward(self.model, self.data)
-        self.meshes = [flex_mesh(self.model, i) for i in range(self.model.nflex)]
+        self.meshes = [read_flex_mesh(self.model, i) for i in range(self.model.nflex)]
         self.encoders = [DeformableEncoder(mesh.topology, BOUND_M) for mesh in self.meshes]
         self.store = AssetStore(folder / "assets")
         self.parsed = parse_mujoco(self.model, self.store)

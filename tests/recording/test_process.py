@@ -23,7 +23,7 @@ from iris_session.recording.feed import BATCH_NS
 from iris_session.recording.paths import part_path
 from iris_session.recording.process import DRAIN_S, FLUSH_S
 from iris_session.scene import AssetStore, decode_arrays
-from iris_session.scene.mujoco_assets import flex_mesh
+from iris_session.scene.mujoco_assets import read_flex_mesh
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.streams.deformable import DeformableEncoder
 from tests.recording.support import (
@@ -235,7 +235,7 @@ def test_vertices_come_into_the_picture_and_cost_the_journal_nothing(tmp_path: P
     path, model = tmp_path / "session.rrd", flexes()
     store = AssetStore(tmp_path / "assets")
     parsed = parse_mujoco(model, store)
-    encoder = DeformableEncoder(flex_mesh(model, 0).topology)
+    encoder = DeformableEncoder(read_flex_mesh(model, 0).topology)
     rest = decode_arrays(store.get(parsed.spec.deformables[0].address), ArrayKind.DEFORMABLE)["position"]
     with recorder(path) as (process, feed):
         session = SmallSession(feed)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.assets import ARRAYS_MAGIC, ArrayHeader, ArrayInfo
 from iris_session.scene import AssetDecodeError, decode_arrays, encode_arrays
-from iris_session.scene.arrays import Stored
+from iris_session.scene.arrays import StoredArray
 
 FILTERS = ("none", "shuffle", "delta", "up")
 
@@ -35,7 +35,7 @@ def test_every_filter_gives_the_same_bits_back(dtype: str, kind: str, shape: lis
         return
     raw = np.random.default_rng(seed).bytes(int(np.prod(shape)) * np.dtype(dtype).itemsize)
     values: NDArray[Any] = np.frombuffer(raw, dtype).reshape(shape)
-    back = decode_arrays(encode_arrays("mesh", [Stored("a", values, kind)]), "mesh")["a"]
+    back = decode_arrays(encode_arrays("mesh", [StoredArray("a", values, kind)]), "mesh")["a"]
     assert back.dtype == values.dtype
     assert back.shape == values.shape
     assert back.tobytes() == values.tobytes()
@@ -44,8 +44,8 @@ def test_every_filter_gives_the_same_bits_back(dtype: str, kind: str, shape: lis
 def test_smooth_content_shrinks_and_noise_costs_no_more_than_itself() -> None:
     slope = (np.arange(200)[:, None] + np.arange(300)).astype(np.uint8)
     noise = np.frombuffer(np.random.default_rng(0).bytes(60_000), np.uint8)
-    assert len(encode_arrays("image", [Stored("a", slope, "up")])) < slope.nbytes / 50
-    assert len(encode_arrays("image", [Stored("a", noise)])) < noise.nbytes + 200
+    assert len(encode_arrays("image", [StoredArray("a", slope, "up")])) < slope.nbytes / 50
+    assert len(encode_arrays("image", [StoredArray("a", noise)])) < noise.nbytes + 200
 
 
 @given(st.binary(max_size=200))
@@ -58,7 +58,7 @@ def test_bytes_of_anybody(data: bytes) -> None:
 @given(st.integers(0, 400), st.integers(0, 255), st.integers(0, 400))
 def test_damaged_assets(at: int, byte: int, length: int) -> None:
     values = np.arange(600, dtype=np.float32).reshape(-1, 3)
-    good = bytearray(encode_arrays("mesh", [Stored("position", values, "shuffle")]))
+    good = bytearray(encode_arrays("mesh", [StoredArray("position", values, "shuffle")]))
     good[at % len(good)] = byte
     for damaged in (good, good[:length]):
         try:
@@ -118,7 +118,7 @@ def test_what_is_quantised_counts_as_large_as_it_becomes() -> None:
 def test_rows_of_a_byte_cost_no_call_each(monkeypatch: pytest.MonkeyPatch) -> None:
     """A few kilobytes that hold a hundred million rows must not stop a client for minutes."""
     tall = np.random.default_rng(0).integers(0, 256, (4_000, 3), np.uint8)
-    data = encode_arrays("image", [Stored("a", tall, "up")])
+    data = encode_arrays("image", [StoredArray("a", tall, "up")])
     monkeypatch.setattr(np, "add", None)
     assert np.array_equal(decode_arrays(data, "image")["a"], tall)
 

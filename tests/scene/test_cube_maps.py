@@ -16,12 +16,12 @@ from PIL import Image
 
 from iris_session.protocol.scene import Geometry, SceneSpec
 from iris_session.scene import AssetStore, EncodeOptions
-from iris_session.scene.cube_maps import Cube, Cubes, _cube_of, baked
+from iris_session.scene.cube_maps import CubeMap, CubeMapReader, _with_atlas, bake_cube_map
 from iris_session.scene.glb import write_glb
 from iris_session.scene.meshes import MeshArrays
 from iris_session.scene.mujoco_scene import parse_mujoco
-from iris_session.scene.report import not_in_glb
-from iris_session.scene.shapes import primitive
+from iris_session.scene.report import list_glb_differences
+from iris_session.scene.shapes import build_primitive
 from tests.scene.models import QUAD, SHAPES, WEDGE
 from tests.scene.pictures import Artist, graphics
 from tests.scene.rays import draw, rays
@@ -203,7 +203,9 @@ def test_large_cubes_are_made_smaller_and_jpeg_stays(
     write_glb(spec, store, tmp_path / "a.glb")
     (picture,) = images(tmp_path / "a.glb")
     assert (picture.size, picture.format) == ((3 * 36, 2 * 36), "JPEG")
-    assert not_in_glb(spec) == ("1 cube textures of more than 32 pixels a face: they are there in a smaller size",)
+    assert list_glb_differences(spec) == (
+        "1 cube textures of more than 32 pixels a face: they are there in a smaller size",
+    )
 
 
 def test_a_cube_that_just_fits_is_taken_as_it_is(store: AssetStore) -> None:
@@ -211,7 +213,7 @@ def test_a_cube_that_just_fits_is_taken_as_it_is(store: AssetStore) -> None:
     visual = spec.visuals[0]
     sides = []
     for most in (512, 511):
-        cube = Cubes(spec, store, most).worn(visual.material, visual.geometry)
+        cube = CubeMapReader(spec, store, most).find(visual.material, visual.geometry)
         assert cube is not None
         assert cube.atlas is not None
         sides.append(cube.atlas.side)
@@ -221,7 +223,7 @@ def test_a_cube_that_just_fits_is_taken_as_it_is(store: AssetStore) -> None:
 @pytest.mark.parametrize(("alpha", "pictured"), [(128, True), (255, False)])
 def test_one_colour_that_is_seen_through_needs_a_picture(alpha: int, *, pictured: bool) -> None:
     faces = np.full((6, 8, 8, 4), (200, 100, 0, alpha), np.uint8)
-    found = _cube_of(Cube("", "png"), faces, 64)
+    found = _with_atlas(CubeMap("", "png"), faces, 64)
     assert (found.atlas is not None) == pictured
     assert (found.tint != (1.0, 1.0, 1.0)) != pictured
 
@@ -230,12 +232,12 @@ def ball(store: AssetStore) -> tuple[SceneSpec, MeshArrays, MeshArrays]:
     """A scene with a painted ball, its shape, and that with a cube."""
     spec = parse_mujoco(painted(SHAPES["sphere"], "cube"), store).spec
     geometry = spec.visuals[0].geometry
-    cube = Cubes(spec, store, 2_048).worn(spec.visuals[0].material, geometry)
-    before = primitive(geometry)
+    cube = CubeMapReader(spec, store, 2_048).find(spec.visuals[0].material, geometry)
+    before = build_primitive(geometry)
     assert cube is not None
     assert cube.atlas is not None
     assert before is not None
-    return spec, before, baked(before, geometry, (1.0, 1.0, 1.0), cube.atlas)
+    return spec, before, bake_cube_map(before, geometry, (1.0, 1.0, 1.0), cube.atlas)
 
 
 def edges(mesh: MeshArrays) -> list[tuple[Any, ...]]:
@@ -262,12 +264,12 @@ def test_what_is_cut_and_split_has_no_gaps(store: AssetStore) -> None:
 def test_colours_at_corners_are_kept(store: AssetStore) -> None:
     """Cut edges have what lies between their ends."""
     spec, before, _ = ball(store)
-    cube = Cubes(spec, store, 2_048).worn(0, spec.visuals[0].geometry)
+    cube = CubeMapReader(spec, store, 2_048).find(0, spec.visuals[0].geometry)
     assert cube is not None
     assert cube.atlas is not None
     color = np.rint(127.5 + 127.5 * np.pad(before.position / 0.3, ((0, 0), (0, 1)))).astype(np.uint8)
     dyed = MeshArrays(before.position, before.normal, None, before.index, color)
-    after = baked(dyed, Geometry("mesh", (0.3, 0.3, 0.3)), (1.0, 1.0, 1.0), cube.atlas)
+    after = bake_cube_map(dyed, Geometry("mesh", (0.3, 0.3, 0.3)), (1.0, 1.0, 1.0), cube.atlas)
     assert after.color is not None
     expected = 127.5 + 127.5 * np.pad(after.position / 0.3, ((0, 0), (0, 1)))
     assert np.abs(after.color - expected).max() < 2

@@ -12,10 +12,10 @@ import trimesh
 
 from iris_session.scene import AssetStore
 from iris_session.scene.builder import SceneBuilder
-from iris_session.scene.elements import matrix_of
-from iris_session.scene.extent import box_extent, extent_of, length, unit_hint
+from iris_session.scene.elements import to_matrix
+from iris_session.scene.extent import compute_box_extent, compute_extent, format_length, format_unit_hint
 from iris_session.scene.mujoco_scene import parse_mujoco
-from iris_session.scene.shapes import primitive
+from iris_session.scene.shapes import build_primitive
 
 TURN = (0.8, 0.1, -0.3, 0.5)
 
@@ -33,11 +33,11 @@ def test_shapes_that_are_turned(tmp_path: Path) -> None:
         getattr(scene, f"add_{kind}")(position=(1, 2, 3), quaternion=TURN, **size)
         store = AssetStore(tmp_path / "store")
         spec = scene.build(store).spec
-        shape = primitive(spec.visuals[0].geometry)
+        shape = build_primitive(spec.visuals[0].geometry)
         assert shape is not None
-        T = matrix_of(spec.visuals[0].T_body_visual)
+        T = to_matrix(spec.visuals[0].T_body_visual)
         placed = shape.position.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
-        found = extent_of(spec, store)
+        found = compute_extent(spec, store)
         assert found is not None
         sides = np.ptp(placed, axis=0)
         assert (np.array(found.size) >= sides - 1e-6).all()
@@ -56,7 +56,7 @@ def test_meshes_by_their_vertices(tmp_path: Path) -> None:
     scene.add_deformable("cloth", [[0, 0, 2], [0.2, 0, 2], [0, 0.2, 2]], [[0, 1, 2]])
     store = AssetStore(tmp_path / "store")
     spec = scene.build(store).spec
-    found, boxes = extent_of(spec, store), box_extent(spec)
+    found, boxes = compute_extent(spec, store), compute_box_extent(spec)
     assert found is not None
     assert boxes is not None
     np.testing.assert_allclose(found.low, (-0.5, -0.5, -0.5), atol=2e-3)
@@ -72,7 +72,7 @@ def test_of_a_model(tmp_path: Path) -> None:
         '<geom size="5" group="4"/><body pos="0 3 0"><joint/><geom size="0.5"/></body></worldbody></mujoco>'
     )
     store = AssetStore(tmp_path)
-    found = extent_of(parse_mujoco(model, store).spec, store)
+    found = compute_extent(parse_mujoco(model, store).spec, store)
     assert found is not None
     np.testing.assert_allclose(found.low, (-1, -2, -3.25))
     np.testing.assert_allclose(found.high, (1, 3.5, 0.5))
@@ -82,7 +82,7 @@ def test_nothing_has_no_extent(tmp_path: Path) -> None:
     scene, store = SceneBuilder(), AssetStore(tmp_path)
     scene.add_plane()
     spec = scene.build(store).spec
-    assert extent_of(spec, store) is None
+    assert compute_extent(spec, store) is None
     assert spec.environment.extent == 1.0
 
 
@@ -98,8 +98,8 @@ def test_nothing_has_no_extent(tmp_path: Path) -> None:
     ],
 )
 def test_what_looks_like_a_mistake_of_units(side: float, says: str) -> None:
-    assert unit_hint(side, "--scale {factor}") == says
+    assert format_unit_hint(side, "--scale {factor}") == says
 
 
 def test_lengths_for_people() -> None:
-    assert [length(v) for v in (0.1, 0.0999, 12.3456, 12_345.6)] == ["0.1 m", "99.9 mm", "12.35 m", "12,346 m"]
+    assert [format_length(v) for v in (0.1, 0.0999, 12.3456, 12_345.6)] == ["0.1 m", "99.9 mm", "12.35 m", "12,346 m"]

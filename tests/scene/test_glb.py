@@ -19,7 +19,7 @@ from iris_session.scene import AssetStore, SceneBuildError
 from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.glb import write_glb
 from iris_session.scene.mujoco_scene import parse_mujoco
-from iris_session.scene.report import not_in_glb
+from iris_session.scene.report import list_glb_differences
 from tests.scene.test_shapes import document
 
 
@@ -104,7 +104,7 @@ def test_ropes_are_lines_and_what_is_hidden_is_not_there(tmp_path: Path, store: 
     (rope,) = found["meshes"][0]["primitives"]
     assert rope["mode"] == 1
     assert found["accessors"][rope["indices"]]["count"] == 4
-    assert "ropes: lines without thickness" in not_in_glb(spec)
+    assert "ropes: lines without thickness" in list_glb_differences(spec)
     (path,) = (one for one in trimesh.load_scene(tmp_path / "a.glb").geometry.values())
     assert path.length == pytest.approx(1.0)
 
@@ -156,7 +156,7 @@ def test_a_sky_has_no_form(tmp_path: Path, store: AssetStore) -> None:
     )
     spec = parse_mujoco(model, store).spec
     assert len(exported(spec, store, tmp_path)["images"]) == 1
-    assert not_in_glb(spec) == ("the skybox: neither has a form for it, nothing is drawn around the scene",)
+    assert list_glb_differences(spec) == ("the skybox: neither has a form for it, nothing is drawn around the scene",)
 
 
 def test_a_mesh_with_coordinates_of_its_own_is_there_once(tmp_path: Path, store: AssetStore) -> None:

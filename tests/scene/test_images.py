@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from iris_session.scene import AssetDecodeError, decode_image, encode_image
-from iris_session.scene.images import halved
+from iris_session.scene.images import halve
 
 ENCODINGS = ("arrays", "png", "jpeg")
 
@@ -46,8 +46,8 @@ def test_flat_drawings_and_pictures_both_shrink() -> None:
 
 
 def test_half_the_size() -> None:
-    assert np.array_equal(halved(np.arange(16, dtype=np.uint8).reshape(4, 4, 1))[..., 0], [[3, 5], [11, 13]])
-    assert halved(picture(5, 1)).shape == (2, 1, 3)
+    assert np.array_equal(halve(np.arange(16, dtype=np.uint8).reshape(4, 4, 1))[..., 0], [[3, 5], [11, 13]])
+    assert halve(picture(5, 1)).shape == (2, 1, 3)
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)

@@ -19,8 +19,8 @@ from iris_session.scene import (
     encode_mesh,
     encode_mesh_quantised,
 )
-from iris_session.scene.arrays import Stored
-from iris_session.scene.mesh_processing import simplified, smooth_mesh, sorted_rows
+from iris_session.scene.arrays import StoredArray
+from iris_session.scene.mesh_processing import build_smooth_mesh, simplify_mesh, sort_rows
 from iris_session.scene.meshes import index_corners
 
 
@@ -34,7 +34,7 @@ def soup(seed: int, faces: int, *, uv: bool) -> MeshArrays:
 
 def ball(subdivisions: int) -> MeshArrays:
     shape = trimesh.creation.icosphere(subdivisions)
-    return smooth_mesh(np.array(shape.vertices), np.array(shape.faces, np.int64))
+    return build_smooth_mesh(np.array(shape.vertices), np.array(shape.faces, np.int64))
 
 
 @given(st.integers(0, 1000), st.integers(0, 60), st.booleans())
@@ -71,7 +71,7 @@ def test_quantised_positions_stay_within_the_bound(seed: int, scale: float, offs
 
 def test_coarser_meshes_stay_within_the_stated_error() -> None:
     mesh = ball(4)
-    coarse = simplified(mesh, mesh.triangles // 4)
+    coarse = simplify_mesh(mesh, mesh.triangles // 4)
     assert coarse is not None
     level, error = coarse
     assert 0.1 * mesh.triangles < level.triangles < 0.5 * mesh.triangles
@@ -111,7 +111,7 @@ def table() -> trimesh.Trimesh:
 def test_what_is_long_and_thin_stays(thin: Callable[[], trimesh.Trimesh], triangles: int) -> None:
     """Where a cell is wider than they are, they would become lines: a table stood on three legs."""
     whole = trimesh.util.concatenate([trimesh.creation.icosphere(5, radius=0.3), thin()])
-    coarse = simplified(smooth_mesh(np.array(whole.vertices), np.array(whole.faces, np.int64)), triangles)
+    coarse = simplify_mesh(build_smooth_mesh(np.array(whole.vertices), np.array(whole.faces, np.int64)), triangles)
     assert coarse is not None
     level, error = coarse
     assert level.triangles < 1.5 * triangles
@@ -122,14 +122,14 @@ def test_what_is_long_and_thin_stays(thin: Callable[[], trimesh.Trimesh], triang
 
 
 def test_textured_meshes_and_small_gains_are_left_alone() -> None:
-    assert simplified(soup(0, 100, uv=True), 20) is None
-    assert simplified(ball(1), 79) is None
-    assert simplified(ball(1), 80) is None
+    assert simplify_mesh(soup(0, 100, uv=True), 20) is None
+    assert simplify_mesh(ball(1), 79) is None
+    assert simplify_mesh(ball(1), 80) is None
 
 
 def test_edges_stay_sharp_and_round_things_smooth() -> None:
     box = trimesh.creation.box()
-    mesh = smooth_mesh(np.array(box.vertices), np.array(box.faces, np.int64))
+    mesh = build_smooth_mesh(np.array(box.vertices), np.array(box.faces, np.int64))
     across = np.cross(*(mesh.position[mesh.index[:, k]] - mesh.position[mesh.index[:, 0]] for k in (1, 2)))
     assert np.einsum("fkc,fc->fk", mesh.normal[mesh.index], across).min() >= 0.8 - 1e-6
     assert mesh.vertices > 8
@@ -139,14 +139,14 @@ def test_edges_stay_sharp_and_round_things_smooth() -> None:
 @pytest.mark.parametrize(
     ("arrays", "text"),
     [
-        ([Stored("position", np.zeros((3, 3), np.float32))], "'normal' is missing"),
-        ([Stored("position", np.zeros((3, 2), np.float32))], "expected f4"),
-        ([Stored("position", np.full((1, 3), np.nan, np.float32))], "not finite"),
-        ([Stored("index", np.full((1, 3), 7, np.uint16))], "has the corner 7"),
-        ([Stored("index", np.full((1, 3), 1, np.uint16))], "has the corner 1, but there are 1"),
+        ([StoredArray("position", np.zeros((3, 3), np.float32))], "'normal' is missing"),
+        ([StoredArray("position", np.zeros((3, 2), np.float32))], "expected f4"),
+        ([StoredArray("position", np.full((1, 3), np.nan, np.float32))], "not finite"),
+        ([StoredArray("index", np.full((1, 3), 7, np.uint16))], "has the corner 7"),
+        ([StoredArray("index", np.full((1, 3), 1, np.uint16))], "has the corner 1, but there are 1"),
     ],
 )
-def test_what_is_no_mesh_is_refused(arrays: list[Stored], text: str) -> None:
+def test_what_is_no_mesh_is_refused(arrays: list[StoredArray], text: str) -> None:
     whole = {
         "position": np.zeros((1, 3), np.float32),
         "normal": np.zeros((1, 3), np.float32),
@@ -156,16 +156,16 @@ def test_what_is_no_mesh_is_refused(arrays: list[Stored], text: str) -> None:
     if len(whole["position"]) != 1:
         del whole["normal"]
     with pytest.raises(AssetDecodeError, match=text):
-        decode_mesh(encode_arrays("mesh", [Stored(name, values) for name, values in whole.items()]))
+        decode_mesh(encode_arrays("mesh", [StoredArray(name, values) for name, values in whole.items()]))
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.int64])
 def test_rows_are_those_of_numpy_in_their_order(kind: type) -> None:
     rows = np.random.default_rng(5).integers(-3, 3, (2000, 3)).astype(kind)
-    first, which = sorted_rows(rows)
+    first, which = sort_rows(rows)
     unique, place, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     np.testing.assert_array_equal(rows[first], unique)
     np.testing.assert_array_equal(first, place)
     np.testing.assert_array_equal(which, inverse.reshape(-1))
-    none, nowhere = sorted_rows(rows[:0])
+    none, nowhere = sort_rows(rows[:0])
     assert len(none) == len(nowhere) == 0

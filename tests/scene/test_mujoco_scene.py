@@ -18,12 +18,12 @@ from hypothesis import strategies as st
 from iris_session.physics import World
 from iris_session.protocol.scene import SceneError, SceneSpec, asset_addresses, decode_scene, encode_scene
 from iris_session.scene import AssetStore, EncodeOptions, decode_arrays
-from iris_session.scene.elements import matrix_of
-from iris_session.scene.mujoco_scene import Parsed, parse_mujoco
+from iris_session.scene.elements import to_matrix
+from iris_session.scene.mujoco_scene import ParsedScene, parse_mujoco
 from tests.scene.models import every_shape, flexes
 
 
-def parse(xml: str, folder: Path, **options: Any) -> Parsed:
+def parse(xml: str, folder: Path, **options: Any) -> ParsedScene:
     return parse_mujoco(mujoco.MjModel.from_xml_string(xml), AssetStore(folder), **options)
 
 
@@ -362,9 +362,9 @@ def test_what_tracks_a_body_stands_where_it_does_at_first(tmp_path: Path) -> Non
     mujoco.mj_kinematics(model, data)
     spec = parse_mujoco(model, AssetStore(tmp_path), data=data).spec
     mujoco.mj_forward(model, data)
-    T_world = {body.id: matrix_of(body.T_world_body) for body in spec.bodies}
+    T_world = {body.id: to_matrix(body.T_world_body) for body in spec.bodies}
     for k, camera in enumerate(spec.cameras):
-        T = T_world[camera.body] @ matrix_of(camera.T_body_camera)
+        T = T_world[camera.body] @ to_matrix(camera.T_body_camera)
         np.testing.assert_allclose(T[:3, 3], data.cam_xpos[k], atol=1e-9)
         np.testing.assert_allclose(T[:3, :3], data.cam_xmat[k].reshape(3, 3), atol=1e-9)
     for k, light in enumerate(spec.lights):

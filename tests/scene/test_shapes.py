@@ -17,7 +17,7 @@ from iris_session.protocol.scene import Geometry, HeightField
 from iris_session.scene import AssetStore
 from iris_session.scene.glb import write_glb
 from iris_session.scene.mujoco_scene import parse_mujoco
-from iris_session.scene.shapes import height_field, primitive
+from iris_session.scene.shapes import build_height_field, build_primitive
 from tests.scene.models import every_shape, flexes
 
 #: How far a face's centre lies below the round surface it stands for, and how far above it a ray begins [m].
@@ -61,13 +61,13 @@ def test_faces_of_a_glb_lie_on_the_surfaces_that_mujoco_has(tmp_path: Path) -> N
 def test_shapes_are_closed_and_look_outwards(kind: str) -> None:
     if kind == "hfield":
         elevation = np.random.default_rng(0).uniform(0.1, 1, (5, 7)).astype(np.float32)
-        mesh = height_field(HeightField("", 5, 7, (1.0, 2.0, 0.5, 0.1), "0" * 64, 0), elevation)
+        mesh = build_height_field(HeightField("", 5, 7, (1.0, 2.0, 0.5, 0.1), "0" * 64, 0), elevation)
         cells = (elevation[:-1, :-1] + elevation[1:, :-1] + elevation[:-1, 1:] + elevation[1:, 1:]) / 4
         exact = 4 * 2 * (0.1 + 0.5 * float(cells.mean()))
     else:
         round_ = {"sphere": (0.3, 0.3, 0.3), "capsule": (0.2, 0.2, 0.5), "cylinder": (0.2, 0.2, 0.5)}
         size = round_.get(kind, (0.1, 0.2, 0.3))
-        made = primitive(Geometry(kind, size))
+        made = build_primitive(Geometry(kind, size))
         assert made is not None
         mesh, (x, y, z) = made, size
         ball, tube = 4 / 3 * np.pi * x * y * (x if kind == "capsule" else z), 2 * np.pi * x * x * z

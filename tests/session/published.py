@@ -8,7 +8,7 @@ import numpy as np
 
 from iris_session.protocol.common import Pose
 from iris_session.protocol.scene import Body, SceneSpec
-from iris_session.scene.composed import Articulation, ComposedScene, DeformableSource, Joint, Part
+from iris_session.scene.composed import ArticulatedBody, Articulation, ComposedScene, DeformableSource, Joint
 from iris_session.streams.deformable_topology import DeformableTopology
 
 UNIT = (1.0, 0.0, 0.0, 0.0)
@@ -22,9 +22,9 @@ def arm() -> Articulation:
         "arm",
         Pose((0.0, 0.0, 0.8), UNIT),
         (
-            Part("arm/base"),
-            Part("arm/upper", 0, joint=0),
-            Part("arm/fore", 1, Pose((1.0, 0.0, 0.0), UNIT), axis=(1.0, 0.0, 0.0), sliding=True, joint=1),
+            ArticulatedBody("arm/base"),
+            ArticulatedBody("arm/upper", 0, joint=0),
+            ArticulatedBody("arm/fore", 1, Pose((1.0, 0.0, 0.0), UNIT), axis=(1.0, 0.0, 0.0), sliding=True, joint=1),
         ),
         (Joint("turn", "revolute", -math.pi, math.pi, 0.0), Joint("slide", "prismatic", 0.0, 0.5, 0.0)),
         {"follower": "turn"},

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from iris_session.protocol.common import IDENTITY, Pose
-from iris_session.scene.composed import Articulation, Joint, Part
+from iris_session.scene.composed import ArticulatedBody, Articulation, Joint
 from iris_session.session.draft import MAX_SAID, SceneDraft
 from iris_session.session.errors import PublishError
 from tests.session.published import CLOTH, MOVING, UNIT, composed
@@ -71,7 +71,7 @@ def test_joints_beyond_their_limits_are_shown_and_said_when_they_are_far_beyond(
 
 def test_of_many_joints_beyond_their_limits_a_few_are_named() -> None:
     joints = tuple(Joint(f"j{i}", "revolute", -1.0, 1.0, 0.0) for i in range(MAX_SAID + 3))
-    parts = (Part("arm/base"), *(Part(f"arm/{i}", i, joint=i) for i in range(len(joints))))
+    parts = (ArticulatedBody("arm/base"), *(ArticulatedBody(f"arm/{i}", i, joint=i) for i in range(len(joints))))
     names = tuple(part.body for part in parts)
     robot = Articulation("arm", IDENTITY, parts, joints, {})
     scene = replace(composed(), moving=names, poses=(IDENTITY,) * len(names), articulations={"arm": robot})
@@ -93,7 +93,7 @@ def on_a_floating_base() -> SceneDraft:
     scene = composed()
     robot = scene.articulations["arm"]
     base, _, fore = robot.parts
-    parts = (base, Part("arm/upper", 0, Pose((0.0, 0.0, 0.2), UNIT)), fore)
+    parts = (base, ArticulatedBody("arm/upper", 0, Pose((0.0, 0.0, 0.2), UNIT)), fore)
     floating = replace(robot, parts=parts, loose={"fly": "arm/upper"})
     return SceneDraft(replace(scene, articulations={"arm": floating}))
 

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from iris_session.scene.elements import Loaded
+from iris_session.scene.elements import LoadedFile
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.importers.references import References
 
@@ -30,7 +30,7 @@ _LISTED: Final = 8
 _OF_CODE: Final = (AttributeError, TypeError, NameError, AssertionError, NotImplementedError, RecursionError)
 
 
-def load_file(path: Path, package_dirs: Sequence[str | PathLike[str]] = (), name: str = "") -> Loaded:
+def load_file(path: Path, package_dirs: Sequence[str | PathLike[str]] = (), name: str = "") -> LoadedFile:
     """The geometry of a file. `name`: of what the file itself calls nothing, as STL, PLY and OFF do; else as the file.
 
     Raises `SceneBuildError` for one that is missing, damaged, or of another form."""
@@ -39,7 +39,7 @@ def load_file(path: Path, package_dirs: Sequence[str | PathLike[str]] = (), name
     if kind not in (*_GLTF, *MESHES):
         raise SceneBuildError(f"{path.name}: {_other_reader(path, kind)}")
     references = References(path, package_dirs)
-    found: Loaded = guarded(path, kind, lambda: _read(path, kind, references, name or path.stem))
+    found: LoadedFile = guarded(path, kind, lambda: _read(path, kind, references, name or path.stem))
     if not any(node.surfaces or node.lights or node.cameras for node in found.nodes):
         raise SceneBuildError(
             f"{path} has nothing that can be drawn" + "".join(f"; {text}" for text in found.skipped[:3])
@@ -128,7 +128,7 @@ def xacro_advice(path: Path) -> str:
     return f"xacro must be expanded first: xacro {path.name} > {stem}.urdf (ROS has it; else pip install xacro)"
 
 
-def _read(path: Path, kind: str, references: References, name: str) -> Loaded:
+def _read(path: Path, kind: str, references: References, name: str) -> LoadedFile:
     if kind in _GLTF:
         from iris_session.scene.importers.gltf import read_gltf
 

@@ -27,18 +27,18 @@ from iris_session.scene.elements import (
     MAX_FILE_BYTES,
     MAX_NODES,
     MAX_TRIANGLES,
-    Loaded,
-    Look,
+    Appearance,
+    LoadedFile,
     Matrix,
     Node,
-    Picture,
     Surface,
-    cut,
+    TextureImage,
+    truncate_name,
 )
 from iris_session.scene.errors import SceneBuildError
-from iris_session.scene.images import PixelBudget, Pixels, read_pixels, without_alpha
+from iris_session.scene.images import PixelBudget, Pixels, drop_alpha, read_pixels
 from iris_session.scene.importers.references import References, read_bounded
-from iris_session.scene.mesh_processing import both_sides, recoloured, unit
+from iris_session.scene.mesh_processing import add_back_sides, merge_vertex_color, normalise
 from iris_session.scene.meshes import MeshArrays, index_corners
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
@@ -76,7 +76,7 @@ _REPEAT: Final = 10497
 Doubles = NDArray[np.float64]
 
 
-def read_gltf(path: Path, references: References) -> Loaded:
+def read_gltf(path: Path, references: References) -> LoadedFile:
     """The file. Raises `SceneBuildError`."""
     return _Reader(GltfData(path, references)).loaded()
 
@@ -89,7 +89,7 @@ class _Reader:
         self._meshes: dict[object, list[Surface]] = {}
         self._triangles = 0
 
-    def loaded(self) -> Loaded:
+    def loaded(self) -> LoadedFile:
         document = self._data.json
         for kind, text in _STILL.items():
             if document.get(kind):
@@ -97,7 +97,7 @@ class _Reader:
         unknown = {str(name) for name in document.get("extensionsUsed", ())} - KNOWN_EXTENSIONS
         for name in sorted(unknown):
             self._skip(f"extension {name}")
-        return Loaded(tuple(self._nodes()), "y", 1.0, tuple(self._skipped))
+        return LoadedFile(tuple(self._nodes()), "y", 1.0, tuple(self._skipped))
 
     def _roots(self) -> list[object]:
         """Nodes at the top of the scene that the file shows."""
@@ -135,7 +135,7 @@ class _Reader:
         return found
 
     def _node(self, entry: dict[str, Any], index: object, parent: int, above: Matrix) -> Node:
-        node = Node(cut(entry.get("name") or f"node_{index}"), parent, above @ self._matrix(entry))
+        node = Node(truncate_name(entry.get("name") or f"node_{index}"), parent, above @ self._matrix(entry))
         if "mesh" in entry:
             node.surfaces += self._surfaces(entry["mesh"])
         extensions = entry.get("extensions")
@@ -178,7 +178,7 @@ class _Reader:
             found = []
             primitives = entry.get("primitives", ())
             for number, primitive in enumerate(primitives):
-                name = cut(entry.get("name") or f"mesh_{mesh}")
+                name = truncate_name(entry.get("name") or f"mesh_{mesh}")
                 surface = self._surface(primitive, name if len(primitives) == 1 else f"{name[:500]}_{number}")
                 if surface is not None:
                     found.append(surface)
@@ -203,9 +203,9 @@ class _Reader:
             raise SceneBuildError(f"{self._data.name}: a vertex of {name} is not finite")
         dress = self._looks.dress(primitive.get("material"))
         mesh = self._mesh(attributes, position, index, dress)
-        mesh, rgba = recoloured(mesh, dress.look.rgba)
+        mesh, rgba = merge_vertex_color(mesh, dress.look.rgba)
         look = dress.look if rgba == dress.look.rgba else replace(dress.look, rgba=rgba)
-        return Surface(both_sides(mesh) if dress.both_sides else mesh, look, name)
+        return Surface(add_back_sides(mesh) if dress.both_sides else mesh, look, name)
 
     def _mesh(self, attributes: dict[str, Any], position: Floats, index: NDArray[np.int64], dress: Dress) -> MeshArrays:
         corners = position[index]
@@ -213,10 +213,10 @@ class _Reader:
             normals = self._of_vertices(attributes["NORMAL"], (3,), len(position)).astype(np.float32)
             length = np.linalg.norm(normals, axis=1)
             off = ~(np.abs(length - 1.0) < 1e-3)
-            normals[off] = unit(np.nan_to_num(normals[off]))
+            normals[off] = normalise(np.nan_to_num(normals[off]))
             normal = normals[index]
         else:  # flat, as glTF asks for
-            flat = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+            flat = normalise(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
             normal = np.repeat(flat[:, None], 3, axis=1).astype(np.float32)
         uv = None
         wanted = f"TEXCOORD_{dress.uv_set}"
@@ -481,7 +481,7 @@ class Dress:
     """A look, whether it is drawn from both sides, and which texture coordinates it takes: `uv_set`, turned by
     `uv_matrix` (3, 3) unless that is `None`; `uv_set` is -1 without textures. `opaque`: alpha says nothing."""
 
-    look: Look
+    look: Appearance
     both_sides: bool = False
     uv_set: int = -1
     uv_matrix: Doubles | None = None
@@ -495,7 +495,7 @@ class GltfLooks:
         self._data = data
         self._skipped = skipped
         self._dresses: dict[object, Dress] = {}
-        self._pictures: dict[tuple[object, ...], Picture] = {}
+        self._pictures: dict[tuple[object, ...], TextureImage] = {}
         self._budget = PixelBudget(data.name)
 
     def dress(self, material: object) -> Dress:
@@ -514,7 +514,7 @@ class GltfLooks:
         rgba: Rgba = (red, green, blue, min(max(alpha, 0.0), 1.0))
         roughness = self.number(pbr.get("roughnessFactor", 1.0))
         rgba, emission = self._emission(entry, rgba)
-        uses: list[tuple[dict[str, Any], str, Picture]] = []
+        uses: list[tuple[dict[str, Any], str, TextureImage]] = []
         base, cutoff = _map(pbr.get("baseColorTexture")), self.number(entry.get("alphaCutoff", 0.5))
         if base:
             picture = self._picture(base, f"{mode} {cutoff}", lambda pixels: _alpha(pixels, mode, cutoff))
@@ -522,15 +522,15 @@ class GltfLooks:
                 role = TextureRole.RGBA if picture.pixels.shape[2] == 4 else TextureRole.RGB
                 uses.append((base, role, picture))
         uses += self._others(entry, pbr)
-        look = Look(
+        look = Appearance(
             rgba=rgba,
-            name=cut(entry.get("name", "")),
+            name=truncate_name(entry.get("name", "")),
             emission=emission,
             specular=0.5 * (1.0 - min(max(roughness, 0.0), 1.0)),
             shininess=1.0 - min(max(roughness, 0.0), 1.0),
             metallic=min(max(self.number(pbr.get("metallicFactor", 1.0)), 0.0), 1.0),
             roughness=min(max(roughness, 0.0), 1.0),
-            pictures=tuple((role, picture) for _, role, picture in uses),
+            images=tuple((role, picture) for _, role, picture in uses),
         )
         uv_set, uv_matrix = self._mapping([use for use, _, _ in uses])
         return Dress(look, bool(entry.get("doubleSided", False)), uv_set, uv_matrix, mode == "OPAQUE")
@@ -551,7 +551,7 @@ class GltfLooks:
             self._skip(f"the colour in which material {entry.get('name', '')!r} glows: it glows in its own")
         return rgba, emission
 
-    def _others(self, entry: dict[str, Any], pbr: dict[str, Any]) -> list[tuple[dict[str, Any], str, Picture]]:
+    def _others(self, entry: dict[str, Any], pbr: dict[str, Any]) -> list[tuple[dict[str, Any], str, TextureImage]]:
         """Pictures other than the colour."""
         found = []
         rough, shade = _map(pbr.get("metallicRoughnessTexture")), _map(entry.get("occlusionTexture"))
@@ -568,7 +568,7 @@ class GltfLooks:
                 found.append((use, role, picture))
         return found
 
-    def _picture(self, use: dict[str, Any], key: str, change: Any, space: str = ColorSpace.AUTO) -> Picture | None:
+    def _picture(self, use: dict[str, Any], key: str, change: Any, space: str = ColorSpace.AUTO) -> TextureImage | None:
         """The picture that `use` names, changed by `change`; `None`, and noted, where it is in a form of its own."""
         texture = self._data.item("textures", use.get("index"))
         webp = _map(_map(texture.get("extensions")).get("EXT_texture_webp"))
@@ -583,10 +583,10 @@ class GltfLooks:
         image = self._data.item("images", source)
         kept = (source, key, space)
         if kept not in self._pictures:
-            name = cut(image.get("name") or texture.get("name") or "")
+            name = truncate_name(image.get("name") or texture.get("name") or "")
             pixels = read_pixels(self._data.picture_bytes(source), f"image {source} of {self._data.name}")
             self._budget.spend(pixels)
-            self._pictures[kept] = Picture(pixels if change is None else change(pixels), name, colorspace=space)
+            self._pictures[kept] = TextureImage(pixels if change is None else change(pixels), name, colorspace=space)
         return self._pictures[kept]
 
     def _mapping(self, uses: list[dict[str, Any]]) -> tuple[int, Doubles | None]:
@@ -630,7 +630,7 @@ class GltfLooks:
 def _alpha(pixels: Pixels, mode: object, cutoff: float) -> Pixels:
     """Alpha as the material has it: not at all, cut, or blended."""
     if mode == "OPAQUE":
-        return without_alpha(pixels, always=True)
+        return drop_alpha(pixels, always=True)
     if mode == "MASK" and pixels.shape[2] == 4:
         pixels = pixels.copy()
         pixels[:, :, 3] = np.where(pixels[:, :, 3] >= cutoff * 255, 255, 0)

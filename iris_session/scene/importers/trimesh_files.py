@@ -21,20 +21,20 @@ from iris_session.scene.elements import (
     GREY,
     MAX_NODES,
     MAX_TRIANGLES,
-    Loaded,
-    Look,
+    Appearance,
+    LoadedFile,
     Node,
-    Picture,
     Surface,
-    cut,
+    TextureImage,
+    truncate_name,
 )
 from iris_session.scene.errors import SceneBuildError
-from iris_session.scene.images import PixelBudget, pixels_of
+from iris_session.scene.images import PixelBudget, to_pixels
 from iris_session.scene.importers.mesh_validation import CHECKS, absolute_corners
 from iris_session.scene.importers.references import References, read_bounded
 from iris_session.scene.importers.xml_files import check_3mf, check_dae
-from iris_session.scene.mesh_processing import creased_normals, recoloured, unit
-from iris_session.scene.meshes import index_corners, unique_rows
+from iris_session.scene.mesh_processing import compute_creased_normals, merge_vertex_color, normalise
+from iris_session.scene.meshes import find_unique_rows, index_corners
 
 _UP: Final = re.compile(rb"<up_axis>\s*([XYZ])_UP\s*<")
 _USED: Final = re.compile(rb"^[ \t]*usemtl[ \t]+(\S[^\r\n]*)", re.MULTILINE)
@@ -46,7 +46,7 @@ _MADE_UP: Final = re.compile(r"geometry(_\d+)?")
 _MAPS: Final = frozenset({"bump", "norm", "disp", "decal", "refl"})
 
 
-def read_with_trimesh(path: Path, references: References, name: str) -> Loaded:
+def read_with_trimesh(path: Path, references: References, name: str) -> LoadedFile:
     """The file; `name`: of what has none in it. Raises `SceneBuildError`, and what trimesh raises for damaged ones."""
     trimesh, kind = _trimesh(), path.suffix.lower().lstrip(".")
     data = _checked(path.name, kind, read_bounded(path))
@@ -60,7 +60,7 @@ def read_with_trimesh(path: Path, references: References, name: str) -> Loaded:
             absolute_corners(path.name, data)  # says which
         raise
     lost = _lost_materials(path.name, data, resolver) if kind == "obj" else ()
-    return Loaded(nodes, _up(kind, data), _unit(trimesh, scene), (*resolver.missing, *lost, *reader.skipped))
+    return LoadedFile(nodes, _up(kind, data), _unit(trimesh, scene), (*resolver.missing, *lost, *reader.skipped))
 
 
 def _checked(name: str, kind: str, data: bytes) -> bytes:
@@ -82,7 +82,7 @@ def _lost_materials(name: str, data: bytes, resolver: Any) -> tuple[str, ...]:
     if not resolver.materials:
         return several
     lost = sorted({found.strip() for found in _USED.findall(data)} - resolver.materials)
-    names = ", ".join(cut(found.decode(errors="replace")) for found in lost[:5])
+    names = ", ".join(truncate_name(found.decode(errors="replace")) for found in lost[:5])
     return (*several, *([f"{name}: materials that its MTL file does not have: {names}"] if lost else []))
 
 
@@ -103,8 +103,8 @@ class _Reader:
         self._trimesh = trimesh
         self._name = name
         self._unnamed = unnamed
-        self._looks: dict[int, Look | None] = {}
-        self._pictures: dict[int, Picture] = {}
+        self._looks: dict[int, Appearance | None] = {}
+        self._pictures: dict[int, TextureImage] = {}
         self._budget = PixelBudget(name)
         self.skipped: list[str] = []
 
@@ -136,7 +136,7 @@ class _Reader:
         made_up = [name for name in given if _MADE_UP.fullmatch(name)]
         several = len(made_up) > 1
         ours = {name: f"{self._unnamed}_{k}" if several else self._unnamed for k, name in enumerate(made_up, start=1)}
-        return {name: cut(ours.get(name, name)) for name in given}
+        return {name: truncate_name(ours.get(name, name)) for name in given}
 
     def _surface(self, geometry: Any, name: str) -> Surface:
         points = np.ascontiguousarray(geometry.vertices, np.float64)
@@ -149,7 +149,7 @@ class _Reader:
         visual = geometry.visual
         uv: NDArray[np.float32] | None = None
         color: NDArray[np.uint8] | None = None
-        look: Look | None = None
+        look: Appearance | None = None
         if visual.kind == "texture":
             look = self._look(visual.material)
             if visual.uv is not None and len(visual.uv) == len(points):
@@ -161,25 +161,25 @@ class _Reader:
             color = np.repeat(np.asarray(visual.face_colors, np.uint8)[:, None], 3, axis=1)
         mesh = index_corners(points[faces].astype(np.float32), self._normals(geometry, points, faces), uv, color)
         if color is not None:
-            mesh, rgba = recoloured(mesh, (1.0, 1.0, 1.0, 1.0))
-            look = Look(rgba=rgba)
+            mesh, rgba = merge_vertex_color(mesh, (1.0, 1.0, 1.0, 1.0))
+            look = Appearance(rgba=rgba)
         return Surface(mesh, look, name)
 
     def _normals(self, geometry: Any, points: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float32]:
         """At the corners: those of the file, else made from the triangles around each point."""
         given = geometry._cache.cache.get("vertex_normals")  # without it trimesh would make its own
         if given is not None and len(given) == len(points):
-            return np.asarray(unit(np.nan_to_num(given))[faces], np.float32)
-        first, same = unique_rows(np.ascontiguousarray(points.astype(np.float32) + np.float32(0.0)))
-        return creased_normals(points[first], same[faces]).astype(np.float32)
+            return np.asarray(normalise(np.nan_to_num(given))[faces], np.float32)
+        first, same = find_unique_rows(np.ascontiguousarray(points.astype(np.float32) + np.float32(0.0)))
+        return compute_creased_normals(points[first], same[faces]).astype(np.float32)
 
-    def _look(self, material: Any) -> Look | None:
+    def _look(self, material: Any) -> Appearance | None:
         if id(material) not in self._looks:
             pbr = isinstance(material, self._trimesh.visual.material.PBRMaterial)
             self._looks[id(material)] = self._of_pbr(material) if pbr else self._of_mtl(material)
         return self._looks[id(material)]
 
-    def _of_mtl(self, material: Any) -> Look | None:
+    def _of_mtl(self, material: Any) -> Appearance | None:
         """`Kd`, `Ks`, `Ns`, `d` or `Tr`, and `map_Kd`, whose picture multiplies the colour. `None` of one that trimesh
         makes up for texture coordinates without a material, grey with a picture that comes from no file."""
         more = getattr(material, "kwargs", None) or {}
@@ -191,38 +191,38 @@ class _Reader:
         alpha = _first(more.get("d"), 1.0 - _first(more.get("tr"), 0.0))
         pictures = self._picture(material.image)
         if maps := ", ".join(sorted(key for key in more if _other_map(key))):
-            self.skipped.append(f"{self._name}: of material {cut(material.name)} the pictures {maps}")
+            self.skipped.append(f"{self._name}: of material {truncate_name(material.name)} the pictures {maps}")
         specular, gloss = more.get("ks"), _first(more.get("ns"), 64.0)
         shine = 0.5 if specular is None else float(np.mean(specular))
-        return Look(
+        return Appearance(
             rgba=(*rgba[:3], min(max(alpha, 0.0), 1.0)),
-            name=cut(material.name),
+            name=truncate_name(material.name),
             specular=min(max(shine, 0.0), 1.0) if math.isfinite(shine) else 0.5,
             shininess=min(max(gloss / 128.0, 0.0), 1.0),
-            pictures=pictures,
+            images=pictures,
         )
 
-    def _of_pbr(self, material: Any) -> Look:
+    def _of_pbr(self, material: Any) -> Appearance:
         rgba = (1.0, 1.0, 1.0, 1.0) if material.baseColorFactor is None else _rgba(material.baseColorFactor)
         glow = 0.0 if material.emissiveFactor is None else float(np.max(material.emissiveFactor))
         metallic = -1.0 if material.metallicFactor is None else float(material.metallicFactor)
         roughness = -1.0 if material.roughnessFactor is None else float(material.roughnessFactor)
-        return Look(
+        return Appearance(
             rgba=rgba,
-            name=cut(material.name),
+            name=truncate_name(material.name),
             emission=max(0.0, glow),
             shininess=0.5 if roughness < 0 else min(max(1.0 - roughness, 0.0), 1.0),
             metallic=metallic,
             roughness=roughness,
-            pictures=self._picture(material.baseColorTexture),
+            images=self._picture(material.baseColorTexture),
         )
 
-    def _picture(self, image: Any) -> tuple[tuple[str, Picture], ...]:
+    def _picture(self, image: Any) -> tuple[tuple[str, TextureImage], ...]:
         if image is None:
             return ()
         if id(image) not in self._pictures:
-            pixels = pixels_of(image, f"a picture of {self._name}")
-            self._pictures[id(image)] = Picture(self._budget.spend(pixels))
+            pixels = to_pixels(image, f"a picture of {self._name}")
+            self._pictures[id(image)] = TextureImage(self._budget.spend(pixels))
         picture = self._pictures[id(image)]
         return ((TextureRole.RGBA if picture.pixels.shape[2] == 4 else TextureRole.RGB, picture),)
 

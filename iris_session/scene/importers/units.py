@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from iris_session.scene.composed import Joint
 from iris_session.scene.elements import Matrix
-from iris_session.scene.extent import LARGEST_M, SMALLEST_M, length, unit_mistake
+from iris_session.scene.extent import LARGEST_M, SMALLEST_M, find_unit_mistake, format_length
 from iris_session.scene.meshes import MeshArrays
 
 #: Limits of a joint that are no radians: three turns and more one way [rad], and no more than 2.5 turns in degrees.
@@ -49,7 +49,7 @@ def side_of(placed: Sequence[tuple[MeshArrays, Matrix]]) -> float:
 
 def file_question(name: str, side_m: float, scale: Sequence[float]) -> tuple[str, ...]:
     """Of a file that is drawn `side_m` large, by the `scale` that was given."""
-    mistake = unit_mistake(side_m)
+    mistake = find_unit_mistake(side_m)
     return () if mistake is None else (f"{name} is {_told(side_m, mistake, _by_scale(scale, mistake[0]))}",)
 
 
@@ -57,7 +57,7 @@ def robot_question(name: str, reach_m: float, drawn: Sequence[Drawn], scale: flo
     """Of a URDF whose links lie within `reach_m` of one another in the file, drawn by the `scale` that was given."""
     largest = max(drawn, key=lambda one: one.side_m, default=Drawn("shape", 0.0))
     side_m, reach_m = scale * largest.side_m, scale * reach_m
-    of_drawn, of_joints = unit_mistake(side_m), unit_mistake(reach_m)
+    of_drawn, of_joints = find_unit_mistake(side_m), find_unit_mistake(reach_m)
     alike = of_drawn == of_joints or not reach_m
     if of_drawn is not None and (alike and (reach_m or scale != 1.0)):
         return (f"{name} is {_told(max(side_m, reach_m), of_drawn, _by_scale([scale], of_drawn[0]))}",)
@@ -120,7 +120,7 @@ def colour_question(name: str, material: str, rgba: Sequence[float]) -> tuple[st
 
 def _told(side_m: float, mistake: tuple[float, str], remedy: str, large: str = " large") -> str:
     factor, what = mistake
-    return f"{length(side_m)}{large}: {what} {remedy} makes it {length(factor * side_m)}"
+    return f"{format_length(side_m)}{large}: {what} {remedy} makes it {format_length(factor * side_m)}"
 
 
 def _by_scale(given: Sequence[float], factor: float) -> str:

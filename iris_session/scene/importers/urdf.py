@@ -20,8 +20,8 @@ import numpy as np
 from iris_session.protocol.common import Pose, Vec3
 from iris_session.protocol.names import GeometryKind, TextureRole
 from iris_session.protocol.scene import Rgba
-from iris_session.scene.composed import Articulation, Joint, Part
-from iris_session.scene.elements import Item, Loaded, Look, Matrix, Picture, cut, pose_of
+from iris_session.scene.composed import ArticulatedBody, Articulation, Joint
+from iris_session.scene.elements import Appearance, DrawnItem, LoadedFile, Matrix, TextureImage, to_pose, truncate_name
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import PixelBudget, read_pixels
 from iris_session.scene.importers.files import ENDINGS, ROBOTS, ending, guarded, load_file, present, xacro_advice
@@ -76,7 +76,7 @@ class Robot:
     `notes`: for each that looks like a mistake."""
 
     articulation: Articulation
-    items: tuple[Item, ...]
+    items: tuple[DrawnItem, ...]
     skipped: tuple[str, ...]
     notes: tuple[str, ...] = ()
 
@@ -152,12 +152,12 @@ class _Reader:
         self._references, self._package_dirs = references, package_dirs
         self._skipped = skipped
         self._collisions = collisions
-        self._files: dict[Path, Loaded] = {}
+        self._files: dict[Path, LoadedFile] = {}
         self._notes: dict[str, None] = {}
         self._sizes: list[Drawn] = []
         self._measured: set[tuple[Path, tuple[float, float, float]]] = set()
-        self._looks: dict[str, Look | None] = {}
-        self._pictures: dict[Path, Picture] = {}
+        self._looks: dict[str, Appearance | None] = {}
+        self._pictures: dict[Path, TextureImage] = {}
         self._budget = PixelBudget(path.name)
         self._materials: dict[str, Any] = {}
         worn = (visual.material for link in robot.links for visual in link.visuals)
@@ -173,8 +173,8 @@ class _Reader:
         for joint in self._robot.joints:
             below.setdefault(joint.parent, []).append(joint)
         links = {link.name: link for link in self._robot.links}
-        parts = [Part(f"{self._name}/{root}")]
-        items: list[Item] = []
+        parts = [ArticulatedBody(f"{self._name}/{root}")]
+        items: list[DrawnItem] = []
         loose: dict[str, str] = {}
         waiting: list[tuple[str, int, Matrix]] = [(root, 0, np.eye(4))]
         while waiting:
@@ -187,17 +187,17 @@ class _Reader:
                     continue
                 body = f"{self._name}/{joint.child}"
                 if joint.type in _LOOSE:
-                    at = pose_of(T_part_child[:3, :3], T_part_child[:3, 3])
-                    parts.append(Part(body, part, at))
+                    at = to_pose(T_part_child[:3, :3], T_part_child[:3, 3])
+                    parts.append(ArticulatedBody(body, part, at))
                     loose[joint.name] = body
                     waiting.append((joint.child, len(parts) - 1, np.eye(4)))
                     continue
                 drive = table.drives[joint.name]
                 parts.append(
-                    Part(
+                    ArticulatedBody(
                         body=body,
                         parent=part,
-                        T_parent_joint=pose_of(T_part_child[:3, :3], T_part_child[:3, 3]),
+                        T_parent_joint=to_pose(T_part_child[:3, :3], T_part_child[:3, 3]),
                         axis=drive.axis,
                         sliding=joint.type == "prismatic",
                         joint=drive.joint,
@@ -216,22 +216,22 @@ class _Reader:
 
     # --- what is drawn ------------------------------------------------------------------------------------------------
 
-    def _drawn(self, link: Any, part: int, T_part_link: Matrix) -> list[Item]:
-        found: list[Item] = []
+    def _drawn(self, link: Any, part: int, T_part_link: Matrix) -> list[DrawnItem]:
+        found: list[DrawnItem] = []
         for shape in link.collisions if self._collisions else link.visuals:
             matrix = T_part_link @ (np.eye(4) if shape.origin is None else shape.origin)
             look = None if self._collisions else self._look(shape.material)
-            name = cut(shape.name or link.name)
+            name = truncate_name(shape.name or link.name)
             geometry = shape.geometry
             if geometry.mesh is not None:
                 found += self._mesh(geometry.mesh, part, name, matrix, look)
                 continue
             kind, size = _shape(self._path.name, geometry)
-            self._sizes.append(Drawn(f"shape, a {kind} of {cut(link.name)},", 2.0 * max(size)))
-            found.append(Item(part, name, matrix, look or Look(), kind=kind, size=size))
+            self._sizes.append(Drawn(f"shape, a {kind} of {truncate_name(link.name)},", 2.0 * max(size)))
+            found.append(DrawnItem(part, name, matrix, look or Appearance(), kind=kind, size=size))
         return found
 
-    def _mesh(self, mesh: Any, part: int, name: str, matrix: Matrix, look: Look | None) -> list[Item]:
+    def _mesh(self, mesh: Any, part: int, name: str, matrix: Matrix, look: Appearance | None) -> list[DrawnItem]:
         if not mesh.filename:
             raise SceneBuildError(f"{self._path.name}: a mesh of {name} names no file")
         path = self._references.find(mesh.filename)
@@ -246,19 +246,21 @@ class _Reader:
         scale = np.diag([loaded.unit * x, loaded.unit * y, loaded.unit * z, 1.0])
         self._measure(path, loaded, (x, y, z), scale)
         return [
-            Item(part, name, matrix @ scale @ node.matrix, surface.look or look or Look(), surface.mesh)
+            DrawnItem(
+                part, name, matrix @ scale @ node.matrix, surface.appearance or look or Appearance(), surface.mesh
+            )
             for node in loaded.nodes
             for surface in node.surfaces
         ]
 
-    def _measure(self, path: Path, loaded: Loaded, given: tuple[float, float, float], scale: Matrix) -> None:
+    def _measure(self, path: Path, loaded: LoadedFile, given: tuple[float, float, float], scale: Matrix) -> None:
         """How large a mesh is, by the scale at its `<mesh>`; once for each that it is drawn with."""
         if (path, given) not in self._measured:
             self._measured.add((path, given))
             placed = [(surface.mesh, scale @ node.matrix) for node in loaded.nodes for surface in node.surfaces]
             self._sizes.append(Drawn(f"mesh, {path.name},", side_of(placed), given))
 
-    def _look(self, material: Any) -> Look | None:
+    def _look(self, material: Any) -> Appearance | None:
         """Of a material of the URDF; one without colour refers to another of its name."""
         if material is None:
             return None
@@ -271,24 +273,26 @@ class _Reader:
         key = f"{known.name} {known.color} {known.texture}"
         if key not in self._looks:
             rgba = self._rgba(known)
-            self._looks[key] = Look(rgba=rgba, name=cut(known.name or ""), pictures=self._texture(known.texture))
+            self._looks[key] = Appearance(
+                rgba=rgba, name=truncate_name(known.name or ""), images=self._texture(known.texture)
+            )
         return self._looks[key]
 
     def _rgba(self, material: Any) -> Rgba:
         values = (1.0,) * 4 if material.color is None else tuple(float(v) for v in material.color.rgba)
         if len(values) != 4 or not all(map(math.isfinite, values)):
             raise SceneBuildError(f"{self._path.name}: material {material.name!r} needs rgba of four finite numbers")
-        self._notes |= dict.fromkeys(colour_question(self._path.name, cut(material.name or ""), values))
+        self._notes |= dict.fromkeys(colour_question(self._path.name, truncate_name(material.name or ""), values))
         red, green, blue, alpha = (min(max(v, 0.0), 1.0) for v in values)
         return red, green, blue, alpha
 
-    def _texture(self, texture: Any) -> tuple[tuple[str, Picture], ...]:
+    def _texture(self, texture: Any) -> tuple[tuple[str, TextureImage], ...]:
         if texture is None or not texture.filename:
             return ()
         path = self._references.find(texture.filename)
         if path not in self._pictures:
             pixels = self._budget.spend(read_pixels(read_bounded(path), str(path)))
-            self._pictures[path] = Picture(pixels, cut(path.stem))
+            self._pictures[path] = TextureImage(pixels, truncate_name(path.stem))
         picture = self._pictures[path]
         return ((TextureRole.RGBA if picture.pixels.shape[2] == 4 else TextureRole.RGB, picture),)
 

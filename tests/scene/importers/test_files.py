@@ -15,7 +15,7 @@ from PIL import Image
 from iris_session.scene import AssetStore, SceneBuildError, decode_image, decode_mesh
 from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.composed import ComposedScene
-from iris_session.scene.elements import MAX_FILE_BYTES, matrix_of
+from iris_session.scene.elements import MAX_FILE_BYTES, to_matrix
 from iris_session.scene.importers.files import load_file
 from iris_session.scene.importers.references import References
 
@@ -79,7 +79,7 @@ def test_geometry_of_every_format(tmp_path: Path, kind: str) -> None:
     assert scene.moving == ("ring",)
     visual = scene.spec.visuals[0]
     found = decode_mesh(store.get(scene.spec.meshes[visual.geometry.mesh].levels[0].address))
-    again = trimesh.Trimesh(found.position, found.index, process=True).apply_transform(matrix_of(visual.T_body_visual))
+    again = trimesh.Trimesh(found.position, found.index, process=True).apply_transform(to_matrix(visual.T_body_visual))
     unit = 0.001 if kind == "3mf" else 1.0  # which counts in millimetres
     np.testing.assert_allclose(again.bounds, unit * mesh.bounds, atol=1e-6)
     assert again.volume == pytest.approx(unit**3 * mesh.volume, rel=1e-5)
@@ -118,7 +118,7 @@ def test_scale_and_the_axis_that_is_up(tmp_path: Path) -> None:
         scene, _ = built(tmp_path / "a.stl", tmp_path, scale=0.01, up=up, position=(0, 0, 5))
         assert scene.spec.environment.center == pytest.approx((0, 0, 5))
         mesh = scene.spec.meshes[0]
-        T = matrix_of(scene.spec.visuals[0].T_body_visual)[:3, :3]
+        T = to_matrix(scene.spec.visuals[0].T_body_visual)[:3, :3]
         extent = np.abs(T @ (np.array(mesh.high) - mesh.low))
         np.testing.assert_allclose(extent, 0.01 * np.array(size), atol=1e-7)
     trimesh.creation.box((1, 2, 3)).export(tmp_path / "x.dae")
@@ -169,12 +169,12 @@ def test_what_a_material_does_not_say_is_not_made_up(tmp_path: Path) -> None:
     """A texture is not darkened, and a URDF colours a mesh that has coordinates but no material."""
     path = write_obj(tmp_path)
     (tmp_path / "parts.mtl").write_text("newmtl painted\nmap_Kd picture.png\n")
-    looks = {node.name: node.surfaces[0].look for node in load_file(path).nodes}
-    painted = next(look for look in looks.values() if look is not None and look.pictures)
+    looks = {node.name: node.surfaces[0].appearance for node in load_file(path).nodes}
+    painted = next(look for look in looks.values() if look is not None and look.images)
     assert painted.rgba == (1.0, 1.0, 1.0, 1.0)
     (tmp_path / "bare.obj").write_text(OBJ.replace("mtllib parts.mtl\n", "").replace("f 1 2 3\n", ""))
     (node,) = load_file(tmp_path / "bare.obj").nodes
-    assert node.surfaces[0].look is None
+    assert node.surfaces[0].appearance is None
     assert node.surfaces[0].mesh.uv is not None
 
 

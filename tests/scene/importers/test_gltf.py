@@ -16,7 +16,7 @@ from iris_session.protocol.common import Pose
 from iris_session.protocol.scene import SceneSpec
 from iris_session.scene import AssetStore, SceneBuildError, decode_image, decode_mesh
 from iris_session.scene.builder import SceneBuilder
-from iris_session.scene.elements import matrix_of
+from iris_session.scene.elements import to_matrix
 from iris_session.scene.glb import write_glb
 from tests.scene.documents import SQUARE, SQUARE_UV, Document
 
@@ -32,12 +32,12 @@ def built(path: Path, store: AssetStore, **options: object) -> SceneSpec:
 
 def drawn(spec: SceneSpec, store: AssetStore) -> trimesh.Trimesh:
     """All meshes of a specification in the world, from bytes."""
-    bodies = {body.id: matrix_of(body.T_world_body) for body in spec.bodies}
+    bodies = {body.id: to_matrix(body.T_world_body) for body in spec.bodies}
     found = []
     for visual in spec.visuals:
         mesh = decode_mesh(store.get(spec.meshes[visual.geometry.mesh].levels[0].address))
         one = trimesh.Trimesh(mesh.position, mesh.index, process=False)
-        found.append(one.apply_transform(bodies[visual.body] @ matrix_of(visual.T_body_visual)))
+        found.append(one.apply_transform(bodies[visual.body] @ to_matrix(visual.T_body_visual)))
     return trimesh.util.concatenate(found)
 
 
@@ -104,8 +104,8 @@ def test_hierarchy_and_looks(tmp_path: Path, store: AssetStore) -> None:
     assert (parents["leg"], parents["top"], parents["table"], parents["ball"]) == ("table", "table", "hall", "hall")
     assert not any(body.moving for body in spec.bodies)
     for body in spec.bodies[1:]:
-        above = matrix_of(spec.bodies[body.parent].T_world_body)
-        np.testing.assert_allclose(above @ matrix_of(body.T_parent_body), matrix_of(body.T_world_body), atol=1e-9)
+        above = to_matrix(spec.bodies[body.parent].T_world_body)
+        np.testing.assert_allclose(above @ to_matrix(body.T_parent_body), to_matrix(body.T_world_body), atol=1e-9)
     looks = {material.name: material for material in spec.materials}
     assert looks["plain"].metallic == 0.5
     assert looks["plain"].roughness == 0.25
@@ -277,14 +277,14 @@ def test_lights_and_cameras_stand_where_they_are(tmp_path: Path, store: AssetSto
         built(document.write(tmp_path / "a.glb"), store),
         built(_again(tmp_path / "a.glb", tmp_path / "b.glb", store), store),
     ):
-        bodies = {body.id: matrix_of(body.T_world_body) for body in spec.bodies}
+        bodies = {body.id: to_matrix(body.T_world_body) for body in spec.bodies}
         light, camera = spec.lights[0], spec.cameras[0]
         # glTF: y is up, so (1, 2, 3) is (1, -3, 2) here; turned by 90 degrees around x, -z looks along +y there: up
         at = bodies[light.body] @ [*light.p_body, 1]
         np.testing.assert_allclose(at[:3], [1, -3, 2], atol=1e-9)
         np.testing.assert_allclose(bodies[light.body][:3, :3] @ light.direction_body, [0, 0, 1], atol=1e-9)
         assert (light.kind, light.diffuse, light.intensity, light.range) == ("spot", (1.0, 0.0, 0.0), 30.0, 9.0)
-        T = bodies[camera.body] @ matrix_of(camera.T_body_camera)
+        T = bodies[camera.body] @ to_matrix(camera.T_body_camera)
         np.testing.assert_allclose(T[:3, 3], [1, -3, 2], atol=1e-9)
         np.testing.assert_allclose(-T[:3, 2], [0, 0, 1], atol=1e-9)
         assert camera.fovy == pytest.approx(math.degrees(1.0))
@@ -309,11 +309,11 @@ def test_lights_and_cameras_look_where_a_mirrored_node_turns_them(
     }
     spec = built(document.write(tmp_path / "a.glb"), store, up="z", name="lamp", movable=movable)
     x, y, z, w = turned
-    R = matrix_of(Pose((0.0, 0.0, 0.0), (w, x, y, z)))[:3, :3]
+    R = to_matrix(Pose((0.0, 0.0, 0.0), (w, x, y, z)))[:3, :3]
     forward, up = np.diag(scale) @ R @ [0, 0, -1], np.diag(scale) @ R @ [0, 1, 0]
-    bodies = {body.id: matrix_of(body.T_world_body) for body in spec.bodies}
+    bodies = {body.id: to_matrix(body.T_world_body) for body in spec.bodies}
     (light,), (camera,) = spec.lights, spec.cameras
-    T = bodies[camera.body] @ matrix_of(camera.T_body_camera)
+    T = bodies[camera.body] @ to_matrix(camera.T_body_camera)
     for found in (bodies[light.body][:3, :3] @ light.direction_body, -T[:3, 2]):
         np.testing.assert_allclose(found, forward / np.linalg.norm(forward), atol=1e-9)
     np.testing.assert_allclose(T[:3, 1], up / np.linalg.norm(up), atol=1e-9)

@@ -15,8 +15,8 @@ from iris_session.protocol.common import Pose
 from iris_session.scene import AssetStore, SceneBuildError
 from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.composed import ComposedScene
-from iris_session.scene.elements import matrix_of
-from iris_session.scene.extent import extent_of
+from iris_session.scene.elements import to_matrix
+from iris_session.scene.extent import compute_extent
 from tests.scene.arm import FREE, JOINTS, write_arm
 from tests.scene.pictures import Artist, cameras, graphics, silhouette_iou
 from tests.scene.rebuild import rebuild
@@ -52,7 +52,7 @@ def test_links_are_where_mujoco_and_yourdfpy_have_them(tmp_path: Path) -> None:
     other = yourdfpy.URDF.load(str(urdf), load_meshes=False)
     for seed in range(20):
         q = positions(seed)
-        found = arm.poses(q)
+        found = arm.compute_poses(q)
         everything = with_followers(q)
         for name, value in everything.items():
             data.qpos[model.joint(name).qposadr[0]] = value
@@ -64,8 +64,8 @@ def test_links_are_where_mujoco_and_yourdfpy_have_them(tmp_path: Path) -> None:
             if link != "base":
                 T_world_link[:3, :3] = data.body(link).xmat.reshape(3, 3)
                 T_world_link[:3, 3] = data.body(link).xpos
-            assert difference(matrix_of(pose), T_world_link) < 1e-9
-            assert difference(matrix_of(pose), other.get_transform(link)) < 1e-9
+            assert difference(to_matrix(pose), T_world_link) < 1e-9
+            assert difference(to_matrix(pose), other.get_transform(link)) < 1e-9
 
 
 def _beside_meshes(urdf: Path) -> Path:
@@ -89,7 +89,7 @@ def test_joints_bodies_and_what_they_follow(tmp_path: Path) -> None:
     assert {"arm/sensor", "arm/hand"}.isdisjoint(arm.bodies)
     assert len(arm.bodies) == 1 + 6 + 2
     assert scene.poses[0] == Pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0))
-    assert arm.poses({})["arm/base"].p == (0.0, 0.0, 0.0)
+    assert arm.compute_poses({})["arm/base"].p == (0.0, 0.0, 0.0)
     colours = {visual.name: visual.rgba for visual in scene.spec.visuals}
     assert colours["link2"] == (0.9, 0.5, 0.1, 1.0)
     assert colours["finger_left"] == (0.5, 0.5, 0.5, 1.0)
@@ -111,7 +111,7 @@ def test_a_joint_may_follow_one_that_follows_in_turn(tmp_path: Path) -> None:
     (tmp_path / "a.urdf").write_text(f'<robot name="r">{links}{joints}</robot>')
     arm = composed(tmp_path / "a.urdf", tmp_path).articulations["arm"]
     assert arm.mimics == {"j1": "j3", "j2": "j3"}
-    at = {body: pose.p[2] for body, pose in arm.poses({"j3": 1.0}).items()}
+    at = {body: pose.p[2] for body, pose in arm.compute_poses({"j3": 1.0}).items()}
     assert at == {"arm/l0": 0.0, "arm/l1": pytest.approx(6.31), "arm/l2": pytest.approx(2.1), "arm/l3": 1.0}
 
 
@@ -261,11 +261,11 @@ def test_a_robot_in_another_size(tmp_path: Path) -> None:
     one, other = whole.articulations["arm"], half.articulations["arm"]
     assert other.joints == one.joints
     q = positions(4)
-    for (name, a), b in zip(one.poses(q).items(), other.poses(q).values(), strict=True):
+    for (name, a), b in zip(one.compute_poses(q).items(), other.compute_poses(q).values(), strict=True):
         np.testing.assert_allclose(b.p, np.array(a.p) / 2, atol=1e-12, err_msg=name)
         assert b.q == a.q
     store = AssetStore(tmp_path / "store")
-    a, b = extent_of(whole.spec, store), extent_of(half.spec, store)
+    a, b = compute_extent(whole.spec, store), compute_extent(half.spec, store)
     assert a is not None
     assert b is not None
     np.testing.assert_allclose(b.size, np.array(a.size) / 2, rtol=1e-5)
@@ -308,13 +308,13 @@ def test_xacro_is_to_be_expanded(tmp_path: Path) -> None:
 def test_what_cannot_be_set_is_refused(tmp_path: Path) -> None:
     arm = composed(write_arm(tmp_path), tmp_path).articulations["arm"]
     with pytest.raises(SceneBuildError, match="follows 'finger_left'"):
-        arm.poses({"finger_right": 0.0})
+        arm.compute_poses({"finger_right": 0.0})
     with pytest.raises(SceneBuildError, match="Joints: turn, lift"):
-        arm.poses({"elbow": 0.0})
+        arm.compute_poses({"elbow": 0.0})
     with pytest.raises(SceneBuildError, match="finite"):
-        arm.poses({"lift": float("nan")})
+        arm.compute_poses({"lift": float("nan")})
     with pytest.raises(SceneBuildError, match="number"):
-        arm.poses({"lift": "high"})  # type: ignore[dict-item]
+        arm.compute_poses({"lift": "high"})  # type: ignore[dict-item]
 
 
 def test_a_file_that_a_package_does_not_have_is_told_with_those_it_has(tmp_path: Path) -> None:
