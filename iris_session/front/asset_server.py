@@ -1,8 +1,9 @@
-"""Sends assets: a thread of the front with a ZeroMQ context of its own, below everything else.
+"""The asset server: a thread of the front that sends chunks of assets, with a ZeroMQ context of its own.
 
-The context's I/O thread, which copies and encrypts, has a lower priority than all other threads of the front. This
-thread has not: it holds Python's lock for moments, and one that is not let run while it holds it would stop the front.
-It makes pauses instead, whenever the front's loop is late.
+The context's I/O thread, which copies and encrypts, has a lower priority than all other threads of the front. The
+server's own thread has not: it holds Python's lock for moments, and a thread that does not get the processor while it
+holds the lock would stop the front. It pauses instead, whenever the front's loop is late. Which client may fetch what
+is decided in `asset_service`; which request is next in `assets.chunk_scheduler`.
 """
 
 from __future__ import annotations
@@ -31,50 +32,55 @@ from iris_session.system.priority import run_at_low_priority
 log = logging.getLogger(__name__)
 
 IDLE_MS: Final = 50
-#: Requests taken, and chunks sent, before the rest is looked at.
+#: Requests handled, and chunks sent, per pass.
 ROUND: Final = 64
 CHUNKS: Final = 2
-#: While the front's loop is late, one chunk goes out in so long: the slowest headset still gets its scene.
+#: While the front's loop is late, one chunk is sent per so long: the slowest headset still gets its scene.
 YIELD_MS: Final = 5
-#: After a fault of ours nothing is done for so long: one that comes back must not take a whole processor.
+#: Pause after a fault of the server: a repeated fault must not use a whole processor.
 FAULT_S: Final = 0.25
-#: As plain integers: operations on the enumerations take longer than what they are for.
+#: As plain integers: operations on the enumerations take longer than the calls that use them.
 _DONTWAIT: Final = int(zmq.DONTWAIT)
 _MORE: Final = int(zmq.DONTWAIT | zmq.SNDMORE)
-#: Of one reader, that wait to be read: far more than all its requests.
+#: Unread bytes of one reader at most: far more than all its requests.
 REQUEST_BYTES: Final = 65_536
 
 
-#: A folder, with the addresses of what is served from it.
+#: A folder, with the addresses of the assets served from it.
 AssetFolder = tuple[str, tuple[str, ...]]
 
 
 class AssetAccess(NamedTuple):
-    """What the thread has to know, replaced as a whole. `listeners`: connections that may ask, with the key by which
-    they come (empty without encryption); `marks`: keys that may connect; `stores`: what is served."""
+    """Access to assets: which client may fetch which. Replaced as a whole, from the front's loop.
 
-    listeners: Mapping[int, str] = {}
-    marks: frozenset[str] = frozenset()
-    stores: tuple[AssetFolder, ...] = ()
+    Attributes:
+        clients: Connections that may request, with the key of their TCP connection (empty without encryption).
+        allowed_keys: Fingerprints of the keys that may connect.
+        folders: Assets that are served.
+    """
+
+    clients: Mapping[int, str] = {}
+    allowed_keys: frozenset[str] = frozenset()
+    folders: tuple[AssetFolder, ...] = ()
 
 
 class AssetCounters(NamedTuple):
-    """Counters since the start, and readers that wait now. `reasons`: refusals and everything thrown away."""
+    """Counters since the start, and readers with pending requests. `reasons`: refusals and drops."""
 
     bytes: int
     chunks: int
     requests: int
-    waiting: int
+    pending_readers: int
     reasons: Mapping[str, int]
 
 
 class AssetSockets:
-    """The channel's sockets, in a context of their own. Raises `FrontError`."""
+    """Sockets of the assets channel, in a context of their own. Raises `FrontError`."""
 
     def __init__(self, config: FrontConfig, key: KeyPair | None) -> None:
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(1)
         self.zap: zmq.Socket[bytes] | None = None
-        if key is not None:  # before anybody can connect: libzmq lets everybody in while nobody decides
+        if key is not None:  # before a client can connect: without a ZAP handler libzmq admits every key
             self.zap = self.context.socket(zmq.ROUTER)
             self.zap.bind(ZAP_ENDPOINT)
         try:
@@ -89,12 +95,16 @@ class AssetSockets:
 
 
 def open_asset_sockets(config: FrontConfig, key: KeyPair | None) -> AssetSockets:
-    """`AssetSockets` whose I/O thread gives way to all others. Raises `FrontError`."""
+    """Open `AssetSockets` whose I/O thread has a low priority. Raises `FrontError`."""
     return run_at_low_priority(lambda: AssetSockets(config, key))
 
 
 class AssetServer:
-    """`publish`, `late_until_ns` and `tallied` are for other threads; everything else belongs to ours."""
+    """Serve assets in a thread. `set_access`, `read_counters` and `late_until_ns` are for other threads.
+
+    Attributes:
+        late_until_ns: Session time until which the server yields to the front's loop.
+    """
 
     def __init__(self, sockets: AssetSockets, guard: ChannelGuard, now_ns: Callable[[], int]) -> None:
         self._sockets = sockets
@@ -111,14 +121,13 @@ class AssetServer:
         self._stopping = False
         self._reported_fault = ""
         self._thread = threading.Thread(target=self._run, name="iris-assets", daemon=True)
-        #: Session time until which the front's loop wants to be left alone.
         self.late_until_ns = 0
 
     def start(self) -> None:
         self._thread.start()
 
     def set_access(self, access: AssetAccess) -> None:
-        """Who may ask for what: whoever hears of it after this call, and asks then, is answered by it."""
+        """Set who may fetch what. A request made after this call returns is answered by it."""
         self._access = access
 
     def read_counters(self) -> AssetCounters:
@@ -130,7 +139,7 @@ class AssetServer:
             )
 
     def close(self) -> None:
-        """Waits for the end of the thread, then frees the sockets."""
+        """Wait for the end of the thread, then close the sockets."""
         self._stopping = True
         if self._thread.ident is not None:
             self._thread.join()
@@ -143,11 +152,12 @@ class AssetServer:
         while not self._stopping:
             try:
                 self._serve()
-            except Exception as error:  # a fault of ours: it costs what was under way, and assets alone
+            except Exception as error:  # a fault of the server costs requests under way, and affects assets alone
                 self._recover(error)
 
     def _recover(self, error: Exception) -> None:
-        """Counts every fault, and tells each the first time in a row. Readers ask again by new connections."""
+        """Count a fault, log it unless it repeats the last one, and close all connections: clients request again by new
+        ones."""
         for descriptor in self._scheduler.begin_anew():
             self._guard.evict(descriptor, "")
         self._count_reasons(["assets_fault"])
@@ -184,15 +194,15 @@ class AssetServer:
         table = self._access
         if table is self._applied:
             return
-        if table.stores != self._applied.stores:
-            self._files.serve(table.stores)
+        if table.folders != self._applied.folders:
+            self._files.serve(table.folders)
         self._applied = table
-        for descriptor in self._scheduler.allow(table.listeners):
+        for descriptor in self._scheduler.allow(table.clients):
             self._guard.evict(descriptor, "")
 
     def _authenticate(self, request: list[bytes]) -> str:
         mark = compute_fingerprint(request[6]) if is_curve_request(request) else ""
-        if mark in self._applied.marks:
+        if mark in self._applied.allowed_keys:
             return mark
         self._count_reasons(["assets_unknown_key"])
         return ""
@@ -206,14 +216,14 @@ class AssetServer:
             with self._lock:
                 self._reasons[reason] = self._reasons.get(reason, 0) + 1
 
-    # --- what is asked -----------------------------------------------------------------------------------------------
+    # --- requests ---------------------------------------------------------------------------------------------------
 
     def _receive_requests(self) -> None:
         for _ in range(ROUND):
             if not readable(self._socket):
                 return
             route = self._socket.recv(_DONTWAIT)
-            self._apply_access()  # a scene that was told of since the last look may be what is asked for
+            self._apply_access()  # the request may be for a scene that was announced since
             frame = self._socket.recv(_DONTWAIT, copy=False)
             lengths = [len(frame)]
             more = frame.more
@@ -232,7 +242,7 @@ class AssetServer:
             self._count_reasons([self._guard.record_message(descriptor, user, lengths, counts=refused)])
 
     def _handle_request(self, route: bytes, descriptor: int, user: str, frame: zmq.Frame, *, single: bool) -> bool:
-        """One message. True: it was refused."""
+        """Handle one message. Return whether it was refused."""
         now_ns = self._now_ns()
         request_id, address = 0, ""
         with self._lock:
@@ -251,21 +261,21 @@ class AssetServer:
         return bool(reason)
 
     def _queue_refusal(self, route: bytes, request_id: int, address: str, reason: str) -> None:
-        """At once, or behind what the reader waits for."""
+        """Refuse a request, at once or after the reader's pending chunks."""
         self._count_reasons([f"assets_{reason}"])
         if self._scheduler.queues(route) or not self._send_refusal(route, _refusal(request_id, address, reason)):
             kept = self._scheduler.refuse(route, request_id, address, reason)
             self._count_reasons([] if kept else ["assets_refusal_unsent"])
 
     def _send_refusal(self, route: bytes, refusal: bytes) -> bool:
-        """False: who is to be told reads nothing, or is gone."""
+        """Send a refusal. Return whether there was room for it."""
         try:
             self._socket.send_multipart((route, refusal), _DONTWAIT)
         except zmq.ZMQError:
             return False
         return True
 
-    # --- what is sent ------------------------------------------------------------------------------------------------
+    # --- chunks ------------------------------------------------------------------------------------------------------
 
     def _send_chunks(self) -> None:
         late = self._now_ns() < self.late_until_ns
@@ -279,7 +289,7 @@ class AssetServer:
         wanted = reader.queue[0]
         chunk = None if wanted.refused else self._files.chunk(wanted.address, wanted.offset, wanted.length)
         try:
-            if chunk is None:  # or the scene changed twice since it was asked for
+            if chunk is None:  # or the scene changed twice since the request
                 reason = wanted.refused or AssetRefusal.UNKNOWN
                 refusal = _refusal(wanted.request_id, wanted.address, reason)
                 self._socket.send_multipart((reader.route, refusal), _DONTWAIT)
@@ -291,7 +301,7 @@ class AssetServer:
         except zmq.Again:
             self._scheduler.full(reader, self._now_ns())
             return
-        except zmq.ZMQError:  # gone; its end will be told of
+        except zmq.ZMQError:  # the connection has ended; its monitor will report that
             self._scheduler.forget(reader.route)
             return
         self._scheduler.sent(reader)

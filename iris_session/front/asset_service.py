@@ -63,7 +63,7 @@ class AssetService:
         listeners = {
             n: self._context.find_channel_key(one) for n, one in self._connections.by_number.items() if one.admitted
         }
-        if keys or listeners != self._published.listeners or self._folders is not self._published.stores:
+        if keys or listeners != self._published.clients or self._folders is not self._published.folders:
             self._publish_access(listeners)
 
     def close(self) -> None:
@@ -77,7 +77,7 @@ class AssetService:
             counters.bytes,
             counters.requests,
             sum(counters.reasons.values()),
-            counters.waiting,
+            counters.pending_readers,
         )
 
     def _yield_to_state(self, now_ns: int) -> None:

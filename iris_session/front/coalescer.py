@@ -1,10 +1,10 @@
-"""What waits for the authority: the newest sample per device, every edge, everything else in order. Bounded. Pure.
+"""Entries pending for the authority: the newest sample per device, every edge, all else in order. Bounded and pure.
 
-A heartbeat and a tracking epoch replace the one before, and so does what the front measured (a proposal, an alarm of
-one kind at one anchor, a comparison with one other): only the newest counts. Two samples of one device in a row are
-merged into the newer one when nothing but the motion differs. A change of clutch, gripper (open or closed), buttons,
-worn, tracked, targets or of any epoch is an edge: both samples stay, so the authority sees every press. Urgent messages
-have a lane of their own that is emptied first; a jump of the tracking frame is one of them, for it stops an arm.
+A heartbeat and a tracking epoch replace the one before, and so do the front's measurements (a proposal, an alarm of
+one kind at one anchor, a cross-check with one other headset): only the newest counts. Two successive samples of one
+device are merged into the newer one when nothing but the motion differs. A change of clutch, gripper (open or closed),
+buttons, worn, tracked, targets or of any epoch is an edge: both samples stay, so the authority sees every press. Urgent
+messages have a queue of their own that is sent first; a jump of the tracking frame is one of them, for it stops an arm.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ GRIPPER_EDGE = 0.5
 
 
 def _has_edge(old: Entry, new: Entry, a: Sample, b: Sample) -> bool:
-    """True when merging sample `a` into `b` would lose more than motion."""
+    """Return whether merging sample `a` into `b` would lose more than motion."""
     return (
         a.clutch is not b.clutch
         or a.buttons != b.buttons
@@ -52,8 +52,10 @@ def _has_edge(old: Entry, new: Entry, a: Sample, b: Sample) -> bool:
 
 
 def _replacement_key(message: EntryMessage) -> Hashable:
-    """What an entry takes the place of while it waits, `None` for nothing. Names of anchors are the session's own, so
-    there are few."""
+    """Return the key under which a pending entry replaces the one before, `None` if it replaces none.
+
+    Anchor names are the session's own, so the keys are few.
+    """
     if isinstance(message, Heartbeat | TrackingEpoch):
         return type(message)
     if isinstance(message, AlignmentProposal):
@@ -65,8 +67,8 @@ def _replacement_key(message: EntryMessage) -> Hashable:
     return None
 
 
-class _Lane:
-    """What waits of one connection. Values are `(arrival number, entry)`."""
+class _ConnectionQueue:
+    """Pending entries of one connection. Values are `(arrival number, entry)`."""
 
     __slots__ = ("messages", "newest", "samples", "urgent")
 
@@ -74,124 +76,128 @@ class _Lane:
         self.urgent: list[tuple[int, Entry]] = []
         self.messages: list[tuple[int, Entry]] = []
         self.samples: dict[str, list[tuple[int, Entry]]] = {}
-        self.newest: dict[Hashable, tuple[int, Entry]] = {}  # by what it replaces
+        self.newest: dict[Hashable, tuple[int, Entry]] = {}  # by replacement key
 
 
 class Coalescer:
-    """`offer` what came in, `take` a batch for the authority."""
+    """Queue entries with `offer`, and send them in batches from `take_batch`.
+
+    Attributes:
+        urgent: An urgent entry is pending.
+    """
 
     def __init__(self, limits: FrontLimits, drops: Drops) -> None:
         self._limits = limits
         self._drops = drops
-        self._lanes: dict[int, _Lane] = {}
+        self._queues: dict[int, _ConnectionQueue] = {}
         self._arrivals = 0
         self._next_connection = 0
         self.urgent = False
 
     def __bool__(self) -> bool:
-        return bool(self._lanes)
+        return bool(self._queues)
 
     def offer(self, entry: Entry) -> bool:
-        """Keeps `entry` for the next batch. False: dropped and counted."""
-        lane = self._lanes.get(entry.connection)
-        if lane is None:
-            lane = self._lanes[entry.connection] = _Lane()
+        """Queue an entry for the next batch. Return false if it was dropped and counted."""
+        queue = self._queues.get(entry.connection)
+        if queue is None:
+            queue = self._queues[entry.connection] = _ConnectionQueue()
         self._arrivals += 1
         item = (self._arrivals, entry)
         message = entry.message
         if isinstance(message, Sample):
-            return self._offer_sample(lane, item, message)
+            return self._offer_sample(queue, item, message)
         if entry.connection == HOST and isinstance(message, RemoveParticipant):
-            return self._offer_removal(lane, item, message)
+            return self._offer_removal(queue, item, message)
         if isinstance(message, URGENT):
-            return self._offer_urgent(lane, item)
+            return self._offer_urgent(queue, item)
         if isinstance(message, AlignmentAlarm) and message.kind == AlarmKind.JUMP:
-            return self._offer_jump(lane, item)
+            return self._offer_jump(queue, item)
         replaces = _replacement_key(message)
         if replaces is not None:
-            lane.newest[replaces] = item
+            queue.newest[replaces] = item
             return True
-        if len(lane.messages) >= self._limits.pending_messages:
+        if len(queue.messages) >= self._limits.pending_messages:
             lost = "audit_lost" if isinstance(message, Audit) else "messages_pending"
             self._drops.count(lost, entry.connection)
             return False
-        lane.messages.append(item)
+        queue.messages.append(item)
         return True
 
-    def _offer_sample(self, lane: _Lane, item: tuple[int, Entry], sample: Sample) -> bool:
-        waiting = lane.samples.get(sample.device)
-        if waiting is None:
-            if len(lane.samples) >= self._limits.pending_devices:
+    def _offer_sample(self, queue: _ConnectionQueue, item: tuple[int, Entry], sample: Sample) -> bool:
+        pending = queue.samples.get(sample.device)
+        if pending is None:
+            if len(queue.samples) >= self._limits.pending_devices:
                 self._drops.count("devices_pending", item[1].connection)
                 return False
-            lane.samples[sample.device] = [item]
+            queue.samples[sample.device] = [item]
             return True
-        old = waiting[-1][1]
+        old = pending[-1][1]
         if not _has_edge(old, item[1], old.message, sample):  # type: ignore[arg-type]
-            waiting[-1] = item
+            pending[-1] = item
             return True
-        if len(waiting) >= self._limits.pending_samples:
+        if len(pending) >= self._limits.pending_samples:
             self._drops.count("samples_pending", item[1].connection)
             if sample.seq > old.message.seq:  # type: ignore[union-attr]
-                waiting[-1] = item  # the newest state of the buttons is the one that must get through
+                pending[-1] = item  # the newest state of the buttons must get through
             return False
-        waiting.append(item)
+        pending.append(item)
         return True
 
-    def _offer_urgent(self, lane: _Lane, item: tuple[int, Entry]) -> bool:
-        """An e-stop or loss is never dropped for want of room: a second one of the same connection says nothing new."""
+    def _offer_urgent(self, queue: _ConnectionQueue, item: tuple[int, Entry]) -> bool:
+        """Queue an urgent entry. An e-stop or loss is never dropped: a second one of a connection adds nothing."""
         message = item[1].message
-        if isinstance(message, Lost) and any(isinstance(e.message, Join) for _, e in lane.messages):
+        if isinstance(message, Lost) and any(isinstance(e.message, Join) for _, e in queue.messages):
             self.remove_connection(item[1].connection)  # the authority never heard of this connection
             return True
-        if isinstance(message, EStop | Lost) and any(type(e.message) is type(message) for _, e in lane.urgent):
+        if isinstance(message, EStop | Lost) and any(type(e.message) is type(message) for _, e in queue.urgent):
             return True
-        if len(lane.urgent) >= self._limits.pending_urgent and not isinstance(message, EStop | Lost):
+        if len(queue.urgent) >= self._limits.pending_urgent and not isinstance(message, EStop | Lost):
             self._drops.count("urgent_pending", item[1].connection)
             return False
         if not isinstance(message, EStop):
             # A release must not overtake the acquire before it.
-            lane.urgent += lane.messages
-            lane.messages = []
+            queue.urgent += queue.messages
+            queue.messages = []
         if isinstance(message, Lost | Bye):
-            lane.samples.clear()
-            lane.newest.clear()
-        lane.urgent.append(item)
+            queue.samples.clear()
+            queue.newest.clear()
+        queue.urgent.append(item)
         self.urgent = True
         return True
 
-    def _offer_jump(self, lane: _Lane, item: tuple[int, Entry]) -> bool:
-        """Never dropped for want of room: of several the newest voids all that was proposed before."""
-        lane.urgent = [one for one in lane.urgent if not isinstance(one[1].message, AlignmentAlarm)]
-        lane.urgent.append(item)
+    def _offer_jump(self, queue: _ConnectionQueue, item: tuple[int, Entry]) -> bool:
+        """Queue a jump. It is never dropped: of several the newest voids all earlier proposals."""
+        queue.urgent = [one for one in queue.urgent if not isinstance(one[1].message, AlignmentAlarm)]
+        queue.urgent.append(item)
         self.urgent = True
         return True
 
-    def _offer_removal(self, lane: _Lane, item: tuple[int, Entry], message: RemoveParticipant) -> bool:
-        """Who lost their key is removed whatever else is to be told: never behind a flood of audits, nor for want of
-        room, but once. There are no more participants than resume tokens."""
-        waiting = [one.message for _, one in lane.urgent]
-        if message in waiting:
+    def _offer_removal(self, queue: _ConnectionQueue, item: tuple[int, Entry], message: RemoveParticipant) -> bool:
+        """Queue the removal of a participant whose key was revoked, once. It is neither delayed nor dropped because of
+        many audit entries. There are no more participants than resume tokens."""
+        pending = [one.message for _, one in queue.urgent]
+        if message in pending:
             return True
-        if len(waiting) >= self._limits.resume_tokens:
+        if len(pending) >= self._limits.resume_tokens:
             self._drops.count("urgent_pending", item[1].connection)
             return False
-        lane.urgent.append(item)
+        queue.urgent.append(item)
         self.urgent = True
         return True
 
     def take_batch(self, urgent_only: bool = False) -> list[Entry]:
-        """The next batch, at most `batch_entries`: urgent entries first, then connections in turn, each in order of
-        arrival. What does not fit stays, and its connection comes first the next time."""
-        urgent = [item for lane in self._lanes.values() for item in lane.urgent]
+        """Return the next batch of at most `batch_entries`: urgent entries first, then one connection after the other,
+        each in order of arrival. The connection that does not fit comes first in the next batch."""
+        urgent = [item for queue in self._queues.values() for item in queue.urgent]
         urgent.sort(key=_arrival)
-        for lane in self._lanes.values():
-            lane.urgent.clear()
+        for queue in self._queues.values():
+            queue.urgent.clear()
         self.urgent = False
         batch = [entry for _, entry in urgent]
         if urgent_only:
             return batch
-        order = sorted(self._lanes)
+        order = sorted(self._queues)
         start = next((i for i, number in enumerate(order) if number >= self._next_connection), 0)
         rest: list[tuple[int, Entry]] = []
         self._next_connection = 0
@@ -199,25 +205,24 @@ class Coalescer:
             if rest and len(batch) + len(rest) >= self._limits.batch_entries:
                 self._next_connection = number
                 break
-            rest += self._list_pending(self._lanes.pop(number))
+            rest += self._list_pending(self._queues.pop(number))
         rest.sort(key=_arrival)
         return batch + [entry for _, entry in rest]
 
     @staticmethod
-    def _list_pending(lane: _Lane) -> list[tuple[int, Entry]]:
-        items = lane.messages
-        for waiting in lane.samples.values():
-            items += waiting
-        items += lane.newest.values()
+    def _list_pending(queue: _ConnectionQueue) -> list[tuple[int, Entry]]:
+        items = queue.messages
+        for pending in queue.samples.values():
+            items += pending
+        items += queue.newest.values()
         return items
 
     def remove_connection(self, connection: int) -> None:
-        """The authority is done with a connection, or never heard of it: nothing that waits of it matters any more, but
-        that it stops the session."""
-        lane = self._lanes.pop(connection, None)
-        stops = [] if lane is None else [item for item in lane.urgent if isinstance(item[1].message, EStop)]
+        """Remove pending entries of a connection that the authority has ended, or never knew, except an e-stop."""
+        queue = self._queues.pop(connection, None)
+        stops = [] if queue is None else [item for item in queue.urgent if isinstance(item[1].message, EStop)]
         if stops:
-            kept = self._lanes[connection] = _Lane()
+            kept = self._queues[connection] = _ConnectionQueue()
             kept.urgent = stops
 
 

@@ -1,6 +1,6 @@
 """Limits on TCP connections, on hellos and on memory: who is rate limited, banned, or closed to make room.
 
-Every open connection costs a descriptor and buffers in libzmq, before anything is said over it. So a connection that
+Every open connection costs a descriptor and buffers in libzmq, before a message is sent over it. So a connection that
 stays silent is closed after a while, the oldest silent ones make room when there are many, and a peer that sends far
 more than its limits is disconnected, banned for a moment and reported. Clients within their limits notice none of it.
 
@@ -188,7 +188,7 @@ class HelloRateLimiter:
     """Limit hellos per source and in total.
 
     A source is an allowed key, or an address in a session without keys. Each source has a few hellos of its own, so a
-    new client is admitted whatever another one does. Beyond them it uses those that all sources share.
+    new client is admitted whatever other clients do. Beyond them it uses those that all sources share.
     """
 
     def __init__(self, limits: FrontLimits) -> None:
@@ -283,7 +283,7 @@ class SubscriberGuard:
             frame = state.recv(zmq.DONTWAIT, copy=False)
             try:
                 descriptor = int(frame.get(zmq.SRCFD))
-            except zmq.ZMQError:  # a ZeroMQ of before 2013: libzmq does not tell the connection
+            except zmq.ZMQError:  # a ZeroMQ of before 2013: without its connection
                 continue
             if frame.bytes[:1] == _SUBSCRIBE:
                 senders[descriptor] = _read_user_id(frame)
@@ -603,7 +603,7 @@ def _remember(table: dict[str, int], key: str, until_ns: int) -> None:
 class MemoryGuard:
     """Bound the memory of the front: queues of libzmq, our own, and those of subscriptions. A `Service`.
 
-    libzmq does not report the size of its queues, and a sum of worst cases would admit nobody. So the process is
+    libzmq does not report the size of its queues, and a sum of worst cases would admit no client. So the process is
     measured: when it holds more than `max_bytes` above what it held once its sockets were open, connections with the
     most pending bytes are evicted.
     """

@@ -36,7 +36,7 @@ _CURVE: Final = 8 + 8 + 16 + 1
 
 
 class Route(NamedTuple):
-    """Where a message came from. `on_behalf_of` is empty except for participants behind a gateway."""
+    """Origin of a message. `on_behalf_of` is empty except for participants behind a gateway."""
 
     routing_id: bytes
     on_behalf_of: str = ""

@@ -1,4 +1,4 @@
-"""What the parts of the front share: configuration, sockets, connections, queues, keys and the clock.
+"""The front's context, shared by its parts: configuration, sockets, connections, queues, keys and the clock.
 
 `FrontSockets` opens all sockets, together or not at all. `FrontContext` holds the state that every part reads and
 changes; a part takes the context and the few other parts whose methods it calls. `loop` wires them. Nothing here
@@ -153,8 +153,8 @@ class FrontSockets:
         self.context.destroy()
 
 
-class AuthorityState:
-    """The authority as the front sees it, written by `Downlink` (the first four) and `Uplink`.
+class LinkState:
+    """State of the link to the authority, written by `Downlink` (the first four) and `Uplink`.
 
     Attributes:
         heard_ns: Session time of its last message, 0 before the first.
@@ -198,7 +198,7 @@ class FrontContext:
     tokens: ResumeTokens
     publisher: StatePublisher
     traffic: TrafficCounter = field(default_factory=TrafficCounter)
-    authority: AuthorityState = field(default_factory=AuthorityState)
+    authority: LinkState = field(default_factory=LinkState)
 
     def find_channel_key(self, connection: FrontConnection) -> str:
         """Return the key of the TCP connections that may carry media and assets of a connection: behind a gateway the

@@ -1,4 +1,4 @@
-"""How connections end: closed by the peer, replaced, silent, slow, or disconnected by the authority."""
+"""The end of connections: closed by the peer, replaced, silent, slow, or disconnected by the authority."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""How clients find the session: beacons, introductions, and its entry in the registry of sessions on this machine.
+"""Discovery of the session by clients: beacons, introductions, and its entry in this machine's session registry.
 
-The beacon tells every network that the session listens on, five times a second, where the session is. The introduction
+The beacon announces where the session is, five times a second, to every network that it listens on. The introduction
 answers a connection to the TCP port below the control port with a description of the session, once: nothing is read
 and nothing kept, the connection is accepted, written to and closed at once, so that none can hold anything. The
 registry entry lets `iris-session pair` find an encrypted session. Resolving endpoints is the client's part.
@@ -282,7 +282,7 @@ class SessionRegistration:
 
 
 class SessionFacts(NamedTuple):
-    """What the introduction contains besides the beacon.
+    """Content of the introduction besides the beacon.
 
     Attributes:
         server_key: Z85, empty without encryption.

@@ -1,7 +1,7 @@
 """The loop of the front process: it wires all parts and runs them. Media, assets and file changes have own threads.
 
 The loop drains the link to the authority first, because state goes out before anything else, then the control socket
-in small rounds with a look at the link in between. It never waits for a client, nor for the authority.
+in small rounds, and drains the link in between. It never waits for a client, nor for the authority.
 """
 
 from __future__ import annotations
@@ -179,7 +179,7 @@ class Front:
                 extra += 1
             try:
                 peer = Peer(int(frame.get(zmq.SRCFD)), str(frame.get("User-Id")) if with_user else "")
-            except zmq.ZMQError:  # a browser, or a ZeroMQ of before 2013: libzmq does not tell the connection
+            except zmq.ZMQError:  # a browser, or a ZeroMQ of before 2013: without its connection
                 self._context.drops.count("unversioned_peer")
                 continue
             self._context.traffic.count_received(peer.descriptor, len(frame.buffer))

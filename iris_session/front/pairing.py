@@ -75,17 +75,17 @@ class PairingService:
         self._rates: dict[str, TokenBucket] = {}
         self._wrong: dict[str, tuple[int, int]] = {}  # network -> wrong attempts, since when [ns]
         self._signature: object = None
-        self._unread, self._retry_s = "", 0.0  # why the codes could not be read, and when they are read again
+        self._read_error, self._retry_s = "", 0.0  # why the codes could not be read, and when they are read again
         self._codes: tuple[JoinCode, ...] = ()
 
     @property
     def has_open_code(self) -> bool:
-        """Whether a join code can be used now."""
+        """True if a join code can be used now."""
         home, key = self._keyring.home, self._keyring.key
         if home is None or key is None:
             return False
         signature = home.join_codes.signature
-        if signature != self._signature or (self._unread and time.monotonic() >= self._retry_s):
+        if signature != self._signature or (self._read_error and time.monotonic() >= self._retry_s):
             self._signature = signature
             self._read_codes(home, key)
         now_s = time.time()
@@ -98,9 +98,9 @@ class PairingService:
         except KeysError as error:
             self._codes, unread = (), str(error)
             self._retry_s = time.monotonic() + RETRY_S
-            if unread != self._unread:
+            if unread != self._read_error:
                 log.warning("pairing does not work: %s", error)
-        self._unread = unread
+        self._read_error = unread
 
     def handle_pair(self, route: Route, peer: Peer, pair: Pair, now_ns: int) -> None:
         """Handle a `Pair`, of a key that is on the list or is not."""
@@ -216,7 +216,7 @@ class PairingService:
         self._count_wrong(pending.address, now_ns)
         kind = AuditKind.CODE_EXHAUSTED if attempt.exhausted else AuditKind.CODE_REFUSED
         self._audit.record(kind, now_ns, subject=mark, name=pending.pair.name, address=pending.address)
-        advice = "run `iris-session pair` anew" if not attempt.open_codes else "look at the code again"
+        advice = "run `iris-session pair` again" if not attempt.open_codes else "check the code"
         self._refuse(pending.route, "this join code is wrong, used or expired", advice)
 
     def _refuse_busy(self, route: Route) -> None:

@@ -1,4 +1,4 @@
-"""Rigid state and presence on the PUB socket: encodes each state frame once, stamps it when it is sent."""
+"""Rigid state and presence on the state socket: encodes each frame once, and stamps it when it is sent."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID, S
 from iris_session.streams.rigid import RigidEncoder
 
 POSE_BYTES = 56  # seven float64
-#: How far back delays are told: what was late longer ago says nothing about now.
+#: Delays are reported of so long: a frame that was late before says nothing about the present.
 RECENT_NS = 5_000_000_000
 _encoder = msgspec.msgpack.Encoder()
 _decode_header = msgspec.msgpack.Decoder(StateHeader).decode
@@ -29,7 +29,12 @@ class _RawPresence(msgspec.Struct, array_like=True):
 
 
 class StatePublisher:
-    """Latest value only: nothing waits here, and a subscriber that does not keep up loses frames in its own queue."""
+    """Publish the latest state. Nothing is queued here; a subscriber that does not keep up loses frames of its queue.
+
+    Attributes:
+        frames: State frames sent so far.
+        scene: The present scene.
+    """
 
     def __init__(
         self, state: zmq.Socket[bytes], scene: SceneInfo, now_ns: Callable[[], int], first_seq: int = 1
@@ -38,8 +43,8 @@ class StatePublisher:
         self._now_ns = now_ns
         self._next_seq = first_seq
         self.frames = 0
-        #: When each of the newest frames was handed to the socket, and how long after the end of its tick; without
-        #: those that are sent again while their source is silent.
+        # When each of the newest frames was handed to the socket, and how long after the end of its tick; without
+        # those that are sent again while their source is silent.
         self._delays: deque[tuple[int, int]] = deque(maxlen=300)
         self._last_session_time = -1
         self.scene = scene
@@ -47,28 +52,28 @@ class StatePublisher:
 
     @property
     def newest_delay_ns(self) -> int:
-        """End of the tick of the newest frame until it was handed to the socket, 0 before the first."""
+        """Time from the end of the tick of the newest frame until it was sent [ns], 0 before the first."""
         return self._delays[-1][1] if self._delays else 0
 
     def read_recent_delays_ns(self) -> list[int]:
-        """The same of all frames of the last seconds, oldest first."""
+        """Return the delays of all frames of the last seconds [ns], oldest first."""
         since_ns = self._now_ns() - RECENT_NS
         return [delay for at_ns, delay in self._delays if at_ns > since_ns]
 
     def replace_socket(self, state: zmq.Socket[bytes] | None) -> None:
-        """Sends on another socket from now on, and closes the one before. `None`: nothing is sent for a while."""
+        """Send on another socket from now on, and close the one before. `None`: nothing is sent until the next call."""
         if self._state is not None:
             self._state.close(linger=0)
         self._state = state
 
     def poll(self) -> None:
-        """Lets libzmq do what it does only when asked for something: else, while no state is sent, all that became of
-        connections would pile up."""
+        """Let libzmq process events of connections, which it does only when called: else they would pile up while no
+        state is sent."""
         if self._state is not None:
             self._state.get(zmq.EVENTS)
 
     def set_scene(self, scene: SceneInfo) -> None:
-        """Takes over another scene: later frames have its bodies. A patch of the present one moves none of them."""
+        """Set the scene of later frames. A patch of the present scene does not change its bodies."""
         before, self.scene = self.scene, scene
         if scene.patches and scene.bodies == before.bodies:
             return
@@ -79,9 +84,14 @@ class StatePublisher:
         self._published = False
 
     def publish(self, header: bytes, poses: bytes) -> bool:
-        """Encodes and sends one state. `header`: encoded `StateHeader` without its `published_ns` and `*_seq`.
+        """Encode and send one state.
 
-        False: the poses are not those of the present scene.
+        Args:
+            header: Encoded `StateHeader` without its `published_ns` and `*_seq`.
+            poses: float64 (n_bodies, 7), `x y z qw qx qy qz`, world frame.
+
+        Returns:
+            False if the poses are not those of the present scene.
         """
         n = len(self.scene.bodies)
         if len(poses) != n * POSE_BYTES:
@@ -111,13 +121,13 @@ class StatePublisher:
         return True
 
     def publish_presence(self, session_time: int, items: bytes) -> None:
-        """`items`: encoded array of `PresenceItem`, passed on as it is."""
+        """Send presence. `items`: encoded array of `PresenceItem`, forwarded unchanged."""
         if self._state is not None:
             presence = _RawPresence(session_time, self._now_ns(), msgspec.Raw(items))
             self._state.send_multipart((TOPIC_PRESENCE, _encoder.encode(presence)))
 
     def read_keyframe(self) -> tuple[int, bytes]:
-        """`(state_seq, float64 (n, 7) poses)` for a snapshot: of the newest frame, or of the scene before the first."""
+        """Return `(state_seq, float64 (n, 7) poses)` for a snapshot: of the newest frame, at first of the scene."""
         if not self._published:
             return 0, self.scene.poses
         seq, poses = self._encoder.keyframe()

@@ -57,7 +57,7 @@ class Uplink:
 
     @property
     def _is_authority_listening(self) -> bool:
-        """Whether the authority reads the link, as far as the front knows."""
+        """True if the authority reads the link, as far as the front knows."""
         return self._authority.heard_ns > 0 and not self._authority.stalled
 
     def _report(self) -> None:

@@ -41,7 +41,7 @@ class FakeServer:
 
     @property
     def served(self) -> set[str]:
-        return {address for root, addresses in self.table.stores for address in addresses if root == ROOT}
+        return {address for root, addresses in self.table.folders for address in addresses if root == ROOT}
 
 
 class AssetServiceRig:
@@ -113,11 +113,11 @@ def test_with_keys_everybody_comes_by_his_own_or_that_of_his_gateway_and_revoked
     rig.join(3, "bob", gateway=2)
     rig.tokens.revoke_key("eve")
     rig.service.tick(0)
-    assert rig.server.table.marks == {"ann", "gate"}
-    assert rig.server.table.listeners == {1: "ann", 2: "gate", 3: "gate"}
+    assert rig.server.table.allowed_keys == {"ann", "gate"}
+    assert rig.server.table.clients == {1: "ann", 2: "gate", 3: "gate"}
     rig.tokens.revoke_key("ann")
     rig.service.tick(PERIOD_NS)
-    assert rig.server.table.marks == {"gate"}
+    assert rig.server.table.allowed_keys == {"gate"}
 
 
 def test_assets_hold_back_when_state_or_the_loop_was_late() -> None:

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iris_session.front.media.budget import (
-    CLIMB_NS,
-    NOTHING,
+    NONE_LEVEL,
+    RAISE_NS,
     BudgetController,
     BudgetGrant,
     LinkMeasure,
@@ -60,7 +60,7 @@ class Link:
     def rises(self) -> list[int]:
         """When a stream was given more."""
         pairs = itertools.pairwise(self.grants)
-        return [b[0] for a, b in pairs if any(b[1].levels[s] < a[1].levels.get(s, NOTHING) for s in b[1].levels)]
+        return [b[0] for a, b in pairs if any(b[1].levels[s] < a[1].levels.get(s, NONE_LEVEL) for s in b[1].levels)]
 
 
 def test_enough_for_everything_stays_so() -> None:
@@ -92,11 +92,11 @@ def test_a_dead_link_gets_nothing_and_a_silent_client_neither() -> None:
     link = Link(8)
     link.play(5)
     link.capacity = 0.0
-    assert link.play(4).levels == {"cloud": NOTHING}
+    assert link.play(4).levels == {"cloud": NONE_LEVEL}
     silent = BudgetController()
     silent.update(1, LinkMeasure(StateReport(10.0, 0.0)), CLOUD, 0)
     grant = silent.update(1, LinkMeasure(None), CLOUD, 4 * SECOND)
-    assert (grant.levels, grant.reason) == ({"cloud": NOTHING}, "the client has not reported for 3 s")
+    assert (grant.levels, grant.reason) == ({"cloud": NONE_LEVEL}, "the client has not reported for 3 s")
 
 
 def test_trouble_that_media_do_not_make_is_learnt() -> None:
@@ -105,7 +105,7 @@ def test_trouble_that_media_do_not_make_is_learnt() -> None:
     link.play(10)
     link.age_ms = 210.0
     link.play(10)
-    assert any(grant.levels["cloud"] == NOTHING for _, grant in link.grants)
+    assert any(grant.levels["cloud"] == NONE_LEVEL for _, grant in link.grants)
     link.play(60)
     assert link.grants[-1][1].levels == {"cloud": 0}
 
@@ -139,7 +139,7 @@ def test_a_new_stream_waits_where_there_is_too_much() -> None:
     link = Link(8)
     link.play(5)
     link.play(0.25, BOTH)
-    assert link.grants[-1][1].levels["cloth"] == NOTHING
+    assert link.grants[-1][1].levels["cloth"] == NONE_LEVEL
     controller = link.controller
     controller.remove(7)
     assert controller.update(7, LinkMeasure(None), BOTH, link.now_ns).levels == {"cloud": 0, "cloth": 0}
@@ -150,10 +150,10 @@ def test_the_ladder_begins_with_what_costs_most() -> None:
     assert (steps[0], steps[1], steps[-1]) == (
         {"cloth": 0, "cloud": 0},
         {"cloth": 0, "cloud": 1},
-        {"cloth": NOTHING, "cloud": NOTHING},
+        {"cloth": NONE_LEVEL, "cloud": NONE_LEVEL},
     )
     assert select_levels(BOTH, 8 * MBIT) == {"cloth": 0, "cloud": 2}
-    assert select_levels(BOTH, 0.0) == {"cloth": NOTHING, "cloud": NOTHING}
+    assert select_levels(BOTH, 0.0) == {"cloth": NONE_LEVEL, "cloud": NONE_LEVEL}
 
 
 rates_of_streams = st.dictionaries(
@@ -176,7 +176,7 @@ def test_a_constant_link_is_not_tried_often(mbit: float, age_ms: float) -> None:
     link = Link(mbit, age_ms)
     link.play(120)
     rises = link.rises()
-    assert all(b - a >= CLIMB_NS for a, b in itertools.pairwise(rises))
+    assert all(b - a >= RAISE_NS for a, b in itertools.pairwise(rises))
     last_minute = [now for now in rises if now > 60 * SECOND]
     assert len(last_minute) <= 8
     fitting = compute_cost(CLOUD, select_levels(CLOUD, 0.95 * link.capacity))
@@ -191,7 +191,7 @@ def test_a_link_that_dies_gets_nothing(mbit: float, after_s: float) -> None:
     link.play(after_s)
     link.capacity = 0.0
     link.play(5)
-    assert all(level == NOTHING for level in link.play(20).levels.values())
+    assert all(level == NONE_LEVEL for level in link.play(20).levels.values())
 
 
 @pytest.mark.parametrize("mbit", [0.0, 1.0])

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import pytest
 
-from iris_session.front.media.budget import NOTHING, SECOND
+from iris_session.front.media.budget import NONE_LEVEL, SECOND
 from iris_session.front.media.scheduler import DeliveryCounters, MediaScheduler, MediaSubscriber
 from iris_session.protocol.codec import decode_media_header
 from iris_session.protocol.media import MAX_STREAMS, MediaHeader, MediaPush, media_topic, parse_topic
@@ -59,7 +59,7 @@ def test_subscribers_get_what_their_level_says() -> None:
     header, frame = wire.got[BOB][-1]
     assert (header.stream, header.budget_class, header.scene_epoch, header.seq % 4) == ("cloud", "quarter", 3, 0)
     assert (header.published_ns - header.capture_ns, header.dropped, frame) == (MS, 0, b"x" * 100)
-    wire.allow(ann=NOTHING, bob=1)
+    wire.allow(ann=NONE_LEVEL, bob=1)
     wire.push(8)
     assert [len(wire.got[who]) for who in (ANN, BOB)] == [8, 6]
 
@@ -121,7 +121,7 @@ def test_one_of_two_readers_of_a_client_leaves() -> None:
     wire.hub.unsubscribe(ANN, "cloud", 3)
     wire.push()
     assert len(wire.got[ANN]) == 1
-    assert wire.hub.read_counters(ANN).taken == 1
+    assert wire.hub.read_counters(ANN).delivered == 1
 
 
 def test_nobody_takes_back_a_subscription_of_another() -> None:

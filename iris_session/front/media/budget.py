@@ -1,8 +1,9 @@
-"""How much media each client gets: a class per stream, lowered when its link suffers. Pure: no clock, no sockets.
+"""The media budget controller: a level per stream and client, lowered when the client's link is congested. Pure.
 
-What suffers first on a crowded link is the age of state, because media and state share one way. So the judge is what
-a client reports of its state, beside what its media connection does not take. Lowering is quick and aims below what
-came through; rising is one step at a time, and after every step that had to be taken back the next waits longer.
+On a congested link the age of state rises first, because media and state share the link. So the controller judges by
+the state that a client reports, and by the frames that its media connection does not take. Levels are lowered quickly,
+to less than what came through. They are raised one step at a time, and after every step that failed the next one comes
+later.
 """
 
 from __future__ import annotations
@@ -17,55 +18,60 @@ from iris_session.protocol.media import CLASSES
 MILLISECOND: Final = 1_000_000
 SECOND: Final = 1_000_000_000
 #: Index of `BudgetClass.NONE`.
-NOTHING: Final = len(CLASSES) - 1
+NONE_LEVEL: Final = len(CLASSES) - 1
 
-#: State that is so much older than it was at its best counts as late [ms], and half of that best beside it. A single
-#: large frame of media before it makes state tens of milliseconds older, which is no reason yet.
+#: State is late if it is so much older than 1.5 times its best age [ms]. A single large frame of media before it makes
+#: state tens of milliseconds older, which is no reason yet.
 RISE_MS: Final = 80.0
-#: More frames of state are missed than at best, by this share. Frames that come together behind a large one of media
-#: count as missed too, but for the newest.
+#: State is missed if the share of missed frames is so much above its best. Frames that arrive together behind a large
+#: one of media count as missed too, except the newest.
 RISE_MISSED: Final = 0.6
-#: Reports among which the best is looked for: a minute.
-REMEMBERED: Final = 60
-#: Share of due frames that a connection did not take, in two measures in a row, that says that the link is full.
+#: Reports of which the best counts: a minute.
+MAX_REPORTS: Final = 60
+#: Share of due frames that a connection did not take, in two measures in a row, from which on the link counts as full.
 BLOCKED: Final = 0.25
-#: After a change what is under way still has to come through.
+#: After a change, frames that are under way still have to arrive.
 SETTLE_NS: Final = 500 * MILLISECOND
-#: Reports do not count for so long after less was given: a queue on the way has to drain, beside the media that are
-#: left, and a report covers the second before it.
+#: Reports do not count for so long after a level was lowered: queues on the way have to drain, beside the media that
+#: are left, and a report covers the second before it.
 DRAIN_NS: Final = 2600 * MILLISECOND
 SILENT_NS: Final = 3 * SECOND
-#: Share of what came through that is asked for after it was too much.
-LESS: Final = 0.7
-#: What was given may grow so much before it is more than was asked for (rates are measured, and vary), and how much
-#: more than its own limit a client gets at most.
+#: Levels are lowered to this share of the rate that came through.
+LOWER_TO: Final = 0.7
+#: Rates are measured and vary: levels stay until they cost so much more than the budget, or than the client's own
+#: limit.
 SLACK: Final = 1.5
 LIMIT_SLACK: Final = 1.15
-#: Distance of steps up. To what has failed it doubles each time, until that works.
-CLIMB_NS: Final = 3 * SECOND
-CLIMB_MAX_NS: Final = 48 * SECOND
-#: Rates are measured, and vary: what costs so much of what has failed is that again.
-SAME: Final = 0.8
-#: Trouble this soon after a step up is blamed on it; without any it has worked.
+#: Time between steps up. To a level that has failed it doubles each time, until the level works.
+RAISE_NS: Final = 3 * SECOND
+RAISE_MAX_NS: Final = 48 * SECOND
+#: Rates are measured and vary: levels that cost this share of those that failed are the same ones.
+SAME_COST: Final = 0.8
+#: Congestion this soon after a step up is blamed on it; without any the step has worked.
 PROBE_NS: Final = 3 * SECOND
-#: Without any media, trouble that stays so long has other causes: it is how this link is now.
+#: Without any media, congestion that stays so long has other causes: it becomes the new normal of the link.
 RELEARN_NS: Final = 5 * SECOND
 
-#: Bytes per second of every stream at full, half, quarter: what a client would be sent.
+#: Bytes per second of every stream at full, half and quarter, as a client would be sent.
 Rates = Mapping[str, Sequence[float]]
 
 
 class StateReport(NamedTuple):
-    """What a client says of its state. `age_ms`: median, 0 when none came."""
+    """A client's report of its state. `age_ms`: median, 0 when none arrived."""
 
     age_ms: float
     missed_share: float
 
 
 class LinkMeasure(NamedTuple):
-    """One look at a client. `report`: its newest, `None` without a new one since the last look. `taken`, `due`: media
-    frames that its connection took, of those that were due, since then. `limit`: bytes per second that it wants at
-    most, 0 for no limit."""
+    """One measurement of a client's link.
+
+    Attributes:
+        report: Newest report of its state, `None` without one since the last measurement.
+        delivered: Media frames that its connection took since then.
+        due: Media frames that were due.
+        limit: Bytes per second that the client wants at most, 0 for no limit.
+    """
 
     report: StateReport | None
     delivered: int = 0
@@ -74,7 +80,7 @@ class LinkMeasure(NamedTuple):
 
 
 class BudgetGrant(NamedTuple):
-    """`levels`: index into `CLASSES` by stream. `bytes_per_s`: bound of all together, 0 for none."""
+    """Levels of one client. `levels`: index into `CLASSES` by stream. `bytes_per_s`: bound of all, 0 for none."""
 
     levels: dict[str, int]
     bytes_per_s: float = 0.0
@@ -82,17 +88,17 @@ class BudgetGrant(NamedTuple):
 
 
 def compute_cost(rates: Rates, levels: Mapping[str, int]) -> float:
-    """Bytes per second of all streams at these levels. A coarser class never counts more than a finer one."""
+    """Return bytes per second of all streams at these levels. A coarser class never costs more than a finer one."""
     return sum(_level_rate(rates[stream], levels.get(stream, 0)) for stream in sorted(rates))
 
 
 def build_ladder(rates: Rates) -> list[dict[str, int]]:
-    """From everything to nothing: each step lowers the stream that costs the most."""
+    """Return the levels from full to none. Each step lowers the stream that costs most."""
     levels = dict.fromkeys(sorted(rates), 0)
     steps = [dict(levels)]
-    while any(level < NOTHING for level in levels.values()):
+    while any(level < NONE_LEVEL for level in levels.values()):
         lowest = max(
-            (stream for stream in levels if levels[stream] < NOTHING),
+            (stream for stream in levels if levels[stream] < NONE_LEVEL),
             key=lambda stream: (_level_rate(rates[stream], levels[stream]), -levels[stream], stream),
         )
         levels[lowest] += 1
@@ -101,7 +107,7 @@ def build_ladder(rates: Rates) -> list[dict[str, int]]:
 
 
 def select_levels(rates: Rates, bytes_per_s: float) -> dict[str, int]:
-    """The first rung of the ladder that costs no more than that; nothing at all for no budget."""
+    """Return the best levels that cost no more than `bytes_per_s`; none at all for no budget."""
     steps = build_ladder(rates)
     if bytes_per_s <= 0.0:
         return steps[-1]
@@ -109,135 +115,135 @@ def select_levels(rates: Rates, bytes_per_s: float) -> dict[str, int]:
 
 
 def _level_rate(rates: Sequence[float], level: int) -> float:
-    return 0.0 if level >= NOTHING else min(rates[: level + 1])
+    return 0.0 if level >= NONE_LEVEL else min(rates[: level + 1])
 
 
 class _ClientBudget:
-    """What is remembered of one client."""
+    """State of one client."""
 
     def __init__(self) -> None:
         self.levels: dict[str, int] = {}
         self.budget = math.inf
         self.reason = ""
-        self.ages: deque[float] = deque(maxlen=REMEMBERED)
-        self.missed: deque[float] = deque(maxlen=REMEMBERED)
+        self.ages: deque[float] = deque(maxlen=MAX_REPORTS)
+        self.missed: deque[float] = deque(maxlen=MAX_REPORTS)
         self.reported_ns = -1
-        self.late = ""  # what the newest report says against us
+        self.complaint = ""  # what the newest report complains about
         self.blocked = 0  # measures in a row
-        self.sent = 1.0  # share of what was due that was taken lately
-        self.changed_ns = self.lowered_ns = self.climbed_ns = self.troubled_ns = -SILENT_NS
-        self.climb_ns = CLIMB_NS
-        self.failed = math.inf  # what a step up cost that had to be taken back
-        self.innocent_ns = -1  # since when there is trouble without any media
+        self.delivered_share = 1.0  # smoothed share of due frames that were delivered
+        self.changed_ns = self.lowered_ns = self.raised_ns = self.congested_ns = -SILENT_NS
+        self.raise_after_ns = RAISE_NS
+        self.failed = math.inf  # cost of the levels that failed
+        self.blameless_since_ns = -1  # since when there is congestion without any media
 
 
 class BudgetController:
-    """All clients of a session. `update` is called a few times a second for each."""
+    """Control the levels of all clients of a session. `update` is called a few times a second for each."""
 
     def __init__(self) -> None:
         self._clients: dict[int, _ClientBudget] = {}
 
     def remove(self, client: int) -> None:
-        """A client is gone."""
+        """Remove a client that has left."""
         self._clients.pop(client, None)
 
     def update(self, client: int, measure: LinkMeasure, rates: Rates, now_ns: int) -> BudgetGrant:
-        """What a client gets of the streams in `rates`, those that it wants. `now_ns` must not go back."""
-        line = self._clients.get(client)
-        if line is None:
-            line = self._clients[client] = _ClientBudget()
+        """Return the levels of the streams in `rates`, which the client subscribed to. `now_ns` must not decrease."""
+        state = self._clients.get(client)
+        if state is None:
+            state = self._clients[client] = _ClientBudget()
         limit = measure.limit or math.inf
-        self._sync_streams(line, rates)
-        trouble = self._find_trouble(line, measure, now_ns)
-        present = compute_cost(rates, line.levels)
-        if trouble:
-            line.troubled_ns = now_ns
-        if trouble and present > 0.0:
-            line.innocent_ns = -1
-            self._lower_levels(line, rates, LESS * present * line.sent, trouble, now_ns)
-        elif trouble:
-            self._relearn_best(line, now_ns)
+        self._sync_streams(state, rates)
+        reason = self._find_congestion(state, measure, now_ns)
+        present = compute_cost(rates, state.levels)
+        if reason:
+            state.congested_ns = now_ns
+        if reason and present > 0.0:
+            state.blameless_since_ns = -1
+            self._lower_levels(state, rates, LOWER_TO * present * state.delivered_share, reason, now_ns)
+        elif reason:
+            self._relearn_best(state, now_ns)
         else:
-            line.innocent_ns = -1
-            self._raise_levels(line, rates, limit, now_ns)
-        allowed = min(line.budget, limit)
-        if compute_cost(rates, line.levels) > min(SLACK * line.budget, LIMIT_SLACK * limit):
-            line.levels = select_levels(rates, allowed)
-            line.reason = line.reason if line.budget <= limit else "the client asked for no more"
+            state.blameless_since_ns = -1
+            self._raise_levels(state, rates, limit, now_ns)
+        allowed = min(state.budget, limit)
+        if compute_cost(rates, state.levels) > min(SLACK * state.budget, LIMIT_SLACK * limit):
+            state.levels = select_levels(rates, allowed)
+            state.reason = state.reason if state.budget <= limit else "the client asked for no more"
         bound = 0.0 if math.isinf(allowed) else allowed
-        return BudgetGrant(dict(line.levels), bound, line.reason if bound or any(line.levels.values()) else "")
+        return BudgetGrant(dict(state.levels), bound, state.reason if bound or any(state.levels.values()) else "")
 
-    # --- what is wrong -----------------------------------------------------------------------------------------------
+    # --- congestion --------------------------------------------------------------------------------------------------
 
-    def _find_trouble(self, line: _ClientBudget, measure: LinkMeasure, now_ns: int) -> str:
-        """Why this client should get less, empty when all is well."""
+    def _find_congestion(self, state: _ClientBudget, measure: LinkMeasure, now_ns: int) -> str:
+        """Return why this client should get less, empty if there is no reason."""
         if measure.report is not None:
-            self._judge_report(line, measure.report, now_ns)
+            self._judge_report(state, measure.report, now_ns)
         if measure.due:
             share = measure.delivered / measure.due
-            line.sent = (line.sent + share) / 2  # buffers take some before the link is known
-            line.blocked = line.blocked + 1 if 1.0 - share > BLOCKED else 0
-        if line.reported_ns >= 0 and now_ns - line.reported_ns > SILENT_NS:
-            line.sent = 0.0
+            state.delivered_share = (state.delivered_share + share) / 2  # buffers take some first
+            state.blocked = state.blocked + 1 if 1.0 - share > BLOCKED else 0
+        if state.reported_ns >= 0 and now_ns - state.reported_ns > SILENT_NS:
+            state.delivered_share = 0.0
             return "the client has not reported for 3 s"
-        if now_ns - line.changed_ns < SETTLE_NS:
+        if now_ns - state.changed_ns < SETTLE_NS:
             return ""
-        if line.blocked >= 2:
+        if state.blocked >= 2:
             return "the link does not take all media"
-        return line.late
+        return state.complaint
 
-    def _judge_report(self, line: _ClientBudget, report: StateReport, now_ns: int) -> None:
-        line.reported_ns = now_ns
-        line.late = ""
-        if now_ns - line.lowered_ns >= DRAIN_NS:
-            best = min(line.ages, default=math.inf)
+    def _judge_report(self, state: _ClientBudget, report: StateReport, now_ns: int) -> None:
+        state.reported_ns = now_ns
+        state.complaint = ""
+        if now_ns - state.lowered_ns >= DRAIN_NS:
+            best = min(state.ages, default=math.inf)
             if report.age_ms > 1.5 * best + RISE_MS:
-                line.late = f"state came {report.age_ms:.0f} ms old, {best:.0f} ms at best"
-            elif report.missed_share > min(line.missed, default=1.0) + RISE_MISSED:
-                line.late = f"{100 * report.missed_share:.0f} % of state was missed"
+                state.complaint = f"state came {report.age_ms:.0f} ms old, {best:.0f} ms at best"
+            elif report.missed_share > min(state.missed, default=1.0) + RISE_MISSED:
+                state.complaint = f"{100 * report.missed_share:.0f} % of state was missed"
         if report.age_ms > 0.0:
-            line.ages.append(report.age_ms)
-            line.missed.append(report.missed_share)
+            state.ages.append(report.age_ms)
+            state.missed.append(report.missed_share)
 
-    def _relearn_best(self, line: _ClientBudget, now_ns: int) -> None:
-        if line.innocent_ns < 0:
-            line.innocent_ns = now_ns
-        elif now_ns - line.innocent_ns > RELEARN_NS and line.ages:
-            age, missed = line.ages[-1], line.missed[-1]
-            for past, last in ((line.ages, age), (line.missed, missed)):
+    def _relearn_best(self, state: _ClientBudget, now_ns: int) -> None:
+        if state.blameless_since_ns < 0:
+            state.blameless_since_ns = now_ns
+        elif now_ns - state.blameless_since_ns > RELEARN_NS and state.ages:
+            age, missed = state.ages[-1], state.missed[-1]
+            for past, last in ((state.ages, age), (state.missed, missed)):
                 past.clear()
                 past.append(last)
-            line.late, line.innocent_ns = "", -1
+            state.complaint, state.blameless_since_ns = "", -1
 
-    # --- what is done ------------------------------------------------------------------------------------------------
+    # --- levels ------------------------------------------------------------------------------------------------------
 
-    def _sync_streams(self, line: _ClientBudget, rates: Rates) -> None:
-        """A stream that is new to this client begins with everything, or with nothing while there is too much."""
-        first = 0 if math.isinf(line.budget) else NOTHING
-        line.levels = {stream: line.levels.get(stream, first) for stream in sorted(rates)}
+    def _sync_streams(self, state: _ClientBudget, rates: Rates) -> None:
+        """Start a new stream with its full level, or with none while the client's budget is limited."""
+        first = 0 if math.isinf(state.budget) else NONE_LEVEL
+        state.levels = {stream: state.levels.get(stream, first) for stream in sorted(rates)}
 
-    def _lower_levels(self, line: _ClientBudget, rates: Rates, bytes_per_s: float, reason: str, now_ns: int) -> None:
-        if now_ns - line.climbed_ns <= PROBE_NS:
-            line.failed = min(line.failed, compute_cost(rates, line.levels))
-            line.climb_ns = min(2 * line.climb_ns, CLIMB_MAX_NS)
+    def _lower_levels(self, state: _ClientBudget, rates: Rates, bytes_per_s: float, reason: str, now_ns: int) -> None:
+        if now_ns - state.raised_ns <= PROBE_NS:
+            state.failed = min(state.failed, compute_cost(rates, state.levels))
+            state.raise_after_ns = min(2 * state.raise_after_ns, RAISE_MAX_NS)
         levels = select_levels(rates, bytes_per_s)
-        line.levels = {stream: max(level, line.levels[stream]) for stream, level in levels.items()}
-        line.budget, line.reason = bytes_per_s, reason
-        line.changed_ns = line.lowered_ns = now_ns
-        line.blocked, line.late = 0, ""
+        state.levels = {stream: max(level, state.levels[stream]) for stream, level in levels.items()}
+        state.budget, state.reason = bytes_per_s, reason
+        state.changed_ns = state.lowered_ns = now_ns
+        state.blocked, state.complaint = 0, ""
 
-    def _raise_levels(self, line: _ClientBudget, rates: Rates, limit: float, now_ns: int) -> None:
-        calm_ns = now_ns - max(line.changed_ns, line.troubled_ns)
-        present = compute_cost(rates, line.levels)
-        if present >= SAME * line.failed and calm_ns > PROBE_NS:
-            line.failed, line.climb_ns = math.inf, CLIMB_NS  # it works now
-        if math.isinf(line.budget) and not any(line.levels.values()):
+    def _raise_levels(self, state: _ClientBudget, rates: Rates, limit: float, now_ns: int) -> None:
+        calm_ns = now_ns - max(state.changed_ns, state.congested_ns)
+        present = compute_cost(rates, state.levels)
+        if present >= SAME_COST * state.failed and calm_ns > PROBE_NS:
+            state.failed, state.raise_after_ns = math.inf, RAISE_NS  # the levels work now
+        if math.isinf(state.budget) and not any(state.levels.values()):
             return
         better = [levels for levels in reversed(build_ladder(rates)) if compute_cost(rates, levels) > present]
         wanted = compute_cost(rates, better[0]) if better else present
-        if wanted > limit or calm_ns < (line.climb_ns if wanted >= SAME * line.failed else CLIMB_NS):
+        if wanted > limit or calm_ns < (state.raise_after_ns if wanted >= SAME_COST * state.failed else RAISE_NS):
             return
-        # Where nothing costs more, what is left to give is given.
-        line.levels = better[0] if better else dict.fromkeys(rates, 0)
-        line.budget = wanted if any(line.levels.values()) else math.inf
-        line.changed_ns = line.climbed_ns = now_ns
+        # If no step costs more, every stream gets its full level.
+        state.levels = better[0] if better else dict.fromkeys(rates, 0)
+        state.budget = wanted if any(state.levels.values()) else math.inf
+        state.changed_ns = state.raised_ns = now_ns

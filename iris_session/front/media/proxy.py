@@ -1,8 +1,8 @@
-"""The media proxy: takes frames of sources, sends each subscriber the newest at its level. A thread of the front.
+"""The media proxy: receives frames of sources and sends each subscriber the newest at its level. A thread of the front.
 
-Its sockets have an I/O thread of their own, so that what media cost in encryption and copying delays neither control
-nor state. Subscribers are told apart by their topic, which names their connection: what one link does not take is
-dropped for that subscriber alone, and what somebody gets is decided here, not there.
+Its sockets have an I/O thread of their own, so that encrypting and copying media delays neither control nor state.
+Subscribers have topics of their own, which name their connection: a frame that one link has no room for is dropped for
+that subscriber alone, and levels are decided here instead of by the subscriber. The levels come from `service`.
 """
 
 from __future__ import annotations
@@ -23,25 +23,38 @@ from iris_session.protocol.media import CLASSES, parse_topic
 
 log = logging.getLogger(__name__)
 
-#: While a connection is full it is tried again after so long; else somebody comes to wake us.
+#: Retry period while a connection is full; otherwise a message wakes the thread.
 RETRY_MS: Final = 4
 IDLE_MS: Final = 50
-#: Messages taken of one socket before the others are looked at.
+#: Messages read of one socket per pass.
 ROUND: Final = 16
-#: Keys of sources that nobody has decided about yet.
+#: Keys of sources that are not decided about yet, at most.
 MAX_UNDECIDED: Final = 64
-#: When memory runs short, nothing is taken for so long.
+#: When memory is short, frames are dropped for so long.
 PAUSE_NS: Final = 2_000_000_000
-#: After a fault of ours nothing is done for so long: one that comes back must not take a whole processor.
+#: Pause after a fault of the proxy: a repeated fault must not use a whole processor.
 FAULT_S: Final = 0.25
 _SUBSCRIBE: Final = 1
 
 
 class MediaProxy:
-    """`hub`, `sources` and `asking` belong to `lock`.
+    """Receive, schedule and send media in a thread.
 
-    `sources`: keys that may hand in frames (the empty one: who needs none). `asking`: keys that try to, and that nobody
-    has decided about yet; `refused`: those that may not. `guard`, `back_doors`: of `out` and of `remote`.
+    Attributes:
+        lock: Protects all attributes below.
+        scheduler: Streams, subscriptions and due frames.
+        sources: Keys that may hand in frames. Without encryption the key is empty and always allowed.
+        undecided: Keys that tried to and are not decided about yet.
+        refused: Keys that may not.
+
+    Args:
+        out: XPUB socket of the subscribers.
+        subscriber_guard: Guards `out`.
+        source_guard: Guards `remote`.
+        local: Socket for frames of this machine's processes.
+        remote: Socket for frames of other machines.
+        now_ns: Returns session time.
+        encrypted: Whether subscribers and remote sources have keys.
     """
 
     def __init__(
@@ -79,12 +92,12 @@ class MediaProxy:
         self._thread.start()
 
     def release_memory(self) -> str:
-        """Memory runs short: media are the first to go. What was closed; empty when there was nothing to be had."""
+        """Release all frames because memory is short. Return what was released, empty if there was nothing."""
         with self.lock:
             return "all media for 2 s" if self.scheduler.release_frames(self._now_ns() + PAUSE_NS) else ""
 
     def close(self) -> None:
-        """Waits for the end of the thread; the sockets are free then."""
+        """Wait for the end of the thread, then close the sockets."""
         self._stopping = True
         if self._thread.ident is not None:
             self._thread.join()
@@ -98,11 +111,11 @@ class MediaProxy:
         while not self._stopping:
             try:
                 self._serve()
-            except Exception as error:  # a fault of ours: it costs what was under way, and media alone
+            except Exception as error:  # a fault of the proxy costs frames under way, and affects media alone
                 self._recover(error)
 
     def _recover(self, error: Exception) -> None:
-        """Counts every fault, and tells each the first time in a row."""
+        """Count a fault, and log it unless it repeats the last one."""
         with self.lock:
             self.scheduler.reset()
             self.scheduler.count_drop("media_fault")
@@ -151,7 +164,7 @@ class MediaProxy:
             return False
         return True
 
-    # --- who wants what ----------------------------------------------------------------------------------------------
+    # --- subscriptions -----------------------------------------------------------------------------------------------
 
     def _receive_subscriptions(self) -> None:
         for _ in range(ROUND):
@@ -160,28 +173,28 @@ class MediaProxy:
             except zmq.Again:
                 return
             data = frame.bytes
-            wanted = parse_topic(data[1:]) if data[:1] in (b"\0", b"\1") else None
+            topic = parse_topic(data[1:]) if data[:1] in (b"\0", b"\1") else None
             descriptor = _read_descriptor(frame)
             if descriptor < 0:
-                continue  # libzmq takes back what a connection had that has ended: we noticed that end
+                continue  # libzmq unsubscribes a connection that has ended: its monitor reported that
             self._read_connection_events()
             user = self._read_user_id(frame)
             cut = self._subscriber_guard.record_message(descriptor, user, (len(data),), counts=True)
             with self.lock:
                 if cut:
                     self.scheduler.count_drop(cut)
-                elif wanted is None:
+                elif topic is None:
                     self.scheduler.count_drop("media_topic_unknown")
                 elif data[0] != _SUBSCRIBE:
-                    self.scheduler.unsubscribe(*wanted, descriptor)
+                    self.scheduler.unsubscribe(*topic, descriptor)
                     self._out.setsockopt(zmq.UNSUBSCRIBE, data[1:])
-                elif self.scheduler.subscribe(*wanted, user, descriptor):
+                elif self.scheduler.subscribe(*topic, user, descriptor):
                     self._out.setsockopt(zmq.SUBSCRIBE, data[1:])
 
     def _read_user_id(self, frame: zmq.Frame) -> str:
         return str(frame.get("User-Id")) if self._encrypted else ""
 
-    # --- what comes in -----------------------------------------------------------------------------------------------
+    # --- frames ------------------------------------------------------------------------------------------------------
 
     def _receive_frames(self, socket: zmq.Socket[bytes]) -> None:
         for _ in range(ROUND):
@@ -203,16 +216,16 @@ class MediaProxy:
     def _handle_remote_frames(self, frames: list[zmq.Frame], lengths: list[int]) -> None:
         user = self._read_user_id(frames[0])
         with self.lock:
-            welcome = not user or user in self.sources
-            if not welcome:
+            allowed = not user or user in self.sources
+            if not allowed:
                 self.scheduler.count_drop("media_source_refused" if user in self.refused else "media_source_undecided")
                 if user not in self.refused and len(self.undecided) < MAX_UNDECIDED:
                     self.undecided.add(user)
         self._source_guard.read_events(self._now_ns())
-        cut = self._source_guard.record_message(_read_descriptor(frames[0]), user, lengths, counts=not welcome)
+        cut = self._source_guard.record_message(_read_descriptor(frames[0]), user, lengths, counts=not allowed)
         with self.lock:
             self._count_reasons((cut,))
-        if welcome:
+        if allowed:
             self._push_frames(frames, user)
 
     def _push_frames(self, frames: list[zmq.Frame], user: str) -> None:
@@ -228,7 +241,7 @@ class MediaProxy:
 
 
 def _read_descriptor(frame: zmq.Frame) -> int:
-    """Of the TCP connection that it came by, -1 where libzmq does not tell."""
+    """Return the descriptor of a frame's TCP connection, -1 if libzmq does not know it."""
     try:
         return int(frame.get(zmq.SRCFD))
     except zmq.ZMQError:

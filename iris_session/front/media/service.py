@@ -10,7 +10,7 @@ from typing import Any, Final
 from iris_session.front.context import FrontContext
 from iris_session.front.media.budget import (
     MILLISECOND,
-    NOTHING,
+    NONE_LEVEL,
     BudgetController,
     BudgetGrant,
     LinkMeasure,
@@ -40,7 +40,7 @@ class _ClientState:
         self.frames = 0  # that the state socket had sent at the time of the report
         self.counters = DeliveryCounters()
         self.grant = BudgetGrant({})
-        self.wanted: list[str] = []
+        self.streams: list[str] = []
         self.bytes_per_s = 0.0
         self.drops = 0
         self.budget: tuple[Any, ...] | None = None
@@ -60,7 +60,7 @@ class MediaService:
         self._proxy = proxy
         self._controller = BudgetController() if context.config.adapt_media else None
         self._states: dict[int, _ClientState] = {}
-        self._facts: dict[str, StreamStats] = {}
+        self._stats: dict[str, StreamStats] = {}
         self._names: dict[str, str] = {}  # of sources, by key
         self._next_ns = 0
         self._connections_changed = False  # since the last tick
@@ -98,17 +98,17 @@ class MediaService:
             MediaStreamReport(
                 name, facts.hz, facts.rates[0] / MBIT, self._names.get(facts.source, ""), facts.subscribers
             )
-            for name, facts in self._facts.items()
+            for name, facts in self._stats.items()
         )
 
     def report_participant(self, number: int) -> dict[str, Any]:
         """Return the media fields of a `ParticipantReport`."""
         state = self._states.get(number)
-        if state is None or not state.wanted:
+        if state is None or not state.streams:
             return {}
         return {
             "budget_class": _lowest_class(state),
-            "media": tuple(self._make_stream_budget(state, stream) for stream in state.wanted),
+            "media": tuple(self._make_stream_budget(state, stream) for stream in state.streams),
             "media_bytes_per_s": state.bytes_per_s,
             "media_drops": state.drops,
         }
@@ -128,7 +128,7 @@ class MediaService:
         proxy = self._proxy
         with proxy.lock:
             proxy.scheduler.sample_rates(now_ns)
-            self._facts = proxy.scheduler.read_streams()
+            self._stats = proxy.scheduler.read_streams()
             reasons, superseded = proxy.scheduler.pop_drops()
             wanted = {number: proxy.scheduler.list_subscriptions(number) for number in self._states}
             tallies = {number: proxy.scheduler.read_counters(number) for number in self._states}
@@ -140,7 +140,7 @@ class MediaService:
             if number in self._states:
                 self._states[number].drops += count
         for number, state in self._states.items():
-            state.wanted = wanted[number]
+            state.streams = wanted[number]
             self._update_client(number, state, tallies[number], now_ns)
         self._publish_levels()
 
@@ -152,8 +152,8 @@ class MediaService:
             fresh = StateReport(report.age_ms_p50, self._missed_share(state, report))
         state.report = report or state.report
         limit = max(0.0, state.report.media_limit_mbit_per_s) * MBIT if state.report is not None else 0.0
-        measure = LinkMeasure(fresh, tally.taken - before.taken, tally.due - before.due, limit)
-        rates = {stream: self._facts[stream].rates for stream in state.wanted if stream in self._facts}
+        measure = LinkMeasure(fresh, tally.delivered - before.delivered, tally.due - before.due, limit)
+        rates = {stream: self._stats[stream].rates for stream in state.streams if stream in self._stats}
         if self._controller is not None:
             state.grant = self._controller.update(number, measure, rates, now_ns)
 
@@ -198,14 +198,14 @@ class MediaService:
 
     def _make_stream_budget(self, state: _ClientState, stream: str) -> StreamBudget:
         level = state.grant.levels.get(stream, _initial_level(state.grant))
-        facts = self._facts.get(stream)
-        rate = 0.0 if facts is None or level >= NOTHING else facts.rates[level]
+        facts = self._stats.get(stream)
+        rate = 0.0 if facts is None or level >= NONE_LEVEL else facts.rates[level]
         return StreamBudget(stream, CLASSES[level], round(rate / MBIT, 3))
 
     def _send_budgets(self) -> None:
         """Send budgets that have changed, other than in their rates."""
         for number, state in self._states.items():
-            streams = tuple(self._make_stream_budget(state, stream) for stream in self._facts)
+            streams = tuple(self._make_stream_budget(state, stream) for stream in self._stats)
             grant = state.grant
             content = (tuple((s.stream, s.budget_class) for s in streams), _lowest_class(state), grant.reason)
             if content == state.budget:
@@ -219,8 +219,8 @@ class MediaService:
 
 def _initial_level(grant: BudgetGrant) -> int:
     """Return the level of a stream that the controller has not seen for this client yet."""
-    return NOTHING if grant.bytes_per_s and grant.reason else 0
+    return NONE_LEVEL if grant.bytes_per_s and grant.reason else 0
 
 
 def _lowest_class(state: _ClientState) -> str:
-    return CLASSES[max(state.grant.levels.values(), default=0)] if state.wanted else BudgetClass.FULL
+    return CLASSES[max(state.grant.levels.values(), default=0)] if state.streams else BudgetClass.FULL
