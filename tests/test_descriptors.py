@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from iris_session.cli.live import LiveView
+from iris_session.cli.live import TerminalView
 from iris_session.emulator.orders import Orders
 from iris_session.netsim.process import ImpairmentProcess
 from iris_session.protocol.server_messages import Event, MarkerAdded
@@ -37,7 +37,7 @@ def crowded() -> Iterator[None]:
 
 
 class _Session:
-    """What `LiveView` asks of a session; its status fills a pipe, so that the display must be waited for."""
+    """What `TerminalView` asks of a session; its status fills a pipe, so that the display must be waited for."""
 
     def recent_events(self) -> list[Event]:
         return [Event(1, 0, 0, MarkerAdded("p1", "hello"))]
@@ -74,7 +74,7 @@ def test_processes_are_heard(tmp_path: Path) -> None:
     with ImpairmentProcess({"127.0.0.2": "none"}, []) as proxy:
         assert proxy.execute("stats")["ok"]
     with (tmp_path / "shown").open("w+") as out:
-        with LiveView(_Session(), out, "title").open() as update:  # type: ignore[arg-type]
+        with TerminalView(_Session(), out, "title").open() as update:  # type: ignore[arg-type]
             update()
         out.seek(0)
         assert "hello" in out.read()

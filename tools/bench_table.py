@@ -1,10 +1,10 @@
-"""Runs the benchmarks of a session under every profile and prints the table of docs/evidence/links.md.
+"""Run the benchmarks of a session under every link profile and print the table of docs/evidence/links.md.
 
 python tools/bench_table.py --seconds 20 > table.md
 python tools/bench_table.py --profiles lan,busy-wifi --seconds 5 --json
 
-Exit status 1 when a benchmark failed. Ctrl-C (or SIGTERM) ends it with the table of what was measured till then, and
-"-" for the rest; exit status 130.
+Exit status 1 if a benchmark failed. Ctrl-C (or SIGTERM) prints the table of the measurements so far, with "-" for the
+rest; exit status 130.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def run(arguments: tuple[str, ...], profile: str, seconds: float, seed: int) -> 
         try:
             out, _ = bench.communicate()
         except KeyboardInterrupt:
-            bench.send_signal(signal.SIGINT)  # it ends its own processes; killed, it would leave them behind
+            bench.send_signal(signal.SIGINT)  # it ends its own processes; if killed, it would leave them
             bench.communicate()
             raise
     if bench.returncode != 0:
@@ -74,7 +74,7 @@ def rows(reports: dict[str, dict[str, dict[str, Any]]], profiles: list[str]) -> 
 
 
 def cell(report: dict[str, Any] | None, key: str) -> str:
-    """Of a benchmark that was not run: "-"."""
+    """Return a cell of the table: "-" for a benchmark that was not run."""
     return "-" if report is None else number(report["results"].get(key, math.nan))
 
 

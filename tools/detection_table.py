@@ -1,10 +1,10 @@
-"""How well sheets are found: distance x tilt x resolution -> found, position and angle error, milliseconds.
+"""Measure the detection of sheets by distance, tilt and resolution: found, position and angle error, milliseconds.
 
     python tools/detection_table.py            the table of docs/anchors-howto.md, as Markdown
     python tools/detection_table.py --json     the same as one JSON object
 
-Prints a sheet as PDF, rasterises it, photographs it from random directions (`render_sheet.py`), and looks for it: the
-whole sheet, and beside it the bare code as OpenCV finds it.
+Renders a sheet as PDF, rasterises it, photographs it from random directions (`render_sheet.py`), and detects it: the
+whole sheet, and for comparison the code alone with OpenCV.
 """
 
 from __future__ import annotations

@@ -1,11 +1,13 @@
-"""Fuzzing: bytes and conversations of nobody honest, for every decoder and every state machine that has a socket.
+"""Fuzz every decoder and every state machine behind a socket with hostile bytes and conversations.
 
     python tools/fuzz.py --target all --inputs 1000000 --seed 1
     python tools/fuzz.py --target client,front --inputs 20000 --json
 
-Inputs are made from the schemas of the messages, right and wrong, and damaged as bytes. A finding is an exception
-that is not the one that a target promises, a broken invariant, or memory that grows; its input is saved, and it
-comes again with the same seed. Exit status 1 when there is one. `--list` names the targets.
+Inputs are generated from the schemas of the messages, valid and invalid, and then damaged as bytes. A finding is an
+exception that a target does not promise, a broken invariant, or memory that grows. Its input is saved, and the same
+seed reproduces it. Prints a table row per target, or one JSON object; exit status 1 if there is a finding.
+
+Decoders are in `fuzz_decoders`, conversations in `fuzz_state_machines`.
 """
 
 from __future__ import annotations
@@ -25,16 +27,16 @@ from fuzz_decoders import DECODERS
 from fuzz_state_machines import ALL_TYPES, MACHINES
 
 TARGETS: Final = {**DECODERS, **MACHINES}
-#: What a target may hold more than after its first inputs.
+#: Allowed growth of memory above that after the first inputs.
 MAX_GROWTH_MIB: Final = 64
 WARM_UP: Final = 5000
-LOOK_EVERY: Final = 1000
+MEASURE_EVERY: Final = 1000
 MAX_FINDINGS: Final = 5
 
 
 @dataclass
 class Result:
-    """What became of one target. `growth_mib`: peak of resident memory above that after the first inputs."""
+    """Result of one target. `growth_mib`: peak of resident memory above that after the first inputs."""
 
     target: str
     inputs: int = 0
@@ -50,7 +52,7 @@ class Result:
 
 
 def fuzz(name: str, inputs: int, seed: int, save: Path | None = None, limit_s: float = float("inf")) -> Result:
-    """Gives `inputs` inputs to a target, or what fits into `limit_s`."""
+    """Feed `inputs` inputs to a target, or as many as fit into `limit_s`."""
     result = Result(name)
     target = TARGETS[name](Random(f"{seed}:{name}"))
     process = getattr(target, "process", None) or psutil.Process()
@@ -61,15 +63,15 @@ def fuzz(name: str, inputs: int, seed: int, save: Path | None = None, limit_s: f
         for i in range(inputs):
             data = target.make()
             try:
-                result.accepted += bool(target.take(data))
-            except Exception as error:  # whatever it is: that is what we look for
+                result.accepted += bool(target.feed(data))
+            except Exception as error:  # any other exception is a finding
                 where = traceback.extract_tb(error.__traceback__)[-1]
                 place = f"{type(error).__name__} at {Path(where.filename).name}:{where.lineno}"
                 if place not in seen:
                     seen.add(place)
-                    result.findings.append(finding(name, seed, i, data, f"{place}: {error}"[:500], save))
+                    result.findings.append(make_finding(name, seed, i, data, f"{place}: {error}"[:500], save))
             result.inputs = i + 1
-            if i % LOOK_EVERY == 0:
+            if i % MEASURE_EVERY == 0:
                 rss = process.memory_info().rss
                 result.peak_rss_mib = max(result.peak_rss_mib, rss / 2**20)
                 base = max(base, rss) if i <= WARM_UP else base
@@ -81,16 +83,19 @@ def fuzz(name: str, inputs: int, seed: int, save: Path | None = None, limit_s: f
     result.growth_mib = max(0.0, result.peak_rss_mib - base / 2**20)
     if result.growth_mib > MAX_GROWTH_MIB:
         result.findings.append(
-            finding(name, seed, result.inputs, b"", f"memory grew by {result.growth_mib:.0f} MiB", None)
+            make_finding(name, seed, result.inputs, b"", f"memory grew by {result.growth_mib:.0f} MiB", None)
         )
     if name in ("client", "front") and inputs > WARM_UP:
         missing = sorted(ALL_TYPES - getattr(target, "types", ALL_TYPES))
         if missing:
-            result.findings.append(finding(name, seed, result.inputs, b"", f"never sent: {', '.join(missing)}", None))
+            result.findings.append(
+                make_finding(name, seed, result.inputs, b"", f"never sent: {', '.join(missing)}", None)
+            )
     return result
 
 
-def finding(name: str, seed: int, number: int, data: bytes, text: str, save: Path | None) -> dict[str, Any]:
+def make_finding(name: str, seed: int, number: int, data: bytes, text: str, save: Path | None) -> dict[str, Any]:
+    """Return a finding as a JSON object, and save its input."""
     path = ""
     if save is not None:
         save.mkdir(parents=True, exist_ok=True)
@@ -100,7 +105,8 @@ def finding(name: str, seed: int, number: int, data: bytes, text: str, save: Pat
     return {"target": name, "seed": seed, "input": number, "text": text, "saved": path}
 
 
-def line(result: Result) -> str:
+def format_row(result: Result) -> str:
+    """Return a row of the table."""
     return (
         f"| {result.target} | {result.inputs:,} | {result.accepted / max(1, result.inputs):.0%} | {result.rate:,.0f} | "
         f"{result.peak_rss_mib:.0f} | {result.growth_mib:.1f} | {len(result.findings)} |"
@@ -109,13 +115,13 @@ def line(result: Result) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--target", default="all", help="names with commas between them, or all")
-    parser.add_argument("--inputs", type=int, default=10_000, help="for each target")
+    parser.add_argument("--target", default="all", help="comma-separated names, or all")
+    parser.add_argument("--inputs", type=int, default=10_000, help="inputs per target")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--limit", type=float, default=float("inf"), help="seconds for each target at most")
+    parser.add_argument("--limit", type=float, default=float("inf"), help="at most this many seconds per target")
     parser.add_argument("--save", type=Path, default=Path("fuzz-findings"), help="folder for inputs of findings")
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--list", action="store_true")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    parser.add_argument("--list", action="store_true", help="list the targets")
     arguments = parser.parse_args()
     if arguments.list:
         print("\n".join(TARGETS))
@@ -131,7 +137,7 @@ def main() -> int:
     for name in names:
         results.append(fuzz(name, arguments.inputs, arguments.seed, arguments.save, arguments.limit))
         if not arguments.json:
-            print(line(results[-1]), flush=True)
+            print(format_row(results[-1]), flush=True)
     findings = [one for result in results for one in result.findings]
     if arguments.json:
         print(json.dumps({"ok": not findings, "results": [{**asdict(r), "per_second": r.rate} for r in results]}))

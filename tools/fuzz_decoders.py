@@ -1,4 +1,8 @@
-"""Inputs for `fuzz.py`: values of any message type from its schema, right and wrong, and damage to encoded bytes."""
+"""Inputs and decoders of `fuzz.py`.
+
+Inputs are values of any message type generated from its schema, valid and invalid, and damaged as bytes. Each decoder
+is a target with the errors that it may raise.
+"""
 
 from __future__ import annotations
 
@@ -69,15 +73,15 @@ WORDS: Final = (
     "operator", "director", "observer", "measured", "not_needed", "exclusive", "start",
     "left\n[red]", "ß" * 64, "\x00", "\U0001d518",
 )  # fmt: skip
-#: MessagePack markers: containers and texts that claim a length, extensions, numbers, what is never used.
+#: MessagePack markers: containers and texts with a length, extensions, numbers, and the unused marker.
 MARKERS: Final = bytes((0xC1, 0xC0, 0xC2, 0xC4, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCF, 0xD3, 0xD4, 0xD9, 0xDB, 0xDC, 0xDD,
                         0xDE, 0xDF, 0x80, 0x8F, 0x90, 0x9F, 0xA0, 0xBF, 0xFF, 0x7F, 0x00))  # fmt: skip
-#: Containers that claim more than there is, and depth.
+#: Containers that claim more content than there is, and deep nesting.
 LIES: Final = (
     b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xdb\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff", b"\xdc\xff\xff",
     b"\xde\xff\xff", b"\x91" * 200, b"\x81\xa1x" * 200, b"\x91" * 5000, b"\xd9\xff", b"\xc9\xff\xff\xff\xff\x01",
 )  # fmt: skip
-#: One field in so many is of another type, too long, or missing.
+#: One field in this many has another type, is too long, or is missing.
 WRONG: Final = 200
 
 
@@ -87,7 +91,7 @@ def schema(kind: Any) -> inspect.Type:
 
 
 def encoded(rng: Random, kind: Any) -> bytes:
-    """MessagePack of a value of `kind`, most often a right one."""
+    """Return MessagePack of a value of `kind`, mostly a valid one."""
     return msgspec.msgpack.encode(value(rng, schema(kind)))
 
 
@@ -96,14 +100,14 @@ def encoded_json(rng: Random, kind: Any) -> bytes:
 
 
 def value(rng: Random, kind: inspect.Type) -> Any:
-    """A value of plain types as `kind` describes it."""
+    """Return a value of builtin types that `kind` describes."""
     if not rng.randrange(WRONG):
         return wrong(rng)
     return _MAKERS[type(kind)](rng, kind)
 
 
 def wrong(rng: Random) -> Any:
-    """Anything."""
+    """Return a value of any type."""
     nested: Any = 0
     for _ in range(rng.choice((1, 3, 40))):
         nested = [nested]
@@ -183,7 +187,7 @@ _MAKERS: Final[dict[type, Callable[[Random, Any], Any]]] = {
 
 
 class Corpus:
-    """Encoded values of some kinds, always fresh ones; `damaged` gives one of them, as it is or damaged."""
+    """Changing collection of encoded values; `damaged` returns one of them, unchanged or damaged."""
 
     SIZE: Final = 256
 
@@ -206,7 +210,7 @@ class Corpus:
 
 
 def damage(rng: Random, data: bytes, other: bytes) -> bytes:
-    """One to three changes to `data`; `other` is what may be spliced in."""
+    """Return `data` with one to three changes; `other` may be spliced in."""
     changed = bytearray(data)
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         at = rng.randrange(len(changed) + 1)
@@ -241,7 +245,7 @@ _decode_keyframe = decoder(journal.Keyframe)
 
 
 class Decoder:
-    """One target: `make` gives the next input, `take` decodes it. True: accepted; false: refused as it should be."""
+    """Target of bytes: `make` returns the next input; `feed` decodes it and returns whether it was accepted."""
 
     def __init__(self, rng: Random, make: Sequence[Make], decode: Callable[[bytes], Any], refusals: Errors) -> None:
         self._corpus = Corpus(rng, make)
@@ -251,7 +255,7 @@ class Decoder:
     def make(self) -> bytes:
         return self._corpus.damaged()
 
-    def take(self, data: bytes) -> bool:
+    def feed(self, data: bytes) -> bool:
         try:
             self._decode(data)
         except self._refusals:
@@ -259,11 +263,11 @@ class Decoder:
         return True
 
     def close(self) -> None:
-        """Nothing was opened."""
+        """Nothing to close."""
 
 
 def _envelope(kind: Any, message_types: dict[str, type]) -> list[Make]:
-    """Makers of envelopes: one per message type, so that each comes as often."""
+    """Return generators of envelopes: one per message type, so that all are equally frequent."""
 
     def of(tag: str) -> Make:
         def make(rng: Random) -> bytes:
@@ -290,7 +294,7 @@ def server_messages() -> list[Make]:
 
 
 def rigid_frames(n_bodies: int) -> Make:
-    """Frames of an encoder of which some bodies moved, behind `state_seq` and `base_seq`."""
+    """Return a generator of frames of moving bodies, prefixed with `state_seq` and `base_seq`."""
     encoders: dict[int, RigidEncoder] = {}
 
     def make(rng: Random) -> bytes:
@@ -310,14 +314,14 @@ def rigid_frames(n_bodies: int) -> Make:
     return make
 
 
-def take_rigid(n_bodies: int) -> Callable[[bytes], None]:
+def make_rigid_check(n_bodies: int) -> Callable[[bytes], None]:
     decoder = RigidDecoder(n_bodies)
 
     def take(data: bytes) -> None:
         if len(data) < 16:
             raise StreamError("no frame")
         state_seq, base_seq = struct.unpack_from("<qq", data)
-        if state_seq > 1000:  # a high number would make the decoder pass over everything after it
+        if state_seq > 1000:  # the decoder would skip everything after a high number
             state_seq %= 1000
         before = decoder.poses.copy()
         try:
@@ -333,7 +337,7 @@ def take_rigid(n_bodies: int) -> Callable[[bytes], None]:
 
 
 def check_journal(data: bytes) -> None:
-    """Rows of a damaged file: decoded, then checked as `verify` does."""
+    """Decode the rows of a damaged file and check them as `verify` does."""
     for row in messages.decode_batch(data).rows:
         journal.check_row(b"\0" * 16, row)
         journal.check_fields(row)
@@ -344,7 +348,7 @@ def check_keyframe(data: bytes) -> None:
     journal.check_keyframe(_decode_keyframe(data))
 
 
-def address_texts(rng: Random) -> bytes:
+def make_address(rng: Random) -> bytes:
     key = rng.choice(("A" * 43, "AAAA", "", "_-" * 21 + "A"))
     code = rng.choice(("7KQ2-M4XD-9PTR", "7kq2m4xd9ptr", "x", "%F0%9F", ""))
     host = rng.choice(("10.0.0.5", "[::1]", "lab.local", "::1", "²", "", "%", "[", "lab:²", "x" * 300))
@@ -354,22 +358,22 @@ def address_texts(rng: Random) -> bytes:
     return f"iris://{host}{port}/?k={key}&c={code}&n={rng.choice(('lab', '%00', 'ü'))}".encode()
 
 
-def take_address(data: bytes) -> None:
+def check_address(data: bytes) -> None:
     Address.parse(data.decode(errors="replace"))
 
 
-def take_introduction(data: bytes) -> None:
+def check_introduction(data: bytes) -> None:
     introduction = codec.decode_introduction(data)
     if introduction is not None:
         is_plausible(introduction.beacon)
 
 
-def take_beacon(data: bytes) -> None:
+def check_beacon(data: bytes) -> None:
     is_plausible(codec.decode_beacon(data))
 
 
-def _of_this_version(rng: Random, kind: Any) -> Any:
-    """A beacon, or something with a beacon in it, mostly of our version of the protocol."""
+def _make_versioned(rng: Random, kind: Any) -> Any:
+    """Return a beacon, or a message with a beacon, mostly of our protocol version."""
     made = msgspec.msgpack.decode(encoded(rng, kind))
     if isinstance(made, dict) and rng.random() < 0.95:
         beacon = made.get("beacon", made)
@@ -379,17 +383,17 @@ def _of_this_version(rng: Random, kind: Any) -> Any:
 
 
 def _beacons(rng: Random) -> bytes:
-    return msgspec.msgpack.encode(_of_this_version(rng, Beacon))
+    return msgspec.msgpack.encode(_make_versioned(rng, Beacon))
 
 
 def _introductions(rng: Random) -> bytes:
-    body = msgspec.msgpack.encode(_of_this_version(rng, Introduction))
+    body = msgspec.msgpack.encode(_make_versioned(rng, Introduction))
     length = len(body) if rng.random() < 0.9 else rng.choice((0, 1, 4001, 2**32 - 1))
     return length.to_bytes(4, "big") + body
 
 
 class KeyFiles(Decoder):
-    """Files of the home of keys, each read as its owner reads it."""
+    """Target of key files: each is read as the program reads it."""
 
     def __init__(
         self, rng: Random, kind: Any, read: Callable[[PrivateFolder], Any], name: str, certificate: Make | None = None
@@ -413,7 +417,7 @@ class KeyFiles(Decoder):
         self._folder.cleanup()
 
 
-#: A pair of the manual of zmq_curve: a public key that is not the secret one's is refused.
+#: Key pair from the manual of zmq_curve: a public key that does not match the secret one is refused.
 _PUBLIC: Final = r"rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7"
 _SECRET: Final = r"JTKVSB%%)wK0E.X)V>+}o?pNmC{O&4W4b!Ni{Lh6"
 
@@ -424,11 +428,11 @@ def _certificate(rng: Random) -> bytes:
     return "\n".join(line for line in lines if rng.random() < 0.95).encode()
 
 
-def plain(kind: Any, decode: Callable[[bytes], Any], refusals: Errors) -> Callable[[Random], Decoder]:
+def decode_plain(kind: Any, decode: Callable[[bytes], Any], refusals: Errors) -> Callable[[Random], Decoder]:
     return lambda rng: Decoder(rng, [lambda rng: encoded(rng, kind)], decode, refusals)
 
 
-#: What somebody honest publishes and watches all the while.
+#: Stream of the honest publisher and viewer.
 HONEST: Final = "honest"
 
 
@@ -438,7 +442,7 @@ def make_media_topic(rng: Random) -> bytes:
 
 
 def make_media_push(rng: Random) -> bytes:
-    """As a source sends it, often enough for the hub to take it: stream names and classes of the protocol."""
+    """Return a push as a source sends it, mostly with stream names and classes of the protocol."""
     if rng.random() < 0.3:
         return encoded(rng, MediaPush)
     classes = tuple(rng.sample(CLASSES, rng.randrange(1, len(CLASSES))))
@@ -451,7 +455,7 @@ def check_media_topic(data: bytes) -> None:
         raise ValueError
 
 
-#: What somebody honest fetches all the while.
+#: Asset that the honest client fetches.
 PICTURE: Final = bytes(range(256)) * 1000
 
 
@@ -460,7 +464,7 @@ def asset_address(data: bytes) -> str:
 
 
 def make_asset_request(rng: Random) -> bytes:
-    """As a client sends it, often enough for the hub to take it."""
+    """Return a request as a client sends it, mostly acceptable."""
     if rng.random() < 0.3:
         return encoded(rng, AssetRequest)
     address = rng.choice(
@@ -468,12 +472,12 @@ def make_asset_request(rng: Random) -> bytes:
     )
     offset = rng.choice((0, 0, 1000, len(PICTURE), len(PICTURE) + 1, 2**62))
     length = rng.choice((1, 1000, MAX_ASSET_CHUNK_BYTES, MAX_ASSET_CHUNK_BYTES + 1, 0, 2**62))
-    epoch = rng.choice((2, 2, 2, 3, 0, 2**62))  # the second to come is nobody honest; the first is let alone
+    epoch = rng.choice((2, 2, 2, 3, 0, 2**62))  # the second connection is hostile; the first is the honest client
     return codec.encode_asset_request(AssetRequest(1, epoch, rng.getrandbits(30), address, offset, length))
 
 
 def _encode_versioned(rng: Random, kind: type[msgspec.Struct]) -> bytes:
-    """Bytes of a struct, more often than not of our version."""
+    """Encode a struct, mostly with our version."""
     data = encoded(rng, kind)
     return data[:1] + b"\x01" + data[2:] if rng.random() < 0.7 else data
 
@@ -484,21 +488,21 @@ DECODERS: Final[dict[str, Callable[[Random], Any]]] = {
     "client": lambda rng: Decoder(rng, client_messages(), codec.decode_client, _OURS),
     "server": lambda rng: Decoder(rng, server_messages(), codec.decode_server, _OURS),
     "version": lambda rng: Decoder(rng, client_messages(), codec.peek_version, _OURS),
-    "state-header": plain(StateHeader, codec.decode_state_header, _OURS),
-    "presence": plain(Presence, codec.decode_presence, _OURS),
-    "beacon": lambda rng: Decoder(rng, [_beacons], take_beacon, _OURS),
-    "introduction": lambda rng: Decoder(rng, [_introductions], take_introduction, _OURS),
-    "rigid": lambda rng: Decoder(rng, [rigid_frames(7)], take_rigid(7), (StreamError,)),
-    "address": lambda rng: Decoder(rng, [address_texts], take_address, (ClientError,)),
-    "entry": plain(entries.Entry, entries.decode_entry, _ENTRIES),
-    "entries": plain(list[entries.Entry], entries.decode_entries, _ENTRIES),
-    "link-decided": plain(link.Decided, link.decode_decided, _ENTRIES),
-    "link-status": plain(link.FrontStatus, link.decode_status, _ENTRIES),
-    "link-ports": plain(Ports, link.decode_ports, _ENTRIES),
-    "link-scene": plain(SceneInfo, link.decode_scene, _ENTRIES),
-    "journal-rows": plain(messages.Batch, check_journal, _ENTRIES),
-    "journal-header": plain(journal.SessionHeader, messages.decode_header, _ENTRIES),
-    "journal-keyframe": plain(journal.Keyframe, check_keyframe, _ENTRIES),
+    "state-header": decode_plain(StateHeader, codec.decode_state_header, _OURS),
+    "presence": decode_plain(Presence, codec.decode_presence, _OURS),
+    "beacon": lambda rng: Decoder(rng, [_beacons], check_beacon, _OURS),
+    "introduction": lambda rng: Decoder(rng, [_introductions], check_introduction, _OURS),
+    "rigid": lambda rng: Decoder(rng, [rigid_frames(7)], make_rigid_check(7), (StreamError,)),
+    "address": lambda rng: Decoder(rng, [make_address], check_address, (ClientError,)),
+    "entry": decode_plain(entries.Entry, entries.decode_entry, _ENTRIES),
+    "entries": decode_plain(list[entries.Entry], entries.decode_entries, _ENTRIES),
+    "link-decided": decode_plain(link.Decided, link.decode_decided, _ENTRIES),
+    "link-status": decode_plain(link.FrontStatus, link.decode_status, _ENTRIES),
+    "link-ports": decode_plain(Ports, link.decode_ports, _ENTRIES),
+    "link-scene": decode_plain(SceneInfo, link.decode_scene, _ENTRIES),
+    "journal-rows": decode_plain(messages.Batch, check_journal, _ENTRIES),
+    "journal-header": decode_plain(journal.SessionHeader, messages.decode_header, _ENTRIES),
+    "journal-keyframe": decode_plain(journal.Keyframe, check_keyframe, _ENTRIES),
     "keys-clients": lambda rng: KeyFiles(rng, list[AllowedKey], lambda f: AllowList(f).read(), "clients.json"),
     "keys-codes": lambda rng: KeyFiles(rng, list[JoinCode], lambda f: JoinCodes(f).read(), "join_codes.json"),
     "keys-servers": lambda rng: KeyFiles(

@@ -1,6 +1,6 @@
-"""What `fuzz.py` gives conversations to: a client's connection and state stream, the front over real sockets, the core.
+"""Conversations of `fuzz.py`: a client's connection, state stream and asset loader, a real front, and the core.
 
-Each keeps its state over many inputs, so a finding is repeated by its seed and number, not by its bytes alone.
+Each target keeps its state over many inputs, so a finding is reproduced by seed and number, not by its bytes alone.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ MS: Final = 1_000_000
 
 
 class HostileSession:
-    """A client that a hostile session talks to: after an honest welcome now and then, anything."""
+    """Client connection that talks to a hostile session; some of its welcomes are valid."""
 
     def __init__(self, rng: Random) -> None:
         self._rng = rng
@@ -91,7 +91,7 @@ class HostileSession:
             return encode_server(ServerEnvelope(PROTOCOL_VERSION, 7, ClockPong(self._now_ns - MS, 0, 0)))
         return self._corpus.damaged()
 
-    def take(self, data: bytes) -> bool:
+    def feed(self, data: bytes) -> bool:
         rng, connection = self._rng, self.connection
         malformed = connection.counters.malformed
         bulk = [rng.randbytes(rng.choice((0, 56, 57, 112)))] if rng.random() < 0.3 else []
@@ -112,11 +112,11 @@ class HostileSession:
         return connection.counters.malformed == malformed
 
     def close(self) -> None:
-        """Nothing was opened."""
+        """Nothing to close."""
 
 
 class ClientState:
-    """State frames and presence from a hostile session."""
+    """State stream of a client that receives from a hostile session."""
 
     def __init__(self, rng: Random) -> None:
         self._rng = rng
@@ -143,7 +143,7 @@ class ClientState:
             frames = rng.choice(([b""], [TOPIC_RIGID], [b"x", b"y"], [*frames, b"more"]))
         return msgspec.msgpack.encode(frames)
 
-    def take(self, data: bytes) -> bool:
+    def feed(self, data: bytes) -> bool:
         rng, stream = self._rng, self.stream
         if not rng.randrange(100):
             stream.reset()
@@ -156,20 +156,20 @@ class ClientState:
         return stream.counters.malformed == malformed
 
     def close(self) -> None:
-        """Nothing was opened."""
+        """Nothing to close."""
 
 
 class FrontControl:
-    """The control port of a real front process. Peers say hello and anything after it, whole or damaged.
+    """Control port of a real front process. Peers send hello, and then any messages, intact or damaged.
 
-    Every `BARRIER` inputs an honest client asks for the time: the front must answer, and hold no more than it may.
+    Every `BARRIER` inputs an honest client sends a ping: the front must answer, and stay within its memory limit.
     """
 
     BARRIER: Final = 2000
     PEERS: Final = 8
-    #: Inputs of one peer before a new one takes its place.
+    #: Inputs of one peer before a new one replaces it.
     LIFE: Final = 400
-    #: Further ones of the front.
+    #: Further settings of the front.
     SETTINGS: Final[Mapping[str, Any]] = {}
 
     def __init__(self, rng: Random) -> None:
@@ -193,8 +193,8 @@ class FrontControl:
     def make(self) -> bytes:
         return self._corpus.damaged()
 
-    def take(self, data: bytes) -> bool:
-        """True when the protocol lets it through to the front's state machine."""
+    def feed(self, data: bytes) -> bool:
+        """Send an input. Return whether the protocol passes it to the front's state machine."""
         rng = self._rng
         self._sent += 1
         peer = self._peer(rng.randrange(self.PEERS))
@@ -204,7 +204,7 @@ class FrontControl:
             accepted = None
         else:
             self.types.add(str(accepted.message.__struct_config__.tag))
-            if rng.random() < 0.7:  # as one who knows what the session said
+            if rng.random() < 0.7:  # as a peer that knows its connection epoch
                 data = encode_client(msgspec.structs.replace(accepted, connection_epoch=self._newest))
         extra = [b"extra"] if not rng.randrange(200) else []
         deadline = time.monotonic() + 10.0
@@ -213,18 +213,18 @@ class FrontControl:
                 peer.send_multipart([data, *extra], zmq.DONTWAIT)
                 break
             except zmq.Again:
-                assert time.monotonic() < deadline, "the front takes nothing"
-                self._turn()
+                assert time.monotonic() < deadline, "the front accepts nothing"
+                self._poll_session()
         if self._sent % 50 == 0:
-            self._turn()
+            self._poll_session()
             self._newest = max((self._newest, *(entry.connection for entry in self.session.entries)))
             self.session.entries.clear()
         if self._sent % self.BARRIER == 0:
             self._check()
         return accepted is not None
 
-    def _turn(self) -> None:
-        """The session goes on, with the same front: one that ended was replaced at once."""
+    def _poll_session(self) -> None:
+        """Poll the session, and check that the front was not replaced."""
         self.session.once()
         assert self.session.process.pid == self.process.pid, "the front ended"
 
@@ -255,7 +255,7 @@ class FrontControl:
         honest.inbox.clear()
         honest.send(ClockPing(self._sent))
         honest.wait_for(ClockPong)
-        self._turn()
+        self._poll_session()
         rss = self.process.memory_info().rss
         self.peak = max(self.peak, rss)
         assert rss - self.base < self.session.config.limits.memory_bytes, f"the front holds {rss >> 20} MiB"
@@ -267,7 +267,7 @@ class FrontControl:
 
 
 def _zmtp(rng: Random) -> bytes:
-    """What a ZeroMQ peer sends: greeting, READY, a message. Mechanism NULL or CURVE."""
+    """Return the bytes of a ZeroMQ peer: greeting, READY, a message. Mechanism NULL or CURVE."""
     mechanism = rng.choice((b"NULL", b"CURVE", b"PLAIN"))
     greeting = (
         b"\xff" + bytes(8) + b"\x7f\x03" + rng.choice((b"\x00", b"\x01")) + mechanism.ljust(20, b"\0") + bytes(32)
@@ -280,7 +280,7 @@ def _zmtp(rng: Random) -> bytes:
 
 
 class FrontTcp(FrontControl):
-    """Bytes of strangers on the ports of control, state and introduction: half and damaged handshakes."""
+    """TCP bytes on the ports of control, state and introduction: partial and damaged handshakes."""
 
     BARRIER: Final = 1000
 
@@ -289,7 +289,7 @@ class FrontTcp(FrontControl):
         self._corpus = Corpus(rng, [_zmtp])
         self._open: list[socket.socket] = []
 
-    def take(self, data: bytes) -> bool:
+    def feed(self, data: bytes) -> bool:
         rng, ports = self._rng, self.session.ports
         self._sent += 1
         port = rng.choice((ports.control, ports.control, ports.state, ports.control - 1))
@@ -300,7 +300,7 @@ class FrontTcp(FrontControl):
         try:
             one.sendall(data)
         except OSError:
-            one.close()  # it was refused before it had said all
+            one.close()  # the connection was refused before all was sent
             return False
         self._open.append(one)
         if len(self._open) > 64:
@@ -316,7 +316,7 @@ class FrontTcp(FrontControl):
 
 
 class Core:
-    """Authority, control and physics under random entries that the schema takes: `tests/session/fuzz_core.py`."""
+    """Authority, control and physics under random entries that the schema accepts: `tests/session/fuzz_core.py`."""
 
     def __init__(self, rng: Random) -> None:
         from tests.session.fuzz_core import Fuzz
@@ -327,8 +327,8 @@ class Core:
     def make(self) -> bytes:
         return b""
 
-    def take(self, data: bytes) -> bool:
-        """One entry is one input: steps get several, now and then many."""
+    def feed(self, data: bytes) -> bool:
+        """Step the core. One entry is one input: a step gets several, sometimes many."""
         if self._given > 0:
             self._given -= 1
             return True
@@ -339,21 +339,21 @@ class Core:
         return True
 
     def close(self) -> None:
-        """Nothing was opened."""
+        """Nothing to close."""
 
 
 # --- media ports ------------------------------------------------------------------------------------------------------
 
 
 class FrontMedia(FrontControl):
-    """The media ports of a real front: subscriptions to anything, frames of anything, in any number of parts.
+    """Media ports of a real front: any subscriptions, and any frames in any number of parts.
 
-    Every `BARRIER` inputs an honest viewer must get a frame that this session published after the last of them.
+    Every `BARRIER` inputs an honest viewer must get a frame that the session published after the last of them.
     """
 
     BARRIER: Final = 1000
     LIFE: Final = 300
-    #: Frames are handed in faster than by any source: whoever is sent so many is sent fewer for seconds, by design.
+    #: Frames are published faster than by any source; adaptive delivery would reduce them for seconds, by design.
     SETTINGS: Final = {"adapt_media": False}
 
     def __init__(self, rng: Random) -> None:
@@ -365,11 +365,11 @@ class FrontMedia(FrontControl):
         self._viewer.subscribe(media_topic(self._honest.epoch, HONEST))
 
     def make(self) -> bytes:
-        """The first byte says which port it is for."""
+        """Return an input; its first byte selects the port."""
         which = self._rng.randrange(2)
         return bytes((which,)) + self._corpora[which].damaged()
 
-    def take(self, data: bytes) -> bool:
+    def feed(self, data: bytes) -> bool:
         rng = self._rng
         self._sent += 1
         which, data = data[0], data[1:]
@@ -380,13 +380,13 @@ class FrontMedia(FrontControl):
             try:
                 peer.send_multipart([data, *parts] if which else [data], zmq.DONTWAIT)
                 break
-            except zmq.Again:  # it is being cut off, or the front is busy
-                assert time.monotonic() < deadline, "the front takes nothing"
-                self._turn()
+            except zmq.Again:  # the peer is being disconnected, or the front is busy
+                assert time.monotonic() < deadline, "the front accepts nothing"
+                self._poll_session()
         if self._sent % 50 == 0:
-            self._turn()
+            self._poll_session()
         if self._sent % self.BARRIER == 0:
-            self._see()
+            self._check_viewer()
             self._check()
         try:
             codec.decode_media_push(data) if which else check_media_topic(data)
@@ -397,15 +397,15 @@ class FrontMedia(FrontControl):
     def _media_peer(self, which: int, i: int) -> zmq.Socket[bytes]:
         i += which * self.PEERS
         while len(self._peers) <= i:
-            self._peers.append(self._connected(len(self._peers)))
+            self._peers.append(self._connect(len(self._peers)))
             self._lives.append(self.LIFE)
         self._lives[i] -= 1
         if self._lives[i] < 0:
             self._peers[i].close(linger=0)
-            self._peers[i], self._lives[i] = self._connected(i), self.LIFE
+            self._peers[i], self._lives[i] = self._connect(i), self.LIFE
         return self._peers[i]
 
-    def _connected(self, i: int) -> zmq.Socket[bytes]:
+    def _connect(self, i: int) -> zmq.Socket[bytes]:
         ports = self.session.ports
         kind, port = (zmq.XSUB, ports.media) if i < self.PEERS else (zmq.PUSH, ports.media_ingest)
         new = self.session.context.socket(kind)
@@ -414,23 +414,23 @@ class FrontMedia(FrontControl):
         new.connect(f"tcp://127.0.0.1:{port}")
         return new
 
-    def _see(self) -> None:
-        """The honest viewer gets a frame that is newer than everything before."""
+    def _check_viewer(self) -> None:
+        """Check that the honest viewer gets a frame that is newer than all before."""
         while self._viewer.poll(0):
             self._viewer.recv_multipart()
         deadline = time.monotonic() + 10.0
         while not self._viewer.poll(0):
-            assert time.monotonic() < deadline, "the honest viewer gets nothing"
+            assert time.monotonic() < deadline, "the honest viewer receives nothing"
             now_ns = self.session.process.link.now_ns
             self.session.process.publish_media(HONEST, b"picture", now_ns, 1, "bytes")
-            self._turn()
+            self._poll_session()
         topic, head, frame = self._viewer.recv_multipart()
         assert topic.startswith(media_topic(self._honest.epoch, HONEST)), topic
         assert codec.decode_media_header(head).stream == HONEST
         assert frame == b"picture"
 
     def _check(self) -> None:
-        for i in range(self.PEERS):  # what they subscribed to, and need not be read
+        for i in range(self.PEERS):  # discard what they subscribed to
             while i < len(self._peers) and self._peers[i].poll(0):
                 self._peers[i].recv_multipart()
         peers, self._peers = self._peers, []
@@ -451,7 +451,7 @@ _REASONS: Final = ("unknown_asset", "bad_range", "busy", "rate", "too_many_outst
 
 
 class LoaderMachine:
-    """The client's loader, and a session that answers anything to anything."""
+    """Asset loader of a client whose session sends arbitrary answers."""
 
     def __init__(self, rng: Random) -> None:
         self._rng = rng
@@ -470,7 +470,7 @@ class LoaderMachine:
         total = rng.choice((10, 2_000_000, 2**62))
         return codec.encode_asset_header(AssetChunk(1, number, address, offset, total))
 
-    def take(self, data: bytes) -> bool:
+    def feed(self, data: bytes) -> bool:
         rng, loader = self._rng, self._loader
         self._now_ns += rng.choice((0, 1_000_000, 3_000_000_000))
         try:
@@ -513,20 +513,20 @@ class LoaderMachine:
         return outcome_ == ""
 
     def _answered(self, number: int, *, fits: bool) -> None:
-        """An answer that fits its request says that those before it were lost."""
+        """Remove an answered request. An answer that fits shows that earlier requests were lost."""
         if number in {ask.request_id for ask in self._asks}:
             self._asks = [
                 ask for ask in self._asks if ask.request_id > number or (ask.request_id < number and not fits)
             ]
 
     def close(self) -> None:
-        """Nothing was opened."""
+        """Nothing to close."""
 
 
 class FrontAssets(FrontControl):
-    """The assets port of a real front: requests for anything, in any number of parts.
+    """Assets port of a real front: any requests, in any number of parts.
 
-    Every `BARRIER` inputs an honest client must get its picture, byte for byte.
+    Every `BARRIER` inputs an honest client must get its asset, byte for byte.
     """
 
     BARRIER: Final = 1000
@@ -548,31 +548,31 @@ class FrontAssets(FrontControl):
             assets=(asset_address(PICTURE), asset_address(b""), "../../etc/passwd"),
         )
         self.session.process.set_scene(shown)
-        self._reader = self._connected()
+        self._reader = self._connect()
         self.session.client().join()
 
     def make(self) -> bytes:
         return self._corpus.damaged()
 
-    def take(self, data: bytes) -> bool:
+    def feed(self, data: bytes) -> bool:
         rng = self._rng
         self._sent += 1
-        peer = self._peer_of(rng.randrange(self.PEERS))
+        peer = self._asset_peer(rng.randrange(self.PEERS))
         parts = [rng.randbytes(rng.choice((0, 1, 100))) for _ in range(rng.choice((0, 0, 0, 0, 1, 3)))]
         deadline = time.monotonic() + 10.0
         while True:
             try:
                 peer.send_multipart([data, *parts], zmq.DONTWAIT)
                 break
-            except zmq.Again:  # it is being cut off, or the front is busy
-                assert time.monotonic() < deadline, "the front takes nothing"
-                while peer.poll(0):  # libzmq connects again only after somebody has made room for what came
+            except zmq.Again:  # the peer is being disconnected, or the front is busy
+                assert time.monotonic() < deadline, "the front accepts nothing"
+                while peer.poll(0):  # libzmq reconnects only after received messages were read
                     peer.recv_multipart()
-                self._turn()
+                self._poll_session()
         if self._sent % 50 == 0:
-            self._turn()
+            self._poll_session()
         if self._sent % self.BARRIER == 0:
-            self._fetch()
+            self._check_fetch()
             self._check()
         try:
             codec.decode_asset_request(data)
@@ -580,29 +580,29 @@ class FrontAssets(FrontControl):
             return False
         return True
 
-    def _peer_of(self, i: int) -> zmq.Socket[bytes]:
+    def _asset_peer(self, i: int) -> zmq.Socket[bytes]:
         while len(self._peers) <= i:
-            self._peers.append(self._connected())
+            self._peers.append(self._connect())
             self._lives.append(self.LIFE)
         self._lives[i] -= 1
         if self._lives[i] < 0:
             self._peers[i].close(linger=0)
-            self._peers[i], self._lives[i] = self._connected(), self.LIFE
+            self._peers[i], self._lives[i] = self._connect(), self.LIFE
         return self._peers[i]
 
-    def _connected(self) -> zmq.Socket[bytes]:
+    def _connect(self) -> zmq.Socket[bytes]:
         new = self.session.context.socket(zmq.DEALER)
         new.linger = 0
         new.sndhwm = new.rcvhwm = 100
         new.connect(f"tcp://127.0.0.1:{self.session.ports.assets}")
         return new
 
-    def _fetch(self) -> None:
-        """The honest client gets its picture."""
+    def _check_fetch(self) -> None:
+        """Check that the honest client gets its asset."""
         deadline, asked_s = time.monotonic() + 20.0, 0.0
         self._sent_request = getattr(self, "_sent_request", 0)
         while True:
-            assert time.monotonic() < deadline, "the honest client gets nothing"
+            assert time.monotonic() < deadline, "the honest client receives nothing"
             if time.monotonic() > asked_s + 0.5:
                 asked_s = time.monotonic()
                 self._sent_request += 1
@@ -610,7 +610,7 @@ class FrontAssets(FrontControl):
                     1, self._honest.epoch, self._sent_request, asset_address(PICTURE), 0, MAX_ASSET_CHUNK_BYTES
                 )
                 self._reader.send(codec.encode_asset_request(request))
-            self._turn()
+            self._poll_session()
             if not self._reader.poll(0):
                 continue
             frames = self._reader.recv_multipart()
@@ -623,7 +623,7 @@ class FrontAssets(FrontControl):
                 return
 
     def _check(self) -> None:
-        for peer in self._peers:  # what they asked for, and need not be read
+        for peer in self._peers:  # discard what they requested
             while peer.poll(0):
                 peer.recv_multipart()
         peers, self._peers = self._peers, []

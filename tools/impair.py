@@ -1,10 +1,10 @@
-"""Puts a bad link between a session and its clients; or measures what the proxy itself adds.
+"""Put an impaired link between a session and its clients, or measure the delay of the proxy itself.
 
     python tools/impair.py --link 127.0.0.2=busy-wifi          clients join at 127.0.0.2:7721, docs/evidence/links.md
     python tools/impair.py measure --clients 16 --json
 
 `measure` sends what a session's state stream sends (60 messages of 3,700 bytes a second to each client) directly and
-over a link of profile `none`, alternately, and prints by how much the messages came later.
+over a link of profile `none`, alternately, and prints the added delay.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a slow link does to the age of state beside 20 Mbit/s of media, with and without adaptive delivery.
+"""Measure the age of state beside 20 Mbit/s of media on slow links, with and without adaptive delivery.
 
     python tools/media_link.py            prints the table of docs/evidence/links.md
 

@@ -1,4 +1,4 @@
-"""What `rerun rrd optimize` gives for a recording, and what it costs: size, chunks, and processor time of reading.
+"""Measure `rerun rrd optimize` on a recording: size, chunks, and processor time of reading.
 
     python tools/optimize_cost.py sessions/20261122T082921.884463Z-lab-1/session.rrd
 

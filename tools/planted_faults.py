@@ -1,13 +1,13 @@
-"""Plants faults, one after the other, and looks whether `iris-session doctor` names each of them.
+"""Plant faults one after the other, and check that `iris-session doctor` names each of them.
 
     python tools/planted_faults.py                 table of docs/evidence/doctor.md; exit status 1 when one is not named
     python tools/planted_faults.py --only revoked --only full-disk --verbose
     python tools/planted_faults.py --list
 
-The faults are in `tools/planted.py`, the two machines in `tools/planted_lab.py`: needs Linux, root, `ip` and `nft`. A
-fault counts as named when the check that stands for it is not well and says the words that name it, when no other check
-failed but those that follow from it, when the exit status is that of its state, and when all fits on one screen.
-Before and after, the doctor must find nothing failed, else nothing is shown.
+The two machines are emulated by `planted_lab`: needs Linux, root, `ip` and `nft`. A fault counts as named when its
+check has the expected state and its text has the expected words, when no other check failed except those that follow
+from the fault, when the exit status fits, and when the output fits on one screen. Before and after, the doctor must
+find nothing failed; otherwise the result does not count. Prints a Markdown table.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from planted_lab import COMMAND, Lab, LabError, Machine, require, system, wait
+from planted_lab import COMMAND, Lab, LabError, Machine, check_requirements, system, wait
 
 from iris_session.cli.doctor import format_findings, format_verdict
 from iris_session.doctor.findings import FAILED, WARNING, Finding
@@ -56,11 +56,11 @@ with Session(scene_path("handover"), config=config) as session:
     print("on", session.address, flush=True)
     session.run()
 """
-#: Another address of the server, at which the link is bad.
+#: Second address of the server, behind an impaired link.
 BEHIND: Final = "10.77.2.3"
-#: Looks at the sheet all the time, so that what the bump did is seen.
+#: Observes the sheet all the time, so that the effect of the bump is detected.
 BUMPED: Final = "name=ann,behaviour=idle,robot=left,glance_every_s=2,bump_m=0.2/0/0"
-#: A session of the next protocol version, as far as a doctor sees it.
+#: Introduction of a session of the next protocol version.
 FUTURE: Final = """
 import socket
 from iris_session.protocol.codec import encode_introduction
@@ -70,27 +70,27 @@ said = Introduction(Beacon(PROTOCOL_VERSION + 1, "s2", "future", "live", "10.77.
 introducing, control = (socket.create_server(("10.77.2.1", port)) for port in (7750, 7751))
 print("listens", flush=True)
 while True:
-    visitor, _ = introducing.accept()
-    with visitor:
-        visitor.sendall(encode_introduction(said))
+    peer, _ = introducing.accept()
+    with peer:
+        peer.sendall(encode_introduction(said))
 """
 
 
 @dataclass(frozen=True)
-class Visit:
-    """Where the doctor is called, and how. `keys`: the user who calls it."""
+class DoctorCall:
+    """Call of the doctor: machine, arguments, and key folder of the user."""
 
     machine: Machine
     arguments: tuple[str, ...]
     keys: str = "keys"
 
 
-Plant = Callable[[Lab], AbstractContextManager[Visit]]
+Plant = Callable[[Lab], AbstractContextManager[DoctorCall]]
 
 
 @dataclass(frozen=True)
 class Fault:
-    """`check` must be in `state` and say all of `says`. `follows`: checks that fail because of it."""
+    """Fault to plant. `check` must be in `state` and its text have all of `says`. `follows`: checks that fail too."""
 
     name: str
     planted: str
@@ -106,10 +106,10 @@ FAULTS: Final[list[Fault]] = []
 
 def fault(
     planted: str, check: str, *says: str, state: str = FAILED, follows: tuple[str, ...] = ()
-) -> Callable[[Callable[[Lab], Iterator[Visit]]], Plant]:
-    """Puts the function on the list. `planted`: what it does, for the table."""
+) -> Callable[[Callable[[Lab], Iterator[DoctorCall]]], Plant]:
+    """Register a function that plants a fault. `planted`: its description in the table."""
 
-    def decorate(function: Callable[[Lab], Iterator[Visit]]) -> Plant:
+    def decorate(function: Callable[[Lab], Iterator[DoctorCall]]) -> Plant:
         plant = contextmanager(function)
         name = function.__name__.replace("_", "-")
         FAULTS.append(Fault(name, planted, plant, check, says, state, follows))
@@ -118,83 +118,83 @@ def fault(
     return decorate
 
 
-def from_client(lab: Lab, *options: str, keys: str = "keys") -> Visit:
-    return Visit(lab.client, (lab.server.address, *options), keys)
+def from_client(lab: Lab, *options: str, keys: str = "keys") -> DoctorCall:
+    return DoctorCall(lab.client, (lab.server.address, *options), keys)
 
 
-# --- the way ---------------------------------------------------------------------------------------------------------
+# --- network ---------------------------------------------------------------------------------------------------------
 
 
 @fault("an address that no machine has", "tcp", "cannot be reached", "lab-1 (10.77.2.1:7721)")
-def wrong_address(lab: Lab) -> Iterator[Visit]:
-    yield Visit(lab.client, ("10.77.2.99",))
+def wrong_address(lab: Lab) -> Iterator[DoctorCall]:
+    yield DoctorCall(lab.client, ("10.77.2.99",))
 
 
 @fault("a port on which nothing listens", "tcp", "nothing listens", "port 7799", "lab-1 (10.77.2.1:7721)")
-def wrong_port(lab: Lab) -> Iterator[Visit]:
-    yield Visit(lab.client, (f"{lab.server.address}:7799",))
+def wrong_port(lab: Lab) -> Iterator[DoctorCall]:
+    yield DoctorCall(lab.client, (f"{lab.server.address}:7799",))
 
 
 @fault("the client is in 10.88.2.0/24", "subnet", "10.88.2.0/24", "same network", follows=("tcp",))
-def wrong_subnet(lab: Lab) -> Iterator[Visit]:
+def wrong_subnet(lab: Lab) -> Iterator[DoctorCall]:
     with lab.client.addressed("10.88.2.2/24"):
         yield from_client(lab)
 
 
 @fault("the server's firewall drops every TCP port", "tcp", "no answer", "a firewall", "allow TCP 7721")
-def firewall(lab: Lab) -> Iterator[Visit]:
+def firewall(lab: Lab) -> Iterator[DoctorCall]:
     with lab.server.firewall("tcp dport 7720-7726"):
         yield from_client(lab)
 
 
 @fault("it drops TCP 7722 alone", "state", "no answer", "port 7722 (state)", "allow TCP 7722")
-def firewall_state_only(lab: Lab) -> Iterator[Visit]:
+def firewall_state_only(lab: Lab) -> Iterator[DoctorCall]:
     with lab.server.firewall("tcp dport 7722"):
         yield from_client(lab)
 
 
 @fault("broadcasts are blocked, the address works", "beacon", "blocks broadcasts", "type", state=WARNING)
-def broadcasts_blocked(lab: Lab) -> Iterator[Visit]:
+def broadcasts_blocked(lab: Lab) -> Iterator[DoctorCall]:
     with lab.client.firewall("udp dport 7720"):
         yield from_client(lab)
 
 
 @fault("broadcasts are blocked, and the session is given by name", "beacon", "'lab-1'", "give its address")
-def by_name_without_broadcasts(lab: Lab) -> Iterator[Visit]:
+def by_name_without_broadcasts(lab: Lab) -> Iterator[DoctorCall]:
     with lab.client.firewall("udp dport 7720"):
-        yield Visit(lab.client, ("--session", "lab-1"))
+        yield DoctorCall(lab.client, ("--session", "lab-1"))
 
 
 @fault("a session of the next protocol version", "version", "version 2", "update this machine")
-def other_version(lab: Lab) -> Iterator[Visit]:
-    with lab.server.doing(sys.executable, "-c", FUTURE, says="listens"):
-        yield Visit(lab.client, (f"{lab.server.address}:7751",))
+def other_version(lab: Lab) -> Iterator[DoctorCall]:
+    with lab.server.running_process(sys.executable, "-c", FUTURE, says="listens"):
+        yield DoctorCall(lab.client, (f"{lab.server.address}:7751",))
 
 
-# --- the door --------------------------------------------------------------------------------------------------------
+# --- joining --------------------------------------------------------------------------------------------------------
 
 
 @fault("a user who has not paired", "key", "not on the session's list", "iris-session pair")
-def not_paired(lab: Lab) -> Iterator[Visit]:
+def not_paired(lab: Lab) -> Iterator[DoctorCall]:
     yield from_client(lab, keys="stranger")
 
 
 @fault("a join code with wrong letters", "code", "join code", "iris-session pair")
-def wrong_code(lab: Lab) -> Iterator[Visit]:
-    lab.code()
+def wrong_code(lab: Lab) -> Iterator[DoctorCall]:
+    lab.create_code()
     yield from_client(lab, "--code", "7KQ2-M4XD-9PTR", keys="stranger")
 
 
 @fault("a join code after its time", "code", "expired", "iris-session pair")
-def expired_code(lab: Lab) -> Iterator[Visit]:
-    code = lab.code("--minutes", "0.02")
+def expired_code(lab: Lab) -> Iterator[DoctorCall]:
+    code = lab.create_code("--minutes", "0.02")
     time.sleep(1.5)  # its 1.2 s
     yield from_client(lab, "--code", code, keys="stranger")
 
 
 @fault("`keys revoke` after the user had joined", "key", "admitted before", "revoked", "iris-session pair")
-def revoked(lab: Lab) -> Iterator[Visit]:
-    joined = lab.client.iris("doctor", lab.server.address, "--code", lab.code("--name", "quest-3"), keys="loser")
+def revoked(lab: Lab) -> Iterator[DoctorCall]:
+    joined = lab.client.iris("doctor", lab.server.address, "--code", lab.create_code("--name", "quest-3"), keys="loser")
     if joined.returncode:
         raise LabError(joined.stdout)
     lab.server.iris("keys", "revoke", "quest-3")
@@ -202,33 +202,33 @@ def revoked(lab: Lab) -> Iterator[Visit]:
 
 
 @fault("an observer's key wants to drive", "role", "may not join", "observer")
-def role(lab: Lab) -> Iterator[Visit]:
-    lab.server.iris("keys", "allow", "screen", lab.key_of("observer"), "--role", "observer")
+def role(lab: Lab) -> Iterator[DoctorCall]:
+    lab.server.iris("keys", "allow", "screen", lab.read_public_key("observer"), "--role", "observer")
     yield from_client(lab, "--role", "operator", keys="observer")
 
 
 @fault("another server at the known address", "server_key", "is known for", "iris-session keys forget")
-def other_server(lab: Lab) -> Iterator[Visit]:
-    with lab.server.doing(
+def other_server(lab: Lab) -> Iterator[DoctorCall]:
+    with lab.server.running_process(
         *COMMAND, "serve", "arm", "--no-record", "--host", lab.server.address, "--port-base", "7760",
         says=r"on \S+:\d+,", keys="elsewhere",
     ):  # fmt: skip
         known = lab.client.folder / "victim" / "known_servers.json"
-        joined = lab.client.iris("doctor", lab.server.address, "--code", lab.code(), keys="victim")
+        joined = lab.client.iris("doctor", lab.server.address, "--code", lab.create_code(), keys="victim")
         if joined.returncode:
             raise LabError(joined.stdout)
         known.write_text(known.read_text().replace(":7721", ":7761"))
-        yield Visit(lab.client, (f"{lab.server.address}:7761",), "victim")
+        yield DoctorCall(lab.client, (f"{lab.server.address}:7761",), "victim")
 
 
 # --- the session -----------------------------------------------------------------------------------------------------
 
 
 def emulate(lab: Lab, says: str, *people: str, orders: bool = False) -> AbstractContextManager[Any]:
-    """People with emulated headsets, from when one of them `says` something."""
+    """Run emulated headsets, from when their output matches `says`."""
     headsets = [word for person in people for word in ("--headset", person)]
     options = ["--orders"] if orders else []
-    return lab.client.doing(*COMMAND, "emulate", lab.server.address, *headsets, *options, says=says)
+    return lab.client.running_process(*COMMAND, "emulate", lab.server.address, *headsets, *options, says=says)
 
 
 @fault(
@@ -238,14 +238,14 @@ def emulate(lab: Lab, says: str, *people: str, orders: bool = False) -> Abstract
     "none usable of a sheet of this session",
     "session: table",
 )
-def no_alignment(lab: Lab) -> Iterator[Visit]:
+def no_alignment(lab: Lab) -> Iterator[DoctorCall]:
     with emulate(lab, r"ann +look", "name=ann,behaviour=idle,robot=left,anchor_id=elsewhere"):
         yield from_client(lab)
 
 
 @fault("a headset was recentred", "alignment", "ann has no alignment (lost", "jumped", "bring the sheet into view")
-def recentred(lab: Lab) -> Iterator[Visit]:
-    with lab.client.doing(sys.executable, "-c", RECENTRED, lab.server.address, says="recentred"):
+def recentred(lab: Lab) -> Iterator[DoctorCall]:
+    with lab.client.running_process(sys.executable, "-c", RECENTRED, lab.server.address, says="recentred"):
         yield from_client(lab)
 
 
@@ -253,7 +253,7 @@ def recentred(lab: Lab) -> Iterator[Visit]:
     "a headset was bumped while its alignment run is stopped", "alarm", "ann: the tracking frame jumped",
     "mm", "bring a sheet into view", follows=("alignment",),
 )  # fmt: skip
-def bumped(lab: Lab) -> Iterator[Visit]:
+def bumped(lab: Lab) -> Iterator[DoctorCall]:
     with emulate(lab, r"ann +work", BUMPED, orders=True) as ann:
         lab.client.iris("anchors", "align", "stop", "ann", "--address", lab.server.address)
         ann.stdin.write(b"bump ann\n")
@@ -270,7 +270,7 @@ def bumped(lab: Lab) -> Iterator[Visit]:
     "right: bob",
     state=WARNING,
 )
-def robot_held(lab: Lab) -> Iterator[Visit]:
+def robot_held(lab: Lab) -> Iterator[DoctorCall]:
     here = ("name=ann,behaviour=idle,robot=left", "name=bob,behaviour=idle,robot=right")
     both, wants = r"ann +work[\s\S]*bob +work|bob +work[\s\S]*ann +work", r"carl +\w+ +samples [1-9]"
     with emulate(lab, both, *here), emulate(lab, wants, "name=carl,behaviour=idle,robot=left"):
@@ -283,14 +283,14 @@ def has_no_robot(lab: Lab, name: str) -> bool:
 
 
 def people(lab: Lab) -> list[dict[str, Any]]:
-    """Participants, as the status has them, those too whose connection is lost."""
+    """Return the participants in the status, disconnected ones too."""
     status = json.loads(lab.client.iris("status", lab.server.address, "--json").stdout)
     participants: list[dict[str, Any]] = status["participants"]
     return participants
 
 
 @fault("a client's program is stopped", "clients", "ann:", "silent", "is the app in front")
-def frozen_client(lab: Lab) -> Iterator[Visit]:
+def frozen_client(lab: Lab) -> Iterator[DoctorCall]:
     with emulate(lab, r"ann +look +samples [1-9]", "name=ann,behaviour=observer") as ann:
         system("kill", "-STOP", str(ann.pid))
         yield from_client(lab)
@@ -304,7 +304,7 @@ def frozen_client(lab: Lab) -> Iterator[Visit]:
     "check the network",
     state=WARNING,
 )
-def slow_link(lab: Lab) -> Iterator[Visit]:
+def slow_link(lab: Lab) -> Iterator[DoctorCall]:
     yield from behind(lab, "100ms")
 
 
@@ -315,38 +315,38 @@ def slow_link(lab: Lab) -> Iterator[Visit]:
     "a very slow or lossy link",
     "check the network",
 )
-def very_slow_link(lab: Lab) -> Iterator[Visit]:
+def very_slow_link(lab: Lab) -> Iterator[DoctorCall]:
     yield from behind(lab, "400ms")
 
 
-def behind(lab: Lab, profile: str) -> Iterator[Visit]:
-    """The server has another address, with such a link before it."""
+def behind(lab: Lab, profile: str) -> Iterator[DoctorCall]:
+    """Give the server a second address behind a link of this profile."""
     words = (sys.executable, IMPAIR, "--link", f"{BEHIND}={profile}", "--target", lab.server.address)
-    with lab.server.addressed(f"{BEHIND}/24", too=True), lab.server.doing(*words, says="."):
-        yield Visit(lab.client, (BEHIND,))
+    with lab.server.addressed(f"{BEHIND}/24", additional=True), lab.server.running_process(*words, says="."):
+        yield DoctorCall(lab.client, (BEHIND,))
 
 
 @fault("physics takes 3 ms of a tick of 2 ms", "ticks", "physics takes longer than a tick", "a larger time step")
-def late_ticks(lab: Lab) -> Iterator[Visit]:
-    with lab.server.doing(sys.executable, "-c", SLOW_LOOP, says="on "):
+def late_ticks(lab: Lab) -> Iterator[DoctorCall]:
+    with lab.server.running_process(sys.executable, "-c", SLOW_LOOP, says="on "):
         time.sleep(5.0)  # most of the ten seconds that late ticks are counted over
-        yield Visit(lab.server, ("127.0.0.1:7741",))
+        yield DoctorCall(lab.server, ("127.0.0.1:7741",))
 
 
 @fault("the disk below the recording is full", "disk", "the disk is full", "make room", follows=("recorder",))
-def full_disk(lab: Lab) -> Iterator[Visit]:
+def full_disk(lab: Lab) -> Iterator[DoctorCall]:
     disk = lab.small_disk(24)
-    with lab.server.doing(
+    with lab.server.running_process(
         *COMMAND, "serve", "handover", "--port-base", "7730", "--no-beacon", "--record", str(disk / "session.rrd"),
         says=r"on \S+:\d+,",
     ):  # fmt: skip
         system("sh", "-c", f"cat /dev/zero > {disk}/other 2>/dev/null || true")
         time.sleep(3.0)  # until the recorder has met it
-        yield Visit(lab.server, ("127.0.0.1:7731",))
+        yield DoctorCall(lab.server, ("127.0.0.1:7731",))
 
 
 @fault("the session's program is stopped", "session", "has not taken a step", "check that program", follows=("join",))
-def session_stopped(lab: Lab) -> Iterator[Visit]:
+def session_stopped(lab: Lab) -> Iterator[DoctorCall]:
     [session] = lab.server.running[:1]
     system("kill", "-STOP", str(session.pid))
     try:
@@ -362,13 +362,13 @@ def session_stopped(lab: Lab) -> Iterator[Visit]:
 SCREEN: Final = (120, 50)
 """Columns and lines of a screen."""
 PLAIN: Final = str.maketrans("|`", "/'")
-"""In a table, and not as commands of the document."""
-FORGOTTEN_S: Final = 20.0
-"""Late ticks are told of the last ten seconds: those of the start, and of a fault, are forgotten then."""
+"""Characters replaced in a table, where they have a meaning."""
+SETTLE_S: Final = 20.0
+"""Late ticks are reported for the last ten seconds: those of the start and of a fault have left it by then."""
 
 
-def consult(visit: Visit) -> tuple[list[Finding], int, float]:
-    """What the doctor found, its exit status, and how long it took [s]."""
+def call_doctor(visit: DoctorCall) -> tuple[list[Finding], int, float]:
+    """Call the doctor. Return its findings, exit status and duration [s]."""
     began = time.monotonic()
     done = visit.machine.iris("doctor", *visit.arguments, "--json", keys=visit.keys)
     took = time.monotonic() - began
@@ -378,7 +378,7 @@ def consult(visit: Visit) -> tuple[list[Finding], int, float]:
 
 
 def screen(findings: list[Finding]) -> int:
-    """Lines that the findings take on a screen."""
+    """Return the number of screen lines of the findings."""
     columns, _ = SCREEN
     return sum(
         max(1, len(textwrap.wrap(line, columns))) for line in [*format_findings(findings), format_verdict(findings)]
@@ -386,7 +386,7 @@ def screen(findings: list[Finding]) -> int:
 
 
 def judge(one: Fault, findings: list[Finding], status: int) -> str:
-    """Why the fault is not named; empty when it is."""
+    """Return why the fault does not count as named; empty if it does."""
     found = {finding.check: finding for finding in findings}
     if one.check not in found or found[one.check].state != one.state:
         return f"`{one.check}` is {found[one.check].state if one.check in found else 'missing'}, not {one.state}"
@@ -406,11 +406,11 @@ def judge(one: Fault, findings: list[Finding], status: int) -> str:
     return ""
 
 
-def healthy(lab: Lab) -> None:
-    """Raises `LabError` when checks go on to fail while nothing is planted: then nothing that follows counts."""
-    until = time.monotonic() + FORGOTTEN_S
+def check_healthy(lab: Lab) -> None:
+    """Raise `LabError` if checks fail although nothing is planted: the result does not count then."""
+    until = time.monotonic() + SETTLE_S
     while True:
-        found, status, _ = consult(from_client(lab))
+        found, status, _ = call_doctor(from_client(lab))
         bad = [f"{one.check}: {one.text}" for one in found if one.failed]
         if not bad and not status:
             return
@@ -419,7 +419,7 @@ def healthy(lab: Lab) -> None:
 
 
 def row(number: int, one: Fault, findings: list[Finding], status: int, took: float) -> str:
-    """A line of the table: in the words of the doctor."""
+    """Return a row of the table, with the texts of the doctor."""
     named = next(finding for finding in findings if finding.check == one.check)
     said = f"{named.text}. Why: {named.why}" if named.why else named.text
     what = [part.translate(PLAIN) for part in (said, named.advice)]
@@ -429,13 +429,13 @@ def row(number: int, one: Fault, findings: list[Finding], status: int, took: flo
 
 
 def examine_all(lab: Lab, chosen: list[Fault], *, verbose: bool) -> list[str]:
-    """Prints the table; a line for each fault that is not named."""
+    """Print the table. Return a line for each fault that is not named."""
     unnamed = []
     print("| | planted | check | what it says | what to do | status | s |\n|---|---|---|---|---|---|---|")
     for number, one in enumerate(chosen, 1):
         try:
             with one.plant(lab) as visit:
-                findings, status, took = consult(visit)
+                findings, status, took = call_doctor(visit)
         except LabError as error:
             unnamed.append(f"{one.name}: could not be planted: {error}")
             print(f"| {number} | {one.planted} | **not planted**: {error} | | | | |", flush=True)
@@ -451,12 +451,14 @@ def examine_all(lab: Lab, chosen: list[Fault], *, verbose: bool) -> list[str]:
 
 
 def main() -> int:
-    """Exit status 1 when a fault is not named, 2 when the faults could not be planted."""
+    """Run the command. Exit status 1 if a fault is not named, 2 if the faults could not be planted."""
     names = [one.name for one in FAULTS]
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--only", action="append", choices=names, metavar="FAULT", help="this fault, repeatable")
-    parser.add_argument("--list", action="store_true", help="only names the faults")
-    parser.add_argument("--verbose", action="store_true", help="what the doctor prints, on standard error")
+    parser.add_argument(
+        "--only", action="append", choices=names, metavar="FAULT", help="plant this fault only, repeatable"
+    )
+    parser.add_argument("--list", action="store_true", help="list the faults")
+    parser.add_argument("--verbose", action="store_true", help="print the output of the doctor on standard error")
     options = parser.parse_args()
     if options.list:
         print("\n".join(f"{one.name:28s} {one.planted}" for one in FAULTS))
@@ -464,13 +466,13 @@ def main() -> int:
     chosen = [one for one in FAULTS if not options.only or one.name in options.only]
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(2))  # else namespaces and processes would stay
     try:
-        require()
+        check_requirements()
         with tempfile.TemporaryDirectory(prefix="iris-faults-") as folder, Lab(Path(folder)) as lab:
             lab.server.serve("--interface", lab.server.interface, "--name", "lab-1", "--no-record")
-            lab.server.iris("keys", "allow", "client", lab.key_of("keys"), "--role", "any")
-            healthy(lab)
+            lab.server.iris("keys", "allow", "client", lab.read_public_key("keys"), "--role", "any")
+            check_healthy(lab)
             unnamed = examine_all(lab, chosen, verbose=options.verbose)
-            healthy(lab)
+            check_healthy(lab)
     except LabError as error:
         print(f"planted_faults: {error}", file=sys.stderr)
         return 2

@@ -1,5 +1,5 @@
-"""Two machines on one cable, for `tools/planted_faults.py`: Linux network namespaces, each with an address, a firewall
-and homes of keys. What they run ends with the lab. Needs root, `ip`, `nft` and `mount`."""
+"""Two emulated machines on one cable, for `tools/planted_faults.py`: Linux network namespaces with address, firewall
+and key folders. Their processes end with the lab. Needs root, `ip`, `nft` and `mount`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-sys.path.insert(0, str(Path(__file__).parents[1]))  # machines are those of the tests
+sys.path.insert(0, str(Path(__file__).parents[1]))  # the namespaces are those of the tests
 
 from tests.namespaces import Namespace, connect
 
@@ -27,11 +27,11 @@ NETWORK: Final = "10.77.2"
 
 
 class LabError(Exception):
-    """The fault could not be planted; that says nothing about the doctor."""
+    """The fault could not be planted. This says nothing about the doctor."""
 
 
 def system(*words: str) -> str:
-    """Runs a command of the system; what it printed."""
+    """Run a system command. Return its output."""
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     if done.returncode:
         raise LabError(f"{' '.join(words)}: {done.stderr.strip()}")
@@ -39,19 +39,19 @@ def system(*words: str) -> str:
 
 
 def wait(true: Callable[[], bool], what: str) -> None:
-    """Until it is so."""
+    """Wait until a condition holds. Raise `LabError` after `DEADLINE_S`."""
     until = time.monotonic() + DEADLINE_S
     while not true():
         if time.monotonic() > until:
-            raise LabError(f"waited {DEADLINE_S:g} s in vain for {what}")
+            raise LabError(f"timeout of {DEADLINE_S:g} s: {what}")
         time.sleep(0.1)
 
 
 class Machine(Namespace):
-    """One machine, and what can befall it."""
+    """One emulated machine, and the faults it can have."""
 
     def iris(self, *arguments: str, keys: str = "keys") -> subprocess.CompletedProcess[str]:
-        """One command, to its end. `keys`: another home than the usual one is another user."""
+        """Run one `iris-session` command to its end. `keys`: key folder; another folder is another user."""
         return subprocess.run(
             self.words(*COMMAND, *arguments),
             capture_output=True,
@@ -63,7 +63,7 @@ class Machine(Namespace):
         )
 
     def start(self, *command: str, says: str, keys: str = "keys") -> subprocess.Popen[bytes]:
-        """A process that goes on, from when its output matches `says`; `stop` ends it."""
+        """Start a process and wait until its output matches `says`. End it with `stop`."""
         out = self.folder / f"{len(self.running)}.out"
         with out.open("wb") as file:
             process = subprocess.Popen(
@@ -85,7 +85,8 @@ class Machine(Namespace):
         return process
 
     @contextlib.contextmanager
-    def doing(self, *command: str, says: str, keys: str = "keys") -> Iterator[subprocess.Popen[bytes]]:
+    def running_process(self, *command: str, says: str, keys: str = "keys") -> Iterator[subprocess.Popen[bytes]]:
+        """Start a process as `start` does, and stop it at the end."""
         process = self.start(*command, says=says, keys=keys)
         try:
             yield process
@@ -93,11 +94,12 @@ class Machine(Namespace):
             stop(process)
 
     def serve(self, *arguments: str, keys: str = "keys") -> subprocess.Popen[bytes]:
+        """Start a session."""
         return self.start(*COMMAND, "serve", "handover", *arguments, says=r"on \S+:\d+,", keys=keys)
 
     @contextlib.contextmanager
     def firewall(self, *rules: str) -> Iterator[None]:
-        """Meanwhile these packets that come in are thrown away, such as `tcp dport 7722`."""
+        """Drop incoming packets that match the rules, such as `tcp dport 7722`, until the end."""
         system(*self.words("nft", "add table inet planted"))
         try:
             system(*self.words("nft", "add chain inet planted in { type filter hook input priority 0; }"))
@@ -108,17 +110,17 @@ class Machine(Namespace):
             system(*self.words("nft", "delete table inet planted"))
 
     @contextlib.contextmanager
-    def addressed(self, address: str, *, too: bool = False) -> Iterator[None]:
-        """Meanwhile it has this address, with its prefix length, in place of its own, or `too`."""
+    def addressed(self, address: str, *, additional: bool = False) -> Iterator[None]:
+        """Set an address with prefix length until the end; `additional`: keep the machine's own address too."""
         own = f"{self.address}/24"
         self._address("add", address)
-        if not too:
+        if not additional:
             self._address("del", own)
         try:
             yield
         finally:
             self._address("del", address)
-            if not too:
+            if not additional:
                 self._address("add", own)
 
     def _address(self, change: str, address: str) -> None:
@@ -126,7 +128,7 @@ class Machine(Namespace):
 
 
 def stop(process: subprocess.Popen[bytes]) -> None:
-    """Ctrl-C, also to one that was stopped; kills what does not heed it."""
+    """Interrupt a process, also a stopped one; kill it if it does not end."""
     if process.stdin is not None:
         process.stdin.close()
     for number in (signal.SIGCONT, signal.SIGINT):
@@ -140,7 +142,7 @@ def stop(process: subprocess.Popen[bytes]) -> None:
 
 
 class Lab:
-    """`server` and `client`. The network is another than that of this machine, which nothing here touches."""
+    """Two machines, `server` and `client`, in a network of their own. The network of this machine is not touched."""
 
     def __init__(self, folder: Path) -> None:
         mark = os.getpid() % 100_000
@@ -160,7 +162,7 @@ class Lab:
         self.close()
 
     def small_disk(self, mib: int) -> Path:
-        """A disk of the server with room for so much."""
+        """Mount a disk of this size on the server."""
         path = self.server.folder / f"disk{len(self._mounted)}"
         path.mkdir()
         system("mount", "-t", "tmpfs", "-o", f"size={mib}m", "tmpfs", str(path))
@@ -177,21 +179,21 @@ class Lab:
         for machine in (self.client, self.server):
             subprocess.run(["ip", "netns", "del", machine.name], capture_output=True, check=False)
 
-    def code(self, *options: str) -> str:
-        """A new join code of the session `lab-1`."""
+    def create_code(self, *options: str) -> str:
+        """Create a join code of the session `lab-1`."""
         done = self.server.iris("pair", "--session", "lab-1", "--no-wait", "--json", *options)
         if done.returncode:
             raise LabError(done.stderr.strip())
         return str(json.loads(done.stdout.splitlines()[0])["code"])
 
-    def key_of(self, keys: str) -> str:
-        """Public key of one of the client's users."""
+    def read_public_key(self, keys: str) -> str:
+        """Return the public key of a user of the client."""
         shown: dict[str, Any] = json.loads(self.client.iris("keys", "show", "--json", keys=keys).stdout)
         return str(shown["identity"]["key"])
 
 
-def require() -> None:
-    """Raises `LabError` where no lab can be made."""
+def check_requirements() -> None:
+    """Raise `LabError` if this machine cannot run a lab."""
     if sys.platform != "linux" or os.geteuid() != 0:
         raise LabError("network namespaces need Linux and root")
     missing = [tool for tool in ("ip", "nft", "mount") if shutil.which(tool) is None]

@@ -1,4 +1,4 @@
-"""What a published state costs the program that publishes it: processor time of its thread, and of the session's.
+"""Measure the processor time of publishing a state, in the thread of the publisher and in the session.
 
 python tools/publish_cost.py --bodies 300 --vertices 10000 --record
 """

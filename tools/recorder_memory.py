@@ -1,4 +1,4 @@
-"""Memory of what writes a recording, over hours of a session that pass as fast as they can be written.
+"""Measure the memory of the recorder's writer over hours of session time, written as fast as possible.
 
     python tools/recorder_memory.py --minutes 120 --operators 8
 

@@ -1,17 +1,17 @@
-"""Soak: people over bad links are cut off, killed, robbed of their robots at random; nothing may leak or get lost.
+"""Soak test: operators over bad links are disconnected, killed, and lose their robots at random; nothing may leak.
 
     python tools/soak.py --seconds 3600 --operators 8 --observers 4 --profile busy-wifi --json
     python tools/soak.py --seconds 60 --operators 3 --observers 1
 
-A session (`iris-session serve`, recorded, mode takeover) with seven-joint arms, emulated people in processes of their
-own behind `emulator.impairment`, and disturbances at random times from `--seed`. Checked at the end:
+Runs a session (`iris-session serve`, recorded, mode takeover) with seven-joint arms, emulated operators in processes
+of their own behind the impairment proxy, and disturbances at random times from `--seed`. Checked at the end:
 
-- everybody is back and drives, within a minute of the last disturbance;
-- every client was handed every event without a gap from each of its snapshots on, and they are those of the recording;
+- every operator is connected and drives, within a minute of the last disturbance;
+- every client received every event without a gap after each of its snapshots, equal to those of the recording;
 - the memory of authority, front and recorder does not grow in the second half;
 - `iris-session verify` finds every step identical.
 
-Exit status 0 when all of that holds; `problems` says what does not.
+Prints the result as text or one JSON object; exit status 0 if all checks hold, else `problems` lists the failures.
 """
 
 from __future__ import annotations
@@ -51,19 +51,19 @@ from iris_session.protocol.server_messages import Event, MarkerAdded
 from iris_session.recording import Recording
 
 COMMAND: Final = [sys.executable, "-m", "iris_session.cli.main"]
-#: Disturbances by how often they come, relative to each other.
+#: Relative frequency of disturbances.
 KINDS: Final = {"kill": 3, "leave": 1, "cut": 3, "reset": 3, "stall": 3, "roam": 2, "freeze": 2, "takeover": 6}
 EVERY_S: Final = 1.5  # mean time between two of them
 LONGEST_S: Final = 4.0  # of a stall or a frozen process
 RECOVER_S: Final = 60.0
 START_S: Final = 90.0
-SAY_EVERY_S: Final = 60.0
+PROGRESS_EVERY_S: Final = 60.0
 END: Final = "end of the soak"
 
 
 @dataclass
 class Worker:
-    """One process of people and its link. `undo`: when what is done to it ends, and how."""
+    """One process of operators and its link. `undo`: time and kind of the end of its disturbance."""
 
     number: int
     link: str
@@ -82,7 +82,7 @@ class Result:
 
 
 class Soak:
-    """One run. `folder`: for recording, logs and identities."""
+    """One run of the soak test. `folder`: of recording, logs and identities."""
 
     def __init__(self, options: argparse.Namespace, folder: Path, stack: ExitStack) -> None:
         self.options, self.folder, self.stack = options, folder, stack
@@ -91,13 +91,13 @@ class Soak:
         self.events: list[Event] = []
         self.recording = folder / "session.rrd"
         self._next_sample_s = 0.0
-        self._robbed: list[tuple[float, str]] = []
+        self._taken_robots: list[tuple[float, str]] = []
         self._sources = 0
 
     # --- start --------------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Session, director, proxy, people. Raises `SystemExit` when the session does not listen."""
+        """Start session, director, proxy and operators. Raise `SystemExit` if the session does not listen."""
         scene = self.folder / "arms.xml"
         spec = n_arms_scene(self.options.operators)
         spec.compile()
@@ -128,7 +128,7 @@ class Soak:
         for worker in self.workers:
             self.stack.callback(self._kill, worker)
             self._spawn(worker)
-        self._run_until(self._everybody_works, START_S, "everybody drives at the beginning")
+        self._run_until(self._is_everyone_driving, START_S, "every operator drives at the beginning")
 
     def _join(self, address: str, role: str) -> Client:
         client = Client(address, role=role, name=f"soak-{role}", alignment="not_needed")
@@ -178,27 +178,27 @@ class Soak:
     # --- the run ------------------------------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Disturbs until the time is over, then lets everybody recover."""
+        """Disturb until the time is over, then wait for recovery."""
         begun = due = said = time.monotonic()
         end = begun + self.options.seconds
         while (now := time.monotonic()) < end:
             self._poll()
             self._undo(now)
-            if now - said >= SAY_EVERY_S:
+            if now - said >= PROGRESS_EVERY_S:
                 said = now
-                self._say(now - begun)
+                self._print_progress(now - begun)
             if now >= due:
                 due = now + self.random.expovariate(1.0 / EVERY_S)
                 kind = self.random.choices(list(KINDS), list(KINDS.values()))[0]
                 self._disturb(kind, now)
         self._undo(float("inf"))
         self.proxy.do("profile good-wifi")
-        if self._run_until(self._everybody_works, RECOVER_S, "everybody drives again at the end"):
+        if self._run_until(self._is_everyone_driving, RECOVER_S, "every operator drives again at the end"):
             self.director.marker(END)
-            self._run_until(self._everybody_knows_the_end, RECOVER_S, "everybody has the last event")
+            self._run_until(self._has_everyone_last_event, RECOVER_S, "every client has the last event")
 
-    def _say(self, seconds: float) -> None:
-        """Where the run stands, for whoever waits."""
+    def _print_progress(self, seconds: float) -> None:
+        """Print the progress of the run."""
         memory = ", ".join(f"{name} {rows[-1][1]:.0f} MiB" for name, rows in self.result.rss.items())
         done = f"{seconds / 60.0:.0f} of {self.options.seconds / 60.0:.0f} min"
         many = f"{self.result.disturbances.total()} disturbances, {len(self.result.problems)} problems"
@@ -229,10 +229,10 @@ class Soak:
         else:
             robot = self.random.choice(arm_names(self.options.operators))
             self._ask(Acquire(0, (robot,)))
-            self._robbed.append((now + self.random.uniform(0.2, 2.0), robot))
+            self._taken_robots.append((now + self.random.uniform(0.2, 2.0), robot))
 
     def _undo(self, now: float) -> None:
-        """Ends what is over: who was killed comes again, who was stopped goes on."""
+        """End disturbances that are over: restart killed processes, continue stopped ones."""
         for worker in self.workers:
             if worker.undo is None or worker.undo[0] > now:
                 continue
@@ -243,8 +243,8 @@ class Soak:
                 self.proxy.do(f"resume @{worker.link}")
             elif worker.process is not None:
                 worker.process.send_signal(signal.SIGCONT)
-        for item in [item for item in self._robbed if item[0] <= now]:
-            self._robbed.remove(item)
+        for item in [item for item in self._taken_robots if item[0] <= now]:
+            self._taken_robots.remove(item)
             lease_version = self.thief.lease_version(item[1])
             if lease_version is not None:
                 self._ask(Release(0, (Target(item[1], lease_version),)))
@@ -254,7 +254,7 @@ class Soak:
             self.thief.submit(message)
 
     def _poll(self) -> None:
-        """Keeps our own clients alive, looks after the processes, notes memory once a second."""
+        """Poll our own clients; once a second, check the processes and record their memory."""
         self.director.poll(0.01)
         self.thief.poll(0.0)
         now = time.monotonic()
@@ -274,7 +274,7 @@ class Soak:
                 continue  # the live view and other helpers
             self.result.rss.setdefault(name, []).append((now, process.memory_info().rss / 2**20))
 
-    def _everybody_works(self) -> bool:
+    def _is_everyone_driving(self) -> bool:
         mirror, state = self.director.mirror, self.director.scene.state
         if state is None:
             return False
@@ -288,7 +288,7 @@ class Soak:
         mine = {s.robot: connected[s.name] for worker in self.workers for s in worker.specs if s.robot}
         return all(fresh.get(robot) == holder for robot, holder in mine.items())
 
-    def _everybody_knows_the_end(self) -> bool:
+    def _has_everyone_last_event(self) -> bool:
         ends = [e.event_seq for e in self.events if isinstance(e.body, MarkerAdded) and e.body.text == END]
         return bool(ends) and all(
             self._event_seq(worker, spec.name) >= ends[0] for worker in self.workers for spec in worker.specs
@@ -301,7 +301,7 @@ class Soak:
             return 0
 
     def _run_until(self, condition: Callable[[], bool], seconds: float, what: str) -> bool:
-        """False, and a problem noted, when `condition` does not hold in time."""
+        """Wait for a condition. If it does not hold in time, record a problem and return False."""
         deadline = time.monotonic() + seconds
         while not condition():
             self._poll()
@@ -314,7 +314,7 @@ class Soak:
     # --- the end ------------------------------------------------------------------------------------------------------
 
     def finish(self) -> None:
-        """Ends everything in order, then checks events, memory and the recording."""
+        """Stop everything, then check events, memory and the recording."""
         result = self.result
         for worker in self.workers:
             if worker.process is not None:
@@ -385,12 +385,12 @@ class Soak:
 # --- checks -----------------------------------------------------------------------------------------------------------
 
 
-#: Growth of the second half that is noise: allocators, caches that fill.
+#: Growth in the second half that is noise: allocators, caches that fill.
 NOISE_MIB: Final = 6.0
 
 
 def check_events(recording: Path, folder: Path) -> tuple[dict[str, int], list[str]]:
-    """Compares the logs `*.events` in `folder` with the recording. Figures, and a line per problem."""
+    """Compare the logs `*.events` in `folder` with the recording. Return counts, and a line per problem."""
     problems: list[str] = []
     with Recording.open(recording) as opened:
         recorded = {event.event_seq: fingerprint(event) for event in opened.events()}
@@ -409,15 +409,25 @@ def check_events(recording: Path, folder: Path) -> tuple[dict[str, int], list[st
 
 
 def check_log(name: str, records: list[tuple[Any, ...]], recorded: dict[int, int]) -> tuple[int, list[str]]:
-    """One client's events (generation, times that it was told of missed ones, event_seq, CRC): none is missed without
-    being told, all in order, each as recorded. A client whose link takes nothing loses events, and is given a snapshot
-    in their place: how often, on connections that went on."""
+    """Check the events of one client.
+
+    All must be in order and as recorded, and none may be missing without a notification. A client whose link is blocked
+    loses events and receives a snapshot instead.
+
+    Args:
+        name: Name of the log.
+        records: Connection generation, number of notifications of missed events so far, `event_seq`, CRC.
+        recorded: CRC by `event_seq` in the recording.
+
+    Returns:
+        The number of gaps that a snapshot filled on a connection that continued, and a line per problem.
+    """
     last_generation = last_told = last_seq = -1
     filled = 0
     for generation, told, seq, crc in records:
         if last_seq >= 0 and seq != last_seq + 1:
             if told == last_told:
-                return filled, [f"{name}: event {seq} came after {last_seq}, and nobody told of those between"]
+                return filled, [f"{name}: event {seq} came after {last_seq}, without a notification of those between"]
             filled += generation == last_generation
         if seq <= last_seq:
             return filled, [f"{name}: event {seq} came after {last_seq}"]
@@ -428,7 +438,7 @@ def check_log(name: str, records: list[tuple[Any, ...]], recorded: dict[int, int
 
 
 def check_memory(rss: dict[str, list[tuple[float, float]]]) -> tuple[dict[str, dict[str, float]], list[str]]:
-    """Per process, of its resident memory over the second half of the run [MiB]: beginning, end, slope per hour."""
+    """Return resident memory per process over the second half of the run [MiB]: start, end, slope per hour."""
     figures: dict[str, dict[str, float]] = {}
     problems: list[str] = []
     for name, series in rss.items():
@@ -443,7 +453,9 @@ def check_memory(rss: dict[str, list[tuple[float, float]]]) -> tuple[dict[str, d
             "mib_per_hour": round(slope * 3600.0, 1),
         }
         if growth > NOISE_MIB:
-            problems.append(f"memory of {name} grew by {growth:.1f} MiB more than it may in the second half")
+            problems.append(
+                f"memory of {name} grew by {growth:.1f} MiB in the second half, allowed are {NOISE_MIB:g} MiB"
+            )
     return figures, problems
 
 
@@ -451,7 +463,7 @@ def check_memory(rss: dict[str, list[tuple[float, float]]]) -> tuple[dict[str, d
 
 
 def soak(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """One run in `folder`; the object that `--json` prints."""
+    """Run the soak test in `folder`. Return the object that `--json` prints."""
     load_profile(options.profile)
     begun = time.monotonic()
     with ExitStack() as stack:
@@ -471,14 +483,14 @@ def soak(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=3600.0, help="of disturbances (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=3600.0, help="duration of disturbances (%(default)s)")
     parser.add_argument("--operators", type=int, default=8)
     parser.add_argument("--observers", type=int, default=4)
+    parser.add_argument("--per-process", type=int, default=2, help="operators per process and link (%(default)s)")
     parser.add_argument(
-        "--per-process", type=int, default=2, help="people who share a process, and a link (%(default)s)"
+        "--profile", default="busy-wifi", help="profile of every link: docs/evidence/links.md (%(default)s)"
     )
-    parser.add_argument("--profile", default="busy-wifi", help="of every link: docs/evidence/links.md (%(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of disturbances, people and weather")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of disturbances, operators and links")
     parser.add_argument("--keep", type=Path, help="folder for recording and logs (default: a temporary one)")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
     options = parser.parse_args()

@@ -1,10 +1,10 @@
-"""People of `tools/soak.py`: emulated headsets in one process, each of which notes every event it is handed.
+"""Operators of `tools/soak.py`: emulated headsets in one process, each of which logs every event it receives.
 
     python tools/soak_worker.py < job.json        {"address": ..., "specs": [HeadsetSpec, ...], "log": "folder/worker3"}
 
-One log per person: `<log>-<name>.events`, records of (connection generation, how often it was told so far that it
-missed events, event_seq, CRC-32 of the event), and one `<log>-<name>.json` with the person's report, written every
-second. Ends at SIGTERM.
+One log per operator: `<log>-<name>.events`, records of (connection generation, notifications of missed events so far,
+event_seq, CRC-32 of the event), and one `<log>-<name>.json` with the operator's report, written every second. Ends at
+SIGTERM.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Job(msgspec.Struct, frozen=True):
 
 
 def fingerprint(event: Event) -> int:
-    """CRC-32 of an event as it is encoded: the same for everybody who got the same one."""
+    """Return the CRC-32 of an encoded event: equal for all clients that received the same event."""
     return zlib.crc32(msgspec.msgpack.encode(event))
 
 
@@ -53,7 +53,7 @@ class Witness:
         self.person.client.on_missed = self._miss
 
     def step(self, ready: bool) -> None:
-        """One round of the loop."""
+        """Run one iteration of the loop."""
         now_ns = time.monotonic_ns()
         if ready:
             try:
@@ -68,7 +68,7 @@ class Witness:
             self.report()
 
     def report(self) -> None:
-        """The report as a file, replaced at once."""
+        """Write the report to a file, replaced atomically."""
         path = f"{self._prefix}.json"
         with open(f"{path}.new", "wb") as file:
             file.write(msgspec.json.encode(self.person.finish_report()))

@@ -1,5 +1,5 @@
-"""Benchmarks behind `iris-session bench`: separate processes, percentiles, one JSON object (`contract`).
+"""Benchmarks: one module per `iris-session bench NAME`, each with a `run_...` function that returns a `BenchReport`.
 
-`state` and `input` run the authority here and its clients (`clients`) in other processes, at most four in each; beside
-them, as their reference, `bare` measures the machine without us.
+`report` defines the report and its bars, `harness` runs a session with client processes, `clients` are those
+processes, `baseline` measures the machine itself. The command line is in `iris_session.cli.bench`.
 """

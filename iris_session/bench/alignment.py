@@ -1,7 +1,10 @@
-"""`bench alignment`: how far apart two headsets put the same physical point, against what they state, and naive ways.
+"""`bench alignment`: distance at which two headsets place the same physical point, compared with the stated error.
 
-Each pair shares the anchors and nothing else. The error of a pair at a point is the distance between where its two
-headsets put it; the stated one is the p95 of the sum of their covariances there. Cases and noise: docs/anchors.md.
+Simulated headsets with tilted, drifting tracking frames observe sheets, with the noise of docs/anchors.md. The
+simulation knows the truth; estimators get only what a headset reports (`ReportedObservation`). The same seed gives the
+same observations. Each pair of headsets shares the anchors and nothing else. The error of a pair at a point is the
+distance between the places at which its headsets put it; the stated error is the p95 of the sum of their covariances
+there. Naive alignments are computed beside ours for comparison.
 """
 
 from __future__ import annotations
@@ -53,7 +56,7 @@ class ReportedObservation:
 
 @dataclass
 class SimulatedHeadset:
-    """The truth about one headset, and what it has reported. `now_s` is where its run has come to."""
+    """True motion of one headset, from which its reports are computed. `now_s`: present time of its run."""
 
     rng: np.random.Generator
     now_s: float = 0.0
@@ -71,11 +74,11 @@ class SimulatedHeadset:
         self.velocity = DRIFT_M_PER_S * way / np.linalg.norm(way)
 
     def T_world_tracking(self, at_s: float) -> tuple[Array, Array]:
-        """The truth at a time."""
+        """Return the true pose of the tracking frame at a time."""
         return self.p0 + at_s * self.velocity, self.q0
 
     def observe_sheet(self, anchor_id: str, p_anchor: Array, q_anchor: Array) -> list[ReportedObservation]:
-        """2 s of observations from a new viewpoint: somewhere around the sheet, 0.4 to 1.2 m away."""
+        """Return 2 s of observations from a new viewpoint around the sheet, 0.4 to 1.2 m away."""
         rng, n = self.rng, PER_VIEWPOINT
         d = rng.uniform(*DISTANCE_M)
         elevation, azimuth = math.radians(rng.uniform(*ELEVATION_DEG)), rng.uniform(-math.pi, math.pi)
@@ -97,7 +100,7 @@ class SimulatedHeadset:
         return self._report(anchor_id, p, q, heads)
 
     def observe_controller(self, anchor_id: str, p_anchor: Array, q_anchor: Array) -> list[ReportedObservation]:
-        """2 s of a tracked controller in its holder."""
+        """Return 2 s of observations of a tracked controller in its holder."""
         rng, n = self.rng, PER_VIEWPOINT
         noise = TIP_SIGMA_M * of_viewpoint(rng.normal(size=3), rng.normal(size=(n, 3)))
         turns = HOLDER_SIGMA_RAD * of_viewpoint(rng.normal(size=3), rng.normal(size=(n, 3)))
@@ -105,13 +108,13 @@ class SimulatedHeadset:
         return self._report(anchor_id, p_anchor + noise, q, np.broadcast_to(p_anchor, (n, 3)))
 
     def touch_mark(self, p_mark: Array, sigma_m: float) -> list[Vec3]:
-        """The tip of a controller on a mark, once."""
+        """Return the position of a controller's tip that touches a mark once."""
         p = p_mark + self.rng.normal(0.0, sigma_m, (1, 3))
         origin, q = self.T_world_tracking(self.now_s)
         return [_to_vec3(v) for v in ((p - origin) @ quat_to_matrix(q)).tolist()]
 
     def _report(self, anchor_id: str, p: Array, q: Array, heads: Array) -> list[ReportedObservation]:
-        """World to tracking at the time of each, then on to the next place."""
+        """Transform observations from world to tracking, each at its time, and go to the next viewpoint."""
         times = self.now_s + PERIOD_S * np.arange(len(p))
         q_inv = quat_conjugate(self.q0)
         R = quat_to_matrix(q_inv)
@@ -129,6 +132,7 @@ class SimulatedHeadset:
         return out
 
     def walk(self) -> None:
+        """Advance the time by a walk to the next viewpoint."""
         self.now_s += WALK_S
 
 
@@ -142,7 +146,7 @@ def _to_quat(v: list[float]) -> Quat:
 
 # --- benchmark --------------------------------------------------------------------------------------------------------
 
-#: Three sheets, 1.5 m from each other, each turned its own way.
+#: Three sheets, 1.5 m from each other, with different headings.
 TRIANGLE: Final[dict[str, PoseTuple]] = {
     name: (
         (1.5 / math.sqrt(3.0) * math.cos(turn), 1.5 / math.sqrt(3.0) * math.sin(turn), 0.0),
@@ -151,7 +155,7 @@ TRIANGLE: Final[dict[str, PoseTuple]] = {
     for k, (name, turn) in enumerate(zip("abc", (0.0, 2.0 * math.pi / 3.0, -2.0 * math.pi / 3.0), strict=True))
 }
 ONE: Final[dict[str, PoseTuple]] = {"a": IDENTITY_POSE}
-#: Marks near the corners of a table top; no two sides alike, so that a mix-up shows.
+#: Marks near the corners of a table top; no two sides are equal, so that swapped marks show.
 MARKS: Final[dict[str, Vec3]] = {
     "a": (-0.30, -0.20, 0.0),
     "b": (0.32, -0.17, 0.0),
@@ -169,7 +173,7 @@ _TIMED: Final = 8  # headsets, at most, whose updates are timed one by one
 
 
 class HeadsetError(NamedTuple):
-    """Where a headset puts what is really at X: at R X + t; `S(X)` is the covariance that it states."""
+    """Error of one headset: it places the true point X at R X + t. `estimate`: its stated error."""
 
     R: Array
     t: Array
@@ -179,7 +183,7 @@ class HeadsetError(NamedTuple):
 
 @dataclass
 class CaseStatistics:
-    """What all pairs of one case came to."""
+    """Errors of all pairs of one case."""
 
     errors: dict[str, list[float]] = field(default_factory=dict)
     covered: dict[str, list[bool]] = field(default_factory=dict)
@@ -188,7 +192,13 @@ class CaseStatistics:
 
 
 def run_alignment(pairs: int = 2000, seed: int = 0, progress: Callable[[str], None] = lambda _: None) -> BenchReport:
-    """`pairs` pairs of headsets in every case."""
+    """Run every case with `pairs` pairs of headsets.
+
+    Args:
+        pairs: Pairs of headsets per case.
+        seed: Random seed.
+        progress: Called with a short text before each case.
+    """
     results: dict[str, Any] = {}
     bars: list[Bar] = []
     for k, case in enumerate(CASES):
@@ -234,7 +244,7 @@ def _run_case(case: str, rngs: Sequence[np.random.Generator]) -> dict[str, float
 def _simulate_looking_headset(
     case: str, rng: np.random.Generator, anchors: dict[str, PoseTuple]
 ) -> tuple[HeadsetError, HeadsetError, HeadsetError]:
-    """One headset's run: our estimate, that of its last observation, and the mean of all."""
+    """Return the errors of one headset: of our estimate, of its last observation, and of the mean of all."""
     headset = SimulatedHeadset(rng)
     estimator = AlignmentEstimator(anchors)
     seen = _simulate_observations(case, headset, anchors)
@@ -253,7 +263,7 @@ def _simulate_looking_headset(
 def _simulate_observations(
     case: str, headset: SimulatedHeadset, anchors: dict[str, PoseTuple]
 ) -> list[ReportedObservation]:
-    """Three viewpoints of every sheet (`quick`: one), of the controller in its holder as many."""
+    """Return observations from three viewpoints of every sheet or holder (`quick`: one viewpoint)."""
     seen: list[ReportedObservation] = []
     for name, (p, q) in anchors.items():
         for _ in range(1 if case == "three_sheets_quick" else 3):
@@ -264,7 +274,7 @@ def _simulate_observations(
 
 
 def _add_observation(estimator: AlignmentEstimator, case: str, o: ReportedObservation) -> None:
-    """What a headset reports, and nothing else."""
+    """Add an observation with what a headset reports, and nothing else."""
     if case == "holder":
         estimator.add(o.anchor_id, o.pose, o.capture_ns, 0, o.viewpoint_id, covariance=controller_covariance())
     else:
@@ -272,7 +282,7 @@ def _add_observation(estimator: AlignmentEstimator, case: str, o: ReportedObserv
 
 
 def _simulate_touching_headset(rng: np.random.Generator) -> tuple[HeadsetError]:
-    """One headset's wearer touches every mark once."""
+    """Return the error of one headset whose wearer touches every mark once."""
     headset = SimulatedHeadset(rng)
     touches = []
     for name, p in MARKS.items():
@@ -285,7 +295,7 @@ def _simulate_touching_headset(rng: np.random.Generator) -> tuple[HeadsetError]:
 
 
 def _align_each_observation(seen: Sequence[ReportedObservation], anchors: dict[str, PoseTuple]) -> tuple[Array, Array]:
-    """`T_world_tracking` as every single observation has it."""
+    """Return `T_world_tracking` for every single observation."""
     pw = np.array([anchors[o.anchor_id][0] for o in seen])
     qw = np.array([anchors[o.anchor_id][1] for o in seen])
     q = quat_multiply(qw, quat_conjugate(np.array([o.pose[1] for o in seen])))
@@ -295,7 +305,7 @@ def _align_each_observation(seen: Sequence[ReportedObservation], anchors: dict[s
 def _average_alignments(
     seen: Sequence[ReportedObservation], anchors: dict[str, PoseTuple], q: Array
 ) -> tuple[Array, Array]:
-    """Plain mean in 6 degrees of freedom: of the rotations (Markley 2007), then of the positions turned by it."""
+    """Return the mean in 6 degrees of freedom: of the rotations (Markley 2007), then of the rotated positions."""
     q_mean = np.linalg.eigh(q.T @ q)[1][:, -1]
     p = np.array([o.pose[0] for o in seen])
     pw = np.array([anchors[o.anchor_id][0] for o in seen])
@@ -317,7 +327,7 @@ def _compute_error(
 def _evaluate_pair(
     tally: CaseStatistics, a: HeadsetError, b: HeadsetError, points: dict[str, Array], hull: list[Array]
 ) -> None:
-    """One pair: errors at the points and at the worst place within the hull (a corner: the error is affine)."""
+    """Add the errors of a pair at the points, and the largest within the hull (at a corner: the error is affine)."""
     tally.pairs += 1
     stated = [o.estimate for o in (a, b) if o.estimate is not None]
     if any(e.refused for e in stated):
@@ -356,8 +366,8 @@ def _p95(values: Sequence[float], scale: float) -> float:
 
 
 def _measure_update_times(seed: int, headsets: int) -> dict[str, float]:
-    """Processor time, as the server spends it: with one sheet and up to three viewpoints, and `loaded`: with three
-    sheets and the last of 15 viewpoints."""
+    """Measure processor time of updates on the server: with one sheet and up to three viewpoints, and `loaded`: with
+    three sheets and the last of 15 viewpoints."""
     few: dict[str, list[float]] = {"update": [], "add": [], "estimate": []}
     many: dict[str, list[float]] = {"update": [], "add": [], "estimate": []}
     for k, rng in enumerate(np.random.default_rng(s) for s in np.random.SeedSequence((seed, 99)).spawn(headsets + 2)):
@@ -381,8 +391,11 @@ def _measure_update_times(seed: int, headsets: int) -> dict[str, float]:
 def _time_estimator(
     estimator: AlignmentEstimator, seen: Sequence[ReportedObservation], spent: dict[str, list[float]]
 ) -> None:
-    """The server takes every observation, and renews the estimate at most five times a second, which is with every
-    second observation at 10 Hz. An update is one observation with its half of an estimate."""
+    """Time updates of an estimator.
+
+    The server adds every observation and renews the estimate at most five times a second, which is every second
+    observation at 10 Hz. An update is one observation with half of an estimate.
+    """
     for first, second in zip(seen[::2], seen[1::2], strict=True):
         start = time.thread_time_ns()
         _add_observation(estimator, "one_sheet", first)

@@ -1,8 +1,8 @@
-"""What this machine can do at all: an empty loop at the session's rate that publishes frames of the session's size.
+"""Baseline of the machine: an empty loop at the session's rate that publishes frames of the session's size.
 
-No physics, no people, no codec: a loop at real-time priority and bare libzmq from PUB to SUB, on the machine and in the
-run in which the session is measured. Where even this is late, so is every session. `bench state` and `bench input` give
-it as their reference.
+No physics, participants or codec: a loop at real-time priority and plain libzmq from PUB to SUB, on the machine and in
+the run in which the session is measured. Where this is late, every session is late. It is the reference of `bench
+state` and `bench input`.
 
     python -m iris_session.bench.baseline ADDRESS SOCKETS     one process of receivers
 """
@@ -35,8 +35,16 @@ _JOIN_S: Final = 30.0
 
 
 def measure_baseline(receivers: int, seconds: float = SECONDS) -> dict[str, float]:
-    """Reference figures, keys as of the session's own: `bare_age_ms_*` from sending to the receiving program,
-    `bare_late_tick_share`, `bare_lateness_ms_p99` of a loop of 2 ms that does nothing else."""
+    """Measure the baseline.
+
+    Args:
+        receivers: Number of receiving sockets.
+        seconds: Length of the measured part.
+
+    Returns:
+        `bare_age_ms_*`: from sending to the receiving program; `bare_late_tick_share`, `bare_lateness_ms_p99`: of a
+        loop of 2 ms that does nothing else.
+    """
     with zmq.Context() as context, context.socket(zmq.XPUB) as socket:
         socket.setsockopt(zmq.LINGER, 1_000)
         socket.setsockopt(zmq.XPUB_VERBOSE, 1)
@@ -78,7 +86,7 @@ def _read_ages(process: subprocess.Popen[bytes]) -> NDArray[np.float64]:
 
 
 def _run_loop(socket: zmq.Socket[bytes], seconds: float) -> list[int]:
-    """Lateness [ns] of every tick; deadlines are start + k * period, as the session's."""
+    """Run the loop. Return the lateness [ns] of every tick; deadlines are start + k * period, as in a session."""
     lateness: list[int] = []
     with tick_priority(), freeze_garbage_collector():
         deadline = published = time.monotonic_ns() + PERIOD_NS
@@ -99,7 +107,7 @@ def _encode_frame(sent_ns: int) -> bytes:
 
 
 def _receive(address: str, sockets: int) -> array[int]:
-    """Ages [ns] of the frames of all sockets after the warm-up, until the end is told."""
+    """Receive until the end frame. Return the ages [ns] of the frames of all sockets after the warm-up."""
     ages = array("q")
     with zmq.Context() as context:
         poller, first_ns = zmq.Poller(), 0
@@ -126,6 +134,7 @@ def _receive(address: str, sockets: int) -> array[int]:
 
 
 def main(arguments: Sequence[str]) -> None:
+    """Run one process of receivers and write the ages to standard output."""
     ages = _receive(arguments[0], int(arguments[1]))
     sys.stdout.buffer.write(ages.tobytes())
 

@@ -1,4 +1,4 @@
-"""Benchmark clients: up to four real clients in one process, which log what they were handed and when.
+"""Benchmark clients: up to four real clients in one process, which log the states they receive, with their times.
 
     python -m iris_session.bench.clients < job.json
 
@@ -35,8 +35,8 @@ JOIN_S: Final = 30.0
 
 
 class ClientJob(msgspec.Struct, frozen=True):
-    """One client. `robot`: drives it with the right controller. `samples`: sends 3 devices x 72 Hz. `link`: address
-    of the bad link that it joins over; empty: directly."""
+    """One client. `robot`: robot to drive with the right controller. `samples`: send 3 devices x 72 Hz. `link`: address
+    of its impaired link; empty: none."""
 
     name: str
     role: str
@@ -46,7 +46,7 @@ class ClientJob(msgspec.Struct, frozen=True):
 
 
 class Job(msgspec.Struct, frozen=True):
-    """What one process does. `keep_poses`: log every decoded pose of every frame. Keys: Z85 text, empty: plain."""
+    """Job of one process. `keep_poses`: log every decoded pose of every frame. Keys: Z85 text; empty: plain."""
 
     address: str
     origin_ns: int
@@ -105,19 +105,19 @@ class BenchClient:
             self.poses[len(self.ticks) - 1] = state.poses
 
     def prepare(self, seconds: float) -> None:
-        """Makes room for the poses of a window and touches it: new pages in every frame would cost the client time."""
+        """Allocate and touch memory for the poses of a window: new pages in every frame would cost time."""
         frames = min(MAX_FRAMES, math.ceil(MAX_HZ * seconds))
         self.poses = np.empty((frames if self._job.keep_poses else 0, len(self.client.mirror.bodies), 7))
         self.poses.fill(np.nan)
 
     def join(self) -> None:
-        """Connects, and takes the robot if there is one to take."""
+        """Connect, and acquire the robot if one is given."""
         self.client.connect(JOIN_S)
         if self.spec.robot:
             self.client.acquire([self.spec.robot])
 
     def step(self, now_ns: int) -> None:
-        """Sends one sample of each device when it is time."""
+        """Send one sample of each device if it is due."""
         if not self.spec.samples or now_ns < self._next_ns:
             return
         if not self._next_ns:  # independent headsets do not sample at the same instant
@@ -134,7 +134,7 @@ class BenchClient:
         self._open_samples = max(0, self._open_samples - 1)
 
     def _pose(self, t: float, device: int) -> PoseTuple:
-        """A slow circle of 3 cm radius, so that inverse kinematics has work to do all the time."""
+        """Return a pose on a slow circle of 3 cm radius, so that inverse kinematics always has work."""
         angle = 2.0 * math.pi * (0.25 * t + self._phase)
         return ((0.03 * math.cos(angle), 0.03 * math.sin(angle), 1.0 + 0.1 * device), (1.0, 0.0, 0.0, 0.0))
 
@@ -148,13 +148,13 @@ def _find_applied_seq(applied: tuple[Applied, ...], robot: str) -> int:
 
 
 def run(job: Job) -> None:
-    """Joins, waits for the window, measures, writes the log."""
+    """Join, wait for the window, measure, and write the log."""
     clients = [BenchClient(job, spec) for spec in job.clients]
     for client in clients:
         client.join()
     gc.collect()
     gc.freeze()
-    gc.disable()  # as an application does that cares for latency: nothing here makes cycles
+    gc.disable()  # as a latency-sensitive application does: nothing here creates cycles
     print("ready", flush=True)
     selector = selectors.DefaultSelector()
     selector.register(sys.stdin, selectors.EVENT_READ)

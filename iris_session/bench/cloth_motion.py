@@ -1,7 +1,7 @@
-"""The motion that `bench deformable` streams: a cloth of 1 m whose corners hands lead, simulated once by MuJoCo.
+"""Motion that `bench deformable` streams: a cloth of 1 m with two guided corners, simulated once by MuJoCo.
 
-It is swung, dragged over a ball, let down to the floor, and lifted again, so it folds and wrinkles. To simulate
-100 x 100 vertices takes some minutes (a cloth vertex is a body), so the recording is kept in the user's cache folder.
+It is swung, dragged over a ball, lowered to the floor, and lifted again, so it folds and wrinkles. Simulating
+100 x 100 vertices takes some minutes (a cloth vertex is a body), so the result is kept in the user's cache folder.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from iris_session.bench.report import BenchError
 HZ: Final = 60
 SECONDS: Final = 6
 EDGE_M: Final = 1.0
-#: Height from which the hands begin.
+#: Initial height of the hands.
 TOP_M: Final = 1.4
 #: Short steps keep the cloth stiff: a constraint of MuJoCo settles within some of them.
 STEPS_PER_FRAME: Final = 6
 TIMESTEP_S: Final = 1.0 / (STEPS_PER_FRAME * HZ)
-#: Of an edge, what one hand holds.
+#: Share of an edge that one hand holds.
 _GRIP: Final = 0.1
-#: Of the scene and of the file: raise it with either.
+#: Version of the scene and of the file: increment it with either.
 VERSION: Final = 2
 #: Coordinates are kept in 16 bits: 2 m of them in steps of 0.03 mm.
 _LEVELS: Final = 2**16 - 1
@@ -60,7 +60,8 @@ _SCENE: Final = """
 
 @dataclass(frozen=True)
 class ClothMotion:
-    """`nodes` (frames, n, 3): coordinates in units of `scale` [m] from `origin` (3,) [m], at 60 Hz. `faces` (m, 3)."""
+    """Motion of a cloth at 60 Hz. `nodes` (frames, n, 3): coordinates in units of `scale` [m] from `origin` (3,) [m].
+    `faces` (m, 3): vertex indices."""
 
     nodes: npt.NDArray[np.uint16]
     origin: npt.NDArray[np.float64]
@@ -69,21 +70,22 @@ class ClothMotion:
 
     @property
     def n_vertices(self) -> int:
+        """Number of vertices."""
         return int(self.nodes.shape[1])
 
     def frame_index(self, frame: int) -> int:
-        """Of the recorded frame to show as the `frame`-th: the motion runs to its end and back again."""
+        """Return the index of the recorded frame for frame number `frame`: the motion runs to its end and back."""
         period = 2 * (len(self.nodes) - 1)
         return min(frame % period, period - frame % period)
 
     def vertices(self, index: int) -> npt.NDArray[np.float64]:
-        """(n, 3) [m], world frame."""
+        """Return the vertices of a recorded frame, (n, 3) [m], world frame."""
         p_world: npt.NDArray[np.float64] = self.origin + self.nodes[index] * self.scale
         return p_world
 
 
 def load_cloth_motion(side: int, seed: int, progress: Callable[[str], None] = lambda _: None) -> ClothMotion:
-    """The recording of a cloth of `side` x `side` vertices: from the cache, or made now and kept there."""
+    """Return the motion of a cloth of `side` x `side` vertices: from the cache, or simulated and stored there."""
     path = _cache_folder() / f"cloth-v{VERSION}-{side}x{side}-{seed}-mujoco-{version('mujoco')}.npz"
     try:
         with path.open("rb") as file, np.load(file) as kept:  # numpy leaves a damaged file open
@@ -91,7 +93,7 @@ def load_cloth_motion(side: int, seed: int, progress: Callable[[str], None] = la
     except FileNotFoundError:
         pass
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        progress(f"{path} cannot be read ({error}): made anew")
+        progress(f"{path} cannot be read ({error}): simulating again")
     motion = simulate_cloth(side, seed, progress)
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.stem}.{os.getpid()}.part.npz")  # numpy insists on the ending
@@ -102,16 +104,16 @@ def load_cloth_motion(side: int, seed: int, progress: Callable[[str], None] = la
         part.replace(path)
     except OSError as error:
         part.unlink(missing_ok=True)
-        progress(f"the recording cannot be kept for the next time: {error}")
+        progress(f"the motion cannot be cached: {error}")
     return motion
 
 
 def simulate_cloth(side: int, seed: int, progress: Callable[[str], None] = lambda _: None) -> ClothMotion:
-    """`SECONDS` of the cloth. The same arguments give the same motion on the same version of MuJoCo."""
+    """Simulate `SECONDS` of the cloth. The same arguments give the same motion on the same version of MuJoCo."""
     spacing = EDGE_M / (side - 1)
     hands = _Hands(seed)
     left, right = (" ".join(map(str, p)) for p in hands.positions_at(0.0))
-    progress(f"simulating a cloth of {side} x {side} vertices, this once: some minutes for 100 x 100")
+    progress(f"simulating a cloth of {side} x {side} vertices once: this takes some minutes for 100 x 100")
     model = mujoco.MjModel.from_xml_string(
         _SCENE.format(
             grips=_format_grips(side),
@@ -133,7 +135,9 @@ def simulate_cloth(side: int, seed: int, progress: Callable[[str], None] = lambd
             mujoco.mj_step(model, data)
         frames[frame] = data.flexvert_xpos
     if not np.isfinite(frames).all():
-        raise BenchError(f"the simulated cloth of {side} x {side} vertices (seed {seed}) diverged: take another --seed")
+        raise BenchError(
+            f"the simulated cloth of {side} x {side} vertices (seed {seed}) diverged: choose another --seed"
+        )
     origin = frames.min(axis=(0, 1))
     scale = float((frames.max(axis=(0, 1)) - origin).max()) / _LEVELS
     nodes = np.rint((frames - origin) / scale).astype(np.uint16)
@@ -141,7 +145,7 @@ def simulate_cloth(side: int, seed: int, progress: Callable[[str], None] = lambd
 
 
 def _format_grips(side: int) -> str:
-    """The hands hold the ends of the first row."""
+    """Return the constraints by which the hands hold the ends of the first row."""
     held = max(1, round(_GRIP * side))
     ends = (("left", range(held)), ("right", range(side - held, side)))
     return "".join(
@@ -150,7 +154,7 @@ def _format_grips(side: int) -> str:
 
 
 class _Hands:
-    """Where two hands lead two corners of one edge: slow large movements with small fast ones on top, from rest."""
+    """Motion of two hands that hold two corners of one edge: slow large movements plus small fast ones, from rest."""
 
     def __init__(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
@@ -158,7 +162,7 @@ class _Hands:
         self._hz = rng.uniform(1.2, 2.2, (2, 3))
 
     def positions_at(self, t: float) -> npt.NDArray[np.float64]:
-        """(2, 3) [m]: left and right at time `t` [s]."""
+        """Return the positions of left and right hand at time `t` [s], (2, 3) [m]."""
         ramp = min(1.0, t)
         turn = 2.0 * math.pi * t / SECONDS
         reach = 0.35 * (1.0 - math.cos(turn))  # over the ball and back

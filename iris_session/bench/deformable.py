@@ -1,4 +1,4 @@
-"""`bench deformable`: a cloth of 1 m in motion, from the session's loop by the media channel to clients that decode."""
+"""`bench deformable`: stream a moving cloth of 1 m from the session's loop over the media channel to clients."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from iris_session.streams.deformable_topology import DeformableTopology
 
 STREAM: Final = "cloth"
 BOUND_M: Final = 0.0005
-#: Rigid bodies that move beside the cloth.
+#: Moving rigid bodies beside the cloth.
 BODIES: Final = 50
-#: Every so manieth recorded frame is encoded for figures that need no session.
+#: Every sixth recorded frame is encoded for results that need no session.
 _SAMPLE: Final = 6
 
 
@@ -42,14 +42,23 @@ def run_deformable(
     profile: str = "",
     progress: Callable[[str], None] = lambda _: None,
 ) -> BenchReport:
-    """`vertices` (a square number) of a cloth at 60 Hz to `clients` observers, beside 50 rigid bodies.
+    """Stream a cloth at 60 Hz to observers, beside 50 rigid bodies.
 
-    `profile`: everybody joins over a link of this kind of their own; no bar applies then.
-    Reference: the same frames as float32, and as float32 through zstd.
+    Args:
+        vertices: Vertices of the cloth, a square number.
+        clients: Number of observers.
+        seconds: Length of the measured window.
+        seed: Random seed.
+        curve: Encrypt and authenticate.
+        profile: Link profile of every client; bars do not apply then.
+        progress: Called with short texts.
+
+    Returns:
+        The report. Reference: the same frames as float32, and as float32 compressed by zstd.
     """
     side = math.isqrt(vertices)
     if side * side != vertices:
-        raise BenchError(f"--vertices {vertices}: the cloth is square, take {side * side} or {(side + 1) ** 2}")
+        raise BenchError(f"--vertices {vertices}: the cloth is square, choose {side * side} or {(side + 1) ** 2}")
     motion = load_cloth_motion(side, seed, progress)
     topology = DeformableTopology(motion.n_vertices, motion.faces)
     specs, links = assign_links([ClientJob(f"client{i}", "observer") for i in range(clients)], profile)
@@ -86,10 +95,10 @@ def run_deformable(
 
 
 class _ClothSource:
-    """Publishes the motion from the session's loop, 60 frames a second, as `runtime` does with what physics bends.
+    """Publishes the motion from the session's loop, 60 frames a second, as the session does with deformables.
 
-    `frames`: index into the motion by `capture_ns`. `encoded`: of every frame session time, what it
-    took on the wall and of the processor [ns], and its bytes.
+    `frames`: index into the motion by `capture_ns`. `encoded`: session time, wall time [ns], processor time [ns] and
+    bytes of every frame.
     """
 
     def __init__(self, motion: ClothMotion, topology: DeformableTopology) -> None:
@@ -102,14 +111,14 @@ class _ClothSource:
         self.refused = 0
 
     def publish(self, session: Session) -> None:
-        """Publishes a frame when it is time."""
+        """Publish a frame if it is due."""
         now_ns = session.clock()
         if self._begin_ns < 0:
             self._begin_ns = now_ns
         due = int((now_ns - self._begin_ns) * HZ // 1_000_000_000)
         if due < self._next:
             return
-        self._next = due + 1  # what the loop had no time for is left out
+        self._next = due + 1  # frames for which the loop had no time are skipped
         index = self.motion.frame_index(due)
         vertices = self.motion.vertices(index)
         wall_ns, cpu_ns = time.perf_counter_ns(), time.thread_time_ns()
@@ -123,7 +132,7 @@ class _ClothSource:
 
 
 def _summarize(got: Measurement, source: _ClothSource) -> dict[str, Any]:
-    """Figures of the window. Bits are those of the messages that were sent to a client, with topic and header."""
+    """Return the results of the window. Bits are those of the messages sent to one client, with topic and header."""
     end_ns = got.begin_ns + got.seconds * 1e9
     rows = np.array([row[1:] for row in source.encoded if got.begin_ns <= row[0] < end_ns]).reshape(-1, 3)
     spent, sizes = rows[:, :2] * 1e-6, rows[:, 2]
@@ -160,7 +169,7 @@ def _summarize(got: Measurement, source: _ClothSource) -> dict[str, Any]:
 
 
 def _compute_max_error_m(logs: dict[str, Log], source: _ClothSource) -> float:
-    """Over all vertices of all frames that were delivered. Also checks that clients decoded them as we do here."""
+    """Return the largest error of all delivered vertices. Also check that clients decoded the same vertices."""
     decoder = DeformableDecoder(source.topology)
     errors: dict[tuple[int, int], float] = {}  # by capture and checksum: the same frame goes to every client
     worst = 0.0
@@ -170,7 +179,7 @@ def _compute_max_error_m(logs: dict[str, Log], source: _ClothSource) -> float:
             if key not in errors:
                 decoded = decoder.decode(payload)
                 if zlib.crc32(decoded.data) != checksum:
-                    raise BenchError(f"{name} decoded a frame to other vertices than its bytes hold")
+                    raise BenchError(f"{name} decoded other vertices than its payload contains")
                 truth = source.motion.vertices(source.frames[capture_ns])
                 errors[key] = float(np.linalg.norm(decoded - truth, axis=1).max())
             worst = max(worst, errors[key])
@@ -178,7 +187,7 @@ def _compute_max_error_m(logs: dict[str, Log], source: _ClothSource) -> float:
 
 
 def _iterate_payloads(log: Log) -> Iterator[tuple[int, int, bytes]]:
-    """`capture_ns`, checksum and bytes of every frame that one client took."""
+    """Yield `capture_ns`, checksum and payload of every frame that one client decoded."""
     end = np.cumsum(log["sizes"])
     for i, capture_ns in enumerate(log["capture_ns"]):
         payload = log["payloads"][end[i] - log["sizes"][i] : end[i]].tobytes()
@@ -186,7 +195,7 @@ def _iterate_payloads(log: Log) -> Iterator[tuple[int, int, bytes]]:
 
 
 def _measure_offline(motion: ClothMotion, topology: DeformableTopology) -> dict[str, Any]:
-    """What the coarser classes would cost at 60 Hz, and what of the motion it is measured on."""
+    """Return the bit rate of the coarser classes at 60 Hz, and the speed of the vertices."""
     found: dict[str, Any] = {}
     for name in (BudgetClass.HALF, BudgetClass.QUARTER):
         encoder = DeformableEncoder(topology, BOUND_M)
@@ -207,7 +216,7 @@ def _measure_offline(motion: ClothMotion, topology: DeformableTopology) -> dict[
 
 
 def _measure_reference(motion: ClothMotion) -> dict[str, float]:
-    """The same frames without a codec of their own: float32, and float32 through zstd, level 1."""
+    """Return the bit rate of the same frames as float32, and as float32 compressed by zstd, level 1."""
     compressor = zstandard.ZstdCompressor(level=1)
     sizes, spent_ns = [], []
     for index in range(0, len(motion.nodes), _SAMPLE):

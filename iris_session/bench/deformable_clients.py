@@ -1,9 +1,9 @@
-"""Clients of `bench deformable`: they subscribe to the stream, decode every frame, and log what they were handed.
+"""Clients of `bench deformable`: subscribe to the stream, decode every frame, and log it.
 
     python -m iris_session.bench.deformable_clients < job.json
 
-The same conversation as `bench.clients`: prints `ready`, reads `begin end`, writes its log as one .npz file. In the log
-are the very bytes that came and a checksum of what they were decoded to, so the parent can compare with the truth.
+Same protocol as `bench.clients`: prints `ready`, reads `begin end`, writes its log as one .npz file. The log has the
+received payloads and a checksum of the decoded vertices, so that the parent can compare with the truth.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from iris_session.streams.deformable_topology import DeformableTopology
 
 
 class DeformableJob(Job, frozen=True, kw_only=True):
-    """`topology`: file that holds it, in place of the scene's asset."""
+    """Job of one process. `topology`: file of the topology, instead of the scene's asset."""
 
     stream: str
     topology: str
@@ -61,7 +61,7 @@ class DeformableClient:
         self.overflow = 0
 
     def decode_newest(self, recording: bool) -> None:
-        """Decodes the newest frame, as an application does before it draws."""
+        """Decode the newest frame, as an application does before it draws."""
         frame = self.feed.pop_newest()
         if frame is None:
             return
@@ -80,7 +80,7 @@ class DeformableClient:
         self.checksums.append(zlib.crc32(vertices.data))
 
     def to_columns(self) -> dict[str, np.ndarray[Any, Any]]:
-        """The log. `sizes`: bytes of each payload. The last of `counts`: bytes of topics and headers."""
+        """Return the log. `sizes`: bytes of each payload. The last of `counts`: bytes of topics and headers."""
         topic = len(media_topic(self.client.connection.connection_epoch, self.feed.stream))
         heads = sum(topic + len(f.header.budget_class) + len(encode_media_header(f.header)) for f in self.frames)
         return {
@@ -97,7 +97,7 @@ class DeformableClient:
 
 
 def run(job: DeformableJob) -> None:
-    """Joins, waits for the window, measures, writes the log."""
+    """Join, wait for the window, measure, and write the log."""
     clients = [DeformableClient(job, spec) for spec in job.clients]
     for client in clients:
         client.client.connect(JOIN_S)

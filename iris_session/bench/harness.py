@@ -1,6 +1,6 @@
-"""What the benchmarks of a session share: a session in this process, clients in others, one measured window.
+"""Harness of the session benchmarks: a session in this process, clients in other processes, one measured window.
 
-Clients join directly, or over a bad link: then the proxy of `emulator.impairment` runs too, in a process of its own.
+Clients join directly, or over an impaired link: then the impairment proxy of `netsim` runs in a process of its own.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ Group = tuple[ClientJob, ...]  # the clients of one process
 
 
 def group_clients(specs: Sequence[ClientJob]) -> list[Group]:
-    """`specs` in processes of at most `CLIENTS_PER_PROCESS`."""
+    """Group clients into processes of at most `CLIENTS_PER_PROCESS`."""
     return [tuple(specs[i : i + CLIENTS_PER_PROCESS]) for i in range(0, len(specs), CLIENTS_PER_PROCESS)]
 
 
 def assign_links(specs: Sequence[ClientJob], profile: str) -> tuple[list[ClientJob], dict[str, str]]:
-    """Each of `specs` on a link of its own, and the profile by link; as they are when `profile` is empty."""
+    """Give each client a link of its own. Return the clients, and the profile by link; unchanged without a profile."""
     if not profile:
         return list(specs), {}
     placed = [msgspec.structs.replace(spec, link=link_address(i)) for i, spec in enumerate(specs)]
@@ -57,10 +57,22 @@ def assign_links(specs: Sequence[ClientJob], profile: str) -> tuple[list[ClientJ
 
 @dataclass
 class Measurement:
-    """One window, from session time `begin_ns` on.
+    """Measurements of one window.
 
-    `truth`: poses by tick as the authority had them. `received`: (connection, device, seq) ->
-    session time of receipt. `logs`: by client name. `late_causes`: late ticks of its last ten seconds."""
+    Attributes:
+        seconds: Length of the window.
+        stats: Lateness of its ticks.
+        cpu_share: Processor time of authority and front as a share of one core.
+        logs: Logs by client name.
+        scheduling: Priority of the tick loop.
+        truth: Poses by tick in the authority.
+        received: Sequence number and session time of receipt of samples, by connection and device.
+        rejected: Rejected samples by reason.
+        connections: Connection numbers by client name.
+        drops: Drops by reason.
+        late_causes: Late ticks of the last ten seconds by cause.
+        begin_ns: Session time of its beginning.
+    """
 
     seconds: float
     stats: PacerStats
@@ -77,7 +89,7 @@ class Measurement:
 
 
 class ClientProcess:
-    """The clients of one group. `module`: what they run."""
+    """Process of one group of clients. `module`: the module that it runs."""
 
     def __init__(self, job: Job, module: str = CLIENTS) -> None:
         self.job = job
@@ -85,7 +97,7 @@ class ClientProcess:
         self._process.write(msgspec.json.encode(job) + b"\n")
 
     def is_ready(self) -> bool:
-        """True once its clients have joined. Raises when it died."""
+        """Return whether its clients have joined. Raise `BenchError` if the process ended."""
         if not self._process.is_running:
             raise BenchError(f"a client process ended with status {self._process.exit_status} before it was ready")
         return b"ready" in self._process.read_available_lines()
@@ -94,7 +106,7 @@ class ClientProcess:
         self._process.write(f"{begin_ns} {end_ns}\n".encode())
 
     def read_result(self) -> dict[str, Log]:
-        """The logs by client name, once the process has ended."""
+        """Return the logs by client name, once the process has ended."""
         if self._process.wait(60.0) != 0:
             raise BenchError(f"a client process failed with status {self._process.exit_status}")
         with np.load(self.job.log) as columns:
@@ -109,7 +121,7 @@ class ClientProcess:
         return self._process.is_running
 
     def send_signal(self, number: int) -> None:
-        """Stops or continues the process, for example."""
+        """Send a signal to the process, for example to stop or continue it."""
         self._process.send_signal(number)
 
     def kill(self) -> None:
@@ -118,7 +130,7 @@ class ClientProcess:
 
 @dataclass
 class BenchRun:
-    """What an action of `measure` acts on. `processes`: by the name of each of their clients."""
+    """Running benchmark, on which an action of `measure` acts. `by_client`: processes by client name."""
 
     session: Session
     processes: list[ClientProcess]
@@ -126,7 +138,7 @@ class BenchRun:
     proxy: ImpairmentProcess | None
 
 
-#: Seconds after the beginning of the window, and what happens then; it must be quick.
+#: Seconds after the beginning of the window, and a function to call then; it must be fast.
 Action = tuple[float, Callable[[BenchRun], None]]
 
 
@@ -146,11 +158,22 @@ def measure(
     on_tick: Callable[[Session], None] = lambda _: None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Measurement:
-    """Runs a session over `model` with the clients of `groups` and measures `seconds` of it, warm-up excluded.
+    """Run a session with clients and measure `seconds` of it, warm-up excluded.
 
-    `links`: profile by address, `seed` is of their weather. `actions`: in the order of their times. `assets`: the store
-    of those of the scene; False: clients get poses only. `module` and `make_job`: what other clients run, and their
-    jobs. `beside`: what the loop does after every tick, warm-up included.
+    Args:
+        model: Model of the session.
+        groups: Clients by process.
+        seconds: Length of the measured window.
+        links: Link profile by address.
+        seed: Random seed of the links.
+        actions: Functions to call during the window, in order of their times.
+        keep_poses: Keep the true poses of every published tick.
+        curve: Encrypt and authenticate.
+        assets: Store of the scene's assets; False: clients get poses only.
+        module: Module that client processes run.
+        make_job: Constructor of their jobs.
+        on_tick: Called after every tick, warm-up included.
+        progress: Called with short texts.
     """
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iris-bench-")))
@@ -243,33 +266,33 @@ def _run_session(
 
 
 def _raise_if_stopped(session: Session) -> None:
-    """Ctrl-C ends a session in order; a benchmark then has no result."""
+    """Raise `KeyboardInterrupt` if the session was stopped by Ctrl-C: the benchmark has no result then."""
     if session.stopping:
         raise KeyboardInterrupt
 
 
 def _start_profiles(arena: BenchRun) -> None:
-    """The moments of a profile count from the beginning of the window."""
+    """Start the link profiles: their times count from the beginning of the window."""
     assert arena.proxy is not None
     arena.proxy.send("start")
 
 
 class _Schedule:
-    """Does what is to happen during the window, each thing once."""
+    """Calls the actions of a window at their times."""
 
     def __init__(self, arena: BenchRun, begin_ns: int, actions: Sequence[Action]) -> None:
         self._arena = arena
         self._actions = [(begin_ns + round(at_s * 1e9), action) for at_s, action in actions]
 
     def run_due(self) -> bool:
-        """Does what is due; never true."""
+        """Call the actions that are due. Return False, for `Session.run(until=...)`."""
         while self._actions and self._arena.session.clock() >= self._actions[0][0]:
             self._actions.pop(0)[1](self._arena)
         return False
 
 
 class _Meter:
-    """Reads lateness and processor time at both ends of the window, inside the one run that holds it."""
+    """Reads lateness and processor time at both ends of the window, within one run of the session."""
 
     def __init__(self, session: Session, begin_ns: int, end_ns: int) -> None:
         self._session, self._begin_ns, self._end_ns = session, begin_ns, end_ns
@@ -278,7 +301,7 @@ class _Meter:
         self.late_causes: dict[str, int] = {}
 
     def is_window_over(self) -> bool:
-        """Whether the window is over; for `Session.run(until=...)`."""
+        """Return whether the window is over, for `Session.run(until=...)`."""
         now = self._session.clock()
         if now >= (self._end_ns if self._readings else self._begin_ns):
             times = self._session.processes.reporter.times
@@ -289,7 +312,7 @@ class _Meter:
         return len(self._readings) == 2
 
     def result(self) -> tuple[PacerStats, float]:
-        """Ticks of the window, and CPU of authority and front as a share of one core."""
+        """Return the tick statistics of the window, and the CPU of authority and front as a share of one core."""
         if len(self._readings) < 2:
             raise BenchError("the session ended before the window was over")
         (before, cpu0), (after, cpu1) = self._readings
@@ -306,7 +329,7 @@ def _are_all_ready(waiting: list[ClientProcess]) -> bool:
 
 
 def _limit_rate(period_s: float, clock: Callable[[], int], check: Callable[[], bool]) -> Callable[[], bool]:
-    """`check` at most every `period_s`: it must not disturb the ticks that are measured."""
+    """Limit calls of `check` to one per `period_s`: it must not disturb the measured ticks."""
     due = 0
 
     def until() -> bool:
@@ -332,7 +355,7 @@ def _store_receipts(received: dict[tuple[int, str], list[tuple[int, int]]], entr
 
 
 def _create_keys(folder: Path) -> dict[str, str]:
-    """A server and a client certificate in `folder`, as an installation would have them."""
+    """Create a server and a client certificate in `folder`, as in an installation."""
     import zmq.auth
 
     (folder / "clients").mkdir()

@@ -1,4 +1,4 @@
-"""`bench input`: from a sample's arrival to the first state frame, in its sender's hands, that shows it applied."""
+"""`bench input`: time from the receipt of a sample to the first state frame at its sender that shows it applied."""
 
 from __future__ import annotations
 
@@ -29,17 +29,27 @@ def run_input(
     seed: int = 0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> BenchReport:
-    """`operators` drive one arm each (3 devices x 72 Hz), `observers` look on, 500 Hz physics.
+    """Drive arms with operators while observers watch, at 500 Hz physics.
 
-    `profile`: everybody joins over a link of this kind of their own; figures then include the link, and no bar applies.
-    Reference: `bare`.
+    Args:
+        operators: Clients that drive one arm each, with 3 devices x 72 Hz.
+        robots: Number of seven-joint arms.
+        observers: Clients that only receive.
+        seconds: Length of the measured window.
+        curve: Encrypt and authenticate.
+        profile: Link profile of every client; results then include the link, and bars do not apply.
+        seed: Random seed.
+        progress: Called with short texts.
+
+    Returns:
+        The report. Reference: `measure_baseline`.
     """
     model = n_arms_scene(robots).compile()
     arms = arm_names(robots)
     specs = [ClientJob(f"operator{i}", "operator", arms[i % robots], samples=True) for i in range(operators)]
     specs += [ClientJob(f"observer{i}", "observer") for i in range(observers)]
     specs, links = assign_links(specs, profile)
-    progress("the machine by itself: an empty loop that publishes to as many receivers")
+    progress("measuring the baseline of the machine: an empty loop that publishes to as many receivers")
     reference = None if profile else measure_baseline(operators + observers)
     got = measure(model, group_clients(specs), seconds, links=links, seed=seed, curve=curve, progress=progress)
     responses = compute_response_ms(got, [spec.name for spec in specs if spec.robot])
@@ -81,8 +91,11 @@ def run_input(
 
 
 def compute_response_ms(got: Measurement, names: list[str]) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """For every sample of a driving device: handed-out time of the first frame whose `applied` has it or a newer one,
-    minus its receipt. Samples of the last half second, whose frame may come after the window, are left out."""
+    """Return the response time of every sample of a driving device [ms].
+
+    It is the delivery time of the first frame whose `applied` has this sample or a newer one, minus the receipt of the
+    sample. Samples of the last half second are excluded: their frame may come after the window.
+    """
     out: list[np.ndarray[Any, np.dtype[np.float64]]] = []
     for name in names:
         log = got.logs[name]

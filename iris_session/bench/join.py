@@ -1,6 +1,8 @@
-"""`bench join`: a scene of 300 objects and 200 MB of assets made ready, fetched, verified and decoded; once more with a
-cache. Others watch the moving scene meanwhile: what they notice is measured too, and what they notice of a program of
-the same priority that only copies memory."""
+"""`bench join`: prepare a scene of 300 objects and 200 MB of assets, join and fetch it, and join again with a cache.
+
+Other clients watch the moving scene meanwhile. The age of their state is measured too, and as a reference beside a
+program of the same priority that only copies memory.
+"""
 
 from __future__ import annotations
 
@@ -27,9 +29,9 @@ from iris_session.bench.report import BenchError, BenchReport, make_bar
 from iris_session.session.session import Session
 from iris_session.system.process import PIPE, ChildProcess, child_environment, module_command
 
-#: From the beginning of the window: what the others are used to is measured first.
+#: Time from the beginning of the window to the join; the baseline of the others is measured first.
 BEGIN_S: Final = 4.0
-#: Rejoining with a cache may cost so much of the bytes.
+#: Largest share of the bytes that a join with a cache may fetch.
 WARM_SHARE: Final = 0.01
 
 
@@ -41,8 +43,20 @@ def run_join(
     seed: int = 0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> BenchReport:
-    """One client joins while `clients` observers watch. References, in the same run: the same bytes in one message, and
-    the others' state while memory is copied at the priority at which a client takes assets."""
+    """Join with one client while observers watch.
+
+    Args:
+        objects: Number of moving bodies with meshes.
+        assets_mb: Size of the assets [MB].
+        clients: Number of observers.
+        seconds: Length of the measured window.
+        seed: Random seed.
+        progress: Called with short texts.
+
+    Returns:
+        The report. References, in the same run: the same bytes in one message, and the age of the others' state while
+        memory is copied at the priority at which a client loads assets.
+    """
     progress("compiling the scene")
     model = make_join_model(objects, assets_mb, seed).compile()
     with ExitStack() as stack:
@@ -55,7 +69,7 @@ def run_join(
         progress("and warm")
         ready = _prepare_scene(file, store.root)
         if ready.built:
-            raise BenchError(f"with a warm cache {ready.built} pieces were encoded anew")
+            raise BenchError(f"{ready.built} assets were encoded again although the cache is warm")
         paths = [store.path(address) for address in ready.sizes]
         joiner = stack.enter_context(_Joiner(folder, stack.enter_context(_BulkServer(paths)).port))
         got = measure(
@@ -115,26 +129,24 @@ def _prepare_scene(model: Path, store: Path) -> PreparedScene:
     command = module_command("iris_session.bench.join_scene", str(model), str(store))
     done = subprocess.run(command, stdout=PIPE, env=child_environment(), check=False)
     if done.returncode:
-        raise BenchError(f"the scene could not be made ready: status {done.returncode}")
+        raise BenchError(f"preparing the scene failed with status {done.returncode}")
     return msgspec.json.decode(done.stdout, type=PreparedScene)
 
 
 def _compute_age_p99_ms(logs: dict[str, Log], begin_ns: int, end_ns: int) -> float:
-    """99th percentile of the age of state at everybody [ms], of frames handed out between two session times."""
+    """Return the 99th percentile of the age of state at all clients [ms], of frames between two session times."""
     ages = [
         (log["handed_ns"] - log["state_ns"])[(log["handed_ns"] >= begin_ns) & (log["handed_ns"] < end_ns)]
         for log in logs.values()
     ]
     together = np.concatenate(ages)
     if not len(together):
-        raise BenchError(
-            "nobody was handed any state while the client joined, before or after it: more seconds are needed"
-        )
+        raise BenchError("no client received state while the client joined, or before or after it: increase --seconds")
     return round(float(np.percentile(together, 99)) * 1e-6, 3)
 
 
 class _Joiner:
-    """The process that joins, begun before it is needed: to start Python is no part of joining."""
+    """Process that joins. It is started before it is needed: starting Python is not part of joining."""
 
     def __init__(self, folder: Path, bare_port: int) -> None:
         self._cache, self._bare_port = str(folder / "cache"), bare_port
@@ -148,7 +160,7 @@ class _Joiner:
             self._process.close()
 
     def prepare(self, session: Session) -> None:
-        """Starts the process. Once, in the warm-up."""
+        """Start the process, once, during the warm-up."""
         if self._process is not None:
             return
         job = JoinJob(session.address, session.origin_ns, self._cache, self._bare_port)
@@ -156,7 +168,7 @@ class _Joiner:
         self._write_line(msgspec.json.encode(job))
 
     def start_join(self) -> None:
-        """Lets it join."""
+        """Let the process join."""
         self._write_line(b"go")
 
     def _write_line(self, line: bytes) -> None:
@@ -164,7 +176,7 @@ class _Joiner:
         self._process.write(line + b"\n")
 
     def read_result(self) -> tuple[JoinResult, JoinResult, CopyInterval, float]:
-        """The first time, the second time, when memory was copied, and the seconds of the bare transfer, made now."""
+        """Return the first and second join, the interval of copying, and the seconds of the bulk transfer, run now."""
         self._read_line()
         first, second = (msgspec.json.decode(self._read_line(), type=JoinResult) for _ in range(2))
         copied = msgspec.json.decode(self._read_line(), type=CopyInterval)
@@ -176,11 +188,11 @@ class _Joiner:
         try:
             return self._process.read_line()
         except EOFError:
-            raise BenchError("the client that joined failed; it has said why") from None
+            raise BenchError("the joining client failed; see its messages") from None
 
 
 class _BulkServer:
-    """All assets in one message to whoever asks, from a thread."""
+    """Server of all assets in one message, in a thread."""
 
     def __init__(self, paths: list[Path]) -> None:
         self._paths = paths
@@ -201,6 +213,6 @@ class _BulkServer:
         try:
             self._socket.recv()
             self._socket.send_multipart([path.read_bytes() for path in self._paths], copy=False)
-            self._socket.poll(60_000)  # until it has left
+            self._socket.poll(60_000)  # until it is sent
         except zmq.ZMQError:  # closed
             return

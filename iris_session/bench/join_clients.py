@@ -1,10 +1,11 @@
-"""Who joins in `bench join`: a client with an empty cache, then another with what that one left; and what both are
-compared with: threads of the same priority that only copy memory, and a bare transfer.
+"""Process that joins in `bench join`: a client with an empty cache, then one with the cache of the first.
+
+It also runs the references: threads of the same priority that only copy memory, and a bulk transfer.
 
     python -m iris_session.bench.join_clients < job.json
 
-Prints `ready`, waits for a line, joins, and prints a `Joined` for each of the two as one line of JSON, then a `Copied`;
-waits for another line, and prints the seconds of the bare transfer.
+Prints `ready`, waits for a line, joins twice, and prints a `JoinResult` for each as one line of JSON, then a
+`CopyInterval`; waits for another line, and prints the seconds of the bulk transfer.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from iris_session.scene import decode_image, decode_mesh
 from iris_session.system.priority import lower_thread_priority
 
 JOIN_S: Final = 60.0
-#: Memory is copied for so long, after a pause in which the machine has nothing to do with joining any more; by as many
-#: threads as a client has for assets.
+#: Time of copying memory, after a pause in which work of the join ends, with as many threads as a client has for
+#: assets.
 COPY_S: Final = 2.0
 PAUSE_S: Final = 0.5
 COPY_THREADS: Final = 2
@@ -35,7 +36,7 @@ COPY_BYTES: Final = 16 << 20
 
 
 class JoinJob(msgspec.Struct, frozen=True):
-    """`bare_port`: where the same bytes come in one message."""
+    """Job of the process. `bare_port`: port of the bulk transfer."""
 
     address: str
     origin_ns: int
@@ -44,8 +45,11 @@ class JoinJob(msgspec.Struct, frozen=True):
 
 
 class JoinResult(msgspec.Struct, frozen=True):
-    """Times from `connect` on [s]. `first_picture_s`: specification and the coarsest shape of everything, decoded.
-    `complete_s`: all assets, verified by hash and decoded. `begin_ns`, `end_ns`: session time."""
+    """Times of one join from `connect` on [s].
+
+    `first_picture_s`: specification and the coarsest level of every shape are decoded. `complete_s`: all assets are
+    verified by hash and decoded. `begin_ns`, `end_ns`: session time.
+    """
 
     first_picture_s: float
     complete_s: float
@@ -57,7 +61,7 @@ class JoinResult(msgspec.Struct, frozen=True):
 
 
 def join(job: JoinJob) -> JoinResult:
-    """One client, from nothing to a whole scene. Raises what the client raises."""
+    """Join with one client and fetch the whole scene. Raises what the client raises."""
     begin_ns, cpu_s = time.monotonic_ns(), time.process_time()
     with Client(job.address, role="observer", name="joiner", alignment="not_needed") as client:
         client.assets.cache = AssetStore(job.cache)
@@ -87,26 +91,28 @@ def join(job: JoinJob) -> JoinResult:
 
 
 class CopyInterval(msgspec.Struct, frozen=True):
-    """When memory was copied: session time."""
+    """Interval in which memory was copied, in session time."""
 
     begin_ns: int
     end_ns: int
 
 
 def copy_memory(origin_ns: int) -> CopyInterval:
-    """As low as a client's threads for assets, and without any of their work: what every program costs the others that
-    leaves no core idle. numpy copies without Python's lock."""
+    """Copy memory at the priority of a client's asset threads.
+
+    This is the cost of any program that leaves no core idle. numpy copies without holding Python's lock.
+    """
     time.sleep(PAUSE_S)
     begin_ns = time.monotonic_ns()
     end_ns = begin_ns + round(COPY_S * 1e9)
 
-    def work() -> None:
+    def copy_until_end() -> None:
         lower_thread_priority()
         source, target = np.ones(COPY_BYTES, np.uint8), np.zeros(COPY_BYTES, np.uint8)
         while time.monotonic_ns() < end_ns:
             np.copyto(target, source)
 
-    threads = [threading.Thread(target=work) for _ in range(COPY_THREADS)]
+    threads = [threading.Thread(target=copy_until_end) for _ in range(COPY_THREADS)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -115,7 +121,7 @@ def copy_memory(origin_ns: int) -> CopyInterval:
 
 
 def _make_decoder(spec: SceneSpec) -> Callable[[str, memoryview], Any]:
-    """What a viewer makes of every asset, by what the scene says of it: this one has meshes and images."""
+    """Return the decoder of a viewer for the assets of a scene: meshes and images."""
     meshes = {level.address for mesh in spec.meshes for level in mesh.levels}
     images = {level.address: level.encoding for texture in spec.textures for level in texture.levels}
 
@@ -128,7 +134,7 @@ def _make_decoder(spec: SceneSpec) -> Callable[[str, memoryview], Any]:
 
 
 def transfer_in_bulk(port: int) -> float:
-    """Seconds for all bytes in one message of ZeroMQ, asked for once: nothing checked, stored or decoded."""
+    """Return the seconds for all bytes in one ZeroMQ message: nothing is checked, stored or decoded."""
     with zmq.Context() as context, context.socket(zmq.REQ) as asking:
         asking.linger = 0
         asking.connect(f"tcp://127.0.0.1:{port}")
@@ -139,9 +145,10 @@ def transfer_in_bulk(port: int) -> float:
 
 
 def main() -> None:
+    """Run the process."""
     job = msgspec.json.decode(sys.stdin.readline(), type=JoinJob)
     gc.collect()
-    gc.freeze()  # what Python and its libraries are made of is no part of joining
+    gc.freeze()  # Python and its libraries are not part of joining
     print("ready", flush=True)
     sys.stdin.readline()
     for _ in range(2):

@@ -1,8 +1,8 @@
-"""The scene that `bench join` shares: moving bodies that look like something, and a server that makes it ready.
+"""Scene of `bench join`: moving bodies with meshes and textures, and a process that prepares it as a server does.
 
-    python -m iris_session.bench.join_scene MODEL.mjb STORE     prints what became of it as one JSON object
+    python -m iris_session.bench.join_scene MODEL.mjb STORE     prints a `PreparedScene` as one JSON object
 
-A process of its own: what memory a scene needs can only be told in one that has done nothing else.
+It runs in a process of its own: the memory of a scene can only be measured in a process that did nothing else.
 """
 
 from __future__ import annotations
@@ -21,16 +21,23 @@ from iris_session.demo.scenes import free_bodies_scene
 
 MESHES: Final = 60
 TEXTURES: Final = 60
-#: Of the bytes; meshes have the rest.
+#: Share of the bytes in textures; meshes have the rest.
 TEXTURE_SHARE: Final = 0.8
-#: As measured, coarser levels included: bytes by those of level 0 as raw pixels, and of a mesh by its vertices.
+#: Measured ratios with coarser levels: bytes of a texture per byte of raw pixels, bytes of a mesh per vertex.
 _LEVELS: Final = 1.228
 _VERTEX_BYTES: Final = 35.5
 
 
 class PreparedScene(msgspec.Struct, frozen=True):
-    """`seconds`: from the compiled model to assets that can be fetched. `rss_mib`: most memory meanwhile, beyond that
-    of the process with the model. `scene`: address of the specification; `sizes`: bytes of all assets by address."""
+    """Result of preparing a scene.
+
+    Attributes:
+        seconds: From the compiled model to assets that can be fetched.
+        rss_mib: Peak memory meanwhile, above that of the process with the model.
+        built: Assets that were encoded.
+        scene: Content hash of the specification.
+        sizes: Bytes of all assets by content hash.
+    """
 
     seconds: float
     rss_mib: float
@@ -40,7 +47,7 @@ class PreparedScene(msgspec.Struct, frozen=True):
 
 
 def make_join_model(objects: int, assets_mb: float, seed: int) -> Any:
-    """An `mujoco.MjSpec`: `objects` moving bodies with 60 meshes and 60 textures between them, about `assets_mb` MB."""
+    """Return an `mujoco.MjSpec` of moving bodies that share 60 meshes and 60 textures, about `assets_mb` MB."""
     import mujoco
 
     spec = free_bodies_scene(objects, seed)
@@ -48,7 +55,7 @@ def make_join_model(objects: int, assets_mb: float, seed: int) -> Any:
     side = max(16, round((assets_mb * 1e6 * TEXTURE_SHARE / TEXTURES / 3 / _LEVELS) ** 0.5))
     vertices = max(100, round(assets_mb * 1e6 * (1.0 - TEXTURE_SHARE) / MESHES / _VERTEX_BYTES))
     for i in range(TEXTURES):
-        pixels = rng.integers(0, 256, (side, side, 3), np.uint8)  # noise: what is sent is what is counted
+        pixels = rng.integers(0, 256, (side, side, 3), np.uint8)  # noise does not compress
         spec.add_texture(
             name=f"texture{i}",
             type=mujoco.mjtTexture.mjTEXTURE_2D,
@@ -79,7 +86,7 @@ def make_join_model(objects: int, assets_mb: float, seed: int) -> Any:
 def _make_stone(
     rng: np.random.Generator, vertices: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
-    """Points [m] of a rough ball of 6 cm, triangles and texture coordinates."""
+    """Return points [m] of a rough ball of 6 cm, triangles and texture coordinates."""
     rows = max(4, round((vertices / 2) ** 0.5))
     columns = 2 * rows
     v, u = np.meshgrid(np.linspace(0.0, 1.0, rows), np.linspace(0.0, 1.0, columns, endpoint=False), indexing="ij")
@@ -98,7 +105,7 @@ def _make_stone(
 
 
 def prepare_scene(model_path: str, store_path: str) -> PreparedScene:
-    """What a server does at its start with a compiled model."""
+    """Prepare a compiled model as a server does at its start."""
     from iris_session.assets.store import AssetStore
     from iris_session.physics.load import load_model
     from iris_session.protocol.scene import asset_addresses, encode_scene
@@ -119,7 +126,7 @@ def prepare_scene(model_path: str, store_path: str) -> PreparedScene:
 
 
 def _read_peak_rss() -> int:
-    """Most resident memory of this process [bytes] since it was last asked to count anew."""
+    """Return the peak resident memory of this process [bytes] since the last reset of the peak."""
     line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
     return int(line.split()[1]) * 1024
 

@@ -1,4 +1,4 @@
-"""The one form in which every benchmark reports: parameters, results, bars, the machine."""
+"""Report of a benchmark: parameters, results, bars, the machine."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _OPERATORS: Final = {
 
 
 class BenchError(Exception):
-    """A benchmark that gives no figures: one line for the person who started it."""
+    """The benchmark has no result. The text is one line for the user."""
 
 
 class Bar(msgspec.Struct, frozen=True):
-    """A bound that a result must keep. `ok` is false for a value that is not a number."""
+    """Bound of a result. `ok` is false for a value that is not a number."""
 
     key: str
     op: str
@@ -35,13 +35,13 @@ class Bar(msgspec.Struct, frozen=True):
 
 
 def make_bar(results: dict[str, Any], key: str, op: str, bound: float) -> Bar:
-    """The bar `results[key] op bound`; a dotted key is that of an object within the results."""
+    """Return the bar `results[key] op bound`; a dotted key names a value of an object within the results."""
     value = float(flatten(results)[key] if "." in key else results[key])
     return Bar(key, op, bound, value, bool(_OPERATORS[op](value, bound)))
 
 
 class BenchReport(msgspec.Struct, frozen=True):
-    """What `iris-session bench NAME --json` prints."""
+    """Report that `iris-session bench NAME --json` prints."""
 
     name: str
     params: dict[str, Any]
@@ -52,10 +52,11 @@ class BenchReport(msgspec.Struct, frozen=True):
 
     @property
     def ok(self) -> bool:
+        """True if no bar is missed."""
         return all(b.ok for b in self.bars)
 
     def as_dict(self) -> dict[str, Any]:
-        """The JSON object of the contract. What never came (an infinite age) is null: JSON has no infinity."""
+        """Return the JSON object. Infinite values (an age of something that never arrived) are null."""
         return {
             "name": self.name,
             "version": self.version,
@@ -67,7 +68,7 @@ class BenchReport(msgspec.Struct, frozen=True):
         }
 
     def format(self) -> str:
-        """The same for people."""
+        """Return the report as text."""
         nested = any("." in b.key for b in self.bars)
         results = flatten(self.results) if nested else self.results
         width = max(map(len, results))
@@ -83,7 +84,7 @@ class BenchReport(msgspec.Struct, frozen=True):
 
 
 def flatten(results: dict[str, Any]) -> dict[str, Any]:
-    """Objects within the results as dotted keys."""
+    """Return the results with nested objects as dotted keys."""
     out: dict[str, Any] = {}
     for key, value in results.items():
         if isinstance(value, dict):
@@ -100,7 +101,7 @@ def _replace_infinite(value: Any) -> Any:
 
 
 def describe_machine() -> dict[str, Any]:
-    """The machine as the contract names it."""
+    """Return the `machine` object of a report."""
     pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     return {
         "cpus": os.cpu_count(),

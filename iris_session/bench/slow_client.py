@@ -1,8 +1,7 @@
-"""`bench slow-client`: one client stands still for three seconds; what it gets then, and what the others notice.
+"""`bench slow-client`: one client stalls for three seconds; measure its recovery, and the effect on the others.
 
-Three kinds of a stretch of time alternate, three times each: `baseline` (nothing happens), `stopped` (a client's
-process is stopped, SIGSTOP), `stalled` (the link of another client lets nothing through). Less than 41 s are room for
-fewer rounds only.
+Three kinds of intervals alternate, three times each: `baseline` (no stall), `stopped` (the process of a client is
+stopped, SIGSTOP), `stalled` (the link of another client passes nothing). Below 41 s there are fewer rounds.
 """
 
 from __future__ import annotations
@@ -23,10 +22,10 @@ from iris_session.netsim.session_link import link_address
 
 ROUNDS: Final = 3
 STALL_S: Final = 3.0
-LEAD_S: Final = 0.5  # from the beginning of a stretch to the stall
-#: Shortest stretch: the stall, what comes after it, and a second in which everybody recovers.
+LEAD_S: Final = 0.5  # from the beginning of an interval to the stall
+#: Shortest interval: the lead, the stall, and a second to recover.
 SHORTEST_S: Final = LEAD_S + STALL_S + 1.0
-#: A frame is fresh when it is no older than this beyond what the client is used to (its median before the stall).
+#: A frame is fresh if it is at most this much older than the median of the client before the stall.
 FRESH_MS: Final = 20.0
 STOPPED, STALLED, BASELINE = "stopped", "stalled", "baseline"
 #: IRIS SimPublisher 2.2 on a machine of this kind, plain: DESIGN of the project, measured.
@@ -34,7 +33,7 @@ REFERENCE: Final = {"resume_first_age_ms": 2980.0, "resume_fresh_after_ms": 4400
 
 
 class StallInterval(NamedTuple):
-    """One stretch of the window, in seconds from its beginning."""
+    """One interval of the window, in seconds from the beginning of the window."""
 
     kind: str
     begin_s: float
@@ -50,7 +49,7 @@ class StallInterval(NamedTuple):
 
 
 def plan_intervals(seconds: float) -> list[StallInterval]:
-    """Baseline, stopped, stalled; as often as there is room for, at most `ROUNDS` times."""
+    """Return rounds of baseline, stopped and stalled: as many as fit, at most `ROUNDS`."""
     rounds = max(1, min(ROUNDS, int(seconds / (3 * SHORTEST_S))))
     length_s = max(SHORTEST_S, seconds / (3 * rounds))
     kinds = (BASELINE, STOPPED, STALLED) * rounds
@@ -66,8 +65,18 @@ def run_slow_client(
     profile: str = "",
     progress: Callable[[str], None] = lambda _: None,
 ) -> BenchReport:
-    """`clients` observers, of whom two are slow in turn. `profile`: of everybody's link; else only the stalled one
-    has a link, which forwards as fast as it can."""
+    """Stall two of the clients in turn.
+
+    Args:
+        clients: Number of observers, two of which stall.
+        bodies: Number of moving bodies.
+        seconds: Length of the measured window.
+        seed: Random seed.
+        curve: Encrypt and authenticate.
+        profile: Link profile of every client; bars do not apply then. Without it only the stalled client has a link,
+            which forwards without delay.
+        progress: Called with short texts.
+    """
     model = free_bodies_scene(bodies, seed).compile()
     specs = [ClientJob(f"client{i}", "observer", samples=i < CLIENTS_PER_PROCESS) for i in range(clients - 2)]
     names = [spec.name for spec in specs]
@@ -99,15 +108,15 @@ def run_slow_client(
     return BenchReport("slow-client", params, results, bars, REFERENCE)
 
 
-def measure_after_stall(log: Log, begin_ns: int, stretch: StallInterval, resumed_ns: int) -> tuple[float, float]:
-    """Age of the first frame handed out after the stall, and time from its end to the first fresh one [ms].
+def measure_after_stall(log: Log, begin_ns: int, interval: StallInterval, resumed_ns: int) -> tuple[float, float]:
+    """Return the age of the first frame after the stall, and the time from its end to the first fresh frame [ms].
 
-    Infinite when none came within the stretch.
+    Infinite if no frame arrived within the interval.
     """
     handed, ages = log["handed_ns"], log["handed_ns"] - log["state_ns"]
-    before = _select_between(log, begin_ns, stretch.begin_s, stretch.stall_s)
+    before = _select_between(log, begin_ns, interval.begin_s, interval.stall_s)
     usual_ns = float(np.median(ages[before])) if before.any() else 0.0
-    after = (handed >= resumed_ns) & (handed < begin_ns + stretch.end_s * 1e9)
+    after = (handed >= resumed_ns) & (handed < begin_ns + interval.end_s * 1e9)
     if not after.any():
         return float("inf"), float("inf")
     fresh = after & (ages <= usual_ns + FRESH_MS * 1e6)
@@ -115,10 +124,11 @@ def measure_after_stall(log: Log, begin_ns: int, stretch: StallInterval, resumed
     return first_ms, float(handed[fresh][0] - resumed_ns) * 1e-6 if fresh.any() else float("inf")
 
 
-def measure_others_p99(logs: dict[str, Log], names: list[str], begin_ns: int, stretch: StallInterval) -> float:
-    """99th percentile of the age at `names` from the stall on [ms]: a stretch of the baseline has the same part."""
+def measure_others_p99(logs: dict[str, Log], names: list[str], begin_ns: int, interval: StallInterval) -> float:
+    """Return the 99th percentile of the age at the clients `names` from the stall on [ms]; in a baseline interval from
+    the same time on."""
     ages = [
-        (log["handed_ns"] - log["state_ns"])[_select_between(log, begin_ns, stretch.stall_s, stretch.end_s)]
+        (log["handed_ns"] - log["state_ns"])[_select_between(log, begin_ns, interval.stall_s, interval.end_s)]
         for log in (logs[name] for name in names)
     ]
     return float(np.percentile(np.concatenate(ages), 99)) * 1e-6
@@ -130,21 +140,21 @@ def _select_between(log: Log, begin_ns: int, from_s: float, to_s: float) -> NDAr
 
 
 def _plan_actions(plan: list[StallInterval], link: str, resumed: dict[StallInterval, int]) -> list[Action]:
-    """Stops and stalls, and what ends them; notes in `resumed` when they ended [session time, ns]."""
+    """Return the actions that begin and end stalls; their ends are stored in `resumed` [session time, ns]."""
     actions: list[Action] = []
-    for stretch in plan:
-        if stretch.kind == STOPPED:
-            actions.append((stretch.stall_s, lambda arena: arena.by_client[STOPPED].send_signal(signal.SIGSTOP)))
-        elif stretch.kind == STALLED:
-            actions.append((stretch.stall_s, lambda arena: _post_link_command(arena, "stall", link)))
-        if stretch.kind != BASELINE:
-            actions.append((stretch.resume_s, lambda arena, s=stretch: _end_stall(arena, s, link, resumed)))  # type: ignore[misc]
+    for interval in plan:
+        if interval.kind == STOPPED:
+            actions.append((interval.stall_s, lambda arena: arena.by_client[STOPPED].send_signal(signal.SIGSTOP)))
+        elif interval.kind == STALLED:
+            actions.append((interval.stall_s, lambda arena: _post_link_command(arena, "stall", link)))
+        if interval.kind != BASELINE:
+            actions.append((interval.resume_s, lambda arena, s=interval: _end_stall(arena, s, link, resumed)))  # type: ignore[misc]
     return actions
 
 
-def _end_stall(arena: BenchRun, stretch: StallInterval, link: str, resumed: dict[StallInterval, int]) -> None:
-    resumed[stretch] = arena.session.clock()
-    if stretch.kind == STOPPED:
+def _end_stall(arena: BenchRun, interval: StallInterval, link: str, resumed: dict[StallInterval, int]) -> None:
+    resumed[interval] = arena.session.clock()
+    if interval.kind == STOPPED:
         arena.by_client[STOPPED].send_signal(signal.SIGCONT)
     else:
         _post_link_command(arena, "resume", link)

@@ -1,4 +1,4 @@
-"""`bench state`: how old the rigid state is when a client's application gets it, how exact, and how many bytes."""
+"""`bench state`: age, accuracy and size of the rigid state when a client's application receives it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from iris_session.bench.harness import Measurement, assign_links, group_clients,
 from iris_session.bench.report import NO_BARS, BenchReport, make_bar
 from iris_session.demo.scenes import free_bodies_scene
 
-#: The bar is stated under input: of the clients, so many send 3 devices x 72 Hz of samples meanwhile.
+#: The bar applies under input: this many of the clients send 3 devices x 72 Hz of samples.
 SENDERS = 8
 
 
@@ -26,15 +26,24 @@ def run_state(
     profile: str = "",
     progress: Callable[[str], None] = lambda _: None,
 ) -> BenchReport:
-    """`bodies` free bodies in motion without contact, `clients` observers, 60 Hz.
+    """Publish free bodies in motion without contact to observers, at 60 Hz.
 
-    `profile`: everybody joins over a link of this kind of their own; figures then include the link, and no bar applies.
-    Reference: `bare`.
+    Args:
+        clients: Number of observers.
+        bodies: Number of moving bodies.
+        seconds: Length of the measured window.
+        seed: Random seed.
+        curve: Encrypt and authenticate.
+        profile: Link profile of every client; results then include the link, and bars do not apply.
+        progress: Called with short texts.
+
+    Returns:
+        The report. Reference: `measure_baseline`.
     """
     model = free_bodies_scene(bodies, seed).compile()
     specs = [ClientJob(f"client{i}", "observer", samples=i < SENDERS) for i in range(clients)]
     specs, links = assign_links(specs, profile)
-    progress("the machine by itself: an empty loop that publishes to as many receivers")
+    progress("measuring the baseline of the machine: an empty loop that publishes to as many receivers")
     reference = None if profile else measure_baseline(clients)
     got = measure(
         model, group_clients(specs), seconds, links=links, seed=seed, keep_poses=True, curve=curve, progress=progress
@@ -89,7 +98,7 @@ def run_state(
 
 
 def compute_errors(got: Measurement) -> tuple[float, float]:
-    """Worst position [mm] and rotation [deg] error over all bodies of every delivered frame of every client."""
+    """Return the largest position [mm] and rotation [deg] error of all bodies in all delivered frames."""
     position = rotation = 0.0
     for log in got.logs.values():
         for tick, poses in zip(log["ticks"], log["poses"], strict=True):
@@ -100,6 +109,6 @@ def compute_errors(got: Measurement) -> tuple[float, float]:
 
 
 def _max_angle(a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]) -> float:
-    """Largest angle between two sets of unit quaternions (n, 4); by the chord, which keeps digits near zero."""
+    """Return the largest angle between two sets of unit quaternions (n, 4), by the chord, which is exact near zero."""
     chord = np.minimum(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))
     return float(4.0 * np.arcsin(np.minimum(chord.max() / 2.0, 1.0)))

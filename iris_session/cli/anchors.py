@@ -73,7 +73,7 @@ def _register_print(actions: argparse._SubParsersAction[argparse.ArgumentParser]
         "detect from a distance, and a ruler to check the printed size.",
         epilog="examples:\n"
         "  iris-session anchors print --size 160mm --id table --out table.pdf\n"
-        "  iris-session anchors print --id door --paper a3 --size 200mm",
+        "  iris-session anchors print --id shelf --paper a3 --size 200mm",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     one.add_argument("--size", type=parse_length, default=0.160, metavar="LENGTH", help="edge of the QR code (160mm)")
@@ -163,7 +163,7 @@ COLUMNS: Final = ("image", "x", "y", "z", "qw", "qx", "qy", "qz")
 
 
 @dataclass(frozen=True)
-class Picture:
+class CalibrationPicture:
     """One picture and the sheets detected in it. `camera_name`: name of its folder."""
 
     path: Path
@@ -250,7 +250,7 @@ def read_poses(path: Path) -> dict[str, PoseTuple]:
     return poses
 
 
-def _read_pictures(folder: Path, intrinsics: Path | None, sheets: list[Sheet]) -> list[Picture]:
+def _read_pictures(folder: Path, intrinsics: Path | None, sheets: list[Sheet]) -> list[CalibrationPicture]:
     """Read the pictures of the folder, or of its subfolders, and detect sheets in them."""
     if not folder.is_dir():
         raise CommandError(f"{folder} is not a folder")
@@ -265,12 +265,12 @@ def _list_pictures(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
 
 
-def _read_camera_folder(folder: Path, intrinsics: Path | None, sheets: list[Sheet]) -> list[Picture]:
+def _read_camera_folder(folder: Path, intrinsics: Path | None, sheets: list[Sheet]) -> list[CalibrationPicture]:
     import cv2
 
     from anchors.detection import DetectionError, SheetDetector
 
-    pictures: list[Picture] = []
+    pictures: list[CalibrationPicture] = []
     detectors: dict[tuple[int, int], SheetDetector] = {}
     for path in _list_pictures(folder):
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
@@ -281,7 +281,7 @@ def _read_camera_folder(folder: Path, intrinsics: Path | None, sheets: list[Shee
             detectors[width, height] = SheetDetector(sheets, _read_camera(folder, intrinsics, width, height))
         detector = detectors[width, height]
         try:
-            pictures.append(Picture(path, folder.name, detector.camera, tuple(detector.detect(image))))
+            pictures.append(CalibrationPicture(path, folder.name, detector.camera, tuple(detector.detect(image))))
         except DetectionError as error:
             raise CommandError(f"{path}: {error}") from error
     return pictures
@@ -307,7 +307,7 @@ def _read_camera(folder: Path, intrinsics: Path | None, width: int, height: int)
 
 
 def _solve_from_robot_poses(
-    pictures: list[Picture], poses: dict[str, PoseTuple], arguments: argparse.Namespace
+    pictures: list[CalibrationPicture], poses: dict[str, PoseTuple], arguments: argparse.Namespace
 ) -> dict[str, Any]:
     from anchors.pose import compose, inverse
     from anchors.robot_world import CalibrationError, solve_camera_on_hand, solve_robot_world
@@ -348,7 +348,7 @@ def _solve_from_robot_poses(
 
 
 def _solve_with_known_hand_pose(
-    pictures: list[Picture], seen: list[Picture], robot: list[PoseTuple], T_ee_sheet: PoseTuple
+    pictures: list[CalibrationPicture], seen: list[CalibrationPicture], robot: list[PoseTuple], T_ee_sheet: PoseTuple
 ) -> dict[str, Any]:
     """Solve with a known pose of the sheet on the hand: its pose is then known in every picture."""
     from anchors.camera_rig import SheetView, solve_rig
@@ -368,7 +368,7 @@ def _solve_with_known_hand_pose(
     }
 
 
-def _solve_from_known_sheets(pictures: list[Picture], arguments: argparse.Namespace) -> dict[str, Any]:
+def _solve_from_known_sheets(pictures: list[CalibrationPicture], arguments: argparse.Namespace) -> dict[str, Any]:
     from anchors.camera_rig import SheetView, solve_rig
     from anchors.pose import compose, inverse
     from anchors.robot_world import CalibrationError
@@ -416,7 +416,7 @@ def _format_no_sheet_found(n: int) -> str:
 
 
 def _compute_residuals(
-    pictures: list[Picture], expected: dict[Path, list[PoseTuple]], left_out: set[str]
+    pictures: list[CalibrationPicture], expected: dict[Path, list[PoseTuple]], left_out: set[str]
 ) -> list[dict[str, Any]]:
     """Return per picture and sheet the residual between detection and result, in space and in the picture."""
     import numpy as np

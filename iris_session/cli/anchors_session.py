@@ -477,14 +477,14 @@ def _resolve_frames(looks: AlignmentHistory, anchors: Any, sizes: dict[str, floa
     show, done = make_progress_printer("solving"), 0
     results = []
 
-    def told() -> None:
+    def advance() -> None:
         nonlocal done
         done += 1
         if show is not None:
             show(done, total)
 
     for frame, every in looks.observations.items():
-        results.append(resolve_frame(frame, every, by_frame[frame], anchors, sizes, told))
+        results.append(resolve_frame(frame, every, by_frame[frame], anchors, sizes, advance))
     return results
 
 
@@ -544,13 +544,13 @@ def _format_frame(person: RecordedParticipant, r: FrameResult) -> Iterator[str]:
     yield from _limit_lines(
         [_format_comparison(one) for one in _select_worst(r.compared)], len(r.compared), "alignments"
     )
-    told = [
+    outliers = [
         f"    outlier: '{o.anchor_id}' from place {o.viewpoint_id} at {o.at_ns * 1e-9:.1f} s, {o.looks} observations: "
         f"{_format_mm(o.off_m)}, {math.degrees(o.off_rad):.1f} deg off, "
         f"95 % expected below {_format_mm(o.expected_p95_m)}"
         for o in r.outliers
     ]
-    yield from _limit_lines(told[:MAX_LISTED], len(told), "outliers")
+    yield from _limit_lines(outliers[:MAX_LISTED], len(outliers), "outliers")
 
 
 def _select_worst(compared: list[LiveComparison]) -> list[LiveComparison]:

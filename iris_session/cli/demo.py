@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run one demo and print its summary."""
     import msgspec
 
-    from iris_session.cli.live import LiveView
+    from iris_session.cli.live import TerminalView
     from iris_session.cli.serve import make_session_config
     from iris_session.demo.plays import make_play
     from iris_session.demo.run import run_demo
@@ -90,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
     out = sys.stderr if arguments.json else sys.stdout
 
     def show(session: Session) -> AbstractContextManager[Callable[[], None]]:
-        return LiveView(session, out, f"demo {arguments.demo} on {session.address}").open()
+        return TerminalView(session, out, f"demo {arguments.demo} on {session.address}").open()
 
     result = run_demo(play, config, arguments.timeout, show, profile, arguments.seed)
     if arguments.json:

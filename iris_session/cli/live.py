@@ -1,6 +1,6 @@
 """Live view of a running session in the terminal, in a process of its own so that drawing never delays a tick.
 
-`LiveView` (in the authority's process) writes one JSON line per refresh into a pipe, without ever blocking;
+`TerminalView` (in the authority's process) writes one JSON line per refresh into a pipe, without ever blocking;
 `python -m iris_session.cli.live` reads them and draws: a live table on a terminal, one line per event elsewhere.
 """
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 REFRESH_S: Final = 0.5
 #: Longest wait for the display at the end of the session [s].
 END_S: Final = 3.0
-#: Frequent events that tell a user little.
+#: Frequent events that are of little use on a screen.
 HIDDEN_EVENTS: Final = frozenset({"engagement_changed", "samples_rejected"})
 
 
@@ -86,7 +86,7 @@ def format_event(event: Event) -> str:
     return to_printable(f"{event.session_time * 1e-9:8.2f} s  {kind:20s} {text}")
 
 
-class LiveView:
+class TerminalView:
     """Sender of refreshes to the display process.
 
     Call `update()` often from the session's loop; it sends at most every `REFRESH_S`. `skipped` counts the refreshes

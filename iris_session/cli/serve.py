@@ -247,8 +247,8 @@ def _serve(
 
 
 def _run_with_live_view(arguments: argparse.Namespace, session: Session | ScenePublisher, out: TextIO) -> None:
-    from iris_session.cli.live import LiveView
+    from iris_session.cli.live import TerminalView
 
-    view = LiveView(session, out, f"iris-session {session.name} on {session.address}")
+    view = TerminalView(session, out, f"iris-session {session.name} on {session.address}")
     with view.open():
         session.run(seconds=arguments.seconds, until=view.update)

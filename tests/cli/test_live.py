@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from iris_session.cli.live import EventFilter, LiveView, _render_table, format_event
+from iris_session.cli.live import EventFilter, TerminalView, _render_table, format_event
 from iris_session.protocol.common import Lease
 from iris_session.protocol.server_messages import (
     Event,
@@ -91,7 +91,7 @@ def test_the_display_process_prints_events_and_survives_cut_lines() -> None:
 
 
 class _Session:
-    """What `LiveView` asks of a session."""
+    """What `TerminalView` asks of a session."""
 
     def __init__(self) -> None:
         self.events: list[Event] = []
@@ -111,7 +111,7 @@ def test_a_display_that_does_not_read_delays_nothing(monkeypatch: pytest.MonkeyP
     import os
 
     session = _Session()
-    view = LiveView(session, io.StringIO(), "title")  # type: ignore[arg-type]
+    view = TerminalView(session, io.StringIO(), "title")  # type: ignore[arg-type]
     read, write = os.pipe()
     os.set_blocking(write, False)
     view._pipe = write

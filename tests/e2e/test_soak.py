@@ -42,9 +42,9 @@ def test_check_of_events_finds_gaps_repeats_and_changes() -> None:
     whole = [(1, 0, 1, 11), (1, 0, 2, 22), (2, 1, 4, 44), (2, 1, 5, 55)]
     assert check_log("a", whole, RECORDED) == (0, [])
     assert check_log("a", [(1, 0, 1, 11), (1, 1, 3, 33), (1, 1, 4, 44)], RECORDED) == (1, [])
-    assert "event 4 came after 2, and nobody told" in problem((1, 0, 2, 22), (1, 0, 4, 44))
-    assert "event 4 came after 2, and nobody told" in problem((1, 0, 2, 22), (2, 0, 4, 44))
-    assert "event 5 came after 3, and nobody told" in problem((1, 0, 1, 11), (1, 1, 3, 33), (1, 1, 5, 55))
+    assert "event 4 came after 2, without a notification" in problem((1, 0, 2, 22), (1, 0, 4, 44))
+    assert "event 4 came after 2, without a notification" in problem((1, 0, 2, 22), (2, 0, 4, 44))
+    assert "event 5 came after 3, without a notification" in problem((1, 0, 1, 11), (1, 1, 3, 33), (1, 1, 5, 55))
     assert "event 2 came after 2" in problem((1, 0, 2, 22), (2, 0, 2, 22))
     assert "event 3 is not that of the recording" in problem((1, 0, 2, 22), (1, 0, 3, 22))
     assert "event 6 is not that of the recording" in problem((1, 0, 5, 55), (1, 0, 6, 66))
