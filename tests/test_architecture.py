@@ -43,7 +43,6 @@ FORBIDDEN = {
 }
 #: Imports between rooms that are still to be untied.
 TRANSITIONAL = {
-    ("netsim", "session"),
     ("session", "client"),
 }  # fmt: skip
 #: Rooms whose result may depend on nothing but what they are given: no order of sets, no addresses, no hash seed.

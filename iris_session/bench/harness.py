@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from iris_session.bench.clients import ClientJob, Job
 from iris_session.bench.report import BenchError
-from iris_session.netsim.process import ImpairmentProcess
-from iris_session.netsim.session_link import link_address, links_before
+from iris_session.netsim.process import ImpairmentProcess, link_address
 from iris_session.physics import PacerStats
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.entries import Entry
@@ -188,7 +187,10 @@ def measure(
             curve_clients="" if keys is None else str(folder / "clients"),
         )
         session = stack.enter_context(Session(model, config=config))
-        proxy = stack.enter_context(links_before(session, links, seed)) if links else None
+        proxy = None
+        if links:
+            ports = session.processes.front_ports
+            proxy = stack.enter_context(ImpairmentProcess(links, ports.for_clients, target=ports.host, seed=seed))
         arena = BenchRun(session, [], {}, proxy)
         for i, group in enumerate(groups):
             job = make_job(
@@ -227,7 +229,7 @@ def _run_session(
     if keep_poses:
         session.stepper.on_state = lambda header, poses: _store_poses(truth, header, poses)
     session.stepper.on_entries = lambda entries: _store_receipts(received, entries)
-    connections, names = dict(session.stepper.ledger.connections), session.stepper.ledger.names()
+    connections, names = dict(session.stepper.ledger.connections), session.stepper.ledger.names_by_id()
     begin = session.clock() + round(WARM_UP_S * 1e9)
     end = begin + round(seconds * 1e9)
     for process in processes:
@@ -305,7 +307,7 @@ class _Meter:
         now = self._session.clock()
         if now >= (self._end_ns if self._readings else self._begin_ns):
             times = self._session.processes.reporter.times
-            self.late_causes = {} if times is None else times.late_causes()
+            self.late_causes = {} if times is None else times.count_late_causes()
             stats = self._session.lateness(anew=not self._readings)
             assert stats is not None
             self._readings.append((stats, sum(p.cpu_times().user + p.cpu_times().system for p in self._processes)))

@@ -18,7 +18,7 @@ from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import CLIENTS_PER_PROCESS, Action, BenchRun, Log, assign_links, group_clients, measure
 from iris_session.bench.report import NO_BARS, BenchReport, make_bar
 from iris_session.demo.scenes import free_bodies_scene
-from iris_session.netsim.session_link import link_address
+from iris_session.netsim.process import link_address
 
 ROUNDS: Final = 3
 STALL_S: Final = 3.0

@@ -139,8 +139,7 @@ def run_print(arguments: argparse.Namespace) -> int:
 
 def run_example(arguments: argparse.Namespace) -> int:
     """Print the anchors of a scene in the format of `serve --anchors`."""
-    from iris_session.session.anchors_file import dump_anchors
-    from iris_session.session.config import SessionConfig
+    from iris_session.session.config import SessionConfig, dump_anchors
 
     config = SessionConfig()
     anchors, sizes = config.anchors, config.sheet_sizes()

@@ -415,7 +415,7 @@ def run_solve(arguments: argparse.Namespace) -> int:
     from iris_session.alignment.resolve import solve_relative_poses
     from iris_session.alignment.smoother import AnchorHistory
     from iris_session.recording import Recording, read_alignment_history
-    from iris_session.session.anchors_file import load_anchors
+    from iris_session.session.config import load_anchors
 
     given = None if arguments.anchors is None else load_anchors(arguments.anchors)
     with Recording.open(arguments.recording, warn=False) as recording:

@@ -160,10 +160,10 @@ def _render_table(title: str, status: dict[str, Any], events: list[str]) -> Rend
     for column in ("participant", "role", "robots", "alignment (p95 at robot)", "hand to robot"):
         table.add_column(column)
     for row in status["participants"]:
-        error = "" if row["alignment_mm"] is None else f" {row['alignment_mm']:.1f} mm"
-        delays = [f"{status['input_to_ctrl_ms'][r]:.0f} ms" for r in row["robots"] if r in status["input_to_ctrl_ms"]]
+        error = f" {row['alignment_error_m'] * 1e3:.1f} mm" if row["alignment"] == "measured" else ""
+        delays = [f"{status['input_to_ctrl_ms'][r]:.0f} ms" for r in row["holds"] if r in status["input_to_ctrl_ms"]]
         name = f"{row['name']} ({row['id']})" + ("" if row["connected"] else " [offline]")
-        cells = (name, row["role"], ", ".join(row["robots"]), row["alignment"] + error, ", ".join(delays))
+        cells = (name, row["role"], ", ".join(row["holds"]), row["alignment"] + error, ", ".join(delays))
         table.add_row(*(Text(to_printable(cell)) for cell in cells))  # names are user input, never markup
     late = status["lateness"]
     state = "E-STOP" if status["estop"] else "paused" if status["paused"] else "running"

@@ -176,7 +176,7 @@ def resume_session(arguments: argparse.Namespace) -> Session:
 
 def apply_anchors_file(config: SessionConfig, path: Path | None) -> SessionConfig:
     """Return the configuration with the anchors of a file, if one is given."""
-    from iris_session.session.anchors_file import load_anchors
+    from iris_session.session.config import load_anchors
 
     if path is None:
         return config

@@ -19,12 +19,13 @@ import msgspec
 from iris_session.demo.goals import GoalWatch
 from iris_session.demo.plays import Play
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
-from iris_session.netsim.session_link import address_over, link_address, links_before
+from iris_session.netsim.process import ImpairmentProcess, link_address
 from iris_session.protocol.client_messages import Episode
 from iris_session.protocol.names import EpisodeAction
 from iris_session.session.config import SessionConfig
+from iris_session.session.ledger import HandoverStatus
 from iris_session.session.session import Session
-from iris_session.session.status import HandoverStatus, SessionStatus
+from iris_session.session.status import SessionStatus
 from iris_session.session.verification import verify_recording
 from iris_session.system.process import PIPE, ChildProcess
 
@@ -141,8 +142,11 @@ def run_demo(
         groups = _groups(play.people)
         links = {link_address(i): profile for i in range(len(groups))} if profile else {}
         if links:
-            stack.enter_context(links_before(session, links, seed))
-        addresses = [address_over(session, link) for link in links] or [session.address] * len(groups)
+            ports = session.processes.front_ports
+            stack.enter_context(ImpairmentProcess(links, ports.for_clients, target=ports.host, seed=seed))
+        addresses = [f"{link}:{session.processes.front_ports.control}" for link in links] or [session.address] * len(
+            groups
+        )
         people = stack.enter_context(_People(addresses, groups, timeout_s))
         next_read_ns = began_ns = 0
 

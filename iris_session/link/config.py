@@ -157,6 +157,11 @@ class Ports(msgspec.Struct, frozen=True):
     media_ingest: int = 0
     assets: int = 0
 
+    @property
+    def for_clients(self) -> tuple[int, ...]:
+        """The ports whose traffic a bad link impairs: control, state and media."""
+        return (self.control, self.state, self.media)
+
 
 class FrontStart(msgspec.Struct, frozen=True):
     """Standard input of the front process. `handback`: opaque memory of a front that this one replaces."""

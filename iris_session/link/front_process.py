@@ -1,6 +1,6 @@
-"""Starting, watching, restarting and ending the front process. The parent's side.
+"""`FrontProcess`: the parent's side of the front process. Start, supervise, restart, end.
 
-The only thread lives for some milliseconds, while a front is replaced: to end a process that hangs and to make another
+Its only thread lives for some milliseconds, while a front is replaced: ending a process that hangs and starting another
 takes longer than a tick.
 """
 
@@ -20,17 +20,16 @@ import zmq
 from iris_session.link.config import FrontConfig, FrontError, FrontStart, Ports, SceneInfo
 from iris_session.link.front_link import FrontLink
 from iris_session.link.media_source import MediaSource
-from iris_session.link.starvation import Starvation
 from iris_session.protocol.common import Pose
 from iris_session.system.process import ChildProcess
 
-#: Room is left for our own names, of folder and socket.
+#: Longest folder that leaves room for our own names of folder and socket.
 LONGEST_FOLDER: Final = 75
-#: A front says something at least every `link_messages.BEAT_NS`, however busy; one that does not for so long hangs.
+#: A front sends something at least every `messages.BEAT_NS`, however busy; one that is silent for so long hangs.
 HANGING_NS: Final = 1_500_000_000
-#: One that gets no processor is waited for so long.
+#: Patience with a front that gets no processor.
 STARVED_NS: Final = 15_000_000_000
-#: From this silence on it is seen whether it gets one.
+#: From this silence on the processor time of the front is sampled.
 _QUIET_NS: Final = 500_000_000
 
 
@@ -50,8 +49,8 @@ class FrontProcess:
 
     def __init__(self, config: FrontConfig, scene: SceneInfo) -> None:
         self._scene = scene
-        self._folder = tempfile.TemporaryDirectory(prefix="iris-", dir=_folder_for_sockets())  # mode 0700
-        #: Where processes of this session hand in media, whichever front there is.
+        self._folder = tempfile.TemporaryDirectory(prefix="iris-", dir=_find_socket_folder())  # mode 0700
+        #: Where processes of this session publish media, to whichever front there is.
         self.media_endpoint = f"ipc://{self._folder.name}/media"
         self._config = msgspec.structs.replace(config, media_endpoint=self.media_endpoint)
         self._generation = 0
@@ -59,7 +58,7 @@ class FrontProcess:
         self._replacing: threading.Thread | None = None
         self._failure: FrontError | None = None
         self._source = MediaSource(self.media_endpoint)
-        self._starvation = Starvation()
+        self._starvation = StarvationDetector()
         self.link = FrontLink(config)
 
     @property
@@ -69,32 +68,32 @@ class FrontProcess:
 
     @property
     def scene(self) -> SceneInfo:
-        """What this front and its successors were told last."""
+        """The scene of this front and its successors."""
         return self._scene
 
     @property
     def alive(self) -> bool:
-        """Whether the front runs, reads its link and says something now and then, or is being replaced."""
+        """Return whether the front runs, reads its link and is heard from, or is being replaced."""
         if self._replacing is not None and self._replacing.is_alive():
             return True
         return not self.fault
 
     @property
     def fault(self) -> str:
-        """What a front did that is to be replaced, empty while all is well."""
+        """Why the front is to be replaced, empty while it works."""
         process = self._process
         if process is None or not process.is_running:
             return "ended"
         if self.link.overrun:
             return "read nothing any more"
-        return "" if not self._hangs(process.pid) else f"said nothing for {self.link.silence_ns * 1e-9:.1f} s"
+        return "" if not self._is_hanging(process.pid) else f"said nothing for {self.link.silence_ns * 1e-9:.1f} s"
 
-    def _hangs(self, pid: int) -> bool:
+    def _is_hanging(self, pid: int) -> bool:
         silence_ns = self.link.silence_ns
         if silence_ns < _QUIET_NS:
             self._starvation.clear()
             return False
-        starved = self._starvation.look(pid, time.monotonic_ns())
+        starved = self._starvation.sample(pid, time.monotonic_ns())
         return silence_ns > (STARVED_NS if starved else HANGING_NS)
 
     @property
@@ -102,18 +101,19 @@ class FrontProcess:
         return max(0, self._generation - 1)
 
     def start(self, timeout_s: float = 60.0) -> Ports:
-        """Starts the front and waits until it listens.
+        """Start the front and wait until it listens.
 
-        Raises `FrontError` with one line that says what to do: a port in use, a missing key, a wrong address.
+        Raises:
+            FrontError: A port in use, a missing key, a wrong address; one line says what to do.
         """
         self._process = self._spawn(self._open_link())
         return self.wait_ready(timeout_s)
 
     def restart(self) -> None:
-        """Replaces a front that died or hangs, on the same ports. Does not wait: `link.ports` is set when it is ready.
+        """Replace a front that died or hangs, on the same ports. Does not wait: `link.ports` is set when it is ready.
 
-        Raises `FrontError` when the last try has failed, because the system gives no process, or no room for its
-        files; it may be tried again.
+        Raises:
+            FrontError: The last try failed: the system gives no process, or no room for its files. Try again.
         """
         self._finish_replacing()
         failure, self._failure = self._failure, None
@@ -135,7 +135,7 @@ class FrontProcess:
 
     def _replace(self, old: ChildProcess | None, start: FrontStart) -> None:
         if old is not None:
-            old.close()  # dead, or it takes part no more: no step waits for its answer
+            old.close()  # dead, or silent: no step waits for its answer
         try:
             self._process = self._spawn(start)
         except FrontError as error:
@@ -147,16 +147,16 @@ class FrontProcess:
             self._replacing = None
 
     def set_scene(self, scene: SceneInfo) -> None:
-        """Another scene, for this front and its successors."""
+        """Set the scene of this front and its successors."""
         self._scene = scene
         self.link.send_scene(scene)
 
     def set_anchors(self, anchors: dict[str, Pose]) -> None:
-        """Where the anchors are now (`T_world_anchor`), for the successors of this front, which hears it by events."""
+        """Set the present `T_world_anchor`, for successors of this front, which follows the events."""
         self._config = msgspec.structs.replace(self._config, anchors=anchors)
 
     def wait_ready(self, timeout_s: float) -> Ports:
-        """Waits for `Ready`. Raises `FrontError` when the front fails, dies or says nothing for `timeout_s`."""
+        """Wait for `Ready`. Raises `FrontError` when the front fails, dies or is silent for `timeout_s`."""
         deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
             # In this order: once the thread has ended, the process is the new one.
@@ -175,45 +175,95 @@ class FrontProcess:
         raise FrontError(f"the front process was not ready after {timeout_s:g} s")
 
     def _open_link(self) -> FrontStart:
-        """Listens for the next front; gives what it is to be told."""
+        """Listen for the next front and return its start configuration."""
         self._generation += 1
         try:
             endpoint = self.link.open(Path(self._folder.name) / f"front-{self._generation}")
         except zmq.ZMQError as error:
-            raise _not_started(error) from error
+            raise _make_start_error(error) from error
         return FrontStart(self._config, self._scene, endpoint, os.getpid(), self.link.handback)
 
     def _spawn(self, start: FrontStart) -> ChildProcess:
         try:
             return ChildProcess("iris_session.front.main", config=msgspec.msgpack.encode(start), own_session=True)
         except OSError as error:
-            raise _not_started(error) from error
+            raise _make_start_error(error) from error
 
     def publish_media(
         self, stream: str, frames: bytes | Mapping[str, bytes], capture_ns: int, scene_epoch: int, encoding: str
     ) -> bool:
-        """Hands a frame to whichever front there is; see `MediaSource.publish`."""
+        """Send a frame to whichever front there is; see `MediaSource.publish`."""
         return self._source.publish(stream, frames, capture_ns, scene_epoch, encoding)
 
-    def _end_process(self, patience_s: float) -> None:
+    def _stop_process(self, patience_s: float) -> None:
         if self._process is not None:
             self._process.close(exit_s=patience_s, terminate_s=0.2 if patience_s else 0.05)
 
     def close(self, timeout_s: float = 2.0) -> None:
-        """Tells the clients that the session ends, ends the front, removes the link. May be called twice."""
+        """Notify clients that the session ends, end the front, remove the link. May be called twice."""
         self._finish_replacing()
         self._source.close()
         self.link.send_end()
-        self._end_process(timeout_s if self.link.ports is not None else 0.0)
+        self._stop_process(timeout_s if self.link.ports is not None else 0.0)
         self._process = None
         self.link.close()
         self._folder.cleanup()
 
 
-def _not_started(error: OSError | zmq.ZMQError) -> FrontError:
+def _make_start_error(error: OSError | zmq.ZMQError) -> FrontError:
     return FrontError(f"the front process cannot be started: {error.strerror or error}")
 
 
-def _folder_for_sockets() -> str | None:
-    """The path of a Unix socket has at most 107 bytes: some TMPDIR are too long for one."""
+def _find_socket_folder() -> str | None:
+    """Return a folder whose sockets fit: their path has at most 107 bytes, and some TMPDIR are too long."""
     return None if len(os.fsencode(tempfile.gettempdir())) <= LONGEST_FOLDER else "/tmp"
+
+
+#: Share of the time since the first sample that a starved process waited for a processor.
+_STARVED_SHARE: Final = 0.5
+
+
+class StarvationDetector:
+    """Tells a process that hangs from one that gets no processor: only the first is worth replacing.
+
+    The successor of a starved one would get no processor either, take longer than the old one to answer, and cost every
+    client its connection. Linux only; elsewhere, and for a process that has ended, nothing counts as starved.
+
+    `sample` costs some 30 us: call it only while there is a reason, and `clear` when the reason is gone.
+    """
+
+    def __init__(self) -> None:
+        self._pid = 0
+        self._first_ns = 0
+        self._ran_ns = 0
+        self._waited_ns = 0
+
+    def clear(self) -> None:
+        """Begin anew with the next sample."""
+        self._pid = 0
+
+    def sample(self, pid: int, now_ns: int) -> bool:
+        """Return whether the process mostly could not run since the first sample, which only begins the count."""
+        try:
+            ran_ns, waited_ns = _read_times(pid)
+            ready = _read_state(pid) == "R"
+        except (OSError, ValueError, IndexError):
+            return False
+        if pid != self._pid:
+            self._pid, self._first_ns, self._ran_ns, self._waited_ns = pid, now_ns, ran_ns, waited_ns
+            return ready
+        enough_ns = _STARVED_SHARE * (now_ns - self._first_ns)
+        # The kernel counts a wait when it ends: of one that goes on, only the state tells.
+        return waited_ns - self._waited_ns >= enough_ns or (ready and ran_ns - self._ran_ns < enough_ns)
+
+
+def _read_times(pid: int) -> tuple[int, int]:
+    """Return time on a processor and time ready without one [ns] (Documentation/scheduler/sched-stats.rst)."""
+    ran, waited, _ = Path(f"/proc/{pid}/schedstat").read_text(encoding="ascii").split()
+    return int(ran), int(waited)
+
+
+def _read_state(pid: int) -> str:
+    """Return the state letter of proc_pid_stat(5): R running or ready, T stopped. It follows the name, which may hold
+    anything."""
+    return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()[0]

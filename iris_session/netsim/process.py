@@ -32,6 +32,11 @@ ANSWER_TIMEOUT_S: Final = 10.0
 REALTIME_PRIORITY: Final = 2
 
 
+def link_address(number: int) -> str:
+    """Return the loopback address of link `number` (0 to 253); each headset has a radio link of its own."""
+    return f"127.0.1.{number + 1}"
+
+
 class ImpairmentError(Exception):
     """The proxy cannot run; the text is one line that says why."""
 

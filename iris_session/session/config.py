@@ -1,22 +1,32 @@
-"""`SessionConfig`: every setting of a session, each with a default that works. Nothing here is required."""
+"""`SessionConfig`: every setting of a session, the checks of what an owner passes, and the anchors file.
+
+The anchors file says where sheets and other anchors are; `serve --anchors` and `anchors solve --out` share it. Its form
+is that of `anchors.constellation`; checked here is what a session needs beyond it.
+"""
 
 from __future__ import annotations
 
 import datetime
+import math
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from types import MappingProxyType
-from typing import Final
+from types import MappingProxyType, NoneType
+from typing import Any, Final, TypeVar
 
+import msgspec
+import mujoco
+import numpy as np
+
+from anchors.constellation import Constellation, ConstellationError
 from anchors.pose import IDENTITY_QUAT, PoseTuple, quat_normalize
 from iris_session.authority import AuthorityConfig
 from iris_session.control import ControlConfig
 from iris_session.protocol.common import Pose
 from iris_session.protocol.discovery import DISCOVERY_PORT
-from iris_session.session.config_checks import check_anchors, check_types
-from iris_session.session.errors import ConfigError
+from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.session.errors import ConfigError, short_repr
 
 #: A printed sheet lying at the near edge of the demo table; `T_world_anchor` of anchor id "table".
 DEFAULT_ANCHORS: Final[Mapping[str, PoseTuple]] = MappingProxyType({"table": ((0.0, -0.45, 0.0), IDENTITY_QUAT)})
@@ -26,22 +36,38 @@ DEFAULT_SHEET_M: Final = 0.16
 
 @dataclass(frozen=True)
 class SessionConfig:
-    """Settings of one session.
+    """Settings of one session. Every value has a default.
 
-    `record`: True writes `sessions/<UTC stamp>-<name>/session.rrd` below the current folder, a path writes there,
-    False records nothing. Port 0 takes any free one. `interfaces`: names or addresses of the networks to listen on,
-    instead of `host`; `advertise`: the address that others are told when it is none of ours (a forwarding router).
-    `beacon_port`: UDP port on which the session tells of itself, 0 for not at all. `anchors`: `T_world_anchor` per
-    anchor id; `anchor_sizes`: edge of the printed sheets [m], of those that are to be checked for a misprint (the
-    default one: 0.16). Off loopback everything is encrypted, with `curve` on loopback too: with the key and the
-    allow-list of the user's home of keys, or with the ZeroMQ certificate `curve_key` and the folder of certificates
-    `curve_clients`.
-    `assets`: meshes and textures for clients, kept in the user's cache of assets or in that folder; False: none.
-    `sites`, `tendons`: clients are told of those of a MuJoCo model too (tendons bring the sites they run through).
-    `adapt_media`: clients on slow links get fewer media streams, so that their state stays fresh.
-    `keyframe_s`: distance of the recording's keyframes [s]. `realtime`: `run()` asks for a real-time priority and goes
-    on without when refused. `resume`: a recording (or its folder) of our loop to go on from; scene, robots, name,
-    authority and control come with it, and what is left at its default here is as it was: addresses, ports, keys.
+    Args:
+        name: Name of the session, 1 to 48 letters, digits, `.`, `_` or `-`. Another session on the network with the
+            same name makes it end in a number.
+        host: Address to listen on. Everything but loopback is encrypted.
+        interfaces: Names or addresses of the networks to listen on, instead of `host`.
+        advertise: Address that clients are told when it is none of this machine (a forwarding router).
+        beacon_port: UDP port of the beacons by which clients find the session; 0 for no beacons.
+        control_port: TCP port of the control channel; 0 for any free one.
+        state_port: TCP port of the state channel; 0 for any free one. Media and assets use ports near it.
+        state_hz: Rate of the published state, 1 to 240 [Hz].
+        record: True writes `sessions/<UTC stamp>-<name>/session.rrd` below the current folder, a path writes there,
+            False records nothing.
+        anchors: `T_world_anchor` by anchor id, as `((x, y, z), (w, x, y, z))` [m].
+        anchor_sizes: Edge of the printed sheets [m] that are to be checked for a misprint. The default sheet has 0.16.
+        curve: Encrypt on loopback too.
+        curve_key: ZeroMQ certificate of the server, instead of the key in the user's home of keys.
+        curve_clients: Folder of public certificates, instead of the user's allow-list.
+        keyframe_s: Distance of keyframes in the recording, 0.5 to 60 [s].
+        assets: Offer meshes and textures to clients: True keeps them in the user's cache, a path in that folder.
+        sites: Include the sites of a MuJoCo model in what clients draw.
+        tendons: Include its tendons, with the sites they run through.
+        adapt_media: Send fewer media to clients on slow links, so that their state stays fresh.
+        realtime: `run()` asks for real-time priority, and continues without it when it is refused.
+        resume: A recording of `run()`, or its folder, to continue. Scene, robots, name, authority and control come from
+            it, and addresses, ports and keys unless they are given.
+        authority: Rules of leases, samples, handovers and alignment.
+        control: Limits and gains of robots that participants drive.
+
+    Raises:
+        ConfigError: A value cannot be used; one line says what would be right.
     """
 
     name: str = "session"
@@ -88,19 +114,196 @@ class SessionConfig:
             raise ConfigError(f"keyframe_s {self.keyframe_s} is out of range: 0.5 to 60")
 
     def anchor_poses(self) -> dict[str, Pose]:
-        """`T_world_anchor` of each anchor, as it travels."""
+        """Return `T_world_anchor` of each anchor."""
         return {name: Pose(p, quat_normalize(q)) for name, (p, q) in self.anchors.items()}
 
     def sheet_sizes(self) -> dict[str, float]:
-        """Edge of each printed sheet [m] whose size is known, the default one's included."""
+        """Return the edge of each printed sheet whose size is known [m], including the default one."""
         known = dict.fromkeys(DEFAULT_ANCHORS, DEFAULT_SHEET_M) if self.anchors == DEFAULT_ANCHORS else {}
         return {**known, **{name: float(size) for name, size in self.anchor_sizes.items()}}
 
     def recording_path(self) -> Path | None:
-        """Where this session records to, None when it does not. The name of a default folder is made at each call."""
+        """Return the path of the recording, `None` for none. A default folder gets its name at each call."""
         if self.record is False:
             return None
         if self.record is True:
             stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%S.%fZ")
             return Path("sessions") / f"{stamp}-{self.name}" / "session.rrd"
         return Path(self.record)
+
+
+_Spec = TypeVar("_Spec", RobotSpec, ObjectSpec)
+#: Error texts: what is expected as robots and objects.
+_ROBOTS: Final = (
+    "a list of RobotSpec is expected; load_robots_toml(file, model) of iris_session.physics reads one from a robots "
+    "file, and without robots= they are found in the model"
+)
+_OBJECTS: Final = (
+    'a list of ObjectSpec is expected, as [ObjectSpec(name="hammer", body="hammer")] of iris_session.protocol.specs; '
+    "without objects= they are found in the model"
+)
+#: Types by annotation of `SessionConfig`. A bool is no number.
+_KINDS: Final[dict[str, tuple[type, ...]]] = {
+    "str": (str,),
+    "int": (int,),
+    "float": (float, int),
+    "bool": (bool,),
+    "bool | str | Path": (bool, str, Path),
+    "str | Path | None": (str, Path, NoneType),
+    "tuple[str, ...]": (tuple,),
+    "Mapping[str, PoseTuple]": (Mapping,),
+    "Mapping[str, float]": (Mapping,),
+    "AuthorityConfig": (msgspec.Struct,),
+    "ControlConfig": (msgspec.Struct,),
+}
+#: Quaternions in hand-written files have few digits.
+UNIT_TOLERANCE: Final = 1e-3
+#: Millimetres in a field of metres are a mistake, not a sheet.
+SMALLEST_SHEET_M: Final = 0.01
+LARGEST_SHEET_M: Final = 5.0
+#: Timestep that `run()` accepts: below, no computer keeps up; above, samples could not be held for a tick.
+SHORTEST_TICK_S: Final = 1e-5
+LONGEST_TICK_S: Final = 0.1
+
+
+def check_types(config: Any) -> None:
+    """Check the fields of a `SessionConfig` against their annotations. Raises `ConfigError`."""
+    for item in fields(config):
+        value, annotation = getattr(config, item.name), str(item.type)
+        kinds = _KINDS.get(annotation, (object,))
+        right = isinstance(value, kinds) and (bool in kinds or not isinstance(value, bool))
+        if kinds == (msgspec.Struct,):
+            right = type(value).__name__ == annotation
+        if kinds == (tuple,):
+            right = right and all(isinstance(part, str) for part in value)
+        if not right:
+            raise ConfigError(f"{item.name} must be {annotation}, not {type(value).__name__} {value!r:.60}")
+
+
+def check_anchors(anchors: Mapping[str, Any], sizes: Mapping[str, Any]) -> None:
+    """Check poses `((x, y, z), (w, x, y, z))` and sizes [m] of anchors. Raises `ConfigError`."""
+    for name, size in sizes.items():
+        if name not in anchors:
+            raise ConfigError(f"anchor_sizes: there is no anchor {name!r}: {', '.join(map(repr, anchors)) or 'none'}")
+        number = isinstance(size, int | float) and not isinstance(size, bool)
+        if not (number and SMALLEST_SHEET_M <= size <= LARGEST_SHEET_M):
+            raise ConfigError(
+                f"anchor_sizes: {name!r}: {size!r:.40} is not the edge of a printed sheet in metres, "
+                f"{SMALLEST_SHEET_M:g} to {LARGEST_SHEET_M:g}"
+            )
+    for name, pose in anchors.items():
+        where = f"anchor {name!r}: {pose!r:.80}"
+        try:
+            p, q = (tuple(float(v) for v in part) for part in pose)
+        except (TypeError, ValueError):
+            p, q = (), ()
+        if not isinstance(name, str) or (len(p), len(q)) != (3, 4):
+            raise ConfigError(
+                f"{where} must be T_world_anchor as ((x, y, z), (w, x, y, z)), metres and unit quaternion"
+            )
+        if not all(map(math.isfinite, (*p, *q))):
+            raise ConfigError(f"{where} holds a number that is not finite")
+        if abs(math.hypot(*q) - 1.0) > UNIT_TOLERANCE:
+            raise ConfigError(f"{where}: the quaternion (w, x, y, z) has length {math.hypot(*q):.3g}, it must be 1")
+
+
+def check_timestep(model: mujoco.MjModel) -> None:
+    """Check that `run()` can keep the timestep of a model; a user loop may have any. Raises `ConfigError`."""
+    timestep = float(model.opt.timestep)
+    if not SHORTEST_TICK_S <= timestep <= LONGEST_TICK_S:
+        raise ConfigError(
+            f"the model has a timestep of {timestep:g} s, run() takes {SHORTEST_TICK_S:g} to {LONGEST_TICK_S:g} s: "
+            '<option timestep="0.002"/>'
+        )
+
+
+def check_robots(robots: object) -> tuple[RobotSpec, ...] | None:
+    """Return the specifications as a tuple, `None` to find them in the model. Raises `ConfigError`."""
+    return None if robots is None else _check_specs("robots", robots, RobotSpec, _ROBOTS)
+
+
+def check_objects(objects: object) -> tuple[ObjectSpec, ...] | None:
+    """Return the specifications as a tuple, `None` to find them in the model. Raises `ConfigError`."""
+    return None if objects is None else _check_specs("objects", objects, ObjectSpec, _OBJECTS)
+
+
+def _check_specs(what: str, given: object, kind: type[_Spec], expected: str) -> tuple[_Spec, ...]:
+    if isinstance(given, str | bytes | Path | Mapping) or not isinstance(given, Iterable):
+        raise ConfigError(f"{what} is {short_repr(given)}: {expected}")
+    specs = tuple(given)
+    for place, spec in enumerate(specs):
+        if not isinstance(spec, kind):
+            raise ConfigError(f"{what}[{place}] is {short_repr(spec)}: {expected}")
+        try:
+            msgspec.msgpack.decode(msgspec.msgpack.encode(spec), type=kind)
+        except (TypeError, ValueError) as error:  # as the journal could not hold it
+            raise ConfigError(f"{what}[{place}] is a {kind.__name__} with a wrong field: {error}") from error
+    return specs
+
+
+def check_arguments(model: object, data: object, config: object) -> None:
+    """Check model, data and configuration. Raises `TypeError`, and `ConfigError` for data of another model."""
+    if type(config).__name__ != "SessionConfig":
+        raise TypeError(f"config must be a SessionConfig, not {type(config).__name__}: Session(model, data, config)")
+    if not isinstance(model, mujoco.MjModel):
+        kind = type(model).__name__
+        advice = "; call its compile() first" if kind == "MjSpec" else ""
+        raise TypeError(f"model must be an MjModel or the path of a model file, not {kind}{advice}")
+    if data is None:
+        return
+    if not isinstance(data, mujoco.MjData):
+        raise TypeError(f"data must be MjData of the model, not {type(data).__name__}: Session(model, data, config)")
+    if np.shape(data.qpos) != (model.nq,) or np.shape(data.ctrl) != (model.nu,):
+        raise ConfigError(
+            f"data is of another model: it has {np.size(data.qpos)} positions and {np.size(data.ctrl)} controls, "
+            f"the model {model.nq} and {model.nu}"
+        )
+
+
+HELP: Final = "`iris-session anchors example` prints one that is right"
+#: Characters of a name on the wire.
+MAX_ID: Final = 64
+#: An anchor further away is in millimetres.
+MAX_DISTANCE_M: Final = 100.0
+
+
+def load_anchors(path: Path) -> Constellation:
+    """Read an anchors file.
+
+    Raises:
+        ConfigError: The file cannot be read or used; one line says what would be right.
+    """
+    try:
+        text = path.expanduser().read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        why = getattr(error, "strerror", None) or "not UTF-8 text"
+        raise ConfigError(f"anchors file {str(path)!r} cannot be read: {why}; {HELP}") from error
+    try:
+        found = Constellation.from_toml(text)
+    except ConstellationError as error:
+        raise ConfigError(f"{path.name}: {' '.join(str(error).split())}; {HELP}") from error
+    for name, (p, _) in found.anchors.items():
+        if not 0 < len(name) <= MAX_ID:
+            raise ConfigError(f"{path.name}: {name[:80]!r} cannot be the id of an anchor: 1 to {MAX_ID} characters")
+        if max(map(abs, p)) > MAX_DISTANCE_M:
+            raise ConfigError(
+                f"{path.name}: anchors.{name}.position_m is {max(map(abs, p)):g} m away: are these metres?"
+            )
+    try:
+        check_anchors(found.anchors, found.sizes)
+    except ConfigError as error:
+        raise ConfigError(f"{path.name}: {error}") from error
+    return found
+
+
+def dump_anchors(anchors: Mapping[str, PoseTuple], sizes: Mapping[str, float]) -> str:
+    """Return the text of an anchors file, to be edited; `load_anchors` reads it back."""
+    reference = next(iter(anchors))
+    head = (
+        "# Where anchors are: T_world_anchor, metres and a unit quaternion, w first. The origin of a sheet is the\n"
+        "# centre of its code, x right, y up along the upright sheet, z out of the paper. `size_m`: edge of the code\n"
+        "# as measured; leave it out where not known. `error_m`: 95 % of how well the place is known relative to\n"
+        "# the reference.\n"
+    )
+    errors = dict.fromkeys(anchors, 0.0)
+    return head + Constellation(reference, dict(anchors), errors, dict(sizes)).to_toml()

@@ -27,13 +27,13 @@ from iris_session.session.config import SessionConfig
 from iris_session.session.errors import ConfigError
 
 
-def unmeasured(cause: str) -> None:
-    """Nobody asks how long the parts of a step take."""
+def ignore_lap(cause: str) -> None:
+    """Ignore a lap: the default of `SessionCore.step`."""
 
 
-#: Entries of a step from which on its ticks solve less: the samples of two people with three devices. Eight people at
-#: 72 Hz send so many in a third of the steps, and a robot still is solved at 62 Hz if all steps had them.
-CROWDED: Final = 6
+#: Entries of a step from which on its ticks solve less: the samples of two participants with three devices. Eight
+#: participants at 72 Hz send so many in a third of the steps; a robot is still solved at 62 Hz if all steps have them.
+CROWDED_ENTRIES: Final = 6
 _encoder = msgspec.msgpack.Encoder()
 _decode_status = msgspec.msgpack.Decoder(tuple[ControlStatus, ...]).decode
 
@@ -53,7 +53,7 @@ _decode_config = msgspec.msgpack.Decoder(CoreConfig).decode
 
 
 class StepOutcome(msgspec.Struct, frozen=True):
-    """What one step gave: decision of the authority, report of control, digest of all of it (16 bytes, or none)."""
+    """Outcome of one step: decision of the authority, report of control, digest of all of it (16 bytes, or none)."""
 
     decision: Decision
     status: tuple[ControlStatus, ...]
@@ -80,10 +80,11 @@ class Plant(NamedTuple):
 
 
 def make_plant(model: mujoco.MjModel, scene: SceneLoaded, control: ControlConfig) -> Plant:
-    """Takes what the scene of a session needs to be stepped, without touching any session.
+    """Make world and controller of a scene, without touching any session.
 
-    Raises the typed errors of `physics` and `control` when the model cannot be driven (for example a torque actuator
-    without a hold law), `SnapshotError` for an initial state of another model.
+    Raises:
+        PhysicsError, ControlError: The model cannot be driven, for example a torque actuator without a hold law.
+        SnapshotError: The initial state is of another model.
     """
     world = World(model, scene.robots, scene.objects)
     if scene.initial_state:
@@ -91,8 +92,8 @@ def make_plant(model: mujoco.MjModel, scene: SceneLoaded, control: ControlConfig
     return Plant(world, Controller(model, scene.robots, scene.objects, control), scene)
 
 
-def no_models(model_hash: str) -> mujoco.MjModel:
-    """Of a session whose scene never changed."""
+def raise_no_model(model_hash: str) -> mujoco.MjModel:
+    """Raise `KeyError`: the default of a session whose scene never changed."""
     raise KeyError(f"the recording does not hold the model {model_hash}")
 
 
@@ -106,16 +107,16 @@ class SessionCore:
         self,
         model: mujoco.MjModel,
         config: CoreConfig,
-        models: Callable[[str], mujoco.MjModel] = no_models,
+        models: Callable[[str], mujoco.MjModel] = raise_no_model,
     ) -> None:
-        #: As a recording gives it back: a whole number in a float field would change `round(x / step)` and the digest.
+        #: Decoded as from a recording: a whole number in a float field would change `round(x / step)` and the digest.
         self.config = config = _decode_config(_encoder.encode(config))
         self._models = models
         #: Plants that were made off the loop, for the `SceneLoaded` to come, by `model_hash`.
         self.prepared: dict[str, Plant] = {}
         self._model = model
-        self._use(self._first_plant())
-        self.authority = Authority(_within_control(config), config.robots, config.objects)
+        self._set_plant(self._make_first_plant())
+        self.authority = Authority(_limit_scales(config), config.robots, config.objects)
         self._status: tuple[ControlStatus, ...] = ()
 
     def step(
@@ -126,9 +127,9 @@ class SessionCore:
         plant: bytes = b"",
         *,
         digest: bool = True,
-        lap: Callable[[str], None] = unmeasured,
+        lap: Callable[[str], None] = ignore_lap,
     ) -> StepOutcome:
-        """One pass at session time `now_ns`, `n_ticks` >= 0 ticks of physics.
+        """Take one step at session time `now_ns` with `n_ticks` >= 0 ticks of physics.
 
         Without `digest` the outcome has an empty one: it takes a sixth of a step, and only a recording needs it.
         `lap` is called after each part with the `LateCause` that its time counts as; it has no influence.
@@ -138,7 +139,7 @@ class SessionCore:
         """
         for entry in entries:
             if isinstance(entry.message, SceneLoaded) and entry.connection == entry.connection_epoch == HOST:
-                self._load(entry.message)
+                self._load_scene(entry.message)
         world = self.world
         if plant:
             world.set_state_bytes(plant)
@@ -150,9 +151,9 @@ class SessionCore:
         elif any(entry.connection == HOST and isinstance(entry.message, ExternalReset) for entry in entries):
             self.controller.reset(world.data)  # the owner moved the robots: they hold where they stand now
         self.controller.begin(now_ns, n_ticks, decision, world.view())
-        crowded = len(entries) >= CROWDED
+        is_crowded = len(entries) >= CROWDED_ENTRIES
         for _ in range(0 if world.diverged else n_ticks):
-            self.controller.tick(world.data, crowded)
+            self.controller.tick(world.data, is_crowded)
             lap(LateCause.CONTROL)
             if not plant and not self._tick():
                 break
@@ -160,16 +161,16 @@ class SessionCore:
         self._status = self.controller.status()
         return StepOutcome(decision, self._status, self._digest(decision) if digest else b"", world.diverged)
 
-    def rest(self, plant: bytes) -> None:
-        """Writes the last `world.data.ctrl` for the plant in state `plant`: robots at rest, objects let go.
+    def write_rest_controls(self, plant: bytes) -> None:
+        """Write the last `world.data.ctrl` for the plant in state `plant`: robots at rest, objects released.
 
-        No step may follow: this one is in no journal.
+        No step may follow: this is in no journal.
         """
         self.world.set_state_bytes(plant)
         self.controller.rest(self.world.data)
 
     def _tick(self) -> bool:
-        """One tick of physics; False when the state is no longer finite: physics then stands still until a reset."""
+        """Advance physics by a tick; False when the state is no longer finite: physics stands still until a reset."""
         try:
             self.world.tick()
         except SimulationDivergedError:
@@ -181,25 +182,25 @@ class SessionCore:
         if self.scene.initial_state:
             self.world.set_state_bytes(self.scene.initial_state)
 
-    def _first_plant(self) -> Plant:
+    def _make_first_plant(self) -> Plant:
         config = self.config
         scene = SceneLoaded("", config.robots, config.objects, config.initial_state)
         return make_plant(self._model, scene, config.control)
 
-    def _load(self, scene: SceneLoaded) -> None:
-        """Another scene, from the beginning of this step on."""
+    def _load_scene(self, scene: SceneLoaded) -> None:
+        """Replace the scene, from the beginning of this step on."""
         plant = self.prepared.pop(scene.model_hash, None)
         if plant is None or plant.scene != scene:
             plant = make_plant(self._models(scene.model_hash), scene, self.config.control)
-        self._use(plant)
+        self._set_plant(plant)
         self._status = ()
 
-    def _use(self, plant: Plant) -> None:
+    def _set_plant(self, plant: Plant) -> None:
         self.world, self.controller, self.scene = plant
         self.controller.reset(self.world.data)
 
-    def as_it_is(self) -> CoreConfig:
-        """The configuration of a session that begins with the present scene."""
+    def current_config(self) -> CoreConfig:
+        """Return the configuration of a session that begins with the present scene."""
         scene = self.scene
         return msgspec.structs.replace(
             self.config, robots=scene.robots, objects=scene.objects, initial_state=scene.initial_state
@@ -213,7 +214,7 @@ class SessionCore:
         return h.digest()
 
     def snapshot(self) -> CoreState:
-        """State after the last step; `restore` of it is invisible to everything that follows."""
+        """Return the state after the last step; restoring it is invisible to everything that follows."""
         return CoreState(
             self.world.snapshot(),
             self.authority.snapshot(),
@@ -222,36 +223,36 @@ class SessionCore:
         )
 
     def restore(self, state: CoreState) -> None:
-        """Inverse of `snapshot`, into a core built with the same model and configuration.
+        """Restore a snapshot into a core that was built with the same model and configuration.
 
-        A scene that was loaded since then is left for the one of the snapshot.
+        A scene that was loaded since then is replaced by the one of the snapshot.
         """
         self.authority.restore(state.authority)
         scene = self.authority.scene
         if scene is None and self.scene.model_hash:
-            self._use(self._first_plant())
+            self._set_plant(self._make_first_plant())
         elif scene is not None and scene != msgspec.structs.replace(self.scene, model_hash=self.world.scene_hash):
-            self._load(scene)
+            self._load_scene(scene)
         self.world.restore(state.plant)
         self.controller.restore(state.controller)
         self._status = _decode_status(state.status)
 
 
-def _within_control(config: CoreConfig) -> AuthorityConfig:
-    """The authority's configuration without the motion scales that control would not follow."""
+def _limit_scales(config: CoreConfig) -> AuthorityConfig:
+    """Return the authority's configuration without the motion scales that control would not follow."""
     authority, control = config.authority, config.control
     low, high = max(authority.min_scale, control.min_scale), min(authority.max_scale, control.max_scale)
     return msgspec.structs.replace(authority, min_scale=low, max_scale=high)
 
 
-def plant_state(model: mujoco.MjModel, data: mujoco.MjData) -> bytes:
-    """`mjSTATE_INTEGRATION` of `data`: what `step(plant=...)` and `CoreConfig.initial_state` take."""
+def read_plant_state(model: mujoco.MjModel, data: mujoco.MjData) -> bytes:
+    """Return `mjSTATE_INTEGRATION` of `data`, for `step(plant=...)` and `CoreConfig.initial_state`."""
     state = np.empty(mujoco.mj_stateSize(model, STATE))
     mujoco.mj_getState(model, data, state, STATE)
     return state.tobytes()
 
 
-def core_of(
+def make_session_core(
     session: SessionConfig,
     model: mujoco.MjModel,
     data: mujoco.MjData | None,
@@ -260,9 +261,9 @@ def core_of(
     user_owned: bool,
     known: SessionCore | None = None,
 ) -> SessionCore:
-    """The core of a session that begins with `data` as it is now; `known` when that is the one."""
+    """Return the core of a session that begins with `data` as it is now; `known` when it is the same."""
     authority = msgspec.structs.replace(session.authority, user_owned_loop=user_owned, anchors=session.anchor_poses())
-    initial = b"" if data is None else plant_state(model, data)
+    initial = b"" if data is None else read_plant_state(model, data)
     config = CoreConfig(authority, session.control, robots, objects, initial)
     if known is not None and known.config == config:
         return known

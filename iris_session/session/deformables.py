@@ -1,7 +1,7 @@
-"""What bends in a session, as media streams: the vertices of every mesh, after every published state.
+"""Deformables of a session as media streams: the vertices of every mesh, after every published state.
 
-A mesh at rest is sent once a second, for those who came meanwhile. Encoding 10,000 vertices takes the loop that takes
-the ticks about a millisecond.
+A mesh at rest is sent once a second, for clients that joined meanwhile. Encoding 10,000 vertices costs the tick loop
+about a millisecond.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from iris_session.scene.mujoco_assets import read_flex_mesh, stream_name
 from iris_session.streams.deformable import DeformableEncoder
 from iris_session.streams.deformable_topology import DeformableTopology
 
-#: Farthest that a delivered vertex is from where it was [m].
+#: Bound on the error of a delivered vertex [m].
 BOUND_M: Final = 0.0005
-#: Of a mesh at rest.
+#: Period of a mesh at rest.
 REPEAT_NS: Final = 1_000_000_000
 #: `publish(stream, frames, capture_ns, scene_epoch, encoding)`; false: the frame is dropped, and counted there.
 Publish = Callable[[str, dict[str, bytes], int, int, str], bool]
 
 
-class Bending(NamedTuple):
-    """A mesh whose vertices move. `vertices` gives those of now, (n, 3) [m], world frame."""
+class DeformableMesh(NamedTuple):
+    """A mesh whose vertices move. `vertices` returns the present ones, shape (n, 3) [m], world frame."""
 
     stream: str
     topology: DeformableTopology
@@ -35,32 +35,37 @@ class Bending(NamedTuple):
 
 
 class _Stream:
-    def __init__(self, mesh: Bending) -> None:
+    def __init__(self, mesh: DeformableMesh) -> None:
         self.mesh = mesh
         self.encoder = DeformableEncoder(mesh.topology, BOUND_M)
         self.sent_ns = 0
 
 
 class DeformableStreams:
-    """What bends in one scene at a time. `publish` hands a frame to the front."""
+    """Streams of the deformables of one scene at a time. `publish` passes a frame to the front."""
 
-    def __init__(self, meshes: Sequence[Bending], publish: Publish) -> None:
-        self._publish = publish
-        self.use(meshes)
+    def __init__(self, meshes: Sequence[DeformableMesh], publish: Publish) -> None:
+        self._publish_frame = publish
+        self.replace_meshes(meshes)
 
-    def use(self, meshes: Sequence[Bending]) -> None:
-        """Those of another scene from now on."""
+    def replace_meshes(self, meshes: Sequence[DeformableMesh]) -> None:
+        """Stream the meshes of another scene from now on."""
         self._streams = [_Stream(mesh) for mesh in meshes]
         self._epoch = -1
 
     @property
-    def streams(self) -> frozenset[str]:
-        """Their names. From any thread."""
+    def stream_names(self) -> frozenset[str]:
+        """Names of the streams. From any thread."""
         return frozenset(one.mesh.stream for one in self._streams)
 
-    def send(self, scene_epoch: int, end_ns: int, shown_ns: int) -> None:
-        """The vertices as they are after the newest tick, which ended at `shown_ns`; call it at the rate of the state.
-        `end_ns`: when it did, or now, where the state is sent again."""
+    def publish(self, scene_epoch: int, end_ns: int, shown_ns: int) -> None:
+        """Publish the vertices as they are after the newest tick; call it at the rate of the state.
+
+        Args:
+            scene_epoch: Of the published state.
+            end_ns: Session time of the end of that tick, or now where the state is published again.
+            shown_ns: Session time of the end of that tick.
+        """
         if scene_epoch != self._epoch:
             self._epoch = scene_epoch
             for stream in self._streams:
@@ -72,15 +77,18 @@ class DeformableStreams:
             if frames is None:
                 continue
             stream.sent_ns = end_ns
-            if not self._publish(stream.mesh.stream, frames, shown_ns, scene_epoch, MediaEncoding.DEFORMABLE):
-                stream.encoder.reset()  # nobody got it: the next one is sent whatever it is
+            if not self._publish_frame(stream.mesh.stream, frames, shown_ns, scene_epoch, MediaEncoding.DEFORMABLE):
+                stream.encoder.reset()  # it was dropped: the next frame must be complete
 
 
-def flexes(world: World) -> list[Bending]:
-    """The flexes of a world."""
+def list_flexes(world: World) -> list[DeformableMesh]:
+    """Return the flexes of a MuJoCo world."""
     meshes = [read_flex_mesh(world.model, index) for index in range(world.model.nflex)]
-    return [Bending(stream_name(index), mesh.topology, _of(world, mesh.vertices)) for index, mesh in enumerate(meshes)]
+    return [
+        DeformableMesh(stream_name(index), mesh.topology, _make_reader(world, mesh.vertices))
+        for index, mesh in enumerate(meshes)
+    ]
 
 
-def _of(world: World, rows: NDArray[np.int64]) -> Callable[[], NDArray[np.floating]]:
+def _make_reader(world: World, rows: NDArray[np.int64]) -> Callable[[], NDArray[np.floating]]:
     return lambda: world.data.flexvert_xpos[rows]

@@ -3,9 +3,9 @@
 SessionError
 ├── ConfigError          a value in the configuration cannot be used
 ├── StartError           a process of the session did not come up (port in use, unwritable folder)
-├── ResumeError          a recording that the session cannot go on from
+├── ResumeError          a recording that cannot be continued
 ├── OwnershipError       the call does not fit the way this session is driven
-└── PublishError         what a publisher was given cannot be shown
+└── PublishError         a pose, joint, mesh or time that cannot be published
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class StartError(SessionError):
 
 
 class ResumeError(SessionError):
-    """The session cannot go on from this recording."""
+    """The recording cannot be continued."""
 
 
 class OwnershipError(SessionError):
@@ -34,9 +34,9 @@ class OwnershipError(SessionError):
 
 
 class PublishError(SessionError):
-    """What a publisher was given cannot be shown; nothing has changed."""
+    """A pose, joint, mesh or time that cannot be published; nothing has changed."""
 
 
-def brief(given: object) -> str:
-    """What somebody gave, for an error text: on one line, however large it is."""
-    return " ".join(reprlib.repr(given).split())
+def short_repr(value: object) -> str:
+    """Return a one-line repr of a value, truncated for error messages."""
+    return " ".join(reprlib.repr(value).split())

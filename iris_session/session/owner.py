@@ -1,6 +1,6 @@
-"""What the owner of a session may do whatever advances its world: begin and end it, speak in it, see how it is.
+"""`Owner`: what the program that embeds a session can do with it, however its world advances.
 
-`Session` (a MuJoCo scene) and `ScenePublisher` (any other world) add how the world goes on.
+`Session` (a MuJoCo scene) and `ScenePublisher` (any other world) add how the world advances.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import signal
 import threading
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -16,29 +16,31 @@ from typing import Self
 
 from iris_session.physics import Pacer
 from iris_session.protocol.client_messages import ClearEStop, EStop, Marker
-from iris_session.protocol.entries import EntryMessage
+from iris_session.protocol.entries import EntryMessage, ScenePatched
+from iris_session.protocol.names import MediaEncoding
+from iris_session.protocol.scene import PatchOp, SceneError, SceneSpec
 from iris_session.protocol.server_messages import Event
 from iris_session.session.config import SessionConfig
-from iris_session.session.errors import OwnershipError
+from iris_session.session.errors import ConfigError, OwnershipError
 from iris_session.session.processes import SessionProcesses
-from iris_session.session.publishing import Publishing
-from iris_session.session.scene_change import ScenePatches
-from iris_session.session.status import SessionStatus, make_status
-from iris_session.session.stepper import Stepper
+from iris_session.session.scene_change import check_patch
+from iris_session.session.status import SessionStatus, make_session_status
+from iris_session.session.stepper import MAX_PENDING_SCENES, NextPatch, Stepper
 
 
-class Owner(Publishing, ScenePatches):
-    """One session, seen by the process that has it."""
+class Owner:
+    """One session, as the process that owns it sees it."""
 
     config: SessionConfig
     clock: Callable[[], int]
     _stop: threading.Event
+    _early_patches: list[NextPatch]  # before the first step; guarded by the lock of the scenes
     _processes: SessionProcesses | None = None
     _stepper: Stepper | None = None
     _pacer: Pacer | None = None
     _scheduling = "normal"
-    _recorded: Path | None = None
-    _ended = False  # by `close`, for good
+    _recording: Path | None = None  # of the closed session
+    _is_closed = False
 
     # --- life --------------------------------------------------------------------------------------------------------
 
@@ -52,8 +54,8 @@ class Owner(Publishing, ScenePatches):
     def post(self, message: EntryMessage) -> None: ...
 
     @abstractmethod
-    def _unchanging(self) -> AbstractContextManager[object]:
-        """Inside, no step is taken by a helper thread."""
+    def _hold_steps(self) -> AbstractContextManager[object]:
+        """Return a context in which no helper thread takes a step."""
 
     def __enter__(self) -> Self:
         self.start()
@@ -65,7 +67,7 @@ class Owner(Publishing, ScenePatches):
         self.close()
 
     def stop(self) -> None:
-        """Ends `run()` after the step in progress. May be called from another thread or a signal handler."""
+        """End `run()` after the step in progress. May be called from another thread or a signal handler."""
         self._stop.set()
 
     @property
@@ -75,71 +77,150 @@ class Owner(Publishing, ScenePatches):
 
     @contextmanager
     def signals(self) -> Iterator[None]:
-        """Inside, Ctrl-C and SIGTERM end `run()` in order, also when they come before it. Main thread only."""
+        """Make Ctrl-C and SIGTERM inside the context end `run()` in order, also before it. Main thread only."""
         with stop_on_signals(self._stop):
             yield
 
-    # --- what the owner says -----------------------------------------------------------------------------------------
+    # --- inputs of the owner -----------------------------------------------------------------------------------------
 
     def estop(self, reason: str = "") -> None:
-        """Stops every robot, latched, whatever the `reason` is. Not a safety-rated stop."""
+        """Stop every robot until `clear_estop()`. Not a safety-rated stop.
+
+        Args:
+            reason: Text for participants and the recording; any text is accepted.
+        """
         self.post(EStop(reason=str(reason).encode("utf-8", "replace").decode()))
 
     def clear_estop(self) -> None:
+        """Allow motion again after an e-stop. Participants must clutch again."""
         self.post(ClearEStop(request_id=0))
 
     def marker(self, text: str) -> None:
-        """A note in the recording."""
+        """Put a note into the recording, and show it to participants."""
         self.post(Marker(request_id=0, text=text))
 
-    # --- what the owner sees -----------------------------------------------------------------------------------------
+    def publish_media(
+        self,
+        stream: str,
+        frames: bytes | Mapping[str, bytes],
+        *,
+        capture_ns: int | None = None,
+        encoding: str = MediaEncoding.BYTES,
+    ) -> bool:
+        """Publish the newest frame of a media stream to every client that subscribed to it. From any thread.
+
+        Args:
+            stream: Name of the stream.
+            frames: Bytes of the frame, or bytes by class: `full`, and the coarser `half` and `quarter`. For a class
+                that is left out, clients get every second or fourth frame of the next better one.
+            capture_ns: Session time of the capture [ns], as of `session.clock()`. Default: now.
+            encoding: Format of the bytes, for those who read them.
+
+        Returns:
+            False when the frame is dropped: the front accepts none now, or the session is closing.
+
+        Raises:
+            ValueError: A name that no stream can have or that belongs to a deformable of the scene, an unknown class,
+                or more than 8 MiB.
+            OwnershipError: The session is not started.
+        """
+        processes = self._require_started()
+        if stream in processes.own_stream_names():
+            raise ValueError(f"stream {stream!r} carries the vertices of a deformable of the scene: take another name")
+        front = processes.front
+        if front is None:  # the session is closing
+            return False
+        last = None if self._stepper is None else self._stepper.last
+        epoch = 0 if last is None else last.decision.scene_epoch
+        return front.publish_media(stream, frames, self.clock() if capture_ns is None else capture_ns, epoch, encoding)
+
+    def patch_scene(self, *ops: PatchOp) -> None:
+        """Change how the scene is drawn for every client: colours, visibility, poses of visuals, decoration.
+
+        Physics is not affected. The change is seen as a whole, with the next step. From any thread.
+
+        Args:
+            ops: At most 64 operations, which refer to the specification `session.scene`.
+
+        Raises:
+            ConfigError: An operation does not fit the scene; nothing is changed.
+            OwnershipError: The session is not started.
+        """
+        scenes = self._require_started().scenes
+        try:
+            checked = check_patch(ops)
+            with scenes.lock:
+                shown = scenes.patch(checked)
+                self._queue_patch(NextPatch(ScenePatched(checked, shown.info.scene_hash), shown))
+                scenes.show(shown)
+        except (SceneError, OSError, RuntimeError) as error:
+            raise ConfigError(f"patch_scene: {error}") from error
+
+    def _queue_patch(self, patch: NextPatch) -> None:
+        if self._stepper is not None:
+            self._stepper.queue_scene(patch)
+        elif len(self._early_patches) < MAX_PENDING_SCENES:
+            self._early_patches.append(patch)
+        else:
+            raise SceneError(f"queue of scene changes full ({MAX_PENDING_SCENES}): call run() first")
+
+    # --- state of the session ----------------------------------------------------------------------------------------
 
     def status(self) -> SessionStatus:
-        """Who is here, who holds what, how late ticks are, what was dropped."""
-        with self._unchanging():
-            return make_status(self._stepper, self._pacer, self._processes, self._scheduling)
+        """Return participants and what they hold, lateness of ticks, drops and restarts."""
+        processes = self._processes
+        drops = {} if processes is None else processes.count_drops()
+        restarts = {} if processes is None else processes.count_restarts()
+        with self._hold_steps():
+            return make_session_status(self._stepper, self._pacer, drops, restarts, self._scheduling)
 
     def recent_events(self) -> list[Event]:
-        """The newest events, oldest first (at most 200; the recording has them all)."""
-        with self._unchanging():
+        """Return the newest events, oldest first (at most 200; the recording has them all)."""
+        with self._hold_steps():
             return [] if self._stepper is None else list(self._stepper.ledger.recent)
+
+    @property
+    def scene(self) -> SceneSpec | None:
+        """What clients draw, with all patches so far; `None` when the session shares no specification."""
+        newest = self._require_started().scenes.newest
+        return None if newest is None else newest.spec
 
     @property
     def processes(self) -> SessionProcesses:
         """Front and recorder, for benchmarks and tests; not part of the public API."""
-        return self._live()
+        return self._require_started()
 
     @property
     def address(self) -> str:
         """`host:port` of the control channel, which is all that a client needs."""
-        return self._live().address
+        return self._require_started().address
 
     @property
     def name(self) -> str:
-        """As the session is known: `config.name`, with a number when another session on the network has that name."""
+        """Name of the session: `config.name`, with a number when another session on the network has that name."""
         return self.config.name if self._processes is None else self._processes.name
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What people should know about how the session started (another name, other addresses), and what clients do
-        not see of its present scene; one line each."""
+        """Messages for people about how the session started (another name, other addresses) and what clients do not see
+        of its present scene; one line each."""
         live = self._processes
         return () if live is None else tuple(dict.fromkeys((*live.notes, *live.scenes.notes)))
 
     @property
     def recording(self) -> Path | None:
-        """Path of the recording, after `close()` too; None when nothing is recorded."""
-        return self._recorded if self._processes is None else self._processes.recording
+        """Path of the recording, after `close()` too; `None` when nothing is recorded."""
+        return self._recording if self._processes is None else self._processes.recording
 
-    def _check_open(self) -> None:
-        if self._ended:
+    def _require_open(self) -> None:
+        if self._is_closed:
             raise OwnershipError(f"the session is closed: make another {type(self).__name__}")
 
-    def _live(self) -> SessionProcesses:
+    def _require_started(self) -> SessionProcesses:
         if self._processes is None:
-            self._check_open()
-            what = type(self).__name__
-            raise OwnershipError(f"the session is not started: use `with {what}(...) as session`, or session.start()")
+            self._require_open()
+            name = type(self).__name__
+            raise OwnershipError(f"the session is not started: use `with {name}(...) as session`, or session.start()")
         return self._processes
 
 

@@ -29,13 +29,13 @@ from iris_session.scene import AssetStore, SceneBuildError
 from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.composed import ComposedScene
 from iris_session.session.config import SessionConfig
-from iris_session.session.core import core_of
+from iris_session.session.core import make_session_core
 from iris_session.session.draft import SceneDraft
 from iris_session.session.errors import ConfigError, OwnershipError, PublishError, StartError
 from iris_session.session.owner import Owner
-from iris_session.session.processes import Composed, SessionProcesses
-from iris_session.session.publish_loop import PublishLoop, ShownVertices
-from iris_session.session.stepper import NextPatch, session_clock
+from iris_session.session.processes import PublishedScene, SessionProcesses
+from iris_session.session.publish_loop import PublishedVertices, PublishLoop
+from iris_session.session.stepper import NextPatch, make_session_clock
 
 #: How often `run` asks `until`.
 RUN_PERIOD_S: Final = 1.0 / 60.0
@@ -43,7 +43,7 @@ RUN_PERIOD_S: Final = 1.0 / 60.0
 LONGEST_S: Final = 9e9
 #: How far ahead of the session's clock a capture may lie: clocks are read one after the other.
 AHEAD_NS: Final = 1_000_000
-_NOBODY_DRIVES: Final = (
+_NOT_DRIVEN: Final = (
     "a published scene has nothing that people drive; for a robot that they do, use Session(model, data) with "
     "begin_tick() and end_tick()"
 )
@@ -59,9 +59,9 @@ class ScenePublisher(Owner):
     """
 
     def __init__(self, scene: SceneBuilder, config: SessionConfig | None = None) -> None:
-        self.config = _checked(scene, SessionConfig() if config is None else config)
+        self.config = _check_arguments(scene, SessionConfig() if config is None else config)
         self.origin_ns = time.monotonic_ns()
-        self.clock = session_clock(self.origin_ns)
+        self.clock = make_session_clock(self.origin_ns)
         self._builder = scene
         self._shown: frozenset[str] = frozenset()  # names that the builder had as the session began
         self._stop = threading.Event()
@@ -86,7 +86,7 @@ class ScenePublisher(Owner):
         """
         if self._processes is not None:
             return
-        self._check_open()
+        self._require_open()
         where = self.config.assets
         try:
             store = AssetStore(None if isinstance(where, bool) else where)
@@ -97,13 +97,14 @@ class ScenePublisher(Owner):
             raise ConfigError(f"the scene cannot be built: {error}") from None
         except OSError as error:
             raise StartError(f"assets: {error.filename or where}: {error.strerror or error}") from None
-        with _held(store, composed.addresses):  # until the processes hold them
+        with _hold_assets(store, composed.addresses):  # until the processes hold them
             self._begin(composed, carrier)
 
     def _begin(self, composed: ComposedScene, carrier: Carrier) -> None:
-        core = core_of(self.config, carrier.model, None, (), (), user_owned=True)
-        vertices = ShownVertices(composed)
-        processes = SessionProcesses(self.config, core, self.origin_ns, composed=Composed(composed, vertices.bending))
+        core = make_session_core(self.config, carrier.model, None, (), (), user_owned=True)
+        vertices = PublishedVertices(composed)
+        published = PublishedScene(composed, vertices.meshes)
+        processes = SessionProcesses(self.config, core, self.origin_ns, published=published)
         processes.start()
         processes.notes += composed.notes
         self._processes = processes
@@ -111,7 +112,7 @@ class ScenePublisher(Owner):
             self._stepper = processes.make_stepper(core, self.clock, user_owned=True)
             self._draft = SceneDraft(composed)
             self._loop = PublishLoop(carrier, vertices, self._stepper, processes, processes.state_period_ns)
-            processes.reporter.notices += [self._loop.warnings, self._draft.warnings]
+            processes.reporter.warning_sources += [self._loop.warnings, self._draft.warnings]
         except BaseException:
             self.close()
             raise
@@ -122,25 +123,25 @@ class ScenePublisher(Owner):
         False: the recording is incomplete, `recording_fault` says why.
         """
         self._stop.set()
-        self._ended = True
+        self._is_closed = True
         try:
             if self._loop is not None:
                 self._loop.close()
         finally:
             if self._processes is not None:
                 self.recording_fault = self._processes.close()
-                self._recorded, self._processes = self._processes.recording, None
+                self._recording, self._processes = self._processes.recording, None
         return not self.recording_fault
 
     def run(self, seconds: float | None = None, until: Callable[[], object] | None = None) -> None:
         """Waits until `stop()`, Ctrl-C or SIGTERM, `seconds`, or `until()`, which is asked at 60 Hz and may publish."""
-        loop = self._started()[1]
+        loop = self._require_parts()[1]
         with self.signals():
             end_ns = None if seconds is None else self.clock() + int(seconds * 1e9)
             while (end_ns is None or self.clock() < end_ns) and not (until is not None and until()):
                 if self._stop.wait(RUN_PERIOD_S):
                     break
-                loop.check()
+                loop.raise_if_ended()
 
     # --- the world ---------------------------------------------------------------------------------------------------
 
@@ -151,23 +152,23 @@ class ScenePublisher(Owner):
 
         One whose length is off by up to 0.001 is normalised. Raises `PublishError`.
         """
-        with self._telling(name):
-            self._started()[0].set_pose(name, position, quaternion)
+        with self._explain_late_names(name):
+            self._require_parts()[0].set_pose(name, position, quaternion)
 
     def set_poses(self, names: Sequence[str], positions: ArrayLike, quaternions: ArrayLike) -> None:
         """`set_pose` for many bodies at once: (n, 3) and (n, 4). All or none: raises `PublishError`."""
-        with self._telling(*(names if isinstance(names, list | tuple) else ())):
-            self._started()[0].set_poses(names, positions, quaternions)
+        with self._explain_late_names(*(names if isinstance(names, list | tuple) else ())):
+            self._require_parts()[0].set_poses(names, positions, quaternions)
 
     def set_joints(self, name: str, positions: Mapping[str, float]) -> None:
         """Positions [rad] or [m] of joints of an articulation, by name; others stay. Raises `PublishError`."""
-        with self._telling(name):
-            self._started()[0].set_joints(name, positions)
+        with self._explain_late_names(name):
+            self._require_parts()[0].set_joints(name, positions)
 
     def set_vertices(self, name: str, vertices: ArrayLike) -> None:
         """Vertices (n, 3) of a deformable [m], world frame, in the order it was added with. Raises `PublishError`."""
-        with self._telling(name):
-            self._started()[0].set_vertices(name, vertices)
+        with self._explain_late_names(name):
+            self._require_parts()[0].set_vertices(name, vertices)
 
     def publish(self, time_s: float | None = None, *, capture_ns: int | None = None) -> None:
         """Everything as it is set now is one state of the world.
@@ -179,11 +180,11 @@ class ScenePublisher(Owner):
 
         Raises `PublishError` for times that cannot be, `OwnershipError` when the session is not under way.
         """
-        draft, loop = self._started()
-        loop.check()
+        draft, loop = self._require_parts()
+        loop.raise_if_ended()
         now_ns = self.clock()
-        captured_ns = now_ns if capture_ns is None else _capture(capture_ns, now_ns)
-        given_s = None if time_s is None else _time(time_s)
+        captured_ns = now_ns if capture_ns is None else _check_capture(capture_ns, now_ns)
+        given_s = None if time_s is None else _check_time(time_s)
         with self._order:
             if capture_ns is None:  # of two threads the second may have looked at the clock first
                 captured_ns = max(captured_ns, self._capture_ns)
@@ -198,11 +199,11 @@ class ScenePublisher(Owner):
             at_s = captured_ns * 1e-9 if given_s is None else given_s
             anew = self._anew or (self._time_s is not None and at_s < self._time_s)
             self._capture_ns, self._time_s, self._anew = captured_ns, at_s, False
-            loop.offer(draft.frame(captured_ns, at_s, anew))
+            loop.offer(draft.make_frame(captured_ns, at_s, anew))
 
     def reset(self) -> None:
         """The next `publish` is of a world that was put into another state: a new `scene_epoch`."""
-        self._started()
+        self._require_parts()
         with self._order:
             self._anew = True
 
@@ -215,8 +216,8 @@ class ScenePublisher(Owner):
 
     def post(self, message: EntryMessage) -> None:
         """Puts an input of the owner (connection 0, rights of a director) into the next step."""
-        self._live()
-        self._started()[1].check()  # else nobody would take it
+        self._require_started()
+        self._require_parts()[1].raise_if_ended()  # else nobody would take it
         assert self._stepper is not None
         self._stepper.post(message)
 
@@ -230,19 +231,19 @@ class ScenePublisher(Owner):
 
     def begin_tick(self) -> NoReturn:
         """Of `Session`."""
-        raise OwnershipError(f"begin_tick: publish() is the tick here. {_NOBODY_DRIVES}")
+        raise OwnershipError(f"begin_tick: publish() is the tick here. {_NOT_DRIVEN}")
 
     def end_tick(self) -> NoReturn:
         """Of `Session`."""
-        raise OwnershipError(f"end_tick: publish() is the tick here. {_NOBODY_DRIVES}")
+        raise OwnershipError(f"end_tick: publish() is the tick here. {_NOT_DRIVEN}")
 
     def assign(self, robots: Sequence[str], participant: str = "") -> NoReturn:
         """Of `Session`."""
-        raise OwnershipError(f"assign: {_NOBODY_DRIVES}")
+        raise OwnershipError(f"assign: {_NOT_DRIVEN}")
 
     def set_scale(self, robot: str, scale: float) -> NoReturn:
         """Of `Session`."""
-        raise OwnershipError(f"set_scale: {_NOBODY_DRIVES}")
+        raise OwnershipError(f"set_scale: {_NOT_DRIVEN}")
 
     def load_scene(self, scene: object) -> NoReturn:
         """Of `Session`."""
@@ -251,8 +252,8 @@ class ScenePublisher(Owner):
     # --- inside ------------------------------------------------------------------------------------------------------
 
     @contextmanager
-    def _telling(self, *names: object) -> Iterator[None]:
-        """What is refused because it was added after the session had begun, told as that."""
+    def _explain_late_names(self, *names: object) -> Iterator[None]:
+        """Explain a refused name that was added after the session had begun."""
         try:
             yield
         except PublishError as error:
@@ -263,28 +264,28 @@ class ScenePublisher(Owner):
                 f"{late[0]!r} was added after the session had begun, and is not shown: add everything before `with`"
             ) from error
 
-    def _queue(self, patch: NextPatch) -> None:
-        self._started()[1].check()
-        super()._queue(patch)
+    def _queue_patch(self, patch: NextPatch) -> None:
+        self._require_parts()[1].raise_if_ended()
+        super()._queue_patch(patch)
 
-    def _unchanging(self) -> AbstractContextManager[object]:
+    def _hold_steps(self) -> AbstractContextManager[object]:
         return nullcontext() if self._loop is None else self._loop.lock
 
-    def _started(self) -> tuple[SceneDraft, PublishLoop]:
-        self._check_open()
+    def _require_parts(self) -> tuple[SceneDraft, PublishLoop]:
+        self._require_open()
         if self._draft is None or self._loop is None:
             raise OwnershipError("the session is not started: use `with ScenePublisher(...) as session`, or start()")
         return self._draft, self._loop
 
 
-def _held(store: AssetStore, addresses: Sequence[str]) -> AbstractContextManager[object]:
+def _hold_assets(store: AssetStore, addresses: Sequence[str]) -> AbstractContextManager[object]:
     try:
         return store.hold(addresses)
     except OSError:  # no locks, or no room: the session says so when it cannot hold them either
         return nullcontext()
 
 
-def _checked(scene: SceneBuilder, config: SessionConfig) -> SessionConfig:
+def _check_arguments(scene: SceneBuilder, config: SessionConfig) -> SessionConfig:
     if not isinstance(scene, SceneBuilder):
         raise ConfigError(
             f"scene is {type(scene).__name__}: a SceneBuilder is expected; for a MuJoCo model use Session"
@@ -300,7 +301,7 @@ def _checked(scene: SceneBuilder, config: SessionConfig) -> SessionConfig:
     return config
 
 
-def _time(time_s: Any) -> float:
+def _check_time(time_s: Any) -> float:
     try:
         given_s = -1.0 if isinstance(time_s, str | bytes) else float(time_s)
     except (TypeError, ValueError):
@@ -310,7 +311,7 @@ def _time(time_s: Any) -> float:
     return given_s
 
 
-def _capture(capture_ns: int, now_ns: int) -> int:
+def _check_capture(capture_ns: int, now_ns: int) -> int:
     try:
         given_ns = operator.index(capture_ns)
     except TypeError:

@@ -11,38 +11,48 @@
 
     session = Session.attach(model, data)      # one line in an existing script: MuJoCo's control callback
 
-The process that makes the `Session` is the authority. Front and recorder are started by exec, watched, and replaced or
-announced when they die (`runtime.processes`).
+The process that makes the `Session` is the authority. Front and recorder are child processes, which are restarted when
+they die (`session.processes`).
 """
 
 from __future__ import annotations
 
 import atexit
+import copy
+import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Final, Self
 
 import mujoco
 
-from iris_session.physics import Pacer, PacerStats
+from iris_session.physics import Pacer, PacerStats, load_model
 from iris_session.protocol.client_messages import Assign, Control, EStop, SetScale
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import EntryMessage
 from iris_session.protocol.names import ControlAction, LateCause
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.recording.environment import use_one_blas_thread
-from iris_session.session.config import SessionConfig
-from iris_session.session.config_checks import check_timestep
-from iris_session.session.continuation import begin
-from iris_session.session.core import SessionCore, core_of
+from iris_session.session.config import SessionConfig, check_arguments, check_objects, check_robots, check_timestep
+from iris_session.session.core import SessionCore, make_session_core, read_plant_state
 from iris_session.session.errors import OwnershipError
 from iris_session.session.owner import Owner
 from iris_session.session.processes import SessionProcesses
-from iris_session.session.scene_change import SceneChanges, follow_timestep
-from iris_session.session.stepper import MAX_HOST_ENTRIES, ROOM_FOR_OURS, Stepper, checked, session_clock
+from iris_session.session.resume import prepare_session
+from iris_session.session.scene_change import adopt_timestep, prepare_scene
+from iris_session.session.stepper import (
+    MAX_HOST_ENTRIES,
+    RESERVED_HOST_ENTRIES,
+    NextPatch,
+    NextScene,
+    Stepper,
+    make_session_clock,
+    normalize_message,
+)
 from iris_session.session.tick_times import TickTimes
 from iris_session.session.user_loop import UserLoop
 from iris_session.system.priority import freeze_garbage_collector, tick_priority
@@ -51,15 +61,36 @@ from iris_session.system.priority import freeze_garbage_collector, tick_priority
 PAUSED_STEP_S: Final = 0.01
 #: Most ticks of one step while paused: at 1 ms a tick, steps still come at 50 Hz.
 PAUSED_STEP_TICKS: Final = 10
+#: The log names an overrun at most so often.
+OVERRUN_LOG_PERIOD_NS: Final = 10_000_000_000
+
+_log = logging.getLogger(__name__)
 
 
-class Session(Owner, SceneChanges):
+class Session(Owner):
     """A shared session over one MuJoCo model.
 
-    `model`: an `MjModel`, or the path of an MJCF or MJB file. `data`: the state to begin with (None: keyframe `home`,
-    else the model's default). With our loop a copy of it is advanced (`session.data` from then on). `robots`,
-    `objects`: None finds them in the model. With `config.resume` all of them come from the recording. Raises
-    `AmbiguousModelError`, `ConfigError`, `StartError`, `ResumeError`.
+    With `config.resume`, model, state, robots and objects come from the recording.
+
+    Args:
+        model: An `MjModel`, or the path of an MJCF or MJB file.
+        data: The state to begin with; `None` for keyframe `home`, else the model's default. `run()` advances a copy of
+            it, which is `session.data` from then on.
+        config: Settings; `None` for the defaults.
+        robots: Robots that can be driven; `None` finds them in the model.
+        objects: Free bodies that robots and hands can take; `None` finds them in the model.
+
+    Attributes:
+        model, data, robots, objects: Of the present scene.
+        origin_ns: `time.monotonic_ns()` at session time 0.
+        clock: Returns session time [ns].
+        recording_fault: After `close()`, why the recording is incomplete; empty when it is complete.
+
+    Raises:
+        AmbiguousModelError: Robots cannot be found in the model without help.
+        ConfigError: A value that cannot be used.
+        ResumeError: The recording of `config.resume` cannot be continued.
+        TypeError: `model` is no model, `data` no `MjData`.
     """
 
     def __init__(
@@ -71,52 +102,57 @@ class Session(Owner, SceneChanges):
         robots: Sequence[RobotSpec] | None = None,
         objects: Sequence[ObjectSpec] | None = None,
     ) -> None:
-        self._past, self.config, scene = begin(config, model, data, robots, objects)
+        self._past, self.config, scene = prepare_session(config, model, data, robots, objects)
         self.model, self.robots, self.objects = scene
         self.data = data
         self.origin_ns = time.monotonic_ns() if self._past is None else self._past.origin_ns
-        self.clock = session_clock(self.origin_ns)
+        self.clock = make_session_clock(self.origin_ns)
         self._processes: SessionProcesses | None = None
         self._core: SessionCore | None = None
         self._stepper: Stepper | None = None
         self._user_loop: UserLoop | None = None
-        self._early: list[EntryMessage] = []  # posted before anybody drove the session
-        self._handing_over = threading.RLock()  # of those; a signal handler may post, too
+        self._early: list[EntryMessage] = []  # posted before the first step
+        self._early_lock = threading.RLock()  # a signal handler may post, too
         self._early_patches = []
         self._pacer: Pacer | None = None
         self._stop = threading.Event()
         self._attached = False
         self._callback: Callable[[mujoco.MjModel, mujoco.MjData], None] | None = None
-        self._asked_ticks = 0  # by a director, while paused
+        self._requested_ticks = 0  # by a director, while paused
         self._scheduling = "normal"
-        #: Why the recording is incomplete, known after `close()`; empty when it is not.
+        self._next_overrun_log_ns = 0
         self.recording_fault = ""
 
     # --- life --------------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Opens the sockets and the recording. Called by `with`. Participants can connect from here on.
+        """Open the sockets and the recording. Called by `with`. Participants can join from here on.
 
-        Raises before it opens anything when the robots cannot be driven: `ControlError`, `PhysicsError`, `ConfigError`;
-        afterwards `StartError`: a port in use, a folder that cannot be written, a key that is missing.
+        Raises:
+            ControlError, PhysicsError, ConfigError: The robots cannot be driven; nothing was opened.
+            StartError: A port is in use, a folder cannot be written, a key is missing.
+            OwnershipError: The session is closed.
         """
         if self._processes is None:
-            self._check_open()
+            self._require_open()
             core = self._make_core(user_owned=False)
             processes = SessionProcesses(self.config, core, self.origin_ns, self._past)
             processes.start()
             self._processes = processes
 
     def close(self) -> bool:
-        """Tells everyone that the session ends, finishes the recording, ends every process. Can be called twice.
+        """Notify clients, finish the recording, end every child process. May be called twice.
 
-        False: the recording is incomplete, `recording_fault` says why. In a user's loop the robots of `data` are left
-        at rest where they are commanded (torque actuators: with the torques that hold them now).
+        In a user loop the robots of `data` are left at rest where they are commanded (torque actuators: with the
+        torques that hold them now).
+
+        Returns:
+            False when the recording is incomplete; `recording_fault` says why.
         """
         self._stop.set()
-        self._ended = True
+        self._is_closed = True
         if self._attached:
-            if mujoco.get_mjcb_control() is self._callback:  # it may be somebody else's by now
+            if mujoco.get_mjcb_control() is self._callback:  # not replaced by another one since
                 mujoco.set_mjcb_control(None)
             atexit.unregister(self.close)
             self._attached = False
@@ -124,7 +160,7 @@ class Session(Owner, SceneChanges):
             self._user_loop.close()
         if self._processes is not None:
             self.recording_fault = self._processes.close()
-            self._recorded, self._processes = self._processes.recording, None
+            self._recording, self._processes = self._processes.recording, None
         if self._past is not None:
             self._past.close()
         return not self.recording_fault
@@ -132,9 +168,17 @@ class Session(Owner, SceneChanges):
     # --- our loop ----------------------------------------------------------------------------------------------------
 
     def run(self, seconds: float | None = None, until: Callable[[], object] | None = None) -> None:
-        """Advances physics in real time until `stop()`, Ctrl-C or SIGTERM, `seconds` of session time, or `until()`.
+        """Advance physics in real time until `stop()`, Ctrl-C or SIGTERM, or until an argument says so.
 
-        One step per tick. A tick that cannot be met in time is taken late and counted (`status().lateness`).
+        Every step has one tick. A tick that misses its deadline is taken late and counted (`status().lateness`).
+
+        Args:
+            seconds: Session time to run [s]; `None` for no limit.
+            until: Called before every step; a true result ends the run. It may call methods of the session.
+
+        Raises:
+            ConfigError: The timestep of the model is out of range.
+            OwnershipError: The session is not started, or a user loop drives it.
         """
         check_timestep(self.model)
         use_one_blas_thread()  # for the same bits in every run
@@ -143,82 +187,107 @@ class Session(Owner, SceneChanges):
             # Counted from here: collecting garbage in a large process takes longer than a short run.
             end_ns = None if seconds is None else self.clock() + int(seconds * 1e9)
             pacer = self._pacer = Pacer(stepper.core.world.tick_period_ns, self.clock())
-            times = self._follow(stepper, pacer)
+            times = self._measure_ticks(stepper, pacer)
             while not self._stop.is_set():
                 now_ns = self.clock()
                 if (end_ns is not None and now_ns >= end_ns) or (until is not None and until()):
                     break
                 times.lap(LateCause.OWNER)
                 if stepper.paused:
-                    self._paused_step(stepper, pacer, times)
-                    times.idle()
+                    self._take_paused_step(stepper, pacer, times)
+                    times.restart_chain()
                 else:
-                    self._tick(stepper, pacer, times)
-                self._live().watch(stepper)
+                    self._take_tick(stepper, pacer, times)
+                self._require_started().supervise(stepper)
                 times.lap(LateCause.SUPERVISION)
-        pacer.pause(self.clock())  # what nobody asked to run is not late
+        pacer.pause(self.clock())  # no tick is late after the end of the run
 
-    def _follow(self, stepper: Stepper, pacer: Pacer) -> TickTimes:
-        """Measures the parts of every tick from here on, for status reports."""
+    def _measure_ticks(self, stepper: Stepper, pacer: Pacer) -> TickTimes:
+        """Measure the parts of every tick from here on, for status reports."""
         times = TickTimes(pacer.period_ns, self.clock)
-        stepper.lap = times.lap
-        reporter = self._live().reporter
+        stepper.on_lap = times.lap
+        reporter = self._require_started().reporter
         reporter.pacer, reporter.times, reporter.scheduling = pacer, times, self._scheduling
         return times
 
-    def _tick(self, stepper: Stepper, pacer: Pacer, times: TickTimes) -> None:
-        self._asked_ticks = 0
+    def _take_tick(self, stepper: Stepper, pacer: Pacer, times: TickTimes) -> None:
+        self._requested_ticks = 0
         now_ns = self.clock()
         pacer.resume(now_ns)
         wait_ns = pacer.next_deadline_ns - now_ns
         if wait_ns > 0:
             time.sleep(wait_ns * 1e-9)
-            times.woke(pacer.next_deadline_ns)
+            times.begin_chain(pacer.next_deadline_ns)
         else:
-            times.gave_up(pacer.skip_backlog(now_ns))
+            self._count_skipped(pacer.skip_backlog(now_ns), times)
         began_ns = max(now_ns, pacer.next_deadline_ns)
         stepper.step(1)
-        if not follow_timestep(stepper, pacer, times, began_ns):
+        if not adopt_timestep(stepper, pacer, times, began_ns):
             lateness_ns = pacer.finished(self.clock())
-            times.finished(lateness_ns)
+            times.finish_tick(lateness_ns)
             stepper.lateness_ns = max(stepper.lateness_ns, lateness_ns)
 
-    def _paused_step(self, stepper: Stepper, pacer: Pacer, times: TickTimes) -> None:
-        """Zero ticks, or some of those that a director asked for: few, so that an e-stop never waits for many."""
+    def _count_skipped(self, ticks: int, times: TickTimes) -> None:
+        times.count_skipped(ticks)
+        if ticks and self.clock() >= self._next_overrun_log_ns:
+            self._next_overrun_log_ns = self.clock() + OVERRUN_LOG_PERIOD_NS
+            _log.warning("tick loop overrun: %d ticks were skipped", ticks)
+
+    def _take_paused_step(self, stepper: Stepper, pacer: Pacer, times: TickTimes) -> None:
+        """Take a step with zero ticks, or a few of those that a director asked for: an e-stop never waits for many."""
         assert stepper.last is not None
         pacer.pause(self.clock())
         time.sleep(PAUSED_STEP_S)
         decision = stepper.last.decision
-        left = 0 if decision.reset else self._asked_ticks
-        self._asked_ticks = min(left + decision.step_ticks, self.config.authority.max_step_ticks)
-        n_ticks = min(self._asked_ticks, PAUSED_STEP_TICKS)
-        self._asked_ticks -= n_ticks
+        left = 0 if decision.reset else self._requested_ticks
+        self._requested_ticks = min(left + decision.step_ticks, self.config.authority.max_step_ticks)
+        n_ticks = min(self._requested_ticks, PAUSED_STEP_TICKS)
+        self._requested_ticks -= n_ticks
         stepper.step(n_ticks)
-        follow_timestep(stepper, pacer, times, self.clock())
+        adopt_timestep(stepper, pacer, times, self.clock())
 
-    # --- the user's loop ---------------------------------------------------------------------------------------------
+    # --- user loop ---------------------------------------------------------------------------------------------
 
     def begin_tick(self) -> None:
-        """Reads what participants want and writes `data.ctrl` of the robots; call right before `mj_step`."""
-        self._loop().begin_tick()
+        """Process inputs of participants and write `data.ctrl` of the robots; call right before `mj_step`.
+
+        Raises:
+            OwnershipError: The session is closed, or has no `data`, or is driven by `run()`.
+        """
+        self._require_user_loop().begin_tick()
 
     def end_tick(self) -> None:
-        """Publishes the state after the user's `mj_step`."""
-        self._loop().end_tick()
+        """Publish the state after the user's `mj_step`.
+
+        Raises:
+            OwnershipError: No tick has begun.
+        """
+        self._require_user_loop().end_tick()
 
     def targets(self) -> dict[str, Pose]:
-        """End-effector targets `T_world_tip` per robot, for an environment's own controller."""
-        self._live()
-        with self._unchanging():
+        """Return the end-effector targets `T_world_tip` by robot, for an environment's own controller [m]."""
+        self._require_started()
+        with self._hold_steps():
             return {} if self._core is None else dict(self._core.controller.targets())
 
     @classmethod
     def attach(cls, model: mujoco.MjModel, data: mujoco.MjData, config: SessionConfig | None = None) -> Self:
-        """Shares a script's own simulation: every `mj_step(model, data)` after this line is one tick of the session.
+        """Share a script's own simulation: every `mj_step(model, data)` after this line is one tick of the session.
 
-        Uses MuJoCo's control callback, which is global to the process: it acts on `data` only, once per new time, and
-        takes time going back as a reset. RK4 calls it four times a step and is refused (`OwnershipError`), as is a
-        callback that is already set. The session ends with `close()`, or with the script.
+        Uses MuJoCo's control callback, which is global to the process. It acts on `data` only, once per new time, and
+        treats time that goes back as a reset. The session ends with `close()`, or with the script.
+
+        Args:
+            model: The model that the script simulates.
+            data: The data that the script advances.
+            config: Settings; `None` for the defaults.
+
+        Returns:
+            The started session.
+
+        Raises:
+            OwnershipError: The integrator is RK4, which calls the callback four times a step, or a callback is set.
+            StartError: A port is in use, a folder cannot be written, a key is missing.
         """
         if int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4):
             raise OwnershipError("attach() cannot be used with the RK4 integrator: set integrator='implicitfast'")
@@ -227,7 +296,7 @@ class Session(Owner, SceneChanges):
         session = cls(model, data, config)
         try:
             session.start()
-            loop = session._loop()
+            loop = session._require_user_loop()
         except BaseException:
             session.close()
             raise
@@ -241,93 +310,191 @@ class Session(Owner, SceneChanges):
         atexit.register(session.close)  # a script may simply end
         return session
 
-    def _unchanging(self) -> AbstractContextManager[object]:
-        """Inside, no step is taken by the helper thread of a user's loop."""
+    def _hold_steps(self) -> AbstractContextManager[object]:
+        """Return a context in which the helper thread of a user loop takes no step."""
         return nullcontext() if self._user_loop is None else self._user_loop.lock
 
-    def _loop(self) -> UserLoop:
+    def _require_user_loop(self) -> UserLoop:
         if self._user_loop is None:
             if self.data is None:
                 raise OwnershipError("begin_tick() needs the data that your loop advances: Session(model, data)")
             stepper = self._make_stepper(user_owned=True)
-            self._user_loop = UserLoop(self.model, self.data, stepper, self._live())
+            self._user_loop = UserLoop(self.model, self.data, stepper, self._require_started())
         return self._user_loop
 
-    # --- what the owner may do ---------------------------------------------------------------------------------------
+    # --- inputs of the owner ---------------------------------------------------------------------------------------
 
     def post(self, message: EntryMessage) -> None:
-        """Puts an input of the owner (connection 0, rights of a director) into the next step. From any thread."""
-        self._check_open()
-        with self._handing_over:
+        """Queue an input of the owner (connection 0, rights of a director) for the next step. From any thread.
+
+        Args:
+            message: A message of `iris_session.protocol.client_messages`.
+
+        Raises:
+            ValueError: A value that the protocol does not allow.
+            OwnershipError: The queue is full, or the session is closed.
+        """
+        self._require_open()
+        with self._early_lock:
             if self._stepper is not None:
                 self._stepper.post(message)
-            elif len(self._early) < MAX_HOST_ENTRIES + (ROOM_FOR_OURS if isinstance(message, EStop) else 0):
-                self._early.append(checked(message))
+            elif len(self._early) < MAX_HOST_ENTRIES + (RESERVED_HOST_ENTRIES if isinstance(message, EStop) else 0):
+                self._early.append(normalize_message(message))
             else:
-                raise OwnershipError(f"more than {MAX_HOST_ENTRIES} inputs wait for the first step: call run() first")
+                text = f"queue of inputs full ({MAX_HOST_ENTRIES} wait for the first step): call run() first"
+                raise OwnershipError(text)
 
     def pause(self) -> None:
-        """Stops physics; leases, heartbeats and requests go on."""
+        """Pause physics; leases, heartbeats and requests continue."""
         self.post(Control(request_id=0, action="pause"))
 
     def resume(self) -> None:
-        """Continues physics; robots hold until clutched again."""
+        """Continue physics; robots hold until participants clutch again."""
         self.post(Control(request_id=0, action="resume"))
 
     def reset(self) -> None:
-        """Back to the initial state, in a new `scene_epoch`. In a user's loop: tells that the user does so before the
-        next tick."""
+        """Return to the initial state, in a new `scene_epoch`.
+
+        In a user loop this announces that the loop does so before the next tick.
+        """
         if self._user_loop is not None:
             self._user_loop.reset()
         else:
             self.post(Control(request_id=0, action="reset"))
 
     def assign(self, robots: Sequence[str], participant: str = "") -> None:
-        """Gives robots to a participant, or frees them, whoever holds them."""
+        """Give robots to a participant, also when another one holds them.
+
+        Args:
+            robots: Names of robots.
+            participant: Id of the participant; empty to release the robots.
+        """
         self.post(Assign(request_id=0, robots=tuple(robots), participant=participant))
 
     def set_scale(self, robot: str, scale: float) -> None:
-        """How far `robot` moves as its holder's hand moves: 1 as far, 0.1 a tenth. Ends with that holder."""
+        """Set the motion scale of a robot until its holder changes.
+
+        Args:
+            robot: Name of the robot.
+            scale: Motion of the robot per motion of the hand: 1 moves as far, 0.1 a tenth.
+        """
         self.post(SetScale(request_id=0, robots=(robot,), scale=scale))
 
     @property
     def stepper(self) -> Stepper:
-        """The machinery behind this session, for benchmarks and tests; not part of the public API."""
+        """The stepper of this session, for benchmarks and tests; not part of the public API."""
         return self._make_stepper(user_owned=self._user_loop is not None)
 
     def lateness(self, *, anew: bool = False) -> PacerStats | None:
-        """Accounting of ticks of the newest `run()`, None before it. `anew`: its percentiles begin again from here."""
+        """Return the lateness of ticks of the newest `run()`, `None` before it.
+
+        Args:
+            anew: Begin the percentiles again from here.
+        """
         return None if self._pacer is None else self._pacer.stats(self.clock(), anew=anew)
+
+    def load_scene(
+        self,
+        model: mujoco.MjModel | str | Path,
+        data: mujoco.MjData | None = None,
+        *,
+        robots: Sequence[RobotSpec] | None = None,
+        objects: Sequence[ObjectSpec] | None = None,
+    ) -> Future[None]:
+        """Load another scene into the running session: a new `scene_epoch` with the same participants.
+
+        The holder of a robot whose name the new scene has too keeps it and must clutch again; other leases end. The
+        model is compiled and prepared in a thread while the session continues with the old scene. Ticks then have the
+        timestep of the new model, and clients are notified.
+
+        Call it once `run()` has begun: from another thread, from `until`, or between two runs (the next one loads the
+        scene).
+
+        Args:
+            model: An `MjModel`, or the path of an MJCF or MJB file.
+            data: The state to begin with; `None` for keyframe `home`, else the model's default.
+            robots: `None` finds them in the model.
+            objects: `None` finds them in the model.
+
+        Returns:
+            A future that is done when the scene is ready for the next step. It raises `ModelNotFoundError`,
+            `ModelInvalidError`, `AmbiguousModelError`, `ControlError`, or `ConfigError` for a timestep out of range.
+
+        Raises:
+            OwnershipError: In a user loop, whose model is not ours, and before the first `run()`.
+            TypeError: `model` is no model.
+            ConfigError: `robots` or `objects` are none.
+        """
+        if self._user_loop is not None:
+            raise OwnershipError("load_scene: your own loop owns the model; end this session and begin another with it")
+        if not isinstance(model, str | Path):
+            check_arguments(model, data, self.config)
+        stepper = self._stepper
+        if stepper is None:
+            raise OwnershipError(
+                "load_scene needs a session that has begun to run: call it after the first run(), or during it; "
+                "what a session begins with is given to Session(model)"
+            )
+        done: Future[None] = Future()
+        scenes = self._require_started().scenes
+        checked = check_robots(robots), check_objects(objects)
+        state_data = copy.copy(data)  # the caller may continue with theirs
+
+        def prepare() -> None:
+            try:
+                loaded = load_model(model) if isinstance(model, str | Path) else model
+                check_arguments(loaded, state_data, self.config)
+                state = b"" if state_data is None else read_plant_state(loaded, state_data)
+                scene = prepare_scene(stepper.core, scenes, loaded, state, *checked)
+                with scenes.lock:
+                    stepper.queue_scene(scene)
+                    scenes.show(scene.shown)
+            except BaseException as error:  # raised by the future
+                done.set_exception(error)
+            else:
+                done.set_result(None)
+
+        done.set_running_or_notify_cancel()
+        threading.Thread(target=prepare, name="iris-scene", daemon=True).start()
+        return done
+
+    def _follow_scene(self, scene: NextScene | NextPatch) -> None:
+        if isinstance(scene, NextPatch):
+            return
+        plant = scene.plant
+        self.model, self.data = plant.world.model, plant.world.data
+        self.robots, self.objects = plant.scene.robots, plant.scene.objects
 
     # --- inside ------------------------------------------------------------------------------------------------------
 
     def _make_stepper(self, *, user_owned: bool) -> Stepper:
         if self._stepper is not None:
             if user_owned != self._stepper.core.config.authority.user_owned_loop:
-                raise OwnershipError("one session is driven in one way: by run(), or by begin_tick() and end_tick()")
+                raise OwnershipError("a session is driven either by run(), or by begin_tick() and end_tick()")
         else:
-            live, core = self._live(), self._make_core(user_owned=user_owned)
+            live, core = self._require_started(), self._make_core(user_owned=user_owned)
             stepper = live.make_stepper(core, self.clock, user_owned=user_owned)
             if not user_owned:
                 self.data = core.world.data
-                stepper.on_scene.append(self._take_scene)
-            with live.scenes.lock, self._handing_over:  # nothing of another thread comes between
-                self._stepper = stepper  # first: what a signal handler posts meanwhile goes there, and is not lost
+                stepper.on_scene.append(self._follow_scene)
+            with live.scenes.lock, self._early_lock:  # against other threads
+                self._stepper = stepper  # first: what a signal handler posts meanwhile goes there
                 for patch in self._early_patches:
-                    stepper.change_scene(patch)
+                    stepper.queue_scene(patch)
                 for message in self._early:
-                    # The data of a user's loop is taken as it is now: there is nothing to go back from.
+                    # The data of a user loop is used as it is now: there is nothing to reset.
                     if not (user_owned and isinstance(message, Control) and message.action == ControlAction.RESET):
-                        stepper.say(message)
+                        stepper.post_own(message)
                 self._early_patches.clear()
                 self._early.clear()
         return self._stepper
 
     def _make_core(self, *, user_owned: bool) -> SessionCore:
-        """The core for the data as it is now; the one made at the start when nothing has changed since."""
+        """Return the core for the data as it is now; the one made at the start when nothing has changed since."""
         if self._past is not None:
             if user_owned:
                 raise OwnershipError("a resumed session is driven by run(): its physics are in the recording")
             return self._past.core
-        self._core = core_of(self.config, self.model, self.data, self.robots, self.objects, user_owned, self._core)
+        scene = self.model, self.data, self.robots, self.objects
+        self._core = make_session_core(self.config, *scene, user_owned, self._core)
         return self._core

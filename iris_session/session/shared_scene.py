@@ -1,6 +1,6 @@
-"""The scene as clients draw it: specification and assets of a world, in a store of files that the front serves.
+"""`SharedScenes`: what clients draw of each scene, as a specification and assets in a store that the front serves.
 
-What a model became is remembered on the disk, so only the first session with a model encodes anything.
+The result for a model is kept on the disk, so only the first session with a model encodes anything.
 """
 
 from __future__ import annotations
@@ -31,16 +31,18 @@ from iris_session.scene import AssetStore, Hold, SceneBuildError
 from iris_session.scene.composed import ComposedScene
 from iris_session.scene.mujoco_scene import parse_mujoco
 
-#: Specifications of patches that are kept: more than can wait for the loop, and as long as a slow disk may take to read
-#: them for the recording. A session that is patched ten times a second must not fill the disk.
-KEPT_LOOKS: Final = 96
-KEPT_LOOKS_S: Final = 10.0
-NOTHING_TO_SEE: Final = "clients get no meshes and textures"
+#: Specifications of patches that are kept: more than can be pending for the loop, and as long as a slow disk may need
+#: to read them for the recording. A session that is patched ten times a second must not fill the disk.
+KEPT_PATCHES: Final = 96
+KEPT_PATCHES_S: Final = 10.0
+NO_SPECIFICATION: Final = "clients get no meshes and textures"
 
 
 class Shown(NamedTuple):
-    """What clients get of one scene. `spec`: None where nothing is shared but bodies and poses. `notes`: what they do
-    not get, a line each."""
+    """One scene as clients get it.
+
+    `spec`: `None` where only bodies and poses are shared. `notes`: what is left out, a line each.
+    """
 
     info: SceneInfo
     spec: SceneSpec | None = None
@@ -49,12 +51,19 @@ class Shown(NamedTuple):
 
 
 class SharedScenes:
-    """Makes what clients get of each scene of one session.
+    """Makes the specifications and assets of the scenes of one session, and keeps scenes and patches in order.
 
-    `where`: True for the store of this user, a folder for another one, False for none: clients then get bodies and
-    poses, nothing to draw them with. `lock`: held while a scene or patch takes its place in the order of both, which is
-    short; `newest`: the last one that did. `composed`: the scene of every world, which then is not read off its model.
-    `sites`, `tendons`: those of a model are in its specification too.
+    Args:
+        where: True for the store of this user, a folder for another one, False for none: clients then get bodies and
+            poses, and nothing to draw them with.
+        name: Name of the scenes.
+        composed: The scene of every world, where it is not read off its model.
+        sites: Include the sites of a model.
+        tendons: Include the tendons of a model.
+
+    Attributes:
+        lock: Held for the moment in which a scene or patch becomes the newest.
+        newest: The newest scene or patch.
     """
 
     def __init__(
@@ -66,32 +75,36 @@ class SharedScenes:
         sites: bool = False,
         tendons: bool = False,
     ) -> None:
-        self._said: list[str] = []  # of the store, whatever the scene
+        self._store_notes: list[str] = []
         self.lock = threading.RLock()
         self.newest: Shown | None = None
         self._name = name
         self._composed = composed
         self._sites, self._tendons = sites, tendons
         self._holds: list[Hold] = []
-        self._looks: deque[_Look] = deque()  # of patches, the oldest first
+        self._patched: deque[_PatchedSpec] = deque()  # oldest first
         self._closed = False
         self._store: AssetStore | None = None
         if where is not False:
             try:
                 self._store = AssetStore(None if where is True else where)
             except OSError as error:
-                self._say(f"{NOTHING_TO_SEE}: {error.filename or where}: {error.strerror or error}")
+                self._add_note(f"{NO_SPECIFICATION}: {error.filename or where}: {error.strerror or error}")
 
     @property
     def notes(self) -> list[str]:
-        """What people should know of the newest scene, and of where its files are kept; one line each."""
+        """Messages for people about the newest scene and about the store, one line each."""
         newest = self.newest
-        return list(dict.fromkeys((*(() if newest is None else newest.notes), *self._said)))
+        return list(dict.fromkeys((*(() if newest is None else newest.notes), *self._store_notes)))
 
     def make(self, world: World, initial_state: bytes = b"", patches: Sequence[PatchOp] = ()) -> Shown:
-        """Of the scene as it begins (`initial_state` empty: as the model says) and what has changed in it since: so
-        a session that goes on shows what it showed. Takes long for a model that was never shared before. From any
-        thread."""
+        """Make specification and assets of a scene. Slow for a model that was never shared before. From any thread.
+
+        Args:
+            world: The world of the scene.
+            initial_state: `mjSTATE_INTEGRATION` of its first state; empty for the model's own.
+            patches: Patches since then, so that a resumed session shows what it showed.
+        """
         poses = np.zeros((len(world.bodies), 7))
         world.poses(poses)
         plain = SceneInfo(
@@ -109,18 +122,17 @@ class SharedScenes:
                 sites=self._sites,
                 tendons=self._tendons,
             )
-            shown = _stored(store, patched(parsed.spec, patches), plain, tuple(patches))
-        except (OSError, SceneBuildError, SceneError) as error:  # the session is worth more than its picture
-            return Shown(plain, notes=(f"{NOTHING_TO_SEE}: {error}",))
+            shown = _store_spec(store, patched(parsed.spec, patches), plain, tuple(patches))
+        except (OSError, SceneBuildError, SceneError) as error:  # the session works without its picture
+            return Shown(plain, notes=(f"{NO_SPECIFICATION}: {error}",))
         return shown._replace(notes=tuple(f"left out for clients: {what}" for what in parsed.skipped))
 
     def patch(self, ops: Sequence[PatchOp]) -> Shown:
-        """The newest scene with `ops`. Raises `SceneError`, `OSError`. Hold `lock` until `take`."""
+        """Return the newest scene with `ops` applied. Raises `SceneError`, `OSError`. Hold `lock` until `show`."""
         newest = self.newest
         if self._store is None or newest is None or newest.spec is None:
-            why = (
-                "; ".join(note for note in self.notes if NOTHING_TO_SEE in note) or "`assets` of SessionConfig is False"
-            )
+            reasons = [note for note in self.notes if NO_SPECIFICATION in note]
+            why = "; ".join(reasons) or "`assets` of SessionConfig is False"
             raise SceneError(f"this session shares no specification of its scene: {why}")
         merging = merged(newest.patches, ops)
         if len(merging) > MAX_PATCHES:
@@ -129,28 +141,28 @@ class SharedScenes:
                 "visual count once: load the scene anew"
             )
         info = msgspec.structs.replace(newest.info, patches=newest.info.patches + 1)
-        return _stored(self._store, patched(newest.spec, ops), info, merging)._replace(notes=newest.notes)
+        return _store_spec(self._store, patched(newest.spec, ops), info, merging)._replace(notes=newest.notes)
 
-    def take(self, shown: Shown) -> SceneInfo:
-        """It is the newest from now on; its files stay, and those of the one before, which the front still serves.
+    def show(self, shown: Shown) -> SceneInfo:
+        """Make a scene the newest. Its files are held, and those of the one before, which the front still serves.
 
-        Raises nothing: what is shown has changed already, and a full disk must not make it look as if it had not.
+        Raises nothing: what clients see has changed already, and a full disk does not change it back.
         """
         with self.lock:
             self.newest = shown
             store = self._store
-            if store is not None and shown.spec is not None and not self._closed:  # a thread may be later than the end
+            if store is not None and shown.spec is not None and not self._closed:  # a thread may come after the end
                 self._hold(store, shown.info.assets)
                 if shown.patches:
                     address = shown.info.scene_hash
-                    self._looks.append(_Look(address, store.last_used_ns(address), time.monotonic()))
-                self._forget_looks(store)
+                    self._patched.append(_PatchedSpec(address, store.last_used_ns(address), time.monotonic()))
+                self._discard_replaced(store)
             while len(self._holds) > 2:
                 self._holds.pop(0).release()
         return shown.info
 
     def close(self) -> None:
-        """Lets go of the files."""
+        """Release the files."""
         with self.lock:
             self._closed = True
             for hold in self._holds:
@@ -162,22 +174,22 @@ class SharedScenes:
             self._holds.append(store.hold(addresses))
         except OSError as error:
             why = error.strerror or error
-            self._say(f"files of the scene in {store.root} cannot be held, so others may take them away: {why}")
+            self._add_note(f"scene files in {store.root} cannot be held, so other processes may remove them: {why}")
 
-    def _forget_looks(self, store: AssetStore) -> None:
-        """Specifications that patches after them have replaced, for everybody."""
-        looks, now = self._looks, time.monotonic()
-        while len(looks) > KEPT_LOOKS and now - looks[0].shown_s > KEPT_LOOKS_S:
-            look = looks.popleft()
-            store.discard(look.address, look.used_at)
+    def _discard_replaced(self, store: AssetStore) -> None:
+        """Discard specifications that later patches have replaced for all clients."""
+        patched_specs, now = self._patched, time.monotonic()
+        while len(patched_specs) > KEPT_PATCHES and now - patched_specs[0].shown_s > KEPT_PATCHES_S:
+            old = patched_specs.popleft()
+            store.discard(old.address, old.used_at)
 
-    def _say(self, text: str) -> None:
-        """Once: a session may load its scenes, and patch them, for days."""
-        if text not in self._said:
-            self._said.append(text)
+    def _add_note(self, text: str) -> None:
+        """Add a note about the store once: a session may load and patch scenes for days."""
+        if text not in self._store_notes:
+            self._store_notes.append(text)
 
 
-class _Look(NamedTuple):
+class _PatchedSpec(NamedTuple):
     """The specification after a patch. `used_at`: as the store says; `shown_s`: monotonic."""
 
     address: str
@@ -185,7 +197,7 @@ class _Look(NamedTuple):
     shown_s: float
 
 
-def _stored(store: AssetStore, spec: SceneSpec, info: SceneInfo, patches: tuple[PatchOp, ...]) -> Shown:
+def _store_spec(store: AssetStore, spec: SceneSpec, info: SceneInfo, patches: tuple[PatchOp, ...]) -> Shown:
     named = asset_addresses(spec)
     if missing := next((address for address in named if address not in store), ""):
         raise SceneError(f"asset {missing} is not in {store.root}: put it there (AssetStore.put) before it is shown")

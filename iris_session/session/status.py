@@ -1,74 +1,78 @@
-"""What a session shows about itself: roster, leases, alignment, lateness, latency, drops. Plain values for people.
+"""Status of a session: `SessionStatus` for its owner, and the authority's half of a `StatusReport` for clients.
 
-`SessionLedger` follows the authority's own events, so it needs no snapshot and no question to the pure core.
+Rows of participants, robots and the recorder are the protocol's reports in both. A `StatusReport` is built about once a
+second between two ticks, when there is time to spare; the front adds what it sees. Everything reads counters and asks
+no disk, because a disk that hangs must not stop physics: the recorder reports the free space of its disk.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Mapping
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final
+import os
+import resource
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
 
 import msgspec
 
-from iris_session.protocol.common import Applied
-from iris_session.protocol.entries import HOST
-from iris_session.protocol.server_messages import (
-    AlignmentChanged,
-    Event,
-    Handover,
-    ParticipantChanged,
-    ParticipantJoined,
-    ParticipantLeft,
-    SamplesRejected,
-    Snapshot,
+from iris_session.physics import Pacer
+from iris_session.protocol.common import MAX_TEXT, Pose
+from iris_session.protocol.status import (
+    AnchorReport,
+    ParticipantReport,
+    RecorderReport,
+    RobotReport,
+    StatusReport,
 )
-from iris_session.protocol.session_mirror import SessionMirror
-from iris_session.protocol.status import AlignmentReport, ParticipantReport, Quantiles, quantiles
-from iris_session.protocol.steps import ControlStatus, Decision
+from iris_session.session.ledger import HandoverStatus
+from iris_session.session.stepper import Stepper
+from iris_session.session.tick_times import TickTimes
 
-if TYPE_CHECKING:
-    from iris_session.physics import Pacer
-    from iris_session.session.processes import SessionProcesses
-    from iris_session.session.stepper import Stepper
-
-#: Events kept for display; the recording has them all.
-RECENT_EVENTS: Final = 200
-#: Samples per robot whose wait for a step is remembered: two to three seconds of one device.
-RECEIVE_TO_STEP: Final = 200
+PERIOD_NS: Final = 1_000_000_000
+#: A loop that is behind gets this long to catch up before a report is built all the same.
+PATIENCE_NS: Final = 1_000_000_000
+PAGE_BYTES: Final = resource.getpagesize()
 
 
-class ParticipantStatus(msgspec.Struct, frozen=True):
-    """One row: `alignment_mm` is the stated p95 error at the robot, None without a measured alignment."""
+class ProcessStatus(msgspec.Struct, frozen=True):
+    """Front and recorder, as their supervisor sees them.
 
-    id: str
-    name: str
-    role: str
-    connected: bool
-    robots: tuple[str, ...]
-    alignment: str
-    alignment_mm: float | None
+    `drops`: what did not leave this process, by reason. `restarts`: of `front` and `recorder`. `sheet_sizes`: edges of
+    the printed sheets [m], where known.
+    """
 
-
-class HandoverStatus(msgspec.Struct, frozen=True):
-    object: str
-    giver: str
-    receiver: str
-    at_s: float
-    duration_s: float
+    recorder: RecorderReport = RecorderReport()
+    drops: dict[str, int] = {}
+    restarts: dict[str, int] = {}
+    sheet_sizes: dict[str, float] = {}
 
 
 class SessionStatus(msgspec.Struct, frozen=True):
-    """`lateness`: ticks, late, late_share, p50_ms, p99_ms. `input_to_ctrl_ms`: capture of the newest applied sample to
-    the step that used it, per robot. `drops`: by reason. `scheduling`: `realtime` or `normal`."""
+    """State of a session for its owner, from `Session.status()`.
+
+    Attributes:
+        session_time_s: Session time [s].
+        tick: Ticks of physics since the scene began.
+        sim_time: Time of the simulation or of the published world [s].
+        paused: Physics is paused by a director or the owner.
+        estop: The e-stop is latched.
+        participants: One row each, as in a `StatusReport`, without what only the front knows.
+        handovers: All handovers since the session began.
+        lateness: Of the ticks of `run()`: `ticks`, `late`, `late_share`, `p50_ms`, `p99_ms`, `max_ms`. Empty in a loop
+            of the owner's.
+        input_to_ctrl_ms: By robot, from the capture of the newest applied sample to the step that applied it [ms].
+        drops: By reason, everything that was not delivered.
+        restarts: Of `front` and `recorder`.
+        scheduling: `realtime` or `normal`.
+    """
 
     session_time_s: float
     tick: int
     sim_time: float
     paused: bool
     estop: bool
-    participants: tuple[ParticipantStatus, ...]
+    participants: tuple[ParticipantReport, ...]
     handovers: tuple[HandoverStatus, ...]
     lateness: dict[str, float]
     input_to_ctrl_ms: dict[str, float]
@@ -77,168 +81,18 @@ class SessionStatus(msgspec.Struct, frozen=True):
     scheduling: str = "normal"
 
     def as_dict(self) -> dict[str, Any]:
+        """Return the status as plain values for JSON."""
         return dict(msgspec.to_builtins(self))
 
 
-class SessionLedger:
-    """Roster, leases and handovers as the decisions tell them."""
-
-    def __init__(self) -> None:
-        self.mirror = SessionMirror()
-        self.mirror.apply_snapshot(Snapshot(0, 0, 1, 0, "", 0, 0.0, 0, participants=(), leases=()))
-        self.handovers: list[HandoverStatus] = []
-        self.recent: deque[Event] = deque(maxlen=RECENT_EVENTS)
-        self.applied: dict[str, Applied] = {}
-        #: Connection number -> participant id, newest connections included.
-        self.connections: dict[int, str] = {}
-        #: Samples not counted so far, by reason, as events tell (at most a second old).
-        self.rejected: dict[tuple[str, str, str], int] = {}
-        #: Session time since when a participant has its alignment, or has lost it to a jump of its tracking frame.
-        self._aligned_ns: dict[str, int] = {}
-        self._void_ns: dict[str, int] = {}
-        self._receive_to_step_ns: dict[str, deque[int]] = {}
-
-    def follow(self, decision: Decision, status: tuple[ControlStatus, ...]) -> None:
-        """Takes over one step."""
-        for admitted in decision.admitted:
-            self.connections[admitted.connection] = admitted.participant_id
-        for dropped in decision.dropped:
-            self.connections.pop(dropped.connection, None)
-        for event in decision.events:
-            self._follow_alignment(event)
-            self.mirror.apply_event(event)
-            self.recent.append(event)
-            body = event.body
-            if isinstance(body, SamplesRejected):
-                self.rejected[body.participant, body.device, body.reason] = body.count
-            if isinstance(body, Handover):
-                self.handovers.append(
-                    HandoverStatus(
-                        body.object, body.giver, body.receiver, event.session_time * 1e-9, body.duration_ns * 1e-9
-                    )
-                )
-        for outgoing in decision.outgoing:
-            if outgoing.connection == HOST and isinstance(outgoing.message, Snapshot):
-                self._begin(outgoing.message)
-        for robot in status:
-            if robot.applied is not None and robot.applied is not self.applied.get(robot.robot):
-                self._follow_applied(robot.robot, robot.applied)
-
-    def _begin(self, snapshot: Snapshot) -> None:
-        """A resumed session: who was in it, what they held."""
-        self.mirror.apply_snapshot(snapshot)
-        for info in snapshot.participants:
-            if info.alignment is not None:
-                self._aligned_ns.setdefault(info.id, snapshot.session_time)
-
-    def _follow_applied(self, robot: str, applied: Applied) -> None:
-        before = self.applied.get(robot)
-        self.applied[robot] = applied
-        if before is None or applied.step_ns != before.step_ns:
-            delays = self._receive_to_step_ns.get(robot)
-            if delays is None:
-                delays = self._receive_to_step_ns[robot] = deque(maxlen=RECEIVE_TO_STEP)
-            delays.append(applied.step_ns - applied.receive_ns)
-
-    def _follow_alignment(self, event: Event) -> None:
-        """Events tell how an alignment is, not since when. Called before the mirror knows of `event`."""
-        body = event.body
-        if isinstance(body, AlignmentChanged):
-            self._aligned_ns[body.participant] = event.session_time
-            self._void_ns.pop(body.participant, None)
-        elif isinstance(body, ParticipantJoined | ParticipantChanged):
-            info = body.participant
-            known = self.mirror.participants.get(info.id)
-            if info.alignment is not None:
-                self._aligned_ns.setdefault(info.id, event.session_time)
-            elif known is not None and known.alignment is not None:
-                self._aligned_ns.pop(info.id, None)
-                self._void_ns[info.id] = event.session_time
-        elif isinstance(body, ParticipantLeft) and not body.grace:
-            self._aligned_ns.pop(body.participant, None)
-            self._void_ns.pop(body.participant, None)
-            self.rejected = {key: n for key, n in self.rejected.items() if key[0] != body.participant}
-
-    def names(self) -> dict[str, str]:
-        """Participant id -> name."""
-        return {info.id: info.name for info in self.mirror.participants.values()}
-
-    def _held(self) -> dict[str, list[str]]:
-        """Participant id -> robots and objects."""
-        held: dict[str, list[str]] = {}
-        for lease in self.mirror.leases.values():
-            for holder in lease.sub_holders or ((lease.holder,) if lease.holder else ()):
-                held.setdefault(holder, []).append(lease.target)
-        return held
-
-    def participants(self) -> tuple[ParticipantStatus, ...]:
-        """The roster with what each participant holds."""
-        held = self._held()
-        rows = []
-        for info in self.mirror.participants.values():
-            alignment = info.alignment
-            measured = alignment is not None and alignment.kind == "measured"
-            rows.append(
-                ParticipantStatus(
-                    info.id,
-                    info.name,
-                    info.role,
-                    info.connected,
-                    tuple(held.get(info.id, ())),
-                    "none" if alignment is None else alignment.kind,
-                    alignment.error_at_robot_m * 1e3 if alignment is not None and measured else None,
-                )
-            )
-        return tuple(rows)
-
-    def participant_reports(
-        self, now_ns: int, alignments: Mapping[str, AlignmentReport] = MappingProxyType({})
-    ) -> tuple[ParticipantReport, ...]:
-        """The authority's part of the roster in a `StatusReport`. `alignments`: by participant."""
-        held = self._held()
-        waits: dict[str, list[str]] = {}
-        for lease in self.mirror.leases.values():
-            for waiting in lease.queue:
-                waits.setdefault(waiting, []).append(lease.target)
-        rejected: dict[str, dict[str, int]] = {}
-        for (participant, _, reason), count in self.rejected.items():
-            counts = rejected.setdefault(participant, {})
-            counts[reason] = counts.get(reason, 0) + count
-        return tuple(
-            ParticipantReport(
-                info.id,
-                info.name,
-                info.role,
-                info.connected,
-                worn=info.worn,
-                alignment="none" if info.alignment is None else info.alignment.kind,
-                alignment_age_ns=now_ns - self._aligned_ns[info.id] if info.id in self._aligned_ns else -1,
-                alignment_void_ns=now_ns - self._void_ns[info.id] if info.id in self._void_ns else -1,
-                alignment_error_m=0.0 if info.alignment is None else info.alignment.error_at_robot_m,
-                tracking_epoch=info.tracking_epoch,
-                holds=tuple(held.get(info.id, ())),
-                waits_for=tuple(waits.get(info.id, ())),
-                rejected=rejected.get(info.id, {}),
-                alignment_report=alignments.get(info.id),
-            )
-            for info in self.mirror.participants.values()
-        )
-
-    def receive_to_step(self, robot: str) -> Quantiles | None:
-        """How long the newest samples behind a robot's motion waited for the step that used them."""
-        return quantiles(self._receive_to_step_ns.get(robot, ()))
-
-    def input_to_ctrl_ms(self) -> dict[str, float]:
-        """Per robot: age of the newest applied sample when its step began to use it."""
-        return {name: (a.step_ns - a.capture_ns) * 1e-6 for name, a in self.applied.items()}
-
-
-def make_status(
-    stepper: Stepper | None, pacer: Pacer | None, processes: SessionProcesses | None, scheduling: str
+def make_session_status(
+    stepper: Stepper | None,
+    pacer: Pacer | None,
+    drops: dict[str, int],
+    restarts: dict[str, int],
+    scheduling: str,
 ) -> SessionStatus:
-    """The status now; empty before the first step."""
-    drops = {} if processes is None else processes.drops()
-    restarts = {} if processes is None else processes.restarts()
+    """Return the status now, empty before the first step."""
     if stepper is None or stepper.last is None:
         return SessionStatus(0.0, 0, 0.0, False, False, (), (), {}, {}, drops, restarts, scheduling)
     now_ns = stepper.clock()
@@ -253,18 +107,144 @@ def make_status(
             "p99_ms": stats.p99_ns * 1e-6,
             "max_ms": stats.max_ns * 1e-6,
         }
-    view, ledger, decision = stepper.core.world.view(), stepper.ledger, stepper.last.decision
+    core, ledger, decision = stepper.core, stepper.ledger, stepper.last.decision
+    view = core.world.view()
     return SessionStatus(
         now_ns * 1e-9,
         view.tick,
         view.sim_time,
         decision.paused,
         decision.estop,
-        ledger.participants(),
+        ledger.make_participant_reports(now_ns, core.authority.build_alignment_reports()),
         tuple(ledger.handovers),
         lateness,
-        ledger.input_to_ctrl_ms(),
+        ledger.compute_input_to_ctrl_ms(),
         drops,
         restarts,
         scheduling,
     )
+
+
+class StatusReporter:
+    """Builds the authority's half of the `StatusReport`s of one session.
+
+    The pacing loop, where it is ours, sets `pacer`, `times` and `scheduling`. `warning_sources` are asked for every
+    report: what a person should know now, though nothing has failed.
+    """
+
+    def __init__(self) -> None:
+        self.pacer: Pacer | None = None
+        self.times: TickTimes | None = None
+        self.scheduling = ""
+        self.warning_sources: list[Callable[[], Sequence[str]]] = []
+        self._next_ns = 0
+        self._cpu_ns = time.process_time_ns()
+        self._cpu_at_ns = time.monotonic_ns()
+
+    def is_due(self, now_ns: int) -> bool:
+        """Return whether a report is to be built now, and if so begin to wait for the next."""
+        if now_ns < self._next_ns:
+            return False
+        pacer = self.pacer
+        is_late = pacer is not None and not pacer.paused and pacer.next_deadline_ns <= now_ns
+        if is_late and now_ns < self._next_ns + PATIENCE_NS:
+            return False
+        self._next_ns = now_ns + PERIOD_NS
+        return True
+
+    def make_report(self, stepper: Stepper, processes: ProcessStatus) -> StatusReport:
+        """Return the session now; fields of the front keep their defaults."""
+        now_ns = stepper.clock()
+        pacer, times = self.pacer, self.times
+        stats = None if pacer is None else pacer.stats(now_ns)
+        if times is not None and stats is not None:
+            times.mark(stats)
+        last, core = stepper.last, stepper.core
+        warnings = [text for source in self.warning_sources for text in source()]
+        return StatusReport(
+            0,
+            "",
+            "",
+            now_ns,
+            tick=core.world.view().tick,
+            tick_period_ns=core.world.tick_period_ns,
+            paused=stepper.paused,
+            estop=last is not None and last.decision.estop,
+            scheduling=self.scheduling,
+            late_share=0.0 if times is None else times.compute_late_share(),
+            late_share_total=0.0 if stats is None else stats.late_share,
+            lateness=None if times is None else times.compute_lateness(),
+            late_causes={} if times is None else times.count_late_causes(),
+            cpu_share=self._measure_cpu_share(),
+            load=os.getloadavg()[0],
+            cpus=os.cpu_count() or 1,
+            memory_bytes=measure_memory_bytes(),
+            participants=stepper.ledger.make_participant_reports(now_ns, core.authority.build_alignment_reports()),
+            robots=make_robot_reports(stepper),
+            recorder=processes.recorder,
+            drops=processes.drops,
+            restarts=processes.restarts,
+            warnings=tuple(collect_warnings(stepper, processes.recorder, self.scheduling, warnings)),
+            anchors=make_anchor_reports(core.authority.anchors, processes.sheet_sizes),
+            cross_checks=core.authority.build_cross_check_reports(),
+        )
+
+    def _measure_cpu_share(self) -> float:
+        """Return the processor time of this process since the last report, 1 for a whole processor."""
+        cpu_ns, at_ns = time.process_time_ns(), time.monotonic_ns()
+        share = (cpu_ns - self._cpu_ns) / max(1, at_ns - self._cpu_at_ns)
+        self._cpu_ns, self._cpu_at_ns = cpu_ns, at_ns
+        return share
+
+
+def make_anchor_reports(poses: Mapping[str, Pose], sizes: Mapping[str, float]) -> tuple[AnchorReport, ...]:
+    """Return where every anchor is now (`T_world_anchor`); `sizes`: edges of the printed sheets [m], where known."""
+    return tuple(AnchorReport(name, T, sizes.get(name, 0.0)) for name, T in poses.items())
+
+
+def make_robot_reports(stepper: Stepper) -> tuple[RobotReport, ...]:
+    """Return for each robot its holder, what it does, and how long its samples waited for their step."""
+    ledger = stepper.ledger
+    names = ledger.names_by_id()
+    commands = {c.robot: c for c in stepper.last.decision.commands} if stepper.last is not None else {}
+    rows = []
+    for spec in stepper.core.scene.robots:
+        lease, command = ledger.mirror.leases.get(spec.name), commands.get(spec.name)
+        holder = "" if lease is None else lease.holder
+        rows.append(
+            RobotReport(
+                spec.name,
+                stepper.core.config.authority.default_mode or spec.mode if lease is None else lease.mode,
+                holder,
+                names.get(holder, ""),
+                "" if command is None else command.kind,
+                "" if command is None else command.hold_reason,
+                ledger.receive_to_step_quantiles(spec.name),
+                () if lease is None else lease.queue,
+            )
+        )
+    return tuple(rows)
+
+
+def collect_warnings(
+    stepper: Stepper, recorder: RecorderReport, scheduling: str, warnings: Sequence[str] = ()
+) -> list[str]:
+    """Return what a person should know though nothing has failed yet, one line each; `warnings` come first."""
+    found = list(warnings)
+    if stepper.last is not None and stepper.last.diverged:
+        found.append(f"physics stands still until a reset: {stepper.last.diverged}"[:MAX_TEXT])
+    if scheduling == "normal":
+        found.append("the tick loop runs without real-time priority: other programs can make its ticks late")
+    if recorder.lost_rows:
+        found.append(f"{recorder.lost_rows} rows of the recording are lost: {recorder.text or 'no room for them'}")
+    return [text[:MAX_TEXT] for text in found]
+
+
+def measure_memory_bytes() -> int:
+    """Return the resident memory of this process; its peak where the system does not say."""
+    try:
+        with open("/proc/self/statm", "rb") as file:
+            return int(file.read().split()[1]) * PAGE_BYTES
+    except (OSError, ValueError, IndexError):
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak if sys.platform == "darwin" else peak * 1024

@@ -1,4 +1,4 @@
-"""One step of a live session: gathers entries, runs the core, sends the results out, journals. No pacing, no threads.
+"""`Stepper`: one step of a live session. Gathers entries, runs the core, sends the results, journals. No pacing.
 
 Session time is stamped here, once per step, and handed to the pure core. Everything that goes out is bounded by the
 ports behind it (front link, recorder feed); what they drop they count.
@@ -6,6 +6,7 @@ ports behind it (front link, recorder feed); what they drop they count.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -32,22 +33,24 @@ from iris_session.protocol.names import LateCause
 from iris_session.protocol.server_messages import BodyInfo, StateHeader
 from iris_session.protocol.steps import Decision
 from iris_session.recording.journal import CRASHED, JournalRow, Keyframe, make_row
-from iris_session.session.core import Plant, SessionCore, StepOutcome, unmeasured
-from iris_session.session.deformables import Bending
+from iris_session.session.core import Plant, SessionCore, StepOutcome, ignore_lap
+from iris_session.session.deformables import DeformableMesh
 from iris_session.session.errors import OwnershipError
+from iris_session.session.ledger import SessionLedger
 from iris_session.session.shared_scene import Shown
-from iris_session.session.status import SessionLedger
 
-#: Host entries waiting for the next step; a script that posts more in one step is refused with an error.
+#: Pending host entries; a script that posts more in one step gets an error.
 MAX_HOST_ENTRIES: Final = 256
-#: As many more are kept for e-stops, and for what the session says itself: a few a step.
-ROOM_FOR_OURS: Final = 64
-#: Scenes and patches that wait; a step takes one.
-MAX_SCENES: Final = 64
+#: Room for as many more: e-stops, and entries of the session itself, which are a few a step.
+RESERVED_HOST_ENTRIES: Final = 64
+#: Pending scenes and patches; a step loads one.
+MAX_PENDING_SCENES: Final = 64
+
+_log = logging.getLogger(__name__)
 
 
 class FrontPort(Protocol):
-    """What the stepper needs of the front process."""
+    """The part of `FrontLink` that the stepper uses."""
 
     def poll(self) -> list[Entry]: ...
 
@@ -57,7 +60,7 @@ class FrontPort(Protocol):
 
 
 class RecorderPort(Protocol):
-    """What the stepper needs of the recorder's feed."""
+    """The part of `RecorderFeed` that the stepper uses."""
 
     @property
     def wants_keyframe(self) -> bool: ...
@@ -97,26 +100,24 @@ class RecorderPort(Protocol):
 
 
 class NextScene(NamedTuple):
-    """A scene that is to take the place of the present one. `packed_model`: to be recorded; `shown`: to clients;
-    `bending`: what bends in it."""
+    """A scene that is to replace the present one. `packed_model`: for the recording; `shown`: for clients."""
 
     plant: Plant
     model_hash: str
     packed_model: bytes
     shown: Shown
-    bending: Sequence[Bending] = ()
+    deformables: Sequence[DeformableMesh] = ()
 
 
 class NextPatch(NamedTuple):
-    """A change of what is drawn. `shown`: to clients after it."""
+    """A change of what is drawn. `shown`: the scene after it, for clients."""
 
     message: ScenePatched
     shown: Shown
 
 
 class ResumedFrom(NamedTuple):
-    """What a session goes on from: newest step and session time of its recording. `anchors`: where they are, when that
-    was given anew; empty: as they were."""
+    """Newest step and session time of the recording that is resumed. `anchors`: new poses; empty: as they were."""
 
     step: int
     now_ns: int
@@ -126,9 +127,25 @@ class ResumedFrom(NamedTuple):
 class Stepper:
     """Drives one `SessionCore` against a front and a recorder.
 
-    `clock` gives session time in nanoseconds. `state_period_ns`: how often rigid state is published and recorded.
-    `chain`: `header_root` of the recording's header (any bytes when nothing is recorded). `resumed_from`: of the
-    recording that `core` goes on from.
+    Args:
+        core: The session as a pure function.
+        front: Link to the front process.
+        recorder: Feed of the recorder, `None` to record nothing.
+        clock: Returns session time [ns].
+        state_period_ns: How often rigid state is published and recorded.
+        keyframe_period_ns: Distance of keyframes in the recording.
+        chain: `header_root` of the recording's header (any bytes when nothing is recorded).
+        resumed_from: The end of the recording that `core` was restored from.
+
+    Attributes:
+        last: Outcome of the newest step.
+        ledger: Participants, leases and events so far.
+        lateness_ns: Worst lateness of a tick since the last published state, set by the pacing loop.
+        on_scene: Called with a scene or patch before the step that loads it.
+        on_publish: Called after a state was published, with scene epoch and the times of `publish_now`.
+        on_state: Called with what was published; for measurements and tests.
+        on_entries: Called with the entries of every step; for measurements and tests.
+        on_lap: Called after each part of a step with the `LateCause` that its time counts as. The pacing loop sets it.
     """
 
     def __init__(
@@ -153,7 +170,6 @@ class Stepper:
         self._ended_at: TracebackType | None = None
         self._host: deque[EntryMessage] = deque()
         self._scenes: deque[NextScene | NextPatch] = deque()
-        #: Called with another scene before the step that loads it.
         self.on_scene: list[Callable[[NextScene | NextPatch], None]] = []
         self._state_period_ns = state_period_ns
         self._keyframe_period_ns = keyframe_period_ns
@@ -161,15 +177,11 @@ class Stepper:
         self._next_keyframe_ns = 0
         self._chain = chain
         self.ledger = SessionLedger()
-        #: Worst lateness of a tick since the last published state, for the recording's plots. Set by the pacing loop.
         self.lateness_ns = 0
-        #: Called after a state was published with its scene epoch and the times of `publish_now`: streams beside it.
-        self.beside_state: list[Callable[[int, int, int], None]] = []
-        #: Called with what was published, and with the entries of every step: for measurements and tests.
+        self.on_publish: list[Callable[[int, int, int], None]] = []
         self.on_state: Callable[[StateHeader, NDArray[np.float64]], None] | None = None
         self.on_entries: Callable[[Sequence[Entry]], None] | None = None
-        #: Called after each part of a step with the `LateCause` that its time counts as. Set by the pacing loop.
-        self.lap: Callable[[str], None] = unmeasured
+        self.on_lap: Callable[[str], None] = ignore_lap
         self._resumed_from = resumed_from
         self._last_now_ns = -1 if resumed_from is None else resumed_from.now_ns
         self._poses = np.zeros((len(core.world.bodies), 7))
@@ -179,41 +191,52 @@ class Stepper:
         return self.last is not None and self.last.decision.paused
 
     def post(self, message: EntryMessage) -> None:
-        """Queues an input of the session's owner for the next step. Thread-safe (`deque.append`).
+        """Queue an input of the session's owner for the next step. Thread-safe (`deque.append`).
 
-        Texts are cut to the length of a `Text`. Raises `ValueError` for anything else that the protocol does not take,
-        `OwnershipError` when too many wait; an e-stop is not refused for that.
+        Texts are cut to the length of a `Text`.
+
+        Raises:
+            ValueError: A value that the protocol does not allow.
+            OwnershipError: The queue is full; an e-stop is accepted all the same.
         """
         if len(self._host) >= MAX_HOST_ENTRIES and not isinstance(message, EStop):
-            raise OwnershipError(f"more than {MAX_HOST_ENTRIES} inputs wait for one step: is the loop running?")
-        self.say(message)
+            raise OwnershipError(f"queue of inputs full ({MAX_HOST_ENTRIES} wait for one step): is the loop running?")
+        self.post_own(message)
 
-    def say(self, message: EntryMessage) -> None:
-        """As `post`, of what befell the session itself: whatever its owner has posted, there is room for it."""
-        if len(self._host) >= MAX_HOST_ENTRIES + ROOM_FOR_OURS:
-            raise RuntimeError(f"{len(self._host)} inputs wait for one step: is the loop running?")
-        self._host.append(checked(message))
+    def post_own(self, message: EntryMessage) -> None:
+        """Queue an entry of the session itself; it has room reserved beside what the owner has posted."""
+        if len(self._host) >= MAX_HOST_ENTRIES + RESERVED_HOST_ENTRIES:
+            raise RuntimeError(f"queue of inputs full ({len(self._host)} wait for one step): is the loop running?")
+        self._host.append(normalize_message(message))
 
-    def change_scene(self, scene: NextScene | NextPatch) -> None:
-        """Another scene, or another look of it, from the next step on. From any thread; of several that wait each gets
-        a step of its own. Raises `RuntimeError` when too many do."""
-        if len(self._scenes) >= MAX_SCENES:
-            raise RuntimeError(f"more than {MAX_SCENES} changes of the scene wait: is the loop running?")
+    def queue_scene(self, scene: NextScene | NextPatch) -> None:
+        """Load a scene or patch with the next step, each with a step of its own. From any thread.
+
+        Raises:
+            RuntimeError: The queue is full.
+        """
+        if len(self._scenes) >= MAX_PENDING_SCENES:
+            raise RuntimeError(f"queue of scene changes full ({MAX_PENDING_SCENES}): is the loop running?")
         self._scenes.append(scene)
 
     def step(self, n_ticks: int, plant: bytes = b"", *, publish: bool = True) -> StepOutcome:
-        """Takes one step now. `plant`: see `SessionCore.step` (open sessions).
+        """Take one step now.
 
-        `publish` false: the state that this step leads to is not there yet, its maker calls `publish` when it is.
-        After one that raised, or that Ctrl-C broke off, no step is taken any more, whoever asks for it: half a step is
-        in no journal, and what followed would not fit it. What ended the first is raised again (`ended_by`).
+        After a step that raised, or that Ctrl-C interrupted, every further call raises the same error (`end_error`):
+        half a step is in no journal, and what followed would not fit it.
+
+        Args:
+            n_ticks: Ticks of physics, 0 or more.
+            plant: See `SessionCore.step` (open sessions).
+            publish: Publish the state when it is due. False: the state of this step does not exist yet, the caller
+                publishes it later.
         """
         if self._ended is not None:
-            raise self._ended.with_traceback(self._ended_at)  # which would grow with every time that it is raised
+            raise self._ended.with_traceback(self._ended_at)  # else it would grow each time
         try:
             return self._step(n_ticks, plant, publish)
         except BaseException as error:
-            self._ended, self._ended_at = ended_by(error), error.__traceback__
+            self._ended, self._ended_at = end_error(error), error.__traceback__
             raise
 
     def _step(self, n_ticks: int, plant: bytes, publish: bool) -> StepOutcome:
@@ -224,10 +247,10 @@ class Stepper:
             n_ticks = 0  # it may be paused
         entries = self._gather(now_ns)
         if self.last is None:
-            self._keyframe(now_ns)
+            self._record_keyframe(now_ns)
         self._last_now_ns = now_ns
         try:
-            outcome = self.core.step(now_ns, entries, n_ticks, plant, digest=self.recorder is not None, lap=self.lap)
+            outcome = self.core.step(now_ns, entries, n_ticks, plant, digest=self.recorder is not None, lap=self.on_lap)
         except Exception:
             if self.recorder is not None:  # what led to it is worth more than all before
                 self.recorder.add_row(make_row(self._chain, self.step_count, now_ns, n_ticks, entries, CRASHED, plant))
@@ -239,26 +262,26 @@ class Stepper:
         anew = self.last is None or not self.last.diverged
         if outcome.diverged and (anew or not (plant or outcome.decision.paused)):  # no resume but by a reset
             if not plant:  # a user's loop is not ours to pause
-                self.say(Control(request_id=0, action="pause"))
-            self.say(Marker(request_id=0, text=f"physics stands still until a reset: {outcome.diverged}"))
+                self.post_own(Control(request_id=0, action="pause"))
+            self.post_own(Marker(request_id=0, text=f"physics stands still until a reset: {outcome.diverged}"))
         self.last = outcome
         self.front.send_decision(self.step_count, outcome.decision)
         self._newest_step = self.step_count
         if publish:
             self.publish(end_ns)
-        self.ledger.follow(outcome.decision, outcome.status)
+        self.ledger.apply_step(outcome.decision, outcome.status)
         if self.recorder is not None:
             self._record(self.recorder, now_ns, n_ticks, entries, plant)
         self.step_count += 1
-        self.lap(LateCause.OUTPUT)
+        self.on_lap(LateCause.OUTPUT)
         return outcome
 
     def _gather(self, now_ns: int) -> list[Entry]:
-        """Host entries first. A long time between two steps is no entry: the authority sees it in `now_ns`."""
+        """Return the entries of a step, host entries first. The authority sees a long gap in `now_ns`."""
         entries = self.front.poll()
         host: list[Entry] = []
         if self.last is None and self._resumed_from is not None:
-            # The ledger knows nobody yet: it learns the roster as a client would.
+            # The ledger is empty: it gets the participants by a snapshot, as a client does.
             past = self._resumed_from
             begin = (SessionResumed(now_ns - past.now_ns, dict(past.anchors)), GetSnapshot())
             host += [Entry(HOST, HOST, now_ns, message) for message in begin]
@@ -269,7 +292,7 @@ class Stepper:
         return host + entries if host else entries
 
     def _announce_scene(self) -> Sequence[EntryMessage]:
-        """Hands the next scene or patch to everybody who must have it before the step."""
+        """Give the next scene or patch to recorder, front and callbacks before its step; return its entries."""
         scene = self._scenes.popleft()
         messages: Sequence[EntryMessage]
         assets = scene.shown.info.asset_root, scene.shown.info.scene_hash
@@ -283,13 +306,13 @@ class Stepper:
             self._poses = np.zeros((len(bodies), 7))
             if self.recorder is not None:
                 self.recorder.send_scene(scene.model_hash, scene.packed_model, bodies, *assets)
-            messages = (scene.plant.scene, GetSnapshot())  # the ledger gets the new leases as a client would
-        for follow in self.on_scene:
-            follow(scene)
+            messages = (scene.plant.scene, GetSnapshot())  # the ledger gets the new leases as a client does
+        for callback in self.on_scene:
+            callback(scene)
         return messages
 
     def publish(self, end_ns: int) -> None:
-        """Sends the rigid state when it is due. `end_ns`: session time of the end of the tick it belongs to."""
+        """Publish the rigid state if it is due. `end_ns`: session time of the end of the tick it belongs to."""
         if self.last is None or end_ns < self._next_state_ns:
             return
         # Aims at a fixed rate; after a long gap it starts over instead of sending a burst.
@@ -297,9 +320,11 @@ class Stepper:
         self.publish_now(end_ns)
 
     def publish_now(self, end_ns: int, shown_ns: int = -1) -> None:
-        """Sends the rigid state, for somebody who keeps the rate himself. A step must have been taken.
+        """Publish the rigid state, for a caller that keeps the rate itself. A step must have been taken.
 
-        `end_ns`: as of `publish`. `shown_ns`: of a state that is sent again, the `end_ns` with which it was sent first.
+        Args:
+            end_ns: As for `publish`.
+            shown_ns: For a state that is published again, the `end_ns` it was published with first.
         """
         assert self.last is not None
         decision, world = self.last.decision, self.core.world
@@ -311,8 +336,8 @@ class Stepper:
             decision.scene_epoch, decision.scene_revision, tick, sim_time, shown_ns, 0, 0, 0, applied
         )  # fmt: skip
         self.front.send_state(header, self._poses)
-        for send in self.beside_state:
-            send(decision.scene_epoch, end_ns, shown_ns)
+        for callback in self.on_publish:
+            callback(decision.scene_epoch, end_ns, shown_ns)
         if self.on_state is not None:
             self.on_state(header, self._poses)
         if self.recorder is not None:
@@ -332,12 +357,13 @@ class Stepper:
         recorder.add_row(row)
         lost = recorder.take_gap()
         if lost:
-            self.say(RecordingGap(lost))
+            _log.warning("gap in the recording: %d rows are lost", lost)
+            self.post_own(RecordingGap(lost))
         if recorder.wants_keyframe or now_ns >= self._next_keyframe_ns:
-            self._keyframe(now_ns)
+            self._record_keyframe(now_ns)
 
-    def _keyframe(self, now_ns: int) -> None:
-        """Stores the state after the newest step, first that before any, so that verification can begin there."""
+    def _record_keyframe(self, now_ns: int) -> None:
+        """Record the state after the newest step (first: before any), so that verification can begin there."""
         if self.recorder is None:
             return
         self._next_keyframe_ns = now_ns + self._keyframe_period_ns
@@ -347,10 +373,13 @@ class Stepper:
         self.recorder.add_keyframe(frame, self._chain)
 
 
-def checked(message: EntryMessage) -> EntryMessage:
-    """What a client's message has passed in the front: front and recorder would end at an input that breaks a limit.
+def normalize_message(message: EntryMessage) -> EntryMessage:
+    """Return a message as it is journaled, checked as the front checks clients' messages.
 
-    Raises `ValueError`.
+    Front and recorder would end at an input that breaks a limit.
+
+    Raises:
+        ValueError: A value that the protocol does not allow.
     """
     try:
         texts = {name: getattr(message, name, "") for name in ("text", "reason", "label")}
@@ -362,8 +391,8 @@ def checked(message: EntryMessage) -> EntryMessage:
         raise ValueError(f"{type(message).__name__} cannot be used: {error}") from error
 
 
-def ended_by(error: BaseException) -> Exception:
-    """What whoever goes on after an error is told: that error, unless it was an interrupt, which is not theirs."""
+def end_error(error: BaseException) -> Exception:
+    """Return the error for callers after the one that failed: the same, but not an interrupt, which was not theirs."""
     if isinstance(error, Exception):
         return error
     ended = OwnershipError("a step was broken off by an interrupt, so the session cannot go on: close it")
@@ -371,6 +400,6 @@ def ended_by(error: BaseException) -> Exception:
     return ended
 
 
-def session_clock(origin_ns: int) -> Callable[[], int]:
-    """Session time [ns]: CLOCK_MONOTONIC minus the origin, the same in every process of this machine."""
+def make_session_clock(origin_ns: int) -> Callable[[], int]:
+    """Return the clock of session time [ns]: CLOCK_MONOTONIC minus the origin, equal in all processes of a machine."""
     return lambda: time.monotonic_ns() - origin_ns

@@ -1,7 +1,7 @@
-"""When a dead process is started again, and the recorder's own supervision, which waits for no disk and no process.
+"""Restarting front and recorder: when a dead process may be started again, and the supervision of the recorder.
 
-What can take longer than a tick (reading the recorder's log, starting its successor) is done by a thread, one at a
-time. The tick loop only looks whether there is something new.
+Supervision waits for no disk and no process. What can take longer than a tick (reading the recorder's log, starting its
+successor) is done by a thread, one at a time; the tick loop only polls for its result.
 """
 
 from __future__ import annotations
@@ -10,43 +10,45 @@ import threading
 from collections.abc import Callable
 from typing import Final, Protocol
 
-from iris_session.recording import RecordingError
+from iris_session.protocol.common import MAX_TEXT
+from iris_session.protocol.status import RecorderReport
+from iris_session.recording import RecorderFeed, RecorderProcess, RecordingError
+from iris_session.system.backoff import Backoff
 
-RESTART_BACKOFF_NS: Final = (0, 500_000_000, 1_000_000_000, 2_000_000_000, 5_000_000_000)
+RESTART_DELAYS_NS: Final = (0, 500_000_000, 1_000_000_000, 2_000_000_000, 5_000_000_000)
 #: A process that lived this long is taken as healthy again.
 HEALTHY_NS: Final = 30_000_000_000
-#: A recorder says something twice a second. It is not ended when it hangs: a slow disk would delay its successor too.
+#: A recorder reports twice a second. It is not ended when it hangs: a slow disk would delay its successor too.
 HANGING_NS: Final = 5_000_000_000
-#: What a successor that is just being started gets at the end: a process more, unless the disk hangs.
+#: Time at the end for a successor that is just being started: a process more, unless the disk hangs.
 CLOSING_S: Final = 5.0
 
 
-class Backoff:
-    """When a dead process may be started again."""
+class RestartTimer:
+    """Spaces the restarts of a process that dies again and again. `restarts`: so far."""
 
     def __init__(self) -> None:
-        self.failures = 0
         self.restarts = 0
+        self._backoff = Backoff(RESTART_DELAYS_NS)
         self._last_ns = 0
         self._due_ns = 0
 
-    def dead(self, now_ns: int) -> bool:
-        """True when it is time to start it again; counts the restart."""
+    def is_due(self, now_ns: int) -> bool:
+        """Return whether the process, which is dead, is to be restarted now; counts the restart."""
         if not self._due_ns:
             if now_ns - self._last_ns > HEALTHY_NS:
-                self.failures = 0
-            self._due_ns = now_ns + RESTART_BACKOFF_NS[min(self.failures, len(RESTART_BACKOFF_NS) - 1)]
+                self._backoff.reset()
+            self._due_ns = now_ns + self._backoff.next_delay()
         if now_ns < self._due_ns:
             return False
         self._due_ns = 0
         self._last_ns = now_ns
-        self.failures += 1
         self.restarts += 1
         return True
 
 
 class Recorder(Protocol):
-    """What is needed of a `RecorderProcess`."""
+    """The part of `RecorderProcess` that supervision uses."""
 
     @property
     def alive(self) -> bool: ...
@@ -60,18 +62,20 @@ class Recorder(Protocol):
 
 
 class RecorderSupervisor:
-    """Watches one recorder. All but the thread's work belongs to the tick loop, which never waits here.
+    """Restarts one recorder. All but the thread's work belongs to the tick loop, which never waits here.
 
-    `alive`, `hangs`, `failure`: as last looked at; `failure` says why it ended until its successor has written for a
-    while.
+    Attributes:
+        alive: As of the last `poll`.
+        hangs: The recorder has not reported for `HANGING_NS` though it has something to write.
+        failure: Why it ended, until its successor has written for a while.
     """
 
     def __init__(self, recorder: Recorder) -> None:
         self._recorder = recorder
-        self._backoff = Backoff()
+        self._timer = RestartTimer()
         self._thread: threading.Thread | None = None
-        self._given_up = threading.Event()
-        self._news: tuple[str, str] | None = None  # why it ended, and what became of it
+        self._is_closed = threading.Event()
+        self._result: tuple[str, str] | None = None  # why it ended, and the outcome of the restart
         self._failed_ns = 0
         self.alive = True
         self.hangs = False
@@ -79,50 +83,86 @@ class RecorderSupervisor:
 
     @property
     def restarts(self) -> int:
-        return self._backoff.restarts
+        return self._timer.restarts
 
-    def look(self, now_ns: int, silence_ns: int) -> list[str]:
-        """What is to be told. `silence_ns`: how long it has said nothing though it has something to write."""
-        told = []
+    def poll(self, now_ns: int, silence_ns: int) -> list[str]:
+        """Restart the recorder when it is dead and it is time to; return what is to be announced, a line each.
+
+        Args:
+            now_ns: Session time.
+            silence_ns: How long it has not reported though it has something to write.
+        """
+        announcements = []
         if self._thread is not None and not self._thread.is_alive():
             self._thread = None
-            if self._news is not None:
-                self.failure, what = self._news
+            if self._result is not None:
+                self.failure, outcome = self._result
                 self._failed_ns = now_ns
-                told.append(f"{self.failure}; it {what}")
+                announcements.append(f"{self.failure}; it {outcome}")
         if self._thread is None:  # while the thread works, the process is the thread's
             self.alive = self._recorder.alive
-            if not self.alive and self._backoff.dead(now_ns):
-                self._news = None
-                self._thread = threading.Thread(target=self._replace, name="iris-recorder", daemon=True)
+            if not self.alive and self._timer.is_due(now_ns):
+                self._result = None
+                self._thread = threading.Thread(target=self._restart, name="iris-recorder", daemon=True)
                 self._thread.start()
         hangs = silence_ns > HANGING_NS
         if hangs and not self.hangs:
-            told.append("the recorder hangs: what it does not take waits on the disk")
+            announcements.append("the recorder hangs: pending rows are spilled to the disk")
         self.hangs = hangs
         if self.failure and self.alive and now_ns - self._failed_ns > HANGING_NS and not hangs:
             self.failure = ""  # its successor writes
-        return told
+        return announcements
 
-    def close(self, patience_s: float = CLOSING_S) -> None:
-        """Waits for the thread: the process is the caller's from here on. One that a disk keeps is left to itself, and
-        ends the successor that it may still start: nobody would look after that one."""
+    def close(self, timeout_s: float = CLOSING_S) -> None:
+        """Wait for the thread: the process is the caller's from here on.
+
+        A thread that is kept by a disk is left alone, and ends the successor that it may still start, which nothing
+        else would supervise.
+        """
         if self._thread is not None:
-            self._thread.join(patience_s)
-            self._given_up.set()
+            self._thread.join(timeout_s)
+            self._is_closed.set()
             self._thread = None
 
-    def _replace(self) -> None:
+    def _restart(self) -> None:
         failure = self._recorder.failure or "the recorder ended"
-        self._news = failure, replaced(self._recorder.restart)
-        if self._given_up.is_set():
+        self._result = failure, try_restart(self._recorder.restart)
+        if self._is_closed.is_set():
             self._recorder.close(0.0)
 
 
-def replaced(restart: Callable[[], None], error_type: type[Exception] = RecordingError) -> str:
-    """Starts a process anew. One that cannot be started now (no memory, a full disk) ends no session."""
+def try_restart(restart: Callable[[], None], error_type: type[Exception] = RecordingError) -> str:
+    """Restart a process and return the outcome for people: no memory or a full disk must not end a session."""
     try:
         restart()
     except error_type as error:
         return f"is not replaced: {error}"
     return "was replaced"
+
+
+def make_recorder_report(
+    feed: RecorderFeed | None, recorder: RecorderProcess | None, supervisor: RecorderSupervisor | None
+) -> RecorderReport:
+    """Return how the recording does, from the recorder's last report and its supervisor; `off` without a recorder."""
+    if feed is None or recorder is None or supervisor is None:
+        return RecorderReport()
+    stats = feed.stats
+    last = stats.recorder
+    fault = supervisor.failure or ("" if last is None else last.fault)
+    state = "running"
+    if fault:
+        state = "failed"
+    elif not supervisor.alive:
+        state = "dead"
+    elif supervisor.hangs:
+        state = "hangs"
+    fault = fault or stats.spill_fault
+    return RecorderReport(
+        state,
+        recorder.path[-MAX_TEXT:],
+        0 if last is None else last.bytes,
+        0 if last is None else last.disk_free,
+        stats.dropped_rows,
+        stats.spilled_bytes,
+        fault[:MAX_TEXT],
+    )

@@ -1,8 +1,8 @@
-"""Where the time of late ticks goes: laps between the parts of a tick, and for each late one the part that is to blame.
+"""`TickTimes`: laps between the parts of a tick, and for each late tick the part that caused it.
 
 Between two waits of the pacing loop lies a chain of ticks: one while all is well, several while it catches up. A late
-tick is blamed on the part whose time in its chain exceeds its usual time the most. Time in which the thread was ready
-to compute but did not run is the scheduler's, whatever part it fell into; time in which it waited for something, such
+tick is attributed to the part whose time in its chain exceeds its usual time the most. Time in which the thread was
+ready but did not run is the scheduler's, whatever part it fell into; time in which it waited for something, such
 as a disk, stays with its part.
 
 Cost per tick: eight laps and one reading of what the system counts for the thread, about 3 us.
@@ -33,24 +33,27 @@ CAUSES: Final = (
     LateCause.SUPERVISION,
     LateCause.OWNER,
 )
-#: Ticks that were given up because a single one took more than a second: suspended, stopped.
+#: Ticks that were skipped because a single one took more than a second: suspended, stopped.
 SKIPPED: Final = "skipped"
 WINDOW_S: Final = 10
 MAX_WINDOW_TICKS: Final = 20_000
-#: Every so many ticks the usual time of each part is looked at, and by how much it follows.
+#: Every so many ticks the usual time of each part is updated, and with which weight.
 USUAL_EVERY: Final = 8
 USUAL_WEIGHT: Final = 0.05
 
 
 class TickTimes:
-    """Follows one pacing loop with ticks of `period_ns`, from the thread that takes them. `clock`: session time.
+    """Measures one pacing loop with ticks of `period_ns`, from the thread that takes them.
 
-    `delayed`: how long the thread was ready and did not run, so far [ns].
+    Args:
+        period_ns: Period of a tick.
+        clock: Returns session time [ns].
+        delayed: Returns how long the thread was ready and did not run so far [ns]; the default asks the system.
     """
 
     def __init__(self, period_ns: int, clock: Callable[[], int], delayed: Callable[[], int] | None = None) -> None:
         self._clock = clock
-        self._delayed = delayed or run_delay()
+        self._delayed = delayed or make_run_delay_reader()
         self._last_ns = clock()
         self._spent = dict.fromkeys(CAUSES, 0)
         self._delayed_ns = self._delayed()
@@ -61,7 +64,7 @@ class TickTimes:
         self._marks: deque[tuple[int, int, dict[str, int]]] = deque(maxlen=WINDOW_S + 1)
 
     def _begin(self, period_ns: int) -> None:
-        """Nothing is usual yet, no tick was measured."""
+        """Forget usual times and measured ticks."""
         self._period_ns = period_ns
         self._usual = dict.fromkeys(CAUSES, 0.0)
         self._ticks = 0
@@ -69,18 +72,18 @@ class TickTimes:
         self._lateness = array("q", bytes(8 * size))
 
     def change_period(self, period_ns: int) -> None:
-        """Ticks are those of another scene from here on, with other costs: a new chain. Causes and marks stay."""
+        """Begin anew with the ticks of another scene, which have other costs. Causes and marks stay."""
         self._begin(period_ns)
-        self.idle()
+        self.restart_chain()
 
     def lap(self, cause: str) -> None:
-        """What was done since the last lap was `cause`."""
+        """Count the time since the last lap as `cause`."""
         now_ns = self._clock()
         self._spent[cause] += now_ns - self._last_ns
         self._last_ns = now_ns
 
-    def woke(self, due_ns: int) -> None:
-        """The loop has waited for a tick that is due at `due_ns`: a new chain."""
+    def begin_chain(self, due_ns: int) -> None:
+        """Begin a chain: the loop has waited for a tick that is due at `due_ns`."""
         spent = self._spent
         for cause in CAUSES:
             spent[cause] = 0
@@ -89,28 +92,28 @@ class TickTimes:
         spent[LateCause.SCHEDULER] = max(0, now_ns - due_ns)
         self._delayed_ns = self._delayed()
 
-    def idle(self) -> None:
-        """The loop did not mean to tick (a pause)."""
-        self.woke(self._clock())
+    def restart_chain(self) -> None:
+        """Begin a chain after a time without ticks (a pause)."""
+        self.begin_chain(self._clock())
 
-    def finished(self, lateness_ns: int) -> None:
-        """A tick ended `lateness_ns` after it was due."""
+    def finish_tick(self, lateness_ns: int) -> None:
+        """Count a tick that ended `lateness_ns` after its deadline."""
         self._lateness[self._ticks % len(self._lateness)] = lateness_ns
         self._ticks += 1
         self._chain += 1
         if lateness_ns > self._period_ns:
-            self._causes[self._cause()] += 1
+            self._causes[self._find_cause()] += 1
         elif self._chain == 1 and not self._ticks % USUAL_EVERY:
             for cause in CAUSES:
                 self._usual[cause] += USUAL_WEIGHT * (self._spent[cause] - self._usual[cause])
 
-    def gave_up(self, ticks: int) -> None:
-        """Ticks were given up, because the loop is too far behind."""
+    def count_skipped(self, ticks: int) -> None:
+        """Count ticks that were skipped because the loop is too far behind."""
         if ticks:
-            self._causes[self._cause() if self._chain > 1 else SKIPPED] += ticks
+            self._causes[self._find_cause() if self._chain > 1 else SKIPPED] += ticks
 
-    def _cause(self) -> str:
-        """The part with the largest excess. The scheduler's share is taken from the others in proportion to theirs."""
+    def _find_cause(self) -> str:
+        """Return the part with the largest excess; the scheduler's share is taken from the others in proportion."""
         excess = {cause: max(0.0, self._spent[cause] - self._chain * self._usual[cause]) for cause in CAUSES}
         delayed_ns = self._delayed() - self._delayed_ns
         others = sum(excess.values()) - excess[LateCause.SCHEDULER]
@@ -121,25 +124,25 @@ class TickTimes:
         return max(CAUSES, key=excess.__getitem__)
 
     def mark(self, stats: PacerStats) -> None:
-        """Call once a second: the shares of the last ten are differences to a mark."""
+        """Store the counters; call once a second. Shares of the last ten seconds are differences to a mark."""
         self._marks.append((stats.ticks, stats.late, dict(self._causes)))
 
-    def late_share(self) -> float:
-        """Of the ticks of the last ten seconds (between the marks)."""
+    def compute_late_share(self) -> float:
+        """Return the share of late ticks of the last ten seconds (between the marks)."""
         if len(self._marks) < 2:
             return 0.0
         (ticks0, late0, _), (ticks1, late1, _) = self._marks[0], self._marks[-1]
         return max(0, late1 - late0) / (ticks1 - ticks0) if ticks1 > ticks0 else 0.0
 
-    def late_causes(self) -> dict[str, int]:
-        """Late ticks of the last ten seconds by cause, those without any left out."""
+    def count_late_causes(self) -> dict[str, int]:
+        """Return the late ticks of the last ten seconds by cause, without zeros."""
         if len(self._marks) < 2:
             return {}
         before, now = self._marks[0][2], self._marks[-1][2]
         return {cause: now[cause] - before[cause] for cause in now if now[cause] > before[cause]}
 
-    def lateness(self) -> Quantiles | None:
-        """Of the ticks of the last ten seconds, `None` before the first."""
+    def compute_lateness(self) -> Quantiles | None:
+        """Return the lateness of the ticks of the last ten seconds [ms], `None` before the first."""
         n = min(self._ticks, len(self._lateness))
         if not n:
             return None
@@ -149,9 +152,12 @@ class TickTimes:
         return Quantiles(float(values[ranks[0]]) * 1e-6, float(values[ranks[1]]) * 1e-6)
 
 
-def run_delay() -> Callable[[], int]:
-    """Reads how long the calling thread was ready and did not run [ns]. Linux counts exactly that; elsewhere it is the
-    time in which the thread did not run, so waiting for a disk counts too."""
+def make_run_delay_reader() -> Callable[[], int]:
+    """Return a function that reads how long the calling thread was ready and did not run [ns].
+
+    Linux counts exactly that; elsewhere it is the time in which the thread did not run, so waiting for a disk counts
+    too.
+    """
     try:
         return _RunDelay(threading.get_native_id())
     except OSError:

@@ -1,4 +1,4 @@
-"""Other sessions on the network while ours starts: nobody shall take one for the other by its name."""
+"""`NameFinder`: a session name that no other session on the network has."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import Final
 from iris_session.client import ClientError
 from iris_session.client.discovery import BeaconListener
 
-#: Beacons come five times a second: who is there is heard twice in this time.
+#: Beacons come five times a second, so a session is heard twice in this time.
 LISTEN_S: Final = 0.5
 MAX_NAME: Final = 48  # as `SessionConfig.name`
 
 
-class Neighbours:
-    """Listens from when it is made, beside whatever else starts; never when `port` is 0.
+class NameFinder:
+    """Listens for beacons of other sessions while this one starts; never when `port` is 0.
 
-    `notes`: what people should be told.
+    `notes`: messages for people, one line each.
     """
 
     def __init__(self, port: int) -> None:
@@ -27,10 +27,10 @@ class Neighbours:
             try:
                 self._listener = BeaconListener(port)
             except ClientError as error:
-                self.notes.append(f"other sessions cannot be heard: {error}")
+                self.notes.append(f"other sessions cannot be found: {error}")
 
-    def free_name(self, name: str, session_id: str = "") -> str:
-        """`name`, or with a number when a session other than `session_id` has it. Waits for the rest of `LISTEN_S`."""
+    def find_free_name(self, name: str, session_id: str = "") -> str:
+        """Return `name`, with a number when a session other than `session_id` has it. Waits the rest of `LISTEN_S`."""
         if self._listener is None:
             return name
         while (left := self._until - time.monotonic()) > 0.0:

@@ -25,18 +25,28 @@ class ReplayCore:
         self.core = SessionCore(model, config, lambda model_hash: model_from_bytes(models(model_hash)))
 
     def step(self, now_ns: int, entries: Sequence[Entry], n_ticks: int, plant: bytes = b"") -> bytes:
-        """Digest of one step."""
+        """Take one step and return its digest."""
         return self.core.step(now_ns, entries, n_ticks, plant).digest
 
     def restore(self, keyframe: Keyframe) -> None:
+        """Restore the state after the step of a keyframe."""
         self.core.restore(CoreState(keyframe.plant, keyframe.authority, keyframe.controller, keyframe.status))
 
     def keyframe(self, step: int) -> Keyframe:
+        """Return a keyframe of the present state, which is after `step`."""
         state = self.core.snapshot()
         return Keyframe(step, state.plant, state.authority, state.controller, state.status)
 
 
 def verify_recording(path: Path, progress: Callable[[int, int], None] | None = None) -> VerifyReport:
-    """Re-simulates every step of the recording at `path`. Raises `RecordingError` when it cannot be read at all."""
+    """Re-simulate every step of a recording.
+
+    Args:
+        path: First file of the recording.
+        progress: Called with the number of steps done and of all steps.
+
+    Raises:
+        RecordingError: The recording cannot be read at all.
+    """
     use_one_blas_thread()  # before versions are compared: threads that are not used here are no difference
     return verify(path, ReplayCore, progress)

@@ -28,8 +28,8 @@ STATUS = {
     "paused": False,
     "estop": True,
     "participants": [
-        {"id": "p1", "name": "ann", "role": "operator", "connected": False, "robots": ["left"], "alignment": "measured",
-         "alignment_mm": 4.2},
+        {"id": "p1", "name": "ann", "role": "operator", "connected": False, "holds": ["left"], "alignment": "measured",
+         "alignment_error_m": 0.0042},
     ],
     "input_to_ctrl_ms": {"left": 21.0},
     "lateness": {"late_share": 0.001, "p99_ms": 0.8},

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from iris_session.link.starvation import Starvation
+from iris_session.link.front_process import StarvationDetector
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "SCHED_IDLE"), reason="the scheduler's idle class is Linux's")
 BUSY = "while True: pass"
@@ -37,32 +37,32 @@ def running(code: str, cpu: int) -> Iterator[int]:
             process.stdout.close()
 
 
-def looks(starvation: Starvation, pid: int, seconds: float = 1.0) -> bool:
+def looks(starvation: StarvationDetector, pid: int, seconds: float = 1.0) -> bool:
     end = time.monotonic() + seconds
     while time.monotonic() < end:
-        starvation.look(pid, time.monotonic_ns())
+        starvation.sample(pid, time.monotonic_ns())
         time.sleep(0.05)
-    return starvation.look(pid, time.monotonic_ns())
+    return starvation.sample(pid, time.monotonic_ns())
 
 
 def test_a_process_that_others_keep_from_running_is_starved() -> None:
     cpu = min(os.sched_getaffinity(0))
     with running(IDLE, cpu) as starved, running(BUSY, cpu):
-        assert looks(Starvation(), starved)
+        assert looks(StarvationDetector(), starved)
 
 
 def test_a_process_that_is_stopped_or_waits_is_not() -> None:
     cpu = min(os.sched_getaffinity(0))
     with running("print('up', flush=True); import time; time.sleep(60)", cpu) as waiting:
-        assert not looks(Starvation(), waiting)
+        assert not looks(StarvationDetector(), waiting)
     with running(BUSY, cpu) as stopped:
         os.kill(stopped, signal.SIGSTOP)
         while "T" not in Path(f"/proc/{stopped}/stat").read_text().rpartition(")")[2]:
             time.sleep(0.001)
-        assert not looks(Starvation(), stopped)
+        assert not looks(StarvationDetector(), stopped)
 
 
 def test_one_that_is_gone_is_not() -> None:
     with running("print('up', flush=True)", min(os.sched_getaffinity(0))) as pid:
         pass
-    assert not Starvation().look(pid, 0)
+    assert not StarvationDetector().sample(pid, 0)

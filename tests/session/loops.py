@@ -19,5 +19,5 @@ def wait_for(condition: Callable[[], object]) -> None:
 class Watch:
     """In place of the processes, which these tests do not need."""
 
-    def watch(self, stepper: Stepper) -> None:
+    def supervise(self, stepper: Stepper) -> None:
         pass

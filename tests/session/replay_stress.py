@@ -32,7 +32,7 @@ from iris_session.protocol import client_messages as cm
 from iris_session.protocol import entries as em
 from iris_session.protocol.common import Pose, Target
 from iris_session.protocol.entries import HOST, Entry, Join, decode_entries, encode_entries
-from iris_session.session.core import CoreConfig, CoreState, SessionCore, plant_state
+from iris_session.session.core import CoreConfig, CoreState, SessionCore, read_plant_state
 
 MS: Final = 1_000_000
 ROOT: Final = Path(__file__).resolve().parents[2]
@@ -146,7 +146,7 @@ class Stress:
         """One step of the session with everything said since the last one."""
         blob = encode_entries(self.entries)
         self.entries = []
-        plant = plant_state(self.model, self.user) if self.user is not None else b""
+        plant = read_plant_state(self.model, self.user) if self.user is not None else b""
         before = self.core.controller._joints.q.copy(), self.core.controller._joints.v.copy()
         outcome = self.core.step(self.now_ns, decode_entries(blob), n_ticks, plant)
         self.journal.rows.append(Row(self.now_ns, blob, n_ticks, plant, outcome.digest))
@@ -163,7 +163,7 @@ class Stress:
             self.user.xfrc_applied[:] = self.core.world.data.xfrc_applied
             mujoco.mj_step(self.model, self.user)
             if self.rng.random() < 0.5:  # `end_tick` shows the new state before the next step, a callback does not
-                self.core.world.set_state_bytes(plant_state(self.model, self.user))
+                self.core.world.set_state_bytes(read_plant_state(self.model, self.user))
 
     def check_motion(self, q: Any, v: Any, n_ticks: int) -> None:
         """Whatever people do, commanded joints keep their limits of velocity and acceleration."""

@@ -8,7 +8,7 @@ import pytest
 
 from anchors.pose import PoseTuple
 from iris_session import ConfigError, SessionConfig
-from iris_session.session.anchors_file import dump_anchors, load_anchors
+from iris_session.session.config import dump_anchors, load_anchors
 
 PLACES: dict[str, PoseTuple] = {
     "table": ((0.0, -0.45, 0.0), (1.0, 0.0, 0.0, 0.0)),

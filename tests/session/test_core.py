@@ -16,7 +16,7 @@ from iris_session.protocol.client_messages import Control
 from iris_session.protocol.entries import ExternalReset
 from iris_session.protocol.names import CommandKind
 from iris_session.protocol.server_messages import SceneChanged
-from iris_session.session.core import CROWDED, SessionCore, plant_state
+from iris_session.session.core import CROWDED_ENTRIES, SessionCore, read_plant_state
 from tests.session.play import TICK_NS, entries, host, make_core, play
 
 
@@ -50,7 +50,7 @@ def test_restoring_a_snapshot_is_invisible(at: int) -> None:
     assert play(other, at, 200) == expected
 
 
-@pytest.mark.parametrize(("n", "crowded"), [(0, False), (CROWDED - 1, False), (CROWDED, True)])
+@pytest.mark.parametrize(("n", "crowded"), [(0, False), (CROWDED_ENTRIES - 1, False), (CROWDED_ENTRIES, True)])
 def test_a_step_with_many_entries_is_crowded(n: int, crowded: bool) -> None:
     core = make_core()
     told: list[bool] = []
@@ -93,7 +93,7 @@ def test_an_initial_state_is_where_it_begins_and_where_a_reset_leads() -> None:
     mujoco.mj_resetDataKeyframe(model, data, 0)
     data.joint("hammer").qpos[0] += 0.05
     plain = make_core(model)
-    core = SessionCore(model, msgspec.structs.replace(plain.config, initial_state=plant_state(model, data)))
+    core = SessionCore(model, msgspec.structs.replace(plain.config, initial_state=read_plant_state(model, data)))
     moved = core.world.view().object_pose("hammer").p
     assert moved[0] - plain.world.view().object_pose("hammer").p[0] == pytest.approx(0.05)
     core.step(TICK_NS, [], 1)
@@ -129,7 +129,7 @@ class Plant:
         mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
 
     def state(self) -> bytes:
-        return plant_state(self.model, self.data)
+        return read_plant_state(self.model, self.data)
 
 
 def test_an_open_session_writes_ctrl_and_leaves_physics_alone() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from iris_session.protocol.names import MediaEncoding
-from iris_session.session.deformables import REPEAT_NS, Bending, DeformableStreams
+from iris_session.session.deformables import REPEAT_NS, DeformableMesh, DeformableStreams
 from tests.session.published import CLOTH, composed
 
 MS = 1_000_000
@@ -23,18 +23,18 @@ def test_a_mesh_at_rest_is_sent_again_for_those_who_come_later_and_is_no_younger
         return taken
 
     topology = composed().deformables["cloth"].topology
-    streams = DeformableStreams([Bending("cloth", topology, lambda: vertices)], publish)
+    streams = DeformableStreams([DeformableMesh("cloth", topology, lambda: vertices)], publish)
     for now_ns in range(0, 2 * REPEAT_NS + 1, 250 * MS):
-        streams.send(1, now_ns, 0)
+        streams.publish(1, now_ns, 0)
     assert sent == [("cloth", 0, 1)] * 3, "the state stands, its source is silent"
     vertices = vertices + np.float32(0.1)
-    streams.send(1, 2 * REPEAT_NS + 16 * MS, 2 * REPEAT_NS + 16 * MS)
-    streams.send(2, 2 * REPEAT_NS + 32 * MS, 2 * REPEAT_NS + 32 * MS)
+    streams.publish(1, 2 * REPEAT_NS + 16 * MS, 2 * REPEAT_NS + 16 * MS)
+    streams.publish(2, 2 * REPEAT_NS + 32 * MS, 2 * REPEAT_NS + 32 * MS)
     assert sent[3:] == [("cloth", 2 * REPEAT_NS + 16 * MS, 1), ("cloth", 2 * REPEAT_NS + 32 * MS, 2)]
     taken = False
-    streams.send(3, 2 * REPEAT_NS + 48 * MS, 2 * REPEAT_NS + 48 * MS)
-    streams.send(3, 2 * REPEAT_NS + 64 * MS, 2 * REPEAT_NS + 64 * MS)
+    streams.publish(3, 2 * REPEAT_NS + 48 * MS, 2 * REPEAT_NS + 48 * MS)
+    streams.publish(3, 2 * REPEAT_NS + 64 * MS, 2 * REPEAT_NS + 64 * MS)
     assert len(sent) == 7, "what nobody got is sent anew"
-    streams.use([])
-    streams.send(4, 9 * REPEAT_NS, 9 * REPEAT_NS)
+    streams.replace_meshes([])
+    streams.publish(4, 9 * REPEAT_NS, 9 * REPEAT_NS)
     assert len(sent) == 7

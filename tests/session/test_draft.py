@@ -11,7 +11,7 @@ import pytest
 
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.scene.composed import ArticulatedBody, Articulation, Joint
-from iris_session.session.draft import MAX_SAID, SceneDraft
+from iris_session.session.draft import MAX_WARNINGS, SceneDraft
 from iris_session.session.errors import PublishError
 from tests.session.published import CLOTH, MOVING, UNIT, composed
 
@@ -24,17 +24,17 @@ def draft() -> SceneDraft:
 
 
 def pose(draft: SceneDraft, name: str) -> list[float]:
-    return draft.frame(0, 0.0, anew=False).poses[MOVING.index(name)].tolist()
+    return draft.make_frame(0, 0.0, anew=False).poses[MOVING.index(name)].tolist()
 
 
 def everything(draft: SceneDraft) -> bytes:
-    frame = draft.frame(0, 0.0, anew=False)
+    frame = draft.make_frame(0, 0.0, anew=False)
     return frame.poses.tobytes() + b"".join(v.tobytes() for v in frame.vertices.values())
 
 
 def test_a_frame_holds_what_was_set_and_the_rest_as_it_was(draft: SceneDraft) -> None:
     draft.set_pose("blue", (1.0, 2.0, 3.0), TURNED)
-    frame = draft.frame(7, 0.5, anew=True)
+    frame = draft.make_frame(7, 0.5, anew=True)
     assert (frame.capture_ns, frame.time_s, frame.anew) == (7, 0.5, True)
     assert frame.poses[1].tolist() == pytest.approx([1.0, 2.0, 3.0, *TURNED])
     assert frame.poses[0].tolist() == [0.0, 0.0, 0.5, *UNIT]
@@ -42,7 +42,7 @@ def test_a_frame_holds_what_was_set_and_the_rest_as_it_was(draft: SceneDraft) ->
     draft.set_vertices("cloth", CLOTH + 1.0)
     assert frame.poses[1, 0] == 1.0, "a frame that was taken does not change any more"
     assert (frame.vertices["cloth"] == CLOTH).all()
-    assert (draft.frame(8, 1.0, anew=False).vertices["cloth"] == CLOTH + 1.0).all()
+    assert (draft.make_frame(8, 1.0, anew=False).vertices["cloth"] == CLOTH + 1.0).all()
 
 
 def test_joints_and_the_root_place_the_bodies_of_an_articulation(draft: SceneDraft) -> None:
@@ -70,14 +70,14 @@ def test_joints_beyond_their_limits_are_shown_and_said_when_they_are_far_beyond(
 
 
 def test_of_many_joints_beyond_their_limits_a_few_are_named() -> None:
-    joints = tuple(Joint(f"j{i}", "revolute", -1.0, 1.0, 0.0) for i in range(MAX_SAID + 3))
+    joints = tuple(Joint(f"j{i}", "revolute", -1.0, 1.0, 0.0) for i in range(MAX_WARNINGS + 3))
     parts = (ArticulatedBody("arm/base"), *(ArticulatedBody(f"arm/{i}", i, joint=i) for i in range(len(joints))))
     names = tuple(part.body for part in parts)
     robot = Articulation("arm", IDENTITY, parts, joints, {})
     scene = replace(composed(), moving=names, poses=(IDENTITY,) * len(names), articulations={"arm": robot})
     draft = SceneDraft(scene)
     draft.set_joints("arm", {joint.name: 57.3 for joint in joints})
-    assert len(draft.warnings()) == MAX_SAID + 1
+    assert len(draft.warnings()) == MAX_WARNINGS + 1
     assert draft.warnings()[-1] == "3 more joints are set far beyond their limits"
 
 
@@ -158,7 +158,9 @@ def test_many_bodies_at_once_are_as_one_after_the_other(draft: SceneDraft) -> No
     draft.set_poses(names, positions, [TURNED, np.array(UNIT) * 1.0005])
     for name, position, q in zip(names, positions, (TURNED, UNIT), strict=True):
         other.set_pose(name, position, q)
-    assert np.allclose(draft.frame(0, 0.0, anew=False).poses, other.frame(0, 0.0, anew=False).poses, atol=1e-15)
+    assert np.allclose(
+        draft.make_frame(0, 0.0, anew=False).poses, other.make_frame(0, 0.0, anew=False).poses, atol=1e-15
+    )
 
 
 def test_a_quaternion_that_was_rounded_is_normalised(draft: SceneDraft) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.scene import MAX_OPS, AddVisual, Geometry, RemoveVisual, SceneError, SetVisual, Visual
-from iris_session.session.patch_ops import checked_ops
+from iris_session.session.scene_change import check_patch
 
 NAN = float("nan")
 
@@ -27,13 +27,13 @@ def test_what_is_computed_becomes_what_is_sent() -> None:
         AddVisual(ball()),
         RemoveVisual(5),
     ]
-    assert checked_ops(given) == (
+    assert check_patch(given) == (
         SetVisual(3, rgba=(1.0, 0.0, 0.0, 1.0)),
         SetVisual(4, rgba=(0.0, 0.0, 0.5, 1.0), T_body_visual=IDENTITY),
         AddVisual(ball()),
         RemoveVisual(5),
     )
-    assert len(checked_ops([RemoveVisual(i) for i in range(MAX_OPS)])) == MAX_OPS
+    assert len(check_patch([RemoveVisual(i) for i in range(MAX_OPS)])) == MAX_OPS
 
 
 @pytest.mark.parametrize(
@@ -65,6 +65,6 @@ def test_what_is_computed_becomes_what_is_sent() -> None:
 )  # fmt: skip
 def test_what_is_none_is_said_on_one_line(ops: list[Any], says: str) -> None:
     with pytest.raises(SceneError, match=says) as caught:
-        checked_ops(ops)
+        check_patch(ops)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 200

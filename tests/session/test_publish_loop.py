@@ -19,7 +19,7 @@ from iris_session.recording.journal import CRASHED
 from iris_session.session.core import CoreConfig, CoreState, SessionCore
 from iris_session.session.draft import Frame, SceneDraft
 from iris_session.session.errors import OwnershipError
-from iris_session.session.publish_loop import REPEAT_NS, PublishLoop, ShownVertices
+from iris_session.session.publish_loop import REPEAT_NS, PublishedVertices, PublishLoop
 from iris_session.session.stepper import Stepper
 from tests.session.loops import Watch, wait_for
 from tests.session.published import CLOTH, UNIT, composed
@@ -44,8 +44,8 @@ class Rig:
         self.entries: list[Entry] = []
         self.stepper.on_entries = self._note
         self.shown: list[tuple[float, float, int]] = []  # x of the red box and of a vertex, scene epoch
-        self.vertices = ShownVertices(scene)
-        self.stepper.beside_state.append(self._show)
+        self.vertices = PublishedVertices(scene)
+        self.stepper.on_publish.append(self._show)
         self.loop = PublishLoop(carrier, self.vertices, self.stepper, Watch(), period_ns)  # type: ignore[arg-type]
 
     def _note(self, entries: Sequence[Entry]) -> None:
@@ -53,14 +53,14 @@ class Rig:
 
     def _show(self, epoch: int, end_ns: int, shown_ns: int) -> None:
         assert self.front.states[-1].session_time == shown_ns, "what bends has the time of the state"
-        (mesh,) = self.vertices.bending
+        (mesh,) = self.vertices.meshes
         red = self.stepper.core.world.data.xpos[1]
         self.shown.append((float(red[0]), float(mesh.vertices()[0, 0]), epoch))
 
     def publish(self, x: float, anew: bool = False, delay_ns: int = 0) -> None:
         self.draft.set_pose("red", (x, 0.0, 0.0), UNIT)
         self.draft.set_vertices("cloth", CLOTH + np.float32(x))
-        self.loop.offer(self.draft.frame(self.now_ns - delay_ns, self.now_ns * 1e-9, anew))
+        self.loop.offer(self.draft.make_frame(self.now_ns - delay_ns, self.now_ns * 1e-9, anew))
 
     def xs(self) -> list[float]:
         return [x for x, _, _ in self.shown]
@@ -261,7 +261,7 @@ def test_a_publish_that_was_under_way_at_the_end_takes_no_step_after_it(rig: Rig
     """Front and recorder are gone then."""
     rig.publish(1.0)
     rig.now_ns += PERIOD_NS
-    rig.loop._hand = Late(rig)  # type: ignore[assignment]
+    rig.loop._pending_lock = Late(rig)  # type: ignore[assignment]
     with pytest.raises(OwnershipError, match="closed"):
         rig.publish(2.0)
     assert rig.xs()[-1] == 1.0

@@ -7,20 +7,20 @@ from typing import Any
 import pytest
 
 from iris_session import SceneBuilder, ScenePublisher, SessionConfig
-from iris_session.session.publishing import Publishing
+from iris_session.session.owner import Owner
 
 
-class Closing(Publishing):
+class Closing(Owner):
     """A session whose front has ended, and whose recorder has not."""
 
     clock = staticmethod(lambda: 0)
     _stepper = None
 
-    def _live(self) -> Any:
+    def _require_started(self) -> Any:
         class Processes:
             front = None
 
-            def own_streams(self) -> frozenset[str]:
+            def own_stream_names(self) -> frozenset[str]:
                 return frozenset()
 
         return Processes()

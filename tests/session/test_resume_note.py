@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from iris_session.session.resume_note import FILE, Listening, NoteKeeper, ResumeNote, read_note
+from iris_session.session.resume import NOTE_FILE, Listening, ResumeNote, ResumeNoteWriter, read_note
 
 
 def test_the_last_note_is_written_also_when_the_end_comes_during_a_write(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    keeper, disk = NoteKeeper(tmp_path / FILE), HangingDisk(monkeypatch)
+    keeper, disk = ResumeNoteWriter(tmp_path / NOTE_FILE), HangingDisk(monkeypatch)
     keeper.offer(ResumeNote("s1", Listening("first")))
     assert disk.reached.wait(30.0)
     keeper.offer(ResumeNote("s1", Listening("last")))
@@ -30,7 +30,7 @@ def test_the_last_note_is_written_also_when_the_end_comes_during_a_write(
 def test_a_note_that_comes_too_late_is_not_put_over_that_of_the_next_session(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    keeper, disk = NoteKeeper(tmp_path / FILE), HangingDisk(monkeypatch)
+    keeper, disk = ResumeNoteWriter(tmp_path / NOTE_FILE), HangingDisk(monkeypatch)
     keeper.offer(ResumeNote("s1", Listening("too late")))
     assert disk.reached.wait(30.0)
     keeper.close(0.0)

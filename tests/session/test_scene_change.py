@@ -15,11 +15,11 @@ from iris_session.physics.load import model_bytes, model_from_bytes, scene_hash
 from iris_session.protocol.client_messages import Control, GetSnapshot
 from iris_session.protocol.entries import SceneLoaded, decode_entries
 from iris_session.protocol.server_messages import SceneChanged, Snapshot
-from iris_session.session.core import SessionCore, make_plant, plant_state
+from iris_session.session.core import SessionCore, make_plant, read_plant_state
 from iris_session.session.errors import ConfigError, OwnershipError
-from iris_session.session.scene_change import follow_timestep, prepare
+from iris_session.session.scene_change import adopt_timestep, prepare_scene
 from iris_session.session.shared_scene import SharedScenes
-from iris_session.session.stepper import MAX_SCENES
+from iris_session.session.stepper import MAX_PENDING_SCENES
 from iris_session.session.tick_times import TickTimes
 from tests.session.play import TICK_NS, entries, host, make_core
 from tests.session.test_stepper import Rig
@@ -89,7 +89,7 @@ def test_a_reset_goes_back_to_the_state_that_the_scene_came_with() -> None:
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     data.qpos[0] += 0.2
-    scene = loaded(model, plant_state(model, data))
+    scene = loaded(model, read_plant_state(model, data))
     core = with_models(model)
     core.step(TICK_NS, [host(TICK_NS, scene)], 0)
     begun = core.world.data.qpos[0]
@@ -98,7 +98,7 @@ def test_a_reset_goes_back_to_the_state_that_the_scene_came_with() -> None:
         core.step(i * TICK_NS, [], 1)
     core.step(21 * TICK_NS, [host(21 * TICK_NS, Control(0, "reset"))], 0)
     assert core.world.data.qpos[0] == begun
-    assert core.as_it_is().initial_state == scene.initial_state
+    assert core.current_config().initial_state == scene.initial_state
 
 
 def test_a_session_that_goes_on_from_the_new_scene_needs_no_other_model() -> None:
@@ -107,7 +107,7 @@ def test_a_session_that_goes_on_from_the_new_scene_needs_no_other_model() -> Non
     scene = loaded(model)
     before = with_models(model)
     play(before, 0, 120, scene)
-    resumed = SessionCore(before.world.model, before.as_it_is())
+    resumed = SessionCore(before.world.model, before.current_config())
     resumed.restore(before.snapshot())
     assert play(resumed, 120, 150, scene) == play(before, 120, 150, scene)
 
@@ -155,16 +155,16 @@ def test_the_loop_keeps_the_timestep_of_the_scene_from_its_first_tick_on() -> No
     rig.steps(30)
     pacer = Pacer(TICK_NS, rig.stepper.clock())
     times = TickTimes(TICK_NS, rig.stepper.clock)
-    scene = prepare(rig.stepper.core, SharedScenes(False, "test"), bench_scene(0.001), b"", None, None)
-    rig.stepper.change_scene(scene)
-    assert not follow_timestep(rig.stepper, pacer, times, pacer.next_deadline_ns)
+    scene = prepare_scene(rig.stepper.core, SharedScenes(False, "test"), bench_scene(0.001), b"", None, None)
+    rig.stepper.queue_scene(scene)
+    assert not adopt_timestep(rig.stepper, pacer, times, pacer.next_deadline_ns)
     rig.steps(1)
-    assert follow_timestep(rig.stepper, pacer, times, pacer.next_deadline_ns)
-    assert (pacer.period_ns, times.lateness()) == (1_000_000, None)
+    assert adopt_timestep(rig.stepper, pacer, times, pacer.next_deadline_ns)
+    assert (pacer.period_ns, times.compute_lateness()) == (1_000_000, None)
     assert pacer.next_deadline_ns == rig.stepper.clock() + 1_000_000
     stats = pacer.stats(rig.stepper.clock())
     assert (stats.finished, stats.late, stats.missing) == (1, 0, 0)
-    assert not follow_timestep(rig.stepper, pacer, times, pacer.next_deadline_ns)
+    assert not adopt_timestep(rig.stepper, pacer, times, pacer.next_deadline_ns)
 
 
 def test_the_stepper_hands_the_scene_to_everybody_before_the_step() -> None:
@@ -172,9 +172,9 @@ def test_the_stepper_hands_the_scene_to_everybody_before_the_step() -> None:
     rig.steps(60)
     seen: list[int] = []
     rig.stepper.on_scene.append(lambda _: seen.append(len(rig.front.decisions)))
-    scene = prepare(rig.stepper.core, SharedScenes(False, "test"), bench_scene(), b"", None, None)
+    scene = prepare_scene(rig.stepper.core, SharedScenes(False, "test"), bench_scene(), b"", None, None)
     rows = len(rig.recorder.rows)
-    rig.stepper.change_scene(scene)
+    rig.stepper.queue_scene(scene)
     rig.steps(30)
     assert rig.recorder.scenes == [(rows, scene.model_hash)]
     assert seen == [rows]
@@ -189,20 +189,20 @@ def test_the_stepper_hands_the_scene_to_everybody_before_the_step() -> None:
 
 def test_changes_that_nobody_takes_are_refused() -> None:
     rig = Rig()
-    scene = prepare(rig.stepper.core, SharedScenes(False, "test"), bench_scene(), b"", None, None)
-    for _ in range(MAX_SCENES):
-        rig.stepper.change_scene(scene)
+    scene = prepare_scene(rig.stepper.core, SharedScenes(False, "test"), bench_scene(), b"", None, None)
+    for _ in range(MAX_PENDING_SCENES):
+        rig.stepper.queue_scene(scene)
     with pytest.raises(RuntimeError, match="is the loop running"):
-        rig.stepper.change_scene(scene)
+        rig.stepper.queue_scene(scene)
 
 
 def test_scenes_that_cannot_take_the_place_are_refused_with_a_reason() -> None:
     core = make_core()
     for timestep in (1e-6, 0.25):
         with pytest.raises(ConfigError, match=rf"timestep of {timestep:g} s, run\(\) takes 1e-05 to 0.1 s"):
-            prepare(core, SharedScenes(False, "test"), bench_scene(timestep), b"", None, None)
+            prepare_scene(core, SharedScenes(False, "test"), bench_scene(timestep), b"", None, None)
     with pytest.raises(PhysicsError):
-        prepare(core, SharedScenes(False, "test"), bench_scene(), b"too short", None, None)
+        prepare_scene(core, SharedScenes(False, "test"), bench_scene(), b"too short", None, None)
 
 
 def test_only_a_session_that_runs_takes_another_scene() -> None:

@@ -28,9 +28,9 @@ from iris_session.protocol.scene import Environment, RemoveVisual, SetVisual
 from iris_session.protocol.server_messages import MarkerAdded, SceneChanged
 from iris_session.recording import Recording
 from iris_session.scene import AssetStore
-from iris_session.session.cadence import SILENT_NS
-from iris_session.session.resume_note import note_path
-from iris_session.session.scene_publisher import AHEAD_NS, _capture
+from iris_session.session.publish_loop import SILENT_NS
+from iris_session.session.resume import find_note_path
+from iris_session.session.scene_publisher import AHEAD_NS, _check_capture
 from iris_session.session.verification import verify_recording
 
 CONFIG = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False)
@@ -58,7 +58,7 @@ def kinds(session: ScenePublisher) -> list[type]:
 
 def box(session: ScenePublisher) -> list[float]:
     """Where the session has it now."""
-    with session._unchanging():
+    with session._hold_steps():
         assert session._stepper is not None
         return session._stepper.core.world.data.xpos[1].tolist()  # type: ignore[no-any-return]
 
@@ -155,9 +155,9 @@ def test_two_states_may_be_of_one_moment(session: ScenePublisher) -> None:
 
 
 def test_what_is_captured_a_moment_ahead_of_the_clock_is_captured_now() -> None:
-    assert _capture(7_000 + AHEAD_NS, 7_000) == 7_000
+    assert _check_capture(7_000 + AHEAD_NS, 7_000) == 7_000
     with pytest.raises(PublishError, match="ahead of"):
-        _capture(7_001 + AHEAD_NS, 7_000)
+        _check_capture(7_001 + AHEAD_NS, 7_000)
 
 
 def test_a_reset_while_a_state_is_published_is_told_with_the_next(session: ScenePublisher) -> None:
@@ -340,4 +340,4 @@ def test_its_recording_replays_and_cannot_be_resumed(tmp_path: Path) -> None:
         assert 10 < sum(bool(row.plant) for row in rows) <= 62, "only where something was published"
     with pytest.raises(ResumeError, match=r"class 'open'.*serve the file again that was shown"):
         Session(config=SessionConfig(resume=path))
-    assert not note_path(path).exists(), "what nobody can go on from needs none"
+    assert not find_note_path(path).exists(), "what nobody can go on from needs none"

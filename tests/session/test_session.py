@@ -24,8 +24,8 @@ from iris_session.protocol.client_messages import Control
 from iris_session.protocol.scene import AddVisual, RemoveVisual, SetVisual, encode_scene
 from iris_session.protocol.server_messages import EStopChanged, Gap, MarkerAdded, PauseChanged, SceneChanged
 from iris_session.scene import AssetStore
-from iris_session.session import scene_change
-from iris_session.session.core import plant_state
+from iris_session.session import owner
+from iris_session.session.core import read_plant_state
 from iris_session.session.stepper import MAX_HOST_ENTRIES
 from iris_session.session.verification import verify_recording
 
@@ -67,7 +67,7 @@ def test_what_the_owner_cannot_say_is_refused_at_once_and_an_e_stop_never(sessio
 def test_an_e_stop_before_the_first_step_is_taken_however_much_waits(session: Session) -> None:
     for _ in range(MAX_HOST_ENTRIES):
         session.clear_estop()
-    with pytest.raises(OwnershipError, match="inputs wait for the first step"):
+    with pytest.raises(OwnershipError, match="queue of inputs full"):
         session.clear_estop()
     session.estop("at once")
     session.run(until=lambda: session.status().estop, seconds=30.0)
@@ -135,11 +135,11 @@ def test_one_session_is_driven_in_one_way() -> None:
     model = load_model(scene_path("handover"))
     with Session(model, mujoco.MjData(model), QUIET) as session:
         session.begin_tick()
-        with pytest.raises(OwnershipError, match="one way"):
+        with pytest.raises(OwnershipError, match="either by run"):
             session.run(seconds=0.1)
     with Session(model, mujoco.MjData(model), QUIET) as session:
         session.run(seconds=0.01)
-        with pytest.raises(OwnershipError, match="one way"):
+        with pytest.raises(OwnershipError, match="either by run"):
             session.begin_tick()
 
 
@@ -178,12 +178,12 @@ def test_a_look_can_be_changed_before_the_first_step(tmp_path: Path, monkeypatch
     with pytest.raises(OwnershipError, match="not started"):
         Session(scene_path("handover"), config=config).patch_scene(RemoveVisual(0))
     with Session(scene_path("handover"), config=config) as session:
-        monkeypatch.setattr(scene_change, "MAX_SCENES", 2)
+        monkeypatch.setattr(owner, "MAX_PENDING_SCENES", 2)
         assert session.scene is not None
         seen = session.scene.visuals[0]
         for green in (0.5, 1.0):
             session.patch_scene(SetVisual(seen.id, rgba=(0.0, green, 0.0, 1.0)))
-        with pytest.raises(ConfigError, match="2 changes wait for the first step: call run"):
+        with pytest.raises(ConfigError, match="queue of scene changes full"):
             session.patch_scene(RemoveVisual(seen.id))
         assert session.scene.visuals[0].rgba == (0.0, 1.0, 0.0, 1.0)
         told = session.scene
@@ -212,15 +212,15 @@ def test_another_scene_begins_with_the_data_that_came_with_its_file(session: Ses
     model = load_model(path)
     data = mujoco.MjData(model)
     data.qpos[0] = 0.3
-    begun = plant_state(model, data)
+    begun = read_plant_state(model, data)
     session.run(seconds=0.05)
     change = session.load_scene(path, data)
     data.qpos[0] = 0.9  # whose it is goes on with it
     session.run(until=change.done)
     change.result()
-    before = session.stepper.core.as_it_is().initial_state
-    session.run(until=lambda: session.stepper.core.as_it_is().initial_state != before, seconds=30.0)
-    assert session.stepper.core.as_it_is().initial_state == begun
+    before = session.stepper.core.current_config().initial_state
+    session.run(until=lambda: session.stepper.core.current_config().initial_state != before, seconds=30.0)
+    assert session.stepper.core.current_config().initial_state == begun
     other = session.load_scene(path, mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>")))
     with pytest.raises(ConfigError, match="data is of another model"):
         other.result(60.0)

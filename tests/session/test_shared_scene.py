@@ -14,7 +14,7 @@ from iris_session.protocol.scene import AddMesh, Mesh, MeshLevel, SceneError, Se
 from iris_session.scene import AssetStore
 from iris_session.session import shared_scene
 from iris_session.session.config import SessionConfig
-from iris_session.session.scene_change import prepare
+from iris_session.session.scene_change import prepare_scene
 from iris_session.session.session import Session
 from iris_session.session.shared_scene import SharedScenes
 from tests.scene.models import flexes
@@ -34,22 +34,22 @@ def test_a_scene_that_was_made_after_the_end_is_not_held(world: World, tmp_path:
     """The thread of `load_scene` may end after the session."""
     scenes = SharedScenes(tmp_path, "test")
     shown = scenes.make(world)
-    scenes.take(shown)
+    scenes.show(shown)
     assert held(tmp_path)
     scenes.close()
-    assert scenes.take(shown) is shown.info
+    assert scenes.show(shown) is shown.info
     assert not held(tmp_path)
 
 
 def test_looks_that_were_replaced_are_not_kept(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shared_scene, "KEPT_LOOKS", 5)
-    monkeypatch.setattr(shared_scene, "KEPT_LOOKS_S", 0.0)
+    monkeypatch.setattr(shared_scene, "KEPT_PATCHES", 5)
+    monkeypatch.setattr(shared_scene, "KEPT_PATCHES_S", 0.0)
     scenes, store = SharedScenes(tmp_path, "test"), AssetStore(tmp_path)
-    scenes.take(scenes.make(world))
+    scenes.show(scenes.make(world))
     assert scenes.newest is not None
     addresses = [scenes.newest.info.scene_hash]
     for i in range(12):
-        addresses.append(scenes.take(scenes.patch([SetVisual(0, rgba=(i / 20, 0.0, 0.0, 1.0))])).scene_hash)
+        addresses.append(scenes.show(scenes.patch([SetVisual(0, rgba=(i / 20, 0.0, 0.0, 1.0))])).scene_hash)
     kept = [address in store for address in addresses]
     assert len(set(addresses)) == len(addresses)
     assert kept == [True, *[False] * 7, *[True] * 5], "the scene itself, and the newest looks of it"
@@ -58,8 +58,8 @@ def test_looks_that_were_replaced_are_not_kept(world: World, tmp_path: Path, mon
 
 def test_the_scene_before_is_held_too_and_patches_on_one_visual_count_once(world: World, tmp_path: Path) -> None:
     scenes = SharedScenes(tmp_path, "test")
-    scenes.take(scenes.make(world))
-    looks = [scenes.take(scenes.patch([SetVisual(0, rgba=(i / 4, 0.0, 0.0, 1.0))])).scene_hash for i in range(3)]
+    scenes.show(scenes.make(world))
+    looks = [scenes.show(scenes.patch([SetVisual(0, rgba=(i / 4, 0.0, 0.0, 1.0))])).scene_hash for i in range(3)]
     store = AssetStore(tmp_path)
     removed = [store.discard(address, store.last_used_ns(address)) for address in looks]
     assert removed == [True, False, False], "the front still serves the one before"
@@ -80,12 +80,12 @@ def test_a_disk_that_is_full_does_not_undo_a_scene(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(AssetStore, "hold", full)
-    assert scenes.take(shown) is shown.info
+    assert scenes.show(shown) is shown.info
     assert scenes.newest is shown
     assert "No space left on device" in scenes.notes[-1]
     said = len(scenes.notes)
     for i in range(3):
-        scenes.take(scenes.patch([SetVisual(0, rgba=(i / 20, 0.0, 0.0, 1.0))]))
+        scenes.show(scenes.patch([SetVisual(0, rgba=(i / 20, 0.0, 0.0, 1.0))]))
     assert len(scenes.notes) == said, "once, however often it is patched"
 
 
@@ -99,11 +99,11 @@ def test_a_scene_that_cannot_be_shared_leaves_the_next_one_its_picture(
 
     with monkeypatch.context() as disk:
         disk.setattr(AssetStore, "_write", full)
-        scenes.take(scenes.make(world))
+        scenes.show(scenes.make(world))
     with pytest.raises(SceneError, match=r"no specification of its scene: clients get no meshes .*No space left"):
         scenes.patch([SetVisual(0, rgba=(0.0, 0.0, 0.0, 1.0))])
     assert "clients get no meshes" in scenes.notes[-1]
-    scenes.take(scenes.make(world))
+    scenes.show(scenes.make(world))
     assert scenes.newest is not None
     assert scenes.newest.spec is not None
     assert scenes.notes == [], "what was so of the scene before"
@@ -116,7 +116,7 @@ def test_what_no_store_has_is_not_shown(world: World, tmp_path: Path) -> None:
     """It would be asked for by everybody, and refused."""
     scenes = SharedScenes(tmp_path, "test")
     before = scenes.make(world)
-    scenes.take(before)
+    scenes.show(before)
     level = MeshLevel("0" * 64, 10, "arrays", 3, 1)
     with pytest.raises(SceneError, match=f"asset {level.address} is not in"):
         scenes.patch([AddMesh(Mesh("arrow", (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), False, (level,)))])
@@ -127,9 +127,9 @@ def test_what_bends_in_the_next_scene_is_prepared_with_it() -> None:
     """Topologies take long: the loop that swaps scenes only hands them over."""
     model = flexes()
     model.opt.timestep = 0.002
-    scene = prepare(make_core(), SharedScenes(False, "test"), model, b"", None, None)
-    assert [mesh.stream for mesh in scene.bending] == ["flex-0", "flex-1", "flex-2"]
-    assert all(len(mesh.vertices()) == mesh.topology.n_vertices for mesh in scene.bending)
+    scene = prepare_scene(make_core(), SharedScenes(False, "test"), model, b"", None, None)
+    assert [mesh.stream for mesh in scene.deformables] == ["flex-0", "flex-1", "flex-2"]
+    assert all(len(mesh.vertices()) == mesh.topology.n_vertices for mesh in scene.deformables)
 
 
 def test_sites_and_tendons_are_shared_on_request_and_else_told_of(tmp_path: Path) -> None:

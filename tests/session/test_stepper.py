@@ -18,7 +18,7 @@ from iris_session.protocol.server_messages import BodyInfo, Gap, StateHeader
 from iris_session.protocol.steps import Decision
 from iris_session.recording.journal import CRASHED, JournalRow, Keyframe, check_row
 from iris_session.session.errors import OwnershipError
-from iris_session.session.stepper import MAX_HOST_ENTRIES, ROOM_FOR_OURS, Stepper
+from iris_session.session.stepper import MAX_HOST_ENTRIES, RESERVED_HOST_ENTRIES, Stepper
 from tests.session.play import TICK_NS, entries, make_core
 
 MS = 1_000_000
@@ -246,8 +246,8 @@ def test_host_entries_are_bounded(rig: Rig) -> None:
         rig.stepper.post(Marker(0, f"m{i}"))
     with pytest.raises(OwnershipError, match="is the loop running"):
         rig.stepper.post(Marker(0, "one more"))
-    rig.stepper.say(ExternalReset())  # a reset that a script's loop has seen, whatever else that script says
-    for _ in range(ROOM_FOR_OURS - 1):
+    rig.stepper.post_own(ExternalReset())  # a reset that a script's loop has seen, whatever else that script says
+    for _ in range(RESERVED_HOST_ENTRIES - 1):
         rig.stepper.post(EStop("somebody shouts"))
     with pytest.raises(RuntimeError, match="is the loop running"):
         rig.stepper.post(EStop("one more"))

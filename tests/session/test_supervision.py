@@ -11,39 +11,43 @@ from iris_session.recording import RecordingError
 from iris_session.session.supervision import (
     HANGING_NS,
     HEALTHY_NS,
-    RESTART_BACKOFF_NS,
-    Backoff,
+    RESTART_DELAYS_NS,
     RecorderSupervisor,
+    RestartTimer,
 )
 
 MS = 1_000_000
 SECOND = 1_000 * MS
 
 
-def _restarts(backoff: Backoff, start_ns: int, until_ns: int) -> list[int]:
+def _restarts(timer: RestartTimer, start_ns: int, until_ns: int) -> list[int]:
     """Times at which a process that dies at once is started again."""
-    return [now for now in range(start_ns, until_ns, 50 * MS) if backoff.dead(now)]
+    return [now for now in range(start_ns, until_ns, 50 * MS) if timer.is_due(now)]
 
 
 def test_the_first_restart_is_at_once_and_later_ones_wait_longer() -> None:
-    backoff = Backoff()
-    times = _restarts(backoff, 60_000 * MS, 90_000 * MS)
+    timer = RestartTimer()
+    times = _restarts(timer, 60_000 * MS, 90_000 * MS)
     waits = [b - a for a, b in pairwise(times)]
     assert times[0] == 60_000 * MS
-    for wait, least in zip(waits, (*RESTART_BACKOFF_NS[1:], *[RESTART_BACKOFF_NS[-1]] * 10), strict=False):
+    for wait, least in zip(waits, (*RESTART_DELAYS_NS[1:], *[RESTART_DELAYS_NS[-1]] * 10), strict=False):
         assert least <= wait <= least + 100 * MS
-    assert backoff.restarts == len(times)
+    assert timer.restarts == len(times)
 
 
 def test_a_process_that_lived_long_is_started_at_once_again() -> None:
-    backoff = Backoff()
+    timer = RestartTimer()
     now_ns = 60_000 * MS
     for _ in range(3):
-        while not backoff.dead(now_ns):
+        while not timer.is_due(now_ns):
             now_ns += 50 * MS
-    assert backoff.failures == 3
-    assert backoff.dead(now_ns + HEALTHY_NS + 50 * MS)
-    assert backoff.failures == 1
+    assert not timer.is_due(now_ns)  # the process died again: restarts wait by now
+    while not timer.is_due(now_ns):
+        now_ns += 50 * MS
+    now_ns += HEALTHY_NS + 50 * MS
+    assert timer.is_due(now_ns)
+    assert not timer.is_due(now_ns + 50 * MS)
+    assert timer.is_due(now_ns + 50 * MS + RESTART_DELAYS_NS[1])
 
 
 class Recorder:
@@ -86,19 +90,19 @@ def _until(look: Callable[[], list[str]]) -> list[str]:
 def test_a_dead_recorder_is_replaced_while_the_loop_goes_on() -> None:
     recorder = Recorder()
     supervisor = RecorderSupervisor(recorder)
-    assert supervisor.look(SECOND, 0) == []
+    assert supervisor.poll(SECOND, 0) == []
     recorder.alive = False
     for i in range(100):  # its log cannot be read now: no look waits
-        assert supervisor.look(2 * SECOND + i * 50 * MS, 0) == []
+        assert supervisor.poll(2 * SECOND + i * 50 * MS, 0) == []
     assert not supervisor.alive
     assert supervisor.restarts == 1
     recorder.disk.set()
-    (told,) = _until(lambda: supervisor.look(8 * SECOND, 0))
+    (told,) = _until(lambda: supervisor.poll(8 * SECOND, 0))
     assert told == "the recorder ended (exit status 1): no space left; it was replaced"
     assert threading.main_thread() not in recorder.readers
     assert supervisor.alive
     assert "no space left" in supervisor.failure
-    assert supervisor.look(8 * SECOND + HANGING_NS + MS, 0) == []
+    assert supervisor.poll(8 * SECOND + HANGING_NS + MS, 0) == []
     assert supervisor.failure == ""  # its successor writes
 
 
@@ -107,27 +111,27 @@ def test_a_recorder_that_cannot_be_started_is_tried_again_and_its_end_stays_told
     recorder.disk.set()
     recorder.alive, recorder.refused = False, True
     supervisor = RecorderSupervisor(recorder)
-    (told,) = _until(lambda: supervisor.look(SECOND, 0))
+    (told,) = _until(lambda: supervisor.poll(SECOND, 0))
     assert told.endswith("it is not replaced: no room for its log")
-    assert supervisor.look(SECOND + 100 * MS, 0) == []
-    (told,) = _until(lambda: supervisor.look(SECOND + 3 * HANGING_NS, 0))
+    assert supervisor.poll(SECOND + 100 * MS, 0) == []
+    (told,) = _until(lambda: supervisor.poll(SECOND + 3 * HANGING_NS, 0))
     assert "not replaced" in told
     assert supervisor.failure
     assert not supervisor.alive
     recorder.refused = False
-    (told,) = _until(lambda: supervisor.look(SECOND + 9 * HANGING_NS, 0))
+    (told,) = _until(lambda: supervisor.poll(SECOND + 9 * HANGING_NS, 0))
     assert told.endswith("it was replaced")
 
 
 def test_a_recorder_that_hangs_is_told_once_and_the_end_waits_for_the_thread() -> None:
     recorder = Recorder()
     supervisor = RecorderSupervisor(recorder)
-    (told,) = supervisor.look(SECOND, HANGING_NS + 1)
+    (told,) = supervisor.poll(SECOND, HANGING_NS + 1)
     assert "hangs" in told
     assert supervisor.hangs
-    assert supervisor.look(2 * SECOND, HANGING_NS + 1) == []
+    assert supervisor.poll(2 * SECOND, HANGING_NS + 1) == []
     recorder.alive = False
-    supervisor.look(3 * SECOND, 0)
+    supervisor.poll(3 * SECOND, 0)
     assert not supervisor.hangs
     recorder.disk.set()
     supervisor.close()
@@ -139,7 +143,7 @@ def test_the_end_does_not_wait_for_a_disk_that_hangs() -> None:
     recorder = Recorder()
     supervisor = RecorderSupervisor(recorder)
     recorder.alive = False
-    supervisor.look(SECOND, 0)
+    supervisor.poll(SECOND, 0)
     supervisor.close(0.05)
     assert not recorder.alive, "and its disk has not answered yet"
     recorder.disk.set()

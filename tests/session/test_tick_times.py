@@ -6,7 +6,7 @@ import pytest
 
 from iris_session.physics import PacerStats
 from iris_session.protocol.names import LateCause
-from iris_session.session.tick_times import CAUSES, SKIPPED, TickTimes, run_delay
+from iris_session.session.tick_times import CAUSES, SKIPPED, TickTimes, make_run_delay_reader
 
 MS = 1_000_000
 PERIOD = 2 * MS
@@ -35,13 +35,13 @@ class Loop:
         extra = extra or {}
         if self.now_ns < self.due_ns:
             self.now_ns = self.due_ns + overslept_ns
-            self.times.woke(self.due_ns)
+            self.times.begin_chain(self.due_ns)
         for cause in (LateCause.AUTHORITY, LateCause.CONTROL, LateCause.PHYSICS, LateCause.OUTPUT):
             self.work(USUAL[cause])
             self.work(extra.get(cause, 0), delayed=delayed)
             self.times.lap(cause)
         lateness = self.now_ns - self.due_ns
-        self.times.finished(lateness)
+        self.times.finish_tick(lateness)
         self.ticks += 1
         self.late += lateness > PERIOD
         self.due_ns += PERIOD
@@ -71,7 +71,7 @@ def test_the_part_that_took_too_long_is_blamed(loop: Loop, cause: str) -> None:
         loop.tick()
     loop.mark()
     assert loop.late > 2, "a pause of 7 ms makes several ticks late: those are caught up one after the other"
-    assert loop.times.late_causes() == {cause: loop.late}
+    assert loop.times.count_late_causes() == {cause: loop.late}
 
 
 def test_what_the_owner_does_between_ticks_is_theirs(loop: Loop) -> None:
@@ -79,7 +79,7 @@ def test_what_the_owner_does_between_ticks_is_theirs(loop: Loop) -> None:
     for _ in range(50):
         loop.tick()
     loop.mark()
-    assert set(loop.times.late_causes()) == {LateCause.OWNER}
+    assert set(loop.times.count_late_causes()) == {LateCause.OWNER}
 
 
 def test_oversleeping_is_the_schedulers(loop: Loop) -> None:
@@ -87,7 +87,7 @@ def test_oversleeping_is_the_schedulers(loop: Loop) -> None:
     for _ in range(50):
         loop.tick()
     loop.mark()
-    assert set(loop.times.late_causes()) == {LateCause.SCHEDULER}
+    assert set(loop.times.count_late_causes()) == {LateCause.SCHEDULER}
 
 
 @pytest.mark.parametrize("cause", [c for c in CAUSES if c != LateCause.SCHEDULER])
@@ -96,7 +96,7 @@ def test_a_part_that_was_interrupted_is_not_to_blame(loop: Loop, cause: str) -> 
     for _ in range(50):
         loop.tick()
     loop.mark()
-    assert set(loop.times.late_causes()) == {LateCause.SCHEDULER}
+    assert set(loop.times.count_late_causes()) == {LateCause.SCHEDULER}
 
 
 def test_the_larger_share_decides(loop: Loop) -> None:
@@ -105,7 +105,7 @@ def test_the_larger_share_decides(loop: Loop) -> None:
     for _ in range(50):
         loop.tick()
     loop.mark()
-    causes = loop.times.late_causes()
+    causes = loop.times.count_late_causes()
     assert causes[LateCause.OUTPUT] > causes[LateCause.SCHEDULER] > 0
 
 
@@ -115,27 +115,27 @@ def test_physics_that_never_fits_is_blamed_throughout() -> None:
     for _ in range(200):
         loop.tick({LateCause.PHYSICS: 2 * MS})
     loop.mark()
-    assert loop.times.late_causes() == {LateCause.PHYSICS: loop.late}
-    assert loop.times.late_share() == pytest.approx(loop.late / 200)
+    assert loop.times.count_late_causes() == {LateCause.PHYSICS: loop.late}
+    assert loop.times.compute_late_share() == pytest.approx(loop.late / 200)
 
 
 def test_ticks_that_were_given_up_have_the_cause_of_their_chain(loop: Loop) -> None:
     for _ in range(300):
         loop.tick({LateCause.CONTROL: 5 * MS})
-    loop.times.gave_up(500)
+    loop.times.count_skipped(500)
     loop.mark(missing=500)
-    assert loop.times.late_causes() == {LateCause.CONTROL: loop.late + 500}
+    assert loop.times.count_late_causes() == {LateCause.CONTROL: loop.late + 500}
 
 
 def test_a_process_that_stood_still_is_told_apart(loop: Loop) -> None:
     loop.tick(overslept_ns=3_000 * MS)
-    loop.times.gave_up(1400)
+    loop.times.count_skipped(1400)
     loop.mark(missing=1400)
-    assert loop.times.late_causes() == {LateCause.SCHEDULER: 1, SKIPPED: 1400}
+    assert loop.times.count_late_causes() == {LateCause.SCHEDULER: 1, SKIPPED: 1400}
 
 
 def test_the_system_counts_how_long_we_did_not_run() -> None:
-    delayed = run_delay()
+    delayed = make_run_delay_reader()
     before = delayed()
     assert delayed() >= before >= 0
 
@@ -147,35 +147,35 @@ def test_shares_are_of_the_last_ten_marks() -> None:
     for _ in range(10):
         loop.tick()
     loop.mark()
-    assert loop.times.late_share() > 0.0
+    assert loop.times.compute_late_share() > 0.0
     for _ in range(10):
         loop.tick()
         loop.mark()
-    assert loop.times.late_share() == 0.0
-    assert loop.times.late_causes() == {}
+    assert loop.times.compute_late_share() == 0.0
+    assert loop.times.count_late_causes() == {}
 
 
 def test_lateness_is_of_the_newest_ticks(loop: Loop) -> None:
     usual_ms = sum(USUAL.values()) * 1e-6
-    lateness = loop.times.lateness()
+    lateness = loop.times.compute_lateness()
     assert lateness is not None
     assert lateness.p50 == pytest.approx(usual_ms)
     for _ in range(5000):
         loop.tick({LateCause.CONTROL: 500_000})
-    lateness = loop.times.lateness()
+    lateness = loop.times.compute_lateness()
     assert lateness is not None
     assert lateness.p50 == pytest.approx(usual_ms + 0.5)
 
 
 def test_nothing_is_known_at_first() -> None:
     times = Loop().times
-    assert (times.lateness(), times.late_share(), times.late_causes()) == (None, 0.0, {})
+    assert (times.compute_lateness(), times.compute_late_share(), times.count_late_causes()) == (None, 0.0, {})
 
 
 def test_a_pause_blames_nobody(loop: Loop) -> None:
     loop.now_ns += 5_000 * MS
-    loop.times.idle()
+    loop.times.restart_chain()
     loop.due_ns = loop.now_ns + PERIOD
     loop.tick()
     loop.mark()
-    assert loop.times.late_causes() == {}
+    assert loop.times.count_late_causes() == {}

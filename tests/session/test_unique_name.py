@@ -13,17 +13,17 @@ import pytest
 from iris_session.client.discovery import BeaconListener
 from iris_session.protocol.codec import encode_beacon
 from iris_session.protocol.discovery import Beacon
-from iris_session.session.unique_name import LISTEN_S, Neighbours
+from iris_session.session.unique_name import LISTEN_S, NameFinder
 
 
 @contextmanager
-def neighbours(*names: str) -> Iterator[Neighbours]:
-    """`Neighbours` on a port of their own, where sessions of these names are heard."""
+def neighbours(*names: str) -> Iterator[NameFinder]:
+    """`NameFinder` on a port of their own, where sessions of these names are heard."""
     with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sender:
         with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as free:
             free.bind(("", 0))
             port = free.getsockname()[1]
-        made = Neighbours(port)
+        made = NameFinder(port)
         for number, name in enumerate(names):
             beacon = Beacon(1, f"s{number}", name, "live", "127.0.0.1", 7721 + 10 * number, 0, 0, 0, 0)
             sender.sendto(encode_beacon(beacon), ("127.0.0.1", port))
@@ -33,19 +33,19 @@ def neighbours(*names: str) -> Iterator[Neighbours]:
 
 def test_a_free_name_is_kept_without_a_word() -> None:
     with neighbours("other") as near:
-        assert near.free_name("lab") == "lab"
+        assert near.find_free_name("lab") == "lab"
         assert near.notes == []
 
 
 def test_a_name_in_use_gets_the_next_free_number() -> None:
     with neighbours("lab", "lab-2", "lab-4") as near:
-        assert near.free_name("lab") == "lab-3"
+        assert near.find_free_name("lab") == "lab-3"
         assert near.notes == ["another session called 'lab' is at 127.0.0.1:7721: this one is called 'lab-3'"]
 
 
 def test_a_long_name_stays_a_name() -> None:
     with neighbours("x" * 48) as near:
-        free = near.free_name("x" * 48)
+        free = near.find_free_name("x" * 48)
     assert free == "x" * 44 + "-2"
 
 
@@ -53,19 +53,19 @@ def test_it_listens_from_when_it_is_made_and_waits_for_no_more_than_the_rest(mon
     with neighbours("lab") as near:
         time.sleep(LISTEN_S)
         monkeypatch.setattr(BeaconListener, "wait", lambda self, timeout_s: pytest.fail("waits again"))
-        assert near.free_name("lab") == "lab-2"
+        assert near.find_free_name("lab") == "lab-2"
 
 
 def test_without_beacons_nothing_is_asked() -> None:
-    near = Neighbours(0)
-    assert near.free_name("lab") == "lab"
+    near = NameFinder(0)
+    assert near.find_free_name("lab") == "lab"
     near.close()
 
 
 def test_a_port_that_others_keep_for_themselves_is_told_and_harms_nothing() -> None:
     with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as greedy:
         greedy.bind(("", 0))
-        near = Neighbours(greedy.getsockname()[1])
-        assert near.free_name("lab") == "lab"
-        assert "cannot be heard" in near.notes[0]
+        near = NameFinder(greedy.getsockname()[1])
+        assert near.find_free_name("lab") == "lab"
+        assert "cannot be found" in near.notes[0]
         near.close()

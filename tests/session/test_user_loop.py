@@ -179,7 +179,7 @@ def test_at_the_end_robots_rest_and_objects_are_free() -> None:
     controller._grasps.commanded = {"ball": ((0.5, 0.0, 2.0), (1.0, 0.0, 0.0, 0.0))}
     twin = rig.stepper.core.world.data
     controller.tick(twin)
-    rig.loop._apply()
+    rig.loop._write_controls()
     assert rig.data.ctrl.any()
     assert rig.data.xfrc_applied[ball].any()
     rig.loop.close()
@@ -193,7 +193,7 @@ def test_the_helper_never_steps_while_something_is_read() -> None:
         session.begin_tick()
         stepper = session.stepper
         wait_for(lambda: stepper.step_count > 2)  # the helper's
-        lock = session._unchanging()
+        lock = session._hold_steps()
         with lock:
             steps = stepper.step_count
             reader = threading.Thread(target=session.status)

@@ -17,8 +17,16 @@ from iris_session.recording.feed import FeedStats
 from iris_session.recording.messages import RecorderStatus
 from iris_session.session.config import SessionConfig
 from iris_session.session.processes import SessionProcesses
-from iris_session.session.report import PATIENCE_NS, PERIOD_NS, Reporter, anchors, recorder_report, robots, warnings
+from iris_session.session.status import (
+    PATIENCE_NS,
+    PERIOD_NS,
+    StatusReporter,
+    collect_warnings,
+    make_anchor_reports,
+    make_robot_reports,
+)
 from iris_session.session.stepper import Stepper
+from iris_session.session.supervision import make_recorder_report
 from tests.session.play import TICK_NS, entries, host, make_core
 from tests.session.test_stepper import Front
 
@@ -39,7 +47,7 @@ class Session:
         self.stepper.step(1)
 
     def people(self) -> dict[str, ParticipantReport]:
-        return {row.name: row for row in self.stepper.ledger.participant_reports(self.now_ns)}
+        return {row.name: row for row in self.stepper.ledger.make_participant_reports(self.now_ns)}
 
 
 @pytest.fixture
@@ -81,12 +89,12 @@ def test_nothing_stays_of_who_left(session: Session) -> None:
 
 def test_robots_and_who_drives_them(session: Session) -> None:
     session.step()
-    before = {row.name: row for row in robots(session.stepper)}
+    before = {row.name: row for row in make_robot_reports(session.stepper)}
     assert {row.mode for row in before.values()} == {"exclusive"}
     assert {(row.state, row.hold_reason) for row in before.values()} == {("hold", "no_lease")}
     for step in range(150):
         session.step(*entries(step))
-    after = {row.name: row for row in robots(session.stepper)}
+    after = {row.name: row for row in make_robot_reports(session.stepper)}
     left = after["left"]
     assert (left.holder_name, left.state) == ("ann", "pose")
     assert left.receive_to_step is not None
@@ -96,19 +104,19 @@ def test_robots_and_who_drives_them(session: Session) -> None:
 
 
 def test_a_report_waits_for_time_to_spare_but_not_for_ever() -> None:
-    reporter = Reporter()
-    assert reporter.due(0)
-    assert not reporter.due(PERIOD_NS - 1)
+    reporter = StatusReporter()
+    assert reporter.is_due(0)
+    assert not reporter.is_due(PERIOD_NS - 1)
     reporter.pacer = Pacer(TICK_NS, 0)  # its first tick was due long ago
-    assert not reporter.due(PERIOD_NS)
-    assert reporter.due(PERIOD_NS + PATIENCE_NS)
+    assert not reporter.is_due(PERIOD_NS)
+    assert reporter.is_due(PERIOD_NS + PATIENCE_NS)
     reporter.pacer = Pacer(TICK_NS, 3 * PERIOD_NS)
-    assert reporter.due(3 * PERIOD_NS)
+    assert reporter.is_due(3 * PERIOD_NS)
 
 
 def test_what_is_noticed_beside_ticks_is_among_the_warnings(session: Session) -> None:
-    assert warnings(session.stepper, RecorderReport(), "") == []
-    assert warnings(session.stepper, RecorderReport(), "", ["x" * 5000]) == ["x" * MAX_TEXT]
+    assert collect_warnings(session.stepper, RecorderReport(), "") == []
+    assert collect_warnings(session.stepper, RecorderReport(), "", ["x" * 5000]) == ["x" * MAX_TEXT]
 
 
 def test_alignments_anchors_and_comparisons_are_in_the_report(session: Session) -> None:
@@ -116,10 +124,10 @@ def test_alignments_anchors_and_comparisons_are_in_the_report(session: Session) 
     row = session.people()["bob"]
     session.step(host(session.now_ns, PlaceAlignment(0, row.id, IDENTITY)))
     reports = session.stepper.core.authority.build_alignment_reports()
-    (told,) = [r for r in session.stepper.ledger.participant_reports(session.now_ns, reports) if r.id == row.id]
+    (told,) = [r for r in session.stepper.ledger.make_participant_reports(session.now_ns, reports) if r.id == row.id]
     assert told.alignment_report is not None
     assert (told.alignment_report.version, told.alignment_report.running) == (1, True)
-    assert anchors({"table": IDENTITY, "door": IDENTITY}, {"table": 0.16}) == (
+    assert make_anchor_reports({"table": IDENTITY, "door": IDENTITY}, {"table": 0.16}) == (
         AnchorReport("table", IDENTITY, 0.16),
         AnchorReport("door", IDENTITY, 0.0),
     )
@@ -134,18 +142,18 @@ def test_a_new_front_is_told_where_the_anchors_are_now() -> None:
     session_processes.front = SimpleNamespace(  # type: ignore[assignment]
         alive=False, fault="ended", set_anchors=told.append, restart=lambda: told.append("restarted"), link=Front()
     )
-    session_processes.reporter = SimpleNamespace(due=lambda now_ns: False)  # type: ignore[assignment]
-    session_processes.watch(Stepper(core, Front(), None, lambda: 10**12, 10**9, 10**9))
+    session_processes.reporter = SimpleNamespace(is_due=lambda now_ns: False)  # type: ignore[assignment]
+    session_processes.supervise(Stepper(core, Front(), None, lambda: 10**12, 10**9, 10**9))
     assert told == [{"table": moved}, "restarted"]
 
 
 def processes(alive: bool = True, hangs: bool = False, failure: str = "", fault: str = "") -> Any:
-    """What the report looks at."""
+    """Return feed, recorder and supervisor."""
     said = RecorderStatus(1, 0, 0, bytes=1000, fault=fault, disk_free=5000)
-    return SimpleNamespace(
-        feed=SimpleNamespace(stats=FeedStats(dropped_rows=2, spilled_bytes=30, recorder=said)),
-        recorder=SimpleNamespace(path="/data/session.rrd", part_path="/data/session.rrd"),
-        supervisor=SimpleNamespace(alive=alive, hangs=hangs, failure=failure),
+    return (
+        SimpleNamespace(stats=FeedStats(dropped_rows=2, spilled_bytes=30, recorder=said)),
+        SimpleNamespace(path="/data/session.rrd"),
+        SimpleNamespace(alive=alive, hangs=hangs, failure=failure),
     )
 
 
@@ -161,10 +169,10 @@ def processes(alive: bool = True, hangs: bool = False, failure: str = "", fault:
     ],
 )
 def test_recorder(fields: dict[str, Any], state: str, text: str) -> None:
-    report = recorder_report(processes(**fields))
+    report = make_recorder_report(*processes(**fields))
     assert (report.state, report.text) == (state, text)
     assert (report.bytes_written, report.disk_free_bytes, report.lost_rows, report.spilled_bytes) == (1000, 5000, 2, 30)
 
 
 def test_without_recorder() -> None:
-    assert recorder_report(SimpleNamespace(feed=None, recorder=None, supervisor=None)).state == "off"  # type: ignore[arg-type]
+    assert make_recorder_report(None, None, None).state == "off"

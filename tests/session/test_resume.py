@@ -45,13 +45,21 @@ from iris_session.recording.environment import read_boot_id
 from iris_session.recording.journal import CRASHED, seal_keyframe
 from iris_session.recording.messages import Batch
 from iris_session.security.resume_tokens import ResumeTokens, encode_handback
-from iris_session.session import continuation
+from iris_session.session import resume
 from iris_session.session.config import SessionConfig
-from iris_session.session.continuation import MARGIN_NS, Continuation, begin
 from iris_session.session.core import CoreState, SessionCore
 from iris_session.session.errors import ConfigError, ResumeError
-from iris_session.session.processes import settings_of
-from iris_session.session.resume_note import Listening, NoteKeeper, ResumeNote, note_path, read_note
+from iris_session.session.processes import make_settings
+from iris_session.session.resume import (
+    MARGIN_NS,
+    Listening,
+    PastSession,
+    ResumeNote,
+    ResumeNoteWriter,
+    find_note_path,
+    prepare_session,
+    read_note,
+)
 from iris_session.session.stepper import ResumedFrom, Stepper
 from iris_session.session.verification import verify_recording
 from tests.recording.support import write
@@ -123,7 +131,7 @@ def session(original: Path, tmp_path: Path) -> Path:
 
 
 def test_the_state_is_that_after_the_last_row(session: Path) -> None:
-    past = Continuation(session.parent)
+    past = PastSession(session.parent)
     assert (past.step, past.now_ns) == (STEPS - 1, LAST_NS)
     assert past.core.snapshot() == state_after(STEPS - 1)
     assert past.recording == session.with_name("session.resume2.rrd")
@@ -138,7 +146,7 @@ def test_a_file_that_was_cut_short_goes_on_where_it_can_be_read(session: Path, s
     """As after a power cut: anywhere in the middle of a write."""
     size = session.stat().st_size
     os.truncate(session, int(size * share))
-    past = Continuation(session)
+    past = PastSession(session)
     assert -1 <= past.step < STEPS
     assert past.core.snapshot() == (state_after(past.step) if past.step >= 0 else make_core().snapshot())
     past.close()
@@ -148,7 +156,7 @@ def test_what_comes_after_a_changed_row_is_left_out_and_said(tmp_path: Path) -> 
     def change(row: JournalRow) -> JournalRow:
         return msgspec.structs.replace(row, n_ticks=2) if row.step == 90 else row
 
-    past = Continuation(recorded(tmp_path / "session.rrd", change))
+    past = PastSession(recorded(tmp_path / "session.rrd", change))
     assert past.step == 89
     assert past.core.snapshot() == state_after(89)
     assert any("step 90" in note and "n_ticks" in note for note in past.notes)
@@ -170,7 +178,7 @@ def test_rows_that_come_out_otherwise_here_are_left_out(tmp_path: Path) -> None:
         before.append(changed.chain)
         return changed
 
-    past = Continuation(recorded(tmp_path / "session.rrd", noting))
+    past = PastSession(recorded(tmp_path / "session.rrd", noting))
     assert past.step == 89
     assert past.core.snapshot() == state_after(89)
     assert any("step 90 gives another result" in note for note in past.notes)
@@ -180,7 +188,7 @@ def test_a_damaged_keyframe_gives_way_to_the_one_before(tmp_path: Path) -> None:
     def damage(keyframe: Keyframe) -> Keyframe:
         return msgspec.structs.replace(keyframe, plant=b"\0" * 8) if keyframe.step == KEYFRAMES[-1] else keyframe
 
-    past = Continuation(recorded(tmp_path / "session.rrd", keyframes=damage))
+    past = PastSession(recorded(tmp_path / "session.rrd", keyframes=damage))
     assert past.step == STEPS - 1
     assert past.core.snapshot() == state_after(STEPS - 1)
 
@@ -196,7 +204,7 @@ def test_the_step_that_ended_the_session_with_an_error_is_not_taken_again(tmp_pa
         chains.append(changed.chain)
         return changed
 
-    past = Continuation(recorded(tmp_path / "session.rrd", noting))
+    past = PastSession(recorded(tmp_path / "session.rrd", noting))
     assert past.step == STEPS - 2
     assert any("ended the session" in note for note in past.notes)
 
@@ -204,7 +212,7 @@ def test_the_step_that_ended_the_session_with_an_error_is_not_taken_again(tmp_pa
 def test_the_newest_recording_that_can_be_read_is_continued(session: Path) -> None:
     session.with_name("session.resume2.rrd").write_bytes(b"")
     session.with_name("session.resume3.rrd").write_bytes(b"no recording at all")
-    past = Continuation(session)
+    past = PastSession(session)
     assert past.file == "session.rrd"
     assert past.recording.name == "session.resume4.rrd"
     assert sum("left out session.resume" in note for note in past.notes) == 2
@@ -213,13 +221,13 @@ def test_the_newest_recording_that_can_be_read_is_continued(session: Path) -> No
 def test_a_recording_in_use_is_refused(session: Path) -> None:
     writing = RecordingLock(session, shared=True)
     with pytest.raises(ResumeError, match=f"still runs: process {os.getpid()}$"):
-        Continuation(session, patience_s=0.1)
+        PastSession(session, patience_s=0.1)
     writing.release()
-    first = Continuation(session)
+    first = PastSession(session)
     with pytest.raises(ResumeError, match=f"being resumed by process {os.getpid()}$"):
-        Continuation(session, patience_s=0.1)
+        PastSession(session, patience_s=0.1)
     first.close()
-    Continuation(session).close()
+    PastSession(session).close()
 
 
 def test_who_waited_while_another_went_on_goes_on_from_there(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -231,8 +239,8 @@ def test_who_waited_while_another_went_on_goes_on_from_there(session: Path, monk
             super().__init__(path, **options)
             newer.touch()
 
-    monkeypatch.setattr(continuation, "RecordingLock", Late)
-    past = Continuation(session)
+    monkeypatch.setattr(resume, "RecordingLock", Late)
+    past = PastSession(session)
     assert past.recording.name == "session.resume3.rrd"
     assert past.file == "session.rrd"
     RecordingLock(session, shared=False, patience_s=0.0).release()
@@ -248,27 +256,27 @@ def test_a_recording_that_cannot_be_opened_is_one_line(tmp_path: Path) -> None:
 
 def test_recordings_of_a_users_loop_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ResumeError, match=r"class 'open'.*only recordings of our own loop"):
-        Continuation(recorded(tmp_path / "session.rrd", recording_class=OPEN))
+        PastSession(recorded(tmp_path / "session.rrd", recording_class=OPEN))
 
 
 @pytest.mark.parametrize("name", ["", "nothing.rrd", "folder"])
 def test_no_recording_is_one_line(tmp_path: Path, name: str) -> None:
     (tmp_path / "folder").mkdir()
     with pytest.raises(ResumeError, match="there is no recording") as refused:
-        Continuation(tmp_path / name)
+        PastSession(tmp_path / name)
     assert "\n" not in str(refused.value)
 
 
 def test_the_scene_may_be_given_and_must_be_the_same(session: Path) -> None:
     config = SessionConfig(resume=session)
-    past, _, scene = begin(config, scene_path("handover"), None, None, None)
+    past, _, scene = prepare_session(config, scene_path("handover"), None, None, None)
     assert past is not None
     past.close()
     assert model_bytes(scene[0]) == model_bytes(load_model(scene_path("handover")))
     other = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
     with pytest.raises(ResumeError, match=r"the scene is not that of session\.rrd"):
-        begin(config, other, None, None, None)
-    Continuation(session, patience_s=0.1).close()  # a refusal keeps nothing
+        prepare_session(config, other, None, None, None)
+    PastSession(session, patience_s=0.1).close()  # a refusal keeps nothing
 
 
 @pytest.mark.parametrize(
@@ -277,17 +285,17 @@ def test_the_scene_may_be_given_and_must_be_the_same(session: Path) -> None:
 )
 def test_what_cannot_be_another_than_it_was_is_refused(session: Path, change: dict[str, object]) -> None:
     with pytest.raises(ConfigError, match="resumed session"):
-        begin(SessionConfig(resume=session, **change), None, None, None, None)  # type: ignore[arg-type]
+        prepare_session(SessionConfig(resume=session, **change), None, None, None, None)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="state, robots and objects"):
-        begin(SessionConfig(resume=session), None, None, (), None)
+        prepare_session(SessionConfig(resume=session), None, None, (), None)
 
 
 def test_it_listens_where_it_listened_unless_told_otherwise(session: Path) -> None:
     listening = Listening("0.0.0.0", control_port=4001, state_port=4002, curve=True, beacon_port=0)
-    keeper = NoteKeeper(note_path(session))
+    keeper = ResumeNoteWriter(find_note_path(session))
     keeper.offer(ResumeNote("s1", listening, encode_handback(0)))
     keeper.close(5.0)
-    past, config, _ = begin(SessionConfig(resume=session, control_port=5001), None, None, None, None)
+    past, config, _ = prepare_session(SessionConfig(resume=session, control_port=5001), None, None, None, None)
     assert past is not None
     assert past.notes == []
     assert dataclasses.replace(config, resume=None) == SessionConfig(
@@ -297,7 +305,7 @@ def test_it_listens_where_it_listened_unless_told_otherwise(session: Path) -> No
 
 def test_rates_are_as_they_were_unless_told_otherwise(tmp_path: Path) -> None:
     path = recorded(tmp_path / "session.rrd", settings=Settings(30.0, 2.0, False))
-    past, config, _ = begin(SessionConfig(resume=path, keyframe_s=1.0), None, None, None, None)
+    past, config, _ = prepare_session(SessionConfig(resume=path, keyframe_s=1.0), None, None, None, None)
     assert past is not None
     past.close()
     assert (config.state_hz, config.keyframe_s, config.realtime) == (30.0, 1.0, False)
@@ -312,7 +320,7 @@ def test_sheets_are_checked_for_misprints_as_they_were(
     anchors = {"wall": Pose((1.0, 0.0, 1.0), IDENTITY_QUAT)}
     path = recorded(tmp_path / "session.rrd", settings=settings, anchors=anchors)
     anew = {"anchors": given} if given else {}
-    past, config, _ = begin(SessionConfig(resume=path, **anew), None, None, None, None)  # type: ignore[arg-type]
+    past, config, _ = prepare_session(SessionConfig(resume=path, **anew), None, None, None, None)  # type: ignore[arg-type]
     assert past is not None
     past.close()
     assert config.sheet_sizes() == sizes
@@ -330,7 +338,7 @@ def test_anchors_are_where_they_were_last_unless_given_anew(tmp_path: Path, give
         anchors={"table": table},
     )
     anew = {"anchors": given} if given else {}
-    past, config, _ = begin(SessionConfig(resume=path, **anew), None, None, None, None)  # type: ignore[arg-type]
+    past, config, _ = prepare_session(SessionConfig(resume=path, **anew), None, None, None, None)  # type: ignore[arg-type]
     assert past is not None
     past.close()
     now = {name: Pose(*T) for name, T in given.items()}
@@ -352,7 +360,7 @@ def test_what_is_noted_for_a_resumed_session_is_what_it_was_given() -> None:
         anchors={"wall": ((1.0, 0.0, 1.0), IDENTITY_QUAT)},
         anchor_sizes={"wall": 0.2},
     )
-    noted = settings_of(config)
+    noted = make_settings(config)
     assert {name: getattr(config, name) for name in noted.__struct_fields__} == msgspec.structs.asdict(noted)
 
 
@@ -363,12 +371,12 @@ def test_tokens_stay_good_and_connection_numbers_go_on(session: Path) -> None:
     tokens = ResumeTokens(8)
     tokens.allocate_connection()
     token = tokens.issue("key", "p1")
-    keeper = NoteKeeper(note_path(session))
+    keeper = ResumeNoteWriter(find_note_path(session))
     keeper.offer(ResumeNote("s1", Listening(), tokens.encode()))
     keeper.close(5.0)
-    assert token not in note_path(session).read_bytes(), "hashes only"
-    assert note_path(session).stat().st_mode & 0o777 == 0o600
-    past = Continuation(session)
+    assert token not in find_note_path(session).read_bytes(), "hashes only"
+    assert find_note_path(session).stat().st_mode & 0o777 == 0o600
+    past = PastSession(session)
     after = ResumeTokens(8, past.handback)
     assert after.find_participant(token, "key") == "p1"
     assert after.find_participant(token, "another key") is None
@@ -376,12 +384,12 @@ def test_tokens_stay_good_and_connection_numbers_go_on(session: Path) -> None:
 
 
 def test_without_a_note_numbers_begin_above_those_of_the_journal(session: Path) -> None:
-    assert ResumeTokens(8, Continuation(session).handback).allocate_connection() == ANN + 1
+    assert ResumeTokens(8, PastSession(session).handback).allocate_connection() == ANN + 1
 
 
 @pytest.mark.parametrize("fault", ["another session", "open to others", "damaged", "nothing"])
 def test_a_note_that_cannot_be_trusted_is_not_used(session: Path, fault: str) -> None:
-    path = note_path(session)
+    path = find_note_path(session)
     if fault != "nothing":
         note = ResumeNote("s2" if fault == "another session" else "s1", Listening("9.9.9.9"))
         path.write_bytes(b"\xc1" if fault == "damaged" else msgspec.msgpack.encode(note))
@@ -392,7 +400,7 @@ def test_a_note_that_cannot_be_trusted_is_not_used(session: Path, fault: str) ->
 
 
 def test_a_recording_of_another_name_has_a_note_of_its_own() -> None:
-    names = [note_path(Path(name)).name for name in ("session.rrd", "session.resume3.part2.rrd", "b.resume2.rrd")]
+    names = [find_note_path(Path(name)).name for name in ("session.rrd", "session.resume3.part2.rrd", "b.resume2.rrd")]
     assert names == ["resume.tokens", "resume.tokens", "b.resume.tokens"]
 
 
@@ -400,13 +408,13 @@ def test_a_recording_of_another_name_has_a_note_of_its_own() -> None:
 
 
 def test_session_time_goes_on_with_the_clock_of_this_boot(session: Path) -> None:
-    past = Continuation(session)
+    past = PastSession(session)
     assert past.origin_ns == past.header.origin_ns
 
 
 @pytest.mark.parametrize("header", [{"boot_id": "another"}, {"boot_id": ""}, {"origin_ns": 2**62}])
 def test_after_a_reboot_session_time_goes_on_above_what_anybody_saw(tmp_path: Path, header: dict[str, object]) -> None:
-    past = Continuation(recorded(tmp_path / "session.rrd", **header))  # type: ignore[arg-type]
+    past = PastSession(recorded(tmp_path / "session.rrd", **header))  # type: ignore[arg-type]
     now_ns = time.monotonic_ns() - past.origin_ns
     assert LAST_NS + MARGIN_NS <= now_ns < LAST_NS + 2 * MARGIN_NS
 
@@ -471,7 +479,7 @@ class Journal:
 @pytest.fixture
 def gone_on(session: Path) -> tuple[Stepper, Front, Path]:
     """Forty steps after five seconds, recorded beside the first recording."""
-    past = Continuation(session)
+    past = PastSession(session)
     now_ns = [LAST_NS + 5_000_000_000]
 
     def clock() -> int:
@@ -508,8 +516,8 @@ def test_people_keep_what_they_had_and_robots_hold(gone_on: tuple[Stepper, Front
     lease = stepper.ledger.mirror.leases["left"]
     assert lease.holder == "p1"
     assert lease.expires_ns > LAST_NS + 5_000_000_000, "the grace period begins anew"
-    (ann,) = stepper.ledger.participants()
-    assert (ann.name, ann.connected, ann.robots) == ("ann", False, ("left",))
+    (ann,) = stepper.ledger.make_participant_reports(0)
+    assert (ann.name, ann.connected, ann.holds) == ("ann", False, ("left",))
     assert all(command.kind == CommandKind.HOLD for _, decision in front.decisions for command in decision.commands)
     assert stepper.core.world.view().tick == STEPS + 39, "the first step has no tick: it may be paused"
 
@@ -522,7 +530,7 @@ def test_both_recordings_verify_and_the_second_says_what_it_continues(gone_on: t
     assert report.steps == 40
     assert report.last_step == STEPS + 39
     assert verify_recording(path.with_name("session.rrd")).ok
-    past = Continuation(path)  # and on again
+    past = PastSession(path)  # and on again
     assert (past.file, past.step) == ("session.resume2.rrd", STEPS + 39)
     past.close()
 

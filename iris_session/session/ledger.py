@@ -1,0 +1,189 @@
+"""`SessionLedger`: who is in a session, what they hold and what happened, from the authority's own decisions.
+
+It needs no snapshot and no question to the pure core. Reports for people and clients are made of it in `status`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Final
+
+import msgspec
+
+from iris_session.protocol.common import Applied
+from iris_session.protocol.entries import HOST
+from iris_session.protocol.server_messages import (
+    AlignmentChanged,
+    Event,
+    Handover,
+    ParticipantChanged,
+    ParticipantJoined,
+    ParticipantLeft,
+    SamplesRejected,
+    Snapshot,
+)
+from iris_session.protocol.session_mirror import SessionMirror
+from iris_session.protocol.status import AlignmentReport, ParticipantReport, Quantiles, quantiles
+from iris_session.protocol.steps import ControlStatus, Decision
+
+#: Events kept for display; the recording has them all.
+RECENT_EVENTS: Final = 200
+#: Samples per robot whose wait for a step is remembered: two to three seconds of one device.
+RECEIVE_TO_STEP: Final = 200
+
+
+class HandoverStatus(msgspec.Struct, frozen=True):
+    """One handover: the robots or hands, session time of its end [s], and how long both held the object [s]."""
+
+    object: str
+    giver: str
+    receiver: str
+    at_s: float
+    duration_s: float
+
+
+class SessionLedger:
+    """Roster, leases and handovers of a session, from the authority's decisions.
+
+    Attributes:
+        mirror: Participants and leases, as a client keeps them.
+        handovers: All handovers since the session began.
+        recent: The newest events, at most `RECENT_EVENTS`.
+        applied: By robot, the newest sample that moved it.
+        connections: Participant id by connection number.
+        rejected: Rejected samples by (participant, device, reason), at most a second old.
+    """
+
+    def __init__(self) -> None:
+        self.mirror = SessionMirror()
+        self.mirror.apply_snapshot(Snapshot(0, 0, 1, 0, "", 0, 0.0, 0, participants=(), leases=()))
+        self.handovers: list[HandoverStatus] = []
+        self.recent: deque[Event] = deque(maxlen=RECENT_EVENTS)
+        self.applied: dict[str, Applied] = {}
+        self.connections: dict[int, str] = {}
+        self.rejected: dict[tuple[str, str, str], int] = {}
+        # Session time since when a participant has its alignment, or lost it to a jump of its tracking frame.
+        self._aligned_ns: dict[str, int] = {}
+        self._void_ns: dict[str, int] = {}
+        self._receive_to_step_ns: dict[str, deque[int]] = {}
+
+    def apply_step(self, decision: Decision, status: tuple[ControlStatus, ...]) -> None:
+        """Apply the decision and the control status of one step."""
+        for admitted in decision.admitted:
+            self.connections[admitted.connection] = admitted.participant_id
+        for dropped in decision.dropped:
+            self.connections.pop(dropped.connection, None)
+        for event in decision.events:
+            self._note_alignment(event)
+            self.mirror.apply_event(event)
+            self.recent.append(event)
+            body = event.body
+            if isinstance(body, SamplesRejected):
+                self.rejected[body.participant, body.device, body.reason] = body.count
+            if isinstance(body, Handover):
+                self.handovers.append(
+                    HandoverStatus(
+                        body.object, body.giver, body.receiver, event.session_time * 1e-9, body.duration_ns * 1e-9
+                    )
+                )
+        for outgoing in decision.outgoing:
+            if outgoing.connection == HOST and isinstance(outgoing.message, Snapshot):
+                self._apply_snapshot(outgoing.message)
+        for robot in status:
+            if robot.applied is not None and robot.applied is not self.applied.get(robot.robot):
+                self._note_applied(robot.robot, robot.applied)
+
+    def _apply_snapshot(self, snapshot: Snapshot) -> None:
+        """Start from the snapshot of a resumed session."""
+        self.mirror.apply_snapshot(snapshot)
+        for info in snapshot.participants:
+            if info.alignment is not None:
+                self._aligned_ns.setdefault(info.id, snapshot.session_time)
+
+    def _note_applied(self, robot: str, applied: Applied) -> None:
+        before = self.applied.get(robot)
+        self.applied[robot] = applied
+        if before is None or applied.step_ns != before.step_ns:
+            delays = self._receive_to_step_ns.get(robot)
+            if delays is None:
+                delays = self._receive_to_step_ns[robot] = deque(maxlen=RECEIVE_TO_STEP)
+            delays.append(applied.step_ns - applied.receive_ns)
+
+    def _note_alignment(self, event: Event) -> None:
+        """Note since when alignments hold, which events do not say. Call before the mirror applies `event`."""
+        body = event.body
+        if isinstance(body, AlignmentChanged):
+            self._aligned_ns[body.participant] = event.session_time
+            self._void_ns.pop(body.participant, None)
+        elif isinstance(body, ParticipantJoined | ParticipantChanged):
+            info = body.participant
+            known = self.mirror.participants.get(info.id)
+            if info.alignment is not None:
+                self._aligned_ns.setdefault(info.id, event.session_time)
+            elif known is not None and known.alignment is not None:
+                self._aligned_ns.pop(info.id, None)
+                self._void_ns[info.id] = event.session_time
+        elif isinstance(body, ParticipantLeft) and not body.grace:
+            self._aligned_ns.pop(body.participant, None)
+            self._void_ns.pop(body.participant, None)
+            self.rejected = {key: n for key, n in self.rejected.items() if key[0] != body.participant}
+
+    def names_by_id(self) -> dict[str, str]:
+        """Return the name of each participant by id."""
+        return {info.id: info.name for info in self.mirror.participants.values()}
+
+    def _list_held(self) -> dict[str, list[str]]:
+        """Return the robots and objects that each participant holds, by participant id."""
+        held: dict[str, list[str]] = {}
+        for lease in self.mirror.leases.values():
+            for holder in lease.sub_holders or ((lease.holder,) if lease.holder else ()):
+                held.setdefault(holder, []).append(lease.target)
+        return held
+
+    def make_participant_reports(
+        self, now_ns: int, alignments: Mapping[str, AlignmentReport] = MappingProxyType({})
+    ) -> tuple[ParticipantReport, ...]:
+        """Return the authority's part of the participants in a `StatusReport`.
+
+        Args:
+            now_ns: Session time.
+            alignments: By participant id.
+        """
+        held = self._list_held()
+        waits: dict[str, list[str]] = {}
+        for lease in self.mirror.leases.values():
+            for waiting in lease.queue:
+                waits.setdefault(waiting, []).append(lease.target)
+        rejected: dict[str, dict[str, int]] = {}
+        for (participant, _, reason), count in self.rejected.items():
+            counts = rejected.setdefault(participant, {})
+            counts[reason] = counts.get(reason, 0) + count
+        return tuple(
+            ParticipantReport(
+                info.id,
+                info.name,
+                info.role,
+                info.connected,
+                worn=info.worn,
+                alignment="none" if info.alignment is None else info.alignment.kind,
+                alignment_age_ns=now_ns - self._aligned_ns[info.id] if info.id in self._aligned_ns else -1,
+                alignment_void_ns=now_ns - self._void_ns[info.id] if info.id in self._void_ns else -1,
+                alignment_error_m=0.0 if info.alignment is None else info.alignment.error_at_robot_m,
+                tracking_epoch=info.tracking_epoch,
+                holds=tuple(held.get(info.id, ())),
+                waits_for=tuple(waits.get(info.id, ())),
+                rejected=rejected.get(info.id, {}),
+                alignment_report=alignments.get(info.id),
+            )
+            for info in self.mirror.participants.values()
+        )
+
+    def receive_to_step_quantiles(self, robot: str) -> Quantiles | None:
+        """Return how long the newest samples of a robot waited for the step that applied them."""
+        return quantiles(self._receive_to_step_ns.get(robot, ()))
+
+    def compute_input_to_ctrl_ms(self) -> dict[str, float]:
+        """Return by robot the age [ms] of the newest applied sample when its step began."""
+        return {name: (a.step_ns - a.capture_ns) * 1e-6 for name, a in self.applied.items()}
