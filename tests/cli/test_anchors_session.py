@@ -37,7 +37,7 @@ from iris_session.protocol.status import (
     ParticipantReport,
     StatusReport,
 )
-from iris_session.recording import Recording, read_alignment_history
+from iris_session.recording import Recording, TrackingFrame, read_alignment_history
 from iris_session.session.config import load_anchors
 from tests.anchors.worlds import headset, shifted
 from tests.client.harness import LiveSession
