@@ -25,6 +25,7 @@ from iris_session.client.assets import ClientAssets
 from iris_session.client.core.arrival_meter import ArrivalMeter
 from iris_session.client.core.connection import ClientConnection, InboxMessage
 from iris_session.client.core.outbox import encode_checked
+from iris_session.client.core.samples import SampleBuilder
 from iris_session.client.core.state_stream import SceneState
 from iris_session.client.core.status import ConnectionPhase
 from iris_session.client.endpoint_resolver import SessionJoiner, parse_connect_request
@@ -64,7 +65,7 @@ from iris_session.protocol.client_messages import (
     TrackingEpoch,
 )
 from iris_session.protocol.common import Alignment, Denial, Lease, Target
-from iris_session.protocol.names import AlignmentKind, AnchorKind, Role, SampleKind, TargetKind
+from iris_session.protocol.names import AlignmentKind, AnchorKind, Role, TargetKind
 from iris_session.protocol.server_messages import Event, Feedback, Reply
 from iris_session.protocol.session_mirror import MissedEvents, SessionMirror
 from iris_session.protocol.status import StatusReport
@@ -176,7 +177,7 @@ class Client:
         self.on_feedback = on_feedback
         self.on_denial = on_denial
         self.feedback: dict[str, Feedback] = {}
-        self._seq: dict[str, int] = {}
+        self._samples = SampleBuilder(self.connection)
         self._arrivals = ArrivalMeter()
         self._generation = 0
         self._sockets = ClientSockets()
@@ -1012,52 +1013,22 @@ class Client:
         for name, length in ARRAYS.items():
             if fields.get(name) is not None:
                 fields[name] = to_numbers(name, fields[name], length)
-        if kind is None:
-            kind = (
-                SampleKind.JOINTS if fields.get("q") else SampleKind.TWIST if fields.get("twist") else SampleKind.POSE
-            )
         fields = {name: to_python_scalar(value) for name, value in fields.items()}
         own_pose = None if pose is None else to_pose("pose", pose)
+        robots, objects = to_names("robots", robots), to_names("objects", objects)
         with self._lock:
-            targets = [*self._held_targets(robots, TargetKind.ROBOT), *self._held_targets(objects, TargetKind.OBJECT)]
-            seq = self._seq[device] = self._seq.get(device, 0) + 1
-            alignment = self.alignment
-            return Sample(
-                device=device,
-                kind=kind,
-                seq=seq,
+            return self._samples.make_sample(
+                device,
+                own_pose,
                 capture_ns=self.session_now_ns() if capture_ns is None else capture_ns,
-                scene_epoch=self.connection.mirror.scene_epoch,
-                tracking_epoch=self.connection.tracking_epoch if tracking_epoch is None else tracking_epoch,
-                alignment_version=0 if alignment is None else alignment.version,
-                targets=tuple(targets),
-                worn=fields.pop("worn", self.connection.worn),
-                pose=own_pose,
+                robots=robots,
+                objects=objects,
+                kind=kind,
+                tracking_epoch=tracking_epoch,
                 **fields,
             )
 
     # --- inside -------------------------------------------------------------------------------------------------------
-
-    def _held_targets(self, names: str | Iterable[str], kind: str) -> list[Target]:
-        targets = []
-        for name in to_names(f"{kind}s", names):
-            token = self.connection.lease_version(name)
-            if token is not None:
-                targets.append(Target(name, token, kind))
-                continue
-            known = self._known_names(kind)
-            if known and name not in known:
-                raise InvalidMessageError(f"{kind}s: no {kind} {name!r} in this session, it has: {', '.join(known)}")
-            self.connection.counters.samples_without_lease += 1
-        return targets
-
-    def _known_names(self, kind: str) -> list[str]:
-        """Return the names of the session's robots or objects; none before the first snapshot."""
-        mirror = self.connection.mirror
-        if kind == TargetKind.ROBOT:
-            return list(mirror.robots)
-        leased = [lease.target for lease in mirror.leases.values() if lease.kind == kind]
-        return list(dict.fromkeys([*leased, *(body.name for body in mirror.bodies if body.object)]))
 
     def _add_holder_name(self, denial: Denial) -> Denial:
         holder = self.connection.mirror.participants.get(denial.holder)

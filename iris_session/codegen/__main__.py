@@ -1,6 +1,6 @@
 """Writes the generated files of a checkout, or checks that they are current.
 
-python -m iris_session.codegen {csharp,typescript,golden,scene,docs,all} [--check]
+python -m iris_session.codegen {csharp,typescript,golden,scene,conversations,docs,all} [--check]
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from iris_session.codegen import csharp, golden, scene_golden, tables, typescript
+from iris_session.codegen import conversations, csharp, golden, scene_golden, tables, typescript
 
 _DOCUMENT: Final = "docs/protocol.md"
 
@@ -33,6 +33,7 @@ TARGETS: Final[dict[str, tuple[str, Callable[[str], str]]]] = {
     "typescript": ("web_client/src/protocol/messages.g.ts", lambda _: typescript.typescript()),
     "golden": ("docs/protocol/golden.json", lambda _: golden.golden()),
     "scene": ("docs/protocol/scene.json", lambda _: scene_golden.scene_golden()),
+    "conversations": ("docs/protocol/conversations.json", lambda _: conversations.render_conversations()),
     "docs": (_DOCUMENT, document),
 }
 
