@@ -109,7 +109,7 @@ class DisconnectHandler:
     def remove(self, connection: FrontConnection, reason: str) -> None:
         """Remove a connection that the authority has ended. Those behind it are disconnected with it."""
         for one in self._connections.list_behind(connection):
-            text = f"the session let this connection go: its gateway has left ({reason})"
+            text = f"the session closed this connection: its gateway has left ({reason})"
             self._outbox.send(one, ProtocolFault(FaultCode.DROPPED, text, "gateway"))
             self.report_lost(one, "gateway")
         self._remove_state(connection, reason)

@@ -128,7 +128,7 @@ class Downlink:
                 self._revocation.disconnect(connection, text, heard_ns, dropped.reason)
                 self._disconnects.remove(connection, dropped.reason)
             elif connection is not None:
-                text = f"the session let this connection go: {dropped.reason}"
+                text = f"the session closed this connection: {dropped.reason}"
                 self._outbox.send(connection, ProtocolFault(FaultCode.DROPPED, text, dropped.reason))
                 self._disconnects.remove(connection, dropped.reason)
             if dropped.key_id:

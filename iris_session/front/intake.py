@@ -56,10 +56,9 @@ class _RawEnvelope(msgspec.Struct, array_like=True):
     message: msgspec.Raw
 
 
-class _RawSamples(msgspec.Struct, array_like=True):
+class _RawSamples(msgspec.Struct):
     """`Samples` with each sample as received."""
 
-    tag: str
     samples: list[msgspec.Raw]
 
 

@@ -48,7 +48,7 @@ MAX_ADDRESSES: Final = 1024
 RETRY_S: Final = 1.0
 REVOKED: Final = "this key was revoked just now"
 BUSY: Final = "the list of keys is busy"
-SHUT_OUT: Final = "too many wrong codes from this address"
+TOO_MANY_WRONG: Final = "too many wrong codes from this address"
 
 
 class _PendingAttempt(NamedTuple):
@@ -94,13 +94,13 @@ class PairingService:
     def _read_codes(self, home: KeyHome, key: KeyPair) -> None:
         """Read the join codes. Codes that cannot be read are tried again a second later, and logged once."""
         try:
-            self._codes, unread = home.join_codes.list_open(key.fingerprint), ""
+            self._codes, read_error = home.join_codes.list_open(key.fingerprint), ""
         except KeysError as error:
-            self._codes, unread = (), str(error)
+            self._codes, read_error = (), str(error)
             self._retry_s = time.monotonic() + RETRY_S
-            if unread != self._read_error:
+            if read_error != self._read_error:
                 log.warning("pairing does not work: %s", error)
-        self._read_error = unread
+        self._read_error = read_error
 
     def handle_pair(self, route: Route, peer: Peer, pair: Pair, now_ns: int) -> None:
         """Handle a `Pair`, of a key that is on the list or is not."""
@@ -109,13 +109,13 @@ class PairingService:
         known = self._keyring.find_key(peer.user_id)
         if known is not None:
             key = known.key
-        taken = self._allow_address(address, now_ns)
+        allowed = self._allow_address(address, now_ns)
         if self._has_exhausted_attempts(address, now_ns):  # before the limits that clients share
             self._audit.record(AuditKind.CODE_REFUSED, now_ns, address=address, detail="too many wrong codes")
             self._drops.count("pair_shut_out")
-            if taken:
-                self._refuse(route, SHUT_OUT, "wait ten minutes")
-        elif not taken or not self._pairs.take(now_ns) or len(self._pending) >= MAX_PENDING:
+            if allowed:
+                self._refuse(route, TOO_MANY_WRONG, "wait ten minutes")
+        elif not allowed or not self._pairs.take(now_ns) or len(self._pending) >= MAX_PENDING:
             self._drops.count("pair_rate")
             if self._refusals.take(now_ns):
                 advice = "try again in a second"
@@ -130,8 +130,8 @@ class PairingService:
             self._refuse(route, "this session takes its keys from a folder", "ask for your public key to be put there")
         elif compute_fingerprint(decode_key(key)) in self._keyring.pending_revocations:
             self._refuse(route, REVOKED, "ask for another join code")
-        elif (again := self._find_earlier_answer(key, pair)) is not None:
-            self._outbox.send_to_route(route, again)
+        elif (earlier := self._find_earlier_answer(key, pair)) is not None:
+            self._outbox.send_to_route(route, earlier)
         elif not self.has_open_code:
             mark = compute_fingerprint(decode_key(key))
             self._audit.record(AuditKind.CODE_REFUSED, now_ns, subject=mark, name=pair.name, address=address)
@@ -142,7 +142,7 @@ class PairingService:
     def _find_earlier_answer(self, key: str, pair: Pair) -> Paired | None:
         """Return the answer to an attempt that succeeded and is repeated, because the first answer was lost or late.
 
-        `None` for another attempt, and for a key that has been taken off the list since.
+        `None` for another attempt, and for a key that has been allowed off the list since.
         """
         mark = compute_fingerprint(decode_key(key))
         proof, answer = self._recently_paired.get(mark, (b"", None))
@@ -172,7 +172,7 @@ class PairingService:
         elif compute_fingerprint(decode_key(one.key)) in self._keyring.pending_revocations:
             self._refuse(one.route, REVOKED, "ask for another join code")
         elif self._has_exhausted_attempts(one.address, now_ns):
-            self._refuse(one.route, SHUT_OUT, "wait ten minutes")
+            self._refuse(one.route, TOO_MANY_WRONG, "wait ten minutes")
         else:
             self._pending.append(one)
 

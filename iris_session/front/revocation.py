@@ -133,7 +133,7 @@ class RevocationService:
     def _disconnect_role(self, connection: FrontConnection, now_ns: int) -> None:
         participant, role = connection.participant_id, connection.hello.role
         if connection.gateway:
-            text = f"the session let this connection go: its gateway may speak for no {role} any more"
+            text = f"the session closed this connection: its gateway may speak for no {role} any more"
             self._outbox.send(connection, ProtocolFault(FaultCode.DROPPED, text, "role"))
         self._disconnects.report_lost(connection, "role")
         if not connection.gateway:

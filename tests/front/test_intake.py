@@ -1,7 +1,8 @@
-"""Intake and admission without a network: who is taken for whom, what is answered, what reaches the authority."""
+"""Intake and admission without a network: identity of peers, answers, entries, and samples for the recorder."""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator
 
 import msgspec
@@ -19,11 +20,16 @@ from iris_session.protocol.client_messages import (
     Heartbeat,
     Hello,
     Marker,
+    Observation,
+    Sample,
+    Samples,
     TrackingEpoch,
     envelope,
 )
 from iris_session.protocol.codec import decode_server, encode_client
+from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.entries import Audit, Entry, Join
+from iris_session.protocol.limits import LIMITS
 from iris_session.protocol.server_messages import Message, ProtocolFault, Refused, Reply, Welcome
 from iris_session.protocol.steps import Admitted
 from tests.front.fakes import make_alignment, make_context, make_status
@@ -35,9 +41,9 @@ HELLO = Hello("operator", "Ann", secret=b"s" * 16)
 
 
 class IntakeRig:
-    """Intake and admission with an outbox that keeps what it is given."""
+    """Intake and admission with an outbox that keeps sent messages. `recorder`: endpoint of raw samples."""
 
-    def __init__(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], recorder: str = "") -> None:
         self.now_ns = 1_000_000_000
         self.sent: list[tuple[bytes, Message, list[bytes]]] = []
         front = make_context(self, lambda: self.now_ns)
@@ -52,7 +58,7 @@ class IntakeRig:
             PairingService(front),
             make_status(front, alignment),
             alignment,
-            RawFeed(context, "", front.drops),
+            RawFeed(context, recorder, front.drops),
         )
 
     def send_multipart(self, frames: list[bytes], _flags: int) -> None:
@@ -282,3 +288,55 @@ def test_who_is_above_the_limits_for_seconds_is_named_as_a_flood(rig: IntakeRig)
             rig.take(Marker(1, "x"), epoch=epoch)
     (flood,) = floods()
     assert (flood.kind, flood.subject, flood.name, flood.detail) == ("flood", "p1", "Ann", "marker")
+
+
+DEVICES = ("head", "controller/left", "controller/right")
+
+
+def together(seq: int) -> Samples:
+    return Samples(tuple(Sample(device, "pose", seq, 0, 1, 0, 0, pose=IDENTITY) for device in DEVICES))
+
+
+def test_each_sample_becomes_an_entry_of_its_own() -> None:
+    with zmq.Context() as context:
+        rig = IntakeRig(context)
+        epoch = rig.join().connection_epoch
+        rig.take(together(7), epoch=epoch)
+        entries = rig.entries()
+    assert [e.message for e in entries] == list(together(7).samples)
+    assert {(e.connection, e.connection_epoch) for e in entries} == {(epoch, epoch)}
+
+
+def test_a_flood_is_cut_at_the_rate_of_single_samples_and_counted() -> None:
+    with zmq.Context() as context:
+        rig = IntakeRig(context)
+        epoch = rig.join().connection_epoch
+        for seq in range(LIMITS[Samples].burst):
+            rig.take(together(seq), epoch=epoch)
+    assert rig.drops.by_reason["rate"] == 3 * LIMITS[Samples].burst - LIMITS[Sample].burst
+
+
+def test_samples_and_observations_are_recorded_as_received() -> None:
+    """Bytes that mean the same, here a float of 32 bits, are not encoded again."""
+    sample = Sample("head", "pose", 7, 0, 1, 0, 0, pose=IDENTITY, gripper=0.5)
+    observation = Observation("table", "qr", IDENTITY, 1000, 1, 0)
+    canonical = msgspec.msgpack.encode(sample)
+    double, single = b"\xcb" + struct.pack(">d", 0.5), b"\xca" + struct.pack(">f", 0.5)
+    assert double in canonical
+    with zmq.Context() as context, context.socket(zmq.PULL) as recorder:
+        recorder.bind("inproc://recorder")
+        rig = IntakeRig(context, "inproc://recorder")
+        epoch = rig.join().connection_epoch
+        rig.take(sample, epoch=epoch)
+        rig.take(together(8), epoch=epoch)
+        rig.take(observation, epoch=epoch)
+        frame = encode_client(envelope(sample, epoch)).replace(double, single)
+        rig.intake.handle_message(ROUTE, ANN, memoryview(frame), 0)
+        recorded = []
+        while recorder.poll(0):
+            connection, receive_ns, data = msgspec.msgpack.decode(recorder.recv())
+            assert (connection, receive_ns) == (epoch, rig.now_ns)
+            recorded.append(data)
+        rig.intake._raw._socket.close(linger=0)  # type: ignore[union-attr]
+    several = [msgspec.msgpack.encode(one) for one in together(8).samples]
+    assert recorded == [canonical, *several, msgspec.msgpack.encode(observation), canonical.replace(double, single)]
