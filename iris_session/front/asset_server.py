@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 
 import zmq
 
-from iris_session.assets.chunk_scheduler import ADVICE, AssetHub, Reader
+from iris_session.assets.chunk_scheduler import ADVICE, ChunkReader, ChunkScheduler
 from iris_session.assets.store import ServedAssets
 from iris_session.front.connection_guard import ChannelGuard
 from iris_session.link.config import MILLISECOND, FrontConfig
@@ -113,7 +113,7 @@ class AssetServer:
         self._now_ns = now_ns
         self._encrypted = sockets.zap is not None
         self._files = ServedAssets()
-        self._scheduler = AssetHub(self._files.size)
+        self._scheduler = ChunkScheduler(self._files.size)
         self._access = self._applied = AssetAccess()
         self._counts = {"bytes": 0, "chunks": 0, "requests": 0}
         self._reasons: dict[str, int] = {}
@@ -135,7 +135,7 @@ class AssetServer:
             counts = self._counts
             reasons = dict(self._reasons)
             return AssetCounters(
-                counts["bytes"], counts["chunks"], counts["requests"], self._scheduler.waiting, reasons
+                counts["bytes"], counts["chunks"], counts["requests"], self._scheduler.n_waiting, reasons
             )
 
     def close(self) -> None:
@@ -158,7 +158,7 @@ class AssetServer:
     def _recover(self, error: Exception) -> None:
         """Count a fault, log it unless it repeats the last one, and close all connections: clients request again by new
         ones."""
-        for descriptor in self._scheduler.begin_anew():
+        for descriptor in self._scheduler.clear():
             self._guard.evict(descriptor, "")
         self._count_reasons(["assets_fault"])
         if repr(error) != self._reported_fault:
@@ -182,7 +182,7 @@ class AssetServer:
             self._send_chunks()
 
     def _poll_timeout_ms(self) -> int:
-        due_ns = self._scheduler.next_turn_ns()
+        due_ns = self._scheduler.next_due_ns()
         if due_ns is None:
             return IDLE_MS
         now_ns = self._now_ns()
@@ -197,7 +197,7 @@ class AssetServer:
         if table.folders != self._applied.folders:
             self._files.serve(table.folders)
         self._applied = table
-        for descriptor in self._scheduler.allow(table.clients):
+        for descriptor in self._scheduler.set_listeners(table.clients):
             self._guard.evict(descriptor, "")
 
     def _authenticate(self, request: list[bytes]) -> str:
@@ -209,7 +209,7 @@ class AssetServer:
 
     def _read_connection_events(self) -> None:
         for descriptor in self._guard.read_events(self._now_ns()):
-            self._scheduler.left(descriptor)
+            self._scheduler.remove_descriptor(descriptor)
 
     def _count_reasons(self, reasons: Iterable[str]) -> None:
         for reason in filter(None, reasons):
@@ -255,7 +255,7 @@ class AssetServer:
             reason = AssetRefusal.MALFORMED
         else:
             request_id, address = request.request_id, request.address
-            reason = self._scheduler.ask(route, descriptor, user, request, now_ns)
+            reason = self._scheduler.request(route, descriptor, user, request, now_ns)
         if reason:
             self._queue_refusal(route, request_id, address, reason)
         return bool(reason)
@@ -263,8 +263,8 @@ class AssetServer:
     def _queue_refusal(self, route: bytes, request_id: int, address: str, reason: str) -> None:
         """Refuse a request, at once or after the reader's pending chunks."""
         self._count_reasons([f"assets_{reason}"])
-        if self._scheduler.queues(route) or not self._send_refusal(route, _refusal(request_id, address, reason)):
-            kept = self._scheduler.refuse(route, request_id, address, reason)
+        if self._scheduler.has_pending(route) or not self._send_refusal(route, _refusal(request_id, address, reason)):
+            kept = self._scheduler.queue_refusal(route, request_id, address, reason)
             self._count_reasons([] if kept else ["assets_refusal_unsent"])
 
     def _send_refusal(self, route: bytes, refusal: bytes) -> bool:
@@ -280,34 +280,34 @@ class AssetServer:
     def _send_chunks(self) -> None:
         late = self._now_ns() < self.late_until_ns
         for _ in range(1 if late else CHUNKS):
-            reader = self._scheduler.turn(self._now_ns())
+            reader = self._scheduler.next_reader(self._now_ns())
             if reader is None:
                 return
             self._send_chunk(reader)
 
-    def _send_chunk(self, reader: Reader) -> None:
-        wanted = reader.queue[0]
-        chunk = None if wanted.refused else self._files.chunk(wanted.address, wanted.offset, wanted.length)
+    def _send_chunk(self, reader: ChunkReader) -> None:
+        pending = reader.queue[0]
+        chunk = None if pending.refusal else self._files.chunk(pending.address, pending.offset, pending.length)
         try:
             if chunk is None:  # or the scene changed twice since the request
-                reason = wanted.refused or AssetRefusal.UNKNOWN
-                refusal = _refusal(wanted.request_id, wanted.address, reason)
+                reason = pending.refusal or AssetRefusal.UNKNOWN
+                refusal = _refusal(pending.request_id, pending.address, reason)
                 self._socket.send_multipart((reader.route, refusal), _DONTWAIT)
             else:
-                head = AssetChunk(PROTOCOL_VERSION, wanted.request_id, wanted.address, wanted.offset, wanted.total)
+                head = AssetChunk(PROTOCOL_VERSION, pending.request_id, pending.address, pending.offset, pending.total)
                 self._socket.send(reader.route, _MORE)
                 self._socket.send(encode_asset_header(head), _MORE)
                 self._socket.send(chunk, _DONTWAIT, copy=False)
         except zmq.Again:
-            self._scheduler.full(reader, self._now_ns())
+            self._scheduler.defer(reader, self._now_ns())
             return
         except zmq.ZMQError:  # the connection has ended; its monitor will report that
-            self._scheduler.forget(reader.route)
+            self._scheduler.remove(reader.route)
             return
-        self._scheduler.sent(reader)
+        self._scheduler.confirm_sent(reader)
         if chunk is not None:
             with self._lock:
-                self._counts["bytes"] += wanted.length
+                self._counts["bytes"] += pending.length
                 self._counts["chunks"] += 1
 
 

@@ -1,7 +1,7 @@
 """Scenes to share: specifications with content-addressed assets, their encodings, levels of detail.
 
 `AssetStore` keeps assets; `decode_mesh`, `decode_image`, `decode_arrays` read them (layouts in docs/scene.md).
-`mujoco_scene.parse_mujoco` makes a scene of a MuJoCo model, `compose.SceneBuilder` one of shapes and files;
+`mujoco_scene.parse_mujoco` makes a scene of a MuJoCo model, `builder.SceneBuilder` one of shapes and files;
 `budget.choose_levels` fits it to what a client draws. Only modules named `mujoco_*` import MuJoCo.
 """
 

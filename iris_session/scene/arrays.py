@@ -225,7 +225,7 @@ def _apply_scale(info: ArrayInfo, stored: Array) -> Array:
 
 
 def to_array(values: Any, what: str) -> NDArray[Any]:
-    """What a caller gave, as an array. Raises `SceneBuildError` for what is none, as rows of different lengths."""
+    """Return an argument as an array. Raises `SceneBuildError` for others, such as rows of different lengths."""
     try:
         return np.asarray(values)
     except (TypeError, ValueError) as error:

@@ -72,7 +72,7 @@ MAX_COORDINATE_M: Final = 1e6
 def assemble_scene(
     world: SceneContent, environment: Environment | None, store: AssetStore, options: EncodeOptions | None, threads: int
 ) -> ComposedScene:
-    """Builds it all. Raises `SceneBuildError`."""
+    """Build the specification and its assets. Raises `SceneBuildError`."""
     builder = AssetBuilder(store, options, threads)
     ids, bodies = _build_bodies(world)
     placed = [split_rigid(item.matrix) for item in world.items]
@@ -126,7 +126,7 @@ def assemble_scene(
 
 
 def _encode_checked(spec: SceneSpec) -> bytes:
-    """The bytes of the specification. Raises `SceneBuildError` for one that no client would read, or draw."""
+    """Encode the specification. Raises `SceneBuildError` for one that clients could not read or draw."""
     try:
         check_scene(spec)
         encoded = encode_scene(spec)
@@ -142,7 +142,7 @@ def _encode_checked(spec: SceneSpec) -> bytes:
 
 
 def _build_bodies(world: SceneContent) -> tuple[dict[int, int], tuple[Body, ...]]:
-    """Ids by the places of things (-1: the world), and the bodies: moving ones first."""
+    """Return ids by index of the body (-1: the world), and the bodies, moving ones first."""
     order = sorted(range(len(world.bodies)), key=lambda k: not world.bodies[k].moving)
     ids = {-1: 0, **{place: number for number, place in enumerate(order, start=1)}}
     bodies = [Body(0, "world", -1, IDENTITY, IDENTITY, moving=False)]
@@ -162,7 +162,7 @@ def _build_bodies(world: SceneContent) -> tuple[dict[int, int], tuple[Body, ...]
 def _build_meshes(
     items: Sequence[DrawnItem], rests: Sequence[Matrix | None], builder: AssetBuilder
 ) -> tuple[tuple[Mesh, ...], list[int]]:
-    """Meshes, and for every item which of them it wears, -1 for a shape. What is equal to the bit is one."""
+    """Return meshes, and the mesh of every item, -1 for a shape. Meshes that are equal to the bit are one."""
     pieces: dict[tuple[object, ...], tuple[str, MeshArrays, Matrix | None]] = {}
     keys: list[tuple[object, ...] | None] = []
     for item, rest in zip(items, rests, strict=True):
@@ -212,7 +212,7 @@ def _mesh_work(builder: AssetBuilder, mesh: MeshArrays, rest: Matrix | None) -> 
 
 
 def _check_reach(mesh: MeshArrays) -> MeshArrays:
-    """Raises `SceneBuildError` for coordinates that nobody can draw."""
+    """Return `mesh`. Raises `SceneBuildError` for coordinates that cannot be drawn."""
     if not np.abs(mesh.position).max(initial=0.0) <= MAX_COORDINATE_M:  # NaN is not
         raise SceneBuildError(
             f"a mesh reaches farther than {MAX_COORDINATE_M:,.0f} m from its origin: scale it to metres, or move it"
@@ -228,7 +228,7 @@ def _build_geometry(item: DrawnItem, mesh: int, meshes: Sequence[Mesh]) -> Geome
     return Geometry(GeometryKind.MESH, half, mesh)
 
 
-# --- looks ------------------------------------------------------------------------------------------------------------
+# --- materials --------------------------------------------------------------------------------------------------------
 
 
 def _build_materials(
@@ -275,7 +275,7 @@ def _to_material(look: Appearance, uses: tuple[TextureUse, ...]) -> Material:
     )
 
 
-# --- what bends, and what is around -----------------------------------------------------------------------------------
+# --- deformables and environment --------------------------------------------------------------------------------------
 
 
 def _build_deformables(
@@ -334,7 +334,7 @@ def _default_environment(spec: SceneSpec, sources: Sequence[DeformableSource]) -
 
 @dataclass(frozen=True)
 class ComposedBody:
-    """A body to be. `parent`: an earlier thing by its place, -1 for the world. `pose`: T_world_body at first."""
+    """A body of the scene. `parent`: index of an earlier body, -1 for the world. `pose`: initial T_world_body."""
 
     name: str
     parent: int
@@ -344,7 +344,7 @@ class ComposedBody:
 
 @dataclass(frozen=True, eq=False)
 class ComposedDeformable:
-    """A deformable to be; `uv` (n, 2) of the vertices."""
+    """A deformable of the scene; `uv` (n, 2) of the vertices."""
 
     name: str
     vertices: NDArray[np.float32]
@@ -357,7 +357,7 @@ class ComposedDeformable:
 
 @dataclass
 class SceneContent:
-    """All that was added. `names`: those that are taken. Bodies of `items`, `lights`, `cameras`: places in `things`."""
+    """Content of a scene. `names`: names in use. Bodies of `items`, `lights`, `cameras` are indices of `bodies`."""
 
     name: str
     bodies: list[ComposedBody] = field(default_factory=list)
@@ -373,7 +373,7 @@ class SceneContent:
 
     @contextmanager
     def atomic(self) -> Iterator[None]:
-        """What is added within is added whole, or, where something is raised, not at all."""
+        """Undo everything that was added in this context when it raises."""
         lists: tuple[list[Any], ...] = (self.bodies, self.items, self.lights, self.cameras, self.skipped, self.notes)
         lengths, names = [len(one) for one in lists], self.names.copy()
         try:
@@ -385,15 +385,15 @@ class SceneContent:
             raise
 
     def add_skipped(self, texts: tuple[str, ...]) -> None:
-        """What clients will not see, each line once."""
+        """Add lines on what clients will not see, each once."""
         self.skipped += dict.fromkeys(text for text in texts if text not in self.skipped)
 
     def add_notes(self, texts: tuple[str, ...]) -> None:
-        """What looks like a mistake, each line once."""
+        """Add lines on likely mistakes, each once."""
         self.notes += dict.fromkeys(text for text in texts if text not in self.notes)
 
     def add_robot(self, robot: Robot) -> None:
-        """An articulation with its bodies, at rest."""
+        """Add an articulation with its bodies, joints at rest."""
         articulation = robot.articulation
         first = len(self.bodies)
         for name, pose in articulation.compute_poses({}).items():
@@ -407,9 +407,10 @@ class SceneContent:
     def add_nodes(
         self, loaded: LoadedFile, body: int, T_body_file: Matrix, look: Appearance | None, *, flat: bool
     ) -> None:
-        """A file on `body`. `flat`: everything on that one, else nodes with something on or below them become bodies.
+        """Add the nodes of a file to `body`.
 
-        `look`, if there is one, replaces those of the file, and colours at vertices.
+        `flat`: draw everything on that body; otherwise nodes with content on or below them become bodies. `look`
+        replaces the materials of the file and its vertex colours, unless it is `None`.
         """
         self.add_skipped(loaded.skipped)
         bare: dict[int, MeshArrays] = {}
@@ -449,7 +450,7 @@ class SceneContent:
 
 
 def _nodes_with_content(loaded: LoadedFile) -> set[int]:
-    """Nodes with something on or below them, by their places."""
+    """Return the indices of nodes with content on or below them."""
     used: set[int] = set()
     for k, node in enumerate(loaded.nodes):
         at = k if node.surfaces or node.lights or node.cameras else -1
@@ -460,7 +461,7 @@ def _nodes_with_content(loaded: LoadedFile) -> set[int]:
 
 
 def _place_light(matrix: Matrix, light: Light) -> Light:
-    """A light in the frame of its body, which `matrix` leads to. It shines where that turns it, mirrored or not."""
+    """Return a light in the frame of its body, which `matrix` leads to; its direction is turned, mirrored or not."""
     p = matrix @ [*light.p_body, 1.0]
     along = matrix[:3, :3] @ light.direction_body
     along /= np.linalg.norm(along)

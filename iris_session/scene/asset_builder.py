@@ -1,6 +1,6 @@
-"""From raw content to assets in a store: levels of detail, in threads, and nothing is built twice.
+"""`AssetBuilder`: encode raw content to assets in a store, with levels of detail, in threads, each content once.
 
-The key of a piece of work is the SHA-256 of its raw content, its options and `ENCODER_VERSION`; the store remembers the
+The key of a piece of work is the SHA-256 of its raw content, its options and `ENCODER_VERSION`; the store keeps the
 result. Hashing, Zstandard and large copies of numpy release the interpreter's lock, so threads help. Of work with more
 than `ALONE_BYTES` of raw content only one piece is in memory at a time.
 """
@@ -52,7 +52,7 @@ class EncodeOptions(msgspec.Struct, frozen=True):
 
 
 class MeshNote(msgspec.Struct, frozen=True):
-    """What a mesh became."""
+    """Result of encoding a mesh."""
 
     low: Vec3
     high: Vec3
@@ -60,13 +60,13 @@ class MeshNote(msgspec.Struct, frozen=True):
 
 
 class TextureNote(msgspec.Struct, frozen=True):
-    """What a texture became."""
+    """Result of encoding a texture."""
 
     levels: tuple[TextureLevel, ...]
 
 
 class BlobNote(msgspec.Struct, frozen=True):
-    """What became one asset without levels."""
+    """Result of encoding one asset without levels."""
 
     address: str
     bytes: int
@@ -77,7 +77,7 @@ Note = TypeVar("Note", MeshNote, TextureNote, BlobNote)
 
 @dataclass(frozen=True)
 class Work(Generic[Note]):
-    """One piece: `raw` is all that the result depends on besides the options; `make` puts the assets into the store."""
+    """One piece of work: the result depends on `raw` and the options; `make` puts the assets into the store."""
 
     kind: type[Note]
     raw: Sequence[bytes | memoryview | NDArray[Any]]
@@ -85,7 +85,10 @@ class Work(Generic[Note]):
 
 
 class AssetBuilder:
-    """Builds into `store`. `built`, `recalled`: pieces of work that were done, and that the store remembered."""
+    """Encoder of meshes, textures and other content into a store.
+
+    `built`, `recalled`: pieces of work that were done, and whose result the store had.
+    """
 
     def __init__(self, store: AssetStore, options: EncodeOptions | None = None, threads: int = 0) -> None:
         self.store = store
@@ -97,7 +100,7 @@ class AssetBuilder:
         self._alone = threading.Lock()
 
     def run(self, pieces: Sequence[Work[Note]]) -> list[Note]:
-        """Results in the order of `pieces`. Equal content is built once."""
+        """Return results in the order of `pieces`. Equal content is built once."""
         with ThreadPoolExecutor(self._threads) as pool:
             keys = list(pool.map(self._index_key, pieces))
             first = dict(zip(keys, pieces, strict=True))

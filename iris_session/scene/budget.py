@@ -26,7 +26,7 @@ PRIMITIVE_TRIANGLES: Final = {
 
 
 class Budget(msgspec.Struct, frozen=True):
-    """What a client can draw. 0: no bound. `texture_bytes`: in the memory of its graphics card."""
+    """Limits of a client. 0: no limit. `texture_bytes`: memory of its graphics card."""
 
     triangles: int = 0
     texture_bytes: int = 0
@@ -52,7 +52,7 @@ class LevelChoice(NamedTuple):
 
 
 def choose_levels(spec: SceneSpec, budget: Budget) -> LevelChoice:
-    """Finest levels that fit: coarsened first is what loses least detail, relative to its size, per triangle saved.
+    """Choose the finest levels that fit: meshes that lose least detail per triangle saved are coarsened first.
 
     Deformables have no levels and are never left out.
     """
@@ -143,7 +143,7 @@ def _choose_texture_levels(spec: SceneSpec, limit: int) -> tuple[tuple[int, ...]
 
 
 def add_totals(spec: SceneSpec) -> SceneSpec:
-    """`spec` with its `totals`."""
+    """Return `spec` with its `totals` computed."""
     level_bytes = {level.address: level.bytes for mesh in spec.meshes for level in mesh.levels[:1]}
     image_bytes = {level.address: level.bytes for texture in spec.textures for level in texture.levels[:1]}
     drawn = [i for i, v in enumerate(spec.visuals) if v.rgba[3] > 0 and v.group in spec.groups_shown]
@@ -160,13 +160,13 @@ def add_totals(spec: SceneSpec) -> SceneSpec:
 
 
 def count_deformables(spec: SceneSpec) -> tuple[int, int]:
-    """How many deformables are drawn at first, and their triangles; ropes are lines."""
+    """Return the number of deformables drawn at first, and of their triangles; ropes are lines."""
     shown = [part for part in spec.deformables if part.rgba[3] > 0 and part.group in spec.groups_shown]
     return len(shown), sum(part.elements for part in shown if part.dim > 1)
 
 
 def count_triangles(spec: SceneSpec, visual: int, level: int = 0) -> int:
-    """Triangles of one visual, by its position in `spec.visuals`."""
+    """Return the triangles of one visual, by its index in `spec.visuals`."""
     geometry = spec.visuals[visual].geometry
     if geometry.mesh >= 0:
         levels = spec.meshes[geometry.mesh].levels
@@ -178,6 +178,6 @@ def count_triangles(spec: SceneSpec, visual: int, level: int = 0) -> int:
 
 
 def texture_memory_bytes(texture: Texture, level: TextureLevel) -> int:
-    """Bytes on a graphics card: four a pixel, and a third more for its smaller copies."""
+    """Return the bytes on a graphics card: four a pixel, and a third more for mipmaps."""
     faces = 1 if texture.kind == TextureKind.IMAGE else 6
     return level.width * level.height * 4 * faces * 4 // 3

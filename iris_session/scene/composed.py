@@ -73,7 +73,7 @@ class ComposedScene:
 
 class Joint(NamedTuple):
     """One that is set. `kind`: revolute, continuous or prismatic. `low`, `high`: limits [rad] or [m], infinite for
-    none; beyond them is drawn as it is told. `rest`: what stands until it is set, the nearest to 0 within the limits.
+    none; beyond them is drawn as set. `rest`: position until it is set, the nearest to 0 within the limits.
     """
 
     name: str
@@ -107,7 +107,7 @@ class Articulation:
 
     `parts`: parents first. `joints`: those that can be set. `mimics`: joints that follow another, by name, and which:
     they cannot be set. `loose`: floating and planar joints, and the body on each: it stands where the file has it until
-    somebody says where it is.
+    its pose is set.
     """
 
     name: str
@@ -134,7 +134,7 @@ class Articulation:
         self, T_world_root: Pose, q: Mapping[str, float], loose: Mapping[str, Pose] = _NONE
     ) -> dict[str, Pose]:
         """T_world_body of every body, as `poses`. `loose`: T_world_body of bodies on floating and planar joints, by
-        name; what is below moves with them, whatever is above."""
+        name; bodies below move with them."""
         self.check_positions(q)
         at = [float(q.get(joint.name, joint.rest)) for joint in self.joints]
         placed: list[tuple[Vec3, tuple[float, float, float, float]]] = []

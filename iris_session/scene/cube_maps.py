@@ -2,7 +2,8 @@
 
 What MuJoCo looks up by a direction at every pixel becomes texture coordinates at corners. Triangles are cut where the
 direction passes from one face of the cube to another, and split until straight lines in the picture are close to what
-MuJoCo draws. Neighbours are cut and split alike, so that no gaps open between them. docs/scene.md has the formulas.
+MuJoCo draws. Adjacent triangles are cut and split alike, so that no gaps open between them.
+docs/scene.md has the formulas.
 """
 
 from __future__ import annotations
@@ -58,8 +59,10 @@ class Atlas(NamedTuple):
 
 
 class CubeMap(NamedTuple):
-    """What a visual wears: one colour (0..1), or an atlas. `address`: of the asset that it is made of. `encoding`: that
-    suits it, PNG or JPEG."""
+    """Cube texture of a visual: one colour (0..1), or an atlas.
+
+    `address`: of the source asset. `encoding`: suitable for export, PNG or JPEG.
+    """
 
     address: str
     encoding: str
@@ -78,8 +81,10 @@ class CubeMapReader:
         self._read: dict[str, CubeMap] = {}
 
     def find(self, material: int, geometry: Geometry) -> CubeMap | None:
-        """What a visual wears; `None` where it has no cube texture, or a mesh has coordinates of its own: MuJoCo draws
-        no cube there."""
+        """Return the cube texture of a visual.
+
+        `None` without one, and for a mesh with texture coordinates: MuJoCo draws no cube there.
+        """
         index = find_cube_texture(self._spec, material)
         textured = geometry.mesh >= 0 and self._spec.meshes[geometry.mesh].textured
         return None if index < 0 or textured else self._read_texture(self._spec.textures[index])
@@ -108,7 +113,7 @@ def split_faces(pixels: Pixels) -> Pixels:
     """(6, side, side, channels) of six faces below one another. Raises `AssetDecodeError` where they are not."""
     if not len(pixels) == _FACES * pixels.shape[1] > 0:
         raise AssetDecodeError(
-            f"a cube of {pixels.shape[1]} x {len(pixels)} pixels: six squares below one another are one"
+            f"a cube texture of {pixels.shape[1]} x {len(pixels)} pixels: expected six squares below one another"
         )
     return pixels.reshape(_FACES, len(pixels) // _FACES, *pixels.shape[1:])
 
@@ -150,7 +155,7 @@ def _add_borders(faces: Pixels, border: int) -> Pixels:
 
 
 def direction_scale(spec: SceneSpec, geometry: Geometry, material: int) -> tuple[float, float, float]:
-    """What positions in a visual's frame are multiplied with to give directions."""
+    """Return the factors that turn positions in a visual's frame into directions."""
     x, y, z = geometry.size
     uniform = spec.materials[material].uniform
     if geometry.kind == GeometryKind.PLANE:  # 0: without end, and no direction then where both are
@@ -194,7 +199,7 @@ def _capsule_directions(position: Floats, direction: Floats, size: tuple[float, 
 
 
 def _cut_at_faces(corners: Floats) -> tuple[Floats, NDArray[np.int64]]:
-    """Triangles that look at one face of the cube each, and which. The first three columns are directions."""
+    """Return triangles that face one side of the cube each, and which side. The first three columns are directions."""
     length = np.abs(corners[:, :, :3]).max(axis=(1, 2))
     margin = np.stack([_face_distances(corners, k).min(axis=(1, 2)) for k in range(_FACES)], axis=1)
     face = margin.argmax(axis=1)
@@ -214,7 +219,7 @@ def _cut_at_faces(corners: Floats) -> tuple[Floats, NDArray[np.int64]]:
 
 
 def _face_distances(corners: Floats, face: int) -> Floats:
-    """How far directions are on the inside of the four planes that bound those of a face (..., 4)."""
+    """Return distances of directions inside the four planes that bound a face (..., 4)."""
     lead, sign, right, _, down, _ = _AXES[face]
     ahead = sign * corners[..., lead]
     a, b = corners[..., right], corners[..., down]

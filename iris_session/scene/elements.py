@@ -1,4 +1,4 @@
-"""What files become before they are part of a scene: nodes with surfaces, looks, lights and cameras, in plain values.
+"""Elements of a scene before it is built: nodes of files, surfaces, appearances, textures, drawn items; plain values.
 
 Frames: a node's matrix leads to the file's own frame, as the file has it, with its scale. Colours are those of the
 specification (as they are seen), texture coordinates too (v down).
@@ -27,7 +27,7 @@ MAX_FILE_BYTES: Final = 512 << 20
 #: Most triangles of one file, and most nodes.
 MAX_TRIANGLES: Final = 20_000_000
 MAX_NODES: Final = 100_000
-#: What has no colour of its own.
+#: Default colour.
 GREY: Final[Rgba] = (0.5, 0.5, 0.5, 1.0)
 #: Farther than this from the identity, a matrix's scale is put into the vertices.
 _RIGID: Final = 1e-9
@@ -38,7 +38,7 @@ Matrix = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class TextureImage:
-    """A texture to be. `pixels` (height, width, channels), 1, 3 or 4 of them; six faces below each other of a cube."""
+    """Image of a texture. `pixels` (height, width, 1, 3 or 4); of a cube six faces below one another."""
 
     pixels: Pixels
     name: str = ""
@@ -48,9 +48,9 @@ class TextureImage:
 
 @dataclass(frozen=True, eq=False)
 class Appearance:
-    """How a surface looks: fields as in `Material`, which it becomes unless it is a colour only.
+    """Appearance of a surface: fields as in `Material`, which it becomes unless it is a colour only.
 
-    `pictures`: (role, picture) pairs.
+    `images`: (role, image) pairs.
     """
 
     rgba: Rgba = GREY
@@ -66,7 +66,7 @@ class Appearance:
 
     @property
     def is_plain_color(self) -> bool:
-        """Whether the colour says all."""
+        """Whether all other values are defaults."""
         defaults = (0.0, 0.5, 0.5, -1.0, -1.0)
         return not self.images and defaults == (
             self.emission,
@@ -79,7 +79,7 @@ class Appearance:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles with one look."""
+    """Triangles with one appearance."""
 
     mesh: MeshArrays
     appearance: Appearance | None = None
@@ -146,7 +146,7 @@ def split_rigid(matrix: Matrix) -> tuple[Pose, Matrix | None]:
 
 
 def is_solid(matrix: Matrix) -> bool:
-    """Whether something is left of what is placed by `matrix`. Raises `SceneBuildError` for one that is not finite."""
+    """Return whether `matrix` keeps all three dimensions. Raises `SceneBuildError` for one that is not finite."""
     if not np.isfinite(matrix).all():
         raise SceneBuildError("a place in the file is not finite")
     scale = np.linalg.svd(matrix[:3, :3], compute_uv=False)
@@ -154,19 +154,19 @@ def is_solid(matrix: Matrix) -> bool:
 
 
 def to_pose(R: NDArray[np.float64], p: Any) -> Pose:
-    """A pose of a rotation matrix (3, 3) and a position."""
+    """Return the pose of a rotation matrix (3, 3) and a position."""
     w, i, j, k = quat_from_matrix(np.asarray(R, np.float64)).tolist()
     return Pose(to_vec3(p), (w, i, j, k))
 
 
 def to_vec3(p: Any) -> Vec3:
-    """The first three of an array."""
+    """Return the first three values of an array."""
     x, y, z = (float(v) for v in p[:3])
     return x, y, z
 
 
 def to_matrix(pose: Pose) -> Matrix:
-    """(4, 4) of a pose."""
+    """Return the matrix (4, 4) of a pose."""
     matrix = np.eye(4)
     matrix[:3, :3] = quat_to_matrix(np.array(pose.q))
     matrix[:3, 3] = pose.p
@@ -174,10 +174,10 @@ def to_matrix(pose: Pose) -> Matrix:
 
 
 def truncate_name(name: object) -> str:
-    """A name as the wire holds it: not longer, and of characters that can be sent (JSON may hold halves of some)."""
+    """Return a name that the wire can hold: not too long, without lone surrogates (JSON may have them)."""
     return str(name)[:MAX_TEXT].encode("utf-8", "replace").decode() if name is not None else ""
 
 
 def compose_poses(a: Pose, b: Pose) -> Pose:
-    """T_a_c of T_a_b and T_b_c."""
+    """Return T_a_c of T_a_b and T_b_c."""
     return Pose(*compose((a.p, a.q), (b.p, b.q)))

@@ -1,6 +1,6 @@
-"""How large a scene is: the box of what is drawn as it begins, and whether that looks like a mistake of units.
+"""Extent of a scene: the bounding box of its initial content, and whether that looks like a mistake of units.
 
-Planes are not counted: a floor is as large as one likes.
+Planes are not counted: a floor has any size.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from iris_session.scene.meshes import decode_mesh
 
 #: No part and no robot is larger, few rooms are; a part of a centimetre whose file counts in millimetres is.
 LARGEST_M: Final = 10.0
-#: Nobody can see or grasp what is smaller; a part of two metres that was divided by 1,000 once too often is.
+#: Smaller things can hardly be seen or grasped; a part of two metres that was divided by 1,000 once too often is.
 SMALLEST_M: Final = 0.002
 Points = NDArray[Any]
 
@@ -93,8 +93,10 @@ def largest_mesh_side(spec: SceneSpec) -> float:
 
 
 def find_unit_mistake(side_m: float) -> tuple[float, str] | None:
-    """What is likely wrong with something whose longest side this is: the factor that mends it, and in words; `None`
-    where nothing is."""
+    """Return the likely mistake of units behind a longest side: the factor that corrects it, and a description.
+
+    `None` where the side is plausible.
+    """
     if side_m > LARGEST_M:
         return 1e-3, "in millimetres where metres are meant?"
     if 0.0 < side_m < SMALLEST_M:
@@ -113,7 +115,7 @@ def format_unit_hint(side_m: float, remedy: str) -> str:
 
 
 def format_size(extent: Extent) -> str:
-    """Its sides for people."""
+    """Return the sides of a box as text."""
     return " x ".join(format_coordinates(extent, extent.size)) + " m"
 
 
@@ -124,7 +126,7 @@ def format_coordinates(extent: Extent, values: Vec3) -> list[str]:
 
 
 def format_length(metres: float) -> str:
-    """A length for people."""
+    """Return a length as text."""
     value, unit = (metres, "m") if metres >= 0.1 else (1e3 * metres, "mm")
     return f"{value:,.0f} {unit}" if value >= 1e4 else f"{value:.4g} {unit}"
 
@@ -147,7 +149,7 @@ def _field_corners(spec: SceneSpec, geometry: Geometry) -> Points:
 
 
 def _shape_reach(geometry: Geometry, R_world_visual: Points) -> Points:
-    """How far a shape reaches from its centre along the axes of the world, (3,) [m]."""
+    """Return the half extents of a shape along the axes of the world, (3,) [m]."""
     R, size = np.abs(R_world_visual), np.array(geometry.size)
     match geometry.kind:
         case GeometryKind.SPHERE | GeometryKind.ELLIPSOID:

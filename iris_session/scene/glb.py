@@ -187,7 +187,7 @@ class _GlbWriter:
         return {**self._shared[key], "material": material}
 
     def _mapping_key(self, visual: Visual, cube: CubeMap | None) -> tuple[object, ...] | None:
-        """What texture coordinates depend on, `None` where there is no texture, or those of a mesh are as they are."""
+        """Return what texture coordinates depend on; `None` without a texture, or with those of the mesh unchanged."""
         if cube is not None:
             scale = direction_scale(self._spec, visual.geometry, visual.material)
             return None if cube.atlas is None else ("cube", scale, cube.atlas.side, cube.atlas.single_colors)
@@ -264,7 +264,7 @@ class _GlbWriter:
         self._blob += data
         return self._add("bufferViews", view)
 
-    # --- looks --------------------------------------------------------------------------------------------------------
+    # --- materials ----------------------------------------------------------------------------------------------------
 
     def _add_material(
         self,

@@ -202,7 +202,7 @@ def scale_mesh(mesh: MeshArrays, scale: Matrix | None) -> MeshArrays:
 
 
 def is_closed(mesh: MeshArrays) -> bool:
-    """Whether every edge has its triangles on both sides, so that nobody sees the inside."""
+    """Return whether every edge has triangles on both sides, so that the inside is never visible."""
     _, vertex = find_unique_rows(np.ascontiguousarray(mesh.position + np.float32(0.0)))  # -0 is 0
     corner = vertex[mesh.index].astype(np.int64)
     start, end = corner.reshape(-1), corner[:, [1, 2, 0]].reshape(-1)

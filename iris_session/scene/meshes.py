@@ -87,7 +87,7 @@ def find_unique_rows(rows: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]
 
 
 def encode_mesh(mesh: MeshArrays) -> bytes:
-    """The asset, exact to the bit."""
+    """Encode a mesh, exact to the bit."""
     arrays = [
         StoredArray(ArrayName.INDEX, _narrow_index(mesh.index, mesh.vertices), ArrayFilter.DELTA),
         StoredArray(ArrayName.POSITION, mesh.position, ArrayFilter.SHUFFLE),
@@ -101,7 +101,10 @@ def encode_mesh(mesh: MeshArrays) -> bytes:
 
 
 def encode_mesh_quantised(mesh: MeshArrays) -> tuple[bytes, float]:
-    """A third of the size, and the bound on the position error [m]: 16 bits a coordinate, 8 a normal's component."""
+    """Encode a mesh with 16 bits a coordinate and 8 a component of a normal, a third of the size.
+
+    Returns the bytes, and the bound on the position error [m].
+    """
     low, step = _lattice(mesh.position)
     error = float(np.linalg.norm(step)) / 2 + _rounding_error(mesh.position)
     arrays = [
@@ -151,7 +154,7 @@ def _lattice(values: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _rounding_error(values: Floats) -> float:
-    """What float32 arithmetic in the decoder may add, over three axes."""
+    """Return the error that float32 arithmetic in the decoder may add, over three axes [m]."""
     return float(np.abs(values).max(initial=0.0)) * 2.0**-22
 
 

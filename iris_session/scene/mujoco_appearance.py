@@ -208,7 +208,7 @@ def _projection(model: mujoco.MjModel, index: int) -> int:
 
 
 def read_environment(model: mujoco.MjModel, textures: Sequence[Texture]) -> Environment:
-    """What surrounds the scene; MuJoCo draws the first texture of kind skybox."""
+    """Return the environment of the scene; MuJoCo draws the first texture of kind skybox."""
     extent = float(model.stat.extent)
     headlight, scale = model.vis.headlight, model.vis.map
     skyboxes = [i for i, texture in enumerate(textures) if texture.kind == TextureKind.SKYBOX]

@@ -180,7 +180,7 @@ def _flex_material(model: mujoco.MjModel, index: int) -> int:
 
 @dataclass(frozen=True)
 class FlexMesh:
-    """What is drawn of a flex: `elements`, edges (n, 2) of a rope, triangles (n, 3) of a cloth or of the surface of a
+    """Drawn mesh of a flex: `elements`, edges (n, 2) of a rope, triangles (n, 3) of a cloth or of the surface of a
     soft body; `uv`, texture coordinates of each element's corners, where it has them.
 
     `vertices`: rows of `flexvert_xpos`, without those inside of a solid; `numbers`: theirs in the flex. `topology`: the
@@ -195,7 +195,7 @@ class FlexMesh:
 
     @property
     def raw(self) -> list[NDArray[Any]]:
-        """What the asset depends on, besides the vertices at rest."""
+        """Content that the asset depends on, besides the vertices at rest."""
         return [self.elements, self.numbers, *([] if self.uv is None else [self.uv])]
 
     def encode(self, rest: NDArray[np.float32]) -> Callable[[], bytes]:

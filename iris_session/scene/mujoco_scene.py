@@ -139,7 +139,7 @@ def _read_bodies(model: mujoco.MjModel, data: Any) -> tuple[Body, ...]:
 
 
 def _flex_vertex_bodies(model: mujoco.MjModel) -> frozenset[int]:
-    """Bodies that hold nothing but a vertex or node of a flex, which nothing looks at: they are not streamed."""
+    """Bodies that hold nothing but a vertex or node of a flex, which nothing else refers to: they are not streamed."""
     listed: set[int] = set()
     for field in ("flex_vertbodyid", "flex_nodebodyid"):
         if model.nflex and hasattr(model, field):
@@ -165,7 +165,7 @@ def _flex_vertex_bodies(model: mujoco.MjModel) -> frozenset[int]:
 
 
 def _has_only_slides(model: mujoco.MjModel, body: int) -> bool:
-    """Whether all joints of a body are slides."""
+    """Return whether all joints of a body are slides."""
     first, n = int(model.body_jntadr[body]), int(model.body_jntnum[body])
     return bool((model.jnt_type[first : first + n] == mujoco.mjtJoint.mjJNT_SLIDE).all())
 
@@ -246,12 +246,12 @@ def _list_skipped(model: mujoco.MjModel) -> tuple[str, ...]:
     if model.nskin:
         found.append(f"{model.nskin} skins: only bodies, shapes and flexes are shared; use a flex")
     if model.nflex > MAX_STREAMS:
-        found.append(f"how {model.nflex - MAX_STREAMS} of {model.nflex} flexes bend: {MAX_STREAMS} are streamed")
+        found.append(f"motion of {model.nflex - MAX_STREAMS} of {model.nflex} flexes: {MAX_STREAMS} are streamed")
     return tuple(found)
 
 
 def _list_unrequested(model: mujoco.MjModel, *, sites: bool, tendons: bool) -> Iterator[str]:
-    """Sites and tendons that MuJoCo shows and that nobody asked for."""
+    """Yield lines on sites and tendons that MuJoCo shows and that were not requested."""
     shown = SceneSpec().groups_shown
     if not sites:
         marks = (_read_site(model, i) for i in range(model.nsite))

@@ -1,4 +1,4 @@
-"""What a scene is made of, what is heavy in it and why, and what a headset will struggle with."""
+"""Report on a scene: its content, its heavy assets, and what exceeds the budget of a headset."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class SceneReport(msgspec.Struct, frozen=True):
 def build_report(
     spec: SceneSpec, scene_hash: str, skipped: tuple[str, ...] = (), extent: Extent | None = None
 ) -> SceneReport:
-    """The report of a scene."""
+    """Return the report of a scene."""
     choice = choose_levels(spec, QUEST_3)
     heavy = sorted(
         (*_heavy_meshes(spec), *_heavy_textures(spec)), key=lambda h: -(h.memory + 40 * h.triangles * h.uses)
@@ -93,7 +93,7 @@ def list_large_meshes(spec: SceneSpec) -> tuple[str, ...]:
 
 
 def list_simplified(spec: SceneSpec) -> tuple[str, ...]:
-    """What clients draw, and pictures of recordings and GLB files do not, or otherwise; a line each."""
+    """Return content that recordings and GLB files draw differently from clients, or not; a line each."""
     found = []
     if spec.environment.skybox >= 0:
         found.append("the skybox: neither has a form for it, nothing is drawn around the scene")
@@ -103,7 +103,7 @@ def list_simplified(spec: SceneSpec) -> tuple[str, ...]:
 
 
 def list_glb_differences(spec: SceneSpec) -> tuple[str, ...]:
-    """What is not in the GLB file of a scene, or otherwise; a line each."""
+    """Return content that a GLB file of the scene lacks or has differently; a line each."""
     opaque = sum(texture.levels[0].encoding == AssetEncoding.OPAQUE for texture in spec.textures)
     found = [f"{opaque} textures in a form of their own (KTX): left out"] if opaque else []
     worn = {find_cube_texture(spec, k) for k in range(len(spec.materials))} - {-1}

@@ -143,7 +143,7 @@ def add_texture_coordinates(mesh: MeshArrays, geometry: Geometry, material: Mate
 
 
 def repeat_texture_coordinates(uv: NDArray[np.float32] | None, material: Material | None) -> NDArray[np.float32] | None:
-    """Coordinates that what bends has itself, as `material` repeats them; it has no size that `uniform` could mean."""
+    """Return texture coordinates of a deformable, repeated by `material`; `uniform` has no meaning without a size."""
     return uv if uv is None or material is None else (uv * np.array(material.repeat)).astype(np.float32)
 
 
@@ -155,7 +155,7 @@ def _project_along_z(position: NDArray[np.float32], geometry: Geometry, material
 
 
 def _shape_coordinates(position: Floats, normal: NDArray[np.float32], geometry: Geometry) -> Floats:
-    """Where corners of triangles (n, 3, 3) are on the surface: 0..1 to the right and down."""
+    """Return texture coordinates of corners of triangles (n, 3, 3): 0..1 to the right and down."""
     size = np.array(geometry.size)
     p = position / np.where(size > 0, size, 1.0)
     match geometry.kind:

@@ -1,4 +1,4 @@
-"""Deformable stream: the vertices of a mesh that bends, each frame decodable by itself.
+"""Deformable stream: the vertices of a deformable mesh, each frame decodable by itself.
 
 Coordinates lie on a lattice fixed in the world, whose step is a power of two, so a vertex at rest does not flicker and
 `index * step` is exact in every language. Each index is predicted from others of the same frame in the order of the
@@ -48,7 +48,7 @@ Nodes = npt.NDArray[np.int32]
 
 
 class FrameHeader(NamedTuple):
-    """What a frame says of itself. `bound_m`: farthest that a vertex is from where it was, step = 2 ** `exponent`."""
+    """Header of a frame. `bound_m`: farthest that a vertex is from where it was, step = 2 ** `exponent`."""
 
     planes: int
     packed: bool
@@ -61,7 +61,10 @@ class FrameHeader(NamedTuple):
 
 
 def exponent_for(bound_m: float) -> int:
-    """Of the largest power of two that keeps half the diagonal of a lattice cell within its share of the bound."""
+    """Return the exponent of the lattice step for a bound [m].
+
+    The largest power of two that keeps half the diagonal of a cell within the lattice's share of the bound.
+    """
     return math.floor(math.log2(_LATTICE_SHARE * bound_m * 2.0 / math.sqrt(3.0)))
 
 
@@ -90,13 +93,13 @@ class DeformableEncoder:
         self._scaled = np.empty((3, topology.n_vertices))
 
     def reset(self) -> None:
-        """The next frame is sent whatever it is: for a new scene epoch."""
+        """Send the next frame even if nothing moved: for a new scene epoch."""
         self._sent = None
 
     def encode(
         self, vertices: npt.NDArray[np.floating], classes: Sequence[str] = (BudgetClass.FULL,)
     ) -> dict[str, bytes] | None:
-        """Payloads by class, as `Session.publish_media` takes them; None while nothing has moved.
+        """Return payloads by class, as `Session.publish_media` takes them; None while nothing has moved.
 
         `vertices`: (n, 3) [m], world frame; any value is taken. The bound of `half` is twice that of `full`, of
         `quarter` four times.
@@ -105,15 +108,15 @@ class DeformableEncoder:
         if vertices.shape != (self.topology.n_vertices, 3):
             raise ValueError(f"vertices have shape {vertices.shape}, expected ({self.topology.n_vertices}, 3)")
         if unknown := [name for name in classes if name not in COARSER]:
-            raise ValueError(f"{unknown[0]!r} is no class of a deformable stream: {', '.join(COARSER)} are")
+            raise ValueError(f"{unknown[0]!r} is no class of a deformable stream: expected {', '.join(COARSER)}")
         self._rested += 1
-        if self._rests(vertices) and self._rested < self._repeat_after:
+        if self._is_at_rest(vertices) and self._rested < self._repeat_after:
             return None
         self._rested = 0
         self._sent = np.array(vertices, np.float64)
-        return {name: self._frame(self._sent, self.bound_m * COARSER[name]) for name in classes}
+        return {name: self._encode_frame(self._sent, self.bound_m * COARSER[name]) for name in classes}
 
-    def _rests(self, vertices: npt.NDArray[np.floating]) -> bool:
+    def _is_at_rest(self, vertices: npt.NDArray[np.floating]) -> bool:
         if self._sent is None:
             return False
         with np.errstate(invalid="ignore", over="ignore"):
@@ -121,14 +124,14 @@ class DeformableEncoder:
             squares = np.einsum("ij,ij->i", moved, moved)
             return bool(squares.max() <= self.drift_m**2)  # false for what is not finite
 
-    def _frame(self, vertices: Floats, bound_m: float) -> bytes:
+    def _encode_frame(self, vertices: Floats, bound_m: float) -> bytes:
         exponent = exponent_for(bound_m)
-        nodes, escaped = self._nodes(vertices, exponent)
+        nodes, escaped = self._to_nodes(vertices, exponent)
         origin = nodes[:, :1].copy()
-        residuals = _residuals(self.topology, nodes - origin)
+        residuals = _predict_residuals(self.topology, nodes - origin)
         coded = ((residuals << 1) ^ (residuals >> 31)).view(np.uint32)  # small numbers of either sign become small
         n_planes = (int(coded.max()).bit_length() + 7) // 8
-        planes = _planes(coded, n_planes)
+        planes = _split_planes(coded, n_planes)
         packed = self._compressor.compress(planes) if n_planes else b""
         flags = _PACKED if len(packed) < len(planes) else 0
         head = _HEADER.pack(
@@ -142,9 +145,9 @@ class DeformableEncoder:
             len(escaped),
             *origin[:, 0].tolist(),
         )
-        return b"".join((head, _escapes(vertices, escaped), packed if flags else planes))
+        return b"".join((head, _encode_escapes(vertices, escaped), packed if flags else planes))
 
-    def _nodes(self, vertices: Floats, exponent: int) -> tuple[Nodes, npt.NDArray[np.int64]]:
+    def _to_nodes(self, vertices: Floats, exponent: int) -> tuple[Nodes, npt.NDArray[np.int64]]:
         """Lattice nodes (3, n) in the order of the topology, and the vertices that have none."""
         scaled = self._scaled
         with np.errstate(invalid="ignore", over="ignore"):
@@ -170,7 +173,7 @@ class DeformableDecoder:
         self._decompressor = zstandard.ZstdDecompressor(max_window_size=_WINDOW)
 
     def decode(self, payload: bytes | memoryview) -> Positions:
-        """Vertices (n, 3) [m], world frame, a new array. Raises `StreamError` for what is no frame of this mesh."""
+        """Return vertices (n, 3) [m], world frame, in a new array. Raises `StreamError` for another mesh's frame."""
         header = read_header(payload)
         topology = self.topology
         if header.n_vertices != topology.n_vertices or header.identity != topology.identity:
@@ -185,9 +188,9 @@ class DeformableDecoder:
         vertex = escapes["vertex"].astype(np.int64)
         if len(vertex) and (vertex[-1] >= topology.n_vertices or (np.diff(vertex) <= 0).any()):
             raise StreamError("escaped vertices are not ascending and in range")
-        coded = self._coded(memoryview(payload)[at:], header)
+        coded = self._unpack_planes(memoryview(payload)[at:], header)
         residuals = (coded >> np.uint32(1)).view(np.int32) ^ -(coded & np.uint32(1)).view(np.int32)
-        nodes = _undo(topology, residuals)
+        nodes = _undo_prediction(topology, residuals)
         nodes += np.array(header.origin, np.int32)[:, None]
         positions = np.empty((topology.n_vertices, 3), np.float32)
         scaled = nodes.astype(np.float32)
@@ -197,7 +200,7 @@ class DeformableDecoder:
         self.bound_m = header.bound_m
         return positions
 
-    def _coded(self, packed: memoryview, header: FrameHeader) -> npt.NDArray[np.uint32]:
+    def _unpack_planes(self, packed: memoryview, header: FrameHeader) -> npt.NDArray[np.uint32]:
         """The numbers (3, n) whose bytes the planes hold."""
         size = 3 * self.topology.n_vertices * header.planes
         planes: bytes | memoryview = packed
@@ -219,7 +222,7 @@ class DeformableDecoder:
 
 
 def read_header(payload: bytes | memoryview) -> FrameHeader:
-    """What a frame says of itself. Raises `StreamError`."""
+    """Return the header of a frame. Raises `StreamError`."""
     if len(payload) < _HEADER.size:
         raise StreamError(f"frame of {len(payload)} bytes, shorter than its header of {_HEADER.size}")
     form, flags, planes, exponent, bound_m, n, identity, n_escaped, x, y, z = _HEADER.unpack_from(payload)
@@ -231,7 +234,7 @@ def read_header(payload: bytes | memoryview) -> FrameHeader:
 
 
 def interpolate(a: Positions, b: Positions, t: float) -> Positions:
-    """Between two decoded frames, `t` = 0 at `a` and 1 at `b`; not beyond them. (n, 3)."""
+    """Interpolate between two decoded frames, `t` = 0 at `a` and 1 at `b`; not beyond them. (n, 3)."""
     t = min(max(t, 0.0), 1.0)
     return a + (b - a) * np.float32(t)
 
@@ -239,8 +242,8 @@ def interpolate(a: Positions, b: Positions, t: float) -> Positions:
 # --- inside ---------------------------------------------------------------------------------------------------------
 
 
-def _residuals(topology: DeformableTopology, nodes: Nodes) -> Nodes:
-    """What remains of `nodes` (3, n) after prediction; int32, which wraps."""
+def _predict_residuals(topology: DeformableTopology, nodes: Nodes) -> Nodes:
+    """Return the residuals of `nodes` (3, n) after prediction; int32, which wraps."""
     if topology.parents is not None:
         a, b, c = topology.parents
         residuals: Nodes = nodes - np.take(nodes, a, axis=1) - np.take(nodes, b, axis=1)
@@ -255,8 +258,8 @@ def _residuals(topology: DeformableTopology, nodes: Nodes) -> Nodes:
     return both.reshape(3, -1)
 
 
-def _undo(topology: DeformableTopology, residuals: Nodes) -> Nodes:
-    """Inverse of `_residuals`; may overwrite its argument."""
+def _undo_prediction(topology: DeformableTopology, residuals: Nodes) -> Nodes:
+    """Inverse of `_predict_residuals`; may overwrite its argument."""
     if topology.parents is not None:
         a, b, c = topology.parents
         for begin, end in topology.levels:
@@ -271,14 +274,14 @@ def _undo(topology: DeformableTopology, residuals: Nodes) -> Nodes:
     return residuals
 
 
-def _planes(coded: npt.NDArray[np.uint32], n_planes: int) -> bytes:
+def _split_planes(coded: npt.NDArray[np.uint32], n_planes: int) -> bytes:
     """The lowest bytes of all numbers, then the next ones."""
     if n_planes == 1:
         return coded.astype(np.uint8).tobytes()
     return coded.astype("<u4", copy=False).view(np.uint8).reshape(-1, 4)[:, :n_planes].T.tobytes()
 
 
-def _escapes(vertices: Floats, escaped: npt.NDArray[np.int64]) -> bytes:
+def _encode_escapes(vertices: Floats, escaped: npt.NDArray[np.int64]) -> bytes:
     escapes = np.empty(len(escaped), _ESCAPE)
     escapes["vertex"] = escaped
     with np.errstate(over="ignore"):

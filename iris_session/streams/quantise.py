@@ -35,7 +35,7 @@ _STEP: Final = 1.0 / ROTATION_CENTRE
 
 
 def rotation_levels(q: Floats) -> Ints:
-    """Levels (3, m) of unit quaternions `q` (4, m), rows `w x y z`.
+    """Return levels (3, m) of unit quaternions `q` (4, m), rows `w x y z`.
 
     Modified Rodrigues parameters: m = (x, y, z) / (1 + w) of the quaternion with w >= 0, so |m| = tan(angle / 4) <= 1.
     """
@@ -47,7 +47,7 @@ def rotation_levels(q: Floats) -> Ints:
 
 
 def rotations(levels: npt.NDArray[np.int32], w: Floats, xyz: Floats) -> None:
-    """Writes the unit quaternions of `levels` (3, m), which is overwritten, to `w` (m,) and `xyz` (3, m).
+    """Write the unit quaternions of `levels` (3, m), which is overwritten, to `w` (m,) and `xyz` (3, m).
 
     w = 2 / (1 + |m|^2) - 1 and (x, y, z) = m * 2 / (1 + |m|^2). Raises `StreamError` for levels of no rotation.
     """
@@ -55,7 +55,7 @@ def rotations(levels: npt.NDArray[np.int32], w: Floats, xyz: Floats) -> None:
     np.multiply(levels, _STEP, out=xyz)
     np.einsum("ij,ij->j", xyz, xyz, out=w)
     if w.size and w.max() > MAX_SQUARES:
-        raise StreamError("the levels of a rotation stand for none")
+        raise StreamError("rotation levels do not encode a rotation: their parameters are longer than 1")
     w += 1.0
     np.divide(2.0, w, out=w)
     xyz *= w

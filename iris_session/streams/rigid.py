@@ -6,7 +6,7 @@ Euclidean) and `MAX_ROTATION_ERROR_RAD` (0.05 deg). How it is kept:
 - A body is *anchored* at a pose. It is anchored anew when its pose has left the anchor by more than the drift
   allowance, so the error is at most allowance + quantisation error, also while it creeps.
 - A frame holds every body that was anchored anew since frame `base_seq` (a window of frames), always with the code
-  of its anchor. So a client that had any complete frame >= `base_seq` is complete again, whatever it lost meanwhile.
+  of its anchor. So a client that had any complete frame >= `base_seq` is complete again after any loss.
 - Resting bodies cost their bit in the mask; a slow round robin repeats them, so that a client which was away longer
   becomes complete even without a snapshot.
 - A body that cannot be quantised (not finite, far away from the others) escapes verbatim as float64.
@@ -101,7 +101,7 @@ class RigidEncoder:
         self._refreshed = 0
 
     def encode(self, poses: Floats, scene_epoch: int) -> EncodedFrame:
-        """Encodes one state.
+        """Encode one state.
 
         `poses`: (n_bodies, 7) float64, world frame, `x y z qw qx qy qz` [m, unit quaternion]; any value is taken,
         not finite ones are sent as they are. A new `scene_epoch` sends every body again.
@@ -114,11 +114,11 @@ class RigidEncoder:
         rows = np.ascontiguousarray(poses.T)
         with np.errstate(invalid="ignore", over="ignore"):
             squares = np.einsum("ij,ij->j", rows[3:], rows[3:])
-            changed = self._changed(rows, squares)
+            changed = self._find_changed(rows, squares)
             if scene_epoch != self._scene_epoch:
                 self._scene_epoch = scene_epoch
                 changed[:] = True
-            self._anchor_anew(rows, squares, changed, seq)
+            self._update_anchors(rows, squares, changed, seq)
         base_seq = max(seq - WINDOW, 0)
         sent = self._anchored_seq > base_seq
         self._add_refresh(sent)
@@ -129,7 +129,7 @@ class RigidEncoder:
         """`(state_seq, poses)` of the newest frame, for a snapshot: (n_bodies, 7), within the drift allowance."""
         return self._next_seq - 1, np.ascontiguousarray(self._anchor.T)
 
-    def _changed(self, rows: Floats, squares: Floats) -> Mask:
+    def _find_changed(self, rows: Floats, squares: Floats) -> Mask:
         """Bodies that left their anchor, and those that cannot be compared (not finite, no anchor yet).
 
         `rows`: (7, n) poses. `squares`: of the length of their quaternions.
@@ -140,8 +140,8 @@ class RigidEncoder:
         near &= (cosine >= _COS_ALLOWANCE * np.sqrt(squares)) & (np.abs(squares - 1.0) <= _MAX_NORM_DEFECT)
         return ~near
 
-    def _anchor_anew(self, rows: Floats, squares: Floats, changed: Mask, seq: int) -> None:
-        """Makes the present pose of the `changed` bodies their anchor and computes its code."""
+    def _update_anchors(self, rows: Floats, squares: Floats, changed: Mask, seq: int) -> None:
+        """Make the present pose of the `changed` bodies their anchor and computes its code."""
         at: Ints | slice = slice(None)
         if not changed.all():
             at = np.flatnonzero(changed)
@@ -163,7 +163,7 @@ class RigidEncoder:
         self._levels[:, at] = rotation_levels(q)
 
     def _add_refresh(self, sent: Mask) -> None:
-        """Marks the next bodies of the round robin in `sent`."""
+        """Mark the next bodies of the round robin in `sent`."""
         count = -(-self.n_bodies // REFRESH_FRAMES)
         for _ in range(count):
             sent[self._refreshed] = True
@@ -194,9 +194,9 @@ class RigidEncoder:
             codes = index.astype("<u4").tobytes() + levels.astype("<u2").tobytes()
         head = _HEADER.pack(FORMAT, layout, self.n_bodies, n_quantised, len(escaped), *origin.tolist())
         mask = b"" if n_quantised == self.n_bodies else np.packbits(quantised, bitorder="little").tobytes()
-        return b"".join((head, codes, mask, self._verbatim(escaped)))
+        return b"".join((head, codes, mask, self._encode_escapes(escaped)))
 
-    def _verbatim(self, bodies: Ints) -> bytes:
+    def _encode_escapes(self, bodies: Ints) -> bytes:
         """The anchors of `bodies` as escapes."""
         if not len(bodies):
             return b""
@@ -207,7 +207,7 @@ class RigidEncoder:
 
 
 def _in_narrow_box(index: Ints) -> Mask:
-    """Which of the nodes `index` (3, m) lie in the narrow box around their median. At least half of them per axis."""
+    """Return which nodes `index` (3, m) lie in the narrow box around their median: at least half of them per axis."""
     middle = np.median(index, axis=1)[:, None]
     inside: Mask = (np.abs(index - middle) < 2 ** (POSITION_BITS - 1) - 1).all(axis=0)
     return inside
@@ -228,7 +228,7 @@ class RigidDecoder:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets everything: for a new connection, whose frames may be numbered anew."""
+        """Clear all state: for a new connection, whose frames may be numbered from 1 again."""
         self.poses: Floats = np.full((self.n_bodies, 7), np.nan)
         self._held.fill(-1)  # newest frame at which the pose was known to be within the bound
         self.state_seq = 0
@@ -241,11 +241,11 @@ class RigidDecoder:
 
     @property
     def complete(self) -> bool:
-        """Whether every body is within the bound at `state_seq`. False before the first frame."""
+        """True if every body is within the bound at `state_seq`; false before the first frame."""
         return self.state_seq > 0 and bool((self._held >= self.state_seq).all())
 
     def apply(self, state_seq: int, base_seq: int, payload: bytes | memoryview) -> bool:
-        """Takes one frame (`state_seq`, `base_seq` from its `StateHeader`). False: ask for a snapshot.
+        """Apply one frame (`state_seq`, `base_seq` from its `StateHeader`). False: ask for a snapshot.
 
         Bodies in the frame are up to date even then. An older frame than the newest is ignored and counted.
         Raises `StreamError` for bytes that are no payload for `n_bodies` bodies; nothing has changed then.
@@ -313,8 +313,8 @@ def _unpack(payload: bytes | memoryview, n_bodies: int) -> tuple[Mask | None, Fl
     end = at_escapes + n_escaped * _ESCAPE.itemsize
     if len(payload) != end:
         raise StreamError(f"payload of {len(payload)} bytes, its header asks for {end}")
-    mask = None if n == n_bodies else _mask(payload, at_mask, n, n_bodies)
-    escapes = _NO_ESCAPES if not n_escaped else _escaped(payload, at_escapes, n_escaped, n_bodies, mask)
+    mask = None if n == n_bodies else _read_mask(payload, at_mask, n, n_bodies)
+    escapes = _NO_ESCAPES if not n_escaped else _read_escapes(payload, at_escapes, n_escaped, n_bodies, mask)
     words = np.ndarray((3, n), "<u4", payload, _HEADER.size)
     if layout == NARROW:
         levels = (words >> _SHIFT).view(np.int32)
@@ -329,14 +329,14 @@ def _unpack(payload: bytes | memoryview, n_bodies: int) -> tuple[Mask | None, Fl
     return mask, rows.T, escapes
 
 
-def _mask(payload: bytes | memoryview, at: int, n_quantised: int, n_bodies: int) -> Mask:
+def _read_mask(payload: bytes | memoryview, at: int, n_quantised: int, n_bodies: int) -> Mask:
     mask = np.unpackbits(np.frombuffer(payload, np.uint8, (n_bodies + 7) // 8, at), bitorder="little").view(np.bool_)
     if np.count_nonzero(mask[:n_bodies]) != n_quantised or mask[n_bodies:].any():
         raise StreamError(f"mask marks other than {n_quantised} of {n_bodies} bodies")
     return mask[:n_bodies]
 
 
-def _escaped(
+def _read_escapes(
     payload: bytes | memoryview, at: int, n_escaped: int, n_bodies: int, mask: Mask | None
 ) -> npt.NDArray[np.void]:
     escapes = np.frombuffer(payload, _ESCAPE, n_escaped, at)

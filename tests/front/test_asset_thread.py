@@ -57,7 +57,7 @@ def test_a_refusal_that_nobody_is_there_to_hear_is_counted(still: Still) -> None
 
 def test_nobody_waits_who_is_gone(still: Still) -> None:
     still.take(1)
-    assert still.server._scheduler.ask(b"gone", 99, "", AssetRequest(1, 1, 7, still.address, 0, 100), 1) == ""
+    assert still.server._scheduler.request(b"gone", 99, "", AssetRequest(1, 1, 7, still.address, 0, 100), 1) == ""
     assert still.server.read_counters().pending_readers == 2
     still.server._send_chunks()
     assert (still.server.read_counters().chunks, still.server.read_counters().pending_readers) == (1, 0)

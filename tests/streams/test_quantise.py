@@ -77,7 +77,7 @@ def test_decoded_quaternions_have_unit_length() -> None:
 
 @pytest.mark.parametrize("levels", [(2 * ROTATION_CENTRE + 1, 8191, 8191), (0, 0, 0), (2**16 - 1,) * 3])
 def test_levels_of_no_rotation_are_refused(levels: tuple[int, ...]) -> None:
-    with pytest.raises(StreamError, match="stand for none"):
+    with pytest.raises(StreamError, match="rotation levels"):
         decoded(np.array([levels]).T)
 
 

@@ -380,6 +380,6 @@ def test_each_check_refuses() -> None:
     refused(good[:last] + b"\x03\0" + good[last + 2 :], "ascending")
     refused(good[:last] + b"\x0a\0" + good[last + 2 :], "ascending")
     refused(good[:last] + b"\x09\0" + good[last + 2 :], "ascending")
-    refused(good[:20] + b"\xff\xff\xff\xff" + good[24:], "stand for none")
+    refused(good[:20] + b"\xff\xff\xff\xff" + good[24:], "rotation levels")
     full = RigidEncoder(n).encode(random_poses(np.random.default_rng(11), n), 1).payload
     refused(full[:6] + b"\x01\0" + full[8:] + good[last:], "ascending")

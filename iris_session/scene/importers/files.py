@@ -63,7 +63,7 @@ def present(path: Path) -> None:
 
 
 def guarded(path: Path, kind: str, read: Callable[[], Any]) -> Any:
-    """What `read` returns. Damaged files make libraries raise anything, `AssertionError` too: `SceneBuildError`."""
+    """Return the result of `read`. Damaged files make libraries raise anything: all becomes `SceneBuildError`."""
     try:
         with np.errstate(all="ignore"):  # readers look for what is not finite
             return read()
@@ -123,7 +123,7 @@ def _other_reader(path: Path, kind: str) -> str:
 
 
 def xacro_advice(path: Path) -> str:
-    """How a URDF is made of xacro."""
+    """Return advice on expanding xacro to URDF."""
     stem = path.name.removesuffix(".xacro").removesuffix(".urdf")
     return f"xacro must be expanded first: xacro {path.name} > {stem}.urdf (ROS has it; else pip install xacro)"
 

@@ -85,7 +85,7 @@ class _Reader:
     def __init__(self, data: GltfData) -> None:
         self._data = data
         self._skipped: dict[str, None] = {}
-        self._looks = GltfLooks(data, self._skipped)
+        self._materials = GltfMaterials(data, self._skipped)
         self._meshes: dict[object, list[Surface]] = {}
         self._triangles = 0
 
@@ -153,8 +153,8 @@ class _Reader:
     def _matrix(self, entry: dict[str, Any]) -> Matrix:
         """T_parent_node."""
         if "matrix" in entry:
-            return np.array(self._looks.numbers(entry["matrix"], 16)).reshape(4, 4).T
-        x, y, z, w = self._looks.numbers(entry.get("rotation", (0, 0, 0, 1)), 4)
+            return np.array(self._materials.numbers(entry["matrix"], 16)).reshape(4, 4).T
+        x, y, z, w = self._materials.numbers(entry.get("rotation", (0, 0, 0, 1)), 4)
         matrix = np.eye(4)
         length = math.sqrt(x * x + y * y + z * z + w * w)
         if length < 1e-9:
@@ -165,8 +165,8 @@ class _Reader:
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
-        matrix[:3, :3] *= self._looks.numbers(entry.get("scale", (1, 1, 1)), 3)
-        matrix[:3, 3] = self._looks.numbers(entry.get("translation", (0, 0, 0)), 3)
+        matrix[:3, :3] *= self._materials.numbers(entry.get("scale", (1, 1, 1)), 3)
+        matrix[:3, 3] = self._materials.numbers(entry.get("translation", (0, 0, 0)), 3)
         return matrix
 
     # --- meshes -------------------------------------------------------------------------------------------------------
@@ -201,13 +201,15 @@ class _Reader:
             return None
         if not np.isfinite(position).all():
             raise SceneBuildError(f"{self._data.name}: a vertex of {name} is not finite")
-        dress = self._looks.dress(primitive.get("material"))
-        mesh = self._mesh(attributes, position, index, dress)
-        mesh, rgba = merge_vertex_color(mesh, dress.look.rgba)
-        look = dress.look if rgba == dress.look.rgba else replace(dress.look, rgba=rgba)
-        return Surface(add_back_sides(mesh) if dress.both_sides else mesh, look, name)
+        used = self._materials.read(primitive.get("material"))
+        mesh = self._mesh(attributes, position, index, used)
+        mesh, rgba = merge_vertex_color(mesh, used.appearance.rgba)
+        look = used.appearance if rgba == used.appearance.rgba else replace(used.appearance, rgba=rgba)
+        return Surface(add_back_sides(mesh) if used.both_sides else mesh, look, name)
 
-    def _mesh(self, attributes: dict[str, Any], position: Floats, index: NDArray[np.int64], dress: Dress) -> MeshArrays:
+    def _mesh(
+        self, attributes: dict[str, Any], position: Floats, index: NDArray[np.int64], used: PrimitiveMaterial
+    ) -> MeshArrays:
         corners = position[index]
         if "NORMAL" in attributes:
             normals = self._of_vertices(attributes["NORMAL"], (3,), len(position)).astype(np.float32)
@@ -219,16 +221,16 @@ class _Reader:
             flat = normalise(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
             normal = np.repeat(flat[:, None], 3, axis=1).astype(np.float32)
         uv = None
-        wanted = f"TEXCOORD_{dress.uv_set}"
+        wanted = f"TEXCOORD_{used.uv_set}"
         if wanted in attributes:
             values = np.nan_to_num(self._of_vertices(attributes[wanted], (2,), len(position)).astype(np.float64))
-            if dress.uv_matrix is not None:
-                values = values @ dress.uv_matrix[:2, :2].T + dress.uv_matrix[:2, 2]
+            if used.uv_matrix is not None:
+                values = values @ used.uv_matrix[:2, :2].T + used.uv_matrix[:2, 2]
             uv = values.astype(np.float32)[index]
         color = None
         if "COLOR_0" in attributes:
             color = _bytes(self._of_vertices(attributes["COLOR_0"], (3, 4), len(position)))[index]
-            if dress.opaque:
+            if used.opaque:
                 color[..., 3] = 255
         return index_corners(corners, normal, uv, color)
 
@@ -268,7 +270,7 @@ class _Reader:
         if type(index) is not int or not 0 <= index < len(lights) or not isinstance(lights[index], dict):
             raise SceneBuildError(f"{self._data.name} refers to light {index!r}, which it does not have")
         entry = lights[index]
-        red, green, blue = (seen(v) for v in self._looks.numbers(entry.get("color", (1, 1, 1)), 3))
+        red, green, blue = (linear_to_srgb(v) for v in self._materials.numbers(entry.get("color", (1, 1, 1)), 3))
         color: Rgb = (red, green, blue)
         kind = _LIGHTS.get(entry.get("type", ""), LightKind.POINT)
         cone = entry.get("spot") if isinstance(entry.get("spot"), dict) else {}
@@ -281,12 +283,12 @@ class _Reader:
             ambient=(0.0, 0.0, 0.0),
             diffuse=color,
             specular=(_SPECULAR * red, _SPECULAR * green, _SPECULAR * blue),
-            cutoff=math.degrees(self._looks.number(cone.get("outerConeAngle", math.pi / 4))),
-            range=max(0.0, self._looks.number(entry.get("range", 0.0))),
+            cutoff=math.degrees(self._materials.number(cone.get("outerConeAngle", math.pi / 4))),
+            range=max(0.0, self._materials.number(entry.get("range", 0.0))),
             # of directional lights glTF gives lux, which has no place in the specification
             intensity=0.0
             if kind == LightKind.DIRECTIONAL
-            else max(0.0, self._looks.number(entry.get("intensity", 1.0))),
+            else max(0.0, self._materials.number(entry.get("intensity", 1.0))),
         )
 
     def _camera(self, index: object, node: Node) -> Camera:
@@ -295,7 +297,9 @@ class _Reader:
         lens = entry.get("orthographic" if flat else "perspective")
         if not isinstance(lens, dict):
             raise SceneBuildError(f"{self._data.name}: camera {index} has no lens")
-        fovy = 2 * self._looks.number(lens.get("ymag", 1.0)) if flat else self._looks.number(lens.get("yfov", 0.8))
+        fovy = (
+            2 * self._materials.number(lens.get("ymag", 1.0)) if flat else self._materials.number(lens.get("yfov", 0.8))
+        )
         return Camera(
             name=node.name,
             body=0,
@@ -309,7 +313,7 @@ class _Reader:
 
 
 def _bytes(color: NDArray[Any]) -> NDArray[np.uint8]:
-    """Linear colours of vertices (n, 3 or 4) as they are seen, in bytes."""
+    """Linear colours of vertices (n, 3 or 4) as they are linear_to_srgb, in bytes."""
     values = np.clip(np.nan_to_num(color.astype(np.float64)), 0, 1)
     shown = np.where(values <= 0.0031308, values * 12.92, 1.055 * values ** (1 / 2.4) - 0.055)
     if values.shape[1] == 4:
@@ -359,12 +363,14 @@ class GltfData:
         return entry
 
     def array(self, accessor: object, widths: tuple[int, ...]) -> NDArray[Any]:
-        """An accessor (count, width), normalised where it says so, else in its own type."""
+        """Return an accessor (count, width): as floats where it is normalised, otherwise in its own type."""
         entry = self.item("accessors", accessor)
         dtype, width = np.dtype(_TYPES.get(entry.get("componentType", 0), "V1")), _WIDTHS.get(entry.get("type", ""), 0)
         count = entry.get("count")
         if dtype.kind == "V" or width not in widths or type(count) is not int or count < 0:
-            raise SceneBuildError(f"{self.name}: accessor {accessor} is none of the form that is needed there")
+            needed = " or ".join(name for name, n in _WIDTHS.items() if n in widths)
+            given = f"{entry.get('type')!r} of componentType {entry.get('componentType')!r}, count {count!r}"
+            raise SceneBuildError(f"{self.name}: accessor {accessor}: expected {needed}, got {given}")
         if "bufferView" in entry:
             values = self._view_array(entry["bufferView"], entry.get("byteOffset", 0), dtype, count, width)
         elif count * width > _MAX_ZEROS:
@@ -378,7 +384,7 @@ class GltfData:
         return values
 
     def picture_bytes(self, image: object) -> bytes:
-        """The encoded bytes of an image."""
+        """Return the encoded bytes of an image."""
         entry = self.item("images", image)
         if "bufferView" in entry:
             return bytes(self._view(entry["bufferView"])[0])
@@ -477,40 +483,42 @@ def _glb(data: bytes, name: str) -> tuple[bytes, bytes | None]:
 
 
 @dataclass(frozen=True, eq=False)
-class Dress:
-    """A look, whether it is drawn from both sides, and which texture coordinates it takes: `uv_set`, turned by
-    `uv_matrix` (3, 3) unless that is `None`; `uv_set` is -1 without textures. `opaque`: alpha says nothing."""
+class PrimitiveMaterial:
+    """Appearance of a primitive, and which texture coordinates it uses.
 
-    look: Appearance
+    `uv_set`, transformed by `uv_matrix` (3, 3) unless that is `None`; -1 without textures. `opaque`: alpha is ignored.
+    """
+
+    appearance: Appearance
     both_sides: bool = False
     uv_set: int = -1
     uv_matrix: Doubles | None = None
     opaque: bool = True
 
 
-class GltfLooks:
-    """Looks by the number of their material; `skipped` takes what has no form."""
+class GltfMaterials:
+    """Reader of materials by index; features that have no counterpart are added to `skipped`."""
 
     def __init__(self, data: GltfData, skipped: dict[str, None]) -> None:
         self._data = data
         self._skipped = skipped
-        self._dresses: dict[object, Dress] = {}
+        self._uses: dict[object, PrimitiveMaterial] = {}
         self._pictures: dict[tuple[object, ...], TextureImage] = {}
         self._budget = PixelBudget(data.name)
 
-    def dress(self, material: object) -> Dress:
-        """Of a primitive that names `material`, or none: then as glTF has it, white and rough."""
+    def read(self, material: object) -> PrimitiveMaterial:
+        """Return the material of a primitive; without one the default of glTF, white and rough."""
         entry = {} if material is None else self._data.item("materials", material)
-        if material not in self._dresses:
-            self._dresses[material] = self._dress(entry)
-        return self._dresses[material]
+        if material not in self._uses:
+            self._uses[material] = self._read_material(entry)
+        return self._uses[material]
 
-    def _dress(self, entry: dict[str, Any]) -> Dress:
+    def _read_material(self, entry: dict[str, Any]) -> PrimitiveMaterial:
         pbr = _map(entry.get("pbrMetallicRoughness"))
         factor = self.numbers(pbr.get("baseColorFactor", (1, 1, 1, 1)), 4)
         mode = entry.get("alphaMode", "OPAQUE")
         alpha = 1.0 if mode == "OPAQUE" else factor[3]
-        red, green, blue = (seen(v) for v in factor[:3])
+        red, green, blue = (linear_to_srgb(v) for v in factor[:3])
         rgba: Rgba = (red, green, blue, min(max(alpha, 0.0), 1.0))
         roughness = self.number(pbr.get("roughnessFactor", 1.0))
         rgba, emission = self._emission(entry, rgba)
@@ -533,12 +541,12 @@ class GltfLooks:
             images=tuple((role, picture) for _, role, picture in uses),
         )
         uv_set, uv_matrix = self._mapping([use for use, _, _ in uses])
-        return Dress(look, bool(entry.get("doubleSided", False)), uv_set, uv_matrix, mode == "OPAQUE")
+        return PrimitiveMaterial(look, bool(entry.get("doubleSided", False)), uv_set, uv_matrix, mode == "OPAQUE")
 
     def _emission(self, entry: dict[str, Any], rgba: Rgba) -> tuple[Rgba, float]:
         """The specification has light of a material's own colour: how much, and the colour where it has none else."""
         strength = _map(_map(entry.get("extensions")).get("KHR_materials_emissive_strength"))
-        factor = np.array([seen(v) for v in self.numbers(entry.get("emissiveFactor", (0, 0, 0)), 3)])
+        factor = np.array([linear_to_srgb(v) for v in self.numbers(entry.get("emissiveFactor", (0, 0, 0)), 3)])
         glow = factor * self.number(strength.get("emissiveStrength", 1.0))
         if not glow.any():
             return rgba, 0.0
@@ -648,7 +656,7 @@ def _map(value: object) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def seen(value: float) -> float:
+def linear_to_srgb(value: float) -> float:
     """A linear factor of glTF as a colour (sRGB)."""
     v = min(max(float(value), 0.0), 1.0)
     if v >= 1.0:

@@ -1,4 +1,4 @@
-"""What trimesh takes without a word, or calls by names of its own: files that are cut, and vertices that are not there.
+"""Checks of mesh files that trimesh reads without an error although they are damaged: truncated files, absent vertices.
 
 Of OBJ also corners that count from the end, which mean another vertex in every line and trimesh takes from the end of
 the file, and those with 0 for a texture coordinate or normal that they do not have, as some exporters write. Names and
@@ -132,7 +132,7 @@ def absolute_corners(name: str, data: bytes) -> bytes:
 
 
 def _plain(data: bytes) -> bool:
-    """Whether it is ASCII; with zeros a disk that was full has filled up what it had lost."""
+    """Return whether it is ASCII; with zeros a disk that was full has filled up what it had lost."""
     return data.isascii() and b"\0" not in data
 
 
@@ -142,7 +142,7 @@ def _place(name: str, data: bytes, at: int) -> str:
 
 
 def _cut_corner(text: bytes) -> bool:
-    """Whether an OBJ ends, without an end of its line, in a corner of a face that has fewer parts than the others."""
+    """Return whether an OBJ ends without a newline in a corner of a face that has fewer parts than the others."""
     words = text[text.rfind(b"\n") + 1 :].split()
     kinds = {tuple(map(bool, word.split(b"/"))) for word in words[1:]}
     return words[:1] == [b"f"] and len(kinds) > 1

@@ -1,5 +1,5 @@
-"""Which files a file may draw in. A scene is shown to everybody in the session, and files come from anywhere: what one
-refers to is read only from folders that belong to it.
+"""Files that a geometry file may refer to. All participants see the scene, and files come from untrusted sources: a
+reference is followed only into folders that belong to the file.
 
 Those are its own folder with all below; folders beside that one which are called as models call theirs (`SIBLINGS`);
 the package it lies in, from the folder with `package.xml`; packages that it names (`package://`), in or beside a folder
@@ -74,7 +74,7 @@ def read_bounded(path: Path) -> bytes:
 
 
 class References:
-    """What the file at `path` may refer to. `package_dirs`: folders of packages, or packages themselves."""
+    """Files that the file at `path` may refer to. `package_dirs`: folders of packages, or packages themselves."""
 
     def __init__(self, path: Path, package_dirs: Sequence[str | PathLike[str]] = ()) -> None:
         self.path = path.resolve()
@@ -155,7 +155,7 @@ class References:
         )
 
     def _may_draw_in(self, root: Path, found: Path) -> bool:
-        """Whether `found`, below the folder `root` that was found by its name, belongs to the file."""
+        """Return whether `found`, below the folder `root` that was found by its name, belongs to the file."""
         named = root in self.given or root.parent in self.given
         return named or (root / _PACKAGE).is_file() or any(found.is_relative_to(own) for own in self._roots)
 
@@ -176,7 +176,7 @@ def _similar(path: Path, others: int = _LISTED) -> str:
 
 
 def _is_package(root: Path, name: str) -> bool:
-    """Whether a folder of another name is the package: checkouts are often called otherwise."""
+    """Return whether a folder of another name is the package: checkouts are often called otherwise."""
     try:
         text = (root / _PACKAGE).read_bytes()[: 1 << 16].decode("utf-8", "replace")
     except OSError:

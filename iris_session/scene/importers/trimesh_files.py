@@ -103,7 +103,7 @@ class _Reader:
         self._trimesh = trimesh
         self._name = name
         self._unnamed = unnamed
-        self._looks: dict[int, Appearance | None] = {}
+        self._appearances: dict[int, Appearance | None] = {}
         self._pictures: dict[int, TextureImage] = {}
         self._budget = PixelBudget(name)
         self.skipped: list[str] = []
@@ -132,7 +132,7 @@ class _Reader:
         return tuple(Node(listed[k].name, -1, matrix, [listed[k]]) for k, matrix in placed)
 
     def _names(self, given: list[str]) -> dict[str, str]:
-        """What the geometries are called: as in the file, or, where trimesh made their names up, as the file is."""
+        """Return the names of the geometries: as in the file, or, where trimesh made their names up, as the file is."""
         made_up = [name for name in given if _MADE_UP.fullmatch(name)]
         several = len(made_up) > 1
         ours = {name: f"{self._unnamed}_{k}" if several else self._unnamed for k, name in enumerate(made_up, start=1)}
@@ -151,7 +151,7 @@ class _Reader:
         color: NDArray[np.uint8] | None = None
         look: Appearance | None = None
         if visual.kind == "texture":
-            look = self._look(visual.material)
+            look = self._appearance(visual.material)
             if visual.uv is not None and len(visual.uv) == len(points):
                 downward = np.asarray(visual.uv, np.float64)[:, :2] * [1, -1] + [0, 1]  # v is up in trimesh
                 uv = np.ascontiguousarray(np.nan_to_num(downward)[faces], np.float32)
@@ -173,11 +173,11 @@ class _Reader:
         first, same = find_unique_rows(np.ascontiguousarray(points.astype(np.float32) + np.float32(0.0)))
         return compute_creased_normals(points[first], same[faces]).astype(np.float32)
 
-    def _look(self, material: Any) -> Appearance | None:
-        if id(material) not in self._looks:
+    def _appearance(self, material: Any) -> Appearance | None:
+        if id(material) not in self._appearances:
             pbr = isinstance(material, self._trimesh.visual.material.PBRMaterial)
-            self._looks[id(material)] = self._of_pbr(material) if pbr else self._of_mtl(material)
-        return self._looks[id(material)]
+            self._appearances[id(material)] = self._of_pbr(material) if pbr else self._of_mtl(material)
+        return self._appearances[id(material)]
 
     def _of_mtl(self, material: Any) -> Appearance | None:
         """`Kd`, `Ks`, `Ns`, `d` or `Tr`, and `map_Kd`, whose picture multiplies the colour. `None` of one that trimesh
@@ -236,7 +236,7 @@ def _rgba(color: Any) -> Rgba:
 
 
 def _other_map(key: str) -> bool:
-    """Whether a word of an MTL file stands for a picture of something else than the colour."""
+    """Return whether a word of an MTL file stands for a picture of something else than the colour."""
     return key in _MAPS or (key.startswith("map_") and key not in ("map_kd", "map_ka"))
 
 
@@ -250,7 +250,7 @@ def _first(value: Any, default: float) -> float:
 
 
 def _resolver(trimesh: Any, references: References) -> Any:
-    """What trimesh asks for further files: ours decides which it may have, and keeps what was missing."""
+    """Resolver that trimesh asks for further files: ours decides which it may have, and keeps what was missing."""
 
     class Resolver(trimesh.resolvers.Resolver):  # type: ignore[misc]
         def __init__(self) -> None:

@@ -1,7 +1,7 @@
-"""Whether what a file says is in metres, radians and colours from 0 to 1: what whoever adds it is asked, a line each.
+"""Questions about the units of a file: lengths in metres, limits in radians, colours from 0 to 1; a line each.
 
-Nothing is refused for it: halls are large, and wheels turn far. Whatever is advised is to be typed as it stands, in
-place of what is there now.
+Nothing is refused for it: halls are large, and wheels turn far. Advice can be typed as it stands, in place of the
+present value.
 """
 
 from __future__ import annotations

@@ -156,7 +156,7 @@ class _Reader:
         self._notes: dict[str, None] = {}
         self._sizes: list[Drawn] = []
         self._measured: set[tuple[Path, tuple[float, float, float]]] = set()
-        self._looks: dict[str, Appearance | None] = {}
+        self._appearances: dict[str, Appearance | None] = {}
         self._pictures: dict[Path, TextureImage] = {}
         self._budget = PixelBudget(path.name)
         self._materials: dict[str, Any] = {}
@@ -220,7 +220,7 @@ class _Reader:
         found: list[DrawnItem] = []
         for shape in link.collisions if self._collisions else link.visuals:
             matrix = T_part_link @ (np.eye(4) if shape.origin is None else shape.origin)
-            look = None if self._collisions else self._look(shape.material)
+            look = None if self._collisions else self._appearance(shape.material)
             name = truncate_name(shape.name or link.name)
             geometry = shape.geometry
             if geometry.mesh is not None:
@@ -254,13 +254,13 @@ class _Reader:
         ]
 
     def _measure(self, path: Path, loaded: LoadedFile, given: tuple[float, float, float], scale: Matrix) -> None:
-        """How large a mesh is, by the scale at its `<mesh>`; once for each that it is drawn with."""
+        """Record the size of a mesh, by the scale at its `<mesh>`; once for each that it is drawn with."""
         if (path, given) not in self._measured:
             self._measured.add((path, given))
             placed = [(surface.mesh, scale @ node.matrix) for node in loaded.nodes for surface in node.surfaces]
             self._sizes.append(Drawn(f"mesh, {path.name},", side_of(placed), given))
 
-    def _look(self, material: Any) -> Appearance | None:
+    def _appearance(self, material: Any) -> Appearance | None:
         """Of a material of the URDF; one without colour refers to another of its name."""
         if material is None:
             return None
@@ -271,12 +271,12 @@ class _Reader:
             self._skip(f"material {material.name!r}, which has neither colour nor texture anywhere")
             return None
         key = f"{known.name} {known.color} {known.texture}"
-        if key not in self._looks:
+        if key not in self._appearances:
             rgba = self._rgba(known)
-            self._looks[key] = Appearance(
+            self._appearances[key] = Appearance(
                 rgba=rgba, name=truncate_name(known.name or ""), images=self._texture(known.texture)
             )
-        return self._looks[key]
+        return self._appearances[key]
 
     def _rgba(self, material: Any) -> Rgba:
         values = (1.0,) * 4 if material.color is None else tuple(float(v) for v in material.color.rgba)
@@ -326,7 +326,7 @@ def _shape(file: str, geometry: Any) -> tuple[str, tuple[float, float, float]]:
 
 
 class Drive(NamedTuple):
-    """What moves one joint: joint `joint` of the table, times `multiplier` plus `offset`, along or around `axis`."""
+    """Drive of one joint: joint `joint` of the table, times `multiplier` plus `offset`, along or around `axis`."""
 
     joint: int
     multiplier: float
@@ -554,6 +554,6 @@ def _check_element(path: Path, element: Any) -> None:
 
 
 def _at(path: Path, element: Any) -> str:
-    """Where an element stands, for error texts."""
+    """Return the position of an element, for messages."""
     name = element.get("name") or ""
     return f"{path.name}, line {element.sourceline}: <{element.tag}>{f' {name}' if name else ''}"

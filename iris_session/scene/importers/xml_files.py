@@ -1,5 +1,5 @@
-"""What a small DAE or 3MF file may not do: name other files by entities, grow without bound by them, or place one thing
-within another so often that memory ends. trimesh and pycollada follow all of that, so it is counted before they read.
+"""Checks of DAE and 3MF files before they are read: no external entities, no unbounded growth by entities, and no
+instances nested so often that memory ends. trimesh and pycollada follow all of that, so it is counted before they read.
 """
 
 from __future__ import annotations
