@@ -28,10 +28,10 @@ from iris_session.link.config import Ports, SceneInfo
 from iris_session.protocol import codec, entries
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, AssetChunk, AssetRefused, AssetRequest
 from iris_session.protocol.client_messages import ClientEnvelope
-from iris_session.protocol.codec import decoder
+from iris_session.protocol.codec import make_decoder
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.errors import ProtocolError
-from iris_session.protocol.media import CLASSES, MediaHeader, MediaPush, media_topic, parse_topic
+from iris_session.protocol.media import CLASSES, MediaHeader, MediaPush, make_topic, parse_topic
 from iris_session.protocol.names import PROTOCOL_VERSION
 from iris_session.protocol.server_messages import Presence, ServerEnvelope, StateHeader
 from iris_session.recording import journal, messages
@@ -241,7 +241,7 @@ def damage(rng: Random, data: bytes, other: bytes) -> bytes:
 
 Errors = tuple[type[Exception], ...]
 Make = Callable[[Random], bytes]
-_decode_keyframe = decoder(journal.Keyframe)
+_decode_keyframe = make_decoder(journal.Keyframe)
 
 
 class Decoder:
@@ -438,7 +438,7 @@ HONEST: Final = "honest"
 
 def make_media_topic(rng: Random) -> bytes:
     stream = rng.choice((HONEST, "cloud", "a", "x" * 48, "Ärger", "", "a/b"))
-    return rng.choice((b"\1", b"\1", b"\0")) + media_topic(rng.choice((0, 1, 2, 7, 2**63, 10**30)), stream)
+    return rng.choice((b"\1", b"\1", b"\0")) + make_topic(rng.choice((0, 1, 2, 7, 2**63, 10**30)), stream)
 
 
 def make_media_push(rng: Random) -> bytes:

@@ -41,11 +41,11 @@ from iris_session.client.identity import Identity
 from iris_session.link import FrontLimits
 from iris_session.protocol import codec
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, AssetChunk, AssetRefused, AssetRequest
-from iris_session.protocol.client_messages import ClientEnvelope, ClockPing, EStop, Hello, Marker, Sample, envelope
+from iris_session.protocol.client_messages import ClientEnvelope, ClockPing, EStop, Hello, Marker, Sample, wrap_message
 from iris_session.protocol.codec import CLIENT_TYPES, decode_client, decode_server, encode_client, encode_server
 from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.errors import ProtocolError
-from iris_session.protocol.media import media_topic
+from iris_session.protocol.media import make_topic
 from iris_session.protocol.names import PROTOCOL_VERSION, AssetRefusal
 from iris_session.protocol.server_messages import (
     TOPIC_PRESENCE,
@@ -237,7 +237,7 @@ class FrontControl:
         new.sndhwm = 100
         new.connect(f"tcp://127.0.0.1:{self.session.ports.control}")
         if self._rng.random() < 0.9:
-            new.send(encode_client(envelope(Hello("operator", "Ann", secret=self._rng.randbytes(16)))))
+            new.send(encode_client(wrap_message(Hello("operator", "Ann", secret=self._rng.randbytes(16)))))
         if i < len(self._peers):
             self._peers[i].close(linger=0)
             self._peers[i], self._lives[i] = new, self.LIFE
@@ -362,7 +362,7 @@ class FrontMedia(FrontControl):
         self._viewer = self.session.context.socket(zmq.SUB)
         self._viewer.linger = 0
         self._viewer.connect(f"tcp://127.0.0.1:{self.session.ports.media}")
-        self._viewer.subscribe(media_topic(self._honest.epoch, HONEST))
+        self._viewer.subscribe(make_topic(self._honest.epoch, HONEST))
 
     def make(self) -> bytes:
         """Return an input; its first byte selects the port."""
@@ -425,7 +425,7 @@ class FrontMedia(FrontControl):
             self.session.process.publish_media(HONEST, b"picture", now_ns, 1, "bytes")
             self._poll_session()
         topic, head, frame = self._viewer.recv_multipart()
-        assert topic.startswith(media_topic(self._honest.epoch, HONEST)), topic
+        assert topic.startswith(make_topic(self._honest.epoch, HONEST)), topic
         assert codec.decode_media_header(head).stream == HONEST
         assert frame == b"picture"
 

@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 import psutil
 
-from iris_session.protocol.client_messages import Sample, envelope
+from iris_session.protocol.client_messages import Sample, wrap_message
 from iris_session.protocol.codec import encode_client
 from iris_session.protocol.common import Applied, Pose
 from iris_session.protocol.entries import Entry
@@ -61,7 +61,7 @@ class Feeder:
         writer.add(batch)
         for person in range(len(self._people)):
             for i in range(len(DEVICES) * 10):
-                writer.add_sample(person, now_ns + i, encode_client(envelope(self._sample(i % len(DEVICES)))))
+                writer.add_sample(person, now_ns + i, encode_client(wrap_message(self._sample(i % len(DEVICES)))))
         writer.flush()
 
     def _tick(self, batch: Batch) -> None:

@@ -25,7 +25,7 @@ from iris_session.protocol.names import (
     Role,
     TargetKind,
 )
-from iris_session.protocol.scene import merged
+from iris_session.protocol.scene import merge_patches
 from iris_session.protocol.server_messages import EpisodeChanged, EStopChanged, Gap, PauseChanged, SceneChanged
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 
@@ -199,7 +199,7 @@ def load_scene(ctx: Context, m: SceneLoaded) -> None:
 def patch_scene(ctx: Context, m: ScenePatched) -> None:
     """Record a visual change of the scene: nothing else changes, so no robot stops."""
     state = ctx.state
-    state.patches = merged(state.patches, m.ops)
+    state.patches = merge_patches(state.patches, m.ops)
     state.scene_revision += 1
     ctx.emit(SceneChanged(state.scene_epoch, state.scene_revision, "patch", m.scene_hash))
 

@@ -24,7 +24,7 @@ from iris_session.bench.clients import JOIN_S, MAX_FRAMES, ClientJob, Job
 from iris_session.client import Client, ClientGroup, CurveKeys
 from iris_session.client.media import MediaFrame
 from iris_session.protocol.codec import encode_media_header
-from iris_session.protocol.media import media_topic
+from iris_session.protocol.media import make_topic
 from iris_session.streams.deformable import DeformableDecoder
 from iris_session.streams.deformable_topology import DeformableTopology
 
@@ -81,7 +81,7 @@ class DeformableClient:
 
     def to_columns(self) -> dict[str, np.ndarray[Any, Any]]:
         """Return the log. `sizes`: bytes of each payload. The last of `counts`: bytes of topics and headers."""
-        topic = len(media_topic(self.client.connection.connection_epoch, self.feed.stream))
+        topic = len(make_topic(self.client.connection.connection_epoch, self.feed.stream))
         heads = sum(topic + len(f.header.budget_class) + len(encode_media_header(f.header)) for f in self.frames)
         return {
             "capture_ns": np.array([f.header.capture_ns for f in self.frames], np.int64),

@@ -22,7 +22,7 @@ import numpy as np
 import zmq
 
 from iris_session.client import AssetStore, Client
-from iris_session.protocol.scene import SceneSpec, asset_addresses, decode_scene
+from iris_session.protocol.scene import SceneSpec, decode_scene, list_assets
 from iris_session.scene import decode_image, decode_mesh
 from iris_session.system.priority import lower_thread_priority
 
@@ -70,7 +70,7 @@ def join(job: JoinJob) -> JoinResult:
         client.wait_for(lambda _: first.done, JOIN_S)
         first.check()
         spec: SceneSpec = first.decoded[scene]
-        sizes, decode = asset_addresses(spec), _make_decoder(spec)
+        sizes, decode = list_assets(spec), _make_decoder(spec)
         shapes = {mesh.levels[-1].address for mesh in spec.meshes} | {field.address for field in spec.hfields}
         rest = client.assets.fetch(sizes, decode=decode)
         client.wait_for(lambda _: shapes.isdisjoint(rest.pending), JOIN_S)

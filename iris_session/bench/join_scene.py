@@ -108,7 +108,7 @@ def prepare_scene(model_path: str, store_path: str) -> PreparedScene:
     """Prepare a compiled model as a server does at its start."""
     from iris_session.assets.store import AssetStore
     from iris_session.physics.load import load_model
-    from iris_session.protocol.scene import asset_addresses, encode_scene
+    from iris_session.protocol.scene import encode_scene, list_assets
     from iris_session.scene.mujoco_scene import parse_mujoco
 
     model = load_model(model_path)
@@ -121,7 +121,7 @@ def prepare_scene(model_path: str, store_path: str) -> PreparedScene:
     data = encode_scene(parsed.spec)
     scene = store.put(data)
     seconds = time.perf_counter() - began_s
-    sizes = {scene: len(data), **asset_addresses(parsed.spec)}
+    sizes = {scene: len(data), **list_assets(parsed.spec)}
     return PreparedScene(seconds, (_read_peak_rss() - before) / 2**20, parsed.built, scene, sizes)
 
 

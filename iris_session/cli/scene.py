@@ -212,7 +212,7 @@ def _parse_model(scene: str, store: AssetStore) -> _ParsedScene:
     model = open_scene(scene).model
     beginning = World(
         model, (), ()
-    ).initial_data()  # the initial state of a session: the keyframe `home`, if there is one
+    ).make_initial_data()  # the initial state of a session: the keyframe `home`, if there is one
     parsed = parse_mujoco(model, store, data=beginning, name=Path(scene).stem)
     return _ParsedScene(parsed.spec, parsed.scene_hash, parsed.skipped, check_model_units(parsed.spec))
 

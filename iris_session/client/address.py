@@ -11,7 +11,7 @@ from typing import Final
 from urllib.parse import parse_qs, quote, urlsplit
 
 from iris_session.client.errors import ClientError
-from iris_session.protocol.pairing import KEY_BYTES, normal_code
+from iris_session.protocol.pairing import KEY_BYTES, normalise_code
 from iris_session.security import KeysError, decode_key
 
 DEFAULT_CONTROL_PORT: Final = 7721
@@ -101,7 +101,7 @@ def _from_uri(address: str) -> Address:
         return replace(
             where,
             server_key=_key_from_uri(fields["k"]) if "k" in fields else "",
-            join_code=normal_code(code) if code else "",
+            join_code=normalise_code(code) if code else "",
             session=fields.get("n", ""),
         )
     except (ValueError, ClientError, KeysError) as error:

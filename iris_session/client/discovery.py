@@ -20,7 +20,7 @@ from iris_session.client.errors import ClientError
 from iris_session.client.host_lookup import resolve_host
 from iris_session.protocol.codec import INTRODUCTION_PREFIX, decode_beacon, decode_introduction
 from iris_session.protocol.discovery import DISCOVERY_PORT, INTRODUCTION_OFFSET, Beacon, Introduction
-from iris_session.protocol.errors import ProtocolError, VersionError
+from iris_session.protocol.errors import ProtocolError, ProtocolVersionError
 from iris_session.protocol.limits import MAX_BEACON_BYTES, MAX_INTRODUCTION_BYTES
 
 #: Sessions kept, and addresses of one session: beacons are made by anybody.
@@ -100,7 +100,7 @@ class BeaconListener:
         try:
             beacon = decode_beacon(data)
         except ProtocolError as error:
-            self._count_ignored("other_version" if isinstance(error, VersionError) else "malformed")
+            self._count_ignored("other_version" if isinstance(error, ProtocolVersionError) else "malformed")
             return
         if not is_plausible(beacon):
             self._count_ignored("malformed")

@@ -33,7 +33,7 @@ from iris_session.client.discovery import (
 from iris_session.client.errors import ClientError, NotConnectedError, RefusedError, SessionNameError, TrustError
 from iris_session.client.sockets import ClientSockets, CurveKeys
 from iris_session.protocol import pairing
-from iris_session.protocol.client_messages import Pair, envelope
+from iris_session.protocol.client_messages import Pair, wrap_message
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.discovery import Introduction
 from iris_session.protocol.errors import ProtocolError
@@ -93,7 +93,7 @@ def parse_connect_request(address: str, session: str, curve: CurveKeys | None, j
     if curve is not None and (session or join_code):
         raise ClientError("curve= names all keys itself: it goes with an address, without name and join code")
     try:
-        code = pairing.normal_code(join_code) if join_code else ""
+        code = pairing.normalise_code(join_code) if join_code else ""
     except ValueError as error:
         raise ClientError(str(error)) from None
     parsed = None if session else Address.parse(LOCAL_ADDRESS if address == "" else address)
@@ -478,10 +478,10 @@ def pair_key(address: Address, server_key: str, own: KeyPair, code: str, name: s
     """
     server_public = decode_key(server_key)
     try:
-        secret = pairing.stretch(code, server_public)
+        secret = pairing.stretch_code(code, server_public)
     except ValueError as error:
         raise ClientError(str(error)) from None
-    request = Pair(name, pairing.client_proof(secret, server_public, own.raw_public), "iris-session")
+    request = Pair(name, pairing.make_client_proof(secret, server_public, own.raw_public), "iris-session")
     sock: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.DEALER)
     try:
         sock.linger = 0
@@ -491,10 +491,10 @@ def pair_key(address: Address, server_key: str, own: KeyPair, code: str, name: s
         sock.curve_publickey = own.public.encode()
         sock.curve_secretkey = own.secret.encode()
         sock.connect(f"tcp://{address}")
-        answer = yield from _request_pairing(sock, encode_client(envelope(request)), address)
+        answer = yield from _request_pairing(sock, encode_client(wrap_message(request)), address)
     finally:
         sock.close()
-    if not pairing.same(answer.proof, pairing.server_proof(secret, server_public, own.raw_public)):
+    if not pairing.is_same_proof(answer.proof, pairing.make_server_proof(secret, server_public, own.raw_public)):
         raise TrustError(
             f"the session at {address} does not know the join code, so it is not the one that gave it out: "
             "nothing was stored; check the address and the code"

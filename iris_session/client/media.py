@@ -16,9 +16,9 @@ from iris_session.client.errors import InvalidMessageError, NotConnectedError
 from iris_session.client.sockets import ClientSockets
 from iris_session.protocol.codec import decode_media_header, encode_media_frames
 from iris_session.protocol.errors import ProtocolError
-from iris_session.protocol.media import MediaHeader, is_stream_name, media_topic, not_a_stream
+from iris_session.protocol.media import MediaHeader, describe_bad_stream_name, is_stream_name, make_topic
 from iris_session.protocol.names import BudgetClass, MediaEncoding
-from iris_session.protocol.status import ClientReport, DeliveryBudget, quantiles
+from iris_session.protocol.status import ClientReport, DeliveryBudget, compute_quantiles
 
 #: Ages of frames kept between two reports: more than come in a second.
 MAX_AGES: Final = 256
@@ -181,7 +181,7 @@ class ClientMedia:
 
     def extend_report(self, report: ClientReport, now_ns: int) -> ClientReport:
         """Return `report` with the media that came since the one before."""
-        ages = quantiles(self._ages)
+        ages = compute_quantiles(self._ages)
         elapsed_ns, self._since_ns = max(PERIOD_NS, now_ns - self._since_ns), now_ns
         received, self._bytes = self._bytes, 0
         self._ages.clear()
@@ -213,10 +213,10 @@ class ClientMedia:
         if not self._sockets.has_media:
             self._subscribed.clear()
         for stream in self._subscribed - self._feeds.keys():
-            self._sockets.unsubscribe_media(media_topic(self._connection.connection_epoch, stream))
+            self._sockets.unsubscribe_media(make_topic(self._connection.connection_epoch, stream))
         new = [stream for stream in self._feeds if stream not in self._subscribed]
         if new:
-            topics = [media_topic(self._connection.connection_epoch, stream) for stream in new]
+            topics = [make_topic(self._connection.connection_epoch, stream) for stream in new]
             self._sockets.subscribe_media(welcome.endpoints.media, topics)
         self._subscribed = set(self._feeds)
 
@@ -247,4 +247,4 @@ class ClientMedia:
 
 def _check_name(stream: str) -> None:
     if not is_stream_name(stream):
-        raise InvalidMessageError(not_a_stream(stream))
+        raise InvalidMessageError(describe_bad_stream_name(stream))

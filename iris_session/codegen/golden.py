@@ -18,7 +18,7 @@ from iris_session.codegen import conversions, rigid_reference
 from iris_session.codegen.examples import extreme, full, least
 from iris_session.protocol import codec
 from iris_session.protocol.assets import AssetChunk, AssetRefused, AssetRequest
-from iris_session.protocol.client_messages import Bye, ClientEnvelope, Hello, Sample, envelope
+from iris_session.protocol.client_messages import Bye, ClientEnvelope, Hello, Sample, wrap_message
 from iris_session.protocol.discovery import Beacon
 from iris_session.protocol.media import MediaHeader, MediaPush
 from iris_session.protocol.names import PROTOCOL_VERSION
@@ -80,14 +80,14 @@ def _messages(side: str, kinds: Any) -> Iterator[dict[str, Any]]:
     for kind in kinds:
         for make in (full, least, extreme):
             value = _wrap(side, make(kind))
-            yield _vector(f"{codec.tag_of(kind)}/{make.__name__}", _pack(value), value)
+            yield _vector(f"{codec.get_tag(kind)}/{make.__name__}", _pack(value), value)
 
 
 def _events() -> Iterator[dict[str, Any]]:
     for kind in codec.EVENT_TYPES.values():
         for make in (full, least):
             value = _wrap("server", Event(event_seq=5, step=1_000, session_time=2_000_000_000, body=make(kind)))
-            yield _vector(f"event/{codec.tag_of(kind)}/{make.__name__}", _pack(value), value)
+            yield _vector(f"event/{codec.get_tag(kind)}/{make.__name__}", _pack(value), value)
 
 
 def _values(name: str, kind: type[msgspec.Struct]) -> Iterator[dict[str, Any]]:
@@ -103,10 +103,10 @@ def _decode_only() -> Iterator[dict[str, Any]]:
     """What a client of another age may send: fields that are missing or unknown, other widths of numbers."""
     hello = Hello(role="surgeon", name="Ada")
     yield _vector(
-        "fields left out", _pack([1, 0, "", {"type": "hello", "role": "surgeon", "name": "Ada"}]), envelope(hello)
+        "fields left out", _pack([1, 0, "", {"type": "hello", "role": "surgeon", "name": "Ada"}]), wrap_message(hello)
     )
     grown = {"new": [{"deep": 1.5}], "type": "hello", "name": "Ada", "role": "surgeon", "newer": None}
-    yield _vector("unknown fields and another order", _pack([1, 0, "", grown, "later element"]), envelope(hello))
+    yield _vector("unknown fields and another order", _pack([1, 0, "", grown, "later element"]), wrap_message(hello))
     sample = Sample("head", "pose", 1, 2, 3, 4, 5, gripper=1.0)
     bare = {
         "type": "sample",
@@ -119,15 +119,15 @@ def _decode_only() -> Iterator[dict[str, Any]]:
         "alignment_version": 5,
         "gripper": 1,
     }
-    yield _vector("an integer where a float is meant", _pack([1, 0, "", bare]), envelope(sample))
+    yield _vector("an integer where a float is meant", _pack([1, 0, "", bare]), wrap_message(sample))
     wide = bytes.fromhex("94 d3 0000000000000001 cf 0000000000000000 d9 00 de 0002 d9 04") + b"type"
     wide += b"\xda\x00\x03bye\xa6reason\xdb\x00\x00\x00\x01x"
-    yield _vector("numbers and strings in wider forms", wide, envelope(Bye("x")))
+    yield _vector("numbers and strings in wider forms", wide, wrap_message(Bye("x")))
 
 
 def _malformed() -> Iterator[dict[str, Any]]:
     """What a server must refuse, with the code of the error."""
-    good = _pack(envelope(Bye("x")))
+    good = _pack(wrap_message(Bye("x")))
     bye = b"\x94\x01\x00\xa0\x82\xa4type\xa3bye"
     cases = {
         "empty": (b"", "malformed"),

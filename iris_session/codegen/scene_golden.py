@@ -53,9 +53,9 @@ from iris_session.protocol.scene import (
     Totals,
     Vec2,
     Visual,
+    apply_patch,
     check_scene,
     encode_scene,
-    patched,
 )
 
 _pack = msgspec.msgpack.encode
@@ -146,7 +146,7 @@ def _patches() -> Iterator[dict[str, Any]]:
         ),
     }
     for name, ops in cases.items():
-        after = _address(encode_scene(patched(before, ops)))
+        after = _address(encode_scene(apply_patch(before, ops)))
         row = {"name": name, "before": "every kind of thing", "after": after, "hex": _pack(ops).hex()}
         yield {**row, "value": msgspec.to_builtins(ops)}
 

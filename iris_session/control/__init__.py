@@ -1,7 +1,9 @@
-"""Command -> `ctrl`: clutch, interpolation, inverse kinematics, limits, hold. No sockets, no clock, no threads."""
+"""Control: commands to `ctrl`. Clutch, interpolation, inverse kinematics, limits, hold.
 
-from iris_session.control.config import ControlConfig
+No sockets, no clock, no threads, and no decision who may command: that is the authority's.
+"""
+
+from iris_session.control.config import ControlConfig, ControlError
 from iris_session.control.controller import Controller
-from iris_session.control.errors import ControlError
 
 __all__ = ["Controller", "ControlConfig", "ControlError"]

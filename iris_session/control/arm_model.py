@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anchors.pose import PoseTuple
-from iris_session.control.errors import ControlError
+from iris_session.control.config import ControlError
 from iris_session.protocol.specs import RobotSpec
 
 Floats = NDArray[np.float64]
@@ -22,8 +22,8 @@ Floats = NDArray[np.float64]
 _JOINT_TYPES = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
-def named_id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, what: str) -> int:
-    """Id of a named element. Raises `ControlError` with the available names."""
+def find_id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, what: str) -> int:
+    """Return the id of a named element. Raises `ControlError` with the available names."""
     found = int(mujoco.mj_name2id(model, int(kind), name))
     if found < 0:
         count = {"joint": model.njnt, "site": model.nsite, "actuator": model.nu, "body": model.nbody}[what]
@@ -36,27 +36,27 @@ class ArmModel:
     """Forward kinematics of one robot's chain. Joint vectors are in the order of `RobotSpec.joints`, shape (n,)."""
 
     def __init__(self, scene: mujoco.MjModel, robot: RobotSpec) -> None:
-        """Raises `ControlError` when the joints do not form one hinge/slide chain that ends at the site."""
-        self.joint_ids = [named_id(scene, mujoco.mjtObj.mjOBJ_JOINT, name, "joint") for name in robot.joints]
-        self.site_id = named_id(scene, mujoco.mjtObj.mjOBJ_SITE, robot.site, "site")
-        chain = _chain(scene, robot, self.joint_ids, int(scene.site_bodyid[self.site_id]))
+        """Raise `ControlError` when the joints do not form one hinge/slide chain that ends at the site."""
+        self.joint_ids = [find_id(scene, mujoco.mjtObj.mjOBJ_JOINT, name, "joint") for name in robot.joints]
+        self.site_id = find_id(scene, mujoco.mjtObj.mjOBJ_SITE, robot.site, "site")
+        chain = _find_chain(scene, robot, self.joint_ids, int(scene.site_bodyid[self.site_id]))
         self.root_body = int(scene.body_parentid[chain[0]])
-        self.model = _build(scene, chain, self.site_id)
+        self.model = _build_arm(scene, chain, self.site_id)
         self.data = mujoco.MjData(self.model)
-        chain_ids = [j for body in chain for j in _joints_of(scene, body)]
+        chain_ids = [j for body in chain for j in _list_joints(scene, body)]
         #: `q_chain = q[to_chain]`, `q = q_chain[from_chain]`.
         self.to_chain = np.array([self.joint_ids.index(j) for j in chain_ids], dtype=np.intp)
         self.from_chain = np.argsort(self.to_chain)
 
-    def fk(self, q: Floats) -> PoseTuple:
-        """`T_root_tip` at joint positions `q`."""
+    def forward_kinematics(self, q: Floats) -> PoseTuple:
+        """Return `T_root_tip` at joint positions `q`."""
         self.data.qpos[:] = q[self.to_chain]
         mujoco.mj_kinematics(self.model, self.data)
-        return site_pose(self.data, 0)
+        return read_site_pose(self.data, 0)
 
 
-def site_pose(data: mujoco.MjData, site_id: int) -> PoseTuple:
-    """World pose of a site, as plain floats."""
+def read_site_pose(data: mujoco.MjData, site_id: int) -> PoseTuple:
+    """Return the world pose of a site, as plain floats."""
     x, y, z = data.site_xpos[site_id].tolist()
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, data.site_xmat[site_id])
@@ -64,8 +64,8 @@ def site_pose(data: mujoco.MjData, site_id: int) -> PoseTuple:
     return ((x, y, z), (w, i, j, k))
 
 
-def moving_base(scene: mujoco.MjModel, body: int) -> bool:
-    """True when `body` can move relative to the world (joints or mocap above it)."""
+def has_moving_base(scene: mujoco.MjModel, body: int) -> bool:
+    """Return true when `body` can move relative to the world (joints or mocap above it)."""
     while body > 0:
         if scene.body_jntnum[body] > 0 or scene.body_mocapid[body] >= 0:
             return True
@@ -73,20 +73,20 @@ def moving_base(scene: mujoco.MjModel, body: int) -> bool:
     return False
 
 
-def joint_ranges(scene: mujoco.MjModel, arms: Sequence[ArmModel]) -> tuple[Floats, Floats]:
-    """Lower and upper limits of all arms' joints, shape (n,) each; infinite where there is none."""
+def read_joint_ranges(scene: mujoco.MjModel, arms: Sequence[ArmModel]) -> tuple[Floats, Floats]:
+    """Return lower and upper limits of all arms' joints, shape (n,) each; infinite where there is none."""
     ids = np.array([joint for arm in arms for joint in arm.joint_ids], dtype=np.intp)
     limited, ranges = np.asarray(scene.jnt_limited)[ids].astype(bool), np.asarray(scene.jnt_range)[ids]
     return np.where(limited, ranges[:, 0], -np.inf), np.where(limited, ranges[:, 1], np.inf)
 
 
-def _joints_of(scene: mujoco.MjModel, body: int) -> list[int]:
+def _list_joints(scene: mujoco.MjModel, body: int) -> list[int]:
     start = int(scene.body_jntadr[body])
     return list(range(start, start + int(scene.body_jntnum[body])))
 
 
-def _chain(scene: mujoco.MjModel, robot: RobotSpec, joint_ids: list[int], tip: int) -> list[int]:
-    """Bodies from the first arm joint to the site's body."""
+def _find_chain(scene: mujoco.MjModel, robot: RobotSpec, joint_ids: list[int], tip: int) -> list[int]:
+    """Return the bodies from the first arm joint to the site's body."""
     path = []
     body = tip
     while body > 0:
@@ -94,9 +94,9 @@ def _chain(scene: mujoco.MjModel, robot: RobotSpec, joint_ids: list[int], tip: i
         body = int(scene.body_parentid[body])
     path.reverse()
     wanted = set(joint_ids)
-    carrying = [k for k, b in enumerate(path) if any(j in wanted for j in _joints_of(scene, b))]
+    carrying = [k for k, b in enumerate(path) if any(j in wanted for j in _list_joints(scene, b))]
     chain = path[carrying[0] :] if carrying else []
-    found = [j for b in chain for j in _joints_of(scene, b)]
+    found = [j for b in chain for j in _list_joints(scene, b)]
     for joint, name in zip(joint_ids, robot.joints, strict=True):
         if joint not in found:
             raise ControlError(
@@ -113,7 +113,7 @@ def _chain(scene: mujoco.MjModel, robot: RobotSpec, joint_ids: list[int], tip: i
     return chain
 
 
-def _build(scene: mujoco.MjModel, chain: list[int], site_id: int) -> mujoco.MjModel:
+def _build_arm(scene: mujoco.MjModel, chain: list[int], site_id: int) -> mujoco.MjModel:
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     parent = spec.worldbody
@@ -121,7 +121,7 @@ def _build(scene: mujoco.MjModel, chain: list[int], site_id: int) -> mujoco.MjMo
         parent = parent.add_body(pos=scene.body_pos[body], quat=scene.body_quat[body])
         # Only kinematics is asked of this model; the compiler wants every moving body to have a mass.
         parent.mass, parent.inertia, parent.explicitinertial = 1.0, [1.0, 1.0, 1.0], True
-        for joint in _joints_of(scene, body):
+        for joint in _list_joints(scene, body):
             parent.add_joint(
                 type=mujoco.mjtJoint(int(scene.jnt_type[joint])),
                 pos=scene.jnt_pos[joint],

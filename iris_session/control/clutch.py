@@ -1,9 +1,12 @@
-"""The clutch: relative motion of hands, latched at engagement, and its blending when several people share a robot.
+"""The clutch: relative motion of hands, latched at engagement, blended when several participants share a robot;
+leaders.
 
 At engagement the device pose and the robot's own commanded target are latched; from then on the target moves as the
 device has moved since: translation times `scale`, rotation about the world's axes, applied to the latched orientation.
 One source of full weight is computed from the latch itself, so rounding never accumulates. Several sources (mode
-`shared`) are blended by increments since each one's previous sample, so nobody's joining or leaving moves the target.
+`shared`) are blended by increments since each one's previous sample, so joining or leaving moves no target.
+
+Leader robots control in joint space: the follower takes the leader's joints, ramped when they are apart.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ import math
 from collections.abc import Sequence
 
 import msgspec
+import numpy as np
 
 from anchors.pose import (
     PoseTuple,
@@ -22,6 +26,8 @@ from anchors.pose import (
     quat_normalize,
     quat_to_rotvec,
 )
+from iris_session.control.arm_model import Floats
+from iris_session.control.config import ControlConfig, ControlError
 from iris_session.protocol.common import Pose
 from iris_session.protocol.steps import Command, CommandSource
 
@@ -30,7 +36,7 @@ Box = tuple[Vec3, Vec3]
 
 
 class SourceLatch(msgspec.Struct, array_like=True):
-    """One source: who it is, and the last sample of it that moved the target."""
+    """One source: its identity, and its last sample that moved the target."""
 
     participant: str
     device: str
@@ -43,7 +49,7 @@ class SourceLatch(msgspec.Struct, array_like=True):
 
 
 class Latch(msgspec.Struct, array_like=True):
-    """State of one robot's clutch. `base`: target at the latch; `target`: `T_world_tip` asked for now."""
+    """State of one robot's clutch. `base`: target at the latch; `target`: `T_world_tip` of the present goal."""
 
     kind: str
     scale: float
@@ -53,25 +59,25 @@ class Latch(msgspec.Struct, array_like=True):
     clamped: bool = False
 
 
-def pose_tuple(pose: Pose) -> PoseTuple:
+def to_pose_tuple(pose: Pose) -> PoseTuple:
     return (pose.p, pose.q)
 
 
 def clip_scale(scale: float, low: float, high: float) -> float:
-    """Motion scale within its limits; a scale that is no number counts as 1."""
+    """Return the motion scale within its limits; a scale that is not finite counts as 1."""
     return min(max(scale, low), high) if math.isfinite(scale) else 1.0
 
 
-def latch(command: Command, scale: float, T_world_target: PoseTuple, previous: Latch | None = None) -> Latch:
-    """Latches every source of `command` against the robot's commanded target.
+def latch_sources(command: Command, scale: float, T_world_target: PoseTuple, previous: Latch | None = None) -> Latch:
+    """Latch every source of `command` against the robot's commanded target.
 
-    Sources that were already in `previous` keep their last sample, so that their motion goes on without a gap.
+    Sources that were already in `previous` keep their last sample, so that their motion continues without a gap.
     """
     kept = {(s.participant, s.device, s.engagement): s for s in previous.sources} if previous else {}
     sources = []
     for source in command.sources:
         old = kept.get((source.participant, source.device, source.engagement))
-        pose = old.pose if old and old.pose else source.pose_world and pose_tuple(source.pose_world)
+        pose = old.pose if old and old.pose else source.pose_world and to_pose_tuple(source.pose_world)
         sources.append(
             SourceLatch(
                 source.participant,
@@ -87,8 +93,8 @@ def latch(command: Command, scale: float, T_world_target: PoseTuple, previous: L
     return Latch(command.kind, scale, T_world_target, T_world_target, sources)
 
 
-def continues(state: Latch, command: Command) -> bool:
-    """True when the command is of the latched kind and at least one latched engagement goes on in it."""
+def is_continued_by(state: Latch, command: Command) -> bool:
+    """Return true when the command is of the latched kind and at least one latched engagement continues in it."""
     if state.kind != command.kind:
         return False
     for new in command.sources:
@@ -98,8 +104,8 @@ def continues(state: Latch, command: Command) -> bool:
     return False
 
 
-def same_sources(state: Latch, command: Command, scale: float) -> bool:
-    """True when nobody joined or left and no weight nor the scale has changed."""
+def has_same_sources(state: Latch, command: Command, scale: float) -> bool:
+    """Return true when the sources, their weights and the scale have not changed."""
     if state.scale != scale or len(state.sources) != len(command.sources):
         return False
     for old, new in zip(state.sources, command.sources, strict=True):
@@ -113,32 +119,34 @@ def same_sources(state: Latch, command: Command, scale: float) -> bool:
     return True
 
 
-def follow(state: Latch, sources: Sequence[CommandSource], box: Box | None) -> None:
-    """Moves `state.target` by the newest samples of pose sources; twists are stored for `integrate`."""
+def follow_poses(state: Latch, sources: Sequence[CommandSource], box: Box | None) -> None:
+    """Move `state.target` by the newest samples of pose sources; twists are stored for `integrate_twists`."""
     if len(sources) == 1 and sources[0].weight == 1.0 and sources[0].pose_world is not None:
-        pose = pose_tuple(sources[0].pose_world)
+        pose = to_pose_tuple(sources[0].pose_world)
         old = state.sources[0]
         if sources[0].absolute:
             state.target = pose
         else:
             old.pose0 = old.pose0 or pose
-            state.target = _relative(state.base, old.pose0, pose, state.scale)
+            state.target = _move_relative(state.base, old.pose0, pose, state.scale)
         old.pose = pose
     else:
         for old, new in zip(state.sources, sources, strict=True):
-            _increment(state, old, new)
-    _clamp(state, box)
+            _add_increment(state, old, new)
+    _clamp_target(state, box)
 
 
-def integrate(state: Latch, dt: float, speed: float, angular_speed: float, box: Box | None) -> bool:
-    """Moves the target by the weighted twists of all sources over `dt` [s], speeds bounded. False: nothing moves."""
+def integrate_twists(state: Latch, dt: float, speed: float, angular_speed: float, box: Box | None) -> bool:
+    """Move the target by the weighted twists of all sources over `dt` [s], speeds bounded. Return false when nothing
+    moves.
+    """
     v, w = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     for source in state.sources:
         if source.twist is not None:
             t, k = source.twist, source.weight
             v = (v[0] + k * t[0], v[1] + k * t[1], v[2] + k * t[2])
             w = (w[0] + k * t[3], w[1] + k * t[4], w[2] + k * t[5])
-    v, w = _bounded(v, speed / state.scale), _bounded(w, angular_speed)
+    v, w = _limit_length(v, speed / state.scale), _limit_length(w, angular_speed)
     if v == (0.0, 0.0, 0.0) == w:
         return False
     step = dt * state.scale
@@ -146,12 +154,12 @@ def integrate(state: Latch, dt: float, speed: float, angular_speed: float, box: 
     p = (p[0] + v[0] * step, p[1] + v[1] * step, p[2] + v[2] * step)
     turn = quat_from_rotvec((w[0] * dt, w[1] * dt, w[2] * dt))
     state.target = (p, quat_normalize(quat_mul(turn, q)))
-    _clamp(state, box)
+    _clamp_target(state, box)
     return True
 
 
-def toward(T_from: PoseTuple, T_to: PoseTuple, distance: float, angle: float) -> PoseTuple:
-    """`T_to`, or the pose on the way to it that is at most `distance` [m] and `angle` [rad] from `T_from`."""
+def step_toward(T_from: PoseTuple, T_to: PoseTuple, distance: float, angle: float) -> PoseTuple:
+    """Return `T_to`, or the pose on the way to it that is at most `distance` [m] and `angle` [rad] from `T_from`."""
     (p, q), (p_to, q_to) = T_from, T_to
     d = (p_to[0] - p[0], p_to[1] - p[1], p_to[2] - p[2])
     r = quat_to_rotvec(quat_mul(q_to, quat_conj(q)))
@@ -164,13 +172,13 @@ def toward(T_from: PoseTuple, T_to: PoseTuple, distance: float, angle: float) ->
     return ((p[0] + k * d[0], p[1] + k * d[1], p[2] + k * d[2]), quat_normalize(quat_mul(part, q)))
 
 
-def separation(T_a: PoseTuple, T_b: PoseTuple) -> tuple[float, float]:
-    """Distance [m] and angle [rad] between two poses."""
+def measure_separation(T_a: PoseTuple, T_b: PoseTuple) -> tuple[float, float]:
+    """Return distance [m] and angle [rad] between two poses."""
     (pa, qa), (pb, qb) = T_a, T_b
     return _norm((pb[0] - pa[0], pb[1] - pa[1], pb[2] - pa[2])), _norm(quat_to_rotvec(quat_mul(qb, quat_conj(qa))))
 
 
-def _relative(base: PoseTuple, start: PoseTuple, now: PoseTuple, scale: float) -> PoseTuple:
+def _move_relative(base: PoseTuple, start: PoseTuple, now: PoseTuple, scale: float) -> PoseTuple:
     (b, qb), (p0, q0), (p, q) = base, start, now
     moved = (b[0] + scale * (p[0] - p0[0]), b[1] + scale * (p[1] - p0[1]), b[2] + scale * (p[2] - p0[2]))
     if q == q0:
@@ -178,13 +186,13 @@ def _relative(base: PoseTuple, start: PoseTuple, now: PoseTuple, scale: float) -
     return (moved, quat_normalize(quat_mul(quat_mul(q, quat_conj(q0)), qb)))
 
 
-def _increment(state: Latch, old: SourceLatch, new: CommandSource) -> None:
-    """Moves the target by a source's motion since its previous sample. That of an absolute one is not scaled."""
+def _add_increment(state: Latch, old: SourceLatch, new: CommandSource) -> None:
+    """Move the target by a source's motion since its previous sample. That of an absolute one is not scaled."""
     if new.twist_world is not None:
         old.twist = new.twist_world
     if new.pose_world is None:
         return
-    pose = pose_tuple(new.pose_world)
+    pose = to_pose_tuple(new.pose_world)
     (p0, q0), (p, q), k = old.pose or pose, pose, new.weight * (1.0 if new.absolute else state.scale)
     r = quat_to_rotvec(quat_mul(q, quat_conj(q0)))
     turn = quat_from_rotvec((new.weight * r[0], new.weight * r[1], new.weight * r[2]))
@@ -194,8 +202,8 @@ def _increment(state: Latch, old: SourceLatch, new: CommandSource) -> None:
     old.pose = pose
 
 
-def _clamp(state: Latch, box: Box | None) -> None:
-    """Keeps the target inside the workspace box, widened to where the robot was at the latch (no jump into it)."""
+def _clamp_target(state: Latch, box: Box | None) -> None:
+    """Keep the target inside the workspace box, widened to where the robot was at the latch (no jump into it)."""
     if box is None:
         return
     p, b = state.target[0], state.base[0]
@@ -208,6 +216,34 @@ def _norm(v: Vec3) -> float:
     return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
 
 
-def _bounded(v: Vec3, limit: float) -> Vec3:
+def _limit_length(v: Vec3, limit: float) -> Vec3:
     n = _norm(v)
     return v if n <= limit else (v[0] * limit / n, v[1] * limit / n, v[2] * limit / n)
+
+
+def compute_leader_goal(state: Latch, sources: Sequence[CommandSource], goal: Floats, config: ControlConfig) -> Floats:
+    """Return the new joint goal, shape (n,).
+
+    One source of full weight: its joints, predicted by `qd` across the interpolation delay. Several (mode `shared`):
+    the present `goal` plus their weighted increments.
+    """
+    n = len(goal)
+    single = len(sources) == 1 and sources[0].weight == 1.0
+    for old, new in zip(state.sources, sources, strict=True):
+        if len(new.q) != n or len(new.qd) not in (0, n):
+            raise ControlError(f"joint sample of {new.participant!r} has {len(new.q)} joints; it must have {n}")
+        q = np.array(new.q)
+        if single:
+            goal = q
+            if new.qd:
+                bound = config.leader_lookahead_max
+                goal = q + np.clip(np.array(new.qd) * config.leader_lookahead_s, -bound, bound)
+        else:
+            goal = goal + new.weight * (q - np.array(old.q or new.q))
+        old.q = new.q
+    return goal
+
+
+def is_ramping(active: bool, apart: float, config: ControlConfig) -> bool:
+    """Return true while the follower is ramped: from `leader_apart` [rad] on, until it has caught up."""
+    return apart > (config.leader_caught_up if active else config.leader_apart)

@@ -1,4 +1,6 @@
-"""Every bound of the control room in one frozen struct. SI units, radians, rates in Hz; defaults for table-top arms."""
+"""Bounds of control in one frozen struct, and its error. SI units, radians, rates in Hz; defaults for
+table-top arms.
+"""
 
 from __future__ import annotations
 
@@ -36,11 +38,17 @@ _POSITIVE: Final = (
 )
 
 
+class ControlError(ValueError):
+    """A robot, object or configuration that control cannot drive as described. One line that says what would be
+    right.
+    """
+
+
 class ControlConfig(msgspec.Struct, frozen=True):
     """Bounds of control. Raises `ValueError` for values that cannot work.
 
     `output`: `ctrl` solves inverse kinematics and writes `data.ctrl`; `targets` only moves the end-effector targets
-    (`Controller.targets()`), for an environment with its own controller: it needs no mink and writes no `ctrl`.
+    (`Controller.get_targets()`), for an environment with its own controller: it needs no mink and writes no `ctrl`.
     """
 
     output: str = OUTPUT_CTRL

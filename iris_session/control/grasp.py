@@ -14,26 +14,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anchors.pose import PoseTuple, Vec3, apply, quat_conj, quat_mul, quat_rotate, quat_to_rotvec
-from iris_session.control.arm_model import Floats, named_id
-from iris_session.control.clutch import pose_tuple
-from iris_session.control.config import ControlConfig
-from iris_session.control.errors import ControlError
+from iris_session.control.arm_model import Floats, find_id
+from iris_session.control.clutch import to_pose_tuple
+from iris_session.control.config import ControlConfig, ControlError
 from iris_session.protocol.specs import ObjectSpec
 from iris_session.protocol.steps import ObjectCommand
 
 
 class Grasps:
-    """Writes `data.xfrc_applied` of the objects that are commanded, and clears it once when they no longer are."""
+    """Writer of `data.xfrc_applied` of the objects that are commanded; clears it once when they no longer are."""
 
     def __init__(self, model: mujoco.MjModel, objects: Sequence[ObjectSpec], config: ControlConfig) -> None:
-        """Raises `ControlError` for an object whose body is not free."""
+        """Raise `ControlError` for an object whose body is not free."""
         self._model = model
         self._config = config
         self._bodies: dict[str, int] = {}
         #: All bodies of an object, by its own body: those with a free joint hang on the world, so they are its root.
         self._parts: dict[int, NDArray[np.intp]] = {}
         for item in objects:
-            body = named_id(model, mujoco.mjtObj.mjOBJ_BODY, item.body, "body")
+            body = find_id(model, mujoco.mjtObj.mjOBJ_BODY, item.body, "body")
             joint = int(model.body_jntadr[body])
             if joint < 0 or int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_FREE):
                 raise ControlError(f"object {item.name!r}: body {item.body!r} must have a free joint")
@@ -44,14 +43,14 @@ class Grasps:
         #: Objects whose wrench this room has written and not cleared yet.
         self.written: list[str] = []
 
-    def command(self, commands: Sequence[ObjectCommand]) -> None:
-        """The objects of this step. Raises `ControlError` for an unknown object."""
+    def set_goals(self, commands: Sequence[ObjectCommand]) -> None:
+        """Set the commanded poses of this step. Raises `ControlError` for an unknown object."""
         if not commands and not self.commanded:
             return
         for c in commands:
             if c.object not in self._bodies:
                 raise ControlError(f"object {c.object!r} is not known. Available objects: {', '.join(self._bodies)}")
-        self.commanded = {c.object: pose_tuple(c.T_world_object) for c in commands}
+        self.commanded = {c.object: to_pose_tuple(c.T_world_object) for c in commands}
 
     def reset(self, data: mujoco.MjData) -> None:
         self.commanded = {}
@@ -64,14 +63,16 @@ class Grasps:
         self.written = list(self.commanded)
         for name, T_world_object in self.commanded.items():
             body = self._bodies[name]
-            data.xfrc_applied[body] = self._wrench(data, body, T_world_object)
+            data.xfrc_applied[body] = self._compute_wrench(data, body, T_world_object)
 
-    def _wrench(self, data: mujoco.MjData, body: int, T_world_object: PoseTuple) -> Floats:
-        """Force [N] and torque [N m] at the body's centre of mass, world axes, shape (6,); zero where nothing moves."""
+    def _compute_wrench(self, data: mujoco.MjData, body: int, T_world_object: PoseTuple) -> Floats:
+        """Return force [N] and torque [N m] at the body's centre of mass, world axes, shape (6,); zero
+        if not finite.
+        """
         w, config = self._config.grasp_frequency, self._config
         qw, qx, qy, qz = data.xquat[body].tolist()
         q = (qw, qx, qy, qz)
-        mass, p_centre, inertia, weight, p_weight = self._whole(data, body)
+        mass, p_centre, inertia, weight, p_weight = self._measure_object(data, body)
         lever: Floats = p_centre - data.xpos[body]
         lx, ly, lz = lever.tolist()
         p_goal = np.array(apply(T_world_object, quat_rotate(quat_conj(q), (lx, ly, lz))))
@@ -80,17 +81,20 @@ class Grasps:
         wx, wy, wz = velocity[3:].tolist()
         omega = np.array(quat_rotate(q, (wx, wy, wz)))
         v_centre = velocity[:3] + np.cross(omega, lever)
-        force = _bounded(mass * (w * w * (p_goal - p_centre) - 2.0 * w * v_centre), config.grasp_max_force)
+        force = _limit_length(mass * (w * w * (p_goal - p_centre) - 2.0 * w * v_centre), config.grasp_max_force)
         turn: Vec3 = quat_to_rotvec(quat_mul(T_world_object[1], quat_conj(q)))
-        torque = _bounded(inertia @ (w * w * np.array(turn) - 2.0 * w * omega), config.grasp_max_torque)
+        torque = _limit_length(inertia @ (w * w * np.array(turn) - 2.0 * w * omega), config.grasp_max_torque)
         at = data.xipos[body]  # where MuJoCo applies it
         torque = torque + np.cross(p_centre - at, force) - np.cross(p_weight - at, weight)
         wrench = np.concatenate((force - weight, torque))
         return wrench if np.isfinite(wrench).all() else np.zeros(6)
 
-    def _whole(self, data: mujoco.MjData, body: int) -> tuple[float, Floats, Floats, Floats, Floats]:
-        """The object as one rigid thing: mass [kg], centre (3,) [m], inertia about it (3, 3), weight (3,) [N] that the
-        model does not carry itself, and where that acts (3,) [m]. All in the world."""
+    def _measure_object(self, data: mujoco.MjData, body: int) -> tuple[float, Floats, Floats, Floats, Floats]:
+        """Return the object as one rigid body, all in the world.
+
+        Mass [kg], centre (3,) [m], inertia about it (3, 3), weight (3,) [N] that the model does not carry itself, and
+        where that acts (3,) [m].
+        """
         model, parts = self._model, self._parts[body]
         masses, p = np.asarray(model.body_mass)[parts], data.xipos[parts]
         mass = float(masses.sum())
@@ -104,6 +108,6 @@ class Grasps:
         return mass, p_centre, inertia, carried.sum() * model.opt.gravity, p_weight
 
 
-def _bounded(vector: Floats, limit: float) -> Floats:
+def _limit_length(vector: Floats, limit: float) -> Floats:
     length = float(np.linalg.norm(vector))
     return vector if length <= limit else vector * (limit / length)

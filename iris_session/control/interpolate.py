@@ -13,8 +13,7 @@ import mujoco
 import numpy as np
 
 from iris_session.control.arm_model import ArmModel, Floats
-from iris_session.control.config import ControlConfig
-from iris_session.control.errors import ControlError
+from iris_session.control.config import ControlConfig, ControlError
 from iris_session.protocol.specs import RobotSpec
 
 #: Arrival after this many sample intervals: above 1, so that motion between regular samples is even.
@@ -47,14 +46,14 @@ class JointInterpolator:
         self.cap[:] = self.near[:] = self.velocity
         self.moving = False
 
-    def aim(self, joints: slice, goal: Floats, interval: float) -> None:
-        """New goal for some joints, to arrive `ARRIVAL_INTERVALS` times `interval` [s] from now."""
+    def set_goal(self, joints: slice, goal: Floats, interval: float) -> None:
+        """Set a new goal for some joints, to arrive `ARRIVAL_INTERVALS` times `interval` [s] from now."""
         self.goal[joints] = goal
         self.remaining[joints] = ARRIVAL_INTERVALS * interval
         self.moving = True
 
     def stop(self, joints: slice) -> None:
-        """New goal: where these joints can stop, but not beyond the goal they already had."""
+        """Set the goal to where these joints can stop, but not beyond the goal they already had."""
         q, v = self.q[joints], self.v[joints]
         # Slowing down from the next tick on, by dv a tick: k dv, (k - 1) dv, ...
         speed = np.maximum(np.abs(v) / self._dv[joints] - 1.0, 0.0)
@@ -68,7 +67,7 @@ class JointInterpolator:
         self.moving = True
 
     def advance(self) -> None:
-        """One tick."""
+        """Advance by one tick."""
         if not self.moving:
             return
         error = self.goal - self.q
@@ -87,12 +86,12 @@ class JointInterpolator:
             # The speed of arrival ends in the next tick, within the acceleration limit whatever is asked then.
             self.moving = not bool((arrived & (self.v == 0.0)).all())
 
-    def state(self) -> list[bytes]:
-        """Arrays as raw bytes, for snapshots."""
+    def save_state(self) -> list[bytes]:
+        """Return the arrays as raw bytes, for snapshots."""
         return [a.tobytes() for a in self._arrays()]
 
-    def set_state(self, arrays: list[bytes], moving: bool) -> None:
-        """Inverse of `state`."""
+    def restore_state(self, arrays: list[bytes], moving: bool) -> None:
+        """Restore the arrays of `save_state`."""
         for array, raw in zip(self._arrays(), arrays, strict=True):
             array[:] = np.frombuffer(raw)
         self.moving = moving
@@ -101,10 +100,10 @@ class JointInterpolator:
         return (self.q, self.v, self.goal, self.remaining, self.cap, self.near)
 
 
-def speed_limits(
+def read_speed_limits(
     model: mujoco.MjModel, robots: Sequence[RobotSpec], arms: Sequence[ArmModel], config: ControlConfig
 ) -> tuple[Floats, Floats]:
-    """Velocity and acceleration limits of all robots' joints, shape (n,) each.
+    """Return velocity and acceleration limits of all robots' joints, shape (n,) each.
 
     Raises `ControlError` when the configuration names a joint that no robot has.
     """

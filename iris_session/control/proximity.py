@@ -1,4 +1,4 @@
-"""Robots near contact: the speed at which two robots close in on each other is bounded by their distance.
+"""Proximity of robots: the speed at which two robots approach each other is bounded by their distance.
 
 Distances are measured on the whole scene between the robots' geoms, finger bodies exempt: grippers must meet to hand
 objects over. Broad phase: boxes around each robot's geoms; then bounding spheres; then `mj_geomDistance` for the
@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.control.arm_model import Floats, named_id
+from iris_session.control.arm_model import Floats, find_id
 from iris_session.control.config import ControlConfig
 from iris_session.protocol.specs import RobotSpec
 
@@ -28,7 +28,7 @@ _MEASURED_PAIRS = 32
 _BOUNDED_PAIRS = 6
 
 
-class Proximity:
+class ProximityLimiter:
     """Speed factors per robot from their distances. Stateless: everything follows from the arguments."""
 
     def __init__(self, model: mujoco.MjModel, robots: Sequence[RobotSpec], config: ControlConfig) -> None:
@@ -37,7 +37,7 @@ class Proximity:
         self._geoms = [_guarded_geoms(model, robot) for robot in robots]
         self._dofs = [
             np.array(
-                [model.jnt_dofadr[named_id(model, mujoco.mjtObj.mjOBJ_JOINT, j, "joint")] for j in robot.joints],
+                [model.jnt_dofadr[find_id(model, mujoco.mjtObj.mjOBJ_JOINT, j, "joint")] for j in robot.joints],
                 dtype=np.intp,
             )
             for robot in robots
@@ -49,8 +49,10 @@ class Proximity:
         self._segment = np.zeros(6)
         self.active = config.proximity_margin > 0.0 and sum(len(g) > 0 for g in self._geoms) > 1
 
-    def factors(self, data: mujoco.MjData, wanted: Sequence[Floats]) -> list[float]:
-        """Factor 0..1 on each robot's joint speed. `wanted`: joint velocities [rad/s] each robot would take, (n_i,)."""
+    def compute_speed_factors(self, data: mujoco.MjData, wanted: Sequence[Floats]) -> list[float]:
+        """Return a factor 0..1 on each robot's joint speed. `wanted`: joint velocities [rad/s] each robot would take,
+        (n_i,).
+        """
         factors = [1.0] * len(self._geoms)
         moves = [bool(joints.any()) for joints in wanted]
         for a, b in self._near_robots(data):
@@ -77,7 +79,7 @@ class Proximity:
         return factors
 
     def _near_robots(self, data: mujoco.MjData) -> list[tuple[int, int]]:
-        """Pairs of robots whose boxes are within the margin, in index order."""
+        """Return pairs of robots whose boxes are within the margin, in index order."""
         present = [i for i, g in enumerate(self._geoms) if len(g)]
         centre = data.geom_xpos[self._all]
         starts = self._starts[present]
@@ -88,7 +90,9 @@ class Proximity:
         return [(present[r], present[c]) for r, c in zip(rows.tolist(), columns.tolist(), strict=True)]
 
     def _near_geoms(self, data: mujoco.MjData, a: int, b: int) -> list[tuple[float, int, int, Floats, Floats]]:
-        """Nearest geom pairs of two robots within the margin: distance [m], geoms, nearest points in the world."""
+        """Return the nearest geom pairs of two robots within the margin: distance [m], geoms, nearest points in the
+        world.
+        """
         margin = self._config.proximity_margin
         geoms_a, geoms_b = self._geoms[a], self._geoms[b]
         centre_a, centre_b = data.geom_xpos[geoms_a], data.geom_xpos[geoms_b]
@@ -119,9 +123,9 @@ class Proximity:
 
 
 def _guarded_geoms(model: mujoco.MjModel, robot: RobotSpec) -> NDArray[np.intp]:
-    """Geoms of the robot's subtree that may collide, without its fingers."""
-    base = named_id(model, mujoco.mjtObj.mjOBJ_BODY, robot.base_body, "body")
-    fingers = {named_id(model, mujoco.mjtObj.mjOBJ_BODY, name, "body") for name in robot.finger_bodies}
+    """Return the geoms of the robot's subtree that may collide, without its fingers."""
+    base = find_id(model, mujoco.mjtObj.mjOBJ_BODY, robot.base_body, "body")
+    fingers = {find_id(model, mujoco.mjtObj.mjOBJ_BODY, name, "body") for name in robot.finger_bodies}
     inside, exempt = {base}, set(fingers)
     for body in range(base + 1, model.nbody):  # parents come before their children
         parent = int(model.body_parentid[body])

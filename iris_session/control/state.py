@@ -36,7 +36,7 @@ class RobotState(msgspec.Struct, array_like=True):
 
 
 class ControllerState(msgspec.Struct, array_like=True):
-    """Everything that `Controller` remembers between calls."""
+    """The whole memory of `Controller` between calls."""
 
     now_ns: int
     tick: int
@@ -59,5 +59,5 @@ def encode_state(state: ControllerState) -> bytes:
 
 
 def decode_state(data: bytes) -> ControllerState:
-    """Raises `msgspec.DecodeError` for bytes that are no snapshot of control."""
+    """Decode a snapshot of control. Raises `msgspec.DecodeError` for other bytes."""
     return _decoder.decode(data)

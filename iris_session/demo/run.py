@@ -222,7 +222,7 @@ class _Judge:
         now_s, reached = world.view().sim_time, False
         for watch in self._watches:
             name = watch.goal.deformable
-            reached |= watch.observe(now_s, world.flexes.vertices(name), world.flexes.touching(name))
+            reached |= watch.observe(now_s, world.flexes.read_vertices(name), world.flexes.find_touching_robots(name))
         if reached and all(watch.at_s is not None for watch in self._watches):
             self._session.post(Episode(0, EpisodeAction.SUCCESS, self._name))
 

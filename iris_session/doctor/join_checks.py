@@ -15,8 +15,8 @@ from iris_session.doctor import network_checks
 from iris_session.doctor.findings import Finding, failed, ok, warning
 from iris_session.protocol.discovery import Introduction
 from iris_session.protocol.names import DenialReason, RefusalCode
-from iris_session.protocol.pairing import normal_code
-from iris_session.protocol.status import StatusReport, quantiles
+from iris_session.protocol.pairing import normalise_code
+from iris_session.protocol.status import StatusReport, compute_quantiles
 from iris_session.security import KeyHome, KeysError, compute_fingerprint, decode_key
 
 JOIN_S: Final = 4.0
@@ -84,7 +84,7 @@ def attempt_join(target: Address, typed: str, code: str, role: str, introduction
     states: list[SceneState] = []
     try:
         if code:
-            normal_code(code)
+            normalise_code(code)
     except ValueError as error:
         visit.findings.append(failed("code", str(error), "", NEW_CODE_ADVICE))
         return visit
@@ -233,7 +233,7 @@ def check_state_age(states: Sequence[SceneState], missed: int) -> Finding:
         age_s = states[-1].age_ns * 1e-9
         why = "nothing new is published"
         return warning("state", f"{text}, always the one of {age_s:.1f} s ago", why, "check the program that publishes")
-    ages = quantiles(state.age_ns for state in new or states)
+    ages = compute_quantiles(state.age_ns for state in new or states)
     assert ages is not None
     text = f"{text}, age p50 {ages.p50:.1f} ms, p99 {ages.p99:.1f} ms"
     if ages.p99 > OLD_MS:

@@ -15,7 +15,7 @@ from iris_session.client.discovery import BeaconListener, FoundSession, request_
 from iris_session.client.errors import ClientError
 from iris_session.doctor.findings import Finding, failed, ok, warning
 from iris_session.protocol.discovery import DISCOVERY_PORT, Introduction
-from iris_session.protocol.errors import ProtocolError, VersionError
+from iris_session.protocol.errors import ProtocolError, ProtocolVersionError
 from iris_session.protocol.names import PROTOCOL_VERSION
 
 #: The system needs 3 s to find that no machine of the network has an address; a firewall is silent for longer.
@@ -190,7 +190,7 @@ def check_introduction(address: Address) -> tuple[Finding, Finding, Introduction
     unknown = Finding("version", "skipped", "not known: there was no introduction")
     try:
         said = _request_introduction(address, CONNECT_S)
-    except VersionError as error:
+    except ProtocolVersionError as error:
         return ok("introduction", f"a session of protocol version {error.version}"), check_version(error.version), None
     except ProtocolError as error:
         text = f"the program at port {address.port - 1} is not a session: {error}"

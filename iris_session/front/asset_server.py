@@ -23,7 +23,7 @@ from iris_session.link.config import MILLISECOND, FrontConfig
 from iris_session.link.sockets import open_assets, readable, watch_tcp
 from iris_session.protocol.assets import AssetChunk, AssetRefused
 from iris_session.protocol.codec import decode_asset_request, encode_asset_header
-from iris_session.protocol.errors import ProtocolError, VersionError
+from iris_session.protocol.errors import ProtocolError, ProtocolVersionError
 from iris_session.protocol.names import PROTOCOL_VERSION, AssetRefusal
 from iris_session.security import KeyPair, compute_fingerprint
 from iris_session.security.zap import ZAP_ENDPOINT, answer_zap_requests, is_curve_request
@@ -249,7 +249,7 @@ class AssetServer:
             self._counts["requests"] += 1
         try:
             request = decode_asset_request(frame.buffer if single else b"")
-        except VersionError:
+        except ProtocolVersionError:
             reason: str = AssetRefusal.VERSION
         except ProtocolError:
             reason = AssetRefusal.MALFORMED

@@ -28,10 +28,10 @@ from iris_session.protocol.client_messages import (
     Samples,
     TrackingEpoch,
 )
-from iris_session.protocol.codec import decode_client, tag_of
+from iris_session.protocol.codec import decode_client, get_tag
 from iris_session.protocol.common import Denial
 from iris_session.protocol.entries import Entry
-from iris_session.protocol.errors import MalformedError, ProtocolError, RateError, VersionError
+from iris_session.protocol.errors import MalformedError, ProtocolError, ProtocolVersionError, RateError
 from iris_session.protocol.limits import LIMITS, Drops, TokenBucket
 from iris_session.protocol.names import PROTOCOL_VERSION, AuditKind, DenialReason, FaultCode, RefusalCode
 from iris_session.protocol.server_messages import ClockPong, ProtocolFault, Refused, Reply
@@ -198,7 +198,7 @@ class Intake:
         mark, name = compute_fingerprint(decode_key(parse_pairing_key(peer.user_id))), getattr(message, "name", "")
         address = peer_of(peer.descriptor)[0]
         self._audit.record(
-            AuditKind.KEY_REFUSED, now_ns, subject=mark, name=name, address=address, detail=tag_of(type(message))
+            AuditKind.KEY_REFUSED, now_ns, subject=mark, name=name, address=address, detail=get_tag(type(message))
         )
         if self._unknown_peer_faults.take(now_ns):
             text, advice = "this key is not on the session's list", "run `iris-session pair` there, join with its code"
@@ -211,7 +211,7 @@ class Intake:
         connection.last_heard_ns = now_ns
         if not connection.admitted and not isinstance(message, (GetStatus, EStop)):  # anyone may stop, however early
             self._drops.count("not_admitted", connection.number)
-            self._count_rejection(connection.peer, connection, now_ns, tag_of(type(message)))
+            self._count_rejection(connection.peer, connection, now_ns, get_tag(type(message)))
             return
         if not connection.confirmed and envelope.connection_epoch == connection.number:
             connection.confirmed = True
@@ -222,12 +222,12 @@ class Intake:
             connection.late_epoch = None
             self._coalescer.offer(late)
         if not connection.rates.allow(kind, now_ns) and kind is not EStop:
-            self._count_flood(connection, tag_of(kind), now_ns)
+            self._count_flood(connection, get_tag(kind), now_ns)
             if isinstance(message, TrackingEpoch):  # the newest must get through: samples of the old frame would move
                 connection.late_epoch = Entry(connection.number, envelope.connection_epoch, now_ns, message)
                 return
             limit = LIMITS[kind]
-            error = RateError(tag_of(kind), limit.per_second, limit.burst)
+            error = RateError(get_tag(kind), limit.per_second, limit.burst)
             self._send_fault(connection.route, connection, error.code, str(error), now_ns)
             self._send_denial(connection, message, str(error), now_ns)
             return
@@ -255,7 +255,7 @@ class Intake:
                 return
         entry = Entry(connection.number, envelope.connection_epoch, now_ns, message)  # type: ignore[arg-type]
         if not self._coalescer.offer(entry) and not isinstance(message, Sample):
-            text = f"{tag_of(kind)}: queue to the session full: send less"
+            text = f"{get_tag(kind)}: queue to the session full: send less"
             if not self._send_denial(connection, message, text, now_ns):
                 self._send_fault(connection.route, connection, FaultCode.RATE, text, now_ns)
 
@@ -320,7 +320,7 @@ class Intake:
         self._drops.count(f"hello_{error.code}")
         if self._unknown_peer_faults.take(now_ns):
             advice = "send the hello of docs/protocol.md"
-            if isinstance(error, VersionError):
+            if isinstance(error, ProtocolVersionError):
                 advice = f"update {'the client' if error.version < PROTOCOL_VERSION else 'the session'}"
             self._outbox.send_to_route(route, Refused(error.code, str(error), advice))
 

@@ -146,7 +146,7 @@ class PairingService:
         """
         mark = compute_fingerprint(decode_key(key))
         proof, answer = self._recently_paired.get(mark, (b"", None))
-        return answer if pairing.same(proof, pair.proof) and self._keyring.find_key(mark) is not None else None
+        return answer if pairing.is_same_proof(proof, pair.proof) and self._keyring.find_key(mark) is not None else None
 
     def tick(self, now_ns: int) -> None:
         """Start the next attempt when the one before is done."""
@@ -206,7 +206,7 @@ class PairingService:
             self._audit.record(
                 AuditKind.PAIRED, now_ns, subject=mark, name=entry.name, address=pending.address, detail=roles
             )
-            paired = Paired(pairing.server_proof(attempt.secret, key.raw_public, client), entry.roles)
+            paired = Paired(pairing.make_server_proof(attempt.secret, key.raw_public, client), entry.roles)
             self._recently_paired.pop(mark, None)
             while len(self._recently_paired) >= MAX_RECENTLY_PAIRED:
                 del self._recently_paired[next(iter(self._recently_paired))]

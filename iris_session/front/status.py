@@ -24,7 +24,7 @@ from iris_session.protocol.status import (
     ParticipantReport,
     Quantiles,
     StatusReport,
-    quantiles,
+    compute_quantiles,
 )
 
 #: Samples of one connection whose delay is kept: five devices at 90 Hz for a second, one for six.
@@ -142,7 +142,7 @@ class StatusService:
             session_id=config.session_id,
             session_name=config.session_name,
             stalled=authority.stalled,
-            step_to_publish=quantiles(delays) if len(delays) >= MIN_DELAYS else None,
+            step_to_publish=compute_quantiles(delays) if len(delays) >= MIN_DELAYS else None,
             participants=tuple(self._merge_row(row, by_participant.get(row.id), now_ns) for row in half.participants),
             drops=drops,
             warnings=(*half.warnings, *self._guard.list_warnings(now_ns)),
@@ -167,7 +167,7 @@ class StatusService:
             software=connection.hello.software,
             heard_ns=now_ns - connection.last_heard_ns,
             samples_per_s=stats.samples_per_s,
-            capture_to_receive=quantiles(stats.delays_ns),
+            capture_to_receive=compute_quantiles(stats.delays_ns),
             drops=self._drops.by_connection.get(connection.number, 0),
             reported=report is not None,
             alignment_report=self._alignment.complete_report(connection.number, row.alignment_report, now_ns),

@@ -13,7 +13,7 @@ from typing import Final
 import msgspec
 
 from iris_session.link.config import Ports, SceneInfo
-from iris_session.protocol.codec import decoder
+from iris_session.protocol.codec import make_decoder
 from iris_session.protocol.server_messages import Event
 from iris_session.protocol.steps import Admitted, Dropped, OutgoingMessage
 
@@ -81,7 +81,7 @@ def add_status(before: FrontStatus, status: FrontStatus) -> FrontStatus:
 
 
 encoder: Final = msgspec.msgpack.Encoder()
-decode_decided: Final = decoder(Decided)
-decode_status: Final = decoder(FrontStatus)
-decode_ports: Final = decoder(Ports)
-decode_scene: Final = decoder(SceneInfo)
+decode_decided: Final = make_decoder(Decided)
+decode_status: Final = make_decoder(FrontStatus)
+decode_ports: Final = make_decoder(Ports)
+decode_scene: Final = make_decoder(SceneInfo)

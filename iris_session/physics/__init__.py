@@ -1,6 +1,6 @@
 """The plant of a session: MuJoCo worlds that are saved and restored exactly, robots found in a model, pacing.
 
-Imports only `protocol`. No sockets, no clock: `Pacer` is told the time.
+Imports only `protocol`. No sockets, no clock: `Pacer` takes the time as an argument. Demo scenes live in `demo`.
 """
 
 from iris_session.physics.errors import (
@@ -15,10 +15,9 @@ from iris_session.physics.errors import (
     SpecError,
     UnknownNameError,
 )
-from iris_session.physics.load import load_model, model_bytes, model_from_bytes, scene_hash
-from iris_session.physics.objects import find_objects
+from iris_session.physics.load import compute_scene_hash, decode_model, encode_model, load_model
 from iris_session.physics.pacer import Pacer, PacerStats
-from iris_session.physics.robots import find_robots
+from iris_session.physics.robots import find_objects, find_robots
 from iris_session.physics.robots_toml import dump_robots_toml, load_robots_toml
 from iris_session.physics.world import World
 
@@ -27,9 +26,9 @@ __all__ = [
     "Pacer",
     "PacerStats",
     "load_model",
-    "model_bytes",
-    "model_from_bytes",
-    "scene_hash",
+    "encode_model",
+    "decode_model",
+    "compute_scene_hash",
     "find_robots",
     "find_objects",
     "load_robots_toml",

@@ -1,4 +1,4 @@
-"""A carrier: a compiled model of bodies that somebody else moves, so that their poses can be a plant's state.
+"""A carrier: a compiled model of bodies that are moved externally, so that their poses can be a plant's state.
 
 A world that is not MuJoCo's is streamed, journaled and verified through it. It has one mocap body per moving body, and
 neither shapes nor dynamics: to show a state takes some tens of microseconds for hundreds of bodies.
@@ -22,10 +22,10 @@ TICK_S: Final = 0.001
 
 
 class Carrier:
-    """Bodies with the ids 1..n, in the order of `names`. `model`: what a `World` of them is made of.
+    """Bodies with the ids 1..n, in the order of `names`. `model`: the model of a `World` of them.
 
     `poses`: T_world_body of each at the beginning. Raises `ModelInvalidError` for names that repeat, or that MuJoCo
-    keeps for itself (`world`).
+    reserves (`world`).
     """
 
     def __init__(self, names: Sequence[str], poses: Sequence[Pose]) -> None:
@@ -41,8 +41,10 @@ class Carrier:
         self._data: Any = mujoco.MjData(self.model)
         self._state: NDArray[np.float64] = np.empty(mujoco.mj_stateSize(self.model, STATE))
 
-    def state(self, time_s: float, poses: NDArray[np.float64]) -> bytes:
-        """The plant's state (`mjSTATE_INTEGRATION`) at that time, with T_world_body (n, 7), `x y z qw qx qy qz`."""
+    def encode_state(self, time_s: float, poses: NDArray[np.float64]) -> bytes:
+        """Return the plant's state (`mjSTATE_INTEGRATION`) at that time, with T_world_body (n, 7), `x y z qw qx qy
+        qz`.
+        """
         data = self._data
         data.time = time_s
         data.mocap_pos[:] = poses[:, :3]

@@ -1,7 +1,7 @@
-"""Who touches what: contact arrays of MuJoCo to `ObjectContact`s and gripper forces, vectorised.
+"""Contacts: contact arrays of MuJoCo to `ObjectContact`s and gripper forces, vectorised.
 
-Lookup tables are made once per model. A contact counts when its distance is within `includemargin`, the condition
-under which MuJoCo makes a constraint of it.
+Lookup tables are made once per model. A contact counts when its distance is within `includemargin`, the condition under
+which MuJoCo makes a constraint of it.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.physics.names import body_names, element_id, element_name
-from iris_session.physics.tree import Tree
+from iris_session.physics.names import find_element_id, get_element_name, list_body_names
+from iris_session.physics.tree import KinematicTree
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import ObjectContact
 
@@ -26,21 +26,21 @@ class ContactTables:
     """Geom -> object, body -> robot and finger, for one model. Geom index -1 (a flex) hits the last table row."""
 
     def __init__(
-        self, model: mujoco.MjModel, robots: Sequence[RobotSpec], objects: Sequence[ObjectSpec], tree: Tree
+        self, model: mujoco.MjModel, robots: Sequence[RobotSpec], objects: Sequence[ObjectSpec], tree: KinematicTree
     ) -> None:
-        names = body_names(model)
+        names = list_body_names(model)
         id_of = {name: index for index, name in enumerate(names)}
         body_object = [_NONE] * model.nbody
         for index, item in enumerate(objects):
-            for body in tree.subtree(element_id(model, "body", item.body, f"object {item.name!r}: ")):
+            for body in tree.list_subtree(find_element_id(model, "body", item.body, f"object {item.name!r}: ")):
                 body_object[body] = index
         #: Robot index of each body: of nested robots the deeper one, of a shared base nobody in particular.
         self.body_robot = [_NONE] * model.nbody
         #: Rigid finger of each body: the id of the body it is welded to, -1 for what is no finger.
         self.body_finger = [_NONE] * model.nbody
-        roots = [(i, root) for i, spec in enumerate(robots) for root in _roots(model, tree, spec)]
-        for index, root in sorted(roots, key=lambda pair: len(tree.ancestors(pair[1]))):
-            for body in tree.subtree(root):
+        roots = [(i, root) for i, spec in enumerate(robots) for root in _find_roots(model, tree, spec)]
+        for index, root in sorted(roots, key=lambda pair: len(tree.list_ancestors(pair[1]))):
+            for body in tree.list_subtree(root):
                 self.body_robot[body] = index
         self._fingers_of: list[int] = []
         geom_finger_robot = np.full(model.ngeom + 1, _NONE, np.int64)
@@ -57,7 +57,7 @@ class ContactTables:
         self._geom_partner = geom_body
         self._n_partners = model.nbody + model.nflex
         self._flex_first = model.nbody if model.nflex else 0
-        flex_names = [element_name(model, "flex", f) or f"flex_{f}" for f in range(model.nflex)]
+        flex_names = [get_element_name(model, "flex", f) or f"flex_{f}" for f in range(model.nflex)]
         self._partner_names = (*names, *flex_names)
         self._robot_names = tuple(spec.name for spec in robots)
         self._object_names = tuple(spec.name for spec in objects)
@@ -71,7 +71,7 @@ class ContactTables:
         self._no_forces = (0.0,) * len(robots)
 
     def object_contacts(self, data: Any) -> tuple[ObjectContact, ...]:
-        """Objects that touch anything, in the order of the objects; names within in the order of ids."""
+        """Return the objects that touch anything, in the order of the objects; names within in the order of ids."""
         if not data.ncon or not self._object_names:
             return ()
         contact = data.contact
@@ -88,11 +88,11 @@ class ContactTables:
             partners = np.where(geom < 0, self._flex_first + contact.flex, partners)
         keys = np.where(objects >= 0, objects * self._n_partners + partners[:, ::-1], _NONE)[active]
         self._last_active = seen
-        self._last_contacts = self._group(sorted(set(keys.ravel().tolist()) - {_NONE}))
+        self._last_contacts = self._group_by_object(sorted(set(keys.ravel().tolist()) - {_NONE}))
         return self._last_contacts
 
-    def _group(self, pairs: list[int]) -> tuple[ObjectContact, ...]:
-        """One `ObjectContact` per object from sorted pairs `object * n_partners + partner`."""
+    def _group_by_object(self, pairs: list[int]) -> tuple[ObjectContact, ...]:
+        """Return one `ObjectContact` per object from sorted pairs `object * n_partners + partner`."""
         found: list[ObjectContact] = []
         start = 0
         while start < len(pairs):
@@ -100,11 +100,11 @@ class ContactTables:
             end = start
             while end < len(pairs) and pairs[end] // self._n_partners == index:
                 end += 1
-            found.append(self._one_object(index, [p - index * self._n_partners for p in pairs[start:end]]))
+            found.append(self._build_contact(index, [p - index * self._n_partners for p in pairs[start:end]]))
             start = end
         return tuple(found)
 
-    def _one_object(self, index: int, partners: list[int]) -> ObjectContact:
+    def _build_contact(self, index: int, partners: list[int]) -> ObjectContact:
         touching: dict[int, set[int]] = {}
         others: list[str] = []
         for partner in partners:
@@ -115,17 +115,17 @@ class ContactTables:
                 continue
             touching.setdefault(robot, set()).add(self.body_finger[partner])
         robots = sorted(touching)
-        grippers = tuple(self._robot_names[r] for r in robots if self._holds(r, touching[r]))
+        grippers = tuple(self._robot_names[r] for r in robots if self._is_holding(r, touching[r]))
         return ObjectContact(
             self._object_names[index], grippers, tuple(self._robot_names[r] for r in robots), tuple(others)
         )
 
-    def _holds(self, robot: int, fingers: set[int]) -> bool:
+    def _is_holding(self, robot: int, fingers: set[int]) -> bool:
         touched = len(fingers - {_NONE})
         return touched >= 2 or (touched == 1 and self._fingers_of[robot] == 1)
 
     def gripper_forces(self, model: mujoco.MjModel, data: Any) -> tuple[float, ...]:
-        """Per robot: sum of the normal contact forces on its finger bodies [N], from solved constraints.
+        """Return per robot the sum of the normal contact forces on its finger bodies [N], from solved constraints.
 
         Only valid between `mj_step2` (or `mj_forward`) and the next `mj_step1`. A contact between two fingers of one
         robot counts once.
@@ -158,8 +158,8 @@ class ContactTables:
         return tuple(forces)
 
 
-def _roots(model: mujoco.MjModel, tree: Tree, spec: RobotSpec) -> tuple[int, int]:
-    """The base body of a robot, and the highest body that one of its joints moves."""
+def _find_roots(model: mujoco.MjModel, tree: KinematicTree, spec: RobotSpec) -> tuple[int, int]:
+    """Return the base body of a robot, and the highest body that one of its joints moves."""
     where = f"robot {spec.name!r}: "
-    moved = [tree.joint_body[element_id(model, "joint", j, where)] for j in spec.joints]
-    return element_id(model, "body", spec.base_body, where), min(moved, key=lambda b: len(tree.ancestors(b)))
+    moved = [tree.joint_body[find_element_id(model, "joint", j, where)] for j in spec.joints]
+    return find_element_id(model, "body", spec.base_body, where), min(moved, key=lambda b: len(tree.list_ancestors(b)))

@@ -54,7 +54,9 @@ class SpecError(PhysicsError):
 
 
 class AmbiguousModelError(PhysicsError):
-    """What `find_robots` cannot decide. The text is one line; `toml` describes what was found, to be completed."""
+    """A model whose robots `find_robots` cannot decide. One line of text; `toml` describes the robots found, to be
+    completed.
+    """
 
     def __init__(self, message: str, toml: str) -> None:
         super().__init__(f"{one_line(message)}. Complete the robots file below and pass it with the model.")
@@ -77,5 +79,5 @@ class SimulationDivergedError(PhysicsError):
 
 
 def one_line(text: object) -> str:
-    """MuJoCo's messages and other texts on one line."""
+    """Return MuJoCo's message or another text on one line."""
     return " ".join(str(text).split())

@@ -1,4 +1,4 @@
-"""Grippers: which actuator moves the fingers of an arm, and which of its ctrl values is open."""
+"""Grippers found in a model: the actuator that moves the fingers of an arm, and its open ctrl value."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.physics.names import element_name
-from iris_session.physics.tree import Tree
+from iris_session.physics.names import get_element_name
+from iris_session.physics.tree import KinematicTree
 
 #: Fingers without a joint range are tried this far from their reference [m or rad].
 _TRIAL = 0.02
@@ -18,8 +18,8 @@ _MIN_CHANGE = 1e-4
 
 
 @dataclass(frozen=True)
-class Gripper:
-    """Ids in the model. `open` and `closed` are ctrl values; None when they could not be told apart."""
+class GripperActuation:
+    """Ids in the model. `open` and `closed` are ctrl values; None when they cannot be distinguished."""
 
     actuators: tuple[int, ...]
     finger_bodies: tuple[int, ...]
@@ -28,12 +28,13 @@ class Gripper:
     closed: float | None
 
 
-def find_gripper(tree: Tree, palm: int, finger_roots: list[int]) -> Gripper | None:
-    """The gripper on the link `palm`; `finger_roots` are the moving bodies right below it. None when nothing drives it.
+def find_gripper(tree: KinematicTree, palm: int, finger_roots: list[int]) -> GripperActuation | None:
+    """Return the gripper on the link `palm`, None when nothing drives it. `finger_roots`: the moving bodies right below
+    it.
 
     An actuator belongs to it when all joints it drives, directly or by a tendon, are below the palm.
     """
-    bodies = [b for root in finger_roots for b in tree.subtree(root)]
+    bodies = [b for root in finger_roots for b in tree.list_subtree(root)]
     below = set(bodies)
     actuators = tuple(
         a for a, driven in enumerate(tree.driven) if driven and all(tree.joint_body[j] in below for j in driven)
@@ -41,15 +42,15 @@ def find_gripper(tree: Tree, palm: int, finger_roots: list[int]) -> Gripper | No
     if not actuators:
         return None
     with_geoms = tuple(b for b in bodies if int(tree.model.body_geomnum[b]))
-    ctrl_range = _ctrl_range(tree, actuators[0])
+    ctrl_range = _find_ctrl_range(tree, actuators[0])
     larger_opens = _larger_ctrl_opens(tree, actuators[0], palm, finger_roots)
     if len(actuators) > 1 or ctrl_range is None or larger_opens is None:
-        return Gripper(actuators, with_geoms, ctrl_range, None, None)
+        return GripperActuation(actuators, with_geoms, ctrl_range, None, None)
     low, high = ctrl_range
-    return Gripper(actuators, with_geoms, ctrl_range, *((high, low) if larger_opens else (low, high)))
+    return GripperActuation(actuators, with_geoms, ctrl_range, *((high, low) if larger_opens else (low, high)))
 
 
-def _ctrl_range(tree: Tree, actuator: int) -> tuple[float, float] | None:
+def _find_ctrl_range(tree: KinematicTree, actuator: int) -> tuple[float, float] | None:
     model = tree.model
     if int(model.actuator_ctrllimited[actuator]):
         low, high = model.actuator_ctrlrange[actuator].tolist()
@@ -64,8 +65,8 @@ def _ctrl_range(tree: Tree, actuator: int) -> tuple[float, float] | None:
     return None
 
 
-def _directions(tree: Tree, actuator: int) -> dict[int, float]:
-    """How each finger joint moves when ctrl grows: driven joints, and those coupled to them by equalities."""
+def _find_directions(tree: KinematicTree, actuator: int) -> dict[int, float]:
+    """Return how each finger joint moves when ctrl grows: driven joints, and those coupled to them by equalities."""
     sign = 1.0 if float(tree.model.actuator_gainprm[actuator, 0]) >= 0.0 else -1.0
     moves = {joint: sign * ratio for joint, ratio in tree.driven[actuator].items() if ratio}
     for _ in tree.couplings:  # a chain of n couplings is complete after n passes
@@ -77,51 +78,53 @@ def _directions(tree: Tree, actuator: int) -> dict[int, float]:
     return moves
 
 
-def _larger_ctrl_opens(tree: Tree, actuator: int, palm: int, finger_roots: list[int]) -> bool | None:
-    """Compares the aperture at both ends of the finger joints. None: it does not change."""
+def _larger_ctrl_opens(tree: KinematicTree, actuator: int, palm: int, finger_roots: list[int]) -> bool | None:
+    """Compare the aperture at both ends of the finger joints. None: it does not change."""
     model = tree.model
     data = mujoco.MjData(model)
     apertures = []
     for end in (-1.0, 1.0):
         data.qpos[:] = model.qpos0
-        for joint, direction in _directions(tree, actuator).items():
+        for joint, direction in _find_directions(tree, actuator).items():
             address = int(model.jnt_qposadr[joint])
             if int(model.jnt_limited[joint]):
                 data.qpos[address] = model.jnt_range[joint][int(direction * end > 0.0)]
             else:
                 data.qpos[address] += _TRIAL * np.sign(direction * end)
         mujoco.mj_kinematics(model, data)
-        apertures.append(_aperture(tree, data, palm, finger_roots))
+        apertures.append(_measure_aperture(tree, data, palm, finger_roots))
     change = apertures[1] - apertures[0]
     return None if abs(change) < _MIN_CHANGE else change > 0.0
 
 
-def _aperture(tree: Tree, data: mujoco.MjData, palm: int, finger_roots: list[int]) -> float:
-    """Mean distance [m] of the fingers' centres; of the tip of a single finger to the palm."""
+def _measure_aperture(tree: KinematicTree, data: mujoco.MjData, palm: int, finger_roots: list[int]) -> float:
+    """Return the mean distance [m] of the fingers' centres; of the tip of a single finger to the palm."""
     if len(finger_roots) == 1:
         return _jaw_aperture(tree, data, palm, finger_roots[0])
-    centres = [_centre(tree, data, root) for root in finger_roots]
+    centres = [_find_centre(tree, data, root) for root in finger_roots]
     pairs = [(a, b) for i, a in enumerate(centres) for b in centres[i + 1 :]]
     return float(np.mean([np.linalg.norm(a - b) for a, b in pairs]))
 
 
-def _centre(tree: Tree, data: mujoco.MjData, root: int) -> NDArray[np.float64]:
-    """Mean position [m] of the geoms below `root`, of its body frames when it has none."""
-    bodies = tree.subtree(root)
+def _find_centre(tree: KinematicTree, data: mujoco.MjData, root: int) -> NDArray[np.float64]:
+    """Return the mean position [m] of the geoms below `root`, of its body frames when it has none."""
+    bodies = tree.list_subtree(root)
     geoms = np.flatnonzero(np.isin(tree.model.geom_bodyid, bodies))
     points = data.geom_xpos[geoms] if len(geoms) else data.xpos[bodies]
     centre: NDArray[np.float64] = points.mean(axis=0)
     return centre
 
 
-def _jaw_aperture(tree: Tree, data: mujoco.MjData, palm: int, root: int) -> float:
-    """Distance [m] from the tip of a jaw, its box corner farthest from its joint, to the boxes of the palm's geoms."""
+def _jaw_aperture(tree: KinematicTree, data: mujoco.MjData, palm: int, root: int) -> float:
+    """Return the distance [m] from the tip of a jaw, its box corner farthest from its joint, to the boxes of the palm's
+    geoms.
+    """
     model = tree.model
-    anchor = data.xanchor[tree.scalar_joints_of(root)[0]]
-    geoms = np.flatnonzero(np.isin(model.geom_bodyid, tree.subtree(root))).tolist()
+    anchor = data.xanchor[tree.list_scalar_joints(root)[0]]
+    geoms = np.flatnonzero(np.isin(model.geom_bodyid, tree.list_subtree(root))).tolist()
     if not geoms:
         return 0.0
-    corners = np.concatenate([_corners(model, data, g) for g in geoms])
+    corners = np.concatenate([_find_corners(model, data, g) for g in geoms])
     # Rounded, so that among corners equally far the same one is taken at both ends.
     tip = corners[int(np.argmax(np.round(np.linalg.norm(corners - anchor, axis=1), 6)))]
     rigid = [b for b, weld in enumerate(tree.weld) if weld == tree.weld[palm]]
@@ -133,7 +136,7 @@ def _jaw_aperture(tree: Tree, data: mujoco.MjData, palm: int, root: int) -> floa
     return min(distances, default=float(np.linalg.norm(tip - data.xpos[palm])))
 
 
-def _corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> NDArray[np.float64]:
+def _find_corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> NDArray[np.float64]:
     """World positions [m] of the corners of a geom's bounding box, shape (8, 3)."""
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     local = model.geom_aabb[geom, :3] + signs * model.geom_aabb[geom, 3:]
@@ -141,9 +144,9 @@ def _corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> NDArray[n
     return corners
 
 
-def describe(tree: Tree, gripper: Gripper) -> str:
-    """What is undecided about the gripper, empty when nothing is."""
-    names = [element_name(tree.model, "actuator", a) or f"number {a}" for a in gripper.actuators]
+def describe_problem(tree: KinematicTree, gripper: GripperActuation) -> str:
+    """Return the undecided property of the gripper in words, empty when there is none."""
+    names = [get_element_name(tree.model, "actuator", a) or f"number {a}" for a in gripper.actuators]
     if len(names) > 1:
         return f"{len(names)} actuators move its gripper ({', '.join(names)})"
     if gripper.range is None:

@@ -6,7 +6,11 @@ machine that compiled it. MJB is readable by the same MuJoCo version only; recor
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -14,20 +18,21 @@ import mujoco
 import numpy as np
 
 from iris_session.physics.errors import ModelInvalidError, ModelNotFoundError, one_line
-from iris_session.physics.told import caught_warnings
 
 TEXT_SUFFIXES: Final = (".xml", ".mjcf", ".urdf")
+#: MuJoCo has one handler of warnings per process.
+_handler_lock = threading.Lock()
 _BUFFER_NAME: Final = "model.mjb"
 
 
 def load_model(path: str | Path) -> mujoco.MjModel:
-    """Compiles an MJCF or URDF file, or loads an MJB.
+    """Compile an MJCF or URDF file, or load an MJB.
 
     Raises `ModelNotFoundError` for a missing file or unknown suffix, `ModelInvalidError` with MuJoCo's message.
     """
     path = Path(path).expanduser()
     if not path.is_file():
-        raise ModelNotFoundError(f"model file {str(path)!r} does not exist{_siblings(path)}")
+        raise ModelNotFoundError(f"model file {str(path)!r} does not exist{_list_siblings(path)}")
     suffix = path.suffix.lower()
     if suffix not in (*TEXT_SUFFIXES, ".mjb"):
         raise ModelNotFoundError(
@@ -35,7 +40,7 @@ def load_model(path: str | Path) -> mujoco.MjModel:
             "shown, not simulated: ScenePublisher with SceneBuilder.add_file"
         )
     try:
-        model = _binary(str(path)) if suffix == ".mjb" else mujoco.MjModel.from_xml_path(str(path))
+        model = _load_binary(str(path)) if suffix == ".mjb" else mujoco.MjModel.from_xml_path(str(path))
         bytes(model.names).decode()
     except UnicodeDecodeError as error:  # MuJoCo takes any bytes, and then cannot give the name
         raise ModelInvalidError(f"{path.name}: a name in it is not UTF-8: save the file as UTF-8") from error
@@ -45,25 +50,27 @@ def load_model(path: str | Path) -> mujoco.MjModel:
     return model
 
 
-def _binary(name: str, assets: dict[str, bytes] | None = None) -> mujoco.MjModel:
-    """Raises `ValueError` with the reason, which MuJoCo itself gives as a warning beside its error."""
-    with caught_warnings() as why:
+def _load_binary(name: str, assets: dict[str, bytes] | None = None) -> mujoco.MjModel:
+    """Load an MJB. Raises `ValueError` with the reason, which MuJoCo itself gives as a warning beside its error."""
+    with catch_warnings() as why:
         try:
             return mujoco.MjModel.from_binary_path(name, assets)
         except (ValueError, mujoco.FatalError) as error:
             raise ValueError("; ".join(why) or one_line(error)) from error
 
 
-def _siblings(path: Path) -> str:
-    """The model files beside a path that does not exist, for the error text."""
+def _list_siblings(path: Path) -> str:
+    """Return the model files beside a path that does not exist, for the error text."""
     if not path.parent.is_dir():
         return f"; neither does its folder {str(path.parent)!r}"
     found = sorted(p.name for p in path.parent.iterdir() if p.suffix.lower() in (*TEXT_SUFFIXES, ".mjb"))
     return f"; its folder has {', '.join(found) or 'no model file'}"
 
 
-def model_bytes(model: mujoco.MjModel) -> bytearray:
-    """MJB bytes of `model`, asset paths blanked. Same model, same MuJoCo, same lengths of paths: same bytes."""
+def encode_model(model: mujoco.MjModel) -> bytearray:
+    """Return the MJB bytes of `model`, asset paths blanked. Same model, same MuJoCo, same lengths of paths: same
+    bytes.
+    """
     data = bytearray(mujoco.mj_sizeModel(model))
     mujoco.mj_saveModel(model, None, np.frombuffer(data, np.uint8))
     paths = bytes(model.paths)
@@ -74,16 +81,43 @@ def model_bytes(model: mujoco.MjModel) -> bytearray:
     return data
 
 
-def model_from_bytes(data: bytes | bytearray) -> mujoco.MjModel:
-    """Inverse of `model_bytes`. Raises `ModelInvalidError` for bytes of another format or MuJoCo version."""
+def decode_model(data: bytes | bytearray) -> mujoco.MjModel:
+    """Return the model of `encode_model`. Raises `ModelInvalidError` for bytes of another format or MuJoCo version."""
     try:
-        return _binary(_BUFFER_NAME, {_BUFFER_NAME: bytes(data)})
+        return _load_binary(_BUFFER_NAME, {_BUFFER_NAME: bytes(data)})
     except (ValueError, mujoco.FatalError) as error:
         raise ModelInvalidError(
             f"these {len(data)} bytes are no model of MuJoCo {mujoco.__version__}: {one_line(error)}"
         ) from error
 
 
-def scene_hash(data: bytes | bytearray) -> str:
-    """Identity of a scene: BLAKE2b of its model bytes, 32 hex characters."""
+def compute_scene_hash(data: bytes | bytearray) -> str:
+    """Return the identity of a scene: BLAKE2b of its model bytes, 32 hex characters."""
     return hashlib.blake2b(data, digest_size=16).hexdigest()
+
+
+@contextlib.contextmanager
+def catch_warnings() -> Iterator[list[str]]:
+    """Collect MuJoCo's warnings of this thread, a line each. Those of other threads go to the earlier handler or to
+    stderr.
+
+    Without a handler MuJoCo prints a line and writes MUJOCO_LOG.TXT into the current folder.
+    """
+    caught: list[str] = []
+    ours = threading.get_ident()
+    with _handler_lock:
+        before = mujoco.get_mju_user_warning()
+
+        def handle(text: str) -> None:
+            if threading.get_ident() == ours:
+                caught.append(one_line(text))
+            elif before is not None:
+                before(text)
+            else:
+                print(f"WARNING: {one_line(text)}", file=sys.stderr)
+
+        mujoco.set_mju_user_warning(handle)
+        try:
+            yield caught
+        finally:
+            mujoco.set_mju_user_warning(before)

@@ -28,27 +28,27 @@ _TYPES: Final = {
 }
 
 
-def element_name(model: mujoco.MjModel, kind: str, index: int) -> str:
-    """Name in the model, empty when it has none. `kind`: body, joint, actuator, site, keyframe or flex."""
+def get_element_name(model: mujoco.MjModel, kind: str, index: int) -> str:
+    """Return the name in the model, empty when it has none. `kind`: body, joint, actuator, site, keyframe or flex."""
     return mujoco.mj_id2name(model, _TYPES[kind][0], index) or ""
 
 
-def element_names(model: mujoco.MjModel, kind: str) -> tuple[str, ...]:
-    """All names of one kind, by id; empty strings for unnamed elements."""
-    return tuple(element_name(model, kind, i) for i in range(getattr(model, _TYPES[kind][1])))
+def list_element_names(model: mujoco.MjModel, kind: str) -> tuple[str, ...]:
+    """Return all names of one kind, by id; empty strings for unnamed elements."""
+    return tuple(get_element_name(model, kind, i) for i in range(getattr(model, _TYPES[kind][1])))
 
 
-def element_id(model: mujoco.MjModel, kind: str, name: str, where: str = "") -> int:
-    """Id of a named element. Raises `UnknownNameError`, which lists the names there are; `where` begins its text."""
+def find_element_id(model: mujoco.MjModel, kind: str, name: str, where: str = "") -> int:
+    """Return the id of a named element. Raises `UnknownNameError` with the available names; `where` begins its text."""
     index = int(mujoco.mj_name2id(model, _TYPES[kind][0], name)) if name else -1
     if index < 0:
-        raise UnknownNameError(kind, name, (n for n in element_names(model, kind) if n), where)
+        raise UnknownNameError(kind, name, (n for n in list_element_names(model, kind) if n), where)
     return index
 
 
-def body_names(model: mujoco.MjModel) -> tuple[str, ...]:
-    """A unique name of at most 64 characters for every body, by id. Named bodies keep theirs."""
-    given = element_names(model, "body")
+def list_body_names(model: mujoco.MjModel) -> tuple[str, ...]:
+    """Return a unique name of at most 64 characters for every body, by id. Named bodies keep theirs."""
+    given = list_element_names(model, "body")
     taken = {name for name in given if name and len(name) <= MAX_NAME}
     names = []
     for index, name in enumerate(given):
@@ -66,6 +66,6 @@ def body_names(model: mujoco.MjModel) -> tuple[str, ...]:
     return tuple(names)
 
 
-def wire_name(name: str) -> bool:
-    """Whether a name can stand on the wire as it is."""
+def is_wire_name(name: str) -> bool:
+    """Return true when a name fits the wire as it is."""
     return 0 < len(name) <= MAX_NAME

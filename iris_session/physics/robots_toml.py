@@ -1,4 +1,4 @@
-"""The robots file: `RobotSpec`s as TOML, for models whose robots cannot be found, or that the user names otherwise.
+"""The robots file: `RobotSpec`s as TOML, for models whose robots cannot be found, or need other names.
 
     [[robot]]
     name = "left"
@@ -20,9 +20,9 @@ from typing import Any, Final
 import mujoco
 
 from iris_session.physics.errors import RobotsFileError, UnknownNameError, one_line
-from iris_session.physics.names import body_names, element_id, element_name, wire_name
-from iris_session.physics.specs import shared_by_robots
-from iris_session.physics.tree import Tree
+from iris_session.physics.names import find_element_id, get_element_name, is_wire_name, list_body_names
+from iris_session.physics.specs import find_shared_by_robots
+from iris_session.physics.tree import KinematicTree
 from iris_session.protocol.names import LeaseMode
 from iris_session.protocol.specs import RobotSpec
 
@@ -35,11 +35,11 @@ _HOLDS: Final = ("", "gravity_pd")
 
 
 def load_robots_toml(path_or_text: str | Path, model: mujoco.MjModel) -> tuple[RobotSpec, ...]:
-    """Robots from a file, or from TOML text (anything with a line break or an equals sign).
+    """Return the robots of a file, or of TOML text (anything with a line break or an equals sign).
 
     Raises `RobotsFileError`, or `UnknownNameError` for a name that the model does not have.
     """
-    where, text = _read(path_or_text)
+    where, text = _read_text(path_or_text)
     try:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -48,33 +48,35 @@ def load_robots_toml(path_or_text: str | Path, model: mujoco.MjModel) -> tuple[R
     tables = document.get("robot", [])
     if unknown or not isinstance(tables, list) or not all(isinstance(t, dict) for t in tables):
         raise RobotsFileError(f"{where}: expected only [[robot]] tables, found {', '.join(unknown) or 'robot'}")
-    tree = Tree(model)
-    robots = tuple(_robot(tree, table, f"{where}, robot {index + 1}") for index, table in enumerate(tables))
-    if shared := shared_by_robots(robots):
+    tree = KinematicTree(model)
+    robots = tuple(_parse_robot(tree, table, f"{where}, robot {index + 1}") for index, table in enumerate(tables))
+    if shared := find_shared_by_robots(robots):
         raise RobotsFileError(f"{where}: {shared}")
     return robots
 
 
 def dump_robots_toml(robots: Sequence[RobotSpec], notes: Sequence[Mapping[str, str]] = ()) -> str:
-    """TOML text that `load_robots_toml` reads back. `notes`: per robot, key -> comment behind that key."""
+    """Return TOML text that `load_robots_toml` reads back. `notes`: per robot, key -> comment behind that key."""
     lines = ["# Robots of this model. Needed: name, joints, site. Gripper values are ctrl units."]
     for index, robot in enumerate(robots):
         comments = notes[index] if index < len(notes) else {}
         lines += ["", "[[robot]]"]
         for key in _ORDER:
             comment = f"  # {one_line(comments[key])}" if key in comments else ""
-            lines.append(f"{key} = {_value(getattr(robot, key))}{comment}")
+            lines.append(f"{key} = {_format_value(getattr(robot, key))}{comment}")
     return "\n".join(lines) + "\n"
 
 
-def _value(value: str | float | tuple[str, ...]) -> str:
-    """TOML of a value: its strings and arrays of strings are those of JSON but for DEL, floats are `repr`."""
+def _format_value(value: str | float | tuple[str, ...]) -> str:
+    """Return the TOML of a value: its strings and arrays of strings are those of JSON but for DEL,
+    floats are `repr`.
+    """
     if isinstance(value, float):
         return repr(value)
     return json.dumps(value if isinstance(value, str) else list(value), ensure_ascii=False).replace("\x7f", "\\u007F")
 
 
-def _read(path_or_text: str | Path) -> tuple[str, str]:
+def _read_text(path_or_text: str | Path) -> tuple[str, str]:
     if isinstance(path_or_text, str) and ("\n" in path_or_text or "=" in path_or_text):
         return "robots", path_or_text
     path = Path(path_or_text).expanduser()
@@ -84,14 +86,14 @@ def _read(path_or_text: str | Path) -> tuple[str, str]:
         raise RobotsFileError(f"robots file {str(path)!r} cannot be read: {one_line(error)}") from error
 
 
-def _robot(tree: Tree, table: dict[str, Any], where: str) -> RobotSpec:
-    fields = _typed(table, where)
+def _parse_robot(tree: KinematicTree, table: dict[str, Any], where: str) -> RobotSpec:
+    fields = _check_types(table, where)
     name = fields["name"]
     where = f"{where} ({name}): "
-    joints = [element_id(tree.model, "joint", j, where) for j in fields["joints"]]
+    joints = [find_element_id(tree.model, "joint", j, where) for j in fields["joints"]]
     _check_joints(tree, fields, joints, where)
-    site = element_id(tree.model, "site", fields["site"], where)
-    fields["actuators"] = _actuators(tree, fields, joints, where)
+    site = find_element_id(tree.model, "site", fields["site"], where)
+    fields["actuators"] = _choose_actuators(tree, fields, joints, where)
     fields["base_body"] = _base_body(tree, fields, joints, site, where)
     _check_gripper(tree, fields, where)
     if fields.get("mode", LeaseMode.EXCLUSIVE) not in LeaseMode.ALL:
@@ -101,8 +103,8 @@ def _robot(tree: Tree, table: dict[str, Any], where: str) -> RobotSpec:
     return RobotSpec(**fields)
 
 
-def _typed(table: dict[str, Any], where: str) -> dict[str, Any]:
-    """The table with known keys and right types only; lists become tuples."""
+def _check_types(table: dict[str, Any], where: str) -> dict[str, Any]:
+    """Return the table with known keys and right types only; lists become tuples."""
     unknown = sorted(set(table) - set(_ORDER))
     if unknown:
         raise RobotsFileError(f"{where}: unknown key {unknown[0]!r}. Available keys: {', '.join(_ORDER)}.")
@@ -120,34 +122,34 @@ def _typed(table: dict[str, Any], where: str) -> dict[str, Any]:
         else:
             kind = "a string" if key in _TEXTS else "a number" if key in _NUMBERS else "a list of strings"
             raise RobotsFileError(f"{where}: {key!r} must be {kind}, not {value!r}")
-    if not wire_name(fields["name"]):
+    if not is_wire_name(fields["name"]):
         raise RobotsFileError(f"{where}: name {fields['name']!r} is longer than 64 characters")
     return fields
 
 
-def _check_joints(tree: Tree, fields: dict[str, Any], joints: list[int], where: str) -> None:
+def _check_joints(tree: KinematicTree, fields: dict[str, Any], joints: list[int], where: str) -> None:
     for name, joint in zip(fields["joints"], joints, strict=True):
-        if joint not in tree.scalar_joints_of(tree.joint_body[joint]):
+        if joint not in tree.list_scalar_joints(tree.joint_body[joint]):
             raise RobotsFileError(f"{where}joint {name!r} is a free or ball joint; a robot's are hinges and slides")
         if joints.count(joint) > 1:
             raise RobotsFileError(f"{where}joint {name!r} is listed twice")
 
 
-def _actuators(tree: Tree, fields: dict[str, Any], joints: list[int], where: str) -> tuple[str, ...]:
-    """One actuator per joint: as listed (each must drive its joint), or the only one that each joint has."""
+def _choose_actuators(tree: KinematicTree, fields: dict[str, Any], joints: list[int], where: str) -> tuple[str, ...]:
+    """Return one actuator per joint: as listed (each must drive its joint), or the only one that each joint has."""
     listed: tuple[str, ...] = fields.get("actuators", ())
     if listed and len(listed) != len(joints):
         raise RobotsFileError(f"{where}{len(joints)} joints but {len(listed)} actuators; one per joint, in order")
     chosen = []
     for index, joint in enumerate(joints):
         candidates = tree.actuators_of_joint[joint]
-        names = [n for a in candidates if (n := element_name(tree.model, "actuator", a))]
+        names = [n for a in candidates if (n := get_element_name(tree.model, "actuator", a))]
         if not listed:
             if len(names) != 1:
                 have = ", ".join(names) or "none"
                 raise RobotsFileError(f"{where}joint {fields['joints'][index]!r} needs one named actuator, has {have}")
             chosen.append(names[0])
-        elif element_id(tree.model, "actuator", listed[index], where) not in candidates:
+        elif find_element_id(tree.model, "actuator", listed[index], where) not in candidates:
             have = ", ".join(names) or "none"
             raise RobotsFileError(
                 f"{where}actuator {listed[index]!r} does not drive joint {fields['joints'][index]!r}; that has {have}"
@@ -155,15 +157,15 @@ def _actuators(tree: Tree, fields: dict[str, Any], joints: list[int], where: str
     return listed or tuple(chosen)
 
 
-def _base_body(tree: Tree, fields: dict[str, Any], joints: list[int], site: int, where: str) -> str:
-    """The given base, which must carry every joint and the site, or the body of the first joint's root."""
+def _base_body(tree: KinematicTree, fields: dict[str, Any], joints: list[int], site: int, where: str) -> str:
+    """Return the given base, which must carry every joint and the site, or the body of the first joint's root."""
     carried = [tree.joint_body[j] for j in joints] + [int(tree.model.site_bodyid[site])]
-    common = [b for b in tree.ancestors(carried[0]) if all(b in tree.ancestors(c) for c in carried)]
-    named = [n for b in common if wire_name(n := element_name(tree.model, "body", b))]
+    common = [b for b in tree.list_ancestors(carried[0]) if all(b in tree.list_ancestors(c) for c in carried)]
+    named = [n for b in common if is_wire_name(n := get_element_name(tree.model, "body", b))]
     given = fields.get("base_body", "")
     if not given and named:
         return named[0]
-    if not given or element_id(tree.model, "body", given, where) not in common:
+    if not given or find_element_id(tree.model, "body", given, where) not in common:
         listed = ", ".join(named) or "none (they share no named body)"
         raise RobotsFileError(
             f"{where}base_body {given!r} must carry all its joints and its site. Available bodies: {listed}."
@@ -171,8 +173,8 @@ def _base_body(tree: Tree, fields: dict[str, Any], joints: list[int], site: int,
     return str(given)
 
 
-def _check_gripper(tree: Tree, fields: dict[str, Any], where: str) -> None:
-    bodies = body_names(tree.model)
+def _check_gripper(tree: KinematicTree, fields: dict[str, Any], where: str) -> None:
+    bodies = list_body_names(tree.model)
     for body in fields.get("finger_bodies", ()):
         if body not in bodies:
             raise UnknownNameError("body", body, bodies[1:], where)
@@ -181,7 +183,7 @@ def _check_gripper(tree: Tree, fields: dict[str, Any], where: str) -> None:
         if fields.get("gripper_open", 0.0) or fields.get("gripper_closed", 0.0) or fields.get("finger_bodies"):
             raise RobotsFileError(f"{where}gripper values or finger bodies without a gripper_actuator")
         return
-    actuator = element_id(tree.model, "actuator", name, where)
+    actuator = find_element_id(tree.model, "actuator", name, where)
     if name in fields["actuators"]:
         raise RobotsFileError(f"{where}gripper_actuator {name!r} is also an actuator of the arm")
     opened, closed = fields.get("gripper_open", 0.0), fields.get("gripper_closed", 0.0)

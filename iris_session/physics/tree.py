@@ -13,7 +13,7 @@ _WRAP_JOINT = int(mujoco.mjtWrap.mjWRAP_JOINT)
 _EQ_JOINT = int(mujoco.mjtEq.mjEQ_JOINT)
 
 
-class Tree:
+class KinematicTree:
     """Read-only view of the bodies, joints and actuators of `model`. All numbers are MuJoCo ids."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -55,39 +55,39 @@ class Tree:
             if int(model.wrap_type[w]) == _WRAP_JOINT
         }
 
-    def joints_of(self, body: int) -> range:
-        """Joint ids of one body, in order."""
+    def list_joints(self, body: int) -> range:
+        """Return the joint ids of one body, in order."""
         first = int(self.model.body_jntadr[body])
         return range(first, first + int(self.model.body_jntnum[body])) if first >= 0 else range(0)
 
-    def scalar_joints_of(self, body: int) -> list[int]:
-        """Hinges and slides of one body."""
-        return [j for j in self.joints_of(body) if self.joint_type[j] not in (_FREE, _BALL)]
+    def list_scalar_joints(self, body: int) -> list[int]:
+        """Return the hinges and slides of one body."""
+        return [j for j in self.list_joints(body) if self.joint_type[j] not in (_FREE, _BALL)]
 
-    def subtree(self, body: int) -> list[int]:
-        """`body` and everything below it, parents first, by id among siblings."""
+    def list_subtree(self, body: int) -> list[int]:
+        """Return `body` and everything below it, parents first, by id among siblings."""
         found = [body]
         for b in found:
             found.extend(self.children[b])
         return found
 
-    def ancestors(self, body: int) -> list[int]:
-        """`body` and its ancestors up to and without the world."""
+    def list_ancestors(self, body: int) -> list[int]:
+        """Return `body` and its ancestors up to and without the world."""
         found = []
         while body > 0:
             found.append(body)
             body = self.parent[body]
         return found
 
-    def jointed_below(self, body: int) -> list[int]:
-        """The nearest bodies below `body` that have hinges or slides: what branches off here."""
+    def list_jointed_below(self, body: int) -> list[int]:
+        """Return the nearest bodies below `body` that have hinges or slides: the branches at this body."""
         found: list[int] = []
         for child in self.children[body]:
-            found.extend([child] if self.scalar_joints_of(child) else self.jointed_below(child))
+            found.extend([child] if self.list_scalar_joints(child) else self.list_jointed_below(child))
         return found
 
-    def moving(self) -> list[bool]:
-        """Of every body, whether it can move: what a joint or the user moves, and all that is fixed on it."""
+    def find_moving_bodies(self) -> list[bool]:
+        """Return for every body whether it can move: by a joint or the user, or because it is fixed on one that can."""
         mocap = (self.model.body_mocapid >= 0).tolist()
         moving = [False] * len(mocap)
         for b, parent in enumerate(self.model.body_parentid.tolist()):
@@ -95,12 +95,11 @@ class Tree:
             moving[b] = b > 0 and (self.weld[b] != 0 or mocap[b] or moving[parent])
         return moving
 
-    def flex_vertex_bodies(self) -> frozenset[int]:
-        """Bodies that MuJoCo made for the vertices or nodes of a flex: one each on one to three slides (`dof` of a
-        flexcomp), and nothing on them or below.
+    def find_flex_vertex_bodies(self) -> frozenset[int]:
+        """Return the bodies that MuJoCo made for the vertices or nodes of a flex.
 
-        Pinned and rigid vertices belong to ordinary bodies, which are not among them. What a light or camera looks at
-        is not either.
+        They have one to three slides each (`dof` of a flexcomp), and nothing on them or below. Pinned and rigid
+        vertices belong to ordinary bodies, which are not among them. The target of a light or camera is not either.
         """
         model = self.model
         used = {*model.light_bodyid.tolist(), *model.cam_bodyid.tolist(), *model.site_bodyid.tolist()}
@@ -118,10 +117,10 @@ class Tree:
             and not self.children[b]
             and int(model.body_geomnum[b]) == 0
             and 1 <= int(model.body_jntnum[b]) <= 3
-            and self._slides(b)
+            and self._has_only_slides(b)
         )
 
-    def _slides(self, body: int) -> bool:
-        """Whether all joints of a body are slides."""
+    def _has_only_slides(self, body: int) -> bool:
+        """Return true when all joints of a body are slides."""
         first, n = int(self.model.body_jntadr[body]), int(self.model.body_jntnum[body])
         return bool((self.model.jnt_type[first : first + n] == mujoco.mjtJoint.mjJNT_SLIDE).all())

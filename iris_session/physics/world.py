@@ -3,7 +3,7 @@
 A tick is `mj_step2` then `mj_step1`: the arithmetic of `mj_step` shifted by half a step, so that after a tick every
 derived quantity (poses, contacts) belongs to the new state. Write `ctrl` and `xfrc_applied` between ticks as usual.
 
-In a user's loop the world is a twin that `set_state_bytes` brings up to date, because after `mj_step` the user's own
+In a user's loop the world is a twin that `restore_state` brings up to date, because after `mj_step` the user's own
 derived quantities are those of the state before it.
 """
 
@@ -25,12 +25,11 @@ from iris_session.physics.errors import (
     SnapshotError,
     one_line,
 )
-from iris_session.physics.flexes import Flexes
-from iris_session.physics.load import model_bytes, scene_hash
-from iris_session.physics.names import body_names, element_id, element_names
+from iris_session.physics.load import compute_scene_hash, encode_model
+from iris_session.physics.names import find_element_id, list_body_names, list_element_names
 from iris_session.physics.specs import check_specs
-from iris_session.physics.tree import Tree
-from iris_session.physics.view import LiveView
+from iris_session.physics.tree import KinematicTree
+from iris_session.physics.view import Flexes, MujocoView
 from iris_session.protocol.common import Pose
 from iris_session.protocol.server_messages import BodyInfo, RobotInfo
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
@@ -97,9 +96,9 @@ class World:
         self._keyframe = _initial_keyframe(model, keyframe)
         self._split = int(model.opt.integrator) in _SPLIT_INTEGRATORS
         self._state: NDArray[np.float64] = np.empty(mujoco.mj_stateSize(model, STATE))
-        tree = Tree(model)
+        tree = KinematicTree(model)
         self._tables = ContactTables(model, robots, objects, tree)
-        self._view = LiveView(model, self.data, robots, objects, self._tables)
+        self._view = MujocoView(model, self.data, robots, objects, self._tables)
         #: Deformables: where their vertices are after the last tick, and who touches them.
         self.flexes = Flexes(model, self.data, robots, self._tables)
         self.bodies = _body_infos(model, tree, objects)
@@ -110,7 +109,7 @@ class World:
         self.robot_infos = tuple(_robot_info(model, spec) for spec in robots)
         self.tick_period_ns = self._view.tick_period_ns
         #: BLAKE2b of the model bytes, 32 hex characters.
-        self.scene_hash = scene_hash(model_bytes(model))
+        self.scene_hash = compute_scene_hash(encode_model(model))
         self._tick = 0
         self._forces: tuple[float, ...] = (0.0,) * len(robots)
         self._shown_state = b""
@@ -118,29 +117,29 @@ class World:
         self.diverged = ""
         self.reset()
 
-    def initial_data(self, state: bytes = b"") -> Any:
-        """Data of its own at the beginning, positions derived: `state` (`mjSTATE_INTEGRATION`), or the initial one."""
+    def make_initial_data(self, state: bytes = b"") -> Any:
+        """Return new data at the beginning, positions derived: `state` (`mjSTATE_INTEGRATION`), or the initial one."""
         data = mujoco.MjData(self.model)
-        self._begin(data)
+        self._reset_data(data)
         if state:
             mujoco.mj_setState(self.model, data, np.frombuffer(state, np.float64), STATE)
         mujoco.mj_fwdPosition(self.model, data)
         return data
 
-    def _begin(self, data: Any) -> None:
+    def _reset_data(self, data: Any) -> None:
         if self._keyframe >= 0:
             mujoco.mj_resetDataKeyframe(self.model, data, self._keyframe)
         else:
             mujoco.mj_resetData(self.model, data)
 
     def reset(self) -> None:
-        """Back to the initial keyframe (or default state), tick 0."""
-        self._begin(self.data)
+        """Return to the initial keyframe (or default state), tick 0."""
+        self._reset_data(self.data)
         self._forces = (0.0,) * len(self._forces)
-        self._derive(0)
+        self._derive_state(0)
 
     def tick(self) -> None:
-        """One timestep with the present `ctrl` and applied forces.
+        """Take one timestep with the present `ctrl` and applied forces.
 
         Raises `SimulationDivergedError`, again and again until `reset` or `restore`.
         """
@@ -156,12 +155,12 @@ class World:
             self._forces = self._tables.gripper_forces(model, data)
             mujoco.mj_step1(model, data)
         except mujoco.FatalError as error:  # out of memory in the middle of a step
-            self._give_up(error)
+            self._raise_diverged(error)
         self._set_tick(self._tick + 1)
-        self._check(data)
+        self._check_diverged(data)
 
-    def set_state_bytes(self, state: bytes) -> None:
-        """Shows a plant that is advanced elsewhere (`state_bytes` of the same model). The tick follows from its time.
+    def restore_state(self, state: bytes) -> None:
+        """Show a plant that is advanced elsewhere (`save_state` of the same model). The tick follows from its time.
 
         Everything the view shows afterwards, contact forces included, is a function of `state` alone.
         """
@@ -171,10 +170,12 @@ class World:
             self.diverged = ""
             return
         time = float(self._state[0])
-        self._show(round(time / float(self.model.opt.timestep)) if math.isfinite(time) else self._tick)
+        self._show_state(round(time / float(self.model.opt.timestep)) if math.isfinite(time) else self._tick)
 
-    def _show(self, tick: int) -> None:
-        """`_state` into the shown data with everything derived, contact forces too; the state itself stays as it is."""
+    def _show_state(self, tick: int) -> None:
+        """Put `_state` into the shown data with everything derived, contact forces too; the state itself stays as it
+        is.
+        """
         model, data = self.model, self.data
         self.diverged = "" if np.isfinite(self._state).all() else "the state holds numbers that are not finite"
         if self.diverged:
@@ -187,8 +188,8 @@ class World:
 
     # --- what others see ----------------------------------------------------------------------------------------------
 
-    def view(self) -> LiveView:
-        """The world after the last tick; one live object, see `LiveView`."""
+    def view(self) -> MujocoView:
+        """Return the world after the last tick; one live object, see `MujocoView`."""
         return self._view
 
     @property
@@ -197,34 +198,36 @@ class World:
         array: NDArray[np.float64] = self.data.ctrl
         return array
 
-    def poses(self, out: NDArray[np.float64]) -> None:
-        """Writes world poses of `bodies`, `x y z qw qx qy qz`, into `out`, shape (len(bodies), 7)."""
+    def read_poses(self, out: NDArray[np.float64]) -> None:
+        """Write world poses of `bodies`, `x y z qw qx qy qz`, into `out`, shape (len(bodies), 7)."""
         out[:, :3] = self.data.xpos[self._rows]
         out[:, 3:] = self.data.xquat[self._rows]
 
     @property
-    def trouble(self) -> dict[str, int]:
-        """How often MuJoCo ran out of room since the last reset, by what it dropped. Empty when never."""
+    def dropped_counts(self) -> dict[str, int]:
+        """Number of times that MuJoCo ran out of room since the last reset, by what it dropped. Empty when never."""
         counts = self.data.warning.number.tolist()
         return {text: counts[i] for text, i in _FULL.items() if counts[i]}
 
-    def model_bytes(self) -> bytes:
-        """The model as MJB, asset paths blanked (see `load.model_bytes`); made anew by every call."""
-        return bytes(model_bytes(self.model))
+    def encode_model(self) -> bytes:
+        """Return the model as MJB, asset paths blanked (see `load.encode_model`); made anew by every call."""
+        return bytes(encode_model(self.model))
 
     # --- saving -------------------------------------------------------------------------------------------------------
 
-    def state_bytes(self) -> bytes:
-        """`mjSTATE_INTEGRATION` as little-endian float64: time, positions, velocities, warm start, inputs, ..."""
+    def save_state(self) -> bytes:
+        """Return `mjSTATE_INTEGRATION` as little-endian float64: time, positions, velocities, warm
+        start, inputs, ...
+        """
         mujoco.mj_getState(self.model, self.data, self._state, STATE)
         return self._state.tobytes()
 
     def snapshot(self) -> bytes:
-        """Everything that later ticks and the view depend on."""
-        return _encoder.encode(_Saved(self.scene_hash, self._tick, self._forces, self.diverged, self.state_bytes()))
+        """Return everything that later ticks and the view depend on."""
+        return _encoder.encode(_Saved(self.scene_hash, self._tick, self._forces, self.diverged, self.save_state()))
 
     def restore(self, snapshot: bytes) -> None:
-        """Inverse of `snapshot`, bit for bit. Raises `SnapshotError` for other bytes or another model's."""
+        """Restore a `snapshot`, bit for bit. Raises `SnapshotError` for other bytes or another model's."""
         try:
             saved = _decoder.decode(snapshot)
         except msgspec.DecodeError as error:
@@ -237,7 +240,7 @@ class World:
         mujoco.mj_resetData(self.model, self.data)  # clears warnings and whatever is outside the state
         mujoco.mj_setState(self.model, self.data, self._state, STATE)
         self._forces = saved.forces
-        self._derive(saved.tick)
+        self._derive_state(saved.tick)
         self.diverged = saved.diverged
 
     # --- inside -------------------------------------------------------------------------------------------------------
@@ -247,12 +250,12 @@ class World:
             raise SnapshotError(f"state of {len(state)} bytes, but this model's has {self._state.nbytes}")
         self._state[:] = np.frombuffer(state, np.float64)
 
-    def _derive(self, tick: int) -> None:
-        """Positions, contacts and velocities of the state that was just put into the shown data."""
+    def _derive_state(self, tick: int) -> None:
+        """Compute positions, contacts and velocities of the state that was just put into the shown data."""
         try:
             mujoco.mj_step1(self.model, self.data)
         except mujoco.FatalError as error:
-            self._give_up(error)
+            self._raise_diverged(error)
         self.diverged = ""
         self._set_tick(tick)
 
@@ -261,21 +264,21 @@ class World:
         self._shown_state = b""
         self._view.advance(tick, self._forces)
 
-    def _check(self, data: Any) -> None:
-        """Raises when MuJoCo met bad numbers in this tick. For those it has reset `data` itself."""
+    def _check_diverged(self, data: Any) -> None:
+        """Raise when MuJoCo met bad numbers in this tick. For those it has reset `data` itself."""
         counts = data.warning.number.tolist()
         found = [text for index, text in _BAD if counts[index]]
         if found:
             self.diverged = "; ".join(found)
             raise SimulationDivergedError(self._tick, float(data.time), self.diverged)
 
-    def _give_up(self, error: mujoco.FatalError) -> NoReturn:
+    def _raise_diverged(self, error: mujoco.FatalError) -> NoReturn:
         self.diverged = one_line(error)
         raise SimulationDivergedError(self._tick, float(self.data.time), self.diverged) from error
 
 
 def _require_exact(model: mujoco.MjModel) -> None:
-    """Refuses what cannot be restored bit for bit: sleeping islands keep timers outside every `mjtState`."""
+    """Refuse models that cannot be restored bit for bit: sleeping islands keep timers outside every `mjtState`."""
     sleep = getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", None)
     if sleep is not None and int(model.opt.enableflags) & int(sleep):
         raise ModelUnsupportedError(
@@ -285,30 +288,30 @@ def _require_exact(model: mujoco.MjModel) -> None:
 
 def _initial_keyframe(model: mujoco.MjModel, name: str) -> int:
     if name:
-        return element_id(model, "keyframe", name)
-    names = element_names(model, "keyframe")
+        return find_element_id(model, "keyframe", name)
+    names = list_element_names(model, "keyframe")
     return names.index(HOME) if HOME in names else min(0, model.nkey - 1)
 
 
-def _body_infos(model: mujoco.MjModel, tree: Tree, objects: Sequence[ObjectSpec]) -> tuple[BodyInfo, ...]:
-    """All bodies but the world and the vertices of flexes, by id."""
-    vertices = tree.flex_vertex_bodies()
+def _body_infos(model: mujoco.MjModel, tree: KinematicTree, objects: Sequence[ObjectSpec]) -> tuple[BodyInfo, ...]:
+    """Return all bodies but the world and the vertices of flexes, by id."""
+    vertices = tree.find_flex_vertex_bodies()
     taken = {spec.body for spec in objects}
-    moving = tree.moving()
+    moving = tree.find_moving_bodies()
     return tuple(
         BodyInfo(index, name, moving=moving[index], object=name in taken)
-        for index, name in enumerate(body_names(model))
+        for index, name in enumerate(list_body_names(model))
         if index and index not in vertices
     )
 
 
 def _robot_info(model: mujoco.MjModel, spec: RobotSpec) -> RobotInfo:
-    site = element_id(model, "site", spec.site, f"robot {spec.name!r}: ")
+    site = find_element_id(model, "site", spec.site, f"robot {spec.name!r}: ")
     (x, y, z), (w, i, j, k) = model.site_pos[site].tolist(), model.site_quat[site].tolist()
     return RobotInfo(
         name=spec.name,
         joints=spec.joints,
-        base_body=element_id(model, "body", spec.base_body, f"robot {spec.name!r}: "),
+        base_body=find_element_id(model, "body", spec.base_body, f"robot {spec.name!r}: "),
         site_body=int(model.site_bodyid[site]),
         T_body_site=Pose((x, y, z), (w, i, j, k)),
         gripper=bool(spec.gripper_actuator),

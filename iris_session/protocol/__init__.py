@@ -1,5 +1,8 @@
 """The wire and the internal contracts of the session. Pure: no sockets, clocks, threads, MuJoCo or randomness.
 
-`names` (open enumerations), `common` (value types), `client_messages`, `server_messages` (the wire), `entries` (what
-reaches the authority and the journal), `specs` (robots, objects), `steps` (authority -> control -> physics).
+Wire: `common` (value types), `names` (open enumerations), `client_messages`, `server_messages`, `status`, `media`,
+`assets`, `scene`, `discovery`, `pairing`; `codec` and `limits` are the trust boundary, `errors` its exceptions.
+Internal contracts: `entries` (input of the authority, the journal), `specs` (robots, objects), `steps` (authority to
+control to physics). `session_mirror` rebuilds the shared state from a snapshot and events. Sockets live in `front` and
+`client`.
 """

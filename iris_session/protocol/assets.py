@@ -30,10 +30,10 @@ _ADDRESS: Final = re.compile(r"[0-9a-f]{64}")
 
 
 class AssetRequest(msgspec.Struct, frozen=True, array_like=True):
-    """Asks for `length` bytes of an asset from `offset` on; fewer come when it ends before.
+    """Request for `length` bytes of an asset from `offset` on; the answer is shorter when the asset ends before.
 
-    `connection_epoch`: of the sender's `Welcome`. `request_id`: any number; it comes back with the answer. `address`:
-    SHA-256 of the asset, 64 hexadecimal digits.
+    `connection_epoch`: of the sender's `Welcome`. `request_id`: any number; repeated in the answer. `address`: SHA-256
+    of the asset, 64 hexadecimal digits.
     """
 
     version: Count
@@ -45,7 +45,7 @@ class AssetRequest(msgspec.Struct, frozen=True, array_like=True):
 
 
 class AssetChunk(msgspec.Struct, frozen=True, array_like=True):
-    """First of two frames; the other holds bytes `offset` and following of an asset that has `total` bytes."""
+    """First of two frames; the second holds bytes `offset` and following of an asset that has `total` bytes."""
 
     version: Count
     request_id: Count
@@ -55,7 +55,7 @@ class AssetChunk(msgspec.Struct, frozen=True, array_like=True):
 
 
 class AssetRefused(msgspec.Struct, frozen=True, array_like=True):
-    """The only frame of an answer: nothing comes for this request. `request_id` 0: it could not be read."""
+    """The only frame of an answer: no bytes come for this request. `request_id` 0: it could not be read."""
 
     version: Count
     request_id: Count
@@ -65,7 +65,7 @@ class AssetRefused(msgspec.Struct, frozen=True, array_like=True):
 
 
 def is_address(text: str) -> bool:
-    """Whether this can be the address of an asset: 64 digits `0-9a-f`."""
+    """Return true when the text can be the address of an asset: 64 digits `0-9a-f`."""
     return _ADDRESS.fullmatch(text) is not None
 
 
@@ -96,7 +96,9 @@ class ArrayInfo(msgspec.Struct, frozen=True):
 
 
 class ArrayHeader(msgspec.Struct, frozen=True):
-    """The header. `kind` of `ArrayKind`; `max_error`: stated bound on the values, in their unit, 0: exact."""
+    """The header of a container. `kind` of `ArrayKind`; `max_error`: stated bound on the values, in their unit, 0:
+    exact.
+    """
 
     kind: Name
     arrays: Annotated[tuple[ArrayInfo, ...], msgspec.Meta(max_length=MAX_ARRAYS)]

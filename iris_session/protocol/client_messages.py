@@ -38,24 +38,28 @@ class Hello(Message, frozen=True, tag="hello"):
 
 
 class Bye(Message, frozen=True, tag="bye"):
-    """Leaves at once: leases are released without grace."""
+    """Leave the session at once: leases are released without grace."""
 
     reason: Text = ""
 
 
 class Heartbeat(Message, frozen=True, tag="heartbeat"):
-    """Sent at least every `Welcome.heartbeat_ns`. `worn` false: the headset lies on the table."""
+    """Sign of life, sent at least every `Welcome.heartbeat_ns`. `worn` false: the headset is not worn."""
 
     worn: bool = True
 
 
 class ClockPing(Message, frozen=True, tag="clock_ping"):
-    """`t0_ns`: the client's own monotonic clock when it sent this. Answered by `ClockPong` from the front."""
+    """Clock measurement. `t0_ns`: the client's own monotonic clock at sending. Answered by `ClockPong` from the
+    front.
+    """
 
     t0_ns: Nanoseconds
 
 
 class GetSnapshot(Message, frozen=True, tag="get_snapshot"):
+    """Request for a `Snapshot`. `request_id` is repeated in it."""
+
     request_id: Count = 0
 
 
@@ -92,14 +96,14 @@ class Sample(Message, frozen=True, tag="sample"):
 class Samples(Message, frozen=True, tag="samples"):
     """Samples of several devices that were taken together, such as head and both controllers at a display frame.
 
-    Each counts by itself, as if it had come alone; together they cost one message, one packet and one wake-up.
+    Each counts as if it had arrived alone; together they cost one message, one packet and one wake-up.
     """
 
     samples: Annotated[tuple[Sample, ...], msgspec.Meta(max_length=8)]
 
 
 class Acquire(Message, frozen=True, tag="acquire"):
-    """Asks for leases, all or none. No names: the assignment policy chooses one robot. `wait`: queue when held."""
+    """Request for leases, all or none. No names: the assignment policy chooses one robot. `wait`: queue when held."""
 
     request_id: Count
     robots: Names = ()
@@ -109,7 +113,7 @@ class Acquire(Message, frozen=True, tag="acquire"):
 
 
 class Release(Message, frozen=True, tag="release"):
-    """Gives leases back. No targets: all of them, and leaves every queue."""
+    """Return leases. No targets: all of them and every place in a queue."""
 
     request_id: Count = 0
     targets: Targets = ()
@@ -124,7 +128,7 @@ class Consent(Message, frozen=True, tag="consent"):
 
 
 class Assign(Message, frozen=True, tag="assign"):
-    """A director gives robots to a participant (empty: frees them), whoever holds them."""
+    """Assign robots to a participant (empty: free them), whoever holds them. Directors only."""
 
     request_id: Count
     robots: Names
@@ -132,7 +136,7 @@ class Assign(Message, frozen=True, tag="assign"):
 
 
 class SetMode(Message, frozen=True, tag="set_mode"):
-    """A director changes the lease mode of a robot. Blending weights (mode `shared`) come with each `Acquire`."""
+    """Change the lease mode of a robot. Directors only. Blending weights (mode `shared`) come with each `Acquire`."""
 
     request_id: Count
     robot: Name
@@ -140,10 +144,11 @@ class SetMode(Message, frozen=True, tag="set_mode"):
 
 
 class SetScale(Message, frozen=True, tag="set_scale"):
-    """A holder or director sets how far robots move as the hand moves: 1 as far, 0.1 a tenth. No names: all of ours.
+    """Set how far robots move as the hand moves: 1 as far, 0.1 a tenth. No names: all robots of the sender.
 
-    Translation is scaled (that of twists too); rotation, joints and device `target` are not. The scale is that of the
-    present holder: the next one begins at 1. Changing it while engaged moves nothing by itself.
+    For holders and directors. Translation is scaled (that of twists too); rotation, joints and device `target` are not.
+    The scale belongs to the present holder: the next one begins at 1. Changing it while engaged moves nothing by
+    itself.
     """
 
     request_id: Count
@@ -152,7 +157,7 @@ class SetScale(Message, frozen=True, tag="set_scale"):
 
 
 class Grasp(Message, frozen=True, tag="grasp"):
-    """A hand without a robot takes a free object. The lease on the object comes back in the `Reply`."""
+    """Take a free object with a hand, without a robot. The lease on the object comes back in the `Reply`."""
 
     request_id: Count
     object: Name
@@ -160,7 +165,7 @@ class Grasp(Message, frozen=True, tag="grasp"):
 
 
 class Observation(Message, frozen=True, tag="observation"):
-    """A headset (or camera) saw an anchor: `T_tracking_anchor`.
+    """Observation of an anchor by a headset or camera: `T_tracking_anchor`.
 
     `kind`: `AnchorKind`. `size_m`: edge of the sheet as detected. `viewpoint_id`: observations with the same number
     share their systematic error. `covariance`: 6x6 row-major (position, rotation) or empty. `quality`: 0 to 1.
@@ -179,7 +184,7 @@ class Observation(Message, frozen=True, tag="observation"):
 
 
 class PlaceAlignment(Message, frozen=True, tag="place_alignment"):
-    """A director aligns a participant by hand, or adds an offset to a measured alignment (`offset` true)."""
+    """Align a participant by hand, or add an offset to a measured alignment (`offset` true). Directors only."""
 
     request_id: Count
     participant: Name
@@ -188,7 +193,7 @@ class PlaceAlignment(Message, frozen=True, tag="place_alignment"):
 
 
 class Align(Message, frozen=True, tag="align"):
-    """Starts or stops the alignment run of a participant (`AlignAction`); `participant` empty: the sender's own.
+    """Start or stop the alignment run of a participant (`AlignAction`); `participant` empty: the sender's own.
 
     A director may do so for everyone, others for themselves. The alignment in force stays until there is a better one.
     """
@@ -199,9 +204,9 @@ class Align(Message, frozen=True, tag="align"):
 
 
 class MoveAnchor(Message, frozen=True, tag="move_anchor"):
-    """A director says where an anchor of the session is: the shared scene moves for everyone who is aligned to it.
+    """Set where an anchor of the session is: the shared scene moves for everyone who is aligned to it. Directors only.
 
-    `force`: also when it is further than 5 m from where it was, which is more often a wrong number than meant.
+    `force`: also when it is further than 5 m from its old place, which is more often a wrong number than intended.
     """
 
     request_id: Count
@@ -211,13 +216,15 @@ class MoveAnchor(Message, frozen=True, tag="move_anchor"):
 
 
 class TrackingEpoch(Message, frozen=True, tag="tracking_epoch"):
-    """The tracking frame jumped (recentre, lost tracking): every earlier alignment of this participant is void."""
+    """Report that the tracking frame jumped (recentre, lost tracking): every earlier alignment of this participant is
+    void.
+    """
 
     tracking_epoch: Count
 
 
 class Episode(Message, frozen=True, tag="episode"):
-    """`EpisodeAction`: start, success, failure, discard, rerecord, reset."""
+    """Start or end an episode, `EpisodeAction`: start, success, failure, discard, rerecord, reset."""
 
     request_id: Count
     action: Name
@@ -225,17 +232,21 @@ class Episode(Message, frozen=True, tag="episode"):
 
 
 class EStop(Message, frozen=True, tag="estop"):
-    """Anyone may stop everything. Latched. Not a safety-rated stop."""
+    """Stop everything. Any participant may do so. Latched. Not a safety-rated stop."""
 
     reason: Text = ""
 
 
 class ClearEStop(Message, frozen=True, tag="clear_estop"):
+    """End the e-stop. Directors only."""
+
     request_id: Count
 
 
 class Control(Message, frozen=True, tag="control"):
-    """A director's `ControlAction`: pause, resume, step (`ticks` physics ticks while paused), reset."""
+    """Control the session, `ControlAction`: pause, resume, step (`ticks` physics ticks while paused), reset. Directors
+    only.
+    """
 
     request_id: Count
     action: Name
@@ -243,17 +254,17 @@ class Control(Message, frozen=True, tag="control"):
 
 
 class Marker(Message, frozen=True, tag="marker"):
-    """A note in the recording, at the session time of its receipt."""
+    """Put a note into the recording, at the session time of its receipt."""
 
     request_id: Count
     text: Text
 
 
 class Pair(Message, frozen=True, tag="pair"):
-    """Asks for the key of this connection to be put on the allow-list: all that an unknown key may say.
+    """Request to put the key of this connection on the allow-list: the only message allowed from an unknown key.
 
-    `proof`: shows that the sender knows a join code, without telling it (`protocol.pairing`). `name`: under which the
-    key is listed, for people.
+    `proof`: shows that the sender knows a join code, without revealing it (`protocol.pairing`). `name`: under which the
+    key is listed.
     """
 
     name: Name
@@ -262,7 +273,7 @@ class Pair(Message, frozen=True, tag="pair"):
 
 
 class RemoveParticipant(Message, frozen=True, tag="remove_participant"):
-    """A director ends someone's participation. `revoke`: their key is taken off the allow-list too."""
+    """End the participation of a participant. Directors only. `revoke`: its key is taken off the allow-list too."""
 
     request_id: Count
     participant: Name
@@ -314,6 +325,6 @@ class ClientEnvelope(msgspec.Struct, frozen=True, array_like=True):
     message: ClientMessage
 
 
-def envelope(message: ClientMessage, connection_epoch: int = 0, on_behalf_of: str = "") -> ClientEnvelope:
-    """Wraps `message` for the control channel of this protocol version."""
+def wrap_message(message: ClientMessage, connection_epoch: int = 0, on_behalf_of: str = "") -> ClientEnvelope:
+    """Return `message` in an envelope for the control channel of this protocol version."""
     return ClientEnvelope(PROTOCOL_VERSION, connection_epoch, on_behalf_of, message)

@@ -17,7 +17,7 @@ from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, AssetChunk, Asse
 from iris_session.protocol.client_messages import ClientEnvelope, ClientMessage
 from iris_session.protocol.common import EventBody, Message
 from iris_session.protocol.discovery import Beacon, Introduction
-from iris_session.protocol.errors import MalformedError, ProtocolError, TooLargeError, VersionError
+from iris_session.protocol.errors import MalformedError, ProtocolError, ProtocolVersionError, TooLargeError
 from iris_session.protocol.limits import (
     LIMITS,
     MAX_ASSET_HEADER_BYTES,
@@ -32,7 +32,7 @@ from iris_session.protocol.limits import (
     MAX_STATE_HEADER_BYTES,
     SERVER_LIMITS,
 )
-from iris_session.protocol.media import CLASSES, MediaHeader, MediaPush, is_stream_name, not_a_stream
+from iris_session.protocol.media import CLASSES, MediaHeader, MediaPush, describe_bad_stream_name, is_stream_name
 from iris_session.protocol.names import PROTOCOL_VERSION, BudgetClass
 from iris_session.protocol.server_messages import (
     EventKind,
@@ -50,8 +50,10 @@ T = TypeVar("T")
 A = TypeVar("A", AssetRequest, AssetChunk, AssetRefused)
 
 
-def decoder(kind: type[K]) -> Callable[[Bytes], K]:
-    """Bytes to a `kind`. Raises `msgspec.DecodeError` (or its subclass `ValidationError`) and nothing else."""
+def make_decoder(kind: type[K]) -> Callable[[Bytes], K]:
+    """Return a decoder of bytes to `kind`. It raises `msgspec.DecodeError` (or its subclass `ValidationError`) and
+    nothing else.
+    """
     decode = msgspec.msgpack.Decoder(kind).decode
 
     def checked(data: Bytes) -> K:
@@ -65,15 +67,15 @@ def decoder(kind: type[K]) -> Callable[[Bytes], K]:
     return checked
 
 
-def tag_of(kind: type[msgspec.Struct]) -> str:
-    """Wire name of a message or event type: `Sample` -> `"sample"`."""
+def get_tag(kind: type[msgspec.Struct]) -> str:
+    """Return the wire name of a message or event type: `Sample` -> `"sample"`."""
     return str(kind.__struct_config__.tag)
 
 
 #: Types by wire name, in the order of their definition.
-CLIENT_TYPES: Final[dict[str, type[Message]]] = {tag_of(kind): kind for kind in get_args(ClientMessage)}
-SERVER_TYPES: Final[dict[str, type[Message]]] = {tag_of(kind): kind for kind in get_args(ServerMessage)}
-EVENT_TYPES: Final[dict[str, type[EventBody]]] = {tag_of(kind): kind for kind in get_args(EventKind)}
+CLIENT_TYPES: Final[dict[str, type[Message]]] = {get_tag(kind): kind for kind in get_args(ClientMessage)}
+SERVER_TYPES: Final[dict[str, type[Message]]] = {get_tag(kind): kind for kind in get_args(ServerMessage)}
+EVENT_TYPES: Final[dict[str, type[EventBody]]] = {get_tag(kind): kind for kind in get_args(EventKind)}
 
 
 class _Version(msgspec.Struct, array_like=True):
@@ -137,45 +139,45 @@ INTRODUCTION_PREFIX: Final = 4
 
 
 def encode_client(envelope: ClientEnvelope) -> bytes:
-    """MessagePack bytes of a message to the session."""
+    """Return the MessagePack bytes of a message to the session."""
     return _encoder.encode(envelope)
 
 
 def decode_client(data: Bytes) -> ClientEnvelope:
-    """Inverse of `encode_client`. Raises `VersionError`, `TooLargeError` or `MalformedError`."""
+    """Decode a message to the session. Raises `ProtocolVersionError`, `TooLargeError` or `MalformedError`."""
     _check_size("message", data, MAX_CLIENT_BYTES)
     try:
         envelope = _client.decode(data)
     except BAD_BYTES as error:
-        raise _explain(error, data, _client_tags, CLIENT_TYPES) from None
+        raise _explain_failure(error, data, _client_tags, CLIENT_TYPES) from None
     if envelope.version != PROTOCOL_VERSION:
-        raise VersionError(envelope.version)
+        raise ProtocolVersionError(envelope.version)
     kind = type(envelope.message)
-    _check_size(tag_of(kind), data, LIMITS[kind].max_bytes)
+    _check_size(get_tag(kind), data, LIMITS[kind].max_bytes)
     return envelope
 
 
 def encode_server(envelope: ServerEnvelope) -> bytes:
-    """MessagePack bytes of a message to a client."""
+    """Return the MessagePack bytes of a message to a client."""
     return _encoder.encode(envelope)
 
 
 def decode_server(data: Bytes) -> ServerEnvelope:
-    """Inverse of `encode_server`. Raises `VersionError`, `TooLargeError` or `MalformedError`."""
+    """Decode a message to a client. Raises `ProtocolVersionError`, `TooLargeError` or `MalformedError`."""
     _check_size("message", data, MAX_SERVER_BYTES)
     try:
         envelope = _server.decode(data)
     except BAD_BYTES as error:
-        raise _explain(error, data, _server_tags, SERVER_TYPES) from None
+        raise _explain_failure(error, data, _server_tags, SERVER_TYPES) from None
     if envelope.version != PROTOCOL_VERSION:
-        raise VersionError(envelope.version)
+        raise ProtocolVersionError(envelope.version)
     kind = type(envelope.message)
-    _check_size(tag_of(kind), data, SERVER_LIMITS[kind].max_bytes)
+    _check_size(get_tag(kind), data, SERVER_LIMITS[kind].max_bytes)
     return envelope
 
 
 def peek_version(data: Bytes) -> int:
-    """Protocol version of an envelope whose other elements may be of any schema. Raises `MalformedError`."""
+    """Return the protocol version of an envelope whose other elements may be of any schema. Raises `MalformedError`."""
     try:
         return _version.decode(data).version
     except BAD_BYTES as error:
@@ -185,47 +187,47 @@ def peek_version(data: Bytes) -> int:
 
 
 def encode_state_header(header: StateHeader) -> bytes:
-    """Second frame of a rigid-state message; the topic before it, the payload after it."""
+    """Return the second frame of a rigid-state message; the topic before it, the payload after it."""
     return _encoder.encode(header)
 
 
 def decode_state_header(data: Bytes) -> StateHeader:
-    """Inverse of `encode_state_header`. Raises `TooLargeError` or `MalformedError`."""
+    """Decode a state header. Raises `TooLargeError` or `MalformedError`."""
     return _decode("state header", _state_header, data, MAX_STATE_HEADER_BYTES)
 
 
 def encode_presence(presence: Presence) -> bytes:
-    """Second frame of a presence message, after the topic."""
+    """Return the second frame of a presence message, after the topic."""
     return _encoder.encode(presence)
 
 
 def decode_presence(data: Bytes) -> Presence:
-    """Inverse of `encode_presence`. Raises `TooLargeError` or `MalformedError`."""
+    """Decode a presence message. Raises `TooLargeError` or `MalformedError`."""
     return _decode("presence", _presence, data, MAX_PRESENCE_BYTES)
 
 
 def encode_media_header(header: MediaHeader) -> bytes:
-    """Second frame of a media message, after the topic."""
+    """Return the second frame of a media message, after the topic."""
     return _encoder.encode(header)
 
 
 def decode_media_header(data: Bytes) -> MediaHeader:
-    """Inverse of `encode_media_header`. Raises `TooLargeError` or `MalformedError`."""
+    """Decode a media header. Raises `TooLargeError` or `MalformedError`."""
     return _decode("media header", _media_header, data, MAX_MEDIA_HEADER_BYTES)
 
 
 def encode_media_push(push: MediaPush) -> bytes:
-    """First frame of what a source hands in."""
+    """Return the first frame of a source's message."""
     return _encoder.encode(push)
 
 
 def encode_media_frames(
     stream: str, frames: bytes | Mapping[str, bytes], capture_ns: int, scene_epoch: int, encoding: str
 ) -> list[bytes]:
-    """All frames of what a source hands in. `frames`: of class `full`, or by class. Raises `ValueError`."""
+    """Return all frames of a source's message. `frames`: of class `full`, or by class. Raises `ValueError`."""
     by_class = frames if isinstance(frames, Mapping) else {BudgetClass.FULL: frames}
     if not isinstance(stream, str) or not is_stream_name(stream):
-        raise ValueError(not_a_stream(stream))
+        raise ValueError(describe_bad_stream_name(stream))
     if BudgetClass.FULL not in by_class or any(name not in CLASSES[:-1] for name in by_class):
         raise ValueError(f"a media frame has class 'full', and may have 'half' and 'quarter', not {list(by_class)}")
     payloads = []
@@ -248,27 +250,29 @@ def encode_media_frames(
 
 
 def decode_media_push(data: Bytes) -> MediaPush:
-    """Inverse of `encode_media_push`. Raises `TooLargeError` or `MalformedError`."""
+    """Decode the first frame of a source's message. Raises `TooLargeError` or `MalformedError`."""
     return _decode("media push", _media_push, data, MAX_MEDIA_HEADER_BYTES)
 
 
 def encode_asset_request(request: AssetRequest) -> bytes:
-    """The one frame of a client's message on the assets channel."""
+    """Return the one frame of a client's message on the assets channel."""
     return _encoder.encode(request)
 
 
 def decode_asset_request(data: Bytes) -> AssetRequest:
-    """Inverse of `encode_asset_request`. Raises `VersionError`, `TooLargeError` or `MalformedError`."""
+    """Decode a request for a chunk. Raises `ProtocolVersionError`, `TooLargeError` or `MalformedError`."""
     return _decode_asset("asset request", _asset_request, data, MAX_ASSET_REQUEST_BYTES)
 
 
 def encode_asset_header(header: AssetChunk | AssetRefused) -> bytes:
-    """First frame of an answer on the assets channel; the bytes of a chunk after it."""
+    """Return the first frame of an answer on the assets channel; the bytes of a chunk follow it."""
     return _encoder.encode(header)
 
 
 def decode_asset_chunk(data: Bytes, payload: int) -> AssetChunk:
-    """First of the two frames of a chunk, whose second has `payload` bytes. Raises as `decode_asset_request`."""
+    """Decode the first of the two frames of a chunk, whose second has `payload` bytes. Raises as
+    `decode_asset_request`.
+    """
     chunk = _decode_asset("asset chunk", _asset_chunk, data, MAX_ASSET_HEADER_BYTES)
     _check_length("asset chunk", payload, MAX_ASSET_CHUNK_BYTES)
     if chunk.offset + payload > chunk.total:
@@ -277,37 +281,37 @@ def decode_asset_chunk(data: Bytes, payload: int) -> AssetChunk:
 
 
 def decode_asset_refused(data: Bytes) -> AssetRefused:
-    """An answer of one frame. Raises as `decode_asset_request`."""
+    """Decode an answer of one frame. Raises as `decode_asset_request`."""
     return _decode_asset("asset refusal", _asset_refused, data, MAX_ASSET_HEADER_BYTES)
 
 
 def encode_beacon(beacon: Beacon) -> bytes:
-    """One discovery datagram."""
+    """Return one discovery datagram."""
     return _encoder.encode(beacon)
 
 
 def decode_beacon(data: Bytes) -> Beacon:
-    """Inverse of `encode_beacon`. Raises `VersionError`, `TooLargeError` or `MalformedError`."""
+    """Decode a beacon. Raises `ProtocolVersionError`, `TooLargeError` or `MalformedError`."""
     _check_size("beacon", data, MAX_BEACON_BYTES)
     try:
         version = _beacon_version.decode(data).protocol
     except BAD_BYTES as error:
         raise MalformedError(f"no beacon: {error}") from None
     if version != PROTOCOL_VERSION:
-        raise VersionError(version)
+        raise ProtocolVersionError(version)
     return _decode("beacon", _beacon, data, MAX_BEACON_BYTES)
 
 
 def encode_introduction(introduction: Introduction) -> bytes:
-    """Everything that is written to a TCP connection on the introduction's port: length (uint32, big-endian), body."""
+    """Return all bytes written to a TCP connection on the introduction's port: length (uint32, big-endian), body."""
     body = _encoder.encode(introduction)
     return len(body).to_bytes(INTRODUCTION_PREFIX, "big") + body
 
 
 def decode_introduction(data: Bytes) -> Introduction | None:
-    """Inverse of `encode_introduction`; `None` while `data`, as received so far, is only its beginning.
+    """Decode an introduction; return `None` while `data`, as received so far, is only its beginning.
 
-    Raises `VersionError`, `TooLargeError` or `MalformedError`.
+    Raises `ProtocolVersionError`, `TooLargeError` or `MalformedError`.
     """
     if len(data) < INTRODUCTION_PREFIX:
         return None
@@ -324,7 +328,7 @@ def decode_introduction(data: Bytes) -> Introduction | None:
     except BAD_BYTES as error:
         raise MalformedError(f"no introduction: {error}") from None
     if version != PROTOCOL_VERSION:
-        raise VersionError(version)
+        raise ProtocolVersionError(version)
     return _decode("introduction", _introduction, body, MAX_INTRODUCTION_BYTES)
 
 
@@ -337,11 +341,11 @@ def _decode(what: str, decoder: msgspec.msgpack.Decoder[T], data: Bytes, limit: 
 
 
 def _decode_asset(what: str, decoder: msgspec.msgpack.Decoder[A], data: Bytes, limit: int) -> A:
-    """A struct that begins with the version, which is looked at first."""
+    """Decode a struct that begins with the version, which is checked first."""
     _check_size(what, data, limit)
     version = peek_version(data)
     if version != PROTOCOL_VERSION:
-        raise VersionError(version)
+        raise ProtocolVersionError(version)
     return _decode(what, decoder, data, limit)
 
 
@@ -354,7 +358,7 @@ def _check_length(what: str, length: int, limit: int) -> None:
         raise TooLargeError(what, length, limit)
 
 
-def _explain(
+def _explain_failure(
     error: Exception,
     data: Bytes,
     tags: msgspec.msgpack.Decoder[_ClientTags] | msgspec.msgpack.Decoder[_ServerTags],
@@ -366,7 +370,7 @@ def _explain(
     except MalformedError as no_envelope:
         return no_envelope
     if version != PROTOCOL_VERSION:
-        return VersionError(version)
+        return ProtocolVersionError(version)
     try:
         message = tags.decode(data).message
     except BAD_BYTES:

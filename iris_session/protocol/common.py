@@ -44,7 +44,7 @@ IDENTITY = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 
 class Target(msgspec.Struct, frozen=True, array_like=True):
-    """What a sample drives, under which lease. `lease_version` is the fencing token."""
+    """Target of a sample, and the lease that it is driven under. `lease_version` is the fencing token."""
 
     name: Name
     lease_version: Count
@@ -52,13 +52,13 @@ class Target(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Lease(msgspec.Struct, frozen=True):
-    """State of one lease as everyone sees it. `holder` is a participant id, empty when free.
+    """Public state of one lease. `holder` is a participant id, empty when free.
 
     `expires_ns` is the session time at which the grace period of a disconnected holder ends, 0 while it is connected.
     `sub_holders` and `weights` have the same length: everyone who shares the target (mode `shared`, objects), or an
-    agent and the human who stands by (mode `priority`; the one in charge is `holder` and has weight 1, the other 0).
-    In mode `shared` a token stays valid for its holder when others join and raise `lease_version`.
-    `scale`: motion scaling of a robot in the hands of `holder`, 1 when nothing else was set.
+    agent and the human who stands by (mode `priority`; the one in charge is `holder` and has weight 1, the other 0). In
+    mode `shared` a token stays valid for its holder when others join and raise `lease_version`. `scale`: motion scaling
+    of a robot for its `holder`, 1 by default.
     """
 
     target: Name
@@ -74,7 +74,7 @@ class Lease(msgspec.Struct, frozen=True):
 
 
 class Denial(msgspec.Struct, frozen=True):
-    """A typed no: the reason (`DenialReason`), who holds what was asked for, and what to do.
+    """A typed denial: the reason (`DenialReason`), the holder of the target, and advice.
 
     Texts that list what would have been right are cut to the length of a `Text`.
     """

@@ -1,4 +1,4 @@
-"""How a session is found: the beacon on UDP, and the introduction that a session gives over TCP to who asks.
+"""Discovery of a session: the beacon on UDP, and the introduction that a session sends over TCP to any peer.
 
 Both are public and unauthenticated. Nothing in them is trusted until the CURVE handshake with `server_key`, and the
 pairing proof or a pinned fingerprint, have confirmed it.
@@ -35,10 +35,11 @@ class Beacon(msgspec.Struct, frozen=True):
 
 
 class Introduction(msgspec.Struct, frozen=True):
-    """What a session says of itself on a TCP connection to control port - 1, before it closes it. It reads nothing.
+    """Introduction of a session, written to a TCP connection to control port - 1, which is then closed. Nothing is
+    read.
 
     `server_key`: the CURVE public key, Z85 (40 characters); empty: the session is not encrypted (loopback only).
-    `pairing`: a join code can be used now. `participants`: how many are here.
+    `pairing`: a join code can be used now. `participants`: how many are connected.
     """
 
     beacon: Beacon

@@ -1,7 +1,7 @@
-"""What reaches the authority: one `Entry` per input of a step, exactly as it is journaled.
+"""Input of the authority: one `Entry` per input of a step, exactly as it is journaled.
 
-Entries are made by the front (after schema and limit checks), or by the process that owns the session (`HOST`).
-They hold no key, secret or token. A step is `(now_ns, entries, n_ticks)`; see docs/architecture.md, "One step".
+Entries are made by the front (after schema and limit checks), or by the process that owns the session (`HOST`). They
+hold no key, secret or token. A step is `(now_ns, entries, n_ticks)`; see docs/architecture.md, "One step".
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from iris_session.protocol.client_messages import (
     SetScale,
     TrackingEpoch,
 )
-from iris_session.protocol.codec import decoder
+from iris_session.protocol.codec import make_decoder
 from iris_session.protocol.common import Count, Message, Name, Names, Nanoseconds, Pose, Text, Vec3
 from iris_session.protocol.scene import MAX_OPS, PatchOp
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
@@ -46,9 +46,8 @@ HOST: Final = 0
 class Join(Message, frozen=True, tag="join"):
     """A connection whose `hello` the front accepted. `key_id`: fingerprint of the authenticated key.
 
-    `resume_of`: participant id whose resume token the front has verified, else empty.
-    `gateway`: connection of the gateway that speaks for this one, else 0.
-    `roles`: what the key may join as; empty: any role.
+    `resume_of`: participant id whose resume token the front has verified, else empty. `gateway`: connection of the
+    gateway in front of this one, else 0. `roles`: those that the key may join as; empty: any role.
     """
 
     key_id: Name
@@ -64,7 +63,7 @@ class Join(Message, frozen=True, tag="join"):
 
 
 class Lost(Message, frozen=True, tag="lost"):
-    """The front lost the connection (socket closed, heartbeats missing). The grace period begins."""
+    """A disconnect (socket closed, heartbeats missing). The grace period begins."""
 
     reason: Name = ""
 
@@ -90,9 +89,10 @@ class AlignmentProposal(Message, frozen=True, tag="alignment_proposal"):
 
 
 class AlignmentAlarm(Message, frozen=True, tag="alignment_alarm"):
-    """The front's watch over the alignment of this entry's connection found it wrong (`AlarmKind`) by `size_m`.
+    """An alarm of the front's drift monitor: the alignment of this entry's connection is wrong (`AlarmKind`) by
+    `size_m`.
 
-    `anchor_id`: where it was seen, empty for the head's own motion. `beside`: anchors that stayed where they were
+    `anchor_id`: where it was observed, empty for the head's own motion. `beside`: anchors that stayed in place
     meanwhile: then `anchor_id` was moved, not the headset.
     """
 
@@ -105,7 +105,7 @@ class AlignmentAlarm(Message, frozen=True, tag="alignment_alarm"):
 
 
 class CrossChecked(Message, frozen=True, tag="cross_checked"):
-    """Two headsets saw the same thing: this entry's connection and `other`. Fields as in `HeadsetsCompared`."""
+    """A cross-check of two headsets: this entry's connection and `other`. Fields as in `HeadsetsCompared`."""
 
     other: Count
     anchor_id: Name
@@ -117,7 +117,7 @@ class CrossChecked(Message, frozen=True, tag="cross_checked"):
 
 
 class ExternalReset(Message, frozen=True, tag="external_reset"):
-    """The user's loop went back in time or replaced the state (host only)."""
+    """The owner's loop went back in time or replaced the state (host only)."""
 
 
 class StalledGap(Message, frozen=True, tag="stalled_gap"):
@@ -127,7 +127,7 @@ class StalledGap(Message, frozen=True, tag="stalled_gap"):
 
 
 class FrontRestarted(Message, frozen=True, tag="front_restarted"):
-    """The front process was replaced (host only): every connection is lost."""
+    """The front process was replaced (host only): every connection is closed."""
 
 
 class RecordingGap(Message, frozen=True, tag="recording_gap"):
@@ -137,7 +137,7 @@ class RecordingGap(Message, frozen=True, tag="recording_gap"):
 
 
 class Audit(Message, frozen=True, tag="audit"):
-    """Something that concerns security, seen by the front (host only); fields as in `Audited`."""
+    """An event that concerns security, reported by the front (host only); fields as in `Audited`."""
 
     kind: Name
     subject: Name = ""
@@ -148,19 +148,20 @@ class Audit(Message, frozen=True, tag="audit"):
 
 
 class SessionResumed(Message, frozen=True, tag="session_resumed"):
-    """The session goes on from a keyframe of an earlier recording, after `gap_ns` (host only). `anchors`: all of them,
-    when they were given anew; empty: as they were."""
+    """The session continues from a keyframe of an earlier recording, after `gap_ns` (host only). `anchors`: all of
+    them, when they were given anew; empty: as they were.
+    """
 
     gap_ns: Nanoseconds
     anchors: dict[Name, Pose] = msgspec.field(default_factory=dict)
 
 
 class SceneLoaded(Message, frozen=True, tag="scene_loaded"):
-    """Another scene takes the place of the present one before the ticks of this step (host only).
+    """Another scene replaces the present one before the ticks of this step (host only).
 
     `model_hash`: BLAKE2b of the MuJoCo model's binary form, which the recording holds beside the journal. `robots`,
-    `objects`: what is in it. `initial_state`: `mjSTATE_INTEGRATION` to begin with and to reset to; empty: the model's
-    own.
+    `objects`: those of the scene. `initial_state`: `mjSTATE_INTEGRATION` to begin with and to reset to; empty: the
+    model's own.
     """
 
     model_hash: Name
@@ -232,25 +233,25 @@ class Entry(msgspec.Struct, frozen=True, array_like=True):
 URGENT: Final = (EStop, Release, Lost, Bye)
 
 _encoder = msgspec.msgpack.Encoder()
-_decode = decoder(Entry)
-_decode_list = decoder(list[Entry])
+_decode = make_decoder(Entry)
+_decode_list = make_decoder(list[Entry])
 
 
 def encode_entry(entry: Entry) -> bytes:
-    """MessagePack bytes of one entry; `decode_entry(encode_entry(e)) == e`, floats exactly."""
+    """Return the MessagePack bytes of one entry; `decode_entry(encode_entry(e)) == e`, floats exactly."""
     return _encoder.encode(entry)
 
 
 def decode_entry(data: bytes) -> Entry:
-    """Inverse of `encode_entry`. Raises `msgspec.DecodeError` (or its subclass `ValidationError`)."""
+    """Decode one entry. Raises `msgspec.DecodeError` (or its subclass `ValidationError`)."""
     return _decode(data)
 
 
 def encode_entries(entries: list[Entry]) -> bytes:
-    """MessagePack array of entries."""
+    """Return the MessagePack array of entries."""
     return _encoder.encode(entries)
 
 
 def decode_entries(data: bytes) -> list[Entry]:
-    """Inverse of `encode_entries`. Raises `msgspec.DecodeError`."""
+    """Decode an array of entries. Raises `msgspec.DecodeError`."""
     return _decode_list(data)

@@ -1,10 +1,10 @@
-"""What can be wrong with bytes from a peer. Each error says what the peer did and what would have been right.
+"""Errors in the bytes of a peer. Each text names the fault and what would have been right.
 
-ProtocolError           base; `code` (a `RefusalCode`) goes into `Refused` or `ProtocolFault` with the text
-|-- MalformedError      not MessagePack, or not a message of the schema (unknown type, missing or wrong field)
-|-- VersionError        another protocol version; `version` is the peer's
-|-- TooLargeError       more bytes than the limit of its type
-`-- RateError           more messages of a type than its rate allows
+ProtocolError                base; `code` (a `RefusalCode`) goes into `Refused` or `ProtocolFault` with the text
+|-- MalformedError           not MessagePack, or not a message of the schema (unknown type, missing or wrong field)
+|-- ProtocolVersionError     another protocol version; `version` is the peer's
+|-- TooLargeError            more bytes than the limit of its type
+`-- RateError                more messages of a type than its rate allows
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class MalformedError(ProtocolError):
     code = RefusalCode.MALFORMED
 
 
-class VersionError(ProtocolError):
-    """The peer speaks protocol version `version`."""
+class ProtocolVersionError(ProtocolError):
+    """The peer uses protocol version `version`."""
 
     code = RefusalCode.VERSION
 

@@ -32,8 +32,8 @@ class StreamBudget(msgspec.Struct, frozen=True):
 class MediaHeader(msgspec.Struct, frozen=True, array_like=True):
     """Second frame of a media message: topic before it, one bulk frame after it.
 
-    `seq`: of the stream, as its source handed it in; at `half` and `quarter` some are left out. `capture_ns`: when it
-    was captured or computed, `published_ns`: when it was handed to the socket, both session time. `dropped`: frames of
+    `seq`: of the stream, as its source numbered it; at `half` and `quarter` some are left out. `capture_ns`: when it
+    was captured or computed, `published_ns`: when it was passed to the socket, both session time. `dropped`: frames of
     this subscriber that its link did not take before newer ones were there, since it subscribed.
     """
 
@@ -48,7 +48,7 @@ class MediaHeader(msgspec.Struct, frozen=True, array_like=True):
 
 
 class MediaPush(msgspec.Struct, frozen=True, array_like=True):
-    """First frame of what a source hands in; a bulk frame for each of `classes` follows, in their order.
+    """First frame of a source's message; a bulk frame for each of `classes` follows, in their order.
 
     `classes`: `full`, and any of `half` and `quarter` that the source has in a coarser form.
     """
@@ -61,24 +61,24 @@ class MediaPush(msgspec.Struct, frozen=True, array_like=True):
 
 
 def is_stream_name(name: str) -> bool:
-    """1 to 48 letters, digits, `.`, `_`, `-`, beginning with a letter or digit."""
+    """Return true for 1 to 48 letters, digits, `.`, `_`, `-`, beginning with a letter or digit."""
     return _STREAM.fullmatch(name) is not None
 
 
-def not_a_stream(name: str) -> str:
-    """What to say of a name that is not `is_stream_name`."""
+def describe_bad_stream_name(name: str) -> str:
+    """Return the error text for a name that is not `is_stream_name`."""
     return (
         f"{name!r} cannot be the name of a media stream: 1 to 48 letters, digits, '.', '_' or '-', beginning with a "
         "letter or digit"
     )
 
 
-def media_topic(connection_epoch: int, stream: str) -> bytes:
-    """What a client subscribes to. Messages have the class after it."""
+def make_topic(connection_epoch: int, stream: str) -> bytes:
+    """Return the topic prefix that a client subscribes to. Messages have the class after it."""
     return b"media/%d/%s/" % (connection_epoch, stream.encode())
 
 
 def parse_topic(topic: bytes) -> tuple[int, str] | None:
-    """Inverse of `media_topic`; `None` for anything else."""
+    """Parse a topic of `make_topic`; return `None` for anything else."""
     match = _TOPIC.fullmatch(topic)
     return None if match is None else (int(match[1]), match[2].decode())

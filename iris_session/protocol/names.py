@@ -14,7 +14,7 @@ SCENE_VERSION: Final = 1
 
 
 class Role:
-    """What a participant may do. Reserved for later message types: `camera`, `source`."""
+    """Rights of a participant. Reserved for later message types: `camera`, `source`."""
 
     OPERATOR: Final = "operator"
     OBSERVER: Final = "observer"
@@ -60,7 +60,7 @@ class Device:
 
 
 class SampleKind:
-    """Which payload of a `Sample` is meant."""
+    """Payload of a `Sample` that counts."""
 
     POSE: Final = "pose"
     TWIST: Final = "twist"
@@ -69,12 +69,14 @@ class SampleKind:
 
 
 class TargetKind:
+    """Kind of a target."""
+
     ROBOT: Final = "robot"
     OBJECT: Final = "object"
 
 
 class LeaseMode:
-    """How a robot's lease passes between participants."""
+    """Rule by which a robot's lease passes between participants."""
 
     EXCLUSIVE: Final = "exclusive"
     REQUEST: Final = "request"
@@ -85,6 +87,8 @@ class LeaseMode:
 
 
 class AssignmentPolicy:
+    """Rule that chooses a robot for a participant that names none."""
+
     CONFIG: Final = "config"
     JOIN_ORDER: Final = "join-order"
     NEAREST: Final = "nearest"
@@ -93,7 +97,7 @@ class AssignmentPolicy:
 
 
 class AlignmentKind:
-    """How `T_world_tracking` of a participant came to be."""
+    """Origin of `T_world_tracking` of a participant."""
 
     NONE: Final = "none"
     MEASURED: Final = "measured"
@@ -102,7 +106,9 @@ class AlignmentKind:
 
 
 class AlignAction:
-    """What `align` asks for. `start`: measure anew, from nothing; `stop`: keep what is in force, whatever is seen."""
+    """Action of `align`. `start`: measure anew, from nothing; `stop`: keep the alignment in force whatever is
+    observed.
+    """
 
     START: Final = "start"
     STOP: Final = "stop"
@@ -110,9 +116,9 @@ class AlignAction:
 
 
 class AlarmKind:
-    """How an alignment was found to be wrong.
+    """Evidence that an alignment is wrong.
 
-    `changed`: an anchor is seen elsewhere than seconds ago. `differs`: and elsewhere than the alignment says. `jump`:
+    `changed`: an anchor is observed elsewhere than seconds ago. `differs`: and elsewhere than by the alignment. `jump`:
     the tracking frame moved at once, which voids the alignment.
     """
 
@@ -123,6 +129,8 @@ class AlarmKind:
 
 
 class AnchorKind:
+    """Physical form of an anchor."""
+
     QR: Final = "qr"
     BOARD: Final = "board"
     CONTROLLER: Final = "controller"
@@ -131,11 +139,15 @@ class AnchorKind:
 
 
 class SessionKind:
+    """Kind of a session."""
+
     LIVE: Final = "live"
     REPLAY: Final = "replay"
 
 
 class CommandKind:
+    """Kind of a robot's command."""
+
     HOLD: Final = "hold"
     POSE: Final = "pose"
     TWIST: Final = "twist"
@@ -143,7 +155,7 @@ class CommandKind:
 
 
 class HoldReason:
-    """Why a robot holds. Exactly one is given with every hold command."""
+    """Reason why a robot holds. Exactly one is given with every hold command."""
 
     NO_LEASE: Final = "no_lease"
     NO_SAMPLE: Final = "no_sample"  # a lease, but nothing counted yet
@@ -162,7 +174,7 @@ class HoldReason:
 
 
 class RejectReason:
-    """Why a sample was not counted. Counted per participant, device and reason."""
+    """Reason why a sample was rejected. Counted per participant, device and reason."""
 
     CONNECTION_EPOCH: Final = "connection_epoch"
     SCENE_EPOCH: Final = "scene_epoch"
@@ -188,7 +200,7 @@ class RejectReason:
 
 
 class DenialReason:
-    """Why a request was denied."""
+    """Reason why a request was denied."""
 
     HELD: Final = "held"  # someone else has the lease
     CONSENT_PENDING: Final = "consent_pending"
@@ -216,7 +228,7 @@ class DenialReason:
 
 
 class RefusalCode:
-    """Why a `hello` was refused by the front, before the authority saw it."""
+    """Reason why the front refused a `hello`, before the authority received it."""
 
     VERSION: Final = "version"
     IDENTITY: Final = "identity"
@@ -231,7 +243,7 @@ class RefusalCode:
 
 
 class FaultCode:
-    """Why a `ProtocolFault` was sent: a message that could not be taken, or what has become of the session."""
+    """Reason of a `ProtocolFault`: a rejected message, or a change in the state of the session."""
 
     VERSION: Final = "version"
     MALFORMED: Final = "malformed"
@@ -246,6 +258,8 @@ class FaultCode:
 
 
 class EpisodeAction:
+    """Action of `episode`."""
+
     START: Final = "start"
     SUCCESS: Final = "success"
     FAILURE: Final = "failure"
@@ -256,6 +270,8 @@ class EpisodeAction:
 
 
 class ControlAction:
+    """Action of `control`."""
+
     PAUSE: Final = "pause"
     RESUME: Final = "resume"
     STEP: Final = "step"
@@ -264,7 +280,7 @@ class ControlAction:
 
 
 class AuditKind:
-    """What an `Audited` event tells."""
+    """Kind of an `Audited` event."""
 
     PAIRED: Final = "paired"
     CODE_REFUSED: Final = "code_refused"
@@ -279,7 +295,7 @@ class AuditKind:
 
 
 class BudgetClass:
-    """How much media a client gets, from everything to nothing. State and control come whatever the class."""
+    """Share of media that a client gets, from everything to nothing. State and control are never cut."""
 
     FULL: Final = "full"
     HALF: Final = "half"
@@ -288,7 +304,7 @@ class BudgetClass:
 
 
 class AssetRefusal:
-    """Why no bytes of an asset come. After the last four the same may be asked again later."""
+    """Reason why a request for an asset is refused. After the last four the same request may succeed later."""
 
     UNKNOWN: Final = "unknown_asset"  # of neither the present scene nor the one before
     BAD_RANGE: Final = "bad_range"
@@ -303,14 +319,14 @@ class AssetRefusal:
 
 
 class MediaEncoding:
-    """What the bytes of a media frame are."""
+    """Encoding of the bytes of a media frame."""
 
     BYTES: Final = "bytes"  # only source and receiver know
     DEFORMABLE: Final = "deformable"  # vertices of a mesh of the scene, docs/deformables.md
 
 
 class LateCause:
-    """Where the time of a late tick went."""
+    """Part of a late tick that took the time."""
 
     SCHEDULER: Final = "scheduler"  # the process did not run when it wanted to
     PHYSICS: Final = "physics"
@@ -340,7 +356,7 @@ class GeometryKind:
 
 
 class TextureKind:
-    """How a texture covers what wears it."""
+    """Mapping of a texture onto a surface."""
 
     IMAGE: Final = "2d"
     CUBE: Final = "cube"  # looked up by the direction from the visual's centre
@@ -349,7 +365,7 @@ class TextureKind:
 
 
 class TextureRole:
-    """What a texture gives to a material. `rgb`, `rgba`: its colour, the only one that every client must draw."""
+    """Use of a texture in a material. `rgb`, `rgba`: its colour, the only one that every client must draw."""
 
     RGB: Final = "rgb"
     OCCLUSION: Final = "occlusion"
@@ -364,7 +380,7 @@ class TextureRole:
 
 
 class ColorSpace:
-    """How the numbers of a texture are meant. `auto`: as they are, without conversion."""
+    """Encoding of the values of a texture. `auto`: as they are, without conversion."""
 
     AUTO: Final = "auto"
     LINEAR: Final = "linear"
@@ -372,6 +388,8 @@ class ColorSpace:
 
 
 class LightKind:
+    """Kind of a light."""
+
     SPOT: Final = "spot"
     DIRECTIONAL: Final = "directional"
     POINT: Final = "point"
@@ -380,7 +398,7 @@ class LightKind:
 
 
 class Follow:
-    """How a light or camera moves. Unknown values: like `fixed`."""
+    """Motion of a light or camera. Unknown values: like `fixed`."""
 
     FIXED: Final = "fixed"  # with its body, by its pose in the body
     TRACK: Final = "track"  # position with its body, orientation fixed in the world
@@ -390,7 +408,7 @@ class Follow:
 
 
 class AssetEncoding:
-    """What the bytes of an asset are."""
+    """Encoding of the bytes of an asset."""
 
     ARRAYS: Final = "arrays"  # `protocol.assets`: a header and compressed arrays
     PNG: Final = "png"
@@ -399,7 +417,7 @@ class AssetEncoding:
 
 
 class ArrayKind:
-    """What the arrays of an asset are together."""
+    """Meaning of an asset of arrays."""
 
     MESH: Final = "mesh"
     IMAGE: Final = "image"
@@ -408,7 +426,7 @@ class ArrayKind:
 
 
 class ArrayName:
-    """What an array of an asset is; which ones a kind has is in docs/scene.md."""
+    """Meaning of an array of an asset; which ones a kind has is in docs/scene.md."""
 
     INDEX: Final = "index"  # of a mesh: three corners a triangle
     POSITION: Final = "position"
@@ -423,7 +441,7 @@ class ArrayName:
 
 
 class ArrayFilter:
-    """What was done to an array before it was compressed."""
+    """Transformation of an array before compression."""
 
     NONE: Final = "none"
     SHUFFLE: Final = "shuffle"  # first bytes of all elements, then second bytes, ...
@@ -432,5 +450,7 @@ class ArrayFilter:
 
 
 class ArrayCodec:
+    """Compression of an array."""
+
     NONE: Final = "none"
     ZSTD: Final = "zstd"  # one Zstandard frame (RFC 8878), without a dictionary

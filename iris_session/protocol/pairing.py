@@ -30,8 +30,8 @@ _SALT: Final = b"iris-pair-1"
 _LOOKS_LIKE: Final = str.maketrans("OILU", "011V")
 
 
-def code_from_bytes(entropy: bytes) -> str:
-    """Join code `XXXX-XXXX-XXXX` from the last 60 bits of eight random bytes."""
+def make_code(entropy: bytes) -> str:
+    """Return the join code `XXXX-XXXX-XXXX` made from the last 60 bits of eight random bytes."""
     if len(entropy) != CODE_BYTES:
         raise ValueError(f"a join code is made from {CODE_BYTES} bytes, not {len(entropy)}")
     number = int.from_bytes(entropy, "big")
@@ -39,41 +39,41 @@ def code_from_bytes(entropy: bytes) -> str:
     return f"{text[:4]}-{text[4:8]}-{text[8:]}"
 
 
-def normal_code(text: str) -> str:
-    """`text` as typed by a person, in the one form that is stretched. Raises `ValueError` for what is no join code."""
+def normalise_code(text: str) -> str:
+    """Return a typed code in the one form that is stretched. Raises `ValueError` for any other text."""
     code = text.upper().translate(_LOOKS_LIKE).replace("-", "").replace(" ", "")
     if len(code) != CODE_CHARACTERS or any(character not in ALPHABET for character in code):
         raise ValueError(f"{text!r} is not a join code: twelve letters and digits, like 7KQ2-M4XD-9PTR")
     return code
 
 
-def stretch(code: str, server_public: bytes) -> bytes:
-    """The secret that both sides derive from `code` (any spelling): takes about 0.1 s, on purpose."""
-    _check(server_public)
-    return hashlib.pbkdf2_hmac("sha256", normal_code(code).encode(), _SALT + server_public, ITERATIONS, 32)
+def stretch_code(code: str, server_public: bytes) -> bytes:
+    """Derive the secret that both sides share from `code` (any spelling): takes about 0.1 s, on purpose."""
+    _check_key(server_public)
+    return hashlib.pbkdf2_hmac("sha256", normalise_code(code).encode(), _SALT + server_public, ITERATIONS, 32)
 
 
-def client_proof(stretched: bytes, server_public: bytes, client_public: bytes) -> bytes:
-    """What the client sends in `Pair`."""
-    return _proof(stretched, b"client", server_public, client_public)
+def make_client_proof(stretched: bytes, server_public: bytes, client_public: bytes) -> bytes:
+    """Return the proof that the client sends in `Pair`."""
+    return _make_proof(stretched, b"client", server_public, client_public)
 
 
-def server_proof(stretched: bytes, server_public: bytes, client_public: bytes) -> bytes:
-    """What the session answers in `Paired`."""
-    return _proof(stretched, b"server", server_public, client_public)
+def make_server_proof(stretched: bytes, server_public: bytes, client_public: bytes) -> bytes:
+    """Return the proof that the session answers in `Paired`."""
+    return _make_proof(stretched, b"server", server_public, client_public)
 
 
-def same(a: bytes, b: bytes) -> bool:
-    """Compares two proofs in constant time."""
+def is_same_proof(a: bytes, b: bytes) -> bool:
+    """Compare two proofs in constant time."""
     return hmac.compare_digest(a, b)
 
 
-def _proof(stretched: bytes, side: bytes, server_public: bytes, client_public: bytes) -> bytes:
-    _check(server_public)
-    _check(client_public)
+def _make_proof(stretched: bytes, side: bytes, server_public: bytes, client_public: bytes) -> bytes:
+    _check_key(server_public)
+    _check_key(client_public)
     return hmac.digest(stretched, side + server_public + client_public, "sha256")
 
 
-def _check(key: bytes) -> None:
+def _check_key(key: bytes) -> None:
     if len(key) != KEY_BYTES:
         raise ValueError(f"a CURVE key has {KEY_BYTES} raw bytes, got {len(key)}: decode Z85 first")

@@ -17,7 +17,7 @@ from typing import Annotated, Final, Protocol
 
 import msgspec
 
-from iris_session.protocol.codec import Bytes, decoder
+from iris_session.protocol.codec import Bytes, make_decoder
 from iris_session.protocol.common import Count, Name, Pose, Text, Vec3
 from iris_session.protocol.names import SCENE_VERSION, AssetEncoding, Follow, TextureRole
 
@@ -42,9 +42,9 @@ class TextureUse(msgspec.Struct, frozen=True):
 
 
 class Material(msgspec.Struct, frozen=True):
-    """How a surface looks, in MuJoCo's terms. `specular`, `shininess` (times 128: exponent), `reflectance`: 0..1.
+    """Surface appearance, in MuJoCo's terms. `specular`, `shininess` (times 128: exponent), `reflectance`: 0..1.
 
-    `emission`: light of its own, times the colour. `metallic`, `roughness`: -1 where the scene does not say. The
+    `emission`: light of its own, times the colour. `metallic`, `roughness`: -1 where the scene does not set them. The
     texture's colour multiplies that of the visual. `repeat`: times that a 2d texture is laid over the shape, or over
     one metre when `uniform` (docs/scene.md, texture coordinates).
     """
@@ -61,8 +61,8 @@ class Material(msgspec.Struct, frozen=True):
     repeat: Vec2 = (1.0, 1.0)
     uniform: bool = False
 
-    def texture(self, *roles: str) -> int:
-        """The texture in the first of `roles` that is there, -1 for none. Without roles: the colour."""
+    def find_texture(self, *roles: str) -> int:
+        """Return the texture in the first of `roles` that is there, -1 for none. Without roles: the colour."""
         for role in roles or (TextureRole.RGB, TextureRole.RGBA):
             for use in self.textures:
                 if use.role == role:
@@ -156,12 +156,12 @@ class Body(msgspec.Struct, frozen=True):
 
 
 class Geometry(msgspec.Struct, frozen=True):
-    """A shape, centred in its own frame. `kind` of `GeometryKind`; draw what you do not know as a box of `size`.
+    """A shape, centred in its own frame. `kind` of `GeometryKind`; draw unknown kinds as a box of `size`.
 
-    `size` [m]: half lengths along x, y, z of what the shape extends over. plane: half lengths x, y, 0 is without end;
-    its normal is +z, z is the spacing of grid lines. sphere: radius three times. capsule, cylinder: radius, radius,
-    half length along z, of a capsule without its caps. hfield: half x, half y, height of elevation 1. mesh, sdf: what
-    generated texture coordinates are measured by (see docs/scene.md); the vertices are in metres as they are.
+    `size` [m]: half lengths along x, y, z of the extent. plane: half lengths x, y, 0 is without end; its normal is +z,
+    z is the spacing of grid lines. sphere: radius three times. capsule, cylinder: radius, radius, half length along z,
+    of a capsule without its caps. hfield: half x, half y, height of elevation 1. mesh, sdf: the scale of generated
+    texture coordinates (see docs/scene.md); the vertices are in metres as they are.
     """
 
     kind: Name
@@ -171,8 +171,8 @@ class Geometry(msgspec.Struct, frozen=True):
 
 
 class Visual(msgspec.Struct, frozen=True):
-    """A shape on a body. `id`: the simulator's number of it (MuJoCo geom). `rgba` is what to draw: a colour of its own,
-    or the material's; 0 alpha is drawn by nobody. `group`: see `SceneSpec.groups_shown`.
+    """A shape on a body. `id`: the simulator's number of it (MuJoCo geom). `rgba` is the colour to draw: a colour of
+    its own, or the material's; with alpha 0 it is not drawn. `group`: see `SceneSpec.groups_shown`.
     """
 
     id: Count
@@ -290,7 +290,7 @@ class Headlight(msgspec.Struct, frozen=True):
 
 
 class Environment(msgspec.Struct, frozen=True):
-    """What surrounds the scene. `skybox`: a texture. Lengths [m]. Haze blends the skybox's horizon, fog all."""
+    """Surroundings of the scene. `skybox`: a texture. Lengths [m]. Haze blends the skybox's horizon, fog all."""
 
     headlight: Headlight = Headlight()
     skybox: Ref = -1
@@ -306,7 +306,7 @@ class Environment(msgspec.Struct, frozen=True):
 
 
 class Totals(msgspec.Struct, frozen=True):
-    """What the scene costs with everything exact: each asset once, triangles as often as they are drawn.
+    """Cost of the scene with everything exact: each asset once, triangles as often as they are drawn.
 
     `objects`, `triangles`: of the groups that are shown at first. `texture_memory`: bytes on a graphics card.
     """
@@ -323,7 +323,7 @@ _SOME: Final = msgspec.Meta(max_length=MAX_THINGS)
 
 
 class SceneSpec(msgspec.Struct, frozen=True):
-    """A whole scene. `bodies`: parents before their children. `source`: what it was made from, for people.
+    """A whole scene. `bodies`: parents before their children. `source`: its origin, for people.
 
     `groups_shown`: visuals, sites, tendons and deformables of other groups are hidden at first.
     """
@@ -348,18 +348,18 @@ class SceneSpec(msgspec.Struct, frozen=True):
 
 
 class SceneError(ValueError):
-    """The bytes are no scene specification that this package reads; the text says why."""
+    """The bytes are not a scene specification that this package reads."""
 
 
 class Identified(Protocol):
-    """What is told apart by its number."""
+    """Anything with an id."""
 
     @property
     def id(self) -> int: ...
 
 
 class Placed(Protocol):
-    """What is on a body."""
+    """Anything on a body."""
 
     @property
     def name(self) -> str: ...
@@ -368,12 +368,14 @@ class Placed(Protocol):
 
 
 _encoder: Final = msgspec.msgpack.Encoder()
-_decode: Final = decoder(SceneSpec)
+_decode: Final = make_decoder(SceneSpec)
 
 
 def encode_scene(spec: SceneSpec) -> bytes:
-    """The bytes of the specification: an asset, whose address is the scene's hash. Raises `SceneError` for one that
-    nobody would read."""
+    """Return the bytes of the specification: an asset, whose address is the scene's hash.
+
+    Raises `SceneError` for one above `MAX_SCENE_BYTES`, which no reader accepts.
+    """
     data = _encoder.encode(spec)
     if len(data) > MAX_SCENE_BYTES:
         what = f"{len(spec.visuals)} visuals, {len(spec.bodies)} bodies"
@@ -382,7 +384,7 @@ def encode_scene(spec: SceneSpec) -> bytes:
 
 
 def decode_scene(data: Bytes) -> SceneSpec:
-    """Inverse of `encode_scene`, checked: every reference has its target. Raises `SceneError`."""
+    """Decode and check a specification: every reference has its target. Raises `SceneError`."""
     if len(data) > MAX_SCENE_BYTES:
         raise SceneError(f"a scene specification of {len(data)} bytes, at most {MAX_SCENE_BYTES} are read")
     try:
@@ -395,8 +397,8 @@ def decode_scene(data: Bytes) -> SceneSpec:
     return spec
 
 
-def asset_addresses(spec: SceneSpec) -> dict[str, int]:
-    """Every asset of a scene with its size in bytes, each once: those that show something early come first.
+def list_assets(spec: SceneSpec) -> dict[str, int]:
+    """Return every asset of a scene with its size in bytes, each once: those that show something early come first.
 
     Order: deformables, height fields and coarsest levels of meshes, of textures, then the finer levels.
     """
@@ -413,38 +415,37 @@ def asset_addresses(spec: SceneSpec) -> dict[str, int]:
 
 
 def check_scene(spec: SceneSpec) -> None:
-    """Raises `SceneError` unless every reference has its target, no id occurs twice, and there is not too much of
-    anything."""
+    """Raise `SceneError` unless every reference has its target, every id is unique, and no list is too long."""
     for kind, most in _MOST.items():
         if len(getattr(spec, kind)) > most:
             raise SceneError(f"{len(getattr(spec, kind))} {kind}, at most {most} are read")
-    bodies, sites = _ids("bodies", spec.bodies), _ids("sites", spec.sites)
-    _ids("visuals", spec.visuals)
+    bodies, sites = _check_ids("bodies", spec.bodies), _check_ids("sites", spec.sites)
+    _check_ids("visuals", spec.visuals)
     before = {-1}
     for body in spec.bodies:
         if body.parent not in before:  # so there is no cycle either
             raise SceneError(f"body {body.id} has the parent {body.parent}, which is not listed before it")
         before.add(body.id)
-    _on_bodies("visual", spec.visuals, bodies)
-    _on_bodies("site", spec.sites, bodies)
-    _on_bodies("light", spec.lights, bodies)
-    _on_bodies("camera", spec.cameras, bodies)
+    _check_bodies("visual", spec.visuals, bodies)
+    _check_bodies("site", spec.sites, bodies)
+    _check_bodies("light", spec.lights, bodies)
+    _check_bodies("camera", spec.cameras, bodies)
     watchers: tuple[Light | Camera, ...] = (*spec.lights, *spec.cameras)
     for watcher in watchers:
         if watcher.target not in bodies and watcher.target != -1:
             raise SceneError(f"{watcher.name!r} looks at body {watcher.target}: no such body")
     for geometry in (*(visual.geometry for visual in spec.visuals), *(site.geometry for site in spec.sites)):
-        _refer("mesh", geometry.mesh, len(spec.meshes))
-        _refer("height field", geometry.hfield, len(spec.hfields))
+        _check_reference("mesh", geometry.mesh, len(spec.meshes))
+        _check_reference("height field", geometry.hfield, len(spec.hfields))
     for worn in (spec.visuals, spec.sites, spec.tendons, spec.deformables):
         for one in worn:
-            _refer("material", one.material, len(spec.materials))
+            _check_reference("material", one.material, len(spec.materials))
     for material in spec.materials:
         for use in material.textures:
-            _refer("texture", use.texture, len(spec.textures))
+            _check_reference("texture", use.texture, len(spec.textures))
     for light in spec.lights:
-        _refer("texture", light.texture, len(spec.textures))
-    _refer("texture", spec.environment.skybox, len(spec.textures))
+        _check_reference("texture", light.texture, len(spec.textures))
+    _check_reference("texture", spec.environment.skybox, len(spec.textures))
     for tendon in spec.tendons:
         if not sites.issuperset(tendon.sites):
             raise SceneError(f"tendon {tendon.name!r} runs through a site that is not there")
@@ -460,20 +461,20 @@ _MOST: Final = {
 }
 
 
-def _ids(what: str, things: Sequence[Identified]) -> set[int]:
+def _check_ids(what: str, things: Sequence[Identified]) -> set[int]:
     found = {thing.id for thing in things}
     if len(found) != len(things):
         raise SceneError(f"two {what} have the same id")
     return found
 
 
-def _on_bodies(what: str, things: Sequence[Placed], bodies: set[int]) -> None:
+def _check_bodies(what: str, things: Sequence[Placed], bodies: set[int]) -> None:
     for thing in things:
         if thing.body not in bodies:
             raise SceneError(f"{what} {thing.name!r} is on body {thing.body}: no such body")
 
 
-def _refer(what: str, index: int, count: int) -> None:
+def _check_reference(what: str, index: int, count: int) -> None:
     if index >= count:
         raise SceneError(f"reference to {what} {index}, but there are {count}")
 
@@ -486,7 +487,7 @@ MAX_PATCHES: Final = 1024
 
 
 class SetVisual(msgspec.Struct, frozen=True, tag_field="op", tag="set_visual"):
-    """Changes how a visual is drawn; what is not given stays. `rgba` with alpha 0 hides it."""
+    """Change how a visual is drawn; fields that are null stay. `rgba` with alpha 0 hides it."""
 
     visual: Count
     rgba: Rgba | None = None
@@ -496,23 +497,25 @@ class SetVisual(msgspec.Struct, frozen=True, tag_field="op", tag="set_visual"):
 
 
 class AddVisual(msgspec.Struct, frozen=True, tag_field="op", tag="add_visual"):
-    """Decoration on a body (0: the world). Its `id` must be free."""
+    """Add decoration to a body (0: the world). Its `id` must be free."""
 
     visual: Visual
 
 
 class RemoveVisual(msgspec.Struct, frozen=True, tag_field="op", tag="remove_visual"):
+    """Remove a visual."""
+
     visual: Count
 
 
 class AddMesh(msgspec.Struct, frozen=True, tag_field="op", tag="add_mesh"):
-    """At the end of the list, for visuals that come after it."""
+    """Append a mesh to the list, for visuals that come after it."""
 
     mesh: Mesh
 
 
 class AddMaterial(msgspec.Struct, frozen=True, tag_field="op", tag="add_material"):
-    """At the end of the list, for visuals that come after it."""
+    """Append a material to the list, for visuals that come after it."""
 
     material: Material
 
@@ -520,8 +523,8 @@ class AddMaterial(msgspec.Struct, frozen=True, tag_field="op", tag="add_material
 PatchOp = SetVisual | AddVisual | RemoveVisual | AddMesh | AddMaterial
 
 
-def patched(spec: SceneSpec, ops: Sequence[PatchOp]) -> SceneSpec:
-    """The scene after a patch. Raises `SceneError` that says what does not fit; nothing is changed then.
+def apply_patch(spec: SceneSpec, ops: Sequence[PatchOp]) -> SceneSpec:
+    """Return the scene after a patch. Raises `SceneError` for an operation that does not fit; nothing is changed then.
 
     `totals` stay those of the scene as it was loaded.
     """
@@ -541,7 +544,7 @@ def patched(spec: SceneSpec, ops: Sequence[PatchOp]) -> SceneSpec:
         elif op.visual not in visuals:
             raise SceneError(f"there is no visual {op.visual}")
         elif isinstance(op, SetVisual):
-            visuals[op.visual] = _set(visuals[op.visual], op)
+            visuals[op.visual] = _apply_set_visual(visuals[op.visual], op)
         else:
             del visuals[op.visual]
     after = msgspec.structs.replace(
@@ -551,16 +554,16 @@ def patched(spec: SceneSpec, ops: Sequence[PatchOp]) -> SceneSpec:
     return after
 
 
-def merged(before: Iterable[PatchOp], ops: Iterable[PatchOp]) -> tuple[PatchOp, ...]:
-    """One list of operations that does what both do, in as few as there is something to say of each visual."""
+def merge_patches(before: Iterable[PatchOp], ops: Iterable[PatchOp]) -> tuple[PatchOp, ...]:
+    """Return one list of operations that has the effect of both, with as few operations per visual as possible."""
     found: list[PatchOp] = list(before)
     for op in ops:
-        earlier = next((i for i in range(len(found) - 1, -1, -1) if _about(found[i]) == _about(op)), -1)
+        earlier = next((i for i in range(len(found) - 1, -1, -1) if _get_visual_id(found[i]) == _get_visual_id(op)), -1)
         old = found[earlier] if earlier >= 0 else None
         if isinstance(op, SetVisual) and isinstance(old, SetVisual):
-            found[earlier] = msgspec.structs.replace(old, **_given(op))
+            found[earlier] = msgspec.structs.replace(old, **_list_changes(op))
         elif isinstance(op, SetVisual) and isinstance(old, AddVisual):
-            found[earlier] = AddVisual(_set(old.visual, op))
+            found[earlier] = AddVisual(_apply_set_visual(old.visual, op))
         elif isinstance(op, RemoveVisual) and isinstance(old, AddVisual):
             del found[earlier]  # what it refers to may serve others: lists keep their order
         elif isinstance(op, RemoveVisual) and isinstance(old, SetVisual):
@@ -570,17 +573,17 @@ def merged(before: Iterable[PatchOp], ops: Iterable[PatchOp]) -> tuple[PatchOp, 
     return tuple(found)
 
 
-def _about(op: PatchOp) -> int | None:
+def _get_visual_id(op: PatchOp) -> int | None:
     """Id of the visual that an operation is about; additions to lists are about themselves only."""
     if isinstance(op, AddVisual):
         return op.visual.id
     return op.visual if isinstance(op, SetVisual | RemoveVisual) else None
 
 
-def _given(op: SetVisual) -> dict[str, object]:
+def _list_changes(op: SetVisual) -> dict[str, object]:
     fields = ("rgba", "group", "material", "T_body_visual")
     return {name: getattr(op, name) for name in fields if getattr(op, name) is not None}
 
 
-def _set(visual: Visual, op: SetVisual) -> Visual:
-    return msgspec.structs.replace(visual, **_given(op))
+def _apply_set_visual(visual: Visual, op: SetVisual) -> Visual:
+    return msgspec.structs.replace(visual, **_list_changes(op))

@@ -29,7 +29,7 @@ from iris_session.protocol.status import DeliveryBudget, StatusReport
 
 
 class Endpoints(msgspec.Struct, frozen=True):
-    """Ports of the other channels on the host that the client already talks to. `media_ingest`: for media sources."""
+    """Ports of the other channels on the host of the control channel. `media_ingest`: for media sources."""
 
     state: Count = 0
     media: Count = 0
@@ -41,7 +41,7 @@ class Endpoints(msgspec.Struct, frozen=True):
 class Welcome(Message, frozen=True, tag="welcome"):
     """Answer to an accepted `hello`. `resume_token` is bound to the key and may be used once.
 
-    `tick_period_ns`: of the scene as it is now; another one that is loaded may have another (`SceneChanged`).
+    `tick_period_ns`: of the present scene; another scene may have another (`SceneChanged`).
     """
 
     session_id: Name
@@ -70,9 +70,9 @@ class Refused(Message, frozen=True, tag="refused"):
 
 
 class ProtocolFault(Message, frozen=True, tag="protocol_fault"):
-    """A message that could not be taken, or what has become of the session. `code`: `FaultCode`.
+    """A message that was rejected, or a change in the state of the session. `code`: `FaultCode`.
 
-    `reason`: with `dropped` and `revoked`, why the session let this connection go: `replaced` (another connection
+    `reason`: with `dropped` and `revoked`, why the session closed this connection: `replaced` (another connection
     resumed this participant: joining again would take it back), `removed`, `revoked`, `expired`, ...
     """
 
@@ -99,7 +99,7 @@ class Reply(Message, frozen=True, tag="reply"):
 
 
 class Feedback(Message, frozen=True, tag="feedback"):
-    """To the holder of a robot, for haptics and hints. Sent on change and at most at 20 Hz per robot.
+    """Feedback to the holder of a robot, for haptics and hints. Sent on change and at most at 20 Hz per robot.
 
     `state`: the command kind in force, `hold_reason` when it is `hold`. `limits`: joints or bounds that are active.
     `rejected`: counts by `RejectReason` for this participant since it joined. `contact_n`: force on the gripper [N].
@@ -150,16 +150,20 @@ class BodyInfo(msgspec.Struct, frozen=True, array_like=True):
 
 
 class ParticipantJoined(EventBody, frozen=True, tag="participant_joined"):
+    """A participant joined, or resumed after a disconnect."""
+
     participant: ParticipantInfo
     resumed: bool = False
 
 
 class ParticipantChanged(EventBody, frozen=True, tag="participant_changed"):
+    """The row of a participant in the roster changed."""
+
     participant: ParticipantInfo
 
 
 class ParticipantLeft(EventBody, frozen=True, tag="participant_left"):
-    """`grace` true: the connection is lost, leases are kept until `Lease.expires_ns`."""
+    """A participant left. `grace` true: it is disconnected, leases are kept until `Lease.expires_ns`."""
 
     participant: Name
     reason: Name
@@ -176,6 +180,8 @@ class LeaseChanged(EventBody, frozen=True, tag="lease_changed"):
 
 
 class ConsentRequested(EventBody, frozen=True, tag="consent_requested"):
+    """`requester` asks `holder` for a robot (mode `request`); answered by `Consent` with this `consent_id`."""
+
     consent_id: Count
     target: Name
     requester: Name
@@ -183,7 +189,7 @@ class ConsentRequested(EventBody, frozen=True, tag="consent_requested"):
 
 
 class Intervention(EventBody, frozen=True, tag="intervention"):
-    """Mode `priority`: a human took the robot from an agent (`active`), or gave it back."""
+    """Mode `priority`: a human overrides an agent (`active`), or the agent has the robot again."""
 
     robot: Name
     human: Name
@@ -192,6 +198,8 @@ class Intervention(EventBody, frozen=True, tag="intervention"):
 
 
 class EngagementChanged(EventBody, frozen=True, tag="engagement_changed"):
+    """A participant's clutch engaged a robot, or the engagement ended for `reason` (`HoldReason`)."""
+
     robot: Name
     participant: Name
     engaged: bool
@@ -199,7 +207,9 @@ class EngagementChanged(EventBody, frozen=True, tag="engagement_changed"):
 
 
 class ScaleChanged(EventBody, frozen=True, tag="scale_changed"):
-    """`participant` set the motion scaling of a robot for its holder. When a holder goes, `LeaseChanged` tells it."""
+    """`participant` set the motion scaling of a robot for its holder. When a holder leaves, `LeaseChanged` has the
+    scale.
+    """
 
     robot: Name
     scale: float
@@ -207,12 +217,14 @@ class ScaleChanged(EventBody, frozen=True, tag="scale_changed"):
 
 
 class AlignmentChanged(EventBody, frozen=True, tag="alignment_changed"):
+    """Another alignment of a participant is in force."""
+
     participant: Name
     alignment: Alignment
 
 
 class AlignmentRun(EventBody, frozen=True, tag="alignment_run"):
-    """The alignment run of a participant was started anew (`running`), or stopped. `run` counts the starts."""
+    """The alignment run of a participant was started (`running`), or stopped. `run` counts the starts."""
 
     participant: Name
     running: bool
@@ -222,7 +234,8 @@ class AlignmentRun(EventBody, frozen=True, tag="alignment_run"):
 
 class AlignmentAlarmed(EventBody, frozen=True, tag="alignment_alarmed"):
     """The alignment of a participant was found wrong by `size_m` (`AlarmKind`); a `jump` has voided it. `beside`:
-    anchors that stayed where they were meanwhile: then the anchor was moved, not the headset."""
+    anchors that stayed in place meanwhile: then the anchor was moved, not the headset.
+    """
 
     participant: Name
     kind: Name
@@ -240,9 +253,10 @@ class AnchorMoved(EventBody, frozen=True, tag="anchor_moved"):
 
 
 class HeadsetsCompared(EventBody, frozen=True, tag="headsets_compared"):
-    """Measured: participants `a` and `b` put one thing (`anchor_id`), at `p_world`, `error_m` and `error_rad` apart.
+    """Cross-check: participants `a` and `b` observe one anchor (`anchor_id`, at `p_world`) `error_m` and `error_rad`
+    apart.
 
-    `expected_p95_m`: what 95 % of such pairs stay below by their stated errors and the noise of these `n` looks.
+    `expected_p95_m`: 95 % of such pairs stay below it by their stated errors and the noise of these `n` observations.
     """
 
     a: Name
@@ -270,12 +284,16 @@ class SceneChanged(EventBody, frozen=True, tag="scene_changed"):
 
 
 class EStopChanged(EventBody, frozen=True, tag="estop_changed"):
+    """The e-stop was latched (`active`) or cleared by `participant`."""
+
     active: bool
     participant: Name
     reason: Text = ""
 
 
 class PauseChanged(EventBody, frozen=True, tag="pause_changed"):
+    """The session was paused or resumed by `participant`."""
+
     paused: bool
     participant: Name = ""
 
@@ -290,6 +308,8 @@ class EpisodeChanged(EventBody, frozen=True, tag="episode_changed"):
 
 
 class ObjectGrasped(EventBody, frozen=True, tag="object_grasped"):
+    """A hand took a free object (`grasped`), or released it."""
+
     object: Name
     participant: Name
     device: Name
@@ -308,6 +328,8 @@ class Handover(EventBody, frozen=True, tag="handover"):
 
 
 class MarkerAdded(EventBody, frozen=True, tag="marker_added"):
+    """A note of a participant in the recording."""
+
     participant: Name
     text: Text
 
@@ -330,8 +352,9 @@ class Gap(EventBody, frozen=True, tag="gap"):
 
 
 class Notice(EventBody, frozen=True, tag="notice"):
-    """Something an operator should read. `level`: info, warning, error. `participant`: whom it concerns. `reason`: the
-    `DenialReason` of a refusal that answers no request (of an alignment)."""
+    """A text for an operator. `level`: info, warning, error. `participant`: whom it concerns. `reason`: the
+    `DenialReason` of a refusal that answers no request (of an alignment).
+    """
 
     level: Name
     text: Text
@@ -340,7 +363,7 @@ class Notice(EventBody, frozen=True, tag="notice"):
 
 
 class Audited(EventBody, frozen=True, tag="audited"):
-    """Something that concerns security. `kind`: `AuditKind`. `subject`: fingerprint of a key, or a participant id.
+    """An event that concerns security. `kind`: `AuditKind`. `subject`: fingerprint of a key, or a participant id.
 
     Repeated ones (wrong codes, unknown keys) come at most once a second and address, with their `count`.
     """
@@ -382,7 +405,7 @@ EventKind = (
 
 
 class Event(Message, frozen=True, tag="event"):
-    """One entry of the shared history. A gap in `event_seq` means: ask for a new snapshot."""
+    """One entry of the shared history. A gap in `event_seq`: request a new snapshot."""
 
     event_seq: Count
     step: Count
@@ -418,10 +441,10 @@ class Snapshot(Message, frozen=True, tag="snapshot"):
 
 
 class Paired(Message, frozen=True, tag="paired"):
-    """The key is on the allow-list. Connect anew to say `hello`: this connection stays that of an unknown key.
+    """The key is on the allow-list. Connect anew to send `hello`: this connection stays that of an unknown key.
 
-    `proof`: shows that the session knows the join code too, so it is the one that gave it out.
-    `roles`: what this key may join as; empty: any role.
+    `proof`: shows that the session knows the join code too, so it is the one that issued it. `roles`: those that this
+    key may join as; empty: any role.
     """
 
     proof: Proof

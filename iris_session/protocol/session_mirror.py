@@ -1,7 +1,7 @@
-"""The client's copy of the shared session state, built from one snapshot and the events after it. Pure.
+"""The shared session state, rebuilt from one snapshot and the events after it. Pure; used by clients and by the server.
 
-`SessionMirror` never guesses: a gap in `event_seq` makes it ask for a new snapshot, and until that comes it keeps the
-newer events aside (bounded). Two clients with equal `event_seq` have equal `mirror_hash()`, whenever they joined.
+`SessionMirror` never guesses: after a gap in `event_seq` it is not `synced`, and until a new snapshot comes it keeps
+the newer events aside (bounded). Two mirrors with equal `event_seq` have equal `mirror_hash()`, whenever they started.
 """
 
 from __future__ import annotations
@@ -38,19 +38,19 @@ _encoder = msgspec.msgpack.Encoder(order="deterministic")
 
 
 class MissedEvents(NamedTuple):
-    """Events `first` to `last` that will not be handed over: a snapshot tells what came of them, not what they were."""
+    """Events `first` to `last` that will not be delivered: a snapshot has their effects, not the events."""
 
     first: int
     last: int
 
 
 class SessionMirror:
-    """Roster, leases, alignments, robots and bodies as the session says they are.
+    """Roster, leases, alignments, robots and bodies of the session.
 
-    `body_index` and `index_of_id` give the row of a body in state frames, by name and by `BodyInfo.id`.
-    `synced` is false before the first snapshot and after a gap; the other attributes then show the last known state.
-    `bodies` are those of the epochs from `bodies_since` to `bodies_until`, as far as is known.
-    Counters: `gaps`, `discarded` (events older than the snapshot or repeated), `held_overflow`.
+    `body_index` and `index_of_id` give the row of a body in state frames, by name and by `BodyInfo.id`. `synced` is
+    false before the first snapshot and after a gap; the other attributes then show the last known state. `bodies` are
+    those of the epochs from `bodies_since` to `bodies_until`, as far as is known. Counters: `gaps`, `discarded` (events
+    older than the snapshot or repeated), `held_overflow`.
     """
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ class SessionMirror:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets the session, keeps the counters."""
+        """Clear the session, keep the counters."""
         self.synced = False
         self._has_snapshot = False  # a snapshot has come
         self.event_seq = 0
@@ -81,11 +81,11 @@ class SessionMirror:
         self._held: deque[Event] = deque(maxlen=MAX_HELD_EVENTS)
 
     def apply_snapshot(self, snapshot: Snapshot) -> list[Event | MissedEvents]:
-        """Takes over a snapshot and the held events after it. Returns, in order, the events since the last one that was
-        applied: each one that came, and for those that did not come that they are missed. What was before the first
-        snapshot is neither.
+        """Apply a snapshot and the held events after it.
 
-        An older snapshot than what is already known (`event_seq`) is discarded unless a gap is open.
+        Returns, in order, the events since the last one that was applied: each one that arrived, and `MissedEvents` for
+        those that did not. Events before the first snapshot are neither. An older snapshot than the known state
+        (`event_seq`) is discarded unless a gap is open.
         """
         if self.synced and snapshot.event_seq < self.event_seq:
             self.discarded += 1
@@ -114,7 +114,9 @@ class SessionMirror:
         return told + [held[seq] for seq in sorted(held) if seq > snapshot.event_seq and self.apply_event(held[seq])]
 
     def _list_covered_events(self, held: dict[int, Event], last: int) -> list[Event | MissedEvents]:
-        """What is to be told of the events up to `last`, which a snapshot contains."""
+        """Return the events up to `last`, which a snapshot contains, with `MissedEvents` for those that did not
+        arrive.
+        """
         told: list[Event | MissedEvents] = []
         next_seq = self.event_seq + 1
         for seq in sorted(seq for seq in held if next_seq <= seq <= last):
@@ -127,9 +129,11 @@ class SessionMirror:
         return told
 
     def apply_event(self, event: Event) -> bool:
-        """Applies the next event. False: it was discarded, or held until a snapshot comes (`synced` is then false)."""
+        """Apply the next event. Return false when it was discarded, or held until a snapshot comes (`synced` is then
+        false).
+        """
         if not self.synced:
-            self._hold(event)
+            self._hold_event(event)
             return False
         if event.event_seq <= self.event_seq:
             self.discarded += 1
@@ -137,37 +141,41 @@ class SessionMirror:
         if event.event_seq != self.event_seq + 1:
             self.gaps += 1
             self.synced = False
-            self._hold(event)
+            self._hold_event(event)
             return False
         self.event_seq = event.event_seq
-        self._apply(event)
+        self._apply_body(event)
         return True
 
     @property
     def connected(self) -> frozenset[str]:
-        """Ids of the participants who are here now."""
+        """Ids of the participants that are connected now."""
         return frozenset(info.id for info in self.participants.values() if info.connected)
 
     def find_alignment(self, participant: str) -> Alignment | None:
-        """The alignment of one participant, `None` while it has none."""
+        """Return the alignment of one participant, `None` while it has none."""
         info = self.participants.get(participant)
         return None if info is None else info.alignment
 
     def find_tip(self, robot: str) -> tuple[int, Pose] | None:
-        """Row of the body that carries the robot's end-effector site, and `T_body_site`; `None`: no such robot."""
+        """Return the row of the body that carries the robot's end-effector site, and `T_body_site`; `None`: no such
+        robot.
+        """
         info = self.robots.get(robot)
         index = None if info is None else self.index_of_id.get(info.site_body)
         return None if info is None or index is None else (index, info.T_body_site)
 
     def find_lease_version(self, target: str, participant: str) -> int | None:
-        """The fencing token of `target` when `participant` holds it (alone or with others), else `None`."""
+        """Return the fencing token of `target` when `participant` holds it (alone or with others), else `None`."""
         lease = self.leases.get(target)
         if lease is None or not (lease.holder == participant or participant in lease.sub_holders):
             return None
         return lease.lease_version
 
     def mirror_hash(self) -> str:
-        """Digest (32 hex digits) of everything shared, independent of when and how this client learned it."""
+        """Return the digest (32 hex digits) of everything shared, independent of when and how this mirror received
+        it.
+        """
         state = (
             self.event_seq,
             self.scene_epoch,
@@ -184,12 +192,12 @@ class SessionMirror:
         )
         return hashlib.blake2b(_encoder.encode(state), digest_size=16).hexdigest()
 
-    def _hold(self, event: Event) -> None:
+    def _hold_event(self, event: Event) -> None:
         if len(self._held) == MAX_HELD_EVENTS:
             self.held_overflow += 1
         self._held.append(event)
 
-    def _apply(self, event: Event) -> None:
+    def _apply_body(self, event: Event) -> None:
         match event.body:
             case ParticipantJoined(participant=info) | ParticipantChanged(participant=info):
                 self.participants[info.id] = info

@@ -1,4 +1,4 @@
-"""What a session is made of: robots and objects by name. Found in a model by `physics`, used by every other room."""
+"""Robots and objects of a session by name. Found in a model by `physics`, used by every other room."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Messages about how the session does: reports of clients, the status that anyone may ask for, delivery budgets.
+"""Messages about the condition of the session: reports of clients, status reports, delivery budgets.
 
 None of them reaches the authority: the front answers them, so asking costs no step and is not journaled.
 """
@@ -15,18 +15,18 @@ from iris_session.protocol.media import StreamBudget
 
 
 class GetStatus(Message, frozen=True, tag="get_status"):
-    """Asks for a `StatusReport`."""
+    """Request for a `StatusReport`."""
 
     request_id: Count = 0
 
 
 class ClientReport(Message, frozen=True, tag="client_report"):
-    """How state arrives at the application of a client, once a second: for status, doctor and delivery budgets.
+    """Delivery of state to the application of a client, once a second: for status, doctor and delivery budgets.
 
     Ages are from the end of the tick to the application, by the client's clock estimate [ms], over the last second.
-    `missed`: frames that were sent (by `state_seq`) and not delivered. `rtt_ms`: lowest round trip of late.
+    `missed`: frames that were sent (by `state_seq`) and not delivered. `rtt_ms`: lowest recent round trip.
     `media_bytes_per_s`, `media_age_ms` (median since capture): of the media channel. `display_hz`: frames drawn, 0 when
-    nothing is. `media_limit_mbit_per_s`: the client wants no more media than that, 0 for no limit of its own.
+    none are. `media_limit_mbit_per_s`: upper bound of media that the client asks for, 0 for no limit of its own.
     """
 
     age_ms_p50: float
@@ -42,11 +42,11 @@ class ClientReport(Message, frozen=True, tag="client_report"):
 
 
 class DeliveryBudget(Message, frozen=True, tag="delivery_budget"):
-    """What media this client gets from now on. Sent after `Welcome`, and whenever it changes.
+    """Media that this client gets from now on. Sent after `Welcome`, and whenever it changes.
 
     `budget_class`: the lowest class among the streams that it subscribed to. State and control are never cut.
     `mbit_per_s`: bound of all media together, 0 for none. `reason`: why it is not everything. `streams`: every stream
-    that there is.
+    of the session.
     """
 
     budget_class: Name
@@ -66,8 +66,8 @@ class Quantiles(msgspec.Struct, frozen=True, array_like=True):
     p99: float
 
 
-def quantiles(durations_ns: Iterable[int]) -> Quantiles | None:
-    """Of durations [ns]; `None` of none."""
+def compute_quantiles(durations_ns: Iterable[int]) -> Quantiles | None:
+    """Return the quantiles of durations [ns], `None` without any."""
     ordered = sorted(durations_ns)
     if not ordered:
         return None
@@ -76,7 +76,7 @@ def quantiles(durations_ns: Iterable[int]) -> Quantiles | None:
 
 
 class AnchorSeen(msgspec.Struct, frozen=True):
-    """One anchor as a headset saw it: how often in this run, and how long ago."""
+    """Observations of one anchor by a headset: their number in this run, and the age of the newest."""
 
     anchor_id: Name
     observations: Count
@@ -84,11 +84,11 @@ class AnchorSeen(msgspec.Struct, frozen=True):
 
 
 class AlignmentReport(msgspec.Struct, frozen=True):
-    """How the alignment of one participant stands, beyond what `AlignmentChanged` tells.
+    """State of the alignment of one participant, beyond `AlignmentChanged`.
 
-    `error_at_anchor_m`, `error_at_robot_m`: stated p95. `pending_m`, `pending_rad`: how far a correction that waits, or
-    slides in, is away. `advice`: why the estimator refuses, or warns. `alarm`: the last `AlarmKind` that no new
-    alignment has answered yet, `alarm_ns` ago. `unusable`: observations that were of no use, since the run began.
+    `error_at_anchor_m`, `error_at_robot_m`: stated p95. `pending_m`, `pending_rad`: size of a correction that waits, or
+    slides in. `advice`: why the estimator refuses, or warns. `alarm`: the last `AlarmKind` that no new alignment has
+    resolved yet, `alarm_ns` ago. `unusable`: observations that could not be used, since the run began.
     """
 
     version: Count = 0
@@ -134,11 +134,11 @@ class ParticipantReport(msgspec.Struct, frozen=True):
     """One participant, as the session sees it. Times in `*_ns` are durations until now, -1 for never.
 
     `capture_to_receive`: device to front. `state_age`: end of tick to application, as its client reports it.
-    `alignment_void_ns`: since the tracking frame jumped and voided the alignment, -1 for not so.
-    `lost`: why the front lost its connection (`silent`, `closed`, `slow`, ...), empty while connected.
-    `rejected`: samples by reason, `drops`: messages thrown away, both since it joined. `reported`: its client reports.
-    `media`: the streams that it subscribed to, `budget_class` the lowest of theirs, empty without one.
-    `media_bytes_per_s`: sent to it, `media_drops`: frames that its link did not take in time, since it joined.
+    `alignment_void_ns`: since the tracking frame jumped and voided the alignment, -1 for not so. `lost`: why it is
+    disconnected (`silent`, `closed`, `slow`, ...), empty while connected. `rejected`: samples by reason, `drops`:
+    messages dropped, both since it joined. `reported`: its client reports. `media`: the streams that it subscribed to,
+    `budget_class` the lowest of theirs, empty without one. `media_bytes_per_s`: sent to it, `media_drops`: frames that
+    its link did not take in time, since it joined.
     """
 
     id: Name
@@ -174,7 +174,7 @@ class ParticipantReport(msgspec.Struct, frozen=True):
 
 
 class RobotReport(msgspec.Struct, frozen=True):
-    """One robot: who has it, what it does, and why it holds."""
+    """One robot: its holder, its state, and the reason why it holds."""
 
     name: Name
     mode: Name
@@ -187,8 +187,9 @@ class RobotReport(msgspec.Struct, frozen=True):
 
 
 class RecorderReport(msgspec.Struct, frozen=True):
-    """`state`: `off` (nothing is recorded), `running`, `hangs` (says nothing for 5 s), `dead` (being replaced) or
-    `failed` (the file cannot be written). `disk_free_bytes` 0: not known. `text`: what it said last, for people."""
+    """State of the recorder: `off` (nothing is recorded), `running`, `hangs` (silent for 5 s), `dead` (being replaced)
+    or `failed` (the file cannot be written). `disk_free_bytes` 0: not known. `text`: its last message, for people.
+    """
 
     state: Name = "off"
     path: Text = ""
@@ -201,7 +202,8 @@ class RecorderReport(msgspec.Struct, frozen=True):
 
 class MediaStreamReport(msgspec.Struct, frozen=True):
     """One media stream, at its best class. `source`: its publisher's name, empty for the session's own process.
-    `subscribers`: participants who want it."""
+    `subscribers`: participants that subscribed to it.
+    """
 
     stream: Name
     hz: float = 0.0
@@ -212,7 +214,8 @@ class MediaStreamReport(msgspec.Struct, frozen=True):
 
 class AssetsReport(msgspec.Struct, frozen=True):
     """The assets channel. `served`: assets of the present scene. Since the front began: `bytes_sent`, `requests`, and
-    `refusals`, of requests and connections. `waiting`: connections that wait for something now."""
+    `refusals`, of requests and connections. `waiting`: connections with an unanswered request.
+    """
 
     served: Count = 0
     bytes_sent: Count = 0
@@ -222,15 +225,14 @@ class AssetsReport(msgspec.Struct, frozen=True):
 
 
 class StatusReport(Message, frozen=True, tag="status_report"):
-    """Answer to `GetStatus`. Shares are of the last ten seconds unless they say `total`.
+    """Answer to `GetStatus`. Shares are of the last ten seconds unless their name has `total`.
 
-    `late_causes`: late ticks by where the time went (`LateCause`), and `skipped` for those given up after a long gap.
-    `lateness`: of ticks, after their deadline. `step_to_publish`: end of tick to the state socket, of the last five
-    seconds; null below 25 states in them.
-    `drops`: by reason, everything that was thrown away anywhere. `restarts`: of front and recorder.
-    `authority_silent_ns`: since the authority last spoke to the front; then its part (ticks, roster, robots, recorder)
-    is as old. -1: it has not spoken yet. `cpu_share`: of one processor, by the authority's process; `load`: of the
-    machine, over a minute.
+    `late_causes`: late ticks by the part that took the time (`LateCause`), and `skipped` for those left out after a
+    long gap. `lateness`: of ticks, after their deadline. `step_to_publish`: end of tick to the state socket, of the
+    last five seconds; null below 25 states in them. `drops`: by reason, all messages dropped anywhere. `restarts`: of
+    front and recorder. `authority_silent_ns`: since the authority's last message to the front; its part (ticks, roster,
+    robots, recorder) is as old. -1: it has sent none yet. `cpu_share`: of one processor, by the authority's process;
+    `load`: of the machine, over a minute.
     """
 
     request_id: Count

@@ -1,4 +1,4 @@
-"""What flows between authority, control and physics within one step. Plain data, no behaviour.
+"""Contracts between authority, control and physics within one step. Plain data, no behaviour.
 
 `Authority.step(now_ns, entries, n_ticks, view) -> Decision`; control turns `Decision.commands` into `ctrl` for each of
 the `n_ticks` ticks; physics gives the next `WorldView`.
@@ -39,7 +39,7 @@ class CommandSource(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Command(msgspec.Struct, frozen=True, array_like=True):
-    """What one robot does in this step. Exactly one per robot and step.
+    """Command of one robot for this step. Exactly one per robot and step.
 
     `kind`: `CommandKind`; with `hold` a `hold_reason` and no sources. More than one source only in lease mode `shared`.
     `gripper`: 0 open to 1 closed, `None`: unchanged. `scale`: motion scaling, 1 = as the hand moves.
@@ -56,7 +56,7 @@ class Command(msgspec.Struct, frozen=True, array_like=True):
 class ObjectCommand(msgspec.Struct, frozen=True, array_like=True):
     """A free object that hands hold without a robot: follow `T_world_object` (spring), until no command names it.
 
-    The authority computes the pose from the hand that leads (first holder); when it lets go while a second hand holds,
+    The authority computes the pose from the hand that leads (first holder); when it releases while a second hand holds,
     the offset is latched anew, so that the object does not jump. `grasp` changes with every change of the leading hand.
     """
 
@@ -73,7 +73,7 @@ class OutgoingMessage(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Admitted(msgspec.Struct, frozen=True, array_like=True):
-    """The authority let a connection in; the front makes `Welcome` and the resume token from it."""
+    """The authority admitted a connection; the front makes `Welcome` and the resume token from it."""
 
     connection: Count
     participant_id: Name
@@ -82,9 +82,9 @@ class Admitted(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Dropped(msgspec.Struct, frozen=True, array_like=True):
-    """The authority is done with a connection (replaced by a resume, expired, said bye): the front closes it.
+    """The authority has ended a connection (replaced by a resume, expired, left): the front closes it.
 
-    `key_id`: of a key that a director has revoked; `connection` is `HOST` then when nobody was connected with it.
+    `key_id`: of a key that a director has revoked; `connection` is `HOST` then when no connection used it.
     """
 
     connection: Count
@@ -116,8 +116,9 @@ class Decision(msgspec.Struct, frozen=True):
 
 
 class ObjectContact(msgspec.Struct, frozen=True, array_like=True):
-    """Who touches an object right now. `grippers`: robots that hold it (contact on at least two finger bodies, or on
-    its only one); `touching`: robots of which any geom touches it; `others`: bodies (not robots) that touch it."""
+    """Contacts of an object. `grippers`: robots that hold it (contact on at least two finger bodies, or on its only
+    one); `touching`: robots of which any geom touches it; `others`: bodies (not robots) that touch it.
+    """
 
     object: Name
     grippers: tuple[Name, ...]
@@ -126,7 +127,7 @@ class ObjectContact(msgspec.Struct, frozen=True, array_like=True):
 
 
 class WorldView(Protocol):
-    """The world after the last tick, as the authority and control may see it. Deterministic, read only.
+    """The world after the last tick, as visible to the authority and control. Deterministic, read only.
 
     Frames: world. `joints` in the order of `RobotSpec.joints`.
     """
@@ -149,12 +150,12 @@ class WorldView(Protocol):
     def object_contacts(self) -> Sequence[ObjectContact]: ...
 
     def gripper_force(self, robot: str) -> float:
-        """Sum of the normal contact forces on the gripper [N]."""
+        """Return the sum of the normal contact forces on the gripper [N]."""
         ...
 
 
 class ControlStatus(msgspec.Struct, frozen=True, array_like=True):
-    """What control reports after a step, for feedback: active limits per robot, leader apart, tracking error."""
+    """Report of control after a step, for feedback: active limits per robot, leader apart, tracking error."""
 
     robot: Name
     limits: tuple[Name, ...] = ()

@@ -15,7 +15,7 @@ from typing import Final
 
 import msgspec
 
-from iris_session.protocol.codec import decoder
+from iris_session.protocol.codec import make_decoder
 from iris_session.protocol.common import Applied, Count, Denial, Name, Nanoseconds
 from iris_session.protocol.server_messages import BodyInfo, Event, PresenceItem
 from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader
@@ -171,16 +171,16 @@ class RecorderStatus(msgspec.Struct, frozen=True, array_like=True):
 
 
 encode_batch = msgspec.msgpack.Encoder().encode
-decode_batch = decoder(Batch)
-_decode_essence = decoder(_Essence)
+decode_batch = make_decoder(Batch)
+_decode_essence = make_decoder(_Essence)
 encode_scene = msgspec.msgpack.Encoder().encode
-decode_scene = decoder(SceneModel)
+decode_scene = make_decoder(SceneModel)
 encode_vertices = msgspec.msgpack.Encoder().encode
-decode_vertices = decoder(VertexFrame)
+decode_vertices = make_decoder(VertexFrame)
 encode_header = msgspec.msgpack.Encoder().encode
-decode_header = decoder(SessionHeader)
+decode_header = make_decoder(SessionHeader)
 encode_status = msgspec.msgpack.Encoder().encode
-decode_status = decoder(RecorderStatus)
+decode_status = make_decoder(RecorderStatus)
 
 
 def decode_journal(data: bytes) -> Batch:

@@ -159,7 +159,7 @@ class SceneReader:
 
     def read_texture(self, material: int) -> Pixels | None:
         """The 2d texture of a material, red, green, blue and perhaps alpha."""
-        index = -1 if material < 0 else self._spec.materials[material].texture()
+        index = -1 if material < 0 else self._spec.materials[material].find_texture()
         if index < 0:
             return None
         if index not in self._textures:

@@ -19,7 +19,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from iris_session.protocol.assets import ARRAYS_MAGIC, MAX_ARRAY_BYTES, MAX_ARRAY_HEADER_BYTES, ArrayHeader, ArrayInfo
-from iris_session.protocol.codec import decoder
+from iris_session.protocol.codec import make_decoder
 from iris_session.protocol.names import ArrayCodec, ArrayFilter
 from iris_session.scene.errors import AssetDecodeError, SceneBuildError
 
@@ -31,7 +31,7 @@ _SCALED: Final = 4
 _SHORT_ROW: Final = 256
 _PREFIX: Final = struct.Struct("<4sI")
 _encoder: Final = msgspec.msgpack.Encoder()
-_decode_header: Final = decoder(ArrayHeader)
+_decode_header: Final = make_decoder(ArrayHeader)
 #: Fast, and on filtered data as small as slower levels.
 LEVEL: Final = 1
 

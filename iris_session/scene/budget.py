@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import msgspec
 
 from iris_session.protocol.names import GeometryKind, TextureKind
-from iris_session.protocol.scene import Mesh, SceneSpec, Texture, TextureLevel, Totals, asset_addresses
+from iris_session.protocol.scene import Mesh, SceneSpec, Texture, TextureLevel, Totals, list_assets
 
 #: Where a Quest 3 begins to struggle: objects (draw calls), triangles, memory of textures [bytes].
 QUEST_OBJECTS: Final = 200
@@ -154,7 +154,7 @@ def add_totals(spec: SceneSpec) -> SceneSpec:
         mesh_bytes=sum(level_bytes.values()),
         texture_bytes=sum(image_bytes.values()),
         texture_memory=sum(texture_memory_bytes(texture, texture.levels[0]) for texture in spec.textures),
-        asset_bytes=sum(asset_addresses(spec).values()),
+        asset_bytes=sum(list_assets(spec).values()),
     )
     return msgspec.structs.replace(spec, totals=totals)
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from anchors.pose import compose, quat_from_rotvec
 from iris_session.protocol.common import IDENTITY, Pose, Vec3
-from iris_session.protocol.scene import SceneSpec, asset_addresses
+from iris_session.protocol.scene import SceneSpec, list_assets
 from iris_session.scene.errors import SceneBuildError
 from iris_session.streams.deformable_topology import DeformableTopology
 
@@ -65,7 +65,7 @@ class ComposedScene:
     @property
     def addresses(self) -> tuple[str, ...]:
         """All assets in the order in which they show something: to be held in the store, and served."""
-        return (self.scene_hash, *asset_addresses(self.spec))
+        return (self.scene_hash, *list_assets(self.spec))
 
 
 # --- articulations ----------------------------------------------------------------------------------------------------

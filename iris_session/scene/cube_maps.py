@@ -105,7 +105,7 @@ class CubeMapReader:
 
 def find_cube_texture(spec: SceneSpec, material: int) -> int:
     """The cube texture of a material's colour; -1 where there is none."""
-    index = -1 if material < 0 else spec.materials[material].texture()
+    index = -1 if material < 0 else spec.materials[material].find_texture()
     return -1 if index < 0 or spec.textures[index].kind == TextureKind.IMAGE else index
 
 

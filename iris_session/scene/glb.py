@@ -192,7 +192,7 @@ class _GlbWriter:
             scale = direction_scale(self._spec, visual.geometry, visual.material)
             return None if cube.atlas is None else ("cube", scale, cube.atlas.side, cube.atlas.single_colors)
         material = None if visual.material < 0 else self._spec.materials[visual.material]
-        worn = -1 if material is None else material.texture()
+        worn = -1 if material is None else material.find_texture()
         if material is None or worn < 0 or self._spec.textures[worn].kind != TextureKind.IMAGE:
             return None
         mesh = visual.geometry.mesh
@@ -300,19 +300,19 @@ class _GlbWriter:
             shine = 1.0 - material.shininess if material.roughness < 0 else material.roughness
             look["roughnessFactor"] = min(max(shine, 0.05), 1.0)
             found["name"] = material.name or f"material_{index}"
-            worn = material.texture()
+            worn = material.find_texture()
             if mapped and worn >= 0 and self._spec.textures[worn].channels == 4:
                 found["alphaMode"] = "BLEND"
             for where, key, texture in (
                 (look, "baseColorTexture", self._add_texture(worn) if cube is None else self._add_atlas(cube)),
-                (look, "metallicRoughnessTexture", self._add_texture(material.texture(TextureRole.ORM))),
+                (look, "metallicRoughnessTexture", self._add_texture(material.find_texture(TextureRole.ORM))),
                 (
                     found,
                     "occlusionTexture",
-                    self._add_texture(material.texture(TextureRole.ORM, TextureRole.OCCLUSION)),
+                    self._add_texture(material.find_texture(TextureRole.ORM, TextureRole.OCCLUSION)),
                 ),
-                (found, "normalTexture", self._add_texture(material.texture(TextureRole.NORMAL))),
-                (found, "emissiveTexture", self._add_texture(material.texture(TextureRole.EMISSIVE))),
+                (found, "normalTexture", self._add_texture(material.find_texture(TextureRole.NORMAL))),
+                (found, "emissiveTexture", self._add_texture(material.find_texture(TextureRole.EMISSIVE))),
             ):
                 if mapped and texture is not None:
                     where[key] = {"index": texture}

@@ -23,8 +23,8 @@ from iris_session.protocol.scene import (
     Site,
     Tendon,
     Visual,
-    asset_addresses,
     encode_scene,
+    list_assets,
 )
 from iris_session.scene.asset_builder import AssetBuilder, EncodeOptions
 from iris_session.scene.budget import add_totals
@@ -64,7 +64,7 @@ class ParsedScene:
     @property
     def addresses(self) -> tuple[str, ...]:
         """All assets in the order in which they show something: to be held in the store, and served."""
-        return (self.scene_hash, *asset_addresses(self.spec))
+        return (self.scene_hash, *list_assets(self.spec))
 
 
 def parse_mujoco(

@@ -81,12 +81,12 @@ class JoinCodes:
         self, server: KeyPair, *, minutes: float = 10.0, roles: tuple[str, ...] = (), name: str = ""
     ) -> tuple[str, JoinCode]:
         """Create a code for sessions with this server key. Returns its text `XXXX-XXXX-XXXX` and the stored entry."""
-        code = pairing.code_from_bytes(os.urandom(pairing.CODE_BYTES))
+        code = pairing.make_code(os.urandom(pairing.CODE_BYTES))
         now_s = time.time()
         made = JoinCode(
             os.urandom(8).hex(),
             server.fingerprint,
-            pairing.stretch(code, server.raw_public),
+            pairing.stretch_code(code, server.raw_public),
             now_s + 60.0 * minutes,
             validate_roles(roles),
             name,
@@ -135,8 +135,8 @@ class JoinCodes:
             known: JoinCode | None = None
             for one in codes:
                 if one.server == server and one.is_open(now_s):
-                    expected = pairing.client_proof(one.secret, server_public, decode_key(client_key))
-                    if pairing.same(expected, proof) and known is None:
+                    expected = pairing.make_client_proof(one.secret, server_public, decode_key(client_key))
+                    if pairing.is_same_proof(expected, proof) and known is None:
                         known = one
             if known is None:
                 return self._count_failed_attempt(codes, server, now_s)

@@ -88,7 +88,7 @@ def make_plant(model: mujoco.MjModel, scene: SceneLoaded, control: ControlConfig
     """
     world = World(model, scene.robots, scene.objects)
     if scene.initial_state:
-        world.set_state_bytes(scene.initial_state)
+        world.restore_state(scene.initial_state)
     return Plant(world, Controller(model, scene.robots, scene.objects, control), scene)
 
 
@@ -142,7 +142,7 @@ class SessionCore:
                 self._load_scene(entry.message)
         world = self.world
         if plant:
-            world.set_state_bytes(plant)
+            world.restore_state(plant)
         decision = self.authority.step(now_ns, entries, n_ticks, world.view(), self._status)
         lap(LateCause.AUTHORITY)
         if decision.reset:
@@ -158,7 +158,7 @@ class SessionCore:
             if not plant and not self._tick():
                 break
             lap(LateCause.PHYSICS)
-        self._status = self.controller.status()
+        self._status = self.controller.get_status()
         return StepOutcome(decision, self._status, self._digest(decision) if digest else b"", world.diverged)
 
     def write_rest_controls(self, plant: bytes) -> None:
@@ -166,8 +166,8 @@ class SessionCore:
 
         No step may follow: this is in no journal.
         """
-        self.world.set_state_bytes(plant)
-        self.controller.rest(self.world.data)
+        self.world.restore_state(plant)
+        self.controller.write_rest(self.world.data)
 
     def _tick(self) -> bool:
         """Advance physics by a tick; False when the state is no longer finite: physics stands still until a reset."""
@@ -180,7 +180,7 @@ class SessionCore:
     def _reset_world(self) -> None:
         self.world.reset()
         if self.scene.initial_state:
-            self.world.set_state_bytes(self.scene.initial_state)
+            self.world.restore_state(self.scene.initial_state)
 
     def _make_first_plant(self) -> Plant:
         config = self.config
@@ -210,7 +210,7 @@ class SessionCore:
         h = hashlib.blake2b(digest_size=16)
         h.update(_encoder.encode(decision))
         h.update(_encoder.encode(self._status))
-        h.update(self.world.state_bytes())
+        h.update(self.world.save_state())
         return h.digest()
 
     def snapshot(self) -> CoreState:

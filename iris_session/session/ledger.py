@@ -25,7 +25,7 @@ from iris_session.protocol.server_messages import (
     Snapshot,
 )
 from iris_session.protocol.session_mirror import SessionMirror
-from iris_session.protocol.status import AlignmentReport, ParticipantReport, Quantiles, quantiles
+from iris_session.protocol.status import AlignmentReport, ParticipantReport, Quantiles, compute_quantiles
 from iris_session.protocol.steps import ControlStatus, Decision
 
 #: Events kept for display; the recording has them all.
@@ -182,7 +182,7 @@ class SessionLedger:
 
     def receive_to_step_quantiles(self, robot: str) -> Quantiles | None:
         """Return how long the newest samples of a robot waited for the step that applied them."""
-        return quantiles(self._receive_to_step_ns.get(robot, ()))
+        return compute_quantiles(self._receive_to_step_ns.get(robot, ()))
 
     def compute_input_to_ctrl_ms(self) -> dict[str, float]:
         """Return by robot the age [ms] of the newest applied sample when its step began."""

@@ -279,7 +279,7 @@ class SessionProcesses:
             recording_class=recording_class,
             tick_period_ns=core.world.tick_period_ns,
             config=msgspec.msgpack.encode(core.current_config()),
-            model=pack_model(core.world.model_bytes()),
+            model=pack_model(core.world.encode_model()),
             scene_hash=core.world.scene_hash,
             robots=core.scene.robots,
             objects=core.scene.objects,
@@ -319,7 +319,7 @@ class SessionProcesses:
 
     def _report_overflows(self, stepper: Stepper) -> None:
         """Count the contacts that MuJoCo drops, which change what happens, and announce the first."""
-        counts = stepper.core.world.trouble
+        counts = stepper.core.world.dropped_counts
         for reason, count in counts.items():
             before = self._world_overflows.get(reason, 0)
             if reason not in self._overflows:

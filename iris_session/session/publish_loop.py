@@ -152,7 +152,7 @@ class PublishLoop:
             self._due_ns = now_ns + self._period_ns
         if frame.anew:
             self._stepper.post_own(ExternalReset())
-        self._step(1, self._carrier.state(frame.time_s, frame.poses))
+        self._step(1, self._carrier.encode_state(frame.time_s, frame.poses))
         self._vertices.newest = frame.vertices
         self._delay_ns = max(0, now_ns - frame.capture_ns)
         self._publish_state(frame.capture_ns)

@@ -30,12 +30,12 @@ import mujoco
 from iris_session.control import ControlError
 from iris_session.physics import (
     PhysicsError,
+    compute_scene_hash,
+    decode_model,
+    encode_model,
     find_objects,
     find_robots,
     load_model,
-    model_bytes,
-    model_from_bytes,
-    scene_hash,
 )
 from iris_session.protocol.common import Pose
 from iris_session.protocol.discovery import DISCOVERY_PORT
@@ -172,7 +172,7 @@ class PastSession:
         return dataclasses.replace(given, control=core.control, **changes)
 
     def _check_model(self, model: mujoco.MjModel) -> None:
-        here, had = scene_hash(model_bytes(model)), self.core.world.scene_hash
+        here, had = compute_scene_hash(encode_model(model)), self.core.world.scene_hash
         if here != had:
             raise ResumeError(
                 f"the scene is not that of {self.file}: hash {here[:12]}, recorded {had[:12]}; "
@@ -340,8 +340,8 @@ def make_core(header: SessionHeader, models: Models) -> SessionCore:
     """Return the core that a header describes, in its initial state. Raises `ResumeError`."""
     try:
         config = msgspec.msgpack.decode(header.config, type=CoreConfig)
-        model = model_from_bytes(unpack_model(header.model))
-        return SessionCore(model, config, lambda model_hash: model_from_bytes(models(model_hash)))
+        model = decode_model(unpack_model(header.model))
+        return SessionCore(model, config, lambda model_hash: decode_model(models(model_hash)))
     except (msgspec.DecodeError, zlib.error, PhysicsError, ControlError, ValueError) as error:
         raise ResumeError(f"the session cannot be built from the header of its recording: {error}") from error
 

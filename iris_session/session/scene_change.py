@@ -16,7 +16,7 @@ import numpy as np
 
 from iris_session.authority.config import check_config
 from iris_session.physics import Pacer, find_objects, find_robots
-from iris_session.physics.load import model_bytes, scene_hash
+from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.protocol.entries import HOST, Entry, SceneLoaded, decode_entry, encode_entry
 from iris_session.protocol.names import GeometryKind
 from iris_session.protocol.scene import MAX_OPS, AddVisual, PatchOp, SceneError, SetVisual
@@ -70,10 +70,10 @@ def prepare_scene(
         ConfigError: A robot, object or timestep that the session cannot use.
         PhysicsError, ControlError: The model cannot be driven.
     """
-    binary = model_bytes(model)
+    binary = encode_model(model)
     all_robots = tuple(find_robots(model) if robots is None else robots)
     all_objects = tuple(find_objects(model) if objects is None else objects)
-    message = SceneLoaded(scene_hash(binary), all_robots, all_objects, state)
+    message = SceneLoaded(compute_scene_hash(binary), all_robots, all_objects, state)
     # What is journaled is what is used: whole numbers in float fields become floats, lists tuples.
     scene = decode_entry(encode_entry(Entry(HOST, HOST, 0, message))).message
     assert isinstance(scene, SceneLoaded)

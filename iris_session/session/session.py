@@ -223,7 +223,7 @@ class Session(Owner):
         began_ns = max(now_ns, pacer.next_deadline_ns)
         stepper.step(1)
         if not adopt_timestep(stepper, pacer, times, began_ns):
-            lateness_ns = pacer.finished(self.clock())
+            lateness_ns = pacer.finish_tick(self.clock())
             times.finish_tick(lateness_ns)
             stepper.lateness_ns = max(stepper.lateness_ns, lateness_ns)
 
@@ -268,7 +268,7 @@ class Session(Owner):
         """Return the end-effector targets `T_world_tip` by robot, for an environment's own controller [m]."""
         self._require_started()
         with self._hold_steps():
-            return {} if self._core is None else dict(self._core.controller.targets())
+            return {} if self._core is None else dict(self._core.controller.get_targets())
 
     @classmethod
     def attach(cls, model: mujoco.MjModel, data: mujoco.MjData, config: SessionConfig | None = None) -> Self:
@@ -391,7 +391,7 @@ class Session(Owner):
         Args:
             anew: Begin the percentiles again from here.
         """
-        return None if self._pacer is None else self._pacer.stats(self.clock(), anew=anew)
+        return None if self._pacer is None else self._pacer.get_stats(self.clock(), anew=anew)
 
     def load_scene(
         self,

@@ -22,10 +22,10 @@ from iris_session.protocol.scene import (
     PatchOp,
     SceneError,
     SceneSpec,
-    asset_addresses,
+    apply_patch,
     encode_scene,
-    merged,
-    patched,
+    list_assets,
+    merge_patches,
 )
 from iris_session.scene import AssetStore, Hold, SceneBuildError
 from iris_session.scene.composed import ComposedScene
@@ -106,7 +106,7 @@ class SharedScenes:
             patches: Patches since then, so that a resumed session shows what it showed.
         """
         poses = np.zeros((len(world.bodies), 7))
-        world.poses(poses)
+        world.read_poses(poses)
         plain = SceneInfo(
             world.scene_hash, world.robot_infos, world.bodies, poses.tobytes(), tick_period_ns=world.tick_period_ns
         )
@@ -117,12 +117,12 @@ class SharedScenes:
             parsed = self._composed or parse_mujoco(
                 world.model,
                 store,
-                data=world.initial_data(initial_state),
+                data=world.make_initial_data(initial_state),
                 name=self._name,
                 sites=self._sites,
                 tendons=self._tendons,
             )
-            shown = _store_spec(store, patched(parsed.spec, patches), plain, tuple(patches))
+            shown = _store_spec(store, apply_patch(parsed.spec, patches), plain, tuple(patches))
         except (OSError, SceneBuildError, SceneError) as error:  # the session works without its picture
             return Shown(plain, notes=(f"{NO_SPECIFICATION}: {error}",))
         return shown._replace(notes=tuple(f"left out for clients: {what}" for what in parsed.skipped))
@@ -134,14 +134,14 @@ class SharedScenes:
             reasons = [note for note in self.notes if NO_SPECIFICATION in note]
             why = "; ".join(reasons) or "`assets` of SessionConfig is False"
             raise SceneError(f"this session shares no specification of its scene: {why}")
-        merging = merged(newest.patches, ops)
+        merging = merge_patches(newest.patches, ops)
         if len(merging) > MAX_PATCHES:
             raise SceneError(
                 f"{len(merging)} operations since the scene was loaded, at most {MAX_PATCHES}, of which those on one "
                 "visual count once: load the scene anew"
             )
         info = msgspec.structs.replace(newest.info, patches=newest.info.patches + 1)
-        return _store_spec(self._store, patched(newest.spec, ops), info, merging)._replace(notes=newest.notes)
+        return _store_spec(self._store, apply_patch(newest.spec, ops), info, merging)._replace(notes=newest.notes)
 
     def show(self, shown: Shown) -> SceneInfo:
         """Make a scene the newest. Its files are held, and those of the one before, which the front still serves.
@@ -198,7 +198,7 @@ class _PatchedSpec(NamedTuple):
 
 
 def _store_spec(store: AssetStore, spec: SceneSpec, info: SceneInfo, patches: tuple[PatchOp, ...]) -> Shown:
-    named = asset_addresses(spec)
+    named = list_assets(spec)
     if missing := next((address for address in named if address not in store), ""):
         raise SceneError(f"asset {missing} is not in {store.root}: put it there (AssetStore.put) before it is shown")
     address = store.put(encode_scene(spec))

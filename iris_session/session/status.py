@@ -98,7 +98,7 @@ def make_session_status(
     now_ns = stepper.clock()
     lateness = {}
     if pacer is not None:
-        stats = pacer.stats(now_ns)
+        stats = pacer.get_stats(now_ns)
         lateness = {
             "ticks": stats.ticks,
             "late": stats.late,
@@ -156,7 +156,7 @@ class StatusReporter:
         """Return the session now; fields of the front keep their defaults."""
         now_ns = stepper.clock()
         pacer, times = self.pacer, self.times
-        stats = None if pacer is None else pacer.stats(now_ns)
+        stats = None if pacer is None else pacer.get_stats(now_ns)
         if times is not None and stats is not None:
             times.mark(stats)
         last, core = stepper.last, stepper.core

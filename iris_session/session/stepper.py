@@ -328,7 +328,7 @@ class Stepper:
         """
         assert self.last is not None
         decision, world = self.last.decision, self.core.world
-        world.poses(self._poses)
+        world.read_poses(self._poses)
         applied = tuple(s.applied for s in self.last.status if s.applied is not None)
         tick, sim_time = world.view().tick, world.view().sim_time
         shown_ns = end_ns if shown_ns < 0 else shown_ns

@@ -144,7 +144,7 @@ class UserLoop:
         went_back = self._detect_reset()
         good = self._read_plant()
         if good and not self._was_reset:  # the epoch of a state after a reset is that of the next step
-            self._stepper.core.world.set_state_bytes(self._plant)
+            self._stepper.core.world.restore_state(self._plant)
             self._stepper.publish(self._stepper.clock())
         self._processes.supervise(self._stepper)
         return good and went_back

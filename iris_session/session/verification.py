@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from iris_session.physics import model_from_bytes
+from iris_session.physics import decode_model
 from iris_session.protocol.entries import Entry
 from iris_session.recording import Keyframe, SessionHeader, VerifyReport, unpack_model, verify
 from iris_session.recording.environment import use_one_blas_thread
@@ -21,8 +21,8 @@ class ReplayCore:
     def __init__(self, header: SessionHeader, models: Models) -> None:
         use_one_blas_thread()
         config = msgspec.msgpack.decode(header.config, type=CoreConfig)
-        model = model_from_bytes(unpack_model(header.model))
-        self.core = SessionCore(model, config, lambda model_hash: model_from_bytes(models(model_hash)))
+        model = decode_model(unpack_model(header.model))
+        self.core = SessionCore(model, config, lambda model_hash: decode_model(models(model_hash)))
 
     def step(self, now_ns: int, entries: Sequence[Entry], n_ticks: int, plant: bytes = b"") -> bytes:
         """Take one step and return its digest."""

@@ -136,7 +136,7 @@ def test_pair_shows_a_uri_that_holds_everything(lab: KeyHome, tmp_path: Path, ca
     address = Address.parse(told["uri"])
     assert (address.host, address.port, address.session) == ("10.0.0.5", 7731, "lab-1")
     assert address.server_key == lab.load_server_key().public
-    assert pairing.normal_code(told["code"]) == address.join_code
+    assert pairing.normalise_code(told["code"]) == address.join_code
     assert told["addresses"] == ["10.0.0.5:7731", "[fd00::5]:7731"]
     assert 60 < told["expires"] - time.time() <= 120
     picture = cv2.imread(str(png))  # of some random codes one of OpenCV's two finders sees no corners
@@ -217,7 +217,7 @@ def test_pair_waits_and_says_who_came(
         while not lab.join_codes.list_open(server.fingerprint):
             time.sleep(0.01)
         (made,) = [one for one in lab.join_codes.read() if one.secret]
-        proof = pairing.client_proof(made.secret, server.raw_public, ann.raw_public)
+        proof = pairing.make_client_proof(made.secret, server.raw_public, ann.raw_public)
         with nullcontext() if not full else pytest.raises(KeysError):
             lab.join_codes.redeem(server.raw_public, ann.public, proof, "ann", lab.clients)
 

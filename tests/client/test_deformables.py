@@ -13,7 +13,7 @@ import pytest
 from iris_session.client import Client
 from iris_session.client.deformables import FIRST_PAUSE_S, MAX_ASSET_BYTES, Deformables, _Mesh, deformable_keys
 from iris_session.protocol.names import ArrayKind, MediaEncoding
-from iris_session.protocol.scene import Deformable, SceneSpec, asset_addresses, encode_scene
+from iris_session.protocol.scene import Deformable, SceneSpec, encode_scene, list_assets
 from iris_session.scene import AssetDecodeError, AssetStore
 from iris_session.scene.arrays import StoredArray, decode_arrays, encode_arrays
 from iris_session.scene.mujoco_scene import parse_mujoco
@@ -40,7 +40,7 @@ class Shared:
         """Address of a specification with these, and all that it needs."""
         spec: SceneSpec = msgspec.structs.replace(self.spec, deformables=tuple(parts), name=name)
         address = self.store.put(encode_scene(spec))
-        return address, (address, *asset_addresses(spec))
+        return address, (address, *list_assets(spec))
 
     def rest(self, part: Deformable) -> tuple[DeformableEncoder, np.ndarray]:
         """Encoder of one, and its vertices at rest."""

@@ -213,7 +213,7 @@ def test_a_session_where_many_pair_at_once_is_asked_again(monkeypatch: pytest.Mo
     session.curve_server = True
     session.curve_publickey, session.curve_secretkey = server.public.encode(), server.secret.encode()
     port = session.bind_to_random_port("tcp://127.0.0.1")
-    proof = pairing.server_proof(pairing.stretch(code, server.raw_public), server.raw_public, own.raw_public)
+    proof = pairing.make_server_proof(pairing.stretch_code(code, server.raw_public), server.raw_public, own.raw_public)
     busy, yes = Refused(RefusalCode.RATE, "many pair at once", "try again in a second"), Paired(proof)
     asked: list[bytes] = []
 

@@ -76,7 +76,7 @@ def test_open_enumerations_are_explained_whole() -> None:
     document = (ROOT / "docs/protocol.md").read_text()
     alarms = " ".join(document.split("#### AlarmKind\n")[1].split("\n#### ")[0].split())
     for text in (
-        "`changed`: an anchor is seen",
+        "`changed`: an anchor is",
         "`differs`: and elsewhere",
         "`jump`: the tracking frame moved at once",
     ):

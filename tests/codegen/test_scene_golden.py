@@ -20,10 +20,10 @@ from iris_session.protocol.scene import (
     PatchOp,
     SceneError,
     SceneSpec,
+    apply_patch,
     check_scene,
     decode_scene,
     encode_scene,
-    patched,
 )
 from tests.codegen.test_interop import reordered, same, unpack
 
@@ -67,7 +67,7 @@ def test_patches_lead_to_the_scene_that_they_say(row: dict[str, Any]) -> None:
     assert same(unpack(data), row["value"])
     assert msgspec.msgpack.encode(ops) == data
     before = decode_scene(bytes.fromhex(SCENES[row["before"]]["hex"]))
-    after = encode_scene(patched(before, ops))
+    after = encode_scene(apply_patch(before, ops))
     assert hashlib.sha256(after).hexdigest() == row["after"]
     changes_nothing = row["name"] != "every operation"
     assert (row["after"] == SCENES[row["before"]]["address"]) == changes_nothing

@@ -12,7 +12,7 @@ import numpy as np
 
 from anchors.pose import PoseTuple, Quat, Vec3, quat_angle
 from iris_session.control import ControlConfig, Controller
-from iris_session.control.arm_model import site_pose
+from iris_session.control.arm_model import read_site_pose
 from iris_session.protocol.common import Pose
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import Command, CommandSource, Decision, FixedView, ObjectCommand
@@ -159,10 +159,10 @@ class Rig:
 
     def tip(self, robot: int = 0) -> PoseTuple:
         """Measured `T_world_tip`."""
-        return site_pose(self.data, self.model.site(self.robots[robot].site).id)
+        return read_site_pose(self.data, self.model.site(self.robots[robot].site).id)
 
     def target(self, robot: int = 0) -> PoseTuple:
-        pose = self.controller.targets()[self.robots[robot].name]
+        pose = self.controller.get_targets()[self.robots[robot].name]
         return (pose.p, pose.q)
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from anchors.pose import compose
 from iris_session.control import ControlError
-from iris_session.control.arm_model import ArmModel, moving_base, site_pose
+from iris_session.control.arm_model import ArmModel, has_moving_base, read_site_pose
 from iris_session.protocol.specs import RobotSpec
 from tests.control.rigs import aloha_model, aloha_robots, apart, iiwa_arms, iiwa_model, iiwa_spec
 
@@ -23,8 +23,8 @@ def check_fk(model: mujoco.MjModel, robot: RobotSpec) -> None:
         mujoco.mj_kinematics(model, data)
         x, y, z = data.xpos[arm.root_body].tolist()
         w, i, j, k = data.xquat[arm.root_body].tolist()
-        tip = compose(((x, y, z), (w, i, j, k)), arm.fk(q))
-        distance, angle = apart(tip, site_pose(data, arm.site_id))
+        tip = compose(((x, y, z), (w, i, j, k)), arm.forward_kinematics(q))
+        distance, angle = apart(tip, read_site_pose(data, arm.site_id))
         assert distance < 1e-12
         assert angle < 1e-6
 
@@ -67,9 +67,9 @@ def test_slides_and_reference_positions() -> None:
 
 def test_a_base_that_moves_is_seen() -> None:
     free = slider(base='<freejoint/><geom size=".1"/>')
-    assert moving_base(free, ArmModel(free, lift_robot("lift", "wrist")).root_body)
+    assert has_moving_base(free, ArmModel(free, lift_robot("lift", "wrist")).root_body)
     still = slider()
-    assert not moving_base(still, ArmModel(still, lift_robot("lift", "wrist")).root_body)
+    assert not has_moving_base(still, ArmModel(still, lift_robot("lift", "wrist")).root_body)
     check_fk(free, lift_robot("lift", "wrist"))
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from anchors.pose import quat_from_rotvec
 from iris_session.control import ControlConfig, ControlError, Controller
-from iris_session.control.arm_model import site_pose
+from iris_session.control.arm_model import read_site_pose
 from iris_session.protocol.common import Pose
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import Command, FixedView, ObjectCommand
@@ -90,14 +90,14 @@ def test_a_robot_without_a_command_or_sources_holds_and_unknown_robots_are_refus
 def test_steps_without_ticks_take_samples_but_move_nothing() -> None:
     rig = iiwa()
     drive(rig, rig.source((0.0, 0.0, 0.0)))
-    ctrl, applied = rig.data.ctrl.copy(), rig.controller.status()[0].applied
+    ctrl, applied = rig.data.ctrl.copy(), rig.controller.get_status()[0].applied
     last = rig.source((0.05, 0.0, 0.0))
     for source in (rig.source((0.02, 0.0, 0.0)), last, old(last)):
         rig.step(decision([pose_command("iiwa", source)]), n_ticks=0)
     assert (rig.data.ctrl == ctrl).all()
-    assert rig.controller.status()[0].applied is applied
+    assert rig.controller.get_status()[0].applied is applied
     rig.step(decision([pose_command("iiwa", old(last))]), n_ticks=3)
-    now = rig.controller.status()[0].applied
+    now = rig.controller.get_status()[0].applied
     assert now is not None
     assert (now.seq, now.step_ns) == (last.seq, rig.steps * 2_000_000)
 
@@ -106,9 +106,9 @@ def test_an_engagement_during_a_pause_is_applied_with_the_first_tick() -> None:
     rig = iiwa()
     source = rig.source((0.0, 0.0, 0.0))
     rig.step(decision([pose_command("iiwa", source)]), n_ticks=0)
-    assert rig.controller.status()[0].applied is None
+    assert rig.controller.get_status()[0].applied is None
     rig.step(decision([pose_command("iiwa", old(source))]))
-    applied = rig.controller.status()[0].applied
+    applied = rig.controller.get_status()[0].applied
     assert applied is not None
     assert applied.seq == source.seq
 
@@ -156,7 +156,7 @@ def test_a_twist_target_does_not_run_away_from_an_arm_that_cannot_follow() -> No
         rig.step(decision([command]))
     state = rig.controller._states[0]
     assert state.latch is not None
-    assert apart(rig.controller._reach.tip(0, state), state.latch.target)[0] <= 0.05 + 1e-9
+    assert apart(rig.controller._ik.compute_tip(0, state), state.latch.target)[0] <= 0.05 + 1e-9
     # A zero twist ends it, and the opposite one works at once.
     back = twist(rig, (-0.2, 0.0, 0.0, 0.0, 0.0, 0.0))
     where = rig.tip()[0][0]
@@ -175,7 +175,7 @@ def test_an_absolute_target_is_reached_at_bounded_speed_from_one_sample() -> Non
     drive(rig, old(rig.source(*goal, absolute=True, device="target")), steps=150)
     assert 0.02 < rig.target()[0][1] - start[0][1] < 0.3 * 0.25 + 0.02
     drive(rig, old(rig.source(*goal, absolute=True, device="target")), steps=1000)
-    assert apart(rig.controller._reach.tip(0, rig.controller._states[0]), goal)[0] < 3e-5
+    assert apart(rig.controller._ik.compute_tip(0, rig.controller._states[0]), goal)[0] < 3e-5
 
 
 def test_sharing_blends_and_nobody_joining_or_leaving_moves_the_robot() -> None:
@@ -254,7 +254,7 @@ def test_the_workspace_is_kept_and_reported() -> None:
     for _ in range(60):
         drive(rig, rig.source((0.0, 0.0, -0.3)), steps=7)
     assert rig.target()[0][2] == pytest.approx(tip[2] - 0.02)
-    assert rig.controller.status()[0].limits == ("workspace",)
+    assert rig.controller.get_status()[0].limits == ("workspace",)
 
 
 def test_a_robot_that_cannot_get_where_it_is_commanded_is_reported() -> None:
@@ -264,9 +264,9 @@ def test_a_robot_that_cannot_get_where_it_is_commanded_is_reported() -> None:
     mujoco.mj_forward(rig.model, rig.data)
     for _ in range(5):
         rig.controller.tick(rig.data)
-    assert rig.controller.status()[0].limits == ("tracking",)
+    assert rig.controller.get_status()[0].limits == ("tracking",)
     rig.hold(2000)
-    assert rig.controller.status()[0].limits == ()
+    assert rig.controller.get_status()[0].limits == ()
 
 
 def test_reset_forgets_everything() -> None:
@@ -290,7 +290,7 @@ def test_reset_forgets_everything() -> None:
     rig.controller.reset(rig.data)
     fresh = Rig(rig.model, [iiwa_spec()], objects=[ObjectSpec("box", "box")])
     assert rig.controller.snapshot() == fresh.controller.snapshot()
-    assert rig.controller.status()[0].applied is None
+    assert rig.controller.get_status()[0].applied is None
 
 
 def test_a_robot_on_a_moving_base_reaches_world_targets() -> None:
@@ -308,7 +308,7 @@ def test_a_robot_on_a_moving_base_reaches_world_targets() -> None:
         rig.step(decision([pose_command("iiwa", rig.source(*goal, absolute=True, new=k % 7 == 0))]))
     state = rig.controller._states[0]
     assert state.T_world_root[0][0] == pytest.approx(0.139, abs=2e-3)
-    assert apart(rig.controller._reach.tip(0, state), goal)[0] < 5e-3  # follows at 0.1 m/s
+    assert apart(rig.controller._ik.compute_tip(0, state), goal)[0] < 5e-3  # follows at 0.1 m/s
 
 
 def test_targets_without_ik_move_at_bounded_speed_and_need_no_mink(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -324,7 +324,7 @@ def test_targets_without_ik_move_at_bounded_speed_and_need_no_mink(monkeypatch: 
     drive(rig, rig.source((0.0, 0.3, 0.0), quat_from_rotvec((0.0, 0.0, 0.2))), steps=100)
     assert rig.target()[0][1] - start[0][1] == pytest.approx(0.3)
     assert apart(start, rig.target())[1] == pytest.approx(math.degrees(0.2))
-    applied = rig.controller.status()[0].applied
+    applied = rig.controller.get_status()[0].applied
     assert applied is not None
     assert applied.seq == rig.seq
     held = rig.target()
@@ -341,7 +341,7 @@ def test_targets_without_ik_move_at_bounded_speed_and_need_no_mink(monkeypatch: 
     data = mujoco.MjData(rig.model)
     data.qpos[:] = q
     mujoco.mj_kinematics(rig.model, data)
-    assert apart(site_pose(data, 0), rig.target())[0] < 1e-9
+    assert apart(read_site_pose(data, 0), rig.target())[0] < 1e-9
     assert (rig.data.ctrl == ctrl).all()
 
 
@@ -370,8 +370,8 @@ def test_no_robots_at_all() -> None:
     controller.reset(data)
     controller.begin(0, 1, decision([]), FixedView())
     controller.tick(data)
-    assert controller.status() == ()
-    assert controller.targets() == {}
+    assert controller.get_status() == ()
+    assert controller.get_targets() == {}
     controller.restore(controller.snapshot())
 
 

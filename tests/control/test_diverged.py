@@ -72,6 +72,6 @@ def test_an_object_that_is_nowhere_is_not_pushed() -> None:
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     grasps = Grasps(model, [ObjectSpec("box", "box")], ControlConfig())
-    grasps.command([ObjectCommand("box", 1, Pose((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0)))])
+    grasps.set_goals([ObjectCommand("box", 1, Pose((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0)))])
     grasps.tick(data)
     assert not data.xfrc_applied.any()

@@ -46,7 +46,7 @@ def to(
 def test_it_follows_and_stays_there_whatever_its_mass(mass: float) -> None:
     model, data, grasps = scene(mass)
     turn = quat_from_rotvec((0.2, -0.4, 0.7))
-    grasps.command(to("box", (0.1, 0.2, 1.3), turn))
+    grasps.set_goals(to("box", (0.1, 0.2, 1.3), turn))
     run(model, data, grasps, 1500)
     assert data.body("box").xpos == pytest.approx((0.1, 0.2, 1.3), abs=1e-5)
     assert abs(float(np.dot(data.body("box").xquat, turn))) == pytest.approx(1.0, abs=1e-9)
@@ -63,7 +63,7 @@ def test_an_object_of_several_parts_is_carried_as_a_whole() -> None:
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     grasps = Grasps(model, OBJECTS, ControlConfig())
-    grasps.command(to("box", (0.0, 0.0, 1.2)))
+    grasps.set_goals(to("box", (0.0, 0.0, 1.2)))
     run(model, data, grasps, 2000)
     assert data.xfrc_applied[1][2] == pytest.approx(0.8 * 9.81, rel=1e-3)
     # The hinge gives under the jaw's weight by 0.3 degrees, and the whole is at its place.
@@ -73,17 +73,17 @@ def test_an_object_of_several_parts_is_carried_as_a_whole() -> None:
 
 def test_the_first_tick_at_its_own_pose_only_carries_the_weight() -> None:
     _, data, grasps = scene()
-    grasps.command(to("box", (0.0, 0.0, 1.0)))
+    grasps.set_goals(to("box", (0.0, 0.0, 1.0)))
     grasps.tick(data)
     assert data.body("box").xfrc_applied == pytest.approx((0, 0, 0.5 * 9.81, 0, 0, 0), abs=1e-9)
-    grasps.command(to("ball", (2.0, 0.0, 1.0)))
+    grasps.set_goals(to("ball", (2.0, 0.0, 1.0)))
     grasps.tick(data)
     assert not data.body("ball").xfrc_applied.any()  # the model carries this one itself
 
 
 def test_force_and_torque_are_bounded() -> None:
     model, data, grasps = scene(wall=0.3)
-    grasps.command(to("box", (5.0, 0.0, 1.0), quat_from_rotvec((0.0, 0.0, math.pi - 0.1))))
+    grasps.set_goals(to("box", (5.0, 0.0, 1.0), quat_from_rotvec((0.0, 0.0, math.pi - 0.1))))
     worst = np.zeros(2)
     for _ in range(1000):
         run(model, data, grasps, 1)
@@ -97,14 +97,14 @@ def test_force_and_torque_are_bounded() -> None:
 def test_let_go_clears_the_wrench_once_and_leaves_others_alone() -> None:
     model, data, grasps = scene()
     data.body("ball").xfrc_applied[:] = 7.0
-    grasps.command(to("box", (0.0, 0.0, 1.2)))
+    grasps.set_goals(to("box", (0.0, 0.0, 1.2)))
     run(model, data, grasps, 5)
     assert data.body("box").xfrc_applied.any()
-    grasps.command([])
+    grasps.set_goals([])
     grasps.tick(data)
     assert not data.body("box").xfrc_applied.any()
     data.body("box").xfrc_applied[2] = 3.0  # the user's own
-    grasps.command([])
+    grasps.set_goals([])
     grasps.tick(data)
     assert data.body("box").xfrc_applied[2] == 3.0
     assert (data.body("ball").xfrc_applied == 7.0).all()
@@ -112,7 +112,7 @@ def test_let_go_clears_the_wrench_once_and_leaves_others_alone() -> None:
 
 def test_reset_lets_go() -> None:
     _, data, grasps = scene()
-    grasps.command(to("box", (0.0, 0.0, 1.2)))
+    grasps.set_goals(to("box", (0.0, 0.0, 1.2)))
     grasps.tick(data)
     grasps.reset(data)
     assert not data.body("box").xfrc_applied.any()
@@ -121,7 +121,7 @@ def test_reset_lets_go() -> None:
 def test_unknown_and_fixed_objects_are_refused() -> None:
     model, _, grasps = scene()
     with pytest.raises(ControlError, match=r"object 'cup' is not known. Available objects: box, ball"):
-        grasps.command(to("cup", (0.0, 0.0, 0.0)))
+        grasps.set_goals(to("cup", (0.0, 0.0, 0.0)))
     with pytest.raises(ControlError, match="body 'wall' must have a free joint"):
         Grasps(model, [ObjectSpec("wall", "wall")], ControlConfig())
     with pytest.raises(ControlError, match="body 'cup' does not exist"):

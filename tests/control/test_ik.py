@@ -9,10 +9,24 @@ import msgspec
 import numpy as np
 import pytest
 
+from anchors.pose import Vec3, quat_from_rotvec
 from iris_session.control import ControlConfig
 from iris_session.control.arm_model import ArmModel
 from iris_session.control.ik import IkSolver, require_solver
-from tests.control.rigs import IIWA_HOME, aloha_model, aloha_robots, apart, iiwa_model, iiwa_spec
+from tests.control.rigs import (
+    IIWA_HOME,
+    Rig,
+    aloha_model,
+    aloha_robots,
+    apart,
+    decision,
+    hold_command,
+    iiwa_arms,
+    iiwa_model,
+    iiwa_spec,
+    old,
+    pose_command,
+)
 
 FREE = np.full(7, 0.1)
 
@@ -21,11 +35,11 @@ def test_reachable_poses_converge_to_within_a_hair() -> None:
     arm = ArmModel(iiwa_model(), iiwa_spec())
     solver, rng, rest = IkSolver(arm, ControlConfig()), np.random.default_rng(3), np.array(IIWA_HOME)
     for _ in range(20):
-        goal = arm.fk(rest + rng.uniform(-0.3, 0.3, 7))
+        goal = arm.forward_kinematics(rest + rng.uniform(-0.3, 0.3, 7))
         q = rest.copy()
         for _ in range(25):
             q = solver.step(q, rest, goal, -FREE, FREE).q
-        distance, angle = apart(arm.fk(q), goal)
+        distance, angle = apart(arm.forward_kinematics(q), goal)
         assert distance < 1e-4
         assert angle < 0.02
 
@@ -35,7 +49,7 @@ def test_joints_in_another_order_than_the_chains_give_the_same_motion() -> None:
     turned = msgspec.structs.replace(robot, joints=robot.joints[3:] + robot.joints[:3])
     arm, other = ArmModel(iiwa_model(), robot), ArmModel(iiwa_model(), turned)
     home = np.array(IIWA_HOME)
-    q, rest, goal = home + 0.1, home - 0.05, arm.fk(home + np.linspace(-0.1, 0.2, 7))
+    q, rest, goal = home + 0.1, home - 0.05, arm.forward_kinematics(home + np.linspace(-0.1, 0.2, 7))
     lower, upper = np.linspace(-0.01, -0.07, 7), np.linspace(0.08, 0.02, 7)
     direct = IkSolver(arm, ControlConfig()).step(q, rest, goal, lower, upper).q
     order = [3, 4, 5, 6, 0, 1, 2]
@@ -58,7 +72,7 @@ def test_bounds_hold_in_every_joint_and_order() -> None:
 def test_result_depends_on_the_arguments_alone() -> None:
     arm, home = ArmModel(iiwa_model(), iiwa_spec()), np.array(IIWA_HOME)
     used, fresh = IkSolver(arm, ControlConfig()), IkSolver(arm, ControlConfig())
-    goal = arm.fk(home + 0.2)
+    goal = arm.forward_kinematics(home + 0.2)
     for k in range(10):
         used.step(home + 0.1 * k, home, goal, -FREE, FREE)
     a, b = used.step(home, home, goal, -FREE, FREE).q, fresh.step(home, home, goal, -FREE, FREE).q
@@ -69,13 +83,13 @@ def test_a_stretched_arm_is_reported_as_singular() -> None:
     arm = ArmModel(iiwa_model(), iiwa_spec())
     solver, home = IkSolver(arm, ControlConfig()), np.array(IIWA_HOME)
     straight = np.zeros(7)
-    assert solver.step(straight, straight, arm.fk(straight), -FREE, FREE).singular
-    assert not solver.step(home, home, arm.fk(home), -FREE, FREE).singular
+    assert solver.step(straight, straight, arm.forward_kinematics(straight), -FREE, FREE).singular
+    assert not solver.step(home, home, arm.forward_kinematics(home), -FREE, FREE).singular
 
 
 def test_a_program_without_solution_leaves_the_joints() -> None:
     arm, home = ArmModel(iiwa_model(), iiwa_spec()), np.array(IIWA_HOME)
-    step = IkSolver(arm, ControlConfig()).step(home, home, arm.fk(home + 0.1), FREE, -FREE)
+    step = IkSolver(arm, ControlConfig()).step(home, home, arm.forward_kinematics(home + 0.1), FREE, -FREE)
     assert (step.q == home).all()
     assert step.singular
 
@@ -92,3 +106,192 @@ def test_the_missing_extra_is_named_in_one_line(monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(ImportError, match=r"mink is missing.*iris-session\[control\]") as missing:
         require_solver()
     assert "\n" not in str(missing.value)
+
+
+# --- solving at its rates ---
+
+
+def rig(config: ControlConfig | None = None) -> Rig:
+    made = Rig(iiwa_model(), [iiwa_spec()], config, home=IIWA_HOME)
+    made.hold(5)
+    return made
+
+
+def count_solves(made: Rig) -> list[tuple[int, int]]:
+    """Records (tick, robot) of every solve from now on."""
+    solves: list[tuple[int, int]] = []
+    solve = made.controller._ik.solve
+
+    def counted(i, r, state, tick):  # type: ignore[no-untyped-def]
+        solves.append((tick, i))
+        solve(i, r, state, tick)
+
+    made.controller._ik.solve = counted  # type: ignore[method-assign]
+    return solves
+
+
+def test_one_far_sample_converges_over_several_solves_at_bounded_speed() -> None:
+    made = rig()
+    start = made.target()
+    first, far = made.source((0.0, 0.0, 0.0)), made.source((0.05, 0.25, -0.1))
+    made.step(decision([pose_command("iiwa", first)]))
+    solves = count_solves(made)
+    previous, fastest = made.data.ctrl.copy(), 0.0
+    for k in range(600):
+        made.step(decision([pose_command("iiwa", far if k == 0 else old(far))]))
+        fastest = max(fastest, float(np.abs(made.data.ctrl - previous).max()) / 0.002)
+        previous = made.data.ctrl.copy()
+    goal = ((start[0][0] + 0.05, start[0][1] + 0.25, start[0][2] - 0.1), start[1])
+    reached = made.controller._ik.compute_tip(0, made.controller._states[0])
+    assert apart(reached, goal)[0] < 3e-5
+    assert apart(made.target(), goal)[0] < 1e-12
+    assert 1.0 < fastest <= 2.5 + 1e-6
+    assert 8 < len(solves) < 60  # and then it stopped
+    assert made.controller.get_status()[0].limits == ()
+
+
+def test_solves_are_at_most_100_hz_per_robot_and_two_a_tick_and_all_robots_get_theirs() -> None:
+    model, robots = iiwa_arms([(1.5 * (i % 4), 1.5 * (i // 4), 0.0) for i in range(8)])
+    made = Rig(model, robots, home=IIWA_HOME)
+    solves = count_solves(made)
+    for k in range(400):  # a new sample of everybody in every step: five times as many as may be solved
+        x = 0.1 * np.sin(0.01 * k)
+        made.step(decision(pose_command(r.name, made.source((x, 0.0, 0.0))) for r in robots))
+    ticks = np.array([t for t, _ in solves])
+    assert np.bincount(ticks).max() == 2
+    assert np.bincount(ticks)[::5].max() <= 1  # ticks in which distances between robots are checked too
+    for i in range(8):
+        own = np.array([t for t, robot in solves if robot == i])
+        assert np.diff(own).min() >= 5  # 10 ms
+        assert np.diff(own).max() <= 6
+        assert len(own) > 70
+
+
+def test_crowded_steps_solve_less_and_starve_nobody_if_all_of_them_are() -> None:
+    model, robots = iiwa_arms([(1.5 * (i % 4), 1.5 * (i // 4), 0.0) for i in range(8)])
+    made = Rig(model, robots, home=IIWA_HOME)
+    solves = count_solves(made)
+    tick = made.controller.tick
+    made.controller.tick = lambda data: tick(data, crowded=True)  # type: ignore[method-assign,assignment,misc]
+    for k in range(400):
+        x = 0.1 * np.sin(0.01 * k)
+        made.step(decision(pose_command(r.name, made.source((x, 0.0, 0.0))) for r in robots))
+    assert np.bincount([t for t, _ in solves]).max() == 1
+    for i in range(8):
+        assert np.diff([t for t, robot in solves if robot == i]).max() <= 8  # 62 Hz
+
+
+@pytest.mark.parametrize(("n", "tick_s", "interval_ticks"), [(3, 0.01, 1), (4, 0.005, 2), (12, 0.002, 5)])
+def test_long_ticks_and_many_robots_starve_nobody(n: int, tick_s: float, interval_ticks: int) -> None:
+    """A robot that is solved less often than its device sends moves slower than its hand."""
+    model, robots = iiwa_arms([(1.5 * (i % 4), 1.5 * (i // 4), 0.0) for i in range(n)])
+    model.opt.timestep = tick_s
+    made = Rig(model, robots, home=IIWA_HOME)
+    solves = count_solves(made)
+    for k in range(40):
+        made.step(decision(pose_command(r.name, made.source((0.001 * k, 0.0, 0.0))) for r in robots))
+    assert np.bincount([t for t, _ in solves]).max() <= 3
+    for i in range(n):
+        own = [t for t, robot in solves if robot == i]
+        assert np.diff(own)[1:].max() <= interval_ticks + 1
+        assert np.diff(own)[1:].mean() < interval_ticks + 0.2
+
+
+def test_a_new_sample_is_solved_in_its_own_tick() -> None:
+    made = rig()
+    made.step(decision([pose_command("iiwa", made.source((0.0, 0.0, 0.0)))]))
+    for k in range(1, 100):
+        source = made.source((0.001 * k, 0.0, 0.0), new=True)
+        made.step(decision([pose_command("iiwa", source)]))
+        applied = made.controller.get_status()[0].applied
+        assert applied is not None
+        assert (applied.seq, applied.step_ns) == (source.seq, made.steps * 2_000_000)
+        assert (applied.robot, applied.participant, applied.device) == ("iiwa", "p1", "controller/right")
+        for _ in range(6):
+            made.step(decision([pose_command("iiwa", old(source))]))
+        assert made.controller.get_status()[0].applied is applied
+
+
+def test_out_of_reach_is_reported_and_solving_ends_until_the_hand_comes_back() -> None:
+    made = rig()
+    far = [made.source((0.0, 0.0, 0.0)), made.source((3.0, 0.0, 0.0))]
+    made.step(decision([pose_command("iiwa", far[0])]))
+    made.step(decision([pose_command("iiwa", far[1])]))
+    for _ in range(1500):
+        made.step(decision([pose_command("iiwa", old(far[1]))]))
+    limits = made.controller.get_status()[0].limits
+    assert "reach" in limits
+    solves = count_solves(made)
+    for _ in range(100):
+        made.step(decision([pose_command("iiwa", old(far[1]))]))
+    assert solves == []
+    back = made.source((0.0, 0.0, 0.0))
+    made.step(decision([pose_command("iiwa", back)]))
+    for _ in range(1500):
+        made.step(decision([pose_command("iiwa", old(back))]))
+    assert "reach" not in made.controller.get_status()[0].limits
+    made.step(decision([hold_command("iiwa")]))
+    assert made.controller.get_status()[0].limits == ()
+
+
+def test_out_of_reach_is_reported_while_samples_flow_and_a_fast_hand_is_not() -> None:
+    made = rig()
+    for k in range(1500):
+        x = 0.1 * np.sin(0.012 * k)  # up to 0.6 m/s
+        made.step(decision([pose_command("iiwa", made.source((x, 0.0, 0.0), new=k % 7 == 0))]))
+        assert "reach" not in made.controller.get_status()[0].limits
+    for k in range(1000):
+        x = min(0.002 * k, 1.5)
+        made.step(decision([pose_command("iiwa", made.source((x, 0.0, 0.0), new=k % 7 == 0))]))
+    assert "reach" in made.controller.get_status()[0].limits
+
+
+@pytest.mark.parametrize(
+    ("aim", "turn", "expected"),
+    [
+        ((-0.3, 0.0, -0.9), (0.0, 0.0, 3.0), {"joint2", "joint4"}),
+        ((-0.5, 0.0, 0.1), (0.0, 2.0, 0.0), {"joint4", "joint6"}),
+        ((-0.9, -0.4, 0.3), (0.0, 0.0, 0.0), {"joint6"}),
+    ],
+)
+def test_joint_limits_hold_and_are_named(aim: Vec3, turn: Vec3, expected: set[str]) -> None:
+    made = rig()
+    made.step(decision([pose_command("iiwa", made.source((0.0, 0.0, 0.0)))]))
+    far, named = made.source(aim, quat_from_rotvec(turn)), set()
+    for k in range(1000):
+        made.step(decision([pose_command("iiwa", far if k == 0 else old(far))]))
+        named |= {name for name in made.controller.get_status()[0].limits if name.startswith("joint")}
+        q = made.controller._joints.q
+        assert (q >= made.model.jnt_range[:, 0] - 1e-9).all()
+        assert (q <= made.model.jnt_range[:, 1] + 1e-9).all()
+    assert named >= expected
+
+
+def test_while_samples_flow_there_is_one_solve_for_each() -> None:
+    made = rig()
+    solves = count_solves(made)
+    for k in range(700):
+        made.step(decision([pose_command("iiwa", made.source((0.0, 0.001 * (k // 7), 0.0), new=k % 7 == 0))]))
+    assert len(solves) == 99  # the first of 100 samples latches
+
+
+def test_a_robot_that_starts_outside_its_range_is_not_thrown_back() -> None:
+    made = Rig(iiwa_model(), [iiwa_spec()], home=(0.0, 0.3, 0.0, -2.2, 0.0, 1.2, 0.0))  # joint4 ends at -2.0944
+    made.hold(3)
+    source = made.source((0.0, 0.0, 0.0))
+    made.step(decision([pose_command("iiwa", source)]))
+    before = made.data.ctrl.copy()
+    made.step(decision([pose_command("iiwa", made.source((0.0, 0.0, 0.001)))]))
+    assert np.abs(made.data.ctrl - before).max() < 2.5 * 0.002
+    assert "joint4" in made.controller.get_status()[0].limits
+
+
+@pytest.mark.parametrize("timestep", [0.001, 0.005, 0.02])
+def test_other_timesteps_track_too(timestep: float) -> None:
+    made = Rig(iiwa_model(timestep=timestep), [iiwa_spec()], home=IIWA_HOME)
+    made.step(decision([pose_command("iiwa", made.source((0.0, 0.0, 0.0)))]))
+    start = made.target()
+    for _ in range(round(2.0 / timestep)):
+        made.step(decision([pose_command("iiwa", made.source((0.0, 0.1, 0.0)))]))
+    assert np.subtract(made.target()[0], start[0]) == pytest.approx((0.0, 0.1, 0.0), abs=1e-9)
+    assert apart(made.controller._ik.compute_tip(0, made.controller._states[0]), made.target())[0] < 5e-5

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from iris_session.control import ControlConfig, ControlError
 from iris_session.control.arm_model import ArmModel
-from iris_session.control.interpolate import JointInterpolator, speed_limits
+from iris_session.control.interpolate import JointInterpolator, read_speed_limits
 from tests.control.rigs import iiwa_model, iiwa_spec
 
 DT = 0.002
@@ -43,7 +43,7 @@ def test_limits_hold_for_any_goals(
         q, v = joints.q.copy(), now
 
     for goal in sequence:
-        joints.aim(ALL, np.array(goal), every * DT)
+        joints.set_goal(ALL, np.array(goal), every * DT)
         for _ in range(every):
             tick()
     if stop:
@@ -64,7 +64,7 @@ def test_limits_hold_for_any_goals(
 def test_regular_goals_give_even_motion() -> None:
     joints, speeds = make(acceleration=60.0), []
     for sample in range(1, 80):
-        joints.aim(ALL, np.full(3, 0.8 * sample * 7 * DT), 7 * DT)
+        joints.set_goal(ALL, np.full(3, 0.8 * sample * 7 * DT), 7 * DT)
         for _ in range(7):
             joints.advance()
             speeds.append(joints.v[0])
@@ -75,20 +75,20 @@ def test_regular_goals_give_even_motion() -> None:
 
 def test_at_rest_nothing_changes() -> None:
     joints = make()
-    joints.aim(ALL, np.full(3, 0.01), 0.014)
+    joints.set_goal(ALL, np.full(3, 0.01), 0.014)
     while joints.moving:
         joints.advance()
-    before = joints.state()
+    before = joints.save_state()
     joints.advance()
-    assert joints.state() == before
+    assert joints.save_state() == before
 
 
 def test_a_stop_while_standing_or_moving_away_stays_near() -> None:
     joints = make()
-    joints.aim(ALL, np.array([0.5, 0.5, 0.0]), 0.014)
+    joints.set_goal(ALL, np.array([0.5, 0.5, 0.0]), 0.014)
     for _ in range(10):
         joints.advance()
-    joints.aim(ALL, np.array([0.5, -0.5, 0.3]), 0.014)  # 0 goes on, 1 must turn round, 2 stands still
+    joints.set_goal(ALL, np.array([0.5, -0.5, 0.3]), 0.014)  # 0 goes on, 1 must turn round, 2 stands still
     q, v = joints.q.copy(), joints.v.copy()
     joints.stop(ALL)
     assert joints.goal[2] == q[2]
@@ -99,8 +99,8 @@ def test_a_stop_while_standing_or_moving_away_stays_near() -> None:
 def test_speed_limits_by_name_and_by_kind() -> None:
     model, robot = iiwa_model(), iiwa_spec()
     config = ControlConfig(velocity_limits={"joint2": 0.7}, acceleration_limits={"joint7": 9.0})
-    velocity, acceleration = speed_limits(model, [robot], [ArmModel(model, robot)], config)
+    velocity, acceleration = read_speed_limits(model, [robot], [ArmModel(model, robot)], config)
     assert velocity.tolist() == [2.5, 0.7, 2.5, 2.5, 2.5, 2.5, 2.5]
     assert acceleration.tolist() == [40.0] * 6 + [9.0]
     with pytest.raises(ControlError, match=r"limit of joint 'elbow': no robot has it. Available joints: joint1"):
-        speed_limits(model, [robot], [ArmModel(model, robot)], ControlConfig(velocity_limits={"elbow": 1.0}))
+        read_speed_limits(model, [robot], [ArmModel(model, robot)], ControlConfig(velocity_limits={"elbow": 1.0}))

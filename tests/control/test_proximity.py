@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from iris_session.control import ControlConfig, Controller
-from iris_session.control.proximity import Proximity
+from iris_session.control.proximity import ProximityLimiter
 from iris_session.protocol.specs import RobotSpec
 from iris_session.protocol.steps import Command
 from tests.control.rigs import IIWA_HOME, Rig, decision, iiwa_arms, pose_command
@@ -18,7 +18,7 @@ from tests.control.rigs import IIWA_HOME, Rig, decision, iiwa_arms, pose_command
 FACING = ([(0.0, 0.0, 0.0), (1.3, 0.0, 0.0)], [0.0, math.pi])
 
 
-def gap(rig: Rig, proximity: Proximity) -> float:
+def gap(rig: Rig, proximity: ProximityLimiter) -> float:
     a, b = proximity._geoms
     distance = mujoco.mj_geomDistance
     return min(distance(rig.model, rig.data, int(i), int(j), 1.0, None) for i in a for j in b)
@@ -32,14 +32,14 @@ def push(rig: Rig, towards: float, steps: int) -> list[tuple[tuple[str, ...], ..
         a = rig.source((x, 0.0, 0.0), new=k % 7 == 0)
         b = rig.source((-x, 0.0, 0.0), new=k % 7 == 0)
         rig.step(decision([pose_command("r0", a), pose_command("r1", b)]))
-        seen.append(tuple(s.limits for s in rig.controller.status()))
+        seen.append(tuple(s.limits for s in rig.controller.get_status()))
     return seen
 
 
 def test_closing_robots_are_slowed_and_stop_apart_and_retreat_freely() -> None:
     model, robots = iiwa_arms(*FACING)
     config = ControlConfig()
-    proximity = Proximity(model, robots, config)
+    proximity = ProximityLimiter(model, robots, config)
     rig = Rig(model, robots, config, home=IIWA_HOME)
     rig.hold(200)
     smallest = 1.0
@@ -52,7 +52,7 @@ def test_closing_robots_are_slowed_and_stop_apart_and_retreat_freely() -> None:
     rig.hold(200)
     # Hold lifts the report and stays apart.
     assert gap(rig, proximity) > 0.005
-    assert rig.controller.status()[0].limits == ()
+    assert rig.controller.get_status()[0].limits == ()
     away = push(rig, -0.15, 400)
     assert gap(rig, proximity) > 0.12
     assert not any("proximity" in limits for both in away[20:] for limits in both)
@@ -60,7 +60,7 @@ def test_closing_robots_are_slowed_and_stop_apart_and_retreat_freely() -> None:
 
 def lean(rig: Rig, steps: int) -> float:
     """Leader robots that send at 500 Hz lean both arms towards each other at 1 rad/s; returns the smallest gap."""
-    proximity, smallest = Proximity(rig.model, rig.robots, ControlConfig()), 1.0
+    proximity, smallest = ProximityLimiter(rig.model, rig.robots, ControlConfig()), 1.0
     for k in range(steps):
         q = np.add(IIWA_HOME, (0.0, min(0.002 * k, 0.7), 0.0, min(0.002 * k, 0.7), 0.0, 0.0, 0.0))
         rows = [rig.source((0.0, 0.0, 0.0), pose_world=None, q=tuple(q.tolist()), device="joints") for _ in range(2)]
@@ -75,7 +75,7 @@ def test_leaders_that_send_at_every_step_do_not_lift_the_bound() -> None:
     rig = Rig(model, robots, home=IIWA_HOME)
     rig.hold(200)
     assert 0.005 < lean(rig, 700) < 0.04
-    assert all("proximity" in status.limits for status in rig.controller.status())
+    assert all("proximity" in status.limits for status in rig.controller.get_status())
     free = Rig(model, robots, ControlConfig(proximity_margin=0.0), home=IIWA_HOME)
     free.hold(200)
     assert lean(free, 700) < 0.0, "without the bound they would have collided"
@@ -103,7 +103,7 @@ def test_without_the_margin_they_collide() -> None:
     rig = Rig(model, robots, ControlConfig(proximity_margin=0.0), home=IIWA_HOME)
     rig.hold(200)
     push(rig, 0.2, 600)
-    assert gap(rig, Proximity(model, robots, ControlConfig())) < 0.005
+    assert gap(rig, ProximityLimiter(model, robots, ControlConfig())) < 0.005
 
 
 def test_a_blocked_robots_solution_does_not_run_away_from_its_joints() -> None:
@@ -137,7 +137,9 @@ def sliders(apart: float, finger: float = 0.0) -> tuple[mujoco.MjModel, mujoco.M
 
 def factors(apart: float, va: float, vb: float, finger: float = 0.0) -> list[float]:
     model, data, robots = sliders(apart, finger)
-    return Proximity(model, robots, ControlConfig()).factors(data, [np.array([va]), np.array([vb]), np.array([0.0])])
+    return ProximityLimiter(model, robots, ControlConfig()).compute_speed_factors(
+        data, [np.array([va]), np.array([vb]), np.array([0.0])]
+    )
 
 
 @pytest.mark.parametrize(
@@ -161,10 +163,10 @@ def test_closing_speed_is_bounded_by_distance(apart: float, va: float, vb: float
 def test_fingers_are_exempt() -> None:
     assert factors(0.6, 1.0, 0.0, finger=0.48) == [1.0, 1.0, 1.0]
     model, _, robots = sliders(0.6, 0.48)
-    guarded = Proximity(model, [msgspec.structs.replace(r, finger_bodies=()) for r in robots], ControlConfig())
+    guarded = ProximityLimiter(model, [msgspec.structs.replace(r, finger_bodies=()) for r in robots], ControlConfig())
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    assert guarded.factors(data, [np.array([1.0]), np.array([0.0]), np.array([0.0])])[0] == 0.0
+    assert guarded.compute_speed_factors(data, [np.array([1.0]), np.array([0.0]), np.array([0.0])])[0] == 0.0
 
 
 def test_coincident_centres_give_no_direction_and_no_crash() -> None:
@@ -173,8 +175,8 @@ def test_coincident_centres_give_no_direction_and_no_crash() -> None:
 
 def test_nothing_to_check_for_one_robot_or_without_geoms() -> None:
     model, _, robots = sliders(0.5)
-    assert not Proximity(model, robots[:1], ControlConfig()).active
-    assert not Proximity(model, [robots[0], robots[2]], ControlConfig()).active
-    assert not Proximity(model, robots, ControlConfig(proximity_margin=0.0)).active
-    assert not Proximity(model, [], ControlConfig()).active
-    assert Proximity(model, robots, ControlConfig()).active
+    assert not ProximityLimiter(model, robots[:1], ControlConfig()).active
+    assert not ProximityLimiter(model, [robots[0], robots[2]], ControlConfig()).active
+    assert not ProximityLimiter(model, robots, ControlConfig(proximity_margin=0.0)).active
+    assert not ProximityLimiter(model, [], ControlConfig()).active
+    assert ProximityLimiter(model, robots, ControlConfig()).active

@@ -93,7 +93,7 @@ def play(rig: Rig, journal: list[tuple[Decision, int]], restart_every: int = 0) 
         rig.step(decision, n_ticks)
         state = np.empty(mujoco.mj_stateSize(rig.model, STATE))
         mujoco.mj_getState(rig.model, rig.data, state, STATE)
-        report = repr((rig.controller.status(), rig.controller.targets())).encode()
+        report = repr((rig.controller.get_status(), rig.controller.get_targets())).encode()
         seen.append(state.tobytes() + rig.data.ctrl.tobytes() + rig.data.xfrc_applied.tobytes() + report)
     return seen
 
@@ -112,7 +112,7 @@ def test_every_kind_of_command_was_in_such_a_session(model: mujoco.MjModel) -> N
     kinds = {c.kind for d, _ in journal for c in d.commands}
     assert kinds == {"hold", "pose", "twist", "joints"}
     assert np.isfinite(rig.data.qpos).all()
-    assert rig.controller.status()[0].applied is not None
+    assert rig.controller.get_status()[0].applied is not None
 
 
 def test_a_lost_piece_of_state_would_be_seen(model: mujoco.MjModel) -> None:

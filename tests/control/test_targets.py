@@ -24,7 +24,7 @@ def lead(rig: Rig, q: np.ndarray, steps: int, engagement: int = 1) -> list[tuple
         now += np.clip(q - now, -0.002, 0.002)
         rig.data.qpos[:] = now
         rig.data.qvel[:] = 0.0
-        limits.append(rig.controller.status()[0].limits)
+        limits.append(rig.controller.get_status()[0].limits)
     return limits
 
 
@@ -45,7 +45,7 @@ def test_the_workspace_of_a_leader_starts_where_the_arm_was_taken_by_others() ->
     rig.hold(1)
     assert rig.controller._joints.goal == pytest.approx(IIWA_HOME)
     lead(rig, np.add(IIWA_HOME, 0.05), 3, engagement=3)
-    assert rig.controller.status()[0].limits == ()
+    assert rig.controller.get_status()[0].limits == ()
 
 
 def test_the_target_of_a_leader_stands_on_the_base_as_it_moves() -> None:

@@ -64,7 +64,7 @@ def test_every_goal_is_somebodys_task_and_its_corners_are_those_of_the_scene(pla
     world = World(play.model, find_robots(play.model), find_objects(play.model))
     for goal in play.goals:
         assert goal.deformable in {task.object for person in play.people for task in person.tasks}
-        vertices = world.flexes.vertices(goal.deformable)
+        vertices = world.flexes.read_vertices(goal.deformable)
         corners = vertices[list(CORNERS[goal.deformable])]
         ends = [corners.min(axis=0), corners.max(axis=0)]
         np.testing.assert_allclose(ends, [vertices.min(axis=0), vertices.max(axis=0)], atol=1e-9)
@@ -77,7 +77,7 @@ def test_every_goal_is_somebodys_task_and_its_corners_are_those_of_the_scene(pla
 def test_the_first_corners_of_a_soft_body_are_those_of_one_end(play: Play) -> None:
     world = World(play.model, find_robots(play.model), ())
     for name in {goal.deformable for goal in play.goals} - {"cloth"}:
-        corners = world.flexes.vertices(name)[list(CORNERS[name])]
+        corners = world.flexes.read_vertices(name)[list(CORNERS[name])]
         assert (corners[:4, 0] < corners[4:, 0]).all()
 
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 import msgspec
 import zmq
 
-from iris_session.protocol.client_messages import GetSnapshot, Hello, Sample, envelope
+from iris_session.protocol.client_messages import GetSnapshot, Hello, Sample, wrap_message
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.server_messages import Welcome
@@ -29,7 +29,7 @@ Send = Callable[[], None]
 
 
 def hello() -> bytes:
-    return encode_client(envelope(Hello("observer", "Mallory", alignment="not_needed", secret=os.urandom(16))))
+    return encode_client(wrap_message(Hello("observer", "Mallory", alignment="not_needed", secret=os.urandom(16))))
 
 
 def control(context: zmq.Context[zmq.Socket[bytes]], host: str, port: int) -> zmq.Socket[bytes]:
@@ -58,12 +58,12 @@ def messages(kind: str, epoch: int) -> Iterator[bytes]:
             yield hello()
     if kind == "snapshots":
         while True:
-            yield encode_client(envelope(GetSnapshot(1), epoch))
+            yield encode_client(wrap_message(GetSnapshot(1), epoch))
     sample = Sample("head", "pose", 1, 0, 1, 0, 0, pose=IDENTITY)
     seq = 0
     while True:
         seq += 1
-        yield encode_client(envelope(msgspec.structs.replace(sample, seq=seq, clutch=seq % 2 == 0), epoch))
+        yield encode_client(wrap_message(msgspec.structs.replace(sample, seq=seq, clutch=seq % 2 == 0), epoch))
 
 
 def sender(kind: str, host: str, port: int, state: int) -> Send:

@@ -12,7 +12,7 @@ import pytest
 import zmq
 
 from iris_session.client import Client
-from iris_session.protocol.client_messages import ClockPing, Hello, envelope
+from iris_session.protocol.client_messages import ClockPing, Hello, wrap_message
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.server_messages import ClockPong, Message, ProtocolFault, Refused, Welcome
 from tests.e2e.conftest import DEADLINE_S, Server, Stage
@@ -107,7 +107,7 @@ def test_slow_talkers_and_half_greetings_are_closed(house: Server) -> None:
 
 def test_nonsense_of_every_depth_is_answered(house: Server) -> None:
     raw = Raw(house)
-    raw.socket.send(encode_client(envelope(Hello("observer", "Mallory", secret=os.urandom(16)))))
+    raw.socket.send(encode_client(wrap_message(Hello("observer", "Mallory", secret=os.urandom(16)))))
     raw.said(Welcome)
     deep = b"\x94\x01\x00\xa0" + b"\x91" * 30_000
     huge_map = b"\x94\x01\x00\xa0\x81\xa4type\xdf\xff\xff\xff\xff"
@@ -124,19 +124,19 @@ def test_nonsense_of_every_depth_is_answered(house: Server) -> None:
 def test_a_replayed_hello_does_not_take_over(house: Server) -> None:
     secret = os.urandom(16)
     first = Raw(house)
-    first.socket.send(encode_client(envelope(Hello("operator", "Ann", alignment="not_needed", secret=secret))))
+    first.socket.send(encode_client(wrap_message(Hello("operator", "Ann", alignment="not_needed", secret=secret))))
     welcome = first.said(Welcome)
     assert isinstance(welcome, Welcome)
     first.close()
     back = encode_client(
-        envelope(Hello("operator", "Ann", alignment="not_needed", secret=secret, resume_token=welcome.resume_token))
+        wrap_message(Hello("operator", "Ann", alignment="not_needed", secret=secret, resume_token=welcome.resume_token))
     )
     second = Raw(house)
     second.socket.send(back)
     again = second.said(Welcome)
     assert isinstance(again, Welcome)
     assert again.participant_id == welcome.participant_id
-    second.socket.send(encode_client(envelope(ClockPing(1), again.connection_epoch)))  # shows that it has its welcome
+    second.socket.send(encode_client(wrap_message(ClockPing(1), again.connection_epoch)))  # its welcome has arrived
     second.said(ClockPong)
     replayed = Raw(house)
     replayed.socket.send(back)

@@ -14,7 +14,7 @@ from anchors.pose import compose
 from iris_session.assets.store import AssetStore
 from iris_session.client import Client
 from iris_session.client.deformables import Deformables
-from iris_session.protocol.scene import asset_addresses, decode_scene
+from iris_session.protocol.scene import decode_scene, list_assets
 from iris_session.protocol.server_messages import SceneChanged
 from iris_session.session.deformables import BOUND_M
 from iris_session.streams.rigid import MAX_POSITION_ERROR_M, MAX_ROTATION_ERROR_RAD
@@ -111,7 +111,7 @@ def test_everybody_sees_a_world_that_mujoco_does_not_know(stage: Stage, tmp_path
     stage.run(lambda: fetch.done, "the specification has come")
     spec = decode_scene(fetch.read(composed.scene_hash))
     assert spec == composed.spec
-    rest = client.assets.fetch(asset_addresses(spec))
+    rest = client.assets.fetch(list_assets(spec))
     stage.run(lambda: rest.done, "its assets have come")
     rest.check()
     assert tuple(body.name for body in client.mirror.bodies) == publisher.NAMES

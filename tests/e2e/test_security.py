@@ -21,7 +21,7 @@ from iris_session.protocol.client_messages import (
     RemoveParticipant,
     Sample,
     SetMode,
-    envelope,
+    wrap_message,
 )
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.names import AuditKind, DenialReason, FaultCode, RefusalCode, RejectReason
@@ -96,7 +96,7 @@ class Attacker:
         self._socket.connect(f"tcp://{lab.server.address}")
 
     def send(self, message: ClientMessage, epoch: int = 0, on_behalf_of: str = "") -> None:
-        self._socket.send(encode_client(envelope(message, epoch, on_behalf_of)))
+        self._socket.send(encode_client(wrap_message(message, epoch, on_behalf_of)))
 
     def got(self, kind: type) -> list:  # type: ignore[type-arg]
         while self._socket.poll(0):

@@ -13,7 +13,7 @@ from iris_session.client import Client
 from iris_session.client.deformables import Deformables
 from iris_session.client.fetched_scene import fetch_scene
 from iris_session.protocol.names import ArrayKind
-from iris_session.protocol.scene import SceneSpec, asset_addresses, decode_scene
+from iris_session.protocol.scene import SceneSpec, decode_scene, list_assets
 from iris_session.recording import Recording
 from iris_session.scene import decode_arrays, decode_mesh
 from tests.e2e.conftest import Server, Stage
@@ -51,7 +51,7 @@ def fetched(stage: Stage, client: Client, cache: Path) -> SceneSpec:
     fetch = client.assets.fetch([address])
     stage.run(lambda: fetch.done, "the specification has come")
     spec = decode_scene(fetch.read(address))
-    rest = client.assets.fetch(asset_addresses(spec))
+    rest = client.assets.fetch(list_assets(spec))
     stage.run(lambda: rest.done, "the assets have come")
     rest.check()
     return spec
@@ -97,14 +97,14 @@ def test_who_comes_again_or_late_needs_nothing_anew(stage: Stage, tmp_path: Path
     ann, bob = stage.join("ann", role="observer"), stage.join("bob", role="observer")
     spec = fetched(stage, ann, tmp_path / "cache")
     bob.assets.cache = AssetStore(tmp_path / "cache")
-    again = bob.assets.fetch([bob.mirror.scene_hash, *asset_addresses(spec)])
+    again = bob.assets.fetch([bob.mirror.scene_hash, *list_assets(spec)])
     stage.run(lambda: again.done, "all of it is there")
     assert (again.bytes_received, again.cached) == (0, len(again.addresses))
     stage.server.children()["front.main"].kill()
     stage.run(lambda: not ann.ready, "the front is gone")
     stage.run(lambda: ann.ready and bob.ready, "another one is there")
     bob.assets.cache = AssetStore(tmp_path / "other")
-    late = bob.assets.fetch(asset_addresses(spec))
+    late = bob.assets.fetch(list_assets(spec))
     stage.run(lambda: late.done, "the front that replaced it serves the scene too")
     late.check()
     assert late.bytes_received == late.bytes_total

@@ -39,7 +39,9 @@ class SoftRig(Rig):
         super()._receive()
         for watch in self.watches:
             name = watch.goal.deformable
-            watch.observe(self.now_s, self.world.flexes.vertices(name), self.world.flexes.touching(name))
+            watch.observe(
+                self.now_s, self.world.flexes.read_vertices(name), self.world.flexes.find_touching_robots(name)
+            )
 
     def _shift_deformable(self, name: str) -> None:
         """Moves and turns it about its middle, by the slides of its vertices or nodes."""
@@ -102,7 +104,7 @@ def main(runs: int, name: str = "cloth", first: int = 0) -> None:
         times.append(rig.now_s)
         tries = [b.attempts for b in rig.behaviours.values()]
         cost = (time.process_time() - began) / rig.now_s
-        notes = f"attempts {tries}, trouble {rig.world.trouble}, {cost:.2f} CPU s/s"
+        notes = f"attempts {tries}, trouble {rig.world.dropped_counts}, {cost:.2f} CPU s/s"
         print(f"seed {seed}: {wrong or 'ok'}, {rig.now_s:.1f} s, {notes}", flush=True)
     print(f"{name}: {good}/{runs} succeeded, {min(times):.1f} to {max(times):.1f} s each")
 

@@ -33,8 +33,7 @@ from iris_session.control.controller import Controller
 from iris_session.demo.plays import Play, make_play
 from iris_session.demo.scenes import scene_path
 from iris_session.emulator.behaviours import Behaviour, Giver, HandInput, Receiver, make_behaviour
-from iris_session.physics.objects import find_objects
-from iris_session.physics.robots import find_robots
+from iris_session.physics.robots import find_objects, find_robots
 from iris_session.physics.world import World
 from iris_session.protocol.common import Pose
 from iris_session.protocol.names import CommandKind, HoldReason
@@ -240,7 +239,7 @@ class Rig:
 
     def moved_by_hand(self) -> None:
         """After `qpos` was written: poses and contacts are those of the new state."""
-        self.world.set_state_bytes(self.world.state_bytes())
+        self.world.restore_state(self.world.save_state())
 
     def _publish(self) -> None:
         if self.now_s < self._next_state_s:
@@ -255,7 +254,7 @@ class Rig:
             tip = self.world.view().tip_pose(spec.name)
             poses[f"tip:{spec.name}"] = (tip.p, tip.q)
         for name, watched in self.vertices.items():
-            p_world = self.world.flexes.vertices(name)
+            p_world = self.world.flexes.read_vertices(name)
             for index in watched:
                 poses[f"vertex:{name}:{index}"] = (tuple(p_world[index].tolist()), IDENTITY_QUAT)
         for view in self.views.values():

@@ -192,7 +192,7 @@ def test_same_seed_same_handover() -> None:
     first, second = handover(13), handover(13)
     first.run(3.0, until=lambda r: False)
     second.run(3.0, until=lambda r: False)
-    assert first.world.state_bytes() == second.world.state_bytes()
+    assert first.world.save_state() == second.world.save_state()
 
 
 def test_make_behaviour() -> None:

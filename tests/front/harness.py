@@ -11,7 +11,7 @@ import numpy as np
 import zmq
 
 from iris_session.link import FrontConfig, FrontProcess, SceneInfo
-from iris_session.protocol.client_messages import ClientMessage, GetSnapshot, Hello, envelope
+from iris_session.protocol.client_messages import ClientMessage, GetSnapshot, Hello, wrap_message
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.entries import Entry, Join
 from iris_session.protocol.server_messages import BodyInfo, Event, Message, Notice, Snapshot, StateHeader, Welcome
@@ -48,7 +48,7 @@ class RawClient:
         return self.welcome.connection_epoch if self.welcome else 0
 
     def send(self, message: ClientMessage, on_behalf_of: str = "", epoch: int | None = None) -> None:
-        self.socket.send(encode_client(envelope(message, self.epoch if epoch is None else epoch, on_behalf_of)))
+        self.socket.send(encode_client(wrap_message(message, self.epoch if epoch is None else epoch, on_behalf_of)))
 
     def receive(self) -> None:
         while self.socket.poll(0):

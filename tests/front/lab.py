@@ -39,8 +39,8 @@ class Lab:
         return pair, client
 
     def proof(self, code: str, pair: KeyPair) -> bytes:
-        secret = pairing.stretch(code, self.server.raw_public)
-        return pairing.client_proof(secret, self.server.raw_public, pair.raw_public)
+        secret = pairing.stretch_code(code, self.server.raw_public)
+        return pairing.make_client_proof(secret, self.server.raw_public, pair.raw_public)
 
     def refused(self, client: RawClient, message: Hello | Pair | EStop | Marker, n: int = 1) -> Refused:
         client.send(message)

@@ -22,7 +22,7 @@ from iris_session.protocol.client_messages import (
     Marker,
     Observation,
     Sample,
-    envelope,
+    wrap_message,
 )
 from iris_session.protocol.codec import decode_presence, decode_state_header, encode_client
 from iris_session.protocol.common import IDENTITY, Pose
@@ -342,7 +342,7 @@ def test_a_gateway_speaks_for_others_and_takes_them_along(session: FrontSession)
 def test_wrong_connection_epoch_is_left_to_the_authority(session: FrontSession) -> None:
     client = session.client()
     client.join()
-    client.socket.send(encode_client(envelope(Acquire(1), 77)))
+    client.socket.send(encode_client(wrap_message(Acquire(1), 77)))
     (acquire,) = session.wait_entries(Acquire)
     assert (acquire.connection, acquire.connection_epoch) == (1, 77)
 

@@ -14,7 +14,7 @@ import pytest
 import zmq
 
 from iris_session.link import FrontLimits
-from iris_session.protocol.client_messages import EStop, GetSnapshot, Heartbeat, Hello, Marker, Sample, envelope
+from iris_session.protocol.client_messages import EStop, GetSnapshot, Heartbeat, Hello, Marker, Sample, wrap_message
 from iris_session.protocol.codec import encode_client
 from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.entries import Entry, Lost
@@ -32,7 +32,7 @@ def test_garbage_is_answered_with_bounded_faults_and_harms_nobody(session: Front
     joined, stranger = session.client(), session.client()
     joined.join()
     rng, began = random.Random(1), time.monotonic()
-    good = encode_client(envelope(Marker(1, "x" * 50), 1))
+    good = encode_client(wrap_message(Marker(1, "x" * 50), 1))
     for _ in range(300):
         noise = rng.randbytes(rng.randrange(200))
         cut = bytearray(good)
@@ -148,7 +148,7 @@ def test_a_flood_of_one_does_not_delay_the_estop_of_another(session: FrontSessio
     other.join("observer", "Eve")
     sample = Sample("head", "pose", 1, 0, 1, 0, 1, pose=IDENTITY)
     flood = [
-        encode_client(envelope(msgspec.structs.replace(sample, seq=seq, clutch=seq % 2 == 1), 1))
+        encode_client(wrap_message(msgspec.structs.replace(sample, seq=seq, clutch=seq % 2 == 1), 1))
         for seq in range(30_000)
     ]
     for data in flood:
@@ -195,7 +195,7 @@ def test_a_client_that_takes_nothing_is_cut_off_as_slow(open_session: OpenSessio
     slow.setsockopt(zmq.RCVBUF, 4096)
     disconnects = slow.get_monitor_socket(zmq.EVENT_DISCONNECTED)
     slow.connect(f"tcp://127.0.0.1:{session.ports.control}")
-    slow.send(encode_client(envelope(Hello("observer", "Slow", secret=b"s" * 16))))
+    slow.send(encode_client(wrap_message(Hello("observer", "Slow", secret=b"s" * 16))))
     session.pump(lambda: slow.poll(0) != 0, "welcome of the slow client")
     text = "x" * 500
 

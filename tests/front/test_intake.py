@@ -24,7 +24,7 @@ from iris_session.protocol.client_messages import (
     Sample,
     Samples,
     TrackingEpoch,
-    envelope,
+    wrap_message,
 )
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.common import IDENTITY
@@ -65,7 +65,7 @@ class IntakeRig:
         self.sent.append((frames[0], decode_server(frames[1]).message, frames[2:]))
 
     def take(self, message: ClientMessage, peer: Peer = ANN, epoch: int = 0, behalf: str = "", extra: int = 0) -> None:
-        data = encode_client(envelope(message, epoch, behalf))
+        data = encode_client(wrap_message(message, epoch, behalf))
         self.intake.handle_message(ROUTE, peer, memoryview(data), extra)
 
     def join(self, peer: Peer = ANN, **hello: object) -> Welcome:
@@ -247,15 +247,15 @@ def test_a_full_house_lets_back_in_who_has_a_token(rig: IntakeRig) -> None:
     for i in range(rig.limits.connections - 1):
         rig.now_ns += 1_000_000_000
         hello = msgspec.structs.replace(HELLO, secret=b"%016d" % i)
-        rig.intake.handle_message(bytes([i]), Peer(100 + i, ""), memoryview(encode_client(envelope(hello))), 0)
+        rig.intake.handle_message(bytes([i]), Peer(100 + i, ""), memoryview(encode_client(wrap_message(hello))), 0)
     assert len(rig.clients) == rig.limits.connections
     rig.now_ns += 1_000_000_000
     rig.coalescer.take_batch()
     late, back = Peer(7, ""), Peer(8, "")
-    data = encode_client(envelope(HELLO))
+    data = encode_client(wrap_message(HELLO))
     rig.intake.handle_message(b"late", late, memoryview(data), 0)
     assert isinstance(rig.sent[-1][1], Refused)
-    data = encode_client(envelope(msgspec.structs.replace(HELLO, resume_token=welcome.resume_token)))
+    data = encode_client(wrap_message(msgspec.structs.replace(HELLO, resume_token=welcome.resume_token)))
     rig.intake.handle_message(b"back", back, memoryview(data), 0)
     (entry,) = rig.coalescer.take_batch()
     assert isinstance(entry.message, Join)
@@ -264,7 +264,7 @@ def test_a_full_house_lets_back_in_who_has_a_token(rig: IntakeRig) -> None:
 
 def test_a_key_that_uses_up_all_hellos_keeps_nobody_else_out(rig: IntakeRig) -> None:
     for i in range(1000):
-        data = encode_client(envelope(Hello("operator", "Eve")))
+        data = encode_client(wrap_message(Hello("operator", "Eve")))
         rig.intake.handle_message(b"%d" % i, Peer(1000 + i, "key-of-eve"), memoryview(data), 0)
     refused = rig.last()
     assert isinstance(refused, Refused)
@@ -330,7 +330,7 @@ def test_samples_and_observations_are_recorded_as_received() -> None:
         rig.take(sample, epoch=epoch)
         rig.take(together(8), epoch=epoch)
         rig.take(observation, epoch=epoch)
-        frame = encode_client(envelope(sample, epoch)).replace(double, single)
+        frame = encode_client(wrap_message(sample, epoch)).replace(double, single)
         rig.intake.handle_message(ROUTE, ANN, memoryview(frame), 0)
         recorded = []
         while recorder.poll(0):

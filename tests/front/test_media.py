@@ -21,7 +21,7 @@ from iris_session.link.sockets import watch_tcp
 from iris_session.protocol.client_messages import Heartbeat
 from iris_session.protocol.codec import decode_media_header, encode_media_frames
 from iris_session.protocol.limits import MAX_MEDIA_FRAME_BYTES
-from iris_session.protocol.media import MediaHeader, media_topic
+from iris_session.protocol.media import MediaHeader, make_topic
 from iris_session.protocol.names import BudgetClass
 from iris_session.protocol.status import ClientReport, DeliveryBudget, GetStatus, ParticipantReport, StatusReport
 from iris_session.security import KeyPair
@@ -87,7 +87,7 @@ class Stage:
     def viewer(
         self, client: RawClient, curve: Curve | None = None, stream: str = "cloud", epoch: int = 0, hwm: int = 1000
     ) -> Viewer:
-        self.viewers.append(Viewer(self.session, [media_topic(epoch or client.epoch, stream)], curve, hwm))
+        self.viewers.append(Viewer(self.session, [make_topic(epoch or client.epoch, stream)], curve, hwm))
         return self.viewers[-1]
 
     def drops(self, reason: str, n: int = 1) -> None:
@@ -122,7 +122,7 @@ def test_a_subscriber_gets_the_newest_frames(media: Stage) -> None:
     viewer = media.viewer(ann)
     media.until(lambda: viewer.take() >= 5, "media")
     topic, header, data = viewer.got[-1]
-    assert topic == media_topic(ann.epoch, "cloud") + b"full"
+    assert topic == make_topic(ann.epoch, "cloud") + b"full"
     assert (header.stream, header.budget_class, header.scene_epoch, header.encoding) == ("cloud", "full", 1, "bytes")
     assert header.capture_ns <= header.published_ns <= session.process.link.now_ns
     assert data == b"c" * 500
@@ -162,7 +162,7 @@ def test_the_status_tells_who_gets_what(media: Stage) -> None:
 def test_topics_that_there_are_not_are_counted_and_give_nothing(media: Stage) -> None:
     session = media.session
     ann = media.joined(session.client())
-    bad = Viewer(session, [b"", b"media/", b"cloud", media_topic(ann.epoch + 7, "cloud")])
+    bad = Viewer(session, [b"", b"media/", b"cloud", make_topic(ann.epoch + 7, "cloud")])
     media.viewers.append(bad)
     other = media.viewer(ann, stream="other")
     media.drops("media_topic_unknown", 3)
@@ -330,7 +330,7 @@ def test_only_the_own_key_opens_a_connections_media(locked: tuple[Lab, Stage]) -
     stage.drops("media_refused")
     anns = stage.viewer(client, lab.curve(ann))
     stage.until(lambda: anns.take() >= 10, "media")
-    bobs.socket.unsubscribe(media_topic(client.epoch, "cloud"))
+    bobs.socket.unsubscribe(make_topic(client.epoch, "cloud"))
     bobs.socket.subscribe(b"that was it")
     stage.drops("media_topic_unknown")
     bobs.socket.close()
@@ -496,7 +496,7 @@ def test_a_fault_costs_what_was_under_way_and_is_told_once(
         source = MediaSource(endpoint)
         with context.socket(zmq.SUB) as viewer:
             viewer.connect(f"tcp://127.0.0.1:{port}")
-            viewer.subscribe(media_topic(1, "cloud"))
+            viewer.subscribe(make_topic(1, "cloud"))
             deadline = time.monotonic() + 30.0
             while not viewer.poll(5):
                 assert time.monotonic() < deadline, "media go on"

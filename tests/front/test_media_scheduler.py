@@ -9,7 +9,7 @@ import pytest
 from iris_session.front.media.budget import NONE_LEVEL, SECOND
 from iris_session.front.media.scheduler import DeliveryCounters, MediaScheduler, MediaSubscriber
 from iris_session.protocol.codec import decode_media_header
-from iris_session.protocol.media import MAX_STREAMS, MediaHeader, MediaPush, media_topic, parse_topic
+from iris_session.protocol.media import MAX_STREAMS, MediaHeader, MediaPush, make_topic, parse_topic
 
 MS = 1_000_000
 ANN, BOB = 7, 8
@@ -33,7 +33,7 @@ class Wire:
         if number in self.full:
             return False
         head = decode_media_header(header)
-        assert topic == media_topic(number, head.stream) + head.budget_class.encode()
+        assert topic == make_topic(number, head.stream) + head.budget_class.encode()
         self.got[number].append((head, frame))
         return True
 
@@ -236,6 +236,6 @@ def test_a_restarted_front_numbers_above_its_predecessor() -> None:
 
 
 def test_topics() -> None:
-    assert parse_topic(media_topic(12, "cloud.1")) == (12, "cloud.1")
+    assert parse_topic(make_topic(12, "cloud.1")) == (12, "cloud.1")
     for bad in (b"", b"media/", b"media/0/x/", b"media/1/x", b"media/1/a/b/", b"media/1//", b"media/-1/x/", b"\xff"):
         assert parse_topic(bad) is None

@@ -65,8 +65,8 @@ class PairingRig:
         self.pairing.handle_pair(Route(own.public.encode()), peer, Pair("ann", proof), self.now_ns)
 
     def proof(self, code: str, own: KeyPair) -> bytes:
-        secret = pairing.stretch(code, self.server.raw_public)
-        return pairing.client_proof(secret, self.server.raw_public, own.raw_public)
+        secret = pairing.stretch_code(code, self.server.raw_public)
+        return pairing.make_client_proof(secret, self.server.raw_public, own.raw_public)
 
     def turn(self, _now_ns: int = 0) -> None:
         self.now_ns += CHECK_PERIOD_NS

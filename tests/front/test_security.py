@@ -56,8 +56,8 @@ def test_a_code_pairs_one_key_which_then_joins_in_the_roles_of_the_code(lab: Lab
     client = lab.client(ann)
     client.send(Pair("ann", lab.proof(code, ann)))
     answer = client.wait_for(Paired)
-    secret = pairing.stretch(code, lab.server.raw_public)
-    assert answer.proof == pairing.server_proof(secret, lab.server.raw_public, ann.raw_public)
+    secret = pairing.stretch_code(code, lab.server.raw_public)
+    assert answer.proof == pairing.make_server_proof(secret, lab.server.raw_public, ann.raw_public)
     assert answer.roles == ("operator", "observer")
     assert lab.refused(client, Hello("operator", "ann")).code == RefusalCode.UNPAIRED  # still an unknown key's
     lab.client(ann).join(name="ann")

@@ -21,7 +21,7 @@ from iris_session.protocol.status import (
     GetStatus,
     ParticipantReport,
     StatusReport,
-    quantiles,
+    compute_quantiles,
 )
 from tests.front.harness import N_BODIES, FrontSession, RawClient
 
@@ -236,5 +236,5 @@ def test_report_of_before_is_no_report_of_now(session: FrontSession) -> None:
     ("durations", "expected"), [((), None), ((2 * MS,), (2.0, 2.0)), (tuple(n * MS for n in range(101)), (50.0, 99.0))]
 )
 def test_quantiles(durations: tuple[int, ...], expected: tuple[float, float] | None) -> None:
-    found = quantiles(durations)
+    found = compute_quantiles(durations)
     assert expected == (None if found is None else pytest.approx((found.p50, found.p99)))

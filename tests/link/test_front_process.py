@@ -19,7 +19,7 @@ import zmq
 import zmq.auth
 
 from iris_session.link import FrontConfig, FrontError, FrontProcess
-from iris_session.protocol.client_messages import GetSnapshot, Heartbeat, Hello, envelope
+from iris_session.protocol.client_messages import GetSnapshot, Heartbeat, Hello, wrap_message
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.entries import FrontRestarted, Join
 from iris_session.protocol.server_messages import ProtocolFault, Snapshot
@@ -152,7 +152,7 @@ def test_ipv6(open_session: OpenSession) -> None:
         client.linger = 0
         client.ipv6 = True
         client.connect(f"tcp://{session.ports.host}:{session.ports.control}")
-        client.send(encode_client(envelope(Hello("operator", "Ann", secret=b"s" * 16))))
+        client.send(encode_client(wrap_message(Hello("operator", "Ann", secret=b"s" * 16))))
         session.wait_entries(Join)
         session.pump(lambda: bool(client.poll(0)), "welcome over IPv6")
 
@@ -345,7 +345,7 @@ def test_the_front_does_not_outlive_its_parent(number: signal.Signals, tmp_path:
     client = context.socket(zmq.DEALER)
     client.linger = 0
     client.connect(f"tcp://127.0.0.1:{port}")
-    client.send(encode_client(envelope(Hello("operator", "Ann", secret=b"s" * 16))))
+    client.send(encode_client(wrap_message(Hello("operator", "Ann", secret=b"s" * 16))))
     assert client.poll(30_000)
     client.recv()
     parent.send_signal(number)

@@ -7,7 +7,7 @@ import pytest
 
 from iris_session.physics import ModelInvalidError, World
 from iris_session.physics.carrier import TICK_S, Carrier
-from iris_session.physics.load import model_from_bytes
+from iris_session.physics.load import decode_model
 from iris_session.protocol.common import Pose
 
 NAMES = ("cup", "arm/link 1", "table top")
@@ -16,7 +16,7 @@ FIRST = tuple(Pose((float(i), 0.0, 0.5), (1.0, 0.0, 0.0, 0.0)) for i in range(3)
 
 def shown(world: World) -> np.ndarray:
     poses = np.zeros((len(world.bodies), 7))
-    world.poses(poses)
+    world.read_poses(poses)
     return poses
 
 
@@ -39,7 +39,7 @@ def test_a_state_shows_the_poses_and_the_time_that_were_given() -> None:
     carrier = Carrier(NAMES, FIRST)
     world = World(carrier.model, (), ())
     for seed, time_s in ((1, 12.3456), (2, 0.0)):
-        world.set_state_bytes(carrier.state(time_s, moved(seed)))
+        world.restore_state(carrier.encode_state(time_s, moved(seed)))
         assert np.allclose(shown(world), moved(seed), atol=1e-15)
         assert (world.view().tick, world.view().sim_time) == (round(time_s / TICK_S), time_s)
 
@@ -47,17 +47,17 @@ def test_a_state_shows_the_poses_and_the_time_that_were_given() -> None:
 def test_a_state_survives_a_snapshot_and_the_model_its_bytes() -> None:
     carrier = Carrier(NAMES, FIRST)
     world = World(carrier.model, (), ())
-    world.set_state_bytes(carrier.state(7.0, moved(3)))
-    again = World(model_from_bytes(world.model_bytes()), (), ())
+    world.restore_state(carrier.encode_state(7.0, moved(3)))
+    again = World(decode_model(world.encode_model()), (), ())
     again.restore(world.snapshot())
-    assert again.state_bytes() == world.state_bytes()
+    assert again.save_state() == world.save_state()
     assert (shown(again) == shown(world)).all()
 
 
 def test_nothing_may_move() -> None:
     carrier = Carrier((), ())
     world = World(carrier.model, (), ())
-    world.set_state_bytes(carrier.state(1.0, np.zeros((0, 7))))
+    world.restore_state(carrier.encode_state(1.0, np.zeros((0, 7))))
     assert (world.bodies, world.view().tick) == ((), 1000)
 
 

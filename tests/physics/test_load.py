@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from iris_session.physics import ModelInvalidError, ModelNotFoundError, load_model, model_bytes, model_from_bytes
-from iris_session.physics.told import caught_warnings
+from iris_session.physics import ModelInvalidError, ModelNotFoundError, decode_model, encode_model, load_model
+from iris_session.physics.load import catch_warnings
 from tests.physics.models import clutter
 
 XML = '<mujoco><worldbody><body name="b"><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
@@ -19,15 +19,15 @@ XML = '<mujoco><worldbody><body name="b"><freejoint/><geom size=".1"/></body></w
 def test_xml_and_mjb_give_the_same_model(tmp_path: Path) -> None:
     (tmp_path / "scene.xml").write_text(XML)
     m = load_model(tmp_path / "scene.xml")
-    (tmp_path / "scene.mjb").write_bytes(model_bytes(m))
+    (tmp_path / "scene.mjb").write_bytes(encode_model(m))
     again = load_model(str(tmp_path / "scene.mjb"))
     assert again.nq == 7
-    assert model_bytes(again) == model_bytes(m)
+    assert encode_model(again) == encode_model(m)
 
 
 def test_bytes_round_trip(aloha: mujoco.MjModel) -> None:
     for m in (clutter(), aloha):
-        again = model_from_bytes(model_bytes(m))
+        again = decode_model(encode_model(m))
         assert (again.nq, again.nu, again.ngeom) == (m.nq, m.nu, m.ngeom)
         assert (again.geom_pos == m.geom_pos).all()
         assert bytes(again.names) == bytes(m.names)
@@ -53,14 +53,14 @@ def test_errors_are_one_line(tmp_path: Path) -> None:
         assert text in str(caught.value)
         assert "\n" not in str(caught.value)
     with pytest.raises(ModelInvalidError, match="these 4 bytes are no model of MuJoCo"):
-        model_from_bytes(b"nope")
+        decode_model(b"nope")
 
 
 def test_a_damaged_binary_is_one_line_and_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """MuJoCo prints a warning, and writes it into a file in the current folder."""
-    good = bytes(model_bytes(clutter()))
+    good = bytes(encode_model(clutter()))
     here = tmp_path / "here"
     here.mkdir()
     monkeypatch.chdir(here)
@@ -79,7 +79,7 @@ def test_a_damaged_binary_is_one_line_and_nothing_else(
                 load_model(tmp_path / "damaged.mjb")
             assert "\n" not in str(caught.value)
             with pytest.raises(ModelInvalidError, match=reason):
-                model_from_bytes(data)
+                decode_model(data)
         assert heard == []
         assert mujoco.get_mju_user_warning() == heard.append
     finally:
@@ -93,7 +93,7 @@ def test_warnings_of_other_threads_are_not_caught(capfd: pytest.CaptureFixture[s
     model = mujoco.MjModel.from_xml_string(XML)
     data = mujoco.MjData(model)
     data.qpos[0] = np.nan
-    with caught_warnings() as caught:
+    with catch_warnings() as caught:
         stepping = threading.Thread(target=mujoco.mj_step, args=(model, data))
         stepping.start()
         stepping.join()

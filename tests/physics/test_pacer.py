@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iris_session.physics import Pacer
-from iris_session.physics.pacer import _bucket, _upper_edge
+from iris_session.physics.pacer import _find_bucket, _upper_edge
 
 MS = 1_000_000
 PERIOD = 2 * MS
@@ -19,45 +19,45 @@ def run(pacer: Pacer, now_ns: int, costs: list[int]) -> int:
     """The loop of a session: waits for the next deadline, takes one tick per step. Returns the time at the end."""
     for cost in costs:
         now_ns = max(now_ns, pacer.next_deadline_ns)
-        assert pacer.ticks_due(now_ns) >= 1
+        assert pacer.count_ticks_due(now_ns) >= 1
         now_ns += cost
-        pacer.finished(now_ns)
+        pacer.finish_tick(now_ns)
     return now_ns
 
 
 def test_deadlines_are_never_rebased() -> None:
     pacer = Pacer(PERIOD, start_ns=17)
     assert pacer.next_deadline_ns == 17 + PERIOD
-    assert pacer.ticks_due(17 + PERIOD - 1) == 0
-    assert pacer.ticks_due(17 + PERIOD) == 1
+    assert pacer.count_ticks_due(17 + PERIOD - 1) == 0
+    assert pacer.count_ticks_due(17 + PERIOD) == 1
     run(pacer, 17, [MS, 50 * MS, MS // 10])
     assert pacer.next_deadline_ns == 17 + 4 * PERIOD
-    assert pacer.ticks_due(17 + 30 * PERIOD) == 27
+    assert pacer.count_ticks_due(17 + 30 * PERIOD) == 27
 
 
 def test_late_is_more_than_one_period_after_the_deadline() -> None:
     pacer = Pacer(PERIOD, 0)
-    assert pacer.finished(2 * PERIOD) == PERIOD
-    assert pacer.stats(2 * PERIOD).late == 0
-    assert pacer.finished(3 * PERIOD + 1) == PERIOD + 1
-    stats = pacer.stats(3 * PERIOD + 1)
+    assert pacer.finish_tick(2 * PERIOD) == PERIOD
+    assert pacer.get_stats(2 * PERIOD).late == 0
+    assert pacer.finish_tick(3 * PERIOD + 1) == PERIOD + 1
+    stats = pacer.get_stats(3 * PERIOD + 1)
     assert (stats.ticks, stats.finished, stats.late, stats.missing) == (2, 2, 1, 0)
     assert stats.late_share == 0.5
-    assert pacer.finished(3 * PERIOD - 5) == 0
+    assert pacer.finish_tick(3 * PERIOD - 5) == 0
 
 
 def test_missing_ticks_are_late() -> None:
     pacer = Pacer(PERIOD, 0)
-    assert pacer.stats(2 * PERIOD).missing == 0
-    assert pacer.stats(2 * PERIOD + 1).missing == 1
-    stats = pacer.stats(10 * PERIOD)
+    assert pacer.get_stats(2 * PERIOD).missing == 0
+    assert pacer.get_stats(2 * PERIOD + 1).missing == 1
+    stats = pacer.get_stats(10 * PERIOD)
     assert (stats.ticks, stats.late, stats.missing, stats.late_share) == (8, 8, 8, 1.0)
 
 
 def test_a_hiccup_is_caught_up_and_counted() -> None:
     pacer = Pacer(PERIOD, 0)
     end = run(pacer, 0, [MS // 2] * 10 + [100 * MS] + [MS // 2] * 200)
-    stats = pacer.stats(end)
+    stats = pacer.get_stats(end)
     assert stats.missing == 0
     assert pacer.skip_backlog(end) == 0
     assert 40 < stats.late < 80
@@ -68,13 +68,13 @@ def test_a_hiccup_is_caught_up_and_counted() -> None:
 def test_a_suspended_process_is_no_fast_forward() -> None:
     pacer = Pacer(PERIOD, 0)
     now = run(pacer, 0, [MS // 2] * 10) + 5_000 * MS
-    overdue = pacer.ticks_due(now)
+    overdue = pacer.count_ticks_due(now)
     gap = pacer.skip_backlog(now)
     assert gap == overdue - 1
-    assert pacer.ticks_due(now) == 1
+    assert pacer.count_ticks_due(now) == 1
     assert pacer.next_deadline_ns % PERIOD == 0, "the grid stays where it was"
     end = run(pacer, now, [MS // 2] * 10)
-    stats = pacer.stats(end)
+    stats = pacer.get_stats(end)
     assert stats.missing == overdue - 1
     assert stats.ticks == 20 + overdue - 1
     assert pacer.skip_backlog(end) == 0
@@ -88,7 +88,7 @@ def test_overload_is_late_with_a_bounded_backlog() -> None:
         now = run(pacer, now, [3 * MS])
         skipped += pacer.skip_backlog(now)
         assert now - pacer.next_deadline_ns <= 1_000 * MS
-    stats = pacer.stats(now)
+    stats = pacer.get_stats(now)
     assert skipped > 1000
     assert stats.ticks == pytest.approx(now // PERIOD, abs=3)
     assert stats.late_share > 0.99
@@ -101,13 +101,13 @@ def test_pause_and_resume_anchor_anew() -> None:
     assert pacer.next_deadline_ns == 6 * PERIOD
     pacer.pause(8 * PERIOD)
     pacer.pause(9 * PERIOD)
-    assert pacer.ticks_due(100 * PERIOD) == 0
+    assert pacer.count_ticks_due(100 * PERIOD) == 0
     assert pacer.skip_backlog(10_000 * PERIOD) == 0
-    assert pacer.stats(100 * PERIOD).missing == 1
+    assert pacer.get_stats(100 * PERIOD).missing == 1
     pacer.resume(100 * PERIOD + 7)
     assert pacer.next_deadline_ns == 101 * PERIOD + 7
     end = run(pacer, 100 * PERIOD + 7, [0] * 3)
-    stats = pacer.stats(end)
+    stats = pacer.get_stats(end)
     assert (stats.finished, stats.missing) == (8, 1)
 
 
@@ -116,9 +116,9 @@ def test_percentiles_are_right_within_three_percent() -> None:
     rng = random.Random(3)
     lateness = [int(rng.expovariate(1 / MS)) for _ in range(5000)]
     for late in lateness:
-        pacer.finished(pacer.next_deadline_ns + late)
+        pacer.finish_tick(pacer.next_deadline_ns + late)
     lateness.sort()
-    stats = pacer.stats(0)
+    stats = pacer.get_stats(0)
     assert lateness[2499] <= stats.p50_ns <= 1.04 * lateness[2500]
     assert lateness[4949] <= stats.p99_ns <= 1.04 * lateness[4950]
     assert stats.max_ns == lateness[-1]
@@ -126,10 +126,10 @@ def test_percentiles_are_right_within_three_percent() -> None:
 
 @given(st.integers(0, 2**42 - 1))
 def test_buckets_hold_their_values_within_three_percent(value: int) -> None:
-    edge = _upper_edge(_bucket(value))
+    edge = _upper_edge(_find_bucket(value))
     assert value <= edge <= value * (1 + 1 / 32)
-    assert _bucket(edge) == _bucket(value)
-    assert _bucket(edge + 1) == _bucket(value) + 1 or edge == 2**42 - 1
+    assert _find_bucket(edge) == _find_bucket(value)
+    assert _find_bucket(edge + 1) == _find_bucket(value) + 1 or edge == 2**42 - 1
 
 
 @settings(max_examples=60)
@@ -141,9 +141,9 @@ def test_accounting_matches_a_plain_reckoning(costs: list[int], start: int) -> N
         due = start + k * PERIOD
         now = max(now, due) + cost
         late += now > due + PERIOD
-        pacer.finished(now)
+        pacer.finish_tick(now)
     never_ran = [k for k in range(len(costs) + 1, len(costs) + 4000) if now > start + k * PERIOD + PERIOD]
-    stats = pacer.stats(now)
+    stats = pacer.get_stats(now)
     assert (stats.ticks, stats.late) == (len(costs) + len(never_ran), late + len(never_ran))
 
 
@@ -162,7 +162,7 @@ def test_accounting_matches_a_plain_reckoning_across_other_periods(
         assert pacer.period_ns == period
         for k, cost in enumerate(costs, 1):
             now = max(now, start + k * period) + cost
-            pacer.finished(now)
+            pacer.finish_tick(now)
             ticks, late = ticks + 1, late + (now > start + (k + 1) * period)
         done = len(costs) + 1
         began = max(now, start + done * period)
@@ -170,7 +170,7 @@ def test_accounting_matches_a_plain_reckoning_across_other_periods(
         ticks, late = ticks + 1 + never_ran, late + (began > start + (done + 1) * period) + never_ran
         now = start = began + swap_ns
         pacer.change_period(next_period, began, now)
-    stats = pacer.stats(now)
+    stats = pacer.get_stats(now)
     assert (stats.ticks, stats.late) == (ticks, late)
 
 
@@ -182,21 +182,21 @@ def test_another_period_begins_a_new_grid_at_the_end_of_the_tick_that_took_it() 
     pacer.change_period(MS, began, end)
     assert (pacer.period_ns, pacer.next_deadline_ns) == (MS, end + MS)
     now = run(pacer, end, [MS // 4] * 20)
-    stats = pacer.stats(now)
+    stats = pacer.get_stats(now)
     assert (stats.ticks, stats.late, stats.missing, stats.max_ns) == (31, 0, 0, MS // 2)
-    pacer.finished(pacer.next_deadline_ns + MS + 1)
-    assert pacer.stats(pacer.next_deadline_ns).late == 1, "late by the new period"
+    pacer.finish_tick(pacer.next_deadline_ns + MS + 1)
+    assert pacer.get_stats(pacer.next_deadline_ns).late == 1, "late by the new period"
 
 
 def test_another_period_forgets_nothing_that_was_late_before_it() -> None:
     pacer = Pacer(PERIOD, 0)
     now = run(pacer, 0, [MS // 2] * 9 + [100 * MS])
-    before = pacer.stats(now)
+    before = pacer.get_stats(now)
     pacer.change_period(MS, now, now + MS)
-    stats = pacer.stats(now + 2 * MS)
+    stats = pacer.get_stats(now + 2 * MS)
     assert stats.ticks == before.ticks > 50
     assert (stats.finished, stats.late) == (11, before.late), "the tick was overdue, and is done late"
-    assert pacer.ticks_due(now + 2 * MS) == 1
+    assert pacer.count_ticks_due(now + 2 * MS) == 1
 
 
 def test_another_period_in_a_pause_counts_nothing() -> None:
@@ -204,18 +204,18 @@ def test_another_period_in_a_pause_counts_nothing() -> None:
     now = run(pacer, 0, [0] * 5)
     pacer.pause(now)
     pacer.change_period(4 * MS, now + 100 * MS, now + 200 * MS)
-    assert pacer.ticks_due(now + 900 * MS) == 0
+    assert pacer.count_ticks_due(now + 900 * MS) == 0
     pacer.resume(now + 1_000 * MS)
     assert pacer.next_deadline_ns == now + 1_004 * MS
-    assert pacer.stats(now + 1_004 * MS) == Pacer(PERIOD, 0).stats(0)._replace(ticks=5, finished=5)
+    assert pacer.get_stats(now + 1_004 * MS) == Pacer(PERIOD, 0).get_stats(0)._replace(ticks=5, finished=5)
 
 
 def test_percentiles_of_a_part_are_of_that_part() -> None:
     pacer = Pacer(PERIOD, 0)
     now = run(pacer, 0, [100 * MS] + [0] * 60)
-    assert pacer.stats(now, anew=True).max_ns >= 98 * MS
+    assert pacer.get_stats(now, anew=True).max_ns >= 98 * MS
     now = run(pacer, now, [MS // 2] * 50)
-    stats = pacer.stats(now)
+    stats = pacer.get_stats(now)
     assert stats.p99_ns == stats.max_ns == MS // 2
     assert stats.finished == 111
 
@@ -228,5 +228,5 @@ def test_nonsense_is_refused() -> None:
     for period in (0, 2_000 * MS):
         with pytest.raises(ValueError, match="must be positive and at most the backlog"):
             Pacer(PERIOD, 0).change_period(period, 0, 0)
-    assert Pacer(PERIOD, 0).stats(0) == (0, 0, 0, 0, 0.0, 0, 0, 0)
-    assert Pacer(PERIOD, 0).finished(2**50) > 2**49
+    assert Pacer(PERIOD, 0).get_stats(0) == (0, 0, 0, 0, 0.0, 0, 0, 0)
+    assert Pacer(PERIOD, 0).finish_tick(2**50) > 2**49

@@ -5,8 +5,9 @@ from __future__ import annotations
 import mujoco
 import pytest
 
-from iris_session.physics import AmbiguousModelError, find_robots, load_robots_toml
-from iris_session.protocol.specs import RobotSpec
+from iris_session.physics import AmbiguousModelError, World, find_objects, find_robots, load_robots_toml
+from iris_session.physics.names import find_element_id, list_body_names, list_element_names
+from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from tests.physics.models import FINGERS, GRIPPER_TENDON, arm, model, scene
 
 VIPERX = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate")
@@ -222,3 +223,40 @@ def test_a_jaw_opens_away_from_the_fixed_one(sign: int) -> None:
     body, actuators = arm("s", joints=6, end=jaw)
     (robot,) = find_robots(scene(body, actuators + f'<position name="s/j" joint="s/jaw" ctrlrange="{low} {high}"/>'))
     assert (robot.gripper_open, robot.gripper_closed) == (sign * 1.57, 0.0)
+
+
+# --- objects are the named free bodies that nothing drives ---
+
+
+def test_objects_of_real_scenes(handover: mujoco.MjModel, aloha: mujoco.MjModel, iiwa: mujoco.MjModel) -> None:
+    assert find_objects(handover) == (ObjectSpec("hammer", "hammer"), ObjectSpec("board", "board"))
+    assert find_objects(aloha) == find_objects(iiwa) == ()
+
+
+def test_robots_fixed_and_unnamed_bodies_are_no_objects() -> None:
+    body, actuators = arm("dog")
+    free = body.replace('<body name="dog/base">', '<body name="dog/base"><freejoint/><geom size=".1"/>')
+    ball = '<body name="ball"><joint type="free"/><geom size=".1"/></body>'
+    scissors = (
+        '<body name="scissors"><freejoint/><geom size=".1"/>'
+        '<body name="blade"><joint axis="0 0 1"/><geom size=".1"/></body></body>'
+    )
+    rest = '<body><freejoint/><geom size=".1"/></body><body name="post"><geom size=".1"/></body>'
+    long = f'<body name="{"n" * 65}"><freejoint/><geom size=".1"/></body>'
+    m = scene(free + ball + scissors + rest + long, actuators)
+    assert [o.name for o in find_objects(m)] == ["ball", "scissors"]
+    flags = {b.name: b.object for b in World(m, (), find_objects(m)).bodies}
+    assert [n for n, is_object in flags.items() if is_object] == ["ball", "scissors"]
+    assert "n" * 64 in flags
+
+
+def test_generated_body_names_are_unique_and_short() -> None:
+    bodies = "".join(
+        f"<body{name}><geom size='.1'/></body>"
+        for name in ("", " name='body_1'", f" name='{'x' * 64}'", f" name='{'x' * 65}'", f" name='{'x' * 66}'", "")
+    )
+    m = model(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    names = list_body_names(m)
+    assert names == ("world", "body_1~2", "body_1", "x" * 64, "x" * 62 + "~2", "x" * 62 + "~3", "body_6")
+    assert list_element_names(m, "body")[1] == ""
+    assert find_element_id(m, "body", "body_1") == 2

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 
+from iris_session.demo.scenes.deformables import BOX_HIGH, BOX_LOW, FOLD_PAIRS, cloth_scene, soft_scene
 from iris_session.physics import UnknownNameError, World, find_objects, find_robots
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import ObjectContact, WorldView
@@ -100,14 +102,14 @@ def test_gripper_force_is_that_of_mj_contact_force() -> None:
             mujoco.mj_contactForce(world.model, world.data, i, force)
             expected += force[0]
     assert expected > 15.0
-    world.set_state_bytes(world.state_bytes())
+    world.restore_state(world.save_state())
     assert world.view().gripper_force("robot") == pytest.approx(expected, rel=1e-6)
 
 
 def test_one_finger_holds_only_when_it_is_the_only_one() -> None:
     world = grasp_world("elliptic")
     m, robots, objects = world.model, find_robots(world.model), find_objects(world.model)
-    push = lambda w: (w.data.qpos.__setitem__(slice(0, 3), (0.0, 0.026, 0.02)), w.set_state_bytes(w.state_bytes()))  # noqa: E731
+    push = lambda w: (w.data.qpos.__setitem__(slice(0, 3), (0.0, 0.026, 0.02)), w.restore_state(w.save_state()))  # noqa: E731
     push(world)
     assert contacts_of(world)["cube"].touching == ("robot",)
     assert contacts_of(world)["cube"].grippers == ()
@@ -216,3 +218,112 @@ def test_two_arms_on_a_shared_base_keep_their_contacts_apart() -> None:
     )
     world = World(m, specs, find_objects(m))
     assert contacts_of(world)["ball"].touching == ("l",)
+
+
+# --- deformables of a world ---
+
+
+SCENES = {"cloth": cloth_scene, "soft": soft_scene}
+
+
+@pytest.fixture(scope="module", params=list(SCENES))
+def flex_model(request: pytest.FixtureRequest) -> Any:
+    return SCENES[request.param]().compile()
+
+
+@pytest.fixture(scope="module")
+def soft() -> Any:
+    return soft_scene().compile()
+
+
+def world_of(flex_model: Any) -> World:
+    return World(flex_model, find_robots(flex_model), find_objects(flex_model))
+
+
+def slides_of(world: World, name: str) -> list[int]:
+    """First of the three slides (x, y, z) of every vertex or node of a deformable: address in `qpos` and `qvel`."""
+    flex_model, flex = world.model, world.flexes.names.index(name)
+    nodes, first = int(flex_model.flex_nodenum[flex]), int(flex_model.flex_nodeadr[flex])
+    bodies = flex_model.flex_nodebodyid[first : first + nodes]
+    if not nodes:
+        first, count = int(flex_model.flex_vertadr[flex]), int(flex_model.flex_vertnum[flex])
+        bodies = flex_model.flex_vertbodyid[first : first + count]
+    return [int(flex_model.jnt_qposadr[flex_model.body_jntadr[body]]) for body in bodies]
+
+
+def move(world: World, name: str, by: np.ndarray) -> None:
+    for at in slides_of(world, name):
+        world.data.qpos[at : at + 3] += by
+    world.restore_state(world.save_state())
+
+
+def test_two_arms_and_no_objects(flex_model: Any) -> None:
+    assert [robot.name for robot in find_robots(flex_model)] == ["left", "right"]
+    assert find_objects(flex_model) == ()
+
+
+def test_vertices_are_no_bodies_of_the_stream(flex_model: Any) -> None:
+    names = {body.name for body in world_of(flex_model).bodies}
+    assert {"table", "sheet", "left/base", "right/hand"} <= names
+    assert len(names) < 30 < flex_model.nbody
+
+
+def test_a_deformed_world_is_restored_bit_for_bit(flex_model: Any) -> None:
+    """Flexes have caches outside of `mjSTATE_INTEGRATION`; nothing later may depend on them."""
+    world, other, rng = world_of(flex_model), world_of(flex_model), np.random.default_rng(3)
+    for name in world.flexes.names:
+        for at in slides_of(world, name):
+            world.data.qvel[at : at + 3] = rng.normal(0.0, 0.4, 3)
+    for _ in range(15):
+        world.tick()
+    saved = world.snapshot()
+    for _ in range(15):
+        world.tick()
+    for _ in range(5):  # another past
+        other.tick()
+    other.restore(saved)
+    for _ in range(15):
+        other.tick()
+    assert other.save_state() == world.save_state()
+    for name in world.flexes.names:
+        assert (other.flexes.read_vertices(name) == world.flexes.read_vertices(name)).all()
+
+
+def test_the_corners_that_fold_are_the_near_and_the_far_ones() -> None:
+    vertices = world_of(cloth_scene().compile()).flexes.read_vertices("cloth")
+    for near, far in FOLD_PAIRS:
+        assert vertices[far] - vertices[near] == pytest.approx([0.0, 0.36, 0.0], abs=1e-6)
+        assert abs(vertices[near][0]) == pytest.approx(0.18)
+
+
+def test_the_box_of_the_goal_is_that_of_the_scene(soft: Any) -> None:
+    world = world_of(soft)
+    walls = {side: world.data.geom(f"box_{side}").xpos for side in ("west", "east", "south", "north")}
+    thick = soft.geom("box_west").size[0]
+    assert BOX_LOW[0] == pytest.approx(walls["west"][0] + thick)
+    assert BOX_HIGH[0] == pytest.approx(walls["east"][0] - thick)
+    assert BOX_LOW[1] == pytest.approx(walls["south"][1] + thick)
+    assert BOX_HIGH[1] == pytest.approx(walls["north"][1] - thick)
+    assert BOX_HIGH[2] == pytest.approx(walls["west"][2] + soft.geom("box_west").size[2])
+
+
+def test_who_touches_a_deformable_and_how_hard_the_gripper_holds_it(soft: Any) -> None:
+    world = world_of(soft)
+    tip = np.array(world.view().tip_pose("right").p)
+    move(world, "mint", tip - world.flexes.read_vertices("mint").mean(axis=0))
+    assert world.flexes.find_touching_robots("mint") == ()
+    world.ctrl[-1] = 0.0  # the gripper of the right arm closes
+    for _ in range(60):
+        world.tick()
+    assert world.flexes.find_touching_robots("mint") == ("right",)
+    assert world.flexes.find_touching_robots("rose") == ()
+    assert world.view().gripper_force("right") > 20.0
+    assert world.view().gripper_force("left") == 0.0
+    assert world.flexes.read_vertices("mint")[:, 2].mean() == pytest.approx(tip[2], abs=0.02)  # held by friction
+
+
+def test_an_unknown_deformable_says_which_there_are(soft: Any) -> None:
+    world = world_of(soft)
+    for ask in (world.flexes.read_vertices, world.flexes.find_touching_robots):
+        with pytest.raises(UnknownNameError, match="rose"):
+            ask("cloth")

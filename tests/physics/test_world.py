@@ -20,9 +20,9 @@ from iris_session.physics import (
     SpecError,
     UnknownNameError,
     World,
+    decode_model,
     find_objects,
     find_robots,
-    model_from_bytes,
 )
 from iris_session.physics.world import STATE
 from iris_session.protocol.server_messages import BodyInfo
@@ -65,7 +65,7 @@ def test_ticks_are_mj_steps_bit_for_bit(integrator: str, option: str, flag: str)
         mujoco.mj_step(m, plain)
         world.tick()
         contacts = max(contacts, int(plain.ncon))
-        assert world.state_bytes() == state_of(m, plain), f"tick {k}"
+        assert world.save_state() == state_of(m, plain), f"tick {k}"
     assert contacts > 8
 
 
@@ -75,7 +75,7 @@ def test_real_models_tick_like_mj_step_and_restore(name: str, request: pytest.Fi
     robots, objects = find_robots(m), find_objects(m)
     world, plain = World(m, robots, objects), mujoco.MjData(m)
     mujoco.mj_resetDataKeyframe(m, plain, 0)
-    assert world.state_bytes() == state_of(m, plain)
+    assert world.save_state() == state_of(m, plain)
     start = world.data.ctrl.copy()
     for k in range(300):
         ctrl = start + 0.2 * np.sin(0.02 * k)
@@ -85,7 +85,7 @@ def test_real_models_tick_like_mj_step_and_restore(name: str, request: pytest.Fi
         world.tick()
         if k == 150:
             saved = world.snapshot()
-    assert world.state_bytes() == state_of(m, plain)
+    assert world.save_state() == state_of(m, plain)
     other = World(m, robots, objects)
     other.restore(saved)
     for k in range(151, 300):
@@ -95,21 +95,21 @@ def test_real_models_tick_like_mj_step_and_restore(name: str, request: pytest.Fi
 
 
 def test_state_holds_every_input(handover: mujoco.MjModel) -> None:
-    """Everything that a person or a script may write into `MjData` is part of `state_bytes`."""
+    """Everything that a person or a script may write into `MjData` is part of `save_state`."""
     m = clutter()
     world = World(m, (), ())
-    before = world.state_bytes()
+    before = world.save_state()
     for field in ("qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat", "userdata"):
         array = getattr(world.data, field)
         kept = array.copy()
         array.flat[-1] += 0.25
-        assert world.state_bytes() != before, field
+        assert world.save_state() != before, field
         array[...] = kept
     world.data.eq_active[0] = 1
-    assert world.state_bytes() != before
+    assert world.save_state() != before
     world.data.eq_active[0] = 0
     world.data.qacc_warmstart[0] = 1.0
-    assert world.state_bytes() != before
+    assert world.save_state() != before
 
 
 @pytest.mark.parametrize(("integrator", "option", "flag"), CASES)
@@ -140,8 +140,8 @@ def test_restore_is_invisible(integrator: str, option: str, flag: str) -> None:
         assert saved_often.view().object_contacts() == world.view().object_contacts()
     assert other.snapshot() == world.snapshot()
     poses = np.zeros((2, len(world.bodies), 7))
-    world.poses(poses[0])
-    other.poses(poses[1])
+    world.read_poses(poses[0])
+    other.read_poses(poses[1])
     assert poses[0].tobytes() == poses[1].tobytes()
     assert other.view().object_contacts() == world.view().object_contacts() != ()
 
@@ -163,16 +163,16 @@ def test_delayed_actuators_and_sensors_are_saved() -> None:
         if k == 60:
             restored = World(m, (), ())
             restored.restore(world.snapshot())
-        assert world.state_bytes() == restored.state_bytes() == state_of(m, plain)
+        assert world.save_state() == restored.save_state() == state_of(m, plain)
     assert world.data.sensordata.tobytes() == restored.data.sensordata.tobytes()
 
 
 CONTINUE = """
 import hashlib, sys, numpy as np
 from pathlib import Path
-from iris_session.physics import World, find_objects, find_robots, model_from_bytes
+from iris_session.physics import World, find_objects, find_robots, decode_model
 folder = Path(sys.argv[1])
-model = model_from_bytes((folder / "model.mjb").read_bytes())
+model = decode_model((folder / "model.mjb").read_bytes())
 world = World(model, find_robots(model), find_objects(model))
 world.restore((folder / "snapshot").read_bytes())
 for k in range(200):
@@ -187,7 +187,7 @@ def test_another_process_continues_bit_for_bit(handover: mujoco.MjModel, tmp_pat
     for k in range(100):
         world.ctrl[:] = world.ctrl + 0.002 * np.sin(0.1 * k)
         world.tick()
-    (tmp_path / "model.mjb").write_bytes(world.model_bytes())
+    (tmp_path / "model.mjb").write_bytes(world.encode_model())
     (tmp_path / "snapshot").write_bytes(world.snapshot())
     command = [sys.executable, "-c", CONTINUE, str(tmp_path)]
     output = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
@@ -203,13 +203,13 @@ def test_derived_quantities_belong_to_the_new_state() -> None:
     for _ in range(150):
         world.tick()
     fresh = mujoco.MjData(m)
-    mujoco.mj_setState(m, fresh, np.frombuffer(world.state_bytes()).copy(), STATE)
+    mujoco.mj_setState(m, fresh, np.frombuffer(world.save_state()).copy(), STATE)
     mujoco.mj_forward(m, fresh)
     assert world.data.xpos.tobytes() == fresh.xpos.tobytes()
     assert int(world.data.ncon) == int(fresh.ncon) > 0
     assert world.data.contact.dist.tobytes() == fresh.contact.dist.tobytes()
     out = np.zeros((len(world.bodies), 7))
-    world.poses(out)
+    world.read_poses(out)
     assert (out[:, :3] == fresh.xpos[1:]).all()
     assert (out[:, 3:] == fresh.xquat[1:]).all()
 
@@ -259,7 +259,7 @@ def test_bodies_of_a_scene_with_flexes_mocap_and_unnamed_bodies() -> None:
         world.tick()
     assert len(world.bodies) < m.nbody - 15
     out = np.full((len(world.bodies), 7), np.nan)
-    world.poses(out)
+    world.read_poses(out)
     assert out[2, 2] < 2.0
     assert np.allclose(np.linalg.norm(out[:, 3:], axis=1), 1.0)
 
@@ -302,7 +302,7 @@ def test_divergence_is_a_typed_error_until_reset() -> None:
     with pytest.raises(SimulationDivergedError, match="ctrl is NaN"):
         other.tick()
     assert world.view().tick == 1
-    assert world.trouble == {}
+    assert world.dropped_counts == {}
 
 
 def pile(memory: str) -> mujoco.MjModel:
@@ -317,7 +317,7 @@ def pile(memory: str) -> mujoco.MjModel:
 def test_full_memory_is_counted() -> None:
     world = World(pile("300K"), (), ())
     world.tick()
-    assert sum(world.trouble.values()) > 0
+    assert sum(world.dropped_counts.values()) > 0
     world.restore(world.snapshot())
     world.reset()
     assert world.diverged == ""
@@ -341,11 +341,11 @@ def test_snapshots_of_others_are_refused(handover: mujoco.MjModel) -> None:
     with pytest.raises(SnapshotError, match=r"snapshot of scene [0-9a-f]{32}, but this world is scene"):
         world.restore(World(handover, (), ()).snapshot())
     with pytest.raises(SnapshotError, match="state of 8 bytes"):
-        world.set_state_bytes(bytes(8))
-    state = np.frombuffer(world.state_bytes()).copy()
+        world.restore_state(bytes(8))
+    state = np.frombuffer(world.save_state()).copy()
     state[0] = np.nan  # the time
     with pytest.raises(SimulationDivergedError, match="not finite"):
-        world.set_state_bytes(state.tobytes())
+        world.restore_state(state.tobytes())
     with_robots = World(handover, find_robots(handover), ())
     with pytest.raises(SnapshotError, match="0 robots, but this world has 2"):
         with_robots.restore(World(handover, (), ()).snapshot())
@@ -365,11 +365,11 @@ def test_sleeping_islands_are_refused() -> None:
 
 def test_scene_hash_does_not_depend_on_the_folder(data_dir: Path, tmp_path: Path, iiwa: mujoco.MjModel) -> None:
     first = World(iiwa, (), ())
-    data = first.model_bytes()
+    data = first.encode_model()
     assert bytes(iiwa.paths).strip(b"\0")
     assert bytes(iiwa.paths) not in data
     assert str(data_dir).encode() not in data
-    again = World(model_from_bytes(data), (), ())
+    again = World(decode_model(data), (), ())
     assert again.scene_hash == first.scene_hash
     assert len(first.scene_hash) == 32
     assert World(clutter(), (), ()).scene_hash != first.scene_hash
@@ -388,8 +388,8 @@ def test_a_twin_shows_the_new_state_of_a_users_data(handover: mujoco.MjModel) ->
             d.ctrl[:] = handover.key_ctrl[0] + 0.1 * np.sin(0.03 * k)
         mujoco.mj_step(handover, user)
         ours.tick()
-        world.set_state_bytes(state_of(handover, user))
-    assert state_of(handover, user) == world.state_bytes()
+        world.restore_state(state_of(handover, user))
+    assert state_of(handover, user) == world.save_state()
     view, expected = world.view(), ours.view()
     assert view.tick == expected.tick == 200
     assert view.tip_pose("left") == expected.tip_pose("left")
@@ -423,18 +423,18 @@ def test_a_shown_state_is_a_function_of_its_bytes(handover: mujoco.MjModel) -> N
     for k in range(40):
         source.ctrl[:] = handover.key_ctrl[0] + 0.1 * np.sin(0.1 * k)
         source.tick()
-        states.append(source.state_bytes())
+        states.append(source.save_state())
     forwards, single = World(handover, robots, objects), World(handover, robots, objects)
     for state in states:
         for _ in range(2):
-            forwards.set_state_bytes(state)
-            assert forwards.state_bytes() == state
+            forwards.restore_state(state)
+            assert forwards.save_state() == state
             forwards.ctrl[:] += 0.5
-    forwards.set_state_bytes(states[-1])
-    single.set_state_bytes(states[-1])
+    forwards.restore_state(states[-1])
+    single.restore_state(states[-1])
     assert single.snapshot() == forwards.snapshot()
     assert single.view().tick == 40
     assert single.view().object_contacts() == source.view().object_contacts()
     single.tick()
     source.tick()
-    assert single.state_bytes() == source.state_bytes()
+    assert single.save_state() == source.save_state()

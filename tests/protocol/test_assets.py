@@ -9,7 +9,7 @@ import pytest
 
 from iris_session.protocol import codec
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, AssetChunk, AssetRefused, AssetRequest, is_address
-from iris_session.protocol.errors import MalformedError, TooLargeError, VersionError
+from iris_session.protocol.errors import MalformedError, ProtocolVersionError, TooLargeError
 from iris_session.protocol.names import AssetRefusal
 
 ADDRESS = hashlib.sha256(b"").hexdigest()
@@ -17,10 +17,10 @@ ADDRESS = hashlib.sha256(b"").hexdigest()
 
 def test_another_version_is_told_from_bad_bytes() -> None:
     request = AssetRequest(2, 1, 1, ADDRESS, 0, 1)
-    with pytest.raises(VersionError) as caught:
+    with pytest.raises(ProtocolVersionError) as caught:
         codec.decode_asset_request(codec.encode_asset_request(request))
     assert caught.value.version == 2
-    with pytest.raises(VersionError):
+    with pytest.raises(ProtocolVersionError):
         codec.decode_asset_request(msgspec.msgpack.encode([2, "of another schema"]))
     for bad in (b"", b"\xc1", msgspec.msgpack.encode([1, 0]), msgspec.msgpack.encode([1, 0, 0, ADDRESS, -1, 5])):
         with pytest.raises(MalformedError):

@@ -13,10 +13,16 @@ from hypothesis import strategies as st
 
 from iris_session.codegen.examples import extreme, full, least
 from iris_session.protocol import codec
-from iris_session.protocol.client_messages import Acquire, Bye, ClientEnvelope, Hello, Sample, envelope
+from iris_session.protocol.client_messages import Acquire, Bye, ClientEnvelope, Hello, Sample, wrap_message
 from iris_session.protocol.common import Pose, Target
 from iris_session.protocol.discovery import Beacon, Introduction
-from iris_session.protocol.errors import MAX_ERROR_TEXT, MalformedError, ProtocolError, TooLargeError, VersionError
+from iris_session.protocol.errors import (
+    MAX_ERROR_TEXT,
+    MalformedError,
+    ProtocolError,
+    ProtocolVersionError,
+    TooLargeError,
+)
 from iris_session.protocol.limits import (
     LIMITS,
     MAX_CLIENT_BYTES,
@@ -34,7 +40,7 @@ BYE = b"\x94\x01\x00\xa0\x82\xa4type\xa3bye"
 @pytest.mark.parametrize("make", MAKES)
 @pytest.mark.parametrize("tag", codec.CLIENT_TYPES)
 def test_client_messages_round_trip(tag: str, make: object) -> None:
-    value = envelope(make(codec.CLIENT_TYPES[tag]), 3)  # type: ignore[operator]
+    value = wrap_message(make(codec.CLIENT_TYPES[tag]), 3)  # type: ignore[operator]
     data = codec.encode_client(value)
     assert codec.decode_client(data) == value
     assert codec.encode_client(codec.decode_client(memoryview(data))) == data
@@ -80,7 +86,7 @@ def test_introduction_round_trips_and_waits_for_its_end() -> None:
     with pytest.raises(TooLargeError):
         codec.decode_introduction((MAX_INTRODUCTION_BYTES + 1).to_bytes(4, "big"))
     later = msgspec.structs.replace(introduction, beacon=msgspec.structs.replace(beacon, protocol=7))
-    with pytest.raises(VersionError):
+    with pytest.raises(ProtocolVersionError):
         codec.decode_introduction(codec.encode_introduction(later))
 
 
@@ -95,7 +101,7 @@ def test_no_bytes_on_the_port_of_the_introduction_raise_anything_else(data: byte
 
 def test_non_finite_floats_pass_to_the_authority() -> None:
     pose = Pose((math.nan, math.inf, -math.inf), (1.0, 0.0, 0.0, 0.0))
-    decoded = codec.decode_client(codec.encode_client(envelope(Sample("head", "pose", 1, 2, 3, 4, 5, pose=pose))))
+    decoded = codec.decode_client(codec.encode_client(wrap_message(Sample("head", "pose", 1, 2, 3, 4, 5, pose=pose))))
     assert isinstance(decoded.message, Sample)
     assert decoded.message.pose is not None
     assert math.isnan(decoded.message.pose.p[0])
@@ -159,11 +165,11 @@ def test_other_versions_are_told_whatever_their_schema(version: int) -> None:
     for rest in ([{"x": 1}], [0, "", {"type": "bye"}], [0, "", {"type": "new"}], [None] * 9):
         data = pack([version, *rest])
         assert codec.peek_version(data) == version
-        with pytest.raises(VersionError, match=f"protocol version {version}, this side speaks 1") as caught:
+        with pytest.raises(ProtocolVersionError, match=f"protocol version {version}, this side speaks 1") as caught:
             codec.decode_client(data)
         assert caught.value.version == version
         assert caught.value.code == "version"
-    with pytest.raises(VersionError):
+    with pytest.raises(ProtocolVersionError):
         codec.decode_server(pack([version, 0, {"type": "clock_pong", "t0_ns": 1, "t1_ns": 2, "t2_ns": 3}]))
 
 
@@ -208,7 +214,7 @@ def test_the_largest_honest_sample_fits() -> None:
     targets = (Target("left-arm-of-lab1", 2**40), Target("right-arm-of-lab", 2**40))
     sample = Sample("controller/right", "pose", *(2**50,) * 5, targets=targets, pose=pose, twist=(value,) * 6)
     sample = msgspec.structs.replace(sample, hand_joints=(value,) * 182, q=(value,) * 64, qd=(value,) * 64)
-    assert codec.decode_client(codec.encode_client(envelope(sample, 2**40, "somebody"))).message == sample
+    assert codec.decode_client(codec.encode_client(wrap_message(sample, 2**40, "somebody"))).message == sample
 
 
 def test_state_channel_and_beacon_errors() -> None:
@@ -219,7 +225,7 @@ def test_state_channel_and_beacon_errors() -> None:
             decode(bytes(300_000))
     with pytest.raises(MalformedError, match="no beacon"):
         codec.decode_beacon(pack({"protocol": 1}))
-    with pytest.raises(VersionError, match="version 9"):
+    with pytest.raises(ProtocolVersionError, match="version 9"):
         codec.decode_beacon(pack({"protocol": 9, "shape": "round"}))
 
 
@@ -277,7 +283,7 @@ def test_random_fields_raise_protocol_errors_only(tag: str, data: st.DataObject)
     st.integers(0, 3),
 )
 def test_damaged_messages_raise_protocol_errors_only(tag: str, flips: list[tuple[int, int]], cut: int) -> None:
-    data = bytearray(pack(envelope(extreme(codec.CLIENT_TYPES[tag]), 1)))
+    data = bytearray(pack(wrap_message(extreme(codec.CLIENT_TYPES[tag]), 1)))
     for at, value in flips:
         data[at % len(data)] = value
     decode_all(bytes(data[: len(data) - cut]))
@@ -293,7 +299,7 @@ def test_long_texts_of_strangers_are_cut() -> None:
 def test_equal_values_give_equal_bytes() -> None:
     one = ClientEnvelope(1, 2, "", Acquire(1, ("a", "b")))
     assert codec.encode_client(one) == codec.encode_client(ClientEnvelope(1, 2, "", Acquire(1, ("a", "b"))))
-    assert codec.tag_of(Bye) == "bye"
+    assert codec.get_tag(Bye) == "bye"
 
 
 @pytest.mark.parametrize(

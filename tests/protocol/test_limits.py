@@ -67,7 +67,7 @@ def test_never_more_than_rate_and_burst(gaps: list[int], per_second: int, burst:
 
 def test_rate_error_says_what_is_allowed() -> None:
     limit = LIMITS[Sample]
-    error = RateError(codec.tag_of(Sample), limit.per_second, limit.burst)
+    error = RateError(codec.get_tag(Sample), limit.per_second, limit.burst)
     assert error.code == "rate"
     assert str(error) == "too many sample messages: at most 600 per second, 200 at once"
 

@@ -20,11 +20,11 @@ SERVER, CLIENT = bytes(range(32)), bytes(range(32, 64))
 def test_the_vector_of_the_document() -> None:
     page = PAGE.read_text(encoding="utf-8")
     vector = dict(re.findall(r"^(stretched|client_proof|server_proof) +([0-9a-f]{64})$", page, re.MULTILINE))
-    stretched = pairing.stretch("7KQ2-M4XD-9PTR", SERVER)
+    stretched = pairing.stretch_code("7KQ2-M4XD-9PTR", SERVER)
     assert vector == {
         "stretched": stretched.hex(),
-        "client_proof": pairing.client_proof(stretched, SERVER, CLIENT).hex(),
-        "server_proof": pairing.server_proof(stretched, SERVER, CLIENT).hex(),
+        "client_proof": pairing.make_client_proof(stretched, SERVER, CLIENT).hex(),
+        "server_proof": pairing.make_server_proof(stretched, SERVER, CLIENT).hex(),
     }
     by_the_text = hashlib.pbkdf2_hmac("sha256", b"7KQ2M4XD9PTR", b"iris-pair-1" + SERVER, 200_000, 32)
     assert by_the_text == stretched
@@ -33,14 +33,14 @@ def test_the_vector_of_the_document() -> None:
 
 @given(st.binary(min_size=8, max_size=8))
 def test_every_code_is_read_back_however_it_is_spelt(entropy: bytes) -> None:
-    code = pairing.code_from_bytes(entropy)
+    code = pairing.make_code(entropy)
     assert re.fullmatch(r"[0-9A-HJKMNP-TV-Z]{4}(-[0-9A-HJKMNP-TV-Z]{4}){2}", code)
-    normal = pairing.normal_code(code)
+    normal = pairing.normalise_code(code)
     assert len(normal) == 12
     for spelt in (code.lower(), normal, f" {code} ", code.replace("0", "O").replace("1", "l").replace("V", "u")):
-        assert pairing.normal_code(spelt) == normal
+        assert pairing.normalise_code(spelt) == normal
     number = int.from_bytes(entropy, "big")
-    assert pairing.code_from_bytes(((number + 1) % 2**64).to_bytes(8, "big")) != code
+    assert pairing.make_code(((number + 1) % 2**64).to_bytes(8, "big")) != code
 
 
 @pytest.mark.parametrize(
@@ -49,19 +49,19 @@ def test_every_code_is_read_back_however_it_is_spelt(entropy: bytes) -> None:
 )
 def test_what_is_no_code_is_said(text: str) -> None:
     with pytest.raises(ValueError, match="not a join code"):
-        pairing.stretch(text, SERVER)
+        pairing.stretch_code(text, SERVER)
 
 
 def test_proofs_are_bound_to_both_keys_and_to_their_side() -> None:
-    stretched = pairing.stretch("7KQ2-M4XD-9PTR", SERVER)
+    stretched = pairing.stretch_code("7KQ2-M4XD-9PTR", SERVER)
     proofs = {
-        pairing.client_proof(stretched, SERVER, CLIENT),
-        pairing.server_proof(stretched, SERVER, CLIENT),
-        pairing.client_proof(stretched, SERVER, SERVER),
-        pairing.client_proof(stretched, CLIENT, SERVER),
-        pairing.client_proof(pairing.stretch("7KQ2-M4XD-9PTS", SERVER), SERVER, CLIENT),
-        pairing.client_proof(pairing.stretch("7KQ2-M4XD-9PTR", CLIENT), SERVER, CLIENT),
+        pairing.make_client_proof(stretched, SERVER, CLIENT),
+        pairing.make_server_proof(stretched, SERVER, CLIENT),
+        pairing.make_client_proof(stretched, SERVER, SERVER),
+        pairing.make_client_proof(stretched, CLIENT, SERVER),
+        pairing.make_client_proof(pairing.stretch_code("7KQ2-M4XD-9PTS", SERVER), SERVER, CLIENT),
+        pairing.make_client_proof(pairing.stretch_code("7KQ2-M4XD-9PTR", CLIENT), SERVER, CLIENT),
     }
     assert len(proofs) == 6
     with pytest.raises(ValueError, match="32 raw bytes"):
-        pairing.client_proof(stretched, b"x" * 40, CLIENT)
+        pairing.make_client_proof(stretched, b"x" * 40, CLIENT)

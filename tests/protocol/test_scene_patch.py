@@ -19,10 +19,10 @@ from iris_session.protocol.scene import (
     SceneSpec,
     SetVisual,
     Visual,
+    apply_patch,
     decode_scene,
     encode_scene,
-    merged,
-    patched,
+    merge_patches,
 )
 
 RED = (1.0, 0.0, 0.0, 1.0)
@@ -49,7 +49,7 @@ def test_a_patch_changes_what_it_names_and_nothing_else() -> None:
         AddMaterial(Material("gold", RED)),
         AddVisual(box(9, material=1)),
     ]
-    after = patched(SPEC, ops)
+    after = apply_patch(SPEC, ops)
     assert after.visuals == (box(1, rgba=RED), box(2, group=4, T_body_visual=UP), box(9, material=1))
     assert after.materials == (*SPEC.materials, Material("gold", RED))
     assert decode_scene(encode_scene(after)) == after
@@ -68,7 +68,7 @@ def test_a_patch_changes_what_it_names_and_nothing_else() -> None:
 )
 def test_what_does_not_fit_is_said_and_changes_nothing(ops: list[PatchOp], said: str) -> None:
     with pytest.raises(SceneError, match=said):
-        patched(SPEC, ops)
+        apply_patch(SPEC, ops)
 
 
 IDS = st.integers(1, 5)
@@ -86,10 +86,10 @@ def test_merged_patches_do_what_they_did_one_by_one(wished: list[PatchOp]) -> No
     spec, done = SPEC, ()
     for op in wished:
         try:
-            spec = patched(spec, [op])
+            spec = apply_patch(spec, [op])
         except SceneError:
             continue
-        done = merged(done, [op])
-    assert encode_scene(patched(SPEC, done)) == encode_scene(spec), "and so the hash is the same"
+        done = merge_patches(done, [op])
+    assert encode_scene(apply_patch(SPEC, done)) == encode_scene(spec), "and so the hash is the same"
     about = [op for op in done if isinstance(op, SetVisual)]
     assert len({op.visual for op in about}) == len(about)

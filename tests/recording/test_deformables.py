@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from iris_session.physics.load import model_bytes, scene_hash
+from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.recording import SessionHeader, pack_model
 from iris_session.recording.deformables import DrawnDeformable
@@ -40,7 +40,7 @@ class World:
         self.store = AssetStore(folder / "assets")
         self.parsed = parse_mujoco(self.model, self.store)
         self.assets = SceneAssets(-1, 0, str(self.store.root), self.parsed.scene_hash)
-        self.packed = pack_model(bytes(model_bytes(self.model)))
+        self.packed = pack_model(bytes(encode_model(self.model)))
         self.path, self.closed = folder / "w.rrd", False
         self.writer = RrdWriter(self.path, "id")
         self.writer.write_header(SessionHeader("s", "n", "closed", 2_000_000, model=self.packed))
@@ -170,7 +170,7 @@ def test_vertices_of_the_scene_before_are_refused(world: World) -> None:
     """They may come late; and what is for the next scene waits for its states."""
     vertices = world.vertices(0)
     world.state(0)
-    hash_ = scene_hash(bytes(model_bytes(world.model)))
+    hash_ = compute_scene_hash(bytes(encode_model(world.model)))
     scene = SceneModel(8, 16_000_007, hash_, world.packed, (BodyInfo(1, "cup", moving=True),))
     world.publish(16, 0, vertices + 0.2)
     world.writer.add(Batch(scenes=[scene], assets=[world.assets]))
@@ -187,7 +187,7 @@ def test_vertices_of_the_last_state_before_a_scene_are_refused(world: World) -> 
     vertices = world.vertices(0)
     world.state(0)
     world.state(8)
-    hash_ = scene_hash(bytes(model_bytes(world.model)))
+    hash_ = compute_scene_hash(bytes(encode_model(world.model)))
     scene = SceneModel(8, 16_000_000, hash_, world.packed, (BodyInfo(1, "cup", moving=True),))  # 7 ns before the state
     world.writer.add(Batch(scenes=[scene], assets=[world.assets]))
     world.publish(8, 0, vertices + 0.1)

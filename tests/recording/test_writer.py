@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from anchors.pose import apply
-from iris_session.physics.load import model_bytes, scene_hash
+from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.protocol.common import Applied, Denial, Pose
 from iris_session.protocol.scene import (
     AddVisual,
@@ -21,8 +21,8 @@ from iris_session.protocol.scene import (
     SceneSpec,
     SetVisual,
     Visual,
+    apply_patch,
     encode_scene,
-    patched,
 )
 from iris_session.protocol.server_messages import BodyInfo, EStopChanged, Event, PresenceItem
 from iris_session.recording import Recording, SessionHeader, pack_model
@@ -182,9 +182,9 @@ OTHER = """
 def other_scene(step: int) -> tuple[SceneModel, bytes]:
     """A scene with one body, and the binary form of its model."""
     model = mujoco.MjModel.from_xml_string(OTHER)
-    mjb = bytes(model_bytes(model))
+    mjb = bytes(encode_model(model))
     row_ns = step * 2_000_000  # the state of that row is later, see `frame`
-    return SceneModel(step, row_ns, scene_hash(mjb), pack_model(mjb), (BodyInfo(1, "cup", moving=True),)), mjb
+    return SceneModel(step, row_ns, compute_scene_hash(mjb), pack_model(mjb), (BodyInfo(1, "cup", moving=True),)), mjb
 
 
 def test_another_scene_is_drawn_from_its_moment_on_and_its_model_can_be_read(tmp_path: Path) -> None:
@@ -279,7 +279,7 @@ def test_a_patch_changes_the_picture_from_its_moment_on(tmp_path: Path) -> None:
         [SetVisual(1, rgba=(0.0, 0.0, 1.0, 1.0))],
     ]
     for i, ops in enumerate(steps, 1):
-        spec = patched(spec, ops)
+        spec = apply_patch(spec, ops)
         address = store.put(encode_scene(spec))
         writer.add(Batch(assets=[SceneAssets(10 * i, 100 * i, str(store.root), address)]))
         writer.add(Batch(states=[frame(10 * i, poses)]))
@@ -312,7 +312,7 @@ def test_a_patch_changes_the_picture_from_its_moment_on(tmp_path: Path) -> None:
 def test_a_patch_before_the_first_state_is_how_the_scene_begins(tmp_path: Path) -> None:
     store = AssetStore(tmp_path / "assets")
     spec, assets = shared(store, mujoco.MjModel.from_xml_string(XML))
-    address = store.put(encode_scene(patched(spec, [SetVisual(1, rgba=(1.0, 0.0, 0.0, 1.0))])))
+    address = store.put(encode_scene(apply_patch(spec, [SetVisual(1, rgba=(1.0, 0.0, 0.0, 1.0))])))
     writer = RrdWriter(tmp_path / "w.rrd", "id")
     writer.write_header(make_header())
     writer.add(Batch(assets=[assets]))

@@ -79,7 +79,7 @@ def _assets(spec: SceneSpec, store: AssetStore, assets: dict[str, bytes]) -> Ite
 
 
 def _material(index: int, material: Material) -> str:
-    worn = material.texture()
+    worn = material.find_texture()
     texture = f'texture="t{worn}"' if worn >= 0 else ""
     return (
         f'<material name="a{index}" rgba="{text(material.rgba)}" emission="{material.emission!r}" '

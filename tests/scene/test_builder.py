@@ -148,7 +148,7 @@ def test_looks(store: AssetStore) -> None:
     assert len(spec.textures) == 1
     first, second = (spec.materials[visual.material] for visual in spec.visuals[3:])
     assert (first.repeat, first.uniform, first.rgba) == ((2.0, 3.0), True, (1.0, 1.0, 1.0, 1.0))
-    assert second.texture("rgba") == 0
+    assert second.find_texture("rgba") == 0
     assert second.rgba == (1.0, 0.0, 0.0, 1.0)
 
 

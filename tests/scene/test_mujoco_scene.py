@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from iris_session.physics import World
-from iris_session.protocol.scene import SceneError, SceneSpec, asset_addresses, decode_scene, encode_scene
+from iris_session.protocol.scene import SceneError, SceneSpec, decode_scene, encode_scene, list_assets
 from iris_session.scene import AssetStore, EncodeOptions, decode_arrays
 from iris_session.scene.elements import to_matrix
 from iris_session.scene.mujoco_scene import ParsedScene, parse_mujoco
@@ -145,7 +145,7 @@ def test_every_shape_and_its_costs(tmp_path: Path) -> None:
     real = spec.cameras[3]
     assert (real.focal, real.principal) == (pytest.approx((200, 210)), pytest.approx((9, -7)))
     assert spec.cameras[2].orthographic
-    addresses = asset_addresses(spec)
+    addresses = list_assets(spec)
     assert all(store.size(address) == size for address, size in addresses.items())
     assert spec.totals.asset_bytes == sum(addresses.values())
     assert spec.totals.objects == len(spec.visuals) - 2  # one is transparent, one hidden

@@ -39,8 +39,8 @@ def mode(path: Path) -> int:
 
 
 def proof_of(code: str, server: KeyPair, client: KeyPair) -> bytes:
-    secret = pairing.stretch(code, server.raw_public)
-    return pairing.client_proof(secret, server.raw_public, client.raw_public)
+    secret = pairing.stretch_code(code, server.raw_public)
+    return pairing.make_client_proof(secret, server.raw_public, client.raw_public)
 
 
 def test_the_home_is_where_the_environment_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -155,7 +155,7 @@ def test_a_code_is_good_for_one_key_and_is_nowhere_to_be_read(home: KeyHome) -> 
     )
     assert good.entry is not None
     assert (good.entry.name, good.entry.roles, good.entry.key) == ("ann", ("observer",), ann.public)
-    assert good.secret == pairing.stretch(code, server.raw_public)
+    assert good.secret == pairing.stretch_code(code, server.raw_public)
     again = home.join_codes.redeem(server.raw_public, eve.public, proof_of(code, server, eve), "eve", home.clients)
     assert again.entry is None
     kept = home.join_codes.find_code(made.id)

@@ -27,7 +27,7 @@ from anchors.pose import Vec3, quat_from_rotvec
 from iris_session.authority import AuthorityConfig
 from iris_session.control import ControlConfig
 from iris_session.demo.scenes import n_arms_scene
-from iris_session.physics import find_objects, find_robots, model_from_bytes
+from iris_session.physics import decode_model, find_objects, find_robots
 from iris_session.protocol import client_messages as cm
 from iris_session.protocol import entries as em
 from iris_session.protocol.common import Pose, Target
@@ -101,12 +101,12 @@ class Stress:
         self.config = make_config(model, open_loop)
         self.core = SessionCore(model, self.config)
         encoded = msgspec.msgpack.encode(self.config)
-        self.journal = Journal(self.core.world.model_bytes(), encoded)
+        self.journal = Journal(self.core.world.encode_model(), encoded)
         self.model = model
         self.user: Any = None
         if open_loop:
             self.user = mujoco.MjData(model)
-            mujoco.mj_setState(model, self.user, np.frombuffer(self.core.world.state_bytes()), _state_kind())
+            mujoco.mj_setState(model, self.user, np.frombuffer(self.core.world.save_state()), _state_kind())
         self.now_ns = 1000 * MS
         self.entries: list[Entry] = []
         self.people: list[Person] = []
@@ -163,7 +163,7 @@ class Stress:
             self.user.xfrc_applied[:] = self.core.world.data.xfrc_applied
             mujoco.mj_step(self.model, self.user)
             if self.rng.random() < 0.5:  # `end_tick` shows the new state before the next step, a callback does not
-                self.core.world.set_state_bytes(read_plant_state(self.model, self.user))
+                self.core.world.restore_state(read_plant_state(self.model, self.user))
 
     def check_motion(self, q: Any, v: Any, n_ticks: int) -> None:
         """Whatever people do, commanded joints keep their limits of velocity and acceleration."""
@@ -361,7 +361,7 @@ def play(seed: int, steps: int, *, open_loop: bool) -> Stress:
 
 def replay(journal: Journal, span: int) -> list[str]:
     """Differences found: the whole journal once, then `span` steps from every frame."""
-    model = model_from_bytes(journal.model)
+    model = decode_model(journal.model)
     config = msgspec.msgpack.decode(journal.config, type=CoreConfig)
     found = []
     for first in (0, *journal.frames):

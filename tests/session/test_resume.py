@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from anchors.pose import IDENTITY_QUAT, PoseTuple
 from iris_session.authority import AuthorityConfig
 from iris_session.demo.scenes import scene_path
-from iris_session.physics import load_model, model_bytes
+from iris_session.physics import encode_model, load_model
 from iris_session.protocol.client_messages import Marker, MoveAnchor
 from iris_session.protocol.common import Applied, Pose
 from iris_session.protocol.entries import Entry, SessionResumed, decode_entries
@@ -91,7 +91,7 @@ def recorded(
         CLOSED,
         TICK_NS,
         msgspec.msgpack.encode(core.config),
-        pack_model(core.world.model_bytes()),
+        pack_model(core.world.encode_model()),
         core.world.scene_hash,
         core.config.robots,
         core.config.objects,
@@ -272,7 +272,7 @@ def test_the_scene_may_be_given_and_must_be_the_same(session: Path) -> None:
     past, _, scene = prepare_session(config, scene_path("handover"), None, None, None)
     assert past is not None
     past.close()
-    assert model_bytes(scene[0]) == model_bytes(load_model(scene_path("handover")))
+    assert encode_model(scene[0]) == encode_model(load_model(scene_path("handover")))
     other = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
     with pytest.raises(ResumeError, match=r"the scene is not that of session\.rrd"):
         prepare_session(config, other, None, None, None)

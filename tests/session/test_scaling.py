@@ -56,7 +56,7 @@ class Ann:
 
     def tip(self) -> Vec3:
         """Where the robot is commanded to, without the sag of the simulated arm."""
-        return self.core.controller.targets()["left"].p
+        return self.core.controller.get_targets()["left"].p
 
     def set_scale(self, scale: float) -> None:
         outcome = self.step(SetScale(9, ("left",), scale))

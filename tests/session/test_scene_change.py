@@ -11,7 +11,7 @@ import pytest
 from iris_session import Session, SessionConfig
 from iris_session.demo.scenes import n_arms_scene, scene_path
 from iris_session.physics import Pacer, PhysicsError, find_objects, find_robots
-from iris_session.physics.load import model_bytes, model_from_bytes, scene_hash
+from iris_session.physics.load import compute_scene_hash, decode_model, encode_model
 from iris_session.protocol.client_messages import Control, GetSnapshot
 from iris_session.protocol.entries import SceneLoaded, decode_entries
 from iris_session.protocol.server_messages import SceneChanged, Snapshot
@@ -34,14 +34,14 @@ def bench_scene(timestep: float = 0.002) -> mujoco.MjModel:
 
 
 def loaded(model: mujoco.MjModel, state: bytes = b"") -> SceneLoaded:
-    return SceneLoaded(scene_hash(model_bytes(model)), find_robots(model), find_objects(model), state)
+    return SceneLoaded(compute_scene_hash(encode_model(model)), find_robots(model), find_objects(model), state)
 
 
 def with_models(*models: mujoco.MjModel) -> SessionCore:
     """A core that can build the scenes that are loaded later, as a replay does."""
     first = make_core()
-    known = {scene_hash(model_bytes(m)): bytes(model_bytes(m)) for m in models}
-    return SessionCore(first.world.model, first.config, lambda model_hash: model_from_bytes(known[model_hash]))
+    known = {compute_scene_hash(encode_model(m)): bytes(encode_model(m)) for m in models}
+    return SessionCore(first.world.model, first.config, lambda model_hash: decode_model(known[model_hash]))
 
 
 def play(core: SessionCore, first: int, last: int, change: SceneLoaded) -> list[bytes]:
@@ -162,7 +162,7 @@ def test_the_loop_keeps_the_timestep_of_the_scene_from_its_first_tick_on() -> No
     assert adopt_timestep(rig.stepper, pacer, times, pacer.next_deadline_ns)
     assert (pacer.period_ns, times.compute_lateness()) == (1_000_000, None)
     assert pacer.next_deadline_ns == rig.stepper.clock() + 1_000_000
-    stats = pacer.stats(rig.stepper.clock())
+    stats = pacer.get_stats(rig.stepper.clock())
     assert (stats.finished, stats.late, stats.missing) == (1, 0, 0)
     assert not adopt_timestep(rig.stepper, pacer, times, pacer.next_deadline_ns)
 

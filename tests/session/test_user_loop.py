@@ -39,7 +39,7 @@ class Rig:
         self.loop = UserLoop(self.model, self.data, self.stepper, Watch())  # type: ignore[arg-type]
 
     def _note(self, entries: Sequence[Entry]) -> None:
-        plant = self.stepper.core.world.state_bytes()
+        plant = self.stepper.core.world.save_state()
         self.read += [(self.stepper.step_count, entry, plant) for entry in entries]
 
     def resets(self) -> list[bytes]:

@@ -6,7 +6,7 @@ from typing import Final
 
 from iris_session.client.core.connection import ClientConnection
 from iris_session.client.core.state_stream import SceneState
-from iris_session.protocol.status import ClientReport, Quantiles, quantiles
+from iris_session.protocol.status import ClientReport, Quantiles, compute_quantiles
 
 PERIOD_NS: Final = 1_000_000_000
 #: Ages kept of one period: more frames than are ever sent in a second.
@@ -54,7 +54,7 @@ class ArrivalMeter:
         if elapsed_ns < PERIOD_NS:
             return None
         if self._ages_ns or not self._delivered:
-            self._ages = quantiles(self._ages_ns)
+            self._ages = compute_quantiles(self._ages_ns)
         report = ClientReport(
             0.0 if self._ages is None else self._ages.p50,
             0.0 if self._ages is None else self._ages.p99,

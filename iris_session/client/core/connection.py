@@ -35,7 +35,7 @@ from iris_session.protocol.client_messages import (
     Sample,
     Samples,
     TrackingEpoch,
-    envelope,
+    wrap_message,
 )
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.errors import ProtocolError
@@ -474,9 +474,9 @@ class ClientConnection:
         hello = msgspec.structs.replace(
             self.hello, secret=self.identity.secret, resume_token=self.identity.resume_token
         )
-        self._outbox.push(hello, encode_client(envelope(hello)))
+        self._outbox.push(hello, encode_client(wrap_message(hello)))
         if self.pending_estop.message is not None:  # every client may stop, however early
-            self._outbox.push(self.pending_estop.message, encode_client(envelope(self.pending_estop.message)))
+            self._outbox.push(self.pending_estop.message, encode_client(wrap_message(self.pending_estop.message)))
 
     def _start_backoff(self, now_ns: int) -> None:
         self.phase = ConnectionPhase.WAITING
@@ -485,7 +485,7 @@ class ClientConnection:
         self._backoff_ns = min(2 * self._backoff_ns, BACKOFF_MAX_NS)
 
     def _queue(self, message: ClientMessage) -> bool:
-        return self._outbox.push(message, encode_client(envelope(message, self.connection_epoch)))
+        return self._outbox.push(message, encode_client(wrap_message(message, self.connection_epoch)))
 
 
 def bounded_heartbeat_ns(welcome: Welcome) -> int:

@@ -18,7 +18,7 @@ from iris_session.protocol.client_messages import (
     Release,
     Sample,
     Samples,
-    envelope,
+    wrap_message,
 )
 from iris_session.protocol.codec import decode_client, encode_client
 from iris_session.protocol.common import Lease
@@ -47,7 +47,7 @@ def encode_checked(message: ClientMessage, connection_epoch: int = 0) -> bytes:
     """
     kind = type(message).__name__
     try:
-        data = encode_client(envelope(message, connection_epoch))
+        data = encode_client(wrap_message(message, connection_epoch))
         decode_client(data)
     except ProtocolError as error:
         text = str(error).removeprefix(f"{kind.lower()}: ")

@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 
 from iris_session.front.media.budget import MILLISECOND, NONE_LEVEL, SECOND
 from iris_session.protocol.codec import encode_media_header
-from iris_session.protocol.media import CLASSES, MAX_STREAMS, MediaHeader, MediaPush, is_stream_name, media_topic
+from iris_session.protocol.media import CLASSES, MAX_STREAMS, MediaHeader, MediaPush, is_stream_name, make_topic
 
 #: A stream without frames for `TAKEOVER_NS` may be taken over by another source; after `EXPIRE_NS` it is removed.
 TAKEOVER_NS: Final = 3 * SECOND
@@ -333,7 +333,7 @@ class MediaScheduler:
             push.encoding,
             subscription.dropped,
         )
-        topic = media_topic(number, name) + CLASSES[level].encode()
+        topic = make_topic(number, name) + CLASSES[level].encode()
         if not send(topic, encode_media_header(header), frame):
             return False
         subscription.delivered += 1

@@ -62,7 +62,7 @@ def test_obj_with_materials_and_a_texture(tmp_path: Path) -> None:
     by_name = {visual.name: visual for visual in scene.spec.visuals}
     assert by_name["red"].rgba == pytest.approx((0.8, 0.2, 0.2, 0.4), abs=0.003)
     painted = by_name["painted"]
-    level = scene.spec.textures[scene.spec.materials[painted.material].texture()].levels[0]
+    level = scene.spec.textures[scene.spec.materials[painted.material].find_texture()].levels[0]
     np.testing.assert_array_equal(decode_image(store.get(level.address), level.encoding), PIXELS)
     mesh = decode_mesh(store.get(scene.spec.meshes[painted.geometry.mesh].levels[0].address))
     assert mesh.uv is not None

@@ -113,7 +113,7 @@ def test_hierarchy_and_looks(tmp_path: Path, store: AssetStore) -> None:
     seen = np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
     np.testing.assert_allclose(looks["plain"].rgba[:3], seen, atol=1e-6)
     assert looks["painted"].metallic == 0.25
-    level = spec.textures[looks["painted"].texture()].levels[0]
+    level = spec.textures[looks["painted"].find_texture()].levels[0]
     np.testing.assert_array_equal(decode_image(store.get(level.address), level.encoding), PIXELS)
     # worn twice, once stretched: two meshes, since a pose has no scale
     assert len(spec.meshes) == 3
@@ -212,7 +212,7 @@ def test_textures_as_the_material_has_them(tmp_path: Path, store: AssetStore) ->
     spec = built(document.write(tmp_path / "a.glb"), store)
 
     def pixels(material: int, *roles: str) -> NDArray[np.uint8]:
-        level = spec.textures[spec.materials[material].texture(*roles)].levels[0]
+        level = spec.textures[spec.materials[material].find_texture(*roles)].levels[0]
         return decode_image(store.get(level.address), level.encoding)
 
     np.testing.assert_array_equal(pixels(0), PIXELS)

@@ -24,7 +24,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// What a participant may do. Reserved for later message types: camera, source.
+    /// Rights of a participant. Reserved for later message types: camera, source.
     /// </summary>
     public static class Role
     {
@@ -56,7 +56,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Which payload of a Sample is meant.
+    /// Payload of a Sample that counts.
     /// </summary>
     public static class SampleKind
     {
@@ -66,7 +66,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Values of an open enumeration: TargetKind.
+    /// Kind of a target.
     /// </summary>
     public static class TargetKind
     {
@@ -75,7 +75,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// How a robot's lease passes between participants.
+    /// Rule by which a robot's lease passes between participants.
     /// </summary>
     public static class LeaseMode
     {
@@ -87,7 +87,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Values of an open enumeration: AssignmentPolicy.
+    /// Rule that chooses a robot for a participant that names none.
     /// </summary>
     public static class AssignmentPolicy
     {
@@ -98,7 +98,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// How T_world_tracking of a participant came to be.
+    /// Origin of T_world_tracking of a participant.
     /// </summary>
     public static class AlignmentKind
     {
@@ -109,7 +109,8 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// What align asks for. start: measure anew, from nothing; stop: keep what is in force, whatever is seen.
+    /// Action of align. start: measure anew, from nothing; stop: keep the alignment in force whatever is
+    /// observed.
     /// </summary>
     public static class AlignAction
     {
@@ -118,9 +119,9 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// How an alignment was found to be wrong.
+    /// Evidence that an alignment is wrong.
     ///
-    /// changed: an anchor is seen elsewhere than seconds ago. differs: and elsewhere than the alignment says. jump:
+    /// changed: an anchor is observed elsewhere than seconds ago. differs: and elsewhere than by the alignment. jump:
     /// the tracking frame moved at once, which voids the alignment.
     /// </summary>
     public static class AlarmKind
@@ -131,7 +132,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Values of an open enumeration: AnchorKind.
+    /// Physical form of an anchor.
     /// </summary>
     public static class AnchorKind
     {
@@ -142,7 +143,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Values of an open enumeration: SessionKind.
+    /// Kind of a session.
     /// </summary>
     public static class SessionKind
     {
@@ -151,7 +152,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Values of an open enumeration: CommandKind.
+    /// Kind of a robot's command.
     /// </summary>
     public static class CommandKind
     {
@@ -162,7 +163,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Why a robot holds. Exactly one is given with every hold command.
+    /// Reason why a robot holds. Exactly one is given with every hold command.
     /// </summary>
     public static class HoldReason
     {
@@ -183,7 +184,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Why a sample was not counted. Counted per participant, device and reason.
+    /// Reason why a sample was rejected. Counted per participant, device and reason.
     /// </summary>
     public static class RejectReason
     {
@@ -211,7 +212,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Why a request was denied.
+    /// Reason why a request was denied.
     /// </summary>
     public static class DenialReason
     {
@@ -241,7 +242,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Why a hello was refused by the front, before the authority saw it.
+    /// Reason why the front refused a hello, before the authority received it.
     /// </summary>
     public static class RefusalCode
     {
@@ -258,7 +259,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Why a ProtocolFault was sent: a message that could not be taken, or what has become of the session.
+    /// Reason of a ProtocolFault: a rejected message, or a change in the state of the session.
     /// </summary>
     public static class FaultCode
     {
@@ -275,7 +276,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Values of an open enumeration: EpisodeAction.
+    /// Action of episode.
     /// </summary>
     public static class EpisodeAction
     {
@@ -288,7 +289,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Values of an open enumeration: ControlAction.
+    /// Action of control.
     /// </summary>
     public static class ControlAction
     {
@@ -299,7 +300,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// What an Audited event tells.
+    /// Kind of an Audited event.
     /// </summary>
     public static class AuditKind
     {
@@ -316,7 +317,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// How much media a client gets, from everything to nothing. State and control come whatever the class.
+    /// Share of media that a client gets, from everything to nothing. State and control are never cut.
     /// </summary>
     public static class BudgetClass
     {
@@ -327,7 +328,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Why no bytes of an asset come. After the last four the same may be asked again later.
+    /// Reason why a request for an asset is refused. After the last four the same request may succeed later.
     /// </summary>
     public static class AssetRefusal
     {
@@ -342,7 +343,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// What the bytes of a media frame are.
+    /// Encoding of the bytes of a media frame.
     /// </summary>
     public static class MediaEncoding
     {
@@ -351,7 +352,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Where the time of a late tick went.
+    /// Part of a late tick that took the time.
     /// </summary>
     public static class LateCause
     {
@@ -381,7 +382,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// How a texture covers what wears it.
+    /// Mapping of a texture onto a surface.
     /// </summary>
     public static class TextureKind
     {
@@ -391,7 +392,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// What a texture gives to a material. rgb, rgba: its colour, the only one that every client must draw.
+    /// Use of a texture in a material. rgb, rgba: its colour, the only one that every client must draw.
     /// </summary>
     public static class TextureRole
     {
@@ -408,7 +409,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// How the numbers of a texture are meant. auto: as they are, without conversion.
+    /// Encoding of the values of a texture. auto: as they are, without conversion.
     /// </summary>
     public static class ColorSpace
     {
@@ -418,7 +419,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Values of an open enumeration: LightKind.
+    /// Kind of a light.
     /// </summary>
     public static class LightKind
     {
@@ -429,7 +430,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// How a light or camera moves. Unknown values: like fixed.
+    /// Motion of a light or camera. Unknown values: like fixed.
     /// </summary>
     public static class Follow
     {
@@ -441,7 +442,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// What the bytes of an asset are.
+    /// Encoding of the bytes of an asset.
     /// </summary>
     public static class AssetEncoding
     {
@@ -452,7 +453,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// What the arrays of an asset are together.
+    /// Meaning of an asset of arrays.
     /// </summary>
     public static class ArrayKind
     {
@@ -463,7 +464,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// What an array of an asset is; which ones a kind has is in docs/scene.md.
+    /// Meaning of an array of an asset; which ones a kind has is in docs/scene.md.
     /// </summary>
     public static class ArrayName
     {
@@ -480,7 +481,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// What was done to an array before it was compressed.
+    /// Transformation of an array before compression.
     /// </summary>
     public static class ArrayFilter
     {
@@ -491,7 +492,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Values of an open enumeration: ArrayCodec.
+    /// Compression of an array.
     /// </summary>
     public static class ArrayCodec
     {
@@ -1118,7 +1119,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// What a sample drives, under which lease. lease_version is the fencing token.
+    /// Target of a sample, and the lease that it is driven under. lease_version is the fencing token.
     /// </summary>
     public sealed class Target : WireValue
     {
@@ -1148,13 +1149,13 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// State of one lease as everyone sees it. holder is a participant id, empty when free.
+    /// Public state of one lease. holder is a participant id, empty when free.
     ///
     /// expires_ns is the session time at which the grace period of a disconnected holder ends, 0 while it is connected.
     /// sub_holders and weights have the same length: everyone who shares the target (mode shared, objects), or an
-    /// agent and the human who stands by (mode priority; the one in charge is holder and has weight 1, the other 0).
-    /// In mode shared a token stays valid for its holder when others join and raise lease_version.
-    /// scale: motion scaling of a robot in the hands of holder, 1 when nothing else was set.
+    /// agent and the human who stands by (mode priority; the one in charge is holder and has weight 1, the other 0). In
+    /// mode shared a token stays valid for its holder when others join and raise lease_version. scale: motion scaling
+    /// of a robot for its holder, 1 by default.
     /// </summary>
     public sealed class Lease : WireValue
     {
@@ -1221,7 +1222,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// A typed no: the reason (DenialReason), who holds what was asked for, and what to do.
+    /// A typed denial: the reason (DenialReason), the holder of the target, and advice.
     ///
     /// Texts that list what would have been right are cut to the length of a Text.
     /// </summary>
@@ -1378,7 +1379,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Ports of the other channels on the host that the client already talks to. media_ingest: for media sources.
+    /// Ports of the other channels on the host of the control channel. media_ingest: for media sources.
     /// </summary>
     public sealed class Endpoints : WireValue
     {
@@ -1632,7 +1633,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// One anchor as a headset saw it: how often in this run, and how long ago.
+    /// Observations of one anchor by a headset: their number in this run, and the age of the newest.
     /// </summary>
     public sealed class AnchorSeen : WireValue
     {
@@ -1671,11 +1672,11 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// How the alignment of one participant stands, beyond what AlignmentChanged tells.
+    /// State of the alignment of one participant, beyond AlignmentChanged.
     ///
-    /// error_at_anchor_m, error_at_robot_m: stated p95. pending_m, pending_rad: how far a correction that waits, or
-    /// slides in, is away. advice: why the estimator refuses, or warns. alarm: the last AlarmKind that no new
-    /// alignment has answered yet, alarm_ns ago. unusable: observations that were of no use, since the run began.
+    /// error_at_anchor_m, error_at_robot_m: stated p95. pending_m, pending_rad: size of a correction that waits, or
+    /// slides in. advice: why the estimator refuses, or warns. alarm: the last AlarmKind that no new alignment has
+    /// resolved yet, alarm_ns ago. unusable: observations that could not be used, since the run began.
     /// </summary>
     public sealed class AlignmentReport : WireValue
     {
@@ -1865,11 +1866,11 @@ namespace IrisSession.Protocol
     /// One participant, as the session sees it. Times in *_ns are durations until now, -1 for never.
     ///
     /// capture_to_receive: device to front. state_age: end of tick to application, as its client reports it.
-    /// alignment_void_ns: since the tracking frame jumped and voided the alignment, -1 for not so.
-    /// lost: why the front lost its connection (silent, closed, slow, ...), empty while connected.
-    /// rejected: samples by reason, drops: messages thrown away, both since it joined. reported: its client reports.
-    /// media: the streams that it subscribed to, budget_class the lowest of theirs, empty without one.
-    /// media_bytes_per_s: sent to it, media_drops: frames that its link did not take in time, since it joined.
+    /// alignment_void_ns: since the tracking frame jumped and voided the alignment, -1 for not so. lost: why it is
+    /// disconnected (silent, closed, slow, ...), empty while connected. rejected: samples by reason, drops:
+    /// messages dropped, both since it joined. reported: its client reports. media: the streams that it subscribed to,
+    /// budget_class the lowest of theirs, empty without one. media_bytes_per_s: sent to it, media_drops: frames that
+    /// its link did not take in time, since it joined.
     /// </summary>
     public sealed class ParticipantReport : WireValue
     {
@@ -2016,7 +2017,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// One robot: who has it, what it does, and why it holds.
+    /// One robot: its holder, its state, and the reason why it holds.
     /// </summary>
     public sealed class RobotReport : WireValue
     {
@@ -2075,8 +2076,8 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// state: off (nothing is recorded), running, hangs (says nothing for 5 s), dead (being replaced) or
-    /// failed (the file cannot be written). disk_free_bytes 0: not known. text: what it said last, for people.
+    /// State of the recorder: off (nothing is recorded), running, hangs (silent for 5 s), dead (being replaced)
+    /// or failed (the file cannot be written). disk_free_bytes 0: not known. text: its last message, for people.
     /// </summary>
     public sealed class RecorderReport : WireValue
     {
@@ -2130,7 +2131,7 @@ namespace IrisSession.Protocol
 
     /// <summary>
     /// One media stream, at its best class. source: its publisher's name, empty for the session's own process.
-    /// subscribers: participants who want it.
+    /// subscribers: participants that subscribed to it.
     /// </summary>
     public sealed class MediaStreamReport : WireValue
     {
@@ -2178,7 +2179,7 @@ namespace IrisSession.Protocol
 
     /// <summary>
     /// The assets channel. served: assets of the present scene. Since the front began: bytes_sent, requests, and
-    /// refusals, of requests and connections. waiting: connections that wait for something now.
+    /// refusals, of requests and connections. waiting: connections with an unanswered request.
     /// </summary>
     public sealed class AssetsReport : WireValue
     {
@@ -2293,7 +2294,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Leaves at once: leases are released without grace.
+    /// Leave the session at once: leases are released without grace.
     /// </summary>
     public sealed class Bye : ClientMessage
     {
@@ -2326,7 +2327,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Sent at least every Welcome.heartbeat_ns. worn false: the headset lies on the table.
+    /// Sign of life, sent at least every Welcome.heartbeat_ns. worn false: the headset is not worn.
     /// </summary>
     public sealed class Heartbeat : ClientMessage
     {
@@ -2359,7 +2360,8 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// t0_ns: the client's own monotonic clock when it sent this. Answered by ClockPong from the front.
+    /// Clock measurement. t0_ns: the client's own monotonic clock at sending. Answered by ClockPong from the
+    /// front.
     /// </summary>
     public sealed class ClockPing : ClientMessage
     {
@@ -2393,6 +2395,9 @@ namespace IrisSession.Protocol
         }
     }
 
+    /// <summary>
+    /// Request for a Snapshot. request_id is repeated in it.
+    /// </summary>
     public sealed class GetSnapshot : ClientMessage
     {
         public const string TagName = "get_snapshot";
@@ -2535,7 +2540,7 @@ namespace IrisSession.Protocol
     /// <summary>
     /// Samples of several devices that were taken together, such as head and both controllers at a display frame.
     ///
-    /// Each counts by itself, as if it had come alone; together they cost one message, one packet and one wake-up.
+    /// Each counts as if it had arrived alone; together they cost one message, one packet and one wake-up.
     /// </summary>
     public sealed class Samples : ClientMessage
     {
@@ -2570,7 +2575,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Asks for leases, all or none. No names: the assignment policy chooses one robot. wait: queue when held.
+    /// Request for leases, all or none. No names: the assignment policy chooses one robot. wait: queue when held.
     /// </summary>
     public sealed class Acquire : ClientMessage
     {
@@ -2621,7 +2626,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Gives leases back. No targets: all of them, and leaves every queue.
+    /// Return leases. No targets: all of them and every place in a queue.
     /// </summary>
     public sealed class Release : ClientMessage
     {
@@ -2701,7 +2706,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// A director gives robots to a participant (empty: frees them), whoever holds them.
+    /// Assign robots to a participant (empty: free them), whoever holds them. Directors only.
     /// </summary>
     public sealed class Assign : ClientMessage
     {
@@ -2744,7 +2749,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// A director changes the lease mode of a robot. Blending weights (mode shared) come with each Acquire.
+    /// Change the lease mode of a robot. Directors only. Blending weights (mode shared) come with each Acquire.
     /// </summary>
     public sealed class SetMode : ClientMessage
     {
@@ -2787,10 +2792,11 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// A holder or director sets how far robots move as the hand moves: 1 as far, 0.1 a tenth. No names: all of ours.
+    /// Set how far robots move as the hand moves: 1 as far, 0.1 a tenth. No names: all robots of the sender.
     ///
-    /// Translation is scaled (that of twists too); rotation, joints and device target are not. The scale is that of the
-    /// present holder: the next one begins at 1. Changing it while engaged moves nothing by itself.
+    /// For holders and directors. Translation is scaled (that of twists too); rotation, joints and device target are not.
+    /// The scale belongs to the present holder: the next one begins at 1. Changing it while engaged moves nothing by
+    /// itself.
     /// </summary>
     public sealed class SetScale : ClientMessage
     {
@@ -2833,7 +2839,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// A hand without a robot takes a free object. The lease on the object comes back in the Reply.
+    /// Take a free object with a hand, without a robot. The lease on the object comes back in the Reply.
     /// </summary>
     public sealed class Grasp : ClientMessage
     {
@@ -2876,7 +2882,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// A headset (or camera) saw an anchor: T_tracking_anchor.
+    /// Observation of an anchor by a headset or camera: T_tracking_anchor.
     ///
     /// kind: AnchorKind. size_m: edge of the sheet as detected. viewpoint_id: observations with the same number
     /// share their systematic error. covariance: 6x6 row-major (position, rotation) or empty. quality: 0 to 1.
@@ -2950,7 +2956,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// A director aligns a participant by hand, or adds an offset to a measured alignment (offset true).
+    /// Align a participant by hand, or add an offset to a measured alignment (offset true). Directors only.
     /// </summary>
     public sealed class PlaceAlignment : ClientMessage
     {
@@ -2997,7 +3003,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Starts or stops the alignment run of a participant (AlignAction); participant empty: the sender's own.
+    /// Start or stop the alignment run of a participant (AlignAction); participant empty: the sender's own.
     ///
     /// A director may do so for everyone, others for themselves. The alignment in force stays until there is a better one.
     /// </summary>
@@ -3042,9 +3048,9 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// A director says where an anchor of the session is: the shared scene moves for everyone who is aligned to it.
+    /// Set where an anchor of the session is: the shared scene moves for everyone who is aligned to it. Directors only.
     ///
-    /// force: also when it is further than 5 m from where it was, which is more often a wrong number than meant.
+    /// force: also when it is further than 5 m from its old place, which is more often a wrong number than intended.
     /// </summary>
     public sealed class MoveAnchor : ClientMessage
     {
@@ -3091,7 +3097,8 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// The tracking frame jumped (recentre, lost tracking): every earlier alignment of this participant is void.
+    /// Report that the tracking frame jumped (recentre, lost tracking): every earlier alignment of this participant is
+    /// void.
     /// </summary>
     public sealed class TrackingEpoch : ClientMessage
     {
@@ -3126,7 +3133,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// EpisodeAction: start, success, failure, discard, rerecord, reset.
+    /// Start or end an episode, EpisodeAction: start, success, failure, discard, rerecord, reset.
     /// </summary>
     public sealed class Episode : ClientMessage
     {
@@ -3169,7 +3176,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Anyone may stop everything. Latched. Not a safety-rated stop.
+    /// Stop everything. Any participant may do so. Latched. Not a safety-rated stop.
     /// </summary>
     public sealed class EStop : ClientMessage
     {
@@ -3201,6 +3208,9 @@ namespace IrisSession.Protocol
         }
     }
 
+    /// <summary>
+    /// End the e-stop. Directors only.
+    /// </summary>
     public sealed class ClearEStop : ClientMessage
     {
         public const string TagName = "clear_estop";
@@ -3234,7 +3244,8 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// A director's ControlAction: pause, resume, step (ticks physics ticks while paused), reset.
+    /// Control the session, ControlAction: pause, resume, step (ticks physics ticks while paused), reset. Directors
+    /// only.
     /// </summary>
     public sealed class Control : ClientMessage
     {
@@ -3277,7 +3288,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// A note in the recording, at the session time of its receipt.
+    /// Put a note into the recording, at the session time of its receipt.
     /// </summary>
     public sealed class Marker : ClientMessage
     {
@@ -3316,10 +3327,10 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Asks for the key of this connection to be put on the allow-list: all that an unknown key may say.
+    /// Request to put the key of this connection on the allow-list: the only message allowed from an unknown key.
     ///
-    /// proof: shows that the sender knows a join code, without telling it (protocol.pairing). name: under which the
-    /// key is listed, for people.
+    /// proof: shows that the sender knows a join code, without revealing it (protocol.pairing). name: under which the
+    /// key is listed.
     /// </summary>
     public sealed class Pair : ClientMessage
     {
@@ -3362,7 +3373,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// A director ends someone's participation. revoke: their key is taken off the allow-list too.
+    /// End the participation of a participant. Directors only. revoke: its key is taken off the allow-list too.
     /// </summary>
     public sealed class RemoveParticipant : ClientMessage
     {
@@ -3409,7 +3420,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Asks for a StatusReport.
+    /// Request for a StatusReport.
     /// </summary>
     public sealed class GetStatus : ClientMessage
     {
@@ -3442,12 +3453,12 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// How state arrives at the application of a client, once a second: for status, doctor and delivery budgets.
+    /// Delivery of state to the application of a client, once a second: for status, doctor and delivery budgets.
     ///
     /// Ages are from the end of the tick to the application, by the client's clock estimate [ms], over the last second.
-    /// missed: frames that were sent (by state_seq) and not delivered. rtt_ms: lowest round trip of late.
+    /// missed: frames that were sent (by state_seq) and not delivered. rtt_ms: lowest recent round trip.
     /// media_bytes_per_s, media_age_ms (median since capture): of the media channel. display_hz: frames drawn, 0 when
-    /// nothing is. media_limit_mbit_per_s: the client wants no more media than that, 0 for no limit of its own.
+    /// none are. media_limit_mbit_per_s: upper bound of media that the client asks for, 0 for no limit of its own.
     /// </summary>
     public sealed class ClientReport : ClientMessage
     {
@@ -3520,7 +3531,7 @@ namespace IrisSession.Protocol
     /// <summary>
     /// Answer to an accepted hello. resume_token is bound to the key and may be used once.
     ///
-    /// tick_period_ns: of the scene as it is now; another one that is loaded may have another (SceneChanged).
+    /// tick_period_ns: of the present scene; another scene may have another (SceneChanged).
     /// </summary>
     public sealed class Welcome : ServerMessage
     {
@@ -3654,9 +3665,9 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// A message that could not be taken, or what has become of the session. code: FaultCode.
+    /// A message that was rejected, or a change in the state of the session. code: FaultCode.
     ///
-    /// reason: with dropped and revoked, why the session let this connection go: replaced (another connection
+    /// reason: with dropped and revoked, why the session closed this connection: replaced (another connection
     /// resumed this participant: joining again would take it back), removed, revoked, expired, ...
     /// </summary>
     public sealed class ProtocolFault : ServerMessage
@@ -3790,7 +3801,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// To the holder of a robot, for haptics and hints. Sent on change and at most at 20 Hz per robot.
+    /// Feedback to the holder of a robot, for haptics and hints. Sent on change and at most at 20 Hz per robot.
     ///
     /// state: the command kind in force, hold_reason when it is hold. limits: joints or bounds that are active.
     /// rejected: counts by RejectReason for this participant since it joined. contact_n: force on the gripper [N].
@@ -3848,7 +3859,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// One entry of the shared history. A gap in event_seq means: ask for a new snapshot.
+    /// One entry of the shared history. A gap in event_seq: request a new snapshot.
     /// </summary>
     public sealed class Event : ServerMessage
     {
@@ -3998,10 +4009,10 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// The key is on the allow-list. Connect anew to say hello: this connection stays that of an unknown key.
+    /// The key is on the allow-list. Connect anew to send hello: this connection stays that of an unknown key.
     ///
-    /// proof: shows that the session knows the join code too, so it is the one that gave it out.
-    /// roles: what this key may join as; empty: any role.
+    /// proof: shows that the session knows the join code too, so it is the one that issued it. roles: those that this
+    /// key may join as; empty: any role.
     /// </summary>
     public sealed class Paired : ServerMessage
     {
@@ -4040,15 +4051,14 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Answer to GetStatus. Shares are of the last ten seconds unless they say total.
+    /// Answer to GetStatus. Shares are of the last ten seconds unless their name has total.
     ///
-    /// late_causes: late ticks by where the time went (LateCause), and skipped for those given up after a long gap.
-    /// lateness: of ticks, after their deadline. step_to_publish: end of tick to the state socket, of the last five
-    /// seconds; null below 25 states in them.
-    /// drops: by reason, everything that was thrown away anywhere. restarts: of front and recorder.
-    /// authority_silent_ns: since the authority last spoke to the front; then its part (ticks, roster, robots, recorder)
-    /// is as old. -1: it has not spoken yet. cpu_share: of one processor, by the authority's process; load: of the
-    /// machine, over a minute.
+    /// late_causes: late ticks by the part that took the time (LateCause), and skipped for those left out after a
+    /// long gap. lateness: of ticks, after their deadline. step_to_publish: end of tick to the state socket, of the
+    /// last five seconds; null below 25 states in them. drops: by reason, all messages dropped anywhere. restarts: of
+    /// front and recorder. authority_silent_ns: since the authority's last message to the front; its part (ticks, roster,
+    /// robots, recorder) is as old. -1: it has sent none yet. cpu_share: of one processor, by the authority's process;
+    /// load: of the machine, over a minute.
     /// </summary>
     public sealed class StatusReport : ServerMessage
     {
@@ -4207,11 +4217,11 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// What media this client gets from now on. Sent after Welcome, and whenever it changes.
+    /// Media that this client gets from now on. Sent after Welcome, and whenever it changes.
     ///
     /// budget_class: the lowest class among the streams that it subscribed to. State and control are never cut.
     /// mbit_per_s: bound of all media together, 0 for none. reason: why it is not everything. streams: every stream
-    /// that there is.
+    /// of the session.
     /// </summary>
     public sealed class DeliveryBudget : ServerMessage
     {
@@ -4257,6 +4267,9 @@ namespace IrisSession.Protocol
         }
     }
 
+    /// <summary>
+    /// A participant joined, or resumed after a disconnect.
+    /// </summary>
     public sealed class ParticipantJoined : EventKind
     {
         public const string TagName = "participant_joined";
@@ -4293,6 +4306,9 @@ namespace IrisSession.Protocol
         }
     }
 
+    /// <summary>
+    /// The row of a participant in the roster changed.
+    /// </summary>
     public sealed class ParticipantChanged : EventKind
     {
         public const string TagName = "participant_changed";
@@ -4326,7 +4342,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// grace true: the connection is lost, leases are kept until Lease.expires_ns.
+    /// A participant left. grace true: it is disconnected, leases are kept until Lease.expires_ns.
     /// </summary>
     public sealed class ParticipantLeft : EventKind
     {
@@ -4412,6 +4428,9 @@ namespace IrisSession.Protocol
         }
     }
 
+    /// <summary>
+    /// requester asks holder for a robot (mode request); answered by Consent with this consent_id.
+    /// </summary>
     public sealed class ConsentRequested : EventKind
     {
         public const string TagName = "consent_requested";
@@ -4457,7 +4476,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Mode priority: a human took the robot from an agent (active), or gave it back.
+    /// Mode priority: a human overrides an agent (active), or the agent has the robot again.
     /// </summary>
     public sealed class Intervention : EventKind
     {
@@ -4503,6 +4522,9 @@ namespace IrisSession.Protocol
         }
     }
 
+    /// <summary>
+    /// A participant's clutch engaged a robot, or the engagement ended for reason (HoldReason).
+    /// </summary>
     public sealed class EngagementChanged : EventKind
     {
         public const string TagName = "engagement_changed";
@@ -4548,7 +4570,8 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// participant set the motion scaling of a robot for its holder. When a holder goes, LeaseChanged tells it.
+    /// participant set the motion scaling of a robot for its holder. When a holder leaves, LeaseChanged has the
+    /// scale.
     /// </summary>
     public sealed class ScaleChanged : EventKind
     {
@@ -4590,6 +4613,9 @@ namespace IrisSession.Protocol
         }
     }
 
+    /// <summary>
+    /// Another alignment of a participant is in force.
+    /// </summary>
     public sealed class AlignmentChanged : EventKind
     {
         public const string TagName = "alignment_changed";
@@ -4627,7 +4653,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// The alignment run of a participant was started anew (running), or stopped. run counts the starts.
+    /// The alignment run of a participant was started (running), or stopped. run counts the starts.
     /// </summary>
     public sealed class AlignmentRun : EventKind
     {
@@ -4675,7 +4701,7 @@ namespace IrisSession.Protocol
 
     /// <summary>
     /// The alignment of a participant was found wrong by size_m (AlarmKind); a jump has voided it. beside:
-    /// anchors that stayed where they were meanwhile: then the anchor was moved, not the headset.
+    /// anchors that stayed in place meanwhile: then the anchor was moved, not the headset.
     /// </summary>
     public sealed class AlignmentAlarmed : EventKind
     {
@@ -4769,9 +4795,10 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Measured: participants a and b put one thing (anchor_id), at p_world, error_m and error_rad apart.
+    /// Cross-check: participants a and b observe one anchor (anchor_id, at p_world) error_m and error_rad
+    /// apart.
     ///
-    /// expected_p95_m: what 95 % of such pairs stay below by their stated errors and the noise of these n looks.
+    /// expected_p95_m: 95 % of such pairs stay below it by their stated errors and the noise of these n observations.
     /// </summary>
     public sealed class HeadsetsCompared : EventKind
     {
@@ -4887,6 +4914,9 @@ namespace IrisSession.Protocol
         }
     }
 
+    /// <summary>
+    /// The e-stop was latched (active) or cleared by participant.
+    /// </summary>
     public sealed class EStopChanged : EventKind
     {
         public const string TagName = "estop_changed";
@@ -4927,6 +4957,9 @@ namespace IrisSession.Protocol
         }
     }
 
+    /// <summary>
+    /// The session was paused or resumed by participant.
+    /// </summary>
     public sealed class PauseChanged : EventKind
     {
         public const string TagName = "pause_changed";
@@ -5010,6 +5043,9 @@ namespace IrisSession.Protocol
         }
     }
 
+    /// <summary>
+    /// A hand took a free object (grasped), or released it.
+    /// </summary>
     public sealed class ObjectGrasped : EventKind
     {
         public const string TagName = "object_grasped";
@@ -5109,6 +5145,9 @@ namespace IrisSession.Protocol
         }
     }
 
+    /// <summary>
+    /// A note of a participant in the recording.
+    /// </summary>
     public sealed class MarkerAdded : EventKind
     {
         public const string TagName = "marker_added";
@@ -5236,7 +5275,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Something an operator should read. level: info, warning, error. participant: whom it concerns. reason: the
+    /// A text for an operator. level: info, warning, error. participant: whom it concerns. reason: the
     /// DenialReason of a refusal that answers no request (of an alignment).
     /// </summary>
     public sealed class Notice : EventKind
@@ -5284,7 +5323,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Something that concerns security. kind: AuditKind. subject: fingerprint of a key, or a participant id.
+    /// An event that concerns security. kind: AuditKind. subject: fingerprint of a key, or a participant id.
     ///
     /// Repeated ones (wrong codes, unknown keys) come at most once a second and address, with their count.
     /// </summary>
@@ -5523,8 +5562,8 @@ namespace IrisSession.Protocol
     /// <summary>
     /// Second frame of a media message: topic before it, one bulk frame after it.
     ///
-    /// seq: of the stream, as its source handed it in; at half and quarter some are left out. capture_ns: when it
-    /// was captured or computed, published_ns: when it was handed to the socket, both session time. dropped: frames of
+    /// seq: of the stream, as its source numbered it; at half and quarter some are left out. capture_ns: when it
+    /// was captured or computed, published_ns: when it was passed to the socket, both session time. dropped: frames of
     /// this subscriber that its link did not take before newer ones were there, since it subscribed.
     /// </summary>
     public sealed class MediaHeader : WireValue
@@ -5570,7 +5609,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// First frame of what a source hands in; a bulk frame for each of classes follows, in their order.
+    /// First frame of a source's message; a bulk frame for each of classes follows, in their order.
     ///
     /// classes: full, and any of half and quarter that the source has in a coarser form.
     /// </summary>
@@ -5608,10 +5647,10 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Asks for length bytes of an asset from offset on; fewer come when it ends before.
+    /// Request for length bytes of an asset from offset on; the answer is shorter when the asset ends before.
     ///
-    /// connection_epoch: of the sender's Welcome. request_id: any number; it comes back with the answer. address:
-    /// SHA-256 of the asset, 64 hexadecimal digits.
+    /// connection_epoch: of the sender's Welcome. request_id: any number; repeated in the answer. address: SHA-256
+    /// of the asset, 64 hexadecimal digits.
     /// </summary>
     public sealed class AssetRequest : WireValue
     {
@@ -5650,7 +5689,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// First of two frames; the other holds bytes offset and following of an asset that has total bytes.
+    /// First of two frames; the second holds bytes offset and following of an asset that has total bytes.
     /// </summary>
     public sealed class AssetChunk : WireValue
     {
@@ -5686,7 +5725,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// The only frame of an answer: nothing comes for this request. request_id 0: it could not be read.
+    /// The only frame of an answer: no bytes come for this request. request_id 0: it could not be read.
     /// </summary>
     public sealed class AssetRefused : WireValue
     {
@@ -5793,10 +5832,11 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// What a session says of itself on a TCP connection to control port - 1, before it closes it. It reads nothing.
+    /// Introduction of a session, written to a TCP connection to control port - 1, which is then closed. Nothing is
+    /// read.
     ///
     /// server_key: the CURVE public key, Z85 (40 characters); empty: the session is not encrypted (loopback only).
-    /// pairing: a join code can be used now. participants: how many are here.
+    /// pairing: a join code can be used now. participants: how many are connected.
     /// </summary>
     public sealed class Introduction : WireValue
     {
@@ -5839,7 +5879,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// A whole scene. bodies: parents before their children. source: what it was made from, for people.
+    /// A whole scene. bodies: parents before their children. source: its origin, for people.
     ///
     /// groups_shown: visuals, sites, tendons and deformables of other groups are hidden at first.
     /// </summary>
@@ -5988,8 +6028,8 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// A shape on a body. id: the simulator's number of it (MuJoCo geom). rgba is what to draw: a colour of its own,
-    /// or the material's; 0 alpha is drawn by nobody. group: see SceneSpec.groups_shown.
+    /// A shape on a body. id: the simulator's number of it (MuJoCo geom). rgba is the colour to draw: a colour of
+    /// its own, or the material's; with alpha 0 it is not drawn. group: see SceneSpec.groups_shown.
     /// </summary>
     public sealed class Visual : WireValue
     {
@@ -6048,12 +6088,12 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// A shape, centred in its own frame. kind of GeometryKind; draw what you do not know as a box of size.
+    /// A shape, centred in its own frame. kind of GeometryKind; draw unknown kinds as a box of size.
     ///
-    /// size [m]: half lengths along x, y, z of what the shape extends over. plane: half lengths x, y, 0 is without end;
-    /// its normal is +z, z is the spacing of grid lines. sphere: radius three times. capsule, cylinder: radius, radius,
-    /// half length along z, of a capsule without its caps. hfield: half x, half y, height of elevation 1. mesh, sdf: what
-    /// generated texture coordinates are measured by (see docs/scene.md); the vertices are in metres as they are.
+    /// size [m]: half lengths along x, y, z of the extent. plane: half lengths x, y, 0 is without end; its normal is +z,
+    /// z is the spacing of grid lines. sphere: radius three times. capsule, cylinder: radius, radius, half length along z,
+    /// of a capsule without its caps. hfield: half x, half y, height of elevation 1. mesh, sdf: the scale of generated
+    /// texture coordinates (see docs/scene.md); the vertices are in metres as they are.
     /// </summary>
     public sealed class Geometry : WireValue
     {
@@ -6096,9 +6136,9 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// How a surface looks, in MuJoCo's terms. specular, shininess (times 128: exponent), reflectance: 0..1.
+    /// Surface appearance, in MuJoCo's terms. specular, shininess (times 128: exponent), reflectance: 0..1.
     ///
-    /// emission: light of its own, times the colour. metallic, roughness: -1 where the scene does not say. The
+    /// emission: light of its own, times the colour. metallic, roughness: -1 where the scene does not set them. The
     /// texture's colour multiplies that of the visual. repeat: times that a 2d texture is laid over the shape, or over
     /// one metre when uniform (docs/scene.md, texture coordinates).
     /// </summary>
@@ -6839,7 +6879,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// What surrounds the scene. skybox: a texture. Lengths [m]. Haze blends the skybox's horizon, fog all.
+    /// Surroundings of the scene. skybox: a texture. Lengths [m]. Haze blends the skybox's horizon, fog all.
     /// </summary>
     public sealed class Environment : WireValue
     {
@@ -6949,7 +6989,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// What the scene costs with everything exact: each asset once, triangles as often as they are drawn.
+    /// Cost of the scene with everything exact: each asset once, triangles as often as they are drawn.
     ///
     /// objects, triangles: of the groups that are shown at first. texture_memory: bytes on a graphics card.
     /// </summary>
@@ -7000,7 +7040,8 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// The header. kind of ArrayKind; max_error: stated bound on the values, in their unit, 0: exact.
+    /// The header of a container. kind of ArrayKind; max_error: stated bound on the values, in their unit, 0:
+    /// exact.
     /// </summary>
     public sealed class ArrayHeader : WireValue
     {
@@ -7101,7 +7142,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Changes how a visual is drawn; what is not given stays. rgba with alpha 0 hides it.
+    /// Change how a visual is drawn; fields that are null stay. rgba with alpha 0 hides it.
     /// </summary>
     public sealed class SetVisual : PatchOp
     {
@@ -7152,7 +7193,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Decoration on a body (0: the world). Its id must be free.
+    /// Add decoration to a body (0: the world). Its id must be free.
     /// </summary>
     public sealed class AddVisual : PatchOp
     {
@@ -7186,6 +7227,9 @@ namespace IrisSession.Protocol
         }
     }
 
+    /// <summary>
+    /// Remove a visual.
+    /// </summary>
     public sealed class RemoveVisual : PatchOp
     {
         public const string TagName = "remove_visual";
@@ -7219,7 +7263,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// At the end of the list, for visuals that come after it.
+    /// Append a mesh to the list, for visuals that come after it.
     /// </summary>
     public sealed class AddMesh : PatchOp
     {
@@ -7254,7 +7298,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// At the end of the list, for visuals that come after it.
+    /// Append a material to the list, for visuals that come after it.
     /// </summary>
     public sealed class AddMaterial : PatchOp
     {

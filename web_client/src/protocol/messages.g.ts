@@ -16,7 +16,7 @@ export const SCENE_VERSION = 1;
 export const MAX_SCENE_BYTES = 32000000;
 export const ARRAYS_MAGIC = "IRA1";
 
-/** What a participant may do. Reserved for later message types: `camera`, `source`. */
+/** Rights of a participant. Reserved for later message types: `camera`, `source`. */
 export const Role = {
   OPERATOR: "operator",
   OBSERVER: "observer",
@@ -44,7 +44,7 @@ export const Device = {
 } as const;
 export type Device = (typeof Device)[keyof typeof Device] | (string & {});
 
-/** Which payload of a `Sample` is meant. */
+/** Payload of a `Sample` that counts. */
 export const SampleKind = {
   POSE: "pose",
   TWIST: "twist",
@@ -52,13 +52,14 @@ export const SampleKind = {
 } as const;
 export type SampleKind = (typeof SampleKind)[keyof typeof SampleKind] | (string & {});
 
+/** Kind of a target. */
 export const TargetKind = {
   ROBOT: "robot",
   OBJECT: "object",
 } as const;
 export type TargetKind = (typeof TargetKind)[keyof typeof TargetKind] | (string & {});
 
-/** How a robot's lease passes between participants. */
+/** Rule by which a robot's lease passes between participants. */
 export const LeaseMode = {
   EXCLUSIVE: "exclusive",
   REQUEST: "request",
@@ -68,6 +69,7 @@ export const LeaseMode = {
 } as const;
 export type LeaseMode = (typeof LeaseMode)[keyof typeof LeaseMode] | (string & {});
 
+/** Rule that chooses a robot for a participant that names none. */
 export const AssignmentPolicy = {
   CONFIG: "config",
   JOIN_ORDER: "join-order",
@@ -76,7 +78,7 @@ export const AssignmentPolicy = {
 } as const;
 export type AssignmentPolicy = (typeof AssignmentPolicy)[keyof typeof AssignmentPolicy] | (string & {});
 
-/** How `T_world_tracking` of a participant came to be. */
+/** Origin of `T_world_tracking` of a participant. */
 export const AlignmentKind = {
   NONE: "none",
   MEASURED: "measured",
@@ -85,7 +87,10 @@ export const AlignmentKind = {
 } as const;
 export type AlignmentKind = (typeof AlignmentKind)[keyof typeof AlignmentKind] | (string & {});
 
-/** What `align` asks for. `start`: measure anew, from nothing; `stop`: keep what is in force, whatever is seen. */
+/**
+ * Action of `align`. `start`: measure anew, from nothing; `stop`: keep the alignment in force whatever is
+ * observed.
+ */
 export const AlignAction = {
   START: "start",
   STOP: "stop",
@@ -93,9 +98,9 @@ export const AlignAction = {
 export type AlignAction = (typeof AlignAction)[keyof typeof AlignAction] | (string & {});
 
 /**
- * How an alignment was found to be wrong.
+ * Evidence that an alignment is wrong.
  *
- * `changed`: an anchor is seen elsewhere than seconds ago. `differs`: and elsewhere than the alignment says. `jump`:
+ * `changed`: an anchor is observed elsewhere than seconds ago. `differs`: and elsewhere than by the alignment. `jump`:
  * the tracking frame moved at once, which voids the alignment.
  */
 export const AlarmKind = {
@@ -105,6 +110,7 @@ export const AlarmKind = {
 } as const;
 export type AlarmKind = (typeof AlarmKind)[keyof typeof AlarmKind] | (string & {});
 
+/** Physical form of an anchor. */
 export const AnchorKind = {
   QR: "qr",
   BOARD: "board",
@@ -113,12 +119,14 @@ export const AnchorKind = {
 } as const;
 export type AnchorKind = (typeof AnchorKind)[keyof typeof AnchorKind] | (string & {});
 
+/** Kind of a session. */
 export const SessionKind = {
   LIVE: "live",
   REPLAY: "replay",
 } as const;
 export type SessionKind = (typeof SessionKind)[keyof typeof SessionKind] | (string & {});
 
+/** Kind of a robot's command. */
 export const CommandKind = {
   HOLD: "hold",
   POSE: "pose",
@@ -127,7 +135,7 @@ export const CommandKind = {
 } as const;
 export type CommandKind = (typeof CommandKind)[keyof typeof CommandKind] | (string & {});
 
-/** Why a robot holds. Exactly one is given with every hold command. */
+/** Reason why a robot holds. Exactly one is given with every hold command. */
 export const HoldReason = {
   NO_LEASE: "no_lease",
   NO_SAMPLE: "no_sample",
@@ -146,7 +154,7 @@ export const HoldReason = {
 } as const;
 export type HoldReason = (typeof HoldReason)[keyof typeof HoldReason] | (string & {});
 
-/** Why a sample was not counted. Counted per participant, device and reason. */
+/** Reason why a sample was rejected. Counted per participant, device and reason. */
 export const RejectReason = {
   CONNECTION_EPOCH: "connection_epoch",
   SCENE_EPOCH: "scene_epoch",
@@ -172,7 +180,7 @@ export const RejectReason = {
 } as const;
 export type RejectReason = (typeof RejectReason)[keyof typeof RejectReason] | (string & {});
 
-/** Why a request was denied. */
+/** Reason why a request was denied. */
 export const DenialReason = {
   HELD: "held",
   CONSENT_PENDING: "consent_pending",
@@ -200,7 +208,7 @@ export const DenialReason = {
 } as const;
 export type DenialReason = (typeof DenialReason)[keyof typeof DenialReason] | (string & {});
 
-/** Why a `hello` was refused by the front, before the authority saw it. */
+/** Reason why the front refused a `hello`, before the authority received it. */
 export const RefusalCode = {
   VERSION: "version",
   IDENTITY: "identity",
@@ -215,7 +223,7 @@ export const RefusalCode = {
 } as const;
 export type RefusalCode = (typeof RefusalCode)[keyof typeof RefusalCode] | (string & {});
 
-/** Why a `ProtocolFault` was sent: a message that could not be taken, or what has become of the session. */
+/** Reason of a `ProtocolFault`: a rejected message, or a change in the state of the session. */
 export const FaultCode = {
   VERSION: "version",
   MALFORMED: "malformed",
@@ -230,6 +238,7 @@ export const FaultCode = {
 } as const;
 export type FaultCode = (typeof FaultCode)[keyof typeof FaultCode] | (string & {});
 
+/** Action of `episode`. */
 export const EpisodeAction = {
   START: "start",
   SUCCESS: "success",
@@ -240,6 +249,7 @@ export const EpisodeAction = {
 } as const;
 export type EpisodeAction = (typeof EpisodeAction)[keyof typeof EpisodeAction] | (string & {});
 
+/** Action of `control`. */
 export const ControlAction = {
   PAUSE: "pause",
   RESUME: "resume",
@@ -248,7 +258,7 @@ export const ControlAction = {
 } as const;
 export type ControlAction = (typeof ControlAction)[keyof typeof ControlAction] | (string & {});
 
-/** What an `Audited` event tells. */
+/** Kind of an `Audited` event. */
 export const AuditKind = {
   PAIRED: "paired",
   CODE_REFUSED: "code_refused",
@@ -263,7 +273,7 @@ export const AuditKind = {
 } as const;
 export type AuditKind = (typeof AuditKind)[keyof typeof AuditKind] | (string & {});
 
-/** How much media a client gets, from everything to nothing. State and control come whatever the class. */
+/** Share of media that a client gets, from everything to nothing. State and control are never cut. */
 export const BudgetClass = {
   FULL: "full",
   HALF: "half",
@@ -272,7 +282,7 @@ export const BudgetClass = {
 } as const;
 export type BudgetClass = (typeof BudgetClass)[keyof typeof BudgetClass] | (string & {});
 
-/** Why no bytes of an asset come. After the last four the same may be asked again later. */
+/** Reason why a request for an asset is refused. After the last four the same request may succeed later. */
 export const AssetRefusal = {
   UNKNOWN: "unknown_asset",
   BAD_RANGE: "bad_range",
@@ -285,14 +295,14 @@ export const AssetRefusal = {
 } as const;
 export type AssetRefusal = (typeof AssetRefusal)[keyof typeof AssetRefusal] | (string & {});
 
-/** What the bytes of a media frame are. */
+/** Encoding of the bytes of a media frame. */
 export const MediaEncoding = {
   BYTES: "bytes",
   DEFORMABLE: "deformable",
 } as const;
 export type MediaEncoding = (typeof MediaEncoding)[keyof typeof MediaEncoding] | (string & {});
 
-/** Where the time of a late tick went. */
+/** Part of a late tick that took the time. */
 export const LateCause = {
   SCHEDULER: "scheduler",
   PHYSICS: "physics",
@@ -318,7 +328,7 @@ export const GeometryKind = {
 } as const;
 export type GeometryKind = (typeof GeometryKind)[keyof typeof GeometryKind] | (string & {});
 
-/** How a texture covers what wears it. */
+/** Mapping of a texture onto a surface. */
 export const TextureKind = {
   IMAGE: "2d",
   CUBE: "cube",
@@ -326,7 +336,7 @@ export const TextureKind = {
 } as const;
 export type TextureKind = (typeof TextureKind)[keyof typeof TextureKind] | (string & {});
 
-/** What a texture gives to a material. `rgb`, `rgba`: its colour, the only one that every client must draw. */
+/** Use of a texture in a material. `rgb`, `rgba`: its colour, the only one that every client must draw. */
 export const TextureRole = {
   RGB: "rgb",
   OCCLUSION: "occlusion",
@@ -341,7 +351,7 @@ export const TextureRole = {
 } as const;
 export type TextureRole = (typeof TextureRole)[keyof typeof TextureRole] | (string & {});
 
-/** How the numbers of a texture are meant. `auto`: as they are, without conversion. */
+/** Encoding of the values of a texture. `auto`: as they are, without conversion. */
 export const ColorSpace = {
   AUTO: "auto",
   LINEAR: "linear",
@@ -349,6 +359,7 @@ export const ColorSpace = {
 } as const;
 export type ColorSpace = (typeof ColorSpace)[keyof typeof ColorSpace] | (string & {});
 
+/** Kind of a light. */
 export const LightKind = {
   SPOT: "spot",
   DIRECTIONAL: "directional",
@@ -357,7 +368,7 @@ export const LightKind = {
 } as const;
 export type LightKind = (typeof LightKind)[keyof typeof LightKind] | (string & {});
 
-/** How a light or camera moves. Unknown values: like `fixed`. */
+/** Motion of a light or camera. Unknown values: like `fixed`. */
 export const Follow = {
   FIXED: "fixed",
   TRACK: "track",
@@ -367,7 +378,7 @@ export const Follow = {
 } as const;
 export type Follow = (typeof Follow)[keyof typeof Follow] | (string & {});
 
-/** What the bytes of an asset are. */
+/** Encoding of the bytes of an asset. */
 export const AssetEncoding = {
   ARRAYS: "arrays",
   PNG: "png",
@@ -376,7 +387,7 @@ export const AssetEncoding = {
 } as const;
 export type AssetEncoding = (typeof AssetEncoding)[keyof typeof AssetEncoding] | (string & {});
 
-/** What the arrays of an asset are together. */
+/** Meaning of an asset of arrays. */
 export const ArrayKind = {
   MESH: "mesh",
   IMAGE: "image",
@@ -385,7 +396,7 @@ export const ArrayKind = {
 } as const;
 export type ArrayKind = (typeof ArrayKind)[keyof typeof ArrayKind] | (string & {});
 
-/** What an array of an asset is; which ones a kind has is in docs/scene.md. */
+/** Meaning of an array of an asset; which ones a kind has is in docs/scene.md. */
 export const ArrayName = {
   INDEX: "index",
   POSITION: "position",
@@ -400,7 +411,7 @@ export const ArrayName = {
 } as const;
 export type ArrayName = (typeof ArrayName)[keyof typeof ArrayName] | (string & {});
 
-/** What was done to an array before it was compressed. */
+/** Transformation of an array before compression. */
 export const ArrayFilter = {
   NONE: "none",
   SHUFFLE: "shuffle",
@@ -409,6 +420,7 @@ export const ArrayFilter = {
 } as const;
 export type ArrayFilter = (typeof ArrayFilter)[keyof typeof ArrayFilter] | (string & {});
 
+/** Compression of an array. */
 export const ArrayCodec = {
   NONE: "none",
   ZSTD: "zstd",
@@ -421,7 +433,7 @@ export type Pose = [
   q: [number, number, number, number],
 ];
 
-/** What a sample drives, under which lease. `lease_version` is the fencing token. */
+/** Target of a sample, and the lease that it is driven under. `lease_version` is the fencing token. */
 export type Target = [
   name: string,
   lease_version: number,
@@ -429,13 +441,13 @@ export type Target = [
 ];
 
 /**
- * State of one lease as everyone sees it. `holder` is a participant id, empty when free.
+ * Public state of one lease. `holder` is a participant id, empty when free.
  *
  * `expires_ns` is the session time at which the grace period of a disconnected holder ends, 0 while it is connected.
  * `sub_holders` and `weights` have the same length: everyone who shares the target (mode `shared`, objects), or an
- * agent and the human who stands by (mode `priority`; the one in charge is `holder` and has weight 1, the other 0).
- * In mode `shared` a token stays valid for its holder when others join and raise `lease_version`.
- * `scale`: motion scaling of a robot in the hands of `holder`, 1 when nothing else was set.
+ * agent and the human who stands by (mode `priority`; the one in charge is `holder` and has weight 1, the other 0). In
+ * mode `shared` a token stays valid for its holder when others join and raise `lease_version`. `scale`: motion scaling
+ * of a robot for its `holder`, 1 by default.
  */
 export interface Lease {
   target: string;
@@ -451,7 +463,7 @@ export interface Lease {
 }
 
 /**
- * A typed no: the reason (`DenialReason`), who holds what was asked for, and what to do.
+ * A typed denial: the reason (`DenialReason`), the holder of the target, and advice.
  *
  * Texts that list what would have been right are cut to the length of a `Text`.
  */
@@ -492,7 +504,7 @@ export type Applied = [
   step_ns: number,
 ];
 
-/** Ports of the other channels on the host that the client already talks to. `media_ingest`: for media sources. */
+/** Ports of the other channels on the host of the control channel. `media_ingest`: for media sources. */
 export interface Endpoints {
   state?: number;
   media?: number;
@@ -544,7 +556,7 @@ export interface StreamBudget {
   mbit_per_s?: number;
 }
 
-/** One anchor as a headset saw it: how often in this run, and how long ago. */
+/** Observations of one anchor by a headset: their number in this run, and the age of the newest. */
 export interface AnchorSeen {
   anchor_id: string;
   observations: number;
@@ -552,11 +564,11 @@ export interface AnchorSeen {
 }
 
 /**
- * How the alignment of one participant stands, beyond what `AlignmentChanged` tells.
+ * State of the alignment of one participant, beyond `AlignmentChanged`.
  *
- * `error_at_anchor_m`, `error_at_robot_m`: stated p95. `pending_m`, `pending_rad`: how far a correction that waits, or
- * slides in, is away. `advice`: why the estimator refuses, or warns. `alarm`: the last `AlarmKind` that no new
- * alignment has answered yet, `alarm_ns` ago. `unusable`: observations that were of no use, since the run began.
+ * `error_at_anchor_m`, `error_at_robot_m`: stated p95. `pending_m`, `pending_rad`: size of a correction that waits, or
+ * slides in. `advice`: why the estimator refuses, or warns. `alarm`: the last `AlarmKind` that no new alignment has
+ * resolved yet, `alarm_ns` ago. `unusable`: observations that could not be used, since the run began.
  */
 export interface AlignmentReport {
   version?: number;
@@ -600,11 +612,11 @@ export interface AnchorReport {
  * One participant, as the session sees it. Times in `*_ns` are durations until now, -1 for never.
  *
  * `capture_to_receive`: device to front. `state_age`: end of tick to application, as its client reports it.
- * `alignment_void_ns`: since the tracking frame jumped and voided the alignment, -1 for not so.
- * `lost`: why the front lost its connection (`silent`, `closed`, `slow`, ...), empty while connected.
- * `rejected`: samples by reason, `drops`: messages thrown away, both since it joined. `reported`: its client reports.
- * `media`: the streams that it subscribed to, `budget_class` the lowest of theirs, empty without one.
- * `media_bytes_per_s`: sent to it, `media_drops`: frames that its link did not take in time, since it joined.
+ * `alignment_void_ns`: since the tracking frame jumped and voided the alignment, -1 for not so. `lost`: why it is
+ * disconnected (`silent`, `closed`, `slow`, ...), empty while connected. `rejected`: samples by reason, `drops`:
+ * messages dropped, both since it joined. `reported`: its client reports. `media`: the streams that it subscribed to,
+ * `budget_class` the lowest of theirs, empty without one. `media_bytes_per_s`: sent to it, `media_drops`: frames that
+ * its link did not take in time, since it joined.
  */
 export interface ParticipantReport {
   id: string;
@@ -639,7 +651,7 @@ export interface ParticipantReport {
   alignment_report?: AlignmentReport | null;
 }
 
-/** One robot: who has it, what it does, and why it holds. */
+/** One robot: its holder, its state, and the reason why it holds. */
 export interface RobotReport {
   name: string;
   mode: LeaseMode;
@@ -652,8 +664,8 @@ export interface RobotReport {
 }
 
 /**
- * `state`: `off` (nothing is recorded), `running`, `hangs` (says nothing for 5 s), `dead` (being replaced) or
- * `failed` (the file cannot be written). `disk_free_bytes` 0: not known. `text`: what it said last, for people.
+ * State of the recorder: `off` (nothing is recorded), `running`, `hangs` (silent for 5 s), `dead` (being replaced)
+ * or `failed` (the file cannot be written). `disk_free_bytes` 0: not known. `text`: its last message, for people.
  */
 export interface RecorderReport {
   state?: string;
@@ -667,7 +679,7 @@ export interface RecorderReport {
 
 /**
  * One media stream, at its best class. `source`: its publisher's name, empty for the session's own process.
- * `subscribers`: participants who want it.
+ * `subscribers`: participants that subscribed to it.
  */
 export interface MediaStreamReport {
   stream: string;
@@ -679,7 +691,7 @@ export interface MediaStreamReport {
 
 /**
  * The assets channel. `served`: assets of the present scene. Since the front began: `bytes_sent`, `requests`, and
- * `refusals`, of requests and connections. `waiting`: connections that wait for something now.
+ * `refusals`, of requests and connections. `waiting`: connections with an unanswered request.
  */
 export interface AssetsReport {
   served?: number;
@@ -708,24 +720,28 @@ export interface Hello {
   join_code?: string;
 }
 
-/** Leaves at once: leases are released without grace. */
+/** Leave the session at once: leases are released without grace. */
 export interface Bye {
   type: "bye";
   reason?: string;
 }
 
-/** Sent at least every `Welcome.heartbeat_ns`. `worn` false: the headset lies on the table. */
+/** Sign of life, sent at least every `Welcome.heartbeat_ns`. `worn` false: the headset is not worn. */
 export interface Heartbeat {
   type: "heartbeat";
   worn?: boolean;
 }
 
-/** `t0_ns`: the client's own monotonic clock when it sent this. Answered by `ClockPong` from the front. */
+/**
+ * Clock measurement. `t0_ns`: the client's own monotonic clock at sending. Answered by `ClockPong` from the
+ * front.
+ */
 export interface ClockPing {
   type: "clock_ping";
   t0_ns: number;
 }
 
+/** Request for a `Snapshot`. `request_id` is repeated in it. */
 export interface GetSnapshot {
   type: "get_snapshot";
   request_id?: number;
@@ -765,14 +781,14 @@ export interface Sample {
 /**
  * Samples of several devices that were taken together, such as head and both controllers at a display frame.
  *
- * Each counts by itself, as if it had come alone; together they cost one message, one packet and one wake-up.
+ * Each counts as if it had arrived alone; together they cost one message, one packet and one wake-up.
  */
 export interface Samples {
   type: "samples";
   samples: Sample[];
 }
 
-/** Asks for leases, all or none. No names: the assignment policy chooses one robot. `wait`: queue when held. */
+/** Request for leases, all or none. No names: the assignment policy chooses one robot. `wait`: queue when held. */
 export interface Acquire {
   type: "acquire";
   request_id: number;
@@ -782,7 +798,7 @@ export interface Acquire {
   weight?: number;
 }
 
-/** Gives leases back. No targets: all of them, and leaves every queue. */
+/** Return leases. No targets: all of them and every place in a queue. */
 export interface Release {
   type: "release";
   request_id?: number;
@@ -797,7 +813,7 @@ export interface Consent {
   grant: boolean;
 }
 
-/** A director gives robots to a participant (empty: frees them), whoever holds them. */
+/** Assign robots to a participant (empty: free them), whoever holds them. Directors only. */
 export interface Assign {
   type: "assign";
   request_id: number;
@@ -805,7 +821,7 @@ export interface Assign {
   participant?: string;
 }
 
-/** A director changes the lease mode of a robot. Blending weights (mode `shared`) come with each `Acquire`. */
+/** Change the lease mode of a robot. Directors only. Blending weights (mode `shared`) come with each `Acquire`. */
 export interface SetMode {
   type: "set_mode";
   request_id: number;
@@ -814,10 +830,11 @@ export interface SetMode {
 }
 
 /**
- * A holder or director sets how far robots move as the hand moves: 1 as far, 0.1 a tenth. No names: all of ours.
+ * Set how far robots move as the hand moves: 1 as far, 0.1 a tenth. No names: all robots of the sender.
  *
- * Translation is scaled (that of twists too); rotation, joints and device `target` are not. The scale is that of the
- * present holder: the next one begins at 1. Changing it while engaged moves nothing by itself.
+ * For holders and directors. Translation is scaled (that of twists too); rotation, joints and device `target` are not.
+ * The scale belongs to the present holder: the next one begins at 1. Changing it while engaged moves nothing by
+ * itself.
  */
 export interface SetScale {
   type: "set_scale";
@@ -826,7 +843,7 @@ export interface SetScale {
   scale?: number;
 }
 
-/** A hand without a robot takes a free object. The lease on the object comes back in the `Reply`. */
+/** Take a free object with a hand, without a robot. The lease on the object comes back in the `Reply`. */
 export interface Grasp {
   type: "grasp";
   request_id: number;
@@ -835,7 +852,7 @@ export interface Grasp {
 }
 
 /**
- * A headset (or camera) saw an anchor: `T_tracking_anchor`.
+ * Observation of an anchor by a headset or camera: `T_tracking_anchor`.
  *
  * `kind`: `AnchorKind`. `size_m`: edge of the sheet as detected. `viewpoint_id`: observations with the same number
  * share their systematic error. `covariance`: 6x6 row-major (position, rotation) or empty. `quality`: 0 to 1.
@@ -854,7 +871,7 @@ export interface Observation {
   covariance?: number[];
 }
 
-/** A director aligns a participant by hand, or adds an offset to a measured alignment (`offset` true). */
+/** Align a participant by hand, or add an offset to a measured alignment (`offset` true). Directors only. */
 export interface PlaceAlignment {
   type: "place_alignment";
   request_id: number;
@@ -864,7 +881,7 @@ export interface PlaceAlignment {
 }
 
 /**
- * Starts or stops the alignment run of a participant (`AlignAction`); `participant` empty: the sender's own.
+ * Start or stop the alignment run of a participant (`AlignAction`); `participant` empty: the sender's own.
  *
  * A director may do so for everyone, others for themselves. The alignment in force stays until there is a better one.
  */
@@ -876,9 +893,9 @@ export interface Align {
 }
 
 /**
- * A director says where an anchor of the session is: the shared scene moves for everyone who is aligned to it.
+ * Set where an anchor of the session is: the shared scene moves for everyone who is aligned to it. Directors only.
  *
- * `force`: also when it is further than 5 m from where it was, which is more often a wrong number than meant.
+ * `force`: also when it is further than 5 m from its old place, which is more often a wrong number than intended.
  */
 export interface MoveAnchor {
   type: "move_anchor";
@@ -888,13 +905,16 @@ export interface MoveAnchor {
   force?: boolean;
 }
 
-/** The tracking frame jumped (recentre, lost tracking): every earlier alignment of this participant is void. */
+/**
+ * Report that the tracking frame jumped (recentre, lost tracking): every earlier alignment of this participant is
+ * void.
+ */
 export interface TrackingEpoch {
   type: "tracking_epoch";
   tracking_epoch: number;
 }
 
-/** `EpisodeAction`: start, success, failure, discard, rerecord, reset. */
+/** Start or end an episode, `EpisodeAction`: start, success, failure, discard, rerecord, reset. */
 export interface Episode {
   type: "episode";
   request_id: number;
@@ -902,18 +922,22 @@ export interface Episode {
   label?: string;
 }
 
-/** Anyone may stop everything. Latched. Not a safety-rated stop. */
+/** Stop everything. Any participant may do so. Latched. Not a safety-rated stop. */
 export interface EStop {
   type: "estop";
   reason?: string;
 }
 
+/** End the e-stop. Directors only. */
 export interface ClearEStop {
   type: "clear_estop";
   request_id: number;
 }
 
-/** A director's `ControlAction`: pause, resume, step (`ticks` physics ticks while paused), reset. */
+/**
+ * Control the session, `ControlAction`: pause, resume, step (`ticks` physics ticks while paused), reset. Directors
+ * only.
+ */
 export interface Control {
   type: "control";
   request_id: number;
@@ -921,7 +945,7 @@ export interface Control {
   ticks?: number;
 }
 
-/** A note in the recording, at the session time of its receipt. */
+/** Put a note into the recording, at the session time of its receipt. */
 export interface Marker {
   type: "marker";
   request_id: number;
@@ -929,10 +953,10 @@ export interface Marker {
 }
 
 /**
- * Asks for the key of this connection to be put on the allow-list: all that an unknown key may say.
+ * Request to put the key of this connection on the allow-list: the only message allowed from an unknown key.
  *
- * `proof`: shows that the sender knows a join code, without telling it (`protocol.pairing`). `name`: under which the
- * key is listed, for people.
+ * `proof`: shows that the sender knows a join code, without revealing it (`protocol.pairing`). `name`: under which the
+ * key is listed.
  */
 export interface Pair {
   type: "pair";
@@ -941,7 +965,7 @@ export interface Pair {
   software?: string;
 }
 
-/** A director ends someone's participation. `revoke`: their key is taken off the allow-list too. */
+/** End the participation of a participant. Directors only. `revoke`: its key is taken off the allow-list too. */
 export interface RemoveParticipant {
   type: "remove_participant";
   request_id: number;
@@ -950,19 +974,19 @@ export interface RemoveParticipant {
   reason?: string;
 }
 
-/** Asks for a `StatusReport`. */
+/** Request for a `StatusReport`. */
 export interface GetStatus {
   type: "get_status";
   request_id?: number;
 }
 
 /**
- * How state arrives at the application of a client, once a second: for status, doctor and delivery budgets.
+ * Delivery of state to the application of a client, once a second: for status, doctor and delivery budgets.
  *
  * Ages are from the end of the tick to the application, by the client's clock estimate [ms], over the last second.
- * `missed`: frames that were sent (by `state_seq`) and not delivered. `rtt_ms`: lowest round trip of late.
+ * `missed`: frames that were sent (by `state_seq`) and not delivered. `rtt_ms`: lowest recent round trip.
  * `media_bytes_per_s`, `media_age_ms` (median since capture): of the media channel. `display_hz`: frames drawn, 0 when
- * nothing is. `media_limit_mbit_per_s`: the client wants no more media than that, 0 for no limit of its own.
+ * none are. `media_limit_mbit_per_s`: upper bound of media that the client asks for, 0 for no limit of its own.
  */
 export interface ClientReport {
   type: "client_report";
@@ -981,7 +1005,7 @@ export interface ClientReport {
 /**
  * Answer to an accepted `hello`. `resume_token` is bound to the key and may be used once.
  *
- * `tick_period_ns`: of the scene as it is now; another one that is loaded may have another (`SceneChanged`).
+ * `tick_period_ns`: of the present scene; another scene may have another (`SceneChanged`).
  */
 export interface Welcome {
   type: "welcome";
@@ -1011,9 +1035,9 @@ export interface Refused {
 }
 
 /**
- * A message that could not be taken, or what has become of the session. `code`: `FaultCode`.
+ * A message that was rejected, or a change in the state of the session. `code`: `FaultCode`.
  *
- * `reason`: with `dropped` and `revoked`, why the session let this connection go: `replaced` (another connection
+ * `reason`: with `dropped` and `revoked`, why the session closed this connection: `replaced` (another connection
  * resumed this participant: joining again would take it back), `removed`, `revoked`, `expired`, ...
  */
 export interface ProtocolFault {
@@ -1041,7 +1065,7 @@ export interface Reply {
 }
 
 /**
- * To the holder of a robot, for haptics and hints. Sent on change and at most at 20 Hz per robot.
+ * Feedback to the holder of a robot, for haptics and hints. Sent on change and at most at 20 Hz per robot.
  *
  * `state`: the command kind in force, `hold_reason` when it is `hold`. `limits`: joints or bounds that are active.
  * `rejected`: counts by `RejectReason` for this participant since it joined. `contact_n`: force on the gripper [N].
@@ -1056,7 +1080,7 @@ export interface Feedback {
   rejected?: Record<string, number>;
 }
 
-/** One entry of the shared history. A gap in `event_seq` means: ask for a new snapshot. */
+/** One entry of the shared history. A gap in `event_seq`: request a new snapshot. */
 export interface Event {
   type: "event";
   event_seq: number;
@@ -1094,10 +1118,10 @@ export interface Snapshot {
 }
 
 /**
- * The key is on the allow-list. Connect anew to say `hello`: this connection stays that of an unknown key.
+ * The key is on the allow-list. Connect anew to send `hello`: this connection stays that of an unknown key.
  *
- * `proof`: shows that the session knows the join code too, so it is the one that gave it out.
- * `roles`: what this key may join as; empty: any role.
+ * `proof`: shows that the session knows the join code too, so it is the one that issued it. `roles`: those that this
+ * key may join as; empty: any role.
  */
 export interface Paired {
   type: "paired";
@@ -1106,15 +1130,14 @@ export interface Paired {
 }
 
 /**
- * Answer to `GetStatus`. Shares are of the last ten seconds unless they say `total`.
+ * Answer to `GetStatus`. Shares are of the last ten seconds unless their name has `total`.
  *
- * `late_causes`: late ticks by where the time went (`LateCause`), and `skipped` for those given up after a long gap.
- * `lateness`: of ticks, after their deadline. `step_to_publish`: end of tick to the state socket, of the last five
- * seconds; null below 25 states in them.
- * `drops`: by reason, everything that was thrown away anywhere. `restarts`: of front and recorder.
- * `authority_silent_ns`: since the authority last spoke to the front; then its part (ticks, roster, robots, recorder)
- * is as old. -1: it has not spoken yet. `cpu_share`: of one processor, by the authority's process; `load`: of the
- * machine, over a minute.
+ * `late_causes`: late ticks by the part that took the time (`LateCause`), and `skipped` for those left out after a
+ * long gap. `lateness`: of ticks, after their deadline. `step_to_publish`: end of tick to the state socket, of the
+ * last five seconds; null below 25 states in them. `drops`: by reason, all messages dropped anywhere. `restarts`: of
+ * front and recorder. `authority_silent_ns`: since the authority's last message to the front; its part (ticks, roster,
+ * robots, recorder) is as old. -1: it has sent none yet. `cpu_share`: of one processor, by the authority's process;
+ * `load`: of the machine, over a minute.
  */
 export interface StatusReport {
   type: "status_report";
@@ -1153,11 +1176,11 @@ export interface StatusReport {
 }
 
 /**
- * What media this client gets from now on. Sent after `Welcome`, and whenever it changes.
+ * Media that this client gets from now on. Sent after `Welcome`, and whenever it changes.
  *
  * `budget_class`: the lowest class among the streams that it subscribed to. State and control are never cut.
  * `mbit_per_s`: bound of all media together, 0 for none. `reason`: why it is not everything. `streams`: every stream
- * that there is.
+ * of the session.
  */
 export interface DeliveryBudget {
   type: "delivery_budget";
@@ -1167,18 +1190,20 @@ export interface DeliveryBudget {
   streams?: StreamBudget[];
 }
 
+/** A participant joined, or resumed after a disconnect. */
 export interface ParticipantJoined {
   event: "participant_joined";
   participant: ParticipantInfo;
   resumed?: boolean;
 }
 
+/** The row of a participant in the roster changed. */
 export interface ParticipantChanged {
   event: "participant_changed";
   participant: ParticipantInfo;
 }
 
-/** `grace` true: the connection is lost, leases are kept until `Lease.expires_ns`. */
+/** A participant left. `grace` true: it is disconnected, leases are kept until `Lease.expires_ns`. */
 export interface ParticipantLeft {
   event: "participant_left";
   participant: string;
@@ -1197,6 +1222,7 @@ export interface LeaseChanged {
   previous_holder?: string;
 }
 
+/** `requester` asks `holder` for a robot (mode `request`); answered by `Consent` with this `consent_id`. */
 export interface ConsentRequested {
   event: "consent_requested";
   consent_id: number;
@@ -1205,7 +1231,7 @@ export interface ConsentRequested {
   holder: string;
 }
 
-/** Mode `priority`: a human took the robot from an agent (`active`), or gave it back. */
+/** Mode `priority`: a human overrides an agent (`active`), or the agent has the robot again. */
 export interface Intervention {
   event: "intervention";
   robot: string;
@@ -1214,6 +1240,7 @@ export interface Intervention {
   active: boolean;
 }
 
+/** A participant's clutch engaged a robot, or the engagement ended for `reason` (`HoldReason`). */
 export interface EngagementChanged {
   event: "engagement_changed";
   robot: string;
@@ -1222,7 +1249,10 @@ export interface EngagementChanged {
   reason?: string;
 }
 
-/** `participant` set the motion scaling of a robot for its holder. When a holder goes, `LeaseChanged` tells it. */
+/**
+ * `participant` set the motion scaling of a robot for its holder. When a holder leaves, `LeaseChanged` has the
+ * scale.
+ */
 export interface ScaleChanged {
   event: "scale_changed";
   robot: string;
@@ -1230,13 +1260,14 @@ export interface ScaleChanged {
   participant: string;
 }
 
+/** Another alignment of a participant is in force. */
 export interface AlignmentChanged {
   event: "alignment_changed";
   participant: string;
   alignment: Alignment;
 }
 
-/** The alignment run of a participant was started anew (`running`), or stopped. `run` counts the starts. */
+/** The alignment run of a participant was started (`running`), or stopped. `run` counts the starts. */
 export interface AlignmentRun {
   event: "alignment_run";
   participant: string;
@@ -1247,7 +1278,7 @@ export interface AlignmentRun {
 
 /**
  * The alignment of a participant was found wrong by `size_m` (`AlarmKind`); a `jump` has voided it. `beside`:
- * anchors that stayed where they were meanwhile: then the anchor was moved, not the headset.
+ * anchors that stayed in place meanwhile: then the anchor was moved, not the headset.
  */
 export interface AlignmentAlarmed {
   event: "alignment_alarmed";
@@ -1267,9 +1298,10 @@ export interface AnchorMoved {
 }
 
 /**
- * Measured: participants `a` and `b` put one thing (`anchor_id`), at `p_world`, `error_m` and `error_rad` apart.
+ * Cross-check: participants `a` and `b` observe one anchor (`anchor_id`, at `p_world`) `error_m` and `error_rad`
+ * apart.
  *
- * `expected_p95_m`: what 95 % of such pairs stay below by their stated errors and the noise of these `n` looks.
+ * `expected_p95_m`: 95 % of such pairs stay below it by their stated errors and the noise of these `n` observations.
  */
 export interface HeadsetsCompared {
   event: "headsets_compared";
@@ -1298,6 +1330,7 @@ export interface SceneChanged {
   tick_period_ns?: number;
 }
 
+/** The e-stop was latched (`active`) or cleared by `participant`. */
 export interface EStopChanged {
   event: "estop_changed";
   active: boolean;
@@ -1305,6 +1338,7 @@ export interface EStopChanged {
   reason?: string;
 }
 
+/** The session was paused or resumed by `participant`. */
 export interface PauseChanged {
   event: "pause_changed";
   paused: boolean;
@@ -1320,6 +1354,7 @@ export interface EpisodeChanged {
   participant?: string;
 }
 
+/** A hand took a free object (`grasped`), or released it. */
 export interface ObjectGrasped {
   event: "object_grasped";
   object: string;
@@ -1339,6 +1374,7 @@ export interface Handover {
   duration_ns: number;
 }
 
+/** A note of a participant in the recording. */
 export interface MarkerAdded {
   event: "marker_added";
   participant: string;
@@ -1363,7 +1399,7 @@ export interface Gap {
 }
 
 /**
- * Something an operator should read. `level`: info, warning, error. `participant`: whom it concerns. `reason`: the
+ * A text for an operator. `level`: info, warning, error. `participant`: whom it concerns. `reason`: the
  * `DenialReason` of a refusal that answers no request (of an alignment).
  */
 export interface Notice {
@@ -1375,7 +1411,7 @@ export interface Notice {
 }
 
 /**
- * Something that concerns security. `kind`: `AuditKind`. `subject`: fingerprint of a key, or a participant id.
+ * An event that concerns security. `kind`: `AuditKind`. `subject`: fingerprint of a key, or a participant id.
  *
  * Repeated ones (wrong codes, unknown keys) come at most once a second and address, with their `count`.
  */
@@ -1445,8 +1481,8 @@ export type Presence = [
 /**
  * Second frame of a media message: topic before it, one bulk frame after it.
  *
- * `seq`: of the stream, as its source handed it in; at `half` and `quarter` some are left out. `capture_ns`: when it
- * was captured or computed, `published_ns`: when it was handed to the socket, both session time. `dropped`: frames of
+ * `seq`: of the stream, as its source numbered it; at `half` and `quarter` some are left out. `capture_ns`: when it
+ * was captured or computed, `published_ns`: when it was passed to the socket, both session time. `dropped`: frames of
  * this subscriber that its link did not take before newer ones were there, since it subscribed.
  */
 export type MediaHeader = [
@@ -1461,7 +1497,7 @@ export type MediaHeader = [
 ];
 
 /**
- * First frame of what a source hands in; a bulk frame for each of `classes` follows, in their order.
+ * First frame of a source's message; a bulk frame for each of `classes` follows, in their order.
  *
  * `classes`: `full`, and any of `half` and `quarter` that the source has in a coarser form.
  */
@@ -1474,10 +1510,10 @@ export type MediaPush = [
 ];
 
 /**
- * Asks for `length` bytes of an asset from `offset` on; fewer come when it ends before.
+ * Request for `length` bytes of an asset from `offset` on; the answer is shorter when the asset ends before.
  *
- * `connection_epoch`: of the sender's `Welcome`. `request_id`: any number; it comes back with the answer. `address`:
- * SHA-256 of the asset, 64 hexadecimal digits.
+ * `connection_epoch`: of the sender's `Welcome`. `request_id`: any number; repeated in the answer. `address`: SHA-256
+ * of the asset, 64 hexadecimal digits.
  */
 export type AssetRequest = [
   version: number,
@@ -1488,7 +1524,7 @@ export type AssetRequest = [
   length: number,
 ];
 
-/** First of two frames; the other holds bytes `offset` and following of an asset that has `total` bytes. */
+/** First of two frames; the second holds bytes `offset` and following of an asset that has `total` bytes. */
 export type AssetChunk = [
   version: number,
   request_id: number,
@@ -1497,7 +1533,7 @@ export type AssetChunk = [
   total: number,
 ];
 
-/** The only frame of an answer: nothing comes for this request. `request_id` 0: it could not be read. */
+/** The only frame of an answer: no bytes come for this request. `request_id` 0: it could not be read. */
 export type AssetRefused = [
   version: number,
   request_id: number,
@@ -1522,10 +1558,11 @@ export interface Beacon {
 }
 
 /**
- * What a session says of itself on a TCP connection to control port - 1, before it closes it. It reads nothing.
+ * Introduction of a session, written to a TCP connection to control port - 1, which is then closed. Nothing is
+ * read.
  *
  * `server_key`: the CURVE public key, Z85 (40 characters); empty: the session is not encrypted (loopback only).
- * `pairing`: a join code can be used now. `participants`: how many are here.
+ * `pairing`: a join code can be used now. `participants`: how many are connected.
  */
 export interface Introduction {
   beacon: Beacon;
@@ -1535,7 +1572,7 @@ export interface Introduction {
 }
 
 /**
- * A whole scene. `bodies`: parents before their children. `source`: what it was made from, for people.
+ * A whole scene. `bodies`: parents before their children. `source`: its origin, for people.
  *
  * `groups_shown`: visuals, sites, tendons and deformables of other groups are hidden at first.
  */
@@ -1575,8 +1612,8 @@ export interface Body {
 }
 
 /**
- * A shape on a body. `id`: the simulator's number of it (MuJoCo geom). `rgba` is what to draw: a colour of its own,
- * or the material's; 0 alpha is drawn by nobody. `group`: see `SceneSpec.groups_shown`.
+ * A shape on a body. `id`: the simulator's number of it (MuJoCo geom). `rgba` is the colour to draw: a colour of
+ * its own, or the material's; with alpha 0 it is not drawn. `group`: see `SceneSpec.groups_shown`.
  */
 export interface Visual {
   id: number;
@@ -1590,12 +1627,12 @@ export interface Visual {
 }
 
 /**
- * A shape, centred in its own frame. `kind` of `GeometryKind`; draw what you do not know as a box of `size`.
+ * A shape, centred in its own frame. `kind` of `GeometryKind`; draw unknown kinds as a box of `size`.
  *
- * `size` [m]: half lengths along x, y, z of what the shape extends over. plane: half lengths x, y, 0 is without end;
- * its normal is +z, z is the spacing of grid lines. sphere: radius three times. capsule, cylinder: radius, radius,
- * half length along z, of a capsule without its caps. hfield: half x, half y, height of elevation 1. mesh, sdf: what
- * generated texture coordinates are measured by (see docs/scene.md); the vertices are in metres as they are.
+ * `size` [m]: half lengths along x, y, z of the extent. plane: half lengths x, y, 0 is without end; its normal is +z,
+ * z is the spacing of grid lines. sphere: radius three times. capsule, cylinder: radius, radius, half length along z,
+ * of a capsule without its caps. hfield: half x, half y, height of elevation 1. mesh, sdf: the scale of generated
+ * texture coordinates (see docs/scene.md); the vertices are in metres as they are.
  */
 export interface Geometry {
   kind: GeometryKind;
@@ -1605,9 +1642,9 @@ export interface Geometry {
 }
 
 /**
- * How a surface looks, in MuJoCo's terms. `specular`, `shininess` (times 128: exponent), `reflectance`: 0..1.
+ * Surface appearance, in MuJoCo's terms. `specular`, `shininess` (times 128: exponent), `reflectance`: 0..1.
  *
- * `emission`: light of its own, times the colour. `metallic`, `roughness`: -1 where the scene does not say. The
+ * `emission`: light of its own, times the colour. `metallic`, `roughness`: -1 where the scene does not set them. The
  * texture's colour multiplies that of the visual. `repeat`: times that a 2d texture is laid over the shape, or over
  * one metre when `uniform` (docs/scene.md, texture coordinates).
  */
@@ -1785,7 +1822,7 @@ export interface Deformable {
   encoding?: AssetEncoding;
 }
 
-/** What surrounds the scene. `skybox`: a texture. Lengths [m]. Haze blends the skybox's horizon, fog all. */
+/** Surroundings of the scene. `skybox`: a texture. Lengths [m]. Haze blends the skybox's horizon, fog all. */
 export interface Environment {
   headlight?: Headlight;
   skybox?: number;
@@ -1809,7 +1846,7 @@ export interface Headlight {
 }
 
 /**
- * What the scene costs with everything exact: each asset once, triangles as often as they are drawn.
+ * Cost of the scene with everything exact: each asset once, triangles as often as they are drawn.
  *
  * `objects`, `triangles`: of the groups that are shown at first. `texture_memory`: bytes on a graphics card.
  */
@@ -1822,7 +1859,10 @@ export interface Totals {
   asset_bytes?: number;
 }
 
-/** The header. `kind` of `ArrayKind`; `max_error`: stated bound on the values, in their unit, 0: exact. */
+/**
+ * The header of a container. `kind` of `ArrayKind`; `max_error`: stated bound on the values, in their unit, 0:
+ * exact.
+ */
 export interface ArrayHeader {
   kind: ArrayKind;
   arrays: ArrayInfo[];
@@ -1846,7 +1886,7 @@ export interface ArrayInfo {
   offset?: number[];
 }
 
-/** Changes how a visual is drawn; what is not given stays. `rgba` with alpha 0 hides it. */
+/** Change how a visual is drawn; fields that are null stay. `rgba` with alpha 0 hides it. */
 export interface SetVisual {
   op: "set_visual";
   visual: number;
@@ -1856,24 +1896,25 @@ export interface SetVisual {
   T_body_visual?: Pose | null;
 }
 
-/** Decoration on a body (0: the world). Its `id` must be free. */
+/** Add decoration to a body (0: the world). Its `id` must be free. */
 export interface AddVisual {
   op: "add_visual";
   visual: Visual;
 }
 
+/** Remove a visual. */
 export interface RemoveVisual {
   op: "remove_visual";
   visual: number;
 }
 
-/** At the end of the list, for visuals that come after it. */
+/** Append a mesh to the list, for visuals that come after it. */
 export interface AddMesh {
   op: "add_mesh";
   mesh: Mesh;
 }
 
-/** At the end of the list, for visuals that come after it. */
+/** Append a material to the list, for visuals that come after it. */
 export interface AddMaterial {
   op: "add_material";
   material: Material;

@@ -1,4 +1,6 @@
-"""From commanded joint motion to `ctrl`, by actuator type; with the joints at rest this is the hold law of each type.
+"""Actuators: from commanded joint motion and gripper closure to `ctrl`.
+
+Joints by actuator type; at rest this is the hold law of each type:
 
 * position (affine bias in the position): the `ctrl` whose equilibrium is the commanded position; at rest constant.
 * velocity (also integrated velocity): commanded velocity plus a correction of the joint error beyond a deadband. At
@@ -10,6 +12,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -17,9 +20,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.control.arm_model import Floats, named_id
-from iris_session.control.config import ControlConfig
-from iris_session.control.errors import ControlError
+from iris_session.control.arm_model import Floats, find_id
+from iris_session.control.config import ControlConfig, ControlError
 from iris_session.protocol.specs import RobotSpec
 
 GRAVITY_PD = "gravity_pd"
@@ -55,7 +57,7 @@ class _Rows:
     offset: list[float] = field(default_factory=list)
     joints: list[int] = field(default_factory=list)
 
-    def group(self, model: mujoco.MjModel) -> _Group:
+    def build_group(self, model: mujoco.MjModel) -> _Group:
         joints = np.array(self.joints, dtype=np.intp)
         return _Group(
             np.array(self.columns, dtype=np.intp),
@@ -68,10 +70,12 @@ class _Rows:
 
 
 class ActuatorLaws:
-    """Writes `data.ctrl` of all robots' arm joints. `lower`, `upper`: joint positions that can be commanded, (n,)."""
+    """Writer of `data.ctrl` of all robots' arm joints. `lower`, `upper`: joint positions that can be
+    commanded, (n,).
+    """
 
     def __init__(self, model: mujoco.MjModel, robots: Sequence[RobotSpec], config: ControlConfig) -> None:
-        """Raises `ControlError` for an actuator that has no law."""
+        """Raise `ControlError` for an actuator that has no law."""
         self._model = model
         self._config = config
         rows = {POSITION: _Rows(), VELOCITY: _Rows(), TORQUE: _Rows()}
@@ -83,21 +87,21 @@ class ActuatorLaws:
                     "it must have one actuator per joint, in the same order"
                 )
             for joint_name, name in zip(robot.joints, robot.actuators, strict=True):
-                actuator = named_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name, "actuator")
-                joint = named_id(model, mujoco.mjtObj.mjOBJ_JOINT, joint_name, "joint")
-                kind, scale, offset = _law(model, robot, actuator, joint)
+                actuator = find_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name, "actuator")
+                joint = find_id(model, mujoco.mjtObj.mjOBJ_JOINT, joint_name, "joint")
+                kind, scale, offset = _find_law(model, robot, actuator, joint)
                 row = rows[kind]
                 row.columns.append(len(bounds))
                 row.actuators.append(actuator)
                 row.scale.append(scale)
                 row.offset.append(offset)
                 row.joints.append(joint)
-                bounds.append(_commandable(model, kind, actuator, joint, scale, offset))
+                bounds.append(_find_bounds(model, kind, actuator, joint, scale, offset))
         limits = np.array(bounds, dtype=np.float64).reshape(-1, 2)
         self.lower, self.upper = limits[:, 0].copy(), limits[:, 1].copy()
-        self._position = rows[POSITION].group(model)
-        self._velocity = rows[VELOCITY].group(model)
-        self._torque = rows[TORQUE].group(model)
+        self._position = rows[POSITION].build_group(model)
+        self._velocity = rows[VELOCITY].build_group(model)
+        self._torque = rows[TORQUE].build_group(model)
         self._acceleration = np.zeros(model.nv)
         self._force = np.zeros(model.nv)
 
@@ -130,7 +134,7 @@ class ActuatorLaws:
         data.ctrl[g.actuators] = torque[g.dof] * g.scale
 
 
-def _law(model: mujoco.MjModel, robot: RobotSpec, actuator: int, joint: int) -> tuple[str, float, float]:
+def _find_law(model: mujoco.MjModel, robot: RobotSpec, actuator: int, joint: int) -> tuple[str, float, float]:
     """Type of one actuator, and scale and offset of its `ctrl`. MuJoCo: force = gain * (ctrl or act) + bias."""
     name = mujoco.mj_id2name(model, int(mujoco.mjtObj.mjOBJ_ACTUATOR), actuator)
     what = f"robot {robot.name!r}: actuator {name!r}"
@@ -156,7 +160,7 @@ def _law(model: mujoco.MjModel, robot: RobotSpec, actuator: int, joint: int) -> 
     raise ControlError(f"{what} must be a position, velocity, integrated velocity or motor actuator")
 
 
-def _commandable(
+def _find_bounds(
     model: mujoco.MjModel, kind: str, actuator: int, joint: int, scale: float, offset: float
 ) -> tuple[float, float]:
     low, high = (float(x) for x in model.jnt_range[joint]) if model.jnt_limited[joint] else (-np.inf, np.inf)
@@ -164,3 +168,56 @@ def _commandable(
         ends = sorted((float(c) - offset) / scale for c in model.actuator_ctrlrange[actuator])
         low, high = max(low, ends[0]), min(high, ends[1])
     return low, high
+
+
+class Grippers:
+    """Gripper `ctrl` of all robots that have one. `ctrl`, `goal`: shape (n_grippers,), in actuator units.
+
+    The closing share 0..1 follows its goal at a bounded speed; it is unchanged in hold and in the first engaged step.
+    """
+
+    def __init__(self, model: mujoco.MjModel, robots: Sequence[RobotSpec], config: ControlConfig, dt: float) -> None:
+        fitted = [(i, r) for i, r in enumerate(robots) if r.gripper_actuator]
+        self._row = {i: k for k, (i, _) in enumerate(fitted)}
+        self._open = [r.gripper_open for _, r in fitted]
+        self._closed = [r.gripper_closed for _, r in fitted]
+        self._actuators = np.array(
+            [find_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, r.gripper_actuator, "actuator") for _, r in fitted],
+            dtype=np.intp,
+        )
+        self._step = np.abs(np.subtract(self._closed, self._open)) * (config.gripper_speed * dt)
+        self.ctrl = np.zeros(len(fitted))
+        self.goal = np.zeros(len(fitted))
+
+    def reset(self, data: mujoco.MjData) -> None:
+        """Hold the grippers at their present `ctrl`."""
+        self.ctrl[:] = data.ctrl[self._actuators]
+        self.goal[:] = self.ctrl
+
+    def set_goal(self, robot: int, closed: float | None) -> None:
+        """Set the closing share 0 (open) to 1 (closed); `None` leaves the goal as it is."""
+        row = self._row.get(robot)
+        if row is not None and closed is not None and math.isfinite(closed):
+            share = min(max(closed, 0.0), 1.0)
+            self.goal[row] = (1.0 - share) * self._open[row] + share * self._closed[row]
+
+    def stop(self, robot: int) -> None:
+        """Hold the gripper at its present `ctrl`."""
+        row = self._row.get(robot)
+        if row is not None:
+            self.goal[row] = self.ctrl[row]
+
+    def tick(self, data: mujoco.MjData) -> None:
+        if not self._actuators.size:
+            return
+        error = self.goal - self.ctrl
+        near = np.abs(error) <= self._step
+        self.ctrl += np.minimum(np.maximum(error, -self._step), self._step)
+        self.ctrl[near] = self.goal[near]
+        data.ctrl[self._actuators] = self.ctrl
+
+    def save_state(self) -> list[bytes]:
+        return [self.ctrl.tobytes(), self.goal.tobytes()]
+
+    def restore_state(self, arrays: list[bytes]) -> None:
+        self.ctrl[:], self.goal[:] = (np.frombuffer(raw) for raw in arrays)

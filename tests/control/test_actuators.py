@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
+import msgspec
 import mujoco
 import numpy as np
 import pytest
 
 from iris_session.control import ControlConfig, ControlError
-from iris_session.control.hold import ActuatorLaws
+from iris_session.control.actuators import ActuatorLaws, Grippers
 from iris_session.protocol.specs import RobotSpec
+from tests.control.rigs import aloha_model, aloha_robots
 
 MODEL = """<mujoco><compiler angle="radian"/><option integrator="implicitfast"/>
 <worldbody><body name="base"><body name="link" gravcomp="{gravcomp}"><joint name="j" axis="0 1 0" {joint}/>
@@ -130,3 +134,64 @@ def test_actuators_without_a_law_are_refused_in_one_line(actuator: str, message:
 def test_one_actuator_per_joint() -> None:
     with pytest.raises(ControlError, match="has 1 joints and 2 actuators"):
         laws('<motor name="a" joint="j"/>', actuators=("a", "a"))
+
+
+# --- grippers move at bounded speed ---
+
+
+def aloha() -> tuple[Grippers, mujoco.MjData, int, int]:
+    model = aloha_model()
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    robots = aloha_robots()
+    plain = msgspec.structs.replace(robots[0], name="plain", gripper_actuator="")
+    grippers = Grippers(model, [robots[0], plain, robots[1]], ControlConfig(gripper_speed=4.0), 0.002)
+    grippers.reset(data)
+    return grippers, data, model.actuator("left/gripper").id, model.actuator("right/gripper").id
+
+
+def test_closing_is_as_fast_as_allowed_and_ends_exactly() -> None:
+    grippers, data, left, right = aloha()
+    grippers.set_goal(0, 1.0)
+    for _ in range(5):
+        grippers.tick(data)
+    assert data.ctrl[left] == pytest.approx(0.037 - 5 * 0.035 * 4.0 * 0.002)
+    for _ in range(130):
+        grippers.tick(data)
+    assert data.ctrl[left] == 0.002
+    assert data.ctrl[right] == 0.037
+
+
+def test_a_stopped_gripper_stays_bitwise() -> None:
+    grippers, data, left, _ = aloha()
+    grippers.set_goal(0, 1.0)
+    grippers.tick(data)
+    grippers.stop(0)
+    before = data.ctrl[left]
+    for _ in range(10):
+        grippers.tick(data)
+    assert data.ctrl[left] == before
+
+
+def test_nothing_is_asked_of_robots_without_gripper_or_by_no_number() -> None:
+    grippers, data, left, right = aloha()
+    grippers.set_goal(1, 1.0)
+    grippers.stop(1)
+    grippers.set_goal(0, None)
+    grippers.set_goal(2, math.nan)
+    grippers.tick(data)
+    assert (data.ctrl[left], data.ctrl[right]) == (0.037, 0.037)
+    grippers.set_goal(2, 7.0)
+    for _ in range(200):
+        grippers.tick(data)
+    assert data.ctrl[right] == 0.002
+
+
+def test_no_grippers_at_all() -> None:
+    model = aloha_model()
+    data = mujoco.MjData(model)
+    before = data.ctrl.copy()
+    grippers = Grippers(model, [], ControlConfig(), 0.002)
+    grippers.reset(data)
+    grippers.tick(data)
+    assert (data.ctrl == before).all()
