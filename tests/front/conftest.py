@@ -1,4 +1,4 @@
-"""Fixtures of the transport tests."""
+"""Fixtures of the front's tests."""
 
 from __future__ import annotations
 

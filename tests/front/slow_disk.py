@@ -1,4 +1,4 @@
-"""A disk that takes its time to make a file durable, and turns of a loop that must not wait for it."""
+"""A disk that takes long to make a file durable, and ticks of a loop that must not wait for it."""
 
 from __future__ import annotations
 

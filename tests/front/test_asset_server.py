@@ -1,4 +1,4 @@
-"""The assets channel at a real front process: who gets which bytes, who is refused and why, and who delays nobody."""
+"""The assets channel of a real front process: chunks, refusals, fairness between clients, and access."""
 
 from __future__ import annotations
 

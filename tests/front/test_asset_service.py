@@ -1,4 +1,4 @@
-"""What the thread of assets is server to serve: two scenes, and for a while the specifications before them."""
+"""Which assets are served: those of two scenes, and for a while the specifications before them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The thread of assets, step by step: what it counts, who gets a chunk when, and who is cut off."""
+"""The thread of the asset server, pass by pass: counters, order of chunks, and evictions."""
 
 from __future__ import annotations
 

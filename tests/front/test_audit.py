@@ -1,4 +1,4 @@
-"""Audit entries: the first at once, the rest counted, never more than the bounds, nothing lost in the sum."""
+"""Audit entries: the first at once, the rest counted, within the bounds, and none lost in the sum."""
 
 from __future__ import annotations
 

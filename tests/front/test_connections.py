@@ -1,4 +1,4 @@
-"""What waits for and from a TCP connection, counted beside libzmq: against real sockets, plain and encrypted."""
+"""Pending bytes of a TCP connection in both directions: against real sockets, plain and encrypted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How connections end, with real TCP connections and a monitor that says what it is told to."""
+"""The end of connections, with real TCP connections and a scripted monitor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""People behind a gateway when its key is revoked or loses roles, and who notices when one of them is revoked."""
+"""Participants behind a gateway whose key is revoked or loses roles."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The media proxy at a real front process: who gets which frames, and who may hand them in."""
+"""The media proxy of a real front process: delivery of frames, and permission to hand them in."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The budget controller against links that are played: what falls, what rises, how often, and what never happens."""
+"""The budget controller against simulated links: which levels fall and rise, how often, and what never happens."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Streams, subscriptions and what is due, without sockets."""
+"""Streams, subscriptions and due frames, without sockets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pairing rig and revocation without sockets: shares of an attacker, a slow disk, words that cross."""
+"""Pairing and revocation without sockets: limits of an attacker, a slow disk, and requests that cross."""
 
 from __future__ import annotations
 

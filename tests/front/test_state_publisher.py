@@ -1,4 +1,4 @@
-"""What a scene that is drawn otherwise costs the state stream: nothing. Another scene begins it anew."""
+"""The state stream across scene changes: a visual patch leaves it alone, another scene restarts it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The status as the front answers it: with a real front, and an authority that says what it is told to say."""
+"""The status report of a real front, with a scripted authority."""
 
 from __future__ import annotations
 
