@@ -42,9 +42,7 @@ FORBIDDEN = {
     "codegen": SOCKETS | CLOCKS | THREADS | RANDOM | {"mujoco", "rerun"},
 }
 #: Imports between rooms that are still to be untied.
-TRANSITIONAL = {
-    ("session", "client"),
-}  # fmt: skip
+TRANSITIONAL: set[tuple[str, str]] = set()
 #: Rooms whose result may depend on nothing but what they are given: no order of sets, no addresses, no hash seed.
 PURE = ("anchors", "protocol", "authority", "control", "streams")
 #: The feed and the process of the recorder talk; the rest of `recording` reads and writes files.

@@ -21,10 +21,10 @@ import numpy as np
 from msgspec import inspect
 
 from iris_session.client.address import Address
-from iris_session.client.discovery import is_plausible
 from iris_session.client.errors import ClientError
 from iris_session.link import messages as link
 from iris_session.link.config import Ports, SceneInfo
+from iris_session.link.discovery import is_plausible
 from iris_session.protocol import codec, entries
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, AssetChunk, AssetRefused, AssetRequest
 from iris_session.protocol.client_messages import ClientEnvelope

@@ -24,6 +24,7 @@ from iris_session.cli import (
     verify,
 )
 from iris_session.cli.common import CommandError, join_negative_poses, list_expected_errors
+from iris_session.system.log import configure_logging
 
 _EPILOG = """examples:
   iris-session demo handover                 two emulated operators hand over a hammer
@@ -59,6 +60,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command. Return the exit status."""
+    configure_logging()
     arguments = build_parser().parse_args(join_negative_poses(sys.argv[1:] if argv is None else argv))
     os.environ.setdefault("MUJOCO_GL", "disable")  # no command draws: MuJoCo need not load OpenGL, in no process
     from iris_session.physics import AmbiguousModelError

@@ -143,7 +143,7 @@ def _format_session_choice(name: str, here: list[RegisteredSession], found: list
 
 
 def _format_address(host: str, port: int) -> str:
-    from iris_session.client.address import host_port
+    from iris_session.link.discovery import host_port
 
     return host_port(host, port)
 

@@ -9,7 +9,7 @@ from iris_session.client.assets import AssetFetch
 from iris_session.client.client import Client
 from iris_session.client.core.interpolation import PoseBuffer, ShownPoses
 from iris_session.client.core.state_stream import SceneState
-from iris_session.client.discovery import FoundSession, find_sessions
+from iris_session.client.discovery import find_sessions
 from iris_session.client.errors import (
     AssetError,
     ClientError,
@@ -26,6 +26,7 @@ from iris_session.client.errors import (
 from iris_session.client.group import ClientGroup, poll_all, wait_any
 from iris_session.client.identity import Identity
 from iris_session.client.sockets import CurveKeys
+from iris_session.link.discovery import FoundSession
 from iris_session.protocol.session_mirror import SessionMirror
 
 __all__ = [

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import base64
 import binascii
-import ipaddress
-import re
 from dataclasses import dataclass, replace
 from typing import Final
 from urllib.parse import parse_qs, quote, urlsplit
 
 from iris_session.client.errors import ClientError
+from iris_session.link.discovery import host_port, is_host
 from iris_session.protocol.pairing import KEY_BYTES, normalise_code
 from iris_session.security import KeysError, decode_key
 
 DEFAULT_CONTROL_PORT: Final = 7721
 SCHEME: Final = "iris"
-#: One part of a name between its dots. Some networks have underscores in theirs.
-_LABEL: Final = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?")
-_SCOPE: Final = re.compile(r"[A-Za-z0-9._-]{1,32}")
-MAX_NAME: Final = 253
 _EXAMPLE: Final = f"127.0.0.1:{DEFAULT_CONTROL_PORT}"
 
 
@@ -48,25 +43,6 @@ class Address:
         if address.lower().startswith(f"{SCHEME}://"):
             return _from_uri(address.strip())
         return _from_text(address)
-
-
-def host_port(host: str, port: int) -> str:
-    """As it is typed: IPv6 in brackets."""
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-
-
-def is_host(host: str) -> bool:
-    """Whether it can be the name or address of a host. The system's resolver and libzmq raise errors of their own for
-    what cannot."""
-    if ":" in host:
-        address, _, scope = host.partition("%")
-        try:
-            ipaddress.IPv6Address(address)
-        except ValueError:
-            return False
-        return not scope or _SCOPE.fullmatch(scope) is not None
-    labels = host.removesuffix(".").split(".")
-    return len(host) <= MAX_NAME and host[:1] != "_" and all(_LABEL.fullmatch(label) for label in labels)
 
 
 def pairing_uri(host: str, port: int, server_key: str, join_code: str = "", session: str = "") -> str:

@@ -23,15 +23,10 @@ import zmq
 from iris_session.client.address import DEFAULT_CONTROL_PORT, Address
 from iris_session.client.core.connection import ClientConnection
 from iris_session.client.core.status import ConnectionPhase
-from iris_session.client.discovery import (
-    LISTEN_S,
-    BeaconListener,
-    FoundSession,
-    is_plausible,
-    request_introduction,
-)
+from iris_session.client.discovery import LISTEN_S, open_listener, request_introduction
 from iris_session.client.errors import ClientError, NotConnectedError, RefusedError, SessionNameError, TrustError
 from iris_session.client.sockets import ClientSockets, CurveKeys
+from iris_session.link.discovery import FoundSession, is_plausible
 from iris_session.protocol import pairing
 from iris_session.protocol.client_messages import Pair, wrap_message
 from iris_session.protocol.codec import decode_server, encode_client
@@ -145,7 +140,7 @@ class EndpointResolver:
 
     def _find_session(self, name: str) -> Generator[None, None, FoundSession]:
         """Wait until a session of that name is heard, and as long as others of that name would be heard too."""
-        with BeaconListener() as listener:
+        with open_listener() as listener:
             heard_at: float | None = None
             while True:
                 sessions = listener.poll_sessions()

@@ -11,9 +11,9 @@ from typing import Final
 import psutil
 
 from iris_session.client.address import Address
-from iris_session.client.discovery import BeaconListener, FoundSession, request_introduction
-from iris_session.client.errors import ClientError
+from iris_session.client.discovery import request_introduction
 from iris_session.doctor.findings import Finding, failed, ok, warning
+from iris_session.link.discovery import BeaconListener, DiscoveryError, FoundSession
 from iris_session.protocol.discovery import DISCOVERY_PORT, Introduction
 from iris_session.protocol.errors import ProtocolError, ProtocolVersionError
 from iris_session.protocol.names import PROTOCOL_VERSION
@@ -44,7 +44,7 @@ def check_beacon(session: str, address: Address | None) -> tuple[Finding, list[F
                 if str(address) in {one.address for one in listener.poll_sessions()}:
                     break  # the wanted session is heard; a search by name goes on, as two may have the name
             found, ignored = listener.poll_sessions(), dict(listener.ignored)
-    except ClientError as error:
+    except DiscoveryError as error:
         return warning("beacon", str(error)), []
     heard = ", ".join(f"{one.name} ({one.address})" for one in found) or "none"
     if session:

@@ -40,6 +40,7 @@ from iris_session.recording.messages import (
 )
 from iris_session.recording.paths import part_path
 from iris_session.recording.writer import RrdWriter
+from iris_session.system.log import configure_logging
 
 #: Sockets are drained at this period instead of at every message: one wake-up for some twenty messages.
 DRAIN_S: Final = 0.03
@@ -357,6 +358,7 @@ def get_free_bytes(path: Path) -> int:
 
 def main() -> int:
     """Entry of the process."""
+    configure_logging()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     config = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=RecorderConfig)
     try:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import time
 from typing import Final
 
-from iris_session.client import ClientError
-from iris_session.client.discovery import BeaconListener
+from iris_session.link.discovery import BeaconListener, DiscoveryError
 
 #: Beacons come five times a second, so a session is heard twice in this time.
 LISTEN_S: Final = 0.5
@@ -26,7 +25,7 @@ class NameFinder:
         if port:
             try:
                 self._listener = BeaconListener(port)
-            except ClientError as error:
+            except DiscoveryError as error:
                 self.notes.append(f"other sessions cannot be found: {error}")
 
     def find_free_name(self, name: str, session_id: str = "") -> str:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from iris_session.client import ClientError
-from iris_session.client.address import Address, host_port, is_host, pairing_uri
+from iris_session.client.address import Address, pairing_uri
+from iris_session.link.discovery import host_port, is_host
 from iris_session.security import KeyPair
 
 KEY = "rY5P4[G=Mu()uIR1{6xjIHL7utHv9:LKIMvLkp?v"

@@ -14,7 +14,8 @@ import msgspec
 import pytest
 
 from iris_session.client import ClientError, FoundSession, find_sessions
-from iris_session.client.discovery import MAX_ADDRESSES, MAX_SESSIONS, BeaconListener, request_introduction
+from iris_session.client.discovery import request_introduction
+from iris_session.link.discovery import MAX_ADDRESSES, MAX_SESSIONS, BeaconListener
 from iris_session.protocol.codec import encode_beacon, encode_introduction
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.errors import ProtocolError

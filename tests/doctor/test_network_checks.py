@@ -11,10 +11,10 @@ from typing import ClassVar
 import pytest
 
 from iris_session.client.address import Address
-from iris_session.client.discovery import FoundSession
 from iris_session.doctor import network_checks
 from iris_session.doctor.findings import failed, ok
 from iris_session.doctor.runner import run_checks
+from iris_session.link.discovery import FoundSession
 from iris_session.protocol.codec import encode_introduction
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.names import PROTOCOL_VERSION
@@ -197,7 +197,7 @@ class Listener:
 
     def wait(self, timeout_s: float) -> None: ...
 
-    def sessions(self) -> list[FoundSession]:
+    def poll_sessions(self) -> list[FoundSession]:
         return list(self.sessions_heard)
 
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from iris_session.client.discovery import BeaconListener
+from iris_session.link.discovery import BeaconListener
 from iris_session.protocol.codec import encode_beacon
 from iris_session.protocol.discovery import Beacon
 from iris_session.session.unique_name import LISTEN_S, NameFinder
