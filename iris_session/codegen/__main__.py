@@ -1,4 +1,4 @@
-"""Writes the generated files of a checkout, or checks that they are current.
+"""Write the generated files of a checkout, or check that they are current.
 
 python -m iris_session.codegen {csharp,typescript,golden,scene,conversations,docs,all} [--check]
 """
@@ -11,7 +11,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from iris_session.codegen import conversations, csharp, golden, scene_golden, tables, typescript
+from iris_session.codegen import (
+    arrays_golden,
+    conversations,
+    csharp,
+    deformable_golden,
+    golden,
+    scene_golden,
+    tables,
+    typescript,
+)
 
 _DOCUMENT: Final = "docs/protocol.md"
 
@@ -34,6 +43,8 @@ TARGETS: Final[dict[str, tuple[str, Callable[[str], str]]]] = {
     "golden": ("docs/protocol/golden.json", lambda _: golden.golden()),
     "scene": ("docs/protocol/scene.json", lambda _: scene_golden.scene_golden()),
     "conversations": ("docs/protocol/conversations.json", lambda _: conversations.render_conversations()),
+    "arrays": ("docs/protocol/arrays.json", lambda _: arrays_golden.text()),
+    "deformable": ("docs/protocol/deformable.json", lambda _: deformable_golden.text()),
     "docs": (_DOCUMENT, document),
 }
 

@@ -1,18 +1,14 @@
 """Golden vectors of the container of arrays, for tests of this and every other reader.
 
-python -m iris_session.codegen.arrays_golden FILE
-
-Writes docs/protocol/arrays.json: assets, and the arrays that they decode to. Frames are those of the zstd that is
-installed: another version may pack them otherwise, which decodes to the same.
+docs/protocol/arrays.json, written by `python -m iris_session.codegen arrays`: assets, and the arrays that they decode
+to. Frames are those of the zstd that is installed: another version may pack them otherwise, which decodes to the same.
 """
 
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, Final
 
 import msgspec
@@ -24,7 +20,7 @@ from iris_session.protocol.names import ArrayCodec, ArrayFilter, ArrayKind
 from iris_session.scene.arrays import StoredArray, decode_arrays, encode_arrays
 from iris_session.scene.meshes import MeshArrays, encode_mesh, encode_mesh_quantised
 
-#: Of one name, told by their content.
+#: Values of the arrays of every dtype.
 _NUMBERS: Final = np.array([[0, 1, 255], [7, 7, 7], [200, 3, 129], [128, 127, 0]])
 
 
@@ -151,7 +147,3 @@ def _numbers(values: NDArray[Any]) -> list[Any]:
         plain: list[Any] = values.ravel().tolist()
         return plain
     return [v if np.isfinite(v) else None for v in values.astype(np.float64).ravel().tolist()]
-
-
-if __name__ == "__main__":
-    Path(sys.argv[1]).write_text(text(), encoding="utf-8", newline="\n")

@@ -1,18 +1,15 @@
 """Golden vectors of the deformable stream, for tests of this and every other decoder.
 
-python -m iris_session.codegen.deformable_golden FILE
-
-Writes docs/protocol/deformable.json: per mesh its topology, and frames with the vertices that they decode to. Packed
-planes are those of the zstd that is installed: another version may pack them otherwise, which decodes to the same.
+docs/protocol/deformable.json, written by `python -m iris_session.codegen deformable`: per mesh its topology, and frames
+with the vertices that they decode to. Packed planes are those of the zstd that is installed: another version may pack
+them otherwise, which decodes to the same.
 """
 
 from __future__ import annotations
 
 import itertools
 import json
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,7 +34,7 @@ def cloth(rows: int, cols: int, spacing_m: float = 0.01) -> tuple[DeformableTopo
 
 
 def shell(side: int, spacing_m: float = 0.02) -> tuple[DeformableTopology, Floats]:
-    """The outside of a box of `side`^3 vertices that somebody squeezes: closed, and numbered without order."""
+    """The outside of a box of `side`^3 vertices that is squeezed: closed, and numbered without order."""
     grid = np.array(list(itertools.product(range(side), repeat=3)))
     number = {tuple(place): i for i, place in enumerate(grid.tolist())}
     faces = []
@@ -116,17 +113,12 @@ def _numbers(positions: npt.NDArray[np.float32]) -> list[list[float | None]]:
     return [[v if np.isfinite(v) else None for v in row] for row in positions.astype(np.float64).tolist()]
 
 
-def main(path: Path) -> None:
-    """Writes the file, a frame a line."""
+def text() -> str:
+    """Return the text of the file, a frame a line."""
     meshes_of = golden()["meshes"]
     blocks = []
     for mesh in meshes_of:
         frames = ",\n".join("      " + json.dumps(frame, allow_nan=False) for frame in mesh["frames"])
         head = f'"name": {json.dumps(mesh["name"])}, "topology": "{mesh["topology"]}"'
         blocks.append(f'    {{{head}, "frames": [\n{frames}\n    ]}}')
-    text = '{\n  "format": 1,\n  "meshes": [\n' + ",\n".join(blocks) + "\n  ]\n}\n"
-    path.write_text(text, encoding="utf-8", newline="\n")
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    return '{\n  "format": 1,\n  "meshes": [\n' + ",\n".join(blocks) + "\n  ]\n}\n"

