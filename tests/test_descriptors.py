@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from iris_session.cli.live import TerminalView
-from iris_session.emulator.orders import Orders
+from iris_session.emulator.runner import DisturbanceReader
 from iris_session.netsim.process import ImpairmentProcess
 from iris_session.protocol.server_messages import Event, MarkerAdded
 from iris_session.recording import RecorderProcess
@@ -59,7 +59,7 @@ def test_orders_are_read() -> None:
     read, write = os.pipe()
     assert read > BEYOND
     os.write(write, b"bump ann\n")
-    assert Orders(read, ["ann"])() == [("bump", "ann")]
+    assert DisturbanceReader(read, ["ann"])() == [("bump", "ann")]
     os.close(read)
     os.close(write)
 

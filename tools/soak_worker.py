@@ -20,7 +20,7 @@ from typing import Final
 import msgspec
 
 from iris_session.client import RefusedError, wait_any
-from iris_session.emulator.person import Person
+from iris_session.emulator.operator import EmulatedOperator
 from iris_session.emulator.specs import HeadsetSpec
 from iris_session.protocol.server_messages import Event
 
@@ -43,7 +43,7 @@ class Witness:
     """One person whose events go to a file as they come."""
 
     def __init__(self, job: Job, spec: HeadsetSpec, start_ns: int) -> None:
-        self.person = Person(job.address, spec, start_ns)
+        self.person = EmulatedOperator(job.address, spec, start_ns)
         self._prefix = f"{job.log}-{spec.name}"
         self._file = os.open(f"{self._prefix}.events", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         self._next_report_ns = 0
@@ -96,7 +96,7 @@ def main() -> int:
     while not stopped:
         for witness in witnesses:
             witness.step(witness.person.client in ready)
-        wake_ns = min(witness.person.next_ns for witness in witnesses)
+        wake_ns = min(witness.person.next_step_ns for witness in witnesses)
         ready = wait_any(clients, max(0.0, (wake_ns - time.monotonic_ns()) * 1e-9))
     for witness in witnesses:
         witness.report()

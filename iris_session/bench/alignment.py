@@ -24,7 +24,7 @@ from anchors.pose import IDENTITY_POSE, PoseTuple, Quat, Vec3, quat_from_yaw
 from anchors.touch import Touch, register_touches
 from anchors.uncertainty import length_p95
 from iris_session.bench.report import Bar, BenchReport, make_bar
-from iris_session.emulator.sheet_noise import SheetNoise, of_viewpoint
+from iris_session.emulator.sheet_noise import SheetNoise, mix_viewpoint_noise
 
 # --- simulated headsets -----------------------------------------------------------------------------------------------
 
@@ -91,19 +91,19 @@ class SimulatedHeadset:
         )
         e2 = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
         axes = np.stack([e1, e2, np.cross(e1, e2)])
-        noise = of_viewpoint(rng.normal(size=3), rng.normal(size=(n, 3)))
-        turns = of_viewpoint(rng.normal(size=3), rng.normal(size=(n, 3)))
-        p, q = NOISE.seen(p_anchor, q_anchor, axes, d, np.hstack([noise, turns]), rng.normal())
+        noise = mix_viewpoint_noise(rng.normal(size=3), rng.normal(size=(n, 3)))
+        turns = mix_viewpoint_noise(rng.normal(size=3), rng.normal(size=(n, 3)))
+        p, q = NOISE.observe(p_anchor, q_anchor, axes, d, np.hstack([noise, turns]), rng.normal())
         for i in np.flatnonzero(rng.random(n) < NOISE.wrong_share):
-            p[i], q[i] = NOISE.wrong(p[i], q[i], e1, rng)
+            p[i], q[i] = NOISE.make_wrong_detection(p[i], q[i], e1, rng)
         heads = p_anchor - d * e1 + rng.normal(0.0, HEAD_SIGMA_M, (n, 3))
         return self._report(anchor_id, p, q, heads)
 
     def observe_controller(self, anchor_id: str, p_anchor: Array, q_anchor: Array) -> list[ReportedObservation]:
         """Return 2 s of observations of a tracked controller in its holder."""
         rng, n = self.rng, PER_VIEWPOINT
-        noise = TIP_SIGMA_M * of_viewpoint(rng.normal(size=3), rng.normal(size=(n, 3)))
-        turns = HOLDER_SIGMA_RAD * of_viewpoint(rng.normal(size=3), rng.normal(size=(n, 3)))
+        noise = TIP_SIGMA_M * mix_viewpoint_noise(rng.normal(size=3), rng.normal(size=(n, 3)))
+        turns = HOLDER_SIGMA_RAD * mix_viewpoint_noise(rng.normal(size=3), rng.normal(size=(n, 3)))
         q = quat_multiply(quat_exp(turns), np.broadcast_to(q_anchor, (n, 4)))
         return self._report(anchor_id, p_anchor + noise, q, np.broadcast_to(p_anchor, (n, 3)))
 

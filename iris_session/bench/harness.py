@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from iris_session.bench.clients import ClientJob, Job
 from iris_session.bench.report import BenchError
-from iris_session.netsim.process import ImpairmentProcess, link_address
+from iris_session.netsim.process import ImpairmentProcess, make_link_address
 from iris_session.physics import PacerStats
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.entries import Entry
@@ -50,7 +50,7 @@ def assign_links(specs: Sequence[ClientJob], profile: str) -> tuple[list[ClientJ
     """Give each client a link of its own. Return the clients, and the profile by link; unchanged without a profile."""
     if not profile:
         return list(specs), {}
-    placed = [msgspec.structs.replace(spec, link=link_address(i)) for i, spec in enumerate(specs)]
+    placed = [msgspec.structs.replace(spec, link=make_link_address(i)) for i, spec in enumerate(specs)]
     return placed, dict.fromkeys((spec.link for spec in placed), profile)
 
 

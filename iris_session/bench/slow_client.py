@@ -18,7 +18,7 @@ from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import CLIENTS_PER_PROCESS, Action, BenchRun, Log, assign_links, group_clients, measure
 from iris_session.bench.report import NO_BARS, BenchReport, make_bar
 from iris_session.demo.scenes import free_bodies_scene
-from iris_session.netsim.process import link_address
+from iris_session.netsim.process import make_link_address
 
 ROUNDS: Final = 3
 STALL_S: Final = 3.0
@@ -81,7 +81,7 @@ def run_slow_client(
     specs = [ClientJob(f"client{i}", "observer", samples=i < CLIENTS_PER_PROCESS) for i in range(clients - 2)]
     names = [spec.name for spec in specs]
     specs, links = assign_links([*specs, ClientJob(STOPPED, "observer"), ClientJob(STALLED, "observer")], profile)
-    stalled = link_address(clients - 1)
+    stalled = make_link_address(clients - 1)
     specs[-1] = msgspec.structs.replace(specs[-1], link=stalled)
     links[stalled] = profile or "none"
     groups = [*group_clients(specs[:-2]), *((spec,) for spec in specs[-2:])]

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import mujoco
 
     from anchors.pose import PoseTuple
-    from iris_session.demo.named_scenes import Scene
+    from iris_session.demo.named_scenes import NamedScene
 
 
 #: Timeout of the test whether a session is reachable [s].
@@ -201,14 +201,14 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--mode", choices=sorted(LeaseMode.ALL), default=None, help="lease mode of every robot")
 
 
-def open_scene(scene: str) -> Scene:
+def open_scene(scene: str) -> NamedScene:
     """Return the scene of that name, or load it from a file."""
-    from iris_session.demo.named_scenes import Scene, scene_by_name
+    from iris_session.demo.named_scenes import NamedScene, scene_by_name
     from iris_session.physics import load_model
 
     path = Path(scene)
     if path.suffix or path.is_file():
-        return Scene(load_model(path))
+        return NamedScene(load_model(path))
     return scene_by_name(scene)
 
 

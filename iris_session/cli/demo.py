@@ -78,14 +78,14 @@ def run(arguments: argparse.Namespace) -> int:
 
     from iris_session.cli.live import TerminalView
     from iris_session.cli.serve import make_session_config
-    from iris_session.demo.plays import make_play
+    from iris_session.demo.demos import make_demo
     from iris_session.demo.run import run_demo
     from iris_session.netsim.profiles import load_profile
 
     profile = arguments.profile if arguments.latency is None else f"{arguments.latency:f}ms"
     if profile:
         load_profile(profile)  # fails before anything is started
-    play = make_play(arguments.demo, arguments.operators, arguments.observers, arguments.seed)
+    play = make_demo(arguments.demo, arguments.operators, arguments.observers, arguments.seed)
     config = make_session_config(arguments, arguments.demo)
     out = sys.stderr if arguments.json else sys.stdout
 

@@ -1,6 +1,6 @@
-"""What people pass to the client, as what the protocol takes: names, numbers, poses, and bytes that were checked.
+"""Conversion of arguments to values of the protocol: names, numbers, poses, texts.
 
-Whatever cannot be converted raises `InvalidMessageError` at once, in one line that names the field.
+A value that cannot be converted raises `InvalidMessageError` at once, in one line that names the field.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def to_text(value: object) -> str:
     """Any value as a `Text`: what stops robots must not fail for want of a good reason."""
     try:
         text = str(value)
-    except Exception:  # whatever the object's own conversion raises
+    except Exception:  # the object's own conversion may raise anything
         text = type(value).__name__
     return text.encode("utf-8", "replace").decode("utf-8")[:MAX_TEXT]
 

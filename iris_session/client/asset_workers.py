@@ -85,7 +85,7 @@ class AssetWorkers:
             thread.start()
 
     def poll_results(self) -> Iterator[Result]:
-        """What was done since the last time."""
+        """Yield the results since the last call."""
         while not self._results.empty():
             yield self._results.get_nowait()
 
@@ -179,7 +179,7 @@ class AssetWorkers:
         except AssetStoreError as error:
             failure = AssetError.from_store(error)
             failure.__cause__ = error
-        except Exception as error:  # a fault of ours: it must not leave somebody waiting
+        except Exception as error:  # a fault of ours: it must not leave a fetch waiting
             failure = AssetError(address, "cache", f"asset {address}: {type(error).__name__}: {error}")
             failure.__cause__ = error
         self._close(address)

@@ -1,4 +1,4 @@
-"""What bends in the session's scene, as a client sees it: the newest vertices of every deformable, and its triangles.
+"""Deformables of the scene: newest vertices of every cloth, rope and soft body, with their triangles and looks.
 
 shapes = Deformables(client)
 while True:
@@ -118,14 +118,14 @@ class _Mesh:
 
 class Deformables:
     """`vertices`: positions (n, 3) [m], world frame, by name of the deformable; numbered as in the model. Those inside
-    of a soft body, which nobody sees, do not travel: their rows are not a number (NaN), `meshes[name].rows` are the
+    of a soft body, which are not seen, do not travel: their rows are not a number (NaN), `meshes[name].rows` are the
     others. One without a name, or with that of another, goes by its stream (`keys`). `capture_ns`: the session time at
     which they were there, by the same names. What is at rest comes once a second: older than that is not known, but
     what was there then. `meshes`: triangles, lines and looks, by the same names, each there before its first vertices.
 
     `scene_hash`: of the scene they are of. After a patch they go on as they are until the new specification is here,
     and what is the same in both goes on after it. `fault`: why something cannot be seen, empty while all is well.
-    Everything happens in `tend`, which never waits.
+    Everything happens in `update`, which never waits.
     """
 
     def __init__(self, client: Client) -> None:
@@ -151,7 +151,11 @@ class Deformables:
         return self._fault or next((mesh.fault for mesh in self._meshes if mesh.fault), "")
 
     def update(self) -> list[str]:
-        """Follows the scene and takes the newest frames. Names of those that have moved since the last call."""
+        """Follow the scene and take the newest frames, without waiting.
+
+        Returns:
+            Names of the deformables that have moved since the last call.
+        """
         now = self._client.scene.version  # the thread of `start` may be about to hear of another
         if now is None:  # it has heard of one, and not yet of which
             return []
@@ -239,7 +243,7 @@ class Deformables:
         self._parked, self._fault = False, ""
 
     def _failed(self, error: Exception) -> None:
-        """What is shown goes on, unless it is of another scene."""
+        """Keep what is shown, unless it is of another scene."""
         if self._client.mirror.scene_hash != self._asked:  # the newest is asked for at the next call
             return
         if self._parked:
@@ -252,7 +256,7 @@ class Deformables:
         frame = mesh.feed.newest
         if frame is None or frame.header.seq == mesh.seq or frame.header.encoding != MediaEncoding.DEFORMABLE:
             return False
-        if frame.header.scene_epoch != self._client.mirror.scene_epoch:  # or events tell of its scene in a moment
+        if frame.header.scene_epoch != self._client.mirror.scene_epoch:  # or the event of its scene is on its way
             return False
         mesh.seq = frame.header.seq
         try:
@@ -266,17 +270,17 @@ class Deformables:
 
 
 def _identity(key: str, part: Deformable | _Mesh) -> tuple[str, str, str]:
-    """What is equal for the same deformable in two specifications."""
+    """Return the key that is equal for the same deformable in two specifications."""
     return key, part.stream, part.address
 
 
 def deformable_keys(parts: Sequence[Deformable]) -> list[str]:
-    """What tells deformables apart: the name of each, where it has one that no other has; else its stream."""
+    """Return unique keys of deformables: the name of each if no other has it, else its stream."""
     names = [part.name for part in parts]
     found: list[str] = []
     for part in parts:
         key = part.name if part.name and names.count(part.name) == 1 else part.stream
-        while key in found or (key != part.name and key in names):  # somebody is called like a stream
+        while key in found or (key != part.name and key in names):  # a deformable is named like a stream
             key += "'"
         found.append(key)
     return found

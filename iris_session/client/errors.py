@@ -64,7 +64,7 @@ class DeniedError(ClientError):
 
 
 class RequestTimeoutError(ClientError, TimeoutError):
-    """No answer came in time. The request may still take effect: look at the leases before asking again."""
+    """No answer came in time. The request may still take effect: check the leases before you ask again."""
 
 
 class InvalidMessageError(ClientError, ValueError):

@@ -43,7 +43,7 @@ class FetchedScene:
     """`spec`: what is where; `meshes`, `textures`: by their place in `spec.meshes` and `spec.textures`. Vertices are in
     the visual's frame [m], pixels (height, width, channels), top row first.
 
-    `hidden`: ids of visuals that the budget leaves out: whoever draws leaves them out too. `failed`: what cannot be
+    `hidden`: ids of visuals that the budget leaves out: leave them out when drawing. `failed`: what cannot be
     drawn, and why, by address.
     """
 
@@ -108,7 +108,7 @@ class _RefusalRetry:
         self._until = 0.0
 
     def should_retry(self, error: ClientError, scene_hash: str, now: float) -> bool:
-        """Whether to ask again, after one more."""
+        """Return whether to ask again, after one more refusal."""
         if not isinstance(error, AssetError) or error.reason != AssetRefusal.UNKNOWN:
             return False
         if scene_hash != self._scene_hash:

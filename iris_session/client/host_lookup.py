@@ -47,7 +47,7 @@ _lookups: dict[str, _Lookup] = {}
 
 
 def resolve_host(host: str, until_s: float) -> Generator[None, None, str]:
-    """Steps towards the network address of `host`; yields wherever it would wait, until `until_s` (`time.monotonic()`).
+    """Resolve the network address of `host`; yields wherever it would wait, until `until_s` (`time.monotonic()`).
 
     A name means IPv4, as on the sockets that say hello. Raises `OSError`: no such name, no answer.
     """

@@ -1,4 +1,4 @@
-"""Who a client is across connections and restarts: a secret and the last resume token.
+"""Identity of a client across connections and restarts: a secret and the last resume token.
 
 On plain loopback the 128-bit secret in `hello` stands for the key; with CURVE the key itself does. In memory by
 default: then a new process is a new participant. With a file, a killed and restarted process resumes its leases.
@@ -72,7 +72,7 @@ class Identity:
 
     @property
     def resume_token(self) -> bytes:
-        """Token of the last `Welcome`, single use; empty: join as somebody new."""
+        """Token of the last `Welcome`, single use; empty: join as a new participant."""
         return self._resume_token
 
     @resume_token.setter

@@ -1,5 +1,4 @@
-"""ZeroMQ sockets of one client: control and assets (DEALER), state and media (SUB), ingest (PUSH), and what tells of
-their end.
+"""ZeroMQ sockets of one client: control and assets (DEALER), state and media (SUB), ingest (PUSH), and their monitors.
 
 No protocol here.
 """
@@ -66,7 +65,7 @@ def to_milliseconds(nanoseconds: int) -> int:
 
 
 class ClientSockets:
-    """Opens, drains and closes. All methods but `wake` belong to one thread."""
+    """Sockets of one client. All methods but `wake` belong to one thread."""
 
     def __init__(self) -> None:
         self._host = ""
@@ -89,7 +88,7 @@ class ClientSockets:
         self._wake_in.setblocking(False)
 
     def set_target(self, host: str, control_port: int, curve: CurveKeys | None) -> None:
-        """Where the sockets that are opened from now on go, and with which keys."""
+        """Set address and keys of the sockets that are opened from now on."""
         self._host = f"[{host}]" if ":" in host else host
         self._control_port = control_port
         self._curve = curve
@@ -101,7 +100,7 @@ class ClientSockets:
             self.version += 1
 
     def open_control(self) -> None:
-        """A fresh control socket; the old one goes at once with everything in it."""
+        """Open a fresh control socket; the old one is closed at once with everything in it."""
         self._close_control(linger_ms=0)
         control = self._new_socket(zmq.DEALER)
         control.setsockopt(zmq.IMMEDIATE, 1)  # nothing waits for a peer that is not there
@@ -134,7 +133,7 @@ class ClientSockets:
 
     @property
     def has_media(self) -> bool:
-        """Whether media come, of whatever stream."""
+        """True when media of any stream are subscribed to."""
         return self._media is not None
 
     def subscribe_media(self, port: int, topics: Sequence[bytes]) -> None:
@@ -158,11 +157,11 @@ class ClientSockets:
                 self._media.setsockopt(zmq.UNSUBSCRIBE, topic)
 
     def drain_media(self) -> list[list[bytes]]:
-        """What came on the media channel, oldest first."""
+        """Return messages of the media channel, oldest first."""
         return _drain(self._media)
 
     def send_media(self, port: int, frames: Sequence[bytes]) -> bool:
-        """Hands in a frame of a source. False: nobody takes it now."""
+        """Publish a frame of a source. False: the link takes nothing now."""
         if self._ingest is None:
             if not port:
                 return False
@@ -178,7 +177,7 @@ class ClientSockets:
 
     @property
     def has_assets(self) -> bool:
-        """Whether the assets channel is open."""
+        """True while the assets channel is open."""
         return self._assets is not None
 
     def open_assets(self, port: int) -> None:
@@ -205,7 +204,7 @@ class ClientSockets:
         return True
 
     def drain_assets(self) -> list[list[memoryview]]:
-        """What came on the assets channel, in order, at most `MAX_DRAIN` messages: as it was received, not copied."""
+        """Return messages of the assets channel, in order, at most `MAX_DRAIN`, without a copy."""
         messages: list[list[memoryview]] = []
         while len(messages) < MAX_DRAIN and _readable(self._assets):
             messages.append([frame.buffer for frame in self._assets.recv_multipart(_NOBLOCK, copy=False)])
@@ -241,16 +240,16 @@ class ClientSockets:
         return True
 
     def drain_control(self) -> list[list[bytes]]:
-        """What came on the control channel, in order, at most `MAX_DRAIN` messages."""
+        """Return messages of the control channel, in order, at most `MAX_DRAIN`."""
         return _drain(self._control)
 
     def drain_state(self) -> list[list[bytes]]:
-        """What came on the state channel, oldest first."""
+        """Return messages of the state channel, oldest first."""
         return _drain(self._state)
 
     @property
     def has_state(self) -> bool:
-        """Whether something came on the state channel."""
+        """True when a message has come on the state channel."""
         return _readable(self._state)
 
     def poll_disconnect(self) -> bool:
@@ -276,13 +275,13 @@ class ClientSockets:
         poller.register(self._wake_in.fileno(), zmq.POLLIN)
 
     def enable_wake_registration(self) -> None:
-        """From now on `wake` wakes whoever waits for our sockets, not only our own `poll`."""
+        """From now on `wake` ends waits for our sockets in other loops too, not only our own `poll`."""
         self._wakes_anybody = True
         self.version += 1
 
     def wake(self) -> None:
         """Ends a wait that includes `register_wake`, from any thread."""
-        with contextlib.suppress(OSError):  # full: it is awake already; closed: nobody waits
+        with contextlib.suppress(OSError):  # full: it is awake already; closed: there is no wait to end
             self._wake_out.send(b"\0")
 
     def clear_wake(self) -> None:
@@ -292,7 +291,7 @@ class ClientSockets:
                 pass
 
     def disconnect(self) -> None:
-        """Disconnects, after a session has sent us away: libzmq would knock at its door for ever."""
+        """Disconnect after a session has refused us: libzmq would reconnect for ever."""
         if self._control is not None or self._state is not None:
             self.version += 1
             self.close_media()
@@ -335,16 +334,16 @@ class ClientSockets:
 
 
 def _readable(sock: zmq.Socket[bytes] | None) -> TypeGuard[zmq.Socket[bytes]]:
-    """Whether something is there. Asking first costs less than the exception of an empty receive."""
+    """Return whether a message has come. Asking first costs less than the exception of an empty receive."""
     return sock is not None and bool(sock.get(_EVENTS) & _POLLIN)  # type: ignore[operator]
 
 
 def _poll_monitor(monitor: zmq.Socket[bytes] | None) -> bool:
-    """Whether a monitor has told something since the last look."""
-    told = False
+    """Return whether a monitor has reported an event since the last call."""
+    reported = False
     while _readable(monitor):
-        told = bool(monitor.recv_multipart(_NOBLOCK))
-    return told
+        reported = bool(monitor.recv_multipart(_NOBLOCK))
+    return reported
 
 
 def _close_watched(watched: zmq.Socket[bytes], monitor: zmq.Socket[bytes] | None, linger_ms: int) -> None:
@@ -355,7 +354,7 @@ def _close_watched(watched: zmq.Socket[bytes], monitor: zmq.Socket[bytes] | None
 
 
 def _drain(sock: zmq.Socket[bytes] | None) -> list[list[bytes]]:
-    """What is there now."""
+    """Return the messages that have come."""
     messages: list[list[bytes]] = []
     while len(messages) < MAX_DRAIN and _readable(sock):
         messages.append(_receive(sock))

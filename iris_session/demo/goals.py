@@ -1,7 +1,7 @@
-"""When a task with a deformable is a success: pure functions on where its vertices are and who touches it.
+"""Success criteria of tasks with a deformable: pure functions of its vertices and contacts.
 
-The criteria are those of the IRIS paper: a cloth is folded when corners meet, a soft body is stowed when it was lifted
-and lies in the box. Both count only when nobody touches it any more and it keeps still.
+The criteria are those of the IRIS paper: a cloth is folded when its corners meet, a soft body is stowed when it was
+lifted and lies in the box. Both count only when no robot touches the deformable and it is at rest.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.common import Vec3
 
-#: It keeps still when no vertex leaves this distance [m] for so long [s].
+#: A deformable is at rest when no vertex moves farther than this [m] for this time [s].
 STILL_M: Final = 0.005
 STILL_S: Final = 0.5
 
@@ -23,41 +23,41 @@ Vertices = NDArray[np.float64]
 
 
 class Goal(Protocol):
-    """What is to be reached with one deformable. Vertices: world [m], shape (n, 3), in the order of the model."""
+    """A goal for one deformable. Vertices: world [m], shape (n, 3), in the order of the model."""
 
     @property
     def deformable(self) -> str: ...
 
     @property
     def name(self) -> str:
-        """What it is called when it is reached, one word."""
+        """One word for the state in which it is reached, such as `folded`."""
         ...
 
-    def begun(self, vertices: Vertices) -> bool:
-        """What must have been seen at some time before it counts."""
+    def has_begun(self, vertices: Vertices) -> bool:
+        """Return True for a state that must occur before the goal counts."""
         ...
 
-    def met(self, vertices: Vertices) -> bool:
-        """Whether it lies as it should."""
+    def is_met(self, vertices: Vertices) -> bool:
+        """Return True if the deformable lies as it should."""
         ...
 
 
 @dataclass(frozen=True)
 class FoldGoal:
-    """Every pair of vertices of `pairs`, apart at first, has come closer than `within_m`."""
+    """Every pair of vertices of `pairs`, apart at first, comes closer than `within_m`."""
 
     deformable: str
     pairs: tuple[tuple[int, int], ...]
     within_m: float = 0.05
     name: str = "folded"
 
-    def begun(self, vertices: Vertices) -> bool:
-        return all(gap > 2.0 * self.within_m for gap in self._gaps(vertices))
+    def has_begun(self, vertices: Vertices) -> bool:
+        return all(gap > 2.0 * self.within_m for gap in self._measure_gaps(vertices))
 
-    def met(self, vertices: Vertices) -> bool:
-        return all(gap <= self.within_m for gap in self._gaps(vertices))
+    def is_met(self, vertices: Vertices) -> bool:
+        return all(gap <= self.within_m for gap in self._measure_gaps(vertices))
 
-    def _gaps(self, vertices: Vertices) -> list[float]:
+    def _measure_gaps(self, vertices: Vertices) -> list[float]:
         return [float(np.linalg.norm(vertices[a] - vertices[b])) for a, b in self.pairs]
 
 
@@ -75,15 +75,15 @@ class StowGoal:
     lifted_m: float = 0.10
     name: str = "stowed"
 
-    def begun(self, vertices: Vertices) -> bool:
+    def has_begun(self, vertices: Vertices) -> bool:
         return bool(vertices[:, 2].min() >= self.table_z + self.lifted_m)
 
-    def met(self, vertices: Vertices) -> bool:
+    def is_met(self, vertices: Vertices) -> bool:
         return bool((vertices >= self.low).all() and (vertices <= self.high).all())
 
 
-class GoalWatch:
-    """Follows one goal from tick to tick. `at_s`: simulated time at which it was reached, `None` until then."""
+class GoalMonitor:
+    """Monitors one goal from tick to tick. `at_s`: simulated time at which it was reached, `None` until then."""
 
     def __init__(self, goal: Goal) -> None:
         self.goal = goal
@@ -92,15 +92,15 @@ class GoalWatch:
         self._rest: Vertices | None = None
         self._rest_since_s = 0.0
 
-    def observe(self, now_s: float, vertices: Vertices, touching: Sequence[str]) -> bool:
-        """Takes in the world after a tick; true in the one in which the goal is reached."""
+    def update(self, now_s: float, vertices: Vertices, touching: Sequence[str]) -> bool:
+        """Process the state after a tick. Returns True in the tick in which the goal is reached."""
         if self.at_s is not None:
             return False
-        self._begun = self._begun or self.goal.begun(vertices)
+        self._begun = self._begun or self.goal.has_begun(vertices)
         moved = self._rest is None or float(np.abs(vertices - self._rest).max()) > STILL_M
         if moved or touching:
             self._rest, self._rest_since_s = vertices, now_s
-        elif self._begun and now_s - self._rest_since_s >= STILL_S and self.goal.met(vertices):
+        elif self._begun and now_s - self._rest_since_s >= STILL_S and self.goal.is_met(vertices):
             self.at_s = now_s
             return True
         return False

@@ -1,6 +1,6 @@
-"""Scenes that are known by name: drawn from primitives, or built around models of real robots (from `IRIS_DATA`).
+"""Scenes by name: drawn from primitives, or built around models of real robots (from `IRIS_DATA`).
 
-Each comes with the place of its alignment sheet. Names like `arms4` say how many arms there are.
+Each comes with the pose of its alignment sheet. Names like `arms4` say how many arms there are.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from iris_session.demo.scenes import free_bodies_scene, n_arms_scene, scene_path
 from iris_session.demo.scenes.aloha import SHEET_Z, aloha_scene
 from iris_session.demo.scenes.deformables import cloth_scene, soft_scene
 from iris_session.demo.scenes.iiwa import iiwa_scene
-from iris_session.demo.scenes.parts import add_sheet, sheet_place
+from iris_session.demo.scenes.parts import add_sheet, get_sheet_position
 from iris_session.physics import load_model
 from iris_session.session.config import DEFAULT_ANCHORS, DEFAULT_SHEET_M
 from iris_session.session.errors import ConfigError
@@ -28,8 +28,8 @@ ANCHOR_ID: Final = next(iter(DEFAULT_ANCHORS))
 
 
 @dataclass(frozen=True)
-class Scene:
-    """A model, and where its sheet lies: the default is for scenes that do not say."""
+class NamedScene:
+    """A model and the poses of its sheets; the default is for scenes that do not specify one."""
 
     model: mujoco.MjModel
     anchors: Mapping[str, PoseTuple] = field(default_factory=lambda: DEFAULT_ANCHORS)
@@ -40,66 +40,69 @@ class Scene:
         return dict.fromkeys(self.anchors, DEFAULT_SHEET_M)
 
 
-def arms(n: int) -> Scene:
-    """`n` arms drawn from primitives around a round table."""
+def make_arms(n: int) -> NamedScene:
+    """Return `n` arms drawn from primitives around a round table."""
     spec = n_arms_scene(n)
-    add_sheet(spec, sheet_place(n))
-    return Scene(spec.compile(), _sheet(sheet_place(n)))
+    add_sheet(spec, get_sheet_position(n))
+    return NamedScene(spec.compile(), _place_sheet(get_sheet_position(n)))
 
 
-def iiwa(n: int) -> Scene:
-    """`n` KUKA iiwa 14 arms around a round table."""
-    return Scene(iiwa_scene(n).compile(), _sheet(sheet_place(n)))
+def make_iiwa(n: int) -> NamedScene:
+    """Return `n` KUKA iiwa 14 arms around a round table."""
+    return NamedScene(iiwa_scene(n).compile(), _place_sheet(get_sheet_position(n)))
 
 
-def aloha() -> Scene:
-    """Two ALOHA stations face to face."""
-    return Scene(aloha_scene().compile(), _sheet((0.0, 0.0, SHEET_Z)))
+def make_aloha() -> NamedScene:
+    """Return two ALOHA stations face to face."""
+    return NamedScene(aloha_scene().compile(), _place_sheet((0.0, 0.0, SHEET_Z)))
 
 
-def cloth() -> Scene:
-    """Two arms and a cloth between them."""
-    return Scene(cloth_scene().compile(), _sheet(sheet_place(2)))
+def make_cloth() -> NamedScene:
+    """Return two arms and a cloth between them."""
+    return NamedScene(cloth_scene().compile(), _place_sheet(get_sheet_position(2)))
 
 
-def soft() -> Scene:
-    """Two arms, a soft body before each, and an open box."""
-    return Scene(soft_scene().compile(), _sheet(sheet_place(2)))
+def make_soft() -> NamedScene:
+    """Return two arms, a soft body before each, and an open box."""
+    return NamedScene(soft_scene().compile(), _place_sheet(get_sheet_position(2)))
 
 
-def packaged(name: str) -> Scene:
-    """An MJCF file of the package."""
-    return Scene(load_model(scene_path(name)))
+def load_packaged(name: str) -> NamedScene:
+    """Return a scene from an MJCF file of the package."""
+    return NamedScene(load_model(scene_path(name)))
 
 
-def _sheet(p_world: tuple[float, float, float]) -> dict[str, PoseTuple]:
+def _place_sheet(p_world: tuple[float, float, float]) -> dict[str, PoseTuple]:
     return {ANCHOR_ID: (p_world, IDENTITY_QUAT)}
 
 
 #: Endings of files in place of a name, for the error text; `serve` shows those that MuJoCo does not simulate.
 FILES: Final = ".xml, .mjcf, .mjb; to be shown: .urdf, .glb, .gltf, .stl, .obj, .ply, .off, .dae, .3mf"
-#: How the scenes of `SCENE_NAMES` are made.
-SCENES: Final[dict[str, Callable[[], Scene]]] = {
-    "handover": lambda: packaged("handover"),
-    "arm": lambda: packaged("arm"),
-    "arms": lambda: arms(8),
-    "iiwa": lambda: iiwa(2),
-    "aloha": aloha,
-    "cloth": cloth,
-    "soft": soft,
-    "bodies": lambda: Scene(free_bodies_scene().compile()),
+#: Constructors of the scenes of `SCENE_NAMES`.
+SCENES: Final[dict[str, Callable[[], NamedScene]]] = {
+    "handover": lambda: load_packaged("handover"),
+    "arm": lambda: load_packaged("arm"),
+    "arms": lambda: make_arms(8),
+    "iiwa": lambda: make_iiwa(2),
+    "aloha": make_aloha,
+    "cloth": make_cloth,
+    "soft": make_soft,
+    "bodies": lambda: NamedScene(free_bodies_scene().compile()),
 }
-NUMBERED: Final[dict[str, Callable[[int], Scene]]] = {"arms": arms, "iiwa": iiwa}
+NUMBERED: Final[dict[str, Callable[[int], NamedScene]]] = {"arms": make_arms, "iiwa": make_iiwa}
 
 
-def scene_by_name(name: str) -> Scene:
-    """Raises `ConfigError` that lists the names, `ModelNotFoundError` without the model of a real robot."""
+def scene_by_name(name: str) -> NamedScene:
+    """Return a scene by name.
+
+    Raises `ConfigError` that lists the names, `ModelNotFoundError` without the model of a real robot.
+    """
     if name in SCENES:
         return SCENES[name]()
     match = re.fullmatch(r"([a-z]+)([0-9]{1,3})", name)
     if match is None or match[1] not in NUMBERED:
         names = ", ".join(SCENE_NAMES)
-        raise ConfigError(f"no scene is called '{name}'. Scenes: {names}; or give a file ({FILES})")
+        raise ConfigError(f"unknown scene '{name}'; expected one of {names}, or a file ({FILES})")
     try:
         return NUMBERED[match[1]](int(match[2]))
     except ValueError as error:  # out of range

@@ -1,8 +1,8 @@
-"""Runs a demo: a session in this process, emulated people in others, and a result that says whether it worked.
+"""Run a demo: a session in this process, emulated operators in others, and a result with a verdict.
 
-It counts only if the session's own detector saw every object change hands by contact alone, if every goal with a
-deformable was reached (`goals`; told in the recording as the verdict of an episode), and if the recording verifies bit
-for bit. What is played is in `plays`.
+A run succeeds only if the session's own detector saw every handover by contact alone, if every goal with a deformable
+was reached (`goals`; recorded as the verdict of an episode), and if the recording verifies bit for bit. The demos
+themselves are in `demos`.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from typing import Any, Final, Self
 
 import msgspec
 
-from iris_session.demo.goals import GoalWatch
-from iris_session.demo.plays import Play
+from iris_session.demo.demos import Demo
+from iris_session.demo.goals import GoalMonitor
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
-from iris_session.netsim.process import ImpairmentProcess, link_address
+from iris_session.netsim.process import ImpairmentProcess, make_link_address
 from iris_session.protocol.client_messages import Episode
 from iris_session.protocol.names import EpisodeAction
 from iris_session.session.config import SessionConfig
@@ -29,19 +29,19 @@ from iris_session.session.status import SessionStatus
 from iris_session.session.verification import verify_recording
 from iris_session.system.process import PIPE, ChildProcess
 
-#: How often the reports of the emulated people are read [ns].
+#: Period at which the reports of the emulated headsets are read [ns].
 READ_PERIOD_NS: Final = 100_000_000
-#: Until the session that the demo itself started lets its people in: a busy machine may take its time.
+#: Time to join the session that the demo itself started: a busy machine may be slow.
 JOIN_TIMEOUT_S: Final = 60.0
-#: So long a deformable may take to come to rest after everybody is done [s].
+#: Time for a deformable to come to rest after all operators are done [s].
 SETTLE_S: Final = 3.0
-#: People who work share a process in pairs, people who only look in fours.
+#: Operators per process, when there are more than two; observers per process.
 WORKERS_PER_PROCESS: Final = 2
 OBSERVERS_PER_PROCESS: Final = 4
 
 
 class EmulatorProcess:
-    """Emulated people in a process of their own. `poll()` reads what they report, without waiting."""
+    """Emulated headsets in a process of their own. `poll()` reads their reports without waiting."""
 
     def __init__(self, address: str, specs: Sequence[HeadsetSpec], seconds: float) -> None:
         options = ["--address", address, "--specs", "-", "--json", "--join-timeout", str(JOIN_TIMEOUT_S)]
@@ -56,12 +56,12 @@ class EmulatorProcess:
         self.reports: dict[str, HeadsetReport] = {}
 
     @property
-    def running(self) -> bool:
+    def is_running(self) -> bool:
         return self._process.is_running
 
     @property
-    def busy(self) -> bool:
-        """Whether somebody here has not yet come to the end of a task that has one."""
+    def is_busy(self) -> bool:
+        """True until every task that has an end is done or failed."""
         reports = [self.reports.get(name) for name in self._awaited]
         return any(r is None or not (r.done or r.failed) for r in reports)
 
@@ -70,13 +70,13 @@ class EmulatorProcess:
         return self._process.pid
 
     def poll(self) -> None:
-        """Takes over the newest report of each person."""
+        """Read the newest report of each headset."""
         for line in self._process.read_available_lines():
             report = msgspec.json.decode(_nan_for_null(line), type=HeadsetReport, strict=False)
             self.reports[report.name] = report
 
     def close(self) -> None:
-        """Ends the process if it still runs, and reads its last words. Can be called twice."""
+        """End the process if it still runs, and read its last reports. Can be called twice."""
         self._process.stop(terminate_s=5.0)
         self.poll()
         self._process.close()
@@ -89,7 +89,7 @@ def _nan_for_null(line: bytes) -> bytes:
 
 
 class GoalStatus(msgspec.Struct, frozen=True):
-    """What became of a goal: `at_s` of simulated time it was reached, `None` when it was not."""
+    """Outcome of a goal: simulated time `at_s` at which it was reached, `None` when it was not."""
 
     deformable: str
     goal: str
@@ -97,8 +97,9 @@ class GoalStatus(msgspec.Struct, frozen=True):
 
 
 class DemoResult(msgspec.Struct, frozen=True):
-    """What `demo NAME --json` prints. `alignment_mm`, by person: stated p95 and true error at the sheet; nobody who
-    never was aligned."""
+    """Result of a demo, as printed by `demo NAME --json`. `alignment_mm`: stated p95 and true error at the sheet, by
+    name
+    of the headset; without those that were never aligned."""
 
     ok: bool
     demo: str
@@ -120,46 +121,46 @@ class DemoResult(msgspec.Struct, frozen=True):
 
 
 def run_demo(
-    play: Play,
+    demo: Demo,
     config: SessionConfig,
     timeout_s: float = 90.0,
     on_session: Callable[[Session], AbstractContextManager[Callable[[], object]]] | None = None,
     profile: str = "",
     seed: int = 0,
 ) -> DemoResult:
-    """Runs `play` to its end. `on_session`: a context around the running session; gives what its loop calls always.
+    """Run `demo` to its end. `on_session`: a context around the running session that yields a function for every loop.
 
-    `profile`: every process of people joins over a bad link like this, with the weather of `seed`; empty: directly.
+    `profile`: each emulator process joins over an impaired link of this profile, with `seed`; empty: directly.
     """
     session = Session(
-        play.model, config=dataclasses.replace(config, anchors=play.anchors, anchor_sizes=play.anchor_sizes)
+        demo.model, config=dataclasses.replace(config, anchors=demo.anchors, anchor_sizes=demo.anchor_sizes)
     )
-    judge = _Judge(play, session)
+    judge = _GoalTracker(demo, session)
     with ExitStack() as stack:
         stack.enter_context(session.signals())
         stack.enter_context(session)
         update = stack.enter_context(on_session(session)) if on_session is not None else (lambda: None)
-        groups = _groups(play.people)
-        links = {link_address(i): profile for i in range(len(groups))} if profile else {}
+        groups = _group_by_process(demo.headsets)
+        links = {make_link_address(i): profile for i in range(len(groups))} if profile else {}
         if links:
             ports = session.processes.front_ports
             stack.enter_context(ImpairmentProcess(links, ports.for_clients, target=ports.host, seed=seed))
         addresses = [f"{link}:{session.processes.front_ports.control}" for link in links] or [session.address] * len(
             groups
         )
-        people = stack.enter_context(_People(addresses, groups, timeout_s))
+        people = stack.enter_context(_EmulatorGroup(addresses, groups, timeout_s))
         next_read_ns = began_ns = 0
 
         def finished() -> bool:
             nonlocal next_read_ns, began_ns
             update()
             now_ns = session.clock()
-            began_ns = began_ns or now_ns  # making the loop ready is no part of its pace
-            judge.look()
+            began_ns = began_ns or now_ns  # preparing the loop is not part of its pace
+            judge.update()
             if now_ns < next_read_ns:
                 return False
             next_read_ns = now_ns + READ_PERIOD_NS
-            return people.finished() and judge.settled()
+            return people.is_finished() and judge.is_settled()
 
         session.run(seconds=timeout_s + 5.0, until=finished)
         run_s = max(session.clock() - began_ns, 1) * 1e-9
@@ -169,16 +170,16 @@ def run_demo(
         seconds = session.clock() * 1e-9
         recording = session.recording
     reports = people.reports
-    # Ctrl-C asks for an end now; `iris-session verify` has all the time it needs.
-    verified, verification = (None, "not verified: interrupted") if interrupted else _verify(recording)
-    problems = ["interrupted before its end"] if interrupted else _problems(play, reports, status, timeout_s)
+    # Ctrl-C requests an immediate end; `iris-session verify` has all the time it needs.
+    verified, verification = (None, "not verified: interrupted") if interrupted else _verify_recording(recording)
+    problems = ["interrupted before its end"] if interrupted else _list_problems(demo, reports, status, timeout_s)
     if not interrupted:
-        problems += judge.problems()
+        problems += judge.list_problems()
     if verified is False:
         problems.append(verification)
     return DemoResult(
-        ok=not problems and len(reports) == len(play.people),
-        demo=play.name,
+        ok=not problems and len(reports) == len(demo.headsets),
+        demo=demo.name,
         seconds=round(seconds, 3),
         participants=tuple(sorted(reports)),
         handovers=status.handovers,
@@ -195,60 +196,60 @@ def run_demo(
         real_time_factor=round(status.sim_time / run_s, 3),
         state_age_ms_p99={name: round(r.age_ms_p99, 2) for name, r in reports.items() if math.isfinite(r.age_ms_p99)},
         problems=tuple(problems),
-        notes=play.notes,
+        notes=demo.notes,
         interrupted=interrupted,
-        goals=judge.status(),
+        goals=judge.get_status(),
     )
 
 
-class _Judge:
-    """Follows the goals of a play, tick by tick, and has the verdict recorded as that of an episode."""
+class _GoalTracker:
+    """Tracks the goals of a demo tick by tick, and records the verdict as that of an episode."""
 
-    def __init__(self, play: Play, session: Session) -> None:
+    def __init__(self, play: Demo, session: Session) -> None:
         self._name = play.name
         self._session = session
-        self._watches = tuple(GoalWatch(goal) for goal in play.goals)
+        self._monitors = tuple(GoalMonitor(goal) for goal in play.goals)
         self._began = False
         self._finished_s: float | None = None
 
-    def look(self) -> None:
-        """After every tick."""
-        if not self._watches:
+    def update(self) -> None:
+        """Process one tick."""
+        if not self._monitors:
             return
         if not self._began:
             self._began = True
             self._session.post(Episode(0, EpisodeAction.START, self._name))
         world = self._session.stepper.core.world
         now_s, reached = world.view().sim_time, False
-        for watch in self._watches:
+        for watch in self._monitors:
             name = watch.goal.deformable
-            reached |= watch.observe(now_s, world.flexes.read_vertices(name), world.flexes.find_touching_robots(name))
-        if reached and all(watch.at_s is not None for watch in self._watches):
+            reached |= watch.update(now_s, world.flexes.read_vertices(name), world.flexes.find_touching_robots(name))
+        if reached and all(watch.at_s is not None for watch in self._monitors):
             self._session.post(Episode(0, EpisodeAction.SUCCESS, self._name))
 
-    def settled(self) -> bool:
-        """Asked when everybody is done: whether the goals are reached, or evidently will not be."""
+    def is_settled(self) -> bool:
+        """Return True, once all tasks are done, when the goals are reached or evidently will not be."""
         now_s = self._session.clock() * 1e-9
         self._finished_s = now_s if self._finished_s is None else self._finished_s
-        return all(watch.at_s is not None for watch in self._watches) or now_s - self._finished_s > SETTLE_S
+        return all(watch.at_s is not None for watch in self._monitors) or now_s - self._finished_s > SETTLE_S
 
-    def status(self) -> tuple[GoalStatus, ...]:
+    def get_status(self) -> tuple[GoalStatus, ...]:
         return tuple(
             GoalStatus(w.goal.deformable, w.goal.name, None if w.at_s is None else round(w.at_s, 3))
-            for w in self._watches
+            for w in self._monitors
         )
 
-    def problems(self) -> list[str]:
-        """The goals that were not reached."""
+    def list_problems(self) -> list[str]:
+        """Return one line per goal that was not reached."""
         return [
-            f"the {w.goal.deformable} was not {w.goal.name}, let go and at rest"
-            for w in self._watches
+            f"the {w.goal.deformable} was not {w.goal.name}, released and at rest"
+            for w in self._monitors
             if w.at_s is None
         ]
 
 
-def _groups(specs: Sequence[HeadsetSpec]) -> list[Sequence[HeadsetSpec]]:
-    """Who shares a process: nobody as long as two people work, else see `WORKERS_PER_PROCESS`."""
+def _group_by_process(specs: Sequence[HeadsetSpec]) -> list[Sequence[HeadsetSpec]]:
+    """Group headsets by process: one each for up to two operators, else `WORKERS_PER_PROCESS`."""
     workers = [spec for spec in specs if not spec.observer]
     observers = [spec for spec in specs if spec.observer]
     each = 1 if len(workers) <= 2 else WORKERS_PER_PROCESS
@@ -256,8 +257,8 @@ def _groups(specs: Sequence[HeadsetSpec]) -> list[Sequence[HeadsetSpec]]:
     return groups + [observers[i : i + OBSERVERS_PER_PROCESS] for i in range(0, len(observers), OBSERVERS_PER_PROCESS)]
 
 
-class _People:
-    """The emulated people of a demo, in processes of their own."""
+class _EmulatorGroup:
+    """The emulated headsets of a demo, in their own processes."""
 
     def __init__(self, addresses: Sequence[str], groups: Sequence[Sequence[HeadsetSpec]], timeout_s: float) -> None:
         self._workers: list[EmulatorProcess] = []
@@ -280,23 +281,23 @@ class _People:
 
     @property
     def reports(self) -> dict[str, HeadsetReport]:
-        """The newest report of everybody, by name."""
+        """The newest report of each headset, by name."""
         return {name: r for process in (*self._workers, *self._observers) for name, r in process.reports.items()}
 
-    def finished(self) -> bool:
-        """Reads the reports; whether everybody whose task has an end has come to it."""
+    def is_finished(self) -> bool:
+        """Read the reports and return True when every task that has an end has ended."""
         for process in (*self._workers, *self._observers):
             process.poll()
-        return not any(process.running and process.busy for process in self._workers)
+        return not any(process.is_running and process.is_busy for process in self._workers)
 
     def close(self) -> None:
         for process in (*self._workers, *self._observers):
             process.close()
 
 
-def _problems(play: Play, reports: dict[str, HeadsetReport], status: SessionStatus, timeout_s: float) -> list[str]:
-    """Why this was no success; empty when it was one."""
-    tasks = {spec.name: spec for spec in play.people}
+def _list_problems(play: Demo, reports: dict[str, HeadsetReport], status: SessionStatus, timeout_s: float) -> list[str]:
+    """Return the reasons why the demo failed, empty after a success."""
+    tasks = {spec.name: spec for spec in play.headsets}
     problems = [f"{name}: {report.failed}" for name, report in reports.items() if report.failed]
     problems += [
         f"{name}: not done within {timeout_s:g} s, at '{r.phase}'"
@@ -310,7 +311,7 @@ def _problems(play: Play, reports: dict[str, HeadsetReport], status: SessionStat
     return problems
 
 
-def _verify(recording: Path | None) -> tuple[bool | None, str]:
+def _verify_recording(recording: Path | None) -> tuple[bool | None, str]:
     if recording is None:
         return None, "not recorded"
     report = verify_recording(recording)

@@ -1,4 +1,4 @@
-"""The scenes that can be named, for help texts: nothing heavy is imported. How they are made is in `scenes`."""
+"""Names of the scenes with descriptions, for help texts without heavy imports. `named_scenes` builds them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""`python -m iris_session.emulator`: emulated people from the command line, or driven by a parent with JSON lines."""
+"""`python -m iris_session.emulator`: emulated headsets from the command line, or with JSON lines for a parent
+process."""
 
 from __future__ import annotations
 
@@ -14,9 +15,8 @@ import msgspec
 
 from iris_session.client import ClientError
 from iris_session.client.endpoint_resolver import ConnectRequest, parse_connect_request, resolve_blocking
-from iris_session.emulator.equipment import behaviour_of, curve_of
-from iris_session.emulator.orders import Orders
-from iris_session.emulator.runner import JOIN_TIMEOUT_S, run_headsets
+from iris_session.emulator.operator import load_curve_keys, make_spec_behaviour
+from iris_session.emulator.runner import JOIN_TIMEOUT_S, DisturbanceReader, run_headsets
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
 
 #: Fields of a headset with several numbers, written as `eye=0.3/-0.9/0.5`. Fields of a field have both names:
@@ -25,20 +25,20 @@ LISTS: Final = frozenset({"eye", "gaze", "recentre_at_s", "bump_at_s", "bump_m"}
 
 
 def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
-    """Exit status 0 when nobody failed, 1 when somebody did, 2 for unusable input. Errors begin with `prog`."""
-    options = _parser().parse_args(argv)
+    """Return exit status 0 when all succeeded, 1 when one failed, 2 for unusable input. Errors begin with `prog`."""
+    options = _build_parser().parse_args(argv)
     try:
-        specs = _specs(options)
+        specs = _parse_specs(options)
         sought = parse_connect_request(options.address, options.session, None, options.code)
         for spec in specs:
-            behaviour_of(spec, spec.robot)
-            curve_of(spec)
+            make_spec_behaviour(spec, spec.robot)
+            load_curve_keys(spec)
     except (msgspec.MsgspecError, OSError, ValueError, ClientError) as error:
         print(f"{prog}: {error}", file=sys.stderr)
         return 2
     try:
         if sought.address is None or sought.join_code or sought.address.join_code:
-            # Everybody here has the key of this user: it is paired once, not by each of them.
+            # All headsets here use the key of this user, which is paired once.
             sought = ConnectRequest(resolve_blocking(sought, options.join_timeout).address)
     except ClientError as error:
         print(f"{prog}: {error}", file=sys.stderr)
@@ -46,8 +46,8 @@ def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
     stopped: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda received, _frame: stopped.append(received))
-    say = _say_json if options.json else _say_line
-    orders = Orders(sys.stdin.fileno(), [spec.name for spec in specs]) if options.orders else tuple
+    say = _print_json if options.json else _print_line
+    orders = DisturbanceReader(sys.stdin.fileno(), [spec.name for spec in specs]) if options.orders else tuple
     try:
         reports = run_headsets(
             str(sought.address), specs, options.seconds, say, lambda: bool(stopped), options.join_timeout, orders
@@ -56,31 +56,33 @@ def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
             say(report, final=True)
             if report.failed:
                 print(f"{prog}: {report.name}: {report.failed}", file=sys.stderr)
-    except BrokenPipeError:  # whoever started us is gone
+    except BrokenPipeError:  # the parent process has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     return int(any(report.failed for report in reports))
 
 
-def _parser() -> argparse.ArgumentParser:
+def _build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m iris_session.emulator", description=__doc__)
     parser.add_argument("--address", default="", help="control channel of the session, HOST:PORT, or an iris:// URI")
     parser.add_argument("--session", default="", metavar="NAME", help="find the session of that name on the network")
     parser.add_argument("--code", default="", metavar="CODE", help="join code, the first time at a session")
-    parser.add_argument("--headset", action="append", default=[], metavar="KEY=VALUE,...", help="one person, see specs")
+    parser.add_argument(
+        "--headset", action="append", default=[], metavar="KEY=VALUE,...", help="one headset, see specs"
+    )
     parser.add_argument("--specs", default="", metavar="FILE", help="JSON list of HeadsetSpec, - for standard input")
     parser.add_argument("--seconds", type=float, default=None, help="at most this long")
     parser.add_argument(
-        "--join-timeout", type=float, default=JOIN_TIMEOUT_S, metavar="S", help="give up when no session lets us in"
+        "--join-timeout", type=float, default=JOIN_TIMEOUT_S, metavar="S", help="fail when not joined after this time"
     )
     parser.add_argument("--curve-server", default="", metavar="FILE", help="the session's public CURVE key")
-    parser.add_argument("--curve-key", default="", metavar="FILE", help="our own CURVE secret key, of everybody here")
+    parser.add_argument("--curve-key", default="", metavar="FILE", help="own CURVE secret key, for all headsets here")
     parser.add_argument("--orders", action="store_true", help="take orders from standard input, such as: bump NAME")
     parser.add_argument("--json", action="store_true", help="one JSON object per line on standard output")
     return parser
 
 
-def _specs(options: argparse.Namespace) -> list[HeadsetSpec]:
+def _parse_specs(options: argparse.Namespace) -> list[HeadsetSpec]:
     specs: list[HeadsetSpec] = []
     if options.specs == "-" and options.orders:
         raise ValueError("--specs - and --orders both read standard input: write the specs into a file")
@@ -91,7 +93,7 @@ def _specs(options: argparse.Namespace) -> list[HeadsetSpec]:
         pairs: dict[str, Any] = dict(part.partition("=")[::2] for part in text.split(","))
         for key in LISTS & pairs.keys():
             pairs[key] = [float(value) for value in pairs[key].split("/")]
-        nested = _nested(pairs)
+        nested = _nest_fields(pairs)
         _check_fields(nested, HeadsetSpec)
         specs.append(msgspec.convert(nested, HeadsetSpec, strict=False))
     if not specs:
@@ -101,8 +103,8 @@ def _specs(options: argparse.Namespace) -> list[HeadsetSpec]:
     return [msgspec.structs.replace(spec, **keys) for spec in specs]
 
 
-def _nested(pairs: Mapping[str, Any]) -> dict[str, Any]:
-    """`model.drift_m_per_min` is a field of a field."""
+def _nest_fields(pairs: Mapping[str, Any]) -> dict[str, Any]:
+    """Nest dotted keys: `model.drift_m_per_min` is a field of the field `model`."""
     nested: dict[str, Any] = {}
     for key, value in pairs.items():
         *path, name = key.split(".")
@@ -117,12 +119,12 @@ def _nested(pairs: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _check_fields(pairs: Mapping[str, Any], kind: type[msgspec.Struct], path: str = "") -> None:
-    """Raises `ValueError` that lists the fields there are, also those of a field."""
+    """Raise `ValueError` for an unknown field, listing the known ones, also in nested structs."""
     fields = {field.name: field.type for field in msgspec.structs.fields(kind)}
     for name, value in pairs.items():
         if name not in fields:
             known = ", ".join(f"{path}{one}" for one in sorted(fields))
-            raise ValueError(f"--headset: there is no field '{path}{name}'; fields: {known}")
+            raise ValueError(f"--headset: unknown field '{path}{name}'; fields: {known}")
         inner = fields[name]
         whole = not (isinstance(inner, type) and issubclass(inner, msgspec.Struct))
         if whole and isinstance(value, Mapping):
@@ -136,21 +138,23 @@ def _read(path: str) -> bytes:
         return file.read()
 
 
-def _say_json(report: HeadsetReport, *, final: bool = False) -> None:
+def _print_json(report: HeadsetReport, *, final: bool = False) -> None:
     print(msgspec.json.encode({"final": final, **msgspec.to_builtins(report)}).decode(), flush=True)
 
 
-def _say_line(report: HeadsetReport, *, final: bool = False) -> None:
+def _print_line(report: HeadsetReport, *, final: bool = False) -> None:
     phase = next(reversed(report.phases), report.phase)
     text = f"{report.name:<12} {phase:<20} samples {report.samples:<6} frames {report.frames:<6}"
-    text += f" age p99 {_known(report.age_ms_p99, 'ms')}, alignment {_known(report.alignment_error_mm, 'mm')}"
+    text += (
+        f" age p99 {_format_value(report.age_ms_p99, 'ms')}, alignment {_format_value(report.alignment_error_mm, 'mm')}"
+    )
     if report.failed:
         text += f"  FAILED: {report.failed}"
     print(("end  " if final else "     ") + text, flush=True)
 
 
-def _known(value: float, unit: str) -> str:
-    """Before there is state or an alignment: not a number."""
+def _format_value(value: float, unit: str) -> str:
+    """Format a value, `-` while it is not a number (before the first state or alignment)."""
     return "-" if math.isnan(value) else f"{value:.1f} {unit}"
 
 

@@ -1,6 +1,6 @@
-"""An emulated XR headset: its own tracking frame, what its cameras make of a printed sheet, and how it samples.
+"""An emulated XR headset: its own tracking frame, its detections of a printed sheet, and its sampling.
 
-It knows the physical truth (`T_world_...`) and gives only what a real headset would: poses in its tracking frame, with
+It knows the true poses (`T_world_...`) and reports only what a real headset would: poses in its tracking frame, with
 noise. Random numbers come from one seeded generator, time is passed in: the same calls give the same readings.
 
 Frames: world as in the session (Z up). A head pose has X forward, Y left, Z up. The anchor frame lies in the sheet,
@@ -30,10 +30,10 @@ from anchors.pose import (
     quat_normalize,
     quat_rotate,
 )
-from iris_session.emulator.sheet_noise import SheetNoise, of_viewpoint
+from iris_session.emulator.sheet_noise import SheetNoise, mix_viewpoint_noise
 from iris_session.netsim.latency import LinkModel
 
-#: Where the sheet lies in the demo scene: on the table in front of the people, facing up (body `sheet`).
+#: Pose of the sheet in the demo scene: on the table in front of the operators, facing up (body `sheet`).
 DEFAULT_T_WORLD_ANCHOR: Final[PoseTuple] = ((0.0, -0.45, 0.0), (1.0, 0.0, 0.0, 0.0))
 DEFAULT_ANCHOR_ID: Final = "table"
 DEFAULT_SHEET_M: Final = 0.16
@@ -41,7 +41,7 @@ MAX_VIEWPOINTS: Final = 256  # viewpoints whose systematic error is remembered
 
 
 class HeadsetModel(msgspec.Struct, frozen=True):
-    """What kind of headset it is. The defaults are a good standalone headset of 2024.
+    """Properties of a headset model. The defaults are those of a good standalone headset of 2024.
 
     `sheet`: the noise that docs/anchors.md fixes. Tracking noise and drift: our assumption for inside-out tracking in a
     textured room.
@@ -61,7 +61,7 @@ class HeadsetModel(msgspec.Struct, frozen=True):
     link: LinkModel = LinkModel()
 
 
-class Headset:
+class EmulatedHeadset:
     """One headset on one head. `tracking_epoch` counts the jumps of its tracking frame; `worn` is up to the user."""
 
     def __init__(self, model: HeadsetModel, seed: int, start_ns: int = 0) -> None:
@@ -69,7 +69,7 @@ class Headset:
         self.rng = np.random.default_rng(seed)
         self.tracking_epoch = 0
         self.worn = True
-        self.late_samples = 0  # sampling instants that were passed over because nobody asked in time
+        self.late_samples = 0  # sampling instants that were missed because the loop was late
         self._T_world_tracking0: PoseTuple = IDENTITY_POSE
         self._drift: Vec3 = (0.0, 0.0, 0.0)  # m/min, world
         self._biases: dict[tuple[int, int], Array] = {}
@@ -77,28 +77,29 @@ class Headset:
         self._detect_ns = int(1e9 / model.detection_hz)
         self._next_sample_ns = start_ns + int(self.rng.uniform(0.0, self._period_ns))
         self._next_detection_ns = start_ns
-        self._new_frame(start_ns)
+        self._start_frame(start_ns)
 
     # --- tracking frame -----------------------------------------------------------------------------------------------
 
-    def T_world_tracking(self, now_ns: int) -> PoseTuple:
-        """The truth, drift included; only judges of the alignment may look at it."""
+    def get_T_world_tracking(self, now_ns: int) -> PoseTuple:
+        """Return the true pose, drift included. Only for measuring alignment errors."""
         minutes = (now_ns - self._epoch_ns) / 60e9
         (x, y, z), q = self._T_world_tracking0
         dx, dy, dz = self._drift
         yaw = quat_from_yaw(self._yaw_drift * minutes)
         return ((x + dx * minutes, y + dy * minutes, z + dz * minutes), quat_mul(yaw, q))
 
-    def recentre(self, now_ns: int) -> None:
-        """The user recentred, or tracking was lost and found: another tracking frame, a new tracking epoch."""
+    def recentre_frame(self, now_ns: int) -> None:
+        """Start another tracking frame and epoch, as after recentring or after tracking was lost."""
         self.tracking_epoch += 1
         self._biases.clear()
-        self._new_frame(now_ns)
+        self._start_frame(now_ns)
 
-    def bump(self, shift_m: Vec3, yaw_rad: float, p_world: Vec3, now_ns: int) -> PoseTuple:
-        """The tracking frame jumps, and the headset does not notice: by `shift_m` (world), turned about the vertical
-        through `p_world`. Returns `T_new_old`: what was tracked at x is tracked at `T_new_old * x` from now on."""
-        old = self.T_world_tracking(now_ns)
+    def bump_frame(self, shift_m: Vec3, yaw_rad: float, p_world: Vec3, now_ns: int) -> PoseTuple:
+        """Move the tracking frame without a new epoch, as the headset does not detect it: by `shift_m` (world), turned
+        about the vertical
+        through `p_world`. Returns `T_new_old`: a pose x in the old frame is `T_new_old * x` in the new one."""
+        old = self.get_T_world_tracking(now_ns)
         turn = quat_from_yaw(yaw_rad)
         arm = quat_rotate(turn, (old[0][0] - p_world[0], old[0][1] - p_world[1], old[0][2] - p_world[2]))
         x, y, z = (p_world[i] + arm[i] + shift_m[i] for i in range(3))
@@ -106,29 +107,29 @@ class Headset:
         self._epoch_ns = now_ns  # the drift so far is in the new pose
         return compose(inverse(self._T_world_tracking0), old)
 
-    def drift(self, m_per_min: float, now_ns: int) -> None:
-        """From now on the tracking frame drifts at this speed, in the direction that is its own."""
-        self._T_world_tracking0 = self.T_world_tracking(now_ns)
+    def start_drift(self, m_per_min: float, now_ns: int) -> None:
+        """Let the tracking frame drift at this speed from now on, in its own direction."""
+        self._T_world_tracking0 = self.get_T_world_tracking(now_ns)
         self._epoch_ns = now_ns
         x, y, z = self._way
         self._drift = (m_per_min * x, m_per_min * y, m_per_min * z)
 
     def track(self, T_world_device: PoseTuple, now_ns: int) -> PoseTuple:
-        """`T_tracking_device` as the headset reports a device that truly is at `T_world_device`."""
-        return self.add_noise(compose(inverse(self.T_world_tracking(now_ns)), T_world_device))
+        """Return `T_tracking_device` as the headset reports a device that truly is at `T_world_device`."""
+        return self.add_noise(compose(inverse(self.get_T_world_tracking(now_ns)), T_world_device))
 
     def add_noise(self, T_tracking_device: PoseTuple) -> PoseTuple:
-        """A tracked pose with the noise of one reading."""
+        """Return a tracked pose with the noise of one reading."""
         p, q = T_tracking_device
-        noise = self._normals(6)
+        noise = self._draw_normals(6)
         s, r = self.model.position_sigma_m, self.model.rotation_sigma_rad
         turn = quat_from_rotvec((r * noise[3], r * noise[4], r * noise[5]))
         return ((p[0] + s * noise[0], p[1] + s * noise[1], p[2] + s * noise[2]), quat_mul(q, turn))
 
     # --- sampling -----------------------------------------------------------------------------------------------------
 
-    def sample_due(self, now_ns: int) -> bool:
-        """True once for every sampling instant that has passed; those missed are counted, not made up for."""
+    def is_sample_due(self, now_ns: int) -> bool:
+        """Return True once per passed sampling instant. Missed ones are counted, not made up for."""
         if now_ns < self._next_sample_ns:
             return False
         missed = (now_ns - self._next_sample_ns) // self._period_ns
@@ -140,8 +141,8 @@ class Headset:
     def next_sample_ns(self) -> int:
         return self._next_sample_ns
 
-    def detection_due(self, now_ns: int) -> bool:
-        """True when the detector has a new camera image to look at."""
+    def is_detection_due(self, now_ns: int) -> bool:
+        """Return True when the detector has a new camera image."""
         if now_ns < self._next_detection_ns:
             return False
         self._next_detection_ns = max(self._next_detection_ns + self._detect_ns, now_ns)
@@ -149,8 +150,8 @@ class Headset:
 
     # --- the sheet ----------------------------------------------------------------------------------------------------
 
-    def sees(self, T_world_head: PoseTuple, T_world_anchor: PoseTuple) -> bool:
-        """Whether the sheet is in the field of view, near enough, and not seen too much from the side."""
+    def can_see(self, T_world_head: PoseTuple, T_world_anchor: PoseTuple) -> bool:
+        """Return True if the sheet is in the field of view, near enough, and not too oblique."""
         d = distance(T_world_head[0], T_world_anchor[0])
         if not 0.05 < d <= self.model.max_distance_m:
             return False
@@ -163,53 +164,54 @@ class Headset:
     def observe(
         self, T_world_head: PoseTuple, T_world_anchor: PoseTuple, now_ns: int, viewpoint_id: int
     ) -> PoseTuple | None:
-        """`T_tracking_anchor` as detected from here, `None` when the sheet is not seen."""
-        if not self.sees(T_world_head, T_world_anchor):
+        """Return `T_tracking_anchor` as detected from here, `None` when the sheet is not visible."""
+        if not self.can_see(T_world_head, T_world_anchor):
             return None
         noise, view = self.model.sheet, _direction(T_world_head[0], T_world_anchor[0])
         p, q = np.array([T_world_anchor[0]]), np.array([T_world_anchor[1]])
         if self.rng.random() < noise.wrong_share:
-            p[0], q[0] = noise.wrong(p[0], q[0], np.array(view), self.rng)
+            p[0], q[0] = noise.make_wrong_detection(p[0], q[0], np.array(view), self.rng)
         else:
             d = distance(T_world_head[0], T_world_anchor[0])
-            units, scale_unit = self._sheet_units(viewpoint_id)
-            p, q = noise.seen(p, q, np.array((view, *_across(view))), d, units[None], scale_unit)
+            units, scale_unit = self._draw_sheet_units(viewpoint_id)
+            p, q = noise.observe(p, q, np.array((view, *_compute_perpendiculars(view))), d, units[None], scale_unit)
         (x, y, z), (w, a, b, c) = p[0].tolist(), q[0].tolist()
-        return compose(inverse(self.T_world_tracking(now_ns)), ((x, y, z), quat_normalize((w, a, b, c))))
+        return compose(inverse(self.get_T_world_tracking(now_ns)), ((x, y, z), quat_normalize((w, a, b, c))))
 
     # --- inside -------------------------------------------------------------------------------------------------------
 
-    def _new_frame(self, now_ns: int) -> None:
-        """A tracking frame somewhere within 3 m, any yaw, a little tilted, drifting in its own direction."""
-        tilt = self._normals(2)
+    def _start_frame(self, now_ns: int) -> None:
+        """Start a random tracking frame: within 3 m, any yaw, slightly tilted, drifting in a random direction."""
+        tilt = self._draw_normals(2)
         level = quat_from_yaw(self.rng.uniform(-math.pi, math.pi))
         tilted = quat_from_rotvec((self.model.tilt_sigma_rad * tilt[0], self.model.tilt_sigma_rad * tilt[1], 0.0))
         x, y = self.rng.uniform(-3.0, 3.0, 2).tolist()
-        z = float(self.rng.uniform(-1.0, 0.2))  # floor or eye level, as the run time likes
+        z = float(self.rng.uniform(-1.0, 0.2))  # floor or eye level, which differs between runtimes
         self._T_world_tracking0 = ((x, y, z), quat_mul(tilted, level))
-        way = self._normals(3)
+        way = self._draw_normals(3)
         length = max(1e-9, math.hypot(*way))
         self._way: Vec3 = (way[0] / length, way[1] / length, way[2] / length)
         self._yaw_drift = self.model.drift_rad_per_min * (1.0 if self.rng.random() < 0.5 else -1.0)
         self._epoch_ns = now_ns
-        self.drift(self.model.drift_m_per_min, now_ns)
+        self.start_drift(self.model.drift_m_per_min, now_ns)
 
-    def _sheet_units(self, viewpoint_id: int) -> tuple[Array, float]:
-        """Six unit normals, half of whose variance is that of the viewpoint, and the viewpoint's error of scale."""
+    def _draw_sheet_units(self, viewpoint_id: int) -> tuple[Array, float]:
+        """Return six unit normals, half of whose variance is that of the viewpoint, and the viewpoint's error of
+        scale."""
         key = (self.tracking_epoch, viewpoint_id)
         if key not in self._biases:
             if len(self._biases) >= MAX_VIEWPOINTS:
                 del self._biases[next(iter(self._biases))]
             self._biases[key] = self.rng.standard_normal(7)
         common = self._biases[key]
-        return of_viewpoint(common[:6], self.rng.standard_normal(6)), float(common[6])
+        return mix_viewpoint_noise(common[:6], self.rng.standard_normal(6)), float(common[6])
 
-    def _normals(self, n: int) -> list[float]:
+    def _draw_normals(self, n: int) -> list[float]:
         return [float(x) for x in self.rng.standard_normal(n)]
 
 
-def look_at(eye: Vec3, target: Vec3) -> PoseTuple:
-    """Head pose at `eye` with X towards `target` and no roll. They must not be one above the other."""
+def compute_look_at(eye: Vec3, target: Vec3) -> PoseTuple:
+    """Return the head pose at `eye` with X towards `target` and no roll. They must not be one above the other."""
     x = _direction(eye, target)
     yaw = math.atan2(x[1], x[0])
     pitch = math.atan2(-x[2], math.hypot(x[0], x[1]))
@@ -230,8 +232,8 @@ def _cross(a: Vec3, b: Vec3) -> Vec3:
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-def _across(e1: Vec3) -> tuple[Vec3, Vec3]:
-    """Two unit vectors across `e1`."""
+def _compute_perpendiculars(e1: Vec3) -> tuple[Vec3, Vec3]:
+    """Return two unit vectors perpendicular to `e1`."""
     helper: Vec3 = (0.0, 0.0, 1.0) if abs(e1[2]) < 0.9 else (1.0, 0.0, 0.0)
     c = _cross(e1, helper)
     n = math.sqrt(_dot(c, c))

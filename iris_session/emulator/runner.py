@@ -1,4 +1,4 @@
-"""Runs emulated people against a session: k headsets in one process and one polling loop.
+"""Run emulated headsets against a session: many in one process and one polling loop.
 
     python -m iris_session.emulator --address 127.0.0.1:7721 \
         --headset name=ann,behaviour=giver,robot=left --headset name=bob,behaviour=receiver,robot=right
@@ -6,12 +6,15 @@
 
 from __future__ import annotations
 
+import os
+import select
+import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 from iris_session.client import ClientError, wait_any
-from iris_session.emulator.person import Person
+from iris_session.emulator.operator import EmulatedOperator
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
 
 REPORT_PERIOD_NS: Final = 1_000_000_000
@@ -29,75 +32,114 @@ def run_headsets(
     join_timeout_s: float = JOIN_TIMEOUT_S,
     orders: Callable[[], Iterable[tuple[str, str]]] = tuple,
 ) -> list[HeadsetReport]:
-    """Runs all `specs` until everyone with a task has finished, `seconds` have passed, or `stop()` is true.
+    """Run all `specs` until every task has finished, `seconds` have passed, or `stop()` is true.
 
-    `report`: called with each person's report at every change of phase and once a second. `orders`: asked in every
-    round for what is done to whom (of `Person.disturb`, name). Returns the final reports, in the order of `specs`.
-    Raises nothing for a person who fails (whom no session let in within `join_timeout_s`, for example):
-    `HeadsetReport.failed` says why.
+    `report`: called with each headset's report at every change of phase and once a second. `orders`: polled for
+    disturbances (kind for `EmulatedOperator.disturb_tracking`, name). Returns the final reports, in the order of
+    `specs`.
+    A headset that fails (for example cannot join within `join_timeout_s`) raises nothing: `HeadsetReport.failed` gives
+    the reason.
     """
     start = time.monotonic_ns()
     end = None if seconds is None else start + int(seconds * 1e9)
-    people = [Person(address, spec, start) for spec in specs]
-    told: dict[str, tuple[str, int]] = {}
-    ready = [person.client for person in people]
+    operators = [EmulatedOperator(address, spec, start) for spec in specs]
+    reported: dict[str, tuple[str, int]] = {}
+    ready = [operator.client for operator in operators]
     try:
         while not stop():
             now = time.monotonic_ns()
-            if (end is not None and now >= end) or _all_finished(people):
-                _give_up_joining(people, 0.0, now)
+            if (end is not None and now >= end) or _are_all_finished(operators):
+                _fail_late_joins(operators, 0.0, now)
                 break
-            for person in people:
-                _drive(person, person.client in ready)
+            for operator in operators:
+                _step_operator(operator, operator.client in ready)
             for kind, name in orders():
-                for person in people:
-                    if person.spec.name == name and person.client.ready:
-                        person.disturb(kind, now)
-            _give_up_joining(people, join_timeout_s, now)
-            for person in people:
+                for operator in operators:
+                    if operator.spec.name == name and operator.client.ready:
+                        operator.disturb_tracking(kind, now)
+            _fail_late_joins(operators, join_timeout_s, now)
+            for operator in operators:
                 if report is not None:
-                    _tell(person, told, report, now)
-            wake = min(person.next_ns for person in people)
+                    _report_changes(operator, reported, report, now)
+            wake = min(operator.next_step_ns for operator in operators)
             if end is not None:
                 wake = min(wake, end)
-            ready = wait_any([person.client for person in people], max(0.0, (wake - time.monotonic_ns()) / 1e9))
-        return [person.finish_report() for person in people]
+            ready = wait_any([operator.client for operator in operators], max(0.0, (wake - time.monotonic_ns()) / 1e9))
+        return [operator.finish_report() for operator in operators]
     finally:
-        for person in people:
-            person.client.close()
+        for operator in operators:
+            operator.client.close()
 
 
-def _drive(person: Person, ready: bool) -> None:
+def _step_operator(operator: EmulatedOperator, ready: bool) -> None:
     try:
         if ready:
-            person.client.poll(0.0)
+            operator.client.poll(0.0)
     except ClientError as error:
-        if not person.finished:
-            person.fail(str(error), time.monotonic_ns())
+        if not operator.finished:
+            operator.fail(str(error), time.monotonic_ns())
         return
-    person.step(time.monotonic_ns())
-    mirror = person.client.mirror
-    if person.report.phase == "acquire" and mirror.synced and not mirror.robots:
-        person.fail("this session has no robots to drive: behaviour=observer looks only", time.monotonic_ns())
+    operator.step(time.monotonic_ns())
+    mirror = operator.client.mirror
+    if operator.report.phase == "acquire" and mirror.synced and not mirror.robots:
+        operator.fail("this session has no robots to drive: use behaviour=observer", time.monotonic_ns())
 
 
-def _give_up_joining(people: Sequence[Person], timeout_s: float, now_ns: int) -> None:
-    for person in people:
-        waited_s = (now_ns - person.started_ns) * 1e-9
-        if person.report.phase == "join" and waited_s >= timeout_s:
-            text = person.client.describe_failure(f"within {waited_s:.1f} s")
-            person.fail(f"no session let us in at {text}", now_ns)
+def _fail_late_joins(operators: Sequence[EmulatedOperator], timeout_s: float, now_ns: int) -> None:
+    for operator in operators:
+        waited_s = (now_ns - operator.started_ns) * 1e-9
+        if operator.report.phase == "join" and waited_s >= timeout_s:
+            text = operator.client.describe_failure(f"within {waited_s:.1f} s")
+            operator.fail(f"no session let us in at {text}", now_ns)
 
 
-def _all_finished(people: Sequence[Person]) -> bool:
-    """Everyone with a task has finished; observers have none, and only observers go on for ever."""
-    working = [person for person in people if not person.observer]
-    return all(person.finished for person in (working or people))
+def _are_all_finished(operators: Sequence[EmulatedOperator]) -> bool:
+    """Return True when every task has finished. Observers have none; only observers run for ever."""
+    working = [operator for operator in operators if not operator.observer]
+    return all(operator.finished for operator in (working or operators))
 
 
-def _tell(person: Person, told: dict[str, tuple[str, int]], report: Report, now_ns: int) -> None:
-    phase, at = told.get(person.spec.name, ("", 0))
-    now_phase = next(reversed(person.report.phases), "join")
+def _report_changes(
+    operator: EmulatedOperator, reported: dict[str, tuple[str, int]], report: Report, now_ns: int
+) -> None:
+    phase, at = reported.get(operator.spec.name, ("", 0))
+    now_phase = next(reversed(operator.report.phases), "join")
     if now_phase != phase or now_ns - at >= REPORT_PERIOD_NS:
-        told[person.spec.name] = (now_phase, now_ns)
-        report(person.finish_report())
+        reported[operator.spec.name] = (now_phase, now_ns)
+        report(operator.finish_report())
+
+
+#: Disturbances of a tracking frame: see `EmulatedOperator.disturb_tracking`.
+KINDS: Final = ("bump", "drift", "recentre", "steady")
+MAX_LINE: Final = 256  # bytes; a longer line is rejected
+
+
+class DisturbanceReader:
+    """Reads lines `KIND NAME` from a file descriptor. A call returns the new ones as (kind, name) and never waits."""
+
+    def __init__(self, fd: int, names: Sequence[str]) -> None:
+        self._fd = fd
+        self._ready = select.poll()  # works with files and pipes, and with descriptors above 1023
+        self._ready.register(fd, select.POLLIN)
+        self._names = tuple(names)
+        self._rest = b""
+        self._open = True
+
+    def __call__(self) -> list[tuple[str, str]]:
+        while self._open and self._ready.poll(0):
+            data = os.read(self._fd, 4096)
+            self._open = bool(data)
+            self._rest += data
+            if self._open and b"\n" not in data and len(self._rest) > MAX_LINE:
+                self._rest = self._rest[-MAX_LINE:]
+        *lines, self._rest = self._rest.split(b"\n")
+        return [order for line in lines if line.strip() for order in self._parse_line(line)]
+
+    def _parse_line(self, line: bytes) -> list[tuple[str, str]]:
+        """Parse one line. An invalid one is reported on standard error."""
+        kind, _, name = line[:MAX_LINE].decode(errors="replace").strip().partition(" ")
+        if kind in KINDS and name in self._names:
+            return [(kind, name)]
+        known = f"{', '.join(KINDS[:-1])} or {KINDS[-1]}, then one of {', '.join(self._names)}"
+        print(f"invalid order: {kind} {name}".rstrip() + f"; expected {known}", file=sys.stderr, flush=True)
+        return []

@@ -1,4 +1,4 @@
-"""How wrong a headset sees a printed sheet: the noise that docs/anchors.md fixes, for emulated headsets and for
+"""Noise of sheet detections, as specified in docs/anchors.md, for emulated headsets and for
 `bench alignment`. Random numbers are the caller's; arrays are of one or more observations from one viewpoint.
 """
 
@@ -31,8 +31,10 @@ class SheetNoise(msgspec.Struct, frozen=True):
     wrong_m: float = 0.25
     wrong_rad: float = 0.5
 
-    def seen(self, p: Array, q: Array, axes: Array, d: float, units: Array, scale_unit: float) -> tuple[Array, Array]:
-        """The sheet (`p`, `q`) as seen from `d` metres. Shapes (n, 3), (n, 4).
+    def observe(
+        self, p: Array, q: Array, axes: Array, d: float, units: Array, scale_unit: float
+    ) -> tuple[Array, Array]:
+        """Return the sheet (`p`, `q`) as observed from `d` metres. Shapes (n, 3), (n, 4).
 
         `axes`: rows (3, 3), the first along the view, away from the viewer. `units`: unit normals (n, 6), position
         along `axes` and turn about the axes of the frame. `scale_unit`: a unit normal of the viewpoint.
@@ -43,8 +45,8 @@ class SheetNoise(msgspec.Struct, frozen=True):
         seen_p = p + (units[:, :3] * sigma) @ axes + scale_unit * self.scale * d * axes[0]
         return seen_p, quat_multiply(quat_exp(turns), np.broadcast_to(q, (len(units), 4)))
 
-    def wrong(self, p: Array, q: Array, view: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        """One observation (3), (4) made wrong: mirrored along `view`, or of something else."""
+    def make_wrong_detection(self, p: Array, q: Array, view: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Return a wrong detection (3), (4): mirrored along `view`, or of something else."""
         if rng.random() < 0.5:
             v = np.append(0.0, view)
             return p, quat_multiply(quat_multiply(v, q), np.array([0.0, 0.0, 0.0, 1.0]))
@@ -52,7 +54,7 @@ class SheetNoise(msgspec.Struct, frozen=True):
         return p + off, quat_multiply(quat_exp(rng.normal(0.0, self.wrong_rad, 3)), q)
 
 
-def of_viewpoint(common: Array, each: Array) -> Array:
-    """Unit normals half of whose variance is that of the viewpoint."""
+def mix_viewpoint_noise(common: Array, each: Array) -> Array:
+    """Return unit normals half of whose variance is common to the viewpoint."""
     half = math.sqrt(0.5)
     return np.asarray(half * common + half * each)

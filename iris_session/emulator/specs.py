@@ -1,4 +1,4 @@
-"""What an emulated person is told (`HeadsetSpec`) and what is told of them afterwards (`HeadsetReport`). Plain data."""
+"""Configuration (`HeadsetSpec`) and report (`HeadsetReport`) of an emulated headset. Plain data."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ from anchors.pose import PoseTuple, Vec3
 from iris_session.emulator.headset import DEFAULT_ANCHOR_ID, DEFAULT_SHEET_M, DEFAULT_T_WORLD_ANCHOR, HeadsetModel
 from iris_session.protocol.names import Device
 
-#: Behaviour of somebody who only looks.
+#: Behaviour of an observer.
 OBSERVER = "observer"
-#: Behaviours that are never done.
+#: Behaviours that never end by themselves.
 ENDLESS = ("wander", "idle")
 
 
 class HandTask(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What one hand does: `behaviour` (a name of `emulator.behaviours`) with `device` on `robot`.
+    """The task of one hand: `behaviour` (a name of `emulator.behaviours`) with `device` on `robot`.
 
-    `object`, `partner`: what is handed over, and the other robot. `arm`: kind of both robots (`behaviours.arms`).
-    `place`: where a receiver lays the object, x and y [m, world].
+    `object`, `partner`: the object that is handed over, and the other robot. `arm`: kind of both robots
+    (`behaviours.arms`).
+    `place`: position at which a receiver lays the object, x and y [m, world].
     """
 
     behaviour: str
@@ -31,17 +32,18 @@ class HandTask(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class HeadsetSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One emulated person with one headset.
+    """One emulated headset and its operator or observer.
 
-    `behaviour`: `observer`, or a name of `emulator.behaviours`; then `robot` is what they drive with `device`. A person
-    who works with both hands has `hands` instead, and takes all their robots or none.
-    `eye`: where the head is while working [m, world]. `gaze`: what it looks at then, else at the sheet;
-    `glance_every_s`: how often it goes to the sheet for `glance_s` meanwhile, 0: never. `T_world_anchor`: where the
-    sheet truly lies, which need not be what the session believes. `recentre_at_s`, `bump_at_s`, `doff_at_s`,
-    `don_at_s`: seconds after joining at which the tracking frame jumps, jumps without the headset noticing (by `bump_m`
+    `behaviour`: `observer`, or a name of `emulator.behaviours`; then it drives `robot` with `device`. An
+    operator of two robots has `hands` instead, and acquires all their robots or none.
+    `eye`: position of the head while working [m, world]. `gaze`: the point that it faces then, default the sheet;
+    `glance_every_s`: period of glances of `glance_s` at the sheet meanwhile, 0 for none. `T_world_anchor`: the true
+    pose of the sheet, which may differ from the one that the session assumes. `recentre_at_s`, `bump_at_s`,
+    `doff_at_s`,
+    `don_at_s`: seconds after joining at which the tracking frame jumps, jumps undetected by the headset (by `bump_m`
     and `bump_yaw_rad` about the head), the headset is taken off, and put on again. `drift_m_per_min`: of the tracking
-    frame between the orders `drift` and `steady`; until then that of `model`. `display_delay_s`: how old the picture is
-    on purpose (interpolation) plus the way to the headset. `identity_file`: keeps the identity across restarts.
+    frame between the orders `drift` and `steady`; until then that of `model`. `display_delay_s`: age of the displayed
+    state: interpolation delay plus the path to the headset. `identity_file`: keeps the identity across restarts.
     `curve_server`, `curve_key`: files with the session's public CURVE key and our own secret one; needed off loopback.
     """
 
@@ -84,12 +86,12 @@ class HeadsetSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     @property
     def endless(self) -> bool:
-        """Whether what this person does never ends by itself."""
+        """True if no task ends by itself."""
         return all(task.behaviour in ENDLESS for task in self.tasks)
 
     @property
     def tasks(self) -> tuple[HandTask, ...]:
-        """What the hands do; nothing for an observer. The robot is empty where the session's policy chooses it."""
+        """Tasks of the hands, empty for an observer. The robot is empty where the session's policy chooses it."""
         if self.hands or self.observer:
             return self.hands
         return (
@@ -106,13 +108,14 @@ class HeadsetSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 class HeadsetReport(msgspec.Struct, kw_only=True):
-    """How it went. Errors of the alignment are against the truth that only the emulator knows.
+    """State and results of one headset. Alignment errors are relative to the true poses that only the emulator knows.
 
     `alignment_error_mm`: at the sheet; `alignment_error_1m_mm`: the worst of points 1 m around it. `age_ms_*`: from
-    the end of the tick to the hands of this program. `rejected`: samples the session did not count, by reason.
-    `alignment_version`: that of the judged alignment. `T_true_shown`: what the session has at x is shown at
-    `T_true_shown * x` of the true world; none while not aligned. `disturbed_ns`: session time of the last of each kind.
-    `alarms`: of our alignment that were heard of, jumps not among them.
+    the end of the tick to the callback of this process. `rejected`: samples that the session rejected, by reason.
+    `alignment_version`: version of the measured alignment. `T_true_shown`: a point that the session has at x is
+    shown at `T_true_shown * x` of the true world; `None` while not aligned. `disturbed_ns`: session time of the last of
+    each kind.
+    `alarms`: alarms of this alignment that were received, without jumps.
     """
 
     name: str

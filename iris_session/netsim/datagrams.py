@@ -1,4 +1,4 @@
-"""UDP over an impaired link: datagrams are lost, come twice, overtake each other. Part of `emulator.impairment`."""
+"""UDP over an impaired link: datagrams are lost, duplicated and reordered."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from typing import Final, Protocol
 from iris_session.netsim.profiles import DOWN, UP, LinkConditions
 
 MAX_DATAGRAM: Final = 65_507
-#: Clients of one port, and datagrams under way per client and direction; more are dropped and counted.
+#: Clients of one port, and datagrams in flight per client and direction; more are dropped and counted.
 MAX_FLOWS: Final = 64
 MAX_QUEUED: Final = 512
 Address = tuple[str, int]
 
 
 class DatagramLink(Protocol):
-    """What a datagram needs of its link."""
+    """The part of a link that datagrams use."""
 
     address: str
     target: str
@@ -32,7 +32,7 @@ class DatagramLink(Protocol):
 
 
 class DatagramPort:
-    """One forwarded UDP port. Each client gets a socket of its own towards the session."""
+    """A forwarded UDP port. Each client gets its own socket towards the session."""
 
     def __init__(self, link: DatagramLink, port: int) -> None:
         self.lost = self.duplicated = self.reordered = self.dropped = 0
@@ -49,14 +49,14 @@ class DatagramPort:
             flow = self._flows.pop(client, None)
             if flow is None:
                 if len(self._flows) >= MAX_FLOWS:
-                    self._flows.pop(next(iter(self._flows))).close()  # the one that was silent for longest
+                    self._flows.pop(next(iter(self._flows))).close()  # the one that has been silent for longest
                 flow = _Flow(self, self._link, self._near, client, self._port)
             self._flows[client] = flow
             flow.queue(UP, data)
 
 
 class _Flow:
-    """The datagrams of one client, both ways."""
+    """The datagrams of one client, in both directions."""
 
     def __init__(
         self, port: DatagramPort, link: DatagramLink, near: socket.socket, client: Address, number: int
@@ -72,7 +72,7 @@ class _Flow:
         self._timer: asyncio.TimerHandle | None = None
 
     def queue(self, direction: str, data: bytes) -> None:
-        """One datagram begins its way; its fate depends on seed and number alone."""
+        """Queue one datagram. Loss, order and copies depend on seed and number alone."""
         link, port = self._link, self._port
         part, weather = link.conditions.phase.get_direction(direction), link.conditions
         number = self._number[direction]
@@ -97,14 +97,14 @@ class _Flow:
         self._deliver()
 
     def close(self) -> None:
-        """Whatever is under way is gone."""
+        """Drop the datagrams in flight and close the socket."""
         if self._timer is not None:
             self._timer.cancel()
         self._loop.remove_reader(self._far.fileno())
         self._far.close()
 
     def _receive_from_session(self) -> None:
-        with contextlib.suppress(BlockingIOError, ConnectionError):  # refused: nobody listens there
+        with contextlib.suppress(BlockingIOError, ConnectionError):  # refused: the session does not listen on that port
             self.queue(DOWN, self._far.recv(MAX_DATAGRAM))
 
     def _deliver(self) -> None:
@@ -114,7 +114,7 @@ class _Flow:
         now_ns = time.monotonic_ns()
         while self._queued and self._queued[0][0] <= now_ns:
             _, _, direction, data = heapq.heappop(self._queued)
-            with contextlib.suppress(OSError):  # what a socket does not take is lost, as datagrams are
+            with contextlib.suppress(OSError):  # a datagram that the socket rejects is lost
                 if direction == UP:
                     self._far.send(data)
                 else:

@@ -1,4 +1,4 @@
-"""The way from a headset to the session: latency, jitter and stalls, in order as TCP keeps it. Pure of clocks."""
+"""The path from a headset to the session: latency, jitter and stalls, in the order that TCP keeps. Reads no clock."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class LinkModel(msgspec.Struct, frozen=True):
     """Delay of one direction of a wireless link.
 
     `latency_s`: tracking run time and radio, least. `jitter_s`: mean of the exponential part on top. `stall_every_s`:
-    mean time between stalls (0: none), in which nothing passes for `stall_s`; then everything comes at once.
+    mean time between stalls (0: none), in which nothing passes for `stall_s`; then everything arrives at once.
     """
 
     latency_s: float = 0.008
@@ -25,7 +25,7 @@ class LinkModel(msgspec.Struct, frozen=True):
 
 
 class DelayLine(Generic[T]):
-    """Holds items until they arrive. Order is kept: a late item holds up those behind it."""
+    """A queue that releases items when they arrive, in order: a late item delays those behind it."""
 
     def __init__(self, model: LinkModel, rng: np.random.Generator) -> None:
         self.model = model
@@ -39,7 +39,7 @@ class DelayLine(Generic[T]):
         return len(self._items)
 
     def push(self, item: T, now_ns: int) -> None:
-        """Sends an item at `now_ns`."""
+        """Send an item at `now_ns`."""
         model = self.model
         arrives = now_ns + int((model.latency_s + self._rng.exponential(1.0) * model.jitter_s) * 1e9)
         arrives = max(arrives, self._last_ns, self._compute_stall_end_ns(now_ns))
@@ -47,7 +47,7 @@ class DelayLine(Generic[T]):
         self._items.append((arrives, item))
 
     def pop(self, now_ns: int) -> list[T]:
-        """Everything that has arrived by `now_ns`."""
+        """Return and remove the items that have arrived by `now_ns`."""
         arrived: list[T] = []
         while self._items and self._items[0][0] <= now_ns:
             arrived.append(self._items.popleft()[1])
@@ -55,7 +55,7 @@ class DelayLine(Generic[T]):
 
     @property
     def next_arrival_ns(self) -> int | None:
-        """When the next item arrives."""
+        """Arrival time of the next item, `None` when the line is empty."""
         return self._items[0][0] if self._items else None
 
     def _compute_stall_end_ns(self, now_ns: int) -> int:

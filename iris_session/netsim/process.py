@@ -1,11 +1,11 @@
-"""The process of the impairment proxy: its command line, the commands it takes while it runs, and a handle for others.
+"""The process of the impairment proxy: its command line, its commands while it runs, and a handle for callers.
 
     python -m iris_session.netsim.process --link 127.0.0.2 --profile busy-wifi --seed 1
 
 Commands, one per line on standard input, each answered by one JSON line; `@ADDRESS` picks one link, else all:
-`stall`, `resume`, `cut` (close all connections), `reset` (break them off), `roam ADDRESS` (another network: connections
-are gone without a word to the session, new ones come from that address), `profile NAME`, `start` (the profile begins
-anew, with the seed), `stats`, `quit`.
+`stall`, `resume`, `cut` (close all connections), `reset` (close them by RST), `roam ADDRESS` (change the network:
+connections end without notice to the session, new ones come from that address), `profile NAME`, `start` (restart the
+profile, with the seed), `stats`, `quit`.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ from iris_session.netsim.proxy import ImpairedLink
 from iris_session.system.process import PIPE, ChildProcess
 
 ANSWER_TIMEOUT_S: Final = 10.0
-#: A real link takes no processor time from those it connects. Below the tick loop's priority, above all else.
+#: A real link takes no processor time from its endpoints. Below the tick loop's priority, above all else.
 REALTIME_PRIORITY: Final = 2
 
 
-def link_address(number: int) -> str:
+def make_link_address(number: int) -> str:
     """Return the loopback address of link `number` (0 to 253); each headset has a radio link of its own."""
     return f"127.0.1.{number + 1}"
 
 
 class ImpairmentError(Exception):
-    """The proxy cannot run; the text is one line that says why."""
+    """The proxy cannot run. The message is one line that says why."""
 
 
 class ImpairmentProcess:
-    """A proxy in a process of its own, as a context. `links`: address -> profile (a name or a file).
+    """A proxy in its own process, as a context. `links`: address -> profile (a name or a file).
 
         with ImpairmentProcess({"127.0.0.2": "busy-wifi"}, ports=[7721, 7722]) as proxy:
             ...  # clients join at 127.0.0.2:7721
-            proxy.do("stall")
+            proxy.execute("stall")
 
     Raises `ImpairmentError` when a port is in use or a profile unknown.
     """
@@ -72,14 +72,14 @@ class ImpairmentProcess:
         return self._process.pid
 
     def execute(self, command: str) -> dict[str, Any]:
-        """One command, and its answer once it is done."""
+        """Send a command and return its answer."""
         self.send(command)
         while self._unanswered > 1:
             self._read_answer("an earlier command")
         return self._read_answer(command)
 
     def send(self, command: str) -> None:
-        """One command, without waiting for it."""
+        """Send a command without waiting for its answer."""
         self._unanswered += 1
         try:
             self._process.write(command.encode() + b"\n")
@@ -87,7 +87,7 @@ class ImpairmentProcess:
             raise ImpairmentError(f"the proxy has ended with status {self._process.exit_status}") from error
 
     def close(self) -> None:
-        """Ends the process; may be called twice."""
+        """End the process. May be called twice."""
         self._process.close(exit_s=2.0)
 
     def __enter__(self) -> Self:
@@ -114,7 +114,7 @@ class ImpairmentProcess:
 
 
 def run_command(links: Sequence[ImpairedLink], line: str) -> dict[str, Any]:
-    """Does one command of standard input; see the module docstring. Raises `ProfileError` for what it does not know."""
+    """Run one command of standard input (see the module docstring). Raises `ProfileError` for an unknown one."""
     words = line.split()
     command = words[0] if words else ""
     named = [word.removeprefix("@") for word in words[1:] if word.startswith("@")]
@@ -138,13 +138,13 @@ def run_command(links: Sequence[ImpairedLink], line: str) -> dict[str, Any]:
             link.start_profile(load_profile(rest[0]))
         else:
             raise ProfileError(
-                f"{line!r} is no command: stall, resume, cut, reset, roam ADDRESS, profile NAME, start, stats, quit"
+                f"{line!r} is not a command: stall, resume, cut, reset, roam ADDRESS, profile NAME, start, stats, quit"
             )
     return {}
 
 
 async def serve(links: Sequence[tuple[str, Profile]], options: argparse.Namespace) -> None:
-    """Forwards until `quit`, a signal, or (with `--until-eof`) the end of standard input."""
+    """Forward until `quit`, a signal, or (with `--until-eof`) the end of standard input."""
     loop = asyncio.get_running_loop()
     done = asyncio.Event()
     made = []
@@ -180,19 +180,19 @@ async def serve(links: Sequence[tuple[str, Profile]], options: argparse.Namespac
 
     loop.add_reader(0, commands)
     gc.freeze()
-    with contextlib.suppress(OSError, AttributeError):  # not permitted, or no Linux: the measure says what it costs
+    with contextlib.suppress(OSError, AttributeError):  # not permitted, or not Linux: `stats` reports the delay
         os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(REALTIME_PRIORITY))
     print(json.dumps({"ok": True, "ready": [link.address for link in made], "ports": options.ports}), flush=True)
     await done.wait()
 
 
 def parse_ports(text: str) -> list[int]:
-    """Type of options that take ports: `7720-7725`, `7721,7722`, nothing."""
+    """Parse an option that takes ports: `7720-7725`, `7721,7722`, or empty."""
     ports: list[int] = []
     for part in filter(None, text.split(",")):
         first, _, last = part.partition("-")
         if not first.isdigit() or not (last or first).isdigit() or not 0 < int(first) <= int(last or first) < 65536:
-            raise argparse.ArgumentTypeError(f"{text!r} are no ports: give for example 7720-7725 or 7721,7722")
+            raise argparse.ArgumentTypeError(f"{text!r} are not valid ports: give for example 7720-7725 or 7721,7722")
         ports += range(int(first), int(last or first) + 1)
     return ports
 

@@ -31,15 +31,15 @@ _NORMAL: Final = NormalDist()
 
 
 class ProfileError(ValueError):
-    """The profile cannot be used; the text is one line that says what would be right."""
+    """The profile is invalid. The message is one line that says what would be right."""
 
 
 class Direction(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One direction of a link. `delay_ms` +- `jitter_ms` (normal, never below 0), one way; `rate_mbit`: megabits a
-    second that all connections share, 0 unlimited; `stalled`: nothing passes.
+    """One direction of a link. `delay_ms` +- `jitter_ms` (normal, at least 0), one way; `rate_mbit`: bandwidth that all
+    connections share [Mbit/s], 0 for unlimited; `stalled`: nothing passes.
 
-    Datagrams only: probability that one is lost, comes twice, or is held back by `reorder_ms` so that later ones
-    overtake it. Bytes of a TCP connection are never lost and keep their order.
+    Datagrams only: probability that one is lost, duplicated, or delayed by `reorder_ms` so that later ones overtake it.
+    Bytes of a TCP connection are never lost and keep their order.
     """
 
     delay_ms: float = 0.0
@@ -53,11 +53,11 @@ class Direction(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 class ProfilePhase(Direction, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A stretch of time of a profile. Its own fields are for both directions; `up`, `down` replace all of them.
+    """A stretch of time of a profile. Its own fields apply to both directions; `up`, `down` replace all of them.
 
     `seconds`: 0 for ever. `at_start`: `cut` closes every connection, `reset` breaks them off (RST). `burst_*`: mean
     time between bursts in which up to `burst_ms` is added to each delay, and how long one lasts. `stall_*`: the same
-    of stalls in which nothing passes; then everything comes at once. Both hit both directions.
+    of stalls in which nothing passes; then everything arrives at once. Both affect both directions.
     """
 
     seconds: float = 0.0
@@ -71,15 +71,15 @@ class ProfilePhase(Direction, frozen=True, kw_only=True, forbid_unknown_fields=T
     down: Direction | None = None
 
     def get_direction(self, name: str) -> Direction:
-        """What holds for `up` or `down`."""
+        """Return the settings of direction `up` or `down`."""
         return (self.up if name == UP else self.down) or self
 
 
 class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Phases one after the other; the last one stays, or with `repeat` it begins again.
+    """A sequence of phases. The last one stays in force; with `repeat` the sequence starts again.
 
-    `window_kib`: bytes that may be under way per connection and direction, as the receiver's TCP window bounds them;
-    the sender is held back beyond. It is how much stale data a stall can leave on the way.
+    `window_kib`: bytes in flight per connection and direction, as bounded by the receiver's TCP window; a sender is
+    blocked beyond. It limits how much stale data a stall leaves in flight.
     """
 
     phases: tuple[ProfilePhase, ...]
@@ -124,7 +124,7 @@ _BUSY: Final = ProfilePhase(
     stall_every_s=10.0,
     stall_s=0.12,
 )
-#: Profiles by name. `none` forwards as fast as it can: what the proxy itself costs.
+#: Profiles by name. `none` forwards as fast as it can and so measures the cost of the proxy itself.
 PROFILES: Final[dict[str, Profile]] = {
     "none": Profile(phases=(ProfilePhase(),)),
     "lan": Profile(phases=(ProfilePhase(delay_ms=0.2, jitter_ms=0.05, rate_mbit=1000.0),)),
@@ -142,12 +142,12 @@ PROFILES: Final[dict[str, Profile]] = {
 
 
 def make_latency_profile(latency_ms: float) -> Profile:
-    """A link that delays by `latency_ms` each way and does nothing else."""
+    """Return a profile that delays by `latency_ms` each way and does nothing else."""
     return Profile(phases=(ProfilePhase(delay_ms=latency_ms),), window_kib=1024)
 
 
 def load_profile(name: str) -> Profile:
-    """A profile by name, `40ms` for a delay alone, or a TOML or JSON file with the fields of `Profile`.
+    """Return a profile by name, `40ms` for a delay alone, or from a TOML or JSON file with the fields of `Profile`.
 
     Raises `ProfileError`.
     """
@@ -168,7 +168,7 @@ def load_profile(name: str) -> Profile:
 
 
 class RandomIntervals:
-    """Stretches of time that come at random: mean time between them, length. Asked for times that never go back."""
+    """Random intervals: mean time between them, length. Must be queried with times that never decrease."""
 
     def __init__(self, rng: random.Random, every_s: float, length_s: float, start_ns: int) -> None:
         self._rng, self._every_s, self._length_ns = rng, every_s, round(length_s * SECOND)
@@ -176,13 +176,13 @@ class RandomIntervals:
         self._draw_next()
 
     def is_active(self, t_ns: int) -> bool:
-        """Whether one is on at `t_ns`."""
+        """Return True if an interval is active at `t_ns`."""
         while t_ns >= self.end_ns and self._every_s > 0.0:
             self._draw_next()
         return self.begin_ns <= t_ns < self.end_ns
 
     def find_change_ns(self, t_ns: int) -> int:
-        """When `covers` changes next after `t_ns`."""
+        """Return when `is_active` changes next after `t_ns`."""
         return self.end_ns if self.is_active(t_ns) else self.begin_ns
 
     def _draw_next(self) -> None:
@@ -194,7 +194,7 @@ class RandomIntervals:
 
 
 class LinkConditions:
-    """The weather of one link. All times are nanoseconds since its start and never go back by more than a phase."""
+    """The conditions of one link. Times are nanoseconds since its start and never decrease by more than a phase."""
 
     def __init__(self, profile: Profile, seed: int = 0) -> None:
         self.profile = profile
@@ -206,14 +206,14 @@ class LinkConditions:
         self._enter_next_phase(0)
 
     def advance(self, t_ns: int, at_start: Callable[[str], None] = lambda _: None) -> None:
-        """Enters the phase of `t_ns`; `at_start` is called with `cut` or `reset` for each phase that begins so."""
+        """Enter the phase of `t_ns`. Calls `at_start` with `cut` or `reset` for each phase that begins so."""
         while t_ns >= self._phase_end_ns:
             self._enter_next_phase(self._phase_end_ns)
             if self.phase.at_start:
                 at_start(self.phase.at_start)
 
     def compute_delay_ns(self, direction: str, t_ns: int) -> int:
-        """One-way delay of what is sent at `t_ns`, without rate and stalls."""
+        """Return the one-way delay of data sent at `t_ns`, without rate and stalls."""
         part = self.phase.get_direction(direction)
         slot = t_ns // SLOT_NS
         delay_ms = part.delay_ms
@@ -224,15 +224,16 @@ class LinkConditions:
         return round(max(0.0, delay_ms) * 1e6)
 
     def is_stalled(self, direction: str, t_ns: int) -> bool:
-        """Whether nothing passes at `t_ns`."""
+        """Return True if nothing passes at `t_ns`."""
         return self.phase.get_direction(direction).stalled or self._stalls.is_active(t_ns)
 
     def find_next_change_ns(self, t_ns: int) -> int:
-        """When `stalled` or the phase changes next after `t_ns`."""
+        """Return when `is_stalled` or the phase changes next after `t_ns`."""
         return min(self._phase_end_ns, self._stalls.find_change_ns(t_ns))
 
     def draw(self, direction: str, number: int, event: int) -> float:
-        """A number in (0, 1) for datagram `number`: the same in every run with this seed. `what`: of its fates."""
+        """Return a number in (0, 1) for datagram `number`, the same in every run. `event`: 0 loss, 1 reorder, 2
+        duplicate."""
         return self._draw_uniform(direction, number, 16 + event)
 
     def _enter_next_phase(self, begin_ns: int) -> None:
@@ -245,7 +246,7 @@ class LinkConditions:
         self._stalls = RandomIntervals(random.Random(f"{key}/stalls"), phase.stall_every_s, phase.stall_s, begin_ns)
 
     def _draw_uniform(self, direction: str, number: int, event: int) -> float:
-        """Uniform in (0, 1), by hashing (splitmix64): any moment can be asked for without those before it."""
+        """Return a uniform number in (0, 1) by hashing (splitmix64), independent of earlier calls."""
         x = (self._seed * 0x9E3779B97F4A7C15 + number * 64 + event * 2 + (direction == UP)) & _MASK
         for _ in range(2):
             x = (x + 0x9E3779B97F4A7C15) & _MASK

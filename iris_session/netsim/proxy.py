@@ -1,9 +1,8 @@
-"""A bad link in user space: forwards the ports of a session from other loopback addresses, later and slower.
+"""Impaired links in user space: forward the ports of a session from other loopback addresses, later and slower.
 
 A client that joins at a link's address (127.0.0.2) has that link between itself and the session, which listens on the
 same ports of another address (127.0.0.1). Connections over one link share its rate and its stalls. TCP: bytes are
-never lost and keep their order; a sender is held back when `window_kib` are under way. The process around this, with
-its command line, is `impairment_process`.
+never lost and keep their order; a sender is blocked when `window_kib` are in flight. `process` runs the links.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from iris_session.netsim.datagrams import DatagramPort
 from iris_session.netsim.profiles import DIRECTIONS, DOWN, UP, LinkConditions, Profile
 
 CHUNK: Final = 16_384
-#: Kernel buffers of our own sockets; they come on top of what the profile lets be under way.
+#: Kernel buffers of the proxy's sockets; they add to the bytes in flight that the profile allows.
 BUFFER_BYTES: Final = 32_768
 #: `select` takes 1024 files, a connection needs two. Its timeouts are exact to 50 us, those of `epoll` to 1 ms.
 MAX_CONNECTIONS: Final = 300
@@ -30,12 +29,12 @@ _RESET: Final = struct.pack("ii", 1, 0)  # SO_LINGER 0: close sends RST
 
 
 class ImpairedLink:
-    """One radio link: its weather, its rate, its connections. All times are CLOCK_MONOTONIC in nanoseconds."""
+    """One impaired link: its conditions, rate and connections. All times are CLOCK_MONOTONIC in nanoseconds."""
 
     def __init__(self, address: str, target: str, profile: Profile, seed: int) -> None:
         self.address, self.target, self.seed = address, target, seed
         self.profile = profile
-        self.stalled_by_command = False  # a stall by command
+        self.stalled_by_command = False
         self.source = ""  # address from which the session is reached; empty: the system's choice
         self.abandoned: deque[socket.socket] = deque()
         self.pipes: set[_Pipe] = set()
@@ -52,11 +51,11 @@ class ImpairedLink:
 
     @property
     def window(self) -> int:
-        """Bytes that may be under way per connection and direction."""
+        """Bytes that may be in flight per connection and direction."""
         return self.profile.window_kib * 1024
 
     def listen(self, ports: Sequence[int], udp_ports: Sequence[int]) -> None:
-        """Opens the ports. Raises `OSError`."""
+        """Open the ports. Raises `OSError`."""
         for port in ports:
             listening = socket.create_server((self.address, port), backlog=512)
             listening.setblocking(False)
@@ -65,7 +64,7 @@ class ImpairedLink:
         self.ports += [DatagramPort(self, port) for port in udp_ports]
 
     def start_profile(self, profile: Profile) -> None:
-        """The profile begins now."""
+        """Start a profile now."""
         self.profile = profile
         self.conditions = LinkConditions(profile, self.seed)
         self._start_ns = time.monotonic_ns()
@@ -73,7 +72,7 @@ class ImpairedLink:
         self.update_stalls()
 
     def update_stalls(self) -> None:
-        """Looks whether stalls began or ended, and when to look again."""
+        """Apply stalls that began or ended, and schedule the next update."""
         now_ns = time.monotonic_ns()
         t_ns = now_ns - self._start_ns
         self.conditions.advance(t_ns, lambda how: self.close_connections(reset=how == "reset"))
@@ -93,7 +92,7 @@ class ImpairedLink:
         return self.stalled_by_command or self.conditions.is_stalled(direction, now_ns - self._start_ns)
 
     def schedule_arrival_ns(self, direction: str, size: int, now_ns: int) -> int:
-        """When `size` bytes that are sent now are there."""
+        """Return when `size` bytes sent now arrive, and reserve the link's rate for them."""
         rate = self.conditions.phase.get_direction(direction).rate_mbit
         sent_ns = max(now_ns, self._free_ns[direction])
         if rate:
@@ -102,13 +101,13 @@ class ImpairedLink:
         return sent_ns + self.conditions.compute_delay_ns(direction, now_ns - self._start_ns)
 
     def close_connections(self, *, reset: bool) -> None:
-        """Closes every connection, in order or by RST."""
+        """Close every connection, in order or by RST."""
         for pair in list(self.connections):
             pair.close(reset=reset)
 
     def roam(self, source: str) -> None:
-        """The clients' network has changed: their connections are gone, though the session hears nothing of that,
-        and new ones come from address `source`."""
+        """Change the clients' network: their connections end without the session being notified, and new ones come from
+        address `source`."""
         self.source = source or self.source
         for pair in list(self.connections):
             self.abandoned.append(pair.abandon())
@@ -116,7 +115,7 @@ class ImpairedLink:
                 self.abandoned.popleft().close()
 
     def collect_stats(self) -> dict[str, Any]:
-        """Counters, and by how much deliveries came later than they should [ms]."""
+        """Return counters, and by how much the proxy itself delayed deliveries [ms]."""
         own = sorted(self.own_ns)
         p50, p99 = (own[int(q * (len(own) - 1))] / 1e6 if own else 0.0 for q in (0.5, 0.99))
         lost, dropped = (sum(getattr(port, name) for port in self.ports) for name in ("lost", "dropped"))
@@ -146,7 +145,7 @@ class ImpairedLink:
 
 
 class _Connection:
-    """One TCP connection: the client's end (`near`), the session's (`far`), a lane each way."""
+    """One TCP connection: the client's end (`near`), the session's (`far`), a pipe in each direction."""
 
     def __init__(self, link: ImpairedLink, near: socket.socket) -> None:
         self.link, self._near = link, near
@@ -160,7 +159,7 @@ class _Connection:
             end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
 
     async def connect(self, port: int) -> None:
-        """Reaches the session; a port where nobody listens is refused to the client by RST."""
+        """Connect to the session. A port that it does not listen on is refused to the client by RST."""
         try:
             if self.link.source:
                 self._far.bind((self.link.source, 0))
@@ -172,7 +171,7 @@ class _Connection:
             self._pipes = [_Pipe(self, UP, self._near, self._far), _Pipe(self, DOWN, self._far, self._near)]
 
     def close(self, *, reset: bool = False) -> None:
-        """Closes both ends at once; what is under way is gone."""
+        """Close both ends at once and drop the bytes in flight."""
         self.link.connections.discard(self)
         for lane in self._pipes:
             lane.stop()
@@ -180,7 +179,7 @@ class _Connection:
             _close(end, reset=reset)
 
     def abandon(self) -> socket.socket:
-        """Closes the client's end only. Returns the other, which the session still takes for a connection."""
+        """Close the client's end only. Returns the other, which the session still considers connected."""
         self.link.connections.discard(self)
         for lane in self._pipes:
             lane.stop()
@@ -188,13 +187,13 @@ class _Connection:
         return self._far
 
     def on_pipe_ended(self) -> None:
-        """One direction has ended in order; both: the connection is over."""
+        """Close the connection when both directions have ended in order."""
         if all(lane.ended for lane in self._pipes):
             self.close()
 
 
 class _Pipe:
-    """One direction of a connection: bytes with the time at which they arrive, in order."""
+    """One direction of a connection: bytes with their arrival times, in order."""
 
     def __init__(self, pair: _Connection, direction: str, source: socket.socket, sink: socket.socket) -> None:
         self.direction, self.size, self.ended = direction, 0, False
@@ -209,7 +208,7 @@ class _Pipe:
         self._resume_reading()
 
     def reschedule(self, now_ns: int) -> None:
-        """A stall has ended: everything that waited leaves now, at the link's rate."""
+        """Send the pending bytes now, at the link's rate, after a stall has ended."""
         self._last_ns = 0
         waiting, self._items = self._items, deque()
         for _, data in waiting:
@@ -218,7 +217,7 @@ class _Pipe:
         self._deliver_due()
 
     def stop(self) -> None:
-        """Lets go of both sockets."""
+        """Stop reading and writing both sockets."""
         self._link.pipes.discard(self)
         self._pause_reading()
         self._stop_writing()
@@ -227,7 +226,7 @@ class _Pipe:
 
     def _on_readable(self) -> None:
         room = self._link.window - self.size
-        if room <= 0:  # another profile, with a smaller window
+        if room <= 0:  # a new profile has a smaller window
             self._pause_reading()
             return
         try:
@@ -245,17 +244,17 @@ class _Pipe:
         self._ending = not data
         if self._ending or self.size >= self._link.window:
             self._pause_reading()
-        if len(self._items) == 1:  # else a timer for the first one runs already
+        if len(self._items) == 1:  # otherwise a timer for the first item is running
             self._deliver_due()
 
     def _deliver_due(self, *, held_up: bool = False) -> None:
-        """Hands on what has arrived; sets the timer for what has not. `held_up`: the sink did not take it earlier."""
+        """Send what has arrived and set the timer for the rest. `held_up`: the sink was full before."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
         now_ns = time.monotonic_ns()
         if self._writing or self._link.is_stalled(self.direction, now_ns):
-            return  # goes on when the sink takes more, or by `retime`
+            return  # continued when the sink is writable, or by `reschedule`
         while self._items and self._items[0][0] <= now_ns:
             arrived_ns, data = self._items.popleft()
             if not data:
@@ -271,7 +270,7 @@ class _Pipe:
             self._resume_reading()
 
     def _send(self, arrived_ns: int, data: bytes) -> bool:
-        """False when the sink took less than all: the rest goes when it can."""
+        """Send to the sink. Returns False when it took only a part: the rest follows when it is writable."""
         try:
             taken = self._sink.send(data)
         except BlockingIOError:

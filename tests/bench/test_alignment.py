@@ -1,4 +1,4 @@
-"""`bench alignment`: every key and bar, the same figures for the same seed; how good they are is the bench's to say."""
+"""`bench alignment`: every key and bar, equal results for equal seeds. Accuracy is measured by the benchmark itself."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The reference of the benchmarks: it measures receivers in other processes, and says when they fail."""
+"""Baseline of the benchmarks: receivers in other processes, and their failures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def test_every_receiver_is_measured_and_none_is_left() -> None:
     assert found["bare_lateness_ms_p99"] > 0.0
 
 
-def test_a_loop_that_is_held_up_is_late() -> None:
+def test_blocked_loop_is_late() -> None:
     class Slow:
         """A socket that takes 5 ms for every frame."""
 

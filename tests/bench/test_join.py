@@ -1,4 +1,4 @@
-"""`bench join` at the size of a toy: every key is there, and what it counts is counted. How fast is never a test."""
+"""`bench join` with a small scene: every key is present, and counts are right. Speed is not tested."""
 
 from __future__ import annotations
 

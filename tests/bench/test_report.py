@@ -1,4 +1,4 @@
-"""Benchmarks report in the one form, with every key; how fast anything is is never a test."""
+"""Reports of benchmarks: the common form with every key. Speed is not tested."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_over_a_bad_link(tmp_path: Path, arguments: tuple[str, ...]) -> None:
     assert result["results"]["age_ms_p50" if arguments[0] == "state" else "response_ms_p50"] > 50.0
 
 
-def test_bench_of_an_unknown_profile_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_profile_is_one_line_error(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "state", "--profile", "nice-wifi"]) == 2
     assert "no profile 'nice-wifi': give one of none, lan, wan" in capsys.readouterr().err
     assert main(["bench", "slow-client", "--clients", "2"]) == 2
@@ -120,7 +120,7 @@ def test_a_bar_is_kept_or_missed(value: float, ok: bool) -> None:
     assert ("MISSED" in report.format()) is not ok
 
 
-def test_what_never_came_is_null() -> None:
+def test_infinite_values_are_null() -> None:
     report = _report(math.inf).as_dict()
     assert report["results"]["age_ms_p99"] is report["bars"][0]["value"] is None
     assert report["bars"][0]["ok"] is False

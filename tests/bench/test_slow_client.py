@@ -1,4 +1,4 @@
-"""What `bench slow-client` makes of its logs."""
+"""`bench slow-client`: evaluation of logs."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_age_of_the_others_counts_from_the_stall_on() -> None:
     assert measure_others_p99({"a": calm}, ["a"], BEGIN, STRETCH) == 3.0
 
 
-def test_stretches_alternate_and_fill_the_time() -> None:
+def test_intervals_alternate_and_fill_the_time() -> None:
     plan = plan_intervals(50.0)
     assert [s.kind for s in plan] == [BASELINE, STOPPED, STALLED] * 3
     assert plan[-1].end_s == 50.0

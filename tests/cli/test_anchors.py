@@ -77,11 +77,11 @@ def _text(pose: PoseTuple) -> str:
     return ",".join(repr(v) for v in (*pose[0], *pose[1]))
 
 
-def _off(told: dict[str, Any], true: PoseTuple) -> tuple[float, float]:
+def _off(result: dict[str, Any], true: PoseTuple) -> tuple[float, float]:
     """[mm], [deg]"""
-    q = told["quaternion_wxyz"]
+    q = result["quaternion_wxyz"]
     angle = quat_angle((q[0], q[1], q[2], q[3]), true[1])
-    p = told["position_m"]
+    p = result["position_m"]
     return 1e3 * distance((p[0], p[1], p[2]), true[0]), math.degrees(angle)
 
 
@@ -89,8 +89,8 @@ def _calibrate(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[s
     status = main(["anchors", "calibrate-camera", *map(str, arguments), *SHEET, "--json"])
     out, err = capsys.readouterr()
     assert status == 0, err
-    told: dict[str, Any] = json.loads(out)
-    return told
+    result: dict[str, Any] = json.loads(out)
+    return result
 
 
 def _refused(capsys: pytest.CaptureFixture[str], status: int, *arguments: object) -> str:
@@ -105,8 +105,8 @@ def test_print_writes_pdf_and_svg(tmp_path: Path, capsys: pytest.CaptureFixture[
     for name, begin in (("a.pdf", b"%PDF-1.4"), ("a.svg", b"<?xml")):
         out = tmp_path / name
         assert main(["anchors", "print", "--size", "12cm", "--id", "door", "--out", str(out), "--json"]) == 0
-        told = json.loads(capsys.readouterr().out)
-        assert (told["file"], told["id"], told["size_m"], told["paper"]) == (str(out), "door", 0.12, "a4")
+        result = json.loads(capsys.readouterr().out)
+        assert (result["file"], result["id"], result["size_m"], result["paper"]) == (str(out), "door", 0.12, "a4")
         assert out.read_bytes().startswith(begin)
 
 
@@ -153,17 +153,17 @@ def test_a_size_needs_its_unit(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_sheet_on_the_hand(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     poses, out = _csv(tmp_path / "poses.csv", _hand()), tmp_path / "camera.toml"
-    told = _calibrate(capsys, folder, "--poses", poses, "--out", out)
-    assert (told["mode"], told["used"], told["left_out"]) == ("sheet-on-hand", 5, 0)
-    mm, deg = _off(told["T_base_camera"], T_BASE_CAMERA)
+    result = _calibrate(capsys, folder, "--poses", poses, "--out", out)
+    assert (result["mode"], result["used"], result["left_out"]) == ("sheet-on-hand", 5, 0)
+    mm, deg = _off(result["T_base_camera"], T_BASE_CAMERA)
     assert mm < 2.0
     assert deg < 0.1
-    assert mm < 2.0 * told["error_mm_p95"] < 20.0
-    assert _off(told["T_ee_sheet"], T_EE_SHEET)[0] < 2.0
-    assert told["residual_px_rms"] < 0.5
-    assert told["residual_mm_rms"] < 1.0
-    assert [row["used"] for row in told["pictures"]] == [True] * 5
-    assert tomllib.loads(out.read_text())["T_base_camera"]["position_m"] == told["T_base_camera"]["position_m"]
+    assert mm < 2.0 * result["error_mm_p95"] < 20.0
+    assert _off(result["T_ee_sheet"], T_EE_SHEET)[0] < 2.0
+    assert result["residual_px_rms"] < 0.5
+    assert result["residual_mm_rms"] < 1.0
+    assert [row["used"] for row in result["pictures"]] == [True] * 5
+    assert tomllib.loads(out.read_text())["T_base_camera"]["position_m"] == result["T_base_camera"]["position_m"]
     assert main(["anchors", "calibrate-camera", str(folder), *SHEET, "--poses", str(poses)]) == 0
     assert "5 used, 0 excluded; residual rms" in capsys.readouterr().out
 
@@ -175,19 +175,19 @@ def test_one_picture_is_enough_where_the_hand_is_known(
     one.mkdir()
     shutil.copy(folder / "0000.png", one)
     poses = _csv(tmp_path / "poses.csv", _hand())
-    told = _calibrate(
+    result = _calibrate(
         capsys, one, "--intrinsics", folder / "intrinsics.toml", "--poses", poses, "--in-hand", _text(T_EE_SHEET)
     )
-    assert _off(told["T_base_camera"], T_BASE_CAMERA)[0] < 3.0
+    assert _off(result["T_base_camera"], T_BASE_CAMERA)[0] < 3.0
 
 
 def test_camera_on_the_hand(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     T_base_sheet, T_ee_camera = T_BASE_CAMERA, T_EE_SHEET
     hand = [compose(T_base_sheet, inverse(compose(T_ee_camera, T))) for T in SEEN]
-    told = _calibrate(capsys, folder, "--poses", _csv(tmp_path / "poses.csv", hand), "--camera-on-hand")
-    assert told["mode"] == "camera-on-hand"
-    assert _off(told["T_ee_camera"], T_ee_camera)[0] < 2.0
-    assert _off(told["T_base_sheet"], T_base_sheet)[0] < 2.0
+    result = _calibrate(capsys, folder, "--poses", _csv(tmp_path / "poses.csv", hand), "--camera-on-hand")
+    assert result["mode"] == "camera-on-hand"
+    assert _off(result["T_ee_camera"], T_ee_camera)[0] < 2.0
+    assert _off(result["T_base_sheet"], T_base_sheet)[0] < 2.0
 
 
 def test_cameras_that_see_a_sheet_on_the_table(
@@ -198,15 +198,15 @@ def test_cameras_that_see_a_sheet_on_the_table(
         (tmp_path / name).mkdir()
         shutil.copy(folder / f"{number:04}.png", tmp_path / name)
         (tmp_path / name / "intrinsics.toml").write_text(INTRINSICS)
-    told = _calibrate(capsys, tmp_path, "--at", f"table={_text(T_base_sheet)}")
+    result = _calibrate(capsys, tmp_path, "--at", f"table={_text(T_base_sheet)}")
     for number, name in enumerate(("front", "left")):
         true = compose(T_base_sheet, inverse(SEEN[number]))
-        assert _off(told["cameras"][name]["T_base_camera"], true)[0] < 2.0
+        assert _off(result["cameras"][name]["T_base_camera"], true)[0] < 2.0
     assert main(["anchors", "calibrate-camera", str(tmp_path), *SHEET, "--at", f"table={_text(T_base_sheet)}"]) == 0
     assert "T_base_camera of left" in capsys.readouterr().out
 
 
-def test_what_does_not_determine_the_camera_is_refused(
+def test_underdetermined_calibration_is_refused(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     still = [pose_from_rvec_tvec(np.array([0.02 * k, 0.0, 0.0]), np.array([0.4, 0.1 * k, 0.3])) for k in range(5)]
@@ -248,7 +248,7 @@ def test_unusable_input_is_one_line(folder: Path, tmp_path: Path, capsys: pytest
         (f"{HEADER}\n\na.png,0,0,0,1,0,0,0\na.png,0,0,0,1,0,0,0\n", "line 4: a second pose for a.png"),
     ],
 )
-def test_poses_that_cannot_be_read(text: str, error: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_poses_file(text: str, error: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "poses.csv").write_text(text)
     assert error in _refused(capsys, 2, tmp_path, *SHEET, "--poses", tmp_path / "poses.csv")
 

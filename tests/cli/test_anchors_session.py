@@ -1,4 +1,4 @@
-"""`iris-session anchors status`, `align`, `place`, `move` on paper: screens, who is meant, what is sent."""
+"""`iris-session anchors status`, `align`, `place`, `move` and `solve`: screens, requests, results."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ REPORT = StatusReport(
 )
 
 
-def test_the_screen_says_what_every_alignment_rests_on() -> None:
+def test_screen_shows_basis_of_every_alignment() -> None:
     text = "\n".join(format_alignment_status(REPORT))
     ann = next(line for line in format_alignment_status(REPORT) if "ann" in line)
     assert " ".join(ann.split()).endswith("(p1) measured 7 61 s 2.1 mm 4.4 mm 210 3 0.2 deg -")
@@ -108,7 +108,7 @@ def test_the_screen_says_what_every_alignment_rests_on() -> None:
     assert "desk" not in text
 
 
-def test_names_of_strangers_move_no_cursor() -> None:
+def test_screen_is_printable() -> None:
     assert all(line.isprintable() for line in format_alignment_status(REPORT))
 
 
@@ -121,7 +121,7 @@ def test_offsets_and_placed_alignments_state_no_error() -> None:
         assert "2.1 mm" not in "\n".join(format_alignment_status(report))
 
 
-def test_what_an_old_session_does_not_say_is_left_out() -> None:
+def test_missing_fields_of_old_sessions_are_omitted() -> None:
     old = StatusReport(1, "s1", "lab", 0, participants=(msgspec.structs.replace(ANN, alignment_report=None),))
     assert any("ann" in line for line in format_alignment_status(old))
     assert "this session has no anchors" in format_alignment_status(old)
@@ -129,11 +129,11 @@ def test_what_an_old_session_does_not_say_is_left_out() -> None:
 
 
 def test_json_has_everything() -> None:
-    told = json.loads(json.dumps(to_dict(REPORT)))
-    assert [one["id"] for one in told["participants"]] == ["p1", "p2"]
-    assert told["participants"][0]["alignment_report"]["seen"][0]["anchor_id"] == "table"
-    assert [one["as_expected"] for one in told["cross_checks"]] == [False, True]
-    assert told["anchors"][0]["T_world_anchor"] == [[0.0, -0.45, 0.0], [1.0, 0.0, 0.0, 0.0]]
+    result = json.loads(json.dumps(to_dict(REPORT)))
+    assert [one["id"] for one in result["participants"]] == ["p1", "p2"]
+    assert result["participants"][0]["alignment_report"]["seen"][0]["anchor_id"] == "table"
+    assert [one["as_expected"] for one in result["cross_checks"]] == [False, True]
+    assert result["anchors"][0]["T_world_anchor"] == [[0.0, -0.45, 0.0], [1.0, 0.0, 0.0, 0.0]]
 
 
 # --- who is meant, and what a director sends --------------------------------------------------------------------------
@@ -185,7 +185,7 @@ def session(monkeypatch: pytest.MonkeyPatch) -> Session:
     return here
 
 
-def test_participants_are_meant_by_id_or_name(session: Any) -> None:
+def test_participants_are_selected_by_id_or_name(session: Any) -> None:
     assert [one.id for one in select_participants(session, "ann")] == ["p1"]
     assert [one.id for one in select_participants(session, "p10")] == ["p10"]
     assert [one.id for one in select_participants(session, "all")] == ["p1", "p2"], "who is here and has a headset"
@@ -199,7 +199,7 @@ def test_participants_are_meant_by_id_or_name(session: Any) -> None:
         select_participants(session, "all", allow_all=False)
 
 
-def test_nobody_to_align(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_align_without_headsets(monkeypatch: pytest.MonkeyPatch) -> None:
     empty: Any = Session()
     with pytest.raises(CommandError, match="no participant of this session has a headset") as caught:
         select_participants(empty, "all")
@@ -219,9 +219,7 @@ def test_runs_are_started_and_stopped(session: Session, capsys: pytest.CaptureFi
     }
 
 
-def test_one_denial_of_several_is_told_and_the_others_go_on(
-    session: Session, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_align_continues_after_a_denial(session: Session, capsys: pytest.CaptureFixture[str]) -> None:
     session.denies = {"p1"}
     assert main(["anchors", "align", "start"]) == 1
     assert session.asked == [("start", "p2")]
@@ -239,12 +237,12 @@ def test_headsets_are_placed_and_anchors_moved(session: Session, capsys: pytest.
         ("p2", ((-0.01, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)), True),
         ("table", ((-0.2, 0.1, 0.0), (0.0, 0.0, 0.0, 1.0))),
     ]
-    told = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert told.pop("moved_m") == pytest.approx(0.585, abs=1e-3)
-    assert told == {"ok": True, "anchor": "table", "follow": ["p1"], "stay": []}, "bob is not aligned at all"
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert result.pop("moved_m") == pytest.approx(0.585, abs=1e-3)
+    assert result == {"ok": True, "anchor": "table", "follow": ["p1"], "stay": []}, "bob is not aligned at all"
 
 
-def test_a_moved_anchor_tells_whose_alignments_follow(session: Session, capsys: pytest.CaptureFixture[str]) -> None:
+def test_move_lists_alignments_that_follow(session: Session, capsys: pytest.CaptureFixture[str]) -> None:
     stopped = msgspec.structs.replace(ANN.alignment_report, running=False)
     others = [
         msgspec.structs.replace(ANN, id="p4", name="cay", alignment_report=stopped),
@@ -275,7 +273,7 @@ def test_an_anchor_is_moved_far_only_by_force(session: Session, capsys: pytest.C
 
 
 @pytest.mark.parametrize("command", [["status"], ["align", "start"], ["move", "table", "--pose", "0,0,0,1,0,0,0"]])
-def test_that_nobody_is_there_is_found_out_without_waiting(
+def test_unreachable_session_fails_at_once(
     command: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Nothing listens at the port: no client is made, which would wait for a session to begin."""
@@ -300,7 +298,7 @@ def test_that_nobody_is_there_is_found_out_without_waiting(
         (["move", "--pose", "0,0,0,1,0,0,0"], "ANCHOR"),
     ],
 )
-def test_commands_that_cannot_be_meant(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_commands(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
         main(["anchors", *words])
     assert caught.value.code == 2
@@ -315,7 +313,7 @@ def test_help_has_examples(action: str, capsys: pytest.CaptureFixture[str]) -> N
     assert re.search(rf"examples:\n  iris-session anchors {action}", capsys.readouterr().out)
 
 
-def test_address_that_is_none(capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_address(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["anchors", "status", "nowhere:port"]) == 2
     assert main(["anchors", "move", "table", "--pose", "0,0,0,1,0,0,0", "--address", "nowhere:port"]) == 2
     lines = capsys.readouterr().err.splitlines()
@@ -323,7 +321,7 @@ def test_address_that_is_none(capsys: pytest.CaptureFixture[str]) -> None:
     assert all("is not HOST:PORT" in line for line in lines)
 
 
-def test_a_running_session_takes_what_a_director_says(capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_work_on_running_session(capsys: pytest.CaptureFixture[str]) -> None:
     """The same commands with a real front and authority."""
     config = AuthorityConfig(anchors={"table": IDENTITY})
     live = LiveSession(config)
@@ -391,13 +389,13 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def solved(capsys: Capture, *words: str) -> dict[str, Any]:
     assert main(["anchors", "solve", *words, "--json"]) == 0
-    told: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return told
+    result: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return result
 
 
 def test_alignments_are_solved_again_and_compared(recording: Path, capsys: Capture) -> None:
-    told = solved(capsys, str(recording))
-    ann, bob, carl = told["participants"]
+    result = solved(capsys, str(recording))
+    ann, bob, carl = result["participants"]
     assert (ann["id"], bob["name"], carl["frames"]) == ("p1", "bob", [])
     (frame,) = ann["frames"]
     assert (frame["looks"], frame["sheets"]) == (120, {"table": 60, "door": 40, "shelf": 20})
@@ -413,9 +411,9 @@ def test_alignments_are_solved_again_and_compared(recording: Path, capsys: Captu
     assert not bob["frames"][0]["alignments"][0]["beyond"]
 
 
-def test_looks_at_a_moved_sheet_are_outliers(recording: Path, capsys: Capture) -> None:
-    told = solved(capsys, str(recording))
-    for person in told["participants"][:2]:
+def test_observations_of_moved_sheet_are_outliers(recording: Path, capsys: Capture) -> None:
+    result = solved(capsys, str(recording))
+    for person in result["participants"][:2]:
         (outlier,) = person["frames"][0]["outliers"]
         assert outlier["anchor_id"] == "shelf"
         assert outlier["off_m"] == pytest.approx(0.03, abs=0.01)
@@ -424,15 +422,15 @@ def test_looks_at_a_moved_sheet_are_outliers(recording: Path, capsys: Capture) -
 def test_where_the_anchors_really_were_can_be_given(recording: Path, tmp_path: Path, capsys: Capture) -> None:
     path = tmp_path / "true.toml"
     path.write_text(Constellation("table", TRUE, {}, {"table": 0.16}).to_toml())
-    told = solved(capsys, str(recording), "--anchors", str(path))
-    assert [one["frames"][0]["outliers"] for one in told["participants"][:2]] == [[], []]
-    assert told["constellation"]["moved"] == []
+    result = solved(capsys, str(recording), "--anchors", str(path))
+    assert [one["frames"][0]["outliers"] for one in result["participants"][:2]] == [[], []]
+    assert result["constellation"]["moved"] == []
 
 
-def test_sheets_to_each_other_and_which_one_was_moved(recording: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_relative_sheet_poses_and_moved_sheet(recording: Path, tmp_path: Path, capsys: Capture) -> None:
     out = tmp_path / "anchors.toml"
-    told = solved(capsys, str(recording), "--out", str(out))
-    (moved,) = told["constellation"]["moved"]
+    result = solved(capsys, str(recording), "--out", str(out))
+    (moved,) = result["constellation"]["moved"]
     assert moved["anchor_id"] == "shelf"
     assert moved["distance_m"] == pytest.approx(0.03, abs=0.008)
     found = load_anchors(out)
@@ -443,7 +441,7 @@ def test_sheets_to_each_other_and_which_one_was_moved(recording: Path, tmp_path:
     assert found.sizes == dict.fromkeys(TRUE, 0.16)
 
 
-def test_the_text_says_it_too(recording: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_solve_prints_text(recording: Path, tmp_path: Path, capsys: Capture) -> None:
     out = tmp_path / "anchors.toml"
     assert main(["anchors", "solve", str(recording), "--out", str(out)]) == 0
     shown = capsys.readouterr().out
@@ -480,7 +478,7 @@ def test_an_anchor_that_a_director_moved_is_where_it_was_at_the_time(tmp_path: P
     assert distance(after.T_world_tracking[0], (x + 0.5, y, z)) < 1e-6
 
 
-def test_what_came_later_counts_too(tmp_path: Path) -> None:
+def test_later_observations_are_used(tmp_path: Path) -> None:
     """Live, there were two looks, which is too few; a minute later there were more."""
     played, T = Played({"table": TRUE["table"]}), frames()[0]
     played.join(1, "p1", "ann")
@@ -501,14 +499,14 @@ def test_unusable_observations_are_counted(tmp_path: Path, capsys: Capture) -> N
     played.join(1, "p1", "ann")
     played.look(1, "table", TRUE["table"], T, 1, n=6)
     played.look(1, "door", TRUE["door"], T, 2, n=5)
-    told = solved(capsys, str(played.write(tmp_path / "session.rrd")))
-    (frame,) = told["participants"][0]["frames"]
+    result = solved(capsys, str(played.write(tmp_path / "session.rrd")))
+    (frame,) = result["participants"][0]["frames"]
     assert frame["refused"]
     assert "measures 160 mm, not 120 mm" in frame["advice"]
     assert frame["unused"] == {"unknown anchor": 5, "wrong size": 6}
 
 
-def test_a_sheet_on_the_wall_is_told_to_be_none_that_lies(tmp_path: Path, capsys: Capture) -> None:
+def test_solve_reports_sheet_against_gravity(tmp_path: Path, capsys: Capture) -> None:
     played, T = Played({"table": TRUE["table"]}), frames()[0]
     upright: PoseTuple = (TRUE["table"][0], quat_from_rotvec((math.pi / 2.0, 0.0, 0.0)))
     played.join(1, "p1", "ann")
@@ -520,13 +518,13 @@ def test_a_sheet_on_the_wall_is_told_to_be_none_that_lies(tmp_path: Path, capsys
     assert "1 sheet was seen" in shown
 
 
-def test_numbers_of_strangers_end_nothing(tmp_path: Path, capsys: Capture) -> None:
+def test_solve_survives_extreme_values(tmp_path: Path, capsys: Capture) -> None:
     played, T = Played({"table": TRUE["table"]}), frames()[0]
     played.join(1, "p1", "ann")
     played.look(1, "table", ((1e300, -1e300, 1e200), TRUE["table"][1]), T, 1, n=6, noise=0.0)
     played.look(1, "table", TRUE["table"], T, 2, n=6)
-    told = solved(capsys, str(played.write(tmp_path / "session.rrd")))
-    assert told["participants"][0]["frames"][0]["unused"] == {"not a pose": 6}
+    result = solved(capsys, str(played.write(tmp_path / "session.rrd")))
+    assert result["participants"][0]["frames"][0]["unused"] == {"not a pose": 6}
 
 
 def test_recordings_without_headsets_or_with_one_sheet(tmp_path: Path, capsys: Capture) -> None:
@@ -541,17 +539,17 @@ def test_recordings_without_headsets_or_with_one_sheet(tmp_path: Path, capsys: C
     assert not (tmp_path / "x.toml").exists()
 
 
-def test_sheets_that_nothing_ties_together_are_named(tmp_path: Path, capsys: Capture) -> None:
+def test_unconnected_sheets_are_named(tmp_path: Path, capsys: Capture) -> None:
     played, (ann, bob) = Played({"table": TRUE["table"]}), frames()
     played.join(1, "p1", "ann")
     played.join(2, "p2", "bob")
     played.look(1, "table", TRUE["table"], ann, 1)
     played.look(2, "door", TRUE["door"], bob, 1)
-    told = solved(capsys, str(played.write(tmp_path / "session.rrd")))
-    assert told["constellation"]["advice"].startswith("sheets not tied to 'table': door")
+    result = solved(capsys, str(played.write(tmp_path / "session.rrd")))
+    assert result["constellation"]["advice"].startswith("sheets not tied to 'table': door")
 
 
-def test_files_that_are_none(tmp_path: Path, recording: Path, capsys: Capture) -> None:
+def test_solve_reports_unusable_files(tmp_path: Path, recording: Path, capsys: Capture) -> None:
     assert main(["anchors", "solve", str(tmp_path / "none.rrd")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert main(["anchors", "solve", str(recording), "--anchors", str(tmp_path / "none.toml")]) == 2
@@ -594,10 +592,10 @@ def test_sheets_seen_before_and_after_a_jump_are_not_pooled(tmp_path: Path, caps
     for viewpoint, name in enumerate(("table", "door"), 4):
         played.look(1, name, TRUE[name], jumped, viewpoint)
     played.aligned("p1", 1, jumped, 0.003)
-    told = solved(capsys, str(played.write(tmp_path / "session.rrd")))
-    before, after = told["participants"][0]["frames"]
+    result = solved(capsys, str(played.write(tmp_path / "session.rrd")))
+    before, after = result["participants"][0]["frames"]
     assert [(one["jumps"], one["looks"]) for one in (before, after)] == [(0, 60), (1, 40)]
-    assert (before["outliers"], after["outliers"], told["constellation"]["moved"]) == ([], [], [])
+    assert (before["outliers"], after["outliers"], result["constellation"]["moved"]) == ([], [], [])
     (alignment,) = after["alignments"]
     assert alignment["off_m"] < 0.01
 

@@ -1,4 +1,4 @@
-"""`iris-session bench`: numbers that cannot be are one line, before anything starts."""
+"""`iris-session bench`: invalid numbers are one line, before anything starts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from iris_session.cli.main import main
         (["join", "--curve"], "--curve"),
     ],
 )
-def test_numbers_that_cannot_be(options: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_numbers_are_one_line_error(options: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", *options]) == 2
     error = capsys.readouterr().err
     assert text in error

@@ -1,4 +1,4 @@
-"""`iris-session emulate`: what it refuses before anybody joins."""
+"""`iris-session emulate`: options that are refused before joining."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from iris_session.cli.main import main
 
 
 @pytest.mark.parametrize("option", [("--drift", "30"), ("--bump-at", "20"), ("--glance-every", "5")])
-def test_what_is_for_nameless_people_is_refused_beside_named_ones(
+def test_options_for_unnamed_headsets_exclude_headset(
     option: tuple[str, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["emulate", "127.0.0.1:1", "--headset", "name=ann", *option]) == 2
@@ -20,14 +20,12 @@ def test_what_is_for_nameless_people_is_refused_beside_named_ones(
 @pytest.mark.parametrize(
     ("headset", "said"),
     [
-        ("name=ann,drift=3", r"there is no field 'drift'; fields: T_world_anchor, anchor_id, .*, drift_m_per_min, "),
-        ("name=ann,model.drift=3", r"there is no field 'model.drift'; fields: .*model\.drift_m_per_min, "),
-        ("name=ann,model.sheet.far=3", r"there is no field 'model.sheet.far'; fields: model\.sheet\.across, "),
+        ("name=ann,drift=3", r"unknown field 'drift'; fields: T_world_anchor, anchor_id, .*, drift_m_per_min, "),
+        ("name=ann,model.drift=3", r"unknown field 'model.drift'; fields: .*model\.drift_m_per_min, "),
+        ("name=ann,model.sheet.far=3", r"unknown field 'model.sheet.far'; fields: model\.sheet\.across, "),
         ("name=ann,seed.x=3", "'seed' has no fields of its own"),
     ],
 )
-def test_a_field_that_there_is_not_is_told_with_those_there_are(
-    headset: str, said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_unknown_field_error_lists_fields(headset: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["emulate", "127.0.0.1:1", "--headset", headset]) == 2
     assert re.search(said, capsys.readouterr().err)

@@ -1,4 +1,4 @@
-"""`iris-session keys` and `pair`: what they print, their exit status, what they leave behind."""
+"""`iris-session keys` and `pair`: output, exit status, and stored keys."""
 
 from __future__ import annotations
 
@@ -63,14 +63,14 @@ def test_allow_list_revoke(home: KeyHome, tmp_path: Path, capsys: Capture) -> No
     assert list(home.clients.read()) == [bob.fingerprint]
 
 
-def test_who_serves_lets_in_themselves(home: KeyHome, capsys: Capture) -> None:
+def test_allow_without_key_adds_own_key(home: KeyHome, capsys: Capture) -> None:
     assert main(["keys", "allow", "me", "--role", "any"]) == 0
     own = home.load_identity()
     assert [(one.name, one.roles) for one in home.clients.read().values()] == [("me", ())]
     assert own.fingerprint in capsys.readouterr().out
 
 
-def test_who_types_no_address_is_told_where_their_session_is(home: KeyHome) -> None:
+def test_default_address_is_own_session(home: KeyHome) -> None:
     """A session that listens on one network is not at 127.0.0.1, where a command looks by itself."""
     home.sessions.add(
         RegisteredSession("s1", "lab-1", os.getpid(), ("192.0.2.7",), 7721, home.load_server_key().fingerprint)
@@ -103,7 +103,7 @@ def test_who_types_no_address_is_told_where_their_session_is(home: KeyHome) -> N
         (["pair", "--address", "lab:99999", "--no-wait"], "not HOST:PORT"),
     ],
 )
-def test_what_cannot_be_done_is_one_line(home: KeyHome, arguments: list[str], text: str, capsys: Capture) -> None:
+def test_expected_errors_are_one_line_each(home: KeyHome, arguments: list[str], text: str, capsys: Capture) -> None:
     assert main(arguments) == 2
     err = capsys.readouterr().err
     assert text in err
@@ -123,7 +123,7 @@ def test_show_names_both_keys_and_never_a_secret(home: KeyHome, capsys: Capture)
     assert home.load_identity().secret not in text
 
 
-def test_forget_lets_an_address_be_trusted_anew(home: KeyHome) -> None:
+def test_forget_removes_stored_key(home: KeyHome) -> None:
     home.known_servers.pin("10.0.0.9:7721", "lab", KeyPair.generate().public)
     assert main(["keys", "forget", "10.0.0.9:7721"]) == 0
     assert home.known_servers.read() == []
@@ -154,7 +154,7 @@ def test_pair_for_people_shows_qr_code_and_fingerprint(lab: KeyHome, capsys: Cap
     assert lab.load_server_key().fingerprint in out
 
 
-def test_of_several_sessions_one_is_chosen(lab: KeyHome, capsys: Capture) -> None:
+def test_pair_selects_one_of_several_sessions(lab: KeyHome, capsys: Capture) -> None:
     mark = lab.load_server_key().fingerprint
     lab.sessions.add(RegisteredSession("id2", "lab-2", os.getpid(), ("10.0.0.5",), 7741, mark))
     assert main(["pair", "--no-wait"]) == 2
@@ -165,7 +165,7 @@ def test_of_several_sessions_one_is_chosen(lab: KeyHome, capsys: Capture) -> Non
     assert json.loads(capsys.readouterr().out)["addresses"] == ["10.0.0.5:7741"]
 
 
-def test_a_code_that_nobody_uses_fails_and_an_interrupted_one_is_void(
+def test_unused_code_fails_and_interrupted_code_is_void(
     lab: KeyHome, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert main(["pair", "--minutes", "0.002"]) == 1
@@ -202,7 +202,7 @@ def test_pair_waits_on_while_another_process_holds_the_list(
 
 
 @pytest.mark.parametrize("full", [False, True])
-def test_pair_waits_and_says_who_came(
+def test_pair_waits_and_prints_paired_name(
     lab: KeyHome, capsys: Capture, monkeypatch: pytest.MonkeyPatch, full: bool
 ) -> None:
     ann = KeyPair.generate()

@@ -1,4 +1,4 @@
-"""What the terminal shows while a session runs."""
+"""Live view of a running session in the terminal."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_numbers_are_rounded() -> None:
     assert "error_m=0.001235 error_rad=0.0 expected_p95_m=0.006 p_world=[0.1235, 0.0, 1.0] n=40" in line
 
 
-def test_headsets_that_agree_as_before_are_not_worth_a_line() -> None:
+def test_unchanged_cross_checks_are_hidden() -> None:
     noteworthy = EventFilter()
 
     def told(error_m: float, a: str = "p1", b: str = "p2") -> bool:
@@ -71,7 +71,7 @@ def test_headsets_that_agree_as_before_are_not_worth_a_line() -> None:
     assert noteworthy(Event(3, 0, 0, MarkerAdded("p1", "hello")))
 
 
-def test_the_table_says_who_is_lost_and_that_everything_stopped() -> None:
+def test_table_shows_offline_participants_and_emergency_stop() -> None:
     from rich.console import Console
 
     console = Console(file=io.StringIO(), width=140)
@@ -106,7 +106,7 @@ class _Session:
         return {"text": "x" * 200_000}
 
 
-def test_a_display_that_does_not_read_delays_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_display_delays_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Refreshes that do not fit into the pipe are skipped and counted; none is cut, and no event is lost."""
     import os
 
@@ -135,6 +135,6 @@ def test_a_display_that_does_not_read_delays_nothing(monkeypatch: pytest.MonkeyP
     assert json.dumps(session.as_dict())
 
 
-def test_nothing_that_a_stranger_wrote_reaches_the_terminal_as_a_command() -> None:
+def test_events_are_printable() -> None:
     line = format_event(Event(1, 0, 0, MarkerAdded("p1", "a\x1b[2Jb\nc\u202ed")))
     assert line.endswith("text=a\ufffd[2Jb\ufffdc\ufffdd")

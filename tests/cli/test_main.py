@@ -1,4 +1,4 @@
-"""The command line as people use it: help with examples, one JSON object, one line per error."""
+"""The command line: help with examples, one JSON object, one line per error."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def test_robots_takes_the_name_of_a_packaged_scene(capsys: pytest.CaptureFixture
     assert capsys.readouterr().out.startswith("# 2 robots, 2 free objects: hammer, board")
 
 
-def test_emulated_people_whom_no_session_lets_in_have_failed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_emulate_fails_without_admission(capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]  # somebody listens there, but it is no session
         assert main(["emulate", f"127.0.0.1:{port}", "--join-timeout", "0.2", "--count", "2"]) == 1
@@ -201,7 +201,7 @@ def test_serve_json_is_one_object_and_the_file_is_verified_as_text_and_json(
     assert report["files"][0]["steps"] == result["tick"]
 
 
-def test_a_reader_that_goes_away_is_no_traceback(tmp_path: Path) -> None:
+def test_closed_pipe_prints_no_traceback(tmp_path: Path) -> None:
     read, write = os.pipe()
     os.close(read)
     command = [sys.executable, "-m", "iris_session.cli.main", "robots", "handover.xml"]

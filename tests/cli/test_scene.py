@@ -41,7 +41,7 @@ def test_export_of_files_and_models(tmp_path: Path, capsys: pytest.CaptureFixtur
             assert extents == pytest.approx([1, 2, 3], abs=1e-6)
 
 
-def test_export_overwrites_nothing_that_it_is_made_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_does_not_overwrite_referenced_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Neither the mesh of a URDF, nor that of a model by another name of its file."""
     part = tmp_path / "part.glb"
     trimesh.creation.box((1, 2, 3)).export(part)
@@ -136,7 +136,7 @@ def test_export_says_what_it_wrote(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "in recordings and GLB: the skybox: neither has a form for it" in capsys.readouterr().out
 
 
-def test_export_does_not_write_over_what_it_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_does_not_overwrite_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     part = furniture(tmp_path / "part.glb")
     before = part.read_bytes()
     (tmp_path / "link.glb").symlink_to(part)

@@ -1,4 +1,4 @@
-"""`serve --anchors` on paper: the file takes the place of the scene's anchors, and its example is one that works."""
+"""`serve --anchors`: the file replaces the anchors of the scene, and the example file works."""
 
 from __future__ import annotations
 

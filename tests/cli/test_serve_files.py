@@ -1,4 +1,4 @@
-"""`serve` with files that MuJoCo does not simulate: what is shown, what is refused and why."""
+"""`serve` with files that MuJoCo does not simulate: what is shown, and what is refused."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ def part(tmp_path: Path) -> Path:
     return path
 
 
-def test_what_is_given_is_a_file_a_model_or_a_name(tmp_path: Path, part: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scene_argument_is_a_file_a_model_or_a_name(
+    tmp_path: Path, part: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in ("scene.xml", "scene.MJCF", "scene.mjb"):
         (tmp_path / name).write_text("")
         assert find_scene_file(str(tmp_path / name)) is None
@@ -59,7 +61,7 @@ def test_what_is_given_is_a_file_a_model_or_a_name(tmp_path: Path, part: Path, m
         ("arm.urdf.xacro", "xacro arm.urdf.xacro > arm.urdf"),
     ],
 )
-def test_what_is_no_file_is_told_with_what_there_is(tmp_path: Path, part: Path, name: str, says: str) -> None:
+def test_unusable_files_are_reported_with_candidates(tmp_path: Path, part: Path, name: str, says: str) -> None:
     for there in ("a.glb", "b.urdf", "c.xml", "part.docx", "part", "arm.urdf.xacro"):
         (tmp_path / there).write_text("x")
     (tmp_path / "folder.glb").mkdir()
@@ -100,7 +102,7 @@ def test_a_file_in_millimetres_is_noticed_and_scaled(tmp_path: Path, capfd: pyte
 
 
 @pytest.mark.parametrize("given", ["0", "-1", "nan", "inf", "small"])
-def test_a_scale_that_is_none_is_refused(given: str, part: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_scale_is_refused(given: str, part: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as raised:
         main(["serve", str(part), f"--scale={given}", *QUIET])
     assert raised.value.code == 2
@@ -119,7 +121,7 @@ def test_what_mujoco_simulates_is_not_scaled(capsys: pytest.CaptureFixture[str])
     "option",
     [("--robots", "robots.toml"), ("--assign", "ann=left"), ("--mode", "request"), ("--assignment", "nearest")],
 )
-def test_what_is_shown_has_no_robots_to_speak_of(
+def test_robot_options_are_refused_for_shown_files(
     option: tuple[str, str], part: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["serve", str(part), *option, *QUIET]) == 2
@@ -128,7 +130,7 @@ def test_what_is_shown_has_no_robots_to_speak_of(
     assert error.count("\n") == 1
 
 
-def test_a_package_elsewhere_is_named(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_package_dir_is_used(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     arm = tmp_path / "arm" / "arm.urdf"
     for path in (arm.parent, tmp_path / "models" / "part"):
         path.mkdir(parents=True)
@@ -176,7 +178,7 @@ def test_serve_and_inspect_tell_one_extent(tmp_path: Path, capfd: pytest.Capture
     assert max(map(float, served[1].split(" x "))) < 1.05
 
 
-def test_what_takes_long_is_told_before(
+def test_progress_is_printed_for_large_files(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(scene, "_LARGE_FILE_BYTES", 1000)

@@ -1,4 +1,4 @@
-"""`iris-session sessions`, and the options that say where a session listens and what it is called."""
+"""`iris-session sessions`, and the options for address and name of a session."""
 
 from __future__ import annotations
 
@@ -29,9 +29,7 @@ def heard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[FoundSession]
     return found
 
 
-def test_what_is_heard_is_listed_with_what_is_known_of_it(
-    heard: list[FoundSession], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_sessions_are_listed_with_known_keys(heard: list[FoundSession], capsys: pytest.CaptureFixture[str]) -> None:
     KeyHome().known_servers.pin("10.0.0.6:7721", "lab-2", KEY)
     heard += [PLAIN, NEW, KNOWN]
     assert main(["sessions"]) == 0
@@ -74,7 +72,7 @@ def test_a_block_of_ports_is_chosen_as_one() -> None:
             options("--port-base", text)
 
 
-def test_where_to_listen_is_said_once() -> None:
+def test_host_and_interface_are_exclusive() -> None:
     given = options("--interface", "eth0", "--interface", "10.0.0.5", "--advertise", "lab.example", "--no-beacon")
     config = make_session_config(given, "x")
     assert (config.interfaces, config.advertise, config.beacon_port) == (("eth0", "10.0.0.5"), "lab.example", 0)
@@ -82,7 +80,7 @@ def test_where_to_listen_is_said_once() -> None:
         make_session_config(options("--interface", "eth0", "--host", "0.0.0.0"), "x")
 
 
-def test_emulated_people_say_what_is_wrong_with_where_they_go(capsys: pytest.CaptureFixture[str]) -> None:
+def test_emulate_reports_invalid_addresses(capsys: pytest.CaptureFixture[str]) -> None:
     for words, text in (
         (["10.0.0.5", "--session", "lab"], "not both"),
         (["10.0.0.5", "--code", "12"], "not a join code"),

@@ -1,4 +1,4 @@
-"""What a command loads before it does anything: each package more is felt at every start."""
+"""Modules that a command loads at its start: each heavy package delays every command."""
 
 from __future__ import annotations
 

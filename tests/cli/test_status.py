@@ -1,4 +1,4 @@
-"""`iris-session status` and `doctor` on paper: screens, metrics, lines. End to end: tests/e2e."""
+"""Output of `iris-session status` and `doctor`: screens, metrics, lines. End to end: tests/e2e."""
 
 from __future__ import annotations
 
@@ -79,14 +79,14 @@ def test_one_screen_says_it_all() -> None:
     assert "mind the gap" in text
 
 
-def test_assets_are_shown_where_there_are_some() -> None:
+def test_status_shows_assets() -> None:
     assert "assets:" not in format_status(msgspec.structs.replace(REPORT, assets=AssetsReport()))
     report = msgspec.structs.replace(REPORT, assets=AssetsReport(183, 17_500_000, 400, 3, 2))
     assert "assets: 183 served, 17.5 MB sent, 3 refused; 2 clients waiting" in format_status(report)
     assert "iris_session_assets_bytes_total 17500000" in format_metrics(report)
 
 
-def test_media_are_shown_with_who_gets_what() -> None:
+def test_status_shows_media_with_subscribers() -> None:
     ann = ParticipantReport("p1", "ann", "observer", True, media=(StreamBudget("cloud", "full", 20.0),))
     bob = ParticipantReport(
         "p2", "bob", "observer", True, media=(StreamBudget("cloud", "quarter", 5.0),), media_drops=7
@@ -97,7 +97,7 @@ def test_media_are_shown_with_who_gets_what() -> None:
     assert "media cloth: 60 Hz, 2.0 Mbit/s; no subscribers" in text
 
 
-def test_names_of_strangers_move_no_cursor() -> None:
+def test_screen_is_printable() -> None:
     assert all(line.isprintable() for line in format_status(REPORT))
 
 
@@ -112,7 +112,7 @@ def test_names_of_strangers_move_no_cursor() -> None:
         ({"warnings": ("a disk", f"{NOT_PUBLISHED} 8.5 s: the program stands still")}, "'lab'  silent for 8.5 s  tick"),
     ],
 )
-def test_what_matters_most_is_on_top(fields: dict[str, object], words: str) -> None:
+def test_first_line_shows_state(fields: dict[str, object], words: str) -> None:
     assert words in format_status(msgspec.structs.replace(REPORT, **fields))[0]
 
 
@@ -148,7 +148,7 @@ def test_metrics_of_everything() -> None:
     assert "iris_session_recorder_disk_free_bytes 5e+09" in text
 
 
-def test_what_was_not_measured_is_left_out() -> None:
+def test_unmeasured_metrics_are_omitted() -> None:
     lines_of_bob = [line for line in format_metrics(REPORT).splitlines() if 'name="bob"' in line]
     assert not any("state_age" in line or "missed" in line for line in lines_of_bob)
 
@@ -169,7 +169,7 @@ def test_lines_of_the_doctor() -> None:
     assert format_verdict(found[:1]) == "all well"
 
 
-def test_address_that_is_none(capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_address(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "nowhere:port"]) == 1
     assert "is not HOST:PORT" in capsys.readouterr().out
     assert main(["status", "nowhere:port"]) == 2

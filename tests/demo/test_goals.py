@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from iris_session.demo.goals import STILL_M, STILL_S, FoldGoal, Goal, GoalWatch, StowGoal, Vertices
+from iris_session.demo.goals import STILL_M, STILL_S, FoldGoal, Goal, GoalMonitor, StowGoal, Vertices
 
 TICK_S = 0.005
 FOLD = FoldGoal("cloth", ((0, 1), (2, 3)))
@@ -24,25 +24,25 @@ def loaf(x: float, y: float, z: float) -> Vertices:
     return np.array([[x - 0.05, y - 0.02, z], [x + 0.05, y + 0.02, z + 0.05]])
 
 
-def play(watch: GoalWatch, seconds: float, vertices: Vertices, now_s: float, touching: tuple[str, ...] = ()) -> float:
+def play(watch: GoalMonitor, seconds: float, vertices: Vertices, now_s: float, touching: tuple[str, ...] = ()) -> float:
     """Shows the same world for some time; returns the time afterwards."""
     for _ in range(round(seconds / TICK_S)):
         now_s += TICK_S
-        watch.observe(now_s, vertices, touching)
+        watch.update(now_s, vertices, touching)
     return now_s
 
 
 def test_a_cloth_is_folded_when_both_pairs_of_corners_meet_and_rest() -> None:
-    watch = GoalWatch(FOLD)
+    watch = GoalMonitor(FOLD)
     now_s = play(watch, 0.1, FLAT, 0.0)
     now_s = play(watch, 2 * STILL_S, folded(0.049), now_s)
     assert watch.at_s == pytest.approx(0.1 + TICK_S + STILL_S, abs=2 * TICK_S)
 
 
 def test_it_is_told_once() -> None:
-    watch = GoalWatch(FOLD)
-    watch.observe(0.0, FLAT, ())
-    told = [watch.observe(0.1 + k * TICK_S, folded(0.01), ()) for k in range(300)]
+    watch = GoalMonitor(FOLD)
+    watch.update(0.0, FLAT, ())
+    told = [watch.update(0.1 + k * TICK_S, folded(0.01), ()) for k in range(300)]
     assert told.count(True) == 1
 
 
@@ -59,14 +59,14 @@ def test_it_is_told_once() -> None:
     ],
 )
 def test_what_is_no_success(goal: Goal, first: Vertices, then: Vertices) -> None:
-    watch = GoalWatch(goal)
+    watch = GoalMonitor(goal)
     now_s = play(watch, 1.0, first, 0.0, ("left",))
     play(watch, 3.0, then, now_s)
     assert watch.at_s is None
 
 
 def test_a_soft_body_is_stowed_when_it_was_lifted_and_lies_in_the_box() -> None:
-    watch = GoalWatch(STOW)
+    watch = GoalMonitor(STOW)
     now_s = play(watch, 0.5, loaf(0.0, 0.0, 0.12), 0.0, ("left",))
     play(watch, 1.0, loaf(0.1, 0.2, 0.01), now_s)
     assert watch.at_s is not None
@@ -74,14 +74,14 @@ def test_a_soft_body_is_stowed_when_it_was_lifted_and_lies_in_the_box() -> None:
 
 @pytest.mark.parametrize("hindrance", ["touched", "moving"])
 def test_it_does_not_count_before_it_is_let_go_and_still(hindrance: str) -> None:
-    watch = GoalWatch(FOLD)
+    watch = GoalMonitor(FOLD)
     now_s = play(watch, 0.1, FLAT, 0.0)
     for k in range(600):  # a vertex of the folded cloth wanders, or somebody's finger lies on it
         now_s += TICK_S
         vertices = folded(0.02)
         if hindrance == "moving":
             vertices[3, 2] += 0.003 * (k // 10)
-        watch.observe(now_s, vertices, ("right",) if hindrance == "touched" else ())
+        watch.update(now_s, vertices, ("right",) if hindrance == "touched" else ())
     assert watch.at_s is None
     now_s = play(watch, 0.9 * STILL_S, vertices, now_s)
     assert watch.at_s is None
@@ -91,10 +91,10 @@ def test_it_does_not_count_before_it_is_let_go_and_still(hindrance: str) -> None
 
 
 def test_trembling_within_the_bound_is_rest() -> None:
-    watch = GoalWatch(FOLD)
-    watch.observe(0.0, FLAT, ())
+    watch = GoalMonitor(FOLD)
+    watch.update(0.0, FLAT, ())
     for k in range(300):
         vertices = folded(0.02)
         vertices[:, 0] += 0.4 * STILL_M * (-1) ** k
-        watch.observe(k * TICK_S, vertices, ())
+        watch.update(k * TICK_S, vertices, ())
     assert watch.at_s is not None

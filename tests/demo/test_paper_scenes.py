@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from iris_session.demo.scenes.aloha import BOARD_SIZE, aloha_scene
-from iris_session.demo.scenes.iiwa import iiwa_radius, iiwa_scene
+from iris_session.demo.scenes.iiwa import compute_iiwa_radius, iiwa_scene
 from iris_session.physics import ModelNotFoundError, find_objects, find_robots
 from tests.models import robot_models
 
@@ -86,7 +86,7 @@ def test_iiwa_arms_stand_around_a_table_and_hold_still(n: int) -> None:
         base, tip = data.body(robot.base_body), data.site(robot.site)
         assert len(robot.joints) == 7
         assert robot.gripper_actuator == f"{robot.name}/gripper"
-        assert np.hypot(*base.xpos[:2]) == pytest.approx(iiwa_radius(n))
+        assert np.hypot(*base.xpos[:2]) == pytest.approx(compute_iiwa_radius(n))
         inward = base.xmat.reshape(3, 3).T @ (tip.xpos - base.xpos)
         np.testing.assert_allclose(inward, (0.5, 0.0, 0.35), atol=5e-3)  # gravity is compensated
         assert tip.xmat.reshape(3, 3)[2, 2] == pytest.approx(-1.0, abs=1e-3)

@@ -1,4 +1,4 @@
-"""What the doctor makes of alignments that are in force, and of media: one fault at a time, in one line."""
+"""Checks of alignments and media: one fault at a time."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def only(report: StatusReport, check: str, state: str, *texts: str) -> None:
     assert all(text in said for text in texts), said
 
 
-def test_headsets_that_are_well() -> None:
+def test_healthy_headsets_have_no_problems() -> None:
     assert [one for one in check_session_report(with_ann(), "p9") if one.state != "ok"] == []
     told = {one.check for one in check_session_report(with_ann(), "p9")}
     assert told == set(SESSION_CHECKS), "every check is told of, and its place in the order is known"
@@ -54,7 +54,7 @@ def test_every_alarm_is_explained() -> None:
     only(with_ann(alarm="of_tomorrow", alarm_ns=S), "alarm", "warning", "ann: of_tomorrow")
 
 
-def test_an_alignment_that_nothing_confirms() -> None:
+def test_unconfirmed_alignment_is_stale() -> None:
     long_ago = (AnchorSeen("table", 9, STALE_NS + 60 * S), AnchorSeen("door", 9, STALE_NS + 120 * S))
     only(with_ann(seen=long_ago), "stale", "warning", "ann has seen no sheet for 11 min", "glance")
     recent = (*long_ago, AnchorSeen("shelf", 9, S))
@@ -87,7 +87,7 @@ def test_headsets_that_disagree() -> None:
     )
 
 
-def test_what_chance_explains_and_what_was_long_ago_is_no_fault() -> None:
+def test_expected_and_old_differences_are_ok() -> None:
     assert is_consistent(change(AGREES, error_m=0.016))
     assert not is_consistent(change(AGREES, error_m=0.0161))
     old = change(AGREES, error_m=0.5, age_ns=601 * S)
@@ -96,13 +96,13 @@ def test_what_chance_explains_and_what_was_long_ago_is_no_fault() -> None:
     assert "1 pairs compared, at most 3 mm apart" in found["agreement"].text
 
 
-def test_who_is_gone_or_needs_no_alignment_is_no_patient() -> None:
+def test_disconnected_and_unaligned_roles_are_excluded() -> None:
     bad: Any = change(ALIGNED, alarm="jump", running=False, pending_m=1.0)
     desk = change(ANN, alignment="not_needed", alignment_report=bad)
     assert all(one.state == "ok" for one in check_session_report(change(WELL, participants=(desk, DOCTOR)), "p9"))
 
 
-def test_media_that_are_cut_down_or_dropped() -> None:
+def test_reduced_or_dropped_media() -> None:
     full, quarter = StreamBudget("cloud", "full", 20.0), StreamBudget("cloth", "quarter", 0.5)
     cut = change(ANN, media=(full, quarter))
     only(change(WELL, participants=(cut, DOCTOR)), "media", "warning", "ann: cloth in class quarter", "links.md")
@@ -110,7 +110,7 @@ def test_media_that_are_cut_down_or_dropped() -> None:
     only(change(WELL, participants=(lossy, DOCTOR)), "media", "warning", f"ann: {MEDIA_DROPS} frames dropped")
 
 
-def test_media_that_are_well() -> None:
+def test_healthy_media() -> None:
     for fields in ({"media": (StreamBudget("cloud"),), "media_drops": MEDIA_DROPS - 1}, {"media": ()}):
         report = change(WELL, participants=(change(ANN, **fields), DOCTOR))
         assert all(one.state == "ok" for one in check_session_report(report, "p9"))

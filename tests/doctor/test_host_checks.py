@@ -1,4 +1,4 @@
-"""The server's machine: what is looked at, on this one."""
+"""Checks of the machine that serves, run on this machine."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_ports_name_who_has_them() -> None:
     assert "python" in found.text or "pytest" in found.text
 
 
-def test_ports_of_a_session_are_no_trouble(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ports_used_by_a_session_are_ok(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each program is told once, with all its ports."""
     monkeypatch.setattr(host_checks, "_is_port_in_use", lambda port: port != 7725)
     monkeypatch.setattr(host_checks, "_list_connections", list)
@@ -57,7 +57,7 @@ def test_ports_of_a_session_are_no_trouble(monkeypatch: pytest.MonkeyPatch) -> N
     assert "7720 (introduction), 7721 (control), " in found.text
 
 
-def test_every_port_of_a_session_is_looked_at() -> None:
+def test_every_port_of_a_session_is_checked() -> None:
     """As the session lays them out: introduction below control, media ingest above the web."""
     assert {host_checks.CONTROL_PORT + offset: name for offset, name in host_checks.PORT_OFFSETS.items()} == {
         7720: "introduction",

@@ -1,4 +1,4 @@
-"""Why joining failed: each refusal under the check that it belongs to; and keys that are or are not the known ones."""
+"""Checks of joining: each refusal has its check; server keys are compared with the known ones."""
 
 from __future__ import annotations
 
@@ -55,14 +55,14 @@ def test_every_refusal_has_its_check(error: Exception, check: str) -> None:
     assert found.text
 
 
-def test_key_that_is_the_known_one(home: KeyHome) -> None:
+def test_known_server_key_is_ok(home: KeyHome) -> None:
     key = KeyPair.generate().public
     assert check_server_key(ADDRESS, said(key)).state == "warning"  # not known yet
     home.known_servers.pin(str(ADDRESS), "lab", key)
     assert check_server_key(ADDRESS, said(key)).state == "ok"
 
 
-def test_key_that_is_another_one(home: KeyHome) -> None:
+def test_changed_server_key_fails(home: KeyHome) -> None:
     home.known_servers.pin(str(ADDRESS), "lab", KeyPair.generate().public)
     found = check_server_key(ADDRESS, said(KeyPair.generate().public))
     assert found.failed
@@ -88,7 +88,7 @@ def test_nothing_to_compare() -> None:
     assert check_server_key(ADDRESS, said("")).state == "ok"
 
 
-def test_who_was_let_in_before_is_told_so(home: KeyHome) -> None:
+def test_revoked_key_is_explained(home: KeyHome) -> None:
     new = explain_unpaired_key(ADDRESS, said(KeyPair.generate().public))
     assert (new.check, new.state, new.why) == ("key", "failed", "")
     assert "iris-session pair" in new.advice
@@ -98,7 +98,7 @@ def test_who_was_let_in_before_is_told_so(home: KeyHome) -> None:
     assert "admitted before" in explain_unpaired_key(ADDRESS, said(key)).why
 
 
-def test_who_serves_the_session_lets_in_themselves(home: KeyHome) -> None:
+def test_owner_is_advised_to_allow_own_key(home: KeyHome) -> None:
     key = KeyPair.generate()
     home.sessions.add(RegisteredSession("s1", "lab", os.getpid(), ("192.0.2.7",), 7721, key.fingerprint))
     assert check_server_key(ADDRESS, said(key.public)).state == "ok"
@@ -106,7 +106,7 @@ def test_who_serves_the_session_lets_in_themselves(home: KeyHome) -> None:
     assert "pair" in explain_unpaired_key(ADDRESS, said(KeyPair.generate().public)).advice
 
 
-def test_what_is_no_join_code_is_a_matter_of_the_code() -> None:
+def test_invalid_join_code_fails_check_code() -> None:
     [found] = attempt_join(ADDRESS, str(ADDRESS), "abc", "observer", None).findings
     assert (found.check, found.state) == ("code", "failed")
     assert "like 7KQ2-M4XD-9PTR" in found.text
@@ -117,7 +117,7 @@ def state(session_time: int, age_ms: int) -> SceneState:
     return SceneState(StateHeader(1, 0, 0, 0.0, session_time, 0, 0, 0), np.zeros((0, 7)), 0, age_ms * 1_000_000)
 
 
-def test_old_state_is_blamed_on_the_link_only_when_something_new_comes() -> None:
+def test_old_state_is_attributed_to_link_only_with_new_states() -> None:
     moving = [state(n, 3) for n in range(90)]
     assert check_state_age(moving, 0).state == "ok"
     slow = check_state_age([state(n, 300) for n in range(90)], 7)

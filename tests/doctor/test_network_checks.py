@@ -1,4 +1,4 @@
-"""The way to a session, on this machine: names, networks, closed ports, what introduces itself."""
+"""Checks of the route to a session on this machine: names, networks, closed ports, introductions."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_another_version(theirs: int, older: str) -> None:
     assert said is None
 
 
-def test_the_base_of_a_block_of_ports_is_told_from_its_control_port() -> None:
+def test_port_base_is_distinguished_from_control_port() -> None:
     """`serve --port-base N` is joined at N + 1; at N it introduces itself."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -101,7 +101,7 @@ def test_the_base_of_a_block_of_ports_is_told_from_its_control_port() -> None:
     assert found.advice == f"use {above}"
 
 
-def test_the_examination_ends_at_the_base_of_a_block(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_ends_at_port_base(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(network_checks, "LISTEN_S", 0.01)
     with says_of_itself(times=2) as above:
         result = run_checks(f"127.0.0.1:{above.port - 1}")
@@ -136,7 +136,7 @@ def test_open_port() -> None:
         assert network_checks.check_tcp(Address("127.0.0.1", listener.getsockname()[1]), "127.0.0.1").state == "ok"
 
 
-def test_a_firewall_is_told_from_a_closed_port(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_firewall_is_distinguished_from_closed_port(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(network_checks, "CONNECT_S", 0.2)
     with socket.socket() as listener, contextlib.ExitStack() as stack:
         listener.bind(("127.0.0.1", 0))
@@ -185,7 +185,7 @@ def test_names() -> None:
 
 
 class Listener:
-    """Hears what it is given."""
+    """Beacon listener that hears the given sessions."""
 
     sessions_heard: tuple[FoundSession, ...] = ()
     ignored: ClassVar[dict[str, int]] = {}
@@ -246,5 +246,5 @@ def test_sessions_that_are_heard_elsewhere_may_be_meant() -> None:
     assert network_checks.mention_heard_sessions(well, typed, there) is well
 
 
-def test_networks_that_cannot_be_used_are_not_told() -> None:
+def test_link_local_networks_are_not_listed() -> None:
     assert not any(network.version == 6 and network.is_link_local for _, network in network_checks.list_own_networks())

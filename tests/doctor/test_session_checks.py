@@ -1,4 +1,4 @@
-"""What the doctor makes of a report: one fault at a time, each named by its check, with what to do."""
+"""Checks of a status report: one fault at a time, each reported by its check, with advice."""
 
 from __future__ import annotations
 
@@ -95,11 +95,11 @@ def only(report: StatusReport, check: str, state: str, *texts: str) -> None:
     assert all(text in f"{one.text} {one.why} {one.advice}" for text in texts), one
 
 
-def test_a_session_that_is_well() -> None:
+def test_healthy_session_has_no_problems() -> None:
     assert troubles(WELL) == {}
 
 
-def test_the_doctor_is_not_a_patient() -> None:
+def test_doctor_itself_is_excluded() -> None:
     unwell = change(DOCTOR, role="operator", alignment="none", heard_ns=5 * S)
     assert troubles(change(WELL, participants=(ANN, unwell))) == {}
 
@@ -118,21 +118,21 @@ def test_session(fields: dict[str, object], state: str, text: str) -> None:
     only(change(WELL, **fields), "session", state, text)
 
 
-def test_nobody_keeps_up_with_a_session_that_stands_still() -> None:
+def test_stalled_session_has_no_client_findings() -> None:
     """What its people and ticks did before says nothing about now."""
     blind = with_ann(state_age=None, missed_share=1.0, capture_to_receive=Quantiles(900.0, 900.0))
     only(change(blind, stalled=True, authority_silent_ns=3 * S), "session", "failed")
 
 
-def test_a_step_that_comes_late_is_no_standstill() -> None:
+def test_late_step_is_not_a_stall() -> None:
     assert troubles(change(WELL, stalled=True, authority_silent_ns=S // 5)) == {}
 
 
-def test_who_drives_needs_an_alignment() -> None:
+def test_driver_needs_an_alignment() -> None:
     only(with_ann(alignment="none"), "alignment", "failed", "ann has no alignment", "bring the sheet into view")
 
 
-def test_who_looks_at_another_sheet_is_told_which_there_are() -> None:
+def test_advice_lists_sheets_of_the_session() -> None:
     elsewhere = with_ann(alignment="none", alignment_report=AlignmentReport(unusable=12))
     report = change(elsewhere, anchors=(AnchorReport("table", ORIGIN), AnchorReport("shelf", ORIGIN)))
     only(
@@ -146,17 +146,17 @@ def test_who_looks_at_another_sheet_is_told_which_there_are() -> None:
     assert "none usable" not in troubles(with_ann(alignment="none", alignment_report=seen))["alignment"].text
 
 
-def test_an_alignment_that_was_lost_is_told_apart() -> None:
+def test_lost_alignment_is_distinguished() -> None:
     only(with_ann(alignment="none", alignment_void_ns=4 * S), "alignment", "failed", "lost 4.0 s ago", "jumped")
 
 
-def test_who_only_looks_should_have_one() -> None:
+def test_observer_without_alignment_is_a_warning() -> None:
     looking = change(ANN, alignment="none", role="observer", holds=())
     report = change(WELL, participants=(looking,), robots=(RIGHT,))
     only(report, "alignment", "warning", "ann has no alignment")
 
 
-def test_where_nobody_drives_a_screen_needs_none() -> None:
+def test_screen_needs_no_alignment_without_robots() -> None:
     screen = change(ANN, alignment="none", role="observer", holds=(), alignment_report=AlignmentReport())
     shown = change(WELL, participants=(screen,), robots=())
     assert "alignment" not in troubles(shown)
@@ -178,7 +178,7 @@ def test_a_free_robot_is_offered() -> None:
     only(change(WELL, participants=(ANN, bob)), "leases", "warning", "bob has no robot", "right is free")
 
 
-def test_a_robot_kept_for_somebody_who_is_gone() -> None:
+def test_robot_kept_for_disconnected_holder() -> None:
     gone = change(ANN, connected=False, lost="silent")
     bob = change(ANN, id="p2", name="bob", holds=())
     found = troubles(change(WELL, participants=(gone, bob), robots=(LEFT,)))
@@ -191,13 +191,13 @@ def test_directors_need_no_robot() -> None:
 
 
 @pytest.mark.parametrize("reason", sorted(HOLD_ADVICE))
-def test_robots_that_hold_against_the_will(reason: str) -> None:
+def test_robots_that_hold_unintentionally(reason: str) -> None:
     held = change(LEFT, state="hold", hold_reason=reason)
     report = change(WELL, robots=(held, RIGHT), participants=(change(ANN, rejected={"stale": 7}),))
     only(report, "robots", "warning", f"left (ann) holds: {reason}, rejected: stale 7", HOLD_ADVICE[reason])
 
 
-def test_an_open_clutch_is_no_fault() -> None:
+def test_open_clutch_is_not_a_problem() -> None:
     held = change(LEFT, state="hold", hold_reason=HoldReason.CLUTCH_OPEN)
     assert troubles(change(WELL, robots=(held, RIGHT))) == {}
 
@@ -215,7 +215,7 @@ def test_slow_clients(fields: dict[str, object], state: str, text: str) -> None:
     only(with_ann(**fields), "clients", state, "ann: ", text)
 
 
-def test_data_age_names_the_guilty_stage() -> None:
+def test_data_age_names_slow_stage() -> None:
     only(
         with_ann(capture_to_receive=Quantiles(50.0, 90.0)), "age", "warning", "device -> front is slow", "90.0 ms (ann)"
     )
@@ -258,7 +258,7 @@ def test_recorder(state: str, text: str) -> None:
     only(report, "recorder", "failed", text)
 
 
-def test_lost_rows_are_told() -> None:
+def test_lost_rows_are_reported() -> None:
     only(change(WELL, recorder=change(WELL.recorder, lost_rows=12)), "recorder", "warning", "12 rows lost")
 
 
@@ -281,7 +281,7 @@ def test_restarts_and_warnings() -> None:
     only(change(WELL, warnings=("physics stands still until a reset",)), "warnings", "warning", "physics stands still")
 
 
-def test_what_drops_mean_is_told() -> None:
+def test_drops_are_explained() -> None:
     (found,) = (
         one
         for one in check_session_report(change(WELL, drops={"send_queue_full": 2, "odd": 1}), "p9")
@@ -316,11 +316,11 @@ def test_every_reason_that_the_front_counts_is_explained() -> None:
         (7, "steps: tick 7, paced by the program that owns the session"),
     ],
 )
-def test_a_pace_that_is_not_ours_is_not_told(tick: int, text: str) -> None:
+def test_tick_rate_of_user_loop_is_not_reported(tick: int, text: str) -> None:
     """The carrier of a scene without physics has a tick of a millisecond: nobody steps at 1000 Hz."""
     report = change(WELL, lateness=None, tick=tick, tick_period_ns=1_000_000)
     assert check_session_report(report, "p9")[0] == Finding("session", "ok", text)
 
 
-def test_drivers_are_who_may_hold_robots_but_directors() -> None:
+def test_drivers_are_driving_roles_without_director() -> None:
     assert {"operator", "agent", "leader"} == DRIVERS

@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from iris_session.demo.goals import GoalWatch
-from iris_session.demo.plays import Play, make_play
+from iris_session.demo.demos import Demo, make_demo
+from iris_session.demo.goals import GoalMonitor
 from iris_session.emulator.behaviours import make_behaviour
-from iris_session.emulator.behaviours.deformables import watched
+from iris_session.emulator.behaviours.deformables import list_observed_vertices
 from tests.emulator.handover_rig import Rig
 
 #: Deformables begin up to so far from their places, and turned by so much.
@@ -26,7 +26,7 @@ MOVED_M, TURNED_RAD = 0.015, math.radians(8.0)
 class SoftRig(Rig):
     """A rig whose goals are those of a demo, judged by the product's own detector after every tick."""
 
-    watches: list[GoalWatch] = field(default_factory=list)
+    watches: list[GoalMonitor] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -39,7 +39,7 @@ class SoftRig(Rig):
         super()._receive()
         for watch in self.watches:
             name = watch.goal.deformable
-            watch.observe(
+            watch.update(
                 self.now_s, self.world.flexes.read_vertices(name), self.world.flexes.find_touching_robots(name)
             )
 
@@ -79,22 +79,22 @@ class SoftRig(Rig):
         return any(b.failed for b in behaviours) or (reached and all(b.done for b in behaviours))
 
 
-def soft_demo(play: Play, seed: int, *, shift: bool = True) -> SoftRig:
+def soft_demo(play: Demo, seed: int, *, shift: bool = True) -> SoftRig:
     """A rig with the cast of a demo."""
     behaviours = {
         task.robot: make_behaviour(task.behaviour, task.robot, task.object, task.partner, task.device, seed)
-        for person in play.people
+        for person in play.headsets
         for task in person.tasks
     }
-    vertices = {goal.deformable: watched(goal.deformable) for goal in play.goals}
-    watches = [GoalWatch(goal) for goal in play.goals]
+    vertices = {goal.deformable: list_observed_vertices(goal.deformable) for goal in play.goals}
+    watches = [GoalMonitor(goal) for goal in play.goals]
     return SoftRig(behaviours, seed, "", vertices=vertices, watches=watches, model=play.model, shift=shift)
 
 
 def main(runs: int, name: str = "cloth", first: int = 0) -> None:
     """Counts successes over `runs` seeds."""
     good, times = 0, []
-    play = make_play(name)
+    play = make_demo(name)
     for seed in range(first, first + runs):
         began = time.process_time()
         rig = soft_demo(play, seed)

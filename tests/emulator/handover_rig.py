@@ -30,7 +30,7 @@ from anchors.pose import (
     quat_normalize,
 )
 from iris_session.control.controller import Controller
-from iris_session.demo.plays import Play, make_play
+from iris_session.demo.demos import Demo, make_demo
 from iris_session.demo.scenes import scene_path
 from iris_session.emulator.behaviours import Behaviour, Giver, HandInput, Receiver, make_behaviour
 from iris_session.physics.robots import find_objects, find_robots
@@ -328,10 +328,10 @@ def handover(seed: int, object: str = "hammer", giver: str = "left", receiver: s
     return Rig(behaviours, seed, object, **options)
 
 
-def demo(play: Play, seed: int, **options: Any) -> Rig:
+def demo(play: Demo, seed: int, **options: Any) -> Rig:
     """A rig with the cast of a demo, one behaviour per robot; who has no partner is left out."""
     behaviours = {}
-    for task in (task for person in play.people for task in person.tasks if task.partner):
+    for task in (task for person in play.headsets for task in person.tasks if task.partner):
         args = (task.behaviour, task.robot, task.object, task.partner, task.device, seed, task.arm, task.place)
         behaviours[task.robot] = make_behaviour(*args)
     return Rig(behaviours, seed, play.objects[0], play.objects[1:], model=play.model, **options)
@@ -372,7 +372,7 @@ def over(rig: Rig) -> bool:
 def main(runs: int, name: str = "handover", operators: int = 2, first: int = 0) -> None:
     """Counts successes over `runs` seeds."""
     good, times = 0, []
-    play = None if name == "board" else make_play(name, operators)
+    play = None if name == "board" else make_demo(name, operators)
     for seed in range(first, first + runs):
         rig = handover(seed, "board", "right", "left") if play is None else demo(play, seed)
         rig.run(90.0, until=over)

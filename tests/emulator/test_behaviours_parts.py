@@ -24,18 +24,24 @@ from anchors.pose import (
     quat_mul,
 )
 from iris_session.demo.scenes import n_arms_scene, scene_path
-from iris_session.emulator.behaviours.eyes import Eyes, Seen
-from iris_session.emulator.behaviours.hand import LONGEST_STEP_S, REARM_S, TRIGGER_S, ClutchedHand
-from iris_session.emulator.behaviours.reach import Reach, min_jerk
-from iris_session.emulator.behaviours.things import (
-    COMMON_THINGS,
-    Thing,
-    face_up,
-    grasps,
-    level,
-    thing_named,
-    tilt,
+from iris_session.emulator.behaviours.hand import (
+    LONGEST_STEP_S,
+    REARM_S,
+    TRIGGER_S,
+    ClutchedHand,
+    HandMovement,
+    compute_min_jerk,
 )
+from iris_session.emulator.behaviours.objects import (
+    COMMON_OBJECTS,
+    HandoverObject,
+    compute_grasps,
+    compute_tilt,
+    find_object,
+    get_face_up,
+    make_level_pose,
+)
+from iris_session.emulator.behaviours.perception import Perception, TrackedPose
 
 STEP_NS = 13_888_889  # 72 Hz
 _metres = st.floats(-1.0, 1.0)
@@ -71,7 +77,7 @@ class PerfectRobot:
         for _ in range(round(seconds * 1e9 / STEP_NS)):
             self.session_time_ns += STEP_NS
             hand.update(self, self.tip)
-            given_input = hand.input()
+            given_input = hand.make_input()
             self.hand = given_input.pose_world
             clutches.append(given_input.clutch)
             if not given_input.clutch:
@@ -86,30 +92,30 @@ class PerfectRobot:
 
 
 def test_min_jerk_begins_and_ends_at_rest() -> None:
-    assert min_jerk(-1.0) == min_jerk(0.0) == 0.0
-    assert min_jerk(1.0) == min_jerk(2.0) == 1.0
-    assert min_jerk(0.5) == pytest.approx(0.5)
+    assert compute_min_jerk(-1.0) == compute_min_jerk(0.0) == 0.0
+    assert compute_min_jerk(1.0) == compute_min_jerk(2.0) == 1.0
+    assert compute_min_jerk(0.5) == pytest.approx(0.5)
     h = 1e-4
     for s in (0.0, 1.0):
-        assert abs(min_jerk(s + h) - min_jerk(s - h)) / (2 * h) < 1e-6
+        assert abs(compute_min_jerk(s + h) - compute_min_jerk(s - h)) / (2 * h) < 1e-6
 
 
 @settings(max_examples=60, deadline=None)
 @given(_poses, _poses)
 def test_reach_keeps_its_speed_limits(start: PoseTuple, goal: PoseTuple) -> None:
-    reach = Reach.plan(start, goal, 5.0, speed=0.4, turn=1.5)
-    assert distance(reach.pose(5.0)[0], start[0]) < 1e-12
-    assert distance(reach.pose(100.0)[0], goal[0]) < 1e-12
-    assert quat_angle(reach.pose(100.0)[1], goal[1]) < 1e-7
-    n, last = 200, reach.pose(5.0)
+    reach = HandMovement.plan(start, goal, 5.0, speed=0.4, turn=1.5)
+    assert distance(reach.compute_pose(5.0)[0], start[0]) < 1e-12
+    assert distance(reach.compute_pose(100.0)[0], goal[0]) < 1e-12
+    assert quat_angle(reach.compute_pose(100.0)[1], goal[1]) < 1e-7
+    n, last = 200, reach.compute_pose(5.0)
     step_s = reach.duration_s / n
     for i in range(1, n + 1):
-        pose = reach.pose(5.0 + i * step_s)
+        pose = reach.compute_pose(5.0 + i * step_s)
         assert distance(last[0], pose[0]) <= 0.4 * step_s * 1.001
         assert quat_angle(last[1], pose[1]) <= 1.5 * step_s * 1.001 + 1e-9
         last = pose
-    assert reach.finished(5.0 + reach.duration_s)
-    assert not reach.finished(5.0 + 0.99 * reach.duration_s)
+    assert reach.is_finished(5.0 + reach.duration_s)
+    assert not reach.is_finished(5.0 + 0.99 * reach.duration_s)
 
 
 @settings(max_examples=12, deadline=None)
@@ -121,9 +127,9 @@ def test_hand_brings_the_tip_to_the_goal_from_anywhere(tip: PoseTuple, hand_at: 
     robot.run(hand, 16.0)
     assert distance(robot.tip[0], goal[0]) < 1e-3
     assert quat_angle(robot.tip[1], goal[1]) < 5e-3
-    assert not hand.arrived()  # seen there for the first time
+    assert not hand.has_arrived()  # seen there for the first time
     robot.run(hand, 0.2)
-    assert hand.arrived()
+    assert hand.has_arrived()
     assert hand.reclutches == 0
 
 
@@ -191,15 +197,15 @@ def test_trigger_takes_its_time() -> None:
     robot.run(hand, 0.1)
     hand.trigger_goal = 1.0
     robot.run(hand, TRIGGER_S / 2)
-    assert hand.input().gripper == pytest.approx(0.5, abs=0.1)
-    assert not hand.trigger_done()
+    assert hand.make_input().gripper == pytest.approx(0.5, abs=0.1)
+    assert not hand.is_trigger_done()
     robot.run(hand, TRIGGER_S)
-    assert hand.input().gripper == 1.0
-    assert hand.trigger_done()
+    assert hand.make_input().gripper == 1.0
+    assert hand.is_trigger_done()
 
 
 def test_seen_smooths_noise_and_follows() -> None:
-    seen, rng = Seen(IDENTITY_POSE, 0.0), np.random.default_rng(1)
+    seen, rng = TrackedPose(IDENTITY_POSE, 0.0), np.random.default_rng(1)
     errors = []
     for i in range(1, 720):
         noisy = (tuple(map(float, rng.normal(0, 1e-3, 3))), quat_from_rotvec(tuple(map(float, rng.normal(0, 5e-3, 3)))))
@@ -260,23 +266,23 @@ def _gripper_at(x: float, y: float, half_gap: float) -> dict[str, PoseTuple]:
     ],
 )
 def test_eyes_see_who_holds_a_thing(x: float, y: float, half_gap: float, holds: bool) -> None:
-    eyes = Eyes(("hammer",), ("left",))
-    eyes.look(Picture(_gripper_at(x, y, half_gap)))
-    assert eyes.ready
-    assert eyes.gap("left") == pytest.approx(2 * half_gap)
-    assert eyes.holds("left", "hammer", thing_named("hammer").half_width) is holds
+    eyes = Perception(("hammer",), ("left",))
+    eyes.observe(Picture(_gripper_at(x, y, half_gap)))
+    assert eyes.is_complete
+    assert eyes.compute_gap("left") == pytest.approx(2 * half_gap)
+    assert eyes.is_holding("left", "hammer", find_object("hammer").half_width) is holds
 
 
 def test_eyes_say_what_is_missing() -> None:
-    eyes = Eyes(("hammer",), ("left",), perhaps=("board",))
+    eyes = Perception(("hammer",), ("left",), perhaps=("board",))
     poses = _gripper_at(0.0, 0.0, 0.04)
     base = poses.pop("left/base")
-    eyes.look(Picture(poses))
+    eyes.observe(Picture(poses))
     assert eyes.missing == ("left/base",)
-    assert eyes.others() == []
-    eyes.look(Picture(poses | {"left/base": base, "board": ((1.0, 2.0, 3.0), IDENTITY_QUAT)}))
-    assert eyes.ready
-    assert eyes.others() == [(1.0, 2.0, 3.0)]
+    assert eyes.list_obstacles() == []
+    eyes.observe(Picture(poses | {"left/base": base, "board": ((1.0, 2.0, 3.0), IDENTITY_QUAT)}))
+    assert eyes.is_complete
+    assert eyes.list_obstacles() == [(1.0, 2.0, 3.0)]
 
 
 def _outline(model: mujoco.MjModel, body: str) -> tuple[np.ndarray, np.ndarray]:
@@ -300,7 +306,7 @@ def test_what_people_know_of_the_things_is_true(body: str) -> None:
         model = n_arms_scene(4).compile()
     else:
         model = mujoco.MjModel.from_xml_path(str(scene_path("handover")))
-    thing: Thing = thing_named(body)
+    thing: HandoverObject = find_object(body)
     low, high = _outline(model, body)
     corners = np.array(thing.corners)
     np.testing.assert_allclose(corners.max(axis=0)[[0, 2]], high[[0, 2]], atol=1.5e-3)
@@ -310,17 +316,17 @@ def test_what_people_know_of_the_things_is_true(body: str) -> None:
     mujoco.mj_resetDataKeyframe(model, data, 0)
     mujoco.mj_forward(model, data)
     T_world_thing = (tuple(data.body(body).xpos.tolist()), tuple(data.body(body).xquat.tolist()))
-    assert abs(thing.lowest(T_world_thing)) < 2e-3  # it lies on the table
+    assert abs(thing.compute_lowest(T_world_thing)) < 2e-3  # it lies on the table
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.floats(-3.1, 3.1), st.booleans(), st.floats(-3.1, 3.1))
 def test_grasps_come_from_above_whichever_face_is_up(yaw: float, flipped: bool, gripper_yaw: float) -> None:
-    thing = level((0.1, 0.2, 0.016), yaw, -1.0 if flipped else 1.0)
-    assert face_up(thing) == (-1.0 if flipped else 1.0)
-    assert tilt(thing) < 1e-6
+    thing = make_level_pose((0.1, 0.2, 0.016), yaw, -1.0 if flipped else 1.0)
+    assert get_face_up(thing) == (-1.0 if flipped else 1.0)
+    assert compute_tilt(thing) < 1e-6
     like = quat_mul(quat_from_yaw(gripper_yaw), (0.0, 1.0, 0.0, 0.0))
-    pose = min(grasps(thing, 0.08), key=lambda way: quat_angle(way[1], like))
+    pose = min(compute_grasps(thing, 0.08), key=lambda way: quat_angle(way[1], like))
     approach = compose((((0.0, 0.0, 0.0)), pose[1]), ((0.0, 0.0, 1.0), IDENTITY_QUAT))[0]
     closing = compose((((0.0, 0.0, 0.0)), compose(inverse(thing), pose)[1]), ((0.0, 1.0, 0.0), IDENTITY_QUAT))[0]
     assert approach[2] == pytest.approx(-1.0)
@@ -330,7 +336,7 @@ def test_grasps_come_from_above_whichever_face_is_up(yaw: float, flipped: bool, 
 
 
 def test_known_things() -> None:
-    assert set(COMMON_THINGS) >= {"hammer", "board", "object1"}
-    assert thing_named("object3") is thing_named("hammer")
-    with pytest.raises(ValueError, match="Known things"):
-        thing_named("objective")
+    assert set(COMMON_OBJECTS) >= {"hammer", "board", "object1"}
+    assert find_object("object3") is find_object("hammer")
+    with pytest.raises(ValueError, match="Known objects"):
+        find_object("objective")

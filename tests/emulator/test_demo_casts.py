@@ -6,8 +6,8 @@ import random
 
 import pytest
 
-from iris_session.demo.plays import make_play
-from iris_session.emulator.behaviours import HandInput, Hands, OperatorView
+from iris_session.demo.demos import make_demo
+from iris_session.emulator.behaviours import CombinedBehaviour, HandInput, OperatorView
 from tests.emulator.handover_rig import LateView, demo, demo_verdict, over
 from tests.models import robot_models
 
@@ -17,7 +17,7 @@ __all__ = ["robot_models"]
 @pytest.mark.usefixtures("robot_models", "untraced")
 def test_everything_changes_hands() -> None:
     """By friction, in mid-air, and ends on a table. Two iiwa, and ALOHA: `tests/e2e/test_demos_paper.py`."""
-    rig = demo(make_play("iiwa", 4), seed=0)
+    rig = demo(make_demo("iiwa", 4), seed=0)
     rig.run(60.0, until=over)
     assert demo_verdict(rig) == ""
     assert rig.fastest_hand < 0.5
@@ -25,7 +25,7 @@ def test_everything_changes_hands() -> None:
 
 @pytest.mark.usefixtures("untraced")
 def test_eight_arms_around_a_table() -> None:
-    rig = demo(make_play("handover", 8), seed=3)
+    rig = demo(make_demo("handover", 8), seed=3)
     rig.run(40.0, until=over)
     assert demo_verdict(rig) == ""
 
@@ -49,7 +49,7 @@ def view() -> LateView:
 
 
 def test_both_hands_work_side_by_side_until_both_are_done() -> None:
-    hands = Hands([Scripted("left", 2), Scripted("right", 3)])
+    hands = CombinedBehaviour([Scripted("left", 2), Scripted("right", 3)])
     assert [i.robot for i in hands.update(view())] == ["left", "right"]
     assert (hands.phase, hands.done) == ("busy", False)
     hands.update(view())
@@ -59,7 +59,7 @@ def test_both_hands_work_side_by_side_until_both_are_done() -> None:
 
 
 def test_a_failure_of_one_hand_is_one_of_the_person() -> None:
-    hands = Hands([Scripted("left", 9), Scripted("right", 1, "dropped it")])
+    hands = CombinedBehaviour([Scripted("left", 9), Scripted("right", 1, "dropped it")])
     hands.update(view())
     assert hands.failed == "dropped it"
     assert not hands.done

@@ -6,7 +6,7 @@ import pytest
 
 from anchors.pose import distance
 from iris_session.emulator.gaze import Gaze
-from iris_session.emulator.headset import Headset, HeadsetModel
+from iris_session.emulator.headset import EmulatedHeadset, HeadsetModel
 from iris_session.emulator.specs import HeadsetSpec
 
 MS = 1_000_000
@@ -16,10 +16,10 @@ AWAY = (0.0, -3.0, 0.6)  # behind the person
 
 def watch(gaze: Gaze, spec: HeadsetSpec, seconds: float) -> list[tuple[int, int]]:
     """(time, viewpoint) at which the sheet is in view of a head at rest, 50 times a second at work."""
-    headset, seen = Headset(HeadsetModel(), 0), []
+    headset, seen = EmulatedHeadset(HeadsetModel(), 0), []
     for now_ns in range(SECOND, SECOND + int(seconds * SECOND), 20 * MS):
-        gaze.work(now_ns)
-        if gaze.still(now_ns) and headset.sees(gaze.pose, spec.T_world_anchor):
+        gaze.look_at_work(now_ns)
+        if gaze.is_still(now_ns) and headset.can_see(gaze.pose, spec.T_world_anchor):
             seen.append((now_ns, gaze.viewpoint_id))
     return seen
 
@@ -36,8 +36,8 @@ def test_glances_are_from_another_side_every_time() -> None:
     spec = HeadsetSpec(name="ann", gaze=AWAY, glance_every_s=1.0, glance_s=1.0)
     gaze, places = Gaze(spec), []
     for now_ns in range(0, 9 * SECOND, 20 * MS):
-        gaze.work(now_ns)
-        if gaze.still(now_ns) and Headset(HeadsetModel(), 0).sees(gaze.pose, spec.T_world_anchor):
+        gaze.look_at_work(now_ns)
+        if gaze.is_still(now_ns) and EmulatedHeadset(HeadsetModel(), 0).can_see(gaze.pose, spec.T_world_anchor):
             places.append(gaze.pose[0])
     stops = [place for place, before in zip(places[1:], places, strict=False) if distance(place, before) > 0.01]
     assert len(stops) >= 2
@@ -49,9 +49,9 @@ def test_a_head_in_motion_detects_nothing_and_a_stop_is_a_viewpoint() -> None:
     assert watch(gaze, spec, 1.0), "by default the sheet is in view of those who work"
     at_rest = gaze.viewpoint_id
     now_ns = 10 * SECOND
-    gaze.look(0, now_ns)
+    gaze.move_to_viewpoint(0, now_ns)
     assert gaze.viewpoint_id == at_rest + 1
-    assert not gaze.still(now_ns + 300 * MS)
-    gaze.look(0, now_ns + 700 * MS)
-    assert gaze.still(now_ns + 700 * MS)
+    assert not gaze.is_still(now_ns + 300 * MS)
+    gaze.move_to_viewpoint(0, now_ns + 700 * MS)
+    assert gaze.is_still(now_ns + 700 * MS)
     assert gaze.viewpoint_id == at_rest + 1

@@ -22,10 +22,16 @@ from anchors.pose import (
     quat_rotate,
     quat_to_rotvec,
 )
-from iris_session.emulator.headset import DEFAULT_ANCHOR_ID, DEFAULT_T_WORLD_ANCHOR, Headset, HeadsetModel, look_at
+from iris_session.emulator.gaze import compute_viewpoint_pose, interpolate_pose
+from iris_session.emulator.headset import (
+    DEFAULT_ANCHOR_ID,
+    DEFAULT_T_WORLD_ANCHOR,
+    EmulatedHeadset,
+    HeadsetModel,
+    compute_look_at,
+)
 from iris_session.emulator.sheet_noise import SheetNoise
 from iris_session.emulator.specs import HeadsetSpec
-from iris_session.emulator.viewpoints import between, viewpoint_pose
 from iris_session.netsim.latency import DelayLine, LinkModel
 
 SECOND = 1_000_000_000
@@ -38,10 +44,10 @@ STILL = HeadsetModel(drift_m_per_min=0.0, drift_rad_per_min=0.0, sheet=SheetNois
 def above(d: float, aside: float = 0.2) -> PoseTuple:
     """A head at distance `d` from the sheet, looking at it from above and a little aside."""
     x, y, z = SHEET[0]
-    return look_at((x, y - d * math.sin(aside), z + d * math.cos(aside)), SHEET[0])
+    return compute_look_at((x, y - d * math.sin(aside), z + d * math.cos(aside)), SHEET[0])
 
 
-def errors(headset: Headset, head: PoseTuple, n: int, viewpoint: int | None = None) -> np.ndarray:
+def errors(headset: EmulatedHeadset, head: PoseTuple, n: int, viewpoint: int | None = None) -> np.ndarray:
     """(n, 4): position error along and across (2) the view, angle about one axis; each from another viewpoint."""
     rows = []
     e1 = np.subtract(SHEET[0], head[0]) / distance(SHEET[0], head[0])
@@ -51,7 +57,7 @@ def errors(headset: Headset, head: PoseTuple, n: int, viewpoint: int | None = No
     for i in range(n):
         seen = headset.observe(head, SHEET, 0, i if viewpoint is None else viewpoint)
         assert seen is not None
-        world = compose(headset.T_world_tracking(0), seen)
+        world = compose(headset.get_T_world_tracking(0), seen)
         off = np.subtract(world[0], SHEET[0])
         turn = quat_to_rotvec(quat_mul(quat_conj(SHEET[1]), world[1]))
         rows.append((off @ e1, off @ e2, off @ e3, turn[2]))
@@ -60,7 +66,7 @@ def errors(headset: Headset, head: PoseTuple, n: int, viewpoint: int | None = No
 
 @pytest.mark.parametrize(("d", "along_mm", "degrees"), [(0.5, 1.5, 0.3), (1.0, 4.8, 0.6)])
 def test_sheet_noise_is_that_of_the_model(d: float, along_mm: float, degrees: float) -> None:
-    spread = errors(Headset(STILL, seed=1), above(d), 3000).std(axis=0)
+    spread = errors(EmulatedHeadset(STILL, seed=1), above(d), 3000).std(axis=0)
     assert spread[0] == pytest.approx(along_mm * 1e-3, rel=0.06)
     assert spread[1] == pytest.approx(along_mm * 1e-3 / 3.0, rel=0.06)
     assert spread[2] == pytest.approx(along_mm * 1e-3 / 3.0, rel=0.06)
@@ -68,36 +74,36 @@ def test_sheet_noise_is_that_of_the_model(d: float, along_mm: float, degrees: fl
 
 
 def test_half_of_the_variance_is_the_same_for_one_viewpoint() -> None:
-    headset = Headset(STILL, seed=2)
+    headset = EmulatedHeadset(STILL, seed=2)
     within = np.mean([errors(headset, above(0.5), 40, viewpoint)[:, 0].var(ddof=1) for viewpoint in range(60)])
     assert within == pytest.approx(0.5 * 0.0015**2, rel=0.1)
 
 
 def test_the_error_of_scale_is_that_of_the_viewpoint() -> None:
     scaled = msgspec.structs.replace(STILL, sheet=SheetNoise(wrong_share=0.0, scale=0.2))
-    headset = Headset(scaled, seed=2)
+    headset = EmulatedHeadset(scaled, seed=2)
     means = [errors(headset, above(0.5), 10, viewpoint)[:, 0] for viewpoint in range(400)]
     assert np.std([m.mean() for m in means]) == pytest.approx(0.2 * 0.5, rel=0.1)
     assert np.mean([m.var(ddof=1) for m in means]) == pytest.approx(0.5 * 0.0015**2, rel=0.1)
 
 
 def test_some_detections_are_wrong_and_half_of_those_mirrored() -> None:
-    headset, head = Headset(HeadsetModel(sheet=SheetNoise(wrong_share=1.0)), seed=2), above(0.5)
-    there = compose(inverse(headset.T_world_tracking(0)), head)[0]
+    headset, head = EmulatedHeadset(HeadsetModel(sheet=SheetNoise(wrong_share=1.0)), seed=2), above(0.5)
+    there = compose(inverse(headset.get_T_world_tracking(0)), head)[0]
     back = []
     for viewpoint in range(400):
         seen = headset.observe(head, SHEET, 0, viewpoint)
         assert seen is not None
-        right_way_round = compose(headset.T_world_tracking(0), mirror_pose(seen, there))
+        right_way_round = compose(headset.get_T_world_tracking(0), mirror_pose(seen, there))
         back.append(distance(right_way_round[0], SHEET[0]) + quat_angle(right_way_round[1], SHEET[1]))
     assert sum(b < 1e-6 for b in back) == pytest.approx(200, abs=40)
     assert sum(b > 0.05 for b in back) == pytest.approx(200, abs=40)
 
 
 def test_same_seed_same_readings() -> None:
-    a, b, c = (Headset(HeadsetModel(), seed) for seed in (3, 3, 4))
+    a, b, c = (EmulatedHeadset(HeadsetModel(), seed) for seed in (3, 3, 4))
     for headset in (a, b, c):
-        headset.recentre(SECOND)
+        headset.recentre_frame(SECOND)
     readings = [[h.observe(above(0.5), SHEET, i * SECOND, 0) for i in range(5)] for h in (a, b, c)]
     assert readings[0] == readings[1]
     assert readings[0] != readings[2]
@@ -109,41 +115,41 @@ def test_same_seed_same_readings() -> None:
         above(2.0),
         above(0.5, aside=1.3),
         compose(above(0.5), ((0.0, 0.0, 0.0), quat_from_rotvec((0.0, 0.0, 1.0)))),
-        look_at((0.0, -0.55, -0.5), SHEET[0]),
+        compute_look_at((0.0, -0.55, -0.5), SHEET[0]),
     ],
     ids=["far", "from the side", "looking away", "from below"],
 )
 def test_the_sheet_is_not_always_seen(head: PoseTuple) -> None:
-    assert Headset(HeadsetModel(), 0).observe(head, SHEET, 0, 0) is None
+    assert EmulatedHeadset(HeadsetModel(), 0).observe(head, SHEET, 0, 0) is None
 
 
 def test_drift_and_tilt_are_small_and_stated() -> None:
-    headset = Headset(HeadsetModel(), seed=5)
-    start, later = headset.T_world_tracking(0), headset.T_world_tracking(10 * MINUTE)
+    headset = EmulatedHeadset(HeadsetModel(), seed=5)
+    start, later = headset.get_T_world_tracking(0), headset.get_T_world_tracking(10 * MINUTE)
     assert distance(start[0], later[0]) == pytest.approx(0.010)
     assert quat_angle(start[1], later[1]) == pytest.approx(math.radians(0.2))
     tilts = []
     for seed in range(200):
-        up = quat_rotate(Headset(HeadsetModel(), seed).T_world_tracking(0)[1], (0.0, 0.0, 1.0))
+        up = quat_rotate(EmulatedHeadset(HeadsetModel(), seed).get_T_world_tracking(0)[1], (0.0, 0.0, 1.0))
         tilts.append(math.acos(min(1.0, up[2])))
     assert np.sqrt(np.mean(np.square(tilts))) == pytest.approx(math.radians(0.2) * math.sqrt(2.0), rel=0.15)
 
 
 def test_recentring_is_another_frame_and_epoch() -> None:
-    headset = Headset(HeadsetModel(), seed=6)
-    before = headset.T_world_tracking(SECOND)
-    headset.recentre(SECOND)
+    headset = EmulatedHeadset(HeadsetModel(), seed=6)
+    before = headset.get_T_world_tracking(SECOND)
+    headset.recentre_frame(SECOND)
     assert headset.tracking_epoch == 1
-    assert distance(before[0], headset.T_world_tracking(SECOND)[0]) > 0.01
+    assert distance(before[0], headset.get_T_world_tracking(SECOND)[0]) > 0.01
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.1])
 def test_a_bump_moves_the_frame_about_the_head_and_keeps_the_epoch(yaw: float) -> None:
-    headset, head = Headset(HeadsetModel(drift_m_per_min=0.06), seed=6), above(0.5)
-    before = headset.T_world_tracking(MINUTE)
+    headset, head = EmulatedHeadset(HeadsetModel(drift_m_per_min=0.06), seed=6), above(0.5)
+    before = headset.get_T_world_tracking(MINUTE)
     tracked = compose(inverse(before), SHEET)
-    T_new_old = headset.bump((0.05, 0.0, 0.0), yaw, head[0], MINUTE)
-    after = headset.T_world_tracking(MINUTE)
+    T_new_old = headset.bump_frame((0.05, 0.0, 0.0), yaw, head[0], MINUTE)
+    after = headset.get_T_world_tracking(MINUTE)
     assert headset.tracking_epoch == 0
     now_at = compose(inverse(after), SHEET)
     expected = compose(T_new_old, tracked)
@@ -152,49 +158,49 @@ def test_a_bump_moves_the_frame_about_the_head_and_keeps_the_epoch(yaw: float) -
     at_head = apply(after, apply(inverse(before), head[0]))
     assert at_head == pytest.approx((head[0][0] + 0.05, head[0][1], head[0][2]))
     assert quat_angle(before[1], after[1]) == pytest.approx(yaw, abs=1e-7)
-    later = headset.T_world_tracking(2 * MINUTE)
+    later = headset.get_T_world_tracking(2 * MINUTE)
     assert distance(after[0], later[0]) == pytest.approx(0.06), "it drifts on from there"
 
 
 def test_a_drift_that_begins_later_begins_where_the_frame_is() -> None:
-    headset = Headset(HeadsetModel(drift_m_per_min=0.0), seed=6)
-    before = headset.T_world_tracking(3 * MINUTE)
-    headset.drift(0.03, 3 * MINUTE)
-    after = headset.T_world_tracking(3 * MINUTE)
+    headset = EmulatedHeadset(HeadsetModel(drift_m_per_min=0.0), seed=6)
+    before = headset.get_T_world_tracking(3 * MINUTE)
+    headset.start_drift(0.03, 3 * MINUTE)
+    after = headset.get_T_world_tracking(3 * MINUTE)
     assert distance(before[0], after[0]) < 1e-12
     assert quat_angle(before[1], after[1]) < 1e-7
-    assert distance(headset.T_world_tracking(5 * MINUTE)[0], before[0]) == pytest.approx(0.06)
+    assert distance(headset.get_T_world_tracking(5 * MINUTE)[0], before[0]) == pytest.approx(0.06)
 
 
 def test_tracking_is_the_inverse_of_the_truth_with_little_noise() -> None:
-    headset = Headset(HeadsetModel(), seed=7)
+    headset = EmulatedHeadset(HeadsetModel(), seed=7)
     seen = [headset.track(above(0.5), SECOND) for _ in range(500)]
-    back = [compose(headset.T_world_tracking(SECOND), pose) for pose in seen]
+    back = [compose(headset.get_T_world_tracking(SECOND), pose) for pose in seen]
     offsets = np.array([np.subtract(pose[0], above(0.5)[0]) for pose in back])
     assert offsets.std() == pytest.approx(headset.model.position_sigma_m, rel=0.1)
 
 
 def test_samples_come_at_the_rate_and_missed_ones_are_counted() -> None:
-    headset = Headset(HeadsetModel(rate_hz=90.0), seed=8)
-    assert sum(headset.sample_due(t) for t in range(0, 10 * SECOND, SECOND // 1000)) == pytest.approx(900, abs=1)
+    headset = EmulatedHeadset(HeadsetModel(rate_hz=90.0), seed=8)
+    assert sum(headset.is_sample_due(t) for t in range(0, 10 * SECOND, SECOND // 1000)) == pytest.approx(900, abs=1)
     assert headset.late_samples == 0
-    assert headset.sample_due(11 * SECOND)
+    assert headset.is_sample_due(11 * SECOND)
     assert headset.late_samples == pytest.approx(89, abs=1)
 
 
 def aligned_error(seed: int, model: HeadsetModel) -> float:
     """Error [m] at the sheet after looking at it from six viewpoints."""
-    headset = Headset(model, seed)
+    headset = EmulatedHeadset(model, seed)
     estimator = AlignmentEstimator({DEFAULT_ANCHOR_ID: SHEET})
     spec = HeadsetSpec(name="ann")
     for viewpoint in range(spec.viewpoints):
         for _ in range(6):
-            seen = headset.observe(viewpoint_pose(spec, viewpoint), SHEET, 0, viewpoint)
+            seen = headset.observe(compute_viewpoint_pose(spec, viewpoint), SHEET, 0, viewpoint)
             assert seen is not None
-            eye = compose(inverse(headset.T_world_tracking(0)), viewpoint_pose(spec, viewpoint))[0]
+            eye = compose(inverse(headset.get_T_world_tracking(0)), compute_viewpoint_pose(spec, viewpoint))[0]
             estimator.add(DEFAULT_ANCHOR_ID, seen, 0, 0, viewpoint, p_tracking_head=eye)
     estimate = estimator.estimate()
-    wrong = compose(estimate.T_world_tracking, inverse(headset.T_world_tracking(0)))
+    wrong = compose(estimate.T_world_tracking, inverse(headset.get_T_world_tracking(0)))
     return distance(apply(wrong, SHEET[0]), SHEET[0])
 
 
@@ -206,15 +212,15 @@ def test_what_it_sees_aligns_it(wrong: float) -> None:
 
 def test_heads_look_where_they_should_and_move_smoothly() -> None:
     spec = HeadsetSpec(name="ann")
-    poses = [viewpoint_pose(spec, i) for i in range(spec.viewpoints)]
+    poses = [compute_viewpoint_pose(spec, i) for i in range(spec.viewpoints)]
     for pose in poses:
         forward = quat_rotate(pose[1], (1.0, 0.0, 0.0))
         towards = np.subtract(SHEET[0], pose[0])
         assert np.dot(forward, towards) == pytest.approx(float(np.linalg.norm(towards)))
-        assert Headset(HeadsetModel(), 0).sees(pose, SHEET)
-    half = between(poses[0], poses[1], 0.5)
+        assert EmulatedHeadset(HeadsetModel(), 0).can_see(pose, SHEET)
+    half = interpolate_pose(poses[0], poses[1], 0.5)
     assert quat_angle(half[1], poses[0][1]) == pytest.approx(quat_angle(half[1], poses[1][1]))
-    assert between(poses[0], poses[1], 1.0)[0] == pytest.approx(poses[1][0])
+    assert interpolate_pose(poses[0], poses[1], 1.0)[0] == pytest.approx(poses[1][0])
 
 
 def test_link_keeps_order_and_delays() -> None:

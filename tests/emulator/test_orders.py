@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from iris_session.emulator.orders import MAX_LINE, Orders
+from iris_session.emulator.runner import MAX_LINE, DisturbanceReader
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def pipe() -> Iterator[tuple[int, int]]:
 
 
 def test_orders_come_in_order_and_whole(pipe: tuple[int, int]) -> None:
-    orders = Orders(pipe[0], ["ann", "bob b"])
+    orders = DisturbanceReader(pipe[0], ["ann", "bob b"])
     assert orders() == []
     os.write(pipe[1], b"bump ann\nrecentre bob b\nbu")
     assert orders() == [("bump", "ann"), ("recentre", "bob b")]
@@ -29,7 +29,7 @@ def test_orders_come_in_order_and_whole(pipe: tuple[int, int]) -> None:
 
 
 def test_what_is_no_order_is_told(pipe: tuple[int, int], capsys: pytest.CaptureFixture[str]) -> None:
-    orders = Orders(pipe[0], ["ann"])
+    orders = DisturbanceReader(pipe[0], ["ann"])
     os.write(pipe[1], b"kick ann\nbump eve\n\xff\n" + b"x" * (3 * MAX_LINE) + b"\nbump ann\n")
     assert orders() == [("bump", "ann")]
     said = capsys.readouterr().err
@@ -39,7 +39,7 @@ def test_what_is_no_order_is_told(pipe: tuple[int, int], capsys: pytest.CaptureF
 
 
 def test_a_line_without_end_is_not_kept(pipe: tuple[int, int]) -> None:
-    orders = Orders(pipe[0], ["ann"])
+    orders = DisturbanceReader(pipe[0], ["ann"])
     for _ in range(50):
         os.write(pipe[1], b"x" * 4000)
         assert orders() == []
@@ -48,7 +48,7 @@ def test_a_line_without_end_is_not_kept(pipe: tuple[int, int]) -> None:
 
 def test_an_end_of_the_file_is_the_end_of_orders() -> None:
     reader, writer = os.pipe()
-    orders = Orders(reader, ["ann"])
+    orders = DisturbanceReader(reader, ["ann"])
     os.write(writer, b"bump ann\n")
     os.close(writer)
     assert orders() == [("bump", "ann")]

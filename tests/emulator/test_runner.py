@@ -222,7 +222,7 @@ def test_where_no_robot_is_nobody_waits_for_one() -> None:
     config = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False, anchors=anchors)
     with ScenePublisher(scene, config) as shown:
         (report,) = run_headsets(shown.address, [HeadsetSpec(name="ann", behaviour="wander", **QUICK)], seconds=60.0)
-    assert report.failed == "this session has no robots to drive: behaviour=observer looks only"
+    assert "no robots to drive" in report.failed
 
 
 def test_who_names_no_robot_gets_one_of_the_policy_and_drives_it(session: LiveSession) -> None:

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from anchors.pose import IDENTITY_POSE, IDENTITY_QUAT
-from iris_session.demo.plays import make_play
+from iris_session.demo.demos import make_demo
 from iris_session.emulator.behaviours import Folder, Stower, make_behaviour
-from iris_session.emulator.behaviours.deformables import CORNERS
-from iris_session.emulator.behaviours.eyes import Seen
+from iris_session.emulator.behaviours.deformables import CORNERS, SEEN_S
+from iris_session.emulator.behaviours.perception import TrackedPose
 from iris_session.emulator.behaviours.phases import SEARCH_S
-from iris_session.emulator.behaviours.soft import SEEN_S
 from iris_session.emulator.behaviours.stower import BOX_INSIDE
 from tests.emulator.deformable_rig import SoftRig, soft_demo
 from tests.emulator.handover_rig import LateView
@@ -22,7 +21,7 @@ from tests.emulator.handover_rig import LateView
 
 @pytest.mark.usefixtures("untraced")
 def test_two_people_fold_a_cloth() -> None:
-    rig = soft_demo(make_play("cloth"), seed=1)
+    rig = soft_demo(make_demo("cloth"), seed=1)
     rig.run(30.0, until=SoftRig.over)
     assert rig.verdict() == ""
     assert rig.world.dropped_counts == {}
@@ -31,7 +30,7 @@ def test_two_people_fold_a_cloth() -> None:
 @pytest.mark.usefixtures("untraced")
 def test_two_people_stow_soft_bodies_and_take_again_what_they_lose() -> None:
     """The first time, somebody opens a gripper half way."""
-    rig = soft_demo(make_play("soft"), seed=2)
+    rig = soft_demo(make_demo("soft"), seed=2)
     left = rig.behaviours["left"]
     rig.run(20.0, until=lambda rig: left.phase == "carry")
     assert left.phase == "carry"
@@ -63,45 +62,47 @@ def test_nobody_knows_any_other_deformable(behaviour: type) -> None:
 def stower(monkeypatch: pytest.MonkeyPatch) -> Stower:
     """Its hand and the box are at the origin, and the fingers 3 cm apart; where the body is, a test says."""
     made = Stower("left", "rose")
-    for name, value in {"tip": IDENTITY_POSE, "body": IDENTITY_POSE, "gap": 0.03}.items():
-        monkeypatch.setattr(made.eyes, name, lambda _, value=value: value)
+    for name, value in {"get_tip": IDENTITY_POSE, "get_body": IDENTITY_POSE, "compute_gap": 0.03}.items():
+        monkeypatch.setattr(made.perception, name, lambda _, value=value: value)
     return made
 
 
 def test_a_late_picture_tells_nothing_of_what_began_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
     one = stower(monkeypatch)
-    monkeypatch.setattr(one, "_holding", lambda: False)
-    eyes = one.eyes
+    monkeypatch.setattr(one, "_is_holding", lambda: False)
+    eyes = one.perception
     eyes.now_s = eyes.captured_s = 5.0
     one._enter("carry")
     eyes.now_s = 9.0
-    assert not one._seen_for(2.5)
-    assert one._stays_behind("lost")
+    assert not one._is_shown_for(2.5)
+    assert one._check_slip("lost")
     eyes.now_s, eyes.captured_s = 11.0, 9.0 + SEEN_S
-    assert one._stays_behind("lost")
-    assert one._seen_for(2.5)
+    assert one._check_slip("lost")
+    assert one._is_shown_for(2.5)
     assert (one.phase, one.attempts) == ("carry", 1), "the picture is not yet of the time since"
     eyes.captured_s += 0.01
-    assert one._stays_behind("lost")
+    assert one._check_slip("lost")
     assert (one.phase, one.attempts) == ("back_off", 2)
 
 
 def test_a_soft_body_is_held_between_the_fingers_and_stowed_within_all_walls(monkeypatch: pytest.MonkeyPatch) -> None:
     one = stower(monkeypatch)
     for away_m, held in ((0.0, True), (0.1, False)):
-        one.eyes._vertices = {index: Seen(((away_m, 0.0, 0.0), IDENTITY_QUAT), 0.0) for index in CORNERS["rose"]}
-        assert one._holding() == held
+        one.perception._vertices = {
+            index: TrackedPose(((away_m, 0.0, 0.0), IDENTITY_QUAT), 0.0) for index in CORNERS["rose"]
+        }
+        assert one._is_holding() == held
     x, y, z = BOX_INSIDE
     for sign in (1.0, -1.0):
-        assert one._inside((sign * 0.9 * x, sign * 0.9 * y, 0.9 * z))
-        assert not one._inside((sign * 1.1 * x, 0.0, 0.0))
-        assert not one._inside((0.0, sign * 1.1 * y, 0.0))
-    assert not one._inside((0.0, 0.0, 1.1 * z))
+        assert one._is_inside_box((sign * 0.9 * x, sign * 0.9 * y, 0.9 * z))
+        assert not one._is_inside_box((sign * 1.1 * x, 0.0, 0.0))
+        assert not one._is_inside_box((0.0, sign * 1.1 * y, 0.0))
+    assert not one._is_inside_box((0.0, 0.0, 1.1 * z))
 
 
 def test_the_rig_moves_deformables_as_a_whole() -> None:
     """Otherwise it would play with a cloth that is pulled out of shape."""
-    play = make_play("cloth")
+    play = make_demo("cloth")
     moved = soft_demo(play, 5).world.flexes.read_vertices("cloth")
     still = soft_demo(play, 5, shift=False).world.flexes.read_vertices("cloth")
     assert np.linalg.norm(moved - still, axis=1).max() > 0.01

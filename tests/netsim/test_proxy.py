@@ -367,7 +367,7 @@ def test_datagrams_are_lost_doubled_and_overtake(tmp_path: Path) -> None:
 
 def test_commands_and_errors(echo: Echo, tmp_path: Path) -> None:
     with ImpairmentProcess({"127.0.0.2": "none"}, [echo.port]) as proxy:
-        with pytest.raises(ImpairmentError, match="is no command: stall, resume"):
+        with pytest.raises(ImpairmentError, match="is not a command: stall, resume"):
             proxy.execute("explode")
         with pytest.raises(ImpairmentError, match=r"no link 127\.0\.0\.9: there are 127\.0\.0\.2"):
             proxy.execute("stall @127.0.0.9")

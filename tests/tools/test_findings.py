@@ -1,4 +1,4 @@
-"""What `tools/fuzz.py` has found, each by an input that showed it."""
+"""Findings of `tools/fuzz.py`, each with an input that showed it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ MS = 1_000_000
 
 
 @pytest.mark.parametrize("port", ["²", "٣", "9" * 5000, "-1", "65536"])
-def test_ports_that_are_no_numbers(port: str) -> None:
+def test_invalid_ports_raise_client_error(port: str) -> None:
     for text in (f"lab:{port}", f"iris://lab:{port}/"):
         with pytest.raises(ClientError):
             Address.parse(text)
@@ -48,12 +48,12 @@ def test_ports_that_are_no_numbers(port: str) -> None:
 
 @pytest.mark.parametrize("decode", [decode_entry, decode_entries, decode_decided, decode_header])
 @pytest.mark.parametrize("data", [b"\x91" * 5000, b"\x94\x01\x01\x01\x81\xa1\xff\x01", b"\x81\xa2\xc3\x28\x01", b""])
-def test_decoders_of_our_own_processes_promise_one_error(decode: object, data: bytes) -> None:
+def test_internal_decoders_raise_one_error_type(decode: object, data: bytes) -> None:
     with pytest.raises(msgspec.DecodeError):
         decode(data)  # type: ignore[operator]
 
 
-def test_counts_of_a_row_that_do_not_fit_are_damage() -> None:
+def test_inconsistent_row_counts_are_damage() -> None:
     row = journal.make_row(b"\0" * 16, 0, 0, 1, [], b"d" * 16)
     for changed in (
         {"entry_lengths": (1, 2)},
@@ -80,7 +80,7 @@ def test_damaged_files_of_keys_are_one_kind_of_error(tmp_path: Path, content: by
             kind(PrivateFolder(tmp_path)).read()
 
 
-def test_a_note_of_a_process_that_cannot_be(tmp_path: Path) -> None:
+def test_session_note_with_invalid_pid_is_ignored(tmp_path: Path) -> None:
     tmp_path.chmod(0o700)
     file = tmp_path / "sessions.json"
     file.touch(0o600)
@@ -112,7 +112,7 @@ def tell(connection: ClientConnection, message: Message) -> None:
 
 
 @pytest.mark.parametrize("heartbeat_ns", [-(2**63), 0, 1])
-def test_a_session_cannot_make_a_client_send_without_rest(heartbeat_ns: int) -> None:
+def test_heartbeat_interval_of_session_is_limited(heartbeat_ns: int) -> None:
     connection = joined(heartbeat_ns)
     heartbeats = 0
     for i in range(100):
@@ -124,7 +124,7 @@ def test_a_session_cannot_make_a_client_send_without_rest(heartbeat_ns: int) -> 
     assert heartbeats <= 10
 
 
-def test_a_silent_session_is_noticed_whatever_heartbeat_it_asked_for() -> None:
+def test_silent_session_is_detected_for_any_heartbeat() -> None:
     connection = joined(2**63 - 1)
     now_ns = 10**12
     for _ in range(100):
@@ -133,7 +133,7 @@ def test_a_silent_session_is_noticed_whatever_heartbeat_it_asked_for() -> None:
     assert connection.counters.reconnects == 1
 
 
-def test_what_a_session_says_does_not_pile_up_in_a_client() -> None:
+def test_faults_and_leases_of_a_client_are_bounded() -> None:
     connection = joined(500 * MS)
     for i in range(6000):
         tell(connection, ProtocolFault(f"code{i}", "x"))
@@ -143,7 +143,7 @@ def test_what_a_session_says_does_not_pile_up_in_a_client() -> None:
     assert len(connection.requests._granted) <= 4096
 
 
-def test_frames_of_bodies_that_are_not_are_refused_unchanged() -> None:
+def test_frames_of_unknown_bodies_change_nothing() -> None:
     decoder = RigidDecoder(3)
     for payload in (b"", b"\0" * 200, b"\xff" * 200):
         with pytest.raises(ValueError):
@@ -151,7 +151,7 @@ def test_frames_of_bodies_that_are_not_are_refused_unchanged() -> None:
     assert decoder.state_seq == 0
 
 
-def test_an_idle_state_socket_does_what_waits() -> None:
+def test_idle_state_socket_processes_events() -> None:
     """libzmq acts on what happened to connections when it is asked for something: also while no state is sent."""
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     state = context.socket(zmq.XPUB)

@@ -1,4 +1,4 @@
-"""The short form of `tools/fuzz.py`, and that it can find something. docs/evidence/fuzzing.md has the long one."""
+"""Short run of `tools/fuzz.py`, and proof that it finds faults. Long runs: docs/evidence/fuzzing.md."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_inputs_come_again_with_their_seed() -> None:
     assert made != [other.make() for _ in range(500)]
 
 
-def test_a_finding_is_told_saved_and_ends_with_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_finding_is_reported_saved_and_exits_with_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def decode(data: bytes) -> Any:
         if b"robot" in data:
             raise IndexError("planted")

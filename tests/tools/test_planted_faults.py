@@ -50,6 +50,6 @@ def test_every_fault_has_a_check_and_can_be_named_or_missed(one: Fault) -> None:
         (FULL, [told(FULL), failed("recorder", "ended")], 1, ""),
     ],
 )
-def test_what_does_not_count_as_named(one: Fault, findings: list[Finding], status: int, why: str) -> None:
+def test_judge_rejects_unnamed_faults(one: Fault, findings: list[Finding], status: int, why: str) -> None:
     said = judge(one, findings, status)
     assert why in said if why else said == ""

@@ -1,11 +1,11 @@
-"""What is to be asked for next, of assets that are wanted in an order. Pure: no socket, file, clock or thread.
+"""Order and window of chunk requests for wanted assets. Pure: no socket, file, clock or thread.
 
     wanted --to_look--> looked up in the cache --missing(offset)--> asked for in chunks --whole--> hashed --again, drop
                                                `--drop
 
 Answers come in the order of the requests, so of one asset the bytes come in order too, and a request whose successor is
-answered was lost: it went with a TCP connection that ended, and is made again. Whatever does not continue what is there
-is passed over. A window bounds what was asked for and is not stored yet. Chunks are as large as the link is fast.
+answered was lost: it went with a TCP connection that ended, and is made again. A chunk that does not continue its asset
+is ignored. A window bounds what was requested and is not stored yet. Chunks are as large as the link is fast.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from iris_session.protocol.assets import (
 from iris_session.protocol.names import AssetRefusal
 
 CHUNK_BYTES: Final = 512 << 10
-#: What a chunk may become. A whole window in less time than `FAST_NS` doubles it: each costs as much work, whatever its
-#: size. One that takes longer than `SLOW_NS` halves it, so that what is lost with a connection is little.
+#: Bounds of the chunk size. A window in less time than `FAST_NS` doubles it: each chunk costs the same work. One that
+#: takes longer than `SLOW_NS` halves it, so that what is lost with a connection is little.
 MIN_CHUNK_BYTES: Final = 64 << 10
 MAX_CHUNK_BYTES: Final = MAX_ASSET_CHUNK_BYTES
 FAST_NS: Final = 100_000_000
@@ -59,27 +59,27 @@ class FailedAsset(NamedTuple):
 
 
 class _Item:
-    """One asset. `got`: bytes that came; `asked`: bytes that came or were asked for; `total` -1: not known yet. `told`:
-    what whoever wants it takes for its size, -1 if nothing: it decides how much is asked for first."""
+    """One asset. `got`: bytes that came; `asked`: bytes that came or were asked for; `total` -1: not known yet.
+    `size_hint`: size as given by `add`, -1 if none: it decides how much is requested first."""
 
-    __slots__ = ("address", "anew", "asked", "got", "told", "total")
+    __slots__ = ("address", "anew", "asked", "got", "size_hint", "total")
 
-    def __init__(self, address: str, got: int, told: int) -> None:
+    def __init__(self, address: str, got: int, size_hint: int) -> None:
         self.address = address
         self.got = self.asked = got
-        self.told = told
+        self.size_hint = size_hint
         self.total = -1
         self.anew = False
 
     def next_bytes(self, most: int) -> int:
-        """How much to ask for next."""
+        """Return the number of bytes to request next."""
         if self.total >= 0:
             return min(most, self.total - self.asked)
-        return min(most, self.told - self.asked) if self.told > self.asked else most
+        return min(most, self.size_hint - self.asked) if self.size_hint > self.asked else most
 
     @property
     def open(self) -> bool:
-        """Whether there is more to ask for now: of an unknown size only a first chunk."""
+        """True when there is more to request now: of an unknown size only a first chunk."""
         return self.asked == self.got if self.total < 0 else self.asked < self.total
 
 
@@ -102,37 +102,37 @@ class AssetLoader:
 
     @property
     def idle(self) -> bool:
-        """Nothing is wanted."""
+        """True when nothing is wanted."""
         return not (self._wanted or self._busy or self._items)
 
     @property
     def needs_link(self) -> bool:
-        """Whether bytes are to come over the network."""
+        """True while bytes are to come over the network."""
         return bool(self._items)
 
     def add(self, address: str, size: int = -1) -> bool:
-        """Adds an asset at the end of the order; its size, if that is known. False: it is on its way already."""
+        """Add an asset at the end of the order; `size` [bytes] if it is known. False: it is on its way already."""
         if address in self._wanted or address in self._busy or address in self._items:
             return False
         self._wanted[address] = size
         return True
 
     def next_lookups(self) -> Iterator[str]:
-        """Assets to be looked up in the cache now."""
+        """Yield assets to be looked up in the cache now."""
         while self._wanted and len(self._busy) + len(self._items) < AT_ONCE:
             address = next(iter(self._wanted))
             self._busy[address] = self._wanted.pop(address)
             yield address
 
     def on_missing(self, address: str, offset: int) -> None:
-        """It is not in the cache, but its first `offset` bytes are."""
+        """Note that an asset is not in the cache, but its first `offset` bytes are."""
         if address in self._busy:
             item = self._items[address] = _Item(address, offset, self._busy.pop(address))
             item.anew = address in self._anew
 
     def restart_asset(self, address: str) -> bool:
-        """The bytes that came were not those of the asset: from the beginning. False: that was the second time. Does
-        nothing for one that was let go of meanwhile."""
+        """Start an asset again whose bytes had another hash. False: that was the second time. Does nothing for an asset
+        that was removed meanwhile."""
         item = self._items.get(address)
         if item is None:
             return True
@@ -144,13 +144,13 @@ class AssetLoader:
         return True
 
     def remove(self, address: str) -> None:
-        """It is there, or will not come."""
+        """Remove an asset that is here, or will not come."""
         for table in (self._wanted, self._busy, self._items):
             table.pop(address, None)
         self._anew.discard(address)
 
     def next_requests(self, now_ns: int) -> Iterator[ChunkRequest]:
-        """What is to be asked now, in the order of the assets. What was yielded counts as asked."""
+        """Yield requests to send now, in the order of the assets. A yielded request counts as sent."""
         if self.is_paused(now_ns):
             return
         for item in list(self._items.values()):
@@ -188,7 +188,7 @@ class AssetLoader:
             return FailedAsset(ask.address, "protocol", f"the session contradicts itself about asset {ask.address}")
         if chunk.total > MAX_ASSET_BYTES:
             self.remove(ask.address)
-            text = f"asset {ask.address} is said to have {chunk.total} bytes: at most {MAX_ASSET_BYTES} are fetched"
+            text = f"asset {ask.address} has {chunk.total} bytes: at most {MAX_ASSET_BYTES} are fetched"
             return FailedAsset(ask.address, "protocol", text)
         item.total = chunk.total
         item.got += size
@@ -207,7 +207,7 @@ class AssetLoader:
                 item.asked = max(item.got, min(item.asked, ask.offset))
 
     def _adapt_chunk_size(self, ask: ChunkRequest, size: int, took_ns: int) -> None:
-        """Larger chunks for a fast link, smaller ones for a slow one: whole chunks tell."""
+        """Use larger chunks on a fast link, smaller ones on a slow one, by the times of whole chunks."""
         if size != self._chunk_bytes or size != ask.length:
             return
         if took_ns < FAST_NS:
@@ -216,12 +216,12 @@ class AssetLoader:
             self._chunk_bytes = max(size // 2, MIN_CHUNK_BYTES)
 
     def is_complete(self, address: str) -> bool:
-        """Whether all its bytes came."""
+        """Return whether all bytes of an asset came."""
         item = self._items.get(address)
         return item is not None and item.got == item.total
 
     def on_stored(self, size: int) -> None:
-        """These bytes are in the cache, or thrown away: they fill the window no more."""
+        """Note that bytes are in the cache, or dropped: they leave the window."""
         self._unstored -= size
 
     def process_refusal(self, refused: AssetRefused, now_ns: int) -> FailedAsset | str:
@@ -249,7 +249,7 @@ class AssetLoader:
         return FailedAsset(ask.address, refused.reason, text)
 
     def is_paused(self, now_ns: int) -> bool:
-        """Whether nothing is to be asked for now."""
+        """Return whether nothing is to be requested now."""
         return now_ns < self._paused_until_ns
 
     def on_link_lost(self, now_ns: int) -> None:
@@ -270,5 +270,5 @@ class AssetLoader:
             item.asked = item.got
 
     def is_overdue(self, now_ns: int) -> bool:
-        """Whether answers have not come for too long."""
+        """Return whether answers have not come for too long."""
         return bool(self._asked) and now_ns - self._progress_ns > PATIENCE_NS

@@ -18,7 +18,7 @@ MAX_AGE_NS = 60_000_000_000  # older exchanges no longer count
 SETTLED = 4  # exchanges before the estimate is used: a single one may have met a busy machine
 SLEW = 0.01  # the estimate moves by 10 ms per second: invisible in 150 ms freshness, monotonic
 LARGE_NS = 5_000_000  # samples from so far in the future do not count: what is more moves ...
-SLEW_LARGE = 0.1  # ... by 100 ms per second, so that a busy link at the start keeps nobody from driving for seconds
+SLEW_LARGE = 0.1  # ... by 100 ms per second, so that a busy link at the start does not prevent driving for seconds
 DRIFT = 100e-6  # two quartz clocks of +-50 ppm each
 JUMP = 4  # exchanges in a row that contradict all before: this clock has jumped, the old ones say nothing any more
 BURST = 8  # exchanges at the start and after a reset ...
@@ -45,7 +45,7 @@ class ClockSync:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets everything: another session."""
+        """Forget everything: another session."""
         self._target = 0
         self._offset = 0
         self._offset_at = 0
@@ -78,7 +78,7 @@ class ClockSync:
         return self._rtt
 
     def poll_ping(self, local_ns: int) -> bool:
-        """True when a `ClockPing` is to be sent now; counts it as sent."""
+        """Return whether a `ClockPing` is to be sent now, and count it as sent."""
         if local_ns < self._next_ping:
             return False
         self._sent += 1
@@ -87,11 +87,11 @@ class ClockSync:
 
     @property
     def next_ping_ns(self) -> int:
-        """When the next ping is due [local ns]."""
+        """Time at which the next ping is due [local ns]."""
         return self._next_ping
 
     def process_pong(self, t0_ns: int, t1_ns: int, t2_ns: int, t3_ns: int) -> None:
-        """Counts one exchange: `t0`, `t3` on the client's clock, `t1`, `t2` in session time.
+        """Count one exchange: `t0`, `t3` on the client's clock, `t1`, `t2` in session time.
 
         Impossible ones (time runs backwards, or the server held it longer than the round trip) are rejected.
         """
@@ -116,7 +116,7 @@ class ClockSync:
         self._estimate(t3_ns, jumped=jumped)
 
     def _contradicts(self, exchange: Exchange) -> bool:
-        """Whether this exchange and the estimate cannot both be right."""
+        """Return whether this exchange and the estimate cannot both be right."""
         reach = _uncertainty(exchange, exchange.at_ns) + int(DRIFT * (exchange.at_ns - self._offset_at))
         return exchange.offset_ns + reach < self._low or exchange.offset_ns - reach > self._high
 
@@ -130,7 +130,7 @@ class ClockSync:
         self._offset, self._offset_at = self._target if jumped else offset, now_ns
 
     def session_ns(self, local_ns: int) -> int:
-        """Session time [ns] at `local_ns`. Meaningless before `synced`."""
+        """Return session time [ns] at `local_ns`. Meaningless before `synced`."""
         return local_ns + self._slewed_offset(local_ns)
 
     def local_ns(self, session_ns: int) -> int:
@@ -153,7 +153,7 @@ class ClockSync:
 
 
 def _uncertainty(exchange: Exchange, now_ns: int) -> int:
-    """How far the offset can be from that of an exchange [ns]."""
+    """Return how far the offset can be from that of an exchange [ns]."""
     return exchange.rtt_ns // 2 + int(DRIFT * (now_ns - exchange.at_ns)) + 1
 
 

@@ -1,7 +1,7 @@
-"""What a display shows: scene poses a fixed delay behind session time, between the frames that came. Pure.
+"""Interpolation of poses for a display: a fixed delay behind session time, between the frames that came. Pure.
 
 Positions are interpolated linearly, orientations by slerp. Nothing is extrapolated: when frames run out the newest one
-stays, and its age says so.
+stays, and its age grows.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ class SceneState:
 
 @dataclass(slots=True)
 class StateCounters:
-    """Where state frames went. Every frame that came is either `delivered` or counted in exactly one other field.
+    """Counters of state frames. Every frame that came is either `delivered` or counted in exactly one other field.
 
     Presence is counted when it is decoded, at most `PRESENCE_WAITING` messages later.
     """
@@ -57,7 +57,7 @@ class StateCounters:
     queued_old: int = 0  # waited in a queue while this client stood still
     out_of_order: int = 0
     before_snapshot: int = 0
-    other_epoch: int = 0  # of a scene that events have not told of yet, or of the one before
+    other_epoch: int = 0  # of a scene whose event has not come yet, or of the one before
     undecodable: int = 0  # base frame missing: a snapshot was asked for
     malformed: int = 0
     unknown_topic: int = 0
@@ -137,7 +137,7 @@ class StateStream:
         return state
 
     def check_fresh(self, local_ns: int) -> bool:
-        """Whether what was drained last is still to be handed out, at `local_ns` on the client's clock.
+        """Return whether the state drained last is still to be passed on, at `local_ns` on the client's clock.
 
         Not when the client stood still since then: fresh frames are right behind. Only the first time in a row, for who
         always takes so long to decode would never be handed anything.
@@ -198,7 +198,7 @@ class StateStream:
         return SceneState(header, poses, now_ns, now_ns - header.session_time)
 
     def _is_from_queue(self, age_ns: int, local_ns: int) -> bool:
-        """Whether a frame that comes now is to be thrown away, because fresher ones must be right behind it."""
+        """Return whether a frame that comes now is to be dropped, because fresher ones must be right behind it."""
         stood_still = self._came_ns >= 0 and local_ns - self._came_ns > STALLED_NS
         self._came_ns = local_ns
         old = age_ns > max(QUEUED_NS, 2 * self._usual_age)

@@ -1,4 +1,4 @@
-"""Scenes that come with the package: the handover demo, and generators for benchmarks.
+"""Scenes of the package: MJCF files for the demos, and generators for demos and benchmarks.
 
 `handover.xml`: two arms, a hammer, a board. `arm.xml`: the arm that every scene here uses. `generators`: N arms around
 a table, free bodies in a hall. Everything is drawn from primitives, so no asset files are needed.
@@ -16,9 +16,16 @@ _FOLDER = Path(__file__).parent
 
 
 def scene_path(name: str) -> Path:
-    """Path of the packaged MJCF file `name` (without `.xml`). Raises `FileNotFoundError` listing the scenes."""
+    """Return the path of a scene that comes with the package.
+
+    Args:
+        name: Name of the MJCF file without `.xml`, such as `handover`.
+
+    Raises:
+        FileNotFoundError: There is no such scene; the message lists the available ones.
+    """
     path = _FOLDER / f"{name}.xml"
     if path.parent != _FOLDER or not path.is_file():
         available = ", ".join(sorted(p.stem for p in _FOLDER.glob("*.xml")))
-        raise FileNotFoundError(f"no scene '{name}' comes with the package. Available scenes: {available}")
+        raise FileNotFoundError(f"no scene '{name}' in the package. Available scenes: {available}")
     return path

@@ -1,7 +1,7 @@
 """Two ALOHA stations face to face: the scene of `iris-session demo aloha`. Models: MuJoCo Menagerie, from `IRIS_DATA`.
 
 World: Z up, table tops at z = 0, room floor at z = -0.75. The stations touch at y = 0; `south` is worked from -y,
-`north` from +y, and left and right are those of the person who sits there. Robots: `south/left`, `south/right`,
+`north` from +y, and left and right are those of the operator who sits there. Robots: `south/left`, `south/right`,
 `north/left`, `north/right`; what is across from `south/right` is `north/left`. Two light boards, red and blue, lie on
 one table each; a printed sheet lies where the tables meet.
 """
@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 from typing import Any, Final
 
-from iris_session.demo.scenes.generators import room
-from iris_session.demo.scenes.models import model_file, read_model
+from iris_session.demo.scenes.generators import make_room
+from iris_session.demo.scenes.models import find_model_file, load_model_spec
 from iris_session.demo.scenes.parts import add_board, add_sheet
 
 STATIONS: Final = ("south", "north")
@@ -34,11 +34,11 @@ _BOARD_FROM_BASE: Final = (0.47, math.radians(165.0))  # m from the right base, 
 
 
 def aloha_scene() -> Any:
-    """The scene as an `mujoco.MjSpec`, keyframe `home`. Raises `ModelNotFoundError` without the model."""
+    """Return the scene as an `mujoco.MjSpec`, keyframe `home`. Raises `ModelNotFoundError` without the model."""
     import mujoco
 
-    spec = room("aloha")
-    path = model_file("aloha", "scene.xml")
+    spec = make_room("aloha")
+    path = find_model_file("aloha", "scene.xml")
     qpos: list[float] = []
     ctrl: list[float] = []
     for index, name in enumerate(STATIONS):
@@ -69,10 +69,10 @@ def aloha_scene() -> Any:
 
 
 def _station(path: Any) -> Any:
-    """One station without what belongs to a scene of its own: floor, lights, sky, targets."""
+    """Return one station without the parts of a complete scene: floor, lights, sky, targets."""
     import mujoco
 
-    spec = read_model(path)
+    spec = load_model_spec(path)
     spec.option.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
     spec.delete(spec.geom("floor"))
     for thing in [*spec.lights, *(b for b in spec.bodies if b.mocap)]:
@@ -91,7 +91,8 @@ def _station(path: Any) -> Any:
 
 
 def _board_place(index: int) -> tuple[float, float, float]:
-    """x, y [m] and yaw [rad] of the board of station `index`: its +x end points away from the right arm's base."""
+    """Return x, y [m] and yaw [rad] of the board of station `index`: its +x end points away from the right arm's
+    base."""
     reach, bearing = _BOARD_FROM_BASE
     x, y = 0.469 + reach * math.cos(bearing), -0.019 - HALF_DEPTH + reach * math.sin(bearing)
     return (x, y, bearing) if index == 0 else (-x, -y, bearing + math.pi)

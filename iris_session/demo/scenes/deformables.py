@@ -1,4 +1,4 @@
-"""Two arms and something that bends on the table between them: the scenes of `iris-session demo cloth` and `demo soft`.
+"""Two arms and deformables on the table between them: the scenes of `iris-session demo cloth` and `demo soft`.
 
 The files hold table and flexes, which only MJCF text can describe; the arms of `arm.xml` are put there here.
 """
@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final
 
-from iris_session.demo.scenes.generators import ARM_FILE, ARM_HOME, FINGER_OPEN, arm_names, bearing_of, place_arm
-from iris_session.demo.scenes.parts import add_sheet, sheet_place
+from iris_session.demo.scenes.generators import ARM_FILE, ARM_HOME, FINGER_OPEN, arm_names, compute_bearing, place_arm
+from iris_session.demo.scenes.parts import add_sheet, get_sheet_position
 from iris_session.protocol.common import Vec3
 
 #: Two arms stand so far from the middle [m], as in handover.xml.
@@ -24,19 +24,23 @@ _OPTIONS: Final = ("timestep", "integrator", "cone", "impratio", "solver", "iter
 
 
 def cloth_scene() -> Any:
-    """An `mujoco.MjSpec`: arms `left` and `right`, a `cloth` of 17 x 17 vertices, a sheet, keyframe `home`."""
+    """Return an `mujoco.MjSpec`: arms `left` and `right`, a `cloth` of 17 x 17 vertices, a sheet, keyframe `home`."""
     return _with_two_arms("cloth", _round_tips)
 
 
 def soft_scene() -> Any:
-    """An `mujoco.MjSpec`: arms `left` and `right`, soft bodies `rose` and `mint`, a body `box`, a sheet, keyframe
+    """Return an `mujoco.MjSpec`: arms `left` and `right`, soft bodies `rose` and `mint`, a body `box`, a sheet,
+    keyframe
     `home`."""
     return _with_two_arms("soft")
 
 
 def _round_tips(arm: Any) -> None:
-    """Finger tips that end in a rubber rod as thick as the pad above it: square ones pierce cloth with their edges, and
-    from under a thicker rod a low wrinkle slips. Faces and ends are where those of the pads were."""
+    """Replace the finger tips by rubber rods as thick as the pad above them.
+
+    Square tips pierce cloth with their edges, and a low wrinkle slips from under a thicker rod. Faces and ends stay
+    where those of the pads were.
+    """
     import mujoco
 
     for side in ("left", "right"):
@@ -49,7 +53,7 @@ def _round_tips(arm: Any) -> None:
 
 
 def _with_two_arms(file: str, change: Callable[[Any], None] | None = None) -> Any:
-    """The packaged `file` with an arm on either side of its table. `change`: what is done to the arm before."""
+    """Return the packaged `file` with an arm on either side of its table. `change`: applied to each arm before."""
     import mujoco
 
     spec = mujoco.MjSpec.from_file(str(ARM_FILE.parent / f"{file}.xml"))
@@ -61,8 +65,8 @@ def _with_two_arms(file: str, change: Callable[[Any], None] | None = None) -> An
             change(arm)
         for option in _OPTIONS:  # MuJoCo warns where they differ
             setattr(arm.option, option, getattr(spec.option, option))
-        place_arm(spec, RADIUS, bearing_of(i, 2)).attach_body(arm.body("base"), f"{name}/", "")
-    add_sheet(spec, sheet_place(2))
+        place_arm(spec, RADIUS, compute_bearing(i, 2)).attach_body(arm.body("base"), f"{name}/", "")
+    add_sheet(spec, get_sheet_position(2))
     qpos = [*resting, *([*ARM_HOME, FINGER_OPEN, FINGER_OPEN] * 2)]
     spec.add_key(name="home", qpos=qpos, ctrl=[*ARM_HOME, FINGER_OPEN] * 2)
     return spec

@@ -16,12 +16,12 @@ _FREE_HALL = (10.0, 10.0, 3.0)  # m
 
 
 def arm_names(n: int) -> tuple[str, ...]:
-    """Names of the arms of `n_arms_scene(n)`: `left`, `right` for two, else `arm1` ... `armN`."""
+    """Return the names of the arms of `n_arms_scene(n)`: `left`, `right` for two, else `arm1` ... `armN`."""
     return ("left", "right") if n == 2 else tuple(f"arm{i + 1}" for i in range(n))
 
 
 def n_arms_scene(n: int, objects: int | None = None) -> Any:
-    """An `mujoco.MjSpec` with `n` (1 to 12) arms around a round table, each facing its centre, keyframe `home`.
+    """Return an `mujoco.MjSpec` with `n` (1 to 12) arms around a round table, each facing its centre, keyframe `home`.
 
     `objects`: free hammers and boards on the table (default: one for every two arms), named `object1` and so on. Arms
     are named as in `arm_names`; their parts as in `handover.xml` (`arm1/joint1`, `arm1/tcp`, ...).
@@ -32,13 +32,13 @@ def n_arms_scene(n: int, objects: int | None = None) -> Any:
     if not 1 <= n <= 12:
         raise ValueError(f"n_arms_scene makes 1 to 12 arms, not {n}")
     n_objects = (n + 1) // 2 if objects is None else objects
-    radius = circle_radius(n)
-    spec = room(f"{n}_arms")
+    radius = compute_circle_radius(n)
+    spec = make_room(f"{n}_arms")
     add_round_table(spec, radius + 0.25)
     for i, name in enumerate(arm_names(n)):
         arm = mujoco.MjSpec.from_file(str(ARM_FILE))
-        arm.material("accent").rgba = [*hue(i / n), 1.0]
-        place_arm(spec, radius, bearing_of(i, n)).attach_body(arm.body("base"), f"{name}/", "")
+        arm.material("accent").rgba = [*compute_hue(i / n), 1.0]
+        place_arm(spec, radius, compute_bearing(i, n)).attach_body(arm.body("base"), f"{name}/", "")
     qpos = [*ARM_HOME, FINGER_OPEN, FINGER_OPEN] * n
     for k in range(n_objects):
         qpos += add_object(spec, k, n_objects, radius - 0.38)
@@ -46,13 +46,14 @@ def n_arms_scene(n: int, objects: int | None = None) -> Any:
     return spec
 
 
-def circle_radius(n: int, least: float = 0.6, apart: float = 0.72) -> float:
-    """Radius [m] of the circle on which `n` arms stand: at least `least`, neighbours at least `apart`."""
+def compute_circle_radius(n: int, least: float = 0.6, apart: float = 0.72) -> float:
+    """Return the radius [m] of the circle on which `n` arms stand: at least `least`, adjacent arms at least `apart`."""
     return max(least, 0.5 * apart / math.sin(math.pi / max(n, 2)))
 
 
-def bearing_of(i: int, n: int) -> float:
-    """Where the `i`-th of `n` stands, seen from the middle of the table [rad]; the first at -x, as in handover.xml."""
+def compute_bearing(i: int, n: int) -> float:
+    """Return the bearing of the `i`-th of `n`, seen from the middle of the table [rad]; the first at -x, as in
+    handover.xml."""
     return math.pi + 2.0 * math.pi * i / n
 
 
@@ -75,7 +76,7 @@ def add_round_table(spec: Any, radius: float) -> None:
 
 
 def free_bodies_scene(n: int = 300, seed: int = 0) -> Any:
-    """An `mujoco.MjSpec` with `n` free bodies (`body001` ...) that fly in a 10 x 10 x 3 m hall without touching.
+    """Return an `mujoco.MjSpec` with `n` free bodies (`body001` ...) that fly in a 10 x 10 x 3 m hall without touching.
 
     No gravity, no contacts. Every body turns at 0.5 rad/s about its centre of mass, which rests 0.2 to 1 m from the
     body's origin: so the origin moves on a circle at a constant 0.1 to 0.5 m/s and stays inside for ever. Drawn from
@@ -84,7 +85,7 @@ def free_bodies_scene(n: int = 300, seed: int = 0) -> Any:
     import mujoco
 
     rng = np.random.default_rng(seed)
-    spec = room(f"{n}_free_bodies", floor_z=0.0)
+    spec = make_room(f"{n}_free_bodies", floor_z=0.0)
     spec.option.gravity = [0, 0, 0]
     qpos: list[float] = []
     qvel: list[float] = []
@@ -103,7 +104,7 @@ def free_bodies_scene(n: int = 300, seed: int = 0) -> Any:
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX if i % 2 else mujoco.mjtGeom.mjGEOM_ELLIPSOID,
             size=list(map(float, rng.uniform(0.03, 0.12, size=3))),
-            rgba=[*hue(i / n), 1.0],
+            rgba=[*compute_hue(i / n), 1.0],
             contype=0,
             conaffinity=0,
         )
@@ -138,7 +139,7 @@ def _circling(rng: np.random.Generator) -> tuple[list[float], list[float], list[
     return tuple(list(map(float, v)) for v in values)  # type: ignore[return-value]
 
 
-def room(name: str, floor_z: float = -0.75) -> Any:
+def make_room(name: str, floor_z: float = -0.75) -> Any:
     """An empty room: options as in `handover.xml`, sky, checker floor at `floor_z`, two lights."""
     import mujoco
 
@@ -193,7 +194,7 @@ def room(name: str, floor_z: float = -0.75) -> Any:
 
 
 def add_object(spec: Any, k: int, count: int, distance: float) -> list[float]:
-    """Adds hammer (even `k`) or board (odd) on the table, `distance` [m] from its middle; returns its home `qpos`."""
+    """Add a hammer (even `k`) or board (odd) on the table, `distance` [m] from its middle; returns its home `qpos`."""
     import mujoco
 
     box = mujoco.mjtGeom.mjGEOM_BOX
@@ -216,8 +217,8 @@ def add_object(spec: Any, k: int, count: int, distance: float) -> list[float]:
     return [*pos, math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)]
 
 
-def hue(x: float) -> tuple[float, float, float]:
-    """A distinct, muted colour for `x` in 0 to 1."""
+def compute_hue(x: float) -> tuple[float, float, float]:
+    """Return a distinct, muted colour for `x` in 0 to 1."""
     return (
         0.5 + 0.35 * math.cos(2 * math.pi * (x + 0.55)),
         0.5 + 0.35 * math.cos(2 * math.pi * (x + 0.22)),

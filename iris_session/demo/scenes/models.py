@@ -1,4 +1,4 @@
-"""Models of real robots, which are not ours to ship: from `models/` in the folder that `IRIS_DATA` names."""
+"""Models of real robots, which the package cannot ship: from `models/` in the folder named by `IRIS_DATA`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from iris_session.physics.errors import ModelInvalidError, ModelNotFoundError, o
 VARIABLE: Final = "IRIS_DATA"
 
 
-def model_file(folder: str, name: str) -> Path:
-    """Absolute path of `models/<folder>/<name>` in the data folder. Raises `ModelNotFoundError` saying what to set."""
+def find_model_file(folder: str, name: str) -> Path:
+    """Return the absolute path of `models/<folder>/<name>` in the data folder. Raises `ModelNotFoundError` saying what
+    to set."""
     source = f"{folder} of MuJoCo Menagerie (github.com/google-deepmind/mujoco_menagerie)"
     value = os.environ.get(VARIABLE, "")
     if not value:
@@ -27,8 +28,8 @@ def model_file(folder: str, name: str) -> Path:
     return path
 
 
-def read_model(path: Path) -> Any:
-    """An `mujoco.MjSpec` of the model, ready to be attached: absolute asset folders, no keyframes.
+def load_model_spec(path: Path) -> Any:
+    """Return an `mujoco.MjSpec` of the model, ready to be attached: absolute asset folders, no keyframes.
 
     Raises `ModelInvalidError` for a file that MuJoCo cannot read.
     """

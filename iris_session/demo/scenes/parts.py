@@ -1,4 +1,4 @@
-"""Things that generated scenes share: boards to hand over, and the printed sheet that headsets align to."""
+"""Parts of generated scenes: boards to hand over, and the printed sheet that headsets align to."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _INK = ((-0.06, 0.06, 0.02), (0.06, 0.06, 0.02), (-0.06, -0.06, 0.02), (0.01, 0.
 
 
 def add_board(spec: Any, name: str, p_world: Vec3, yaw: float, half_size: Vec3, mass: float, rgb: Vec3) -> list[float]:
-    """Adds a free board: x along its length, y across (where a gripper takes it). Returns its `qpos`, 7 numbers.
+    """Add a free board: x along its length, y across (where a gripper takes it). Returns its `qpos`, 7 numbers.
 
     Its contacts have the friction that ALOHA's model gives its finger tips; priority makes them stiffer than the
     model's, which are so soft for a light thing that fingers sink 2 mm into it.
@@ -38,7 +38,7 @@ def add_board(spec: Any, name: str, p_world: Vec3, yaw: float, half_size: Vec3, 
 
 
 def add_sheet(spec: Any, p_world: Vec3) -> None:
-    """Adds a printed sheet, face up, its middle at `p_world`: for the eye only, nothing can touch it."""
+    """Add a printed sheet, face up, its middle at `p_world`. It is visual only and has no contacts."""
     import mujoco
 
     sheet = spec.worldbody.add_body(name="sheet", pos=list(p_world))
@@ -55,7 +55,7 @@ def add_sheet(spec: Any, p_world: Vec3) -> None:
         )
 
 
-def sheet_place(n_arms: int) -> Vec3:
-    """Where the sheet lies in a scene of `n_arms` around a round table: before two arms as in `handover.xml`, else in
-    the middle."""
+def get_sheet_position(n_arms: int) -> Vec3:
+    """Return the sheet position for `n_arms` around a round table: before two arms as in `handover.xml`, else the
+    middle."""
     return (0.0, -0.45, 0.0) if n_arms <= 2 else (0.0, 0.0, 0.0)

@@ -1,17 +1,17 @@
 """Scripted operators: closed loops from what a headset shows to what the hands do. No MuJoCo, no network, no clock.
 
-`base` (the contract), `giver` and `receiver` (hand a thing over in mid-air), `folder` (folds a cloth with a partner),
-`stower` (stows a soft body), `wander` (motion without a task).
+`base` (the interface), `phases` (task phases), `handover` (giver and receiver), `folder` (folds a cloth with a
+partner),
+`stower` (stows a soft body), `wander` (motion without a task), `hand` (clutched motion), `perception`, `objects`,
+`arms`.
 """
 
 from __future__ import annotations
 
-from iris_session.emulator.behaviours.arms import arm_kind
-from iris_session.emulator.behaviours.base import Behaviour, HandInput, OperatorView
+from iris_session.emulator.behaviours.arms import get_arm_kind
+from iris_session.emulator.behaviours.base import Behaviour, CombinedBehaviour, HandInput, OperatorView
 from iris_session.emulator.behaviours.folder import Folder
-from iris_session.emulator.behaviours.giver import Giver
-from iris_session.emulator.behaviours.hands import Hands
-from iris_session.emulator.behaviours.receiver import Receiver
+from iris_session.emulator.behaviours.handover import Giver, Receiver
 from iris_session.emulator.behaviours.stower import Stower
 from iris_session.emulator.behaviours.wander import Idle, Wander
 from iris_session.protocol.names import Device
@@ -21,7 +21,7 @@ __all__ = [
     "Folder",
     "Giver",
     "HandInput",
-    "Hands",
+    "CombinedBehaviour",
     "Idle",
     "OperatorView",
     "Receiver",
@@ -44,11 +44,12 @@ def make_behaviour(
     arm: str = "arm",
     place: tuple[float, float] | None = None,
 ) -> Behaviour:
-    """The behaviour `name` for `robot`. `partner`: the other robot of a handover or fold; default the other of left and
+    """Return the behaviour `name` for `robot`. `partner`: the other robot of a handover or fold; default the other of
+    left and
     right. `object`: a thing, or a deformable. `arm`: kind of both arms. `place`: where a receiver or stower lays it
     (x, y [m], world); default before its robot.
 
-    Raises `ValueError` naming what is available.
+    Raises `ValueError` listing the available behaviours.
     """
     if name in _WITH_PARTNER and not partner:
         if robot not in {"left", "right"}:
@@ -56,13 +57,13 @@ def make_behaviour(
         partner = "right" if robot == "left" else "left"
     match name:
         case "giver":
-            return Giver(robot, object, partner, device, arm_kind(arm))
+            return Giver(robot, object, partner, device, get_arm_kind(arm))
         case "receiver":
-            return Receiver(robot, object, partner, device, arm_kind(arm), place)
+            return Receiver(robot, object, partner, device, get_arm_kind(arm), place)
         case "folder":
-            return Folder(robot, object, partner, device, arm_kind(arm))
+            return Folder(robot, object, partner, device, get_arm_kind(arm))
         case "stower":
-            return Stower(robot, object, device, arm_kind(arm), place)
+            return Stower(robot, object, device, get_arm_kind(arm), place)
         case "wander":
             return Wander(robot, device, seed)
         case "idle":

@@ -1,5 +1,5 @@
-"""What a person knows about the arm that is in front of him: where its fingers touch, how it stands, how it likes to
-take things. Names of bodies follow the robot's name and a slash."""
+"""Arm models known to scripted operators: finger pads, mounting, and preferred grasps. Names of bodies follow the
+robot's name and a slash."""
 
 from __future__ import annotations
 
@@ -40,7 +40,8 @@ ARM: Final = ArmKind()
 #: KUKA iiwa 14 with the same gripper.
 IIWA: Final = ArmKind(exchange_height=0.30, exchange_inward=0.35, lean=math.radians(20.0), reach=0.62, speed=0.33)
 #: ViperX 300 of an ALOHA station. The camera above its gripper is in the way of a partner's unless both lean; leaning
-#: farther, its wrist would be stretched (singular) at the table. Its light servos give way and lag: it is moved slowly.
+#: farther, its wrist would be stretched (singular) at the table. Its light servos are compliant and lag: it is moved
+#: slowly.
 VIPERX: Final = ArmKind(
     base="base_link",
     fingers=("left_finger_link", "right_finger_link"),
@@ -56,8 +57,8 @@ VIPERX: Final = ArmKind(
 ARM_KINDS: Final[dict[str, ArmKind]] = {"arm": ARM, "iiwa": IIWA, "viperx": VIPERX}
 
 
-def arm_kind(name: str) -> ArmKind:
-    """The kind of that name. Raises `ValueError` listing the kinds."""
+def get_arm_kind(name: str) -> ArmKind:
+    """Return the arm model of that name. Raises `ValueError` listing the kinds."""
     if name not in ARM_KINDS:
-        raise ValueError(f"no operator knows the arm '{name}'. Known arms: {', '.join(ARM_KINDS)}")
+        raise ValueError(f"unknown arm '{name}'. Known arms: {', '.join(ARM_KINDS)}")
     return ARM_KINDS[name]

@@ -1,7 +1,8 @@
-"""What a scripted operator is given and what it gives back. Nothing here knows the network, the headset or MuJoCo."""
+"""Interface of scripted operators: their input and output. Independent of the network, the headset and MuJoCo."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -9,7 +10,7 @@ from anchors.pose import PoseTuple, Vec3
 
 
 class OperatorView(Protocol):
-    """What the person sees through the headset: the state stream, in the world frame, late and noisy as it is."""
+    """The scene as displayed in the headset: the state stream in the world frame, delayed and noisy."""
 
     @property
     def session_time_ns(self) -> int:
@@ -28,26 +29,26 @@ class OperatorView(Protocol):
         ...
 
     def vertex(self, deformable: str, index: int) -> Vec3 | None:
-        """Where vertex `index` of a deformable is [m]; `None`: not in the stream."""
+        """Position of vertex `index` of a deformable [m]; `None`: not in the stream."""
         ...
 
     def vertices_ns(self, deformable: str) -> int:
-        """Session time at which the vertices of a deformable were where they are shown; 0: not in the stream. They may
-        be late: media give way where a link or a computer is busy."""
+        """Session time of the displayed vertices of a deformable; 0: not in the stream. They may be late: media have
+        lower priority on a busy link or computer."""
         ...
 
     def lease_version(self, robot: str) -> int | None:
-        """Version of my lease on `robot`; `None`: it is not mine."""
+        """Version of the own lease on `robot`; `None` without one."""
         ...
 
     def device_pose(self, device: str) -> PoseTuple:
-        """Where my own hand is now."""
+        """Present pose of the own hand."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class HandInput:
-    """What the person does with one hand at this moment. `gripper`: trigger, 0 open to 1 closed."""
+    """Input of one hand. `gripper`: trigger, 0 open to 1 closed."""
 
     device: str
     robot: str
@@ -57,9 +58,9 @@ class HandInput:
 
 
 class Behaviour(Protocol):
-    """A closed loop from what is seen to what the hands do.
+    """A closed loop from the displayed scene to hand inputs.
 
-    `phase`: what it is at, one word. `done`: it will only keep still from now on. `failed`: why it gave up, else "".
+    `phase`: present task phase, one word. `done`: the task has ended. `failed`: reason of a failure, else "".
     """
 
     phase: str
@@ -69,3 +70,21 @@ class Behaviour(Protocol):
     def update(self, view: OperatorView) -> tuple[HandInput, ...]:
         """Called once per headset frame or input sample (60-90 Hz)."""
         ...
+
+
+class CombinedBehaviour:
+    """Several behaviours as one: done when all are, failed when one is. `phase`: that of the first not yet done."""
+
+    def __init__(self, hands: Sequence[Behaviour]) -> None:
+        self._hands = tuple(hands)
+        self.phase = self._hands[0].phase
+        self.done = False
+        self.failed = ""
+
+    def update(self, view: OperatorView) -> tuple[HandInput, ...]:
+        """The inputs of all hands; see `Behaviour.update`."""
+        inputs = tuple(hand_input for hand in self._hands for hand_input in hand.update(view))
+        self.phase = next((hand.phase for hand in self._hands if not hand.done), "done")
+        self.done = all(hand.done for hand in self._hands)
+        self.failed = next((hand.failed for hand in self._hands if hand.failed), "")
+        return inputs

@@ -1,19 +1,22 @@
-"""What a person sees and knows of deformables: where points of them are, and which points are the corners.
+"""Perception of deformables, and the base of tasks with them.
 
-Their picture may be later than that of the robots, even stand still for a while. Vertices are numbered as in the
+The vertices may be older than the poses of the robots, even stand still for a while: a deformable counts as held until
+newer vertices show otherwise. Vertices are numbered as in the
 model: a MuJoCo grid counts its last axis fastest.
 """
 
 from __future__ import annotations
 
 import itertools
+from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from typing import Final
 
 from anchors.pose import IDENTITY_QUAT, PoseTuple, Vec3
 from iris_session.emulator.behaviours.arms import ARM, ArmKind
 from iris_session.emulator.behaviours.base import OperatorView
-from iris_session.emulator.behaviours.eyes import Eyes, Seen
+from iris_session.emulator.behaviours.perception import Perception, TrackedPose
+from iris_session.emulator.behaviours.phases import PhasedTask
 
 #: Vertices at the corners of each deformable of the demo scenes.
 CORNERS: Final[Mapping[str, tuple[int, ...]]] = {
@@ -27,12 +30,12 @@ INNER: Final[Mapping[str, Mapping[int, tuple[int, int]]]] = {
 }
 
 
-def watched(deformable: str) -> tuple[int, ...]:
-    """Vertices of `deformable` that people look at."""
+def list_observed_vertices(deformable: str) -> tuple[int, ...]:
+    """Return the vertices of `deformable` that operators track."""
     return (*CORNERS[deformable], *itertools.chain(*INNER.get(deformable, {}).values()))
 
 
-class SoftEyes(Eyes):
+class DeformablePerception(Perception):
     """Watches the corners of one deformable and what is next to them, robots, and bodies. `missing`: which of them were
     never seen so far."""
 
@@ -40,16 +43,16 @@ class SoftEyes(Eyes):
         self, deformable: str, robots: tuple[str, ...], bodies: tuple[str, ...] = (), arm: ArmKind = ARM
     ) -> None:
         if deformable not in CORNERS:
-            raise ValueError(f"no operator knows the deformable '{deformable}'. Known: {', '.join(CORNERS)}")
+            raise ValueError(f"unknown deformable '{deformable}'. Known: {', '.join(CORNERS)}")
         super().__init__(bodies, robots, arm=arm)
         self.deformable = deformable
-        self._indices = watched(deformable)
-        self._vertices: dict[int, Seen] = {}
+        self._indices = list_observed_vertices(deformable)
+        self._vertices: dict[int, TrackedPose] = {}
         #: Session time of the picture, and at which the deformable was as it is shown [s].
         self.now_s = self.captured_s = 0.0
 
-    def look(self, view: OperatorView) -> None:
-        super().look(view)
+    def observe(self, view: OperatorView) -> None:
+        super().observe(view)
         self.now_s = now_s = view.session_time_ns * 1e-9
         self.captured_s = view.vertices_ns(self.deformable) * 1e-9
         for index in self._indices:
@@ -60,15 +63,15 @@ class SoftEyes(Eyes):
             if index in self._vertices:
                 self._vertices[index].update(pose, now_s)
             else:
-                self._vertices[index] = Seen(pose, now_s)
+                self._vertices[index] = TrackedPose(pose, now_s)
         if len(self._vertices) < len(self._indices):
             self.missing = (*self.missing, self.deformable)
 
-    def corner(self, index: int) -> Vec3:
-        """Where a corner is [m], smoothed."""
+    def get_corner(self, index: int) -> Vec3:
+        """Return the position of a corner [m], smoothed."""
         return self._vertices[index].pose[0]
 
-    def inside(self, corner: int, cells: float) -> Vec3:
+    def compute_inner_point(self, corner: int, cells: float) -> Vec3:
         """A point so far from a corner towards the middle [m], in cells of the grid along both edges, 1 to 2."""
         (ax, ay, az), (bx, by, bz) = (self._vertices[index].pose[0] for index in INNER[self.deformable][corner])
         w = cells - 1.0
@@ -76,21 +79,68 @@ class SoftEyes(Eyes):
 
     @property
     def corners(self) -> dict[int, Vec3]:
-        """Where all corners are [m], smoothed, by vertex."""
+        """Positions of all corners [m], smoothed, by vertex."""
         return {index: self._vertices[index].pose[0] for index in CORNERS[self.deformable]}
 
     @property
     def middle(self) -> Vec3:
         """Between all corners [m]."""
-        return mean(self.corners.values())
+        return compute_mean(self.corners.values())
 
     @property
     def corners_still_s(self) -> float:
-        """For how long [s] all corners were seen to keep still: a picture that stands still tells of nothing."""
+        """Time for which all corners have been at rest [s], by the capture times of the vertices."""
         return max(0.0, self.captured_s - max(self._vertices[index].rest_since_s for index in CORNERS[self.deformable]))
 
 
-def mean(points: Iterable[Vec3]) -> Vec3:
-    """The point in the middle of `points`."""
+def compute_mean(points: Iterable[Vec3]) -> Vec3:
+    """Return the mean of `points`."""
     xs, ys, zs = zip(*points, strict=True)
     return (sum(xs) / len(xs), sum(ys) / len(ys), sum(zs) / len(zs))
+
+
+#: The picture of a deformable may come so much later than that of the fingers which hold it [s].
+PICTURE_LATE_S: float = 10.0
+#: So long a picture must go on showing that it is not held [s].
+SEEN_S: float = 0.6
+
+
+class DeformableTask(PhasedTask):
+    """Phases of a task with what `eyes` watch."""
+
+    def __init__(self, robot: str, device: str, eyes: DeformablePerception, arm: ArmKind) -> None:
+        self.perception = eyes
+        super().__init__(robot, device, eyes, arm)
+        self._lost_s: float | None = None  # since when it seems to stay behind; session time
+        self._phase_s = 0.0  # when the phase began; session time
+
+    def _enter(self, phase: str) -> None:
+        super()._enter(phase)
+        self._phase_s = self.perception.now_s
+
+    def _is_shown_for(self, seconds: float) -> bool:
+        """Return True if the vertices show the first `seconds` of this phase, or are too late for that."""
+        return self.perception.captured_s > self._phase_s + seconds or self._has_lasted(seconds + PICTURE_LATE_S)
+
+    @abstractmethod
+    def _is_holding(self) -> bool:
+        """Return True if the displayed deformable moves with the fingers."""
+
+    def _check_slip(self, reason: str) -> bool:
+        """Return True while the displayed deformable does not move with the fingers.
+
+        Its vertices may only be late: the hand stops until they show the same moment, then the phase starts again. If
+        the deformable was lost, another attempt starts with `reason`."""
+        now_s, lost_s = self.perception.now_s, self._lost_s
+        if self._is_holding():
+            if lost_s is not None:
+                self._lost_s = None
+                self._enter(self.phase)
+            return lost_s is not None
+        if lost_s is None:
+            self._lost_s = now_s
+            self.hand.move_to(self.perception.get_tip(self.robot), correct=False)
+        elif self.perception.captured_s > lost_s + SEEN_S or now_s > lost_s + PICTURE_LATE_S:
+            self._lost_s = None
+            self._retry(reason)
+        return True

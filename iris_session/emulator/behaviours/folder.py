@@ -1,5 +1,5 @@
-"""Folds a cloth with a partner: each pinches the corner on his side that is nearer to the people, and both carry
-theirs over the corners behind at the same time."""
+"""Folds a cloth with a partner: each operator pinches the nearer corner on their side, and both carry
+these over the corners behind at the same time."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ import math
 
 from anchors.pose import PoseTuple, Vec3, distance, quat_angle, quat_from_yaw, quat_mul
 from iris_session.emulator.behaviours.arms import ARM, ArmKind
-from iris_session.emulator.behaviours.deformables import SoftEyes
-from iris_session.emulator.behaviours.soft import SoftPhases
-from iris_session.emulator.behaviours.things import DOWN, above
+from iris_session.emulator.behaviours.deformables import DeformablePerception, DeformableTask
+from iris_session.emulator.behaviours.objects import DOWN, raise_pose
 from iris_session.protocol.names import Device
 
 #: The cloth is pinched so far from its corner, along both edges, in cells of 22.5 mm.
@@ -20,18 +19,18 @@ PRESS: float = 0.0115
 DEEPER: float = 0.0015
 #: How far the trigger is pulled when the fingers come down, 60 mm apart then: both must land on the cloth.
 TRIGGER_BEFORE: float = 0.25
-#: Height of the tip above the table at which the corner is let go [m]: much lower, and cloth heaps up around the
+#: Height of the tip above the table at which the corner is released [m]: much lower, and cloth heaps up around the
 #: fingers; higher, and it swings back as it falls.
 RELEASE: float = 0.036
-#: So far towards the partner a corner falls back when it is let go, because it was pinched into a wrinkle [m].
+#: So far towards the partner a corner falls back when it is released, because it was pinched into a wrinkle [m].
 FALLS_BACK: float = 0.006
 #: So far at most the fingers are carried out from between the people [m]: a cloth that is drawn taut flies in when the
-#: first of them lets go.
+#: first of them is released.
 APART: float = 0.01
 #: So far at most the fingers go beyond the other corner [m]: the one that is tucked under them may unfold when it is
-#: let go.
+#: released.
 BEYOND: float = 0.01
-#: How far the trigger stays pulled when the corner is let go: the fingers slide off the wrinkle upwards. Fingers that
+#: How far the trigger stays pulled when the corner is released: the fingers slide off the wrinkle upwards. Fingers that
 #: open wide sweep the cloth along.
 TRIGGER_AFTER: float = 0.75
 CLEAR_ABOVE: float = 0.10
@@ -49,12 +48,12 @@ SHAKES: int = 3
 #: A hand that is so far above the table is back where it began [m]; the cloth is looked at once more after this [s].
 HOME_ABOVE: float = 0.22
 SETTLED_S: float = 1.5
-#: How long a partner is waited for [s]; and before the corners are let go at once, which succeeds alone, too.
+#: How long a partner is waited for [s]; and before the corners are released, which succeeds alone, too.
 PATIENCE_S: float = 60.0
 TOGETHER_S: float = 6.0
 
 
-class Folder(SoftPhases):
+class Folder(DeformableTask):
     """Folds `cloth` with `robot`, together with the operator of `partner`."""
 
     most_attempts = 6  # corners that were laid down apart are soon brought together
@@ -62,7 +61,7 @@ class Folder(SoftPhases):
     def __init__(
         self, robot: str, cloth: str, partner: str, device: str = Device.CONTROLLER_RIGHT, arm: ArmKind = ARM
     ) -> None:
-        super().__init__(robot, device, SoftEyes(cloth, (robot, partner), arm=arm), arm)
+        super().__init__(robot, device, DeformablePerception(cloth, (robot, partner), arm=arm), arm)
         self.cloth, self.partner = cloth, partner
         self._slipped = f"the {cloth} slipped out of the gripper of {robot}"
         self._mine = self._onto = self._other = -1  # vertices: to take, to bring it to, and the one the partner takes
@@ -77,19 +76,19 @@ class Folder(SoftPhases):
         self._diagonal = 0.0  # yaw from my corner to the middle [rad]
         self._steps |= {
             "wait": self._wait,
-            "look": self._look,
+            "look": self._choose_pinch,
             "approach": self._approach,
             "descend": self._descend,
             "press": self._press,
             "pinch": self._pinching,
             "lift": self._lift,
-            "together": self._together,
-            "over": self._over,
-            "across": self._across,
+            "together": self._wait_for_partner,
+            "over": self._carry_over,
+            "across": self._carry_across,
             "sight": self._sight,
             "aim": self._aim,
             "lower": self._lower,
-            "ready": self._ready,
+            "ready": self._wait_for_release,
             "open": self._open,
             "leave": self._leave,
             "judge": self._judge,
@@ -99,56 +98,60 @@ class Folder(SoftPhases):
         }
 
     def _wait(self) -> None:
-        self._home = self.eyes.tip(self.robot)
+        self._home = self.perception.get_tip(self.robot)
         self._enter("look")
 
-    def _look(self) -> None:
+    def _choose_pinch(self) -> None:
         """Waits until the cloth lies still; chooses the corners on the own side."""
-        if self.eyes.corners_still_s < 0.3:
+        if self.perception.corners_still_s < 0.3:
             return
         if self._mine < 0:
-            self._choose()
-        mine = self.eyes.corner(self._mine)
-        self._pinch = self.eyes.inside(self._mine, INSET_CELLS)  # wherever and however the corner lies
-        self._goal = self.eyes.inside(self._onto, INSET_CELLS)
+            self._choose_corners()
+        mine = self.perception.get_corner(self._mine)
+        self._pinch = self.perception.compute_inner_point(
+            self._mine, INSET_CELLS
+        )  # wherever and however the corner lies
+        self._goal = self.perception.compute_inner_point(self._onto, INSET_CELLS)
         self._diagonal = math.atan2(self._pinch[1] - mine[1], self._pinch[0] - mine[0])
         self._enter("approach")
 
-    def _choose(self) -> None:
+    def _choose_corners(self) -> None:
         """The corners on the own side, and the directions of the fold, while the cloth lies flat."""
-        corners, base = self.eyes.corners, self.eyes.base(self.robot)[0]
+        corners, base = self.perception.corners, self.perception.get_base(self.robot)[0]
         near = sorted(corners, key=lambda index: distance(corners[index], base))[:2]
         self._mine, self._onto = sorted(near, key=lambda index: corners[index][1])
         self._other = min(set(corners) - set(near), key=lambda index: corners[index][1])
         mine, onto, other = corners[self._mine], corners[self._onto], corners[self._other]
-        self._outward, self._ahead = _toward(other, mine), _toward(mine, onto)
+        self._outward, self._ahead = _compute_direction(other, mine), _compute_direction(mine, onto)
 
     def _approach(self) -> None:
         if self._entering_now:
             self.hand.trigger_goal = TRIGGER_BEFORE
-            self.hand.move_to(self._tip_at(self._pinch, CLEAR_ABOVE))
-        if self.hand.arrived(0.006, 0.06) and self.hand.trigger_done():
+            self.hand.move_to(self._compute_tip(self._pinch, CLEAR_ABOVE))
+        if self.hand.has_arrived(0.006, 0.06) and self.hand.is_trigger_done():
             self._enter("descend")
-        elif self._waited(8.0):
+        elif self._has_lasted(8.0):
             self._retry(f"{self.robot} cannot reach the corner of the {self.cloth}")
 
     def _descend(self) -> None:
         """To a finger's breadth above the cloth."""
         if self._entering_now:
-            self.hand.move_to(self._tip_at(self._pinch, PRESS + 0.014), CAREFUL_SPEED)
-        if self.hand.arrived(0.0025, 0.03) or (self._waited(4.0) and self.hand.arrived(0.005, 0.06)):
+            self.hand.move_to(self._compute_tip(self._pinch, PRESS + 0.014), CAREFUL_SPEED)
+        if self.hand.has_arrived(0.0025, 0.03) or (self._has_lasted(4.0) and self.hand.has_arrived(0.005, 0.06)):
             self._enter("press")
-        elif self._waited(6.0):
+        elif self._has_lasted(6.0):
             self._retry(f"{self.robot} cannot reach down to the {self.cloth}")
 
     def _press(self) -> None:
         """Down onto the cloth by what is still missing in height; the table stops the fingers."""
         if self._entering_now:
-            (x, y, z), q = self.eyes.tip(self.robot)
+            (x, y, z), q = self.perception.get_tip(self.robot)
             self.hand.move_to(
-                ((x, y, min(z, self._table() + PRESS - DEEPER * (self.attempts - 1))), q), 0.04, correct=False
+                ((x, y, min(z, self._compute_table_height() + PRESS - DEEPER * (self.attempts - 1))), q),
+                0.04,
+                correct=False,
             )
-        if self.hand.moved() and self._waited(0.6):
+        if self.hand.has_moved() and self._has_lasted(0.6):
             self._enter("pinch")
 
     def _pinching(self) -> None:
@@ -156,61 +159,68 @@ class Folder(SoftPhases):
         if self._entering_now:
             self.hand.hold_still()
             self.hand.trigger_goal = 1.0
-        both = (self._alone or self.eyes.gap(self.partner) < SHUT) and self.hand.trigger_done() and self._waited(0.9)
+        both = (
+            (self._alone or self.perception.compute_gap(self.partner) < SHUT)
+            and self.hand.is_trigger_done()
+            and self._has_lasted(0.9)
+        )
         if both:
             self._enter("lift")
-        elif self._waited(PATIENCE_S):
-            self._give_up(f"{self.partner} did not take the other corner within {PATIENCE_S:.0f} s")
+        elif self._has_lasted(PATIENCE_S):
+            self._fail(f"{self.partner} did not take the other corner within {PATIENCE_S:.0f} s")
 
     def _lift(self) -> None:
         """Both at once: a corner that goes up alone drags the other from under the fingers that press on it."""
         if self._entering_now:
-            (x, y, _), q = self.eyes.tip(self.robot)
-            self.hand.move_to(((x, y, self._table() + PRESS + 0.08), q), CAREFUL_SPEED, correct=False)
-        if self.hand.moved() and self._waited(1.0) and not self._stays_behind(self._slipped):
+            (x, y, _), q = self.perception.get_tip(self.robot)
+            self.hand.move_to(((x, y, self._compute_table_height() + PRESS + 0.08), q), CAREFUL_SPEED, correct=False)
+        if self.hand.has_moved() and self._has_lasted(1.0) and not self._check_slip(self._slipped):
             self._enter("together")
 
-    def _together(self) -> None:
-        """Waits until the partner has lifted his corner too."""
+    def _wait_for_partner(self) -> None:
+        """Wait until the partner has lifted the other corner."""
         if self._entering_now:
             self.hand.hold_still()
-        if self._stays_behind(self._slipped):
+        if self._check_slip(self._slipped):
             return
-        lifted = self.eyes.corner(self._other)[2] > self._table() + 0.05 and self.eyes.gap(self.partner) < SHUT
+        lifted = (
+            self.perception.get_corner(self._other)[2] > self._compute_table_height() + 0.05
+            and self.perception.compute_gap(self.partner) < SHUT
+        )
         if lifted or self._alone:
-            self._alone = True  # the partner may have laid his down when mine has to be taken again
+            self._alone = True  # the partner may have laid the other corner down before a new attempt
             self._enter("sight" if self._mending else "over")
-        elif self._waited(PATIENCE_S):
-            self._give_up(f"{self.partner} did not lift the other corner within {PATIENCE_S:.0f} s")
+        elif self._has_lasted(PATIENCE_S):
+            self._fail(f"{self.partner} did not lift the other corner within {PATIENCE_S:.0f} s")
 
-    def _over(self) -> None:
+    def _carry_over(self) -> None:
         """Up to above the fold."""
         if self._entering_now:
-            self.hand.move_to(self._tip_at(_between(self._pinch, self._goal), 0.17), CARRY_SPEED)
-        self._carried("across", 0.02)
+            self.hand.move_to(self._compute_tip(_compute_middle(self._pinch, self._goal), 0.17), CARRY_SPEED)
+        self._finish_carry("across", 0.02)
 
-    def _across(self) -> None:
+    def _carry_across(self) -> None:
         if self._entering_now:
-            self.hand.move_to(self._tip_at(self._goal, 0.08), CARRY_SPEED)
-        self._carried("sight", 0.02)
+            self.hand.move_to(self._compute_tip(self._goal, 0.08), CARRY_SPEED)
+        self._finish_carry("sight", 0.02)
 
     def _sight(self) -> None:
         """Waits for a picture of the cloth that is younger than the movement."""
-        if self._seen_for(0.2):
-            self._carried("aim", math.inf)
+        if self._is_shown_for(0.2):
+            self._finish_carry("aim", math.inf)
 
     def _aim(self) -> None:
         """By sight: the corner itself over the other, which may have moved meanwhile."""
         if self._entering_now:
-            tip = self.eyes.tip(self.robot)[0]
-            mine, onto = self.eyes.corner(self._mine), self.eyes.corner(self._onto)
+            tip = self.perception.get_tip(self.robot)[0]
+            mine, onto = self.perception.get_corner(self._mine), self.perception.get_corner(self._onto)
             self._goal = (tip[0] + onto[0] - mine[0], tip[1] + onto[1] - mine[1], 0.0)
             if not self._mending:
-                self._goal = self._within_reach_of_the_cloth(onto)
-            self.hand.move_to(self._tip_at(self._goal, RELEASE + 0.015), CAREFUL_SPEED)
-        self._carried("lower", 0.006)
+                self._goal = self._limit_goal(onto)
+            self.hand.move_to(self._compute_tip(self._goal, RELEASE + 0.015), CAREFUL_SPEED)
+        self._finish_carry("lower", 0.006)
 
-    def _within_reach_of_the_cloth(self, onto: Vec3) -> Vec3:
+    def _limit_goal(self, onto: Vec3) -> Vec3:
         """The goal, a little outwards because the corner falls back, but so that the cloth is not drawn taut."""
         (x, y, _), (ox, oy, _), (fx, fy, _) = self._goal, self._outward, self._ahead
         x, y = x + FALLS_BACK * ox, y + FALLS_BACK * oy
@@ -218,52 +228,53 @@ class Folder(SoftPhases):
         back = min(0.0, BEYOND - (x - onto[0]) * fx - (y - onto[1]) * fy)
         return (x + apart * ox + back * fx, y + apart * oy + back * fy, 0.0)
 
-    def _carried(self, then: str, within_m: float) -> None:
-        if self._stays_behind(f"{self.robot} dropped the {self.cloth} on the way"):
+    def _finish_carry(self, then: str, within_m: float) -> None:
+        if self._check_slip(f"{self.robot} dropped the {self.cloth} on the way"):
             return
-        if self.hand.arrived(within_m, 0.06) or self._waited(6.0):
+        if self.hand.has_arrived(within_m, 0.06) or self._has_lasted(6.0):
             self._enter(then)
 
     def _lower(self) -> None:
         if self._entering_now:
-            self.hand.move_to(self._tip_at(self._goal, RELEASE), CAREFUL_SPEED)
-        self._carried("ready", 0.005)
+            self.hand.move_to(self._compute_tip(self._goal, RELEASE), CAREFUL_SPEED)
+        self._finish_carry("ready", 0.005)
 
-    def _ready(self) -> None:
-        """Both let go at once: the cloth between them draws on the corner that is let go first."""
+    def _wait_for_release(self) -> None:
+        """Release both corners at once: the cloth between them pulls on the one that is released first."""
         if self._entering_now:
             self.hand.hold_still()
-        low = self.eyes.tip(self.partner)[0][2] < self._table() + RELEASE + 0.008
-        if low or self.eyes.gap(self.partner) > SHUT or self._waited(TOGETHER_S):
+        low = self.perception.get_tip(self.partner)[0][2] < self._compute_table_height() + RELEASE + 0.008
+        if low or self.perception.compute_gap(self.partner) > SHUT or self._has_lasted(TOGETHER_S):
             self._enter("open")
 
     def _open(self) -> None:
         if self._entering_now:
             self.hand.hold_still()
             self.hand.trigger_goal = TRIGGER_AFTER
-        if self.hand.trigger_done() and self._waited(0.8):
+        if self.hand.is_trigger_done() and self._has_lasted(0.8):
             self._enter("leave")
 
     def _leave(self) -> None:
         if self._entering_now:
-            self.hand.move_to(above(self.eyes.tip(self.robot), CLEAR_ABOVE), 0.12, correct=False)
-        if self.hand.moved():
+            self.hand.move_to(raise_pose(self.perception.get_tip(self.robot), CLEAR_ABOVE), 0.12, correct=False)
+        if self.hand.has_moved():
             self._enter("judge")
 
     def _judge(self) -> None:
-        """Whether the corner stayed where it was laid."""
-        if self.eyes.corners_still_s < 0.3 and not self._seen_for(5.0):
+        """Check that the corner stayed where it was laid."""
+        if self.perception.corners_still_s < 0.3 and not self._is_shown_for(5.0):
             return
-        if self.eyes.corner(self._mine)[2] > self._table() + HANGING and self._shakes < SHAKES:
+        if self.perception.get_corner(self._mine)[2] > self._compute_table_height() + HANGING and self._shakes < SHAKES:
             self._shakes += 1
             self._enter("shake")
-        elif self._folded(LAID):
+        elif self._is_folded(LAID):
             self._enter("return")
 
-    def _folded(self, within_m: float) -> bool:
-        """Whether the corners lie together. If not, they are brought together: the outer one is taken, which lies by
+    def _is_folded(self, within_m: float) -> bool:
+        """Return True if the corners lie together. If not, start to bring them together: the outer one is grasped,
+        which lies by
         itself and not on the other layer."""
-        mine, onto = self.eyes.corner(self._mine), self.eyes.corner(self._onto)
+        mine, onto = self.perception.get_corner(self._mine), self.perception.get_corner(self._onto)
         missing = distance(mine, onto)
         if missing <= within_m:
             return True
@@ -274,58 +285,61 @@ class Folder(SoftPhases):
         self._retry(f"the corners of the {self.cloth} lie {missing * 100:.1f} cm apart")
         return False
 
-    def _returned(self) -> None:
+    def _on_returned(self) -> None:
         self._enter("watch")
 
     def _watch(self) -> None:
-        """Until the partner is back too: what he does may move the own corner."""
-        busy = self.eyes.tip(self.partner)[0][2] < self._table() + HOME_ABOVE
+        """Until the partner is back too: the partner may still move the own corner."""
+        busy = self.perception.get_tip(self.partner)[0][2] < self._compute_table_height() + HOME_ABOVE
         if self._entering_now or busy:
-            self._since_s = self.eyes.now_s
-        settled = self.eyes.captured_s > self._since_s + SETTLED_S
-        if (settled or self._waited(PATIENCE_S)) and self._folded(FOLDED):
+            self._since_s = self.perception.now_s
+        settled = self.perception.captured_s > self._since_s + SETTLED_S
+        if (settled or self._has_lasted(PATIENCE_S)) and self._is_folded(FOLDED):
             self._finish()
 
     def _shake(self) -> None:
         """Down to where it belongs, and the fingers moved, so that it slips off."""
         if self._entering_now:
             self.hand.trigger_goal = 0.0 if self._shakes % 2 else TRIGGER_AFTER
-            self.hand.move_to(self._tip_at(self._goal, RELEASE), CAREFUL_SPEED)
-        if self.hand.moved() and self.hand.trigger_done() and self._waited(1.2):
+            self.hand.move_to(self._compute_tip(self._goal, RELEASE), CAREFUL_SPEED)
+        if self.hand.has_moved() and self.hand.is_trigger_done() and self._has_lasted(1.2):
             self._enter("leave")
 
     def _back_off(self) -> None:
         if self._entering_now:
             self.hand.trigger_goal = 0.0
-            self.hand.move_to(above(self.eyes.tip(self.robot), CLEAR_ABOVE), correct=False)
-        if self.hand.moved() and self.hand.trigger_done() and self._waited(1.5):
+            self.hand.move_to(raise_pose(self.perception.get_tip(self.robot), CLEAR_ABOVE), correct=False)
+        if self.hand.has_moved() and self.hand.is_trigger_done() and self._has_lasted(1.5):
             self._enter("look")
 
     # --- geometry as seen ---------------------------------------------------------------------------------------------
 
-    def _table(self) -> float:
+    def _compute_table_height(self) -> float:
         """Height of the table [m], world frame."""
-        return self.eyes.base(self.robot)[0][2] - self.arm.above_table
+        return self.perception.get_base(self.robot)[0][2] - self.arm.above_table
 
-    def _holding(self) -> bool:
-        """Whether the corner goes with the fingers."""
-        tip = self.eyes.tip(self.robot)[0]
-        return distance(self.eyes.corner(self._mine), tip) < 0.06 and self.eyes.gap(self.robot) < SHUT
+    def _is_holding(self) -> bool:
+        """Return True if the corner moves with the fingers."""
+        tip = self.perception.get_tip(self.robot)[0]
+        return (
+            distance(self.perception.get_corner(self._mine), tip) < 0.06
+            and self.perception.compute_gap(self.robot) < SHUT
+        )
 
-    def _tip_at(self, place: Vec3, height: float) -> PoseTuple:
+    def _compute_tip(self, place: Vec3, height: float) -> PoseTuple:
         """Fingers down, closing across the diagonal of the corner; `height` above the table. Turns the wrist least."""
-        home = (self._home or self.eyes.tip(self.robot))[1]
+        home = (self._home or self.perception.get_tip(self.robot))[1]
         turns = [quat_mul(quat_from_yaw(self._diagonal + half), DOWN) for half in (0.0, math.pi)]
         q = min(turns, key=lambda turn: quat_angle(turn, home))
-        return ((place[0], place[1], self._table() + height), q)
+        return ((place[0], place[1], self._compute_table_height() + height), q)
 
 
-def _toward(a: Vec3, b: Vec3) -> Vec3:
+def _compute_direction(a: Vec3, b: Vec3) -> Vec3:
     """Horizontal unit vector from `a` to `b`."""
     dx, dy = b[0] - a[0], b[1] - a[1]
     apart = max(math.hypot(dx, dy), 1e-6)
     return (dx / apart, dy / apart, 0.0)
 
 
-def _between(a: Vec3, b: Vec3) -> Vec3:
+def _compute_middle(a: Vec3, b: Vec3) -> Vec3:
     return ((a[0] + b[0]) / 2.0, (a[1] + b[1]) / 2.0, (a[2] + b[2]) / 2.0)

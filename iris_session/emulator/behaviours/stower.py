@@ -1,4 +1,4 @@
-"""Stows a soft body: takes it from the table, lifts it clear, lays it into an open box and lets go."""
+"""Stows a soft body: takes it from the table, lifts it clear, lays it into an open box and releases it."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ import math
 
 from anchors.pose import PoseTuple, Vec3, apply, distance, inverse, quat_angle, quat_from_yaw, quat_mul
 from iris_session.emulator.behaviours.arms import ARM, ArmKind
-from iris_session.emulator.behaviours.deformables import CORNERS, SoftEyes, mean
-from iris_session.emulator.behaviours.operator import CAREFUL_SPEED, CLEAR_ABOVE
-from iris_session.emulator.behaviours.soft import SoftPhases
-from iris_session.emulator.behaviours.things import DOWN, above
+from iris_session.emulator.behaviours.deformables import CORNERS, DeformablePerception, DeformableTask, compute_mean
+from iris_session.emulator.behaviours.handover import CAREFUL_SPEED, CLEAR_ABOVE
+from iris_session.emulator.behaviours.objects import DOWN, raise_pose
 from iris_session.protocol.names import Device
 
 #: The body of the box; its origin is in the middle of the inner floor.
@@ -18,14 +17,14 @@ BOX: str = "box"
 BOX_INSIDE: Vec3 = (0.240, 0.095, 0.070)
 #: So far its lowest corner is lifted above the table [m]: over the walls of the box, and more than 10 cm.
 LIFTED: float = 0.12
-#: The body is let go so far above the floor of the box [m].
+#: The body is released so far above the floor of the box [m].
 DROP: float = 0.006
 #: A body that is squeezed is narrower than this between the pads [m], one that is not there lets them close.
 SQUEEZED: float = 0.050
 EMPTY: float = 0.012
 
 
-class Stower(SoftPhases):
+class Stower(DeformableTask):
     """Stows `soft` with `robot`. `place`: where in the box its middle comes to lie (x, y [m], world)."""
 
     def __init__(
@@ -36,13 +35,13 @@ class Stower(SoftPhases):
         arm: ArmKind = ARM,
         place: tuple[float, float] | None = None,
     ) -> None:
-        super().__init__(robot, device, SoftEyes(soft, (robot,), (BOX,), arm), arm)
+        super().__init__(robot, device, DeformablePerception(soft, (robot,), (BOX,), arm), arm)
         self.soft = soft
         self._place = place
         self._grip: PoseTuple = ((0.0, 0.0, 0.0), DOWN)
         self._steps |= {
             "wait": self._wait,
-            "look": self._look,
+            "look": self._choose_grip,
             "approach": self._approach,
             "descend": self._descend,
             "close": self._close,
@@ -56,120 +55,120 @@ class Stower(SoftPhases):
         }
 
     def _wait(self) -> None:
-        self._home = self.eyes.tip(self.robot)
+        self._home = self.perception.get_tip(self.robot)
         self._enter("look")
 
-    def _look(self) -> None:
+    def _choose_grip(self) -> None:
         """Waits until it lies still."""
-        if self.eyes.corners_still_s >= 0.3:
-            self._grip = (self.eyes.middle, self._across(self.eyes.corners))
+        if self.perception.corners_still_s >= 0.3:
+            self._grip = (self.perception.middle, self._compute_grip_turn(self.perception.corners))
             self._enter("approach")
 
     def _approach(self) -> None:
         if self._entering_now:
             self.hand.trigger_goal = 0.0
-            self.hand.move_to(above(self._grip, CLEAR_ABOVE))
-        if self.hand.arrived(0.008, 0.06) and self.hand.trigger_done():
+            self.hand.move_to(raise_pose(self._grip, CLEAR_ABOVE))
+        if self.hand.has_arrived(0.008, 0.06) and self.hand.is_trigger_done():
             self._enter("descend")
-        elif self._waited(8.0):
+        elif self._has_lasted(8.0):
             self._retry(f"{self.robot} cannot reach the {self.soft}")
 
     def _descend(self) -> None:
         if self._entering_now:
             self.hand.move_to(self._grip, CAREFUL_SPEED)
-        if self.hand.arrived(0.004, 0.04):
+        if self.hand.has_arrived(0.004, 0.04):
             self._enter("close")
-        elif self._waited(6.0):
+        elif self._has_lasted(6.0):
             self._retry(f"{self.robot} cannot reach down to the {self.soft}")
 
     def _close(self) -> None:
         if self._entering_now:
             self.hand.hold_still()
             self.hand.trigger_goal = 1.0
-        if self.hand.trigger_done() and self._waited(0.9) and self._holding():
+        if self.hand.is_trigger_done() and self._has_lasted(0.9) and self._is_holding():
             self._enter("lift")
-        elif self._seen_for(2.5):
+        elif self._is_shown_for(2.5):
             self._retry(f"{self.robot} closed its gripper beside the {self.soft}")
 
     def _lift(self) -> None:
         if self._entering_now:
-            self.hand.move_to(above(self._grip, LIFTED + 0.03))
-        self._carried("carry", 0.01)
+            self.hand.move_to(raise_pose(self._grip, LIFTED + 0.03))
+        self._finish_carry("carry", 0.01)
 
     def _carry(self) -> None:
         if self._entering_now:
-            (x, y), z = self._goal(), self.eyes.tip(self.robot)[0][2]
+            (x, y), z = self._compute_goal(), self.perception.get_tip(self.robot)[0][2]
             self.hand.move_to(((x, y, z), self._grip[1]))
-        self._carried("lower", 0.006)
+        self._finish_carry("lower", 0.006)
 
     def _lower(self) -> None:
         """Until its lowest corner is just above the floor of the box."""
         if self._entering_now:
-            lowest = min(corner[2] for corner in self.eyes.corners.values())
-            down = lowest - self.eyes.body(BOX)[0][2] - DROP
-            self.hand.move_to(above(self.eyes.tip(self.robot), -down), CAREFUL_SPEED)
-        self._carried("open", 0.005)
+            lowest = min(corner[2] for corner in self.perception.corners.values())
+            down = lowest - self.perception.get_body(BOX)[0][2] - DROP
+            self.hand.move_to(raise_pose(self.perception.get_tip(self.robot), -down), CAREFUL_SPEED)
+        self._finish_carry("open", 0.005)
 
-    def _carried(self, then: str, within_m: float) -> None:
-        if self._stays_behind(f"the {self.soft} slipped out of the gripper of {self.robot}"):
+    def _finish_carry(self, then: str, within_m: float) -> None:
+        if self._check_slip(f"the {self.soft} slipped out of the gripper of {self.robot}"):
             return
-        if self.hand.arrived(within_m, 0.06) or self._waited(5.0):
+        if self.hand.has_arrived(within_m, 0.06) or self._has_lasted(5.0):
             self._enter(then)
 
     def _open(self) -> None:
         if self._entering_now:
             self.hand.hold_still()
             self.hand.trigger_goal = 0.0
-        if self.hand.trigger_done() and self._waited(0.8):
+        if self.hand.is_trigger_done() and self._has_lasted(0.8):
             self._enter("leave")
 
     def _leave(self) -> None:
         if self._entering_now:
-            self.hand.move_to(above(self.eyes.tip(self.robot), CLEAR_ABOVE), 0.25, correct=False)
-        if self.hand.moved():
+            self.hand.move_to(raise_pose(self.perception.get_tip(self.robot), CLEAR_ABOVE), 0.25, correct=False)
+        if self.hand.has_moved():
             self._enter("judge")
 
     def _judge(self) -> None:
-        """Whether it lies in the box."""
-        if self.eyes.corners_still_s < 0.3 and not self._seen_for(5.0):
+        """Check that it lies in the box."""
+        if self.perception.corners_still_s < 0.3 and not self._is_shown_for(5.0):
             return
-        if all(self._inside(corner) for corner in self.eyes.corners.values()):
+        if all(self._is_inside_box(corner) for corner in self.perception.corners.values()):
             self._enter("return")
         else:
-            self._give_up(f"the {self.soft} does not lie in the box")
+            self._fail(f"the {self.soft} does not lie in the box")
 
     def _back_off(self) -> None:
         if self._entering_now:
             self.hand.trigger_goal = 0.0
-            self.hand.move_to(above(self.eyes.tip(self.robot), CLEAR_ABOVE), correct=False)
-        if self.hand.moved() and self.hand.trigger_done() and self._waited(1.5):
+            self.hand.move_to(raise_pose(self.perception.get_tip(self.robot), CLEAR_ABOVE), correct=False)
+        if self.hand.has_moved() and self.hand.is_trigger_done() and self._has_lasted(1.5):
             self._enter("look")
 
     # --- geometry as seen ---------------------------------------------------------------------------------------------
 
-    def _across(self, corners: dict[int, Vec3]) -> tuple[float, float, float, float]:
+    def _compute_grip_turn(self, corners: dict[int, Vec3]) -> tuple[float, float, float, float]:
         """Turn of a tip that takes it from above across its length, and turns the wrist least."""
         order = CORNERS[self.soft]
-        (ax, ay, _), (bx, by, _) = (mean(corners[i] for i in end) for end in (order[:4], order[4:]))
+        (ax, ay, _), (bx, by, _) = (compute_mean(corners[i] for i in end) for end in (order[:4], order[4:]))
         yaw = math.atan2(by - ay, bx - ax)
-        home = (self._home or self.eyes.tip(self.robot))[1]
+        home = (self._home or self.perception.get_tip(self.robot))[1]
         turns = [quat_mul(quat_from_yaw(yaw + half), DOWN) for half in (0.0, math.pi)]
         return min(turns, key=lambda turn: quat_angle(turn, home))
 
-    def _goal(self) -> tuple[float, float]:
-        """Where to lay it: the given place, else the half of the box on this side."""
+    def _compute_goal(self) -> tuple[float, float]:
+        """Return where to lay it: the given place, else the half of the box on this side."""
         if self._place is not None:
             return self._place
-        T_world_box = self.eyes.body(BOX)
-        mine = apply(inverse(T_world_box), self.eyes.base(self.robot)[0])
+        T_world_box = self.perception.get_body(BOX)
+        mine = apply(inverse(T_world_box), self.perception.get_base(self.robot)[0])
         x, y, _ = apply(T_world_box, (math.copysign(0.5 * BOX_INSIDE[0], mine[0]), 0.0, 0.0))
         return (x, y)
 
-    def _holding(self) -> bool:
-        """Whether it is between the pads and goes with them."""
-        near = distance(self.eyes.middle, self.eyes.tip(self.robot)[0]) < 0.04
-        return near and EMPTY < self.eyes.gap(self.robot) < SQUEEZED
+    def _is_holding(self) -> bool:
+        """Return True if it is between the pads and moves with them."""
+        near = distance(self.perception.middle, self.perception.get_tip(self.robot)[0]) < 0.04
+        return near and EMPTY < self.perception.compute_gap(self.robot) < SQUEEZED
 
-    def _inside(self, p_world: Vec3) -> bool:
-        x, y, z = apply(inverse(self.eyes.body(BOX)), p_world)
+    def _is_inside_box(self, p_world: Vec3) -> bool:
+        x, y, z = apply(inverse(self.perception.get_body(BOX)), p_world)
         return abs(x) < BOX_INSIDE[0] and abs(y) < BOX_INSIDE[1] and z < BOX_INSIDE[2]

@@ -6,8 +6,8 @@ import random
 
 from anchors.pose import PoseTuple, quat_from_rotvec, quat_mul
 from iris_session.emulator.behaviours.base import HandInput, OperatorView
-from iris_session.emulator.behaviours.eyes import Seen
 from iris_session.emulator.behaviours.hand import ClutchedHand
+from iris_session.emulator.behaviours.perception import TrackedPose
 from iris_session.protocol.names import Device
 
 #: How far the tip wanders from where it was at the start: per axis [m], and about each axis [rad].
@@ -16,7 +16,7 @@ ROAM_TURN = 0.25
 
 
 class Wander:
-    """Moves the tip about its first pose: a new goal, a short rest, now and then the clutch opened and closed again."""
+    """Moves the tip about its first pose: a new goal, a short rest, and at times a reclutch."""
 
     def __init__(self, robot: str, device: str = Device.CONTROLLER_RIGHT, seed: int = 0) -> None:
         self.phase = "wait"
@@ -25,7 +25,7 @@ class Wander:
         self.hand = ClutchedHand(device, robot)
         self._robot = robot
         self._random = random.Random(seed)
-        self._tip: Seen | None = None
+        self._tip: TrackedPose | None = None
         self._home: PoseTuple | None = None
         self._next_s = 0.0
         self._goals_left = 3
@@ -34,21 +34,21 @@ class Wander:
         """One hand input; see `Behaviour.update`."""
         seen, now_s = view.tip_pose(self._robot), view.session_time_ns * 1e-9
         if seen is not None and self._tip is None:
-            self._tip = Seen(seen, now_s)
+            self._tip = TrackedPose(seen, now_s)
         elif seen is not None and self._tip is not None:
             self._tip.update(seen, now_s)
         if self.hand.update(view, None if self._tip is None else self._tip.pose) and self._tip is not None:
             self._home = self._home or self._tip.pose
             if self.hand.now_s >= self._next_s:
                 self._begin_next(self._home)
-        return (self.hand.input(),)
+        return (self.hand.make_input(),)
 
     def _begin_next(self, home: PoseTuple) -> None:
         rng = self._random
         if self._goals_left == 0:
             self.phase = "clutch"
             pause_s = rng.uniform(0.4, 0.9)
-            self.hand.let_go(pause_s)
+            self.hand.open_clutch(pause_s)
             self._next_s, self._goals_left = self.hand.now_s + pause_s, rng.randint(2, 5)
             return
         self.phase = "move"
@@ -61,7 +61,7 @@ class Wander:
 
 
 class Idle:
-    """A person who holds the device and does nothing."""
+    """An operator who holds the device and does nothing."""
 
     def __init__(self, robot: str = "", device: str = Device.CONTROLLER_RIGHT) -> None:
         self.phase = "idle"

@@ -1,8 +1,8 @@
-"""What is played in the demos: for each a scene, where its sheet lies, and who does what. Nothing runs here.
+"""The demos: for each its scene, the pose of its sheet, and its cast of emulated operators. Nothing runs here.
 
-`handover`: two arms drawn from primitives and a hammer, or up to eight around a round table; always there.
-`iiwa`: the same with KUKA iiwa 14 arms. `aloha`: two ALOHA stations, two people with two arms each. `cloth`: two people
-fold a cloth. `soft`: two people stow a soft body each.
+`handover`: two arms drawn from primitives and a hammer, or up to eight around a round table; needs no data.
+`iiwa`: the same with KUKA iiwa 14 arms. `aloha`: two ALOHA stations, two operators with two arms each. `cloth`: two
+operators fold a cloth. `soft`: two operators stow a soft body each.
 """
 
 from __future__ import annotations
@@ -17,87 +17,102 @@ import mujoco
 
 from anchors.pose import PoseTuple, Vec3
 from iris_session.demo.goals import FoldGoal, Goal, StowGoal
-from iris_session.demo.named_scenes import Scene, aloha, arms, cloth, iiwa, scene_by_name, soft
+from iris_session.demo.named_scenes import (
+    NamedScene,
+    make_aloha,
+    make_arms,
+    make_cloth,
+    make_iiwa,
+    make_soft,
+    scene_by_name,
+)
 from iris_session.demo.scenes.deformables import BOX_HIGH, BOX_LOW, FOLD_PAIRS, RADIUS
-from iris_session.demo.scenes.generators import arm_names, bearing_of, circle_radius
-from iris_session.demo.scenes.iiwa import iiwa_radius
+from iris_session.demo.scenes.generators import arm_names, compute_bearing, compute_circle_radius
+from iris_session.demo.scenes.iiwa import compute_iiwa_radius
 from iris_session.emulator.headset import DEFAULT_ANCHOR_ID
 from iris_session.emulator.specs import HandTask, HeadsetSpec
 from iris_session.protocol.names import Device
 from iris_session.session.errors import ConfigError
 
-MOST_OPERATORS: Final = 8
-MOST_OBSERVERS: Final = 16
+MAX_OPERATORS: Final = 8
+MAX_OBSERVERS: Final = 16
 #: In the order in which they join.
 NAMES: Final = ("ann", "bob", "cem", "dia", "eli", "fay", "gus", "hoa")
-#: A person sits so far behind his arm, and his eyes are so far above the table [m].
+#: Distance of an operator behind the arm, and height of the eyes above the table [m].
 _BEHIND, _EYES = 0.45, 0.55
 
 
 @dataclass(frozen=True)
-class Play:
-    """A demo ready to run. `objects`: what must change hands. `goals`: what must be reached with deformables. `notes`:
-    what a reader should know about the cast."""
+class Demo:
+    """A demo ready to run. `objects`: objects that must be handed over. `goals`: goals for deformables. `notes`:
+    remarks
+    about the cast for the reader of the result."""
 
     name: str
     model: mujoco.MjModel
     anchors: Mapping[str, PoseTuple]
-    people: tuple[HeadsetSpec, ...]
+    headsets: tuple[HeadsetSpec, ...]
     objects: tuple[str, ...]
     notes: tuple[str, ...] = ()
     anchor_sizes: Mapping[str, float] = field(default_factory=dict)
     goals: tuple[Goal, ...] = ()
 
 
-def make_play(name: str, operators: int = 2, observers: int = 0, seed: int = 0) -> Play:
-    """The demo `name`. Raises `ConfigError` for people that it cannot use, `ModelNotFoundError` without its models."""
-    if name not in PLAYS:
-        raise ConfigError(f"there is no demo '{name}': {', '.join(PLAYS)}")
-    if not 0 <= observers <= MOST_OBSERVERS:
-        raise ConfigError(f"--observers {observers} is out of range: 0 to {MOST_OBSERVERS}")
-    play = PLAYS[name](operators, seed)
+def make_demo(name: str, operators: int = 2, observers: int = 0, seed: int = 0) -> Demo:
+    """Return the demo `name`. Raises `ConfigError` for an unusable cast, `ModelNotFoundError` without its models."""
+    if name not in DEMOS:
+        raise ConfigError(f"there is no demo '{name}': {', '.join(DEMOS)}")
+    if not 0 <= observers <= MAX_OBSERVERS:
+        raise ConfigError(f"--observers {observers} is out of range: 0 to {MAX_OBSERVERS}")
+    play = DEMOS[name](operators, seed)
     sheet = play.anchors[DEFAULT_ANCHOR_ID]
-    watching = tuple(_observer(i, observers, sheet, seed) for i in range(observers))
-    return dataclasses.replace(play, people=(*play.people, *watching))
+    watching = tuple(_make_observer(i, observers, sheet, seed) for i in range(observers))
+    return dataclasses.replace(play, headsets=(*play.headsets, *watching))
 
 
 # --- arms around a table ----------------------------------------------------------------------------------------------
 
 
-def _handover(operators: int, seed: int) -> Play:
+def _make_handover(operators: int, seed: int) -> Demo:
     _check_operators("handover", operators)
     if operators == 2:
-        play = _play("handover", scene_by_name("handover"), ("hammer",))
-        return _around(play, operators, 0.6, "arm", seed)
-    play = _play("handover", arms(operators), _things(operators))
-    return _around(play, operators, circle_radius(operators), "arm", seed)
+        play = _make_without_cast("handover", scene_by_name("handover"), ("hammer",))
+        return _cast_around_table(play, operators, 0.6, "arm", seed)
+    play = _make_without_cast("handover", make_arms(operators), _list_objects(operators))
+    return _cast_around_table(play, operators, compute_circle_radius(operators), "arm", seed)
 
 
-def _iiwa(operators: int, seed: int) -> Play:
+def _make_iiwa(operators: int, seed: int) -> Demo:
     _check_operators("iiwa", operators)
-    return _around(_play("iiwa", iiwa(operators), _things(operators)), operators, iiwa_radius(operators), "iiwa", seed)
+    return _cast_around_table(
+        _make_without_cast("iiwa", make_iiwa(operators), _list_objects(operators)),
+        operators,
+        compute_iiwa_radius(operators),
+        "iiwa",
+        seed,
+    )
 
 
-def _play(name: str, scene: Scene, objects: tuple[str, ...]) -> Play:
-    """Without its cast."""
-    return Play(name, scene.model, scene.anchors, (), objects, anchor_sizes=scene.anchor_sizes)
+def _make_without_cast(name: str, scene: NamedScene, objects: tuple[str, ...]) -> Demo:
+    """Return a demo without its cast."""
+    return Demo(name, scene.model, scene.anchors, (), objects, anchor_sizes=scene.anchor_sizes)
 
 
 def _check_operators(demo: str, operators: int) -> None:
-    if not 2 <= operators <= MOST_OPERATORS:
+    if not 2 <= operators <= MAX_OPERATORS:
         raise ConfigError(
-            f"demo {demo} takes 2 to {MOST_OPERATORS} operators, not {operators}: each has an arm of his own, and it "
+            f"demo {demo} takes 2 to {MAX_OPERATORS} operators, not {operators}: each has an arm, and it "
             "takes two to hand something over"
         )
 
 
-def _things(operators: int) -> tuple[str, ...]:
+def _list_objects(operators: int) -> tuple[str, ...]:
     return tuple(f"object{k + 1}" for k in range(operators // 2))
 
 
-def _around(play: Play, operators: int, radius: float, arm: str, seed: int) -> Play:
-    """Casts neighbours as pairs: the first gives to the second, the third to the fourth. Who is left over has no
-    partner."""
+def _cast_around_table(play: Demo, operators: int, radius: float, arm: str, seed: int) -> Demo:
+    """Cast adjacent operators as pairs: the first gives to the second, the third to the fourth. With an odd number the
+    last one has no partner."""
     sheet = play.anchors[DEFAULT_ANCHOR_ID]
     robots = arm_names(operators)
     people = []
@@ -116,31 +131,31 @@ def _around(play: Play, operators: int, radius: float, arm: str, seed: int) -> P
                 object=play.objects[min(i // 2, len(play.objects) - 1)],
                 arm=arm,
                 seed=seed + i,
-                eye=_seat(i, operators, radius, sheet[0]),
+                eye=_compute_seat(i, operators, radius, sheet[0]),
                 T_world_anchor=sheet,
             )
         )
-    return dataclasses.replace(play, people=tuple(people), notes=tuple(notes))
+    return dataclasses.replace(play, headsets=tuple(people), notes=tuple(notes))
 
 
-def _seat(i: int, operators: int, radius: float, sheet: Vec3) -> Vec3:
-    """Two people stand side by side before the sheet, more of them behind their arms."""
+def _compute_seat(i: int, operators: int, radius: float, sheet: Vec3) -> Vec3:
+    """Return the eye position: two operators stand side by side before the sheet, more of them behind their arms."""
     if operators == 2:
         return (0.35 * (2 * i - 1), sheet[1] - 0.5, _EYES)
-    bearing = bearing_of(i, operators)
+    bearing = compute_bearing(i, operators)
     return ((radius + _BEHIND) * math.cos(bearing), (radius + _BEHIND) * math.sin(bearing), _EYES)
 
 
 # --- two ALOHA stations -----------------------------------------------------------------------------------------------
 
 
-def _aloha(operators: int, seed: int) -> Play:
+def _make_aloha(operators: int, seed: int) -> Demo:
     if operators != 2:
         raise ConfigError(
             f"demo aloha has two stations with two arms each: 2 operators, not {operators}. For more people: "
             "iris-session demo handover --operators N"
         )
-    play = _play("aloha", aloha(), ("red_board", "blue_board"))
+    play = _make_without_cast("aloha", make_aloha(), ("red_board", "blue_board"))
     sheet = play.anchors[DEFAULT_ANCHOR_ID]
 
     def hand(station: str, side: str, behaviour: str, thing: str, partner: str, place: tuple[float, float]) -> HandTask:
@@ -154,7 +169,7 @@ def _aloha(operators: int, seed: int) -> Play:
             place=place,
         )
 
-    far, near = (0.015, 0.53), (-0.015, -0.53)  # where what was taken is laid: on the own table, out of the way
+    far, near = (0.015, 0.53), (-0.015, -0.53)  # where a receiver lays the board: on its own table, out of the way
     ann = (
         hand("south", "right", "giver", "red_board", "north/left", far),
         hand("south", "left", "receiver", "blue_board", "north/right", near),
@@ -167,32 +182,32 @@ def _aloha(operators: int, seed: int) -> Play:
         HeadsetSpec(name=name, hands=hands, seed=seed + i, eye=(0.0, y, 0.6), T_world_anchor=sheet)
         for i, (name, hands, y) in enumerate((("ann", ann, -1.25), ("bob", bob, 1.25)))
     )
-    return dataclasses.replace(play, people=people)
+    return dataclasses.replace(play, headsets=people)
 
 
-# --- things that bend -------------------------------------------------------------------------------------------------
+# --- deformables ------------------------------------------------------------------------------------------------------
 
 
-def _cloth(operators: int, seed: int) -> Play:
+def _make_cloth(operators: int, seed: int) -> Demo:
     goals = (FoldGoal("cloth", FOLD_PAIRS),)
-    return _at_table("cloth", operators, seed, cloth(), goals, ("folder", "folder"), ("cloth", "cloth"))
+    return _cast_at_table("cloth", operators, seed, make_cloth(), goals, ("folder", "folder"), ("cloth", "cloth"))
 
 
-def _soft(operators: int, seed: int) -> Play:
+def _make_soft(operators: int, seed: int) -> Demo:
     goals = tuple(StowGoal(name, BOX_LOW, BOX_HIGH) for name in ("rose", "mint"))
-    return _at_table("soft", operators, seed, soft(), goals, ("stower", "stower"), ("rose", "mint"))
+    return _cast_at_table("soft", operators, seed, make_soft(), goals, ("stower", "stower"), ("rose", "mint"))
 
 
-def _at_table(
+def _cast_at_table(
     name: str,
     operators: int,
     seed: int,
-    scene: Scene,
+    scene: NamedScene,
     goals: tuple[Goal, ...],
     behaviours: tuple[str, str],
     things: tuple[str, str],
-) -> Play:
-    """Two people side by side before the sheet, one arm each."""
+) -> Demo:
+    """Cast two operators side by side before the sheet, one arm each."""
     if operators != 2:
         raise ConfigError(
             f"demo {name} has two arms at one table: 2 operators, not {operators}. For more people: "
@@ -208,26 +223,26 @@ def _at_table(
             partner=partner,
             object=things[i],
             seed=seed + i,
-            eye=_seat(i, operators, RADIUS, sheet[0]),
+            eye=_compute_seat(i, operators, RADIUS, sheet[0]),
             T_world_anchor=sheet,
         )
         for i, (robot, partner) in enumerate(((left, right), (right, left)))
     )
-    play = _play(name, scene, ())
-    return dataclasses.replace(play, people=people, goals=goals)
+    play = _make_without_cast(name, scene, ())
+    return dataclasses.replace(play, headsets=people, goals=goals)
 
 
-PLAYS: Final[dict[str, Callable[[int, int], Play]]] = {
-    "handover": _handover,
-    "iiwa": _iiwa,
-    "aloha": _aloha,
-    "cloth": _cloth,
-    "soft": _soft,
+DEMOS: Final[dict[str, Callable[[int, int], Demo]]] = {
+    "handover": _make_handover,
+    "iiwa": _make_iiwa,
+    "aloha": _make_aloha,
+    "cloth": _make_cloth,
+    "soft": _make_soft,
 }
 
 
-def _observer(i: int, count: int, sheet: PoseTuple, seed: int) -> HeadsetSpec:
-    """Somebody who only looks, 1.2 m from the sheet."""
+def _make_observer(i: int, count: int, sheet: PoseTuple, seed: int) -> HeadsetSpec:
+    """Return an observer 1.2 m from the sheet."""
     x, y, z = sheet[0]
     bearing = -0.5 * math.pi + 2.0 * math.pi * (i + 0.5) / count
     eye = (x + 1.2 * math.cos(bearing), y + 1.2 * math.sin(bearing), z + _EYES)

@@ -1,4 +1,4 @@
-"""What a person knows about the things of the demo scenes: their size, and where to take and offer them.
+"""Objects of the demo scenes as known to scripted operators: their size, and where to grasp and offer them.
 
 Frames as in `demo/scenes/handover.xml`: x along the handle towards its free end, y across (the closing direction of
 a gripper), z up when it lies on the table, origin in the middle of the length.
@@ -28,8 +28,8 @@ _GRASP_ABOVE = 0.003
 
 
 @dataclass(frozen=True, slots=True)
-class Thing:
-    """A thing that can be handed over.
+class HandoverObject:
+    """An object that can be handed over.
 
     `giver_x`, `receiver_x`: where along x the giver and the receiver take it [m]. `half_width`: along y at both places
     [m]. `corners`: points of its outline that can touch a table. `symmetric`: either end may be given.
@@ -42,24 +42,24 @@ class Thing:
     corners: tuple[Vec3, ...]
     symmetric: bool = False
 
-    def lowest(self, T_world_thing: PoseTuple) -> float:
-        """Height of its lowest point [m]."""
+    def compute_lowest(self, T_world_thing: PoseTuple) -> float:
+        """Return the height of its lowest point [m]."""
         return min(apply(T_world_thing, corner)[2] for corner in self.corners)
 
 
 def _outline(*boxes: tuple[float, float, float, float]) -> tuple[Vec3, ...]:
-    """Corners of boxes given as (x from, x to, half width, half thickness)."""
+    """Return the corners of boxes given as (x from, x to, half width, half thickness)."""
     return tuple((x, y, z) for a, b, w, t in boxes for x in (a, b) for y in (-w, w) for z in (-t, t))
 
 
-HAMMER = Thing(
+HAMMER = HandoverObject(
     giver_x=-0.080,
     receiver_x=0.085,
     half_width=0.0123,
     half_thickness=0.016,
     corners=_outline((-0.164, -0.132, 0.062, 0.016), (0.036, 0.140, 0.0125, 0.0155)),
 )
-BOARD = Thing(
+BOARD = HandoverObject(
     giver_x=-0.080,
     receiver_x=0.080,
     half_width=0.028,
@@ -68,7 +68,7 @@ BOARD = Thing(
     symmetric=True,
 )
 #: Of the ALOHA scene: light enough for the points of its finger tips.
-SLAT = Thing(
+SLAT = HandoverObject(
     giver_x=-0.100,
     receiver_x=0.100,
     half_width=0.016,
@@ -76,43 +76,42 @@ SLAT = Thing(
     corners=_outline((-0.145, 0.145, 0.016, 0.0125)),
     symmetric=True,
 )
-KNOWN: dict[str, Thing] = {"hammer": HAMMER, "board": BOARD, "red_board": SLAT, "blue_board": SLAT}
+KNOWN_OBJECTS: dict[str, HandoverObject] = {"hammer": HAMMER, "board": BOARD, "red_board": SLAT, "blue_board": SLAT}
 
-#: Things that may lie about, to be kept clear of.
-COMMON_THINGS = (*KNOWN, *(f"object{i}" for i in range(1, 9)))
+#: Objects that may lie in the scene as obstacles.
+COMMON_OBJECTS = (*KNOWN_OBJECTS, *(f"object{i}" for i in range(1, 9)))
 
 
-def thing_named(name: str) -> Thing:
-    """The thing that body `name` is: one of `KNOWN`, or `objectN` of a generated scene (odd N: hammers)."""
+def find_object(name: str) -> HandoverObject:
+    """Return the object of body `name`: one of `KNOWN`, or `objectN` of a generated scene (odd N: hammers)."""
     if name.startswith("object") and name[6:].isdigit():
         return HAMMER if int(name[6:]) % 2 else BOARD
-    if name not in KNOWN:
-        raise ValueError(
-            f"no operator knows how to take '{name}'. Known things: {', '.join(KNOWN)}, object1, object2, ..."
-        )
-    return KNOWN[name]
+    if name not in KNOWN_OBJECTS:
+        raise ValueError(f"unknown object '{name}'. Known objects: {', '.join(KNOWN_OBJECTS)}, object1, object2, ...")
+    return KNOWN_OBJECTS[name]
 
 
-def face_up(T_world_thing: PoseTuple) -> float:
-    """1 when the thing's z axis points up, -1 when it lies on its other face."""
+def get_face_up(T_world_thing: PoseTuple) -> float:
+    """Return 1 when the object's z axis points up, -1 when it lies on its other face."""
     return 1.0 if quat_rotate(T_world_thing[1], (0.0, 0.0, 1.0))[2] >= 0.0 else -1.0
 
 
-def tilt(T_world_thing: PoseTuple) -> float:
-    """Angle [rad] between the thing's z axis and the vertical, 0 on either face."""
+def compute_tilt(T_world_thing: PoseTuple) -> float:
+    """Return the angle [rad] between the object's z axis and the vertical, 0 on either face."""
     return math.acos(min(1.0, abs(quat_rotate(T_world_thing[1], (0.0, 0.0, 1.0))[2])))
 
 
-def level(p_world: Vec3, yaw: float, up: float) -> PoseTuple:
-    """Pose of a thing that lies level with its x axis along `yaw` [rad], on the face given by `up`."""
+def make_level_pose(p_world: Vec3, yaw: float, up: float) -> PoseTuple:
+    """Return the pose of an object that lies level with its x axis along `yaw` [rad], on the face given by `up`."""
     q = quat_from_yaw(yaw)
     return (p_world, q if up > 0.0 else quat_mul(q, (0.0, 1.0, 0.0, 0.0)))
 
 
-def grasps(T_world_thing: PoseTuple, x: float, lean: float = 0.0) -> list[PoseTuple]:
-    """The two tip poses that take the thing at `x` [m] from above, half a turn from each other. The fingers lean
+def compute_grasps(T_world_thing: PoseTuple, x: float, lean: float = 0.0) -> list[PoseTuple]:
+    """Return the two tip poses that grasp the object at `x` [m] from above, half a turn from each other. The fingers
+    lean
     towards its middle by `lean` [rad]."""
-    up = face_up(T_world_thing)
+    up = get_face_up(T_world_thing)
     ways: tuple[Quat, Quat] = ((0.0, 0.0, 1.0, 0.0), (0.0, 1.0, 0.0, 0.0))
     if up < 0.0:
         ways = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
@@ -121,7 +120,7 @@ def grasps(T_world_thing: PoseTuple, x: float, lean: float = 0.0) -> list[PoseTu
     return [compose(T_world_thing, ((x, 0.0, up * _GRASP_ABOVE), quat_mul(leaning, way))) for way in ways]
 
 
-def above(pose: PoseTuple, height: float) -> PoseTuple:
-    """The same pose `height` [m] higher."""
+def raise_pose(pose: PoseTuple, height: float) -> PoseTuple:
+    """Return the same pose `height` [m] higher."""
     (x, y, z), q = pose
     return ((x, y, z + height), q)

@@ -6,12 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from iris_session.demo.plays import Play, make_play
+from iris_session.demo.demos import Demo, make_demo
 from iris_session.demo.scenes.deformables import BOX_HIGH, BOX_LOW
-from iris_session.emulator.behaviours.arms import arm_kind
+from iris_session.emulator.behaviours.arms import get_arm_kind
 from iris_session.emulator.behaviours.deformables import CORNERS
+from iris_session.emulator.behaviours.objects import find_object
 from iris_session.emulator.behaviours.stower import BOX, BOX_INSIDE
-from iris_session.emulator.behaviours.things import thing_named
 from iris_session.physics import World, find_objects, find_robots
 from iris_session.protocol.names import Device
 from iris_session.session.errors import ConfigError
@@ -33,61 +33,61 @@ CASTS = [
 
 
 @pytest.fixture(params=CASTS, ids=lambda cast: f"{cast[0]}-{cast[1]}")
-def play(request: pytest.FixtureRequest) -> Play:
+def play(request: pytest.FixtureRequest) -> Demo:
     name, operators = request.param
-    return make_play(name, operators, observers=3, seed=7)
+    return make_demo(name, operators, observers=3, seed=7)
 
 
-def test_everybody_has_robots_that_are_there_and_nobody_elses(play: Play) -> None:
+def test_everybody_has_robots_that_are_there_and_nobody_elses(play: Demo) -> None:
     robots = {robot.name for robot in find_robots(play.model)}
-    taken = [task.robot for person in play.people for task in person.tasks]
+    taken = [task.robot for person in play.headsets for task in person.tasks]
     assert sorted(taken) == sorted(set(taken))
     assert set(taken) == robots
-    assert sum(person.observer for person in play.people) == 3
-    assert len({person.name for person in play.people}) == len(play.people)
-    assert len({person.seed for person in play.people}) == len(play.people)
+    assert sum(person.observer for person in play.headsets) == 3
+    assert len({person.name for person in play.headsets}) == len(play.headsets)
+    assert len({person.seed for person in play.headsets}) == len(play.headsets)
 
 
-def test_every_object_goes_from_one_person_to_another(play: Play) -> None:
-    tasks = {task.robot: (person.name, task) for person in play.people for task in person.tasks}
+def test_every_object_goes_from_one_person_to_another(play: Demo) -> None:
+    tasks = {task.robot: (person.name, task) for person in play.headsets for task in person.tasks}
     names = {o.name for o in find_objects(play.model)}
     for thing in play.objects:
         assert thing in names
-        assert thing_named(thing).half_width > 0.0
+        assert find_object(thing).half_width > 0.0
         (giver,) = [t for _, t in tasks.values() if t.behaviour == "giver" and t.object == thing]
         (receiver,) = [t for _, t in tasks.values() if t.behaviour == "receiver" and t.object == thing]
         assert (giver.partner, receiver.partner) == (receiver.robot, giver.robot)
         assert tasks[giver.robot][0] != tasks[receiver.robot][0]
 
 
-def test_every_goal_is_somebodys_task_and_its_corners_are_those_of_the_scene(play: Play) -> None:
+def test_every_goal_is_somebodys_task_and_its_corners_are_those_of_the_scene(play: Demo) -> None:
     world = World(play.model, find_robots(play.model), find_objects(play.model))
     for goal in play.goals:
-        assert goal.deformable in {task.object for person in play.people for task in person.tasks}
+        assert goal.deformable in {task.object for person in play.headsets for task in person.tasks}
         vertices = world.flexes.read_vertices(goal.deformable)
         corners = vertices[list(CORNERS[goal.deformable])]
         ends = [corners.min(axis=0), corners.max(axis=0)]
         np.testing.assert_allclose(ends, [vertices.min(axis=0), vertices.max(axis=0)], atol=1e-9)
-        assert not goal.met(vertices)
+        assert not goal.is_met(vertices)
     if play.name == "soft":  # people know the box by its body and its size
         np.testing.assert_allclose(np.subtract(BOX_HIGH, BOX_LOW)[:2] / 2.0, BOX_INSIDE[:2], atol=1e-9)
         np.testing.assert_allclose(np.add(BOX_HIGH, BOX_LOW)[:2] / 2.0, world.data.body(BOX).xpos[:2], atol=1e-9)
 
 
-def test_the_first_corners_of_a_soft_body_are_those_of_one_end(play: Play) -> None:
+def test_the_first_corners_of_a_soft_body_are_those_of_one_end(play: Demo) -> None:
     world = World(play.model, find_robots(play.model), ())
     for name in {goal.deformable for goal in play.goals} - {"cloth"}:
         corners = world.flexes.read_vertices(name)[list(CORNERS[name])]
         assert (corners[:4, 0] < corners[4:, 0]).all()
 
 
-def test_what_people_know_of_their_arms_is_true(play: Play) -> None:
+def test_what_people_know_of_their_arms_is_true(play: Demo) -> None:
     """Bodies have the names that they look for, and closed pads meet at the tip."""
     data = mujoco.MjData(play.model)
     mujoco.mj_resetDataKeyframe(play.model, data, 0)
     mujoco.mj_forward(play.model, data)
-    for task in (task for person in play.people for task in person.tasks):
-        arm = arm_kind(task.arm)
+    for task in (task for person in play.headsets for task in person.tasks):
+        arm = get_arm_kind(task.arm)
         assert data.body(f"{task.robot}/{arm.base}").xpos[2] == pytest.approx(arm.above_table, abs=2e-3)
         pads = [
             data.body(f"{task.robot}/{finger}").xpos + data.body(f"{task.robot}/{finger}").xmat.reshape(3, 3) @ pad
@@ -99,18 +99,18 @@ def test_what_people_know_of_their_arms_is_true(play: Play) -> None:
         assert abs(across @ tip.xmat.reshape(3, 3)[:, 1]) == pytest.approx(1.0, abs=1e-3)
 
 
-def test_the_sheet_lies_where_the_session_believes(play: Play) -> None:
+def test_the_sheet_lies_where_the_session_believes(play: Demo) -> None:
     data = mujoco.MjData(play.model)
     mujoco.mj_resetDataKeyframe(play.model, data, 0)
     mujoco.mj_forward(play.model, data)
     (sheet,) = play.anchors.values()
     np.testing.assert_allclose(data.body("sheet").xpos, sheet[0], atol=1e-9)
-    assert {person.T_world_anchor for person in play.people} == {sheet}
+    assert {person.T_world_anchor for person in play.headsets} == {sheet}
 
 
 def test_aloha_gives_each_person_two_hands() -> None:
-    play = make_play("aloha")
-    assert [[t.device for t in p.tasks] for p in play.people] == [
+    play = make_demo("aloha")
+    assert [[t.device for t in p.tasks] for p in play.headsets] == [
         [Device.CONTROLLER_RIGHT, Device.CONTROLLER_LEFT],
         [Device.CONTROLLER_LEFT, Device.CONTROLLER_RIGHT],
     ]
@@ -118,9 +118,9 @@ def test_aloha_gives_each_person_two_hands() -> None:
 
 
 def test_who_is_left_over_moves_freely_and_it_is_said() -> None:
-    play = make_play("handover", 5)
-    assert [p.behaviour for p in play.people] == ["giver", "receiver", "giver", "receiver", "wander"]
-    assert play.people[-1].endless
+    play = make_demo("handover", 5)
+    assert [p.behaviour for p in play.headsets] == ["giver", "receiver", "giver", "receiver", "wander"]
+    assert play.headsets[-1].endless
     assert "eli has no partner" in play.notes[0]
 
 
@@ -138,4 +138,4 @@ def test_who_is_left_over_moves_freely_and_it_is_said() -> None:
 )
 def test_people_that_a_demo_cannot_use_are_explained(demo: str, operators: int, observers: int, why: str) -> None:
     with pytest.raises(ConfigError, match=why):
-        make_play(demo, operators, observers)
+        make_demo(demo, operators, observers)

@@ -1,0 +1,436 @@
+"""Handover tasks: the giver offers an object in mid-air, the receiver takes its free end and lays it down."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+
+from anchors.pose import PoseTuple, Vec3, apply, compose, distance, inverse, quat_angle, quat_rotate
+from iris_session.emulator.behaviours.arms import ARM, ArmKind
+from iris_session.emulator.behaviours.objects import (
+    COMMON_OBJECTS,
+    HandoverObject,
+    compute_grasps,
+    compute_tilt,
+    find_object,
+    get_face_up,
+    make_level_pose,
+    raise_pose,
+)
+from iris_session.emulator.behaviours.perception import Perception
+from iris_session.emulator.behaviours.phases import PhasedTask
+from iris_session.protocol.names import Device
+
+#: How far above a grasp the hand first goes, and how far it backs off afterwards [m].
+CLEAR_ABOVE = 0.11
+#: Speed of the last centimetres before a grasp [m/s].
+CAREFUL_SPEED = 0.16
+
+
+class HandoverTask(PhasedTask):
+    """Takes a thing, and has a partner. A subclass adds its phases to `self._steps`, and says where to take it."""
+
+    def __init__(self, robot: str, object: str, partner: str, device: str, arm: ArmKind = ARM) -> None:
+        self.perception = Perception(
+            (object,), (robot, partner), tuple(name for name in COMMON_OBJECTS if name != object), arm
+        )
+        super().__init__(robot, device, self.perception, arm)
+        self.object, self.partner = object, partner
+        self.object_model: HandoverObject = find_object(object)
+        self._steps |= {
+            "wait": self._wait,
+            "approach": self._approach,
+            "descend": self._descend,
+            "close": self._close,
+            "back_off": self._back_off,
+            "rise": self._rise,
+            "step_back": self._step_back,
+        }
+        self._clutched_again = 0
+        self._take_x = 0.0  # where along the thing it is taken [m]
+        self._after_close = ""
+
+    # --- phases that both know ----------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _first_phase(self) -> str:
+        """The phase in which taking the thing begins, and begins again after a failed attempt."""
+
+    def _wait(self) -> None:
+        self._home = self.perception.get_tip(self.robot)
+        self._enter(self._first_phase())
+
+    def _approach(self) -> None:
+        if self._entering_now:
+            self.hand.trigger_goal = 0.0
+            self.hand.move_to(raise_pose(self._compute_grasp(), CLEAR_ABOVE))
+        if self.hand.has_arrived(0.008, 0.06) and self.hand.is_trigger_done():
+            self._enter("descend")
+        elif self._has_lasted(8.0):
+            self._retry(f"{self.robot} cannot reach the {self.object}")
+
+    def _descend(self) -> None:
+        if self._entering_now:
+            self.hand.move_to(self._compute_grasp(), CAREFUL_SPEED)
+        if self.hand.has_arrived(self.arm.near_m, self.arm.near_rad) or (
+            self._has_lasted(4.0) and self.hand.has_arrived(0.006, 0.06)
+        ):
+            self._enter("close")
+        elif self._has_lasted(6.0):
+            self._retry(f"{self.robot} cannot reach down to the {self.object}")
+
+    def _close(self) -> None:
+        if self._entering_now:
+            self.hand.hold_still()
+            self.hand.trigger_goal = 1.0
+        if self.hand.is_trigger_done() and self._has_lasted(0.7) and self._is_holding():
+            self._enter(self._after_close)
+        elif self._has_lasted(2.5):
+            self._retry(f"{self.robot} closed its gripper beside the {self.object}")
+
+    def _back_off(self) -> None:
+        if self._entering_now:
+            self.hand.trigger_goal = 0.0
+            self.hand.move_to(self.perception.get_tip(self.robot))
+        if self.hand.is_trigger_done() and self._has_lasted(0.8):
+            self.hand.move_to(raise_pose(self.perception.get_tip(self.robot), CLEAR_ABOVE), correct=False)
+            self._enter("rise")
+
+    def _rise(self) -> None:
+        if self.hand.has_moved():
+            self._enter("step_back")
+
+    def _step_back(self) -> None:
+        """Back to where the hand began: nothing leans on the arm there, and both operators can see the object."""
+        if self._entering_now and self._home is not None:
+            self.hand.move_to(self._home)
+        if self.hand.has_arrived(0.02, 0.1) or self._has_lasted(4.0):
+            self._enter(self._first_phase())
+
+    def _open_gripper(self, then: str) -> None:
+        """Opens, goes on with `then`. A gripper that does not follow: the engagement was lost, clutch again."""
+        if self._entering_now:
+            self._clutched_again = 0
+        self.hand.hold_still()
+        self.hand.trigger_goal = 0.0
+        if (
+            self.hand.is_trigger_done()
+            and self.perception.compute_gap(self.robot) > 2.0 * self.object_model.half_width + 0.010
+        ):
+            self._enter(then)
+        elif self._has_lasted(8.0):
+            self._fail(f"the gripper of {self.robot} does not open")
+        elif self._has_lasted(1.5 * (self._clutched_again + 1)):
+            self._clutched_again += 1
+            self.hand.reclutch()
+
+    # --- geometry as seen ---------------------------------------------------------------------------------------------
+
+    def _compute_grasp(self) -> PoseTuple:
+        """Tip pose that takes the thing where it is seen now, and turns the wrist least."""
+        T_world_thing = self.perception.get_body(self.object)
+        return min(
+            compute_grasps(T_world_thing, self._take_x, self.arm.lean),
+            key=lambda tip: self._compute_turn(tip, T_world_thing),
+        )
+
+    def _compute_turn(self, T_world_tip: PoseTuple, T_world_thing: PoseTuple) -> float:
+        """Return the turn of the wrist from home [rad] for a grasp with this tip pose."""
+        return quat_angle(T_world_tip[1], (self._home or self.perception.get_tip(self.robot))[1])
+
+    def _is_holding(self) -> bool:
+        return self.perception.is_holding(self.robot, self.object, self.object_model.half_width)
+
+    def _has_lost_object(self) -> bool:
+        """Return True if the object is no longer between the fingers."""
+        taken_at = apply(self.perception.get_body(self.object), (self._take_x, 0.0, 0.0))
+        return distance(taken_at, self.perception.get_tip(self.robot)[0]) > 0.05
+
+    def _compute_tip(self, T_world_thing: PoseTuple) -> PoseTuple:
+        """Tip pose that brings the thing, as it now lies in the gripper, to `T_world_thing`."""
+        T_tip_thing = compose(inverse(self.perception.get_tip(self.robot)), self.perception.get_body(self.object))
+        return compose(T_world_thing, inverse(T_tip_thing))
+
+    def _compute_exchange(self) -> tuple[Vec3, Vec3]:
+        """Return the place of the handover (world), and the horizontal direction to the partner."""
+        mine, other = self.perception.get_base(self.robot), self.perception.get_base(self.partner)
+        (ax, ay, az), (bx, by, bz) = mine[0], other[0]
+        (fx, fy, _), (gx, gy, _) = (quat_rotate(base[1], (1.0, 0.0, 0.0)) for base in (mine, other))
+        inward = self.arm.exchange_inward / 2.0
+        apart = max(((bx - ax) ** 2 + (by - ay) ** 2) ** 0.5, 1e-6)
+        place = ((ax + bx) / 2.0 + inward * (fx + gx), (ay + by) / 2.0 + inward * (fy + gy))
+        return (*place, (az + bz) / 2.0 + self.arm.exchange_height), ((bx - ax) / apart, (by - ay) / apart, 0.0)
+
+    def _compute_table_height(self) -> float:
+        """Height of the table [m], world frame."""
+        return self.perception.get_base(self.robot)[0][2] - self.arm.above_table
+
+
+#: The other must be seen to hold the thing for so long [s] before the giver opens.
+SURE_S = 0.35
+#: A thing that lies more askew than this is left alone [rad].
+MOST_TILT = 0.3
+
+
+class Giver(HandoverTask):
+    """Grasps `object` near its heavy end with `robot` and hands it to the operator of `partner`.
+
+    `patience_s`: how long the thing is offered before the giver gives up.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        object: str,
+        partner: str,
+        device: str = Device.CONTROLLER_RIGHT,
+        arm: ArmKind = ARM,
+        patience_s: float = 60.0,
+    ) -> None:
+        super().__init__(robot, object, partner, device, arm)
+        self._after_close = "lift"
+        self._patience_s = patience_s
+        self._taken_since_s = math.inf
+        self._steps |= {
+            "look": self._choose_grasp,
+            "lift": self._lift,
+            "present": self._present,
+            "offer": self._offer,
+            "release": self._release,
+            "retreat": self._retreat,
+        }
+
+    def _first_phase(self) -> str:
+        return "look"
+
+    def _choose_grasp(self) -> None:
+        """Waits until the thing lies still, and chooses the end to take: the one that turns the wrist least."""
+        if self.perception.get_still_s(self.object) < 0.3:
+            return
+        if compute_tilt(self.perception.get_body(self.object)) > MOST_TILT:
+            if self._has_lasted(3.0):
+                self._fail(f"the {self.object} does not lie flat, it cannot be taken from above")
+            return
+        ends = (
+            (self.object_model.giver_x, -self.object_model.giver_x)
+            if self.object_model.symmetric
+            else (self.object_model.giver_x,)
+        )
+        self._take_x = min(ends, key=self._compute_effort)
+        self._enter("approach")
+
+    def _compute_effort(self, take_x: float) -> float:
+        """Return the turn of the wrist [rad] to grasp the object at this end and to offer the other."""
+        self._take_x = take_x
+        return self._compute_turn(self._compute_grasp(), self.perception.get_body(self.object))
+
+    def _lift(self) -> None:
+        if self._entering_now:
+            self.hand.move_to(raise_pose(self.perception.get_tip(self.robot), CLEAR_ABOVE))
+        if self._has_lost_object():
+            self._retry(f"the {self.object} slipped out of the gripper of {self.robot}")
+        elif self.hand.has_arrived(0.015, 0.06) or self._has_lasted(4.0):
+            self._enter("present")
+
+    def _present(self) -> None:
+        if self._entering_now:
+            self.hand.move_to(self._compute_tip(self._compute_offer_pose()))
+        if self._has_lost_object():
+            self._retry(f"the {self.object} slipped out of the gripper of {self.robot}")
+        elif self.hand.has_arrived(0.008, 0.05) or self._has_lasted(8.0):
+            self._enter("offer")
+
+    def _compute_offer_pose(self) -> PoseTuple:
+        """Pose of the thing when it is offered: its free end towards the partner."""
+        place, (dx, dy, _) = self._compute_exchange()
+        towards = math.atan2(dy, dx) if self._take_x < 0.0 else math.atan2(-dy, -dx)
+        return make_level_pose(place, towards, get_face_up(self.perception.get_body(self.object)))
+
+    def _compute_turn(self, T_world_tip: PoseTuple, T_world_thing: PoseTuple) -> float:
+        """The same way has to do for offering it, and the turn between the two is work as well."""
+        offered = self._compute_offer_pose()
+        offering = compose(offered, compose(inverse(T_world_thing), T_world_tip))
+        farthest = max(
+            super()._compute_turn(T_world_tip, T_world_thing), super()._compute_turn(offering, T_world_thing)
+        )
+        return farthest + 0.5 * quat_angle(offered[1], T_world_thing[1])
+
+    def _offer(self) -> None:
+        thing = self.perception.get_body(self.object)
+        near = apply(
+            thing, (self.object_model.receiver_x if self._take_x < 0.0 else -self.object_model.receiver_x, 0.0, 0.0)
+        )
+        if distance(self.perception.get_tip(self.partner)[0], near) < 0.07:
+            self.hand.hold_still()
+        if self._has_lost_object():
+            self._retry(f"the {self.object} slipped out of the gripper of {self.robot}")
+        elif not self.perception.is_holding(self.partner, self.object, self.object_model.half_width):
+            self._taken_since_s = math.inf
+            if self._has_lasted(self._patience_s):
+                self._fail(f"{self.partner} did not take the {self.object} within {self._patience_s:.0f} s")
+        else:
+            self._taken_since_s = min(self._taken_since_s, self.hand.now_s)
+            if self.hand.now_s - self._taken_since_s >= SURE_S:
+                self._enter("release")
+
+    def _release(self) -> None:
+        self._open_gripper("retreat")
+
+    def _retreat(self) -> None:
+        if self._entering_now:
+            self.hand.move_to(raise_pose(self.perception.get_tip(self.robot), CLEAR_ABOVE + 0.02), 0.3, correct=False)
+        if self.hand.has_moved():
+            self._enter("return")
+
+
+#: A thing nearer to the place of exchange than this is offered [m].
+OFFERED_M = 0.10
+#: A giver whose tip is farther than this from where it held the thing has left [m].
+LEFT_M = 0.08
+
+
+class Receiver(HandoverTask):
+    """Takes `object` with `robot` from the operator of `partner` and lays it on the table.
+
+    `place`: where (x, y [m] in the world); default: in front of the robot, on its freer side. `patience_s`: how long it
+    waits for an offer before it gives up.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        object: str,
+        partner: str,
+        device: str = Device.CONTROLLER_RIGHT,
+        arm: ArmKind = ARM,
+        place: tuple[float, float] | None = None,
+        patience_s: float = 120.0,
+    ) -> None:
+        super().__init__(robot, object, partner, device, arm)
+        self._after_close = "secure"
+        self._place = place
+        self._patience_s = patience_s
+        self._laid: PoseTuple | None = None
+        self._steps |= {
+            "watch": self._watch,
+            "raise": self._raise_hand,
+            "secure": self._secure,
+            "carry": self._carry,
+            "lower": self._lower,
+            "put": self._touch_down,
+            "open": self._open,
+            "leave": self._leave,
+        }
+
+    def _first_phase(self) -> str:
+        return "watch"
+
+    def _watch(self) -> None:
+        if self._entering_now and self._home is not None:
+            self.hand.move_to(self._home)
+        middle, _ = self._compute_exchange()
+        offered = (
+            distance(self.perception.get_body(self.object)[0], middle) < OFFERED_M
+            and self.perception.get_still_s(self.object) > 0.4
+            and self.perception.is_holding(self.partner, self.object, self.object_model.half_width)
+        )
+        if offered:
+            self._take_x = self._find_free_end()
+            self._enter("raise")
+        elif self._has_lasted(self._patience_s):
+            self._fail(f"{self.partner} did not offer the {self.object} within {self._patience_s:.0f} s")
+
+    def _raise_hand(self) -> None:
+        """Straight up to where the thing will be approached from: on a slant, the fingers could push it away."""
+        if self._entering_now:
+            (x, y, z), q = self.perception.get_tip(self.robot)
+            height = self._compute_grasp()[0][2] + CLEAR_ABOVE
+            self.hand.move_to(((x, y, max(z, height)), q))
+        if self.hand.has_arrived(0.03, 0.1) or self._has_lasted(4.0):
+            self._enter("approach")
+
+    def _find_free_end(self) -> float:
+        """Return where to grasp the object [m along its x]: for a symmetric thing the end away from the giver's
+        fingers."""
+        x = self.object_model.receiver_x
+        if not self.object_model.symmetric:
+            return x
+        thing, giver = self.perception.get_body(self.object), self.perception.get_tip(self.partner)[0]
+        return max((x, -x), key=lambda end: distance(apply(thing, (end, 0.0, 0.0)), giver))
+
+    def _secure(self) -> None:
+        """Keeps hold until the giver has opened and left. Both robots hold the thing: no corrections."""
+        if self._entering_now:
+            self.hand.hold_still()
+        given_at = apply(self.perception.get_body(self.object), (-self._take_x, 0.0, 0.0))
+        opened = self.perception.compute_gap(self.partner) > 2.0 * self.object_model.half_width + 0.010
+        if opened and distance(self.perception.get_tip(self.partner)[0], given_at) > LEFT_M:
+            self._enter("carry")
+        elif self._has_lasted(1.0) and not self._is_holding():
+            self._retry(f"the {self.object} slipped out of the gripper of {self.robot}")
+        elif self._has_lasted(15.0):
+            self._retry(f"{self.partner} did not release the {self.object}")
+
+    def _carry(self) -> None:
+        if self._entering_now:
+            x, y = self._place if self._place is not None else self._find_free_place()
+            bx, by, _ = self.perception.get_base(self.robot)[0]
+            yaw = math.atan2(by - y, bx - x) if self._take_x > 0.0 else math.atan2(y - by, x - bx)
+            up = get_face_up(self.perception.get_body(self.object))
+            self._laid = make_level_pose(
+                (x, y, self._compute_table_height() + self.object_model.half_thickness), yaw, up
+            )
+            self.hand.move_to(self._compute_tip(raise_pose(self._laid, CLEAR_ABOVE)))
+        if self._has_lost_object():
+            self._fail(f"{self.robot} dropped the {self.object} on the way")
+        elif self.hand.has_arrived(0.01, 0.06) or self._has_lasted(8.0):
+            self._enter("lower")
+
+    def _lower(self) -> None:
+        """Down to a finger's breadth above the table, level again as the thing now hangs in the gripper."""
+        if self._entering_now and self._laid is not None:
+            self.hand.move_to(self._compute_tip(raise_pose(self._laid, 0.015)), CAREFUL_SPEED)
+        if self._has_lost_object():
+            self._fail(f"{self.robot} dropped the {self.object} on the way")
+        elif self.hand.has_arrived(0.004, 0.03) or self._has_lasted(5.0):
+            self._enter("put")
+
+    def _touch_down(self) -> None:
+        """The last centimetre, by the height that is seen below the lowest point."""
+        if self._entering_now:
+            below = (
+                self.object_model.compute_lowest(self.perception.get_body(self.object)) - self._compute_table_height()
+            )
+            self.hand.move_to(
+                raise_pose(self.perception.get_tip(self.robot), -max(below - 0.0005, 0.0)), 0.05, correct=False
+            )
+        if self.hand.has_moved() and self._has_lasted(0.9):
+            self._enter("open")
+
+    def _open(self) -> None:
+        self._open_gripper("leave")
+
+    def _leave(self) -> None:
+        if self._entering_now:
+            self.hand.move_to(raise_pose(self.perception.get_tip(self.robot), CLEAR_ABOVE), 0.3, correct=False)
+        if not self.hand.has_moved():
+            return
+        p_world = self.perception.get_body(self.object)[0]
+        if self._laid is None or distance(p_world, self._laid[0]) > 0.06:
+            self._fail(f"the {self.object} did not stay where {self.robot} put it")
+        else:
+            self._enter("return")
+
+    def _find_free_place(self) -> tuple[float, float]:
+        """A place in front of the robot, on the side of the shared table that is farther from other things."""
+        base, q = self.perception.get_base(self.robot)
+        dx, dy, _ = quat_rotate(q, (self.arm.reach, 0.0, 0.0))
+        aside = 0.2 / self.arm.reach
+        sides = [(base[0] + dx - s * aside * dy, base[1] + dy + s * aside * dx, base[2]) for s in (1.0, -1.0)]
+        others = self.perception.list_obstacles()
+
+        def room(place: Vec3) -> float:
+            return min((distance(place, other) for other in others), default=1.0)
+
+        best = max(sides, key=room)
+        return best[0], best[1]
