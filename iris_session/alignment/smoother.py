@@ -145,7 +145,7 @@ class AlignmentSmoother:
         away = np.abs(self._times - moment)
         groups: dict[tuple[str, int], list[RecordedObservation]] = {}
         for i in np.argsort(away, kind="stable").tolist():
-            seen = self._looks[i].seen
+            seen = self._looks[i].observation
             key = (seen.anchor_id, seen.viewpoint_id)
             if away[i] > AROUND_NS or (key not in groups and len(groups) >= MAX_GROUPS):
                 break
