@@ -1,9 +1,9 @@
 """Estimates `T_world_tracking` of one headset from observations of anchors whose world pose is known.
 
 Yaw and translation are free; the tilt is held near zero by gravity, which headsets and worlds share to about 0.2 deg,
-and gives way only as far as rotations or the baselines between several anchors measure it better (`dof` 6: no gravity).
-Robust against wrong detections, mirrored poses and moved sheets; the covariance counts what is common to a viewpoint
-once. Pure: time and observations are passed in. Mathematics and sources: docs/anchors.md.
+and follows the data only as far as rotations or the baselines between several anchors measure it better (`dof` 6: no
+gravity). Robust against wrong detections, mirrored poses and moved sheets; the covariance counts what is common to a
+viewpoint once. Pure: time and observations are passed in. Mathematics and sources: docs/anchors.md.
 
 Noise models are optimistic, so every stage checks them against what is left over: residuals larger than stated widen
 the covariance (Birge ratio: chi-square per degree of freedom). Where no majority agrees there is no result.
@@ -13,37 +13,55 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 
-from anchors.advice import CONTRADICT, LOOK, disagreement, size_advice, tilted, upright
-from anchors.groups import Group, Key, Memory, Sighting
 from anchors.lie import Array
-from anchors.noise import NoiseModel, isotropic, stated
 from anchors.pose import (
     PoseTuple,
     Quat,
     Vec3,
     compose,
+    distance,
     inverse,
-    is_place,
     is_rigid,
+    is_valid_point,
     quat_mul,
     quat_normalize,
     quat_rotate,
 )
-from anchors.robust import Merged
-from anchors.solve import Prior, Problem, Solution, agreeing_anchors, common_tilt, in_world, inverted, problem, solve
-from anchors.uncertainty import Z99, at_point, chi2_quantile, length_p95, position_error_p95, rotation_error_p95
+from anchors.solver import (
+    AlignmentPrior,
+    AlignmentProblem,
+    AlignmentSolution,
+    build_problem,
+    count_agreeing_anchors,
+    median_tilt,
+    solve_alignment,
+    to_inverse_pose,
+    to_world_covariance,
+)
+from anchors.uncertainty import (
+    Z99,
+    NoiseModel,
+    chi2_quantile,
+    covariance_at_point,
+    isotropic_covariance,
+    length_p95,
+    position_error_p95,
+    rotation_error_p95,
+    validate_covariance,
+)
+from anchors.viewpoints import AnchorObservation, GroupKey, MergedObservation, ObservationBuffer, ViewpointGroup
 
 __all__ = [
     "AlignmentConfig",
     "AlignmentEstimate",
     "AlignmentEstimator",
-    "mirrored",
+    "mirror_pose",
     "position_error_p95",
 ]
 
@@ -85,14 +103,14 @@ class AlignmentConfig:
     size_tolerance: float = 0.03
 
     @property
-    def prior(self) -> Prior:
+    def prior(self) -> AlignmentPrior:
         tilt = self.tilt_sigma_rad if self.dof == 4 else math.inf
-        return Prior(tilt, self.drift_m_per_s, self.walk_m_per_sqrt_s)
+        return AlignmentPrior(tilt, self.drift_m_per_s, self.walk_m_per_sqrt_s)
 
 
 @dataclass(frozen=True)
 class AlignmentEstimate:
-    """Result, or the reason why there is none (`refused`, with `advice` for the person who wears the headset).
+    """Result, or the reason why there is none (`refused`, with `advice` for the wearer of the headset).
 
     `covariance`: 36 values, 6x6 row-major, order (x, y, z [m], rx, ry, rz [rad]), world frame, at `pivot_world`.
     `residual_tilt_rad`: tilt of the frame as the anchors alone show it. `moved`: anchors that all others outvote.
@@ -111,11 +129,11 @@ class AlignmentEstimate:
     moved: tuple[str, ...] = ()
 
     def covariance_at(self, point_world: Vec3) -> Array:
-        """Covariance (3, 3) [m^2] of the position error at a point of the world."""
-        return at_point(self.covariance, self.pivot_world, point_world)
+        """Return the covariance (3, 3) [m^2] of the position error at a point of the world."""
+        return covariance_at_point(self.covariance, self.pivot_world, point_world)
 
     def error_at(self, point_world: Vec3) -> float:
-        """Stated p95 [m] at a point of the world, infinite when refused."""
+        """Return the stated p95 [m] of the position error at a point of the world, infinite when refused."""
         return math.inf if self.refused else position_error_p95(self.covariance, self.pivot_world, point_world)
 
     @property
@@ -126,10 +144,10 @@ class AlignmentEstimate:
 
 @dataclass
 class AlignmentEstimator:
-    """Collects observations of one headset; `estimate()` solves what is there. A new `tracking_epoch` starts anew.
+    """Estimator of one headset: `add` observations, `estimate` from all of them. A new `tracking_epoch` resets it.
 
-    `anchors`: `T_world_anchor`. `sizes`: edge of the printed sheets [m], of those whose size is known. Counters say
-    what became of observations that were not used as they came; `unmirrored` ones were used the other way round.
+    `anchors`: `T_world_anchor`. `sizes`: edge length [m] of printed sheets, where known. The counters tell why
+    observations were not used as they came; `unmirrored` ones were used with the mirrored pose.
     """
 
     anchors: Mapping[str, PoseTuple]
@@ -145,13 +163,13 @@ class AlignmentEstimator:
     _against_gravity: int = 0  # in this epoch
     _misprints: dict[str, str] = field(default_factory=dict)  # by sheet: what its last measured size says
     _near: tuple[Array, Array] | None = None  # where the last solution was: the next one is not far
-    _memory: Memory = field(init=False)
+    _memory: ObservationBuffer = field(init=False)
 
     def __post_init__(self) -> None:
         if self.config.dof not in (4, 6):
             raise ValueError(f"dof {self.config.dof}: it is 4 (level headset) or 6 (tilt is measured)")
         c = self.config
-        self._memory = Memory(c.max_observations, c.max_in_group, c.max_groups, c.max_age_ns)
+        self._memory = ObservationBuffer(c.max_observations, c.max_in_group, c.max_groups, c.max_age_ns)
 
     @property
     def forgotten(self) -> int:
@@ -174,12 +192,25 @@ class AlignmentEstimator:
         p_tracking_head: Vec3 | None = None,
         alternative: PoseTuple | None = None,
     ) -> bool:
-        """Takes one observation. False when it is not used: unknown anchor, older epoch, not a rigid transform, a sheet
-        of another size than it should have, or one that gravity contradicts.
+        """Add one observation.
 
-        `size_m` 0: not measured. `covariance`: 6x6 row-major, tracking axes, else that of the noise model as seen from
-        `p_tracking_head`. `alternative`: the other pose that explains the same image; without it the pose mirrored
-        along the line of sight is tried, where that is known.
+        Args:
+            anchor_id: Name of the anchor.
+            T_tracking_anchor: Observed pose.
+            capture_ns: Time of the observation.
+            tracking_epoch: Tracking frame of the observation; a newer one resets the estimator.
+            viewpoint_id: Observations from one viewpoint have common errors.
+            quality: Confidence of the detector, 0 to 1.
+            size_m: Measured edge length of the sheet, 0 if not measured.
+            covariance: 6x6 row-major (position [m], rotation [rad]) in tracking axes; empty: that of the noise model as
+                seen from `p_tracking_head`.
+            p_tracking_head: Position of the observer.
+            alternative: The other pose that explains the same image; without it the pose mirrored along the line of
+                sight is tried, if `p_tracking_head` is known.
+
+        Returns:
+            False if it is not used: unknown anchor, older epoch, not a rigid transform, a sheet of the wrong size, or
+            contradicted by gravity.
         """
         T_world_anchor = self.anchors.get(anchor_id)
         if T_world_anchor is None:
@@ -188,48 +219,51 @@ class AlignmentEstimator:
         if tracking_epoch < self.tracking_epoch:
             self.stale_epochs += 1
             return False
-        if not is_rigid(T_tracking_anchor) or not math.isfinite(quality) or not is_place(p_tracking_head):
+        if not is_rigid(T_tracking_anchor) or not math.isfinite(quality) or not is_valid_point(p_tracking_head):
             self.invalid += 1
             return False
         if tracking_epoch > self.tracking_epoch:
             self.tracking_epoch = tracking_epoch
-            self.start_anew()
-        if not self._is_of_size(anchor_id, size_m):
+            self.reset()
+        if not self._has_expected_size(anchor_id, size_m):
             return False
-        pose = self._upright(T_world_anchor, T_tracking_anchor, p_tracking_head, alternative)
+        pose = self._resolve_mirror(T_world_anchor, T_tracking_anchor, p_tracking_head, alternative)
         if pose is None:
             self.against_gravity += 1
             self._against_gravity += 1
             return False
         self._memory.add(
             (anchor_id, viewpoint_id),
-            Sighting(capture_ns, pose[0], pose[1], p_tracking_head, stated(covariance), quality, size_m),
+            AnchorObservation(
+                capture_ns, pose[0], pose[1], p_tracking_head, validate_covariance(covariance), quality, size_m
+            ),
         )
         return True
 
-    def start_anew(self) -> None:
-        """What was observed holds no more: the tracking frame is another one."""
+    def reset(self) -> None:
+        """Discard all observations: the tracking frame has changed."""
         self._memory.clear()
         self._against_gravity, self._misprints, self._near = 0, {}, None
 
-    def _upright(
+    def _resolve_mirror(
         self, T_world_anchor: PoseTuple, seen: PoseTuple, p_head: Vec3 | None, alternative: PoseTuple | None
     ) -> PoseTuple | None:
-        """The pose, or its mirrored one when only that agrees with gravity."""
+        """Return the pose, or its mirrored pose if only that one agrees with gravity, `None` if neither does."""
         pose = (seen[0], quat_normalize(seen[1]))
         if self.config.dof == 6 or _tilt(T_world_anchor, pose) <= self.config.max_tilt_rad:
             return pose
         if alternative is not None:
             other = (alternative[0], quat_normalize(alternative[1])) if is_rigid(alternative) else None
         else:
-            other = mirrored(pose, p_head) if p_head is not None else None
+            other = mirror_pose(pose, p_head) if p_head is not None else None
         if other is None or _tilt(T_world_anchor, other) > self.config.max_tilt_rad:
             return None
         self.unmirrored += 1
         return other
 
-    def _is_of_size(self, anchor_id: str, size_m: float) -> bool:
-        """A sheet printed too large is seen too near: its pose is off by the same share."""
+    def _has_expected_size(self, anchor_id: str, size_m: float) -> bool:
+        """Return whether the sheet has its configured size: one printed too large appears too near by the same
+        share."""
         size = self.sizes.get(anchor_id, 0.0)
         if size <= 0.0 or not size_m > 0.0:
             return True
@@ -242,54 +276,58 @@ class AlignmentEstimator:
         )
         return False
 
-    def _misprint(self) -> str:
+    def _misprint_advice(self) -> str:
         return next(iter(self._misprints.values()), "")
 
     def estimate(self) -> AlignmentEstimate:
-        """Solves what was observed in the current epoch. Groups that did not change are not merged again."""
+        """Return the alignment by all observations of the current epoch. Unchanged groups are not merged again."""
         if len(self._memory) < self.config.min_observations:
-            return self._refusal(self._misprint() or upright(self._against_gravity, len(self._memory)) or LOOK)
-        groups = self._memory.with_a_say(self.config.min_observations)
+            return self._refuse(
+                self._misprint_advice() or gravity_advice(self._against_gravity, len(self._memory)) or LOOK_ADVICE
+            )
+        groups = self._memory.select_mature_groups(self.config.min_observations)
         keys, merged = self._merge(groups)
         if not merged:
-            return self._refusal(CONTRADICT)
+            return self._refuse(CONTRADICT)
         prior = self.config.prior
         b = self._problem(keys, merged, prior)
-        s = solve(b, prior, self._near)
+        s = solve_alignment(b, prior, self._near)
         against = prior.gravity and not self._is_majority(b, s, len(groups))
-        if against and common_tilt(b) > self.config.tilt_warning_rad:  # do they contradict each other, or gravity?
-            free = solve(b, replace(prior, tilt_sigma_rad=math.inf))
+        if against and median_tilt(b) > self.config.tilt_warning_rad:  # do they contradict each other, or gravity?
+            free = solve_alignment(b, replace(prior, tilt_sigma_rad=math.inf))
             s = free if self._is_majority(b, free, len(groups)) else s
         if not s.inside.any():
-            return self._refusal(disagreement(sorted(set(b.anchor))))
-        tilt = s.tilt_seen(b)
+            return self._refuse(disagreement_advice(sorted(set(b.anchor))))
+        tilt = s.observed_tilt(b)
         if prior.gravity and tilt > self.config.follow_tilt_rad:
-            return self._refusal(tilted(tilt))
+            return self._refuse(tilt_advice(tilt))
         if prior.gravity and tilt > self.config.tilt_warning_rad:  # all see the same sheet: follow it, and warn
-            s = solve(b, replace(prior, tilt_sigma_rad=tilt), (s.q, s.t))
+            s = solve_alignment(b, replace(prior, tilt_sigma_rad=tilt), (s.q, s.t))
         self._near = (s.q, s.t)
         agreeing = sum(m.n for m, ok in zip(merged, s.inside.tolist(), strict=True) if ok)
-        moved = outvoted(b.anchor, s)
+        moved = find_outvoted(b.anchor, s)
         if agreeing < self.config.min_observations or not self._is_majority(b, s, len(groups)):
-            return self._refusal(disagreement(sorted(set(b.anchor))))
-        return self._result(b, s, tilt, moved)
+            return self._refuse(disagreement_advice(sorted(set(b.anchor))))
+        return self._to_estimate(b, s, tilt, moved)
 
-    def _merge(self, groups: Mapping[Key, Group]) -> tuple[list[Key], list[Merged]]:
-        """One merged observation per anchor and viewpoint, of those whose observations agree."""
-        fallback = isotropic(self.config.position_sigma_m, self.config.rotation_sigma_rad)
+    def _merge(self, groups: Mapping[GroupKey, ViewpointGroup]) -> tuple[list[GroupKey], list[MergedObservation]]:
+        """Return one merged observation per anchor and viewpoint whose observations agree, with their keys."""
+        fallback = isotropic_covariance(self.config.position_sigma_m, self.config.rotation_sigma_rad)
         keys, merged = [], []
         for key, group in groups.items():
-            one = group.solve(self.config.noise, fallback, self.config.min_agreeing)
+            one = group.merge(self.config.noise, fallback, self.config.min_agreeing)
             if one is not None:
                 keys.append(key)
                 merged.append(one)
         return keys, merged
 
-    def _problem(self, keys: list[Key], merged: list[Merged], prior: Prior) -> Problem:
+    def _problem(
+        self, keys: list[GroupKey], merged: list[MergedObservation], prior: AlignmentPrior
+    ) -> AlignmentProblem:
         times = [self._memory.groups[key].capture_ns for key in keys]
-        newest = max(group.sightings[-1].capture_ns for group in self._memory.groups.values())
+        newest = max(group.observations[-1].capture_ns for group in self._memory.groups.values())
         poses = [self.anchors[anchor_id] for anchor_id, _ in keys]
-        return problem(
+        return build_problem(
             [anchor_id for anchor_id, _ in keys],
             np.array([p for p, _ in poses]),
             np.array([q for _, q in poses]),
@@ -298,20 +336,22 @@ class AlignmentEstimator:
             prior,
         )
 
-    def _is_majority(self, b: Problem, s: Solution, n_groups: int) -> bool:
-        """Of three or more anchors most must agree (one that was moved may have been looked at most often), else of the
-        viewpoints; those whose own observations do not agree count against it."""
+    def _is_majority(self, b: AlignmentProblem, s: AlignmentSolution, n_groups: int) -> bool:
+        """Return whether a majority agrees: of the anchors if there are three or more (a moved one may have been
+        observed most often), else of the viewpoints, counting those whose own observations disagree."""
         anchors = set(b.anchor)
         if len(anchors) > 2:
-            return 2 * agreeing_anchors(b.anchor, s.inside) > len(anchors)
+            return 2 * count_agreeing_anchors(b.anchor, s.inside) > len(anchors)
         return 2 * int(np.count_nonzero(s.inside)) > n_groups
 
-    def _result(self, b: Problem, s: Solution, tilt: float, moved: tuple[str, ...]) -> AlignmentEstimate:
+    def _to_estimate(
+        self, b: AlignmentProblem, s: AlignmentSolution, tilt: float, moved: tuple[str, ...]
+    ) -> AlignmentEstimate:
         wider = s.chi2 / s.freedom if s.freedom > 0.0 and s.chi2 > chi2_quantile(s.freedom, Z99) else 1.0
         pivot = s.inside @ b.p_world / float(s.inside.sum())
         x, y, z = pivot.tolist()
         pivot_world = (x, y, z)
-        in_the_world = in_world(s.q, s.covariance, pivot) * wider
+        in_the_world = to_world_covariance(s.q, s.covariance, pivot) * wider
         covariance = tuple(in_the_world.ravel().tolist())
         error = length_p95(in_the_world[:3, :3])
         refused = not error <= self.config.max_error_m
@@ -322,9 +362,9 @@ class AlignmentEstimator:
         elif tilt > self.config.tilt_warning_rad and self.config.dof == 4:
             advice = f"the headset's vertical is off by {math.degrees(tilt):.1f} deg: is the sheet level as configured?"
         else:
-            advice = size_advice(self._memory.groups, self.config.size_tolerance) or self._misprint()
+            advice = size_advice(self._memory.groups, self.config.size_tolerance) or self._misprint_advice()
         return AlignmentEstimate(
-            inverted(s.t, s.q),
+            to_inverse_pose(s.t, s.q),
             self.tracking_epoch,
             covariance,
             pivot_world,
@@ -337,7 +377,7 @@ class AlignmentEstimator:
             moved,
         )
 
-    def _refusal(self, advice: str) -> AlignmentEstimate:
+    def _refuse(self, advice: str) -> AlignmentEstimate:
         viewpoints = len({viewpoint for _, viewpoint in self._memory.groups})
         zero = (0.0, 0.0, 0.0)
         n = len(self._memory)
@@ -346,14 +386,14 @@ class AlignmentEstimator:
         )
 
     def snapshot(self) -> bytes:
-        """Everything that `estimate` and `add` depend on but anchors, sizes and configuration."""
+        """Return the whole state except anchors, sizes and configuration."""
         counters = [getattr(self, name) for name in _COUNTERS]
         near = None if self._near is None else [part.tolist() for part in self._near]
         plain = {"counters": counters, "misprints": self._misprints, "near": near}
         return json.dumps({**plain, **self._memory.snapshot()}).encode()
 
     def restore(self, snapshot: bytes) -> None:
-        """Takes up a snapshot: from here on results are the same as those of the estimator that wrote it."""
+        """Restore a snapshot: later results equal those of the estimator that wrote it."""
         data = json.loads(snapshot)
         for name, value in zip(_COUNTERS, data["counters"], strict=True):
             setattr(self, name, int(value))
@@ -368,14 +408,15 @@ _COUNTERS: Final = (
 )
 
 
-def outvoted(anchor: tuple[str, ...], s: Solution) -> tuple[str, ...]:
-    """Anchors of which no viewpoint agrees with the rest."""
+def find_outvoted(anchor: tuple[str, ...], s: AlignmentSolution) -> tuple[str, ...]:
+    """Return the anchors of which no viewpoint agrees with the rest."""
     agreeing = {name for name, ok in zip(anchor, s.inside.tolist(), strict=True) if ok}
     return tuple(sorted(set(anchor) - agreeing))
 
 
-def mirrored(T_tracking_anchor: PoseTuple, p_tracking_head: Vec3) -> PoseTuple:
-    """The other pose of a flat sheet that gives nearly the same image: its plane reflected along the line of sight.
+def mirror_pose(T_tracking_anchor: PoseTuple, p_tracking_head: Vec3) -> PoseTuple:
+    """Return the other pose of a flat sheet that gives nearly the same image: its plane reflected along the line of
+    sight.
 
     Under weak perspective an image does not change when depth is negated: R' = (I - 2 v v^T) R diag(1, 1, -1)
     (Oberkampf, DeMenthon and Davis 1996; Collins and Bartoli 2014). As quaternions: q' = v * q * z.
@@ -390,7 +431,68 @@ def mirrored(T_tracking_anchor: PoseTuple, p_tracking_head: Vec3) -> PoseTuple:
 
 
 def _tilt(T_world_anchor: PoseTuple, T_tracking_anchor: PoseTuple) -> float:
-    """Angle [rad] between the vertical and that of the tracking frame as this one observation has it."""
+    """Return the angle [rad] between the vertical of the world and of the tracking frame by this one observation."""
     _, q = compose(T_world_anchor, inverse(T_tracking_anchor))
     up = quat_rotate(q, (0.0, 0.0, 1.0))
     return math.atan2(math.hypot(up[0], up[1]), up[2])
+
+
+# --- advice -----------------------------------------------------------------------------------------------------------
+
+LOOK_ADVICE: Final = "look at the anchor sheet for a few seconds, from about half a metre"
+CONTRADICT: Final = (
+    "observations contradict each other: did the sheet move, or the headset lose tracking? hold still, look at the "
+    "sheet again"
+)
+
+
+def disagreement_advice(anchor_ids: Sequence[str]) -> str:
+    """Return the advice for contradicting observations, with names if several sheets take part."""
+    if len(anchor_ids) < 2:
+        return CONTRADICT
+    return f"{CONTRADICT}; one of these was moved: {', '.join(anchor_ids)}"
+
+
+def gravity_advice(against_gravity: int, taken: int) -> str:
+    """Return the advice if most observations contradict gravity, else an empty text."""
+    if against_gravity <= 2 * taken or against_gravity < 5:
+        return ""
+    return "the sheet is not mounted as configured (lying, or on a wall): its pose contradicts the vertical"
+
+
+def tilt_advice(tilt_rad: float) -> str:
+    """Return the advice for observations that agree with each other, but not with gravity."""
+    return (
+        f"the sheet is tilted by {math.degrees(tilt_rad):.0f} deg against the headset's vertical: lay it level, or "
+        "configure how it lies"
+    )
+
+
+def size_advice(groups: Mapping[GroupKey, ViewpointGroup], tolerance: float) -> str:
+    """Return a warning about a sheet measured in several sizes; single wrong measurements do not count."""
+    extremes: dict[str, tuple[float, float]] = {}
+    for (anchor_id, _), group in groups.items():
+        if group.sizes is not None:
+            low, high = extremes.get(anchor_id, group.sizes)
+            extremes[anchor_id] = (min(low, group.sizes[0]), max(high, group.sizes[1]))
+    for anchor_id, (least, most) in extremes.items():
+        if most - least <= tolerance * least:
+            continue  # then no quantiles are further apart
+        seen = sorted(size for (name, _), group in groups.items() if name == anchor_id for size in group.list_sizes())
+        low, high = seen[len(seen) // 10], seen[(9 * len(seen)) // 10 if len(seen) > 1 else 0]
+        if high - low > tolerance * low:
+            return f"sheet '{anchor_id}' is seen in different sizes: is there a second one, printed at another scale?"
+    return ""
+
+
+def error_advice(error_m: float, limit_m: float, pivot_world: Vec3, point_world: Vec3, n_viewpoints: int) -> str:
+    """Return how to bring the error at a point below its limit; empty if it is below."""
+    if error_m <= limit_m:
+        return ""
+    far = distance(pivot_world, point_world)
+    wrong = f"the error {far:.1f} m from the sheet would be {error_m * 1e3:.0f} mm, {limit_m * 1e3:.0f} are allowed: "
+    if n_viewpoints < 3:
+        return wrong + "look at the sheet from several sides, from about half a metre"
+    if far > 0.8:
+        return wrong + "add a sheet near the robot"
+    return wrong + "step closer to the sheet"

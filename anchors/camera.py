@@ -21,11 +21,11 @@ _N_DISTORTION: Final = (0, 4, 5, 8)
 
 
 class CameraError(ValueError):
-    """Intrinsics that cannot be; the text says what would be right."""
+    """Invalid intrinsics."""
 
 
 @dataclass(frozen=True)
-class Camera:
+class CameraModel:
     """Image size [px], focal lengths and principal point [px], distortion coefficients."""
 
     width: int
@@ -51,11 +51,11 @@ class Camera:
     def coefficients(self) -> Array:
         return np.array(self.distortion if self.distortion else (0.0,) * 4)
 
-    def scaled(self, width: int, height: int) -> Camera:
-        """The same camera read out at another resolution of the same field of view."""
+    def scaled(self, width: int, height: int) -> CameraModel:
+        """Return the same camera read out at another resolution with the same field of view."""
         sx, sy = width / self.width, height / self.height
         # Pixel centres are whole numbers: the image's left edge is at -0.5.
-        return Camera(
+        return CameraModel(
             width,
             height,
             self.fx * sx,
@@ -66,12 +66,13 @@ class Camera:
         )
 
     def project(self, points: Array, T_camera_points: PoseTuple | None = None) -> Array:
-        """Pixels, shape (n, 2), of points, shape (n, 3) [m]."""
+        """Project points (n, 3) [m] to pixels (n, 2)."""
         pose = T_camera_points if T_camera_points is not None else ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-        return self.project_with_jacobian(points, *rvec_tvec(pose))[0]
+        return self.project_with_jacobian(points, *to_rvec_tvec(pose))[0]
 
     def project_with_jacobian(self, points: Array, rvec: Array, tvec: Array) -> tuple[Array, Array]:
-        """Pixels, shape (n, 2), and their derivatives by rotation vector and translation, shape (2 n, 6)."""
+        """Project points to pixels (n, 2); return also their derivatives by rotation vector and translation (2 n,
+        6)."""
         import cv2
 
         found: Any = cv2.projectPoints(
@@ -79,8 +80,8 @@ class Camera:
         )
         return np.asarray(found[0]).reshape(-1, 2), np.asarray(found[1])[:, :6]
 
-    def normalise(self, pixels: Array) -> Array:
-        """Undistorted coordinates (x / z, y / z), shape (n, 2), of pixels."""
+    def undistort(self, pixels: Array) -> Array:
+        """Return undistorted coordinates (x / z, y / z) of pixels, shape (n, 2)."""
         import cv2
 
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
@@ -91,12 +92,20 @@ class Camera:
         return np.asarray(found).reshape(-1, 2)
 
 
-def parse_camera(text: str, width: int = 0, height: int = 0) -> Camera:
-    """Intrinsics from a file: TOML (`width, height, fx, fy, cx, cy`, optional `distortion`), or a bare 3x3 matrix, for
-    which the size of the images is needed."""
-    matrix = _matrix_of(text)
+def parse_camera(text: str, width: int = 0, height: int = 0) -> CameraModel:
+    """Parse intrinsics: TOML (`width, height, fx, fy, cx, cy`, optional `distortion`), or a bare 3x3 matrix.
+
+    Args:
+        text: Contents of the file.
+        width: Image width [px], needed for a matrix.
+        height: Image height [px], needed for a matrix.
+
+    Raises:
+        CameraError: The text is neither, or the values are invalid.
+    """
+    matrix = _parse_matrix(text)
     if matrix is not None:
-        return Camera(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+        return CameraModel(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
     wanted = "width, height, fx, fy, cx, cy [pixels], and if known distortion = [k1, k2, p1, p2, k3]"
     try:
         table = tomllib.loads(text)
@@ -105,7 +114,7 @@ def parse_camera(text: str, width: int = 0, height: int = 0) -> Camera:
     try:
         fx, fy, cx, cy = (float(table[key]) for key in ("fx", "fy", "cx", "cy"))
         width, height = int(table.get("width", width)), int(table.get("height", height))
-        return Camera(width, height, fx, fy, cx, cy, tuple(float(k) for k in table.get("distortion", ())))
+        return CameraModel(width, height, fx, fy, cx, cy, tuple(float(k) for k in table.get("distortion", ())))
     except KeyError as error:
         raise CameraError(f"{error.args[0]} is missing; wanted: {wanted}") from error
     except (TypeError, ValueError) as error:
@@ -114,7 +123,7 @@ def parse_camera(text: str, width: int = 0, height: int = 0) -> Camera:
         raise CameraError(f"not a number ({error}); wanted: {wanted}") from error
 
 
-def _matrix_of(text: str) -> Array | None:
+def _parse_matrix(text: str) -> Array | None:
     try:
         values = np.array([float(word) for word in text.split()])
     except ValueError:
@@ -122,19 +131,19 @@ def _matrix_of(text: str) -> Array | None:
     return values.reshape(3, 3) if values.size == 9 else None
 
 
-def rvec_tvec(pose: PoseTuple) -> tuple[Array, Array]:
-    """Rotation vector and translation of a pose, as OpenCV takes them."""
+def to_rvec_tvec(pose: PoseTuple) -> tuple[Array, Array]:
+    """Return rotation vector and translation of a pose, as OpenCV takes them."""
     return np.array(quat_to_rotvec(pose[1])), np.array(pose[0])
 
 
-def pose_of(rvec: Array, tvec: Array) -> PoseTuple:
-    """The pose of a rotation vector and translation."""
+def pose_from_rvec_tvec(rvec: Array, tvec: Array) -> PoseTuple:
+    """Return the pose of a rotation vector and translation."""
     r, t = np.asarray(rvec).ravel(), np.asarray(tvec).ravel()
     return (float(t[0]), float(t[1]), float(t[2])), quat_from_rotvec((float(r[0]), float(r[1]), float(r[2])))
 
 
-def matrix_of(pose: PoseTuple) -> Array:
-    """4x4 matrix of a pose."""
+def pose_to_matrix(pose: PoseTuple) -> Array:
+    """Return the matrix (4, 4) of a pose."""
     (x, y, z), (w, i, j, k) = pose
     return np.array(
         [
@@ -146,10 +155,10 @@ def matrix_of(pose: PoseTuple) -> Array:
     )
 
 
-def pose_of_matrix(matrix: Array) -> PoseTuple:
-    """The pose of a 4x4 matrix; its rotation is made orthonormal (nearest in the least-squares sense)."""
+def pose_from_matrix(matrix: Array) -> PoseTuple:
+    """Return the pose of a matrix (4, 4); its rotation is made orthonormal (nearest in the least-squares sense)."""
     from scipy.spatial.transform import Rotation
 
     u, _, vt = np.linalg.svd(matrix[:3, :3])
     turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return pose_of(Rotation.from_matrix(turn).as_rotvec(), matrix[:3, 3])
+    return pose_from_rvec_tvec(Rotation.from_matrix(turn).as_rotvec(), matrix[:3, 3])

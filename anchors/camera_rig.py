@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.camera import matrix_of, pose_of_matrix
+from anchors.camera import pose_from_matrix, pose_to_matrix
 from anchors.pose import PoseTuple, compose, inverse
 from anchors.robot_world import CalibrationError
 
@@ -24,7 +24,7 @@ _FLOOR: Final = (0.0003, math.radians(0.05))
 
 
 @dataclass(frozen=True)
-class View:
+class SheetView:
     """One camera saw one sheet: `T_camera_sheet` with its covariance (36 values, camera frame)."""
 
     camera: str
@@ -34,7 +34,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Rig:
+class CameraRig:
     """Poses in the common frame, covariances (36 values, common frame) beside them. `residuals`: per view, distance
     [m] and angle [rad] between what was seen and what follows from the result."""
 
@@ -44,12 +44,19 @@ class Rig:
     residuals: tuple[tuple[float, float], ...]
 
 
-def solve_rig(views: Sequence[View], T_base_sheet: Mapping[str, PoseTuple]) -> Rig:
-    """Cameras and unknown sheets in the frame in which the known ones stand. Raises `CalibrationError` for what
-    nothing connects with a known sheet."""
+def solve_rig(views: Sequence[SheetView], T_base_sheet: Mapping[str, PoseTuple]) -> CameraRig:
+    """Solve the poses of cameras and unknown sheets in the frame of the known sheets.
+
+    Args:
+        views: Observations of sheets by cameras.
+        T_base_sheet: Poses of the known sheets.
+
+    Raises:
+        CalibrationError: No view, or a camera is not connected with a known sheet.
+    """
     if not views:
         raise CalibrationError("no camera saw a sheet: step closer, light the sheet, check its size and id")
-    poses = _first_guess(views, T_base_sheet)
+    poses = _initial_guess(views, T_base_sheet)
     names = [*sorted({("camera", v.camera) for v in views}), *sorted({("sheet", v.sheet) for v in views})]
     free = [name for name in names if not (name[0] == "sheet" and name[1] in T_base_sheet)]
     poses, normal, scale = _least_squares(views, poses, free)
@@ -59,10 +66,10 @@ def solve_rig(views: Sequence[View], T_base_sheet: Mapping[str, PoseTuple]) -> R
         for k, name in enumerate(free)
         if name[0] == "camera"
     }
-    differences = [_difference(view, poses) for view in views]
-    return Rig(
-        {name: pose_of_matrix(poses[kind, name]) for kind, name in names if kind == "camera"},
-        {name: pose_of_matrix(poses[kind, name]) for kind, name in names if kind == "sheet"},
+    differences = [_view_residual(view, poses) for view in views]
+    return CameraRig(
+        {name: pose_from_matrix(poses[kind, name]) for kind, name in names if kind == "camera"},
+        {name: pose_from_matrix(poses[kind, name]) for kind, name in names if kind == "sheet"},
         blocks,
         tuple((float(np.linalg.norm(d[:3])), float(np.linalg.norm(d[3:]))) for d in differences),
     )
@@ -71,8 +78,8 @@ def solve_rig(views: Sequence[View], T_base_sheet: Mapping[str, PoseTuple]) -> R
 _Name = tuple[str, str]
 
 
-def _first_guess(views: Sequence[View], known: Mapping[str, PoseTuple]) -> dict[_Name, Array]:
-    """From known sheets outwards, one view for each."""
+def _initial_guess(views: Sequence[SheetView], known: Mapping[str, PoseTuple]) -> dict[_Name, Array]:
+    """Return initial poses, outwards from the known sheets, by one view each."""
     poses: dict[_Name, PoseTuple] = {("sheet", name): T for name, T in known.items()}
     waiting = list(views)
     while waiting:
@@ -92,11 +99,11 @@ def _first_guess(views: Sequence[View], known: Mapping[str, PoseTuple]) -> dict[
                 "let it see one of those, or a sheet that another camera sees too"
             )
         waiting = left
-    return {name: matrix_of(T) for name, T in poses.items()}
+    return {name: pose_to_matrix(T) for name, T in poses.items()}
 
 
 def _least_squares(
-    views: Sequence[View], poses: dict[_Name, Array], free: list[_Name]
+    views: Sequence[SheetView], poses: dict[_Name, Array], free: list[_Name]
 ) -> tuple[dict[_Name, Array], Array, float]:
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
@@ -104,7 +111,7 @@ def _least_squares(
     floor = np.diag([_FLOOR[0] ** 2] * 3 + [_FLOOR[1] ** 2] * 3)
     whiteners = [np.linalg.inv(np.linalg.cholesky(np.reshape(view.covariance, (6, 6)) + floor)) for view in views]
 
-    def moved(p: Array) -> dict[_Name, Array]:
+    def apply_increments(p: Array) -> dict[_Name, Array]:
         out = dict(poses)
         for name, step in zip(free, p.reshape(-1, 6), strict=True):
             M = np.eye(4)
@@ -114,19 +121,23 @@ def _least_squares(
         return out
 
     def residuals(p: Array) -> Array:
-        at = moved(p)
-        return np.concatenate([W @ _difference(view, at) for W, view in zip(whiteners, views, strict=True)])
+        at = apply_increments(p)
+        return np.concatenate([W @ _view_residual(view, at) for W, view in zip(whiteners, views, strict=True)])
 
     solved = least_squares(residuals, np.zeros(6 * len(free)), loss="huber", f_scale=3.0, x_scale="jac")
     freedom = max(6 * (len(views) - len(free)), 1)
-    return moved(solved.x), np.asarray(solved.jac.T @ solved.jac), max(1.0, 2.0 * float(solved.cost) / freedom)
+    return (
+        apply_increments(solved.x),
+        np.asarray(solved.jac.T @ solved.jac),
+        max(1.0, 2.0 * float(solved.cost) / freedom),
+    )
 
 
-def _difference(view: View, poses: Mapping[_Name, Array]) -> Array:
-    """Position and rotation of the sheet as it follows from the poses against what was seen, camera frame."""
+def _view_residual(view: SheetView, poses: Mapping[_Name, Array]) -> Array:
+    """Return predicted minus observed position [m] and rotation [rad] of a sheet (6,), camera frame."""
     from scipy.spatial.transform import Rotation
 
-    seen = matrix_of(view.T_camera_sheet)
+    seen = pose_to_matrix(view.T_camera_sheet)
     P = np.linalg.inv(poses["camera", view.camera]) @ poses["sheet", view.sheet]
     turn = Rotation.from_matrix(P[:3, :3] @ seen[:3, :3].T).as_rotvec()
     return np.concatenate([P[:3, 3] - seen[:3, 3], turn])

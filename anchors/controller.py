@@ -13,30 +13,30 @@ from typing import Final
 
 import numpy as np
 
-from anchors.lie import Array, quat_conjugate, quat_log, quat_matrix, quat_multiply
-from anchors.noise import isotropic
+from anchors.lie import Array, quat_conjugate, quat_log, quat_multiply, quat_to_matrix
 from anchors.pose import PoseTuple, Vec3, compose, is_rigid, quat_normalize
+from anchors.uncertainty import isotropic_covariance
 
 _ZERO: Final[Vec3] = (0.0, 0.0, 0.0)
 _TRIM: Final = 4.0  # residuals beyond this many sigmas are wrong readings
 
 
 def holder_anchor(T_world_holder: PoseTuple, T_holder_controller: PoseTuple) -> PoseTuple:
-    """`T_world_anchor` of a controller that stands in a holder fixed in the room. `T_holder_controller` is a property
-    of the printed holder and of what the run time calls the pose of that controller (its grip or aim pose)."""
+    """Return `T_world_anchor` of a controller that stands in a holder fixed in the room. `T_holder_controller` is a
+    property of the printed holder and of what the run time calls the pose of that controller (its grip or aim pose)."""
     return compose(T_world_holder, T_holder_controller)
 
 
 def controller_covariance(
     position_sigma_m: float = 0.0015, rotation_sigma_rad: float = math.radians(0.3)
 ) -> tuple[float, ...]:
-    """Covariance to state with each observation of a tracked controller (36 values, the form of an observation)."""
-    return tuple(float(v) for v in isotropic(position_sigma_m, rotation_sigma_rad).ravel())
+    """Return the covariance of an observation of a tracked controller (36 values, the form of an observation)."""
+    return tuple(float(v) for v in isotropic_covariance(position_sigma_m, rotation_sigma_rad).ravel())
 
 
 @dataclass(frozen=True)
 class TipCalibration:
-    """Where the tip of a controller is (`p_controller_tip`), or why that cannot be said (`refused`, `advice`).
+    """Position of the tip of a controller (`p_controller_tip`), or why it is unknown (`refused`, `advice`).
 
     `sigma_m`: standard deviation of the tip along its least certain direction; `residual_m`: how far the readings
     scatter about the pivot (root mean square, 3D).
@@ -58,25 +58,24 @@ def calibrate_tip(
     max_sigma_m: float = 0.001,
     max_residual_m: float = 0.006,
 ) -> TipCalibration:
-    """Pivot calibration: the tip rests in a dent while the controller is turned about it (Yaniv 2015, algebraic one
-    step).
+    """Calibrate a tip by pivoting: it rests in a dent while the controller is turned about it (Yaniv 2015, algebraic
+    one-step method).
 
-    Each pose `T_tracking_controller` = (R, t) says R p_tip + t = p_pivot: linear in both unknown points. Readings far
-    off, and what is no pose, are left out. Refused when the turns do not fix all three coordinates, or when the tip
-    slipped.
+    Each pose `T_tracking_controller` = (R, t) says R p_tip + t = p_pivot: linear in both unknown points. Outliers
+    and invalid poses are left out. Refused if the rotations do not determine all three coordinates, or the tip slipped.
     """
     poses = [T for T in poses if is_rigid(T)]
     if len(poses) < min_poses:
-        return _refused(f"{len(poses)} poses of at least {min_poses}: keep the tip in place and go on turning")
+        return _refuse(f"{len(poses)} poses of at least {min_poses}: keep the tip in place and go on turning")
     q = np.array([quat_normalize(T[1]) for T in poses])
     t = np.array([T[0] for T in poses])
-    weak = _second_turn(q)
+    weak = _second_axis_rotation(q)
     if weak < min_turn_rad:
-        return _refused(
+        return _refuse(
             f"turned by {math.degrees(weak):.0f} deg about the least used direction, {math.degrees(min_turn_rad):.0f} "
             "are needed: tilt the controller to the front and to the side while its tip stays"
         )
-    A = np.concatenate([quat_matrix(q), np.broadcast_to(-np.eye(3), (len(q), 3, 3))], axis=2)  # (n, 3, 6)
+    A = np.concatenate([quat_to_matrix(q), np.broadcast_to(-np.eye(3), (len(q), 3, 3))], axis=2)  # (n, 3, 6)
     keep = np.ones(len(q), dtype=bool)
     x, errors, sigma = np.zeros(6), np.zeros(len(q)), 0.0
     for _ in range(5):
@@ -98,25 +97,27 @@ def calibrate_tip(
         advice = f"the readings scatter by {residual * 1e3:.1f} mm: the tip slipped; rest it in a dent and turn slowly"
     elif tip_sigma > max_sigma_m:
         advice = f"the tip is known to {tip_sigma * 1e3:.1f} mm only: turn further, in every direction"
-    return TipCalibration(_vec3(x[:3]), _vec3(x[3:]), tip_sigma, residual, n, bool(advice), advice)
+    return TipCalibration(_to_vec3(x[:3]), _to_vec3(x[3:]), tip_sigma, residual, n, bool(advice), advice)
 
 
 def tip_position(T_tracking_controller: PoseTuple, p_controller_tip: Vec3) -> Vec3:
-    """Where the tip is in the tracking frame."""
+    """Return the position of the tip in the tracking frame [m]."""
     return compose(T_tracking_controller, (p_controller_tip, (1.0, 0.0, 0.0, 0.0)))[0]
 
 
-def _second_turn(q: Array) -> float:
-    """How far [rad] the poses turn about the second of their principal axes: turns about one alone leave the tip free
-    along it. Twice the standard deviation, which for even turns from end to end is 0.58 of the range."""
+def _second_axis_rotation(q: Array) -> float:
+    """Return the rotation [rad] about the second principal axis: rotations about one axis leave the tip free along it.
+
+    It is twice the standard deviation, which for even rotations from end to end is 0.58 of the range.
+    """
     turns = quat_log(quat_multiply(q, quat_conjugate(q[len(q) // 2])))
     spread = np.linalg.eigvalsh(np.cov(turns.T))
     return 2.0 * math.sqrt(max(0.0, float(spread[1])))
 
 
-def _refused(advice: str) -> TipCalibration:
+def _refuse(advice: str) -> TipCalibration:
     return TipCalibration(_ZERO, _ZERO, math.inf, math.inf, 0, True, advice)
 
 
-def _vec3(v: Array) -> Vec3:
+def _to_vec3(v: Array) -> Vec3:
     return (float(v[0]), float(v[1]), float(v[2]))

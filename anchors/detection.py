@@ -1,7 +1,8 @@
-"""Finds printed sheets in camera pictures: `T_camera_sheet` with covariance, and the mirrored pose it may be taken for.
+"""Detect printed sheets in camera pictures: `T_camera_sheet` with covariance, and the mirrored pose of nearly the same
+image.
 
 Markers first (OpenCV's detector; where some are missing, once more in the picture enlarged twice), all markers of one
-sheet as one board, then the whole print is laid over the picture (`anchors.registration`). A plane seen from afar has
+sheet as one board, then the whole print is laid over the picture (`anchors.photometric`). A plane seen from afar has
 two poses that look nearly alike (Collins and Bartoli 2014, IPPE): both are refined, the better one is the result, and
 `mirrored_ratio` says how much worse the other one fits. Bare codes: `detect_codes`.
 """
@@ -17,10 +18,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.camera import Camera, pose_of, rvec_tvec
+from anchors.camera import CameraModel, pose_from_rvec_tvec, to_rvec_tvec
+from anchors.photometric import PhotometricFit, fit_print
 from anchors.pose import PoseTuple
-from anchors.registration import Registered, register
-from anchors.sheet import Sheet, dictionary
+from anchors.sheet import Sheet, load_dictionary
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -35,7 +36,7 @@ _CODE_CORNER_SIGMA_PX: Final = 1.2  # of a bare code, whose corners are not refi
 _ENLARGE: Final = 2
 _MIN_PERIMETER_PX: Final = 24.0  # smaller ones cannot be read
 _MAX_ENLARGED_PIXELS: Final = 5_000_000
-#: Where the mirrored pose fits the corners worse than by this factor it is not looked at any further.
+#: A mirrored pose that fits the corners worse than by this factor is not considered any further.
 _CLEAR_RATIO: Final = 4.0
 #: Ratios of residuals below which both poses fit alike: of thousands of pixels, and of a few corners.
 _AMBIGUOUS_PRINT: Final = 1.05
@@ -47,12 +48,12 @@ _MAX_RMS: Final = 0.25
 
 
 @dataclass(frozen=True)
-class Sighting:
+class SheetDetection:
     """One sheet in one picture.
 
     `covariance`: 36 values, 6x6 row-major, (x, y, z [m], rx, ry, rz [rad]), camera frame, at the sheet's origin.
     `mirrored`, `mirrored_ratio`: the other pose that a plane allows, and its residual over that of the result, at least
-    1: near 1 nobody can tell which is right (`ambiguous`). `reprojection_px`: rms of the corners
+    1: near 1 the two cannot be told apart (`ambiguous`). `reprojection_px`: rms of the corners
     that the detector found. `registered`: whether the whole print was used.
     """
 
@@ -69,19 +70,19 @@ class Sighting:
 
     @property
     def ambiguous(self) -> bool:
-        """Whether nobody can tell which of the two poses is right; an estimator should not use such a sighting."""
+        """True if both poses fit equally well; an estimator should not use such a detection."""
         bound = _AMBIGUOUS_PRINT if self.registered else _AMBIGUOUS_CORNERS
         return self.mirrored is not None and self.mirrored_ratio < bound
 
 
 class DetectionError(ValueError):
-    """Pictures or sheets that cannot be used; the text says what would be right."""
+    """A picture or a set of sheets that cannot be used."""
 
 
 class SheetDetector:
-    """Finds known sheets in pictures of one camera."""
+    """Detector of known sheets in pictures of one camera."""
 
-    def __init__(self, sheets: Sequence[Sheet], camera: Camera) -> None:
+    def __init__(self, sheets: Sequence[Sheet], camera: CameraModel) -> None:
         names = [sheet.anchor_id for sheet in sheets]
         if len(set(names)) != len(names):
             raise DetectionError(f"two sheets have the same id: {', '.join(sorted(names))}")
@@ -90,19 +91,23 @@ class SheetDetector:
         longer = max(camera.width, camera.height)
         self._detectors = {scale: _marker_detector(longer * scale) for scale in (1, _ENLARGE)}
 
-    def detect(self, image: NDArray[Any]) -> list[Sighting]:
-        """Sheets in one picture, shape (height, width) or (height, width, 3) uint8, by id."""
-        grey = grey_of(image, self.camera)
-        found = self._find(grey, 1)
+    def detect(self, image: NDArray[Any]) -> list[SheetDetection]:
+        """Return the sheets detected in a picture, shape (height, width) or (height, width, 3) uint8.
+
+        Raises:
+            DetectionError: The picture is not one of this camera.
+        """
+        grey = to_grey(image, self.camera)
+        found = self._find_markers(grey, 1)
         wanted = [sheet for sheet in self.sheets if sum(k in found for k in sheet.marker_ids) < len(sheet.marker_ids)]
         if wanted and grey.size * _ENLARGE**2 <= _MAX_ENLARGED_PIXELS:
-            for marker_id, corners in self._find(grey, _ENLARGE).items():
+            for marker_id, corners in self._find_markers(grey, _ENLARGE).items():
                 found.setdefault(marker_id, corners)
-        sightings = [self._board(sheet, found, grey) for sheet in self.sheets]
+        sightings = [self._detect_sheet(sheet, found, grey) for sheet in self.sheets]
         return [one for one in sightings if one is not None]
 
-    def _find(self, grey: Image, scale: int) -> dict[int, list[Array]]:
-        """Corners of markers by id, shape (4, 2) [px of the picture]; an id may be seen more than once."""
+    def _find_markers(self, grey: Image, scale: int) -> dict[int, list[Array]]:
+        """Return corners of markers by id, shape (4, 2) [px of the picture]; an id may be found more than once."""
         import cv2
 
         picture: Any = grey
@@ -114,17 +119,17 @@ class SheetDetector:
             found.setdefault(marker_id, []).append((four.reshape(4, 2).astype(np.float64) + 0.5) / scale - 0.5)
         return found
 
-    def _board(self, sheet: Sheet, found: Mapping[int, list[Array]], grey: Image) -> Sighting | None:
+    def _detect_sheet(self, sheet: Sheet, found: Mapping[int, list[Array]], grey: Image) -> SheetDetection | None:
         seen = {
             number: candidates[0]
             for number, marker_id in enumerate(sheet.marker_ids)
-            # Seen twice: one is of another sheet or of the room, and nothing here says which.
+            # Found twice: one belongs to another sheet or to the room.
             if len(candidates := found.get(marker_id, [])) == 1
         }
-        poses = _consistent_board(sheet, seen, self.camera)
+        poses = _find_consistent_markers(sheet, seen, self.camera)
         if poses is None:
             return None
-        return _refined(sheet, poses, grey, self.camera)
+        return _refine_photometric(sheet, poses, grey, self.camera)
 
 
 @dataclass(frozen=True)
@@ -138,11 +143,11 @@ class _Poses:
     markers: int
 
 
-def detect_codes(image: NDArray[Any], camera: Camera, edges_m: Mapping[str, float]) -> list[Sighting]:
-    """Bare QR codes whose text and edge [m] are known. Reaches half as far as the markers of a sheet."""
+def detect_codes(image: NDArray[Any], camera: CameraModel, edges_m: Mapping[str, float]) -> list[SheetDetection]:
+    """Detect bare QR codes whose text and edge length [m] are known, at half the range of the markers of a sheet."""
     import cv2
 
-    grey = grey_of(image, camera)
+    grey = to_grey(image, camera)
     found, texts, corners, _ = cv2.QRCodeDetectorAruco().detectAndDecodeMulti(grey)
     sightings = []
     for text, four in zip(texts if found else (), corners if found else (), strict=True):
@@ -151,12 +156,16 @@ def detect_codes(image: NDArray[Any], camera: Camera, edges_m: Mapping[str, floa
         sheet = Sheet(text, edges_m[text])
         poses = _plane_poses(sheet.code_corners, np.asarray(four, dtype=np.float64), camera, 0)
         if poses is not None:
-            sightings.append(replace(_by_corners(sheet, poses, camera, _CODE_CORNER_SIGMA_PX), kind="qr"))
+            sightings.append(replace(_detect_by_corners(sheet, poses, camera, _CODE_CORNER_SIGMA_PX), kind="qr"))
     return sightings
 
 
-def grey_of(image: NDArray[Any], camera: Camera) -> Image:
-    """The picture as grey values. Raises `DetectionError` when it is not one of this camera."""
+def to_grey(image: NDArray[Any], camera: CameraModel) -> Image:
+    """Return the picture as grey values (height, width) uint8.
+
+    Raises:
+        DetectionError: The picture is not one of this camera.
+    """
     import cv2
 
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (3, 4)):
@@ -177,11 +186,11 @@ def _marker_detector(longer_side_px: int) -> Any:
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     parameters.minMarkerPerimeterRate = _MIN_PERIMETER_PX / longer_side_px
     parameters.relativeCornerRefinmentWinSize = 0.2
-    return cv2.aruco.ArucoDetector(dictionary(), parameters)
+    return cv2.aruco.ArucoDetector(load_dictionary(), parameters)
 
 
-def _consistent_board(sheet: Sheet, seen: Mapping[int, Array], camera: Camera) -> _Poses | None:
-    """Poses by as many markers as agree on one board; of equally many, those that fit best."""
+def _find_consistent_markers(sheet: Sheet, seen: Mapping[int, Array], camera: CameraModel) -> _Poses | None:
+    """Return poses by the largest set of markers that agree on one board; of equally large ones, the best fit."""
     for n in range(len(seen), MIN_MARKERS - 1, -1):
         agreeing = []
         for numbers in combinations(seen, n):
@@ -195,15 +204,15 @@ def _consistent_board(sheet: Sheet, seen: Mapping[int, Array], camera: Camera) -
     return None
 
 
-def _largest_error(poses: _Poses, pose: PoseTuple, camera: Camera) -> float:
+def _largest_error(poses: _Poses, pose: PoseTuple, camera: CameraModel) -> float:
     return float(np.linalg.norm(camera.project(poses.points, pose) - poses.pixels, axis=1).max())
 
 
-def _plane_poses(points: Array, pixels: Array, camera: Camera, markers: int) -> _Poses | None:
+def _plane_poses(points: Array, pixels: Array, camera: CameraModel, markers: int) -> _Poses | None:
     import cv2
 
     # Undistorted to the last bit first: solvePnP does so to a few hundredths of a pixel only.
-    normalised = camera.normalise(pixels)
+    normalised = camera.undistort(pixels)
     ok, rvecs, tvecs, _ = cv2.solvePnPGeneric(
         points.reshape(-1, 1, 3), normalised.reshape(-1, 1, 2), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
     )
@@ -218,12 +227,12 @@ def _plane_poses(points: Array, pixels: Array, camera: Camera, markers: int) -> 
     if not solved:
         return None
     solved.sort(key=lambda one: one[1])
-    other = solved[1] if len(solved) > 1 and _differ(solved[0][0], solved[1][0]) else None
+    other = solved[1] if len(solved) > 1 and _are_distinct(solved[0][0], solved[1][0]) else None
     return _Poses(solved[0], other, points, pixels, markers)
 
 
-def _refine_corners(points: Array, pixels: Array, camera: Camera, rvec: Array, tvec: Array) -> PoseTuple | None:
-    """Least squares of the reprojection from one of the two starts; `None` when it leaves the front of the camera."""
+def _refine_corners(points: Array, pixels: Array, camera: CameraModel, rvec: Array, tvec: Array) -> PoseTuple | None:
+    """Minimize the reprojection error from one of the two starts; `None` if the result lies behind the camera."""
     from scipy.optimize import least_squares
 
     if not (np.all(np.isfinite(rvec)) and np.all(np.isfinite(tvec)) and tvec[2] > 0.0):
@@ -235,20 +244,20 @@ def _refine_corners(points: Array, pixels: Array, camera: Camera, rvec: Array, t
         method="lm",
         max_nfev=50,
     )
-    return pose_of(solved.x[:3], solved.x[3:]) if solved.x[5] > 0.0 else None
+    return pose_from_rvec_tvec(solved.x[:3], solved.x[3:]) if solved.x[5] > 0.0 else None
 
 
-def _differ(a: PoseTuple, b: PoseTuple) -> bool:
+def _are_distinct(a: PoseTuple, b: PoseTuple) -> bool:
     return abs(sum(p * q for p, q in zip(a[1], b[1], strict=True))) < math.cos(0.5 * math.radians(0.5))
 
 
-def _refined(sheet: Sheet, poses: _Poses, grey: Image, camera: Camera) -> Sighting | None:
-    """The better of both poses after the print was laid over the picture; by corners alone where that fails."""
-    by_corners = _by_corners(sheet, poses, camera)
+def _refine_photometric(sheet: Sheet, poses: _Poses, grey: Image, camera: CameraModel) -> SheetDetection | None:
+    """Return the better of both poses after the photometric fit; by corners alone where that fails."""
+    by_corners = _detect_by_corners(sheet, poses, camera)
     starts = [poses.best[0]]
     if poses.mirrored is not None and by_corners.mirrored_ratio < _CLEAR_RATIO:
         starts.append(poses.mirrored[0])
-    tried = [register(grey, camera, sheet, start) for start in starts]
+    tried = [fit_print(grey, camera, sheet, start) for start in starts]
     right = [
         one
         for one in tried
@@ -261,7 +270,7 @@ def _refined(sheet: Sheet, poses: _Poses, grey: Image, camera: Camera) -> Sighti
     best = min(right, key=lambda one: one.rms)
     mirrored, ratio = by_corners.mirrored, by_corners.mirrored_ratio
     if len(starts) > 1:
-        mirrored, ratio = _compared(best, starts, tried)
+        mirrored, ratio = _compare_mirrored(best, starts, tried)
     return replace(
         by_corners,
         T_camera_sheet=best.T_camera_sheet,
@@ -272,33 +281,35 @@ def _refined(sheet: Sheet, poses: _Poses, grey: Image, camera: Camera) -> Sighti
     )
 
 
-def _compared(
-    best: Registered, starts: Sequence[PoseTuple], tried: Sequence[Registered | None]
+def _compare_mirrored(
+    best: PhotometricFit, starts: Sequence[PoseTuple], tried: Sequence[PhotometricFit | None]
 ) -> tuple[PoseTuple | None, float]:
-    """The pose that the other start leads to, and how much worse it fits; none where both lead to the same one."""
+    """Return the pose that the other start leads to and its residual ratio; `None` if both lead to the same pose."""
     for start, other in zip(starts, tried, strict=True):
         if other is None:
-            return start, 1.0  # it leads nowhere: nothing was compared
-        if _differ(best.T_camera_sheet, other.T_camera_sheet):
+            return start, 1.0  # no fit, so nothing was compared
+        if _are_distinct(best.T_camera_sheet, other.T_camera_sheet):
             return other.T_camera_sheet, other.rms / max(best.rms, 1e-9)
     return None, math.inf
 
 
-def _by_corners(sheet: Sheet, poses: _Poses, camera: Camera, sigma_px: float = _CORNER_SIGMA_PX) -> Sighting:
+def _detect_by_corners(
+    sheet: Sheet, poses: _Poses, camera: CameraModel, sigma_px: float = _CORNER_SIGMA_PX
+) -> SheetDetection:
     pose, rms = poses.best
-    rvec, tvec = rvec_tvec(pose)
+    rvec, tvec = to_rvec_tvec(pose)
     J = camera.project_with_jacobian(poses.points, rvec, tvec)[1]
     per_axis = max(rms / math.sqrt(2.0), sigma_px)
     by_rvec: Array = np.asarray(np.linalg.inv(J.T @ J) * per_axis**2, dtype=np.float64)
     mirrored, ratio = None, math.inf
     if poses.mirrored is not None:
         mirrored, ratio = poses.mirrored[0], poses.mirrored[1] / max(rms, 1e-9)
-    return Sighting(
+    return SheetDetection(
         anchor_id=sheet.anchor_id,
         kind="board",
         edge_m=sheet.edge_m,
         T_camera_sheet=pose,
-        covariance=tuple(float(v) for v in _position_first(by_rvec, rvec).ravel()),
+        covariance=tuple(float(v) for v in _to_pose_covariance(by_rvec, rvec).ravel()),
         mirrored=mirrored,
         mirrored_ratio=ratio,
         reprojection_px=rms,
@@ -307,9 +318,9 @@ def _by_corners(sheet: Sheet, poses: _Poses, camera: Camera, sigma_px: float = _
     )
 
 
-def _position_first(by_rvec: Array, rvec: Array) -> Array:
-    """Covariance of (rotation vector, translation) as one of (translation, small rotation in the camera frame): the
-    left Jacobian of the exponential map (Barfoot 2017, section 7.1.5) takes changes of the one into the other."""
+def _to_pose_covariance(by_rvec: Array, rvec: Array) -> Array:
+    """Convert a covariance (6, 6) of (rotation vector, translation) to (translation, small rotation in the camera
+    frame) by the left Jacobian of the exponential map (Barfoot 2017, section 7.1.5)."""
     angle = float(np.linalg.norm(rvec))
     left = np.eye(3)
     if angle > 1e-9:

@@ -1,7 +1,7 @@
-"""Watches an alignment in force: alarms when an anchor is suddenly seen elsewhere, and lets corrections in smoothly.
+"""Detect drift and jumps of the tracking frame of one headset.
 
-A change is found in two ways. (1) Against what was seen just before: the same anchor, the last second against the ten
-before it; what is common to a viewpoint cancels, so small changes show. (2) Against the alignment in force, also after
+A change is found in two ways. (1) Against earlier observations of the same anchor: the last second against the ten
+before it; errors common to a viewpoint cancel, so small changes show. (2) Against the alignment in force, also after
 the anchor was out of sight; here all uncertainties count. A jump (the tracking frame moved at once) needs no
 statistics: a new `tracking_epoch`, a head faster than people are, or three detections in a row that agree with each
 other far away. Pure: times are passed in.
@@ -18,22 +18,24 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 
 from anchors.alignment import AlignmentEstimate
-from anchors.lie import Array, quat_matrix
-from anchors.noise import NoiseModel, isotropic
-from anchors.pose import PoseTuple, Vec3, apply, distance, is_place, is_rigid, quat_angle
+from anchors.lie import Array, quat_to_matrix
+from anchors.pose import PoseTuple, Vec3, apply, distance, is_rigid, is_valid_point, quat_angle
+from anchors.uncertainty import NoiseModel, isotropic_covariance
 
 AlarmKind = Literal["changed", "differs", "jump", "epoch"]
 
 _CHI2_3_ONE_IN_A_MILLION: Final = 30.66
-_ENOUGH_BESIDE: Final = 2  # looks at another anchor: one alone may be a wrong detection
+_MIN_BESIDE: Final = 2  # detections of another anchor: one alone may be wrong
 _MEDIAN_VARIANCE: Final = math.pi / 2.0  # of a median over that of a mean, Gaussian noise
 
 
 class Alarm(NamedTuple):
-    """What was seen: `changed` and `differs` ask for a new look, `jump` and `epoch` invalidate the alignment at once.
+    """A detected change: `changed` and `differs` ask for a new observation, `jump` and `epoch` invalidate the
+    alignment.
 
-    `size_m`: by how much; `capture_ns`: when it was found out, of a jump when it was first seen; `beside`: other
-    anchors that did not change in that time (then this one was moved)."""
+    `size_m`: distance; `capture_ns`: time of detection, of a jump the time of its first observation; `beside`: other
+    anchors that did not change meanwhile (then this one was moved).
+    """
 
     kind: AlarmKind
     anchor_id: str
@@ -48,11 +50,14 @@ class Alarm(NamedTuple):
 
 @dataclass(frozen=True)
 class DriftConfig:
-    """`window_ns`: what counts as now; `reference_ns`: what counts as before, summed up anew every
-    `reference_every_ns`. `min_change_m`: less is left to smooth
-    updates. `jump_m`: detections that far away, three in a row, are a jump. `max_speed_m_per_s`, `max_turn_rad_per_s`:
-    no head is faster. `quiet_ns`: an anchor that raised an alarm raises no other for so long. `unseen_sigma_m`: noise
-    per axis of detections from where nobody knows."""
+    """Thresholds of the monitor.
+
+    `window_ns`: length of the present window; `reference_ns`: of the window before it, which is summarized every
+    `reference_every_ns`. `min_change_m`: smaller changes are left to corrections. `jump_m`: `jump_count` consecutive
+    detections that far away are a jump. `max_speed_m_per_s`, `max_turn_rad_per_s`: upper bounds of a head's motion.
+    `quiet_ns`: time after an alarm in which an anchor raises no other. `unknown_viewpoint_sigma_m`: noise per axis of
+    detections without a head pose.
+    """
 
     window_ns: int = 1_000_000_000
     reference_ns: int = 10_000_000_000
@@ -61,15 +66,15 @@ class DriftConfig:
     min_change_m: float = 0.005
     min_difference_m: float = 0.010
     jump_m: float = 0.03
-    jump_in_a_row: int = 3
+    jump_count: int = 3
     max_speed_m_per_s: float = 6.0
     max_turn_rad_per_s: float = 20.0
     quiet_ns: int = 2_000_000_000
-    max_seen: int = 600
-    unseen_sigma_m: float = 0.005
+    max_detections: int = 600
+    unknown_viewpoint_sigma_m: float = 0.005
 
 
-class _Seen(NamedTuple):
+class _Detection(NamedTuple):
     capture_ns: int
     p: Vec3
     p_head: Vec3 | None
@@ -87,23 +92,24 @@ class _Window(NamedTuple):
 
 @dataclass
 class DriftMonitor:
-    """Watches one headset. `anchors`: `T_world_anchor`. Feed every detection and, as often as known, the head pose."""
+    """Monitor of one headset. `anchors`: `T_world_anchor`. Add every detection and, as often as known, the head
+    pose."""
 
     anchors: Mapping[str, PoseTuple]
     noise: NoiseModel = field(default_factory=NoiseModel)
     config: DriftConfig = field(default_factory=DriftConfig)
     tracking_epoch: int = 0
-    _seen: dict[str, deque[_Seen]] = field(default_factory=dict)
+    _detections: dict[str, deque[_Detection]] = field(default_factory=dict)
     _quiet_until_ns: dict[str, int] = field(default_factory=dict)
     _references: dict[str, tuple[int, int, _Window | None]] = field(default_factory=dict)
     _steady_ns: dict[str, int] = field(default_factory=dict)
     _head: tuple[int, PoseTuple] | None = None
 
-    def head(self, T_tracking_head: PoseTuple, capture_ns: int, tracking_epoch: int) -> Alarm | None:
-        """A head pose as tracked: a new epoch or an impossible speed is a jump."""
+    def add_head_pose(self, T_tracking_head: PoseTuple, capture_ns: int, tracking_epoch: int) -> Alarm | None:
+        """Add a tracked head pose and return an alarm for a new epoch or an impossible speed."""
         if tracking_epoch < self.tracking_epoch or not is_rigid(T_tracking_head):
-            return None  # of a frame that is void, or no pose: nothing to compare with
-        alarm = self._epoch(capture_ns, tracking_epoch)
+            return None  # old tracking frame or invalid pose
+        alarm = self._update_epoch(capture_ns, tracking_epoch)
         last, self._head = self._head, (capture_ns, T_tracking_head)
         if alarm is not None or last is None or not 0 < capture_ns - last[0] <= 500_000_000:
             return alarm
@@ -111,11 +117,11 @@ class DriftMonitor:
         moved, turned = distance(last[1][0], T_tracking_head[0]), quat_angle(last[1][1], T_tracking_head[1])
         c = self.config
         if moved > c.jump_m + c.max_speed_m_per_s * seconds or turned > 0.2 + c.max_turn_rad_per_s * seconds:
-            self._forget()
+            self._reset()
             return Alarm("jump", "", moved, capture_ns)
         return None
 
-    def observe(
+    def add_observation(
         self,
         anchor_id: str,
         p_tracking_anchor: Vec3,
@@ -125,47 +131,49 @@ class DriftMonitor:
         viewpoint_id: int = 0,
         alignment: AlignmentEstimate | None = None,
     ) -> Alarm | None:
-        """One detection, and the alignment in force (`None`: none). Says at most one thing at a time."""
-        if not is_place(p_tracking_anchor) or not is_place(p_tracking_head):
+        """Add one detection and return at most one alarm. `alignment`: the alignment in force, if any."""
+        if not is_valid_point(p_tracking_anchor) or not is_valid_point(p_tracking_head):
             return None
-        alarm = self._epoch(capture_ns, tracking_epoch)
+        alarm = self._update_epoch(capture_ns, tracking_epoch)
         if alarm is not None or tracking_epoch < self.tracking_epoch or anchor_id not in self.anchors:
             return alarm
-        seen = self._seen.setdefault(anchor_id, deque(maxlen=self.config.max_seen))
+        seen = self._detections.setdefault(anchor_id, deque(maxlen=self.config.max_detections))
         while seen and not 0 <= capture_ns - seen[0].capture_ns <= self.config.window_ns + self.config.reference_ns:
             seen.popleft()
-        seen.append(_Seen(capture_ns, p_tracking_anchor, p_tracking_head, viewpoint_id))
+        seen.append(_Detection(capture_ns, p_tracking_anchor, p_tracking_head, viewpoint_id))
         if 0 < self._quiet_until_ns.get(anchor_id, 0) - capture_ns <= self.config.quiet_ns:
             return None  # more than that: the clock was set back
-        return self._judge(anchor_id, capture_ns, alignment)
+        return self._check_anchor(anchor_id, capture_ns, alignment)
 
-    def _judge(self, anchor_id: str, now_ns: int, alignment: AlignmentEstimate | None) -> Alarm | None:
-        seen = self._seen[anchor_id]
-        new = self._newest(seen, now_ns)
-        reference = self._before(anchor_id, now_ns, new[-1].viewpoint_id)
-        jumped = self._jump(new, reference)
+    def _check_anchor(self, anchor_id: str, now_ns: int, alignment: AlignmentEstimate | None) -> Alarm | None:
+        seen = self._detections[anchor_id]
+        new = self._select_summarize_viewpoint(seen, now_ns)
+        reference = self._get_reference(anchor_id, now_ns, new[-1].viewpoint_id)
+        jumped = self._measure_jump(new, reference)
         if jumped:
-            since_ns = new[-self.config.jump_in_a_row].capture_ns
-            beside = self._stayed_beside(anchor_id, since_ns, jumped)
+            since_ns = new[-self.config.jump_count].capture_ns
+            beside = self._find_unmoved_anchors(anchor_id, since_ns, jumped)
             if beside:
-                return self._alarm("changed", anchor_id, jumped, now_ns, beside)
-            self._forget()
+                return self._raise_alarm("changed", anchor_id, jumped, now_ns, beside)
+            self._reset()
             return Alarm("jump", anchor_id, jumped, since_ns)
         if len(new) < self.config.min_in_window:
             return None
-        now = self._summary(new)
-        changed = self._change(now, reference)
+        now = self._summarize(new)
+        changed = self._measure_change(now, reference)
         if changed:
-            beside = self._stayed_beside(anchor_id, new[len(new) // 2].capture_ns, changed)
-            return self._alarm("changed", anchor_id, changed, now_ns, beside)
-        differs = self._difference(anchor_id, now, alignment)
+            beside = self._find_unmoved_anchors(anchor_id, new[len(new) // 2].capture_ns, changed)
+            return self._raise_alarm("changed", anchor_id, changed, now_ns, beside)
+        differs = self._measure_difference(anchor_id, now, alignment)
         if differs:
-            return self._alarm("differs", anchor_id, differs, now_ns, self._steady_beside(anchor_id, now_ns))
+            return self._raise_alarm(
+                "differs", anchor_id, differs, now_ns, self._find_steady_anchors(anchor_id, now_ns)
+            )
         self._steady_ns[anchor_id] = now_ns
         return None
 
-    def _newest(self, seen: deque[_Seen], now_ns: int) -> list[_Seen]:
-        """Of the last window, those from where it is seen now; oldest first."""
+    def _select_summarize_viewpoint(self, seen: deque[_Detection], now_ns: int) -> list[_Detection]:
+        """Return the detections of the last window from the present viewpoint, oldest first."""
         new = []
         for s in reversed(seen):
             if now_ns - s.capture_ns >= self.config.window_ns:
@@ -174,42 +182,44 @@ class DriftMonitor:
                 new.append(s)
         return new[::-1]
 
-    def _alarm(self, kind: AlarmKind, anchor_id: str, size_m: float, now_ns: int, beside: tuple[str, ...]) -> Alarm:
-        """From here on the new place is what was seen before."""
+    def _raise_alarm(
+        self, kind: AlarmKind, anchor_id: str, size_m: float, now_ns: int, beside: tuple[str, ...]
+    ) -> Alarm:
+        """Return an alarm, and start over with the new pose of the anchor."""
         self._quiet_until_ns[anchor_id] = now_ns + self.config.quiet_ns
         self._references.pop(anchor_id, None)
         self._steady_ns.pop(anchor_id, None)
-        self._seen[anchor_id].clear()
+        self._detections[anchor_id].clear()
         return Alarm(kind, anchor_id, size_m, now_ns, beside)
 
-    def _stayed_beside(self, anchor_id: str, since_ns: int, size_m: float) -> tuple[str, ...]:
-        """Other anchors that are seen where they were, after this one was seen to be off by `size_m`."""
+    def _find_unmoved_anchors(self, anchor_id: str, since_ns: int, size_m: float) -> tuple[str, ...]:
+        """Return other anchors that did not move since this one was off by `size_m`."""
         stayed = []
-        for other in sorted(self._seen):
+        for other in sorted(self._detections):
             kept = self._references.get(other)
-            later = [s.p for s in self._seen[other] if s.capture_ns >= since_ns]
-            if other == anchor_id or kept is None or kept[2] is None or len(later) < _ENOUGH_BESIDE:
+            later = [s.p for s in self._detections[other] if s.capture_ns >= since_ns]
+            if other == anchor_id or kept is None or kept[2] is None or len(later) < _MIN_BESIDE:
                 continue
             if float(np.linalg.norm(_median(later) - kept[2].p)) < 0.5 * size_m:
                 stayed.append(other)
         return tuple(stayed)
 
-    def _steady_beside(self, anchor_id: str, now_ns: int) -> tuple[str, ...]:
-        """Other anchors that are seen where the alignment says."""
+    def _find_steady_anchors(self, anchor_id: str, now_ns: int) -> tuple[str, ...]:
+        """Return other anchors observed where the alignment predicts them."""
         window_ns = self.config.window_ns
         return tuple(o for o, ns in sorted(self._steady_ns.items()) if o != anchor_id and abs(now_ns - ns) < window_ns)
 
-    def _before(self, anchor_id: str, now_ns: int, viewpoint_id: int) -> _Window | None:
+    def _get_reference(self, anchor_id: str, now_ns: int, viewpoint_id: int) -> _Window | None:
         kept = self._references.get(anchor_id)
         if kept is not None and 0 < kept[0] - now_ns <= self.config.reference_every_ns and kept[1] == viewpoint_id:
             return kept[2]
-        old = [s for s in self._seen[anchor_id] if now_ns - s.capture_ns >= self.config.window_ns]
-        reference = self._window(old, viewpoint_id)
+        old = [s for s in self._detections[anchor_id] if now_ns - s.capture_ns >= self.config.window_ns]
+        reference = self._summarize_viewpoint(old, viewpoint_id)
         self._references[anchor_id] = (now_ns + self.config.reference_every_ns, viewpoint_id, reference)
         return reference
 
-    def _window(self, seen: list[_Seen], viewpoint_id: int) -> _Window | None:
-        """Those of the wanted viewpoint, else of the one that has most; `None` when there are too few of either."""
+    def _summarize_viewpoint(self, seen: list[_Detection], viewpoint_id: int) -> _Window | None:
+        """Summarize the detections of the given viewpoint, else of the one that has most; `None` if too few."""
         counts: dict[int, int] = {}
         for s in seen:
             counts[s.viewpoint_id] = counts.get(s.viewpoint_id, 0) + 1
@@ -218,19 +228,19 @@ class DriftMonitor:
         rows = [s for s in seen if s.viewpoint_id == viewpoint_id]
         if len(rows) < self.config.min_in_window:
             return None
-        return self._summary(rows)
+        return self._summarize(rows)
 
-    def _summary(self, rows: list[_Seen]) -> _Window:
+    def _summarize(self, rows: list[_Detection]) -> _Window:
         p = _median([s.p for s in rows])
         p_head = rows[len(rows) // 2].p_head
         if p_head is None:
-            common, each = self.noise.split(isotropic(self.config.unseen_sigma_m, 0.0))
+            common, each = self.noise.split_covariance(isotropic_covariance(self.config.unknown_viewpoint_sigma_m, 0.0))
         else:
-            common, each = self.noise.seen_from(np.array(p_head), p)
+            common, each = self.noise.compute_covariances(np.array(p_head), p)
         return _Window(p, each[:3, :3] * (_MEDIAN_VARIANCE / len(rows)), common[:3, :3], rows[-1].viewpoint_id)
 
-    def _change(self, now: _Window, before: _Window | None, least_m: float = 0.0) -> float:
-        """How far it is from where it was, 0 for as good as not."""
+    def _measure_change(self, now: _Window, before: _Window | None, least_m: float = 0.0) -> float:
+        """Return the distance [m] from the reference, 0 if not significant."""
         if before is None:
             return 0.0
         C = now.own + before.own
@@ -238,20 +248,21 @@ class DriftMonitor:
             C = C + now.common + before.common
         return _significant(now.p - before.p, C, least_m or self.config.min_change_m)
 
-    def _difference(self, anchor_id: str, now: _Window, alignment: AlignmentEstimate | None) -> float:
-        """How far it is from where the alignment says, 0 for as good as not."""
+    def _measure_difference(self, anchor_id: str, now: _Window, alignment: AlignmentEstimate | None) -> float:
+        """Return the distance [m] from the pose that the alignment predicts, 0 if not significant."""
         if alignment is None or alignment.refused or alignment.tracking_epoch != self.tracking_epoch:
             return 0.0
         p_world = self.anchors[anchor_id][0]
         placed = apply(alignment.T_world_tracking, (float(now.p[0]), float(now.p[1]), float(now.p[2])))
-        R = quat_matrix(np.array(alignment.T_world_tracking[1]))
+        R = quat_to_matrix(np.array(alignment.T_world_tracking[1]))
         C = alignment.covariance_at(p_world) + R @ (now.own + now.common) @ R.T
         return _significant(np.array(placed) - p_world, C, self.config.min_difference_m)
 
-    def _jump(self, new: list[_Seen], reference: _Window | None) -> float:
-        """The last few detections, far from the reference and near to each other: one alone is a wrong detection."""
-        last = new[-self.config.jump_in_a_row :]
-        if reference is None or len(last) < self.config.jump_in_a_row:
+    def _measure_jump(self, new: list[_Detection], reference: _Window | None) -> float:
+        """Return the distance [m] of the last few detections from the reference, 0 unless they agree with each other:
+        one alone may be wrong."""
+        last = new[-self.config.jump_count :]
+        if reference is None or len(last) < self.config.jump_count:
             return 0.0
         before = reference.p.tolist()
         if not min(math.dist(s.p, before) for s in last) > self.config.jump_m:
@@ -260,17 +271,17 @@ class DriftMonitor:
         together = float(np.max(np.linalg.norm(away - away.mean(axis=0), axis=1)))
         if together > max(0.5 * self.config.jump_m, 0.1 * float(np.linalg.norm(away[0]))):
             return 0.0
-        return self._change(self._summary(last), reference, self.config.jump_m)
+        return self._measure_change(self._summarize(last), reference, self.config.jump_m)
 
-    def _epoch(self, capture_ns: int, tracking_epoch: int) -> Alarm | None:
+    def _update_epoch(self, capture_ns: int, tracking_epoch: int) -> Alarm | None:
         if tracking_epoch <= self.tracking_epoch:
             return None
         self.tracking_epoch = tracking_epoch
-        self._forget()
+        self._reset()
         return Alarm("epoch", "", math.inf, capture_ns)
 
-    def _forget(self) -> None:
-        self._seen.clear()
+    def _reset(self) -> None:
+        self._detections.clear()
         self._references.clear()
         self._quiet_until_ns.clear()
         self._steady_ns.clear()
@@ -278,13 +289,13 @@ class DriftMonitor:
 
 
 def _median(points: list[Vec3]) -> Array:
-    """Of each coordinate. For a few dozen points sorting is several times as fast as numpy."""
+    """Return the median (3,) per coordinate. For a few dozen points sorting is several times as fast as numpy."""
     half, odd = divmod(len(points), 2)
     columns = [sorted(column) for column in zip(*points, strict=True)]
     return np.array([c[half] if odd else 0.5 * (c[half - 1] + c[half]) for c in columns])
 
 
 def _significant(d: Array, C: Array, least_m: float) -> float:
-    """Length of `d` [m] when it is at least so long and chance explains it once in a million; else 0."""
+    """Return the length of `d` [m] if it is at least `least_m` and chance exceeds it once in a million; else 0."""
     size = float(np.linalg.norm(d))
     return size if size >= least_m and float(d @ np.linalg.solve(C, d)) > _CHI2_3_ONE_IN_A_MILLION else 0.0

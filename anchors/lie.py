@@ -24,7 +24,7 @@ _CONJUGATE: Final = np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def quat_multiply(a: Array, b: Array) -> Array:
-    """Hamilton product of quaternions `(..., 4)`: the rotation `b` followed by `a`."""
+    """Return the Hamilton product of quaternions `(..., 4)`: the rotation `b` followed by `a`."""
     if b.ndim == 1:  # many by one: a product with a matrix is one call
         w, x, y, z = b.tolist()
         return np.asarray(a @ np.array([[w, x, y, z], [-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]]))
@@ -33,12 +33,12 @@ def quat_multiply(a: Array, b: Array) -> Array:
 
 
 def quat_conjugate(q: Array) -> Array:
-    """Inverse of unit quaternions `(..., 4)`."""
+    """Return the inverse of unit quaternions `(..., 4)`."""
     return np.asarray(q * _CONJUGATE)
 
 
 def quat_exp(r: Array) -> Array:
-    """Rotation vectors `(..., 3)` to unit quaternions `(..., 4)`, smooth at zero."""
+    """Return unit quaternions `(..., 4)` of rotation vectors `(..., 3)` [rad], smooth at zero."""
     if r.ndim == 1:  # one alone: plain floats are faster
         return np.array(quat_from_rotvec((float(r[0]), float(r[1]), float(r[2]))))
     angle = np.linalg.norm(r, axis=-1, keepdims=True)
@@ -47,23 +47,23 @@ def quat_exp(r: Array) -> Array:
     return np.concatenate((np.cos(0.5 * angle), scale * r), axis=-1)
 
 
-def turned(q: Array, r: Array) -> Array:
-    """One quaternion (4,) turned by a rotation vector (3,), `exp(r) * q`: in plain floats, which are faster."""
+def quat_perturb(q: Array, r: Array) -> Array:
+    """Return `exp(r) * q` for one quaternion (4,) and rotation vector (3,) [rad], in plain floats, which are faster."""
     x, y, z = r.tolist()
     w, i, j, k = q.tolist()
     return np.array(quat_mul(quat_from_rotvec((x, y, z)), (w, i, j, k)))
 
 
 def quat_log(q: Array) -> Array:
-    """Unit quaternions `(..., 4)` to their shortest rotation vectors `(..., 3)`, length at most pi, smooth at zero."""
+    """Return the shortest rotation vectors `(..., 3)` [rad] of unit quaternions `(..., 4)`, smooth at zero."""
     w, v = q[..., :1], q[..., 1:]
     n = np.sqrt(np.add.reduce(v * v, axis=-1, keepdims=True))
     half = np.arctan2(n, np.abs(w)) / np.maximum(n, 1e-150)  # half the angle over n, which tends to 1 / w
     return np.asarray(np.copysign(2.0, w) * half * v)
 
 
-def quat_matrix(q: Array) -> Array:
-    """Rotation matrices `(..., 3, 3)` of unit quaternions `(..., 4)`."""
+def quat_to_matrix(q: Array) -> Array:
+    """Return rotation matrices `(..., 3, 3)` of unit quaternions `(..., 4)`."""
     w, x, y, z = q.tolist() if q.ndim == 1 else (q[..., 0], q[..., 1], q[..., 2], q[..., 3])
     rows = (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
@@ -75,8 +75,8 @@ def quat_matrix(q: Array) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def matrix_quat(R: Array) -> Array:
-    """Unit quaternion (4,), w >= 0, of a rotation matrix (3, 3): the greatest of four forms (Shepperd 1978)."""
+def quat_from_matrix(R: Array) -> Array:
+    """Return the unit quaternion (4,), w >= 0, of a rotation matrix (3, 3) (Shepperd 1978: greatest of four forms)."""
     t = float(np.trace(R))
     candidates = (t, float(R[0, 0]), float(R[1, 1]), float(R[2, 2]))
     k = candidates.index(max(candidates))
@@ -94,7 +94,7 @@ def matrix_quat(R: Array) -> Array:
 
 
 def skew(v: Array) -> Array:
-    """Cross-product matrices `(..., 3, 3)`: `skew(a) @ b == cross(a, b)`."""
+    """Return cross-product matrices `(..., 3, 3)`: `skew(a) @ b == cross(a, b)`."""
     out = np.zeros((*v.shape[:-1], 3, 3))
     out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
     out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
@@ -103,7 +103,7 @@ def skew(v: Array) -> Array:
 
 
 def left_jacobian(r: Array) -> Array:
-    """Left Jacobian (3, 3) of SO(3) at rotation vector `r`: exp(r + d) ~ exp(J d) exp(r) (Barfoot 2017, eq. 7.77)."""
+    """Return the left Jacobian (3, 3) of SO(3) at `r`: exp(r + d) ~ exp(J d) exp(r) (Barfoot 2017, eq. 7.77)."""
     angle = float(np.linalg.norm(r))
     K = skew(r)
     if angle < 1e-4:  # series: the closed forms cancel
@@ -112,19 +112,21 @@ def left_jacobian(r: Array) -> Array:
 
 
 def se3_exp(xi: Array) -> tuple[Array, Array]:
-    """Twist (6,), position part first, to a pose: position (3,) and quaternion (4,)."""
+    """Return the pose (position (3,), quaternion (4,)) of a twist (6,), position part first."""
     return left_jacobian(xi[3:]) @ xi[:3], quat_exp(xi[3:])
 
 
 def se3_log(p: Array, q: Array) -> Array:
-    """Twist (6,) of a pose; the inverse of `se3_exp` for rotations below pi."""
+    """Return the twist (6,) of a pose; the inverse of `se3_exp` for rotations below pi."""
     r = quat_log(q)
     return np.concatenate((np.linalg.solve(left_jacobian(r), p), r))
 
 
 def swing(q: Array) -> Array:
-    """Tilt of rotations `(..., 4)`: the rotation vector `(..., 2)` (x, y) [rad] that is left when the turn about Z is
-    taken off on the right, `q = swing * twist` (Dobrowolski 2015)."""
+    """Return the tilt of rotations `(..., 4)` as rotation vectors `(..., 2)` (x, y) [rad].
+
+    The tilt is the swing of the swing-twist decomposition about Z, `q = swing * twist` (Dobrowolski 2015).
+    """
     w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     n = np.sqrt(w * w + z * z)
     safe = np.maximum(n, 1e-12)

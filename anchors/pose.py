@@ -19,7 +19,7 @@ IDENTITY_POSE: Final[PoseTuple] = ((0.0, 0.0, 0.0), IDENTITY_QUAT)
 
 
 def quat_mul(a: Quat, b: Quat) -> Quat:
-    """Hamilton product: the rotation `b` followed by `a`."""
+    """Return the Hamilton product `a * b`: the rotation `b` followed by `a`."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     return (
@@ -31,12 +31,16 @@ def quat_mul(a: Quat, b: Quat) -> Quat:
 
 
 def quat_conj(q: Quat) -> Quat:
-    """Inverse of a unit quaternion."""
+    """Return the inverse of a unit quaternion."""
     return (q[0], -q[1], -q[2], -q[3])
 
 
 def quat_normalize(q: Quat) -> Quat:
-    """`q` scaled to unit length. Raises `ValueError` for a zero or non-finite quaternion."""
+    """Scale `q` to unit length.
+
+    Raises:
+        ValueError: The quaternion is zero or not finite.
+    """
     n = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     if not (n > 1e-12 and math.isfinite(n)):
         raise ValueError(f"quaternion {q} cannot be normalised: it must be finite and not zero")
@@ -44,7 +48,7 @@ def quat_normalize(q: Quat) -> Quat:
 
 
 def quat_rotate(q: Quat, v: Vec3) -> Vec3:
-    """Vector `v` turned by unit quaternion `q`: v + 2 w (u x v) + 2 u x (u x v)."""
+    """Rotate vector `v` by unit quaternion `q = (w, u)`: v + 2 w (u x v) + 2 u x (u x v)."""
     w, x, y, z = q
     vx, vy, vz = v
     tx = 2.0 * (y * vz - z * vy)
@@ -58,14 +62,14 @@ def quat_rotate(q: Quat, v: Vec3) -> Vec3:
 
 
 def quat_from_rotvec(r: Vec3) -> Quat:
-    """Exponential map: rotation vector [rad] to quaternion, smooth at zero."""
+    """Return the quaternion of a rotation vector [rad] (exponential map, smooth at zero)."""
     angle = math.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
     s = 0.5 - angle * angle / 48.0 if angle < 1e-6 else math.sin(0.5 * angle) / angle
     return quat_normalize((math.cos(0.5 * angle), s * r[0], s * r[1], s * r[2]))
 
 
 def quat_to_rotvec(q: Quat) -> Vec3:
-    """Logarithm of a unit quaternion: the shortest rotation vector [rad], length at most pi."""
+    """Return the shortest rotation vector [rad] of a unit quaternion (logarithm, length at most pi)."""
     w, x, y, z = q if q[0] >= 0.0 else (-q[0], -q[1], -q[2], -q[3])
     n = math.sqrt(x * x + y * y + z * z)
     s = 2.0 / w if n < 1e-9 else 2.0 * math.atan2(n, w) / n
@@ -73,18 +77,18 @@ def quat_to_rotvec(q: Quat) -> Vec3:
 
 
 def quat_from_yaw(yaw: float) -> Quat:
-    """Rotation about the vertical (Z) axis by `yaw` [rad]."""
+    """Return the rotation about the vertical (Z) axis by `yaw` [rad]."""
     return (math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw))
 
 
 def quat_angle(a: Quat, b: Quat) -> float:
-    """Angle [rad] between two orientations, 0 to pi."""
+    """Return the angle [rad] between two orientations, 0 to pi."""
     r = quat_to_rotvec(quat_mul(quat_conj(a), b))
     return math.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
 
 
 def compose(a: PoseTuple, b: PoseTuple) -> PoseTuple:
-    """`T_a_c = compose(T_a_b, T_b_c)`. The quaternion is normalised again, so chains do not drift."""
+    """Return `T_a_c = compose(T_a_b, T_b_c)`. The quaternion is normalised again, so chains do not drift."""
     r = quat_rotate(a[1], b[0])
     return (
         (a[0][0] + r[0], a[0][1] + r[1], a[0][2] + r[2]),
@@ -93,30 +97,30 @@ def compose(a: PoseTuple, b: PoseTuple) -> PoseTuple:
 
 
 def inverse(a: PoseTuple) -> PoseTuple:
-    """`T_b_a` from `T_a_b`."""
+    """Return `T_b_a` from `T_a_b`."""
     qi = quat_conj(a[1])
     r = quat_rotate(qi, a[0])
     return ((-r[0], -r[1], -r[2]), qi)
 
 
 def apply(a: PoseTuple, p: Vec3) -> Vec3:
-    """Point `p` of frame b in frame a."""
+    """Transform a point from frame b to frame a: `p_a = apply(T_a_b, p_b)`."""
     r = quat_rotate(a[1], p)
     return (a[0][0] + r[0], a[0][1] + r[1], a[0][2] + r[2])
 
 
 def distance(a: Vec3, b: Vec3) -> float:
-    """Euclidean distance [m]."""
+    """Return the Euclidean distance [m] of two points."""
     return math.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
 
 
 def is_rigid(T: PoseTuple, reach_m: float = 1e3) -> bool:
-    """Whether numbers from elsewhere are a pose: finite, a unit quaternion (to 1 %), no further away than `reach_m`."""
+    """Return whether untrusted numbers are a pose: finite, unit quaternion (to 1 %), coordinates within `reach_m`."""
     p, q = T
     norm = math.sqrt(sum(c * c for c in q))
     return all(map(math.isfinite, (*p, *q))) and abs(norm - 1.0) <= 1e-2 and max(map(abs, p)) <= reach_m
 
 
-def is_place(p: Vec3 | None, reach_m: float = 1e3) -> bool:
-    """Whether numbers from elsewhere are a point within `reach_m`, or `None`: not known."""
+def is_valid_point(p: Vec3 | None, reach_m: float = 1e3) -> bool:
+    """Return whether untrusted numbers are a finite point within `reach_m`; `None` (unknown) is valid."""
     return p is None or (all(map(math.isfinite, p)) and max(map(abs, p)) <= reach_m)

@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.camera import matrix_of, pose_of_matrix
+from anchors.camera import pose_from_matrix, pose_to_matrix
 from anchors.pose import PoseTuple, compose, inverse
 
 Array = NDArray[np.float64]
@@ -34,16 +34,16 @@ _TURN_ADVICE: Final = (
 _MIXED_UP: Final = (
     "are the poses those of these pictures (metres, quaternion w first), and did the marker stay fixed on the hand?"
 )
-#: Median of the pictures used, [m] and [rad]: beyond this nothing fits, whatever the noise is said to be.
+#: Median residual of the pictures used, [m] and [rad]: beyond this nothing fits, whatever the stated noise.
 MAX_RESIDUAL: Final = (0.02, math.radians(3.0))
 
 
 class CalibrationError(ValueError):
-    """The poses do not determine a result; the text says what would help."""
+    """The poses do not determine a result."""
 
 
 @dataclass(frozen=True)
-class Noise:
+class CalibrationNoise:
     """Standard deviations per axis of the robot's poses (repeatability and kinematics), and of what the camera saw
     where no covariance came with it."""
 
@@ -54,7 +54,7 @@ class Noise:
 
 
 @dataclass(frozen=True)
-class Solved:
+class RobotWorldCalibration:
     """`covariance`: 36 values, (x, y, z [m], rx, ry, rz [rad]) of the camera in the frame of the base; scaled up where
     residuals are larger than stated. `residuals`: per picture, distance [m] and angle [rad] between both chains.
     `left_out`: pictures that contradict the others. `spread_rad`: how much the hand turned, about its second axis."""
@@ -71,48 +71,57 @@ class Solved:
     def used(self) -> tuple[int, ...]:
         return tuple(k for k in range(len(self.residuals)) if k not in self.left_out)
 
-    def rms(self) -> tuple[float, float]:
-        """Root mean square of the residuals of the pictures used: [m], [rad]."""
+    def compute_rms(self) -> tuple[float, float]:
+        """Return the root mean square of the residuals of the pictures used: [m], [rad]."""
         kept = np.array([self.residuals[k] for k in self.used])
         m, rad = np.sqrt(np.mean(kept**2, axis=0))
         return float(m), float(rad)
 
 
-def one_pose(T_base_ee: PoseTuple, T_ee_marker: PoseTuple, T_camera_marker: PoseTuple) -> PoseTuple:
-    """`T_base_camera` where the place of the marker on the hand is known."""
+def solve_single_pose(T_base_ee: PoseTuple, T_ee_marker: PoseTuple, T_camera_marker: PoseTuple) -> PoseTuple:
+    """Return `T_base_camera` from one picture, if the pose of the marker on the hand is known."""
     return compose(compose(T_base_ee, T_ee_marker), inverse(T_camera_marker))
 
 
-def solve(
+def solve_robot_world(
     T_base_ee: Sequence[PoseTuple],
     T_camera_marker: Sequence[PoseTuple],
     covariances: Sequence[Sequence[float]] | None = None,
-    noise: Noise | None = None,
-) -> Solved:
-    """`T_base_camera` and `T_ee_marker` from many poses; neither needs to be known. `covariances`: of each
-    `T_camera_marker`, camera frame. Raises `CalibrationError`."""
+    noise: CalibrationNoise | None = None,
+) -> RobotWorldCalibration:
+    """Estimate `T_base_camera` and `T_ee_marker` from many poses; neither needs to be known.
+
+    Args:
+        T_base_ee: Poses of the hand by kinematics, one per picture.
+        T_camera_marker: Poses of the marker by the camera, one per picture.
+        covariances: Of each `T_camera_marker` (36 values), camera frame.
+        noise: Standard deviations where no covariance is given, and of the robot.
+
+    Raises:
+        CalibrationError: Too few pictures agree, or the hand rotated too little.
+    """
     if len(T_base_ee) != len(T_camera_marker):
         raise CalibrationError(f"{len(T_base_ee)} poses of the robot, {len(T_camera_marker)} of the marker")
-    data = _Data.of(T_base_ee, T_camera_marker, covariances, noise or Noise())
+    data = _Data.from_poses(T_base_ee, T_camera_marker, covariances, noise or CalibrationNoise())
     kept = list(range(len(data.A)))
     while True:
         if len(kept) < max(MIN_POSES, math.ceil(_MIN_AGREEING * len(data.A))):
-            raise CalibrationError(_too_few(len(kept), len(data.A)))
-        spread = _spread(data.A[kept])
+            raise CalibrationError(_disagreement_text(len(kept), len(data.A)))
+        spread = _rotation_spread(data.A[kept])
         if spread < MIN_SPREAD_RAD:
             raise CalibrationError(
                 f"the hand turned by {math.degrees(spread):.1f} deg about its second axis, which leaves the result "
                 f"open: {_TURN_ADVICE}"
             )
-        X, Y, normal = _least_squares(data.only(kept))
-        whitened = np.linalg.norm(data.whitened(X, Y), axis=1)
+        X, Y, normal = _least_squares(data.select(kept))
+        whitened = np.linalg.norm(data.whiten(X, Y), axis=1)
         # One at a time: a wrong picture drags the result towards it, and others away.
         limit = _OUTLIER * max(float(np.median(whitened[kept])), math.sqrt(6.0) / 2.0)
         worst = max(kept, key=lambda k: whitened[k])
         if whitened[worst] <= limit:
             break
         kept.remove(worst)
-    differences = data.differences(X, Y)
+    differences = data.residuals(X, Y)
     residuals = np.column_stack(
         [np.linalg.norm(differences[:, :3], axis=1), np.linalg.norm(differences[:, 3:], axis=1)]
     )
@@ -123,9 +132,9 @@ def solve(
         )
     birge = max(1.0, float(np.sum(whitened[kept] ** 2)) / max(6 * len(kept) - 12, 1))
     covariance = (np.linalg.inv(normal) * birge)[:6, :6]
-    return Solved(
-        pose_of_matrix(X),
-        pose_of_matrix(Y),
+    return RobotWorldCalibration(
+        pose_from_matrix(X),
+        pose_from_matrix(Y),
         tuple(float(v) for v in covariance.ravel()),
         tuple((float(m), float(rad)) for m, rad in residuals),
         tuple(k for k in range(len(data.A)) if k not in kept),
@@ -134,26 +143,28 @@ def solve(
     )
 
 
-def camera_on_hand(
+def solve_camera_on_hand(
     T_base_ee: Sequence[PoseTuple],
     T_camera_sheet: Sequence[PoseTuple],
     covariances: Sequence[Sequence[float]] | None = None,
-    noise: Noise | None = None,
-) -> Solved:
-    """A camera on the hand that looks at a sheet in the room: `T_base_camera` of the result is `T_base_sheet`, and
-    `T_ee_marker` is `T_ee_camera`."""
+    noise: CalibrationNoise | None = None,
+) -> RobotWorldCalibration:
+    """Calibrate a camera on the hand that sees a sheet in the room.
+
+    `T_base_camera` of the result is `T_base_sheet`, and `T_ee_marker` is `T_ee_camera`.
+    """
     turned = None
     if covariances is not None:
-        turned = [_of_inverse(T, cov) for T, cov in zip(T_camera_sheet, covariances, strict=True)]
-    return solve(T_base_ee, [inverse(T) for T in T_camera_sheet], turned, noise)
+        turned = [_invert_covariance(T, cov) for T, cov in zip(T_camera_sheet, covariances, strict=True)]
+    return solve_robot_world(T_base_ee, [inverse(T) for T in T_camera_sheet], turned, noise)
 
 
-def T_world_base_of_twin(
-    T_base_ee: Sequence[PoseTuple], T_world_marker: Sequence[PoseTuple], noise: Noise | None = None
-) -> tuple[PoseTuple, Solved]:
-    """Where the real robot stands in the world, from a marker on its hand that an aligned headset or camera saw (or a
-    tracked controller held there): the virtual robot belongs there."""
-    solved = solve(T_base_ee, T_world_marker, None, noise)
+def solve_twin_base(
+    T_base_ee: Sequence[PoseTuple], T_world_marker: Sequence[PoseTuple], noise: CalibrationNoise | None = None
+) -> tuple[PoseTuple, RobotWorldCalibration]:
+    """Return `T_world_base` of a real robot from a marker on its hand that an aligned headset or camera observed (or a
+    tracked controller held there): the pose for its virtual twin."""
+    solved = solve_robot_world(T_base_ee, T_world_marker, None, noise)
     return inverse(solved.T_base_camera), solved
 
 
@@ -164,41 +175,42 @@ class _Data:
     whitener: Array  # of the difference between both chains, shape (n, 6, 6)
 
     @classmethod
-    def of(
+    def from_poses(
         cls,
         robot: Sequence[PoseTuple],
         camera: Sequence[PoseTuple],
         covariances: Sequence[Sequence[float]] | None,
-        noise: Noise,
+        noise: CalibrationNoise,
     ) -> _Data:
         seen = np.tile(np.diag([noise.seen_m**2] * 3 + [noise.seen_rad**2] * 3), (len(camera), 1, 1))
         if covariances is not None:
             seen = np.reshape(np.asarray(covariances, dtype=np.float64), (-1, 6, 6))
         floor = np.diag([noise.robot_m**2] * 3 + [noise.robot_rad**2] * 3)
         whitener = np.linalg.inv(np.linalg.cholesky(seen + floor)) if len(seen) else seen
-        A, B = (np.array([matrix_of(T) for T in poses]).reshape(-1, 4, 4) for poses in (robot, camera))
+        A, B = (np.array([pose_to_matrix(T) for T in poses]).reshape(-1, 4, 4) for poses in (robot, camera))
         return cls(A, B, whitener)
 
-    def differences(self, X: Array, Y: Array) -> Array:
-        """Position and rotation of the marker by kinematics against what was seen, camera frame, shape (n, 6)."""
+    def residuals(self, X: Array, Y: Array) -> Array:
+        """Return position and rotation of the marker by kinematics minus observed, camera frame, shape (n, 6)."""
         from scipy.spatial.transform import Rotation
 
         P = np.linalg.inv(X) @ self.A @ Y
         turn = Rotation.from_matrix(P[:, :3, :3] @ self.B[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
         return np.concatenate([P[:, :3, 3] - self.B[:, :3, 3], turn], axis=1)
 
-    def whitened(self, X: Array, Y: Array) -> Array:
-        return np.asarray(np.einsum("nij,nj->ni", self.whitener, self.differences(X, Y)))
+    def whiten(self, X: Array, Y: Array) -> Array:
+        return np.asarray(np.einsum("nij,nj->ni", self.whitener, self.residuals(X, Y)))
 
-    def only(self, kept: list[int]) -> _Data:
+    def select(self, kept: list[int]) -> _Data:
         return _Data(self.A[kept], self.B[kept], self.whitener[kept])
 
 
 def _closed_form(data: _Data) -> tuple[Array, Array]:
-    """Relative motions see `A Y = Y B` only: rotation by aligning their axes, then position linearly."""
+    """Return (X, Y) in closed form from relative motions `A Y = Y B`: rotation by aligning axes, then position
+    linearly."""
     from scipy.spatial.transform import Rotation
 
-    i, j = _pairs(len(data.A))
+    i, j = _index_pairs(len(data.A))
     a, b = np.linalg.inv(data.A[j]) @ data.A[i], np.linalg.inv(data.B[j]) @ data.B[i]
     alpha, beta = (Rotation.from_matrix(m[:, :3, :3]).as_rotvec() for m in (a, b))
     u, _, vt = np.linalg.svd(alpha.T @ beta)
@@ -214,21 +226,21 @@ def _closed_form(data: _Data) -> tuple[Array, Array]:
 
 
 def _least_squares(data: _Data) -> tuple[Array, Array, Array]:
-    """Both unknowns, and the normal matrix of (camera, marker)."""
+    """Return both unknowns and the normal matrix (12, 12) of (camera, marker)."""
     from scipy.optimize import least_squares
 
     X, Y = _closed_form(data)
     solved = least_squares(
-        lambda p: data.whitened(_moved(X, p[:6]), _moved(Y, p[6:])).ravel(),
+        lambda p: data.whiten(_apply_increment(X, p[:6]), _apply_increment(Y, p[6:])).ravel(),
         np.zeros(12),
         loss="huber",
         f_scale=3.0,
         x_scale="jac",
     )
-    return _moved(X, solved.x[:6]), _moved(Y, solved.x[6:]), np.asarray(solved.jac.T @ solved.jac)
+    return _apply_increment(X, solved.x[:6]), _apply_increment(Y, solved.x[6:]), np.asarray(solved.jac.T @ solved.jac)
 
 
-def _moved(M: Array, step: Array) -> Array:
+def _apply_increment(M: Array, step: Array) -> Array:
     from scipy.spatial.transform import Rotation
 
     out = np.eye(4)
@@ -237,29 +249,29 @@ def _moved(M: Array, step: Array) -> Array:
     return out
 
 
-def _pairs(n: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _index_pairs(n: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     i, j = np.triu_indices(n, 1)
     return i, j
 
 
-def _spread(A: Array) -> float:
-    """Root mean square rotation between poses about the second of the main axes [rad]."""
+def _rotation_spread(A: Array) -> float:
+    """Return the root mean square rotation [rad] between poses about the second of the main axes."""
     from scipy.spatial.transform import Rotation
 
-    i, j = _pairs(len(A))
+    i, j = _index_pairs(len(A))
     turns = Rotation.from_matrix(A[i, :3, :3].transpose(0, 2, 1) @ A[j, :3, :3]).as_rotvec()
     return math.sqrt(max(float(np.linalg.eigvalsh(turns.T @ turns / len(turns))[1]), 0.0))
 
 
-def _too_few(agreeing: int, n: int) -> str:
+def _disagreement_text(agreeing: int, n: int) -> str:
     if n < MIN_POSES:
         return f"{n} pictures in which the marker was found: at least {MIN_POSES} are needed; {_TURN_ADVICE}"
     return f"only {agreeing} of {n} pictures agree; {_MIXED_UP}"
 
 
-def _of_inverse(T: PoseTuple, covariance: Sequence[float]) -> tuple[float, ...]:
-    """Covariance of the inverse of a pose."""
-    M = matrix_of(T)
+def _invert_covariance(T: PoseTuple, covariance: Sequence[float]) -> tuple[float, ...]:
+    """Return the covariance (36 values) of the inverse of a pose."""
+    M = pose_to_matrix(T)
     R, (x, y, z) = M[:3, :3], M[:3, 3]
     J = np.zeros((6, 6))
     J[:3, :3] = J[3:, 3:] = -R.T

@@ -2,7 +2,7 @@
 
 Headsets track the code natively and report its edge and centre. Cameras find the markers from much further away, and
 measure the pose over the whole page. Every length is a fixed share of the edge of the code, so id and edge determine
-the sheet, whatever paper it is printed on. Which markers it has follows from a hash of the id: sheets are told apart
+the sheet, whatever paper it is printed on. Which markers it has follows from a hash of the id: sheets are distinguished
 even where the code cannot be read.
 
 Sheet frame: origin in the centre of the code, x right, y up, z out of the paper towards the viewer [m].
@@ -37,7 +37,7 @@ MAX_EDGE_M: Final = 2.0
 
 
 class SheetError(ValueError):
-    """A sheet that cannot be; the text says what would be right."""
+    """An invalid sheet or paper."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Sheet:
     @cached_property
     def marker_ids(self) -> tuple[int, ...]:
         """Markers of the frame: upper left, upper right, lower right, lower left. All different."""
-        return marker_ids(self.anchor_id)
+        return compute_marker_ids(self.anchor_id)
 
     @property
     def marker_edge_m(self) -> float:
@@ -88,31 +88,33 @@ class Sheet:
         w, h, m = HALF_WIDTH * self.edge_m, HALF_HEIGHT * self.edge_m, self.marker_edge_m
         left = ((-w, h), (w - m, h), (w - m, m - h), (-w, m - h))
         corners = [[(x, y, 0.0), (x + m, y, 0.0), (x + m, y - m, 0.0), (x, y - m, 0.0)] for x, y in left]
-        return _frozen(np.array(corners))
+        return _freeze(np.array(corners))
 
     @cached_property
     def code_corners(self) -> Array:
         """Corners of the code, shape (4, 3) [m], clockwise from the upper left."""
         e = 0.5 * self.edge_m
-        return _frozen(np.array([(-e, e, 0.0), (e, e, 0.0), (e, -e, 0.0), (-e, -e, 0.0)]))
+        return _freeze(np.array([(-e, e, 0.0), (e, e, 0.0), (e, -e, 0.0), (-e, -e, 0.0)]))
 
     @cached_property
     def code(self) -> NDArray[np.bool_]:
         """Modules of the QR code, True where black, first row on top."""
-        return code_modules(self.anchor_id)
+        return encode_code(self.anchor_id)
 
-    def black(self) -> dict[str, list[Rect]]:
-        """What is black on the paper: rectangles of the `code`, and of each marker (`marker 0` to `marker 3`)."""
-        shapes = {"code": _runs(self.code, self.code_corners[0], self.edge_m)}
+    def list_black_rects(self) -> dict[str, list[Rect]]:
+        """Return the black rectangles of the `code` and of each marker (`marker 0` to `marker 3`)."""
+        shapes = {"code": _merge_runs(self.code, self.code_corners[0], self.edge_m)}
         for number, marker_id in enumerate(self.marker_ids):
             corner = self.marker_corners[number][0]
-            shapes[f"marker {number}"] = _runs(marker_modules(marker_id), corner, self.marker_edge_m)
+            shapes[f"marker {number}"] = _merge_runs(encode_marker(marker_id), corner, self.marker_edge_m)
         return shapes
 
 
-def marker_ids(anchor_id: str) -> tuple[int, ...]:
-    """Four different markers out of `DICTIONARY_SIZE`, by SHA-256 of the id. Two sheets have all four in common once
-    in 4e10; a single one in 1.6 % of the pairs, which geometry tells apart."""
+def compute_marker_ids(anchor_id: str) -> tuple[int, ...]:
+    """Return four different markers out of `DICTIONARY_SIZE`, by SHA-256 of the id.
+
+    Two sheets have all four in common once in 4e10; a single one in 1.6 % of the pairs, which geometry resolves.
+    """
     digest = hashlib.sha256(b"iris-session sheet 1\0" + anchor_id.encode()).digest()
     ids: list[int] = []
     for k in range(0, len(digest), 2):
@@ -122,31 +124,31 @@ def marker_ids(anchor_id: str) -> tuple[int, ...]:
     return tuple(ids[:MARKERS])
 
 
-def code_modules(text: str) -> NDArray[np.bool_]:
-    """QR code of `text`: the smallest version at error correction M, or better where it costs no module."""
+def encode_code(text: str) -> NDArray[np.bool_]:
+    """Return the modules of the QR code of `text`: the smallest version at error correction M, or better where free."""
     import segno
 
     return np.array(segno.make(text, micro=False, error="m").matrix, dtype=np.bool_)
 
 
-def marker_modules(marker_id: int) -> NDArray[np.bool_]:
-    """Modules of an ArUco marker with its border, True where black, shape (6, 6)."""
+def encode_marker(marker_id: int) -> NDArray[np.bool_]:
+    """Return the modules of an ArUco marker with its border, True where black, shape (6, 6)."""
     import cv2
 
-    picture: Any = cv2.aruco.generateImageMarker(dictionary(), marker_id, MARKER_MODULES)
+    picture: Any = cv2.aruco.generateImageMarker(load_dictionary(), marker_id, MARKER_MODULES)
     black: NDArray[np.bool_] = np.asarray(picture) == 0
     return black
 
 
-def dictionary() -> Any:
-    """The dictionary of all sheets."""
+def load_dictionary() -> Any:
+    """Return OpenCV's marker dictionary of all sheets."""
     import cv2
 
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARY))
 
 
-def _runs(modules: NDArray[np.bool_], upper_left: Array, edge_m: float) -> list[Rect]:
-    """Black modules as rectangles, those beside one another in a row as one."""
+def _merge_runs(modules: NDArray[np.bool_], upper_left: Array, edge_m: float) -> list[Rect]:
+    """Return black modules as rectangles, adjacent ones of a row as one."""
     n = len(modules)
     m = edge_m / n
     rects: list[Rect] = []
@@ -157,6 +159,6 @@ def _runs(modules: NDArray[np.bool_], upper_left: Array, edge_m: float) -> list[
     return rects
 
 
-def _frozen(a: Array) -> Array:
+def _freeze(a: Array) -> Array:
     a.setflags(write=False)
     return a

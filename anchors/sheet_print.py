@@ -38,7 +38,7 @@ class _Text:
 
 @dataclass(frozen=True)
 class _Page:
-    """What is drawn [mm], origin in the upper left corner, y down."""
+    """Shapes and texts of a page [mm], origin in the upper left corner, y down."""
 
     width: float
     height: float
@@ -47,43 +47,52 @@ class _Page:
 
 
 def largest_edge_mm(paper: str) -> int:
-    """Largest code, in whole millimetres, whose sheet fits on the paper."""
-    width, height = _paper(paper)
+    """Return the edge [mm] of the largest code, in whole millimetres, whose sheet fits on the paper."""
+    width, height = _find_paper(paper)
     return int(min((width / 2 - MARGIN_MM) / HALF_WIDTH, (height / 2 - MARGIN_MM) / HALF_HEIGHT))
 
 
 def to_svg(sheet: Sheet, paper: str = "a4") -> str:
-    """The sheet as an SVG whose user unit is one millimetre."""
-    page = _page(sheet, paper)
+    """Return the sheet as an SVG whose user unit is one millimetre."""
+    page = _lay_out(sheet, paper)
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{page.width:g}mm" height="{page.height:g}mm" '
         f'viewBox="0 0 {page.width:g} {page.height:g}">',
-        f"<title>{_xml(_title(sheet))}</title>",
+        f"<title>{_escape_xml(_title(sheet))}</title>",
         f'<rect width="{page.width:g}" height="{page.height:g}" fill="white"/>',
     ]
     for shape in page.shapes:
-        path = "".join(f"M{_n(r.x)} {_n(r.y)}h{_n(r.width)}v{_n(r.height)}h{_n(-r.width)}z" for r in shape)
+        path = "".join(
+            f"M{_format_mm(r.x)} {_format_mm(r.y)}h{_format_mm(r.width)}v{_format_mm(r.height)}h{_format_mm(-r.width)}z"
+            for r in shape
+        )
         lines.append(f'<path d="{path}"/>')
     for text in page.texts:
         lines.append(
-            f'<text x="{_n(text.x)}" y="{_n(text.y)}" font-family="Courier, monospace" '
-            f'font-size="{_n(text.height)}" text-anchor="middle">{_xml(text.text)}</text>'
+            f'<text x="{_format_mm(text.x)}" y="{_format_mm(text.y)}" font-family="Courier, monospace" '
+            f'font-size="{_format_mm(text.height)}" text-anchor="middle">{_escape_xml(text.text)}</text>'
         )
     return "\n".join([*lines, "</svg>", ""])
 
 
 def to_pdf(sheet: Sheet, paper: str = "a4") -> bytes:
-    """The sheet as a one-page PDF 1.4; viewers are told not to scale it (`/PrintScaling /None`)."""
-    page = _page(sheet, paper)
+    """Return the sheet as a one-page PDF 1.4; it asks viewers not to scale it (`/PrintScaling /None`)."""
+    page = _lay_out(sheet, paper)
     content = "\n".join([f"{POINTS_PER_MM:.9f} 0 0 {-POINTS_PER_MM:.9f} 0 {page.height * POINTS_PER_MM:.6f} cm", "0 g"])
     for shape in page.shapes:
-        content += "\n" + "\n".join(f"{_n(r.x)} {_n(r.y)} {_n(r.width)} {_n(r.height)} re" for r in shape) + "\nf"
+        content += (
+            "\n"
+            + "\n".join(
+                f"{_format_mm(r.x)} {_format_mm(r.y)} {_format_mm(r.width)} {_format_mm(r.height)} re" for r in shape
+            )
+            + "\nf"
+        )
     for text in page.texts:
-        x = text.x - 0.5 * _width_of(text.text) * text.height
+        x = text.x - 0.5 * _text_width(text.text) * text.height
         # The page's y points down: the text matrix turns it back up.
-        place = f"1 0 0 -1 {_n(x)} {_n(text.y)} Tm"
-        content += f"\nBT /F1 {_n(text.height)} Tf {place} ({_pdf_text(text.text)}) Tj ET"
+        place = f"1 0 0 -1 {_format_mm(x)} {_format_mm(text.y)} Tm"
+        content += f"\nBT /F1 {_format_mm(text.height)} Tf {place} ({_escape_pdf(text.text)}) Tj ET"
     stream = content.encode("ascii")
     box = f"[0 0 {page.width * POINTS_PER_MM:.4f} {page.height * POINTS_PER_MM:.4f}]"
     objects = [
@@ -93,13 +102,13 @@ def to_pdf(sheet: Sheet, paper: str = "a4") -> bytes:
         "/Resources << /Font << /F1 5 0 R >> >> >>".encode("ascii"),
         b"<< /Length %d >>\nstream\n%s\nendstream" % (len(stream), stream),
         b"<< /Type /Font /Subtype /Type1 /BaseFont /Courier /Encoding /WinAnsiEncoding >>",
-        f"<< /Title ({_pdf_text(_title(sheet))}) >>".encode("ascii"),
+        f"<< /Title ({_escape_pdf(_title(sheet))}) >>".encode("ascii"),
     ]
-    return _pdf_file(objects)
+    return _assemble_pdf(objects)
 
 
-def _pdf_file(objects: list[bytes]) -> bytes:
-    """Objects 1, 2, ... with header, cross-reference table and trailer (PDF reference 1.4, section 3.4)."""
+def _assemble_pdf(objects: list[bytes]) -> bytes:
+    """Return objects 1, 2, ... with header, cross-reference table and trailer (PDF reference 1.4, section 3.4)."""
     out = b"%PDF-1.4\n%\xe2\xe3\xcf\xd3\n"
     offsets = []
     for number, text in enumerate(objects, 1):
@@ -112,14 +121,14 @@ def _pdf_file(objects: list[bytes]) -> bytes:
     return out + trailer % (len(objects) + 1, len(objects), start)
 
 
-def _paper(name: str) -> tuple[float, float]:
+def _find_paper(name: str) -> tuple[float, float]:
     if name not in PAPERS:
         raise SheetError(f"no paper {name!r}: {', '.join(PAPERS)}")
     return PAPERS[name]
 
 
-def _page(sheet: Sheet, paper: str) -> _Page:
-    width, height = _paper(paper)
+def _lay_out(sheet: Sheet, paper: str) -> _Page:
+    width, height = _find_paper(paper)
     edge = 1e3 * sheet.edge_m
     largest = largest_edge_mm(paper)
     if edge > largest + 1e-9:
@@ -129,12 +138,12 @@ def _page(sheet: Sheet, paper: str) -> _Page:
     x0, y0 = 0.5 * width, 0.5 * height
     shapes = [
         [Rect(x0 + 1e3 * r.x, y0 - 1e3 * (r.y + r.height), 1e3 * r.width, 1e3 * r.height) for r in rects]
-        for rects in sheet.black().values()
+        for rects in sheet.list_black_rects().values()
     ]
-    ruler, figures = _ruler(x0, y0 + 0.80 * edge, edge)
+    ruler, figures = _place_ruler(x0, y0 + 0.80 * edge, edge)
     unit = 0.03 * edge  # height of the text; everything grows with the sheet
     texts = [
-        *_lines(x0, y0 - 0.80 * edge, edge, unit, sheet.anchor_id),
+        *_place_title(x0, y0 - 0.80 * edge, edge, unit, sheet.anchor_id),
         _Text(x0, y0 - 0.70 * edge, unit, f"code {edge:g} mm  ^ up"),
         _Text(x0, y0 + 0.73 * edge, 0.8 * unit, "print at 100 %, then measure:"),
         *figures,
@@ -142,17 +151,17 @@ def _page(sheet: Sheet, paper: str) -> _Page:
     return _Page(width, height, [*shapes, ruler], texts)
 
 
-def _lines(x: float, y: float, edge: float, unit: float, text: str) -> list[_Text]:
-    """The id between the two upper markers: as large as fits, long ones in several lines."""
+def _place_title(x: float, y: float, edge: float, unit: float, text: str) -> list[_Text]:
+    """Return the id between the two upper markers: as large as fits, long ones in several lines."""
     room = 2.0 * (HALF_WIDTH - MARKER_EDGE) * edge - 4.0 * unit
-    n = min(len(text), max(16, int(room / (_width_of("m") * unit))))
+    n = min(len(text), max(16, int(room / (_text_width("m") * unit))))
     parts = [text[k : k + n] for k in range(0, len(text), n)]
-    height = min(2.0 * unit, room / _width_of(parts[0]))
+    height = min(2.0 * unit, room / _text_width(parts[0]))
     return [_Text(x, y + 1.2 * height * (k - 0.5 * (len(parts) - 1)), height, part) for k, part in enumerate(parts)]
 
 
-def _ruler(x: float, y: float, edge: float) -> tuple[list[Rect], list[_Text]]:
-    """A ruler of whole centimetres (millimetres on small sheets) between the two lower markers, centred at x."""
+def _place_ruler(x: float, y: float, edge: float) -> tuple[list[Rect], list[_Text]]:
+    """Return a ruler of whole centimetres (millimetres on small sheets) between the two lower markers, centred at x."""
     step = 10.0 if edge >= 60.0 else 1.0
     n = int(0.5 * edge / step)
     length = n * step
@@ -172,20 +181,20 @@ def _title(sheet: Sheet) -> str:
     return f"anchor {sheet.anchor_id}, code {1e3 * sheet.edge_m:g} mm"
 
 
-def _width_of(text: str) -> float:
-    """Width of text over its height: every character of Courier is 0.6 wide."""
+def _text_width(text: str) -> float:
+    """Return the width of text over its height: every character of Courier is 0.6 wide."""
     return 0.6 * len(text)
 
 
-def _n(value: float) -> str:
-    """A length with a tenth of a micrometre, without trailing zeros."""
+def _format_mm(value: float) -> str:
+    """Format a length with a tenth of a micrometre, without trailing zeros."""
     text = f"{value:.4f}".rstrip("0").rstrip(".")
     return "0" if text in ("-0", "") else text
 
 
-def _pdf_text(text: str) -> str:
+def _escape_pdf(text: str) -> str:
     return text.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)")
 
 
-def _xml(text: str) -> str:
+def _escape_xml(text: str) -> str:
     return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace('"', "&quot;")

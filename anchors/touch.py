@@ -1,7 +1,7 @@
-"""Alignment by touching marked points with the calibrated tip of a controller, with residuals that name what is wrong.
+"""Alignment by touching marked points with the calibrated tip of a controller.
 
-Points on one line fix nothing, and points touched in the wrong order fit nowhere; both are told by name. Which order
-was touched is found by trying the others.
+Collinear points do not determine the alignment, and points touched in the wrong order do not fit; the advice names
+the points. The order that was touched is found by trying the others.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from typing import Final
 import numpy as np
 
 from anchors.alignment import AlignmentConfig, AlignmentEstimate
-from anchors.lie import Array, quat_exp, quat_matrix, quat_multiply, skew, swing
+from anchors.lie import Array, quat_exp, quat_multiply, quat_to_matrix, skew, swing
 from anchors.pose import PoseTuple, Vec3
-from anchors.solve import in_world, inverted
+from anchors.solver import to_inverse_pose, to_world_covariance
 from anchors.uncertainty import Z99, chi2_quantile, position_error_p95
 
 _CHI2_3_999: Final = 16.266
 _MAX_PERMUTED: Final = 6  # of more points only pairs are tried in exchange
 _MIN_WIDTH_M: Final = 0.05  # how far a point must lie beside the line through the others
 _REACH_M: Final = 1e3  # no tracking frame is larger
-_MAX_TOLD: Final = 5  # wrong distances that are listed, the largest first
+_MAX_LISTED: Final = 5  # wrong distances that are listed, the largest first
 _NOWHERE: Final[PoseTuple] = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 
@@ -37,36 +37,46 @@ class Touch:
 
 
 @dataclass(frozen=True)
-class Registration:
-    """The alignment, and by how much each touched point misses its mark [m]. `suspects`: points to blame for a
-    refusal."""
+class TouchRegistration:
+    """The alignment and the residual of each touched point [m]. `suspects`: points that caused a refusal."""
 
     estimate: AlignmentEstimate
     residuals_m: dict[str, float]
     suspects: tuple[str, ...] = ()
 
 
-def register(
+def register_touches(
     points_world: Mapping[str, Vec3],
     touches: Sequence[Touch],
     tracking_epoch: int = 0,
     sigma_m: float = 0.0015,
     config: AlignmentConfig | None = None,
-) -> Registration:
-    """`T_world_tracking` from at least three touched points. `sigma_m`: noise of one touch per axis."""
+) -> TouchRegistration:
+    """Estimate `T_world_tracking` from at least three touched points.
+
+    Args:
+        points_world: Positions of the marks.
+        touches: Touches in the tracking frame, any number per mark.
+        tracking_epoch: Tracking frame of the touches.
+        sigma_m: Noise of one touch per axis.
+        config: Bounds, as for the estimate by sheets.
+
+    Returns:
+        The alignment, or a refusal whose advice names what is wrong.
+    """
     config = config or AlignmentConfig()
     wrong = [t for t in touches if t.point not in points_world or not all(abs(c) <= _REACH_M for c in t.p_tracking_tip)]
     if wrong:
         known = ", ".join(sorted(points_world))
-        return _refused(tracking_epoch, f"point '{wrong[0].point}' is not marked, or was not read; marked are {known}")
+        return _refuse(tracking_epoch, f"point '{wrong[0].point}' is not marked, or was not read; marked are {known}")
     names = sorted({t.point for t in touches})
     if len(names) < 3:
         left = ", ".join(sorted(set(points_world) - set(names)))
-        return _refused(tracking_epoch, f"{len(names)} points touched, 3 are needed; not yet touched: {left}")
+        return _refuse(tracking_epoch, f"{len(names)} points touched, 3 are needed; not yet touched: {left}")
     world = np.array([points_world[name] for name in names])
-    in_line = _in_line(names, world)
+    in_line = _describe_collinear(names, world)
     if in_line:
-        return _refused(tracking_epoch, in_line, names)
+        return _refuse(tracking_epoch, in_line, names)
     by_name = [np.array([t.p_tracking_tip for t in touches if t.point == name]) for name in names]
     torn = [
         name
@@ -74,16 +84,16 @@ def register(
         if float(np.max(np.linalg.norm(p - p.mean(axis=0), axis=1))) > 4.0 * sigma_m * math.sqrt(2.0)
     ]
     if torn:
-        return _refused(tracking_epoch, f"point '{torn[0]}' was touched in two places: touch it again", torn)
+        return _refuse(tracking_epoch, f"point '{torn[0]}' was touched in two places: touch it again", torn)
     tip = np.array([p.mean(axis=0) for p in by_name])
     sigma = sigma_m / np.sqrt([len(p) for p in by_name])
     fit = _fit(world, tip, sigma, config)
     residuals = {name: float(r) for name, r in zip(names, np.linalg.norm(fit.residuals, axis=1), strict=True)}
     if not fit.good:
-        advice, suspects = _blame(names, world, tip, sigma, config)
-        return Registration(_refusal(tracking_epoch, advice, len(touches)), residuals, suspects)
-    alike = _alike(names, world, sigma_m)
-    return Registration(_estimate(fit, world, tracking_epoch, len(touches), config, alike), residuals)
+        advice, suspects = _diagnose(names, world, tip, sigma, config)
+        return TouchRegistration(_to_refusal(tracking_epoch, advice, len(touches)), residuals, suspects)
+    alike = _find_symmetry(names, world, sigma_m)
+    return TouchRegistration(_estimate(fit, world, tracking_epoch, len(touches), config, alike), residuals)
 
 
 @dataclass(frozen=True)
@@ -98,16 +108,16 @@ class _Fit:
 
 
 def _fit(world: Array, tip: Array, sigma: Array, config: AlignmentConfig) -> _Fit:
-    """Least squares of `tip = R world + t` with gravity as in `anchors.solve`; the first guess is level (4) or Kabsch's
-    (6), after which Gauss-Newton has a few small steps to go."""
+    """Solve `tip = R world + t` by Gauss-Newton with gravity as in `anchors.solver`; the initial guess is level (`dof`
+    4) or Kabsch's (6)."""
     gravity = 1.0 / config.tilt_sigma_rad**2 if config.dof == 4 else 0.0
-    q = _level(world, tip, sigma) if gravity else _kabsch(world, tip, sigma)
+    q = _fit_yaw(world, tip, sigma) if gravity else _fit_rotation(world, tip, sigma)
     w = 1.0 / sigma**2
     centre = w @ world / np.sum(w)
-    t = w @ tip / np.sum(w) - quat_matrix(q) @ centre
+    t = w @ tip / np.sum(w) - quat_to_matrix(q) @ centre
     H = np.eye(6)
     for _ in range(8):
-        turned = world @ quat_matrix(q).T
+        turned = world @ quat_to_matrix(q).T
         r = tip - turned - t
         J = np.concatenate([np.broadcast_to(np.eye(3), (len(world), 3, 3)), -skew(turned)], axis=2)
         H = np.einsum("nij,n,nik->jk", J, w, J)
@@ -120,7 +130,7 @@ def _fit(world: Array, tip: Array, sigma: Array, config: AlignmentConfig) -> _Fi
         q = quat_multiply(quat_exp(step[3:]), q)
         if float(np.max(np.abs(step))) < 1e-10:
             break
-    r = tip - world @ quat_matrix(q).T - t
+    r = tip - world @ quat_to_matrix(q).T - t
     d2 = np.sum(r * r, axis=1) * w
     tilt2 = float(np.sum(swing(q) ** 2)) * gravity
     freedom = 3.0 * len(world) - (4.0 if gravity else 6.0)
@@ -129,8 +139,8 @@ def _fit(world: Array, tip: Array, sigma: Array, config: AlignmentConfig) -> _Fi
     return _Fit(q, t, np.asarray(np.linalg.inv(H), dtype=np.float64), r, chi2, freedom, good)
 
 
-def _level(world: Array, tip: Array, sigma: Array) -> Array:
-    """The turn about Z that fits best: planar Procrustes."""
+def _fit_yaw(world: Array, tip: Array, sigma: Array) -> Array:
+    """Return the best rotation (4,) about Z: planar Procrustes."""
     w = 1.0 / sigma**2
     a, b = world - w @ world / np.sum(w), tip - w @ tip / np.sum(w)
     cross = float(w @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]))
@@ -138,8 +148,8 @@ def _level(world: Array, tip: Array, sigma: Array) -> Array:
     return quat_exp(np.array([0.0, 0.0, math.atan2(cross, dot)]))
 
 
-def _kabsch(world: Array, tip: Array, sigma: Array) -> Array:
-    """Best rotation of centred points (Kabsch 1976), as a quaternion by Horn's eigenvector (1987)."""
+def _fit_rotation(world: Array, tip: Array, sigma: Array) -> Array:
+    """Return the best rotation of centred points (Kabsch 1976) as a quaternion (4,) by Horn's eigenvector (1987)."""
     w = 1.0 / sigma**2
     a, b = world - w @ world / np.sum(w), tip - w @ tip / np.sum(w)
     S = (a * w[:, None]).T @ b
@@ -151,8 +161,8 @@ def _kabsch(world: Array, tip: Array, sigma: Array) -> Array:
     return np.asarray(np.linalg.eigh(N)[1][:, -1])
 
 
-def _in_line(names: Sequence[str], world: Array) -> str:
-    """Which points lie on one line, and how little is missing; empty when one of them is well beside it."""
+def _describe_collinear(names: Sequence[str], world: Array) -> str:
+    """Return the advice for points on one line; empty if one lies well beside it."""
     centred = world - world.mean(axis=0)
     _, _, axes = np.linalg.svd(centred)
     beside = np.linalg.norm(centred - np.outer(centred @ axes[0], axes[0]), axis=1)
@@ -166,10 +176,10 @@ def _in_line(names: Sequence[str], world: Array) -> str:
     )
 
 
-def _blame(
+def _diagnose(
     names: Sequence[str], world: Array, tip: Array, sigma: Array, config: AlignmentConfig
 ) -> tuple[str, tuple[str, ...]]:
-    """What went wrong where the points do not fit: another order, or one of them touched elsewhere."""
+    """Return advice and suspects for points that do not fit: another order, or one touched elsewhere."""
     n = len(names)
     fits = [(order, _fit(world[list(order)], tip, sigma, config)) for order in _likely_orders(world, tip, sigma)]
     order, best = min(fits, key=lambda one: one[1].chi2, default=((), None))
@@ -181,19 +191,20 @@ def _blame(
         alone = []
         for i in range(n):
             rest = [k for k in range(n) if k != i]
-            if not _in_line([names[k] for k in rest], world[rest]):
+            if not _describe_collinear([names[k] for k in rest], world[rest]):
                 fit = _fit(world[rest], tip[rest], sigma[rest], config)
                 if fit.good:
-                    off = float(np.linalg.norm(tip[i] - quat_matrix(fit.q) @ world[i] - fit.t))
+                    off = float(np.linalg.norm(tip[i] - quat_to_matrix(fit.q) @ world[i] - fit.t))
                     alone.append((fit.chi2, i, off))
         if alone:
             _, i, off = min(alone)
             return f"point '{names[i]}' is {off * 1e3:.0f} mm off: touch it again", (names[i],)
-    return _blame_distances(names, world, tip, float(np.max(sigma)))
+    return _diagnose_distances(names, world, tip, float(np.max(sigma)))
 
 
-def _alike(names: Sequence[str], world: Array, sigma_m: float) -> str:
-    """A layout that looks the same in another order when turned about the vertical: that order would not be noticed."""
+def _find_symmetry(names: Sequence[str], world: Array, sigma_m: float) -> str:
+    """Return a warning if the layout is symmetric under a rotation about the vertical, so that a wrong order would not
+    be noticed."""
     fine = np.full(len(names), sigma_m)
     for order in _likely_orders(world, world, fine):
         moved = world[list(order)]
@@ -205,10 +216,10 @@ def _alike(names: Sequence[str], world: Array, sigma_m: float) -> str:
 
 
 def _likely_orders(world: Array, tip: Array, sigma: Array) -> list[tuple[int, ...]]:
-    """Other orders in which all distances between points are right, as far as noise goes: no other can fit, for no
-    turn changes a distance. To fit them all would take seconds."""
+    """Return other orders that keep all distances between points within noise: no other can fit, since a rotation
+    changes no distance. Fitting all orders would take seconds."""
     n = len(world)
-    orders = np.array(_orders(n), dtype=np.int64).reshape(-1, n)
+    orders = np.array(_list_orders(n), dtype=np.int64).reshape(-1, n)
     marks = np.linalg.norm(world[:, None] - world, axis=2)
     tips = np.linalg.norm(tip[:, None] - tip, axis=2)
     slack = math.sqrt(_CHI2_3_999) * (sigma[:, None] + sigma)  # each may miss its mark by so much, see `_fit`
@@ -216,8 +227,8 @@ def _likely_orders(world: Array, tip: Array, sigma: Array) -> list[tuple[int, ..
     return [tuple(order) for order in orders[np.all(off <= slack, axis=(1, 2))].tolist()]
 
 
-def _orders(n: int) -> list[tuple[int, ...]]:
-    """Orders other than the given one: all of few points, exchanged pairs of many."""
+def _list_orders(n: int) -> list[tuple[int, ...]]:
+    """Return orders other than the given one: all for few points, exchanged pairs for many."""
     identity = tuple(range(n))
     if n <= _MAX_PERMUTED:
         return [p for p in permutations(identity) if p != identity]
@@ -229,9 +240,9 @@ def _orders(n: int) -> list[tuple[int, ...]]:
     return out
 
 
-def _blame_distances(names: Sequence[str], world: Array, tip: Array, sigma: float) -> tuple[str, tuple[str, ...]]:
-    """With three points no majority fits; a point is to blame when both of its distances are wrong and the third is
-    not."""
+def _diagnose_distances(names: Sequence[str], world: Array, tip: Array, sigma: float) -> tuple[str, tuple[str, ...]]:
+    """Return advice and suspects by distances: of three points, one is wrong if both of its distances are and the third
+    is not."""
     bad = []
     for i, j in combinations(range(len(names)), 2):
         off = float(np.linalg.norm(tip[i] - tip[j])) - float(np.linalg.norm(world[i] - world[j]))
@@ -240,7 +251,7 @@ def _blame_distances(names: Sequence[str], world: Array, tip: Array, sigma: floa
     shared = [k for k in range(len(names)) if bad and all(k in (i, j) for i, j, _ in bad)]
     if len(bad) > 1 and len(shared) == 1:
         return f"point '{names[shared[0]]}' does not fit the others: touch it again", (names[shared[0]],)
-    worst = sorted(bad, key=lambda one: -abs(one[2]))[:_MAX_TOLD]
+    worst = sorted(bad, key=lambda one: -abs(one[2]))[:_MAX_LISTED]
     told = ", ".join(f"'{names[i]}'-'{names[j]}' by {off * 1e3:+.0f} mm" for i, j, off in worst)
     return (
         f"distances between points are wrong ({told or 'not any: the order is turned round'}): touch all of them again",
@@ -249,16 +260,16 @@ def _blame_distances(names: Sequence[str], world: Array, tip: Array, sigma: floa
 
 
 def _estimate(fit: _Fit, world: Array, epoch: int, n: int, config: AlignmentConfig, alike: str) -> AlignmentEstimate:
-    """The same form as the estimate by sheets."""
+    """Return the fit in the form of an estimate by sheets."""
     pivot = world.mean(axis=0)
     wider = fit.chi2 / fit.freedom if fit.chi2 > chi2_quantile(fit.freedom, Z99) else 1.0
-    covariance = tuple(float(v) for v in (wider * in_world(fit.q, fit.covariance, pivot)).ravel())
+    covariance = tuple(float(v) for v in (wider * to_world_covariance(fit.q, fit.covariance, pivot)).ravel())
     at: Vec3 = (float(pivot[0]), float(pivot[1]), float(pivot[2]))
     error = position_error_p95(covariance, at, at)
     tilt = float(np.linalg.norm(swing(fit.q)))
     refused = not error <= config.max_error_m
     return AlignmentEstimate(
-        inverted(fit.t, fit.q),
+        to_inverse_pose(fit.t, fit.q),
         epoch,
         covariance,
         at,
@@ -271,9 +282,9 @@ def _estimate(fit: _Fit, world: Array, epoch: int, n: int, config: AlignmentConf
     )
 
 
-def _refusal(epoch: int, advice: str, n: int = 0) -> AlignmentEstimate:
+def _to_refusal(epoch: int, advice: str, n: int = 0) -> AlignmentEstimate:
     return AlignmentEstimate(_NOWHERE, epoch, (0.0,) * 36, (0.0, 0.0, 0.0), math.inf, 0.0, n, 0, True, advice)
 
 
-def _refused(epoch: int, advice: str, suspects: Sequence[str] = ()) -> Registration:
-    return Registration(_refusal(epoch, advice), {}, tuple(suspects))
+def _refuse(epoch: int, advice: str, suspects: Sequence[str] = ()) -> TouchRegistration:
+    return TouchRegistration(_to_refusal(epoch, advice), {}, tuple(suspects))

@@ -1,4 +1,4 @@
-"""How large an error is stated: quantiles of the length of a Gaussian error, and covariances carried to other points.
+"""Uncertainty: noise model of observations, covariances at other points, and quantiles of Gaussian errors.
 
 Covariances of alignments are 6x6, order (x, y, z [m], rx, ry, rz [rad]), world frame, at a pivot.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -22,13 +23,13 @@ Z999: Final = 3.090232306167813
 
 
 def chi2_quantile(freedom: float, z: float) -> float:
-    """Quantile of chi-square at the standard normal quantile `z` (Wilson and Hilferty 1931)."""
+    """Return the quantile of chi-square at the standard normal quantile `z` (Wilson and Hilferty 1931)."""
     a = 2.0 / (9.0 * freedom)
     return freedom * max(0.0, 1.0 - a + z * math.sqrt(a)) ** 3
 
 
 def length_p95(S: Array) -> float:
-    """95 % quantile of the length of an error with covariance `S` (3, 3).
+    """Return the 95 % quantile of the length of an error with covariance `S` (3, 3).
 
     The squared length is a weighted sum of chi-square variables, approximated by a scaled chi-square with the same mean
     and variance (Satterthwaite 1946).
@@ -41,8 +42,9 @@ def length_p95(S: Array) -> float:
     return math.sqrt(mean / freedom * chi2_quantile(freedom, Z95))
 
 
-def at_point(covariance: Sequence[float] | Array, pivot_world: Vec3, point_world: Vec3) -> Array:
-    """Covariance (3, 3) of the position error at `point_world`: d(point) = d(pivot) + rot x (point - pivot)."""
+def covariance_at_point(covariance: Sequence[float] | Array, pivot_world: Vec3, point_world: Vec3) -> Array:
+    """Return the covariance (3, 3) of the position error at `point_world`: d(point) = d(pivot) + rot x (point -
+    pivot)."""
     cov = np.asarray(covariance, dtype=np.float64).reshape(6, 6)
     rx, ry, rz = (point_world[i] - pivot_world[i] for i in range(3))
     J = np.array(
@@ -56,10 +58,77 @@ def at_point(covariance: Sequence[float] | Array, pivot_world: Vec3, point_world
 
 
 def position_error_p95(covariance: Sequence[float] | Array, pivot_world: Vec3, point_world: Vec3) -> float:
-    """Stated 95 % bound [m] of the position error at `point_world`, lever arm from `pivot_world` included."""
-    return length_p95(at_point(covariance, pivot_world, point_world))
+    """Return the stated 95 % bound [m] of the position error at `point_world`, lever arm from `pivot_world`
+    included."""
+    return length_p95(covariance_at_point(covariance, pivot_world, point_world))
 
 
 def rotation_error_p95(covariance: Sequence[float] | Array) -> float:
-    """Stated 95 % bound [rad] of the rotation error."""
+    """Return the stated 95 % bound [rad] of the rotation error."""
     return length_p95(np.asarray(covariance, dtype=np.float64).reshape(6, 6)[3:, 3:])
+
+
+# --- noise of observations --------------------------------------------------------------------------------------------
+# Covariances of
+# observations are 6x6, position [m] then rotation [rad], in the axes of the tracking frame. The part that is common to
+# all observations from one viewpoint is separate from the part that is new in each.
+
+#: No observation is better than this: printing and mounting of a sheet alone. [m^2], [rad^2]
+FLOOR: Final = np.diag([1e-8, 1e-8, 1e-8, 1e-7, 1e-7, 1e-7])
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Detection of a printed sheet by the cameras of a headset (docs/anchors.md, "Noise").
+
+    Seen from `d` metres the position is off by `along_m + along_m_per_m2 * d^2` along the view and `across` times that
+    across it, the rotation by `rotation_rad_per_m * d` about each axis (standard deviations). The share
+    `viewpoint_share` of each variance is the same for all observations from one viewpoint, and so is an error of scale
+    (`scale`, share of the distance).
+    """
+
+    along_m: float = 0.0004
+    along_m_per_m2: float = 0.0044
+    across: float = 1.0 / 3.0
+    rotation_rad_per_m: float = math.radians(0.3) / 0.5
+    scale: float = 0.003
+    viewpoint_share: float = 0.5
+
+    def compute_covariances(self, p_head: Array, p_anchor: Array) -> tuple[Array, Array]:
+        """Return the covariances (6, 6) of one observation of an anchor from `p_head`: (common to the viewpoint, new in
+        each observation)."""
+        ray = p_anchor - p_head
+        d2 = float(ray @ ray)
+        d = math.sqrt(d2)
+        view = ray[:, None] * ray / max(d2, 1e-12)
+        along = self.along_m + self.along_m_per_m2 * d2
+        noise = np.zeros((6, 6))
+        noise[:3, :3] = along**2 * (1.0 - self.across**2) * view
+        noise.flat[:21:7] += (along * self.across) ** 2
+        noise.flat[21::7] = (self.rotation_rad_per_m * d) ** 2
+        common, each = self.split_covariance(noise)
+        common[:3, :3] += (self.scale * d) ** 2 * view
+        return common, each
+
+    def split_covariance(self, noise: Array) -> tuple[Array, Array]:
+        """Split a covariance (6, 6) into (common to the viewpoint, new in each observation)."""
+        whole = noise + FLOOR
+        common = self.viewpoint_share * whole
+        return common, whole - common
+
+
+def isotropic_covariance(position_sigma_m: float, rotation_sigma_rad: float) -> Array:
+    """Return a covariance (6, 6) with the same uncertainty along every axis."""
+    return np.diag([position_sigma_m**2] * 3 + [rotation_sigma_rad**2] * 3)
+
+
+def validate_covariance(covariance: Sequence[float]) -> tuple[float, ...]:
+    """Return a client's covariance (36 values) made symmetric; empty if it is not finite, symmetric and positive
+    definite."""
+    if len(covariance) != 36 or not all(map(math.isfinite, covariance)) or max(map(abs, covariance)) > 1e3:
+        return ()
+    C = np.array(covariance, dtype=np.float64).reshape(6, 6)
+    if not float(np.abs(C - C.T).max()) <= 1e-3 * float(np.abs(C).max()):
+        return ()
+    C = 0.5 * (C + C.T)
+    return tuple(C.ravel().tolist()) if float(np.linalg.eigvalsh(C)[0]) > 0.0 else ()

@@ -25,14 +25,14 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from render_sheet import Conditions, Page, photograph
 
-from anchors.camera import Camera
-from anchors.detection import SheetDetector, Sighting, detect_codes
+from anchors.camera import CameraModel
+from anchors.detection import SheetDetection, SheetDetector, detect_codes
 from anchors.pose import PoseTuple, compose, distance, quat_angle, quat_conj, quat_from_rotvec, quat_mul, quat_to_rotvec
 from anchors.sheet import Sheet
 from anchors.sheet_print import to_pdf
 
 #: 640 x 480 with the intrinsics of a real depth camera, and an ordinary lens; 1280 x 960 is the same, read out finer.
-CAMERA = Camera(640, 480, 585.0, 585.0, 319.5, 239.5, (0.08, -0.18, 0.0008, -0.0005, 0.0))
+CAMERA = CameraModel(640, 480, 585.0, 585.0, 319.5, 239.5, (0.08, -0.18, 0.0008, -0.0005, 0.0))
 CHI2_6_95 = 12.592  # 95 % quantile of chi-square with 6 degrees of freedom
 
 
@@ -47,7 +47,7 @@ class Cell:
     inside: list[bool] = field(default_factory=list)
     ambiguous: int = 0
 
-    def add(self, seen: list[Sighting], true: PoseTuple, ms: float) -> None:
+    def add(self, seen: list[SheetDetection], true: PoseTuple, ms: float) -> None:
         self.tried += 1
         self.ms.append(ms)
         for one in seen[:1]:

@@ -341,7 +341,7 @@ def check_journal(data: bytes) -> None:
     for row in messages.decode_batch(data).rows:
         journal.check_row(b"\0" * 16, row)
         journal.check_fields(row)
-        journal.chain_of(b"\0" * 16, row)
+        journal.compute_chain(b"\0" * 16, row)
 
 
 def check_keyframe(data: bytes) -> None:

@@ -26,7 +26,7 @@ from iris_session.protocol.common import Applied, Pose
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.server_messages import BodyInfo, PresenceItem
 from iris_session.recording import CLOSED, Keyframe, SessionHeader, header_root, make_row
-from iris_session.recording.journal import seal
+from iris_session.recording.journal import seal_keyframe
 from iris_session.recording.messages import Batch, MetricRecord, StateFrame
 from iris_session.recording.writer import RrdWriter
 
@@ -79,7 +79,7 @@ class Feeder:
         if self.step % KEYFRAME_TICKS == 0:
             plant, authority, controller, status = (self._bytes(20_000) for _ in range(4))
             keyframe = Keyframe(self.step, plant, authority, controller, status)
-            batch.keyframes.append(seal(keyframe, self._chain))
+            batch.keyframes.append(seal_keyframe(keyframe, self._chain))
         self.step += 1
 
     def _sample(self, device: int) -> Sample:
@@ -98,7 +98,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory(dir=".") as folder:
         path = Path(folder) / "session.rrd"
         writer = RrdWriter(path, "memory")
-        writer.header(feeder.header)
+        writer.write_header(feeder.header)
         began = time.process_time()
         while feeder.step < ticks:
             feeder.feed(writer)

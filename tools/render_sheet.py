@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.camera import Camera, matrix_of
+from anchors.camera import CameraModel, pose_to_matrix
 from anchors.pose import PoseTuple
 
 Array = NDArray[np.float64]
@@ -73,7 +73,7 @@ class Page:
 
 def photograph(
     pages: list[tuple[Page, PoseTuple]],
-    camera: Camera,
+    camera: CameraModel,
     conditions: Conditions,
     rng: np.random.Generator,
     background: Image | None = None,
@@ -100,7 +100,7 @@ def photograph(
     return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
 
 
-def _light(camera: Camera, conditions: Conditions, rng: np.random.Generator) -> Array:
+def _light(camera: CameraModel, conditions: Conditions, rng: np.random.Generator) -> Array:
     """Brightness: falls by `light` from one side of the picture to the other, in a direction drawn at random."""
     v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float64)
     angle = rng.uniform(0.0, 2.0 * np.pi)
@@ -108,7 +108,7 @@ def _light(camera: Camera, conditions: Conditions, rng: np.random.Generator) -> 
     return np.asarray(1.0 - conditions.light * (0.5 + along))
 
 
-def _region(page: Page, camera: Camera, T_camera_sheet: PoseTuple) -> tuple[int, int, int, int]:
+def _region(page: Page, camera: CameraModel, T_camera_sheet: PoseTuple) -> tuple[int, int, int, int]:
     """Pixels that may show the page."""
     w, h = (0.5 * s for s in page.size_m)
     around = np.linspace(-1.0, 1.0, 21)
@@ -121,12 +121,12 @@ def _region(page: Page, camera: Camera, T_camera_sheet: PoseTuple) -> tuple[int,
 
 
 def _rays(
-    page: Page, camera: Camera, T_camera_sheet: PoseTuple, region: tuple[int, int, int, int], n: int
+    page: Page, camera: CameraModel, T_camera_sheet: PoseTuple, region: tuple[int, int, int, int], n: int
 ) -> tuple[Array, Array]:
     """Mean reflectance of the rays of each pixel that meet the page, and the share of them that do."""
     x0, y0, x1, y1 = region
     x, y = (grid[y0 * n : y1 * n, x0 * n : x1 * n] for grid in _grid(camera, n))
-    M = matrix_of(T_camera_sheet)
+    M = pose_to_matrix(T_camera_sheet)
     H = np.linalg.inv(M[:3, [0, 1, 3]])
     s = H[2, 0] * x + H[2, 1] * y + H[2, 2]
     X = (H[0, 0] * x + H[0, 1] * y + H[0, 2]) / s
@@ -141,7 +141,7 @@ def _rays(
 
 
 @lru_cache(maxsize=2)
-def _grid(camera: Camera, n: int) -> tuple[Array, Array]:
+def _grid(camera: CameraModel, n: int) -> tuple[Array, Array]:
     """Normalised coordinates of n x n rays through every pixel of a camera."""
     offsets = (np.arange(n) + 0.5) / n - 0.5
     u = (np.arange(camera.width)[:, None] + offsets).ravel()
@@ -149,7 +149,7 @@ def _grid(camera: Camera, n: int) -> tuple[Array, Array]:
     return undistort(camera, *np.meshgrid(u, v))
 
 
-def undistort(camera: Camera, u: Array, v: Array) -> tuple[Array, Array]:
+def undistort(camera: CameraModel, u: Array, v: Array) -> tuple[Array, Array]:
     """Normalised coordinates of pixels, by Newton's method on the distortion, to 1e-9 (a millionth of a pixel)."""
     xd, yd = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
     k1, k2, p1, p2, k3 = (*camera.distortion, *(0.0,) * 5)[:5]

@@ -1,7 +1,7 @@
 """Schedule the cross-check of headsets: which pair is compared when, and which disagreement is reported.
 
 One pair per call, each pair at most once a second; a pair is reported at most every five seconds, and only after new
-observations. The mathematics is in `anchors.crosscheck`.
+observations. The mathematics is in `anchors.cross_check`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from itertools import combinations
 from typing import Final
 
 from anchors.alignment import AlignmentEstimate
-from anchors.crosscheck import CrossCheck, CrossCheckConfig, Disagreement
+from anchors.cross_check import CrossCheck, CrossCheckConfig, Disagreement
 from anchors.pose import PoseTuple, Vec3
 from iris_session.alignment.estimator import NUMERICAL_ERRORS
 from iris_session.protocol.entries import CrossChecked, Entry
@@ -39,7 +39,7 @@ class CrossCheckScheduler:
     def __init__(self, anchors: Collection[str]) -> None:
         """Create a scheduler; `anchors`: names of the targets that stand still."""
         self._anchors = anchors
-        self._check = CrossCheck(config=CrossCheckConfig(max_things=_MAX_TARGETS))
+        self._check = CrossCheck(config=CrossCheckConfig(max_targets=_MAX_TARGETS))
         self._n_observations: dict[int, int] = {}  # by connection
         self._moving: dict[int, set[str]] = {}
         self._epochs: dict[int, int] = {}  # tracking epochs of `_moving`
@@ -68,7 +68,7 @@ class CrossCheckScheduler:
         if len(moving) > MAX_MOVING:
             return False
         dropped = self._check.dropped
-        self._check.see(
+        self._check.add_observation(
             str(connection), target, T_tracking_target, p_tracking_head, capture_ns, tracking_epoch, viewpoint_id
         )
         if self._check.dropped > dropped:
@@ -79,13 +79,13 @@ class CrossCheckScheduler:
 
     def discard_observations(self, connection: int) -> None:
         """Discard the observations of a connection whose tracking frame has changed."""
-        self._check.forget(str(connection))
+        self._check.discard_headset(str(connection))
         self._moving.pop(connection, None)
         self._epochs.pop(connection, None)
 
     def discard_target(self, target: str) -> None:
         """Discard all observations of a target that was moved."""
-        self._check.forget_thing(target)
+        self._check.discard_target(target)
 
     def remove_connection(self, connection: int) -> None:
         """Forget the state of a connection that has ended."""
@@ -137,5 +137,5 @@ class CrossCheckScheduler:
 
 def _to_message(found: Disagreement, other: int) -> CrossChecked:
     return CrossChecked(
-        other, found.thing, found.error_m, found.error_rad, found.expected_p95_m, found.p_world, found.n
+        other, found.target, found.error_m, found.error_rad, found.expected_p95_m, found.p_world, found.n
     )

@@ -17,8 +17,8 @@ import numpy as np
 
 from anchors.alignment import AlignmentEstimate, AlignmentEstimator
 from anchors.controller import controller_covariance
-from anchors.pose import IDENTITY_POSE, PoseTuple, Vec3, is_place
-from anchors.touch import Registration, Touch, register
+from anchors.pose import IDENTITY_POSE, PoseTuple, Vec3, is_valid_point
+from anchors.touch import Touch, TouchRegistration, register_touches
 from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.common import MAX_TEXT, Pose
 from iris_session.protocol.entries import AlignmentProposal
@@ -79,7 +79,7 @@ class ConnectionEstimator:
 
     def reset(self) -> None:
         """Discard the observations of this run: the tracking frame has changed."""
-        self._estimator.start_anew()
+        self._estimator.reset()
         self._touches.reset()
         self._pending = False  # an observation since the last proposal changes the estimate or its advice
         self._refused: tuple[int, str] | None = None  # tracking epoch and advice of the last refusal
@@ -241,7 +241,7 @@ class TouchEstimator:
 
     def add_touch(self, point: str, p_tracking_tip: Vec3, tracking_epoch: int) -> bool:
         """Add one touch; return false if it is of an older tracking frame or not a finite point."""
-        if tracking_epoch < self._tracking_epoch or not is_place(p_tracking_tip):
+        if tracking_epoch < self._tracking_epoch or not is_valid_point(p_tracking_tip):
             return False
         if tracking_epoch > self._tracking_epoch:
             self.reset()
@@ -279,12 +279,12 @@ class TouchEstimator:
         self.pending = False
         touches = [Touch(point, p) for point, kept in self._touches.items() for p in kept]
         marks = {point: self._anchors[point][0] for point in self._touches}
-        registration = register(marks, touches, self._tracking_epoch)
+        registration = register_touches(marks, touches, self._tracking_epoch)
         self._suspects = frozenset(registration.suspects)
         return replace(registration.estimate, advice=registration.estimate.advice or _residuals_text(registration))
 
 
-def _residuals_text(registration: Registration) -> str:
+def _residuals_text(registration: TouchRegistration) -> str:
     residuals = ", ".join(f"'{point}' {r * 1e3:.1f} mm" for point, r in sorted(registration.residuals_m.items()))
     return f"touched points miss their marks by: {residuals}" if residuals else ""
 

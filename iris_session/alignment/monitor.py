@@ -121,7 +121,7 @@ class AlignmentMonitor:
     def add_head_pose(self, T_tracking_head: PoseTuple, capture_ns: int, tracking_epoch: int) -> Alarm | None:
         """Record an unvalidated head pose (up to 90 per second) and return an alarm if it shows a jump."""
         self.heads.append(capture_ns, tracking_epoch, T_tracking_head)
-        return _drop_epoch_alarm(self._monitor.head(T_tracking_head, capture_ns, tracking_epoch))
+        return _drop_epoch_alarm(self._monitor.add_head_pose(T_tracking_head, capture_ns, tracking_epoch))
 
     def check_observation(self, observation: Observation, p_tracking_head: Vec3 | None) -> Alarm | None:
         """Return an alarm if this observation shows that the alignment is wrong."""
@@ -129,7 +129,7 @@ class AlignmentMonitor:
         if not is_rigid((pose.p, pose.q)):
             return None
         try:
-            alarm = self._monitor.observe(
+            alarm = self._monitor.add_observation(
                 observation.anchor_id,
                 pose.p,
                 p_tracking_head,

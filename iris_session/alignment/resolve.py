@@ -18,18 +18,23 @@ from anchors.alignment import AlignmentConfig, AlignmentEstimate
 from anchors.constellation import (
     Constellation,
     ConstellationError,
-    Moved,
-    Seen,
-    Solved,
+    ConstellationSolution,
+    MovedSheet,
+    SheetObservation,
     find_moved,
     solve_constellation,
 )
-from anchors.noise import NoiseModel, isotropic, stated
 from anchors.pose import IDENTITY_POSE, PoseTuple, apply, compose, distance, inverse, is_rigid, quat_angle
-from anchors.uncertainty import length_p95
-from iris_session.alignment.smoother import MAX_IN_GROUP, Anchors, Resolver, covariance_of, pose_of
+from anchors.uncertainty import NoiseModel, isotropic_covariance, length_p95, validate_covariance
+from iris_session.alignment.smoother import (
+    MAX_IN_GROUP,
+    AlignmentSmoother,
+    AnchorHistory,
+    observed_covariance,
+    observed_pose,
+)
 from iris_session.protocol.names import AlignmentKind, AnchorKind
-from iris_session.recording import Frame, InForce, Look, Looks
+from iris_session.recording import AlignmentHistory, AlignmentPeriod, RecordedObservation, TrackingFrame
 
 #: Beyond the stated 95 % by this factor it is not chance.
 BEYOND: Final = 2.0
@@ -50,14 +55,14 @@ class Outlier:
 
 
 @dataclass(frozen=True)
-class Compared:
+class LiveComparison:
     """A live alignment against the solution of the same moment, `None` where that is refused.
 
     `off_m`, `off_rad`: when it came into force, at the sheet. `off_end_m`: when it ended. `stated_m`, `solved_m`: the
     stated p95 at the sheet of both.
     """
 
-    live: InForce
+    live: AlignmentPeriod
     off_m: float | None = None
     off_rad: float | None = None
     off_end_m: float | None = None
@@ -70,7 +75,7 @@ class Compared:
         return a.error_at_anchor_m if a.kind == AlignmentKind.MEASURED and not a.offset else None
 
     @property
-    def beyond(self) -> bool:
+    def is_beyond_stated(self) -> bool:
         """Further off than both stated errors explain."""
         if self.off_m is None or self.solved_m is None or self.stated_m is None:
             return False
@@ -78,10 +83,10 @@ class Compared:
 
 
 @dataclass
-class Result:
+class FrameResult:
     """One tracking frame. `last`: the solution at its last look."""
 
-    frame: Frame
+    frame: TrackingFrame
     looks: int
     viewpoints: int
     sheets: dict[str, int]
@@ -89,40 +94,44 @@ class Result:
     last_ns: int
     last: AlignmentEstimate
     unused: dict[str, int]
-    compared: list[Compared] = field(default_factory=list)
+    compared: list[LiveComparison] = field(default_factory=list)
     outliers: list[Outlier] = field(default_factory=list)
 
 
-def resolve(
-    frame: Frame,
-    looks: Sequence[Look],
-    in_force: Iterable[InForce],
-    anchors: Anchors,
+def resolve_frame(
+    frame: TrackingFrame,
+    looks: Sequence[RecordedObservation],
+    in_force: Iterable[AlignmentPeriod],
+    anchors: AnchorHistory,
     sizes: Mapping[str, float],
-    told: Callable[[], None] = lambda: None,
-) -> Result:
+    on_progress: Callable[[], None] = lambda: None,
+) -> FrameResult:
     """Everything about one tracking frame. `told`: called for every moment that was solved."""
-    resolver = Resolver(looks, anchors, sizes)
-    first_ns, last_ns = looks[0].seen.capture_ns, looks[-1].seen.capture_ns
+    resolver = AlignmentSmoother(looks, anchors, sizes)
+    first_ns, last_ns = looks[0].observation.capture_ns, looks[-1].observation.capture_ns
     sheets: dict[str, int] = {}
     for look in looks:
-        sheets[look.seen.anchor_id] = sheets.get(look.seen.anchor_id, 0) + 1
-    viewpoints = len({look.seen.viewpoint_id for look in looks})
-    result = Result(frame, len(looks), viewpoints, sheets, first_ns, last_ns, resolver.at(last_ns), resolver.unused())
+        sheets[look.observation.anchor_id] = sheets.get(look.observation.anchor_id, 0) + 1
+    viewpoints = len({look.observation.viewpoint_id for look in looks})
+    result = FrameResult(
+        frame, len(looks), viewpoints, sheets, first_ns, last_ns, resolver.estimate_at(last_ns), resolver.count_unused()
+    )
     for live in in_force:
-        result.compared.append(compare(live, resolver, last_ns))
-        told()
-    result.outliers = outliers(looks, resolver, anchors)
+        result.compared.append(compare_live(live, resolver, last_ns))
+        on_progress()
+    result.outliers = find_outliers(looks, resolver, anchors)
     return result
 
 
-def compare(live: InForce, resolver: Resolver, last_ns: int) -> Compared:
+def compare_live(live: AlignmentPeriod, resolver: AlignmentSmoother, last_ns: int) -> LiveComparison:
     """A live alignment against the solution when it came into force, and when it ended."""
-    begin = resolver.at(live.since_ns)
+    begin = resolver.estimate_at(live.since_ns)
     end_ns = live.until_ns if live.until_ns >= 0 else max(last_ns, live.since_ns)
-    off = _apart(live, begin)
-    end = _apart(live, resolver.at(max(live.since_ns, end_ns - 1)))  # what ended it may have moved an anchor
-    return Compared(
+    off = _measure_difference(live, begin)
+    end = _measure_difference(
+        live, resolver.estimate_at(max(live.since_ns, end_ns - 1))
+    )  # what ended it may have moved an anchor
+    return LiveComparison(
         live,
         None if off is None else off[0],
         None if off is None else off[1],
@@ -131,7 +140,7 @@ def compare(live: InForce, resolver: Resolver, last_ns: int) -> Compared:
     )
 
 
-def _apart(live: InForce, solved: AlignmentEstimate) -> tuple[float, float] | None:
+def _measure_difference(live: AlignmentPeriod, solved: AlignmentEstimate) -> tuple[float, float] | None:
     """Distance at the sheet [m] and angle [rad] between a live alignment and a solution."""
     if solved.refused:
         return None
@@ -140,20 +149,26 @@ def _apart(live: InForce, solved: AlignmentEstimate) -> tuple[float, float] | No
     return distance(apply(T, p_tracking), solved.pivot_world), quat_angle(T[1], solved.T_world_tracking[1])
 
 
-def outliers(looks: Sequence[Look], resolver: Resolver, anchors: Anchors) -> list[Outlier]:
+def find_outliers(
+    looks: Sequence[RecordedObservation], resolver: AlignmentSmoother, anchors: AnchorHistory
+) -> list[Outlier]:
     """Viewpoints that contradict the solution of their time, the worst first."""
-    groups: dict[tuple[str, int], list[Look]] = {}
+    groups: dict[tuple[str, int], list[RecordedObservation]] = {}
     for look in looks:
-        if look.seen.kind != AnchorKind.TOUCH:
-            groups.setdefault((look.seen.anchor_id, look.seen.viewpoint_id), []).append(look)
+        if look.observation.kind != AnchorKind.TOUCH:
+            groups.setdefault((look.observation.anchor_id, look.observation.viewpoint_id), []).append(look)
     found = []
     for (anchor_id, viewpoint_id), group in groups.items():
-        at_ns = group[len(group) // 2].seen.capture_ns
-        place = anchors.of(anchors.era(at_ns)).get(anchor_id)
-        solved = resolver.at(at_ns)
+        at_ns = group[len(group) // 2].observation.capture_ns
+        place = anchors.get_poses(anchors.find_period(at_ns)).get(anchor_id)
+        solved = resolver.estimate_at(at_ns)
         if place is None or solved.refused:
             continue
-        seen = [compose(solved.T_world_tracking, pose_of(look.seen)) for look in group if is_rigid(pose_of(look.seen))]
+        seen = [
+            compose(solved.T_world_tracking, observed_pose(look.observation))
+            for look in group
+            if is_rigid(observed_pose(look.observation))
+        ]
         if not seen:
             continue
         middle = np.median(np.array([p for p, _ in seen]), axis=0)
@@ -165,15 +180,17 @@ def outliers(looks: Sequence[Look], resolver: Resolver, anchors: Anchors) -> lis
     return sorted(found, key=lambda one: -one.off_m)
 
 
-def noise_p95(look: Look) -> float:
+def noise_p95(look: RecordedObservation) -> float:
     """What 95 % of single looks like this one are better than [m]."""
-    given = stated(covariance_of(look.seen))
+    given = validate_covariance(observed_covariance(look.observation))
     if given:
         return length_p95(np.reshape(given, (6, 6))[:3, :3])
     config = AlignmentConfig()
     if look.p_tracking_head is None:
-        return length_p95(isotropic(config.position_sigma_m, config.rotation_sigma_rad)[:3, :3])
-    common, each = NoiseModel().seen_from(np.array(look.p_tracking_head), np.array(look.seen.T_tracking_anchor.p))
+        return length_p95(isotropic_covariance(config.position_sigma_m, config.rotation_sigma_rad)[:3, :3])
+    common, each = NoiseModel().compute_covariances(
+        np.array(look.p_tracking_head), np.array(look.observation.T_tracking_anchor.p)
+    )
     return length_p95((common + each)[:3, :3])
 
 
@@ -181,25 +198,25 @@ def noise_p95(look: Look) -> float:
 
 
 @dataclass(frozen=True)
-class Relative:
+class RelativePoses:
     """Where sheets lie relative to each other by everything that was seen, or why that cannot be said (`advice`).
 
     `moved`: sheets that no longer lie where the session (or the file) has them; `unsaid`: why that cannot be told.
     """
 
-    solved: Solved | None
+    solved: ConstellationSolution | None
     advice: str = ""
-    moved: tuple[Moved, ...] = ()
-    unsaid: str = ""
+    moved: tuple[MovedSheet, ...] = ()
+    moved_advice: str = ""
 
 
-def constellation(looks: Looks, saved: Constellation) -> Relative:
+def solve_relative_poses(looks: AlignmentHistory, saved: Constellation) -> RelativePoses:
     """Of all sheets that were seen, configured or not. `saved`: where they ought to be, and which is the reference."""
-    seen = list(_seen(looks))
+    seen = list(_list_sheet_observations(looks))
     names = {one.anchor_id for one in seen}
     if len(names) < 2:
         were = "sheet was" if len(names) == 1 else "sheets were"
-        return Relative(None, f"{len(names)} {were} seen: 2 are needed to say where they lie to each other")
+        return RelativePoses(None, f"{len(names)} {were} seen: 2 are needed to say where they lie to each other")
     known = [name for name in (saved.reference, *saved.anchors) if name in names]
     reference = known[0] if known else min(names)
     try:
@@ -207,30 +224,32 @@ def constellation(looks: Looks, saved: Constellation) -> Relative:
             seen, reference, saved.anchors.get(reference, IDENTITY_POSE), sizes=_sizes(looks, saved)
         )
     except ConstellationError as error:
-        return Relative(None, str(error))
+        return RelativePoses(None, str(error))
     try:
-        return Relative(solved, moved=find_moved(saved, solved.constellation))
+        return RelativePoses(solved, moved=find_moved(saved, solved.constellation))
     except ConstellationError as error:
-        return Relative(solved, unsaid=str(error))
+        return RelativePoses(solved, moved_advice=str(error))
 
 
-def _seen(looks: Looks) -> Iterable[Seen]:
-    for frame, every in looks.looks.items():
+def _list_sheet_observations(looks: AlignmentHistory) -> Iterable[SheetObservation]:
+    for frame, every in looks.observations.items():
         groups: dict[tuple[str, int], int] = {}
         for look in every:
-            o = look.seen
+            o = look.observation
             key = (o.anchor_id, o.viewpoint_id)
             groups[key] = groups.get(key, 0) + 1
-            if o.kind in SHEETS and groups[key] <= MAX_IN_GROUP and is_rigid(pose_of(o)):
+            if o.kind in SHEETS and groups[key] <= MAX_IN_GROUP and is_rigid(observed_pose(o)):
                 headset = f"{frame.participant} {frame.run} {frame.jumps}"  # a tracking frame of its own after each
-                yield Seen(headset, o.tracking_epoch, o.viewpoint_id, o.anchor_id, pose_of(o), look.p_tracking_head)
+                yield SheetObservation(
+                    headset, o.tracking_epoch, o.viewpoint_id, o.anchor_id, observed_pose(o), look.p_tracking_head
+                )
 
 
-def _sizes(looks: Looks, saved: Constellation) -> dict[str, float]:
+def _sizes(looks: AlignmentHistory, saved: Constellation) -> dict[str, float]:
     """Of each sheet: as configured, else the median of what headsets measured."""
     measured: dict[str, list[float]] = {}
-    for every in looks.looks.values():
+    for every in looks.observations.values():
         for look in every:
-            if look.seen.size_m > 0.0 and math.isfinite(look.seen.size_m):
-                measured.setdefault(look.seen.anchor_id, []).append(look.seen.size_m)
+            if look.observation.size_m > 0.0 and math.isfinite(look.observation.size_m):
+                measured.setdefault(look.observation.anchor_id, []).append(look.observation.size_m)
     return {name: float(np.median(values)) for name, values in measured.items()} | saved.sizes

@@ -34,7 +34,7 @@ from anchors.uncertainty import length_p95
 from iris_session.alignment.estimator import NUMERICAL_ERRORS
 from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.names import AnchorKind
-from iris_session.recording import Look, Looks
+from iris_session.recording import AlignmentHistory, RecordedObservation
 
 Array = NDArray[np.float64]
 AROUND_NS: Final = 600_000_000_000
@@ -47,43 +47,47 @@ GRAIN_NS: Final = 10_000_000_000
 CHI2_6_999: Final = 22.458
 
 
-class Anchors:
+class AnchorHistory:
     """Where anchors were, over time: as configured, then as directors moved them; or by a file, always the same."""
 
-    def __init__(self, looks: Looks, configured: Mapping[str, PoseTuple], given: Constellation | None) -> None:
+    def __init__(
+        self, looks: AlignmentHistory, configured: Mapping[str, PoseTuple], given: Constellation | None
+    ) -> None:
         self._eras: list[tuple[int, dict[str, PoseTuple]]] = [(0, dict(configured if given is None else given.anchors))]
-        for moved in () if given is not None else looks.moved:
+        for moved in () if given is not None else looks.anchor_moves:
             pose = (moved.T_world_anchor.p, moved.T_world_anchor.q)
             self._eras.append((moved.session_time, {**self._eras[-1][1], moved.anchor_id: pose}))
 
-    def era(self, now_ns: int) -> int:
+    def find_period(self, now_ns: int) -> int:
         """Number of the period in which none was moved."""
         return max(i for i, (since, _) in enumerate(self._eras) if i == 0 or since <= now_ns)
 
-    def of(self, era: int) -> dict[str, PoseTuple]:
+    def get_poses(self, era: int) -> dict[str, PoseTuple]:
         return self._eras[era][1]
 
     @property
-    def last(self) -> dict[str, PoseTuple]:
+    def last_poses(self) -> dict[str, PoseTuple]:
         return self._eras[-1][1]
 
 
-class Resolver:
+class AlignmentSmoother:
     """Solutions of one tracking frame at any moment, each computed once. `looks`: in order of capture."""
 
-    def __init__(self, looks: Sequence[Look], anchors: Anchors, sizes: Mapping[str, float]) -> None:
+    def __init__(
+        self, looks: Sequence[RecordedObservation], anchors: AnchorHistory, sizes: Mapping[str, float]
+    ) -> None:
         self._looks, self._anchors, self._sizes = looks, anchors, sizes
-        self._times = np.array([look.seen.capture_ns for look in looks], dtype=np.int64)
+        self._times = np.array([look.observation.capture_ns for look in looks], dtype=np.int64)
         self._known: dict[tuple[int, int], AlignmentEstimate] = {}
 
-    def at(self, now_ns: int) -> AlignmentEstimate:
+    def estimate_at(self, now_ns: int) -> AlignmentEstimate:
         """What was seen around `now_ns` as one alignment, with the anchors of then."""
         moment = (now_ns // GRAIN_NS) * GRAIN_NS + GRAIN_NS // 2
-        key = (moment, self._anchors.era(now_ns))
+        key = (moment, self._anchors.find_period(now_ns))
         if key not in self._known:
-            places = self._anchors.of(key[1])
+            places = self._anchors.get_poses(key[1])
             solved = self._solve(moment, places)
-            seen = sorted({look.seen.anchor_id for look in self._looks} & set(places))
+            seen = sorted({look.observation.anchor_id for look in self._looks} & set(places))
             if solved.refused and len(seen) > 2:
                 solved = self._without_one(moment, places, seen) or solved
             self._known[key] = solved
@@ -101,15 +105,15 @@ class Resolver:
                 tried.append(replace(solved, moved=(name,), advice=advice))
         return min(tried, key=lambda one: one.error_at_anchor_m, default=None)
 
-    def unused(self) -> dict[str, int]:
+    def count_unused(self) -> dict[str, int]:
         """How many observations are of no use at all, by reason."""
-        e = AlignmentEstimator(self._anchors.last, AlignmentConfig(), self._sizes)
+        e = AlignmentEstimator(self._anchors.last_poses, AlignmentConfig(), self._sizes)
         touched = 0
         for look in self._looks:
-            if look.seen.kind == AnchorKind.TOUCH:
+            if look.observation.kind == AnchorKind.TOUCH:
                 touched += 1
             else:
-                add(e, look, look.seen.capture_ns)
+                add_observation(e, look, look.observation.capture_ns)
         counts = {
             "unknown anchor": e.unknown_anchors,
             "wrong size": e.wrong_size,
@@ -124,32 +128,32 @@ class Resolver:
         halves = self._sides(moment)
         for looks, sign in zip(halves, (1, -1), strict=True):
             estimator = AlignmentEstimator(places, _config(), self._sizes)
-            ages = [sign * (look.seen.capture_ns - moment) for look in looks]
+            ages = [sign * (look.observation.capture_ns - moment) for look in looks]
             for look, age_ns in sorted(zip(looks, ages, strict=True), key=lambda one: one[1]):
-                add(estimator, look, moment + age_ns)
-            sides.append(_later(estimate(estimator), -max(ages, default=0) * 1e-9))
+                add_observation(estimator, look, moment + age_ns)
+            sides.append(_later(estimate_or_refuse(estimator), -max(ages, default=0) * 1e-9))
         before, after = sides
         if before.refused and after.refused:
             return before if len(halves[0]) >= len(halves[1]) else after
         if before.refused or after.refused:
             return after if before.refused else before
-        return fused(before, after)
+        return fuse_estimates(before, after)
 
-    def _sides(self, moment: int) -> tuple[list[Look], list[Look]]:
+    def _sides(self, moment: int) -> tuple[list[RecordedObservation], list[RecordedObservation]]:
         """The looks that count, before the moment and after it. What was seen from one viewpoint stays together: its
         errors are common."""
         away = np.abs(self._times - moment)
-        groups: dict[tuple[str, int], list[Look]] = {}
+        groups: dict[tuple[str, int], list[RecordedObservation]] = {}
         for i in np.argsort(away, kind="stable").tolist():
-            seen = self._looks[i].seen
+            seen = self._looks[i].observation
             key = (seen.anchor_id, seen.viewpoint_id)
             if away[i] > AROUND_NS or (key not in groups and len(groups) >= MAX_GROUPS):
                 break
             if seen.kind != AnchorKind.TOUCH and len(groups.setdefault(key, [])) < MAX_IN_GROUP:
                 groups[key].append(self._looks[i])
-        sides: tuple[list[Look], list[Look]] = ([], [])
+        sides: tuple[list[RecordedObservation], list[RecordedObservation]] = ([], [])
         for group in groups.values():
-            late = 2 * sum(look.seen.capture_ns > moment for look in group) > len(group)
+            late = 2 * sum(look.observation.capture_ns > moment for look in group) > len(group)
             sides[late].extend(group)
         return sides
 
@@ -177,7 +181,7 @@ def _with(e: AlignmentEstimate, T: PoseTuple, C: Array) -> AlignmentEstimate:
     return replace(e, T_world_tracking=T, covariance=tuple(C.ravel().tolist()), error_at_anchor_m=length_p95(C[:3, :3]))
 
 
-def fused(a: AlignmentEstimate, b: AlignmentEstimate) -> AlignmentEstimate:
+def fuse_estimates(a: AlignmentEstimate, b: AlignmentEstimate) -> AlignmentEstimate:
     """Both as one, at the pivot of `a`: means weighted by covariances, wider where they differ by more than these."""
     p_tracking = apply(inverse(a.T_world_tracking), a.pivot_world)
     p_b = apply(b.T_world_tracking, p_tracking)
@@ -215,19 +219,19 @@ def _carried(e: AlignmentEstimate, p_world: Vec3) -> Array:
     return np.asarray(J @ np.reshape(e.covariance, (6, 6)) @ J.T)
 
 
-def add(estimator: AlignmentEstimator, look: Look, capture_ns: int) -> bool:
+def add_observation(estimator: AlignmentEstimator, look: RecordedObservation, capture_ns: int) -> bool:
     """As the front does it."""
-    seen = look.seen
+    seen = look.observation
     try:
         return estimator.add(
             seen.anchor_id,
-            pose_of(seen),
+            observed_pose(seen),
             capture_ns,
             seen.tracking_epoch,
             viewpoint_id=seen.viewpoint_id,
             quality=seen.quality,
             size_m=seen.size_m,
-            covariance=covariance_of(seen),
+            covariance=observed_covariance(seen),
             p_tracking_head=None if seen.kind == AnchorKind.CONTROLLER else look.p_tracking_head,
         )
     except NUMERICAL_ERRORS:
@@ -235,7 +239,7 @@ def add(estimator: AlignmentEstimator, look: Look, capture_ns: int) -> bool:
         return False
 
 
-def estimate(estimator: AlignmentEstimator) -> AlignmentEstimate:
+def estimate_or_refuse(estimator: AlignmentEstimator) -> AlignmentEstimate:
     """The solution; refused for numbers that nobody can solve."""
     try:
         return estimator.estimate()
@@ -245,11 +249,11 @@ def estimate(estimator: AlignmentEstimator) -> AlignmentEstimate:
         return AlignmentEstimate(IDENTITY_POSE, epoch, (0.0,) * 36, zero, math.inf, 0.0, 0, 0, True, text)
 
 
-def pose_of(seen: Observation) -> PoseTuple:
+def observed_pose(seen: Observation) -> PoseTuple:
     return seen.T_tracking_anchor.p, seen.T_tracking_anchor.q
 
 
-def covariance_of(seen: Observation) -> tuple[float, ...]:
+def observed_covariance(seen: Observation) -> tuple[float, ...]:
     """As stated; that of a tracked controller where its client states none."""
     if seen.kind == AnchorKind.CONTROLLER and not seen.covariance:
         return controller_covariance()

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
+from anchors.correction import interpolate_about_pivot
 from anchors.pose import (
     apply,
     compose,
@@ -28,7 +29,6 @@ from anchors.pose import (
     quat_normalize,
     quat_to_rotvec,
 )
-from anchors.smooth import between
 from iris_session.authority import engagement
 from iris_session.authority.context import Context
 from iris_session.authority.state import Correction, Participant, Placement, WarningState
@@ -313,7 +313,7 @@ def _slide_correction(ctx: Context, p: Participant, c: Correction, away_m: float
         return _complete_correction(ctx, p, c)
     old, new = _get_measured_pose(p), c.T_world_tracking
     p_tracking = apply(inverse((new.p, new.q)), c.pivot_world)
-    T = Pose(*between((old.p, old.q), (new.p, new.q), p_tracking, 1.0 / parts))
+    T = Pose(*interpolate_about_pivot((old.p, old.q), (new.p, new.q), p_tracking, 1.0 / parts))
     at = apply((T.p, T.q), p_tracking)
     left = [c.pivot_world[i] - at[i] for i in range(3)] + list(quat_to_rotvec(quat_mul(new.q, quat_conj(T.q))))
     c.slides_ns = ctx.now_ns + ctx.config.slide_ns

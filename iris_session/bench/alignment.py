@@ -19,9 +19,9 @@ import numpy as np
 
 from anchors.alignment import AlignmentEstimate, AlignmentEstimator
 from anchors.controller import controller_covariance
-from anchors.lie import Array, quat_conjugate, quat_exp, quat_log, quat_matrix, quat_multiply
+from anchors.lie import Array, quat_conjugate, quat_exp, quat_log, quat_multiply, quat_to_matrix
 from anchors.pose import IDENTITY_POSE, PoseTuple, Quat, Vec3, quat_from_yaw
-from anchors.touch import Touch, register
+from anchors.touch import Touch, register_touches
 from anchors.uncertainty import length_p95
 from iris_session.bench.report import Bar, BenchReport, make_bar
 from iris_session.emulator.sheet_noise import SheetNoise, mix_viewpoint_noise
@@ -111,13 +111,13 @@ class SimulatedHeadset:
         """Return the position of a controller's tip that touches a mark once."""
         p = p_mark + self.rng.normal(0.0, sigma_m, (1, 3))
         origin, q = self.T_world_tracking(self.now_s)
-        return [_to_vec3(v) for v in ((p - origin) @ quat_matrix(q)).tolist()]
+        return [_to_vec3(v) for v in ((p - origin) @ quat_to_matrix(q)).tolist()]
 
     def _report(self, anchor_id: str, p: Array, q: Array, heads: Array) -> list[ReportedObservation]:
         """Transform observations from world to tracking, each at its time, and go to the next viewpoint."""
         times = self.now_s + PERIOD_S * np.arange(len(p))
         q_inv = quat_conjugate(self.q0)
-        R = quat_matrix(q_inv)
+        R = quat_to_matrix(q_inv)
         origin = self.p0 + times[:, None] * self.velocity
         p_tracking, head_tracking = (p - origin) @ R.T, (heads - origin) @ R.T
         q_tracking = quat_multiply(q_inv, q)
@@ -290,7 +290,7 @@ def _simulate_touching_headset(rng: np.random.Generator) -> tuple[HeadsetError]:
         touches.append(Touch(name, tip))
         at = headset.now_s
         headset.walk()
-    estimate = register(MARKS, touches, sigma_m=TIP_SIGMA_M).estimate
+    estimate = register_touches(MARKS, touches, sigma_m=TIP_SIGMA_M).estimate
     return (_compute_error(_to_arrays(estimate.T_world_tracking), headset.T_world_tracking(at), estimate),)
 
 
@@ -299,7 +299,7 @@ def _align_each_observation(seen: Sequence[ReportedObservation], anchors: dict[s
     pw = np.array([anchors[o.anchor_id][0] for o in seen])
     qw = np.array([anchors[o.anchor_id][1] for o in seen])
     q = quat_multiply(qw, quat_conjugate(np.array([o.pose[1] for o in seen])))
-    return pw - np.einsum("nij,nj->ni", quat_matrix(q), np.array([o.pose[0] for o in seen])), q
+    return pw - np.einsum("nij,nj->ni", quat_to_matrix(q), np.array([o.pose[0] for o in seen])), q
 
 
 def _average_alignments(
@@ -309,7 +309,7 @@ def _average_alignments(
     q_mean = np.linalg.eigh(q.T @ q)[1][:, -1]
     p = np.array([o.pose[0] for o in seen])
     pw = np.array([anchors[o.anchor_id][0] for o in seen])
-    return np.mean(pw - p @ quat_matrix(q_mean).T, axis=0), q_mean
+    return np.mean(pw - p @ quat_to_matrix(q_mean).T, axis=0), q_mean
 
 
 def _to_arrays(T: PoseTuple) -> tuple[Array, Array]:
@@ -320,7 +320,7 @@ def _compute_error(
     found: tuple[Array, Array], true: tuple[Array, Array], estimate: AlignmentEstimate | None
 ) -> HeadsetError:
     q = quat_multiply(found[1], quat_conjugate(true[1]))
-    R = quat_matrix(q)
+    R = quat_to_matrix(q)
     return HeadsetError(R, found[0] - R @ true[0], q, estimate)
 
 

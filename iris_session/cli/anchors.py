@@ -31,8 +31,8 @@ from iris_session.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from anchors.camera import Camera
-    from anchors.detection import Sighting
+    from anchors.camera import CameraModel
+    from anchors.detection import SheetDetection
     from anchors.pose import PoseTuple
     from anchors.sheet import Sheet
 
@@ -167,8 +167,8 @@ class CalibrationPicture:
 
     path: Path
     camera_name: str
-    camera: Camera
-    sightings: tuple[Sighting, ...]
+    camera: CameraModel
+    sightings: tuple[SheetDetection, ...]
 
 
 def calibrate_cameras(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -286,7 +286,7 @@ def _read_camera_folder(folder: Path, intrinsics: Path | None, sheets: list[Shee
     return pictures
 
 
-def _read_camera(folder: Path, intrinsics: Path | None, width: int, height: int) -> Camera:
+def _read_camera(folder: Path, intrinsics: Path | None, width: int, height: int) -> CameraModel:
     from anchors.camera import CameraError, parse_camera
 
     places = [intrinsics] if intrinsics is not None else [folder / "intrinsics.toml", folder / "intrinsics.txt"]
@@ -309,7 +309,7 @@ def _solve_from_robot_poses(
     pictures: list[CalibrationPicture], poses: dict[str, PoseTuple], arguments: argparse.Namespace
 ) -> dict[str, Any]:
     from anchors.pose import compose, inverse
-    from anchors.robot_world import CalibrationError, camera_on_hand, solve
+    from anchors.robot_world import CalibrationError, solve_camera_on_hand, solve_robot_world
 
     missing = [picture.path.name for picture in pictures if picture.path.name not in poses]
     if missing:
@@ -321,7 +321,7 @@ def _solve_from_robot_poses(
     if arguments.in_hand is not None:
         return _solve_with_known_hand_pose(pictures, seen, robot, arguments.in_hand)
     found = [picture.sightings[0] for picture in seen]
-    solver = camera_on_hand if arguments.camera_on_hand else solve
+    solver = solve_camera_on_hand if arguments.camera_on_hand else solve_robot_world
     solved = solver(robot, [one.T_camera_sheet for one in found], [one.covariance for one in found])
     X, Y = solved.T_base_camera, solved.T_ee_marker
     result: dict[str, Any]
@@ -350,11 +350,11 @@ def _solve_with_known_hand_pose(
     pictures: list[CalibrationPicture], seen: list[CalibrationPicture], robot: list[PoseTuple], T_ee_sheet: PoseTuple
 ) -> dict[str, Any]:
     """Solve with a known pose of the sheet on the hand: its pose is then known in every picture."""
-    from anchors.camera_rig import View, solve_rig
+    from anchors.camera_rig import SheetView, solve_rig
     from anchors.pose import compose, inverse
 
     known = {str(p.path): compose(T, T_ee_sheet) for p, T in zip(seen, robot, strict=True)}
-    views = [View("camera", str(p.path), p.sightings[0].T_camera_sheet, p.sightings[0].covariance) for p in seen]
+    views = [SheetView("camera", str(p.path), p.sightings[0].T_camera_sheet, p.sightings[0].covariance) for p in seen]
     rig = solve_rig(views, known)
     at = rig.cameras["camera"]
     rows = _compute_residuals(pictures, {p.path: [compose(inverse(at), known[str(p.path)])] for p in seen}, set())
@@ -368,12 +368,12 @@ def _solve_with_known_hand_pose(
 
 
 def _solve_from_known_sheets(pictures: list[CalibrationPicture], arguments: argparse.Namespace) -> dict[str, Any]:
-    from anchors.camera_rig import View, solve_rig
+    from anchors.camera_rig import SheetView, solve_rig
     from anchors.pose import compose, inverse
     from anchors.robot_world import CalibrationError
 
     views = [
-        View(picture.camera_name, one.anchor_id, one.T_camera_sheet, one.covariance)
+        SheetView(picture.camera_name, one.anchor_id, one.T_camera_sheet, one.covariance)
         for picture in pictures
         for one in picture.sightings
         if not one.ambiguous

@@ -28,11 +28,11 @@ from iris_session.protocol.names import AlignAction, AlignmentKind
 if TYPE_CHECKING:
     from anchors.constellation import Constellation
     from anchors.pose import PoseTuple
-    from iris_session.alignment.resolve import Compared, Relative, Result
+    from iris_session.alignment.resolve import FrameResult, LiveComparison, RelativePoses
     from iris_session.client import Client
     from iris_session.protocol.server_messages import ParticipantInfo
     from iris_session.protocol.status import AlignmentReport, CrossCheckReport, ParticipantReport, StatusReport
-    from iris_session.recording import Looks, Person, Recording
+    from iris_session.recording import AlignmentHistory, RecordedParticipant, Recording
 
 
 ALL_PARTICIPANTS: Final = "all"
@@ -412,18 +412,18 @@ def register_solve(actions: argparse._SubParsersAction[argparse.ArgumentParser])
 
 def run_solve(arguments: argparse.Namespace) -> int:
     """Solve a recording and print the result. Exit status 1 if `--out` is given and there is nothing to write."""
-    from iris_session.alignment.resolve import constellation
-    from iris_session.alignment.smoother import Anchors
-    from iris_session.recording import Recording, read_looks
+    from iris_session.alignment.resolve import solve_relative_poses
+    from iris_session.alignment.smoother import AnchorHistory
+    from iris_session.recording import Recording, read_alignment_history
     from iris_session.session.config import load_anchors
 
     given = None if arguments.anchors is None else load_anchors(arguments.anchors)
     with Recording.open(arguments.recording, warn=False) as recording:
-        looks = read_looks(recording, make_progress_printer("reading"))
+        looks = read_alignment_history(recording, make_progress_printer("reading"))
         saved = _load_reference_anchors(recording, given)
-        anchors = Anchors(looks, dict(saved.anchors), given)
+        anchors = AnchorHistory(looks, dict(saved.anchors), given)
         results = _resolve_frames(looks, anchors, saved.sizes)
-        relative = constellation(looks, _replace_anchors(saved, anchors.last))
+        relative = solve_relative_poses(looks, _replace_anchors(saved, anchors.last_poses))
         damage = recording.damage + recording.missing
     wanted = arguments.out is not None
     written = _write_constellation(arguments.out, relative) if wanted and relative.solved is not None else ""
@@ -469,10 +469,10 @@ def _replace_anchors(saved: Constellation, anchors: dict[str, PoseTuple]) -> Con
     return Constellation(saved.reference, anchors, saved.error_m, saved.sizes)
 
 
-def _resolve_frames(looks: Looks, anchors: Any, sizes: dict[str, float]) -> list[Result]:
-    from iris_session.alignment.resolve import resolve
+def _resolve_frames(looks: AlignmentHistory, anchors: Any, sizes: dict[str, float]) -> list[FrameResult]:
+    from iris_session.alignment.resolve import resolve_frame
 
-    by_frame = {frame: [one for one in looks.in_force if one.frame == frame] for frame in looks.looks}
+    by_frame = {frame: [one for one in looks.in_force if one.frame == frame] for frame in looks.observations}
     total = sum(map(len, by_frame.values()))
     show, done = make_progress_printer("solving"), 0
     results = []
@@ -483,12 +483,12 @@ def _resolve_frames(looks: Looks, anchors: Any, sizes: dict[str, float]) -> list
         if show is not None:
             show(done, total)
 
-    for frame, every in looks.looks.items():
-        results.append(resolve(frame, every, by_frame[frame], anchors, sizes, advance))
+    for frame, every in looks.observations.items():
+        results.append(resolve_frame(frame, every, by_frame[frame], anchors, sizes, advance))
     return results
 
 
-def _write_constellation(path: Path, relative: Relative) -> str:
+def _write_constellation(path: Path, relative: RelativePoses) -> str:
     """Write the constellation as a file for `serve --anchors`. Return its path."""
     assert relative.solved is not None
     try:
@@ -501,9 +501,11 @@ def _write_constellation(path: Path, relative: Relative) -> str:
 # --- solve: text ------------------------------------------------------------------------------------------------------
 
 
-def format_solution(looks: Looks, results: list[Result], relative: Relative, damage: list[str]) -> Iterator[str]:
+def format_solution(
+    looks: AlignmentHistory, results: list[FrameResult], relative: RelativePoses, damage: list[str]
+) -> Iterator[str]:
     """Return lines about every headset, then the sheets, then damage."""
-    wearers = [one for one in looks.people.values() if one.aligned]
+    wearers = [one for one in looks.participants.values() if one.aligned]
     if not wearers:
         yield "no participant of this recording had a headset to align"
     for person in wearers:
@@ -520,7 +522,7 @@ def format_solution(looks: Looks, results: list[Result], relative: Relative, dam
     yield from (f"damaged: {line}" for line in damage)
 
 
-def _format_frame(person: Person, r: Result) -> Iterator[str]:
+def _format_frame(person: RecordedParticipant, r: FrameResult) -> Iterator[str]:
     run = f", run {r.frame.run}" if len(person.runs) > 1 else ""
     run += f", after jump {r.frame.jumps}" if r.frame.jumps else ""
     sheets = ", ".join(f"{name} {n}" for name, n in sorted(r.sheets.items()))
@@ -551,7 +553,7 @@ def _format_frame(person: Person, r: Result) -> Iterator[str]:
     yield from _limit_lines(outliers[:MAX_LISTED], len(outliers), "outliers")
 
 
-def _select_worst(compared: list[Compared]) -> list[Compared]:
+def _select_worst(compared: list[LiveComparison]) -> list[LiveComparison]:
     """Return the alignments with the largest errors, in order of time."""
     kept = sorted(compared, key=lambda one: -max(one.off_m or 0.0, one.off_end_m or 0.0))[:MAX_LISTED]
     return sorted(kept, key=lambda one: one.live.since_ns)
@@ -563,7 +565,7 @@ def _limit_lines(shown: list[str], of: int, what: str) -> Iterator[str]:
         yield f"    ... {of - len(shown)} more {what}, listed by --json"
 
 
-def _format_comparison(one: Compared) -> str:
+def _format_comparison(one: LiveComparison) -> str:
     a, until = one.live.alignment, one.live.until_ns
     end = "the end" if until < 0 else f"{until * 1e-9:.1f} s"
     kind = a.kind + (" with offset" if a.offset else "")
@@ -573,11 +575,11 @@ def _format_comparison(one: Compared) -> str:
     stated = "no error stated" if one.stated_m is None else f"stated {_format_mm(one.stated_m)}"
     at_end = "" if one.off_end_m is None else f", {_format_mm(one.off_end_m)} at its end"
     solved = "" if one.solved_m is None else f", re-solved {_format_mm(one.solved_m)}"
-    beyond = "  EXCEEDS THE STATED ERROR" if one.beyond else ""
+    beyond = "  EXCEEDS THE STATED ERROR" if one.is_beyond_stated else ""
     return f"{head}: {_format_mm(one.off_m)}, {math.degrees(one.off_rad):.2f} deg off{at_end}; {stated}{solved}{beyond}"
 
 
-def _format_sheets(relative: Relative) -> Iterator[str]:
+def _format_sheets(relative: RelativePoses) -> Iterator[str]:
     if relative.solved is None:
         yield f"relative poses of sheets: {relative.advice}"
         return
@@ -600,8 +602,8 @@ def _format_sheets(relative: Relative) -> Iterator[str]:
             f"{math.degrees(moved.angle_rad):.1f} deg "
             "from its expected pose, relative to the others"
         )
-    if relative.unsaid:
-        yield f"moved sheets: {relative.unsaid}"
+    if relative.moved_advice:
+        yield f"moved sheets: {relative.moved_advice}"
 
 
 def _format_mm(metres: float) -> str:
@@ -612,7 +614,12 @@ def _format_mm(metres: float) -> str:
 
 
 def solution_to_dict(
-    path: str, looks: Looks, results: list[Result], relative: Relative, damage: list[str], written: str
+    path: str,
+    looks: AlignmentHistory,
+    results: list[FrameResult],
+    relative: RelativePoses,
+    damage: list[str],
+    written: str,
 ) -> dict[str, Any]:
     """Return the object that `--json` prints."""
     people = [
@@ -622,7 +629,7 @@ def solution_to_dict(
             "role": one.role,
             "frames": [_frame_to_dict(r) for r in results if r.frame.participant == one.id],
         }
-        for one in looks.people.values()
+        for one in looks.participants.values()
         if one.aligned
     ]
     return {
@@ -636,7 +643,7 @@ def solution_to_dict(
     }
 
 
-def _frame_to_dict(r: Result) -> dict[str, Any]:
+def _frame_to_dict(r: FrameResult) -> dict[str, Any]:
     return {
         "run": r.frame.run,
         "tracking_epoch": r.frame.tracking_epoch,
@@ -668,7 +675,7 @@ def _frame_to_dict(r: Result) -> dict[str, Any]:
     }
 
 
-def _alignment_to_dict(one: Compared) -> dict[str, Any]:
+def _alignment_to_dict(one: LiveComparison) -> dict[str, Any]:
     a, until = one.live.alignment, one.live.until_ns
     return {
         "version": a.version,
@@ -681,11 +688,11 @@ def _alignment_to_dict(one: Compared) -> dict[str, Any]:
         "off_end_m": one.off_end_m,
         "stated_m": one.stated_m,
         "solved_m": one.solved_m,
-        "beyond": one.beyond,
+        "beyond": one.is_beyond_stated,
     }
 
 
-def _constellation_to_dict(relative: Relative) -> dict[str, Any]:
+def _constellation_to_dict(relative: RelativePoses) -> dict[str, Any]:
     if relative.solved is None:
         return {"advice": relative.advice}
     c = relative.solved.constellation
@@ -699,5 +706,5 @@ def _constellation_to_dict(relative: Relative) -> dict[str, Any]:
         "anchors": sheets,
         "rejected": [list(one) for one in relative.solved.rejected],
         "moved": moved,
-        "advice": relative.unsaid,
+        "advice": relative.moved_advice,
     }

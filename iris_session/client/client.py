@@ -71,8 +71,8 @@ from iris_session.protocol.session_mirror import MissedEvents, SessionMirror
 from iris_session.protocol.status import StatusReport
 
 if TYPE_CHECKING:
-    from anchors.camera import Camera
-    from anchors.detection import Sighting
+    from anchors.camera import CameraModel
+    from anchors.detection import SheetDetection
     from anchors.sheet import Sheet
 
 DEFAULT_TIMEOUT_S: Final = 5.0
@@ -826,7 +826,7 @@ class Client:
     def observe_image(
         self,
         image: NDArray[Any],
-        camera: Camera,
+        camera: CameraModel,
         sheets: Sequence[Sheet],
         T_tracking_camera: PoseLike,
         *,
@@ -835,7 +835,7 @@ class Client:
         device: str = "head",
         camera_sigma: tuple[float, float] = CAMERA_SIGMA,
         tracking_epoch: int | None = None,
-    ) -> list[Sighting]:
+    ) -> list[SheetDetection]:
         """Detect sheets in an image and report them as observations.
 
         Sheets with an ambiguous pose (both poses of a plane fit) are left out. Takes tenths of a second: not for the

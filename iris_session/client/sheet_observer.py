@@ -18,8 +18,8 @@ from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.common import Pose
 
 if TYPE_CHECKING:
-    from anchors.camera import Camera
-    from anchors.detection import Sighting
+    from anchors.camera import CameraModel
+    from anchors.detection import SheetDetection
     from anchors.sheet import Sheet
 
 #: From further away, or after such a turn, the errors of lens and light are others: a new viewpoint.
@@ -55,14 +55,14 @@ class SheetObserver:
         self.viewpoints = ViewpointCounter()
         self._detector: Any = None
 
-    def detect(self, image: NDArray[Any], camera: Camera, sheets: Sequence[Sheet]) -> list[Sighting]:
+    def detect(self, image: NDArray[Any], camera: CameraModel, sheets: Sequence[Sheet]) -> list[SheetDetection]:
         """Return the sheets in an image, (height, width[, 3]) uint8, whose pose is not ambiguous.
 
         Raises `InvalidMessageError` for an image or camera that cannot be, `ClientError` without OpenCV.
         """
         return [one for one in self._sightings(image, camera, sheets) if not one.ambiguous]
 
-    def _sightings(self, image: NDArray[Any], camera: Camera, sheets: Sequence[Sheet]) -> list[Sighting]:
+    def _sightings(self, image: NDArray[Any], camera: CameraModel, sheets: Sequence[Sheet]) -> list[SheetDetection]:
         try:
             from anchors.camera import CameraError
             from anchors.detection import DetectionError, SheetDetector
@@ -80,7 +80,7 @@ class SheetObserver:
 
 
 def to_observation(
-    sighting: Sighting,
+    sighting: SheetDetection,
     T_tracking_camera: PoseTuple,
     *,
     capture_ns: int,

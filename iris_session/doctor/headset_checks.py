@@ -12,7 +12,7 @@ from iris_session.protocol.status import CrossCheckReport, ParticipantReport, St
 
 #: Tracking frames drift by millimetres a minute: after this time without a sheet the stated error is no longer true.
 STALE_NS: Final = 600_000_000_000
-#: An error above the 95 % bound by this factor is not chance, as in `anchors.crosscheck`.
+#: An error above the 95 % bound by this factor is not chance, as in `anchors.cross_check`.
 MAX_ERROR_RATIO: Final = 2.0
 #: Older cross-checks say nothing about the present.
 MAX_CROSS_CHECK_AGE_NS: Final = 600_000_000_000

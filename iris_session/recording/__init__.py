@@ -5,7 +5,6 @@ Rerun is imported only where files are written or read, so that the authority st
 
 from iris_session.recording.errors import NotARecordingError, RecorderError, RecordingError
 from iris_session.recording.feed import FeedStats, RecorderFeed
-from iris_session.recording.items import RawSample, State
 from iris_session.recording.journal import (
     CLOSED,
     OPEN,
@@ -21,8 +20,16 @@ from iris_session.recording.journal import (
     unpack_model,
 )
 from iris_session.recording.lock import RecordingInUseError, RecordingLock
-from iris_session.recording.looks import Frame, InForce, Look, Looks, Person, read_looks
+from iris_session.recording.observations import (
+    AlignmentHistory,
+    AlignmentPeriod,
+    RecordedObservation,
+    RecordedParticipant,
+    TrackingFrame,
+    read_alignment_history,
+)
 from iris_session.recording.reader import Recording
+from iris_session.recording.record_batches import RawSample, RecordedState
 from iris_session.recording.supervise import RecorderProcess
 from iris_session.recording.verify import Core, Problem, VerifyReport, verify
 
@@ -45,14 +52,14 @@ __all__ = [
     "FeedStats",
     # reading one
     "Recording",
-    "State",
+    "RecordedState",
     "RawSample",
-    "read_looks",
-    "Looks",
-    "Look",
-    "Frame",
-    "InForce",
-    "Person",
+    "read_alignment_history",
+    "AlignmentHistory",
+    "RecordedObservation",
+    "TrackingFrame",
+    "AlignmentPeriod",
+    "RecordedParticipant",
     "verify",
     "VerifyReport",
     "Problem",

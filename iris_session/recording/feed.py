@@ -2,16 +2,17 @@
 
 Batches of about 20 ms are numbered and kept until the recorder says that they are in the file: first in a window in
 memory, beyond it in a spill file. A recorder that was killed and started anew gets everything that was not yet in the
-file. Only when memory and spill are both full are rows dropped: counted, and told by `take_gap`.
+file. Only when memory and spill are both full are rows dropped: they are counted and reported by `take_gap`.
 
-Vertices of what bends are for the picture only. They go by a socket of their own, nobody keeps them, and those that it
-does not take at once are dropped and counted: they cost the journal nothing.
+Vertices of deformables are for the picture only. They have a socket of their own and are not stored: frames that do not
+fit into its queue are dropped and counted, so they cost the journal nothing.
 """
 
 from __future__ import annotations
 
 import math
 import os
+import struct
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -26,7 +27,7 @@ from iris_session.protocol.common import Applied
 from iris_session.protocol.server_messages import BodyInfo, PresenceItem, Reply
 from iris_session.protocol.steps import Decision
 from iris_session.recording import messages
-from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader, seal
+from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader, seal_keyframe
 from iris_session.recording.messages import (
     Batch,
     DenialRecord,
@@ -37,8 +38,6 @@ from iris_session.recording.messages import (
     StateFrame,
     VertexFrame,
 )
-from iris_session.recording.spill import SpillFile
-from iris_session.recording.vertices import VertexPace
 from iris_session.streams.deformable import read_header
 
 _T = TypeVar("_T")
@@ -50,17 +49,20 @@ WINDOW_BYTES: Final = 16 << 20
 SPILL_BYTES: Final = 2 << 30
 #: Records taken from the spill file per flush: 20 ms of backlog 4 times over, so that a flush stays short.
 UNSPILL_BATCHES: Final = 4
-#: A recorder that writes says so every half second. Longer than this nobody who wants to end waits for its word.
+#: A recorder that writes sends a status every half second. Closing does not wait longer than this for one.
 SILENCE_S: Final = 1.0
 #: Bound on each list of one batch. A flush comes long before; it holds when a caller never takes a step.
 BATCH_ITEMS: Final = 4096
-#: Frames of vertices on their way. The recorder takes them thirty times a second.
+#: Frames of vertices in transit. The recorder receives them thirty times a second.
 VERTEX_FRAMES: Final = 32
 
 
 class FeedStats(msgspec.Struct):
-    """Counters of one feed. `dropped_rows`: rows that are lost for the recording, `dropped_items`: states, events
-    and so on that are, `dropped_vertices`: frames that the picture lacks; `recorder`: its last status."""
+    """Counters of one feed.
+
+    `dropped_rows`: rows missing in the recording; `dropped_items`: states, events and other items missing;
+    `dropped_vertices`: frames missing in the picture; `recorder`: the last status of the recorder.
+    """
 
     rows: int = 0
     batches: int = 0
@@ -110,7 +112,7 @@ class RecorderFeed:
             self._vertices.setsockopt(zmq.LINGER, 0)
             self._vertices.setsockopt(zmq.RECONNECT_IVL, 50)
             self._vertices.connect(vertices_endpoint)
-        self._pace = VertexPace()
+        self._vertex_limit = VertexRateLimit()
         self._header = b""
         self._scene = Batch()  # the newest `SceneModel`, and what the picture is drawn from
         self._next = 0
@@ -121,23 +123,23 @@ class RecorderFeed:
         self._batch = Batch()
         self._batch_since = 0
         self._now = (0, 0)  # step and session time of the newest row
-        self._heard_ns = 0
-        #: Session time in which a recorder that has something to write has said nothing: it may hang.
+        self._last_status_ns = 0
+        #: Session time since the last status of a recorder that has something to write: it may hang.
         self.silence_ns = 0
         self._presence: tuple[PresenceItem, ...] = ()
 
     @property
     def wants_keyframe(self) -> bool:
-        """True once there is room again after a loss: verification can go on from the next keyframe."""
+        """True once there is room again after rows were dropped: verification can continue from the next keyframe."""
         return self._lost and not self._spill and 2 * self.stats.window_bytes <= self._window_limit
 
-    def header(self, header: SessionHeader, root: str = "", scene_hash: str = "") -> None:
-        """Names the session: once, before the first row. `root`, `scene_hash`: see `SceneAssets`."""
+    def send_header(self, header: SessionHeader, root: str = "", scene_hash: str = "") -> None:
+        """Send the header of the session, once, before the first row. `root`, `scene_hash`: see `SceneAssets`."""
         self._header = messages.encode_header(header)
         self._scene.assets = [SceneAssets(-1, 0, root, scene_hash)]
-        self._exchange()
+        self._transfer()
 
-    def scene(
+    def send_scene(
         self,
         model_hash: str,
         packed_model: bytes,
@@ -145,42 +147,44 @@ class RecorderFeed:
         root: str = "",
         scene_hash: str = "",
     ) -> None:
-        """The model of a scene, before the row that loads it. States from then on are of its `bodies`."""
-        self._pace.reset()
+        """Send the model of a scene, before the row that loads it. Later states are of its `bodies`."""
+        self._vertex_limit.reset()
         scene = SceneModel(*self._now, model_hash, packed_model, bodies)
-        self._tell(Batch(scenes=[scene], assets=[SceneAssets(*self._now, root, scene_hash)]))
+        self._send_scene_data(Batch(scenes=[scene], assets=[SceneAssets(*self._now, root, scene_hash)]))
 
-    def patch(self, root: str, scene_hash: str) -> None:
-        """The present scene is drawn in another way from now on, before the row that says so."""
+    def send_patch(self, root: str, scene_hash: str) -> None:
+        """Send a patched specification of the present scene, before the row that patches it."""
         assets = [SceneAssets(*self._now, root, scene_hash)]
-        self._tell(Batch(scenes=self._scene.scenes, assets=assets), Batch(assets=assets))
+        self._send_scene_data(Batch(scenes=self._scene.scenes, assets=assets), Batch(assets=assets))
 
-    def _tell(self, known: Batch, news: Batch | None = None) -> None:
-        """`known`: what a recorder that comes later is to know; `news`: what this one is told, if not all of that."""
+    def _send_scene_data(self, known: Batch, news: Batch | None = None) -> None:
+        """Send scene data. `known`: for recorders that start later; `news`: for the present one, if less than
+        `known`."""
         self.flush()
         self._scene, news = known, known if news is None else news
         self._batch.scenes, self._batch.assets = list(news.scenes), list(news.assets)
         self.flush()
 
-    def row(self, row: JournalRow) -> None:
-        """One step. Flushes after 10 rows or 20 ms of session time."""
+    def add_row(self, row: JournalRow) -> None:
+        """Add the row of one step. Flushes after 10 rows or 20 ms of session time."""
         batch = self._batch
         if not batch.rows:
             self._batch_since = row.now_ns
         batch.rows.append(row)
         self._now = (row.step, row.now_ns)
-        self._heard_ns = self._heard_ns or row.now_ns  # a resumed session does not begin at time zero
+        self._last_status_ns = self._last_status_ns or row.now_ns  # a resumed session does not begin at time zero
         self.stats.rows += 1
         if len(batch.rows) >= BATCH_ROWS or row.now_ns - self._batch_since >= BATCH_NS:
             self.flush()
 
-    def keyframe(self, keyframe: Keyframe, chain: bytes) -> None:
-        """Snapshots after the step of the newest row, whose `chain` is given (`header_root` before the first row)."""
+    def add_keyframe(self, keyframe: Keyframe, chain: bytes) -> None:
+        """Add snapshots after the step of the newest row, whose `chain` is given (`header_root` before the first
+        row)."""
         self._lost = False
-        self._batch.keyframes.append(seal(keyframe, chain))
+        self._batch.keyframes.append(seal_keyframe(keyframe, chain))
         self.flush()
 
-    def state(
+    def add_state(
         self,
         step: int,
         tick: int,
@@ -189,12 +193,13 @@ class RecorderFeed:
         poses: NDArray[np.float64],
         applied: Sequence[Applied] = (),
     ) -> None:
-        """World poses (n_bodies, 7) `x y z qw qx qy qz` of the header's bodies, at the state rate; presence with it."""
+        """Add world poses (n_bodies, 7) `x y z qw qx qy qz` of the header's bodies, at the state rate; presence with
+        it."""
         frame = StateFrame(step, tick, sim_time, session_time, poses.tobytes(), self._presence, tuple(applied))
         self._add(self._batch.states, frame)
 
-    def decision(self, step: int, session_time: int, decision: Decision) -> None:
-        """Events and denials of one step; its presence goes with the next state."""
+    def add_decision(self, step: int, session_time: int, decision: Decision) -> None:
+        """Add events and denials of one step; its presence is sent with the next state."""
         if decision.presence:
             self._presence = decision.presence
         for event in decision.events:
@@ -205,14 +210,16 @@ class RecorderFeed:
                 record = DenialRecord(step, session_time, outgoing.connection, message.denial)
                 self._add(self._batch.denials, record)
 
-    def metric(self, name: str, value: float) -> None:
-        """A scalar at the newest row's step and time, plotted as `/metrics/<name>`."""
+    def add_metric(self, name: str, value: float) -> None:
+        """Add a scalar at the newest row's step and time, plotted as `/metrics/<name>`."""
         self._add(self._batch.metrics, MetricRecord(*self._now, name, float(value)))
 
-    def vertices(self, stream: str, frame: bytes, session_time: int) -> None:
-        """`full` of a deformable's media stream, as it was published with the state of `session_time`. For the picture:
-        not all of them go in (`VertexPace`), and none waits."""
-        if self._vertices is None or not self._pace.take(stream, read_header(frame).n_vertices, session_time):
+    def send_vertices(self, stream: str, frame: bytes, session_time: int) -> None:
+        """Send a frame (level `full`) of a deformable as published with the state of `session_time`, for the picture.
+
+        Frames beyond `VertexRateLimit` are left out, and frames that do not fit into the queue are dropped.
+        """
+        if self._vertices is None or not self._vertex_limit.take(stream, read_header(frame).n_vertices, session_time):
             return
         try:
             self._vertices.send(messages.encode_vertices(VertexFrame(stream, session_time, frame)), zmq.NOBLOCK)
@@ -220,29 +227,36 @@ class RecorderFeed:
             self.stats.dropped_vertices += 1
 
     def take_gap(self) -> int:
-        """Rows lost since the last call: journal them as `Entry(RecordingGap(rows))` and take a keyframe."""
+        """Return the rows dropped since the last call: journal them as `Entry(RecordingGap(rows))` and add a
+        keyframe."""
         rows, self._gap_rows = self._gap_rows, 0
         return rows
 
     def flush(self) -> None:
-        """Numbers the pending batch and hands over what the window allows. Never blocks."""
+        """Number the pending batch and send what the window allows. Never blocks."""
         batch = self._batch
         lists: tuple[list[Any], ...] = (batch.states, batch.events, batch.denials, batch.metrics, batch.keyframes)
         lists += (batch.scenes, batch.assets)
         if batch.rows or any(lists):
             self._batch = Batch(dropped_rows=self.stats.dropped_rows)
             self._enqueue(messages.encode_batch(batch), len(batch.rows), sum(len(items) for items in lists))
-        self._exchange()
-        self.silence_ns = self._now[1] - self._heard_ns if self._window else 0
+        self._transfer()
+        self.silence_ns = self._now[1] - self._last_status_ns if self._window else 0
 
     def close(
         self, timeout_s: float = 5.0, alive: Callable[[], bool] = lambda: True, silence_s: float = math.inf
     ) -> bool:
-        """Hands over everything and waits until it is in the file. False: not all of it is known to be there, after
-        `timeout_s`, or when the recorder is no longer `alive` or has said nothing for `silence_s`
-        (`SILENCE_S`, unless it was just started and is not there yet).
+        """Send everything and wait until it is in the file.
 
-        Without a header nothing was recorded, and there is nothing to wait for. A second call does nothing.
+        Without a header nothing was recorded, and the call does not wait. A second call does nothing.
+
+        Args:
+            timeout_s: Longest wait.
+            alive: Returns whether the recorder process still runs.
+            silence_s: Longest time without a status (`SILENCE_S`, unless the recorder was just started).
+
+        Returns:
+            False if not everything is known to be in the file.
         """
         if self._socket.closed:
             return self._complete
@@ -251,13 +265,13 @@ class RecorderFeed:
         silent, said = 0, self.stats.recorder
         while waits and silent < silence_s / 0.02 and alive() and self._header and (self._window or self._spill):
             self._socket.poll(20)
-            self._exchange()
+            self._transfer()
             waits -= 1
             silent = 0 if self.stats.recorder is not said else silent + 1
             said = self.stats.recorder
         self._complete = not self._window and not self._spill
         if self._spill:
-            self._lose(self._spill.rows, self._spill.others, "the session ended before the recorder could take it all")
+            self._drop(self._spill.rows, self._spill.others, "the session ended before the recorder could take it all")
         self._spill.close()
         if self._vertices is not None:
             self._vertices.close(0)
@@ -277,9 +291,9 @@ class RecorderFeed:
         elif self._spill.push(body, rows, others):
             self.stats.spilled_batches += 1
         else:
-            self._lose(rows, others, self._spill.fault)
+            self._drop(rows, others, self._spill.fault)
 
-    def _lose(self, rows: int, others: int, why: str) -> None:
+    def _drop(self, rows: int, others: int, why: str) -> None:
         self.stats.dropped_rows += rows
         self.stats.dropped_items += others
         self.stats.spill_fault = why
@@ -296,30 +310,30 @@ class RecorderFeed:
         if self._instance and self._header_sent_to == self._instance:
             self._socket.send_multipart((messages.FRAME.pack(messages.BATCH, number), body), zmq.NOBLOCK)
 
-    def _exchange(self) -> None:
+    def _transfer(self) -> None:
         while int(self._socket.get(zmq.EVENTS)) & zmq.POLLIN:
-            self._take(messages.decode_status(self._socket.recv(zmq.NOBLOCK)))
+            self._process_status(messages.decode_status(self._socket.recv(zmq.NOBLOCK)))
         for _ in range(UNSPILL_BATCHES):
             if not self._spill or self.stats.window_bytes >= self._window_limit:
                 break
             try:
                 record = self._spill.pop()
             except OSError as error:  # a disk that fails must not end the session
-                self._lose(self._spill.rows, self._spill.others, f"the spill file cannot be read: {error}")
+                self._drop(self._spill.rows, self._spill.others, f"the spill file cannot be read: {error}")
                 self._spill.close()
                 break
             if record is not None:
                 self._send_batch(record[0])
         self.stats.waiting_in_spill = len(self._spill)
-        self.stats.spilled_bytes = self._spill.waiting_bytes
+        self.stats.spilled_bytes = self._spill.pending_bytes
 
-    def _take(self, status: RecorderStatus) -> None:
+    def _process_status(self, status: RecorderStatus) -> None:
         self.stats.recorder = status
-        self._heard_ns = self._now[1]
+        self._last_status_ns = self._now[1]
         if status.instance != self._instance:
             self._instance = status.instance
             self.stats.recorders += 1
-            self._pace.reset()
+            self._vertex_limit.reset()
         while self._window and self._window[0][0] <= status.written:
             self.stats.window_bytes -= len(self._window.popleft()[1])
         if status.expecting < 0 and self._header and self._header_sent_to != self._instance and not status.fault:
@@ -330,3 +344,140 @@ class RecorderFeed:
             self._socket.send_multipart(head, zmq.NOBLOCK)
             for number, body in self._window:
                 self._socket.send_multipart((messages.FRAME.pack(messages.BATCH, number), body), zmq.NOBLOCK)
+
+
+_HEAD: Final = struct.Struct("<III")  # bytes of the record, rows in it, other items in it
+
+
+class SpillFile:
+    """A bounded first-in first-out queue of byte records in a file, at most `limit_bytes` on disk.
+
+    The file has no name in its folder: nothing stays behind, however the process ends. `rows`, `others`: journal rows
+    and other items in the queue. `fault`: why the last `push` failed.
+    """
+
+    def __init__(self, path: Path, limit_bytes: int) -> None:
+        self._path = path
+        self._limit = limit_bytes
+        self._fd = -1
+        self._read_at = 0
+        self._write_at = 0
+        self._wrap_at = -1  # where the records go on at the beginning of the file; -1: nowhere
+        self.records = 0
+        self.rows = 0
+        self.others = 0
+        self.fault = ""
+
+    def __len__(self) -> int:
+        return self.records
+
+    @property
+    def pending_bytes(self) -> int:
+        """Bytes of all records in the queue."""
+        wrapped = self._wrap_at if self._wrap_at >= 0 else 0
+        return self._write_at - self._read_at + wrapped
+
+    def push(self, data: bytes, rows: int, others: int = 0) -> bool:
+        """Append a record of `rows` journal rows and `others` other items; false if the disk or the limit refuses
+        it."""
+        record = _HEAD.pack(len(data), rows, others) + data
+        at = self._find_room(len(record))
+        if at < 0:
+            self.fault = f"the spill file {self._path} holds its limit of {self._limit >> 20} MiB"
+            return False
+        try:
+            if self._fd < 0:
+                self._path.unlink(missing_ok=True)
+                flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC  # never through a link of another user
+                self._fd = os.open(self._path, flags, 0o600)
+                self._path.unlink()  # no other process reads it, and a killed session leaves nothing behind
+            written = os.pwrite(self._fd, record, at)
+        except OSError as error:
+            self.fault = f"the spill file {self._path} cannot be written: {error.strerror}"
+            return False
+        if written != len(record):  # the disk is full: the next push writes over the partial record
+            self.fault = f"the spill file {self._path} cannot be written: no space left"
+            return False
+        if at < self._write_at:
+            self._wrap_at = self._write_at
+        self._write_at = at + len(record)
+        self.records += 1
+        self.rows += rows
+        self.others += others
+        return True
+
+    def pop(self) -> tuple[bytes, int] | None:
+        """Remove and return the oldest record as `(data, rows)`, `None` if empty. Raises `OSError` if it cannot be
+        read."""
+        if not self.records:
+            return None
+        length, rows, others = _HEAD.unpack(self._read(_HEAD.size, self._read_at))
+        data = self._read(length, self._read_at + _HEAD.size)
+        self._read_at += _HEAD.size + length
+        if self._read_at == self._wrap_at:
+            self._read_at, self._wrap_at = 0, -1
+        self.records -= 1
+        self.rows -= rows
+        self.others -= others
+        if not self.records:
+            self.close()
+        return data, rows
+
+    def _find_room(self, length: int) -> int:
+        """Return the offset for a record of this length: behind the newest, or where records were read; -1 if full."""
+        if self._wrap_at >= 0 or self._write_at + length <= self._limit:
+            end = self._read_at - 1 if self._wrap_at >= 0 else self._limit
+            return self._write_at if self._write_at + length <= end else -1
+        return 0 if length < self._read_at else -1
+
+    def _read(self, n: int, at: int) -> bytes:
+        data = os.pread(self._fd, n, at)
+        if len(data) != n:
+            raise OSError(f"the spill file holds {len(data)} of {n} bytes at {at}")
+        return data
+
+    def close(self) -> None:
+        """Remove the file and its records."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+        self._wrap_at = -1
+        self._read_at = self._write_at = self.records = self.rows = self.others = 0
+
+
+#: Frames a second of one deformable, as long as all of them together fit. People see this as smooth.
+PERIOD_NS: Final = 50_000_000
+#: What vertices may add to the file [bytes/s]: about twice what two people and fifty bodies do.
+BYTES_PER_S: Final = 1_000_000
+#: Of one vertex of one frame in the file: position and normal, float32.
+VERTEX_BYTES: Final = 24
+
+
+class VertexRateLimit:
+    """Limit the frames of deformables in the picture: a rate per deformable, and bytes per second for all of a scene.
+
+    It is applied where vertices are published, so that a frame that is left out costs one comparison.
+    """
+
+    def __init__(self) -> None:
+        self._counts: dict[str, int] = {}
+        self._due_ns: dict[str, int] = {}
+        self._period_ns = PERIOD_NS
+
+    def reset(self) -> None:
+        """Start over: another scene, or a new recorder."""
+        self._counts.clear()
+        self._due_ns.clear()
+        self._period_ns = PERIOD_NS
+
+    def take(self, stream: str, count: int, session_time: int) -> bool:
+        """Return whether a frame of `count` vertices is recorded."""
+        if self._counts.get(stream) != count:
+            self._counts[stream] = count
+            frame_bytes = sum(self._counts.values()) * VERTEX_BYTES
+            self._period_ns = max(PERIOD_NS, frame_bytes * 1_000_000_000 // BYTES_PER_S)
+        if session_time < self._due_ns.get(stream, 0):
+            return False
+        # A frame that is a little late, as states are, does not delay those after it.
+        self._due_ns[stream] = max(self._due_ns.get(stream, 0), session_time - PERIOD_NS // 4) + self._period_ns
+        return True

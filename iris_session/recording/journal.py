@@ -149,10 +149,10 @@ class RowProblem(msgspec.Struct, frozen=True):
 
 def header_root(header: SessionHeader) -> bytes:
     """The chain value before the first row: 16 bytes that bind the rows to this header."""
-    return root_of(_encoder.encode(header))
+    return blob_root(_encoder.encode(header))
 
 
-def root_of(blob: bytes) -> bytes:
+def blob_root(blob: bytes) -> bytes:
     """`header_root` of an encoded header, also of one with fewer fields than ours."""
     return hashlib.blake2b(blob, digest_size=HASH_BYTES).digest()
 
@@ -220,7 +220,7 @@ def check_row(prev_chain: bytes, row: JournalRow) -> RowProblem | None:
     return RowProblem(row.step, "chain", text)
 
 
-def chain_of(prev_chain: bytes, row: JournalRow) -> bytes:
+def compute_chain(prev_chain: bytes, row: JournalRow) -> bytes:
     """The chain value that `row` ought to have; to go on checking after a row whose `chain` was changed."""
     return _rechain(prev_chain, row)
 
@@ -230,7 +230,7 @@ def check_fields(row: JournalRow) -> RowProblem | None:
     return _field_problem(None, row) or _entry_problem(row)
 
 
-def seal(keyframe: Keyframe, chain: bytes) -> Keyframe:
+def seal_keyframe(keyframe: Keyframe, chain: bytes) -> Keyframe:
     """`keyframe` with the chain value of its row and its CRCs."""
     return msgspec.structs.replace(keyframe, chain=chain, crcs=_keyframe_crcs(keyframe, chain))
 

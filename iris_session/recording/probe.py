@@ -83,11 +83,11 @@ class Prober:
     def __init__(self) -> None:
         self._child: _Child | None = None
 
-    def readable(self, path: str | Path) -> bool:
+    def is_readable(self, path: str | Path) -> bool:
         """True when every message of the first recording in `path` decodes."""
         return self._asked(READABLE, path) > 0
 
-    def recordings(self, path: str | Path) -> int:
+    def count_recordings(self, path: str | Path) -> int:
         """How many recordings are in `path`, 0 when that cannot be told. Quick only for a file with an index."""
         return self._asked(RECORDINGS, path)
 

@@ -64,7 +64,7 @@ TRIAL_BYTES: Final = 128 << 10
 _decode_sample = msgspec.msgpack.Decoder(tuple[int, int, bytes]).decode
 
 
-class Recorder:
+class RecorderLoop:
     """The loop of the process. `stop` may be called from a signal handler."""
 
     def __init__(self, config: RecorderConfig) -> None:
@@ -143,7 +143,7 @@ class Recorder:
 
     def _begin_part(self) -> None:
         path = part_path(self._config.path, self._config.part)
-        self._made_folder = claim(Path(path))
+        self._made_folder = claim_file(Path(path))
         try:
             self._writer = RrdWriter(path, self._config.recording_id)
             self._writer.flush()
@@ -226,7 +226,7 @@ class Recorder:
         kind, number = FRAME.unpack(frames[0])
         if kind == HEADER and self._expecting < 0:
             self._header = decode_header(frames[1])
-            self._writer.header(self._header)
+            self._writer.write_header(self._header)
             for known in frames[2:]:
                 self._writer.add(decode_batch(known))
             self._expecting = number
@@ -267,7 +267,7 @@ class Recorder:
             self._samples,
             self._refused,
             self._fault,
-            disk_free(Path(self._writer.path)),
+            get_free_bytes(Path(self._writer.path)),
             self._writer.vertices_refused,
         )
         with suppress(zmq.Again):
@@ -312,7 +312,7 @@ class _Syncer:
                 return
 
 
-def claim(path: Path) -> bool:
+def claim_file(path: Path) -> bool:
     """Creates the folder and the empty file. True: there was no such folder.
 
     Raises `RecorderError`: no right, no space, or a file that exists.
@@ -347,7 +347,7 @@ def _try_to_write(path: Path) -> None:
         os.close(fd)
 
 
-def disk_free(path: Path) -> int:
+def get_free_bytes(path: Path) -> int:
     """Bytes that we may still write on the disk of `path`, at least 1; 0 when the system does not tell."""
     try:
         free = os.statvfs(path)
@@ -362,7 +362,7 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     config = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=RecorderConfig)
     try:
-        recorder = Recorder(config)
+        recorder = RecorderLoop(config)
     except (RecorderError, WriteError) as error:
         print(f"failed: {error}", flush=True)
         sys.stderr.write(f"{FAULT_PREFIX}{error}\n")

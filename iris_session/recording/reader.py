@@ -22,13 +22,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.protocol.server_messages import Event
-from iris_session.recording import items, paths, rrd_file
+from iris_session.recording import paths, rrd_file
+from iris_session.recording import record_batches as items
 from iris_session.recording.errors import NotARecordingError
-from iris_session.recording.items import UNREADABLE, RawSample, State
-from iris_session.recording.joining import count, join, spans
-from iris_session.recording.journal import FORMAT, JournalRow, Keyframe, SessionHeader, open_blob, root_of, unpack_model
+from iris_session.recording.journal import (
+    FORMAT,
+    JournalRow,
+    Keyframe,
+    SessionHeader,
+    blob_root,
+    open_blob,
+    unpack_model,
+)
 from iris_session.recording.messages import DenialRecord, decode_header
 from iris_session.recording.probe import Prober
+from iris_session.recording.record_batches import (
+    UNREADABLE,
+    RawSample,
+    RecordedState,
+    count_joined_rows,
+    group_spans,
+    join_pieces,
+)
 
 _T = TypeVar("_T")
 #: Lines of `damage` at most: a file may be damaged in any number of places.
@@ -62,7 +77,7 @@ class Recording:
                 for path in files:
                     self._add_part(path, prober)
             self.header = self._header(files[0])
-            ends = dict(self._items(paths.END, items.ends))
+            ends = dict(self._items(paths.END, items.decode_ends))
         except BaseException:
             self.close()
             raise
@@ -108,10 +123,10 @@ class Recording:
     def rows(self, after: int | None = None) -> Iterator[JournalRow]:
         """The journal in order, or what comes after a step of it. Where rows are missing, `step` jumps."""
         if after is None:
-            return self._unique(paths.ROWS, items.rows, lambda row: row.chain)
+            return self._unique(paths.ROWS, items.decode_rows, lambda row: row.chain)
 
         def later(batch: Any) -> Iterator[JournalRow]:
-            return items.rows(batch) if max(items.index(batch, paths.STEP)) > after else iter(())
+            return items.decode_rows(batch) if max(items.read_index(batch, paths.STEP)) > after else iter(())
 
         return (row for row in self._unique(paths.ROWS, later, lambda row: row.chain) if row.step > after)
 
@@ -125,43 +140,43 @@ class Recording:
 
     def keyframes(self) -> Iterator[Keyframe]:
         """The keyframes in order."""
-        return self._unique(paths.KEYFRAMES, items.keyframes, lambda keyframe: (keyframe.step, keyframe.chain))
+        return self._unique(paths.KEYFRAMES, items.decode_keyframes, lambda keyframe: (keyframe.step, keyframe.chain))
 
-    def states(self) -> Iterator[State]:
+    def states(self) -> Iterator[RecordedState]:
         """Poses of all bodies at the state rate, with presence and the applied samples."""
         # By steps, not times: the state of the row before a scene is later than that row, by the time that it took.
         # A scene from before the first row has time 0.
-        scenes = (scene for _, scene in self._items(paths.MODELS, items.models))
+        scenes = (scene for _, scene in self._items(paths.MODELS, items.decode_models))
         loaded = [(scene.step if scene.session_time else -1, scene.bodies) for scene in scenes]
         loaded.sort(key=lambda scene: scene[0])
         before = [step for step, _ in loaded]  # the newest step that each was not yet there in
         bodies = [self.header.bodies, *(bodies for _, bodies in loaded)]
-        for state in self._unique(paths.STATE, items.states, lambda state: state.session_time):
+        for state in self._unique(paths.STATE, items.decode_states, lambda state: state.session_time):
             yield state._replace(bodies=bodies[bisect_left(before, state.step)])
 
     def model(self, model_hash: str) -> bytes:
         """Binary form (mjb) of the model of a scene that was loaded in the session, else `LookupError`."""
-        for _, scene in self._items(paths.MODELS, items.models):
+        for _, scene in self._items(paths.MODELS, items.decode_models):
             if scene.model_hash == model_hash:
                 return unpack_model(scene.model)
         raise LookupError(f"the recording does not hold the model {model_hash[:12]} of a scene that was loaded")
 
     def events(self) -> Iterator[Event]:
         """The shared history in order of `event_seq`."""
-        return self._unique(paths.EVENTS, items.events, lambda event: event.event_seq)
+        return self._unique(paths.EVENTS, items.decode_events, lambda event: event.event_seq)
 
     def denials(self) -> Iterator[DenialRecord]:
         """Every typed no, in order."""
-        return (record for _, record in self._unique(paths.DENIALS, items.numbered_denials(), lambda pair: pair))
+        return (record for _, record in self._unique(paths.DENIALS, items.numbered_denial_decoder(), lambda pair: pair))
 
     def samples(self) -> Iterator[RawSample]:
         """Raw messages of clients, in the order of receipt."""
-        return (sample for _, sample in self._items(paths.SAMPLES, items.samples))
+        return (sample for _, sample in self._items(paths.SAMPLES, items.decode_samples))
 
     def metrics(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
         """Per name: session times [ns] and values."""
         found: dict[str, tuple[list[int], list[float]]] = {}
-        for _, scalar in self._items(f"{paths.METRICS}/**", items.scalars):
+        for _, scalar in self._items(f"{paths.METRICS}/**", items.decode_scalars):
             times, values = found.setdefault(scalar.entity.removeprefix(paths.METRICS + "/"), ([], []))
             times.append(scalar.session_time)
             values.append(scalar.value)
@@ -170,7 +185,7 @@ class Recording:
     def changed_spans(self) -> list[str]:
         """Spans of bytes that were changed since the recorder wrote them, wherever in the file; a line each."""
         marks: dict[int, list[rrd_file.Mark]] = {}
-        for part, mark in self._items(paths.MARKS, items.marks):
+        for part, mark in self._items(paths.MARKS, items.decode_marks):
             marks.setdefault(part, []).append(mark)
         return [
             f"{os.path.basename(self.files[part])}: {line}"
@@ -218,30 +233,30 @@ class Recording:
         """Part number and item. What does not decode is left out with the rest of its chunk, and said in `damage`."""
         for i, pieces in self._spans(entity):
             try:
-                yield from ((i, item) for item in decode(join(pieces)))
+                yield from ((i, item) for item in decode(join_pieces(pieces)))
             except UNREADABLE as error:
                 place = f"{os.path.basename(self.files[i])}: {entity}"
                 self._harmed(f"{place} holds something damaged, which is left out: {_said(error)}")
 
     def _count(self, entity: str) -> int:
-        return sum(count(pieces) for _, pieces in self._spans(entity))
+        return sum(count_joined_rows(pieces) for _, pieces in self._spans(entity))
 
     def _spans(self, entity: str) -> Iterator[tuple[int, list[Any]]]:
         """Part number (from 0) and the record batches of some rows of an entity, over all parts in order."""
         for i, path in enumerate(self._readable):
-            for pieces in spans(chunk.to_record_batch() for chunk in rrd_file.chunks(path, entity)):
+            for pieces in group_spans(chunk.to_record_batch() for chunk in rrd_file.read_chunks(path, entity)):
                 yield i, pieces
 
     def _add_part(self, path: str, prober: Prober) -> None:
         """A part that holds nothing (its recorder ended before the first write) is said, not fatal."""
         try:
-            found = rrd_file.scan(path) if os.path.getsize(path) else None
+            found = rrd_file.scan_file(path) if os.path.getsize(path) else None
             if found is None or not (found.messages or found.holes):
                 self.notes.append(f"{os.path.basename(path)}: nothing was written into it")
                 return
             if found.cut:
                 self.cuts.append(f"{os.path.basename(path)}: ends in the middle of a write, at byte {found.good_bytes}")
-            whole = found.good_bytes == found.size and not found.holes and prober.readable(path)
+            whole = found.good_bytes == found.size and not found.holes and prober.is_readable(path)
             readable = path if whole else self._salvaged(path, prober)
         except NotARecordingError as error:
             self._harmed(str(error))
@@ -251,7 +266,7 @@ class Recording:
             return
         if found.indexed:
             self._rewritten.add(readable)
-            if whole and (n := prober.recordings(path)) > 1:
+            if whole and (n := prober.count_recordings(path)) > 1:
                 self._several.append((os.path.basename(path), n))
         self._readable.append(readable)
         self.files.append(path)
@@ -290,21 +305,21 @@ class Recording:
     def _headers(self) -> Iterator[tuple[int, Any]]:
         """The header of each part that has one: a chunk near its beginning, so that nobody need read on."""
         for i, path in enumerate(self._readable):
-            chunk = next(rrd_file.chunks(path, paths.HEADER), None)
+            chunk = next(rrd_file.read_chunks(path, paths.HEADER), None)
             if chunk is not None:
                 yield i, chunk.to_record_batch()
 
     def _header(self, path: str) -> SessionHeader:
         for _, batch in self._headers():
             try:
-                blob, intact = open_blob(items.values(batch, "blob")[0])
+                blob, intact = open_blob(items.read_values(batch, "blob")[0])
                 header = decode_header(blob)
             except UNREADABLE as error:
                 raise NotARecordingError(f"the header of {path} is damaged: {_said(error)}") from error
             if header.format != FORMAT and intact:
                 had = f"{path} was recorded in format {header.format} on {header.created_utc[:10] or 'an unknown day'}"
                 raise NotARecordingError(f"{had}, this iris-session reads format {FORMAT}: use the one that made it")
-            self.root = root_of(blob)
+            self.root = blob_root(blob)
             if intact:
                 self._leave_out_others()
             else:
@@ -318,8 +333,8 @@ class Recording:
         """A part with another header is of another session, whose file has come to lie here."""
         for i, batch in reversed(list(self._headers())):
             with suppress(*UNREADABLE):
-                blob, intact = open_blob(items.values(batch, "blob")[0])
-                if intact and root_of(blob) != self.root:
+                blob, intact = open_blob(items.read_values(batch, "blob")[0])
+                if intact and blob_root(blob) != self.root:
                     self._harmed(f"{os.path.basename(self.files[i])} is of another session, and left out")
                     del self.files[i], self._readable[i]
 

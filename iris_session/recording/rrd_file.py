@@ -36,7 +36,7 @@ GROUP: Final = 256
 WINDOW_BYTES: Final = 1 << 20
 
 
-class Message(NamedTuple):
+class RrdMessage(NamedTuple):
     """`offset` of its head in the file, `length` of its body [bytes]."""
 
     offset: int
@@ -52,7 +52,7 @@ class Scan(NamedTuple):
     recorder does not write: one of Rerun's tools has made it, from one file or several.
     """
 
-    messages: list[Message]
+    messages: list[RrdMessage]
     holes: list[tuple[int, int]]
     good_bytes: int
     size: int
@@ -68,10 +68,10 @@ class Mark(NamedTuple):
     crc: int
 
 
-def scan(path: str | Path) -> Scan:
+def scan_file(path: str | Path) -> Scan:
     """Walks over the messages of a file without decoding them. Raises `NotARecordingError`."""
     size = os.path.getsize(path)
-    found: list[Message] = []
+    found: list[RrdMessage] = []
     holes: list[tuple[int, int]] = []
     with open(path, "rb") as file:
         if file.read(FILE_HEAD)[: len(MAGIC)] != MAGIC:
@@ -107,13 +107,13 @@ def end_of_messages(data: bytes) -> int:
     raise ValueError("a Rerun file without an end")
 
 
-def _message_at(file: BinaryIO, at: int, size: int) -> Message | None:
+def _message_at(file: BinaryIO, at: int, size: int) -> RrdMessage | None:
     file.seek(at)
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size:
         return None
     kind, length = _HEAD.unpack(head)
-    return Message(at, kind, length) if kind <= KIND_LAST and at + _HEAD.size + length <= size else None
+    return RrdMessage(at, kind, length) if kind <= KIND_LAST and at + _HEAD.size + length <= size else None
 
 
 def _next_message(file: BinaryIO, begin: int, size: int) -> int | None:
@@ -138,7 +138,7 @@ def changed_spans(path: str | Path, marks: Sequence[Mark]) -> list[str]:
 
     None of a file that another tool has rewritten: there the marks end nowhere between messages.
     """
-    found = scan(path)
+    found = scan_file(path)
     if found.indexed:
         return []
     ends = {m.offset for m in found.messages} | {found.size}
@@ -161,7 +161,7 @@ def _crc(file: BinaryIO, mark: Mark) -> int:
     return crc
 
 
-def chunks(path: str | Path, entity: str) -> Iterator[Any]:
+def read_chunks(path: str | Path, entity: str) -> Iterator[Any]:
     """Chunks of one entity in the order of the file. It must be readable, see `Prober`.
 
     Raises `NotARecordingError` when it is so no longer.
@@ -183,7 +183,7 @@ def salvage(path: str | Path, copy: str | Path, prober: Prober) -> list[str]:
 
     Raises `NotARecordingError` when nothing is readable.
     """
-    found = scan(path)
+    found = scan_file(path)
     damage = [f"bytes {begin} to {end} hold no message and are left out" for begin, end in found.holes]
     if found.good_bytes < found.size and not found.cut:
         damage.append(f"nothing after byte {found.good_bytes} of {found.size} is readable")
@@ -193,7 +193,7 @@ def salvage(path: str | Path, copy: str | Path, prober: Prober) -> list[str]:
         trial = _Trial(file, infos, Path(folder) / "trial.rrd", prober)
         if not infos or not trial.passes([]):
             raise NotARecordingError(f"{path} holds no recording that can be read")
-        bad: list[Message] = []
+        bad: list[RrdMessage] = []
         others = [m for m in messages if m.kind != KIND_STORE_INFO]
         for i in range(0, len(others), GROUP):
             bad += trial.bad_ones(others[i : i + GROUP])
@@ -206,17 +206,17 @@ def salvage(path: str | Path, copy: str | Path, prober: Prober) -> list[str]:
 class _Trial:
     """Finds the messages of `file` that do not decode, by halving groups of them."""
 
-    def __init__(self, file: BinaryIO, infos: Sequence[Message], path: Path, prober: Prober) -> None:
+    def __init__(self, file: BinaryIO, infos: Sequence[RrdMessage], path: Path, prober: Prober) -> None:
         self._file = file
         self._infos = infos
         self._path = path
         self._prober = prober
 
-    def passes(self, group: Sequence[Message]) -> bool:
+    def passes(self, group: Sequence[RrdMessage]) -> bool:
         _write(self._file, [*self._infos, *group], self._path)
-        return self._prober.readable(self._path)
+        return self._prober.is_readable(self._path)
 
-    def bad_ones(self, group: Sequence[Message]) -> list[Message]:
+    def bad_ones(self, group: Sequence[RrdMessage]) -> list[RrdMessage]:
         if self.passes(group):
             return []
         if len(group) == 1:
@@ -225,7 +225,7 @@ class _Trial:
         return self.bad_ones(group[:half]) + self.bad_ones(group[half:])
 
 
-def _write(file: BinaryIO, messages: Sequence[Message], path: Path) -> None:
+def _write(file: BinaryIO, messages: Sequence[RrdMessage], path: Path) -> None:
     file.seek(0)
     with open(path, "wb") as out:
         out.write(file.read(FILE_HEAD))

@@ -18,7 +18,7 @@ from typing import Any, Final, Protocol
 import msgspec
 
 from iris_session.protocol.entries import Entry, decode_entries
-from iris_session.recording import versions
+from iris_session.recording import environment as versions
 from iris_session.recording.errors import NotARecordingError
 from iris_session.recording.journal import (
     CRASHED,
@@ -28,10 +28,10 @@ from iris_session.recording.journal import (
     Keyframe,
     RowProblem,
     SessionHeader,
-    chain_of,
     check_fields,
     check_keyframe,
     check_row,
+    compute_chain,
 )
 from iris_session.recording.messages import EndMark
 from iris_session.recording.reader import Recording
@@ -159,7 +159,7 @@ def verify(
     with Recording.open(path, warn=False) as recording:
         header = recording.header
         report = VerifyReport(str(path), recording_class=header.recording_class, parts=len(recording.files))
-        report.version_differences = versions.differences(header.versions)
+        report.version_differences = versions.compare_environment(header.versions)
         total = recording.count_rows() if progress else 0
         try:
             core = make_core(header, recording.model) if make_core else None
@@ -230,7 +230,7 @@ class _Run:
         # A changed chain value follows from the one before it, unless it was that one that was changed: see `_check`.
         bad_chain = problem is not None and problem.field == "chain" and self._chain is not None
         self._stored_chain = row.chain if bad_chain else None
-        self._chain = chain_of(self._chain, row) if bad_chain and self._chain is not None else row.chain
+        self._chain = compute_chain(self._chain, row) if bad_chain and self._chain is not None else row.chain
         self._simulate(row, compare=problem is None or problem.field != "digest")
         self._meet_keyframe(self.last_step)
 

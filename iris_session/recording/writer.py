@@ -1,18 +1,21 @@
-"""Writes one part of a recording into a Rerun file: journal and raw data exactly, and a picture of the session.
+"""Write one part of a recording into a Rerun file: journal and raw data exactly, and a picture of the session.
 
-Moving bodies and people are rows of `/tf` (one transform per body and change, named frames as in ROS); geometry stands
-still in those frames, vertices of what bends do not. Exact float64 poses, raw samples and the journal lie beside it as
-plain columns.
+Moving bodies and devices of participants are rows of `/tf` (one transform per body and change, named frames as in ROS);
+geometry is fixed in those frames, except vertices of deformables. Exact float64 poses, raw samples and the journal are
+plain columns beside it. `RrdStream` appends the bytes, `describe_...` make the lines that the viewer shows.
 """
 
 from __future__ import annotations
 
+import os
+import zlib
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -23,9 +26,20 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.common import Applied
 from iris_session.protocol.names import Device
-from iris_session.protocol.server_messages import BodyInfo, Event
-from iris_session.recording import paths, scene
-from iris_session.recording.columns import blobs, each, lists, matrix, nanoseconds, sequence
+from iris_session.protocol.server_messages import (
+    BodyInfo,
+    ConsentRequested,
+    EpisodeChanged,
+    EStopChanged,
+    Event,
+    Gap,
+    Handover,
+    Notice,
+    ParticipantLeft,
+    SamplesRejected,
+)
+from iris_session.recording import paths
+from iris_session.recording import scene_geometry as scene
 from iris_session.recording.errors import WriteError
 from iris_session.recording.journal import SessionHeader, seal_blob
 from iris_session.recording.messages import (
@@ -40,9 +54,8 @@ from iris_session.recording.messages import (
     encode_header,
     encode_scene,
 )
-from iris_session.recording.pictures import Moment, ScenePicture, Source, entity_part
-from iris_session.recording.rrd_stream import RrdStream
-from iris_session.recording.text import describe_denial, describe_event, describe_session
+from iris_session.recording.picture import Moment, ScenePicture, SceneSource, escape_entity_part
+from iris_session.recording.rrd_file import END_MESSAGE, FILE_HEAD, MAGIC, Mark, end_of_messages
 from iris_session.streams.errors import StreamError
 
 #: Colours of participants in the order of their appearance.
@@ -52,7 +65,7 @@ LATENCIES_NS = 1_000_000_000
 #: States whose moments are known to vertices that come later: 4 s at 60 Hz.
 KNOWN_MOMENTS = 256
 #: Frames of vertices that may wait for the states that they were published with.
-WAITING_VERTICES = 256
+MAX_PENDING_VERTICES = 256
 _encode = msgspec.msgpack.Encoder().encode
 
 
@@ -64,7 +77,7 @@ class RrdWriter:
         self.path = str(path)
         self._stream = RrdStream(self.path, paths.APPLICATION, recording_id)
         self._rec = self._stream.recording
-        self._rec.send_blueprint(_blueprint())
+        self._rec.send_blueprint(_build_blueprint())
         self._picture = ScenePicture(self._rec)
         self._pending = Batch()
         self._samples: list[tuple[int, int, bytes]] = []
@@ -84,80 +97,80 @@ class RrdWriter:
         self._people: dict[str, tuple[int, int, int]] = {}
         self._devices: dict[tuple[str, str], int] = {}  # newest capture time drawn
 
-    def header(self, header: SessionHeader) -> None:
+    def write_header(self, header: SessionHeader) -> None:
         """Writes the header and the scene. Must come before the first flush with data."""
         self._rec.send_recording_name(header.session_name)
-        self._static(paths.HEADER, rr.AnyValues(blob=pa.array([seal_blob(encode_header(header))], pa.binary())))
-        self._static(paths.INFO, rr.TextDocument(describe_session(header), media_type="text/markdown"))
-        self._use(header.bodies)
+        self._log_static(paths.HEADER, rr.AnyValues(blob=pa.array([seal_blob(encode_header(header))], pa.binary())))
+        self._log_static(paths.INFO, rr.TextDocument(describe_session(header), media_type="text/markdown"))
+        self._set_bodies(header.bodies)
         root = rr.Transform3D(parent_frame="tf#/", child_frame=scene.WORLD)  # tf#/: frame of the root entity
-        self._static(paths.TRANSFORMS + "_static", root)
-        self._static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        self._log_static(paths.TRANSFORMS + "_static", root)
+        self._log_static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         if header.model:
-            self._picture.begin(Source(header.model, header.bodies))
+            self._picture.set_scene(SceneSource(header.model, header.bodies))
 
-    def _use(self, bodies: tuple[BodyInfo, ...]) -> None:
+    def _set_bodies(self, bodies: tuple[BodyInfo, ...]) -> None:
         self._bodies = bodies
         self._moving = np.array([i for i, body in enumerate(bodies) if body.moving], np.intp)
         self._frames = [bodies[i].name for i in self._moving]
         self._last_poses = None
 
     def add(self, batch: Batch) -> None:
-        """Collects one batch of the authority. States of one flush are of one scene."""
+        """Collect one batch of the authority. States of one flush are of one scene."""
         if batch.scenes or batch.assets:
             self.flush()
-            self._scenes(batch.scenes, batch.assets)
+            self._write_scenes(batch.scenes, batch.assets)
         pending = self._pending
         for name in ("rows", "states", "events", "denials", "metrics", "keyframes"):
             getattr(pending, name).extend(getattr(batch, name))
 
     def add_sample(self, connection: int, receive_ns: int, data: bytes) -> None:
-        """Collects one raw message of a client, as it came."""
+        """Collect one raw message of a client, as received."""
         self._samples.append((connection, receive_ns, data))
 
     def add_vertices(self, frame: VertexFrame) -> None:
-        """Collects what moved of one deformable. Of too many that wait, the oldest are given up."""
-        if len(self._vertices) >= WAITING_VERTICES:
+        """Collect a frame of a deformable. If too many are pending, the oldest is dropped."""
+        if len(self._vertices) >= MAX_PENDING_VERTICES:
             self._vertices.popleft()
             self.vertices_refused += 1
         self._vertices.append(frame)
 
     def flush(self, timeout_s: float = 10.0) -> None:
-        """Writes what was collected. Raises `WriteError`; the file is then good up to an earlier flush."""
+        """Write everything collected. Raises `WriteError`; the file is then valid up to an earlier flush."""
         batch, self._pending = self._pending, Batch()
         samples, self._samples = self._samples, []
         try:
-            self._rows(batch)
-            self._keyframes(batch)
+            self._write_rows(batch)
+            self._write_keyframes(batch)
             for _, states in groupby(batch.states, key=lambda state: len(state.poses)):
-                self._states(list(states))
-            self._events(batch.events)
-            self._denials(batch.denials)
-            self._metrics(batch.metrics)
-            self._raw_samples(samples)
-            self._bends()
+                self._write_states(list(states))
+            self._write_events(batch.events)
+            self._write_denials(batch.denials)
+            self._write_metrics(batch.metrics)
+            self._write_samples(samples)
+            self._write_vertices()
             self._stream.write(timeout_s)
             if batch.keyframes:
-                self._mark()
+                self._write_mark()
         except (RuntimeError, ValueError, OSError) as error:
-            raise self._fault(error) from error
+            raise self._to_error(error) from error
 
     def close(self) -> None:
-        """Writes the rest and the end mark, and closes the file. Raises `WriteError`."""
+        """Write the rest and the end mark, and close the file. Raises `WriteError`."""
         self._write_latencies()
         self.flush()
-        self._picture.draw((-1, 0, 0, 0))  # without a state: it is to be seen all the same
+        self._picture.draw((-1, 0, 0, 0))  # without a state the scene is drawn nevertheless
         self.flush()
-        self._mark()
+        self._write_mark()
         mark = EndMark(*self._newest_row)
-        self._static(paths.END, rr.AnyValues(end=pa.array([_encode(mark)], pa.binary())))
+        self._log_static(paths.END, rr.AnyValues(end=pa.array([_encode(mark)], pa.binary())))
         self.flush()
         try:
             self._stream.close()
         except OSError as error:
-            raise self._fault(error) from error
+            raise self._to_error(error) from error
 
-    def _fault(self, error: Exception) -> WriteError:
+    def _to_error(self, error: Exception) -> WriteError:
         said = (isinstance(error, OSError) and error.strerror) or " ".join(str(error).split())
         return WriteError(f"{self.path} cannot be written: {said}")
 
@@ -166,59 +179,61 @@ class RrdWriter:
         """Bytes in the file so far."""
         return self._stream.size
 
-    def _mark(self) -> None:
-        times = [sequence(paths.STEP, [self._newest_row[0]])]
-        self._send(paths.MARKS, times, [blobs("mark", [_encode(self._stream.mark())])])
+    def _write_mark(self) -> None:
+        times = [sequence_index(paths.STEP, [self._newest_row[0]])]
+        self._send_columns(paths.MARKS, times, [bytes_column("mark", [_encode(self._stream.mark())])])
 
-    def _static(self, entity: str, *values: Any) -> None:
+    def _log_static(self, entity: str, *values: Any) -> None:
         self._rec.log(entity, *values, static=True, strict=True)
 
-    def _send(self, entity: str, times: Sequence[Any], columns: Sequence[Any]) -> None:
+    def _send_columns(self, entity: str, times: Sequence[Any], columns: Sequence[Any]) -> None:
         rr.send_columns(entity, times, columns, recording=self._rec, strict=True)
 
-    def _rows(self, batch: Batch) -> None:
+    def _write_rows(self, batch: Batch) -> None:
         rows = batch.rows
         if not rows:
             return
         columns = [
-            each("n_ticks", [row.n_ticks for row in rows], pa.int64()),
-            blobs("entries", [row.entries for row in rows]),
-            lists("entry_lengths", [row.entry_lengths for row in rows], pa.uint32()),
-            lists("entry_crcs", [row.entry_crcs for row in rows], pa.uint32()),
-            blobs("digest", [row.digest for row in rows]),
-            blobs("chain", [row.chain for row in rows]),
-            lists("field_crcs", [row.field_crcs for row in rows], pa.uint32()),
+            scalar_column("n_ticks", [row.n_ticks for row in rows], pa.int64()),
+            bytes_column("entries", [row.entries for row in rows]),
+            list_column("entry_lengths", [row.entry_lengths for row in rows], pa.uint32()),
+            list_column("entry_crcs", [row.entry_crcs for row in rows], pa.uint32()),
+            bytes_column("digest", [row.digest for row in rows]),
+            bytes_column("chain", [row.chain for row in rows]),
+            list_column("field_crcs", [row.field_crcs for row in rows], pa.uint32()),
         ]
         if any(row.plant for row in rows):
-            columns.append(blobs("plant", [row.plant for row in rows]))
+            columns.append(bytes_column("plant", [row.plant for row in rows]))
         times = [
-            sequence(paths.STEP, [row.step for row in rows]),
-            nanoseconds(paths.SESSION_TIME, [row.now_ns for row in rows]),
+            sequence_index(paths.STEP, [row.step for row in rows]),
+            duration_index(paths.SESSION_TIME, [row.now_ns for row in rows]),
         ]
-        self._send(paths.ROWS, times, columns)
+        self._send_columns(paths.ROWS, times, columns)
         self._newest_row = (rows[-1].step, rows[-1].chain)
 
-    def _scenes(self, scenes: list[SceneModel], assets: list[SceneAssets]) -> None:
-        """Models for verification, and the picture from here on."""
+    def _write_scenes(self, scenes: list[SceneModel], assets: list[SceneAssets]) -> None:
+        """Write models for verification, and change the picture."""
         if scenes:
-            times = [sequence(paths.STEP, [s.step for s in scenes])]
-            self._send(paths.MODELS, times, [blobs("scene", [seal_blob(encode_scene(s)) for s in scenes])])
+            times = [sequence_index(paths.STEP, [s.step for s in scenes])]
+            self._send_columns(
+                paths.MODELS, times, [bytes_column("scene", [seal_blob(encode_scene(s)) for s in scenes])]
+            )
         for loaded in scenes:
-            self._use(loaded.bodies)
+            self._set_bodies(loaded.bodies)
             self._last_step = loaded.step if loaded.session_time else self._last_step
-            source = Source(loaded.model, loaded.bodies, *assets[-1:])
-            self._picture.change(source, (loaded.step, *self._clock, loaded.session_time))
+            source = SceneSource(loaded.model, loaded.bodies, *assets[-1:])
+            self._picture.replace_scene(source, (loaded.step, *self._clock, loaded.session_time))
         for patch in () if scenes else assets:
-            self._picture.patch(patch, (patch.step, *self._clock, patch.session_time))
+            self._picture.patch_scene(patch, (patch.step, *self._clock, patch.session_time))
 
-    def _keyframes(self, batch: Batch) -> None:
+    def _write_keyframes(self, batch: Batch) -> None:
         frames = batch.keyframes
         if not frames:
             return
-        times = [sequence(paths.STEP, [k.step for k in frames])]
-        self._send(paths.KEYFRAMES, times, [blobs("keyframe", [_encode(k) for k in frames])])
+        times = [sequence_index(paths.STEP, [k.step for k in frames])]
+        self._send_columns(paths.KEYFRAMES, times, [bytes_column("keyframe", [_encode(k) for k in frames])])
 
-    def _states(self, states: list[StateFrame]) -> None:
+    def _write_states(self, states: list[StateFrame]) -> None:
         if not states:
             return
         poses = np.stack([np.frombuffer(s.poses, np.float64).reshape(-1, 7) for s in states])
@@ -227,44 +242,47 @@ class RrdWriter:
         self._picture.draw((step, 0, min(0, sim_ns), session_ns))  # a reset begins ticks and simulated time again
         times = np.array(moments, np.int64).T
         columns = [
-            matrix("poses", poses.reshape(len(states), -1)),
-            each("sim_time_s", [s.sim_time for s in states], pa.float64()),
-            blobs("presence", [_encode(s.presence) for s in states]),
-            blobs("applied", [_encode(s.applied) for s in states]),
+            matrix_column("poses", poses.reshape(len(states), -1)),
+            scalar_column("sim_time_s", [s.sim_time for s in states], pa.float64()),
+            bytes_column("presence", [_encode(s.presence) for s in states]),
+            bytes_column("applied", [_encode(s.applied) for s in states]),
         ]
-        self._send(paths.STATE, _times(times), columns)
+        self._send_columns(paths.STATE, _time_columns(times), columns)
         self._note_latencies(states)
-        if poses.shape[1] == len(self._bodies):  # a new recorder gets what was on its way of the scene before, too
-            self._transforms(states, poses, times)
+        if poses.shape[1] == len(self._bodies):  # a new recorder also gets pending states of the scene before
+            self._write_transforms(states, poses, times)
         self._clock = moments[-1][1:3]
         self._known.extend(moments)
 
-    def _bends(self) -> None:
-        """Vertices whose states are in the file. What is of another scene than is drawn now is refused."""
+    def _write_vertices(self) -> None:
+        """Write vertices whose states are in the file. Frames of another scene than the drawn one are refused."""
         times = [moment[3] for moment in self._known]
         rows: dict[str, list[tuple[Moment, Any]]] = {}
         while self._vertices and times and self._vertices[0].session_time <= times[-1]:
             frame = self._vertices.popleft()
             at = bisect_right(times, frame.session_time) - 1
-            bending = self._picture.bending.get(frame.stream)
-            if bending is None:  # hidden, or said to be not drawn
+            bending = self._picture.deformables.get(frame.stream)
+            if bending is None:  # hidden, or reported as not drawn
                 continue
             try:
-                # The state of that step is later than its row, by the time that the step took: times do not tell.
+                # The state of a step is later than its row, by the duration of the step, so times cannot be compared.
                 late = at < 0 or frame.session_time < self._picture.since_ns or self._known[at][0] <= self._last_step
-                vertices = None if late else bending.taken(frame.frame)
+                vertices = None if late else bending.decode_frame(frame.frame)
             except StreamError:
                 late, vertices = True, None
             self.vertices_refused += late
             if vertices is not None:
                 rows.setdefault(frame.stream, []).append(((*self._known[at][:3], frame.session_time), vertices))
         for stream, taken in rows.items():
-            bending = self._picture.bending[stream]
+            bending = self._picture.deformables[stream]
             moments = np.array([moment for moment, _ in taken], np.int64).T
-            self._send(bending.entity, _times(moments), [*bending.columns([row for _, row in taken])])
+            self._send_columns(
+                bending.entity, _time_columns(moments), [*bending.build_columns([row for _, row in taken])]
+            )
 
     def _note_latencies(self, states: list[StateFrame]) -> None:
-        """For the plots: from the capture of a sample to the step that it entered, per robot. Written once a second."""
+        """Record latencies for the plots, written once a second: from the capture of a sample to its step, per
+        robot."""
         for state in states:
             for applied in state.applied:
                 if self._applied.get(applied.robot) != applied:
@@ -278,10 +296,10 @@ class RrdWriter:
 
     def _write_latencies(self) -> None:
         latencies, self._latencies = self._latencies, []
-        self._metrics(latencies)
+        self._write_metrics(latencies)
 
-    def _transforms(self, states: list[StateFrame], poses: NDArray[np.float64], times: NDArray[np.int64]) -> None:
-        """One row per body that changed in a frame, and per device of a person that has a new pose."""
+    def _write_transforms(self, states: list[StateFrame], poses: NDArray[np.float64], times: NDArray[np.int64]) -> None:
+        """Write a row per body that changed in a frame, and per device of a participant that has a new pose."""
         moving = poses[:, self._moving]
         before = np.empty_like(moving)
         before[1:] = moving[:-1]
@@ -290,7 +308,7 @@ class RrdWriter:
         frame, body = np.nonzero((moving != before).any(axis=2))
         values = moving[frame, body]
         names = [self._frames[i] for i in body]
-        people = self._people_rows(states)
+        people = self._list_device_rows(states)
         if people:
             frame = np.concatenate([frame, np.array([row[0] for row in people], np.intp)])
             values = np.concatenate([values, np.array([row[2] for row in people], np.float64)])
@@ -303,82 +321,82 @@ class RrdWriter:
             child_frame=names,
             parent_frame=[scene.WORLD] * len(names),
         )
-        self._send(paths.TRANSFORMS, _times(times[:, frame]), [*columns])
+        self._send_columns(paths.TRANSFORMS, _time_columns(times[:, frame]), [*columns])
 
-    def _people_rows(self, states: list[StateFrame]) -> list[tuple[int, str, tuple[float, ...]]]:
+    def _list_device_rows(self, states: list[StateFrame]) -> list[tuple[int, str, tuple[float, ...]]]:
         rows: list[tuple[int, str, tuple[float, ...]]] = []
         for i, state in enumerate(states):
             for item in state.presence:
                 key = (item.participant, item.device)
                 if key not in self._devices:
-                    self._introduce(*key)
+                    self._write_device(*key)
                 elif item.capture_ns and item.capture_ns == self._devices[key]:
                     continue
                 self._devices[key] = item.capture_ns
                 rows.append((i, _presence_frame(*key), (*item.pose.p, *item.pose.q)))
         return rows
 
-    def _introduce(self, participant: str, device: str) -> None:
-        """Static geometry of a device that appears for the first time: a box for a head, a ball for a hand."""
+    def _write_device(self, participant: str, device: str) -> None:
+        """Write static geometry of a device that appears for the first time: a box for a head, a ball for a hand."""
         color = self._people.setdefault(participant, PALETTE[len(self._people) % len(PALETTE)])
         frame = rr.CoordinateFrame(_presence_frame(participant, device))
-        entity = f"{paths.PRESENCE}/{entity_part(participant)}/{entity_part(device)}"
+        entity = f"{paths.PRESENCE}/{escape_entity_part(participant)}/{escape_entity_part(device)}"
         solid = rr.components.FillMode.Solid
         if device == Device.HEAD:
             shape = rr.Boxes3D(half_sizes=[(0.06, 0.09, 0.05)], colors=[color], labels=[participant], fill_mode=solid)
         else:
             shape = rr.Ellipsoids3D(half_sizes=[(0.05, 0.03, 0.03)], colors=[color], fill_mode=solid)
-        self._static(entity, frame, shape)
+        self._log_static(entity, frame, shape)
 
-    def _events(self, events: list[Event]) -> None:
+    def _write_events(self, events: list[Event]) -> None:
         if not events:
             return
         lines = [describe_event(event) for event in events]
         text = rr.TextLog.columns(text=[line.text for line in lines], level=[line.level for line in lines])
-        columns = [*text, blobs("event", [_encode(event) for event in events])]
-        times = self._moments([e.step for e in events], [e.session_time for e in events])
-        self._send(paths.EVENTS, times, columns)
+        columns = [*text, bytes_column("event", [_encode(event) for event in events])]
+        times = self._to_times([e.step for e in events], [e.session_time for e in events])
+        self._send_columns(paths.EVENTS, times, columns)
 
-    def _denials(self, denials: list[DenialRecord]) -> None:
+    def _write_denials(self, denials: list[DenialRecord]) -> None:
         if not denials:
             return
         lines = [describe_denial(record) for record in denials]
         text = rr.TextLog.columns(text=[line.text for line in lines], level=[line.level for line in lines])
-        columns = [*text, blobs("denial", [_encode(record) for record in denials])]
-        times = self._moments([d.step for d in denials], [d.session_time for d in denials])
-        self._send(paths.DENIALS, times, columns)
+        columns = [*text, bytes_column("denial", [_encode(record) for record in denials])]
+        times = self._to_times([d.step for d in denials], [d.session_time for d in denials])
+        self._send_columns(paths.DENIALS, times, columns)
 
-    def _metrics(self, metrics: list[MetricRecord]) -> None:
+    def _write_metrics(self, metrics: list[MetricRecord]) -> None:
         by_name: dict[str, list[MetricRecord]] = {}
         for record in metrics:
             by_name.setdefault(record.name, []).append(record)
         for name, records in by_name.items():
-            times = self._moments([r.step for r in records], [r.session_time for r in records])
+            times = self._to_times([r.step for r in records], [r.session_time for r in records])
             values = rr.Scalars.columns(scalars=[r.value for r in records])
-            self._send(f"{paths.METRICS}/{name}", times, [*values])
+            self._send_columns(f"{paths.METRICS}/{name}", times, [*values])
 
-    def _raw_samples(self, samples: list[tuple[int, int, bytes]]) -> None:
+    def _write_samples(self, samples: list[tuple[int, int, bytes]]) -> None:
         if not samples:
             return
         columns = [
-            each("connection", [s[0] for s in samples], pa.int64()),
-            blobs("data", [s[2] for s in samples]),
+            scalar_column("connection", [s[0] for s in samples], pa.int64()),
+            bytes_column("data", [s[2] for s in samples]),
         ]
-        self._send(paths.SAMPLES, [nanoseconds(paths.SESSION_TIME, [s[1] for s in samples])], columns)
+        self._send_columns(paths.SAMPLES, [duration_index(paths.SESSION_TIME, [s[1] for s in samples])], columns)
 
-    def _moments(self, steps: list[int], session_times: list[int]) -> list[Any]:
+    def _to_times(self, steps: list[int], session_times: list[int]) -> list[Any]:
         moments = [(step, *self._clock, now_ns) for step, now_ns in zip(steps, session_times, strict=True)]
-        return _times(np.array(moments, np.int64).T)
+        return _time_columns(np.array(moments, np.int64).T)
 
 
-def _times(times: NDArray[np.int64]) -> list[Any]:
+def _time_columns(times: NDArray[np.int64]) -> list[Any]:
     """`times` (4, rows): step, tick, sim_time [ns], session_time [ns]."""
     step, tick, sim_ns, session_ns = times
     return [
-        sequence(paths.STEP, step),
-        sequence(paths.TICK, tick),
-        nanoseconds(paths.SIM_TIME, sim_ns),
-        nanoseconds(paths.SESSION_TIME, session_ns),
+        sequence_index(paths.STEP, step),
+        sequence_index(paths.TICK, tick),
+        duration_index(paths.SIM_TIME, sim_ns),
+        duration_index(paths.SESSION_TIME, session_ns),
     ]
 
 
@@ -386,10 +404,195 @@ def _presence_frame(participant: str, device: str) -> str:
     return f"presence/{participant}/{device}"
 
 
-def _blueprint() -> Any:
+def _build_blueprint() -> Any:
     view = rrb.Spatial3DView(origin="/", name="scene", contents=["+ /**", "- /journal/**", "- /samples"])
     log = rrb.TextLogView(origin="/", name="events", contents=[f"+ {paths.EVENTS}", f"+ {paths.DENIALS}"])
     plots = rrb.TimeSeriesView(origin=paths.METRICS, name="metrics")
     about = rrb.TextDocumentView(origin=paths.INFO, name="session")
     side = rrb.Vertical(log, plots, about)
     return rrb.Blueprint(rrb.Horizontal(view, side, column_shares=[2, 1]), collapse_panels=True)
+
+
+# --- file -------------------------------------------------------------------------------------------------------------
+# #
+# Rerun encodes the messages, `RrdStream` appends them to the file.
+#
+# Rerun's own file sink keeps some 4 KB in memory per chunk, for a footer with an index: 0.1-0.2 MiB/s of a session.
+# Here the encoded bytes are taken out of the stream at every write, and what is only for a footer is left out; so
+# memory does not grow, and an error of the disk is an error of ours. `rerun rrd optimize` makes a copy with such an
+# index.
+
+#: The stream's own batcher never acts: the writer sends whole columns, and `write` takes them.
+_BATCHER: Final = rr.ChunkBatcherConfig(flush_tick=3600.0, flush_num_bytes=1 << 30)
+
+
+class RrdStream:
+    """A new file. Data logged to `recording` is in it after `write`.
+
+    All methods may raise `OSError` (the disk), `RuntimeError` and `ValueError` (Rerun).
+    """
+
+    def __init__(self, path: str, application: str, recording_id: str) -> None:
+        self.recording = rr.RecordingStream(application, recording_id=recording_id, batcher_config=_BATCHER)
+        self._encoded = self.recording.binary_stream()
+        self._file: Any = open(path, "wb", buffering=0)  # noqa: SIM115 - closed by `close`
+        self.size = 0  # bytes in the file
+        self._marked = 0  # bytes of the file that marks cover
+        self._crc = 0  # of the bytes after them
+
+    def write(self, timeout_s: float) -> None:
+        """Append the data logged since the last call, all or nothing, and hand it to the operating system."""
+        data = self._encoded.read(flush=True, flush_timeout_sec=timeout_s)
+        if not data:
+            return
+        if data[: len(MAGIC)] != MAGIC:
+            raise ValueError("this version of Rerun encodes its messages in another way")
+        self._append(memoryview(data)[FILE_HEAD if self.size else 0 : end_of_messages(data)])
+
+    def mark(self) -> Mark:
+        """Return the CRC-32 of all bytes since the last mark, so that any later change of them is found."""
+        mark = Mark(self._marked, self.size, self._crc)
+        self._marked, self._crc = self.size, 0
+        return mark
+
+    def close(self) -> None:
+        """End the file after the last `write` with the message that marks its end."""
+        self._append(memoryview(END_MESSAGE))
+        self._file.close()
+        self.recording.disconnect()
+
+    def _append(self, data: memoryview) -> None:
+        rest = data
+        try:
+            while rest:
+                rest = rest[self._file.write(rest) :]
+        except OSError:
+            with suppress(OSError):  # half a message would confuse readers
+                os.ftruncate(self._file.fileno(), self.size)
+            self._file.close()
+            raise
+        self.size += len(data)
+        self._crc = zlib.crc32(data, self._crc)
+
+
+# --- Arrow columns for `rerun.send_columns`, built without a Python object per value where rows are many --------------
+
+
+class ArrowColumn:
+    """One component column: `values` is an Arrow list array with one list per row."""
+
+    def __init__(self, name: str, values: Any) -> None:
+        self._descriptor = rr.ComponentDescriptor(name)
+        self._values = values
+
+    def component_descriptor(self) -> Any:
+        """Return the name of the component in the file."""
+        return self._descriptor
+
+    def as_arrow_array(self) -> Any:
+        """Return the rows."""
+        return self._values
+
+
+def scalar_column(name: str, values: Any, kind: Any) -> ArrowColumn:
+    """Return a column of one value of Arrow type `kind` per row."""
+    array = pa.array(values, kind)
+    return ArrowColumn(name, pa.ListArray.from_arrays(pa.array(np.arange(len(array) + 1, dtype=np.int32)), array))
+
+
+def bytes_column(name: str, values: Iterable[bytes]) -> ArrowColumn:
+    """Return a column of one byte string per row."""
+    return scalar_column(name, list(values), pa.binary())
+
+
+def list_column(name: str, values: Sequence[Sequence[int]], kind: Any) -> ArrowColumn:
+    """Return a column of a list of integers per row."""
+    flat = [item for row in values for item in row]
+    offsets = np.zeros(len(values) + 1, np.int32)
+    np.cumsum([len(row) for row in values], out=offsets[1:])
+    return ArrowColumn(name, pa.ListArray.from_arrays(pa.array(offsets), pa.array(flat, kind)))
+
+
+def matrix_column(name: str, values: NDArray[np.float64]) -> ArrowColumn:
+    """Return a column of a list of float64 per row of `values` (rows, items)."""
+    rows, items = values.shape
+    offsets = np.arange(rows + 1, dtype=np.int32) * items
+    return ArrowColumn(name, pa.ListArray.from_arrays(pa.array(offsets), pa.array(values.ravel())))
+
+
+def sequence_index(timeline: str, values: Any) -> Any:
+    """Return an integer index."""
+    return rr.TimeColumn(timeline, sequence=np.asarray(values, np.int64))
+
+
+def duration_index(timeline: str, values: Any) -> Any:
+    """Return an index of durations from integer nanoseconds, exactly."""
+    return rr.TimeColumn(timeline, duration=np.asarray(values, np.int64).view("timedelta64[ns]"))
+
+
+# --- text for the viewer ----------------------------------------------------------------------------------------------
+
+
+class LogLine(NamedTuple):
+    """`level`: a Rerun log level (`INFO`, `WARN`, `CRITICAL`)."""
+
+    level: str
+    text: str
+
+
+_LEVELS: dict[type, str] = {
+    EStopChanged: "CRITICAL",
+    Gap: "ERROR",
+    Notice: "WARN",
+    SamplesRejected: "WARN",
+    ParticipantLeft: "WARN",
+    ConsentRequested: "INFO",
+    EpisodeChanged: "INFO",
+    Handover: "INFO",
+}
+
+
+def describe_event(event: Event) -> LogLine:
+    """Return `#12 lease_changed target=left holder=p1 ...`: the number, the kind, and every field with a value."""
+    body: dict[str, Any] = msgspec.to_builtins(event.body)
+    kind = body.pop("event")
+    fields = " ".join(_list_fields(body))
+    return LogLine(_LEVELS.get(type(event.body), "INFO"), f"#{event.event_seq} {kind} {fields}".rstrip())
+
+
+def describe_denial(record: DenialRecord) -> LogLine:
+    """Return who was denied what, why, and the advice."""
+    denial = record.denial
+    parts = [f"connection {record.connection}: {denial.reason}: {denial.message}"]
+    if denial.holder:
+        parts.append(f"held by {denial.holder_name or denial.holder}")
+    if denial.advice:
+        parts.append(denial.advice)
+    return LogLine("WARN", "; ".join(parts))
+
+
+def describe_session(header: SessionHeader) -> str:
+    """Return a Markdown page about the recording."""
+    versions = "\n".join(f"| {name} | {value} |" for name, value in header.versions.items())
+    return (
+        f"# {header.session_name}\n\n"
+        f"Session `{header.session_id}`, class **{header.recording_class}**, {header.created_utc}\n\n"
+        f"Robots: {', '.join(r.name for r in header.robots) or 'none'}. "
+        f"Objects: {', '.join(o.name for o in header.objects) or 'none'}. "
+        f"Bodies: {len(header.bodies)}. Tick: {header.tick_period_ns / 1e6:g} ms.\n\n"
+        f"| library | version |\n|---|---|\n{versions}\n"
+    )
+
+
+def _list_fields(body: dict[str, Any], prefix: str = "") -> list[str]:
+    out = []
+    for name, value in body.items():
+        if isinstance(value, dict):
+            out += _list_fields(value, f"{prefix}{name}.")
+        elif name == "covariance" or value in ("", None, [], ()):
+            continue
+        elif isinstance(value, float):
+            out.append(f"{prefix}{name}={value:.6g}")
+        else:
+            out.append(f"{prefix}{name}={value}")
+    return out

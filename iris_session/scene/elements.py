@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.lie import matrix_quat, quat_matrix
+from anchors.lie import quat_from_matrix, quat_to_matrix
 from anchors.pose import compose
 from iris_session.protocol.common import MAX_TEXT, Pose, Vec3
 from iris_session.protocol.names import ColorSpace, GeometryKind, TextureKind
@@ -155,7 +155,7 @@ def is_solid(matrix: Matrix) -> bool:
 
 def to_pose(R: NDArray[np.float64], p: Any) -> Pose:
     """Return the pose of a rotation matrix (3, 3) and a position."""
-    w, i, j, k = matrix_quat(np.asarray(R, np.float64)).tolist()
+    w, i, j, k = quat_from_matrix(np.asarray(R, np.float64)).tolist()
     return Pose(to_vec3(p), (w, i, j, k))
 
 
@@ -168,7 +168,7 @@ def to_vec3(p: Any) -> Vec3:
 def to_matrix(pose: Pose) -> Matrix:
     """Return the matrix (4, 4) of a pose."""
     matrix = np.eye(4)
-    matrix[:3, :3] = quat_matrix(np.array(pose.q))
+    matrix[:3, :3] = quat_to_matrix(np.array(pose.q))
     matrix[:3, 3] = pose.p
     return matrix
 

@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.lie import matrix_quat
+from anchors.lie import quat_from_matrix
 from anchors.pose import PoseTuple, apply, compose, inverse, quat_conj, quat_mul, quat_rotate
 from iris_session.assets.store import AssetStore
 from iris_session.protocol.common import Pose, Quat, Vec3
@@ -448,7 +448,7 @@ def _seeing(camera: Camera, spec: SceneSpec) -> Quat:
     if not across.any():  # it follows nothing, or it looks straight up or down
         return camera.T_body_camera.q
     across /= np.linalg.norm(across)
-    w, x, y, z = matrix_quat(np.stack([across, np.cross(back, across), back], axis=1)).tolist()
+    w, x, y, z = quat_from_matrix(np.stack([across, np.cross(back, across), back], axis=1)).tolist()
     return quat_mul(quat_conj(T_world_body[1]), (w, x, y, z))
 
 
@@ -475,5 +475,5 @@ def _look_at(light: Light, spec: SceneSpec) -> list[float]:
     back /= np.linalg.norm(back) or 1.0
     side = np.cross([0.0, 1.0, 0.0] if abs(back[1]) < 0.9 else [1.0, 0.0, 0.0], back)
     side /= np.linalg.norm(side) or 1.0
-    w, x, y, z = matrix_quat(np.stack([side, np.cross(back, side), back], axis=1)).tolist()
+    w, x, y, z = quat_from_matrix(np.stack([side, np.cross(back, side), back], axis=1)).tolist()
     return [x, y, z, w]

@@ -33,8 +33,8 @@ from iris_session.recording import (
     header_root,
     pack_model,
 )
+from iris_session.recording.environment import describe_environment, read_boot_id
 from iris_session.recording.feed import SILENCE_S
-from iris_session.recording.versions import boot_id, environment
 from iris_session.scene.composed import ComposedScene
 from iris_session.session.config import SessionConfig
 from iris_session.session.core import SessionCore
@@ -242,7 +242,7 @@ class SessionProcesses:
         if self.feed is not None:
             header = self._make_header(core, OPEN if user_owned else CLOSED)
             shown = self.scenes.newest
-            self.feed.header(header, *(() if shown is None else (shown.info.asset_root, shown.info.scene_hash)))
+            self.feed.send_header(header, *(() if shown is None else (shown.info.asset_root, shown.info.scene_hash)))
             chain = header_root(header)
         keyframe_ns = round(self._config.keyframe_s * 1e9)
         past = self._past
@@ -263,7 +263,7 @@ class SessionProcesses:
         self, stream: str, frames: dict[str, bytes], capture_ns: int, scene_epoch: int, encoding: str
     ) -> bool:
         if self.feed is not None:
-            self.feed.vertices(stream, frames[BudgetClass.FULL], capture_ns)
+            self.feed.send_vertices(stream, frames[BudgetClass.FULL], capture_ns)
         return self.front is not None and self.front.publish_media(stream, frames, capture_ns, scene_epoch, encoding)
 
     def _follow_scene(self, scene: NextScene | NextPatch) -> None:
@@ -284,11 +284,11 @@ class SessionProcesses:
             robots=core.scene.robots,
             objects=core.scene.objects,
             bodies=core.world.bodies,
-            versions=environment(),
+            versions=describe_environment(),
             created_utc=datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds"),
             continues=None if self._past is None else self._past.continues,
             origin_ns=self._origin_ns,
-            boot_id=boot_id(),
+            boot_id=read_boot_id(),
             anchors=self._config.anchor_poses(),
             settings=make_settings(self._config),
         )

@@ -51,15 +51,14 @@ from iris_session.recording import (
     RecordingError,
     RecordingLock,
     SessionHeader,
-    blas,
     check_row,
     unpack_model,
 )
+from iris_session.recording.environment import read_boot_id, use_one_blas_thread
 from iris_session.recording.journal import CRASHED, check_keyframe
 from iris_session.recording.lock import PATIENCE_S
 from iris_session.recording.paths import resume_path, split_part, split_resume
 from iris_session.recording.verify import Models
-from iris_session.recording.versions import boot_id
 from iris_session.security.resume_tokens import encode_handback
 from iris_session.session.config import SessionConfig, check_arguments, check_objects, check_robots
 from iris_session.session.core import CoreConfig, CoreState, SessionCore
@@ -204,7 +203,7 @@ class PastSession:
                 "was shown, or start the program that moved the world"
             )
         problems: list[str] = []
-        blas.use_one_thread()  # as in the run that is replayed
+        use_one_blas_thread()  # as in the run that is replayed
         for keyframe in list_keyframes(recording):
             try:
                 self.core = restore_core(header, keyframe, recording.model)
@@ -240,7 +239,7 @@ class PastSession:
         except msgspec.DecodeError:
             self.handback = encode_handback(last)
         now_ns = time.monotonic_ns()
-        same_boot = bool(header.boot_id) and header.boot_id == boot_id()
+        same_boot = bool(header.boot_id) and header.boot_id == read_boot_id()
         origin_ns = header.origin_ns if same_boot else now_ns
         if now_ns - origin_ns <= self.now_ns:
             origin_ns = now_ns - self.now_ns - MARGIN_NS

@@ -36,7 +36,7 @@ from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import EntryMessage
 from iris_session.protocol.names import ControlAction, LateCause
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
-from iris_session.recording import blas
+from iris_session.recording.environment import use_one_blas_thread
 from iris_session.session.config import SessionConfig, check_arguments, check_objects, check_robots, check_timestep
 from iris_session.session.core import SessionCore, make_session_core, read_plant_state
 from iris_session.session.errors import OwnershipError
@@ -181,7 +181,7 @@ class Session(Owner):
             OwnershipError: The session is not started, or a user loop drives it.
         """
         check_timestep(self.model)
-        blas.use_one_thread()  # for the same bits in every run
+        use_one_blas_thread()  # for the same bits in every run
         stepper = self._make_stepper(user_owned=False)
         with self.signals(), freeze_garbage_collector(), tick_priority(self.config.realtime) as self._scheduling:
             # Counted from here: collecting garbage in a large process takes longer than a short run.

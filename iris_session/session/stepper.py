@@ -65,7 +65,7 @@ class RecorderPort(Protocol):
     @property
     def wants_keyframe(self) -> bool: ...
 
-    def scene(
+    def send_scene(
         self,
         model_hash: str,
         packed_model: bytes,
@@ -74,15 +74,15 @@ class RecorderPort(Protocol):
         scene_hash: str = "",
     ) -> None: ...
 
-    def patch(self, root: str, scene_hash: str) -> None: ...
+    def send_patch(self, root: str, scene_hash: str) -> None: ...
 
-    def row(self, row: JournalRow) -> None: ...
+    def add_row(self, row: JournalRow) -> None: ...
 
     def flush(self) -> None: ...
 
-    def keyframe(self, keyframe: Keyframe, chain: bytes) -> None: ...
+    def add_keyframe(self, keyframe: Keyframe, chain: bytes) -> None: ...
 
-    def state(
+    def add_state(
         self,
         step: int,
         tick: int,
@@ -92,9 +92,9 @@ class RecorderPort(Protocol):
         applied: Sequence[Applied] = (),
     ) -> None: ...
 
-    def decision(self, step: int, session_time: int, decision: Decision) -> None: ...
+    def add_decision(self, step: int, session_time: int, decision: Decision) -> None: ...
 
-    def metric(self, name: str, value: float) -> None: ...
+    def add_metric(self, name: str, value: float) -> None: ...
 
     def take_gap(self) -> int: ...
 
@@ -253,7 +253,7 @@ class Stepper:
             outcome = self.core.step(now_ns, entries, n_ticks, plant, digest=self.recorder is not None, lap=self.on_lap)
         except Exception:
             if self.recorder is not None:  # what led to it is worth more than all before
-                self.recorder.row(make_row(self._chain, self.step_count, now_ns, n_ticks, entries, CRASHED, plant))
+                self.recorder.add_row(make_row(self._chain, self.step_count, now_ns, n_ticks, entries, CRASHED, plant))
                 self.recorder.flush()
             raise
         end_ns = self.clock()
@@ -298,14 +298,14 @@ class Stepper:
         assets = scene.shown.info.asset_root, scene.shown.info.scene_hash
         if isinstance(scene, NextPatch):
             if self.recorder is not None:
-                self.recorder.patch(*assets)
+                self.recorder.send_patch(*assets)
             messages = (scene.message,)
         else:
             self.core.prepared[scene.model_hash] = scene.plant
             bodies = scene.plant.world.bodies
             self._poses = np.zeros((len(bodies), 7))
             if self.recorder is not None:
-                self.recorder.scene(scene.model_hash, scene.packed_model, bodies, *assets)
+                self.recorder.send_scene(scene.model_hash, scene.packed_model, bodies, *assets)
             messages = (scene.plant.scene, GetSnapshot())  # the ledger gets the new leases as a client does
         for callback in self.on_scene:
             callback(scene)
@@ -341,8 +341,8 @@ class Stepper:
         if self.on_state is not None:
             self.on_state(header, self._poses)
         if self.recorder is not None:
-            self.recorder.state(self._newest_step, tick, sim_time, end_ns, self._poses, applied)
-            self.recorder.metric("lateness_ms", self.lateness_ns * 1e-6)
+            self.recorder.add_state(self._newest_step, tick, sim_time, end_ns, self._poses, applied)
+            self.recorder.add_metric("lateness_ms", self.lateness_ns * 1e-6)
             self.lateness_ns = 0
 
     def _record(
@@ -353,8 +353,8 @@ class Stepper:
         self._chain = row.chain
         decision = self.last.decision
         if decision.events or decision.outgoing or decision.presence:
-            recorder.decision(self.step_count, now_ns, decision)
-        recorder.row(row)
+            recorder.add_decision(self.step_count, now_ns, decision)
+        recorder.add_row(row)
         lost = recorder.take_gap()
         if lost:
             _log.warning("gap in the recording: %d rows are lost", lost)
@@ -370,7 +370,7 @@ class Stepper:
         state = self.core.snapshot()
         step = self.step_count if self.last is not None else self.step_count - 1
         frame = Keyframe(step, state.plant, state.authority, state.controller, state.status)
-        self.recorder.keyframe(frame, self._chain)
+        self.recorder.add_keyframe(frame, self._chain)
 
 
 def normalize_message(message: EntryMessage) -> EntryMessage:

@@ -9,7 +9,8 @@ import msgspec
 
 from iris_session.physics import decode_model
 from iris_session.protocol.entries import Entry
-from iris_session.recording import Keyframe, SessionHeader, VerifyReport, blas, unpack_model, verify
+from iris_session.recording import Keyframe, SessionHeader, VerifyReport, unpack_model, verify
+from iris_session.recording.environment import use_one_blas_thread
 from iris_session.recording.verify import Models
 from iris_session.session.core import CoreConfig, CoreState, SessionCore
 
@@ -18,7 +19,7 @@ class ReplayCore:
     """A `SessionCore` as `recording.verify` drives it."""
 
     def __init__(self, header: SessionHeader, models: Models) -> None:
-        blas.use_one_thread()
+        use_one_blas_thread()
         config = msgspec.msgpack.decode(header.config, type=CoreConfig)
         model = decode_model(unpack_model(header.model))
         self.core = SessionCore(model, config, lambda model_hash: decode_model(models(model_hash)))
@@ -47,5 +48,5 @@ def verify_recording(path: Path, progress: Callable[[int, int], None] | None = N
     Raises:
         RecordingError: The recording cannot be read at all.
     """
-    blas.use_one_thread()  # before versions are compared: threads that are not used here are no difference
+    use_one_blas_thread()  # before versions are compared: threads that are not used here are no difference
     return verify(path, ReplayCore, progress)

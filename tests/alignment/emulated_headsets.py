@@ -1,4 +1,4 @@
-"""Synthetic headsets in front of `Anchoring`: the noise of docs/anchors.md, seeded; the clock is turned by hand."""
+"""Emulated headsets for `AlignmentService`: the noise model of docs/anchors.md, seeded, with a simulated clock."""
 
 from __future__ import annotations
 

@@ -492,8 +492,8 @@ def test_memory_is_bounded() -> None:
     person = lab.service._states[1]
     assert len(person.monitor.heads) <= 128
     assert len(lab.service._cross_check._moving[1]) <= 4
-    assert len(lab.service._cross_check._check._looks) <= 5
-    assert all(len(looks) <= 100 for looks in lab.service._cross_check._check._looks.values())
+    assert len(lab.service._cross_check._check._observations) <= 5
+    assert all(len(looks) <= 100 for looks in lab.service._cross_check._check._observations.values())
     assert set(person.estimator._observed) == {"sheet"}
     assert len(person.estimator._estimator._memory) <= 600
     for n in range(2000):

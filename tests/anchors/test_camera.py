@@ -9,29 +9,37 @@ import cv2
 import numpy as np
 import pytest
 
-from anchors.camera import Camera, CameraError, matrix_of, parse_camera, pose_of, pose_of_matrix, rvec_tvec
+from anchors.camera import (
+    CameraError,
+    CameraModel,
+    parse_camera,
+    pose_from_matrix,
+    pose_from_rvec_tvec,
+    pose_to_matrix,
+    to_rvec_tvec,
+)
 from tests.models import BESIDE
 
-CAMERA = Camera(640, 480, 585.0, 584.0, 319.5, 239.5, (0.08, -0.18, 0.0008, -0.0005, 0.01))
+CAMERA = CameraModel(640, 480, 585.0, 584.0, 319.5, 239.5, (0.08, -0.18, 0.0008, -0.0005, 0.01))
 
 
 def test_projection_is_that_of_opencv_and_its_inverse() -> None:
     rng = np.random.default_rng(2)
     points = rng.uniform(-0.3, 0.3, (50, 3))
     rvec, tvec = np.array([0.3, -0.5, 1.1]), np.array([0.05, -0.02, 1.3])
-    pixels = CAMERA.project(points, pose_of(rvec, tvec))
+    pixels = CAMERA.project(points, pose_from_rvec_tvec(rvec, tvec))
     wanted = cv2.projectPoints(points, rvec, tvec, CAMERA.matrix, CAMERA.coefficients)[0].reshape(-1, 2)
     assert np.allclose(pixels, wanted, atol=1e-9)
     seen = points @ cv2.Rodrigues(rvec)[0].T + tvec
-    assert np.allclose(CAMERA.normalise(pixels), seen[:, :2] / seen[:, 2:], atol=1e-10)
+    assert np.allclose(CAMERA.undistort(pixels), seen[:, :2] / seen[:, 2:], atol=1e-10)
 
 
 def test_matrices_agree_with_rodrigues() -> None:
     for rvec in ([0.0, 0.0, 0.0], [0.2, -0.3, 2.0], [np.pi, 0.0, 0.0]):
-        pose = pose_of(np.array(rvec), np.array([1.0, 2.0, 3.0]))
-        assert np.allclose(matrix_of(pose)[:3, :3], cv2.Rodrigues(np.array(rvec))[0], atol=1e-12)
-        assert np.allclose(matrix_of(pose_of_matrix(matrix_of(pose))), matrix_of(pose), atol=1e-12)
-        assert np.allclose(matrix_of(pose_of(*rvec_tvec(pose))), matrix_of(pose), atol=1e-12)
+        pose = pose_from_rvec_tvec(np.array(rvec), np.array([1.0, 2.0, 3.0]))
+        assert np.allclose(pose_to_matrix(pose)[:3, :3], cv2.Rodrigues(np.array(rvec))[0], atol=1e-12)
+        assert np.allclose(pose_to_matrix(pose_from_matrix(pose_to_matrix(pose))), pose_to_matrix(pose), atol=1e-12)
+        assert np.allclose(pose_to_matrix(pose_from_rvec_tvec(*to_rvec_tvec(pose))), pose_to_matrix(pose), atol=1e-12)
 
 
 def test_another_resolution_sees_the_same() -> None:

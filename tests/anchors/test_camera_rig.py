@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from anchors.camera import matrix_of, pose_of, pose_of_matrix
-from anchors.camera_rig import View, solve_rig
+from anchors.camera import pose_from_matrix, pose_from_rvec_tvec, pose_to_matrix
+from anchors.camera_rig import SheetView, solve_rig
 from anchors.pose import PoseTuple, compose, distance, inverse, quat_from_rotvec
 from anchors.robot_world import CalibrationError
 
@@ -26,17 +26,17 @@ COVARIANCE = tuple(np.diag([1e-6] * 3 + [math.radians(0.2) ** 2] * 3).ravel())
 SEEN = [("front", "table"), ("front", "shelf"), ("left", "shelf"), ("left", "wand@1"), ("wrist", "wand@1")]
 
 
-def _views(seen: list[tuple[str, str]], rng: np.random.Generator | None = None) -> list[View]:
+def _views(seen: list[tuple[str, str]], rng: np.random.Generator | None = None) -> list[SheetView]:
     views = []
     for camera, sheet in seen:
         T = compose(inverse(CAMERAS[camera]), SHEETS[sheet])
         if rng is not None:
-            noise = matrix_of(pose_of(rng.normal(0.0, math.radians(0.2), 3), np.zeros(3)))[:3, :3]
-            M = matrix_of(T)
+            noise = pose_to_matrix(pose_from_rvec_tvec(rng.normal(0.0, math.radians(0.2), 3), np.zeros(3)))[:3, :3]
+            M = pose_to_matrix(T)
             M[:3, :3] = noise @ M[:3, :3]
             M[:3, 3] += rng.normal(0.0, 1e-3, 3)
-            T = pose_of_matrix(M)
-        views.append(View(camera, sheet, T, COVARIANCE))
+            T = pose_from_matrix(M)
+        views.append(SheetView(camera, sheet, T, COVARIANCE))
     return views
 
 

@@ -10,7 +10,7 @@ import pytest
 from anchors.constellation import (
     Constellation,
     ConstellationError,
-    Seen,
+    SheetObservation,
     find_moved,
     solve_constellation,
 )
@@ -27,7 +27,7 @@ ROOM: dict[str, PoseTuple] = {
 
 def _looks(
     room: dict[str, PoseTuple], plan: dict[str, str], seed: int = 0, noise: float = 1.0, repeat: int = 10
-) -> list[Seen]:
+) -> list[SheetObservation]:
     """Headset -> initials of the sheets it looks at, one viewpoint each."""
     rng = np.random.default_rng(seed)
     by_initial = {name[0]: name for name in room}
@@ -38,7 +38,7 @@ def _looks(
             name = by_initial[initial]
             look = Look(rng, room[name], around(rng, room[name][0], rng.uniform(0.4, 0.9)), noise)
             for _ in range(repeat):
-                out.append(Seen(who, 0, viewpoint, name, look.new(T), look.head(T)))
+                out.append(SheetObservation(who, 0, viewpoint, name, look.new(T), look.head(T)))
     return out
 
 
@@ -67,7 +67,7 @@ def test_noisy_looks_give_what_the_stated_error_says() -> None:
 def test_a_look_that_fits_nowhere_is_named_and_left_out() -> None:
     seen = _looks(ROOM, {"a": "dlrwdlrw", "b": "dlrwdlrw"}, 4)
     wrong = [
-        Seen(
+        SheetObservation(
             o.headset, 0, o.viewpoint_id, o.anchor_id, shifted(o.T_tracking_anchor, (0.2, 0.1, 0.0)), o.p_tracking_head
         )
         if (o.headset, o.viewpoint_id) == ("b", 2)
@@ -189,7 +189,7 @@ def test_a_sheet_of_which_nothing_fits_is_named_and_states_no_error() -> None:
     """Two headsets saw it at two places: with these looks left out nothing holds it, which is no error of 0 mm."""
     seen = _looks(ROOM, {"a": "drw", "b": "drw"}, 4)
     torn = [
-        Seen(
+        SheetObservation(
             o.headset,
             0,
             o.viewpoint_id,
@@ -207,5 +207,5 @@ def test_a_sheet_of_which_nothing_fits_is_named_and_states_no_error() -> None:
 
 def test_what_is_no_pose_is_left_out() -> None:
     seen = _looks(ROOM, {"a": "dlrw"}, 4)
-    bad = [Seen("a", 0, 0, "door", (ROOM["door"][0], (math.nan, 0.0, 0.0, 0.0))), *seen]
+    bad = [SheetObservation("a", 0, 0, "door", (ROOM["door"][0], (math.nan, 0.0, 0.0, 0.0))), *seen]
     assert solve_constellation(bad, "door").constellation == solve_constellation(seen, "door").constellation

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from anchors.controller import TipCalibration, calibrate_tip, controller_covariance, holder_anchor, tip_position
-from anchors.lie import Array, quat_exp, quat_matrix, quat_multiply
+from anchors.lie import Array, quat_exp, quat_multiply, quat_to_matrix
 from anchors.pose import PoseTuple, compose, inverse, quat_from_rotvec
 
 TIP = np.array([0.01, -0.02, -0.12])
@@ -18,7 +18,7 @@ PIVOT = np.array([0.4, 1.1, -0.3])
 def _poses(turns: Array, sigma_m: float = 0.001, seed: int = 1) -> list[PoseTuple]:
     rng = np.random.default_rng(seed)
     q = quat_multiply(quat_exp(turns), quat_exp(np.array([0.3, 0.2, 2.0])))
-    t = PIVOT - quat_matrix(q) @ TIP + rng.normal(0.0, sigma_m, (len(turns), 3))
+    t = PIVOT - quat_to_matrix(q) @ TIP + rng.normal(0.0, sigma_m, (len(turns), 3))
     return [(tuple(p), tuple(r)) for p, r in zip(t.tolist(), q.tolist(), strict=True)]
 
 

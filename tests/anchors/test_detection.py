@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from anchors.camera import Camera, pose_of
-from anchors.detection import DetectionError, SheetDetector, Sighting, detect_codes
+from anchors.camera import CameraModel, pose_from_rvec_tvec
+from anchors.detection import DetectionError, SheetDetection, SheetDetector, detect_codes
 from anchors.pose import PoseTuple, compose, distance, inverse, quat_angle, quat_from_rotvec, quat_to_rotvec
 from anchors.sheet import Sheet
 from anchors.sheet_print import to_pdf
@@ -25,7 +25,7 @@ from render_sheet import Conditions, Page, photograph
 
 TABLE, DOOR = Sheet("table", 0.160), Sheet("door", 0.120)
 #: Intrinsics of a real depth camera, with the distortion of an ordinary lens.
-CAMERA = Camera(640, 480, 585.0, 585.0, 319.5, 239.5, (0.08, -0.18, 0.0008, -0.0005, 0.0))
+CAMERA = CameraModel(640, 480, 585.0, 585.0, 319.5, 239.5, (0.08, -0.18, 0.0008, -0.0005, 0.0))
 CONDITIONS = Conditions(rays=2)
 RGBD = Path(os.environ.get("IRIS_DATA") or BESIDE) / "rgbd"
 
@@ -43,7 +43,7 @@ def _facing(p: tuple[float, float, float], tilt_deg: float, roll_deg: float = 20
     return (p, compose(((0.0, 0.0, 0.0), turn), ((0.0, 0.0, 0.0), rolled[1]))[1])
 
 
-def _off(seen: Sighting, true: PoseTuple) -> tuple[float, float]:
+def _off(seen: SheetDetection, true: PoseTuple) -> tuple[float, float]:
     """Errors [mm], [deg]."""
     at = seen.T_camera_sheet
     return 1e3 * distance(at[0], true[0]), math.degrees(quat_angle(at[1], true[1]))
@@ -114,7 +114,7 @@ def test_two_sheets_are_told_apart_and_a_covered_marker_is_not_needed(pages: dic
 
 
 def test_nothing_is_found_where_no_sheet_is() -> None:
-    camera = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
+    camera = CameraModel(640, 480, 585.0, 585.0, 320.0, 240.0)
     sheets = [Sheet(f"sheet-{k}", 0.160) for k in range(8)]
     frames = sorted(RGBD.glob("*.color.jpg"))[::12]
     assert frames
@@ -135,7 +135,7 @@ def test_flat_scan_of_the_page_is_read_back(pages: dict[str, Page]) -> None:
     page = pages["table"].levels[3]
     picture = np.round(255.0 * page).astype(np.uint8)
     per_m = picture.shape[1] / pages["table"].size_m[0]
-    camera = Camera(
+    camera = CameraModel(
         picture.shape[1], picture.shape[0], 1000.0, 1000.0, 0.5 * picture.shape[1] - 0.5, 0.5 * picture.shape[0] - 0.5
     )
     (seen,) = SheetDetector([TABLE], camera).detect(picture)
@@ -158,7 +158,7 @@ def test_corners_alone_agree_with_opencv() -> None:
     pose, rms = poses.best
     assert rms < 1e-6
     assert distance(pose[0], true[0]) < 1e-8
-    assert distance(pose_of(rvec, tvec)[0], pose[0]) < 1e-5
+    assert distance(pose_from_rvec_tvec(rvec, tvec)[0], pose[0]) < 1e-5
     assert poses.mirrored is not None
     mirrored, worse = poses.mirrored
     assert worse > 0.1
@@ -167,21 +167,21 @@ def test_corners_alone_agree_with_opencv() -> None:
 
 
 def test_wrong_marker_is_outvoted() -> None:
-    from anchors.detection import _consistent_board
+    from anchors.detection import _find_consistent_markers
 
     true = _facing((0.0, 0.0, 1.0), 25.0)
     seen = {k: CAMERA.project(corners, true) for k, corners in enumerate(TABLE.marker_corners)}
     seen[2] = seen[2] + 40.0  # the same marker on another sheet
-    poses = _consistent_board(TABLE, seen, CAMERA)
+    poses = _find_consistent_markers(TABLE, seen, CAMERA)
     assert poses is not None
     assert poses.markers == 3
     assert distance(poses.best[0][0], true[0]) < 1e-6
-    assert _consistent_board(TABLE, {0: seen[0], 2: seen[2]}, CAMERA) is None
-    assert _consistent_board(TABLE, {0: seen[0]}, CAMERA) is None
+    assert _find_consistent_markers(TABLE, {0: seen[0], 2: seen[2]}, CAMERA) is None
+    assert _find_consistent_markers(TABLE, {0: seen[0]}, CAMERA) is None
 
 
 def test_covariance_of_corners_is_that_of_their_noise() -> None:
-    from anchors.detection import _CORNER_SIGMA_PX, _by_corners, _plane_poses
+    from anchors.detection import _CORNER_SIGMA_PX, _detect_by_corners, _plane_poses
 
     rng = np.random.default_rng(5)
     true = _facing((0.1, 0.0, 0.8), 40.0)
@@ -191,7 +191,7 @@ def test_covariance_of_corners_is_that_of_their_noise() -> None:
         pixels = CAMERA.project(points, true) + rng.normal(0.0, _CORNER_SIGMA_PX, (len(points), 2))
         poses = _plane_poses(points, pixels, CAMERA, 4)
         assert poses is not None
-        seen = _by_corners(TABLE, poses, CAMERA)
+        seen = _detect_by_corners(TABLE, poses, CAMERA)
         turn = quat_to_rotvec(compose(seen.T_camera_sheet, inverse(true))[1])
         d = np.concatenate([np.subtract(seen.T_camera_sheet[0], true[0]), turn])
         distances.append(float(d @ np.linalg.solve(np.reshape(seen.covariance, (6, 6)), d)))

@@ -43,7 +43,7 @@ def _watch(
         p = look.new(T_world_tracking)[0]
         if wrong is not None and wrong.random() < 0.05:
             p = (p[0] + wrong.normal(0.0, 0.25), p[1] + wrong.normal(0.0, 0.25), p[2])
-        alarm = monitor.observe("sheet", p, look.head(T_world_tracking), i * PERIOD, 0, viewpoint, alignment)
+        alarm = monitor.add_observation("sheet", p, look.head(T_world_tracking), i * PERIOD, 0, viewpoint, alignment)
         if alarm is not None:
             alarms.append(alarm)
     return alarms
@@ -115,7 +115,7 @@ def test_the_sheet_that_was_moved_is_told_from_the_others_that_stayed() -> None:
         for name, look in looks.items():
             place = shifted(SHEET, (0.02, 0.0, 0.0)) if name == "sheet" and i >= 30 else None
             p = look.new(T_world_tracking, place)[0]
-            alarm = monitor.observe(name, p, look.head(T_world_tracking), i * PERIOD, 0)
+            alarm = monitor.add_observation(name, p, look.head(T_world_tracking), i * PERIOD, 0)
             alarms += [alarm] if alarm is not None else []
     assert [(a.anchor_id, a.beside) for a in alarms] == [("sheet", ("other",))]
 
@@ -123,50 +123,50 @@ def test_the_sheet_that_was_moved_is_told_from_the_others_that_stayed() -> None:
 def test_a_new_tracking_epoch_is_a_jump_and_starts_anew() -> None:
     monitor = DriftMonitor(ANCHORS)
     zero: Vec3 = (0.0, 0.0, 0.0)
-    alarm = monitor.observe("sheet", (0.0, 0.0, 1.0), zero, 0, 1)
+    alarm = monitor.add_observation("sheet", (0.0, 0.0, 1.0), zero, 0, 1)
     assert alarm is not None
     assert (alarm.kind, alarm.invalidates) == ("epoch", True)
-    assert monitor.observe("sheet", (0.0, 0.0, 1.0), zero, 1, 1) is None
-    assert monitor.observe("sheet", (0.0, 0.0, 1.0), zero, 2, 0) is None, "what is older is of no use"
-    assert monitor.head((zero, (1.0, 0.0, 0.0, 0.0)), 3, 2) is not None
+    assert monitor.add_observation("sheet", (0.0, 0.0, 1.0), zero, 1, 1) is None
+    assert monitor.add_observation("sheet", (0.0, 0.0, 1.0), zero, 2, 0) is None, "what is older is of no use"
+    assert monitor.add_head_pose((zero, (1.0, 0.0, 0.0, 0.0)), 3, 2) is not None
 
 
 def test_a_head_faster_than_people_is_a_jump() -> None:
     monitor = DriftMonitor(ANCHORS)
     pose: PoseTuple = ((0.0, 0.0, 1.6), (1.0, 0.0, 0.0, 0.0))
     turned: PoseTuple = (pose[0], quat_from_rotvec((0.0, 0.0, 1.0)))
-    assert monitor.head(pose, 0, 0) is None
-    assert monitor.head(shifted(pose, (0.03, 0.0, 0.0)), 14_000_000, 0) is None
-    alarm = monitor.head(shifted(pose, (0.5, 0.0, 0.0)), 28_000_000, 0)
+    assert monitor.add_head_pose(pose, 0, 0) is None
+    assert monitor.add_head_pose(shifted(pose, (0.03, 0.0, 0.0)), 14_000_000, 0) is None
+    alarm = monitor.add_head_pose(shifted(pose, (0.5, 0.0, 0.0)), 28_000_000, 0)
     assert alarm is not None
     assert alarm.kind == "jump"
-    assert monitor.head(pose, 42_000_000, 0) is None, "after a jump a new count begins"
-    assert monitor.head(turned, 56_000_000, 0) is not None
-    assert monitor.head(pose, 2_000_000_000, 0) is None, "after a pause anything may have happened"
+    assert monitor.add_head_pose(pose, 42_000_000, 0) is None, "after a jump a new count begins"
+    assert monitor.add_head_pose(turned, 56_000_000, 0) is not None
+    assert monitor.add_head_pose(pose, 2_000_000_000, 0) is None, "after a pause anything may have happened"
 
 
 def test_hostile_numbers_and_unknown_anchors_say_nothing_and_memory_is_bounded() -> None:
-    monitor = DriftMonitor(ANCHORS, config=DriftConfig(max_seen=50))
+    monitor = DriftMonitor(ANCHORS, config=DriftConfig(max_detections=50))
     zero: Vec3 = (0.0, 0.0, 0.0)
-    assert monitor.observe("sheet", (math.nan, 0.0, 0.0), zero, 0, 0) is None
-    assert monitor.observe("nobody", zero, zero, 0, 0) is None
+    assert monitor.add_observation("sheet", (math.nan, 0.0, 0.0), zero, 0, 0) is None
+    assert monitor.add_observation("nobody", zero, zero, 0, 0) is None
     for i in range(200):
-        monitor.observe("sheet", (0.0, 0.0, 1.0), zero, 5, 0)
-        monitor.observe("sheet", (0.0, 0.0, 1.0), zero, 5 - i, 0)
-    assert len(monitor._seen["sheet"]) <= 50
+        monitor.add_observation("sheet", (0.0, 0.0, 1.0), zero, 5, 0)
+        monitor.add_observation("sheet", (0.0, 0.0, 1.0), zero, 5 - i, 0)
+    assert len(monitor._detections["sheet"]) <= 50
 
 
 def test_heads_of_a_void_frame_and_heads_that_are_no_pose_are_no_jump() -> None:
     monitor = DriftMonitor(ANCHORS)
     place: PoseTuple = ((0.0, 0.0, 1.6), (1.0, 0.0, 0.0, 0.0))
-    assert monitor.head(place, 0, 0) is None
-    moved = monitor.head(shifted(place, (2.0, 0.0, 0.0)), PERIOD, 1)
+    assert monitor.add_head_pose(place, 0, 0) is None
+    moved = monitor.add_head_pose(shifted(place, (2.0, 0.0, 0.0)), PERIOD, 1)
     assert moved is not None
     assert moved.kind == "epoch"
-    assert monitor.head(shifted(place, (2.0, 0.0, 0.0)), 2 * PERIOD, 1) is None
-    assert monitor.head(place, 2 * PERIOD + 1, 0) is None, "late, of the frame before"
-    assert monitor.head(((math.nan, 0.0, 0.0), place[1]), 2 * PERIOD + 2, 1) is None
-    jumped = monitor.head(shifted(place, (4.0, 0.0, 0.0)), 3 * PERIOD, 1)
+    assert monitor.add_head_pose(shifted(place, (2.0, 0.0, 0.0)), 2 * PERIOD, 1) is None
+    assert monitor.add_head_pose(place, 2 * PERIOD + 1, 0) is None, "late, of the frame before"
+    assert monitor.add_head_pose(((math.nan, 0.0, 0.0), place[1]), 2 * PERIOD + 2, 1) is None
+    jumped = monitor.add_head_pose(shifted(place, (4.0, 0.0, 0.0)), 3 * PERIOD, 1)
     assert jumped is not None
     assert jumped.kind == "jump"
 
@@ -193,7 +193,7 @@ def _watch_both(
         for k, (name, look) in enumerate(looks.items()):
             place = shifted(SHEET, (moved, 0.0, 0.0)) if name == "sheet" and i >= 30 else None
             p = look.new(now, place)[0]
-            alarm = monitor.observe(name, p, look.head(now), i * PERIOD + k * PERIOD // 2, 0)
+            alarm = monitor.add_observation(name, p, look.head(now), i * PERIOD + k * PERIOD // 2, 0)
             alarms += [(i, alarm)] if alarm is not None else []
     return alarms
 
@@ -234,6 +234,6 @@ def test_without_a_head_changes_must_be_larger_to_be_told() -> None:
     look, alarms = Look(rng, SHEET, around(rng, SHEET[0], 0.6)), []
     for i in range(80):
         p = look.new(shifted(frame, (0.025 if i >= 40 else 0.0, 0.0, 0.0)))[0]
-        alarm = monitor.observe("sheet", p, None, i * PERIOD, 0)
+        alarm = monitor.add_observation("sheet", p, None, i * PERIOD, 0)
         alarms += [alarm] if alarm is not None else []
     assert [a.kind for a in alarms] == ["changed"]

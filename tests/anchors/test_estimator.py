@@ -8,11 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from anchors.advice import error_advice
-from anchors.alignment import AlignmentConfig, AlignmentEstimate, AlignmentEstimator, mirrored
-from anchors.lie import matrix_quat, quat_matrix
-from anchors.noise import NoiseModel, stated
+from anchors.alignment import AlignmentConfig, AlignmentEstimate, AlignmentEstimator, error_advice, mirror_pose
+from anchors.lie import quat_from_matrix, quat_to_matrix
 from anchors.pose import PoseTuple, Vec3, apply, compose, distance, inverse, quat_angle, quat_from_rotvec, quat_from_yaw
+from anchors.uncertainty import NoiseModel, validate_covariance
 from tests.anchors.worlds import NOISE, Look, around, axis, headset, shifted
 
 SHEET: PoseTuple = ((0.1, -0.4, 0.72), quat_from_yaw(0.3))
@@ -103,14 +102,14 @@ def test_mirrored_is_the_other_pose_of_opencv() -> None:
         assert n == 2
         poses = []
         for r, t in zip(turns, places, strict=True):
-            q = matrix_quat(cv2.Rodrigues(r)[0]).tolist()
+            q = quat_from_matrix(cv2.Rodrigues(r)[0]).tolist()
             p = t.ravel().tolist()
             poses.append(((p[0], p[1], p[2]), (q[0], q[1], q[2], q[3])))
-        other = mirrored(poses[0], (0.0, 0.0, 0.0))
+        other = mirror_pose(poses[0], (0.0, 0.0, 0.0))
         # That the sheet is near and not infinitely far is worth a few degrees.
         assert quat_angle(other[1], poses[1][1]) < math.radians(6.0)
         assert quat_angle(poses[0][1], poses[1][1]) > math.radians(40.0)
-        assert quat_angle(mirrored(other, (0.0, 0.0, 0.0))[1], poses[0][1]) < 1e-6
+        assert quat_angle(mirror_pose(other, (0.0, 0.0, 0.0))[1], poses[0][1]) < 1e-6
 
 
 @pytest.mark.parametrize("tell", ["head", "alternative", "nothing"])
@@ -121,7 +120,7 @@ def test_a_viewpoint_that_sees_the_sheet_mirrored_is_put_right(tell: str) -> Non
     look = Look(rng, SHEET, around(rng, SHEET[0], 0.6))
     for i in range(20):
         good, head = look.new(T), look.head(T)
-        seen = mirrored(good, head)
+        seen = mirror_pose(good, head)
         used = estimator.add(
             "sheet",
             seen,
@@ -269,22 +268,24 @@ def test_near_looks_count_for_more_than_far_ones() -> None:
 
 def test_covariances_that_are_none_are_not_taken() -> None:
     good = tuple(np.diag([1e-6] * 6).ravel().tolist())
-    assert stated(good) == good
-    assert all(stated(bad) == () for bad in ((), good[:35], (*good[:35], math.nan), tuple(-x for x in good)))
+    assert validate_covariance(good) == good
+    assert all(
+        validate_covariance(bad) == () for bad in ((), good[:35], (*good[:35], math.nan), tuple(-x for x in good))
+    )
     lopsided = list(good)
     lopsided[1] = 1.0
-    assert stated(lopsided) == ()
+    assert validate_covariance(lopsided) == ()
 
 
 def test_noise_is_along_the_view_and_grows_with_distance() -> None:
-    common, each = NOISE.seen_from(np.array([0.0, 0.0, 1.0]), np.zeros(3))
+    common, each = NOISE.compute_covariances(np.array([0.0, 0.0, 1.0]), np.zeros(3))
     assert math.sqrt(each[2, 2]) == pytest.approx(0.0048 * math.sqrt(0.5), rel=0.01)
     assert math.sqrt(each[0, 0]) == pytest.approx(0.0016 * math.sqrt(0.5), rel=0.01)
     assert math.sqrt(common[2, 2] - each[2, 2]) == pytest.approx(0.003, rel=0.01)
     assert math.sqrt((common + each)[4, 4]) == pytest.approx(math.radians(0.6), rel=0.01)
-    near, _ = NoiseModel().seen_from(np.array([0.0, 0.0, 0.5]), np.zeros(3))
+    near, _ = NoiseModel().compute_covariances(np.array([0.0, 0.0, 0.5]), np.zeros(3))
     assert near[2, 2] < 0.3 * common[2, 2]
-    assert np.allclose(quat_matrix(np.array([1.0, 0.0, 0.0, 0.0])), np.eye(3))
+    assert np.allclose(quat_to_matrix(np.array([1.0, 0.0, 0.0, 0.0])), np.eye(3))
 
 
 def test_advice_on_the_error_at_the_robot() -> None:

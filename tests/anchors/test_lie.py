@@ -48,7 +48,7 @@ def test_log_is_the_inverse_of_exp(axis: Array, angle: float) -> None:
 
 @given(axes, angles)
 def test_exp_agrees_with_scipy_and_opencv(axis: Array, angle: float) -> None:
-    R = lie.quat_matrix(lie.quat_exp(axis * angle))
+    R = lie.quat_to_matrix(lie.quat_exp(axis * angle))
     assert np.allclose(R, Rotation.from_rotvec(axis * angle).as_matrix(), atol=1e-9)
     assert np.allclose(R, cv2.Rodrigues(axis * angle)[0], atol=1e-9)
 
@@ -56,9 +56,9 @@ def test_exp_agrees_with_scipy_and_opencv(axis: Array, angle: float) -> None:
 @given(axes, angles)
 def test_log_agrees_with_opencv(axis: Array, angle: float) -> None:
     R = Rotation.from_rotvec(axis * angle).as_matrix()
-    ours = lie.quat_log(lie.matrix_quat(R))
+    ours = lie.quat_log(lie.quat_from_matrix(R))
     theirs = cv2.Rodrigues(R)[0].ravel()
-    assert np.allclose(lie.quat_matrix(lie.quat_exp(ours)), cv2.Rodrigues(theirs)[0], atol=1e-6)
+    assert np.allclose(lie.quat_to_matrix(lie.quat_exp(ours)), cv2.Rodrigues(theirs)[0], atol=1e-6)
     if angle < math.pi - 1e-3:
         assert np.allclose(ours, theirs, atol=1e-6)
 
@@ -67,7 +67,7 @@ def test_log_agrees_with_opencv(axis: Array, angle: float) -> None:
 def test_product_is_application_in_turn(a: Array, b: Array, v: Array) -> None:
     qa, qb = lie.quat_exp(a), lie.quat_exp(b)
     both = lie.quat_multiply(qa, qb)
-    assert np.allclose(lie.quat_matrix(both) @ v, lie.quat_matrix(qa) @ (lie.quat_matrix(qb) @ v), atol=1e-9)
+    assert np.allclose(lie.quat_to_matrix(both) @ v, lie.quat_to_matrix(qa) @ (lie.quat_to_matrix(qb) @ v), atol=1e-9)
     assert np.allclose(lie.quat_multiply(both, lie.quat_conjugate(both)), [1.0, 0.0, 0.0, 0.0], atol=1e-12)
 
 
@@ -75,7 +75,7 @@ def test_product_is_application_in_turn(a: Array, b: Array, v: Array) -> None:
 def test_many_at_once_are_as_one_by_one_and_as_plain_tuples(r: Array) -> None:
     q = lie.quat_exp(r)
     product = lie.quat_multiply(q, q[::-1])
-    turned = lie.quat_matrix(q) @ np.array([1.0, -2.0, 0.5])
+    turned = lie.quat_to_matrix(q) @ np.array([1.0, -2.0, 0.5])
     for i in range(5):
         a, b = tuple(q[i].tolist()), tuple(q[4 - i].tolist())
         assert np.allclose(product[i], quat_mul(a, b), atol=1e-12)
@@ -86,13 +86,13 @@ def test_many_at_once_are_as_one_by_one_and_as_plain_tuples(r: Array) -> None:
 @given(vectors)
 def test_matrix_and_back(r: Array) -> None:
     q = lie.quat_exp(r)
-    assert _turned_alike(lie.matrix_quat(lie.quat_matrix(q)), q)
+    assert _turned_alike(lie.quat_from_matrix(lie.quat_to_matrix(q)), q)
 
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.6, 0.0, 0.8)])
 def test_matrix_to_quaternion_at_half_a_turn(axis: tuple[float, float, float]) -> None:
     q = np.array([0.0, *axis])
-    assert _turned_alike(lie.matrix_quat(lie.quat_matrix(q)), q)
+    assert _turned_alike(lie.quat_from_matrix(lie.quat_to_matrix(q)), q)
 
 
 @given(vectors, vectors)
@@ -117,7 +117,7 @@ def test_se3_exp_agrees_with_the_matrix_exponential_and_log_undoes_it(v: Array, 
     T = expm(generator)
     p, q = lie.se3_exp(xi)
     assert np.allclose(p, T[:3, 3], atol=1e-9)
-    assert np.allclose(lie.quat_matrix(q), T[:3, :3], atol=1e-9)
+    assert np.allclose(lie.quat_to_matrix(q), T[:3, :3], atol=1e-9)
     assert np.allclose(lie.se3_log(p, q), xi, atol=1e-7)
 
 

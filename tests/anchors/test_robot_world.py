@@ -7,22 +7,22 @@ import math
 import numpy as np
 import pytest
 
-from anchors.camera import matrix_of, pose_of, pose_of_matrix
+from anchors.camera import pose_from_matrix, pose_from_rvec_tvec, pose_to_matrix
 from anchors.pose import PoseTuple, compose, distance, inverse, quat_angle, quat_from_rotvec, quat_to_rotvec
 from anchors.robot_world import (
     CalibrationError,
-    Noise,
-    Solved,
-    T_world_base_of_twin,
-    _of_inverse,
-    camera_on_hand,
-    one_pose,
-    solve,
+    CalibrationNoise,
+    RobotWorldCalibration,
+    _invert_covariance,
+    solve_camera_on_hand,
+    solve_robot_world,
+    solve_single_pose,
+    solve_twin_base,
 )
 
 T_BASE_CAMERA: PoseTuple = ((1.4, -0.3, 0.9), quat_from_rotvec((-1.9, 0.4, 0.3)))
 T_EE_MARKER: PoseTuple = ((0.02, -0.05, 0.11), quat_from_rotvec((0.3, -2.1, 0.5)))
-NOISE = Noise(robot_m=0.0004, robot_rad=math.radians(0.05), seen_m=0.001, seen_rad=math.radians(0.2))
+NOISE = CalibrationNoise(robot_m=0.0004, robot_rad=math.radians(0.05), seen_m=0.001, seen_rad=math.radians(0.2))
 
 
 def _robot(rng: np.random.Generator, n: int, turn: float = 0.6, axes: int = 3) -> list[PoseTuple]:
@@ -30,15 +30,15 @@ def _robot(rng: np.random.Generator, n: int, turn: float = 0.6, axes: int = 3) -
     for _ in range(n):
         r = rng.normal(0.0, turn, 3) * (np.arange(3) < axes)
         p = np.array([0.5, 0.0, 0.4]) + rng.uniform(-0.25, 0.25, 3)
-        poses.append(pose_of(r, p))
+        poses.append(pose_from_rvec_tvec(r, p))
     return poses
 
 
 def _noisy(rng: np.random.Generator, pose: PoseTuple, m: float, rad: float) -> PoseTuple:
-    M = matrix_of(pose)
-    M[:3, :3] = matrix_of(pose_of(rng.normal(0.0, rad, 3), np.zeros(3)))[:3, :3] @ M[:3, :3]
+    M = pose_to_matrix(pose)
+    M[:3, :3] = pose_to_matrix(pose_from_rvec_tvec(rng.normal(0.0, rad, 3), np.zeros(3)))[:3, :3] @ M[:3, :3]
     M[:3, 3] += rng.normal(0.0, m, 3)
-    return pose_of_matrix(M)
+    return pose_from_matrix(M)
 
 
 def _seen(robot: list[PoseTuple], X: PoseTuple = T_BASE_CAMERA) -> list[PoseTuple]:
@@ -51,7 +51,7 @@ def _observed(rng: np.random.Generator, n: int) -> tuple[list[PoseTuple], list[P
     return [_noisy(rng, T, NOISE.robot_m, NOISE.robot_rad) for T in robot], seen
 
 
-def _off(solved: Solved) -> tuple[float, float]:
+def _off(solved: RobotWorldCalibration) -> tuple[float, float]:
     at = solved.T_base_camera
     return distance(at[0], T_BASE_CAMERA[0]), quat_angle(at[1], T_BASE_CAMERA[1])
 
@@ -59,16 +59,16 @@ def _off(solved: Solved) -> tuple[float, float]:
 @pytest.mark.parametrize("n", [3, 12])
 def test_exact_without_noise(n: int) -> None:
     robot = _robot(np.random.default_rng(n), n)
-    solved = solve(robot, _seen(robot))
+    solved = solve_robot_world(robot, _seen(robot))
     assert max(_off(solved)) < 1e-7
     assert distance(solved.T_ee_marker[0], T_EE_MARKER[0]) < 1e-7
     assert solved.left_out == ()
-    assert max(solved.rms()) < 1e-7
+    assert max(solved.compute_rms()) < 1e-7
 
 
 def test_one_pose_is_the_chain() -> None:
     (robot,) = _robot(np.random.default_rng(1), 1)
-    at = one_pose(robot, T_EE_MARKER, _seen([robot])[0])
+    at = solve_single_pose(robot, T_EE_MARKER, _seen([robot])[0])
     assert distance(at[0], T_BASE_CAMERA[0]) < 1e-12
     assert quat_angle(at[1], T_BASE_CAMERA[1]) < 1e-7
 
@@ -78,9 +78,9 @@ def test_stated_covariance_is_that_of_the_errors() -> None:
     distances = []
     for seed in range(30):
         rng = np.random.default_rng(seed)
-        solved = solve(*_observed(rng, 15), noise=NOISE)
-        difference = matrix_of(solved.T_base_camera) @ np.linalg.inv(matrix_of(T_BASE_CAMERA))
-        turn = quat_to_rotvec(pose_of_matrix(difference)[1])
+        solved = solve_robot_world(*_observed(rng, 15), noise=NOISE)
+        difference = pose_to_matrix(solved.T_base_camera) @ np.linalg.inv(pose_to_matrix(T_BASE_CAMERA))
+        turn = quat_to_rotvec(pose_from_matrix(difference)[1])
         d = np.concatenate([np.subtract(solved.T_base_camera[0], T_BASE_CAMERA[0]), turn])
         C = np.reshape(solved.covariance, (6, 6))
         distances.append(float(d @ np.linalg.solve(C, d)))
@@ -93,10 +93,10 @@ def test_wrong_pictures_are_left_out_and_named() -> None:
     robot, seen = _observed(rng, 14)
     seen[4] = _noisy(rng, seen[4], 0.05, 0.3)
     robot[9], robot[10] = robot[10], robot[9]
-    solved = solve(robot, seen, noise=NOISE)
+    solved = solve_robot_world(robot, seen, noise=NOISE)
     assert set(solved.left_out) == {4, 9, 10}
     assert _off(solved)[0] < 0.004
-    assert solved.residuals[4][0] > 5.0 * solved.rms()[0]
+    assert solved.residuals[4][0] > 5.0 * solved.compute_rms()[0]
 
 
 def test_camera_on_the_hand() -> None:
@@ -104,7 +104,7 @@ def test_camera_on_the_hand() -> None:
     T_base_sheet, T_ee_camera = T_BASE_CAMERA, T_EE_MARKER
     seen = [compose(inverse(compose(T, T_ee_camera)), T_base_sheet) for T in robot]
     covariance = [tuple(np.diag([1e-6] * 6).ravel())] * 8
-    solved = camera_on_hand(robot, seen, covariance)
+    solved = solve_camera_on_hand(robot, seen, covariance)
     assert distance(solved.T_ee_marker[0], T_ee_camera[0]) < 1e-7
     assert distance(solved.T_base_camera[0], T_base_sheet[0]) < 1e-7
 
@@ -115,14 +115,14 @@ def test_covariance_of_the_inverse_is_that_of_inverted_samples() -> None:
     samples = []
     for _ in range(4000):
         d = root @ rng.normal(size=6)
-        M = matrix_of(T_BASE_CAMERA)
-        M[:3, :3] = matrix_of(pose_of(d[3:], np.zeros(3)))[:3, :3] @ M[:3, :3]
+        M = pose_to_matrix(T_BASE_CAMERA)
+        M[:3, :3] = pose_to_matrix(pose_from_rvec_tvec(d[3:], np.zeros(3)))[:3, :3] @ M[:3, :3]
         M[:3, 3] += d[:3]
-        back, true = inverse(pose_of_matrix(M)), inverse(T_BASE_CAMERA)
+        back, true = inverse(pose_from_matrix(M)), inverse(T_BASE_CAMERA)
         turn = quat_to_rotvec(compose(back, inverse(true))[1])
         samples.append([*np.subtract(back[0], true[0]), *turn])
     wanted = np.cov(np.array(samples).T)
-    found = np.reshape(_of_inverse(T_BASE_CAMERA, (root @ root).ravel().tolist()), (6, 6))
+    found = np.reshape(_invert_covariance(T_BASE_CAMERA, (root @ root).ravel().tolist()), (6, 6))
     scale = np.sqrt(np.outer(np.diag(wanted), np.diag(wanted)))
     assert np.allclose(found / scale, wanted / scale, atol=0.08)
 
@@ -131,7 +131,7 @@ def test_virtual_robot_over_its_twin() -> None:
     T_world_base: PoseTuple = ((0.3, 0.8, -0.1), quat_from_rotvec((0.0, 0.01, 1.2)))
     robot = _robot(np.random.default_rng(6), 6)
     seen = [compose(T_world_base, compose(T, T_EE_MARKER)) for T in robot]
-    at, solved = T_world_base_of_twin(robot, seen)
+    at, solved = solve_twin_base(robot, seen)
     assert distance(at[0], T_world_base[0]) < 1e-7
     assert quat_angle(at[1], T_world_base[1]) < 1e-7
     assert solved.left_out == ()
@@ -141,20 +141,20 @@ def test_virtual_robot_over_its_twin() -> None:
 def test_too_small_rotations_are_refused_with_advice(turn: float, axes: int) -> None:
     robot = _robot(np.random.default_rng(7), 10, turn, axes)
     with pytest.raises(CalibrationError, match=r"second axis.*turn the hand by 30 degrees or more about at least two"):
-        solve(robot, _seen(robot))
+        solve_robot_world(robot, _seen(robot))
 
 
 def test_too_few_or_contradicting_pictures_are_refused() -> None:
     rng = np.random.default_rng(8)
     robot = _robot(rng, 10)
     with pytest.raises(CalibrationError, match="2 pictures in which the marker was found: at least 3"):
-        solve(robot[:2], _seen(robot[:2]))
+        solve_robot_world(robot[:2], _seen(robot[:2]))
     with pytest.raises(CalibrationError, match="3 poses of the robot, 2 of the marker"):
-        solve(robot[:3], _seen(robot[:2]))
+        solve_robot_world(robot[:3], _seen(robot[:2]))
 
 
 def test_mixed_up_pictures_are_refused() -> None:
     rng = np.random.default_rng(9)
     robot, seen = _observed(rng, 12)
     with pytest.raises(CalibrationError, match=r"pictures (do not )?agree.*are the poses those of these pictures"):
-        solve(robot, [seen[(k * 5) % 12] for k in range(12)], noise=NOISE)
+        solve_robot_world(robot, [seen[(k * 5) % 12] for k in range(12)], noise=NOISE)

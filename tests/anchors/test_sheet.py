@@ -12,7 +12,7 @@ import pypdfium2
 import pytest
 from numpy.typing import NDArray
 
-from anchors.sheet import Sheet, SheetError, marker_ids
+from anchors.sheet import Sheet, SheetError, compute_marker_ids
 from anchors.sheet_print import MARGIN_MM, PAPERS, largest_edge_mm, to_pdf, to_svg
 
 TABLE = Sheet("table", 0.160)
@@ -27,7 +27,7 @@ def _raster(pdf: bytes) -> NDArray[np.uint8]:
 def test_sheets_that_hang_in_labs_stay_valid() -> None:
     """Whoever changes these numbers makes every printed sheet worthless."""
     assert TABLE.marker_ids == (929, 562, 578, 437)
-    assert marker_ids("door") == (544, 3, 618, 419)
+    assert compute_marker_ids("door") == (544, 3, 618, 419)
     assert TABLE.marker_edge_m == pytest.approx(0.0464)
     assert TABLE.marker_corners[0][0] == pytest.approx([-0.096, 0.1424, 0.0])
     assert TABLE.marker_corners[2][2] == pytest.approx([0.096, -0.1424, 0.0])
@@ -35,7 +35,7 @@ def test_sheets_that_hang_in_labs_stay_valid() -> None:
 
 
 def test_ids_of_sheets_differ() -> None:
-    all_ids = [marker_ids(f"anchor-{k}") for k in range(500)]
+    all_ids = [compute_marker_ids(f"anchor-{k}") for k in range(500)]
     assert all(len(set(ids)) == 4 and min(ids) >= 0 and max(ids) < 1000 for ids in all_ids)
     assert len({frozenset(ids) for ids in all_ids}) == 500
 

@@ -9,7 +9,7 @@ import pytest
 
 from anchors.alignment import AlignmentConfig
 from anchors.pose import PoseTuple, Vec3, apply, distance, inverse, quat_angle, quat_from_rotvec, quat_from_yaw
-from anchors.touch import Touch, register
+from anchors.touch import Touch, register_touches
 
 MARKS: dict[str, Vec3] = {
     "a": (0.0, 0.0, 0.0),
@@ -35,7 +35,7 @@ def _touches(
 @pytest.mark.parametrize("names", ["abc", "abcd", "dbcaabcd"])
 def test_exact_without_noise(names: str, dof: int) -> None:
     T = T_WORLD_TRACKING if dof == 4 else ((0.3, 1.0, 2.0), quat_from_rotvec((0.9, -1.2, 0.4)))
-    got = register(MARKS, _touches(names, T=T), tracking_epoch=3, config=AlignmentConfig(dof=dof))
+    got = register_touches(MARKS, _touches(names, T=T), tracking_epoch=3, config=AlignmentConfig(dof=dof))
     assert not got.estimate.refused
     assert got.estimate.tracking_epoch == 3
     assert distance(got.estimate.T_world_tracking[0], T[0]) < 1e-8
@@ -46,7 +46,7 @@ def test_exact_without_noise(names: str, dof: int) -> None:
 def test_stated_error_is_honest() -> None:
     inside = 0
     for seed in range(100):
-        got = register(MARKS, _touches("abcd", 0.0015, seed))
+        got = register_touches(MARKS, _touches("abcd", 0.0015, seed))
         assert not got.estimate.refused
         at = apply(got.estimate.T_world_tracking, apply(inverse(T_WORLD_TRACKING), MARKS["c"]))
         inside += distance(at, MARKS["c"]) <= got.estimate.error_at(MARKS["c"])
@@ -59,21 +59,21 @@ def test_gravity_holds_the_tilt() -> None:
     off: dict[int, list[float]] = {4: [], 6: []}
     for seed in range(30):
         for dof, errors in off.items():
-            got = register(MARKS, _touches("abcd", 0.0015, seed), config=AlignmentConfig(dof=dof))
+            got = register_touches(MARKS, _touches("abcd", 0.0015, seed), config=AlignmentConfig(dof=dof))
             at = apply(got.estimate.T_world_tracking, apply(inverse(T_WORLD_TRACKING), far))
             errors.append(distance(at, far))
     assert np.median(off[4]) < 0.8 * np.median(off[6])
 
 
 def test_too_few_points_names_those_left() -> None:
-    got = register(MARKS, _touches("ab"))
+    got = register_touches(MARKS, _touches("ab"))
     assert got.estimate.refused
     assert got.estimate.advice == "2 points touched, 3 are needed; not yet touched: c, d"
 
 
 def test_points_on_a_line_are_refused_by_name() -> None:
     marks = {"a": (0.0, 0.0, 0.0), "b": (0.3, 0.004, 0.0), "c": (0.6, 0.0, 0.0)}
-    got = register(marks, _touches("abc", marks=marks))
+    got = register_touches(marks, _touches("abc", marks=marks))
     assert got.estimate.refused
     assert got.estimate.advice.startswith("points a, b, c lie on one line ('b' is 3 mm beside it)")
     assert got.suspects == ("a", "b", "c")
@@ -82,7 +82,7 @@ def test_points_on_a_line_are_refused_by_name() -> None:
 def test_mixed_up_points_are_named() -> None:
     touches = _touches("abcd", 0.001)
     swapped = [Touch({"b": "c", "c": "b"}.get(t.point, t.point), t.p_tracking_tip) for t in touches]
-    got = register(MARKS, swapped)
+    got = register_touches(MARKS, swapped)
     assert got.estimate.refused
     assert got.suspects == ("b", "c")
     assert got.estimate.advice.startswith("points are mixed up: 'b' was touched at 'c', 'c' was touched at 'b'")
@@ -93,14 +93,14 @@ def test_of_eight_points_a_swapped_pair_is_found() -> None:
     marks: dict[str, Vec3] = {name: (*rng.uniform(0.0, 1.0, 2).tolist(), 0.0) for name in "abcdefgh"}
     touches = _touches("abcdefgh", 0.001, marks=marks)
     swapped = [Touch({"d": "g", "g": "d"}.get(t.point, t.point), t.p_tracking_tip) for t in touches]
-    assert register(marks, swapped).suspects == ("d", "g")
+    assert register_touches(marks, swapped).suspects == ("d", "g")
 
 
 def test_one_point_touched_elsewhere_is_named_with_how_far() -> None:
     touches = _touches("abcd", 0.0005)
     x, y, z = touches[2].p_tracking_tip
     touches[2] = Touch("c", (x, y, z + 0.03))
-    got = register(MARKS, touches)
+    got = register_touches(MARKS, touches)
     assert got.suspects == ("c",)
     assert "point 'c' is 30 mm off" in got.estimate.advice
 
@@ -109,7 +109,7 @@ def test_of_three_points_the_one_with_two_wrong_distances_is_named() -> None:
     touches = _touches("abc")
     x, y, z = touches[0].p_tracking_tip
     touches[0] = Touch("a", (x + 0.05, y + 0.03, z))
-    got = register(MARKS, touches)
+    got = register_touches(MARKS, touches)
     assert got.estimate.refused
     assert "'a'" in got.estimate.advice
 
@@ -117,21 +117,23 @@ def test_of_three_points_the_one_with_two_wrong_distances_is_named() -> None:
 def test_a_point_touched_in_two_places_is_named() -> None:
     touches = _touches("abcd")
     x, y, z = touches[1].p_tracking_tip
-    got = register(MARKS, [*touches, Touch("b", (x + 0.04, y, z))])
+    got = register_touches(MARKS, [*touches, Touch("b", (x + 0.04, y, z))])
     assert got.suspects == ("b",)
 
 
 def test_unknown_and_unread_points_are_refused() -> None:
-    assert "'x' is not marked" in register(MARKS, [*_touches("abc"), Touch("x", (0.0, 0.0, 0.0))]).estimate.advice
-    assert register(MARKS, [*_touches("abc"), Touch("d", (math.nan, 0.0, 0.0))]).estimate.refused
+    assert (
+        "'x' is not marked" in register_touches(MARKS, [*_touches("abc"), Touch("x", (0.0, 0.0, 0.0))]).estimate.advice
+    )
+    assert register_touches(MARKS, [*_touches("abc"), Touch("d", (math.nan, 0.0, 0.0))]).estimate.refused
 
 
 def test_marks_that_look_alike_turned_round_are_warned_about() -> None:
     square: dict[str, Vec3] = {"a": (0.0, 0.0, 0.0), "b": (0.5, 0.0, 0.0), "c": (0.5, 0.5, 0.0), "d": (0.0, 0.5, 0.0)}
-    got = register(square, _touches("abcd", marks=square))
+    got = register_touches(square, _touches("abcd", marks=square))
     assert not got.estimate.refused
     assert "look the same in another order" in got.estimate.advice
-    assert register(MARKS, _touches("abcd")).estimate.advice == ""
+    assert register_touches(MARKS, _touches("abcd")).estimate.advice == ""
 
 
 def test_of_many_wrong_distances_the_largest_are_told() -> None:
@@ -139,7 +141,7 @@ def test_of_many_wrong_distances_the_largest_are_told() -> None:
     marks = {f"mark {i}": (0.1 * i, 0.01 * i * i, 0.0) for i in range(9)}
     places = rng.uniform(0.0, 1.0, (9, 2)).tolist()
     touches = [Touch(name, (x, y, 0.0)) for name, (x, y) in zip(marks, places, strict=True)]
-    got = register(marks, touches)
+    got = register_touches(marks, touches)
     assert got.estimate.refused
     assert got.estimate.advice.count(" mm") == 5
 
@@ -147,7 +149,7 @@ def test_of_many_wrong_distances_the_largest_are_told() -> None:
 @pytest.mark.parametrize("value", [math.nan, math.inf, 1e308])
 def test_a_touch_nowhere_is_not_read(value: float) -> None:
     marks = {"a": (0.0, 0.0, 0.0), "b": (1.0, 0.0, 0.0), "c": (0.0, 1.0, 0.0)}
-    got = register(marks, [Touch(name, (value, 0.0, 0.0)) for name in marks])
+    got = register_touches(marks, [Touch(name, (value, 0.0, 0.0)) for name in marks])
     assert got.estimate.refused
     assert "was not read" in got.estimate.advice
 
@@ -162,7 +164,7 @@ def test_orders_that_no_distance_allows_are_not_fitted(n: int, monkeypatch: pyte
     rng = np.random.default_rng(4)
     marks = {c: _at(rng.uniform(-0.5, 0.5, 3)) for c in "abcdefgh"[:n]}
     wrong = [Touch(c, _at(rng.uniform(-1.0, 1.0, 3))) for c in marks]
-    assert register(marks, wrong).estimate.refused
+    assert register_touches(marks, wrong).estimate.refused
     assert len(fits) <= n + 1
 
 

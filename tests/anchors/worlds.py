@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anchors.lie import Array, quat_exp, quat_matrix, quat_multiply
-from anchors.noise import NoiseModel
+from anchors.lie import Array, quat_exp, quat_multiply, quat_to_matrix
 from anchors.pose import PoseTuple, Vec3, apply, compose, inverse
+from anchors.uncertainty import NoiseModel
 
 NOISE = NoiseModel()
 
@@ -25,7 +25,7 @@ class Look:
 
     def __post_init__(self) -> None:
         head, p = np.array(self.p_head_world), np.array(self.T_world_anchor[0])
-        self._common, self._each = NOISE.seen_from(head, p)
+        self._common, self._each = NOISE.compute_covariances(head, p)
         self.common = self._draw(self._common)
 
     def new(self, T_world_tracking: PoseTuple, T_world_anchor: PoseTuple | None = None) -> PoseTuple:
@@ -62,7 +62,7 @@ def shifted(T: PoseTuple, by: Vec3) -> PoseTuple:
 
 
 def axis(q: tuple[float, ...], i: int) -> Array:
-    return np.asarray(quat_matrix(np.array(q))[:, i])
+    return np.asarray(quat_to_matrix(np.array(q))[:, i])
 
 
 def _vec3(v: Array) -> Vec3:

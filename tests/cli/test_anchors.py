@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from anchors.camera import Camera, pose_of
+from anchors.camera import CameraModel, pose_from_rvec_tvec
 from anchors.pose import PoseTuple, compose, distance, inverse, quat_angle, quat_from_rotvec
 from anchors.sheet import Sheet
 from anchors.sheet_print import to_pdf
@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
 from render_sheet import Conditions, Page, photograph
 
-CAMERA = Camera(640, 480, 585.0, 585.0, 319.5, 239.5, (0.08, -0.18, 0.0008, -0.0005, 0.0))
+CAMERA = CameraModel(640, 480, 585.0, 585.0, 319.5, 239.5, (0.08, -0.18, 0.0008, -0.0005, 0.0))
 INTRINSICS = (
     "width = 640\nheight = 480\nfx = 585.0\nfy = 585.0\ncx = 319.5\ncy = 239.5\n"
     "distortion = [0.08, -0.18, 0.0008, -0.0005, 0.0]\n"
@@ -209,7 +209,7 @@ def test_cameras_that_see_a_sheet_on_the_table(
 def test_underdetermined_calibration_is_refused(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    still = [pose_of(np.array([0.02 * k, 0.0, 0.0]), np.array([0.4, 0.1 * k, 0.3])) for k in range(5)]
+    still = [pose_from_rvec_tvec(np.array([0.02 * k, 0.0, 0.0]), np.array([0.4, 0.1 * k, 0.3])) for k in range(5)]
     poses = _csv(tmp_path / "poses.csv", still)
     error = _refused(capsys, 1, folder, *SHEET, "--poses", poses)
     assert "turn the hand by 30 degrees or more about at least two axes" in error

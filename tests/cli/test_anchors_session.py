@@ -20,7 +20,7 @@ import pytest
 from anchors.alignment import AlignmentEstimate
 from anchors.constellation import Constellation
 from anchors.pose import PoseTuple, compose, distance, inverse, quat_from_rotvec
-from iris_session.alignment.smoother import Anchors, Resolver, fused
+from iris_session.alignment.smoother import AlignmentSmoother, AnchorHistory, fuse_estimates
 from iris_session.authority import AuthorityConfig
 from iris_session.cli import anchors_session
 from iris_session.cli.anchors_session import format_alignment_status, select_participants, to_dict
@@ -37,7 +37,7 @@ from iris_session.protocol.status import (
     ParticipantReport,
     StatusReport,
 )
-from iris_session.recording import Frame, Recording, read_looks
+from iris_session.recording import Recording, TrackingFrame, read_alignment_history
 from iris_session.session.config import load_anchors
 from tests.anchors.worlds import headset, shifted
 from tests.client.harness import LiveSession
@@ -469,9 +469,11 @@ def test_an_anchor_that_a_director_moved_is_where_it_was_at_the_time(tmp_path: P
     moved_ns = played.now_ns
     played.wait(20.0)
     with Recording.open(played.write(tmp_path / "session.rrd")) as recording:
-        looks = read_looks(recording)
-    resolver = Resolver(looks.looks[Frame("p1", 1, 0)], Anchors(looks, {"table": TRUE["table"]}, None), {})
-    before, after = resolver.at(moved_ns - 1), resolver.at(moved_ns)
+        looks = read_alignment_history(recording)
+    resolver = AlignmentSmoother(
+        looks.observations[TrackingFrame("p1", 1, 0)], AnchorHistory(looks, {"table": TRUE["table"]}, None), {}
+    )
+    before, after = resolver.estimate_at(moved_ns - 1), resolver.estimate_at(moved_ns)
     x, y, z = before.T_world_tracking[0]
     assert distance(after.T_world_tracking[0], (x + 0.5, y, z)) < 1e-6
 
@@ -485,8 +487,10 @@ def test_later_observations_are_used(tmp_path: Path) -> None:
     played.wait(60.0)
     played.look(1, "table", TRUE["table"], T, 2)
     with Recording.open(played.write(tmp_path / "session.rrd")) as recording:
-        looks = read_looks(recording)
-    solution = Resolver(looks.looks[Frame("p1", 1, 0)], Anchors(looks, {"table": TRUE["table"]}, None), {}).at(early_ns)
+        looks = read_alignment_history(recording)
+    solution = AlignmentSmoother(
+        looks.observations[TrackingFrame("p1", 1, 0)], AnchorHistory(looks, {"table": TRUE["table"]}, None), {}
+    ).estimate_at(early_ns)
     assert (solution.refused, solution.n_observations) == (False, 20)
 
 
@@ -566,13 +570,13 @@ def test_both_sides_of_a_moment_are_weighted_by_what_they_know() -> None:
             here, 0, tuple(C.ravel()), shifted((sheet, T[1]), (off_m, 0, 0))[0], 0.0, 0.0, 9, 2, False, ""
         )
 
-    both = fused(known(0.0, 0.001), known(0.01, 0.01))
+    both = fuse_estimates(known(0.0, 0.001), known(0.01, 0.01))
     assert distance(both.T_world_tracking[0], T[0]) < 0.0005
     assert both.error_at(both.pivot_world) < 0.0028, "no worse than the better one"
     assert both.n_observations == 18
-    half = fused(known(0.0, 0.002), known(0.004, 0.002))
+    half = fuse_estimates(known(0.0, 0.002), known(0.004, 0.002))
     assert distance(half.T_world_tracking[0], T[0]) == pytest.approx(0.002, abs=1e-4)
-    apart = fused(known(0.0, 0.002), known(0.05, 0.002))
+    apart = fuse_estimates(known(0.0, 0.002), known(0.05, 0.002))
     assert apart.error_at_anchor_m > 3.0 * half.error_at_anchor_m
 
 
@@ -598,17 +602,23 @@ def test_sheets_seen_before_and_after_a_jump_are_not_pooled(tmp_path: Path, caps
 
 def test_where_all_but_one_sheet_agree_that_one_was_moved(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where the live estimator sees no majority."""
-    solve = Resolver._solve
+    solve = AlignmentSmoother._solve
 
-    def blind(self: Resolver, moment: int, places: dict[str, PoseTuple]) -> AlignmentEstimate:
+    def blind(self: AlignmentSmoother, moment: int, places: dict[str, PoseTuple]) -> AlignmentEstimate:
         return replace(solve(self, moment, places), refused="shelf" in places)
 
-    monkeypatch.setattr(Resolver, "_solve", blind)
+    monkeypatch.setattr(AlignmentSmoother, "_solve", blind)
     with Recording.open(recording) as opened:
-        looks = read_looks(opened)
-    resolver = Resolver(looks.looks[Frame("p1", 1, 0)], Anchors(looks, BELIEVED, None), {})
-    solved = resolver.at(10_000_000_000)
+        looks = read_alignment_history(opened)
+    resolver = AlignmentSmoother(
+        looks.observations[TrackingFrame("p1", 1, 0)], AnchorHistory(looks, BELIEVED, None), {}
+    )
+    solved = resolver.estimate_at(10_000_000_000)
     assert (solved.refused, solved.moved) == (False, ("shelf",))
     assert "sheet 'shelf'; it is not used" in solved.advice
     two = {name: pose for name, pose in BELIEVED.items() if name != "door"}
-    assert Resolver(looks.looks[Frame("p1", 1, 0)], Anchors(looks, two, None), {}).at(10_000_000_000).refused
+    assert (
+        AlignmentSmoother(looks.observations[TrackingFrame("p1", 1, 0)], AnchorHistory(looks, two, None), {})
+        .estimate_at(10_000_000_000)
+        .refused
+    )

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from anchors.camera import Camera
+from anchors.camera import CameraModel
 from anchors.pose import PoseTuple, compose, distance, quat_angle, quat_from_rotvec
 from anchors.sheet import Sheet
 from anchors.sheet_print import to_pdf
@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
 from render_sheet import Conditions, Page, photograph
 
-CAMERA = Camera(640, 480, 585.0, 585.0, 319.5, 239.5)
+CAMERA = CameraModel(640, 480, 585.0, 585.0, 319.5, 239.5)
 TABLE = Sheet("table", 0.120)
 T_CAMERA_SHEET: PoseTuple = ((0.03, -0.02, 0.7), quat_from_rotvec((math.pi - 0.5, 0.0, 0.0)))
 T_TRACKING_CAMERA: PoseTuple = ((0.4, 1.2, 1.5), quat_from_rotvec((-1.8, 0.5, 0.4)))
@@ -122,7 +122,7 @@ def test_without_opencv_the_extra_is_named(ann: Quiet, picture: Any, monkeypatch
 def test_ambiguous_sightings_are_left_out(ann: Quiet, picture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     from anchors import detection
 
-    monkeypatch.setattr(detection.Sighting, "ambiguous", property(lambda _: True))
+    monkeypatch.setattr(detection.SheetDetection, "ambiguous", property(lambda _: True))
     assert ann.observe_image(picture, CAMERA, [TABLE], T_TRACKING_CAMERA) == []
     assert ann.sent == []
 

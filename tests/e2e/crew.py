@@ -13,12 +13,12 @@ import msgspec
 import numpy as np
 
 from anchors.pose import Vec3, apply, distance
-from anchors.uncertainty import at_point, length_p95
+from anchors.uncertainty import covariance_at_point, length_p95
 from iris_session.client import Client
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
 from tests.e2e.conftest import DEADLINE_S, ENDS_WITH_US
 
-#: Twice the p95 of a pair is beyond chance (`anchors.crosscheck.Disagreement.as_expected`).
+#: Twice the p95 of a pair is beyond chance (`anchors.cross_check.Disagreement.as_expected`).
 BEYOND_CHANCE: Final = 2.0
 
 
@@ -76,7 +76,7 @@ class View:
     def __init__(self, report: HeadsetReport, covariance: tuple[float, ...], pivot_world: Vec3, point: Vec3) -> None:
         assert report.T_true_shown is not None
         self.p_true = apply(report.T_true_shown, point)
-        self.covariance = at_point(covariance, pivot_world, point)
+        self.covariance = covariance_at_point(covariance, pivot_world, point)
 
 
 def views(crew: list[Emulated], watcher: Client, point: Vec3) -> list[View] | None:

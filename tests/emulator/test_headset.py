@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from anchors.alignment import AlignmentEstimator, mirrored
+from anchors.alignment import AlignmentEstimator, mirror_pose
 from anchors.pose import (
     PoseTuple,
     apply,
@@ -94,7 +94,7 @@ def test_some_detections_are_wrong_and_half_of_those_mirrored() -> None:
     for viewpoint in range(400):
         seen = headset.observe(head, SHEET, 0, viewpoint)
         assert seen is not None
-        right_way_round = compose(headset.get_T_world_tracking(0), mirrored(seen, there))
+        right_way_round = compose(headset.get_T_world_tracking(0), mirror_pose(seen, there))
         back.append(distance(right_way_round[0], SHEET[0]) + quat_angle(right_way_round[1], SHEET[1]))
     assert sum(b < 1e-6 for b in back) == pytest.approx(200, abs=40)
     assert sum(b > 0.05 for b in back) == pytest.approx(200, abs=40)

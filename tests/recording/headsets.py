@@ -115,7 +115,7 @@ class Played:
     def write(self, path: Path) -> Path:
         """The recording."""
         writer = RrdWriter(path, "id")
-        writer.header(self.header)
+        writer.write_header(self.header)
         chain, rows = header_root(self.header), []
         times = sorted({0, self.now_ns, *self._entries, *(now_ns for now_ns, _ in self._events)})
         for step, now_ns in enumerate(times):

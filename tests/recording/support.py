@@ -30,7 +30,7 @@ from iris_session.recording import (
     make_row,
     pack_model,
 )
-from iris_session.recording.journal import seal
+from iris_session.recording.journal import seal_keyframe
 from iris_session.recording.messages import Batch
 from iris_session.recording.verify import Models
 from iris_session.recording.writer import RrdWriter
@@ -121,8 +121,8 @@ class SmallSession:
         self.step_count = 0
         self.poses: list[np.ndarray] = []
         self._keyframe_steps = keyframe_steps
-        feed.header(self.header)
-        feed.keyframe(self.core.keyframe(-1), self.chain)
+        feed.send_header(self.header)
+        feed.add_keyframe(self.core.keyframe(-1), self.chain)
 
     def take(self, steps: int, pause_s: float = 0.0) -> None:
         for _ in range(steps):
@@ -138,19 +138,19 @@ class SmallSession:
         digest = core.step(now_ns, entries, 1, plant)
         row = make_row(self.chain, step, now_ns, 1, entries, digest, plant)
         self.chain = row.chain
-        feed.row(row)
+        feed.add_row(row)
         head = PresenceItem("p1", "head", Pose((0.0, 0.0, 1.0 + step / 1000), (1.0, 0.0, 0.0, 0.0)), now_ns)
         events = ()
         if step % 50 == 0:
             events = (Event(step // 50 + 1, step, now_ns, MarkerAdded("p1", f"event {step}")),)
-        feed.decision(step, now_ns, Decision(commands=(), events=events, presence=(head,)))
-        feed.metric("late_ms", step / 10)
+        feed.add_decision(step, now_ns, Decision(commands=(), events=events, presence=(head,)))
+        feed.add_metric("late_ms", step / 10)
         if step % 8 == 0:
             poses = np.concatenate([core.data.xpos[1:], core.data.xquat[1:]], axis=1)
             self.poses.append(poses.copy())
-            feed.state(step, step + 1, core.data.time, now_ns, poses)
+            feed.add_state(step, step + 1, core.data.time, now_ns, poses)
         if step % self._keyframe_steps == self._keyframe_steps - 1 or feed.wants_keyframe:
-            feed.keyframe(core.keyframe(step), self.chain)
+            feed.add_keyframe(core.keyframe(step), self.chain)
         self.step_count += 1
 
 
@@ -191,7 +191,7 @@ def journal(steps: int, recording_class: str = CLOSED, keyframe_steps: int = 50)
     """Header, rows and keyframes of a session that was never written."""
     core, header = SmallCore(), make_header(recording_class)
     chain = header_root(header)
-    batch = Batch(keyframes=[seal(core.keyframe(-1), chain)])
+    batch = Batch(keyframes=[seal_keyframe(core.keyframe(-1), chain)])
     for step in range(steps):
         if recording_class == OPEN:
             core.data.qvel[0] = np.sin(step)  # what only the user's loop knows
@@ -201,14 +201,14 @@ def journal(steps: int, recording_class: str = CLOSED, keyframe_steps: int = 50)
         batch.rows.append(make_row(chain, step, now_ns, 1, entries, digest, plant))
         chain = batch.rows[-1].chain
         if step % keyframe_steps == keyframe_steps - 1:
-            batch.keyframes.append(seal(core.keyframe(step), chain))
+            batch.keyframes.append(seal_keyframe(core.keyframe(step), chain))
     return header, batch
 
 
 def write(path: Path, header: SessionHeader, batch: Batch, rows_per_chunk: int = 20) -> Path:
     """A finished file with this content."""
     writer = RrdWriter(path, "id")
-    writer.header(header)
+    writer.write_header(header)
     for i in range(0, len(batch.rows), rows_per_chunk):
         last = i + rows_per_chunk >= len(batch.rows)
         keyframes = [k for k in batch.keyframes if k.step < i + rows_per_chunk or last]

@@ -74,14 +74,14 @@ def played(tmp_path: Path) -> Iterator[tuple[PlayedRecorder, str, Path]]:
 @pytest.fixture
 def feed(played: tuple[PlayedRecorder, str, Path]) -> Iterator[RecorderFeed]:
     feed = RecorderFeed(played[1], played[2])
-    feed.header(make_header())
+    feed.send_header(make_header())
     yield feed
     feed.close(0.0)
 
 
 def steps(feed: RecorderFeed, first: int, n: int) -> None:
     for step in range(first, first + n):
-        feed.row(make_row(ROOT, step, step * 2_000_000, 1, [], b"d" * 16))
+        feed.add_row(make_row(ROOT, step, step * 2_000_000, 1, [], b"d" * 16))
 
 
 def numbers(batch: Batch) -> list[int]:
@@ -106,8 +106,8 @@ def test_rows_go_out_after_ten_or_twenty_milliseconds(feed: RecorderFeed, played
     assert played[0].is_quiet()
     steps(feed, BATCH_ROWS - 1, 1)
     assert len(numbers(decode_batch(played[0].take(1)[0][2]))) == BATCH_ROWS
-    feed.row(make_row(ROOT, 10, 100_000_000, 0, [], b"d" * 16))
-    feed.row(make_row(ROOT, 11, 120_000_000, 0, [], b"d" * 16))  # paused: 50 steps a second
+    feed.add_row(make_row(ROOT, 10, 100_000_000, 0, [], b"d" * 16))
+    feed.add_row(make_row(ROOT, 11, 120_000_000, 0, [], b"d" * 16))  # paused: 50 steps a second
     assert numbers(decode_batch(played[0].take(1)[0][2])) == [10, 11]
 
 
@@ -131,7 +131,7 @@ def test_what_is_written_is_forgotten_and_a_new_recorder_gets_the_rest(feed: Rec
 def test_a_full_window_spills_and_comes_back_in_order(played) -> None:  # type: ignore[no-untyped-def]
     recorder, endpoint, folder = played
     feed = RecorderFeed(endpoint, folder, window_bytes=2000)
-    feed.header(make_header())
+    feed.send_header(make_header())
     steps(feed, 0, 300)
     assert feed.stats.spilled_batches > 10
     assert feed.stats.dropped_rows == 0
@@ -153,7 +153,7 @@ def test_a_full_window_spills_and_comes_back_in_order(played) -> None:  # type: 
 def test_when_the_spill_is_full_rows_are_dropped_counted_and_told(played) -> None:  # type: ignore[no-untyped-def]
     recorder, endpoint, folder = played
     feed = RecorderFeed(endpoint, folder, window_bytes=3000, spill_bytes=3000)
-    feed.header(make_header())
+    feed.send_header(make_header())
     steps(feed, 0, 500)
     lost = feed.stats.dropped_rows
     assert 0 < lost < 500
@@ -167,7 +167,7 @@ def test_when_the_spill_is_full_rows_are_dropped_counted_and_told(played) -> Non
         _, number, _ = recorder.take(1)[0]
         recorder.say(feed, 1, number + 1, number)
     assert feed.wants_keyframe
-    feed.keyframe(Keyframe(499, b"", b"", b""), ROOT)
+    feed.add_keyframe(Keyframe(499, b"", b"", b""), ROOT)
     assert not feed.wants_keyframe
     batch = decode_batch(recorder.take(1)[0][2])
     assert batch.dropped_rows == lost
@@ -178,7 +178,7 @@ def test_when_the_spill_is_full_rows_are_dropped_counted_and_told(played) -> Non
 def test_what_nobody_took_before_the_end_is_counted(played) -> None:  # type: ignore[no-untyped-def]
     _, endpoint, folder = played
     feed = RecorderFeed(endpoint, folder, window_bytes=2000)
-    feed.header(make_header())
+    feed.send_header(make_header())
     steps(feed, 0, 300)
     waiting = feed._spill.rows
     assert not feed.close(0.0)
@@ -198,14 +198,14 @@ def test_the_silence_of_a_recorder_that_has_something_to_write_is_measured(feed:
     feed.flush()
     assert feed.silence_ns == 0
     played[0].say(feed, 1, 20, 19)
-    feed.row(make_row(ROOT, 200, 60_000_000_000, 0, [], b"d" * 16))  # the session itself stood still
+    feed.add_row(make_row(ROOT, 200, 60_000_000_000, 0, [], b"d" * 16))  # the session itself stood still
     assert feed.silence_ns == 0
 
 
 def test_a_spill_file_that_cannot_be_read_back_is_a_gap_and_not_the_end(played) -> None:  # type: ignore[no-untyped-def]
     recorder, endpoint, folder = played
     feed = RecorderFeed(endpoint, folder, window_bytes=2000)
-    feed.header(make_header())
+    feed.send_header(make_header())
     steps(feed, 0, 300)
     waiting = feed._spill.rows
     os.ftruncate(feed._spill._fd, 10)
@@ -226,10 +226,10 @@ def test_states_events_and_denials_travel_with_the_rows(feed: RecorderFeed, play
     head = PresenceItem("p1", "head", Pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0)), 5)
     denial = Denial("held", "left is held", "ask", "left", "p2", "Ada")
     replies = (OutgoingMessage(4, Reply(1, False, denial)), OutgoingMessage(5, Reply(2, True)))
-    feed.decision(3, 70, Decision(commands=(), outgoing=replies, presence=(head,)))
-    feed.state(3, 9, 0.1, 70, np.arange(21.0).reshape(3, 7))
-    feed.metric("late_ms", 2.5)
-    feed.keyframe(Keyframe(2, b"p", b"a", b"c"), ROOT)
+    feed.add_decision(3, 70, Decision(commands=(), outgoing=replies, presence=(head,)))
+    feed.add_state(3, 9, 0.1, 70, np.arange(21.0).reshape(3, 7))
+    feed.add_metric("late_ms", 2.5)
+    feed.add_keyframe(Keyframe(2, b"p", b"a", b"c"), ROOT)
     batch = decode_batch(played[0].take(1)[0][2])
     assert [(d.connection, d.denial) for d in batch.denials] == [(4, denial)]
     assert batch.states[0].presence == (head,)
@@ -241,7 +241,7 @@ def test_states_events_and_denials_travel_with_the_rows(feed: RecorderFeed, play
 
 def test_lists_are_bounded_when_no_step_is_taken(feed: RecorderFeed) -> None:
     for i in range(BATCH_ITEMS + 10):
-        feed.metric("m", i)
+        feed.add_metric("m", i)
     assert feed.stats.dropped_items == 10
 
 
@@ -254,7 +254,7 @@ def test_a_scene_comes_before_its_row_and_again_with_the_header_for_a_new_record
     assert [decode_batch(frame) for frame in recorder.more] == [Batch(assets=[SceneAssets()])]
     steps(feed, 0, 3)
     bodies = (BodyInfo(1, "cup", moving=True),)
-    feed.scene("hash", b"packed", bodies, "/store", "ab")
+    feed.send_scene("hash", b"packed", bodies, "/store", "ab")
     steps(feed, 3, BATCH_ROWS)
     before, scene, after = (decode_batch(body) for _, _, body in recorder.take(3))
     assert [row.step for row in before.rows] == [0, 1, 2]
@@ -266,7 +266,7 @@ def test_a_scene_comes_before_its_row_and_again_with_the_header_for_a_new_record
     recorder.take(1)
     known = [Batch(scenes=scene.scenes, assets=scene.assets)]
     assert [decode_batch(frame) for frame in recorder.more] == known
-    feed.patch("/store", "cd")
+    feed.send_patch("/store", "cd")
     (patch,) = (decode_batch(body) for _, _, body in recorder.take(1))
     assert (patch.scenes, patch.assets) == ([], [SceneAssets(12, 24_000_000, "/store", "cd")])
     recorder.say(feed, 3, -1, -1)
@@ -288,10 +288,10 @@ def test_vertices_go_by_a_socket_of_their_own_at_their_rate(played, tmp_path: Pa
     vertices = recorder.context.socket(zmq.PULL)
     vertices.bind(f"ipc://{tmp_path}/v")
     feed = RecorderFeed(endpoint, folder, vertices_endpoint=f"ipc://{tmp_path}/v")
-    feed.header(make_header())
+    feed.send_header(make_header())
     for now_ns in (0, 20_000_000, 50_000_000):
-        feed.vertices("flex-0", square, now_ns)
-    feed.vertices("flex-1", square, 50_000_000)
+        feed.send_vertices("flex-0", square, now_ns)
+    feed.send_vertices("flex-1", square, 50_000_000)
     taken = []
     while len(taken) < 3:
         assert vertices.poll(5000)
@@ -302,7 +302,7 @@ def test_vertices_go_by_a_socket_of_their_own_at_their_rate(played, tmp_path: Pa
         ("flex-1", 50_000_000, square),
     ]
     recorder.say(feed, 1, -1, -1)  # has seen none of them
-    feed.vertices("flex-0", square, 60_000_000)
+    feed.send_vertices("flex-0", square, 60_000_000)
     assert vertices.poll(5000)
     vertices.close()
     feed.close(0.0)
@@ -315,9 +315,9 @@ def test_vertices_that_nobody_takes_are_dropped_and_counted_and_the_journal_goes
 ) -> None:
     recorder, endpoint, folder = played
     feed = RecorderFeed(endpoint, folder, vertices_endpoint=f"ipc://{tmp_path}/nobody")
-    feed.header(make_header())
+    feed.send_header(make_header())
     for i in range(VERTEX_FRAMES + 7):
-        feed.vertices("flex-0", square, i * 50_000_000)
+        feed.send_vertices("flex-0", square, i * 50_000_000)
     assert (feed.stats.dropped_vertices, feed.stats.window_bytes) == (7, 0)
     recorder.say(feed, 1, -1, -1)
     steps(feed, 0, BATCH_ROWS)

@@ -15,14 +15,14 @@ from iris_session.recording.journal import (
     JournalRow,
     Keyframe,
     array_header,
-    chain_of,
     check_fields,
     check_keyframe,
     check_row,
+    compute_chain,
     header_root,
     make_row,
     pack_model,
-    seal,
+    seal_keyframe,
     unpack_model,
 )
 from tests.recording.support import make_entries, make_header
@@ -43,7 +43,7 @@ def test_a_row_is_what_was_written() -> None:
     row = a_row()
     assert check_row(ROOT, row) is None
     assert check_fields(row) is None
-    assert chain_of(ROOT, row) == row.chain
+    assert compute_chain(ROOT, row) == row.chain
     assert decode_entries(row.entries) == (make_entries(5) * 9)[:3]
     assert row.entries == encode_entries((make_entries(5) * 9)[:3])
 
@@ -116,7 +116,7 @@ def test_the_first_chain_value_binds_the_header() -> None:
 
 
 def test_a_changed_keyframe_is_named() -> None:
-    sealed = seal(Keyframe(9, b"plant", b"authority", b"controller", b"status"), ROOT)
+    sealed = seal_keyframe(Keyframe(9, b"plant", b"authority", b"controller", b"status"), ROOT)
     assert check_keyframe(sealed) == ""
     for name in ("plant", "authority", "controller", "status"):
         assert check_keyframe(msgspec.structs.replace(sealed, **{name: b"x"})) == name

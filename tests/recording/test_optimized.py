@@ -45,7 +45,7 @@ def record(path: Path, recording_class: str) -> Path:
     """A whole recording, with something of every kind in it."""
     header, batch = journal(STEPS, recording_class)
     writer = RrdWriter(path, "id")
-    writer.header(header)
+    writer.write_header(header)
     rng = np.random.default_rng(5)
     for i in range(0, STEPS, 20):
         part = Batch(rows=batch.rows[i : i + 20])
@@ -107,14 +107,14 @@ def test_denials_that_are_alike_are_counted_across_chunks(tmp_path: Path) -> Non
     alike = [DenialRecord(7, 70, 3, Denial("held", "it is held"))] * 40
     for number in (1, 2):
         writer = RrdWriter(part_path(str(tmp_path / "session.rrd"), number), "id")
-        writer.header(header)
+        writer.write_header(header)
         writer.add(Batch(rows=batch.rows[:10], denials=[*alike]))
         writer.close()
     copy = optimize(
         tmp_path / "indexed.rrd", "--split-size-ratio", "1", "--max-rows", "7",
         tmp_path / "session.rrd", tmp_path / "session.part2.rrd",
     )  # fmt: skip
-    pieces = [chunk.num_rows for chunk in rrd_file.chunks(copy, DENIALS)]
+    pieces = [chunk.num_rows for chunk in rrd_file.read_chunks(copy, DENIALS)]
     assert len(pieces) > 2, "else this shows nothing"
     for path in (copy, tmp_path / "session.rrd"):
         with Recording.open(path) as recording:
@@ -124,10 +124,10 @@ def test_denials_that_are_alike_are_counted_across_chunks(tmp_path: Path) -> Non
 def test_columns_do_lie_in_chunks_of_their_own(tmp_path: Path) -> None:
     """Else the tests above would show nothing."""
     copy = optimize(tmp_path / "indexed.rrd", "--split-size-ratio", "1.5", record(tmp_path / "session.rrd", OPEN))
-    columns = [set(chunk.to_record_batch().schema.names) for chunk in rrd_file.chunks(copy, ROWS)]
+    columns = [set(chunk.to_record_batch().schema.names) for chunk in rrd_file.read_chunks(copy, ROWS)]
     assert any("plant" in names and "chain" not in names for names in columns)
-    assert rrd_file.scan(copy).indexed
-    assert not rrd_file.scan(tmp_path / "session.rrd").indexed
+    assert rrd_file.scan_file(copy).indexed
+    assert not rrd_file.scan_file(tmp_path / "session.rrd").indexed
 
 
 def test_a_plant_that_only_some_rows_have(tmp_path: Path) -> None:
@@ -268,7 +268,7 @@ def test_of_several_recordings_in_a_file_it_is_said_that_one_is_read(tmp_path: P
     second = tmp_path / "b.rrd"
     writer = RrdWriter(second, "another id")
     other = msgspec.structs.replace(header, session_name="the other")
-    writer.header(other)
+    writer.write_header(other)
     writer.add(Batch(denials=[DenialRecord(1, 7, 3, Denial("held", "it is held"))]))
     writer.close()
     merged = optimize(tmp_path / "one.rrd", first, second)

@@ -35,15 +35,15 @@ def asked() -> list[psutil.Process]:
 def test_a_process_that_answered_is_asked_again_and_at_most_one_is_kept(path: Path) -> None:
     with Prober() as first, Prober() as second:
         assert asked() == []
-        assert first.readable(path)
+        assert first.is_readable(path)
         (one,) = asked()
-        assert second.recordings(path) == 1
+        assert second.count_recordings(path) == 1
         (other,) = set(asked()) - {one}
     assert asked() in ([one], [other])
     (kept,) = asked()
     with Prober() as prober:
-        assert not prober.readable(path.with_name("none.rrd"))
-        assert prober.readable(path)
+        assert not prober.is_readable(path.with_name("none.rrd"))
+        assert prober.is_readable(path)
         assert asked() == [kept]
         prober.__exit__(KeyboardInterrupt, KeyboardInterrupt(), None)  # an answer may still be on its way
         assert asked() == []
@@ -51,18 +51,18 @@ def test_a_process_that_answered_is_asked_again_and_at_most_one_is_kept(path: Pa
 
 def test_one_that_ended_between_two_questions_is_not_taken_for_a_damaged_file(path: Path) -> None:
     with Prober() as prober:
-        assert prober.readable(path)
+        assert prober.is_readable(path)
         asked()[0].kill()
-        assert prober.readable(path)
+        assert prober.is_readable(path)
 
 
 def test_one_that_ended_meanwhile_is_not_taken_for_a_damaged_file(path: Path) -> None:
     with Prober() as prober:
-        assert prober.readable(path)
+        assert prober.is_readable(path)
     (kept,) = asked()
     kept.kill()
     with Prober() as prober:
-        assert prober.readable(path)
+        assert prober.is_readable(path)
     assert kept not in asked()
 
 
@@ -79,7 +79,7 @@ def test_it_ends_where_nobody_asks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_fork_does_not_ask_what_its_parent_started(path: Path) -> None:
     with Prober() as prober:
-        assert prober.readable(path)
+        assert prober.is_readable(path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # other threads: the fork does nothing but look
         pid = os.fork()

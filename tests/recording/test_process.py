@@ -99,7 +99,7 @@ def test_a_batch_that_breaks_a_limit_is_counted_and_its_journal_kept(tmp_path: P
     with recorder(path) as (process, feed):
         session = SmallSession(feed)
         session.take(5)
-        feed.metric("n" * 100, 1.0)
+        feed.add_metric("n" * 100, 1.0)
         session.take(100)
         assert feed.close(20.0)
         assert feed.stats.recorder is not None
@@ -239,7 +239,7 @@ def test_vertices_come_into_the_picture_and_cost_the_journal_nothing(tmp_path: P
     rest = decode_arrays(store.get(parsed.spec.deformables[0].address), ArrayKind.DEFORMABLE)["position"]
     with recorder(path) as (process, feed):
         session = SmallSession(feed)
-        feed.patch(str(store.root), parsed.scene_hash)
+        feed.send_patch(str(store.root), parsed.scene_hash)
         for i in range(40):
             if i == 10:
                 wait_until(lambda: _status(feed).written >= 4)
@@ -249,7 +249,7 @@ def test_vertices_come_into_the_picture_and_cost_the_journal_nothing(tmp_path: P
             session.take(25)
             frames = encoder.encode(rest + 0.01 * i)
             assert frames is not None
-            feed.vertices("flex-0", frames["full"], (session.step_count - 8) * TICK_NS)  # a state is every eighth
+            feed.send_vertices("flex-0", frames["full"], (session.step_count - 8) * TICK_NS)  # a state is every eighth
         assert feed.close(20.0)
         assert feed.stats.recorder is not None
         assert feed.stats.recorder.vertices_refused == 0

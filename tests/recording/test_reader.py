@@ -19,11 +19,10 @@ from iris_session.recording import (
     rrd_file,
     verify,
 )
-from iris_session.recording.columns import blobs, nanoseconds, sequence
 from iris_session.recording.journal import FORMAT
 from iris_session.recording.paths import part_path
 from iris_session.recording.verify import _Run
-from iris_session.recording.writer import RrdWriter
+from iris_session.recording.writer import RrdWriter, bytes_column, duration_index, sequence_index
 from tests.recording.support import SmallCore, journal, write
 
 
@@ -33,7 +32,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def test_scan_finds_every_message_of_a_whole_file(path: Path) -> None:
-    found = rrd_file.scan(path)
+    found = rrd_file.scan_file(path)
     assert found.good_bytes == found.size == os.path.getsize(path)
     assert found.messages[-1].kind == rrd_file.KIND_END
 
@@ -41,7 +40,7 @@ def test_scan_finds_every_message_of_a_whole_file(path: Path) -> None:
 @pytest.mark.parametrize(("lost_messages", "least"), [(1, 200), (4, 180), (14, 80)])
 def test_a_file_that_was_cut_reads_up_to_the_cut(path: Path, lost_messages: int, least: int) -> None:
     """As after a kill in the middle of a write: no footer, and half of a message at the end."""
-    cut = rrd_file.scan(path).messages[-lost_messages]
+    cut = rrd_file.scan_file(path).messages[-lost_messages]
     path.write_bytes(path.read_bytes()[: cut.offset + (16 + cut.length) // 2])
     with Recording.open(path) as recording:
         steps = [row.step for row in recording.rows()]
@@ -61,11 +60,11 @@ def test_a_damaged_length_hides_one_message_and_not_the_rest(
 ) -> None:
     monkeypatch.setattr(rrd_file, "WINDOW_BYTES", window)
     data = bytearray(path.read_bytes())
-    messages = [m for m in rrd_file.scan(path).messages if m.kind == rrd_file.KIND_ARROW]
+    messages = [m for m in rrd_file.scan_file(path).messages if m.kind == rrd_file.KIND_ARROW]
     victim = messages[-6]
     data[victim.offset + 12] ^= 0x40
     path.write_bytes(data)
-    found = rrd_file.scan(path)
+    found = rrd_file.scan_file(path)
     assert found.holes == [(victim.offset, messages[-5].offset)]
     assert not found.cut
     report = verify(path, SmallCore)
@@ -92,7 +91,7 @@ def test_any_flipped_bit_in_the_file_is_survived_and_found(path: Path) -> None:
 
 def test_a_damaged_message_is_left_out_and_the_rest_is_read(path: Path) -> None:
     data = bytearray(path.read_bytes())
-    messages = [m for m in rrd_file.scan(path).messages if m.kind == rrd_file.KIND_ARROW]
+    messages = [m for m in rrd_file.scan_file(path).messages if m.kind == rrd_file.KIND_ARROW]
     victim = messages[-8]
     for i in range(victim.offset + 60, victim.offset + victim.length, 7):
         data[i] ^= 0xFF
@@ -113,7 +112,7 @@ def test_a_damaged_message_is_left_out_and_the_rest_is_read(path: Path) -> None:
 def test_damage_is_a_list_that_somebody_can_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reader, "MOST_DAMAGE", 3)
     data = bytearray(path.read_bytes())
-    for victim in [m for m in rrd_file.scan(path).messages if m.kind == rrd_file.KIND_ARROW][-12:-3]:
+    for victim in [m for m in rrd_file.scan_file(path).messages if m.kind == rrd_file.KIND_ARROW][-12:-3]:
         for i in range(victim.offset + 60, victim.offset + victim.length, 7):
             data[i] ^= 0xFF
     path.write_bytes(data)
@@ -203,7 +202,7 @@ def test_a_part_that_is_missing_is_found(tmp_path: Path) -> None:
 
 
 def test_a_file_that_was_cut_between_two_writes_is_not_called_finished(path: Path) -> None:
-    message = rrd_file.scan(path).messages[-14]
+    message = rrd_file.scan_file(path).messages[-14]
     os.truncate(path, message.offset)
     report = verify(path, SmallCore)
     assert (report.ok, report.finished, report.cuts) == (True, False, [])
@@ -226,12 +225,12 @@ def test_what_does_not_decode_is_one_line_that_names_the_place(tmp_path: Path) -
     path = tmp_path / "session.rrd"
     header, batch = journal(60)
     writer = RrdWriter(path, "id")
-    writer.header(header)
+    writer.write_header(header)
     writer.add(batch)
     writer.flush()
-    times = [sequence(paths.STEP, [59]), nanoseconds(paths.SESSION_TIME, [0])]
+    times = [sequence_index(paths.STEP, [59]), duration_index(paths.SESSION_TIME, [0])]
     for entity, column in PLACES.items():
-        writer._send(entity, times, [blobs(column, [b"\xc1 nothing"])])
+        writer._send_columns(entity, times, [bytes_column(column, [b"\xc1 nothing"])])
     writer.flush()
     writer._stream.close()
     report = verify(path, SmallCore)
@@ -243,7 +242,7 @@ def test_what_does_not_decode_is_one_line_that_names_the_place(tmp_path: Path) -
 
 
 def test_a_mark_of_bytes_that_cannot_be_is_found(path: Path) -> None:
-    marks = [rrd_file.Mark(-5, 2**62, 0), rrd_file.Mark(12, rrd_file.scan(path).size, 0)]
+    marks = [rrd_file.Mark(-5, 2**62, 0), rrd_file.Mark(12, rrd_file.scan_file(path).size, 0)]
     assert [line.partition(" are")[0] for line in rrd_file.changed_spans(path, marks)] == [
         f"bytes {mark.begin} to {mark.end}" for mark in marks
     ]

@@ -13,7 +13,7 @@ import pytest
 from iris_session.recording import Recording
 from iris_session.recording.errors import WriteError
 from iris_session.recording.messages import Batch, MetricRecord
-from iris_session.recording.rrd_file import scan
+from iris_session.recording.rrd_file import scan_file
 from iris_session.recording.writer import RrdWriter
 from tests.recording.support import journal
 
@@ -25,7 +25,7 @@ def metrics(i: int) -> Batch:
 def test_memory_does_not_grow_with_chunks(tmp_path: Path) -> None:
     """Rerun's own file sink would keep some 3 KB of every one of these 5,000 chunks."""
     writer = RrdWriter(tmp_path / "w.rrd", "id")
-    writer.header(journal(0)[0])
+    writer.write_header(journal(0)[0])
     process, after = psutil.Process(), 0
     for i in range(175):
         writer.add(metrics(i))
@@ -41,7 +41,7 @@ def test_a_write_that_fails_leaves_no_half_message(tmp_path: Path) -> None:
     path = tmp_path / "w.rrd"
     writer = RrdWriter(path, "id")
     header, batch = journal(50)
-    writer.header(header)
+    writer.write_header(header)
     writer.add(batch)
     writer.flush()
     size = path.stat().st_size
@@ -50,7 +50,7 @@ def test_a_write_that_fails_leaves_no_half_message(tmp_path: Path) -> None:
     with pytest.raises(WriteError, match=r"w\.rrd cannot be written: No space left on device$"):
         writer.flush()
     assert path.stat().st_size == size
-    assert not scan(path).cut
+    assert not scan_file(path).cut
     with Recording.open(path) as recording:
         assert (len(list(recording.rows())), recording.finished, recording.damage) == (50, False, [])
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from iris_session.recording.spill import SpillFile
+from iris_session.recording.feed import SpillFile
 
 
 def test_first_in_first_out_and_gone_when_empty(tmp_path: Path) -> None:
@@ -54,7 +54,7 @@ def test_the_limit_is_on_what_waits(tmp_path: Path) -> None:
         while len(plain) > rng.randrange(2, 12):
             assert spill.pop() == plain.pop(0)
         assert (len(spill), spill.rows, spill.others) == (len(plain), sum(n for _, n in plain), 2 * len(plain))
-        assert spill.waiting_bytes == sum(len(d) + 12 for d, _ in plain)
+        assert spill.pending_bytes == sum(len(d) + 12 for d, _ in plain)
         most = max(most, os.fstat(spill._fd).st_size)
     assert spill.push(b"x" * 100, 0)
     assert most <= 1000

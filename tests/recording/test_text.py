@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from iris_session.protocol.common import Alignment, Denial, Lease, Pose
 from iris_session.protocol.server_messages import AlignmentChanged, Event, Gap, LeaseChanged
-from iris_session.recording import versions
+from iris_session.recording import environment as versions
 from iris_session.recording.messages import DenialRecord
-from iris_session.recording.text import describe_denial, describe_event, describe_session
+from iris_session.recording.writer import describe_denial, describe_event, describe_session
 from tests.recording.support import make_header
 
 
@@ -35,8 +35,8 @@ def test_the_session_page_names_class_and_versions() -> None:
 
 
 def test_versions_here_equal_versions_here() -> None:
-    here = versions.environment()
+    here = versions.describe_environment()
     assert here["numpy"] != "absent"
-    assert versions.differences(here) == []
+    assert versions.compare_environment(here) == []
     other = {**here, "numpy": "1.0", "gone": "2"}
-    assert [line.split(":")[0] for line in versions.differences(other)] == ["gone", "numpy"]
+    assert [line.split(":")[0] for line in versions.compare_environment(other)] == ["gone", "numpy"]

@@ -13,7 +13,7 @@ import pytest
 from iris_session.protocol.client_messages import Marker
 from iris_session.protocol.entries import HOST, Entry
 from iris_session.recording import Recording, SessionHeader, verify
-from iris_session.recording.journal import CRASHED, Keyframe, make_row, seal
+from iris_session.recording.journal import CRASHED, Keyframe, make_row, seal_keyframe
 from iris_session.recording.verify import Models
 from tests.recording.support import TICK_NS, SmallCore, journal, write
 
@@ -154,7 +154,7 @@ def test_changed_keyframes_are_named(path: Path) -> None:
 def test_a_sealed_keyframe_of_another_state_is_a_divergence(path: Path) -> None:
     header, batch = journal(200)
     true = batch.keyframes[2]
-    batch.keyframes[2] = seal(Keyframe(99, true.plant, b"other" * 4, true.controller, true.status), true.chain)
+    batch.keyframes[2] = seal_keyframe(Keyframe(99, true.plant, b"other" * 4, true.controller, true.status), true.chain)
     report = verify(write(path, header, batch), SmallCore)
     assert [(p.step, p.field, p.kind) for p in report.problems] == [(99, "authority", "divergence")]
 

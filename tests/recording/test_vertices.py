@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from iris_session.recording.vertices import BYTES_PER_S, PERIOD_NS, VERTEX_BYTES, VertexPace
+from iris_session.recording.feed import BYTES_PER_S, PERIOD_NS, VERTEX_BYTES, VertexRateLimit
 
 S = 1_000_000_000
 
 
-def taken(pace: VertexPace, counts: dict[str, int], seconds: int, hz: float) -> dict[str, int]:
+def taken(pace: VertexRateLimit, counts: dict[str, int], seconds: int, hz: float) -> dict[str, int]:
     """Frames that go in of meshes that move in every state."""
     found = dict.fromkeys(counts, 0)
     for i in range(round(seconds * hz)):
@@ -20,13 +20,13 @@ def taken(pace: VertexPace, counts: dict[str, int], seconds: int, hz: float) -> 
 
 @pytest.mark.parametrize("hz", [60.0, 59.94, 30.0, 21.0])
 def test_a_small_mesh_comes_at_its_rate(hz: float) -> None:
-    n = taken(VertexPace(), {"a": 1000}, 10, hz)["a"]
+    n = taken(VertexRateLimit(), {"a": 1000}, 10, hz)["a"]
     assert 10 * S / PERIOD_NS * 0.75 <= n <= 10 * S / PERIOD_NS + 1
 
 
 @pytest.mark.parametrize("counts", [{"a": 10_000}, {"a": 20_000, "b": 20_000, "c": 100}, {"a": 262_144}])
 def test_large_meshes_share_the_bytes_and_none_starves(counts: dict[str, int]) -> None:
-    found = taken(VertexPace(), counts, 60, 60.0)
+    found = taken(VertexRateLimit(), counts, 60, 60.0)
     size = sum(found[stream] * count * VERTEX_BYTES for stream, count in counts.items())
     first = sum(counts.values()) * VERTEX_BYTES  # goes in whatever its size
     assert 0.7 * 60 * BYTES_PER_S <= size <= 60 * BYTES_PER_S + 2 * first
@@ -34,7 +34,7 @@ def test_large_meshes_share_the_bytes_and_none_starves(counts: dict[str, int]) -
 
 
 def test_a_new_scene_is_seen_at_once() -> None:
-    pace = VertexPace()
+    pace = VertexRateLimit()
     assert pace.take("a", 100_000, 0)
     assert not pace.take("a", 100_000, S)
     pace.reset()

@@ -25,10 +25,11 @@ from iris_session.protocol.scene import (
     encode_scene,
 )
 from iris_session.protocol.server_messages import BodyInfo, EStopChanged, Event, PresenceItem
-from iris_session.recording import Recording, SessionHeader, pack_model, scene
+from iris_session.recording import Recording, SessionHeader, pack_model
+from iris_session.recording import scene_geometry as scene
 from iris_session.recording.messages import Batch, DenialRecord, SceneAssets, SceneModel, StateFrame
-from iris_session.recording.pictures import drawing
-from iris_session.recording.scene import Form
+from iris_session.recording.picture import build_components
+from iris_session.recording.scene_geometry import VisualShape
 from iris_session.recording.writer import RrdWriter
 from iris_session.scene import AssetStore
 from iris_session.scene.mujoco_scene import parse_mujoco
@@ -46,7 +47,7 @@ def test_transforms_are_the_poses_of_moving_bodies_when_they_change(tmp_path: Pa
     path = tmp_path / "w.rrd"
     bodies = (BodyInfo(1, "a/b c", True), BodyInfo(2, "fixed", False), BodyInfo(3, "d", True))
     writer = RrdWriter(path, "id")
-    writer.header(SessionHeader("s", "n", "closed", 2_000_000, bodies=bodies))
+    writer.write_header(SessionHeader("s", "n", "closed", 2_000_000, bodies=bodies))
     poses = np.zeros((3, 7))
     poses[:, 3] = 1.0
     writer.add(Batch(states=[frame(0, poses)]))
@@ -75,7 +76,7 @@ def test_the_scene_stands_still_in_the_frames_that_move(tmp_path: Path) -> None:
     path = tmp_path / "w.rrd"
     writer = RrdWriter(path, "id")
     header = make_header()
-    writer.header(header)
+    writer.write_header(header)
     writer.add(Batch(states=[frame(5, np.zeros((len(header.bodies), 7)))]))
     writer.close()
     found = read(path)
@@ -92,14 +93,14 @@ def test_the_scene_stands_still_in_the_frames_that_move(tmp_path: Path) -> None:
 def test_a_scene_without_a_state_is_drawn_too(tmp_path: Path) -> None:
     path = tmp_path / "w.rrd"
     writer = RrdWriter(path, "id")
-    writer.header(make_header())
+    writer.write_header(make_header())
     writer.close()
     assert column(read(path)["/scene/1/ball/g\\/ball"], "step") == [-1]
 
 
 def test_capsules_begin_at_one_end_in_rerun_and_are_centred_in_mujoco() -> None:
     q = (0.8, 0.2, -0.4, 0.4)
-    poses = drawing(Form(scene.CAPSULE, (0.1, 0.1, 0.25)), (1, 2, 3, 4), "b", ((1.0, 2.0, 3.0), q))[1]
+    poses = build_components(VisualShape(scene.CAPSULE, (0.1, 0.1, 0.25)), (1, 2, 3, 4), "b", ((1.0, 2.0, 3.0), q))[1]
     start = tuple(poses.translations.as_arrow_array().to_pylist()[0])
     end = apply((start, q), (0.0, 0.0, 0.5))
     assert [(a + b) / 2 for a, b in zip(start, end, strict=True)] == pytest.approx((1.0, 2.0, 3.0))
@@ -108,7 +109,7 @@ def test_capsules_begin_at_one_end_in_rerun_and_are_centred_in_mujoco() -> None:
 def test_latencies_of_applied_samples_are_plotted_once_each(tmp_path: Path) -> None:
     path = tmp_path / "w.rrd"
     writer = RrdWriter(path, "id")
-    writer.header(SessionHeader("s", "n", "closed", 2_000_000))
+    writer.write_header(SessionHeader("s", "n", "closed", 2_000_000))
     first = Applied("left", "p1", "controller/right", 1, 1_000_000, 4_000_000, 6_000_000)
     second = msgspec.structs.replace(first, seq=2, capture_ns=5_000_000, step_ns=8_000_000)
     states = [
@@ -123,7 +124,7 @@ def test_latencies_of_applied_samples_are_plotted_once_each(tmp_path: Path) -> N
 def test_people_appear_once_and_move_with_their_captures(tmp_path: Path) -> None:
     path = tmp_path / "w.rrd"
     writer = RrdWriter(path, "id")
-    writer.header(SessionHeader("s", "n", "closed", 2_000_000))
+    writer.write_header(SessionHeader("s", "n", "closed", 2_000_000))
     none = np.zeros((0, 7))
 
     def person(x: float, capture_ns: int) -> tuple[PresenceItem, ...]:
@@ -142,7 +143,7 @@ def test_people_appear_once_and_move_with_their_captures(tmp_path: Path) -> None
 def test_events_and_denials_are_lines_to_read(tmp_path: Path) -> None:
     path = tmp_path / "w.rrd"
     writer = RrdWriter(path, "id")
-    writer.header(SessionHeader("s", "n", "closed", 2_000_000))
+    writer.write_header(SessionHeader("s", "n", "closed", 2_000_000))
     stop = Event(4, 9, 77, EStopChanged(True, "p1", "smoke"))
     denied = DenialRecord(9, 77, 3, Denial("held", "left is held", "ask for it", "left", "p2", "Ada"))
     writer.add(Batch(events=[stop], denials=[denied]))
@@ -157,7 +158,7 @@ def test_events_and_denials_are_lines_to_read(tmp_path: Path) -> None:
 def test_a_model_that_mujoco_refuses_does_not_stop_the_recording(tmp_path: Path) -> None:
     path = tmp_path / "w.rrd"
     writer = RrdWriter(path, "id")
-    writer.header(msgspec.structs.replace(make_header(), model=b"no zlib"))
+    writer.write_header(msgspec.structs.replace(make_header(), model=b"no zlib"))
     writer.close()
     assert "the scene is not drawn" in column(read(path)["/events/recorder"], "TextLog:text")[0][0]
 
@@ -190,7 +191,7 @@ def test_another_scene_is_drawn_from_its_moment_on_and_its_model_can_be_read(tmp
     path = tmp_path / "w.rrd"
     writer = RrdWriter(path, "id")
     header = make_header()
-    writer.header(header)
+    writer.write_header(header)
     cup, mjb = other_scene(8)
     first, second = np.zeros((len(header.bodies), 7)), np.array([[1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0]])
     writer.add(Batch(states=[frame(0, first), frame(8, first)]))
@@ -219,7 +220,7 @@ def test_states_of_the_scene_before_may_come_after_another_scene(tmp_path: Path)
     path = tmp_path / "w.rrd"
     writer = RrdWriter(path, "id")
     header = make_header()
-    writer.header(header)
+    writer.write_header(header)
     cup, _ = other_scene(8)
     before, after = np.zeros((len(header.bodies), 7)), np.zeros((1, 7))
     writer.add(Batch(scenes=[cup]))
@@ -240,7 +241,7 @@ def shared(store: AssetStore, model: mujoco.MjModel, **changes: Any) -> tuple[Sc
 def begun(path: Path, assets: SceneAssets) -> tuple[RrdWriter, Any]:
     """A file of the small session, and one state of it at step 0."""
     writer, header = RrdWriter(path, "id"), make_header()
-    writer.header(header)
+    writer.write_header(header)
     writer.add(Batch(assets=[assets]))
     poses = np.zeros((len(header.bodies), 7))
     writer.add(Batch(states=[frame(0, poses)]))
@@ -313,7 +314,7 @@ def test_a_patch_before_the_first_state_is_how_the_scene_begins(tmp_path: Path) 
     spec, assets = shared(store, mujoco.MjModel.from_xml_string(XML))
     address = store.put(encode_scene(apply_patch(spec, [SetVisual(1, rgba=(1.0, 0.0, 0.0, 1.0))])))
     writer = RrdWriter(tmp_path / "w.rrd", "id")
-    writer.header(make_header())
+    writer.write_header(make_header())
     writer.add(Batch(assets=[assets]))
     writer.add(Batch(assets=[SceneAssets(3, 9, str(store.root), address)]))
     writer.close()
@@ -340,7 +341,7 @@ def test_assets_that_are_gone_are_said_and_everything_else_is_written(tmp_path: 
 def test_a_model_that_was_changed_is_not_used(tmp_path: Path) -> None:
     path = tmp_path / "w.rrd"
     writer = RrdWriter(path, "id")
-    writer.header(make_header())
+    writer.write_header(make_header())
     cup, _ = other_scene(8)
     writer.add(Batch(scenes=[cup]))
     writer.close()

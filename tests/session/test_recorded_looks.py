@@ -14,7 +14,7 @@ from iris_session.protocol.common import IDENTITY, Applied
 from iris_session.protocol.entries import AlignmentAlarm, Entry, Join
 from iris_session.protocol.server_messages import Event, StateHeader
 from iris_session.protocol.steps import Decision
-from iris_session.recording import Frame, JournalRow, Keyframe, Recording, header_root, read_looks
+from iris_session.recording import JournalRow, Keyframe, Recording, TrackingFrame, header_root, read_alignment_history
 from iris_session.recording.messages import Batch
 from iris_session.recording.writer import RrdWriter
 from iris_session.session.stepper import Stepper
@@ -49,17 +49,17 @@ class Recorder:
         self.rows: list[JournalRow] = []
         self.events: list[Event] = []
 
-    def row(self, row: JournalRow) -> None:
+    def add_row(self, row: JournalRow) -> None:
         self.rows.append(row)
 
-    def decision(self, step: int, session_time: int, decision: Decision) -> None:
+    def add_decision(self, step: int, session_time: int, decision: Decision) -> None:
         self.events.extend(decision.events)
 
     def flush(self) -> None: ...
 
-    def keyframe(self, keyframe: Keyframe, chain: bytes) -> None: ...
+    def add_keyframe(self, keyframe: Keyframe, chain: bytes) -> None: ...
 
-    def state(
+    def add_state(
         self,
         step: int,
         tick: int,
@@ -69,7 +69,7 @@ class Recorder:
         applied: Sequence[Applied] = (),
     ) -> None: ...
 
-    def metric(self, name: str, value: float) -> None: ...
+    def add_metric(self, name: str, value: float) -> None: ...
 
     def take_gap(self) -> int:
         return 0
@@ -92,18 +92,18 @@ def test_looks_of_a_session_have_their_owners_and_frames(tmp_path: Path) -> None
             front.waiting = [Entry(connection, connection, now_ns, message)]
         stepper.step(1)
     writer = RrdWriter(tmp_path / "session.rrd", "id")
-    writer.header(header)
+    writer.write_header(header)
     writer.add(Batch(rows=recorder.rows, events=recorder.events))
     for connection, at_ns in ((ANN, 20 * TICK_NS), (BOB, 20 * TICK_NS), (ANN, 26 * TICK_NS)):
         writer.add_sample(connection, at_ns, _encode(Observation("table", "qr", IDENTITY, at_ns, 0, 1)))
     writer.close()
 
     with Recording.open(tmp_path / "session.rrd") as recording:
-        found = read_looks(recording)
+        found = read_alignment_history(recording)
     assert found.unowned == 0
-    assert {frame: len(looks) for frame, looks in found.looks.items()} == {
-        Frame("p1", 1, 0): 1,
-        Frame("p1", 1, 0, 1): 1,
-        Frame("p2", 1, 0): 1,
+    assert {frame: len(looks) for frame, looks in found.observations.items()} == {
+        TrackingFrame("p1", 1, 0): 1,
+        TrackingFrame("p1", 1, 0, 1): 1,
+        TrackingFrame("p2", 1, 0): 1,
     }
-    assert found.people["p1"].runs == ["run:a"]
+    assert found.participants["p1"].runs == ["run:a"]

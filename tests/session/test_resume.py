@@ -41,9 +41,9 @@ from iris_session.recording import (
     make_row,
     pack_model,
 )
-from iris_session.recording.journal import CRASHED, seal
+from iris_session.recording.environment import read_boot_id
+from iris_session.recording.journal import CRASHED, seal_keyframe
 from iris_session.recording.messages import Batch
-from iris_session.recording.versions import boot_id
 from iris_session.security.resume_tokens import ResumeTokens, encode_handback
 from iris_session.session import resume
 from iris_session.session.config import SessionConfig
@@ -97,11 +97,11 @@ def recorded(
         core.config.objects,
         core.world.bodies,
         origin_ns=time.monotonic_ns() - LAST_NS,
-        boot_id=boot_id(),
+        boot_id=read_boot_id(),
     )
     head = msgspec.structs.replace(head, **header)
     chain = header_root(head)
-    batch = Batch(keyframes=[seal(keyframe_of(core, -1), chain)])
+    batch = Batch(keyframes=[seal_keyframe(keyframe_of(core, -1), chain)])
     for step in range(STEPS):
         now_ns = (step + 1) * TICK_NS
         came = [*entries(step), *said.get(step, ())]
@@ -109,7 +109,7 @@ def recorded(
         batch.rows.append(change(row))
         chain = batch.rows[-1].chain
         if step in KEYFRAMES:
-            batch.keyframes.append(keyframes(seal(keyframe_of(core, step), chain)))
+            batch.keyframes.append(keyframes(seal_keyframe(keyframe_of(core, step), chain)))
     return write(path, head, batch)
 
 
@@ -446,16 +446,16 @@ class Journal:
     def __init__(self) -> None:
         self.batch = Batch()
 
-    def row(self, row: JournalRow) -> None:
+    def add_row(self, row: JournalRow) -> None:
         self.batch.rows.append(row)
 
     def flush(self) -> None:
         pass
 
-    def keyframe(self, keyframe: Keyframe, chain: bytes) -> None:
-        self.batch.keyframes.append(seal(keyframe, chain))
+    def add_keyframe(self, keyframe: Keyframe, chain: bytes) -> None:
+        self.batch.keyframes.append(seal_keyframe(keyframe, chain))
 
-    def state(
+    def add_state(
         self,
         step: int,
         tick: int,
@@ -466,10 +466,10 @@ class Journal:
     ) -> None:
         pass
 
-    def decision(self, step: int, session_time: int, decision: Decision) -> None:
+    def add_decision(self, step: int, session_time: int, decision: Decision) -> None:
         pass
 
-    def metric(self, name: str, value: float) -> None:
+    def add_metric(self, name: str, value: float) -> None:
         pass
 
     def take_gap(self) -> int:

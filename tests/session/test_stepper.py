@@ -61,7 +61,7 @@ class Recorder:
         self.scenes: list[tuple[int, str]] = []  # rows before it, hash
         self.drawn: list[tuple[str, str]] = []
 
-    def scene(
+    def send_scene(
         self,
         model_hash: str,
         packed_model: bytes,
@@ -74,20 +74,20 @@ class Recorder:
         self.scenes.append((len(self.rows), model_hash))
         self.drawn.append((root, scene_hash))
 
-    def patch(self, root: str, scene_hash: str) -> None:
+    def send_patch(self, root: str, scene_hash: str) -> None:
         self.drawn.append((root, scene_hash))
 
-    def row(self, row: JournalRow) -> None:
+    def add_row(self, row: JournalRow) -> None:
         self.rows.append(row)
 
     def flush(self) -> None:
         self.flushed = len(self.rows)
 
-    def keyframe(self, keyframe: Keyframe, chain: bytes) -> None:
+    def add_keyframe(self, keyframe: Keyframe, chain: bytes) -> None:
         assert chain == (self.rows[-1].chain if self.rows else b"root")
         self.keyframes.append(keyframe)
 
-    def state(
+    def add_state(
         self,
         step: int,
         tick: int,
@@ -99,10 +99,10 @@ class Recorder:
         self.states += 1
         self.state_times.append(session_time)
 
-    def decision(self, step: int, session_time: int, decision: Decision) -> None:
+    def add_decision(self, step: int, session_time: int, decision: Decision) -> None:
         pass
 
-    def metric(self, name: str, value: float) -> None:
+    def add_metric(self, name: str, value: float) -> None:
         self.metrics.append((name, value))
 
     def take_gap(self) -> int:

@@ -65,7 +65,7 @@ def test_inconsistent_row_counts_are_damage() -> None:
         assert journal.check_row(b"\0" * 16, damaged) is not None
         journal.check_fields(damaged)
     assert journal.check_row(b"\0" * 16, row) is None
-    keyframe = journal.seal(journal.Keyframe(3, b"p", b"a", b"c"), b"chain")
+    keyframe = journal.seal_keyframe(journal.Keyframe(3, b"p", b"a", b"c"), b"chain")
     assert journal.check_keyframe(keyframe) == ""
     assert journal.check_keyframe(msgspec.structs.replace(keyframe, step=2**64 - 1)) == "step"
 

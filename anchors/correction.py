@@ -1,7 +1,7 @@
-"""How a new estimate comes into force: small corrections slide in unnoticed, larger ones wait or are announced.
+"""Apply new estimates to an alignment: small corrections slide in unnoticed, larger ones are announced first.
 
-Nobody may see the scene jump, and no robot may move because an estimate did. While a clutch is engaged nothing changes;
-what has gathered meanwhile is told as `pending_m`. Pure: times are passed in.
+The scene must not jump visibly, and no robot may move because an estimate changed. While a clutch is engaged nothing
+changes; the correction gathered meanwhile is reported as `pending_m`. Pure: times are passed in.
 """
 
 from __future__ import annotations
@@ -26,13 +26,16 @@ from anchors.pose import (
     quat_to_rotvec,
 )
 
-Step = Literal["none", "first", "slide", "announced", "jump"]
+CorrectionStep = Literal["none", "first", "slide", "announced", "jump"]
 
 
 @dataclass(frozen=True)
-class SmoothConfig:
-    """`slide_m_per_s`, `slide_rad_per_s`: slow enough not to be noticed in a headset. Corrections above `announce_m` or
-    `announce_rad` are put off until they are accepted (`accept`), as a person would see them."""
+class CorrectionConfig:
+    """Limits of corrections.
+
+    `slide_m_per_s`, `slide_rad_per_s`: slow enough not to be noticed in a headset. Corrections above `announce_m` or
+    `announce_rad` would be visible and wait until `accept`.
+    """
 
     slide_m_per_s: float = 0.004
     slide_rad_per_s: float = math.radians(0.3)
@@ -41,64 +44,66 @@ class SmoothConfig:
 
 
 @dataclass(frozen=True)
-class InForce:
-    """The alignment to use now. `pending_m`, `pending_rad`: how far the estimate is away, at its pivot."""
+class CorrectedAlignment:
+    """The alignment to use now. `pending_m`, `pending_rad`: distance of the estimate, at its pivot."""
 
     T_world_tracking: PoseTuple
-    step: Step
+    step: CorrectionStep
     pending_m: float
     pending_rad: float
 
 
 @dataclass
-class SmoothAlignment:
-    """Follows the estimates of one headset."""
+class CorrectionFilter:
+    """Filter that follows the estimates of one headset."""
 
-    config: SmoothConfig = field(default_factory=SmoothConfig)
+    config: CorrectionConfig = field(default_factory=CorrectionConfig)
     _T_world_tracking: PoseTuple | None = None
     _epoch: int = 0
     _last_ns: int = 0
     _accepted: bool = False
 
     def accept(self) -> None:
-        """The announced correction may come, with the next update."""
+        """Accept the announced correction; it is applied with the next update."""
         self._accepted = True
 
-    def update(self, estimate: AlignmentEstimate, now_ns: int, engaged: bool = False) -> InForce | None:
-        """`None`: there is no alignment (refused and none before, or the tracking frame is a new one)."""
+    def update(self, estimate: AlignmentEstimate, now_ns: int, engaged: bool = False) -> CorrectedAlignment | None:
+        """Return the alignment to use, `None` if there is none (refused and none before, or a new tracking frame)."""
         seconds, self._last_ns = max(0.0, (now_ns - self._last_ns) * 1e-9), now_ns
         if estimate.tracking_epoch != self._epoch:
             self._T_world_tracking, self._epoch, self._accepted = None, estimate.tracking_epoch, False
         if estimate.refused:
-            return None if self._T_world_tracking is None else InForce(self._T_world_tracking, "none", 0.0, 0.0)
+            return (
+                None if self._T_world_tracking is None else CorrectedAlignment(self._T_world_tracking, "none", 0.0, 0.0)
+            )
         old, new = self._T_world_tracking, estimate.T_world_tracking
         if old is None:
             self._T_world_tracking = new
-            return InForce(new, "first", 0.0, 0.0)
+            return CorrectedAlignment(new, "first", 0.0, 0.0)
         pivot_tracking = apply(inverse(new), estimate.pivot_world)
         away, turn = distance(apply(old, pivot_tracking), estimate.pivot_world), quat_angle(old[1], new[1])
         if engaged:
-            return InForce(old, "none", away, turn)
+            return CorrectedAlignment(old, "none", away, turn)
         if away > self.config.announce_m or turn > self.config.announce_rad:
             if not self._accepted:
-                return InForce(old, "announced", away, turn)
+                return CorrectedAlignment(old, "announced", away, turn)
             self._T_world_tracking, self._accepted = new, False
-            return InForce(new, "jump", 0.0, 0.0)
+            return CorrectedAlignment(new, "jump", 0.0, 0.0)
         self._accepted = False
-        share = min(1.0, self._share(away, turn, seconds))
-        self._T_world_tracking = between(old, new, pivot_tracking, share)
-        return InForce(
+        share = min(1.0, self._slide_share(away, turn, seconds))
+        self._T_world_tracking = interpolate_about_pivot(old, new, pivot_tracking, share)
+        return CorrectedAlignment(
             self._T_world_tracking, "slide" if share > 0.0 else "none", (1.0 - share) * away, (1.0 - share) * turn
         )
 
-    def _share(self, away: float, turn: float, seconds: float) -> float:
+    def _slide_share(self, away: float, turn: float, seconds: float) -> float:
         needed = max(away / self.config.slide_m_per_s, turn / self.config.slide_rad_per_s, 1e-9)
         return min(seconds, 1.0) / needed  # after a pause it goes on sliding, it does not leap
 
 
-def between(old: PoseTuple, new: PoseTuple, pivot_tracking: Vec3, share: float) -> PoseTuple:
-    """`T_world_tracking` at a share of the way: the pivot moves on a straight line and everything turns about it, so
-    that a small turn moves nothing far at the anchor."""
+def interpolate_about_pivot(old: PoseTuple, new: PoseTuple, pivot_tracking: Vec3, share: float) -> PoseTuple:
+    """Interpolate `T_world_tracking`: the pivot moves on a straight line and everything rotates about it, so that a
+    small rotation moves nothing far at the anchor."""
     r = quat_to_rotvec(quat_mul(new[1], quat_conj(old[1])))
     q = quat_mul(quat_from_rotvec((share * r[0], share * r[1], share * r[2])), old[1])
     a, b = apply(old, pivot_tracking), apply(new, pivot_tracking)

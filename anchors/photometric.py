@@ -1,4 +1,4 @@
-"""Lays the known print over the photograph: the pose at which the sheet, rendered, looks most like the picture.
+"""Fit the known print to the photograph: the pose at which the rendered sheet resembles the picture most.
 
 Corners found by a detector are good to a few tenths of a pixel, and off in the same direction where a marker is a few
 pixels wide. Every edge of the print says more: this fits pose, brightness and contrast (both with a slope across the
@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.camera import Camera, matrix_of, pose_of_matrix
+from anchors.camera import CameraModel, pose_from_matrix, pose_to_matrix
 from anchors.pose import PoseTuple
 from anchors.sheet import HALF_HEIGHT, HALF_WIDTH, MARKER_EDGE, Sheet
 
@@ -24,7 +24,7 @@ Picture = NDArray[np.float32]
 
 #: Texels of the print per edge of the code.
 _TEXELS: Final = 640
-#: White around the markers that is looked at, as a share of the edge: less than every printer leaves.
+#: White border around the markers that is used, as a share of the edge: less than every printer leaves.
 _BORDER: Final = 0.025
 _MAX_PIXELS: Final = 30_000  # of the part of the picture that is used; larger ones are averaged first
 #: Where a module is a few pixels, the print is rendered on a finer grid, each way, and averaged as a sensor does.
@@ -42,7 +42,7 @@ _FLOOR_PX: Final = 0.02
 
 
 @dataclass(frozen=True)
-class Registered:
+class PhotometricFit:
     """`covariance`: 6x6 of position of the sheet's origin [m] and rotation [rad], camera frame. `rms`: what is left
     over, as a share of the contrast between paper and ink."""
 
@@ -60,15 +60,17 @@ class _View:
     rays: tuple[Array, Array]
     fine_rays: tuple[Array, Array]
     finer: int
-    camera: Camera
+    camera: CameraModel
 
 
-def register(grey: NDArray[np.uint8], camera: Camera, sheet: Sheet, T_camera_sheet: PoseTuple) -> Registered | None:
-    """Refines a pose that is right to about a pixel; `None` where it does not converge or too little is visible."""
-    view = _view(grey, camera, sheet, T_camera_sheet)
+def fit_print(
+    grey: NDArray[np.uint8], camera: CameraModel, sheet: Sheet, T_camera_sheet: PoseTuple
+) -> PhotometricFit | None:
+    """Refine a pose that is correct to about a pixel; `None` if it does not converge or too little is visible."""
+    view = _crop(grey, camera, sheet, T_camera_sheet)
     if view is None:
         return None
-    M = matrix_of(T_camera_sheet)
+    M = pose_to_matrix(T_camera_sheet)
     first = _fit(view, sheet, M, _BLURS[1], _ITERATIONS)
     if first is None:
         return None
@@ -78,14 +80,14 @@ def register(grey: NDArray[np.uint8], camera: Camera, sheet: Sheet, T_camera_she
     if fit is None:
         return None
     M, normal, rms = fit
-    covariance = _CORRELATED * np.linalg.inv(normal) + _floor(camera, sheet, M)
+    covariance = _CORRELATED * np.linalg.inv(normal) + _floor_covariance(camera, sheet, M)
     # From the camera's origin, about which the increments turn, to that of the sheet.
     shift = np.eye(6)
     shift[:3, 3:] = -_cross(M[:3, 3])
-    return Registered(pose_of_matrix(M), shift @ covariance @ shift.T, rms)
+    return PhotometricFit(pose_from_matrix(M), shift @ covariance @ shift.T, rms)
 
 
-def _view(grey: NDArray[np.uint8], camera: Camera, sheet: Sheet, pose: PoseTuple) -> _View | None:
+def _crop(grey: NDArray[np.uint8], camera: CameraModel, sheet: Sheet, pose: PoseTuple) -> _View | None:
     import cv2
 
     w, h = (HALF_WIDTH + _BORDER) * sheet.edge_m, (HALF_HEIGHT + _BORDER) * sheet.edge_m
@@ -103,23 +105,25 @@ def _view(grey: NDArray[np.uint8], camera: Camera, sheet: Sheet, pose: PoseTuple
     finer = _FINER if n > 1 or sheet.edge_m / 25.0 * small.fx < _FINE_ENOUGH_PX * pose[0][2] else 1
     return _View(
         part.astype(np.float32),
-        _rays(camera, low, n, part.shape, 1),
-        _rays(camera, low, n, part.shape, finer),
+        _compute_rays(camera, low, n, part.shape, 1),
+        _compute_rays(camera, low, n, part.shape, finer),
         finer,
         small,
     )
 
 
-def _rays(camera: Camera, low: NDArray[Any], n: int, shape: tuple[int, int], finer: int) -> tuple[Array, Array]:
-    """Normalised coordinates of a picture's part that begins at `low` and was averaged over n x n pixels."""
+def _compute_rays(
+    camera: CameraModel, low: NDArray[Any], n: int, shape: tuple[int, int], finer: int
+) -> tuple[Array, Array]:
+    """Return undistorted coordinates of a picture's part that begins at `low` and was averaged over n x n pixels."""
     v, u = ((np.arange(size * finer) + 0.5) * n / finer - 0.5 for size in shape)
     uu, vv = np.meshgrid(u + low[0], v + low[1])
-    rays = camera.normalise(np.column_stack([uu.ravel(), vv.ravel()]))
+    rays = camera.undistort(np.column_stack([uu.ravel(), vv.ravel()]))
     return rays[:, 0].reshape(uu.shape), rays[:, 1].reshape(uu.shape)
 
 
 def _fit(view: _View, sheet: Sheet, M: Array, blur: float, iterations: int) -> tuple[Array, Array, float] | None:
-    """Pose, its normal matrix over the variance of a pixel, and the relative residual."""
+    """Return the pose (4, 4), its normal matrix (6, 6) over the variance of a pixel, and the relative residual."""
     v, u = np.mgrid[-1.0 : 1.0 : view.grey.shape[0] * 1j, -1.0 : 1.0 : view.grey.shape[1] * 1j]
     for _ in range(iterations):
         rendered, inside, slopes = _render(view, sheet, M, blur)
@@ -152,15 +156,15 @@ def _fit(view: _View, sheet: Sheet, M: Array, blur: float, iterations: int) -> t
 
 
 def _render(view: _View, sheet: Sheet, M: Array, blur: float) -> tuple[Array, NDArray[np.bool_], Array]:
-    """The print as the camera should see it, which pixels count, and the change of each with (position, rotation) of
-    the sheet, shape (rows, columns, 6)."""
+    """Return the print as the camera should see it, the mask of pixels that count, and the derivative of each by
+    (position, rotation) of the sheet, shape (rows, columns, 6)."""
     import cv2
 
     texels_per_sample = _TEXELS / sheet.edge_m * float(np.linalg.norm(M[:3, 3])) / view.camera.fx / view.finer
-    levels = _levels(sheet.anchor_id)
+    levels = _build_pyramid(sheet.anchor_id)
     level = int(np.clip(np.log2(max(texels_per_sample, 1.0)), 0, len(levels) - 1))
     per_edge = _TEXELS / 2**level
-    X, Y, _ = _on_sheet(sheet, M, *view.fine_rays)
+    X, Y, _ = _intersect_sheet(sheet, M, *view.fine_rays)
     U = ((X + HALF_WIDTH + _BORDER) * per_edge - 0.5).astype(np.float32)
     V = ((HALF_HEIGHT + _BORDER - Y) * per_edge - 0.5).astype(np.float32)
     seen: Any = cv2.remap(levels[level], np.nan_to_num(U, nan=-1e6), np.nan_to_num(V, nan=-1e6),
@@ -175,16 +179,16 @@ def _render(view: _View, sheet: Sheet, M: Array, blur: float) -> tuple[Array, ND
     dv: Array = -view.camera.fy * np.asarray(down)
     x, y = view.rays
     dw = -(du * x + dv * y)
-    X, Y, s = _on_sheet(sheet, M, x, y)
-    slopes = np.stack([du * s, dv * s, dw * s, *_turned(du, dv, dw, x, y)], axis=2)
+    X, Y, s = _intersect_sheet(sheet, M, x, y)
+    slopes = np.stack([du * s, dv * s, dw * s, *_rotation_derivatives(du, dv, dw, x, y)], axis=2)
     ax, ay = np.abs(X), np.abs(Y)
     inside = (ax < HALF_WIDTH + _BORDER) & (ay < HALF_HEIGHT + _BORDER)
     written = (ay > 0.5 + 2 * _BORDER) & (ax < HALF_WIDTH - MARKER_EDGE - _BORDER)
     return rendered, inside & ~written, np.nan_to_num(slopes)
 
 
-def _on_sheet(sheet: Sheet, M: Array, x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Where rays meet the sheet, in edges of the code, and 1 / depth [1/m]; not a number behind the camera."""
+def _intersect_sheet(sheet: Sheet, M: Array, x: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Return where rays meet the sheet, in edges of the code, and 1 / depth [1/m]; NaN behind the camera."""
     H = np.linalg.inv(M[:3, [0, 1, 3]])
     s = H[2, 0] * x + H[2, 1] * y + H[2, 2]
     s = np.where(s > 1e-6, s, np.nan)
@@ -193,22 +197,22 @@ def _on_sheet(sheet: Sheet, M: Array, x: Array, y: Array) -> tuple[Array, Array,
     return X / sheet.edge_m, Y / sheet.edge_m, s
 
 
-def _turned(du: Array, dv: Array, dw: Array, x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Derivatives by a rotation about the camera's origin: (x, y, 1) x (du, dv, dw), the depth cancels."""
+def _rotation_derivatives(du: Array, dv: Array, dw: Array, x: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Return derivatives by a rotation about the camera's origin: (x, y, 1) x (du, dv, dw), the depth cancels."""
     return y * dw - dv, du - x * dw, x * dv - y * du
 
 
 @lru_cache(maxsize=32)
-def _levels(anchor_id: str) -> tuple[Picture, ...]:
-    """The print with its border, 1 for paper and 0 for ink, and ever coarser copies of it."""
+def _build_pyramid(anchor_id: str) -> tuple[Picture, ...]:
+    """Return the print with its border, 1 for paper and 0 for ink, and an image pyramid of it."""
     sheet = Sheet(anchor_id, 1.0)
     w, h = HALF_WIDTH + _BORDER, HALF_HEIGHT + _BORDER
     columns, rows = round(2 * w * _TEXELS), round(2 * h * _TEXELS)
     ink = np.zeros((rows, columns), dtype=np.float32)
-    for rects in sheet.black().values():
+    for rects in sheet.list_black_rects().values():
         for r in rects:
-            across = _coverage((r.x + w) * _TEXELS, r.width * _TEXELS, columns)
-            down = _coverage((h - r.y - r.height) * _TEXELS, r.height * _TEXELS, rows)
+            across = _cover_cells((r.x + w) * _TEXELS, r.width * _TEXELS, columns)
+            down = _cover_cells((h - r.y - r.height) * _TEXELS, r.height * _TEXELS, rows)
             (i,), (j,) = np.nonzero(down), np.nonzero(across)
             ink[i[0] : i[-1] + 1, j[0] : j[-1] + 1] += np.outer(down[i], across[j]).astype(np.float32)
     levels: list[Picture] = [(1.0 - np.minimum(ink, 1.0)).astype(np.float32)]
@@ -218,28 +222,29 @@ def _levels(anchor_id: str) -> tuple[Picture, ...]:
     return tuple(levels)
 
 
-def _coverage(start: float, length: float, n: int) -> Array:
-    """Share of each of n cells that the interval covers."""
+def _cover_cells(start: float, length: float, n: int) -> Array:
+    """Return the share of each of n cells that the interval covers."""
     cells = np.arange(n)
     covered: Array = np.clip(np.minimum(cells + 1, start + length) - np.maximum(cells, start), 0.0, 1.0)
     return covered
 
 
-def _floor(camera: Camera, sheet: Sheet, M: Array) -> Array:
-    """Covariance, increments about the camera's origin, if every marker corner had an error of `_FLOOR_PX`."""
+def _floor_covariance(camera: CameraModel, sheet: Sheet, M: Array) -> Array:
+    """Return the covariance (6, 6) of increments about the camera's origin if every corner had an error of
+    `_FLOOR_PX`."""
     points = sheet.marker_corners.reshape(-1, 3) @ M[:3, :3].T + M[:3, 3]
     x, y, s = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2], 1.0 / points[:, 2]
     rows = []
     for fu, fv in ((camera.fx, 0.0), (0.0, camera.fy)):
         du, dv = np.full_like(x, fu), np.full_like(x, fv)
         dw = -(du * x + dv * y)
-        rows.append(np.column_stack([du * s, dv * s, dw * s, *_turned(du, dv, dw, x, y)]))
+        rows.append(np.column_stack([du * s, dv * s, dw * s, *_rotation_derivatives(du, dv, dw, x, y)]))
     J = np.concatenate(rows)
     return np.asarray(np.linalg.inv(J.T @ J) * _FLOOR_PX**2)
 
 
 def _exp(step: Array) -> Array:
-    """4x4 matrix that turns by the rotation vector `step[3:]` about the origin, then moves by `step[:3]`."""
+    """Return the matrix (4, 4) that rotates by `step[3:]` [rad] about the origin, then translates by `step[:3]` [m]."""
     from scipy.spatial.transform import Rotation
 
     out = np.eye(4)
@@ -249,5 +254,5 @@ def _exp(step: Array) -> Array:
 
 
 def _cross(v: Array) -> Array:
-    """Matrix of the cross product `v x`."""
+    """Return the matrix (3, 3) of the cross product `v x`."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

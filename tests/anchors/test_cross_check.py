@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from anchors.alignment import AlignmentEstimate, AlignmentEstimator
-from anchors.crosscheck import CrossCheck, CrossCheckConfig
+from anchors.cross_check import CrossCheck, CrossCheckConfig
 from anchors.pose import PoseTuple, compose, inverse, quat_from_yaw
 from tests.anchors.worlds import Look, around, headset, shifted
 
@@ -29,7 +29,7 @@ def _aligned(rng: np.random.Generator, T_world_tracking: PoseTuple) -> Alignment
 
 def _see(check: CrossCheck, name: str, look: Look, T: PoseTuple, n: int = 20, epoch: int = 0, start: int = 1) -> None:
     for i in range(start, start + n):
-        check.see(name, "sheet", look.new(T), look.head(T), i * PERIOD, epoch)
+        check.add_observation(name, "sheet", look.new(T), look.head(T), i * PERIOD, epoch)
 
 
 def test_headsets_that_agree_do_so_within_what_is_expected() -> None:
@@ -42,8 +42,8 @@ def test_headsets_that_agree_do_so_within_what_is_expected() -> None:
             alignments[name] = _aligned(rng, T)
             _see(check, name, Look(rng, SHEET, around(rng, SHEET[0], 0.6)), T)
         (got,) = check.compare(alignments, 30 * PERIOD)
-        assert (got.a, got.b, got.thing, got.n) == ("a", "b", "sheet", 20)
-        assert got.as_expected
+        assert (got.a, got.b, got.target, got.n) == ("a", "b", "sheet", 20)
+        assert got.is_expected
         assert got.error_rad < math.radians(3.0)
         assert math.dist(got.p_world, SHEET[0]) < 0.01
         sizes.append(got.error_m)
@@ -60,7 +60,7 @@ def test_a_headset_that_was_bumped_disagrees_by_as_much() -> None:
         _see(check, name, Look(rng, SHEET, around(rng, SHEET[0], 0.6)), shifted(T, (bump, 0.0, 0.0)))
     (got,) = check.compare(alignments, 30 * PERIOD)
     assert got.error_m == pytest.approx(0.05, abs=0.01)
-    assert not got.as_expected
+    assert not got.is_expected
 
 
 def test_a_moving_controller_is_compared_at_the_same_instants() -> None:
@@ -72,7 +72,7 @@ def test_a_moving_controller_is_compared_at_the_same_instants() -> None:
         name = "ab"[i % 2]  # 72 Hz each, never at the same time; 1 m/s
         at: PoseTuple = ((i * 0.00694, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
         pose = compose(inverse(frames[name]), at)
-        check.see(name, "controller", pose, (0.0, 0.0, 0.0), i * 6_940_000, 0)
+        check.add_observation(name, "controller", pose, (0.0, 0.0, 0.0), i * 6_940_000, 0)
     (got,) = check.compare(exact, 200 * 6_940_000, moving=frozenset({"controller"}))
     assert got.error_m < 1e-6
     assert check.compare(exact, 200 * 6_940_000 + 61 * 10**9, moving=frozenset({"controller"})) == []
@@ -92,19 +92,19 @@ def test_a_recentred_refused_or_stale_headset_is_not_compared() -> None:
     assert check.compare({"a": good, "b": good}, 700 * 10**9) == [], "too long ago"
     _see(check, "b", look, T, epoch=1, start=40)
     assert check.compare({"a": good, "b": good}, 60 * PERIOD) == [], "its alignment is of another tracking frame"
-    check.forget("a")
+    check.discard_headset("a")
     assert check.compare({"a": good}, 60 * PERIOD) == []
 
 
 def test_memory_is_bounded_and_what_is_of_no_use_is_counted() -> None:
-    check = CrossCheck(config=CrossCheckConfig(max_things=2, max_seen=10))
+    check = CrossCheck(config=CrossCheckConfig(max_targets=2, max_observations=10))
     pose, zero = SHEET, (0.0, 0.0, 0.0)
     for i in range(100):
-        check.see("a", f"thing{i}", pose, zero, i, 0)
-        check.see("a", "thing0", pose, zero, i, 0)
+        check.add_observation("a", f"thing{i}", pose, zero, i, 0)
+        check.add_observation("a", "thing0", pose, zero, i, 0)
     assert check.dropped == 98 + 1
-    check.see("a", "thing0", ((math.nan, 0.0, 0.0), pose[1]), zero, 1000, 0)
-    check.see("a", "thing0", pose, zero, 5, 0)
+    check.add_observation("a", "thing0", ((math.nan, 0.0, 0.0), pose[1]), zero, 1000, 0)
+    check.add_observation("a", "thing0", pose, zero, 5, 0)
     assert check.dropped == 98 + 1 + 2
 
 
@@ -121,9 +121,9 @@ def test_what_comes_late_of_an_earlier_frame_forgets_nothing() -> None:
 
 
 def test_what_nobody_sees_any_more_makes_room() -> None:
-    check = CrossCheck(config=CrossCheckConfig(max_things=2, max_age_ns=10 * PERIOD))
+    check = CrossCheck(config=CrossCheckConfig(max_targets=2, max_age_ns=10 * PERIOD))
     for i, thing in enumerate("abcd"):
-        check.see("h", thing, SHEET, (0.0, 0.0, 1.0), i, 0)
+        check.add_observation("h", thing, SHEET, (0.0, 0.0, 1.0), i, 0)
     assert check.dropped == 2
-    check.see("h", "c", SHEET, (0.0, 0.0, 1.0), 20 * PERIOD, 0)
+    check.add_observation("h", "c", SHEET, (0.0, 0.0, 1.0), 20 * PERIOD, 0)
     assert check.dropped == 2

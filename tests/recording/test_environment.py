@@ -7,11 +7,10 @@ import sys
 
 SCRIPT = """
 import numpy, scipy.linalg
-from iris_session.recording import blas
-from iris_session.recording.versions import environment
-before = blas.threads()
-blas.use_one_thread()
-print(before, environment()["blas_threads"], bool(environment()["cpu"]))
+from iris_session.recording.environment import count_blas_threads, describe_environment, use_one_blas_thread
+before = count_blas_threads()
+use_one_blas_thread()
+print(before, describe_environment()["blas_threads"], bool(describe_environment()["cpu"]))
 """
 
 

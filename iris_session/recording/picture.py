@@ -18,10 +18,11 @@ import rerun as rr
 from anchors.pose import PoseTuple
 from iris_session.protocol.scene import SceneSpec, Visual
 from iris_session.protocol.server_messages import BodyInfo
-from iris_session.recording import paths, scene
-from iris_session.recording.bending import Bending
+from iris_session.recording import paths
+from iris_session.recording import scene_geometry as scene
+from iris_session.recording.deformables import DrawnDeformable
 from iris_session.recording.messages import SceneAssets
-from iris_session.recording.scene import Form, SceneReader
+from iris_session.recording.scene_geometry import SceneReader, VisualShape
 from iris_session.scene import SceneBuildError
 
 #: Step, tick, simulated time [ns], session time [ns].
@@ -32,7 +33,7 @@ NAMED: Final = 5
 _NOT_DRAWN: Final = (ValueError, LookupError, TypeError, OSError, zlib.error, SceneBuildError)
 
 
-class Source(NamedTuple):
+class SceneSource(NamedTuple):
     """What a scene is drawn from. `packed_model`: for where nothing is shared."""
 
     packed_model: bytes
@@ -58,28 +59,28 @@ class ScenePicture:
         self._rec = recording
         self._rec.set_log_time_enabled(False)
         self._number = 0
-        self._source: Source | None = None
+        self._source: SceneSource | None = None
         self._waits = False
         self._visuals: dict[int, _Drawn] = {}
         self._names: Counter[str] = Counter()
         self._failed: list[str] = []
-        self.bending: dict[str, Bending] = {}
+        self.deformables: dict[str, DrawnDeformable] = {}
         self.since_ns = 0
 
-    def begin(self, source: Source) -> None:
+    def set_scene(self, source: SceneSource) -> None:
         """The scene that the session began with. It is drawn by `draw`."""
         self._source, self._waits = source, True
 
-    def change(self, source: Source, moment: Moment) -> None:
+    def replace_scene(self, source: SceneSource, moment: Moment) -> None:
         """Another scene from `moment` on."""
         begun = not self._waits and self._source is not None
-        self.begin(source)
+        self.set_scene(source)
         if begun:
             self._at(moment)
             self._rec.log(self._folder, rr.Clear(recursive=True), strict=True)
             self.draw(moment)
 
-    def patch(self, assets: SceneAssets, moment: Moment) -> None:
+    def patch_scene(self, assets: SceneAssets, moment: Moment) -> None:
         """The present scene looks like this from `moment` on."""
         if self._source is None:
             return
@@ -97,7 +98,7 @@ class ScenePicture:
         self._number += 1
         self._visuals.clear()
         self._names.clear()
-        self.bending.clear()
+        self.deformables.clear()
         self.since_ns = moment[3]
         self._at(moment)
         self._with_scene(self._draw_all)
@@ -112,7 +113,7 @@ class ScenePicture:
         assert self._source is not None
         self._failed = []
         try:
-            with scene.opened(self._source.assets, self._source.packed_model) as (spec, store):
+            with scene.open_scene(self._source.assets, self._source.packed_model) as (spec, store):
                 work(spec, SceneReader(spec, store, self._source.bodies))
         except _NOT_DRAWN as error:
             self._say(f"the scene is not drawn: {error}")
@@ -132,19 +133,19 @@ class ScenePicture:
 
     def _draw_all(self, spec: SceneSpec, reader: SceneReader) -> None:
         for visual in spec.visuals:
-            if reader.shown(visual):
+            if reader.is_shown(visual):
                 self._draw(reader, visual)
         for deformable in spec.deformables:
-            if reader.shown(deformable):
+            if reader.is_shown(deformable):
                 entity = self._entity(scene.WORLD, deformable.name or deformable.stream)
                 try:
-                    texture = reader.texture(deformable.material)
-                    bending = Bending(entity, deformable, reader.arrays(deformable), texture)
+                    texture = reader.read_texture(deformable.material)
+                    bending = DrawnDeformable(entity, deformable, reader.read_arrays(deformable), texture)
                 except _NOT_DRAWN as error:
                     self._failed.append(f"{entity} ({error})")
                     continue
-                self.bending[deformable.stream] = bending
-                self._rec.log(entity, *bending.drawing(), strict=True)
+                self.deformables[deformable.stream] = bending
+                self._rec.log(entity, *bending.build_components(), strict=True)
 
     def _update(self, spec: SceneSpec, reader: SceneReader) -> None:
         """What differs from what is drawn. Deformables do not: patches concern visuals."""
@@ -154,7 +155,7 @@ class ScenePicture:
             old = self._visuals.get(visual.id)
             if old is not None and old.visual != visual:
                 self._redraw(reader, old, visual)
-            elif old is None and reader.shown(visual):
+            elif old is None and reader.is_shown(visual):
                 self._draw(reader, visual)
 
     def _draw(self, reader: SceneReader, visual: Visual) -> None:
@@ -162,13 +163,15 @@ class ScenePicture:
         body = next((body.name for body in self._source.bodies if body.id == visual.body), scene.WORLD)
         entity = self._entity(body, visual.name or f"visual_{visual.id}")
         try:
-            form = reader.form(visual)
+            form = reader.read_shape(visual)
         except _NOT_DRAWN as error:
             self._failed.append(f"{entity} ({error})")
             return
-        frame, T_frame_visual = reader.place(visual)
+        frame, T_frame_visual = reader.place_visual(visual)
         self._visuals[visual.id] = _Drawn(visual, entity, form.kind, form.tint, shown=True)
-        self._rec.log(entity, *drawing(form, scene.colour(visual.rgba, form.tint), frame, T_frame_visual), strict=True)
+        self._rec.log(
+            entity, *build_components(form, scene.to_rgba8(visual.rgba, form.tint), frame, T_frame_visual), strict=True
+        )
 
     def _redraw(self, reader: SceneReader, old: _Drawn, visual: Visual) -> None:
         """Says what has changed, and not the mesh again."""
@@ -176,16 +179,16 @@ class ScenePicture:
         alike = msgspec.structs.replace(was, rgba=visual.rgba, group=visual.group, T_body_visual=visual.T_body_visual)
         if alike != visual:
             self._clear(visual.id)
-            if reader.shown(visual):
+            if reader.is_shown(visual):
                 self._draw(reader, visual)
             return
-        shown = reader.shown(visual)
+        shown = reader.is_shown(visual)
         parts: list[Any] = []
         if visual.rgba != was.rgba:
-            parts.append(recoloured(old.kind, scene.colour(visual.rgba, old.tint)))
+            parts.append(build_colour(old.kind, scene.to_rgba8(visual.rgba, old.tint)))
         if shown != old.shown or visual.T_body_visual != was.T_body_visual:
             size = visual.geometry.size[2]
-            parts.append(placed(old.kind, size, reader.place(visual)[1], shown=shown))
+            parts.append(build_pose(old.kind, size, reader.place_visual(visual)[1], shown=shown))
         self._visuals[visual.id] = old._replace(visual=visual, shown=shown)
         if parts:
             self._rec.log(old.entity, *parts, strict=True)
@@ -195,12 +198,12 @@ class ScenePicture:
 
     def _entity(self, body: str, name: str) -> str:
         """Where something is drawn: nothing else is."""
-        entity = f"{self._folder}/{entity_part(body)}/{entity_part(name)}"
+        entity = f"{self._folder}/{escape_entity_part(body)}/{escape_entity_part(name)}"
         self._names[entity] += 1
         return entity if self._names[entity] == 1 else self._entity(body, f"{name} ({self._names[entity]})")
 
 
-def drawing(form: Form, rgba: scene.Rgba8, frame: str, T_frame_visual: PoseTuple) -> list[Any]:
+def build_components(form: VisualShape, rgba: scene.Rgba8, frame: str, T_frame_visual: PoseTuple) -> list[Any]:
     """Rerun components of one visual: its frame, its pose in that frame, and its form."""
     drawn: Any
     solid = rr.components.FillMode.Solid
@@ -224,10 +227,10 @@ def drawing(form: Form, rgba: scene.Rgba8, frame: str, T_frame_visual: PoseTuple
             albedo_texture=form.texture,
             albedo_factor=rgba,
         )
-    return [rr.CoordinateFrame(frame), placed(form.kind, half, T_frame_visual), drawn]
+    return [rr.CoordinateFrame(frame), build_pose(form.kind, half, T_frame_visual), drawn]
 
 
-def placed(kind: str, half: float, T_frame_visual: PoseTuple, *, shown: bool = True) -> Any:
+def build_pose(kind: str, half: float, T_frame_visual: PoseTuple, *, shown: bool = True) -> Any:
     """Where a visual is drawn in its frame. Hidden, it has no extent: so its mesh need not be written again."""
     p, (w, x, y, z) = T_frame_visual
     if kind == scene.CAPSULE:
@@ -238,7 +241,7 @@ def placed(kind: str, half: float, T_frame_visual: PoseTuple, *, shown: bool = T
     return rr.InstancePoses3D(translations=[p], quaternions=[rr.Quaternion(xyzw=[x, y, z, w])], scales=scales)
 
 
-def recoloured(kind: str, rgba: scene.Rgba8) -> Any:
+def build_colour(kind: str, rgba: scene.Rgba8) -> Any:
     """The colour alone."""
     if kind == scene.MESH:
         return rr.Mesh3D.from_fields(albedo_factor=rgba)
@@ -251,6 +254,6 @@ def recoloured(kind: str, rgba: scene.Rgba8) -> Any:
     return primitives[kind].from_fields(colors=[rgba])
 
 
-def entity_part(name: str) -> str:
+def escape_entity_part(name: str) -> str:
     """`name` as one part of an entity path (names may hold slashes and spaces)."""
     return str(rr.escape_entity_path_part(name))

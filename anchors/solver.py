@@ -17,26 +17,29 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.lie import Array, quat_conjugate, quat_log, quat_matrix, quat_multiply, skew, swing, turned
+from anchors.lie import Array, quat_conjugate, quat_log, quat_multiply, quat_perturb, quat_to_matrix, skew, swing
 from anchors.pose import PoseTuple, quat_normalize
-from anchors.robust import Merged, circular_median
 from anchors.uncertainty import Z999, chi2_quantile
+from anchors.viewpoints import MergedObservation, circular_median
 
 _CHI2_6_999: Final = 22.458
 _CHI2_3_999: Final = 16.266
 _ITERATIONS: Final = 6
 _STEADY_S: Final = 60.0  # for so long the drift is taken as steady, later the frame also wanders
 _CONVERGED: Final = 2e-4  # [m], [rad]; with residuals of milliradians the step after would be below 1e-6
-_LEFT_OUT: Final = 4  # sheets, at most, that are left out in turn
-_SURE: Final = 2  # more sheets than these agree by no chance
+_MAX_LEFT_OUT: Final = 4  # sheets that are left out in turn
+_MIN_SURE: Final = 2  # more sheets than this do not agree by chance
 _EYE: Final = np.eye(6)
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Prior:
-    """What is known before any observation. `tilt_sigma_rad` is infinite where the tilt is to be measured too;
-    `drift_m_per_s`: speed of the tracking frame, `walk_m_per_sqrt_s`: its wandering, standard deviations per axis."""
+class AlignmentPrior:
+    """Prior of the alignment, standard deviations per axis.
+
+    `tilt_sigma_rad`: tilt against gravity, infinite to measure it. `drift_m_per_s`: velocity of the tracking frame.
+    `walk_m_per_sqrt_s`: its random walk.
+    """
 
     tilt_sigma_rad: float
     drift_m_per_s: float
@@ -48,8 +51,8 @@ class Prior:
 
 
 @dataclass(frozen=True)
-class Problem:
-    """Groups as arrays: anchors in the world, how each was seen, how long ago [s] (at most 0)."""
+class AlignmentProblem:
+    """Merged observations as arrays, one row per group: anchor in the world, observed pose, age [s] (at most 0)."""
 
     anchor: tuple[str, ...]
     p_world: Array  # (G, 3)
@@ -65,7 +68,7 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Solution:
+class AlignmentSolution:
     """`T_tracking_world` at the time of the newest observation. `covariance` (6, 6) of translation and rotation
     (tracking axes, rotation on the left), `inside` (G,): which groups agree, `chi2` of those, `freedom` of that,
     `distance2` (G,) and `turns` (G, 3): how far each group is off, squared in units of its noise, and in rotation."""
@@ -80,17 +83,22 @@ class Solution:
     distance2: Array
     turns: Array
 
-    def tilt_seen(self, b: Problem) -> float:
-        """Tilt [rad] that the agreeing groups show together, gravity left out."""
+    def observed_tilt(self, b: AlignmentProblem) -> float:
+        """Return the tilt [rad] that the agreeing groups show together, without the gravity prior."""
         weight = self.inside / np.add.reduce(b.covariance[:, 3:, 3:].reshape(-1, 9)[:, ::4], axis=1)
         tilt = _tilt(self.q) + weight @ self.turns[:, :2] / float(weight.sum())
         return math.hypot(float(tilt[0]), float(tilt[1]))
 
 
-def problem(
-    anchor: Sequence[str], p_world: Array, q_world: Array, merged: Sequence[Merged], age_s: Array, prior: Prior
-) -> Problem:
-    """Groups as arrays. Older ones are less certain: the tracking frame wanders."""
+def build_problem(
+    anchor: Sequence[str],
+    p_world: Array,
+    q_world: Array,
+    merged: Sequence[MergedObservation],
+    age_s: Array,
+    prior: AlignmentPrior,
+) -> AlignmentProblem:
+    """Return merged observations as arrays. Older ones are less certain: the tracking frame wanders."""
     # Joined, not stacked: of small arrays that takes a third of the time.
     p = np.concatenate([m.p for m in merged]).reshape(-1, 3)
     q = quat_multiply(np.concatenate([m.q for m in merged]).reshape(-1, 4), quat_conjugate(q_world))
@@ -98,92 +106,103 @@ def problem(
     if float(age_s.min()) < -_STEADY_S:
         walked = prior.walk_m_per_sqrt_s**2 * np.maximum(-age_s - _STEADY_S, 0.0)
         covariance[:, [0, 1, 2], [0, 1, 2]] += walked[:, None]
-    return Problem(tuple(anchor), p_world, p, q, covariance, np.linalg.inv(covariance), age_s)
+    return AlignmentProblem(tuple(anchor), p_world, p, q, covariance, np.linalg.inv(covariance), age_s)
 
 
-def solve(b: Problem, prior: Prior, near: tuple[Array, Array] | None = None) -> Solution:
-    """Robust solution; `inside` is all false where two groups are all there is and they disagree. `near`: rotation and
-    translation of an earlier solution, to begin with."""
+def solve_alignment(
+    b: AlignmentProblem, prior: AlignmentPrior, near: tuple[Array, Array] | None = None
+) -> AlignmentSolution:
+    """Return the robust solution; `inside` is all false if there are only two groups and they disagree.
+
+    `near`: rotation (4,) and translation (3,) of an earlier solution, used as the initial guess.
+    """
     everyone = np.ones(b.size, dtype=bool)
-    solution = _fit(b, everyone, near or _start(b, prior), prior)
+    solution = _fit(b, everyone, near or _initial_guess(b, prior), prior)
     if bool(np.all(solution.distance2 <= _CHI2_6_999)) and (b.size != 2 or solution.chi2 <= _CHI2_6_999):
         return solution
     if b.size == 1:
         return solution
     if b.size == 2:
-        return _without(solution)
+        return _reject_all(solution)
     inside, start = _consensus(b, prior)
     if not inside.any():  # each is tilted so far that it contradicts gravity
-        return _without(solution)
-    found = _settled(b, inside, start, prior)
-    if agreeing_anchors(b.anchor, found.inside) > _SURE and _is_likely(found):
+        return _reject_all(solution)
+    found = _refine_inliers(b, inside, start, prior)
+    if count_agreeing_anchors(b.anchor, found.inside) > _MIN_SURE and _is_likely(found):
         return found
-    others = [one for one in _with_one_sheet_less(b, solution, prior) if _is_likely(one)]
-    return max([found, *others], key=lambda one: _rank(b, one))
+    others = [one for one in _solve_without_sheet(b, solution, prior) if _is_likely(one)]
+    return max([found, *others], key=lambda one: _rank_key(b, one))
 
 
-def _with_one_sheet_less(b: Problem, everyone: Solution, prior: Prior) -> Iterator[Solution]:
-    """Of three or more sheets one may have been moved so little that each alone seems to agree with it (rotations of
-    one sheet say little about the place of the others): each of those that fit worst is left out in turn."""
+def _solve_without_sheet(
+    b: AlignmentProblem, everyone: AlignmentSolution, prior: AlignmentPrior
+) -> Iterator[AlignmentSolution]:
+    """Yield solutions without one of the worst fitting sheets each, for three or more sheets.
+
+    A sheet may have been moved so little that each other one alone agrees with it, since the rotation of one sheet
+    determines the positions of the others badly.
+    """
     off = dict.fromkeys(b.anchor, 0.0)
     for name, distance2 in zip(b.anchor, everyone.distance2.tolist(), strict=True):
         off[name] = max(off[name], distance2)
     if len(off) < 3:
         return
-    start = _start(b, prior)
-    for out in sorted(off, key=lambda name: -off[name])[:_LEFT_OUT]:
-        yield _settled(b, np.array([name != out for name in b.anchor]), start, prior)
+    start = _initial_guess(b, prior)
+    for out in sorted(off, key=lambda name: -off[name])[:_MAX_LEFT_OUT]:
+        yield _refine_inliers(b, np.array([name != out for name in b.anchor]), start, prior)
 
 
-def _is_likely(s: Solution) -> bool:
-    """Whether what is left over is noise: of two sheets that should agree each may be off by half of what they are."""
+def _is_likely(s: AlignmentSolution) -> bool:
+    """Return whether the residuals are explained by noise (chi-square below its 99.9 % quantile)."""
     return s.freedom > 0.0 and s.chi2 <= chi2_quantile(s.freedom, Z999)
 
 
-def _settled(b: Problem, inside: Mask, start: tuple[Array, Array], prior: Prior) -> Solution:
-    """Fitted to some of the groups, then to those that agree with that."""
+def _refine_inliers(
+    b: AlignmentProblem, inside: Mask, start: tuple[Array, Array], prior: AlignmentPrior
+) -> AlignmentSolution:
+    """Fit to the given inliers, then repeatedly to the groups that agree with the fit."""
     for _ in range(3):
         solution = _fit(b, inside, start, prior)
         now = solution.distance2 <= _CHI2_6_999
         if not now.any():
-            return _without(solution)
+            return _reject_all(solution)
         if bool(np.all(now == inside)):
             break
         inside, start = now, (solution.q, solution.t)
     return solution
 
 
-def _rank(b: Problem, s: Solution) -> tuple[int, int, float]:
-    """The better the larger: agreeing sheets, agreeing looks, and how well they agree."""
-    return agreeing_anchors(b.anchor, s.inside), int(np.count_nonzero(s.inside)), -s.chi2
+def _rank_key(b: AlignmentProblem, s: AlignmentSolution) -> tuple[int, int, float]:
+    """Return a sort key, larger is better: agreeing sheets, agreeing groups, negative chi-square."""
+    return count_agreeing_anchors(b.anchor, s.inside), int(np.count_nonzero(s.inside)), -s.chi2
 
 
-def common_tilt(b: Problem) -> float:
-    """Tilt [rad] that most groups show, each by itself and gravity left out."""
+def median_tilt(b: AlignmentProblem) -> float:
+    """Return the median tilt [rad] of the groups, each by itself and without the gravity prior."""
     middle = np.median(swing(b.q), axis=0)
     return math.hypot(float(middle[0]), float(middle[1]))
 
 
-def _without(s: Solution) -> Solution:
+def _reject_all(s: AlignmentSolution) -> AlignmentSolution:
     return replace(s, inside=np.zeros(len(s.inside), dtype=bool))
 
 
-def _level(q: Array) -> Array:
-    """The turn about Z in quaternions `(..., 4)`."""
+def _keep_yaw(q: Array) -> Array:
+    """Return the rotation about Z in quaternions `(..., 4)`."""
     out = q * np.array([1.0, 0.0, 0.0, 1.0])
     return np.asarray(out / np.maximum(np.linalg.norm(out, axis=-1, keepdims=True), 1e-12))
 
 
-def _start(b: Problem, prior: Prior) -> tuple[Array, Array]:
-    """First guess by medians, which a minority cannot spoil."""
+def _initial_guess(b: AlignmentProblem, prior: AlignmentPrior) -> tuple[Array, Array]:
+    """Return an initial guess (rotation, translation) by medians, robust to a minority of outliers."""
     yaws = 2.0 * np.arctan2(b.q[:, 3], b.q[:, 0])
     k = int(np.argmin(np.abs(yaws - circular_median(yaws))))
-    q = _level(b.q[k]) if prior.gravity else b.q[k]
-    return q, np.median(b.p - b.p_world @ quat_matrix(q).T, axis=0)
+    q = _keep_yaw(b.q[k]) if prior.gravity else b.q[k]
+    return q, np.median(b.p - b.p_world @ quat_to_matrix(q).T, axis=0)
 
 
-def _fit(b: Problem, inside: Mask, start: tuple[Array, Array], prior: Prior) -> Solution:
-    """Gauss-Newton over (t, rotation on the left, drift); distances of all groups to the result."""
+def _fit(b: AlignmentProblem, inside: Mask, start: tuple[Array, Array], prior: AlignmentPrior) -> AlignmentSolution:
+    """Run Gauss-Newton over (t, left rotation, drift) with the inliers; return distances of all groups too."""
     q, t = start
     drift = np.zeros(3)
     J = np.zeros((b.size, 6, 9))
@@ -209,7 +228,7 @@ def _fit(b: Problem, inside: Mask, start: tuple[Array, Array], prior: Prior) -> 
         inverse = np.asarray(np.linalg.inv(H), dtype=np.float64)
         step = inverse @ g
         t, drift = t + step[:3], drift + step[6:]
-        q = turned(q, step[3:6])
+        q = quat_perturb(q, step[3:6])
         if float(np.abs(step[:6]).max()) < _CONVERGED:
             break
     r = r - J @ step  # the last step was small: its linear effect is all there is
@@ -220,7 +239,7 @@ def _fit(b: Problem, inside: Mask, start: tuple[Array, Array], prior: Prior) -> 
         tilt = _tilt(q)
         chi2 += tilt_information * float(tilt @ tilt)
         freedom += 2.0
-    return Solution(t, q, inverse[:6, :6], inside, chi2, freedom, drift, distance2, r[:, 3:])
+    return AlignmentSolution(t, q, inverse[:6, :6], inside, chi2, freedom, drift, distance2, r[:, 3:])
 
 
 def _tilt(q: Array) -> Array:
@@ -235,21 +254,21 @@ def _tilt(q: Array) -> Array:
     return np.array([scale * sx, scale * sy])
 
 
-def _residuals(b: Problem, q: Array, t: Array, drift: Array) -> tuple[Array, Array]:
+def _residuals(b: AlignmentProblem, q: Array, t: Array, drift: Array) -> tuple[Array, Array]:
     """Observed minus predicted, positions then rotation vectors (G, 6); and the turned anchor positions (G, 3)."""
-    P = b.p_world @ quat_matrix(q).T
+    P = b.p_world @ quat_to_matrix(q).T
     r = np.empty((b.size, 6))
     r[:, :3] = b.p - P - t - b.age_s[:, None] * drift
     r[:, 3:] = quat_log(quat_multiply(b.q, quat_conjugate(q)))
     return r, P
 
 
-def _consensus(b: Problem, prior: Prior) -> tuple[Mask, tuple[Array, Array]]:
+def _consensus(b: AlignmentProblem, prior: AlignmentPrior) -> tuple[Mask, tuple[Array, Array]]:
     """The largest set of groups that agree with one of them: first counted in anchors, then in groups. Every group is
     tried, so nothing is left to chance."""
-    q = _level(b.q) if prior.gravity else b.q  # (H, 4)
-    t = b.p - np.einsum("hij,hj->hi", quat_matrix(q), b.p_world)
-    predicted = np.einsum("hij,gj->hgi", quat_matrix(q), b.p_world) + t[:, None, :]
+    q = _keep_yaw(b.q) if prior.gravity else b.q  # (H, 4)
+    t = b.p - np.einsum("hij,hj->hi", quat_to_matrix(q), b.p_world)
+    predicted = np.einsum("hij,gj->hgi", quat_to_matrix(q), b.p_world) + t[:, None, :]
     r = b.p[None, :, :] - predicted
     turn_var = np.trace(b.covariance[:, 3:, 3:], axis1=1, axis2=2) / 3.0
     tilt_var = prior.tilt_sigma_rad**2 if prior.gravity else 0.0
@@ -267,24 +286,24 @@ def _consensus(b: Problem, prior: Prior) -> tuple[Mask, tuple[Array, Array]]:
     return agree[best], (q[best], t[best])
 
 
-def _votes(b: Problem, agree: Mask, misfit: float) -> tuple[int, int, float]:
-    return agreeing_anchors(b.anchor, agree), int(np.count_nonzero(agree)), -misfit
+def _votes(b: AlignmentProblem, agree: Mask, misfit: float) -> tuple[int, int, float]:
+    return count_agreeing_anchors(b.anchor, agree), int(np.count_nonzero(agree)), -misfit
 
 
-def agreeing_anchors(anchor: Sequence[str], agree: Mask) -> int:
-    """Of how many anchors most groups agree."""
+def count_agreeing_anchors(anchor: Sequence[str], agree: Mask) -> int:
+    """Return the number of anchors of which most groups agree."""
     balance: dict[str, int] = {}
     for name, ok in zip(anchor, agree.tolist(), strict=True):
         balance[name] = balance.get(name, 0) + (1 if ok else -1)
     return sum(1 for votes in balance.values() if votes > 0)
 
 
-def in_world(q: Array, covariance: Array, pivot_world: Array) -> Array:
-    """Covariance (6, 6) of `T_world_tracking` at the pivot, world axes, from that of `T_tracking_world` (t, q).
+def to_world_covariance(q: Array, covariance: Array, pivot_world: Array) -> Array:
+    """Return the covariance (6, 6) of `T_world_tracking` at the pivot, world axes, from that of `T_tracking_world`.
 
     A tracking frame off by (d, w) shows the point X of the world off by R^T d + (R^T w) x X.
     """
-    R_world_tracking = quat_matrix(q).T
+    R_world_tracking = quat_to_matrix(q).T
     J = np.zeros((6, 6))
     J[:3, :3] = J[3:, 3:] = R_world_tracking
     J[:3, 3:] = -skew(pivot_world) @ R_world_tracking
@@ -292,9 +311,9 @@ def in_world(q: Array, covariance: Array, pivot_world: Array) -> Array:
     return np.asarray(0.5 * (S + S.T))
 
 
-def inverted(t: Array, q: Array) -> PoseTuple:
-    """`T_b_a` as plain numbers from `T_a_b`."""
+def to_inverse_pose(t: Array, q: Array) -> PoseTuple:
+    """Return `T_b_a` as plain floats from `T_a_b` (translation (3,), quaternion (4,))."""
     q_inv = quat_conjugate(q)
-    p = -(quat_matrix(q_inv) @ t)
+    p = -(quat_to_matrix(q_inv) @ t)
     unit = quat_normalize((float(q_inv[0]), float(q_inv[1]), float(q_inv[2]), float(q_inv[3])))
     return (float(p[0]), float(p[1]), float(p[2])), unit

@@ -49,7 +49,7 @@ _KINDS: Final = (
 _decode = msgspec.msgpack.Decoder(Sample | Observation).decode
 
 
-class Frame(NamedTuple):
+class TrackingFrame(NamedTuple):
     """One tracking frame: of a participant, in one run of its app (counted from 1), in one tracking epoch. `jumps`: how
     often in this run an alarm said that the frame had moved, which a client that did not notice tells by no epoch."""
 
@@ -59,23 +59,23 @@ class Frame(NamedTuple):
     jumps: int = 0
 
 
-class Look(NamedTuple):
+class RecordedObservation(NamedTuple):
     """One observation, and where the head was then, in the same tracking frame; None where no sample is near."""
 
-    seen: Observation
+    observation: Observation
     p_tracking_head: Vec3 | None
 
 
-class InForce(NamedTuple):
+class AlignmentPeriod(NamedTuple):
     """An alignment and from when to when it held, session time; `until_ns` -1: to the end."""
 
-    frame: Frame
+    frame: TrackingFrame
     alignment: Alignment
     since_ns: int
     until_ns: int = -1
 
 
-class Moved(NamedTuple):
+class AnchorMove(NamedTuple):
     """A director moved an anchor."""
 
     session_time: int
@@ -84,7 +84,7 @@ class Moved(NamedTuple):
 
 
 @dataclass
-class Person:
+class RecordedParticipant:
     """`aligned`: has a headset that is to be aligned. `runs`: what its clients called the runs of their tracking."""
 
     id: str
@@ -95,14 +95,14 @@ class Person:
 
 
 @dataclass
-class Looks:
+class AlignmentHistory:
     """`people`: everybody who joined, by id. `looks`: by tracking frame, in order of capture. `unreadable`: messages
     that do not decode; `unowned`: observations over connections whose join is not in this recording."""
 
-    people: dict[str, Person] = field(default_factory=dict)
-    looks: dict[Frame, list[Look]] = field(default_factory=dict)
-    in_force: list[InForce] = field(default_factory=list)
-    moved: list[Moved] = field(default_factory=list)
+    participants: dict[str, RecordedParticipant] = field(default_factory=dict)
+    observations: dict[TrackingFrame, list[RecordedObservation]] = field(default_factory=dict)
+    in_force: list[AlignmentPeriod] = field(default_factory=list)
+    anchor_moves: list[AnchorMove] = field(default_factory=list)
     unreadable: int = 0
     unowned: int = 0
 
@@ -114,7 +114,7 @@ class _Roster:
 
     owners: dict[int, tuple[str, int]] = field(default_factory=dict)
     jumps: dict[tuple[str, int], list[int]] = field(default_factory=dict)
-    present: dict[str, InForce] = field(default_factory=dict)
+    present: dict[str, AlignmentPeriod] = field(default_factory=dict)
 
 
 @dataclass
@@ -157,19 +157,21 @@ class _Heads:
         return x, y, z
 
 
-def read_looks(recording: Recording, told: Callable[[int, int], None] | None = None) -> Looks:
+def read_alignment_history(
+    recording: Recording, on_progress: Callable[[int, int], None] | None = None
+) -> AlignmentHistory:
     """Everything that `Looks` has. `told(done, total)` hears how far it is."""
     n_rows, n_samples = recording.count_rows(), recording.count_samples()
-    say = told or (lambda done, total: None)
+    say = on_progress or (lambda done, total: None)
     events = [event for event in recording.events() if isinstance(event.body, _KINDS)]
-    found = Looks()
+    found = AlignmentHistory()
     roster = _roster(recording, events, found, lambda done: say(done, n_rows + n_samples))
     _messages(recording, roster, found, lambda done: say(n_rows + done, n_rows + n_samples))
     say(n_rows + n_samples, n_rows + n_samples)
     return found
 
 
-def _roster(recording: Recording, events: list[Event], found: Looks, say: Callable[[int], None]) -> _Roster:
+def _roster(recording: Recording, events: list[Event], found: AlignmentHistory, say: Callable[[int], None]) -> _Roster:
     """Fills in people, alignments and moved anchors."""
     wanted = {e.session_time for e in events if isinstance(e.body, ParticipantJoined) or _is_jump(e.body)}
     said: dict[int, _Said] = {}
@@ -203,22 +205,22 @@ def _said(entries: bytes) -> _Said:
     return said
 
 
-def _take(event: Event, said: _Said, roster: _Roster, found: Looks) -> None:
+def _take(event: Event, said: _Said, roster: _Roster, found: AlignmentHistory) -> None:
     """One event of the history. `said`: by the journal, in its step."""
     body, now_ns, present = event.body, event.session_time, roster.present
     if isinstance(body, AnchorMoved):
-        found.moved.append(Moved(now_ns, body.anchor_id, body.T_world_anchor))
+        found.anchor_moves.append(AnchorMove(now_ns, body.anchor_id, body.T_world_anchor))
     elif isinstance(body, AlignmentChanged):
         _end(body.participant, now_ns, present, found)
-        person = found.people.get(body.participant)
+        person = found.participants.get(body.participant)
         run = len(person.runs) if person else 0
         jumps = len(roster.jumps.get((body.participant, run), ()))
-        frame = Frame(body.participant, run, body.alignment.tracking_epoch, jumps)
-        present[body.participant] = InForce(frame, body.alignment, now_ns)
+        frame = TrackingFrame(body.participant, run, body.alignment.tracking_epoch, jumps)
+        present[body.participant] = AlignmentPeriod(frame, body.alignment, now_ns)
     elif isinstance(body, AlignmentAlarmed):
         if _is_jump(body):
             _end(body.participant, now_ns, present, found)
-            person = found.people.get(body.participant)
+            person = found.participants.get(body.participant)
             _jump(body.participant, len(person.runs) if person else 0, now_ns, said.jumps, roster)
     elif isinstance(body, ParticipantLeft):
         if not body.grace:
@@ -228,13 +230,16 @@ def _take(event: Event, said: _Said, roster: _Roster, found: Looks) -> None:
         if info.alignment is None:
             _end(info.id, now_ns, present, found)
         aligned = info.alignment is None or info.alignment.kind != AlignmentKind.NOT_NEEDED
-        person = found.people.setdefault(info.id, Person(info.id, info.name, info.role, aligned))
+        person = found.participants.setdefault(info.id, RecordedParticipant(info.id, info.name, info.role, aligned))
         if isinstance(body, ParticipantJoined):
             _own(person, info, said.joins, roster.owners)
 
 
 def _own(
-    person: Person, info: ParticipantInfo, joins: list[tuple[int, Join]], owners: dict[int, tuple[str, int]]
+    person: RecordedParticipant,
+    info: ParticipantInfo,
+    joins: list[tuple[int, Join]],
+    owners: dict[int, tuple[str, int]],
 ) -> None:
     """The join that this person came with, by its name and role (`info`), as who resumes may have another name. Those
     of one step are answered in their order, but for refused ones."""
@@ -260,16 +265,16 @@ def _jump(participant: str, run: int, now_ns: int, alarms: list[tuple[int, Align
     insort(roster.jumps.setdefault((participant, run), []), at_ns)
 
 
-def _end(participant: str, now_ns: int, present: dict[str, InForce], found: Looks) -> None:
+def _end(participant: str, now_ns: int, present: dict[str, AlignmentPeriod], found: AlignmentHistory) -> None:
     was = present.pop(participant, None)
     if was is not None:
         found.in_force.append(was._replace(until_ns=now_ns))
 
 
-def _messages(recording: Recording, roster: _Roster, found: Looks, say: Callable[[int], None]) -> None:
+def _messages(recording: Recording, roster: _Roster, found: AlignmentHistory, say: Callable[[int], None]) -> None:
     """Fills in the looks: observations with the head pose nearest in time."""
-    heads: dict[Frame, _Heads] = {}
-    seen: dict[Frame, list[Observation]] = {}
+    heads: dict[TrackingFrame, _Heads] = {}
+    seen: dict[TrackingFrame, list[Observation]] = {}
     for done, raw in enumerate(recording.samples()):
         if done % TOLD_EVERY == 0:
             say(done)
@@ -283,17 +288,17 @@ def _messages(recording: Recording, roster: _Roster, found: Looks, say: Callable
             found.unowned += isinstance(message, Observation)
             continue
         jumps = bisect_right(roster.jumps.get(owner, ()), message.capture_ns)
-        frame = Frame(*owner, message.tracking_epoch, jumps)
+        frame = TrackingFrame(*owner, message.tracking_epoch, jumps)
         if isinstance(message, Observation):
             seen.setdefault(frame, []).append(message)
         elif message.device == Device.HEAD and message.pose is not None and message.tracked:
             heads.setdefault(frame, _Heads()).add(message.capture_ns, message.pose.p)
     for frame, observations in sorted(seen.items()):
-        found.looks[frame] = _with_heads(observations, heads.get(frame))
+        found.observations[frame] = _with_heads(observations, heads.get(frame))
 
 
-def _with_heads(observations: Iterable[Observation], heads: _Heads | None) -> list[Look]:
+def _with_heads(observations: Iterable[Observation], heads: _Heads | None) -> list[RecordedObservation]:
     if heads is not None:
         heads.sort()
     ordered = sorted(observations, key=lambda one: one.capture_ns)
-    return [Look(one, None if heads is None else heads.at(one.capture_ns)) for one in ordered]
+    return [RecordedObservation(one, None if heads is None else heads.at(one.capture_ns)) for one in ordered]

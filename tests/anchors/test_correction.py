@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 
 from anchors.alignment import AlignmentEstimate
+from anchors.correction import CorrectionConfig, CorrectionFilter, interpolate_about_pivot
 from anchors.pose import PoseTuple, Vec3, apply, distance, inverse, quat_from_rotvec, quat_from_yaw
-from anchors.smooth import SmoothAlignment, SmoothConfig, between
 
 PIVOT: Vec3 = (0.5, 2.0, 0.7)
 SECOND = 1_000_000_000
@@ -21,7 +21,7 @@ def _estimate(x: float = 0.0, yaw: float = 0.3, epoch: int = 0, refused: bool = 
 
 
 def test_the_first_estimate_counts_at_once_and_none_is_none() -> None:
-    smooth = SmoothAlignment()
+    smooth = CorrectionFilter()
     assert smooth.update(_estimate(refused=True), 0) is None
     got = smooth.update(_estimate(), 1)
     assert got is not None
@@ -29,7 +29,7 @@ def test_the_first_estimate_counts_at_once_and_none_is_none() -> None:
 
 
 def test_a_small_correction_slides_in_no_faster_than_allowed() -> None:
-    smooth = SmoothAlignment(SmoothConfig(slide_m_per_s=0.004))
+    smooth = CorrectionFilter(CorrectionConfig(slide_m_per_s=0.004))
     smooth.update(_estimate(), 0)
     last, steps = 0.0, 0
     for i in range(1, 200):
@@ -44,7 +44,7 @@ def test_a_small_correction_slides_in_no_faster_than_allowed() -> None:
 
 
 def test_nothing_moves_while_engaged_and_after_release_it_slides_not_leaps() -> None:
-    smooth = SmoothAlignment()
+    smooth = CorrectionFilter()
     smooth.update(_estimate(), 0)
     for i in range(1, 10):
         got = smooth.update(_estimate(0.009), i * SECOND, engaged=True)
@@ -59,7 +59,7 @@ def test_nothing_moves_while_engaged_and_after_release_it_slides_not_leaps() -> 
 
 @pytest.mark.parametrize("estimate", [_estimate(0.05), _estimate(0.0, 0.3 + math.radians(3.0))])
 def test_a_large_correction_waits_until_it_is_accepted(estimate: AlignmentEstimate) -> None:
-    smooth = SmoothAlignment()
+    smooth = CorrectionFilter()
     smooth.update(_estimate(), 0)
     got = smooth.update(estimate, SECOND)
     assert got is not None
@@ -71,7 +71,7 @@ def test_a_large_correction_waits_until_it_is_accepted(estimate: AlignmentEstima
 
 
 def test_a_new_tracking_epoch_voids_it_and_a_refusal_within_one_does_not() -> None:
-    smooth = SmoothAlignment()
+    smooth = CorrectionFilter()
     smooth.update(_estimate(), 0)
     kept = smooth.update(_estimate(refused=True), 1)
     assert kept is not None
@@ -89,5 +89,10 @@ def test_on_the_way_the_pivot_moves_on_a_straight_line() -> None:
     a, b = apply(old, pivot), apply(new, pivot)
     for share in (0.0, 0.25, 0.5, 1.0):
         expected = tuple(x + share * (y - x) for x, y in zip(a, b, strict=True))
-        assert distance(apply(between(old, new, pivot, share), pivot), (expected[0], expected[1], expected[2])) < 1e-12
+        assert (
+            distance(
+                apply(interpolate_about_pivot(old, new, pivot, share), pivot), (expected[0], expected[1], expected[2])
+            )
+            < 1e-12
+        )
     assert replace(_estimate(), refused=True).error_at(PIVOT) == math.inf

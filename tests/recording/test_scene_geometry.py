@@ -13,9 +13,10 @@ import pytest
 from anchors.pose import apply, compose
 from iris_session.protocol.scene import SceneSpec
 from iris_session.protocol.server_messages import BodyInfo
-from iris_session.recording import pack_model, scene
+from iris_session.recording import pack_model
+from iris_session.recording import scene_geometry as scene
 from iris_session.recording.messages import SceneAssets
-from iris_session.recording.pictures import drawing
+from iris_session.recording.picture import build_components
 from iris_session.scene import AssetMissingError, AssetStore, EncodeOptions
 from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.mujoco_scene import parse_mujoco
@@ -36,9 +37,9 @@ def test_the_small_scene(tmp_path: Path) -> None:
     model, store = mujoco.MjModel.from_xml_string(XML), AssetStore(tmp_path)
     spec = parse_mujoco(model, store).spec
     reader = scene.SceneReader(spec, store, infos(model))
-    visuals = {visual.id: visual for visual in spec.visuals if reader.shown(visual)}
+    visuals = {visual.id: visual for visual in spec.visuals if reader.is_shown(visual)}
     assert sorted(visuals) == [0, 1, 2, 3, 4, 5], "group 3 is not visible"
-    forms = {i: reader.form(visual) for i, visual in visuals.items()}
+    forms = {i: reader.read_shape(visual) for i, visual in visuals.items()}
     assert [forms[i].kind for i in sorted(forms)] == [
         scene.BOX,
         scene.ELLIPSOID,
@@ -49,15 +50,20 @@ def test_the_small_scene(tmp_path: Path) -> None:
     ]
     assert forms[0].size == (10.0, 10.0, scene.PLANE_HALF_THICKNESS_M)
     assert forms[2].size == pytest.approx((0.04, 0.04, 0.2))
-    assert scene.colour(visuals[0].rgba) == (204, 204, 204, 255)
-    assert [reader.place(visuals[i])[0] for i in range(6)] == ["world", "ball", *["arm/link 1"] * 2, *["tip"] * 2]
+    assert scene.to_rgba8(visuals[0].rgba) == (204, 204, 204, 255)
+    assert [reader.place_visual(visuals[i])[0] for i in range(6)] == [
+        "world",
+        "ball",
+        *["arm/link 1"] * 2,
+        *["tip"] * 2,
+    ]
 
 
 def test_a_body_that_is_not_streamed_is_drawn_in_its_parents_frame(tmp_path: Path) -> None:
     model, store = mujoco.MjModel.from_xml_string(XML), AssetStore(tmp_path)
     spec = parse_mujoco(model, store).spec
     reader = scene.SceneReader(spec, store, [body for body in infos(model) if body.name != "tip"])
-    frame, (p, _) = reader.place(spec.visuals[4])
+    frame, (p, _) = reader.place_visual(spec.visuals[4])
     assert frame == "arm/link 1"
     assert p == pytest.approx((0.4, 0.0, 0.0))
 
@@ -74,7 +80,7 @@ def test_what_is_fixed_on_what_is_fixed_on_something_that_moves_goes_with_it(tmp
     reader = scene.SceneReader(spec, store, [body for body in infos(model) if body.name == "arm"])
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    frame, T_arm_visual = reader.place(spec.visuals[1])
+    frame, T_arm_visual = reader.place_visual(spec.visuals[1])
     assert frame == "arm"
     T_world_arm = (tuple(data.xpos[1].tolist()), tuple(data.xquat[1].tolist()))
     assert apply(T_world_arm, T_arm_visual[0]) == pytest.approx(tuple(data.geom_xpos[1]))
@@ -91,7 +97,7 @@ def test_one_shape_under_two_cubes_is_cut_for_each(tmp_path: Path) -> None:
     spec = parse_mujoco(model, store).spec
 
     def worn(reader: scene.SceneReader, visual: int) -> bytes:
-        uv = reader.form(spec.visuals[visual]).uv
+        uv = reader.read_shape(spec.visuals[visual]).uv
         assert uv is not None
         return uv.tobytes()
 
@@ -110,7 +116,7 @@ def test_a_tall_texture_is_taken_as_small_as_a_wide_one(tmp_path: Path) -> None:
     store = AssetStore(tmp_path)
     spec = builder.build(store).spec
     reader = scene.SceneReader(spec, store, [])
-    found = [reader.texture(visual.material) for visual in spec.visuals]
+    found = [reader.read_texture(visual.material) for visual in spec.visuals]
     assert [max(one.shape) for one in found if one is not None] == [scene.TEXTURE_SIDE] * 3
 
 
@@ -123,11 +129,11 @@ def test_every_geom_of_real_robots_is_where_mujoco_has_it(path: str, tmp_path: P
     data = mujoco.MjData(model)
     data.qpos[:] += np.linspace(-0.3, 0.3, model.nq)
     mujoco.mj_kinematics(model, data)
-    visible = [visual for visual in spec.visuals if reader.shown(visual)]
+    visible = [visual for visual in spec.visuals if reader.is_shown(visual)]
     assert len(visible) > 10
     bodies = {body.name: body.id for body in infos(model)}
     for visual in visible:
-        frame, T_frame_visual = reader.place(visual)
+        frame, T_frame_visual = reader.place_visual(visual)
         body = bodies.get(frame, 0)
         T_world_visual = compose((tuple(data.xpos[body]), tuple(data.xquat[body])), T_frame_visual)
         R = data.geom_xmat[visual.id].reshape(3, 3)
@@ -143,7 +149,7 @@ def test_every_shape_wears_its_texture(tmp_path: Path) -> None:
     for visual in spec.visuals:
         look = spec.materials[visual.material].name if visual.material >= 0 else ""
         looks.add((visual.geometry.kind, visual.geometry.mesh, look))
-        form = reader.form(visual)
+        form = reader.read_shape(visual)
         coordinates = visual.geometry.mesh >= 0 and spec.meshes[visual.geometry.mesh].textured
         worn = look in ("image", "uniform") or ("cube" in look and not coordinates)
         assert form.tint == (1.0, 1.0, 1.0)
@@ -170,10 +176,10 @@ def test_a_large_mesh_wears_the_mean_colour_of_its_cube(tmp_path: Path, monkeypa
     large = [v for v in spec.visuals if v.geometry.hfield >= 0 and "cube" in spec.materials[v.material].name]
     assert large
     for visual in large:
-        assert reader.form(visual).mesh is reader.form(visual).mesh  # cut once
+        assert reader.read_shape(visual).mesh is reader.read_shape(visual).mesh  # cut once
     monkeypatch.setattr(scene, "MOST_BAKED", 1)
     for visual in large:
-        form = reader.form(visual)
+        form = reader.read_shape(visual)
         assert (form.kind, form.texture, form.uv) == (scene.MESH, None, None)
         assert all(0.05 < part < 0.95 for part in form.tint)
 
@@ -191,7 +197,7 @@ def test_a_cube_of_one_colour_tints_and_a_large_one_is_small(tmp_path: Path) -> 
     for options in (None, EncodeOptions(levels=False)):
         spec = parse_mujoco(model, store, options=options).spec
         reader = scene.SceneReader(spec, store, [])
-        plain, checked = (reader.form(visual) for visual in spec.visuals)
+        plain, checked = (reader.read_shape(visual) for visual in spec.visuals)
         assert (plain.kind, plain.texture) == (scene.ELLIPSOID, None)
         assert plain.tint == pytest.approx((1.0, 0.5, 0.0), abs=0.003)
         assert checked.kind == scene.MESH
@@ -208,7 +214,8 @@ def test_colours_at_corners_are_drawn(tmp_path: Path) -> None:
     spec = builder.build(store).spec
     reader = scene.SceneReader(spec, store, [])
     drawn = [
-        drawing(reader.form(visual), scene.colour(visual.rgba), *reader.place(visual))[-1] for visual in spec.visuals
+        build_components(reader.read_shape(visual), scene.to_rgba8(visual.rgba), *reader.place_visual(visual))[-1]
+        for visual in spec.visuals
     ]
     packed = (colors.astype(np.uint32) * [1 << 24, 1 << 16, 1 << 8, 1]).sum(axis=1)
     assert drawn[0].vertex_colors.as_arrow_array().to_pylist() == packed.tolist()
@@ -220,7 +227,7 @@ def test_a_shape_that_nobody_knows_is_a_box_of_its_size(tmp_path: Path) -> None:
     spec = parse_mujoco(model, store).spec
     reader = scene.SceneReader(spec, store, infos(model))
     geometry = msgspec.structs.replace(spec.visuals[4].geometry, kind="superquadric", size=(0.1, 0.2, 0.3))
-    form = reader.form(msgspec.structs.replace(spec.visuals[4], geometry=geometry))
+    form = reader.read_shape(msgspec.structs.replace(spec.visuals[4], geometry=geometry))
     assert (form.kind, form.size) == (scene.BOX, (0.1, 0.2, 0.3))
 
 
@@ -228,9 +235,9 @@ def test_the_specification_is_read_where_it_lies_and_made_where_there_is_none(tm
     model = mujoco.MjModel.from_xml_string(XML)
     store = AssetStore(tmp_path)
     parsed = parse_mujoco(model, store, name="shared")
-    with scene.opened(SceneAssets(0, 0, str(tmp_path), parsed.scene_hash), b"") as (spec, _):
+    with scene.open_scene(SceneAssets(0, 0, str(tmp_path), parsed.scene_hash), b"") as (spec, _):
         assert spec.name == "shared"
-    with scene.opened(SceneAssets(), make_header().model) as (spec, private):
+    with scene.open_scene(SceneAssets(), make_header().model) as (spec, private):
         assert [visual.T_body_visual for visual in spec.visuals] == [v.T_body_visual for v in parsed.spec.visuals]
         assert isinstance(spec, SceneSpec)
         folder = private.root
@@ -247,5 +254,5 @@ def test_the_specification_is_read_where_it_lies_and_made_where_there_is_none(tm
 )
 def test_what_cannot_be_read_is_said(tmp_path: Path, assets: bool, model: bytes, error: type[Exception]) -> None:
     missing = SceneAssets(0, 0, str(tmp_path), "0" * 64) if assets else SceneAssets()
-    with pytest.raises(error), scene.opened(missing, model):
+    with pytest.raises(error), scene.open_scene(missing, model):
         pass

@@ -13,7 +13,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from iris_session.protocol.scene import Deformable
-from iris_session.recording.scene import WORLD, Pixels, Rgba8, colour
+from iris_session.recording.scene_geometry import WORLD, Pixels, Rgba8, to_rgba8
 from iris_session.scene import AssetDecodeError
 from iris_session.scene.arrays import require_array
 from iris_session.scene.mesh_processing import normalise
@@ -25,7 +25,7 @@ Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 
-class Bending:
+class DrawnDeformable:
     """One deformable. `arrays`: of its asset. Raises `AssetDecodeError` for another one's."""
 
     def __init__(
@@ -49,7 +49,7 @@ class Bending:
             raise AssetDecodeError(f"deformable {deformable.name!r}: {topology.n_vertices} vertices are streamed")
         self._decoder = DeformableDecoder(topology)
         self._last: Floats = self._rest
-        self._radius, self._colour = deformable.radius, colour(deformable.rgba)
+        self._radius, self._colour = deformable.radius, to_rgba8(deformable.rgba)
         self._form: _Lines | _Surface
         if deformable.dim == 1:
             self._form = _Lines(elements)
@@ -57,11 +57,11 @@ class Bending:
             uv = require_array(arrays, "uv", "f4", (len(elements), 3, 2)) if "uv" in arrays else None
             self._form = _Surface(elements, uv, texture)
 
-    def drawing(self) -> list[Any]:
+    def build_components(self) -> list[Any]:
         """Rerun components that stay, and the vertices at rest."""
-        return [rr.CoordinateFrame(WORLD), self._form.drawing(self._rest, self._colour, self._radius)]
+        return [rr.CoordinateFrame(WORLD), self._form.build_components(self._rest, self._colour, self._radius)]
 
-    def taken(self, frame: bytes) -> Floats | None:
+    def decode_frame(self, frame: bytes) -> Floats | None:
         """Vertices of a frame of the stream; `None`: the same as before. Raises `StreamError`."""
         vertices = np.nan_to_num(self._decoder.decode(frame), copy=False, nan=0.0, posinf=0.0, neginf=0.0)
         if np.array_equal(vertices, self._last):
@@ -69,9 +69,9 @@ class Bending:
         self._last = vertices
         return vertices
 
-    def columns(self, rows: list[Floats]) -> Any:
+    def build_columns(self, rows: list[Floats]) -> Any:
         """What `taken` gave, a row each, as `rerun.send_columns` has it."""
-        return self._form.columns(np.stack(rows))
+        return self._form.build_columns(np.stack(rows))
 
 
 class _Lines:
@@ -80,10 +80,10 @@ class _Lines:
     def __init__(self, edges: Ints) -> None:
         self._edges = edges
 
-    def drawing(self, rest: Floats, rgba: Rgba8, radius: float) -> Any:
+    def build_components(self, rest: Floats, rgba: Rgba8, radius: float) -> Any:
         return rr.LineStrips3D(strips=rest[self._edges], radii=[radius], colors=[rgba])
 
-    def columns(self, vertices: Floats) -> Any:
+    def build_columns(self, vertices: Floats) -> Any:
         strips = vertices[:, self._edges]
         columns = rr.LineStrips3D.columns(strips=strips.reshape(-1, 2, 3))
         return columns.partition([len(self._edges)] * len(vertices))
@@ -106,7 +106,7 @@ class _Surface:
             self._source, self._drawn = different[:, 0].astype(np.int64), index.reshape(-1, 3)
             self._uv = different[:, 1:].astype(np.float32)
 
-    def drawing(self, rest: Floats, rgba: Rgba8, radius: float) -> Any:
+    def build_components(self, rest: Floats, rgba: Rgba8, radius: float) -> Any:
         position, normal = self._arranged(rest)
         worn = {} if self._source is None else {"vertex_texcoords": self._uv, "albedo_texture": self._texture}
         return rr.Mesh3D(
@@ -117,7 +117,7 @@ class _Surface:
             **worn,
         )
 
-    def columns(self, vertices: Floats) -> Any:
+    def build_columns(self, vertices: Floats) -> Any:
         both = [self._arranged(row) for row in vertices]
         columns = rr.Mesh3D.columns(
             vertex_positions=np.concatenate([position for position, _ in both]),

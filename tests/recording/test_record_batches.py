@@ -10,7 +10,7 @@ from typing import Any
 import pyarrow as pa
 import pytest
 
-from iris_session.recording.joining import ROW_ID, count, entity_of, join, spans
+from iris_session.recording.record_batches import ROW_ID, count_joined_rows, get_entity, group_spans, join_pieces
 
 COLUMNS = ("a", "b", "c")
 
@@ -32,7 +32,7 @@ def values(batches: list[Any]) -> dict[str, list[Any]]:
 
 def test_rows_as_they_were_written_stay_as_they_are() -> None:
     written = [table(0, 5), table(5, 1), table(6, 3)]
-    assert [join(pieces) for pieces in spans(written)] == written
+    assert [join_pieces(pieces) for pieces in group_spans(written)] == written
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -44,9 +44,9 @@ def test_columns_cut_at_any_place_are_joined(seed: int) -> None:
         cuts = [0, *sorted(rng.sample(range(1, 100), rng.randrange(8))), 100]
         batches += [table(a, b - a, group) for a, b in pairwise(cuts)]
     batches.sort(key=lambda batch: (batch.column("step")[0].as_py(), rng.random()))
-    found = list(spans(batches))
-    assert values([join(pieces) for pieces in found]) == values([table(0, 100)])
-    assert sum(map(count, found)) == 100
+    found = list(group_spans(batches))
+    assert values([join_pieces(pieces) for pieces in found]) == values([table(0, 100)])
+    assert sum(map(count_joined_rows, found)) == 100
 
 
 def test_no_more_is_waited_for_than_lies_side_by_side() -> None:
@@ -60,23 +60,23 @@ def test_no_more_is_waited_for_than_lies_side_by_side() -> None:
             taken += 1
             yield table(first, 10, ("a",))
 
-    for n, pieces in enumerate(spans(thick_and_thin())):
-        assert count(pieces) == 10
+    for n, pieces in enumerate(group_spans(thick_and_thin())):
+        assert count_joined_rows(pieces) == 10
         assert taken <= n + 2
 
 
 def test_rows_without_a_column_have_null_in_it() -> None:
     first, second = table(0, 4), table(4, 2, ("b", "c"))
-    batch = join([first, second])
+    batch = join_pieces([first, second])
     assert batch.column("a").to_pylist() == [[b"a0"], [b"a1"], [b"a2"], [b"a3"], None, None]
     assert batch.column("b").null_count == 0
 
 
 def test_rows_out_of_order_within_a_batch_are_sorted() -> None:
     mixed = table(0, 6, ("a", "c")).take(pa.array([3, 1, 0, 5, 4, 2]))
-    found = list(spans([mixed, table(0, 3, ("b",)), table(3, 3, ("b",))]))
-    assert list(map(count, found)) == [3, 3]
-    assert values(list(map(join, found))) == values([table(0, 6)])
+    found = list(group_spans([mixed, table(0, 3, ("b",)), table(3, 3, ("b",))]))
+    assert list(map(count_joined_rows, found)) == [3, 3]
+    assert values(list(map(join_pieces, found))) == values([table(0, 6)])
 
 
 def test_a_row_that_stands_twice_in_a_batch_is_one() -> None:
@@ -91,23 +91,27 @@ def test_a_row_that_stands_twice_in_a_batch_is_one() -> None:
         .to_batches()
     )
     assert merged[0].num_rows == 12
-    (pieces,) = spans(merged)
-    assert count(pieces) == 6
-    assert values([join(pieces)]) == values([table(0, 6)])
+    (pieces,) = group_spans(merged)
+    assert count_joined_rows(pieces) == 6
+    assert values([join_pieces(pieces)]) == values([table(0, 6)])
 
 
 def test_entities_are_kept_apart() -> None:
     mixed = [table(0, 2, entity="/x"), table(1, 3, entity="/y"), table(2, 2, entity="/x")]
-    assert [(entity_of(join(p)), count(p)) for p in spans(mixed)] == [("/x", 2), ("/x", 2), ("/y", 3)]
+    assert [(get_entity(join_pieces(p)), count_joined_rows(p)) for p in group_spans(mixed)] == [
+        ("/x", 2),
+        ("/x", 2),
+        ("/y", 3),
+    ]
 
 
 def test_two_values_of_one_row_are_an_error() -> None:
     with pytest.raises(ValueError, match="more than one b"):
-        join([table(0, 3, ("a", "b")), table(0, 3, ("b", "c"))])
+        join_pieces([table(0, 3, ("a", "b")), table(0, 3, ("b", "c"))])
 
 
 def test_two_times_of_one_row_are_an_error() -> None:
     other = table(0, 3, ("b", "c"))
     moved = other.set_column(1, other.schema.field(1), pa.array([0, 1, 7], pa.int64()))
     with pytest.raises(ValueError, match="more than one step"):
-        join([table(0, 3, ("a",)), moved])
+        join_pieces([table(0, 3, ("a",)), moved])

@@ -15,7 +15,7 @@ from iris_session.protocol.server_messages import (
     ParticipantInfo,
     ParticipantLeft,
 )
-from iris_session.recording import Frame, Looks, Recording, read_looks
+from iris_session.recording import AlignmentHistory, Recording, TrackingFrame, read_alignment_history
 from tests.recording.headsets import Played, S
 
 TABLE: PoseTuple = ((0.0, -0.45, 0.0), (1.0, 0.0, 0.0, 0.0))
@@ -28,9 +28,9 @@ def played() -> Played:
     return Played({"table": TABLE})
 
 
-def read(played: Played, folder: Path) -> Looks:
+def read(played: Played, folder: Path) -> AlignmentHistory:
     with Recording.open(played.write(folder / "session.rrd")) as recording:
-        return read_looks(recording)
+        return read_alignment_history(recording)
 
 
 def test_looks_are_told_apart_by_whose_they_are(played: Played, tmp_path: Path) -> None:
@@ -44,9 +44,12 @@ def test_looks_are_told_apart_by_whose_they_are(played: Played, tmp_path: Path) 
     played.look(2, "table", TABLE, HERE, 2, n=3)
     played.look(9, "table", TABLE, HERE, 3, n=2)
     found = read(played, tmp_path)
-    assert {frame: len(looks) for frame, looks in found.looks.items()} == {Frame("p1", 1, 0): 3, Frame("p2", 1, 0): 4}
+    assert {frame: len(looks) for frame, looks in found.observations.items()} == {
+        TrackingFrame("p1", 1, 0): 3,
+        TrackingFrame("p2", 1, 0): 4,
+    }
     assert found.unowned == 2, "nobody joined by that connection"
-    assert {id: one.aligned for id, one in found.people.items()} == {"p1": True, "p2": True, "p3": False}
+    assert {id: one.aligned for id, one in found.participants.items()} == {"p1": True, "p2": True, "p3": False}
 
 
 def test_every_run_and_epoch_is_a_tracking_frame_of_its_own(played: Played, tmp_path: Path) -> None:
@@ -58,10 +61,10 @@ def test_every_run_and_epoch_is_a_tracking_frame_of_its_own(played: Played, tmp_
     played.join(3, "p1", "ann", run="run:b")  # the app was started anew
     played.look(3, "table", TABLE, HERE, 4, n=5)
     found = read(played, tmp_path)
-    assert {frame: len(looks) for frame, looks in found.looks.items()} == {
-        Frame("p1", 1, 0): 2,
-        Frame("p1", 1, 1): 7,
-        Frame("p1", 2, 0): 5,
+    assert {frame: len(looks) for frame, looks in found.observations.items()} == {
+        TrackingFrame("p1", 1, 0): 2,
+        TrackingFrame("p1", 1, 1): 7,
+        TrackingFrame("p1", 2, 0): 5,
     }
 
 
@@ -81,14 +84,14 @@ def test_a_jump_begins_a_tracking_frame(played: Played, tmp_path: Path) -> None:
     played.join(3, "p1", "ann", run="run:b")
     played.look(3, "table", TABLE, HERE, 3, n=3)
     found = read(played, tmp_path)
-    assert {frame: len(looks) for frame, looks in found.looks.items()} == {
-        Frame("p1", 1, 0): 2,
-        Frame("p1", 1, 0, 1): 1,
-        Frame("p1", 2, 0): 3,
-        Frame("p2", 1, 0): 4,
+    assert {frame: len(looks) for frame, looks in found.observations.items()} == {
+        TrackingFrame("p1", 1, 0): 2,
+        TrackingFrame("p1", 1, 0, 1): 1,
+        TrackingFrame("p1", 2, 0): 3,
+        TrackingFrame("p2", 1, 0): 4,
     }
-    assert all(look.p_tracking_head is not None for look in found.looks[Frame("p1", 1, 0, 1)])
-    assert [one.frame for one in found.in_force] == [Frame("p1", 1, 0, 1)]
+    assert all(look.p_tracking_head is not None for look in found.observations[TrackingFrame("p1", 1, 0, 1)])
+    assert [one.frame for one in found.in_force] == [TrackingFrame("p1", 1, 0, 1)]
 
 
 def test_who_comes_back_under_another_name_is_the_same_person(played: Played, tmp_path: Path) -> None:
@@ -97,7 +100,7 @@ def test_who_comes_back_under_another_name_is_the_same_person(played: Played, tm
     played.join(2, "p1", "anna", run="run:a")
     played.look(2, "table", TABLE, HERE, 2, n=3)
     found = read(played, tmp_path)
-    assert {frame: len(looks) for frame, looks in found.looks.items()} == {Frame("p1", 1, 0): 5}
+    assert {frame: len(looks) for frame, looks in found.observations.items()} == {TrackingFrame("p1", 1, 0): 5}
     assert found.unowned == 0
 
 
@@ -108,17 +111,17 @@ def test_the_head_pose_nearest_in_time_goes_with_a_look(
     played.join(1, "p1", "ann")
     played.look(1, "table", TABLE, HERE, 1, n=1, head_late_ns=late_ns)
     played.sample(1, (9.0, 9.0, 9.0), played.now_ns + 2 * abs(late_ns))
-    (look,) = read(played, tmp_path).looks[Frame("p1", 1, 0)]
+    (look,) = read(played, tmp_path).observations[TrackingFrame("p1", 1, 0)]
     assert (look.p_tracking_head is not None) == known
     if look.p_tracking_head is not None:
-        assert distance(look.p_tracking_head, look.seen.T_tracking_anchor.p) < 0.7
+        assert distance(look.p_tracking_head, look.observation.T_tracking_anchor.p) < 0.7
 
 
 def test_heads_of_another_tracking_epoch_say_nothing(played: Played, tmp_path: Path) -> None:
     played.join(1, "p1", "ann")
     played.look(1, "table", TABLE, HERE, 1, n=1, head_late_ns=S)
     played.sample(1, (1.0, 2.0, 3.0), played.now_ns, epoch=1)
-    (look,) = read(played, tmp_path).looks[Frame("p1", 1, 0)]
+    (look,) = read(played, tmp_path).observations[TrackingFrame("p1", 1, 0)]
     assert look.p_tracking_head is None
 
 
@@ -150,13 +153,13 @@ def test_alignments_hold_until_something_ends_them(played: Played, tmp_path: Pat
         (4, 5, 7),
         (1, 7, -1),
     ]
-    assert found[3].frame == Frame("p1", 1, 1, 1), "jumps are counted through a run, whatever epochs it tells"
+    assert found[3].frame == TrackingFrame("p1", 1, 1, 1), "jumps are counted through a run, whatever epochs it tells"
 
 
 def test_moved_anchors_are_told(played: Played, tmp_path: Path) -> None:
     played.wait(2.0)
     played.event(AnchorMoved("table", Pose(*HERE)))
-    (moved,) = read(played, tmp_path).moved
+    (moved,) = read(played, tmp_path).anchor_moves
     assert moved == (2 * S, "table", Pose(*HERE))
 
 
@@ -166,13 +169,13 @@ def test_what_does_not_decode_is_counted(played: Played, tmp_path: Path) -> None
     played.raw(1, b"\x81\xa4type\xa3bye")
     played.look(1, "table", TABLE, HERE, 1, n=2)
     found = read(played, tmp_path)
-    assert (found.unreadable, len(found.looks[Frame("p1", 1, 0)])) == (2, 2)
+    assert (found.unreadable, len(found.observations[TrackingFrame("p1", 1, 0)])) == (2, 2)
 
 
 def test_recordings_of_any_session_can_be_read(played: Played, tmp_path: Path) -> None:
     """Nobody came, and no raw message was written at all."""
     found = read(played, tmp_path)
-    assert (found.people, found.looks, found.in_force) == ({}, {}, [])
+    assert (found.participants, found.observations, found.in_force) == ({}, {}, [])
 
 
 def test_progress_comes_to_its_end(played: Played, tmp_path: Path) -> None:
@@ -180,7 +183,7 @@ def test_progress_comes_to_its_end(played: Played, tmp_path: Path) -> None:
     played.look(1, "table", TABLE, HERE, 1, n=2)
     told: list[tuple[int, int]] = []
     with Recording.open(played.write(tmp_path / "session.rrd")) as recording:
-        read_looks(recording, lambda done, total: told.append((done, total)))
+        read_alignment_history(recording, lambda done, total: told.append((done, total)))
         assert told[-1] == (recording.count_rows() + recording.count_samples(),) * 2
         assert recording.count_samples() == 4
     assert told == sorted(told)

@@ -13,9 +13,9 @@ import pytest
 from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.recording import SessionHeader, pack_model
-from iris_session.recording.bending import Bending
+from iris_session.recording.deformables import DrawnDeformable
 from iris_session.recording.messages import Batch, SceneAssets, SceneModel, VertexFrame
-from iris_session.recording.writer import WAITING_VERTICES, RrdWriter
+from iris_session.recording.writer import MAX_PENDING_VERTICES, RrdWriter
 from iris_session.scene import AssetDecodeError, AssetStore, decode_arrays
 from iris_session.scene.mujoco_assets import read_flex_mesh
 from iris_session.scene.mujoco_scene import parse_mujoco
@@ -43,7 +43,7 @@ class World:
         self.packed = pack_model(bytes(encode_model(self.model)))
         self.path, self.closed = folder / "w.rrd", False
         self.writer = RrdWriter(self.path, "id")
-        self.writer.header(SessionHeader("s", "n", "closed", 2_000_000, model=self.packed))
+        self.writer.write_header(SessionHeader("s", "n", "closed", 2_000_000, model=self.packed))
         self.writer.add(Batch(assets=[self.assets]))
 
     def vertices(self, index: int) -> np.ndarray:
@@ -214,7 +214,7 @@ def test_what_is_no_frame_is_refused_and_counted(world: World) -> None:
 
 def test_vertices_whose_states_do_not_come_are_bounded(world: World) -> None:
     world.state(0)
-    for i in range(WAITING_VERTICES + 5):
+    for i in range(MAX_PENDING_VERTICES + 5):
         world.writer.add_vertices(VertexFrame("flex-0", 8_000_000 + i, b""))
     assert world.writer.vertices_refused == 5
     assert len(told(world.read()[CLOTH], "Mesh3D:vertex_positions")) == 1
@@ -225,8 +225,8 @@ def test_vertices_are_split_where_texture_coordinates_differ(world: World) -> No
     arrays = dict(decode_arrays(world.store.get(cloth.address), "deformable"))
     n = len(arrays["elements"])
     arrays["uv"] = np.tile(np.array([(0, 0), (1, 0), (0, 1)], np.float32), (n, 1, 1))
-    bending = Bending("e", cloth, arrays, np.zeros((2, 2, 3), np.uint8))
-    mesh = bending.drawing()[1]
+    bending = DrawnDeformable("e", cloth, arrays, np.zeros((2, 2, 3), np.uint8))
+    mesh = bending.build_components()[1]
     indices = np.array(mesh.triangle_indices.as_arrow_array().to_pylist())
     uv = np.array(mesh.vertex_texcoords.as_arrow_array().to_pylist())
     assert np.array_equal(uv[indices], arrays["uv"])
@@ -241,4 +241,4 @@ def test_an_asset_that_is_damaged_is_an_error_of_assets(world: World, name: str)
     arrays = dict(decode_arrays(world.store.get(cloth.address), "deformable"))
     arrays[name] = arrays[name][:-1] if name == "position" else np.full_like(arrays[name], 200)
     with pytest.raises(AssetDecodeError):
-        Bending("e", cloth, arrays)
+        DrawnDeformable("e", cloth, arrays)

@@ -8,16 +8,16 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from anchors.lie import Array, quat_conjugate, quat_exp, quat_matrix, quat_multiply, swing
-from anchors.robust import Merged, merge, middle
-from anchors.solve import Prior, Problem, Solution, problem, solve
+from anchors.lie import Array, quat_conjugate, quat_exp, quat_multiply, quat_to_matrix, swing
+from anchors.solver import AlignmentPrior, AlignmentProblem, AlignmentSolution, build_problem, solve_alignment
+from anchors.viewpoints import MergedObservation, fast_median, merge_poses
 
-PRIOR = Prior(math.radians(0.2), 0.003 / 60.0, 0.0)
+PRIOR = AlignmentPrior(math.radians(0.2), 0.003 / 60.0, 0.0)
 P_WORLD = np.array([[0.0, 0.0, 0.7], [1.5, 0.1, 0.7], [0.6, 1.2, 0.8], [0.0, 0.0, 0.7]])
 AGES = np.array([-45.0, -30.0, -15.0, 0.0])
 
 
-def _problem(rng: np.random.Generator) -> tuple[Problem, Array, Array]:
+def _problem(rng: np.random.Generator) -> tuple[AlignmentProblem, Array, Array]:
     """Four looks, each with a covariance of its own, at a frame that is tilted and drifts; and the truth at age 0."""
     tilt = quat_exp(np.append(rng.normal(0.0, PRIOR.tilt_sigma_rad, 2), 0.0))
     q = quat_multiply(tilt, quat_exp(np.array([0.0, 0.0, rng.uniform(-3.0, 3.0)])))
@@ -28,15 +28,15 @@ def _problem(rng: np.random.Generator) -> tuple[Problem, Array, Array]:
         root = rng.normal(size=(6, 6)) * np.repeat([0.001, 0.002], 3)[:, None]
         C = root @ root.T + np.diag([1e-7] * 6)
         noise = np.linalg.cholesky(C) @ rng.normal(size=6)
-        seen = quat_matrix(q) @ p + t + age * drift + noise[:3]
-        merged.append(Merged(seen, quat_multiply(quat_exp(noise[3:]), q), C, 20, 20))
+        seen = quat_to_matrix(q) @ p + t + age * drift + noise[:3]
+        merged.append(MergedObservation(seen, quat_multiply(quat_exp(noise[3:]), q), C, 20, 20))
     level = np.tile([1.0, 0.0, 0.0, 0.0], (4, 1))
-    return problem("abca", P_WORLD, level, merged, AGES, PRIOR), t, q
+    return build_problem("abca", P_WORLD, level, merged, AGES, PRIOR), t, q
 
 
-def _scipy(b: Problem, start: Solution) -> tuple[Array, Array]:
+def _scipy(b: AlignmentProblem, start: AlignmentSolution) -> tuple[Array, Array]:
     """The same by another solver, with rotations by scipy."""
-    R0 = Rotation.from_matrix(quat_matrix(start.q))
+    R0 = Rotation.from_matrix(quat_to_matrix(start.q))
     seen = Rotation.from_quat(np.roll(b.q, -1, axis=1))
 
     def residuals(x: Array) -> Array:
@@ -58,11 +58,11 @@ def test_the_optimum_is_that_of_scipy() -> None:
     """But for what the derivative of the logarithm at residuals of milliradians is taken as: 1e-5 rad."""
     for seed in range(5):
         b, _, _ = _problem(np.random.default_rng(seed))
-        got = solve(b, PRIOR)
+        got = solve_alignment(b, PRIOR)
         t, R = _scipy(b, got)
         assert got.inside.all()
         assert np.allclose(got.t, t, atol=2e-5)
-        assert np.allclose(quat_matrix(got.q), R, atol=1e-5)
+        assert np.allclose(quat_to_matrix(got.q), R, atol=1e-5)
 
 
 def test_errors_scatter_as_the_covariance_says() -> None:
@@ -70,7 +70,7 @@ def test_errors_scatter_as_the_covariance_says() -> None:
     distances = []
     for seed in range(200):
         b, t, q = _problem(np.random.default_rng(seed))
-        got = solve(b, PRIOR)
+        got = solve_alignment(b, PRIOR)
         turn = Rotation.from_quat(np.roll(quat_multiply(q, quat_conjugate(got.q)), -1)).as_rotvec()
         e = np.concatenate([t - got.t, turn])
         distances.append(float(e @ np.linalg.solve(got.covariance, e)))
@@ -79,10 +79,10 @@ def test_errors_scatter_as_the_covariance_says() -> None:
 
 def test_an_earlier_solution_to_begin_with_changes_nothing() -> None:
     b, _, _ = _problem(np.random.default_rng(1))
-    first = solve(b, PRIOR)
-    again = solve(b, PRIOR, (quat_multiply(quat_exp(np.array([0.01, 0.0, 0.05])), first.q), first.t + 0.02))
+    first = solve_alignment(b, PRIOR)
+    again = solve_alignment(b, PRIOR, (quat_multiply(quat_exp(np.array([0.01, 0.0, 0.05])), first.q), first.t + 0.02))
     assert np.allclose(first.t, again.t, atol=1e-6)
-    assert np.allclose(quat_matrix(first.q), quat_matrix(again.q), atol=1e-6)
+    assert np.allclose(quat_to_matrix(first.q), quat_to_matrix(again.q), atol=1e-6)
 
 
 def test_merge_is_the_mean_of_what_agrees() -> None:
@@ -93,11 +93,11 @@ def test_merge_is_the_mean_of_what_agrees() -> None:
     q[::2] *= -1.0  # the same rotations
     p[4] += 0.1
     q[9] = quat_exp(np.array([0.5, 0.0, 0.0]))
-    got = merge(p, q, C, C, 0.6)
+    got = merge_poses(p, q, C, C, 0.6)
     assert got is not None
-    assert (got.n, got.of) == (19, 21)
+    assert (got.n, got.n_total) == (19, 21)
     keep = [i for i in range(21) if i not in (4, 9)]
     assert np.allclose(got.p, p[keep].mean(axis=0))
     assert np.allclose(got.covariance, C + C / 19)
-    assert merge(p, quat_exp(rng.uniform(-3.0, 3.0, (21, 3))), C, C, 0.6) is None
-    assert np.allclose(middle(p), np.median(p, axis=0))
+    assert merge_poses(p, quat_exp(rng.uniform(-3.0, 3.0, (21, 3))), C, C, 0.6) is None
+    assert np.allclose(fast_median(p), np.median(p, axis=0))

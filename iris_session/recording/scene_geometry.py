@@ -62,7 +62,7 @@ Rgba8 = tuple[int, int, int, int]
 Pixels = NDArray[np.uint8]
 
 
-class Form(NamedTuple):
+class VisualShape(NamedTuple):
     """How a visual is drawn. `size`: half sizes (box, ellipsoid), or radius twice and half length along z (capsule,
     cylinder) [m]; unused for meshes. `tint`: to multiply its colour with, in place of a texture of one colour."""
 
@@ -74,7 +74,7 @@ class Form(NamedTuple):
     tint: tuple[float, float, float] = _WHITE
 
 
-class Place(NamedTuple):
+class BodyPlacement(NamedTuple):
     """`T`: of a body in the frame."""
 
     frame: str
@@ -82,7 +82,7 @@ class Place(NamedTuple):
 
 
 @contextmanager
-def opened(assets: SceneAssets, packed_model: bytes) -> Iterator[tuple[SceneSpec, AssetStore]]:
+def open_scene(assets: SceneAssets, packed_model: bytes) -> Iterator[tuple[SceneSpec, AssetStore]]:
     """Specification and store of a scene. Raises `SceneBuildError`, `OSError`, and `ValueError` for bytes that are no
     specification or no model."""
     if assets.root:
@@ -114,41 +114,41 @@ class SceneReader:
     def __init__(self, spec: SceneSpec, store: AssetStore, bodies: Sequence[BodyInfo]) -> None:
         self._spec = spec
         self._store = store
-        self._places = places(spec, bodies)
+        self._places = place_bodies(spec, bodies)
         self._meshes: dict[tuple[int, int], MeshArrays] = {}
         self._textures: dict[int, Pixels | None] = {}
         self._cubes = CubeMapReader(spec, store, CUBE_SIDE)
         self._baked: dict[tuple[Geometry, int], MeshArrays] = {}
 
-    def shown(self, thing: Visual | Deformable) -> bool:
+    def is_shown(self, thing: Visual | Deformable) -> bool:
         """Whether it is drawn at all."""
         return thing.rgba[3] > 0 and thing.group in self._spec.groups_shown
 
-    def place(self, visual: Visual) -> tuple[str, PoseTuple]:
+    def place_visual(self, visual: Visual) -> tuple[str, PoseTuple]:
         """Frame, and T_frame_visual."""
         frame, T_frame_body = self._places[visual.body]
         return frame, compose(T_frame_body, _tuple(visual.T_body_visual))
 
-    def form(self, visual: Visual) -> Form:
+    def read_shape(self, visual: Visual) -> VisualShape:
         """Shape and surface."""
         geometry = visual.geometry
         cube = self._cubes.find(visual.material, geometry)
         atlas, tint = (None, _WHITE) if cube is None else (cube.atlas, cube.tint)
-        texture = self.texture(visual.material) if atlas is None else _with_colours(atlas.pixels)
+        texture = self.read_texture(visual.material) if atlas is None else _with_colours(atlas.pixels)
         mesh = self._mesh(geometry)
         if atlas is not None and mesh is not None and mesh.triangles > MOST_BAKED:
-            return Form(MESH, mesh=mesh, tint=_mean_colour(atlas.pixels))
+            return VisualShape(MESH, mesh=mesh, tint=_mean_colour(atlas.pixels))
         if mesh is None and texture is not None:
             mesh = build_primitive(_ended(geometry))
         if mesh is None:
-            return Form(_FORMS.get(geometry.kind, BOX), _half_sizes(geometry), tint=tint)
+            return VisualShape(_FORMS.get(geometry.kind, BOX), _half_sizes(geometry), tint=tint)
         if texture is None:
-            return Form(MESH, mesh=mesh, tint=tint)
+            return VisualShape(MESH, mesh=mesh, tint=tint)
         if atlas is not None:
             mesh = self._with_atlas(mesh, visual, atlas)
         else:
             mesh = add_texture_coordinates(mesh, geometry, self._spec.materials[visual.material])
-        return Form(MESH, mesh=mesh, uv=mesh.uv, texture=texture)
+        return VisualShape(MESH, mesh=mesh, uv=mesh.uv, texture=texture)
 
     def _with_atlas(self, mesh: MeshArrays, visual: Visual, atlas: Atlas) -> MeshArrays:
         key = visual.geometry, visual.material
@@ -157,7 +157,7 @@ class SceneReader:
             self._baked[key] = bake_cube_map(mesh, visual.geometry, scale, atlas)
         return self._baked[key]
 
-    def texture(self, material: int) -> Pixels | None:
+    def read_texture(self, material: int) -> Pixels | None:
         """The 2d texture of a material, red, green, blue and perhaps alpha."""
         index = -1 if material < 0 else self._spec.materials[material].find_texture()
         if index < 0:
@@ -166,7 +166,7 @@ class SceneReader:
             self._textures[index] = self._texture(index)
         return self._textures[index]
 
-    def arrays(self, deformable: Deformable) -> dict[str, NDArray[Any]]:
+    def read_arrays(self, deformable: Deformable) -> dict[str, NDArray[Any]]:
         """The asset of a deformable, with texture coordinates as its material repeats them."""
         arrays = decode_arrays(self._store.get(deformable.address), ArrayKind.DEFORMABLE)
         worn = None if deformable.material < 0 else self._spec.materials[deformable.material]
@@ -206,22 +206,22 @@ def _mean_colour(pixels: Pixels) -> tuple[float, float, float]:
     return (red, green, blue)
 
 
-def places(spec: SceneSpec, bodies: Sequence[BodyInfo]) -> dict[int, Place]:
+def place_bodies(spec: SceneSpec, bodies: Sequence[BodyInfo]) -> dict[int, BodyPlacement]:
     """For every body: the nearest moving streamed body at or above it, and where it is in that one's frame."""
     moving = {body.id: body.name for body in bodies if body.moving}
-    found: dict[int, Place] = {-1: Place(WORLD, IDENTITY_POSE)}
+    found: dict[int, BodyPlacement] = {-1: BodyPlacement(WORLD, IDENTITY_POSE)}
     for body in spec.bodies:  # parents before their children
         name, above = moving.get(body.id), found[body.parent]
         if name is not None:
-            found[body.id] = Place(name, IDENTITY_POSE)
+            found[body.id] = BodyPlacement(name, IDENTITY_POSE)
         elif above.frame == WORLD:
-            found[body.id] = Place(WORLD, _tuple(body.T_world_body))
+            found[body.id] = BodyPlacement(WORLD, _tuple(body.T_world_body))
         else:
-            found[body.id] = Place(above.frame, compose(above.T, _tuple(body.T_parent_body)))
+            found[body.id] = BodyPlacement(above.frame, compose(above.T, _tuple(body.T_parent_body)))
     return found
 
 
-def colour(rgba: Rgba, tint: tuple[float, float, float] = _WHITE) -> Rgba8:
+def to_rgba8(rgba: Rgba, tint: tuple[float, float, float] = _WHITE) -> Rgba8:
     """As Rerun has colours: 0 to 255."""
     r, g, b, a = (min(255, max(0, round(v * t * 255.0))) for v, t in zip(rgba, (*tint, 1.0), strict=True))
     return r, g, b, a

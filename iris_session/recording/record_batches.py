@@ -1,0 +1,309 @@
+"""Arrow record batches of a recording: rejoin rows that Rerun's tools have split, and decode their columns. Pure.
+
+Each `decode_` function takes a record batch and yields one value per row: journal rows, keyframes, states, events, raw
+messages. It raises one of `UNREADABLE` if the bytes mean something else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, Final, NamedTuple, TypeVar
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.protocol.common import Applied
+from iris_session.protocol.server_messages import BodyInfo, Event, PresenceItem
+from iris_session.recording import paths
+from iris_session.recording.journal import JournalRow, Keyframe, open_blob
+from iris_session.recording.messages import DenialRecord, EndMark, SceneModel, decode_scene
+from iris_session.recording.rrd_file import Mark
+
+#: Errors of decoding bytes that mean something else; the last one is Arrow's, for types that it cannot convert.
+UNREADABLE: Final = (msgspec.DecodeError, LookupError, TypeError, ValueError, ArithmeticError, NotImplementedError)
+#: Bytes of a row id that are the time of the write.
+_WRITE: Final = 8
+_T = TypeVar("_T")
+
+_decode_presence = msgspec.msgpack.Decoder(tuple[PresenceItem, ...]).decode
+_decode_applied = msgspec.msgpack.Decoder(tuple[Applied, ...]).decode
+
+
+class RawSample(NamedTuple):
+    """A message of a client as received. `receive_ns`: session time."""
+
+    connection: int
+    receive_ns: int
+    data: bytes
+
+
+class RecordedState(NamedTuple):
+    """State of all bodies at one moment.
+
+    `poses`: float64 (n_bodies, 7) `x y z qw qx qy qz`, world frame, exactly as in the session. `bodies`: the body of
+    each pose. `sim_time` [s], `session_time` [ns].
+    """
+
+    step: int
+    tick: int
+    sim_time: float
+    session_time: int
+    poses: NDArray[np.float64]
+    presence: tuple[PresenceItem, ...]
+    applied: tuple[Applied, ...]
+    bodies: tuple[BodyInfo, ...] = ()
+
+
+class Scalar(NamedTuple):
+    """A value of a plot. `session_time`: [ns]."""
+
+    entity: str
+    session_time: int
+    value: float
+
+
+def decode_rows(batch: Any) -> Iterator[JournalRow]:
+    """Yield rows of the journal."""
+    columns = zip(
+        read_index(batch, paths.STEP),
+        read_index(batch, paths.SESSION_TIME),
+        read_values(batch, "n_ticks"),
+        read_values(batch, "entries"),
+        _read_lists(batch, "entry_lengths"),
+        _read_lists(batch, "entry_crcs"),
+        read_values(batch, "digest"),
+        read_values(batch, "chain"),
+        _read_lists(batch, "field_crcs"),
+        _read_plants(batch),
+        strict=True,
+    )
+    return (JournalRow(*row) for row in columns)
+
+
+def decode_states(batch: Any) -> Iterator[RecordedState]:
+    """Yield states without their `bodies`."""
+    _flatten(batch, "poses")
+    lists = batch.column("poses")
+    ends = np.cumsum(np.asarray(lists.value_lengths(), np.intp))  # another scene has other bodies
+    poses = [p.reshape(-1, 7) for p in np.split(np.asarray(lists.flatten(), np.float64), ends[:-1])]
+    columns = zip(
+        read_index(batch, paths.STEP),
+        read_index(batch, paths.TICK),
+        read_values(batch, "sim_time_s"),
+        read_index(batch, paths.SESSION_TIME),
+        poses,
+        map(_decode_presence, read_values(batch, "presence")),
+        map(_decode_applied, read_values(batch, "applied")),
+        strict=True,
+    )
+    return (RecordedState(*row) for row in columns)
+
+
+def decode_models(batch: Any) -> Iterator[SceneModel]:
+    """Yield the models of scenes that were loaded."""
+    for sealed in read_values(batch, "scene"):
+        blob, intact = open_blob(sealed)
+        if not intact:
+            raise ValueError("a model was changed (checksum)")
+        yield decode_scene(blob)
+
+
+def decode_samples(batch: Any) -> Iterator[RawSample]:
+    """Yield raw messages."""
+    columns = (read_values(batch, "connection"), read_index(batch, paths.SESSION_TIME), read_values(batch, "data"))
+    return (RawSample(*row) for row in zip(*columns, strict=True))
+
+
+def decode_scalars(batch: Any) -> Iterator[Scalar]:
+    """Yield values of plots."""
+    columns = (read_index(batch, paths.SESSION_TIME), read_values(batch, "Scalars:scalars"))
+    return (Scalar(get_entity(batch), *row) for row in zip(*columns, strict=True))
+
+
+def numbered_denial_decoder() -> Callable[[Any], Iterator[tuple[int, DenialRecord]]]:
+    """Return a decoder of denials for batches in order, which numbers those of one step: two may be equal.
+
+    The recorder writes the denials of a step at once, and the first half of Rerun's row id identifies the write. So a
+    step continues where Rerun's tools have split its denials, and starts over where another part repeats it.
+    """
+    place, n = (b"", -1), 0
+
+    def decode(batch: Any) -> Iterator[tuple[int, DenialRecord]]:
+        nonlocal place, n
+        for record, row in zip(decode_denials(batch), batch.column(ROW_ID).to_pylist(), strict=True):
+            at = (row[:_WRITE], record.step)
+            place, n = at, n + 1 if at == place else 0
+            yield n, record
+
+    return decode
+
+
+def _msgpack_decoder(column: str, kind: type[_T]) -> Callable[[Any], Iterator[_T]]:
+    """Return a decoder of a column with one MessagePack value per row."""
+    decode = msgspec.msgpack.Decoder(kind).decode
+    return lambda batch: map(decode, read_values(batch, column))
+
+
+decode_keyframes: Final = _msgpack_decoder("keyframe", Keyframe)
+decode_events: Final = _msgpack_decoder("event", Event)
+decode_denials: Final = _msgpack_decoder("denial", DenialRecord)
+decode_marks: Final = _msgpack_decoder("mark", Mark)
+decode_ends: Final = _msgpack_decoder("end", EndMark)
+
+
+def read_values(batch: Any, column: str) -> list[Any]:
+    """Return one value per row of a component column."""
+    flat = _flatten(batch, column)
+    if len(flat) != batch.num_rows:
+        raise ValueError(f"{column} has {len(flat)} values in {batch.num_rows} rows")
+    return list(flat.to_pylist())
+
+
+def read_index(batch: Any, timeline: str) -> list[int]:
+    """Return integer values of a timeline (durations in nanoseconds)."""
+    return [int(v) for v in np.asarray(batch.column(timeline).cast("int64"))]
+
+
+def _read_plants(batch: Any) -> list[bytes]:
+    """Return the plant state per row, empty where there is none; without any, the column is missing."""
+    if "plant" not in batch.schema.names:
+        return [b""] * batch.num_rows
+    return [value[0] if value else b"" for value in batch.column("plant").to_pylist()]
+
+
+def _read_lists(batch: Any, column: str) -> Iterator[tuple[Any, ...]]:
+    """Yield a tuple per row of a component column."""
+    _flatten(batch, column)
+    return map(tuple, batch.column(column).to_pylist())
+
+
+def _flatten(batch: Any, column: str) -> Any:
+    """Return all values of a column that must not have nulls."""
+    lists = batch.column(column)
+    flat = lists.flatten()
+    if missing := lists.null_count + flat.null_count:
+        raise ValueError(f"{column} has {missing} missing values")
+    return flat
+
+
+# --- rows that Rerun's tools have split -------------------------------------------------------------------------------
+# #
+# `rerun rrd optimize` puts large columns of an entity into chunks of their own, merges chunks, and fills in nulls where
+# a merged chunk had no such column; one chunk may hold a row twice then, with something in other columns each time.
+# What it keeps is the id of every row, which grows in the order of writing: the parts of one row have one id. As
+# measured with rerun-sdk 0.41, the chunks of an entity come in the order of their first rows; so no more is
+# held here than the longest chunk and those beside it. In another order parts stay separate, and readers miss the rest
+# of their rows.
+
+ROW_ID: Final = "rerun.controls.RowId"
+_ENTITY: Final = b"rerun:entity_path"
+_KIND: Final = b"rerun:kind"
+_DATA: Final = b"data"
+
+
+def group_spans(batches: Iterable[Any]) -> Iterator[list[Any]]:
+    """Group record batches of any entities into spans: all pieces of some rows of one entity.
+
+    Mostly a span is one batch, as it was written. Spans of an entity come in the order of its rows.
+    """
+    waiting: dict[str, list[Any]] = {}
+    for batch in batches:
+        if batch.num_rows:
+            ordered = _in_order(batch)
+            pieces = waiting.setdefault(get_entity(batch), [])
+            yield from _release_before(pieces, ordered.column(ROW_ID)[0])
+            pieces.append(ordered)
+    yield from filter(None, waiting.values())
+
+
+def join_pieces(pieces: list[Any]) -> Any:
+    """Join a span into one record batch, null where a row has no value in a column.
+
+    Raises:
+        ValueError: Pieces contradict each other in one row: the file was changed.
+    """
+    import pyarrow as pa  # type: ignore[import-untyped]
+
+    if _is_whole(pieces):
+        return pieces[0]
+    ids = _list_row_ids(pieces)
+    fields = {field.name: field for piece in pieces for field in piece.schema}
+    columns = [
+        _join_column(field, ids, [p for p in pieces if field.name in p.schema.names]) for field in fields.values()
+    ]
+    schema = pa.schema(fields.values(), metadata=pieces[0].schema.metadata)
+    return pa.RecordBatch.from_arrays(columns, schema=schema)
+
+
+def count_joined_rows(pieces: list[Any]) -> int:
+    """Return the number of rows that `join_pieces` would return."""
+    return pieces[0].num_rows if _is_whole(pieces) else len(_list_row_ids(pieces))
+
+
+def get_entity(batch: Any) -> str:
+    """Return the entity path of the rows."""
+    return str(batch.schema.metadata[_ENTITY].decode())
+
+
+def _is_whole(pieces: list[Any]) -> bool:
+    """Return whether it is one piece with every row once, as a recorder writes them."""
+    return len(pieces) == 1 and _is_ascending(pieces[0])
+
+
+def _is_ascending(batch: Any) -> bool:
+    import pyarrow.compute as pc  # type: ignore[import-untyped]
+
+    ids = batch.column(ROW_ID)
+    return pc.all(pc.less(ids[:-1], ids[1:])).as_py() is not False  # None: too few to compare
+
+
+def _in_order(batch: Any) -> Any:
+    import pyarrow.compute as pc
+
+    return batch if _is_ascending(batch) else batch.take(pc.sort_indices(batch.column(ROW_ID)))
+
+
+def _release_before(pieces: list[Any], bound: Any) -> Iterator[list[Any]]:
+    """Remove the rows before the id `bound` from `pieces` and yield them as a span."""
+    import pyarrow.compute as pc
+
+    heads, tails = [], []
+    for piece in pieces:
+        n = pc.sum(pc.less(piece.column(ROW_ID), bound)).as_py()
+        if n:
+            heads.append(piece.slice(0, n))
+        if n < piece.num_rows:
+            tails.append(piece.slice(n))
+    pieces[:] = tails
+    if heads:
+        yield heads
+
+
+def _list_row_ids(pieces: list[Any]) -> Any:
+    """Return the row ids of all pieces, each once, in order."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    ids = pc.unique(pa.concat_arrays([piece.column(ROW_ID) for piece in pieces]))
+    return ids.take(pc.sort_indices(ids))
+
+
+def _join_column(field: Any, ids: Any, pieces: list[Any]) -> Any:
+    """Return the values of one column for the rows `ids`. `pieces`: those that have the column."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    have = pa.concat_arrays([piece.column(ROW_ID) for piece in pieces])
+    values = pa.concat_arrays([piece.column(field.name) for piece in pieces])
+    if values.null_count:
+        have, values = have.filter(values.is_valid()), values.drop_null()
+    if have.equals(ids):
+        return values
+    found = values.take(pc.index_in(ids, value_set=have))
+    if len(pc.unique(have)) < len(have):
+        # Row ids and times stand in every piece, and must agree; data stand in one.
+        is_data = (field.metadata or {}).get(_KIND) == _DATA
+        if is_data or not found.take(pc.index_in(have, value_set=ids)).equals(values):
+            raise ValueError(f"rows have more than one {field.name}")
+    return found
