@@ -192,7 +192,7 @@ class Soak:
                 kind = self.random.choices(list(KINDS), list(KINDS.values()))[0]
                 self._disturb(kind, now)
         self._undo(float("inf"))
-        self.proxy.do("profile good-wifi")
+        self.proxy.execute("profile good-wifi")
         if self._run_until(self._is_everyone_driving, RECOVER_S, "every operator drives again at the end"):
             self.director.marker(END)
             self._run_until(self._has_everyone_last_event, RECOVER_S, "every client has the last event")
@@ -216,12 +216,12 @@ class Soak:
             worker.process = None
             worker.undo = (now + seconds, "spawn")
         elif kind in ("cut", "reset"):
-            self.proxy.do(f"{kind} @{worker.link}")
+            self.proxy.execute(f"{kind} @{worker.link}")
         elif kind == "roam":
             self._sources = self._sources % 250 + 1
-            self.proxy.do(f"roam 127.0.2.{self._sources} @{worker.link}")
+            self.proxy.execute(f"roam 127.0.2.{self._sources} @{worker.link}")
         elif kind == "stall":
-            self.proxy.do(f"stall @{worker.link}")
+            self.proxy.execute(f"stall @{worker.link}")
             worker.undo = (now + seconds, "resume")
         elif kind == "freeze":
             worker.process.send_signal(signal.SIGSTOP)
@@ -240,7 +240,7 @@ class Soak:
             if what == "spawn":
                 self._spawn(worker)
             elif what == "resume":
-                self.proxy.do(f"resume @{worker.link}")
+                self.proxy.execute(f"resume @{worker.link}")
             elif worker.process is not None:
                 worker.process.send_signal(signal.SIGCONT)
         for item in [item for item in self._taken_robots if item[0] <= now]:
@@ -322,7 +322,7 @@ class Soak:
         for worker in self.workers:
             if worker.process is not None and worker.process.wait(20.0) != 0:
                 self._problem(f"worker {worker.number} ended with status {worker.process.returncode}")
-        result.details["proxy"] = self.proxy.do("stats")["links"]
+        result.details["proxy"] = self.proxy.execute("stats")["links"]
         self.server.send_signal(signal.SIGINT)
         if self.server.wait(60.0) != 0:
             self._problem(f"the session ended with status {self.server.returncode}")
