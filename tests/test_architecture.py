@@ -9,7 +9,21 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+#: A file is one concept; longer ones hold two.
 MAX_LINES = 800
+#: Most parameters of a constructor besides `self`; more are a configuration of their own.
+MAX_PARAMETERS = 8
+#: A module of fewer lines with one importer is a part of that importer, unless it is named here.
+SLIVER_LINES = 80
+SLIVERS = {}
+#: Words of docstrings, comments, messages and names for which docs/glossary.md has a standard term.
+DENIED_WORDS = re.compile(
+    r"\b(somebody|nobody|whoever|befell|told|gives way|gave way|made below|let go of|taken leave|crowd|doors|desk"
+    r"|visitors?|neighbou?rs|departures|knock|what bends)\b",
+    re.IGNORECASE,
+)
+#: Questions instead of statements at the beginning of a docstring.
+QUESTION = re.compile(r"(What|Who|Whether|Where|When|How|Which|Why)\b")
 #: One class whose public methods all document their arguments.
 LONG = {"iris_session/client/client.py": 1250}
 
@@ -176,3 +190,94 @@ def test_files_are_of_readable_length() -> None:
     lines = {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8").count("\n") for path in modules()}
     offenders = [f"{name}: {n} lines" for name, n in lines.items() if n > LONG.get(name, MAX_LINES)]
     assert not offenders, f"more than {MAX_LINES} lines: {offenders}"
+
+
+def dotted_name(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+@cache
+def importers() -> dict[str, set[str]]:
+    """Module of ours -> modules of ours that import it, for type checkers only too."""
+    known = {dotted_name(path) for path in modules()}
+    found: dict[str, set[str]] = {name: set() for name in known}
+    for path in (*modules(), *(ROOT / "tools").glob("*.py"), *(ROOT / "examples").glob("*.py")):
+        for name in set(imports(path)) & known - {dotted_name(path)}:
+            found[name].add(dotted_name(path))
+    return found
+
+
+def circle_from(start: str, imported: dict[str, set[str]]) -> list[str]:
+    """A way along imports from `start` back to it, or an empty list."""
+    ways, seen = [[start]], {start}
+    while ways:
+        way = ways.pop()
+        for after in sorted(imported[way[-1]]):
+            if after == start:
+                return way
+            if after not in seen:
+                seen.add(after)
+                ways.append([*way, after])
+    return []
+
+
+def test_no_imports_in_a_circle_inside_a_room() -> None:
+    rooms = {dotted_name(path): room_of(path) for path in modules() if path.name != "__init__.py"}
+    imported = {
+        name: {to for to, by in importers().items() if name in by and rooms.get(to) == room}
+        for name, room in rooms.items()
+    }
+    circles = {tuple(sorted(circle)) for name in rooms if (circle := circle_from(name, imported))}
+    assert not circles, "\n".join(" -> ".join(circle) for circle in sorted(circles))
+
+
+def test_no_slivers() -> None:
+    offenders = []
+    for path in modules():
+        name, text = dotted_name(path), path.read_text(encoding="utf-8")
+        if path.name in ("__init__.py", "__main__.py") or "__main__" in text or room_of(path) == "cli":
+            continue
+        if text.count("\n") < SLIVER_LINES and len(importers()[name]) == 1 and name not in SLIVERS:
+            offenders.append(f"{name} ({text.count(chr(10))} lines) <- {next(iter(importers()[name]))}")
+    assert not offenders, "merge with the only importer:\n" + "\n".join(offenders)
+
+
+def test_constructors_take_few_parameters() -> None:
+    offenders = []
+    for path in modules():
+        for node in ast.walk(tree(path)):
+            if isinstance(node, ast.FunctionDef) and node.name == "__init__":
+                n = len(node.args.posonlyargs) + len(node.args.args) + len(node.args.kwonlyargs) - 1
+                if n > MAX_PARAMETERS :
+                    offenders.append(f"{path.relative_to(ROOT)}:{node.lineno}: {n}")
+    assert not offenders, f"more than {MAX_PARAMETERS} parameters:\n" + "\n".join(offenders)
+
+
+def test_standard_words() -> None:
+    offenders = []
+    for path in modules():
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+            if found := DENIED_WORDS.search(line):
+                offenders.append(f"{path.relative_to(ROOT)}:{number}: {found[0]}")
+    assert not offenders, "docs/glossary.md has standard words:\n" + "\n".join(offenders)
+
+
+def test_docstrings_state() -> None:
+    offenders = []
+    for path in modules():
+        for node in ast.walk(tree(path)):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+                text = ast.get_docstring(node) or ""
+                if QUESTION.match(text):
+                    offenders.append(f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 1)}: {text.splitlines()[0]}")
+    assert not offenders, "a docstring begins with a verb or a noun:\n" + "\n".join(offenders)
+
+
+def test_one_class_per_name() -> None:
+    places: dict[str, list[str]] = {}
+    for path in modules():
+        for node in tree(path).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places.setdefault(node.name, []).append(dotted_name(path))
+    offenders = {name: where for name, where in places.items() if len(where) > 1}
+    assert not offenders, offenders
