@@ -222,7 +222,7 @@ class TrafficCounter:
         return length + (_SHORT_HEADER if length <= _SHORT else _LONG_HEADER)
 
 
-class Outbox:
+class ControlSender:
     """Send on the control socket. A message for which a send queue has no room is dropped and counted.
 
     Attributes:
@@ -274,5 +274,5 @@ class Outbox:
 
 
 def encode_message(message: ServerMessage) -> bytes:
-    """Encode a message for `Outbox.send_encoded`."""
+    """Encode a message for `ControlSender.send_encoded`."""
     return _encoder.encode(message)

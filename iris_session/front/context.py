@@ -19,7 +19,7 @@ from iris_session.front.asset_server import AssetSockets, open_asset_sockets
 from iris_session.front.audit import AuditTrail
 from iris_session.front.coalescer import Coalescer
 from iris_session.front.connection_guard import ConnectionGuard
-from iris_session.front.connections import ConnectionTable, FrontConnection, Outbox, TrafficCounter
+from iris_session.front.connections import ConnectionTable, ControlSender, FrontConnection, TrafficCounter
 from iris_session.front.discovery import Listeners, choose_address_host, list_reachable_hosts, open_with_introduction
 from iris_session.front.state_publisher import StatePublisher
 from iris_session.link import messages as link
@@ -191,7 +191,7 @@ class FrontContext:
     now_ns: Callable[[], int]
     drops: Drops
     connections: ConnectionTable
-    outbox: Outbox
+    outbox: ControlSender
     coalescer: Coalescer
     audit: AuditTrail
     guard: ConnectionGuard
@@ -238,7 +238,7 @@ def open_front(start: FrontStart) -> tuple[FrontContext, FrontSockets]:
         now_ns=now_ns,
         drops=drops,
         connections=connections,
-        outbox=Outbox(sockets.control.socket, limits, drops, traffic),
+        outbox=ControlSender(sockets.control.socket, limits, drops, traffic),
         coalescer=coalescer,
         audit=audit,
         guard=guard,

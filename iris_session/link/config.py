@@ -178,7 +178,7 @@ class FrontError(Exception):
 
 
 class PortInUseError(FrontError):
-    """Somebody else listens on a port of ours."""
+    """Another process listens on a port of the session."""
 
     def __init__(self, port: int, name: str) -> None:
         super().__init__(

@@ -26,7 +26,7 @@ REPEAT_NS: Final = 1_000_000_000
 Publish = Callable[[str, dict[str, bytes], int, int, str], bool]
 
 
-class DeformableMesh(NamedTuple):
+class DeformableSourceMesh(NamedTuple):
     """A mesh whose vertices move. `vertices` returns the present ones, shape (n, 3) [m], world frame."""
 
     stream: str
@@ -35,7 +35,7 @@ class DeformableMesh(NamedTuple):
 
 
 class _Stream:
-    def __init__(self, mesh: DeformableMesh) -> None:
+    def __init__(self, mesh: DeformableSourceMesh) -> None:
         self.mesh = mesh
         self.encoder = DeformableEncoder(mesh.topology, BOUND_M)
         self.sent_ns = 0
@@ -44,11 +44,11 @@ class _Stream:
 class DeformableStreams:
     """Streams of the deformables of one scene at a time. `publish` passes a frame to the front."""
 
-    def __init__(self, meshes: Sequence[DeformableMesh], publish: Publish) -> None:
+    def __init__(self, meshes: Sequence[DeformableSourceMesh], publish: Publish) -> None:
         self._publish_frame = publish
         self.replace_meshes(meshes)
 
-    def replace_meshes(self, meshes: Sequence[DeformableMesh]) -> None:
+    def replace_meshes(self, meshes: Sequence[DeformableSourceMesh]) -> None:
         """Stream the meshes of another scene from now on."""
         self._streams = [_Stream(mesh) for mesh in meshes]
         self._epoch = -1
@@ -81,11 +81,11 @@ class DeformableStreams:
                 stream.encoder.reset()  # it was dropped: the next frame must be complete
 
 
-def list_flexes(world: World) -> list[DeformableMesh]:
+def list_flexes(world: World) -> list[DeformableSourceMesh]:
     """Return the flexes of a MuJoCo world."""
     meshes = [read_flex_mesh(world.model, index) for index in range(world.model.nflex)]
     return [
-        DeformableMesh(stream_name(index), mesh.topology, _make_reader(world, mesh.vertices))
+        DeformableSourceMesh(stream_name(index), mesh.topology, _make_reader(world, mesh.vertices))
         for index, mesh in enumerate(meshes)
     ]
 

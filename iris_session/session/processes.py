@@ -38,7 +38,7 @@ from iris_session.recording.feed import SILENCE_S
 from iris_session.scene.composed import ComposedScene
 from iris_session.session.config import SessionConfig
 from iris_session.session.core import SessionCore
-from iris_session.session.deformables import DeformableMesh, DeformableStreams, list_flexes
+from iris_session.session.deformables import DeformableSourceMesh, DeformableStreams, list_flexes
 from iris_session.session.errors import StartError
 from iris_session.session.resume import (
     Listening,
@@ -74,7 +74,7 @@ class PublishedScene(NamedTuple):
     """A scene whose world is not MuJoCo's: what clients draw, and its deformables."""
 
     scene: ComposedScene
-    deformables: tuple[DeformableMesh, ...]
+    deformables: tuple[DeformableSourceMesh, ...]
 
 
 class SessionProcesses:
@@ -313,7 +313,7 @@ class SessionProcesses:
             self.front.link.send_report(self.reporter.make_report(stepper, self.make_status()))
 
     def _announce(self, stepper: Stepper, text: str) -> None:
-        """Mark in the recording, for participants and in the log what befell the session itself."""
+        """Mark in the recording, for participants and in the log a change of the session itself."""
         _log.warning("%s", text)
         stepper.post_own(Marker(request_id=0, text=text))
 

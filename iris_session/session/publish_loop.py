@@ -23,7 +23,7 @@ from iris_session.physics.carrier import Carrier
 from iris_session.protocol.entries import ExternalReset
 from iris_session.protocol.status import NOT_PUBLISHED
 from iris_session.scene.composed import ComposedScene
-from iris_session.session.deformables import DeformableMesh
+from iris_session.session.deformables import DeformableSourceMesh
 from iris_session.session.draft import Frame
 from iris_session.session.errors import OwnershipError
 from iris_session.session.processes import SessionProcesses
@@ -45,7 +45,8 @@ class PublishedVertices:
     def __init__(self, scene: ComposedScene) -> None:
         self.newest: Mapping[str, NDArray[np.float32]] = {name: one.vertices for name, one in scene.deformables.items()}
         self.meshes = tuple(
-            DeformableMesh(one.stream, one.topology, self._make_reader(name)) for name, one in scene.deformables.items()
+            DeformableSourceMesh(one.stream, one.topology, self._make_reader(name))
+            for name, one in scene.deformables.items()
         )
 
     def _make_reader(self, name: str) -> Callable[[], NDArray[np.floating]]:

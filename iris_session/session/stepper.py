@@ -34,7 +34,7 @@ from iris_session.protocol.server_messages import BodyInfo, StateHeader
 from iris_session.protocol.steps import Decision
 from iris_session.recording.journal import CRASHED, JournalRow, Keyframe, make_row
 from iris_session.session.core import Plant, SessionCore, StepOutcome, ignore_lap
-from iris_session.session.deformables import DeformableMesh
+from iris_session.session.deformables import DeformableSourceMesh
 from iris_session.session.errors import OwnershipError
 from iris_session.session.ledger import SessionLedger
 from iris_session.session.shared_scene import Shown
@@ -106,7 +106,7 @@ class NextScene(NamedTuple):
     model_hash: str
     packed_model: bytes
     shown: Shown
-    deformables: Sequence[DeformableMesh] = ()
+    deformables: Sequence[DeformableSourceMesh] = ()
 
 
 class NextPatch(NamedTuple):

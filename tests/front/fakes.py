@@ -9,7 +9,7 @@ from iris_session.alignment.service import AlignmentService
 from iris_session.front.audit import AuditTrail
 from iris_session.front.coalescer import Coalescer
 from iris_session.front.connection_guard import ConnectionGuard
-from iris_session.front.connections import ConnectionTable, Outbox
+from iris_session.front.connections import ConnectionTable, ControlSender
 from iris_session.front.context import FrontContext
 from iris_session.front.status import StatusService
 from iris_session.link import FrontConfig, Ports
@@ -39,7 +39,7 @@ def make_context(
         now_ns=now_ns,
         drops=drops,
         connections=connections,
-        outbox=control if hasattr(control, "send_to_route") else Outbox(control, config.limits, drops),
+        outbox=control if hasattr(control, "send_to_route") else ControlSender(control, config.limits, drops),
         coalescer=coalescer,
         audit=audit,
         guard=ConnectionGuard(connections, drops, audit, config.limits),

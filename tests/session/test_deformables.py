@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from iris_session.protocol.names import MediaEncoding
-from iris_session.session.deformables import REPEAT_NS, DeformableMesh, DeformableStreams
+from iris_session.session.deformables import REPEAT_NS, DeformableSourceMesh, DeformableStreams
 from tests.session.published import CLOTH, composed
 
 MS = 1_000_000
@@ -23,7 +23,7 @@ def test_a_mesh_at_rest_is_sent_again_for_those_who_come_later_and_is_no_younger
         return taken
 
     topology = composed().deformables["cloth"].topology
-    streams = DeformableStreams([DeformableMesh("cloth", topology, lambda: vertices)], publish)
+    streams = DeformableStreams([DeformableSourceMesh("cloth", topology, lambda: vertices)], publish)
     for now_ns in range(0, 2 * REPEAT_NS + 1, 250 * MS):
         streams.publish(1, now_ns, 0)
     assert sent == [("cloth", 0, 1)] * 3, "the state stands, its source is silent"
