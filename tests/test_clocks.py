@@ -23,7 +23,6 @@ ALLOWED = {
     "iris_session/security/join_codes.py": "when a join code ends: shared by processes, outlives a reboot",
     "iris_session/front/pairing.py": "whether a join code is open, as join_codes.py says",
     "iris_session/cli/pair.py": "how long a join code is shown, as join_codes.py says",
-    "iris_session/assets/cache.py": "which files were used longest ago, as the file system stamps them",
     "iris_session/assets/store.py": "which files were used longest ago, as the file system stamps them",
     "iris_session/session/config.py": "name of a default folder",
     "iris_session/session/processes.py": "when a recording was made, for people",

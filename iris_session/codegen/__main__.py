@@ -1,6 +1,6 @@
 """Write the generated files of a checkout, or check that they are current.
 
-python -m iris_session.codegen {csharp,typescript,golden,scene,conversations,docs,all} [--check]
+python -m iris_session.codegen {csharp,typescript,golden,scene,conversations,arrays,deformable,docs,reference,all} [--check]
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from iris_session.codegen import (
     csharp,
     deformable_golden,
     golden,
+    reference,
     scene_golden,
     tables,
     typescript,
@@ -46,6 +47,7 @@ TARGETS: Final[dict[str, tuple[str, Callable[[str], str]]]] = {
     "arrays": ("docs/protocol/arrays.json", lambda _: arrays_golden.text()),
     "deformable": ("docs/protocol/deformable.json", lambda _: deformable_golden.text()),
     "docs": (_DOCUMENT, document),
+    "reference": ("docs/reference.md", lambda _: reference.render_reference()),
 }
 
 

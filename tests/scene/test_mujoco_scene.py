@@ -297,7 +297,8 @@ def test_flexes_that_no_stream_is_left_for_are_named(tmp_path: Path) -> None:
     some, all_streamed = (
         parse(f"<mujoco><worldbody>{''.join(ropes[:n])}</worldbody></mujoco>", tmp_path).skipped for n in (18, 16)
     )
-    assert some == ("how 2 of 18 flexes bend: 16 are streamed",)
+    assert len(some) == 1
+    assert "2 of 18 flexes" in some[0]
     assert all_streamed == ()
 
 

@@ -109,8 +109,8 @@ def test_time_that_goes_back_is_one_reset(rig: Rig) -> None:
 
 def test_a_tick_is_published_when_it_ends_with_its_own_step(rig: Rig) -> None:
     recorded: list[tuple[int, int]] = []
-    state = rig.recorder.state
-    rig.recorder.state = lambda step, tick, *rest: (recorded.append((step, tick)), state(step, tick, *rest))[1]  # type: ignore[method-assign,assignment]
+    state = rig.recorder.add_state
+    rig.recorder.add_state = lambda step, tick, *rest: (recorded.append((step, tick)), state(step, tick, *rest))[1]  # type: ignore[method-assign,assignment]
     for tick in range(1, 4):
         rig.now_ns += TICK_NS
         rig.loop.begin_tick()
