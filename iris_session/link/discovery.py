@@ -36,13 +36,15 @@ class DiscoveryError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class FoundSession:
-    """A session whose beacon was received.
+    """Session whose beacon was received.
 
     Attributes:
-        address: `HOST:PORT` of its control channel, as first received.
-        addresses: All addresses received, at most `MAX_ADDRESSES`.
+        name: Name of the session.
+        address: `HOST:PORT` of its control channel.
+        session_id: Id of the session.
         kind: `live` or `replay`.
-        key_fingerprint: Of its key, as the beacon claims; empty: not encrypted.
+        key_fingerprint: Fingerprint of its key, as the beacon claims; empty: not encrypted.
+        addresses: All addresses from which its beacon was received.
     """
 
     name: str
