@@ -36,9 +36,15 @@ class DiscoveryError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class FoundSession:
-    """A session whose beacon was received. `address`: `HOST:PORT` of its control channel; `addresses`: all received.
+    """Session whose beacon was received.
 
-    `kind`: `live` or `replay`. `key_fingerprint`: of its key, as the beacon claims; empty: not encrypted.
+    Attributes:
+        name: Name of the session.
+        address: `HOST:PORT` of its control channel.
+        session_id: Id of the session.
+        kind: `live` or `replay`.
+        key_fingerprint: Fingerprint of its key, as the beacon claims; empty: not encrypted.
+        addresses: All addresses from which its beacon was received.
     """
 
     name: str
