@@ -113,11 +113,11 @@ class Hold:
 
 
 class AssetStore:
-    """A folder of assets, created with the first write. Safe for several threads and processes.
+    """Folder of assets by content hash, created with the first write. Safe for several threads and processes.
 
     Attributes:
         root: The folder.
-        max_bytes: Size above which files that were used longest ago are removed.
+        max_bytes: Size above which the least recently used files are removed [bytes].
         evicted: Number of files that this object removed to make room.
     """
 

@@ -30,28 +30,35 @@ from iris_session.streams.deformable import DeformableDecoder
 from iris_session.streams.deformable_topology import MAX_FACES, MAX_VERTICES, DeformableTopology
 from iris_session.streams.errors import StreamError
 
-#: A scene whose assets did not come is asked for again after so long [s], then after twice that, at most the second.
+#: First and longest pause before the assets of a scene are requested again after a failure [s]; each pause is twice the
+#: one before.
 FIRST_PAUSE_S: Final = 0.02
 LONGEST_PAUSE_S: Final = 2.5
-#: Largest asset of a deformable in memory, about twice what the largest mesh has: it is read where the client polls.
+#: Largest asset of a deformable in memory [bytes], about twice that of the largest mesh. It is decoded in the thread
+#: that polls the client.
 MAX_ASSET_BYTES: Final = 128 << 20
 
 
-#: `Deformable.dim` of what is drawn as lines.
+#: `Deformable.dim` of deformables that are drawn as lines.
 ROPE: Final = 1
 
 
 @dataclass(frozen=True)
 class DeformableMesh:
-    """Of the deformable `name`, whose vertices are `Deformables.vertices[name]`. Arrays are read-only.
+    """Mesh of one deformable, whose vertices are `Deformables.vertices[name]`. Arrays are read-only.
 
-    `faces` (m, 3): triangles, counter-clockwise from outside where it has an outside; `edges` (k, 2): lines of a rope,
-    drawn as cylinders. One of the two is empty. Both name rows of the vertices, and none that is not a number.
-    `uv` (m, 3, 2) or `None`: of every triangle's corners; u to the right, v down from the upper left of the image.
-    `rows` (n,): rows of the vertices that are drawn. A soft body's others are inside of it: they do not
-    travel, and are not a number (NaN), so that rows are the numbers of its vertices in the model.
-    `look`: what the specification says: `dim` (1 rope, 2 cloth, 3 soft body), `group`, `rgba`, `material` (a place in
-    `FetchedScene.spec.materials`, -1: none), `radius` (half the thickness [m]), `flat` (one normal per triangle).
+    Attributes:
+        faces: Triangles (m, 3), rows of the vertices, counter-clockwise from outside where it has an outside; empty
+            for a rope.
+        edges: Lines (k, 2) of a rope, rows of the vertices, drawn as cylinders; empty otherwise.
+        uv: Texture coordinates (m, 3, 2) of the corners of every triangle, or `None`; u to the right, v down from the
+            upper left of the image.
+        rows: Rows (n,) of the vertices that are drawn. The other vertices of a soft body are inside of it: they are not
+            transferred and are NaN, so that row numbers equal vertex numbers in the model. `faces` and `edges` never
+            refer to them.
+        look: Its entry in the specification: `dim` (1 rope, 2 cloth, 3 soft body), `group`, `rgba`, `material` (index
+            in `FetchedScene.spec.materials`, -1: none), `radius` (half the thickness [m]), `flat` (one normal per
+            triangle).
     """
 
     faces: NDArray[np.int32]
@@ -61,12 +68,22 @@ class DeformableMesh:
     look: Deformable
 
     def with_look(self, look: Deformable) -> DeformableMesh:
-        """The same with another look."""
+        """Return the same mesh with another look."""
         return self if look == self.look else replace(self, look=look)
 
 
 def read_mesh(spec: Deformable, arrays: Mapping[str, NDArray[Any]], n_vertices: int) -> DeformableMesh:
-    """`arrays`: of its asset. `n_vertices`: how many its stream has. Raises `AssetDecodeError` or `ValueError`."""
+    """Return the mesh of a deformable.
+
+    Args:
+        spec: Its entry in the specification.
+        arrays: Arrays of its asset.
+        n_vertices: Number of vertices in its stream.
+
+    Raises:
+        AssetDecodeError: An array is missing, or has another type or shape.
+        ValueError: Numbers of vertices or elements are out of range.
+    """
     corners = 2 if spec.dim == ROPE else 3
     rows = np.arange(n_vertices, dtype=np.int32)
     if ArrayName.VERTEX in arrays:
@@ -83,7 +100,7 @@ def read_mesh(spec: Deformable, arrays: Mapping[str, NDArray[Any]], n_vertices: 
     elements, none = rows[places], np.empty((0, 5 - corners), np.int32)
     uv = None
     if ArrayName.UV in arrays:
-        # A copy: no view of the asset.
+        # A copy, so that the asset can be freed.
         uv = require_array(arrays, ArrayName.UV, "f4", (len(places), corners, 2)).astype(np.float32)
     faces, edges = (none, elements) if corners == 2 else (elements, none)
     for array in (faces, edges, rows, uv):
@@ -93,7 +110,7 @@ def read_mesh(spec: Deformable, arrays: Mapping[str, NDArray[Any]], n_vertices: 
 
 
 class _Mesh:
-    """One deformable: its stream, and where its vertices stand in the numbering of the model."""
+    """One deformable: its stream, and the numbers of its vertices in the model."""
 
     feed: MediaFeed
 
@@ -108,7 +125,7 @@ class _Mesh:
         self.fault = ""
 
     def place_vertices(self, p_world: NDArray[np.float32]) -> NDArray[np.float32]:
-        """By number in the model; what is inside of a solid is not a number."""
+        """Return vertices by their number in the model; those inside of a solid are NaN."""
         if not self.numbered:
             return p_world
         everywhere = np.full((int(self.shape.rows.max()) + 1, 3), np.nan, np.float32)
@@ -117,15 +134,20 @@ class _Mesh:
 
 
 class Deformables:
-    """`vertices`: positions (n, 3) [m], world frame, by name of the deformable; numbered as in the model. Those inside
-    of a soft body, which are not seen, do not travel: their rows are not a number (NaN), `meshes[name].rows` are the
-    others. One without a name, or with that of another, goes by its stream (`keys`). `capture_ns`: the session time at
-    which they were there, by the same names. What is at rest comes once a second: older than that is not known, but
-    what was there then. `meshes`: triangles, lines and looks, by the same names, each there before its first vertices.
+    """Vertices and meshes of the deformables of a session, kept up to date by `update`, which never waits.
 
-    `scene_hash`: of the scene they are of. After a patch they go on as they are until the new specification is here,
-    and what is the same in both goes on after it. `fault`: why something cannot be seen, empty while all is well.
-    Everything happens in `update`, which never waits.
+    After a patch of the scene they continue unchanged until the new specification has arrived; deformables that are
+    equal in both continue after it.
+
+    Attributes:
+        vertices: Positions (n, 3) [m] in the world frame, by name of the deformable, numbered as in the model. Vertices
+            inside of a soft body are not transferred: their rows are NaN, `meshes[name].rows` lists the others. A
+            deformable without a unique name has the name of its stream as key.
+        capture_ns: Session time of `vertices` [ns], by the same names. Deformables at rest are sent once a second, so
+            their time may be that old.
+        meshes: Triangles, lines and looks, by the same names; present before the first vertices.
+        scene_hash: Content hash of the scene that they belong to.
+        fault: Reason why a deformable cannot be shown; empty without a fault.
     """
 
     def __init__(self, client: Client) -> None:
@@ -135,9 +157,9 @@ class Deformables:
         self.capture_ns: dict[str, int] = {}
         self._meshes: list[_Mesh] = []
         self._epoch = ("", -1)  # session and scene epoch: every session counts from 1
-        self._parked = False  # the meshes are of a scene that is no more: their vertices are not shown
-        self._asked = ""  # the scene whose specification is on its way, or did not come
-        self._parts: tuple[Deformable, ...] | None = None  # of that
+        self._parked = False  # the meshes belong to an earlier scene: their vertices are not shown
+        self._asked = ""  # the scene whose specification was requested, arrived or not
+        self._parts: tuple[Deformable, ...] | None = None  # deformables of that scene
         self._fetch: AssetFetch | None = None
         self._fault = ""
         self._pause_s = self._retry_s = 0.0

@@ -1,6 +1,6 @@
-"""Finding sessions: listening for beacons on UDP, and asking one address for its introduction over TCP.
+"""Find sessions: listen for beacons on UDP, and request the introduction of one address over TCP.
 
-Both are said in public by anybody: what is trusted of them is decided in `meeting`.
+Beacons and introductions are public and unauthenticated: `endpoint_resolver` decides what to trust of them.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from iris_session.protocol.codec import INTRODUCTION_PREFIX, decode_introduction
 from iris_session.protocol.discovery import DISCOVERY_PORT, INTRODUCTION_OFFSET, Introduction
 from iris_session.protocol.limits import MAX_INTRODUCTION_BYTES
 
-#: More than two periods of a beacon: one may be lost.
+#: More than two periods of the beacon: one may be lost.
 LISTEN_S: Final = 1.0
-#: A connection that is not there yet, as different systems say it.
+#: Error numbers by which different systems report a connection that is not established yet.
 _NOT_YET: Final = frozenset({errno.EAGAIN, errno.EWOULDBLOCK, errno.EINPROGRESS, errno.ENOTCONN})
 
 
@@ -34,9 +34,20 @@ def open_listener(port: int = DISCOVERY_PORT) -> BeaconListener:
 
 
 def find_sessions(timeout_s: float = LISTEN_S, *, port: int = DISCOVERY_PORT) -> list[FoundSession]:
-    """The sessions that tell of themselves on the networks of this machine, by name. Listens for `timeout_s`.
+    """Listen for sessions that announce themselves on the networks of this machine.
 
-    Empty where an access point blocks broadcasts: type the address then, or scan the code of `iris-session pair`.
+    Where an access point blocks broadcasts the list is empty: use the address of the session, or the QR code of
+    `iris-session pair`.
+
+    Args:
+        timeout_s: Seconds to listen.
+        port: UDP port of the beacons.
+
+    Returns:
+        The sessions, sorted by name.
+
+    Raises:
+        ClientError: The port cannot be used.
     """
     end = time.monotonic() + timeout_s
     with open_listener(port) as listener:
@@ -47,9 +58,19 @@ def find_sessions(timeout_s: float = LISTEN_S, *, port: int = DISCOVERY_PORT) ->
 
 
 def request_introduction(host: str, control_port: int, timeout_s: float) -> Generator[None, None, Introduction]:
-    """Steps towards the introduction of the session at an address; yields wherever it would wait.
+    """Request the introduction of the session at an address; yields wherever it would wait.
 
-    Raises `OSError` (nobody there, no answer) or `ProtocolError` (no introduction, or another protocol version).
+    Args:
+        host: Name or address of the machine.
+        control_port: Port of the session's control channel.
+        timeout_s: Seconds to wait at most.
+
+    Returns:
+        The introduction.
+
+    Raises:
+        OSError: No such host, or no answer.
+        ProtocolError: The answer is no introduction, or has another protocol version.
     """
     until = time.monotonic() + timeout_s
     target = yield from resolve_host(host, until)

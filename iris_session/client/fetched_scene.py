@@ -1,4 +1,4 @@
-"""The scene of a session as a Python client draws it: specification, meshes and textures, fetched and decoded.
+"""Scene of a session, fetched and decoded for drawing: specification, meshes and textures.
 
 scene = fetch_scene(client)
 for visual in scene.spec.visuals:
@@ -25,26 +25,30 @@ from iris_session.scene import MeshArrays, decode_image, decode_mesh
 from iris_session.scene.budget import Budget, choose_levels
 from iris_session.scene.images import Pixels
 
-#: No bound: the finest of everything.
+#: No limits: the finest levels of everything.
 EVERYTHING: Final = Budget()
-#: How long a slow network may take [s].
+#: Default timeout of a fetch [s], sized for slow networks.
 DEFAULT_TIMEOUT_S: Final = 60.0
-#: How long a session may say that it has not the specification that it names, and the first pause before it is asked
-#: again [s]; each is twice the one before.
+#: Time for which a session may refuse the specification that it names itself as unknown, and the first pause before
+#: the next request [s]. Each pause is twice the one before.
 REFUSED_S: Final = 2.0
 FIRST_PAUSE_S: Final = 0.01
-#: How long a scene that is here, and was patched meanwhile, is brought up to date before it is returned as it is: one
-#: may be patched faster than a specification comes over a network.
+#: Time for which a complete scene that was patched meanwhile is updated before it is returned as it is [s]: a scene may
+#: be patched faster than its specification travels over the network.
 CATCH_UP_S: Final = 1.0
 
 
 @dataclass(frozen=True)
 class FetchedScene:
-    """`spec`: what is where; `meshes`, `textures`: by their place in `spec.meshes` and `spec.textures`. Vertices are in
-    the visual's frame [m], pixels (height, width, channels), top row first.
+    """Scene with decoded assets, as `fetch_scene` returns it.
 
-    `hidden`: ids of visuals that the budget leaves out: leave them out when drawing. `failed`: what cannot be
-    drawn, and why, by address.
+    Attributes:
+        scene_hash: Content hash of the specification.
+        spec: Specification of the scene.
+        meshes: Meshes by their index in `spec.meshes`; vertices are in the frame of the visual [m].
+        textures: Pixels (height, width, channels) uint8, top row first, by their index in `spec.textures`.
+        hidden: Ids of visuals that exceed the budget and must not be drawn.
+        failed: Errors of the assets that could not be fetched or decoded, by address.
     """
 
     scene_hash: str
@@ -61,13 +65,26 @@ def fetch_scene(
     timeout_s: float = DEFAULT_TIMEOUT_S,
     on_progress: Callable[[AssetFetch], None] | None = None,
 ) -> FetchedScene:
-    """Fetches the present scene and waits for it; what the cache of this machine has does not travel.
+    """Fetch the present scene and wait until it is complete. Assets in the local cache are not transferred again.
 
-    A scene that is replaced meanwhile is left for the new one, of which only what is new comes. One that is patched
-    without end comes as it was after one of the patches. After `scene_changed`, and at once, call it again when
-    `client.mirror.scene_hash` is not that of what you have. Raises `NotConnectedError` when it takes longer than
-    `timeout_s`, or the session shares no specification; `AssetError` for a specification that the session says for
-    `REFUSED_S` not to have; `ClientError` for one that this package does not read; `TypeError` for what is no budget.
+    When the session loads another scene meanwhile, the fetch continues with that one and transfers only new assets. A
+    scene that is patched continually is returned in the state after one of its patches. So compare `scene_hash` with
+    `client.mirror.scene_hash` after the call and on every `scene_changed`, and call again when they differ.
+
+    Args:
+        client: A connected client.
+        budget: Limits that select levels of detail; by default the finest levels.
+        timeout_s: Seconds to wait at most.
+        on_progress: Called with the fetch as bytes arrive.
+
+    Returns:
+        The scene; assets that could not be had are listed in `failed`.
+
+    Raises:
+        NotConnectedError: It took longer than `timeout_s`, or the session shares no specification.
+        AssetError: The session refused its own specification as unknown for `REFUSED_S`.
+        ClientError: This package cannot read the specification.
+        TypeError: `budget` is no `Budget`.
     """
     if not isinstance(budget, Budget):
         raise TypeError(
@@ -76,7 +93,7 @@ def fetch_scene(
         )
     until = time.monotonic() + timeout_s
     refused = _RefusalRetry()
-    whole: tuple[int, float] | None = None  # scene epoch of the first that was here, and when it was
+    whole: tuple[int, float] | None = None  # scene epoch of the first complete scene, and the time of its arrival
     made: Mapping[str, MeshArrays | Pixels] = {}
     while True:
         scene_hash, epoch = client.mirror.scene_hash, client.mirror.scene_epoch
@@ -99,8 +116,10 @@ def fetch_scene(
 
 
 class _RefusalRetry:
-    """Refusals of one specification: a session may name it moments before it serves it. `pause_s`: until it is asked
-    for again."""
+    """Retries after refusals of one specification: a session may name it moments before it serves it.
+
+    `pause_s`: time until the next request [s].
+    """
 
     def __init__(self) -> None:
         self.pause_s = 0.0
@@ -129,7 +148,7 @@ def _fetch(
     on_progress: Callable[[AssetFetch], None] | None,
     before: Mapping[str, MeshArrays | Pixels],
 ) -> tuple[FetchedScene, Mapping[str, MeshArrays | Pixels]]:
-    """The scene, and all that it is made of, by address. `before`: what is decoded already."""
+    """Return the scene, and its decoded assets by address. `before`: assets decoded earlier."""
     spec = _specification(client, scene_hash, until)
     choice = choose_levels(spec, budget)
     meshes = [mesh.levels[level] for mesh, level in zip(spec.meshes, choice.mesh_levels, strict=True)]
@@ -156,7 +175,7 @@ def _fetch(
 
 
 def _specification(client: Client, scene_hash: str, until: float) -> SceneSpec:
-    if not is_address(scene_hash):  # that of a model, of which nothing but bodies and poses is shared
+    if not is_address(scene_hash):  # hash of a model, of which only bodies and poses are shared
         raise NotConnectedError("this session shares no specification of its scene, only bodies and poses")
     fetch = _wait(client, client.assets.fetch([scene_hash]), until)
     try:

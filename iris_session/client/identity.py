@@ -27,7 +27,16 @@ class _Stored(msgspec.Struct, frozen=True):
 
 
 class Identity:
-    """Secret and resume token. `path` set: every change is written there at once, readable by its owner only."""
+    """Identity of a client: a secret and the resume token of its last session.
+
+    Attributes:
+        secret: `SECRET_BYTES` random bytes.
+        resume_token: Token of the last `Welcome`; single use.
+        path: File that every change is written to at once, readable by its owner only; `None`: in memory.
+
+    Raises:
+        IdentityError: `secret` has another length.
+    """
 
     def __init__(self, secret: bytes, resume_token: bytes = b"", path: Path | None = None) -> None:
         if len(secret) != SECRET_BYTES:
@@ -39,19 +48,26 @@ class Identity:
 
     @classmethod
     def in_memory(cls) -> Identity:
-        """A new identity that ends with the process."""
+        """Create a new identity that ends with the process."""
         return cls(secrets.token_bytes(SECRET_BYTES))
 
     @classmethod
     def from_file(cls, path: str | Path) -> Identity:
-        """Reads the identity at `path`, or makes one there.
+        """Read the identity at `path`, or create one there.
 
-        Raises `IdentityError` when the file is damaged, or may be read by other users.
+        Args:
+            path: The identity file.
+
+        Returns:
+            The identity.
+
+        Raises:
+            IdentityError: The file is damaged, may be read by other users, or cannot be read or created.
         """
         path = Path(path)
         try:
             with path.open("rb") as file:
-                status = os.fstat(file.fileno())  # of the very file that is read
+                status = os.fstat(file.fileno())  # of the open file: the path may be replaced meanwhile
                 data = file.read()
         except FileNotFoundError:
             identity = cls(secrets.token_bytes(SECRET_BYTES), path=path)
@@ -83,9 +99,16 @@ class Identity:
                 self._write()
 
     def remember(self, token: bytes) -> bool:
-        """Sets `resume_token`; false, with a warning the first time, when the file cannot be written.
+        """Set `resume_token`.
 
-        A full disk ends no participation: this process has the token, only another one could not resume with it.
+        A full disk does not end a participation: this process has the token, only another process could not resume
+        with it.
+
+        Args:
+            token: Token of a `Welcome`.
+
+        Returns:
+            False when the file cannot be written; the first time a warning is logged.
         """
         try:
             self.resume_token = token
@@ -97,8 +120,11 @@ class Identity:
         return True
 
     def _write(self) -> None:
-        """Replaces the file in one step, so that a kill leaves the old or the new one. Written is a file that was not
-        there before, under a name that nobody could guess: else somebody may hold it open, or it may lead elsewhere."""
+        """Replace the file in one step, so that a kill leaves either the old or the new content.
+
+        The new content goes to a new file with an unpredictable name: a file that is there already could be open in
+        another process, or be a link to another place.
+        """
         assert self.path is not None
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)

@@ -43,7 +43,13 @@ _NOBLOCK: Final = int(zmq.NOBLOCK)
 
 @dataclass(frozen=True, slots=True)
 class CurveKeys:
-    """CURVE keys, Z85 text (40 characters) as bytes: the server's public key, and our own pair."""
+    """CURVE keys of a connection, as Z85 text (40 characters) in bytes.
+
+    Attributes:
+        server_public: Public key of the session.
+        public: Own public key.
+        secret: Own secret key.
+    """
 
     server_public: bytes
     public: bytes
@@ -51,7 +57,18 @@ class CurveKeys:
 
     @classmethod
     def from_files(cls, server_file: str | os.PathLike[str], own_secret_file: str | os.PathLike[str]) -> CurveKeys:
-        """From ZeroMQ certificates: the server's `*.key`, and our own `*.key_secret`. Raises `IdentityError`."""
+        """Read keys from ZeroMQ certificates.
+
+        Args:
+            server_file: Certificate `*.key` of the session.
+            own_secret_file: Own certificate `*.key_secret`.
+
+        Returns:
+            The keys.
+
+        Raises:
+            IdentityError: A file is missing, damaged, or readable by others.
+        """
         try:
             server_public, own = load_public(server_file), load_secret(own_secret_file)
         except KeysError as error:

@@ -95,7 +95,15 @@ NUMBERED: Final[dict[str, Callable[[int], NamedScene]]] = {"arms": make_arms, "i
 def scene_by_name(name: str) -> NamedScene:
     """Return a scene by name.
 
-    Raises `ConfigError` that lists the names, `ModelNotFoundError` without the model of a real robot.
+    Args:
+        name: A key of `SCENES`, or a key of `NUMBERED` followed by a number of one to three digits.
+
+    Returns:
+        The scene.
+
+    Raises:
+        ConfigError: Unknown name, or number out of range; the message lists the names.
+        ModelNotFoundError: The model of a real robot is not installed.
     """
     if name in SCENES:
         return SCENES[name]()

@@ -28,7 +28,15 @@ _BUFFER_NAME: Final = "model.mjb"
 def load_model(path: str | Path) -> mujoco.MjModel:
     """Compile an MJCF or URDF file, or load an MJB.
 
-    Raises `ModelNotFoundError` for a missing file or unknown suffix, `ModelInvalidError` with MuJoCo's message.
+    Args:
+        path: Path of the file; `~` is expanded.
+
+    Returns:
+        The compiled model.
+
+    Raises:
+        ModelNotFoundError: The file is missing, or has an unknown suffix.
+        ModelInvalidError: MuJoCo cannot compile or load it; the message is MuJoCo's.
     """
     path = Path(path).expanduser()
     if not path.is_file():

@@ -35,9 +35,18 @@ _HOLDS: Final = ("", "gravity_pd")
 
 
 def load_robots_toml(path_or_text: str | Path, model: mujoco.MjModel) -> tuple[RobotSpec, ...]:
-    """Return the robots of a file, or of TOML text (anything with a line break or an equals sign).
+    """Read the robots of a model from TOML.
 
-    Raises `RobotsFileError`, or `UnknownNameError` for a name that the model does not have.
+    Args:
+        path_or_text: Path of a file, or TOML text (anything with a line break or an equals sign).
+        model: Model whose joints, sites and actuators the file names.
+
+    Returns:
+        The robots, in the order of the file.
+
+    Raises:
+        RobotsFileError: The TOML is damaged, or a table lacks or repeats something.
+        UnknownNameError: The model does not have a name in it.
     """
     where, text = _read_text(path_or_text)
     try:

@@ -10,7 +10,7 @@ import msgspec
 from iris_session.protocol.names import GeometryKind, TextureKind
 from iris_session.protocol.scene import Mesh, SceneSpec, Texture, TextureLevel, Totals, list_assets
 
-#: Where a Quest 3 begins to struggle: objects (draw calls), triangles, memory of textures [bytes].
+#: Limits above which a Quest 3 begins to struggle: objects (draw calls), triangles, memory of textures [bytes].
 QUEST_OBJECTS: Final = 200
 QUEST_TRIANGLES: Final = 750_000
 QUEST_TEXTURE_BYTES: Final = 700 << 20
@@ -26,7 +26,13 @@ PRIMITIVE_TRIANGLES: Final = {
 
 
 class Budget(msgspec.Struct, frozen=True):
-    """Limits of a client. 0: no limit. `texture_bytes`: memory of its graphics card."""
+    """Limits of what a client draws; 0 means no limit.
+
+    Attributes:
+        triangles: Triangles drawn.
+        texture_bytes: Memory of textures on the graphics card [bytes].
+        objects: Objects drawn (draw calls).
+    """
 
     triangles: int = 0
     texture_bytes: int = 0
@@ -37,9 +43,14 @@ QUEST_3: Final = Budget(QUEST_TRIANGLES, QUEST_TEXTURE_BYTES, QUEST_OBJECTS)
 
 
 class LevelChoice(NamedTuple):
-    """`mesh_levels`, `texture_levels`: one per mesh and texture. `hidden`: ids of visuals to leave out, the smallest.
+    """Levels of detail chosen for a budget.
 
-    `triangles`, `texture_bytes`, `objects`: what remains. `fits`: false when even the coarsest levels exceed it.
+    Attributes:
+        mesh_levels: Level of each mesh.
+        texture_levels: Level of each texture.
+        hidden: Ids of visuals to leave out, the smallest ones.
+        triangles, texture_bytes, objects: Cost of the rest.
+        fits: False when even the coarsest levels exceed the budget.
     """
 
     mesh_levels: tuple[int, ...]
@@ -76,7 +87,7 @@ def _select_hidden(spec: SceneSpec, drawn: list[int], objects: int) -> frozenset
 
 
 def _visual_size(spec: SceneSpec, visual: int) -> float:
-    """Largest side [m]; planes are never too small."""
+    """Return the largest side of a visual [m]; planes count as infinitely large."""
     geometry = spec.visuals[visual].geometry
     if geometry.kind == GeometryKind.PLANE:
         return float("inf")
@@ -91,7 +102,7 @@ def _longest_side(mesh: Mesh) -> float:
 
 
 def _choose_mesh_levels(spec: SceneSpec, kept: list[int], limit: int, besides: int) -> tuple[tuple[int, ...], int]:
-    """`besides`: triangles of what has no levels."""
+    """Return the level of each mesh, and the triangles drawn. `besides`: triangles of visuals without levels."""
     levels = [0] * len(spec.meshes)
     uses = [0] * len(spec.meshes)
     for i in kept:
@@ -115,7 +126,7 @@ def _choose_mesh_levels(spec: SceneSpec, kept: list[int], limit: int, besides: i
 
 
 def _relative_loss(mesh: Mesh, level: int, uses: int) -> float:
-    """Error relative to the size, per triangle that going to `level` saves; 0 where there is nothing to save."""
+    """Return the error relative to the size, per triangle that `level` saves; 0 when it saves none."""
     if level >= len(mesh.levels) or not uses:
         return 0.0
     saved = mesh.levels[level - 1].triangles - mesh.levels[level].triangles

@@ -49,10 +49,14 @@ _WRAP_SITE: Final = int(mujoco.mjtWrap.mjWRAP_SITE)
 
 @dataclass(frozen=True)
 class ParsedScene:
-    """A scene whose assets, the specification among them, are in the store.
+    """Scene whose assets, the specification among them, are in the store.
 
-    `scene_hash`: address of the specification. `skipped`: what the model has and the specification does not, in words
-    for people. `built`, `recalled`: pieces of work that were done, and that were known from before.
+    Attributes:
+        spec: The specification.
+        scene_hash: Address of the specification.
+        skipped: Content of the model that the specification lacks, one line each.
+        built: Number of meshes, textures and other content that were encoded.
+        recalled: Number of those whose encoding the store already had.
     """
 
     spec: SceneSpec
@@ -63,7 +67,7 @@ class ParsedScene:
 
     @property
     def addresses(self) -> tuple[str, ...]:
-        """All assets in the order in which they show something: to be held in the store, and served."""
+        """Addresses of all assets in the order in which they become visible, to be kept in the store and served."""
         return (self.scene_hash, *list_assets(self.spec))
 
 
@@ -78,10 +82,20 @@ def parse_mujoco(
     tendons: bool = False,
     threads: int = 0,
 ) -> ParsedScene:
-    """The specification of `model`; its assets are in `store` afterwards.
+    """Convert a compiled MuJoCo model to a scene specification, and put its assets into `store`.
 
-    `data`: the initial state, with kinematics; else the model's default one. `sites`, `tendons`: list them too (tendons
-    bring the sites they run through).
+    Args:
+        model: The model; it is not changed.
+        store: Store for the assets and the encoded specification.
+        data: Initial state with kinematics computed; by default that of the model.
+        name: Name of the scene.
+        options: Encoding of meshes and textures; see `EncodeOptions`.
+        sites: Include sites.
+        tendons: Include spatial tendons, and the sites that they run through.
+        threads: Number of threads that encode; 0: one per CPU core, at most 8.
+
+    Returns:
+        The scene, and a line for each thing that was left out.
     """
     at = compute_tracked(model, data)
     if data is None:
@@ -116,13 +130,13 @@ def parse_mujoco(
 
 
 def _read_bodies(model: mujoco.MjModel, data: Any) -> tuple[Body, ...]:
-    """All bodies but those that MuJoCo made for vertices of flexes, by id; the world is 0."""
+    """Return all bodies by id, without those that MuJoCo made for vertices of flexes; the world is 0."""
     vertices = _flex_vertex_bodies(model)
     weld = model.body_weldid.tolist()
     mocap = model.body_mocapid.tolist()
     moving = [False] * len(weld)
     for i, parent in enumerate(model.body_parentid.tolist()):
-        # Before MuJoCo 3.4 mocap bodies, and what is fixed on them, are welded to the world.
+        # Before MuJoCo 3.4 mocap bodies, and bodies fixed to them, are welded to the world.
         moving[i] = i > 0 and (weld[i] != 0 or mocap[i] >= 0 or moving[parent])
     return tuple(
         Body(
@@ -139,7 +153,7 @@ def _read_bodies(model: mujoco.MjModel, data: Any) -> tuple[Body, ...]:
 
 
 def _flex_vertex_bodies(model: mujoco.MjModel) -> frozenset[int]:
-    """Bodies that hold nothing but a vertex or node of a flex, which nothing else refers to: they are not streamed."""
+    """Return bodies that hold only a vertex or node of a flex, and that nothing refers to: they are not streamed."""
     listed: set[int] = set()
     for field in ("flex_vertbodyid", "flex_nodebodyid"):
         if model.nflex and hasattr(model, field):
@@ -221,7 +235,7 @@ def _read_geometry(model: mujoco.MjModel, kind: int, size: Any, asset: int) -> G
 
 
 def _read_tendons(model: mujoco.MjModel) -> tuple[Tendon, ...]:
-    """Spatial tendons: those that run through at least two sites."""
+    """Return the spatial tendons that run through at least two sites."""
     found = []
     for i in range(model.ntendon):
         wraps = range(int(model.tendon_adr[i]), int(model.tendon_adr[i]) + int(model.tendon_num[i]))

@@ -1,7 +1,7 @@
-"""Interpolation of poses for a display: a fixed delay behind session time, between the frames that came. Pure.
+"""Interpolation of poses for a display, at a fixed delay behind session time. Pure.
 
-Positions are interpolated linearly, orientations by slerp. Nothing is extrapolated: when frames run out the newest one
-stays, and its age grows.
+Positions are interpolated linearly, orientations by slerp. Nothing is extrapolated: without a newer frame the newest
+pose stays, and its age grows.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class ShownPoses(NamedTuple):
 
 
 def interpolate(a: Poses, b: Poses, fraction: float) -> Poses:
-    """Poses (n, 7) between `a` (fraction 0) and `b` (1): linear positions, shortest-arc slerp."""
+    """Return poses (n, 7) between `a` (fraction 0) and `b` (1): linear positions, shortest-arc slerp."""
     out = np.empty_like(a)
     out[:, :3] = a[:, :3] + fraction * (b[:, :3] - a[:, :3])
     qa, qb = a[:, 3:], b[:, 3:]
@@ -43,10 +43,15 @@ def interpolate(a: Poses, b: Poses, fraction: float) -> Poses:
 
 
 class PoseBuffer:
-    """The last `capacity` frames, shown `delay_ns` behind.
+    """History of the last frames of poses, from which `poses_at` interpolates.
 
-    A delay of two frame periods hides one lost frame. Counters: `late` (frames that came out of order, dropped),
-    `starvations` (times `show` found no frame new enough).
+    Args:
+        delay_ns: Time by which the shown poses are behind session time [ns]. Two frame periods hide one lost frame.
+        capacity: Number of frames kept.
+
+    Attributes:
+        late: Number of frames dropped because they came out of order.
+        starvations: Number of calls of `poses_at` that found no frame new enough.
     """
 
     def __init__(self, delay_ns: int = 33_000_000, capacity: int = 16) -> None:
@@ -57,12 +62,17 @@ class PoseBuffer:
         self._shown_ns = 0
 
     def clear(self) -> None:
-        """Forgets all frames: the scene jumped (new `scene_epoch`), nothing lies between before and after."""
+        """Remove all frames: after a jump of the scene (new `scene_epoch`) nothing may be interpolated across it."""
         self._frames.clear()
         self._shown_ns = 0
 
     def add(self, session_time_ns: int, poses: Poses) -> None:
-        """Adds a frame (n, 7) of the given session time. `poses` must not be changed afterwards."""
+        """Add a frame.
+
+        Args:
+            session_time_ns: Session time of the frame [ns].
+            poses: Poses (n, 7) `x y z qw qx qy qz` in the world frame; must not be changed afterwards.
+        """
         if self._frames and (session_time_ns < self._frames[-1][0] or poses.shape != self._frames[-1][1].shape):
             self.late += 1
         elif self._frames and session_time_ns == self._frames[-1][0]:
@@ -71,7 +81,14 @@ class PoseBuffer:
             self._frames.append((session_time_ns, poses))
 
     def poses_at(self, now_ns: int) -> ShownPoses | None:
-        """The scene at `now_ns - delay_ns`, or the nearest frame held; `None` before the first. Never goes back."""
+        """Return the poses at `now_ns - delay_ns`; the shown time never goes back.
+
+        Args:
+            now_ns: Present session time [ns].
+
+        Returns:
+            Interpolated poses, or the nearest frame; `None` before the first frame.
+        """
         if not self._frames:
             return None
         wanted = max(now_ns - self.delay_ns, self._shown_ns)

@@ -21,6 +21,9 @@ def scene_path(name: str) -> Path:
     Args:
         name: Name of the MJCF file without `.xml`, such as `handover`.
 
+    Returns:
+        Path of the MJCF file.
+
     Raises:
         FileNotFoundError: There is no such scene; the message lists the available ones.
     """

@@ -21,11 +21,20 @@ def arm_names(n: int) -> tuple[str, ...]:
 
 
 def n_arms_scene(n: int, objects: int | None = None) -> Any:
-    """Return an `mujoco.MjSpec` with `n` (1 to 12) arms around a round table, each facing its centre, keyframe `home`.
+    """Build a scene of `n` arms around a round table, each facing its centre, with a keyframe `home`.
 
-    `objects`: free hammers and boards on the table (default: one for every two arms), named `object1` and so on. Arms
-    are named as in `arm_names`; their parts as in `handover.xml` (`arm1/joint1`, `arm1/tcp`, ...).
-    Raises `ValueError` when `n` is out of range.
+    Arms are named as in `arm_names`, their parts as in `handover.xml` (`arm1/joint1`, `arm1/tcp`, ...).
+
+    Args:
+        n: Number of arms, 1 to 12.
+        objects: Number of free hammers and boards on the table, named `object1` and so on; by default one for every two
+            arms.
+
+    Returns:
+        A `mujoco.MjSpec`.
+
+    Raises:
+        ValueError: `n` is out of range.
     """
     import mujoco
 

@@ -1,4 +1,4 @@
-"""Any file with geometry, as nodes: the reader by the file's ending, and the error of what cannot be read."""
+"""`load_file`: read a file with geometry into nodes, by the reader for its suffix, with clear errors."""
 
 from __future__ import annotations
 
@@ -15,25 +15,32 @@ from iris_session.scene.elements import LoadedFile
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.importers.references import References
 
-#: Endings that `load_file` reads; the others of trimesh are points, archives of anything, or hardly ever met.
+#: Suffixes that `load_file` reads; the others of trimesh are point clouds, general archives, or very rare.
 _GLTF: Final = ("glb", "gltf")
 MESHES: Final = ("3mf", "dae", "obj", "off", "ply", "stl")
 ROBOTS: Final = ("urdf",)
-#: What MuJoCo reads.
+#: Suffixes of files that MuJoCo reads.
 MODELS: Final = ("mjb", "mjcf", "xml")
 ENDINGS: Final = tuple(sorted((*_GLTF, *MESHES, *ROBOTS, *MODELS)))
 _ADDRESS: Final = re.compile(r"(https?|ftp):[/\\]")
 _ROOM: Final = Path(__file__).parents[1]
-#: Most files that an error text lists.
+#: Maximum number of files that an error message lists.
 _LISTED: Final = 8
-#: Errors whose texts say nothing of a file.
+#: Errors whose messages are about code, not about the file.
 _OF_CODE: Final = (AttributeError, TypeError, NameError, AssertionError, NotImplementedError, RecursionError)
 
 
 def load_file(path: Path, package_dirs: Sequence[str | PathLike[str]] = (), name: str = "") -> LoadedFile:
-    """The geometry of a file. `name`: of what the file itself calls nothing, as STL, PLY and OFF do; else as the file.
+    """Return the geometry of a file.
 
-    Raises `SceneBuildError` for one that is missing, damaged, or of another form."""
+    Args:
+        path: Path of the file.
+        package_dirs: Folders that `package://` references are searched in.
+        name: Name of content without a name in the file, as in STL, PLY and OFF; by default the stem of the file.
+
+    Raises:
+        SceneBuildError: The file is missing, damaged, or in another format.
+    """
     kind = ending(path)
     present(path)
     if kind not in (*_GLTF, *MESHES):
@@ -48,9 +55,9 @@ def load_file(path: Path, package_dirs: Sequence[str | PathLike[str]] = (), name
 
 
 def present(path: Path) -> None:
-    """Raises `SceneBuildError` unless there is a file with something in it."""
+    """Check that there is a file that is not empty. Raises `SceneBuildError`."""
     try:
-        if _ADDRESS.match(str(path)):  # a path has made one slash of its two
+        if _ADDRESS.match(str(path)):  # `Path` merges the two slashes of an address
             raise SceneBuildError(f"{path.name}: files are read, not addresses: download it first")
         if path.is_dir():
             raise SceneBuildError(f"{path} is a folder: name a file{readable_in(path, 'in it')}")
@@ -58,14 +65,16 @@ def present(path: Path) -> None:
             raise SceneBuildError(f"{path}: no such file{readable_in(path.parent, 'in its folder', ending(path))}")
         if not path.stat().st_size:
             raise SceneBuildError(f"{path} is empty: 0 bytes")
-    except (OSError, ValueError) as error:  # a name that no file can have
+    except (OSError, ValueError) as error:  # not a possible file name
         raise SceneBuildError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
 
 def guarded(path: Path, kind: str, read: Callable[[], Any]) -> Any:
-    """Return the result of `read`. Damaged files make libraries raise anything: all becomes `SceneBuildError`."""
+    """Return the result of `read`; every error becomes `SceneBuildError`, as damaged files make libraries raise any
+    kind.
+    """
     try:
-        with np.errstate(all="ignore"):  # readers look for what is not finite
+        with np.errstate(all="ignore"):  # readers check for values that are not finite
             return read()
     except SceneBuildError:
         raise
@@ -73,7 +82,7 @@ def guarded(path: Path, kind: str, read: Callable[[], Any]) -> Any:
         raise SceneBuildError(f"{path} does not fit into memory: make it smaller") from None
     except (IndexError, KeyError) as error:
         raise SceneBuildError(f"{path} names something that it does not have ({error}): export it again") from error
-    except _OF_CODE as error:  # what they say is about the code of a library, which has not found what it needs
+    except _OF_CODE as error:  # a library did not find what it needs; the message is about its code
         raise SceneBuildError(
             f"{path} is damaged, or no {kind.upper()}: something in it is missing or of another kind; "
             f"export or download it again{_of_ours(error)}"
@@ -84,7 +93,7 @@ def guarded(path: Path, kind: str, read: Callable[[], Any]) -> Any:
 
 
 def _of_ours(error: BaseException) -> str:
-    """For error texts: where our own code stopped, if it was not a library; then it may be wrong, not the file."""
+    """Return, for error messages, where our own code failed, if it did: then that may be wrong, not the file."""
     *_, last = traceback.extract_tb(error.__traceback__)
     place = Path(last.filename)
     if _ROOM not in place.parents:
@@ -94,12 +103,12 @@ def _of_ours(error: BaseException) -> str:
 
 
 def ending(path: Path) -> str:
-    """In lower case, without the dot."""
+    """Return the suffix in lower case, without the dot."""
     return path.suffix.lower().lstrip(".")
 
 
 def readable_in(folder: Path, where: str, wanted: str = "") -> str:
-    """For error texts: the files of a folder that can be read, those that end in `wanted` first."""
+    """Return, for error messages, the readable files of a folder, those with suffix `wanted` first."""
     try:
         found = [entry for entry in folder.iterdir() if ending(entry) in ENDINGS and entry.is_file()]
         names = [entry.name for entry in sorted(found, key=lambda one: (ending(one) != wanted, one.name))]

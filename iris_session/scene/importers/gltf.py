@@ -1,8 +1,8 @@
-"""glTF 2.0 and GLB files as nodes: the container, its accessors and images, meshes, materials, lights and cameras.
+"""Reader of glTF 2.0 and GLB files: the container, its accessors and images, meshes, materials, lights and cameras.
 
-Read here and not by trimesh, which rounds colours to 8 bits, does not read sparse or normalised accessors, and drops
-what hangs below a camera. Everything is checked against the bytes that are present; nothing raises but
-`SceneBuildError`. Factors of glTF are linear and colours of a specification sRGB: they are converted. Images are not.
+trimesh is not used for them: it rounds colours to 8 bits, does not read sparse or normalised accessors, and drops
+children of cameras. Everything is checked against the bytes that are present, and only `SceneBuildError` is raised.
+Factors in glTF are linear and colours in a specification are sRGB, so factors are converted. Images are not.
 """
 
 from __future__ import annotations
@@ -47,22 +47,22 @@ _LIGHTS: Final = {
     "point": LightKind.POINT,
     "spot": LightKind.SPOT,
 }
-#: What these lists hold is not in the specification.
+#: Lists whose content has no counterpart in the specification.
 _STILL: Final = {
     "skins": "skins: drawn as they were modelled, they do not bend",
     "animations": "animations: nothing of the file moves by itself",
 }
-#: Share of a light's colour that shines on glossy surfaces: MuJoCo's default.
+#: Share of a light's colour in specular highlights: MuJoCo's default.
 _SPECULAR: Final = 0.3
 Floats = NDArray[np.float32]
 _TYPES: Final = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS: Final = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _BOM: Final = b"\xef\xbb\xbf"
-#: Whole numbers that stand for 0..1 or -1..1, and what 1 is.
+#: Integer types that stand for 0..1 or -1..1 when normalised, and the integer that stands for 1.
 _ONE: Final = {"i1": 127.0, "u1": 255.0, "i2": 32_767.0, "u2": 65_535.0}
-#: Most numbers of an accessor that has no bytes of its own: a file of a few hundred bytes can ask for any number.
+#: Maximum number of values of an accessor without bytes: a file of a few hundred bytes can request any number.
 _MAX_ZEROS: Final = 1 << 24
-#: What is drawn as the file means it; others are listed as left out, or refused when the file requires them.
+#: Extensions that are drawn as intended; others are listed as left out, or rejected when the file requires them.
 KNOWN_EXTENSIONS: Final = frozenset(
     {
         "KHR_lights_punctual",
@@ -77,7 +77,7 @@ Doubles = NDArray[np.float64]
 
 
 def read_gltf(path: Path, references: References) -> LoadedFile:
-    """The file. Raises `SceneBuildError`."""
+    """Read a glTF or GLB file. Raises `SceneBuildError`."""
     return _Reader(GltfData(path, references)).loaded()
 
 
@@ -100,7 +100,7 @@ class _Reader:
         return LoadedFile(tuple(self._nodes()), "y", 1.0, tuple(self._skipped))
 
     def _roots(self) -> list[object]:
-        """Nodes at the top of the scene that the file shows."""
+        """Return the top nodes of the default scene."""
         document = self._data.json
         scenes = document.get("scenes", ())
         if not scenes:
@@ -117,7 +117,7 @@ class _Reader:
         return children
 
     def _nodes(self) -> list[Node]:
-        """Nodes of the scene, parents first, as deep as they are."""
+        """Return the nodes of the scene, parents first, at any depth."""
         found: list[Node] = []
         seen_before: set[object] = set()
         waiting = [(index, -1) for index in reversed(self._roots())]
@@ -151,7 +151,7 @@ class _Reader:
         return node
 
     def _matrix(self, entry: dict[str, Any]) -> Matrix:
-        """T_parent_node."""
+        """Return T_parent_node."""
         if "matrix" in entry:
             return np.array(self._materials.numbers(entry["matrix"], 16)).reshape(4, 4).T
         x, y, z, w = self._materials.numbers(entry.get("rotation", (0, 0, 0, 1)), 4)
@@ -172,7 +172,7 @@ class _Reader:
     # --- meshes -------------------------------------------------------------------------------------------------------
 
     def _surfaces(self, mesh: object) -> list[Surface]:
-        """One per primitive; of a mesh that many nodes wear, the same objects."""
+        """Return one surface per primitive; nodes that share a mesh get the same objects."""
         entry = self._data.item("meshes", mesh)
         if mesh not in self._meshes:
             found = []
@@ -217,7 +217,7 @@ class _Reader:
             off = ~(np.abs(length - 1.0) < 1e-3)
             normals[off] = normalise(np.nan_to_num(normals[off]))
             normal = normals[index]
-        else:  # flat, as glTF asks for
+        else:  # flat, as glTF demands
             flat = normalise(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
             normal = np.repeat(flat[:, None], 3, axis=1).astype(np.float32)
         uv = None
@@ -241,7 +241,7 @@ class _Reader:
         return values
 
     def _index(self, primitive: dict[str, Any], mode: int, count: int) -> NDArray[np.int64]:
-        """Triangles (m, 3), vertex numbers."""
+        """Return the triangles (m, 3) of a primitive, as vertex numbers."""
         flat = (
             self._data.array(primitive["indices"], (1,))[:, 0].astype(np.int64)
             if "indices" in primitive
@@ -285,7 +285,7 @@ class _Reader:
             specular=(_SPECULAR * red, _SPECULAR * green, _SPECULAR * blue),
             cutoff=math.degrees(self._materials.number(cone.get("outerConeAngle", math.pi / 4))),
             range=max(0.0, self._materials.number(entry.get("range", 0.0))),
-            # of directional lights glTF gives lux, which has no place in the specification
+            # glTF gives directional lights in lux, which the specification cannot express
             intensity=0.0
             if kind == LightKind.DIRECTIONAL
             else max(0.0, self._materials.number(entry.get("intensity", 1.0))),
@@ -313,7 +313,7 @@ class _Reader:
 
 
 def _bytes(color: NDArray[Any]) -> NDArray[np.uint8]:
-    """Linear colours of vertices (n, 3 or 4) as they are linear_to_srgb, in bytes."""
+    """Convert linear vertex colours (n, 3 or 4) to sRGB in bytes, as `linear_to_srgb`."""
     values = np.clip(np.nan_to_num(color.astype(np.float64)), 0, 1)
     shown = np.where(values <= 0.0031308, values * 12.92, 1.055 * values ** (1 / 2.4) - 0.055)
     if values.shape[1] == 4:
@@ -327,7 +327,7 @@ def _bytes(color: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 class GltfData:
-    """A document (`json`) with its buffers. Raises `SceneBuildError` for what is no glTF 2.0."""
+    """Document (`json`) of a glTF 2.0 file with its buffers. Raises `SceneBuildError` for other files."""
 
     def __init__(self, path: Path, references: References) -> None:
         self.name = path.name
@@ -353,7 +353,7 @@ class GltfData:
         self._read = len(data)
 
     def item(self, kind: str, index: object) -> dict[str, Any]:
-        """Entry `index` of the list `kind`."""
+        """Return entry `index` of the list `kind`."""
         entries = self.json.get(kind, ())
         if not isinstance(entries, list) or type(index) is not int or not 0 <= index < len(entries):
             raise SceneBuildError(f"{self.name} refers to {kind} {index!r}, which it does not have")
@@ -427,7 +427,7 @@ class GltfData:
         return np.ndarray((count, width), dtype, data, offset, (step, dtype.itemsize)).copy()
 
     def _view(self, index: object) -> tuple[memoryview, int]:
-        """Bytes of a view, and the distance of its entries, 0 where it does not say."""
+        """Return the bytes of a buffer view, and its stride, 0 when it has none."""
         entry = self.item("bufferViews", index)
         start, length, stride = (entry.get(key, 0) for key in ("byteOffset", "byteLength", "byteStride"))
         whole = self._buffer(entry.get("buffer"))
@@ -444,7 +444,7 @@ class GltfData:
         return self._buffers[index]
 
     def _uri(self, uri: object) -> bytes:
-        """Bytes of a reference; all of a file's together are bounded."""
+        """Return the bytes behind a URI; the total per file is bounded."""
         if not isinstance(uri, str):
             raise SceneBuildError(f"{self.name}: a buffer or image says nowhere where its bytes are")
         if uri.startswith("data:"):
@@ -462,7 +462,7 @@ class GltfData:
 
 
 def _glb(data: bytes, name: str) -> tuple[bytes, bytes | None]:
-    """Text and binary chunk of a GLB."""
+    """Return the JSON and the binary chunk of a GLB."""
     stream = io.BytesIO(data)
     _, version, length = struct.unpack("<4sII", stream.read(12).ljust(12, b"\0"))
     if version != 2 or length > len(data):
@@ -484,9 +484,10 @@ def _glb(data: bytes, name: str) -> tuple[bytes, bytes | None]:
 
 @dataclass(frozen=True, eq=False)
 class PrimitiveMaterial:
-    """Appearance of a primitive, and which texture coordinates it uses.
+    """Appearance of a primitive, and the texture coordinates that it uses.
 
-    `uv_set`, transformed by `uv_matrix` (3, 3) unless that is `None`; -1 without textures. `opaque`: alpha is ignored.
+    `uv_set`: number of the set, -1 without textures; transformed by `uv_matrix` (3, 3) unless that is `None`. `opaque`:
+    alpha is ignored.
     """
 
     appearance: Appearance
@@ -544,14 +545,17 @@ class GltfMaterials:
         return PrimitiveMaterial(look, bool(entry.get("doubleSided", False)), uv_set, uv_matrix, mode == "OPAQUE")
 
     def _emission(self, entry: dict[str, Any], rgba: Rgba) -> tuple[Rgba, float]:
-        """The specification has light of a material's own colour: how much, and the colour where it has none else."""
+        """Return colour and strength of emission.
+
+        In the specification a material emits its own colour; a black material takes the emitted colour as its own.
+        """
         strength = _map(_map(entry.get("extensions")).get("KHR_materials_emissive_strength"))
         factor = np.array([linear_to_srgb(v) for v in self.numbers(entry.get("emissiveFactor", (0, 0, 0)), 3)])
         glow = factor * self.number(strength.get("emissiveStrength", 1.0))
         if not glow.any():
             return rgba, 0.0
         own = np.array(rgba[:3])
-        if own.max() < 0.01:  # black that glows: the glow is its colour
+        if own.max() < 0.01:  # a black material that emits light takes the emitted colour
             red, green, blue = (glow / max(1.0, glow.max())).tolist()
             return (red, green, blue, rgba[3]), float(max(1.0, glow.max()))
         emission = float(glow @ own / (own @ own))
@@ -560,7 +564,7 @@ class GltfMaterials:
         return rgba, emission
 
     def _others(self, entry: dict[str, Any], pbr: dict[str, Any]) -> list[tuple[dict[str, Any], str, TextureImage]]:
-        """Pictures other than the colour."""
+        """Return the textures other than colour."""
         found = []
         rough, shade = _map(pbr.get("metallicRoughnessTexture")), _map(entry.get("occlusionTexture"))
         packed = bool(rough) and rough.get("index") == shade.get("index")
@@ -577,7 +581,7 @@ class GltfMaterials:
         return found
 
     def _picture(self, use: dict[str, Any], key: str, change: Any, space: str = ColorSpace.AUTO) -> TextureImage | None:
-        """The picture that `use` names, changed by `change`; `None`, and noted, where it is in a form of its own."""
+        """Return the texture that `use` names, converted by `change`; `None`, with a note, in an unknown format."""
         texture = self._data.item("textures", use.get("index"))
         webp = _map(_map(texture.get("extensions")).get("EXT_texture_webp"))
         source = webp.get("source", texture.get("source"))
@@ -598,7 +602,7 @@ class GltfMaterials:
         return self._pictures[kept]
 
     def _mapping(self, uses: list[dict[str, Any]]) -> tuple[int, Doubles | None]:
-        """Texture coordinates are those of the first texture, the colour where there is one."""
+        """Return texture coordinates: those of the first texture, the colour where there is one."""
         ways = []
         for use in uses:
             turn = _map(_map(use.get("extensions")).get("KHR_texture_transform"))
@@ -620,13 +624,13 @@ class GltfMaterials:
         return uv_set, np.array([[c * a, s * b, x], [-s * a, c * b, y], [0, 0, 1]])
 
     def number(self, value: object) -> float:
-        """A finite number. Raises `SceneBuildError`."""
+        """Return a finite number. Raises `SceneBuildError`."""
         if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
             raise SceneBuildError(f"{self._data.name}: {value!r} stands where a finite number is needed")
         return float(value)
 
     def numbers(self, values: object, count: int) -> list[float]:
-        """As many finite numbers."""
+        """Return `count` finite numbers. Raises `SceneBuildError`."""
         if not isinstance(values, list | tuple) or len(values) != count:
             raise SceneBuildError(f"{self._data.name}: {count} numbers are needed, not {str(values)[:80]}")
         return [self.number(value) for value in values]
@@ -636,7 +640,7 @@ class GltfMaterials:
 
 
 def _alpha(pixels: Pixels, mode: object, cutoff: float) -> Pixels:
-    """Alpha as the material has it: not at all, cut, or blended."""
+    """Apply the alpha mode of the material: opaque, masked, or blended."""
     if mode == "OPAQUE":
         return drop_alpha(pixels, always=True)
     if mode == "MASK" and pixels.shape[2] == 4:
@@ -646,7 +650,7 @@ def _alpha(pixels: Pixels, mode: object, cutoff: float) -> Pixels:
 
 
 def _no_occlusion(pixels: Pixels) -> Pixels:
-    """Roughness and metallic in green and blue, with nothing shaded in red."""
+    """Return roughness and metallic in green and blue, with occlusion in red set to none."""
     packed = np.full((*pixels.shape[:2], 3), 255, np.uint8)
     packed[:, :, 1:] = pixels[:, :, 1:3] if pixels.shape[2] >= 3 else pixels[:, :, :1]
     return packed
@@ -657,8 +661,8 @@ def _map(value: object) -> dict[str, Any]:
 
 
 def linear_to_srgb(value: float) -> float:
-    """A linear factor of glTF as a colour (sRGB)."""
+    """Convert a linear factor of glTF to sRGB."""
     v = min(max(float(value), 0.0), 1.0)
     if v >= 1.0:
-        return 1.0  # which the formula misses by a bit
+        return 1.0  # the formula is off by one bit there
     return v * 12.92 if v <= 0.0031308 else 1.055 * v ** (1 / 2.4) - 0.055

@@ -1,9 +1,9 @@
-"""Checks of mesh files that trimesh reads without an error although they are damaged: truncated files, absent vertices.
+"""Checks of mesh files that trimesh reads without an error although they are damaged, such as truncated files.
 
-Of OBJ also corners that count from the end, which mean another vertex in every line and trimesh takes from the end of
-the file, and those with 0 for a texture coordinate or normal that they do not have, as some exporters write. Names and
-comments may be in any encoding, numbers are ASCII. Each check is given the file's name and bytes, and returns the bytes
-to be read.
+In OBJ files they also convert corners that trimesh misreads: negative numbers count back from the current line, but
+trimesh counts from the end of the file; and some exporters write 0 for an absent texture coordinate or normal. Names
+and comments may be in any encoding, numbers are ASCII. Each check takes the name and the bytes of the file, and returns
+the bytes to be read.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ from iris_session.scene.errors import SceneBuildError
 
 _STL_HEAD: Final = 84
 _STL_TRIANGLE: Final = 50
-#: Largest head of a PLY that is searched.
+#: Bytes of a PLY that are searched for the end of its header.
 _PLY_HEAD: Final = 1 << 16
-#: A corner of a face, of an OBJ line, that is 0 or negative.
+#: A corner of an OBJ face with a number that is 0 or negative.
 _ODD_CORNER: Final = re.compile(rb"^[ \t]*f(?=[ \t])[^\n]*?[ \t/](?:-|0+(?:[/ \t\r\n]|$))", re.MULTILINE)
 _NO_NORMAL: Final = re.compile(rb"^[ \t]*f[ \t][^\n]*?/[^ \t\n/]*/0+(?=[ \t\r\n]|$)", re.MULTILINE)
-#: Lines of an OBJ with numbers. A comment behind them; one with bytes that are no text of numbers, or that begins so;
-#: a face with fewer than three corners.
+#: OBJ lines with numbers: those with a comment behind them; those with, or beginning with, bytes that are no numbers;
+#: faces with fewer than three corners.
 _BEHIND: Final = re.compile(rb"^([ \t]*(?:v[tnp]?|f)[ \t][^\n#]*)#[^\n]*", re.MULTILINE)
 _NO_TEXT: Final = re.compile(rb"^[ \t]*(?:(?:v[tnp]?|f)[ \t][^\n]*)?[\x00\x80-\xff]", re.MULTILINE)
 _FEW_CORNERS: Final = re.compile(rb"^[ \t]*f(?:[ \t]+\S+){0,2}[ \t]*\r?$", re.MULTILINE)
 _BOM: Final = b"\xef\xbb\xbf"
 _OBJ_LISTS: Final = (b"v", b"vt", b"vn")
-#: Of what is no corner, in the error text [characters].
+#: Characters of an invalid corner that the error message shows.
 _SHOWN: Final = 60
 _WHAT: Final = ("vertex", "texture coordinate", "normal")
 
 
 def stl(name: str, data: bytes) -> bytes:
-    """A binary one has as many triangles as it says, one of text an end."""
+    """Check that a binary STL has as many triangles as its header states, and that a text STL has an end."""
     count = int.from_bytes(data[80:_STL_HEAD], "little")
     size = _STL_HEAD + count * _STL_TRIANGLE
     if len(data) >= _STL_HEAD and len(data) == size:
@@ -48,11 +48,11 @@ def stl(name: str, data: bytes) -> bytes:
             f"{name} is cut, or no STL: its head says {count:,} triangles, {size:,} bytes, and it has {len(data):,}; "
             "export or download it again"
         )
-    return data[:size]  # some writers fill up their last block
+    return data[:size]  # some writers pad the last block
 
 
 def ply(name: str, data: bytes) -> bytes:
-    """One of text has as many lines as its head says."""
+    """Check that a text PLY has as many lines as its header states."""
     head, found, _ = data[:_PLY_HEAD].partition(b"end_header")
     if not found or b"format ascii" not in head or b"\n" not in head:
         return data
@@ -65,8 +65,10 @@ def ply(name: str, data: bytes) -> bytes:
 
 
 def off(name: str, data: bytes) -> bytes:
-    """As many faces as its head says, the last one with all its corners. Without comments: of what stands before the
-    first one trimesh reads all but a line twice."""
+    """Check that an OFF has as many faces as its header states, and that the last face is complete.
+
+    Comments are removed: trimesh reads everything but one line before the first comment twice.
+    """
     if b"#" in data:
         data = b"\n".join(line.partition(b"#")[0] for line in data.splitlines())
     if not _plain(data):
@@ -87,8 +89,10 @@ def off(name: str, data: bytes) -> bytes:
 
 
 def obj(name: str, data: bytes) -> bytes:
-    """Faces have at least three corners, which count from 1, and forward. Without comments behind them, which trimesh
-    takes for corners. Numbers are text: what is none it leaves out."""
+    """Check that faces have at least three corners and that all numbers are text: trimesh leaves out other lines.
+
+    Comments behind faces are removed, because trimesh reads them as corners; zero and negative numbers are converted.
+    """
     data = data.removeprefix(_BOM).removesuffix(b"\0")
     if b"\n" not in data:
         data = data.replace(b"\r", b"\n")
@@ -111,9 +115,12 @@ CHECKS: Final[Mapping[str, Callable[[str, bytes], bytes]]] = {"stl": stl, "ply":
 
 
 def absolute_corners(name: str, data: bytes) -> bytes:
-    """An OBJ whose faces name vertices, texture coordinates and normals from 1. Raises `SceneBuildError` for the first
-    that names what is not there. A texture coordinate of 0 is none: where the file has some it becomes one at (0, 0),
-    as trimesh takes all or none. A normal of 0 leaves out all of them: they are made."""
+    """Return an OBJ whose faces refer to vertices, texture coordinates and normals by numbers from 1.
+
+    A texture coordinate 0 means none: when others exist it becomes one at (0, 0), because trimesh takes all or none.
+    One normal 0 drops all normals of the file; they are computed later. Raises `SceneBuildError` for the first number
+    out of range.
+    """
     counts = [0, 0, 0]
     total = [len(re.findall(rb"^[ \t]*" + kind + rb"[ \t]", data, re.MULTILINE)) for kind in _OBJ_LISTS]
     text = _one_line_each(data)
@@ -132,7 +139,7 @@ def absolute_corners(name: str, data: bytes) -> bytes:
 
 
 def _plain(data: bytes) -> bool:
-    """Return whether it is ASCII; with zeros a disk that was full has filled up what it had lost."""
+    """Return whether the data are ASCII without zero bytes: a full disk leaves zeros in place of lost data."""
     return data.isascii() and b"\0" not in data
 
 
@@ -149,13 +156,20 @@ def _cut_corner(text: bytes) -> bool:
 
 
 def _one_line_each(data: bytes) -> bytes:
-    """An OBJ without lines that go on in the next one."""
+    """Join continued lines of an OBJ."""
     return data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
 
 
 def _corner(where: str, corner: bytes, counts: list[int], total: list[int], parts: int) -> bytes:
-    """`counts`: how many there are so far, by which what is negative counts; `total`: in the whole file; `parts`: how
-    many of the corner's numbers are read."""
+    """Return a corner with numbers from 1.
+
+    Args:
+        where: File and line, for messages.
+        corner: Text of the corner.
+        counts: Numbers of vertices, texture coordinates and normals so far; negative numbers count back from them.
+        total: The same numbers for the whole file.
+        parts: How many of the numbers of the corner are read.
+    """
     found = []
     for k, text in enumerate(corner.split(b"/")[:parts]):
         if not text:

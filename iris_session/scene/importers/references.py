@@ -1,10 +1,13 @@
-"""Files that a geometry file may refer to. All participants see the scene, and files come from untrusted sources: a
-reference is followed only into folders that belong to the file.
+"""Files that a geometry file may refer to. All participants see the scene, and files come from untrusted sources, so a
+reference is followed only into folders that belong to the file:
 
-Those are its own folder with all below; folders beside that one which are called as models call theirs (`SIBLINGS`);
-the package it lies in, from the folder with `package.xml`; packages that it names (`package://`), in or beside a folder
-above it, if they have a `package.xml` too; and the folders that the caller names. Symbolic links are followed before
-this is judged.
+- its own folder with all subfolders;
+- sibling folders with the usual names for models (`SIBLINGS`);
+- the package that contains it, from the folder with `package.xml`;
+- packages that it names (`package://`), in or beside one of its parent folders, if they have a `package.xml` too;
+- the folders that the caller names.
+
+Symbolic links are resolved before this check.
 """
 
 from __future__ import annotations
@@ -21,9 +24,9 @@ from typing import Final
 from iris_session.scene.elements import MAX_FILE_BYTES
 from iris_session.scene.errors import SceneBuildError
 
-#: How far up from a file a package is searched.
+#: Number of parent folders that are searched for a package.
 _UP: Final = 8
-#: Folders beside the file's own that belong to it: `../meshes/link.stl` is how most models refer to theirs.
+#: Sibling folders that belong to a file: most models refer to their meshes as `../meshes/link.stl`.
 SIBLINGS: Final = (
     "assets",
     "collision",
@@ -39,7 +42,7 @@ SIBLINGS: Final = (
     "visual",
     "visuals",
 )
-#: Most files that an error text lists.
+#: Maximum number of files that an error message lists.
 _LISTED: Final = 8
 _PACKAGE: Final = "package.xml"
 _files: ContextVar[list[Path] | None] = ContextVar("files that were read", default=None)
@@ -47,7 +50,7 @@ _files: ContextVar[list[Path] | None] = ContextVar("files that were read", defau
 
 @contextmanager
 def files_read() -> Iterator[list[Path]]:
-    """The files that this thread reads meanwhile: those named, and all that these refer to."""
+    """Yield a list that collects the files read by this thread meanwhile, including referenced ones."""
     found: list[Path] = []
     token = _files.set(found)
     try:
@@ -57,7 +60,7 @@ def files_read() -> Iterator[list[Path]]:
 
 
 def read_bounded(path: Path) -> bytes:
-    """The bytes of a file. Raises `SceneBuildError` for one that is missing, unreadable, or too large."""
+    """Return the bytes of a file. Raises `SceneBuildError` when it is missing, unreadable, or too large."""
     try:
         if not path.is_file():
             raise SceneBuildError(f"{path}: no such file")
@@ -74,7 +77,7 @@ def read_bounded(path: Path) -> bytes:
 
 
 class References:
-    """Files that the file at `path` may refer to. `package_dirs`: folders of packages, or packages themselves."""
+    """Resolver of the references in the file at `path`. `package_dirs`: folders of packages, or packages themselves."""
 
     def __init__(self, path: Path, package_dirs: Sequence[str | PathLike[str]] = ()) -> None:
         self.path = path.resolve()
@@ -84,11 +87,11 @@ class References:
                 raise SceneBuildError(f"{folder}: no such folder, named in package_dirs")
         package = next((up for up in self._above() if (up / _PACKAGE).is_file()), None)
         here = self.path.parent
-        beside = (here.parent / name for name in SIBLINGS)  # not resolved: a link in their place leads elsewhere
+        beside = (here.parent / name for name in SIBLINGS)  # not resolved: a link of that name leads elsewhere
         self._roots = (here, *beside, *([package] if package else []), *self.given)
 
     def find(self, reference: str) -> Path:
-        """The file that `reference` names. Raises `SceneBuildError` when there is none, or it may not be read."""
+        """Return the file that `reference` names. Raises `SceneBuildError` when it is missing or may not be read."""
         if "$(" in reference or "${" in reference:
             raise SceneBuildError(
                 f"{self.path.name} refers to {reference}: xacro must be expanded first: xacro IN.urdf.xacro > OUT.urdf "
@@ -110,7 +113,7 @@ class References:
         raise SceneBuildError(f"{self.path.name} refers to {reference}: only files and package:// are read")
 
     def folders(self, path: Path) -> tuple[Path, ...]:
-        """Of the file's own folders those that a file found here lies in: what that refers to may lie there too."""
+        """Return the allowed folders that contain a found file: its own references may lead there too."""
         return tuple(root for root in self._roots if root.is_dir() and path.is_relative_to(root))
 
     def _allowed(self, reference: str, path: Path) -> Path:
@@ -126,7 +129,9 @@ class References:
         return found
 
     def _in_package(self, reference: str, package: str, inside: str) -> Path:
-        """As ROS has it: the folder of that name; searched in what was given, then upward from the file."""
+        """Find a file of a package by the name of its folder, as ROS does: in `package_dirs`, then upward from the
+        file.
+        """
         if package in ("", ".", ".."):
             raise SceneBuildError(f"{self.path.name} refers to {reference}: no package is named there")
         tried, closed = [], None
@@ -148,24 +153,24 @@ class References:
                 f"{_similar(within[0])}"
             )
         hint = f"looked in {', '.join(map(str, tried))}" if tried else "no such package above the file"
-        if closed is not None:  # any folder has a name: also one of private images or keys
+        if closed is not None:  # any folder could be named as a package, also one of private images or keys
             hint = f"{closed} has no {_PACKAGE}, so it is no package"
         raise SceneBuildError(
             f"{self.path.name} refers to {reference}: {hint}; name the package's folder in package_dirs"
         )
 
     def _may_draw_in(self, root: Path, found: Path) -> bool:
-        """Return whether `found`, below the folder `root` that was found by its name, belongs to the file."""
+        """Return whether `found`, below the folder `root` that was found by name, belongs to the file."""
         named = root in self.given or root.parent in self.given
         return named or (root / _PACKAGE).is_file() or any(found.is_relative_to(own) for own in self._roots)
 
     def _above(self) -> tuple[Path, ...]:
-        """The file's folder and those above it, without the root of the file system."""
+        """Return the folder of the file and its parents, without the root of the file system."""
         return tuple(up for up in self.path.parents if up != Path(up.anchor))[:_UP]
 
 
 def _similar(path: Path, others: int = _LISTED) -> str:
-    """For error texts: files that are called nearly so, else so many of the others in its folder."""
+    """Return, for error messages, files with similar names, else at most `others` other files of that folder."""
     folder = path.parent
     try:
         names = sorted(entry.name for entry in folder.iterdir() if entry.is_file())
@@ -176,7 +181,7 @@ def _similar(path: Path, others: int = _LISTED) -> str:
 
 
 def _is_package(root: Path, name: str) -> bool:
-    """Return whether a folder of another name is the package: checkouts are often called otherwise."""
+    """Return whether a folder of another name is the package: checkouts often have another name."""
     try:
         text = (root / _PACKAGE).read_bytes()[: 1 << 16].decode("utf-8", "replace")
     except OSError:
@@ -185,6 +190,6 @@ def _is_package(root: Path, name: str) -> bool:
 
 
 def _plain(address: str) -> str:
-    """An address with its `%20` and the like as the characters that they stand for."""
+    """Decode percent-encoding (`%20`)."""
     data = re.sub(rb"%([0-9a-fA-F]{2})", lambda found: bytes.fromhex(found.group(1).decode()), address.encode())
     return data.decode("utf-8", "replace")

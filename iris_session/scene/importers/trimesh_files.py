@@ -1,6 +1,6 @@
-"""Mesh files that trimesh reads: OBJ with MTL, STL, PLY with colours, OFF, DAE, 3MF. Not glTF: see `gltf`.
+"""Reader of mesh files by way of trimesh: OBJ with MTL, STL, PLY with colours, OFF, DAE, 3MF. Not glTF: see `gltf`.
 
-Colours are taken as they stand in the file. Where it has no normals they are made as MuJoCo makes them, with creases.
+Colours are taken unchanged. Missing normals are computed with creases, as MuJoCo does.
 """
 
 from __future__ import annotations
@@ -40,14 +40,17 @@ _UP: Final = re.compile(rb"<up_axis>\s*([XYZ])_UP\s*<")
 _USED: Final = re.compile(rb"^[ \t]*usemtl[ \t]+(\S[^\r\n]*)", re.MULTILINE)
 _DEFINED: Final = re.compile(rb"^[ \t]*newmtl[ \t]+(\S[^\r\n]*)", re.MULTILINE | re.IGNORECASE)
 _LIBRARIES: Final = re.compile(rb"^[ \t]*mtllib[ \t]+(\S[^\r\n]*)", re.MULTILINE)
-#: What trimesh calls geometries that have no name in their file.
+#: Names that trimesh gives to geometries without a name in the file.
 _MADE_UP: Final = re.compile(r"geometry(_\d+)?")
-#: What an MTL file may map on a surface besides its colour; the picture of `map_ka` is that of the colour.
+#: Maps of an MTL file other than colour; the image of `map_ka` is that of the colour.
 _MAPS: Final = frozenset({"bump", "norm", "disp", "decal", "refl"})
 
 
 def read_with_trimesh(path: Path, references: References, name: str) -> LoadedFile:
-    """The file; `name`: of what has none in it. Raises `SceneBuildError`, and what trimesh raises for damaged ones."""
+    """Read a file. `name`: name of content without one in the file.
+
+    Raises `SceneBuildError`, and any error that trimesh raises for damaged files.
+    """
     trimesh, kind = _trimesh(), path.suffix.lower().lstrip(".")
     data = _checked(path.name, kind, read_bounded(path))
     resolver = _resolver(trimesh, references)
@@ -57,7 +60,7 @@ def read_with_trimesh(path: Path, references: References, name: str) -> LoadedFi
         nodes = reader.nodes(scene)
     except IndexError:
         if kind == "obj":
-            absolute_corners(path.name, data)  # says which
+            absolute_corners(path.name, data)  # raises with the line
         raise
     lost = _lost_materials(path.name, data, resolver) if kind == "obj" else ()
     return LoadedFile(nodes, _up(kind, data), _unit(trimesh, scene), (*resolver.missing, *lost, *reader.skipped))
@@ -76,7 +79,9 @@ def _checked(name: str, kind: str, data: bytes) -> bytes:
 
 
 def _lost_materials(name: str, data: bytes, resolver: Any) -> tuple[str, ...]:
-    """Materials that no MTL file has, if there is one: without any, the viewer chooses the appearance of an OBJ."""
+    """Return materials that no MTL file defines, if there is an MTL file: without any, the viewer chooses the
+    appearance.
+    """
     libraries = {found.strip() for found in _LIBRARIES.findall(data)}
     several = (f"{name}: its MTL files but for the first of {len(libraries)}",) if len(libraries) > 1 else ()
     if not resolver.materials:
@@ -87,7 +92,7 @@ def _lost_materials(name: str, data: bytes, resolver: Any) -> tuple[str, ...]:
 
 
 def _up(kind: str, data: bytes) -> str:
-    """COLLADA says which axis is up, and means y when it does not; the others say nothing and are taken as z up."""
+    """Return the up axis: COLLADA states it, y by default; the other formats do not, and count as z up."""
     if kind != "dae":
         return "z"
     found = _UP.search(data)
@@ -109,7 +114,7 @@ class _Reader:
         self.skipped: list[str] = []
 
     def nodes(self, scene: Any) -> tuple[Node, ...]:
-        """Flat, in the order of the file's geometries: trimesh keeps no other."""
+        """Return the nodes, flat, in the order of the geometries in the file: trimesh keeps no other order."""
         surfaces: dict[str, Surface] = {}
         names = self._names(list(scene.geometry))
         for name, geometry in scene.geometry.items():
@@ -127,12 +132,12 @@ class _Reader:
                 placed.append((order[name], np.array(matrix, np.float64)))
         if len(placed) > MAX_NODES:
             raise SceneBuildError(f"{self._name} has {len(placed)} parts, at most {MAX_NODES} are read")
-        placed.sort(key=lambda entry: (entry[0], entry[1].tolist()))  # names of nodes may be made up by the library
+        placed.sort(key=lambda entry: (entry[0], entry[1].tolist()))  # not by name: the library may invent names
         listed = list(surfaces.values())
         return tuple(Node(listed[k].name, -1, matrix, [listed[k]]) for k, matrix in placed)
 
     def _names(self, given: list[str]) -> dict[str, str]:
-        """Return the names of the geometries: as in the file, or, where trimesh made their names up, as the file is."""
+        """Return the names of the geometries: those in the file, or its own name where trimesh invented them."""
         made_up = [name for name in given if _MADE_UP.fullmatch(name)]
         several = len(made_up) > 1
         ours = {name: f"{self._unnamed}_{k}" if several else self._unnamed for k, name in enumerate(made_up, start=1)}
@@ -153,7 +158,7 @@ class _Reader:
         if visual.kind == "texture":
             look = self._appearance(visual.material)
             if visual.uv is not None and len(visual.uv) == len(points):
-                downward = np.asarray(visual.uv, np.float64)[:, :2] * [1, -1] + [0, 1]  # v is up in trimesh
+                downward = np.asarray(visual.uv, np.float64)[:, :2] * [1, -1] + [0, 1]  # v points up in trimesh
                 uv = np.ascontiguousarray(np.nan_to_num(downward)[faces], np.float32)
         elif visual.kind == "vertex":
             color = np.asarray(visual.vertex_colors, np.uint8)[faces]
@@ -166,8 +171,8 @@ class _Reader:
         return Surface(mesh, look, name)
 
     def _normals(self, geometry: Any, points: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float32]:
-        """At the corners: those of the file, else made from the triangles around each point."""
-        given = geometry._cache.cache.get("vertex_normals")  # without it trimesh would make its own
+        """Return normals at the corners: those of the file, else computed from the triangles around each point."""
+        given = geometry._cache.cache.get("vertex_normals")  # the property would compute normals
         if given is not None and len(given) == len(points):
             return np.asarray(normalise(np.nan_to_num(given))[faces], np.float32)
         first, same = find_unique_rows(np.ascontiguousarray(points.astype(np.float32) + np.float32(0.0)))
@@ -180,8 +185,11 @@ class _Reader:
         return self._appearances[id(material)]
 
     def _of_mtl(self, material: Any) -> Appearance | None:
-        """`Kd`, `Ks`, `Ns`, `d` or `Tr`, and `map_Kd`, whose picture multiplies the colour. `None` of one that trimesh
-        makes up for texture coordinates without a material, grey with a picture that comes from no file."""
+        """Return the appearance of an MTL material.
+
+        It is read from `Kd`, `Ks`, `Ns`, `d` or `Tr`, and `map_Kd`, which multiplies the colour. `None` for the
+        material that trimesh invents for texture coordinates without one: grey, with an image from no file.
+        """
         more = getattr(material, "kwargs", None) or {}
         if not more and getattr(material.image, "format", None) is None:
             return None
@@ -228,7 +236,7 @@ class _Reader:
 
 
 def _rgba(color: Any) -> Rgba:
-    """Bytes of trimesh as a colour."""
+    """Convert a colour of trimesh in bytes."""
     if color is None:
         return GREY
     red, green, blue, alpha = (float(v) / 255 for v in np.asarray(color).reshape(-1)[:4])
@@ -236,12 +244,12 @@ def _rgba(color: Any) -> Rgba:
 
 
 def _other_map(key: str) -> bool:
-    """Return whether a word of an MTL file stands for a picture of something else than the colour."""
+    """Return whether a keyword of an MTL file denotes a map other than colour."""
     return key in _MAPS or (key.startswith("map_") and key not in ("map_kd", "map_ka"))
 
 
 def _first(value: Any, default: float) -> float:
-    """A finite number of an MTL file, which may come as a list of texts."""
+    """Return a finite number of an MTL file, which may be a list of texts."""
     try:
         found = float(value[0] if isinstance(value, list | tuple) else value)
     except (TypeError, ValueError, IndexError):
@@ -250,12 +258,12 @@ def _first(value: Any, default: float) -> float:
 
 
 def _resolver(trimesh: Any, references: References) -> Any:
-    """Resolver that trimesh asks for further files: ours decides which it may have, and keeps what was missing."""
+    """Return the resolver that trimesh asks for further files: `references` decides, and missing files are recorded."""
 
     class Resolver(trimesh.resolvers.Resolver):  # type: ignore[misc]
         def __init__(self) -> None:
             self.missing: list[str] = []
-            self.materials: set[bytes] = set()  # names that MTL files define
+            self.materials: set[bytes] = set()  # names defined by MTL files
 
         def get(self, name: str) -> bytes:
             try:
@@ -285,6 +293,6 @@ def _trimesh() -> Any:
     except ImportError:
         raise SceneBuildError("mesh files need trimesh: pip install 'iris-session[files]'") from None
     logger = logging.getLogger("trimesh")
-    if not logger.handlers:  # else Python prints its tracebacks although no log was configured
+    if not logger.handlers:  # otherwise Python prints its tracebacks although no logging was configured
         logger.addHandler(logging.NullHandler())
     return trimesh

@@ -1,7 +1,7 @@
-"""Questions about the units of a file: lengths in metres, limits in radians, colours from 0 to 1; a line each.
+"""Notes on likely mistakes of units in a file: lengths not in metres, limits not in radians, colours not from 0 to 1.
 
-Nothing is refused for it: halls are large, and wheels turn far. Advice can be typed as it stands, in place of the
-present value.
+They are questions, one line each, never errors: halls are large, and some wheels turn far. The advice in them can be
+copied as it is to replace the present value.
 """
 
 from __future__ import annotations
@@ -18,20 +18,25 @@ from iris_session.scene.elements import Matrix
 from iris_session.scene.extent import LARGEST_M, SMALLEST_M, find_unit_mistake, format_length
 from iris_session.scene.meshes import MeshArrays
 
-#: Limits of a joint that are no radians: three turns and more one way [rad], and no more than 2.5 turns in degrees.
-#: What is beyond is how some say that there are none.
+#: Limits of a joint that are hardly radians: more than three turns one way [rad], and at most 2.5 turns in degrees.
+#: Larger values are a common way to write "no limit".
 _FAR_RAD: Final = 20.0
 _FAR_DEGREES: Final = 900.0
-#: How far a colour may be above 1 by rounding.
+#: Tolerance for colours above 1 by rounding.
 _ABOVE_ONE: Final = 1e-3
 _BYTE: Final = 255.0
-#: A box that is turned by 45 degrees around two axes has a box around it that is so many times as long, at most.
+#: Upper bound of the growth of an axis-aligned bounding box when the box in it is rotated.
 _TURNED: Final = 3.0**0.5
 
 
 class Drawn(NamedTuple):
-    """One mesh or shape of a URDF. `what`: what it is. `side_m`: its longest side as the file has it. `scale`: of a
-    mesh, as its `<mesh>` has it, 1 where that has none; `None` for a shape, whose sizes stand in the file."""
+    """One mesh or shape of a URDF.
+
+    Attributes:
+        what: Description for messages.
+        side_m: Its longest side in the file [m].
+        scale: Scale of its `<mesh>`, 1 by default; `None` for a shape, whose sizes are in the file.
+    """
 
     what: str
     side_m: float
@@ -39,8 +44,10 @@ class Drawn(NamedTuple):
 
 
 def side_of(placed: Sequence[tuple[MeshArrays, Matrix]]) -> float:
-    """Longest side of the box around meshes, each with where it is (4, 4) [m]; 0 of none. Where nobody would ask about
-    it, that of the boxes around them."""
+    """Return the longest side of the bounding box of meshes with their poses (4, 4) [m]; 0 without meshes.
+
+    When the size is clearly plausible, the bounding boxes of the meshes are used instead of their vertices.
+    """
     rough = _side(_corners(mesh) @ T[:3, :3].T + T[:3, 3] for mesh, T in placed if mesh.vertices)
     if _TURNED * SMALLEST_M <= rough <= LARGEST_M:
         return rough
@@ -48,13 +55,20 @@ def side_of(placed: Sequence[tuple[MeshArrays, Matrix]]) -> float:
 
 
 def file_question(name: str, side_m: float, scale: Sequence[float]) -> tuple[str, ...]:
-    """Of a file that is drawn `side_m` large, by the `scale` that was given."""
+    """Return a note when a file drawn `side_m` large, with the given `scale`, is likely in another unit."""
     mistake = find_unit_mistake(side_m)
     return () if mistake is None else (f"{name} is {_told(side_m, mistake, _by_scale(scale, mistake[0]))}",)
 
 
 def robot_question(name: str, reach_m: float, drawn: Sequence[Drawn], scale: float) -> tuple[str, ...]:
-    """Of a URDF whose links lie within `reach_m` of one another in the file, drawn by the `scale` that was given."""
+    """Return a note when a URDF is likely in another unit.
+
+    Args:
+        name: Name of the file.
+        reach_m: Extent of the origins of its links, in the file [m].
+        drawn: Its meshes and shapes.
+        scale: Scale by which it is drawn.
+    """
     largest = max(drawn, key=lambda one: one.side_m, default=Drawn("shape", 0.0))
     side_m, reach_m = scale * largest.side_m, scale * reach_m
     of_drawn, of_joints = find_unit_mistake(side_m), find_unit_mistake(reach_m)
@@ -70,7 +84,7 @@ def robot_question(name: str, reach_m: float, drawn: Sequence[Drawn], scale: flo
 
 
 def reach_of(joints: Iterable[Any], root: str) -> float:
-    """Longest side of the box around the origins of all links, joints at 0, as the file has them [m]."""
+    """Return the longest side of the box around the origins of all links in the file, joints at 0 [m]."""
     below: dict[str, list[Any]] = {}
     for joint in joints:
         below.setdefault(joint.parent, []).append(joint)
@@ -85,7 +99,7 @@ def reach_of(joints: Iterable[Any], root: str) -> float:
 
 
 def degrees_question(name: str, joints: Iterable[Joint]) -> tuple[str, ...]:
-    """Of joints whose limits can hardly be radians."""
+    """Return a note on joints whose limits are hardly radians."""
     odd = [
         joint
         for joint in joints
@@ -103,7 +117,7 @@ def degrees_question(name: str, joints: Iterable[Joint]) -> tuple[str, ...]:
 
 
 def colour_question(name: str, material: str, rgba: Sequence[float]) -> tuple[str, ...]:
-    """Of a colour that is not from 0 to 1."""
+    """Return a note on a colour that is not from 0 to 1."""
     if min(rgba) >= 0.0 and max(rgba) <= 1.0 + _ABOVE_ONE:
         return ()
     given = " ".join(f"{v:g}" for v in rgba)
@@ -124,7 +138,7 @@ def _told(side_m: float, mistake: tuple[float, str], remedy: str, large: str = "
 
 
 def _by_scale(given: Sequence[float], factor: float) -> str:
-    """The scale that makes what was drawn by `given` larger by `factor`."""
+    """Return advice on the scale that makes content drawn by `given` larger by `factor`."""
     whole = [factor * one for one in given]
     if all(math.isclose(one, 1.0) for one in whole):
         return "leaving out scale (--scale)"
@@ -146,7 +160,7 @@ def _in_file(drawn: Drawn, factor: float) -> str:
 
 
 def _corners(mesh: MeshArrays) -> NDArray[np.float64]:
-    """Of the box around a mesh, (8, 3)."""
+    """Return the corners (8, 3) of the bounding box of a mesh."""
     low, high = mesh.position.min(axis=0), mesh.position.max(axis=0)
     return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])], float)
 

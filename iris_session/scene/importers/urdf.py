@@ -1,8 +1,8 @@
-"""URDF robots as articulations: the document, its joints, and its links as drawn items.
+"""Reader of URDF robots as articulations: the document, its joints, and its links as drawn items.
 
-The document is checked for what yourdfpy needs and does not check, with the line in the message; what yourdfpy does not
-know is taken out and reported. Joints: which link is the root, which joints are set, which mimic others, and that all
-form one tree.
+The document is checked for everything that yourdfpy needs and does not check, with the line in the message; elements
+that yourdfpy does not know are removed and reported. The joints determine the root link, the joints that are set, and
+those that mimic others; together they must form one tree.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from iris_session.scene.importers.units import (
 )
 from iris_session.scene.importers.xml_files import no_xml
 
-#: Joints that move in more ways than one: their links are moved as bodies, not by positions of joints.
+#: Joints with several degrees of freedom: their links are moved as bodies, not by joint positions.
 _LOOSE: Final = frozenset({"floating", "planar"})
 _MOVING: Final = frozenset({"revolute", "continuous", "prismatic"})
 _TREE: Final = "a URDF is a tree, leave one of them out (closed chains: in MJCF, one joint as an equality constraint)"
 _KNOWN: Final = _MOVING | {"fixed", "floating", "planar"}
 _SHAPES: Final = frozenset({"box", "cylinder", "sphere", "mesh"})
-#: Attributes without which an element says nothing, by the element and, where that matters, what it stands in.
+#: Required attributes by element and, where that matters, its parent element.
 _NEEDED: Final = {
     "link": ("name",),
     "joint": ("name", "type"),
@@ -54,9 +54,9 @@ _NEEDED: Final = {
     "geometry/cylinder": ("radius", "length"),
     "geometry/sphere": ("radius",),
 }
-#: Elements that a joint needs.
+#: Required elements of a joint.
 _ENDS: Final = ("parent", "child")
-#: Attributes that are numbers, and how many of them.
+#: Numeric attributes, and how many numbers each has.
 _NUMBERS: Final[Mapping[str, Mapping[str, int | tuple[int, ...]]]] = {
     "origin": {"xyz": 3, "rpy": 3},
     "axis": {"xyz": 3},
@@ -72,8 +72,11 @@ _NUMBERS: Final[Mapping[str, Mapping[str, int | tuple[int, ...]]]] = {
 
 @dataclass(frozen=True)
 class Robot:
-    """A URDF: `items` are on `articulation.parts`, by their places. `skipped`: a line for each thing left out;
-    `notes`: for each that looks like a mistake."""
+    """Result of reading a URDF.
+
+    `items` belong to `articulation.parts`, by index. `skipped`: a line for each thing left out; `notes`: a line for
+    each likely mistake.
+    """
 
     articulation: Articulation
     items: tuple[DrawnItem, ...]
@@ -90,10 +93,10 @@ def read_urdf(
     collisions: bool = False,
     scale: float = 1.0,
 ) -> Robot:
-    """The robot under `name`: its bodies are called `name/link`. `collisions`: draw these instead of visuals. `scale`:
-    how large it is drawn; joints keep their positions, also those that slide.
+    """Return the robot of a URDF file. Raises `SceneBuildError`.
 
-    Raises `SceneBuildError`.
+    Its bodies are called `name/link`. `collisions`: draw collision geometry instead of visuals. `scale`: size factor of
+    the drawing; joints keep their positions, also sliding ones.
     """
     present(path)
     if ending(path) == "xacro":
@@ -103,7 +106,7 @@ def read_urdf(
     references = References(path, package_dirs)
     data = read_bounded(path)
 
-    def read() -> Robot:  # yourdfpy raises arbitrary errors for missing attributes
+    def read() -> Robot:  # yourdfpy raises any kind of error for missing attributes
         robot, skipped = parsed(path, data)
         return _Reader(path, name, robot, references, package_dirs, skipped, collisions).robot(T_world_root, scale)
 
@@ -112,7 +115,7 @@ def read_urdf(
 
 
 def _scaled(robot: Robot, scale: float) -> Robot:
-    """The same robot in another size."""
+    """Return the robot in another size."""
 
     def at(pose: Pose) -> Pose:
         x, y, z = pose.p
@@ -166,7 +169,7 @@ class _Reader:
                 self._materials.setdefault(material.name, material)
 
     def robot(self, T_world_root: Pose, scale: float) -> Robot:
-        """`scale`: by which it will be drawn."""
+        """Return the robot. `scale`: size factor by which it will be drawn."""
         root = root_link(self._path.name, self._robot)
         table = read_joints(self._path.name, self._robot)
         below: dict[str, list[Any]] = {}
@@ -254,14 +257,14 @@ class _Reader:
         ]
 
     def _measure(self, path: Path, loaded: LoadedFile, given: tuple[float, float, float], scale: Matrix) -> None:
-        """Record the size of a mesh, by the scale at its `<mesh>`; once for each that it is drawn with."""
+        """Record the size of a mesh, with the scale of its `<mesh>`; once for each scale."""
         if (path, given) not in self._measured:
             self._measured.add((path, given))
             placed = [(surface.mesh, scale @ node.matrix) for node in loaded.nodes for surface in node.surfaces]
             self._sizes.append(Drawn(f"mesh, {path.name},", side_of(placed), given))
 
     def _appearance(self, material: Any) -> Appearance | None:
-        """Of a material of the URDF; one without colour refers to another of its name."""
+        """Return the appearance of a URDF material; one without colour refers to another one by name."""
         if material is None:
             return None
         known = material
@@ -301,7 +304,7 @@ class _Reader:
 
 
 def _matrix(file: str, joint: Any) -> Matrix:
-    """T_parent_joint, as the file has it."""
+    """Return T_parent_joint of the file."""
     matrix = np.eye(4) if joint.origin is None else np.asarray(joint.origin, np.float64)
     if not np.isfinite(matrix).all():
         raise SceneBuildError(f"{file}: the origin of joint {joint.name} is not finite")
@@ -309,7 +312,7 @@ def _matrix(file: str, joint: Any) -> Matrix:
 
 
 def _shape(file: str, geometry: Any) -> tuple[str, tuple[float, float, float]]:
-    """Kind and size of a simple shape, as in `Geometry`."""
+    """Return kind and size of a simple shape, as in `Geometry`."""
     if geometry.box is not None:
         kind, sizes = GeometryKind.BOX, [0.5 * float(v) for v in geometry.box.size]
     elif geometry.cylinder is not None:
@@ -335,7 +338,11 @@ class Drive(NamedTuple):
 
 
 class JointTable(NamedTuple):
-    """`joints` that are set, in the order of the file; `drives` by the names of moving joints; `mimics`."""
+    """Joints of a robot.
+
+    `joints`: those that are set, in the order of the file; `drives`: by the names of moving joints; `mimics`: those
+    that follow others.
+    """
 
     joints: tuple[Joint, ...]
     drives: Mapping[str, Drive]
@@ -343,7 +350,7 @@ class JointTable(NamedTuple):
 
 
 def root_link(file: str, robot: Any) -> str:
-    """The link that no joint holds. Raises `SceneBuildError` unless links and joints are one tree."""
+    """Return the link that no joint moves. Raises `SceneBuildError` unless links and joints form one tree."""
     names = [link.name for link in robot.links]
     if len(set(names)) != len(names) or not names:
         raise SceneBuildError(f"{file}: no link, or two of one name: {_repeated(names)}")
@@ -378,7 +385,7 @@ def root_link(file: str, robot: Any) -> str:
 
 
 def _loop(robot: Any, link: str) -> list[str]:
-    """The joints of the loop that a link hangs in or below, from link to link."""
+    """Return the joints of the loop that contains a link or an ancestor of it, from link to link."""
     above = {joint.child: (joint.parent, joint.name) for joint in robot.joints}
     places: dict[str, int] = {}
     joints: list[str] = []
@@ -390,7 +397,7 @@ def _loop(robot: Any, link: str) -> list[str]:
 
 
 def read_joints(file: str, robot: Any) -> JointTable:
-    """The joints of a robot that is a tree. Raises `SceneBuildError`."""
+    """Return the joints of a robot that is a tree. Raises `SceneBuildError`."""
     by_name = {joint.name: joint for joint in robot.joints}
     if len(by_name) != len(robot.joints):
         raise SceneBuildError(f"{file}: two joints of one name: {_repeated([joint.name for joint in robot.joints])}")
@@ -412,7 +419,7 @@ def read_joints(file: str, robot: Any) -> JointTable:
 
 
 def _followed(file: str, joint: Any, by_name: Mapping[str, Any]) -> tuple[str, float, float]:
-    """The joint that is set, and what its position is multiplied by and added to, along a chain of mimics."""
+    """Return the joint that is set, with multiplier and offset of its position, along a chain of mimics."""
     multiplier, offset, seen = 1.0, 0.0, {joint.name}
     while joint.mimic is not None:
         times = 1.0 if joint.mimic.multiplier is None else float(joint.mimic.multiplier)
@@ -440,7 +447,7 @@ def _axis(file: str, joint: Any) -> Vec3:
 
 
 def _limits(file: str, joint: Any) -> Joint:
-    """URDF counts a missing limit as 0; a joint without both has none."""
+    """Return a joint with its limits: a missing one counts as 0, as in URDF; without both there are none."""
     low, high = -math.inf, math.inf
     limit = joint.limit
     if joint.type != "continuous" and limit is not None and (limit.lower is not None or limit.upper is not None):
@@ -458,7 +465,7 @@ def _repeated(names: list[str]) -> str:
 
 
 def parsed(path: Path, data: bytes) -> tuple[Any, dict[str, None]]:
-    """The robot as yourdfpy has it, and what was taken out of it, a line each. Raises `SceneBuildError`."""
+    """Return the robot of yourdfpy, and a line for each element that was removed. Raises `SceneBuildError`."""
     try:
         import yourdfpy
         from lxml import etree
@@ -486,7 +493,7 @@ def parsed(path: Path, data: bytes) -> tuple[Any, dict[str, None]]:
 
 
 def _document(etree: Any, path: Path, data: bytes) -> Any:
-    """The document, without what has a prefix that nobody declared: extensions of one simulator, often found so."""
+    """Return the document without elements of undeclared prefixes: these are common extensions for one simulator."""
     safe = {"resolve_entities": False, "no_network": True, "huge_tree": False}
     parser = etree.XMLParser(**safe)
     try:
@@ -519,8 +526,11 @@ def _without_other_shapes(path: Path, root: Any) -> dict[str, None]:
 
 
 def _check(path: Path, root: Any) -> None:
-    """Raises `SceneBuildError` for what is missing, and for numbers that are none. Only what the robot is drawn of:
-    transmissions and sensors have joints and limits of their own, and exporters write masses as they know them."""
+    """Raise `SceneBuildError` for missing attributes and invalid numbers.
+
+    Only elements that are drawn are checked: transmissions and sensors have joints and limits of their own, and
+    exporters write masses in several ways.
+    """
     for part in root:
         if part.tag in ("link", "joint", "material"):
             for element in part.iter():

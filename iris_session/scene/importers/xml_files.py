@@ -1,5 +1,5 @@
-"""Checks of DAE and 3MF files before they are read: no external entities, no unbounded growth by entities, and no
-instances nested so often that memory ends. trimesh and pycollada follow all of that, so it is counted before they read.
+"""Checks of DAE and 3MF files before they are read: no external entities, no unbounded expansion of entities, and no
+instances nested so often that memory runs out. trimesh and pycollada follow all of these, so they are counted first.
 """
 
 from __future__ import annotations
@@ -14,32 +14,32 @@ from typing import Any, Final, NamedTuple
 from iris_session.scene.elements import MAX_FILE_BYTES, MAX_NODES, MAX_TRIANGLES
 from iris_session.scene.errors import SceneBuildError
 
-#: Encodings in which what is looked for here has the bytes of ASCII.
+#: Encodings in which the text that is searched for here has the bytes of ASCII.
 _PLAIN: Final = frozenset(
     {"utf-8", "utf8", "us-ascii", "ascii", "iso-8859-1", "iso-8859-15", "latin-1", "windows-1252"}
 )
 _ENCODING: Final = re.compile(rb"""^<\?xml[^>]{0,200}?encoding\s*=\s*["']([^"']{1,40})["']""")
 _BOM: Final = b"\xef\xbb\xbf"
-#: Most levels of things within things.
+#: Maximum depth of nesting.
 _MAX_DEPTH: Final = 64
-#: Characters of a DAE that a triangle takes at least: three numbers of one digit, and what is between them.
+#: Minimum characters of a triangle in a DAE: three numbers of one digit with separators.
 _TRIANGLE_CHARACTERS: Final = 6
-#: One of a 3MF, with any prefix of its name.
+#: A triangle of a 3MF, with any namespace prefix.
 _TRIANGLE: Final = re.compile(rb"<(?:[\w.-]+:)?triangle[\s/>]")
 
 
 def check_dae(name: str, data: bytes) -> None:
-    """Raises `SceneBuildError`. What a geometry of the file costs is copied wherever it is placed."""
+    """Check a DAE. Raises `SceneBuildError`. A geometry counts wherever it is placed, because it is copied there."""
     check_xml(name, data)
     try:
         links, weights = _dae_places(data)
-    except SyntaxError as error:  # as lxml has it
+    except SyntaxError as error:  # raised by lxml
         raise SceneBuildError(no_xml(name, data, "COLLADA", error.lineno or 1, error.msg)) from None
     _check_places(name, links, weights, MAX_TRIANGLES, "triangles")
 
 
 def check_3mf(name: str, data: bytes) -> None:
-    """Raises `SceneBuildError`; for other bytes, what the reader says of them is left to it."""
+    """Check a 3MF. Raises `SceneBuildError`; bytes that are no archive are left to the reader."""
     if not zipfile.is_zipfile(io.BytesIO(data)):
         raise SceneBuildError(f"{name} is cut, or no 3MF, which is a ZIP archive: export or download it again")
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -54,7 +54,7 @@ def check_3mf(name: str, data: bytes) -> None:
                 model = archive.read(entry)
                 check_xml(name, model)
                 triangles[entry.filename] = len(_TRIANGLE.findall(model))
-                if "3d/3dmodel.model" in entry.filename.lower():  # the one that says what is where
+                if "3d/3dmodel.model" in entry.filename.lower():  # the file that places the objects
                     for thing, parts, files in _3mf_places(model):
                         places.setdefault(thing, []).extend(parts)
                         outside += files
@@ -64,8 +64,10 @@ def check_3mf(name: str, data: bytes) -> None:
 
 
 def check_xml(name: str, data: bytes) -> None:
-    """Raises `SceneBuildError` for a DOCTYPE, whose entities may be other files, or grow, and for encodings that would
-    hide one."""
+    """Raise `SceneBuildError` for a DOCTYPE or another encoding.
+
+    Entities of a DOCTYPE may be other files or expand without bound, and other encodings could hide one.
+    """
     start = data.removeprefix(_BOM)[:1024].lstrip()
     declared = _ENCODING.match(start)
     if not start.startswith(b"<") or (declared and declared.group(1).decode(errors="replace").lower() not in _PLAIN):
@@ -75,7 +77,10 @@ def check_xml(name: str, data: bytes) -> None:
 
 
 def no_xml(name: str, data: bytes, root: str, line: int, said: str) -> str:
-    """For people: why a document whose outermost element is `root` does not parse. `said`: the parser, in `line`."""
+    """Return a message on a document with outermost element `root` that does not parse.
+
+    `said`: message of the parser, at line `line`.
+    """
     if f"<{root}".encode() in data and f"</{root}".encode() not in data:
         lines = data.count(b"\n") + 1
         return f"{name} is cut: it ends in line {lines}, without </{root}>; export or download it again"
@@ -84,22 +89,22 @@ def no_xml(name: str, data: bytes, root: str, line: int, said: str) -> str:
 
 
 class _Dae(NamedTuple):
-    """`links`: by a thing, those placed in it, as often as they are; `weights`: triangles of each."""
+    """Instances in a DAE. `links`: by each element, those placed in it, repeated; `weights`: triangles of each."""
 
     links: dict[str, list[str]]
     weights: dict[str, float]
 
 
-#: `library_nodes`: what is in it is drawn where it is referred to, and nowhere else.
+#: `library_nodes`: its content is drawn only where it is referred to.
 _DAE_THINGS: Final = ("node", "geometry", "controller", "library_nodes")
 
 
 def _dae_places(data: bytes) -> _Dae:
-    """Nodes by numbers of their own, geometries, controllers and nodes that are referred to by their ids."""
+    """Return nodes by serial numbers, and geometries, controllers and nodes that are referred to by their ids."""
     links: dict[str, list[str]] = {"": []}
     weights: dict[str, float] = {}
     above: list[str] = [""]
-    for event, element in _events(data, recover=False):  # no more does pycollada
+    for event, element in _events(data, recover=False):  # as pycollada
         tag = str(element.tag).rpartition("}")[2] if isinstance(element.tag, str) else ""
         if tag in _DAE_THINGS:
             if event == "start":
@@ -123,7 +128,10 @@ def _dae_places(data: bytes) -> _Dae:
 
 
 def _check_outside(name: str, triangles: int) -> None:
-    """Of other files of the archive (production extension) all meshes are read, each time that one is referred to."""
+    """Raise `SceneBuildError` for too many triangles in other files of the archive (production extension).
+
+    trimesh reads all meshes of such a file each time that one is referred to.
+    """
     if triangles > MAX_TRIANGLES:
         raise SceneBuildError(
             f"{name} refers to its other files so often that {triangles:,} triangles are read, at most "
@@ -132,8 +140,10 @@ def _check_outside(name: str, triangles: int) -> None:
 
 
 def _3mf_places(model: bytes) -> Iterator[tuple[str, list[str], list[str]]]:
-    """Objects, those that they are put together of, and the files that these are in, where that is another one; what is
-    built, as one without a name."""
+    """Yield objects, the objects that they consist of, and the files of these where it is another one.
+
+    The build is yielded as an object without a name.
+    """
     for event, element in _events(model, recover=True):
         if event == "end" and isinstance(element.tag, str):
             tag = element.tag.rpartition("}")[2]
@@ -161,14 +171,17 @@ def _events(data: bytes, *, recover: bool) -> Iterator[tuple[str, Any]]:
 
 
 def _check_places(name: str, links: dict[str, list[str]], weights: dict[str, float], most: int, what: str) -> None:
-    """Counts what is drawn of the thing without a name, everything as often as it is placed."""
+    """Count what is drawn by the element without a name, everything as often as it is placed.
+
+    Raises `SceneBuildError` for too much or too deep nesting.
+    """
     try:
         order = [*graphlib.TopologicalSorter(links).static_order()]
     except graphlib.CycleError:
         raise SceneBuildError(f"{name} contains an instance of itself: remove it") from None
     drawn: dict[str, float] = {}
     depth: dict[str, int] = {}
-    for thing in order:  # what is within something comes before it
+    for thing in order:  # contained elements come first
         below = links.get(thing, ())
         drawn[thing] = weights.get(thing, 0.0) + sum(drawn[one] for one in below)
         depth[thing] = 1 + max((depth[one] for one in below), default=0)
