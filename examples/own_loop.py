@@ -26,7 +26,7 @@ def main(seconds: float) -> None:
             session.end_tick()  # publishes the new state
             time.sleep(max(0.0, begun + data.time - time.monotonic()))
         for person in session.status().participants:
-            print(f"{person.name} ({person.role}) drives {', '.join(person.robots) or 'nothing'}")
+            print(f"{person.name} ({person.role}) drives {', '.join(person.holds) or 'nothing'}")
 
 
 if __name__ == "__main__":

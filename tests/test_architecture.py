@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import tokenize
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -13,10 +14,21 @@ ROOT = Path(__file__).parents[1]
 MAX_LINES = 800
 #: Most parameters of a constructor besides `self`; more are a configuration of their own.
 MAX_PARAMETERS = 8
-#: A module of fewer lines with one importer is a part of that importer, unless it is named here.
+#: Keyword arguments of the public API.
+KEYWORD_CONSTRUCTORS = {"iris_session/client/client.py"}
+#: A module of fewer lines with one importer is a part of that importer, unless a reason stands here.
 SLIVER_LINES = 80
-SLIVERS = {}
-#: Words of docstrings, comments, messages and names for which docs/glossary.md has a standard term.
+SLIVERS = {
+    "iris_session.codegen.conversions": "the reference for clients that convert to engine frames",
+    "iris_session.doctor.drop_explanations": "a table that grows with every reason",
+    "iris_session.emulator.behaviours.wander": "one behaviour per file",
+    "iris_session.front.uplink": "the counterpart of downlink",
+    "iris_session.security.key_home": "where keys are is looked for by this name",
+    "iris_session.session.unique_name": "a listener with a socket of its own",
+    "iris_session.streams.quantise": "number formats that clients port",
+    "iris_session.system.backoff": "the one back-off",
+}
+#: Words of docstrings and comments for which docs/glossary.md has a standard term.
 DENIED_WORDS = re.compile(
     r"\b(somebody|nobody|whoever|befell|told|gives way|gave way|made below|let go of|taken leave|crowd|doors|desk"
     r"|visitors?|neighbou?rs|departures|knock|what bends)\b",
@@ -248,17 +260,32 @@ def test_constructors_take_few_parameters() -> None:
         for node in ast.walk(tree(path)):
             if isinstance(node, ast.FunctionDef) and node.name == "__init__":
                 n = len(node.args.posonlyargs) + len(node.args.args) + len(node.args.kwonlyargs) - 1
-                if n > MAX_PARAMETERS :
+                if n > MAX_PARAMETERS and str(path.relative_to(ROOT)) not in KEYWORD_CONSTRUCTORS:
                     offenders.append(f"{path.relative_to(ROOT)}:{node.lineno}: {n}")
     assert not offenders, f"more than {MAX_PARAMETERS} parameters:\n" + "\n".join(offenders)
 
 
+def documented(path: Path) -> Iterator[tuple[int, str]]:
+    """Comments and docstrings of a module, with their lines."""
+    docstrings = {
+        node.body[0].lineno
+        for node in ast.walk(tree(path))
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+        and ast.get_docstring(node)
+    }
+    with tokenize.open(path) as file:
+        for token in tokenize.generate_tokens(file.readline):
+            if token.type == tokenize.COMMENT or (token.type == tokenize.STRING and token.start[0] in docstrings):
+                yield from enumerate(token.string.splitlines(), token.start[0])
+
+
 def test_standard_words() -> None:
-    offenders = []
-    for path in modules():
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
-            if found := DENIED_WORDS.search(line):
-                offenders.append(f"{path.relative_to(ROOT)}:{number}: {found[0]}")
+    offenders = [
+        f"{path.relative_to(ROOT)}:{number}: {found[0]}"
+        for path in modules()
+        for number, text in documented(path)
+        if (found := DENIED_WORDS.search(text))
+    ]
     assert not offenders, "docs/glossary.md has standard words:\n" + "\n".join(offenders)
 
 

@@ -135,6 +135,7 @@ class AssetStore:
         self._total = 0
         self._scan_above = -1  # the first write scans the folder
         self._unscanned = 0
+        self._is_scanning = False
 
     # --- reading ------------------------------------------------------------------------------------------------------
 
@@ -296,8 +297,8 @@ class AssetStore:
 
     def trim(self) -> int:
         """Remove stale parts, and files beyond `max_bytes`. Return the bytes that remain."""
+        self._scan(0)
         with self._lock:
-            self._scan(0)
             return self._total
 
     def reserve(self, n_bytes: int) -> None:
@@ -307,9 +308,9 @@ class AssetStore:
             AssetStoreError: `MAX_OVERFILL * max_bytes` are in use already.
         """
         limit = MAX_OVERFILL * self.max_bytes
+        if not self._make_room(n_bytes) and self._total > limit:
+            self._scan(n_bytes)  # files may have been removed, or aged, since the last scan
         with self._lock:
-            if not self._make_room(n_bytes) and self._total > limit:
-                self._scan(n_bytes)  # files may have been removed, or aged, since the last scan
             if self._total > limit:
                 self._total -= n_bytes
                 raise AssetStoreError(
@@ -343,8 +344,7 @@ class AssetStore:
         return self.root / _INDEX / key[:2] / key
 
     def _write(self, path: Path, data: bytes | bytearray | memoryview) -> None:
-        with self._lock:
-            self._make_room(len(data))
+        self._make_room(len(data))
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f"{path.name}.", suffix=".part")
         try:
@@ -360,15 +360,25 @@ class AssetStore:
 
         Where everything is in use, only every 64th part of `max_bytes` that is written causes a scan.
         """
-        self._total += n_bytes
-        self._unscanned += n_bytes
-        full = self._total > self._scan_above or self._unscanned >= SCAN_EVERY_BYTES
-        if full:
+        with self._lock:
+            self._total += n_bytes
+            self._unscanned += n_bytes
+            full = self._total > self._scan_above or self._unscanned >= SCAN_EVERY_BYTES
+            if not full or self._is_scanning:
+                return False
+            self._is_scanning = True
+        try:
             self._scan(n_bytes)
-        return full
+        finally:
+            self._is_scanning = False
+        return True
 
     def _scan(self, n_bytes: int) -> None:
-        """Remove what processes left half-made, then the files used longest ago until `n_bytes` more fit."""
+        """Remove what processes left half-made, then the files used longest ago until `n_bytes` more fit.
+
+        The lock is not held meanwhile: a large folder takes a while, and other threads go on writing.
+        """
+        unscanned = self._unscanned
         held, now = self._read_holds(), time.time()
         self._remove_half_made_holds(now)
         files: list[tuple[float, int, os.DirEntry[str]]] = []
@@ -394,9 +404,10 @@ class AssetStore:
                     os.unlink(entry.path)
                 total -= size
                 self.evicted += 1
-        self._total = total
-        self._unscanned = 0
-        self._scan_above = max(self.max_bytes, total + self.max_bytes // 64)
+        with self._lock:
+            self._unscanned = max(0, self._unscanned - unscanned)  # written by others during the scan
+            self._total = total + self._unscanned
+            self._scan_above = max(self.max_bytes, total + self.max_bytes // 64)
 
     def _iterate_files(self) -> Iterator[tuple[os.DirEntry[str], os.stat_result]]:
         """Yield the files of assets, of the index, and parts. No holds, and no files of others."""

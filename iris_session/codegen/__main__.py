@@ -1,6 +1,6 @@
 """Write the generated files of a checkout, or check that they are current.
 
-python -m iris_session.codegen {csharp,typescript,golden,scene,conversations,arrays,deformable,docs,reference,all} [--check]
+python -m iris_session.codegen all [--check]        or one of: csharp, typescript, golden, docs, reference, ...
 """
 
 from __future__ import annotations

@@ -47,29 +47,11 @@ FLOOD_NS: Final = 2_000_000_000
 _encode = msgspec.msgpack.Encoder().encode
 
 
-class _RawEnvelope(msgspec.Struct, array_like=True):
-    """`ClientEnvelope` with its message as received."""
-
-    version: int
-    connection_epoch: int
-    on_behalf_of: str
-    message: msgspec.Raw
-
-
-class _RawSamples(msgspec.Struct):
-    """`Samples` with each sample as received."""
-
-    samples: list[msgspec.Raw]
-
-
-_decode_raw_envelope = msgspec.msgpack.Decoder(_RawEnvelope).decode
-_decode_raw_samples = msgspec.msgpack.Decoder(_RawSamples).decode
-
-
 class RawFeed:
-    """Forward samples and observations to the recorder as received: `[connection, receive_ns, message bytes]`.
+    """Forward samples and observations to the recorder: `[connection, receive_ns, message bytes]`.
 
-    Never blocks. Without an endpoint nothing is forwarded.
+    Never blocks. Without an endpoint nothing is forwarded. Messages are encoded again rather than forwarded as received:
+    then the recording holds nothing that the schema does not have, however large or deep a client made it.
     """
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, drops: Drops) -> None:
@@ -80,20 +62,12 @@ class RawFeed:
             self._socket.setsockopt(zmq.LINGER, 200)
             self._socket.connect(endpoint)
 
-    def split(self, frame: memoryview, *, together: bool) -> Sequence[Any]:
-        """Return the bytes of the message in a valid frame, or of each sample in it (`together`); nothing if they are
-        not forwarded."""
-        if self._socket is None:
-            return ()
-        message = _decode_raw_envelope(frame).message
-        return _decode_raw_samples(message).samples if together else (message,)
-
-    def send(self, connection: int, receive_ns: int, message: msgspec.Raw) -> None:
+    def send(self, connection: int, receive_ns: int, message: Sample | Observation) -> None:
         """Forward one message."""
         if self._socket is None:
             return
         try:
-            self._socket.send(_encode((connection, receive_ns, bytes(message))), zmq.DONTWAIT)
+            self._socket.send(_encode((connection, receive_ns, _encode(message))), zmq.DONTWAIT)
         except zmq.Again:
             self._drops.count("recorder_queue_full", connection)
 
@@ -144,14 +118,14 @@ class Intake:
         if envelope.on_behalf_of:
             route = Route(routing_id, envelope.on_behalf_of)
             self._touch_gateway(Route(routing_id), peer, now_ns)
-        self._dispatch(route, peer, envelope, data, now_ns)
+        self._dispatch(route, peer, envelope, now_ns)
 
     def _touch_gateway(self, route: Route, peer: Peer, now_ns: int) -> None:
         gateway = self._connections.find(route, peer)
         if gateway is not None:
             gateway.last_heard_ns = now_ns
 
-    def _dispatch(self, route: Route, peer: Peer, envelope: ClientEnvelope, data: memoryview, now_ns: int) -> None:
+    def _dispatch(self, route: Route, peer: Peer, envelope: ClientEnvelope, now_ns: int) -> None:
         message = envelope.message
         if isinstance(message, Pair):
             self._guard.touch(peer.descriptor, now_ns)
@@ -183,7 +157,7 @@ class Intake:
             text = "this connection has not said hello: say hello (again)"
             self._send_fault(route, None, FaultCode.HELLO, text, now_ns)
         else:
-            self._handle_from_connection(connection, envelope, data, now_ns)
+            self._handle_from_connection(connection, envelope, now_ns)
 
     def _forward_late_estop(self, route: Route, peer: Peer, envelope: ClientEnvelope, now_ns: int) -> None:
         """Forward the e-stop of a client that was disconnected and does not know it yet."""
@@ -205,7 +179,7 @@ class Intake:
             self._outbox.send_to_route(route, Refused(RefusalCode.UNPAIRED, text, advice))
 
     def _handle_from_connection(
-        self, connection: FrontConnection, envelope: ClientEnvelope, data: memoryview, now_ns: int
+        self, connection: FrontConnection, envelope: ClientEnvelope, now_ns: int
     ) -> None:
         message = envelope.message
         connection.last_heard_ns = now_ns
@@ -240,16 +214,16 @@ class Intake:
             self._status.record_report(connection, message, now_ns)
             return
         if isinstance(message, Samples):
-            self._handle_samples(connection, envelope.connection_epoch, message, data, now_ns)
+            self._handle_samples(connection, envelope.connection_epoch, message, now_ns)
             return
         if isinstance(message, ClockPing):
             self._outbox.send(connection, ClockPong(message.t0_ns, now_ns, self._now_ns()))
             return
         if isinstance(message, Sample):
-            self._forward_raw(connection, data, now_ns)
+            self._raw.send(connection.number, now_ns, message)
             self._observe_sample(connection, message, now_ns)
         elif isinstance(message, Observation):
-            self._forward_raw(connection, data, now_ns)
+            self._raw.send(connection.number, now_ns, message)
             self._alignment.process_observation(connection, message, now_ns)
             if not self._config.forward_observations:
                 return
@@ -270,24 +244,16 @@ class Intake:
             self._outbox.send(connection, Reply(request_id, False, denial))
         return bool(request_id)
 
-    def _handle_samples(
-        self, connection: FrontConnection, epoch: int, samples: Samples, data: memoryview, now_ns: int
-    ) -> None:
+    def _handle_samples(self, connection: FrontConnection, epoch: int, samples: Samples, now_ns: int) -> None:
         """Handle each sample within the rate limit of single samples."""
-        raw = self._raw.split(data, together=True)
-        for index, sample in enumerate(samples.samples):
+        for sample in samples.samples:
             if connection.rates.allow(Sample, now_ns):
-                if raw:
-                    self._raw.send(connection.number, now_ns, raw[index])
+                self._raw.send(connection.number, now_ns, sample)
                 self._observe_sample(connection, sample, now_ns)
                 self._coalescer.offer(Entry(connection.number, epoch, now_ns, sample))
             else:
                 self._drops.count(FaultCode.RATE, connection.number)
                 self._count_flood(connection, "sample", now_ns)
-
-    def _forward_raw(self, connection: FrontConnection, data: memoryview, now_ns: int) -> None:
-        for message in self._raw.split(data, together=False):
-            self._raw.send(connection.number, now_ns, message)
 
     def _observe_sample(self, connection: FrontConnection, sample: Sample, now_ns: int) -> None:
         """Pass every sample on to status and alignment, before samples are coalesced."""

@@ -21,7 +21,6 @@ from iris_session.system.process import die_with_parent, is_parent, wait_for_par
 def main() -> int:
     """Serve one session. The exit status is 1 if the front cannot start; the authority was notified over the link."""
     configure_logging()
-    configure_logging()
     start = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=FrontStart)
     raise_descriptor_limit()
     try:

@@ -18,8 +18,7 @@ import rerun as rr
 from anchors.pose import PoseTuple
 from iris_session.protocol.scene import SceneSpec, Visual
 from iris_session.protocol.server_messages import BodyInfo
-from iris_session.recording import paths
-from iris_session.recording import scene_geometry as scene
+from iris_session.recording import paths, scene_geometry
 from iris_session.recording.deformables import DrawnDeformable
 from iris_session.recording.messages import SceneAssets
 from iris_session.recording.scene_geometry import SceneReader, VisualShape
@@ -116,7 +115,7 @@ class ScenePicture:
         assert self._source is not None
         self._failed = []
         try:
-            with scene.open_scene(self._source.assets, self._source.packed_model) as (spec, store):
+            with scene_geometry.open_scene(self._source.assets, self._source.packed_model) as (spec, store):
                 work(spec, SceneReader(spec, store, self._source.bodies))
         except _NOT_DRAWN as error:
             self._say(f"the scene is not drawn: {error}")
@@ -140,7 +139,7 @@ class ScenePicture:
                 self._draw(reader, visual)
         for deformable in spec.deformables:
             if reader.is_shown(deformable):
-                entity = self._entity(scene.WORLD, deformable.name or deformable.stream)
+                entity = self._entity(scene_geometry.WORLD, deformable.name or deformable.stream)
                 try:
                     texture = reader.read_texture(deformable.material)
                     bending = DrawnDeformable(entity, deformable, reader.read_arrays(deformable), texture)
@@ -163,7 +162,7 @@ class ScenePicture:
 
     def _draw(self, reader: SceneReader, visual: Visual) -> None:
         assert self._source is not None
-        body = next((body.name for body in self._source.bodies if body.id == visual.body), scene.WORLD)
+        body = next((body.name for body in self._source.bodies if body.id == visual.body), scene_geometry.WORLD)
         entity = self._entity(body, visual.name or f"visual_{visual.id}")
         try:
             form = reader.read_shape(visual)
@@ -173,7 +172,9 @@ class ScenePicture:
         frame, T_frame_visual = reader.place_visual(visual)
         self._visuals[visual.id] = _Drawn(visual, entity, form.kind, form.tint, shown=True)
         self._rec.log(
-            entity, *build_components(form, scene.to_rgba8(visual.rgba, form.tint), frame, T_frame_visual), strict=True
+            entity,
+            *build_components(form, scene_geometry.to_rgba8(visual.rgba, form.tint), frame, T_frame_visual),
+            strict=True,
         )
 
     def _redraw(self, reader: SceneReader, old: _Drawn, visual: Visual) -> None:
@@ -188,7 +189,7 @@ class ScenePicture:
         shown = reader.is_shown(visual)
         parts: list[Any] = []
         if visual.rgba != was.rgba:
-            parts.append(build_colour(old.kind, scene.to_rgba8(visual.rgba, old.tint)))
+            parts.append(build_colour(old.kind, scene_geometry.to_rgba8(visual.rgba, old.tint)))
         if shown != old.shown or visual.T_body_visual != was.T_body_visual:
             size = visual.geometry.size[2]
             parts.append(build_pose(old.kind, size, reader.place_visual(visual)[1], shown=shown))
@@ -206,18 +207,18 @@ class ScenePicture:
         return entity if self._names[entity] == 1 else self._entity(body, f"{name} ({self._names[entity]})")
 
 
-def build_components(form: VisualShape, rgba: scene.Rgba8, frame: str, T_frame_visual: PoseTuple) -> list[Any]:
+def build_components(form: VisualShape, rgba: scene_geometry.Rgba8, frame: str, T_frame_visual: PoseTuple) -> list[Any]:
     """Return the Rerun components of one visual: its frame, its pose in that frame, and its shape."""
     drawn: Any
     solid = rr.components.FillMode.Solid
     radius, _, half = form.size
-    if form.kind == scene.BOX:
+    if form.kind == scene_geometry.BOX:
         drawn = rr.Boxes3D(half_sizes=[form.size], colors=[rgba], fill_mode=solid)
-    elif form.kind == scene.ELLIPSOID:
+    elif form.kind == scene_geometry.ELLIPSOID:
         drawn = rr.Ellipsoids3D(half_sizes=[form.size], colors=[rgba], fill_mode=solid)
-    elif form.kind == scene.CYLINDER:
+    elif form.kind == scene_geometry.CYLINDER:
         drawn = rr.Cylinders3D(lengths=[2.0 * half], radii=[radius], colors=[rgba], fill_mode=solid)
-    elif form.kind == scene.CAPSULE:
+    elif form.kind == scene_geometry.CAPSULE:
         drawn = rr.Capsules3D(lengths=[2.0 * half], radii=[radius], colors=[rgba], fill_mode=solid)
     else:
         assert form.mesh is not None
@@ -236,7 +237,7 @@ def build_components(form: VisualShape, rgba: scene.Rgba8, frame: str, T_frame_v
 def build_pose(kind: str, half: float, T_frame_visual: PoseTuple, *, shown: bool = True) -> Any:
     """Return the pose of a visual in its frame. A hidden one has scale 0, so its mesh need not be written again."""
     p, (w, x, y, z) = T_frame_visual
-    if kind == scene.CAPSULE:
+    if kind == scene_geometry.CAPSULE:
         # Rerun's capsule begins at the origin and ours is centred there: shift it by half a length along its axis.
         axis = (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y))
         p = (p[0] - half * axis[0], p[1] - half * axis[1], p[2] - half * axis[2])
@@ -244,15 +245,15 @@ def build_pose(kind: str, half: float, T_frame_visual: PoseTuple, *, shown: bool
     return rr.InstancePoses3D(translations=[p], quaternions=[rr.Quaternion(xyzw=[x, y, z, w])], scales=scales)
 
 
-def build_colour(kind: str, rgba: scene.Rgba8) -> Any:
+def build_colour(kind: str, rgba: scene_geometry.Rgba8) -> Any:
     """Return the component of the colour alone."""
-    if kind == scene.MESH:
+    if kind == scene_geometry.MESH:
         return rr.Mesh3D.from_fields(albedo_factor=rgba)
     primitives: dict[str, Any] = {
-        scene.BOX: rr.Boxes3D,
-        scene.ELLIPSOID: rr.Ellipsoids3D,
-        scene.CYLINDER: rr.Cylinders3D,
-        scene.CAPSULE: rr.Capsules3D,
+        scene_geometry.BOX: rr.Boxes3D,
+        scene_geometry.ELLIPSOID: rr.Ellipsoids3D,
+        scene_geometry.CYLINDER: rr.Cylinders3D,
+        scene_geometry.CAPSULE: rr.Capsules3D,
     }
     return primitives[kind].from_fields(colors=[rgba])
 

@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.protocol.server_messages import Event
-from iris_session.recording import paths, rrd_file
-from iris_session.recording import record_batches as items
+from iris_session.recording import paths, record_batches, rrd_file
 from iris_session.recording.errors import NotARecordingError
 from iris_session.recording.journal import (
     FORMAT,
@@ -86,7 +85,7 @@ class Recording:
                 for path in files:
                     self._add_part(path, prober)
             self.header = self._header(files[0])
-            ends = dict(self._items(paths.END, items.decode_ends))
+            ends = dict(self._items(paths.END, record_batches.decode_ends))
         except BaseException:
             self.close()
             raise
@@ -153,10 +152,14 @@ class Recording:
             NotARecordingError: A file can no longer be read.
         """
         if after is None:
-            return self._unique(paths.ROWS, items.decode_rows, lambda row: row.chain)
+            return self._unique(paths.ROWS, record_batches.decode_rows, lambda row: row.chain)
 
         def later(batch: Any) -> Iterator[JournalRow]:
-            return items.decode_rows(batch) if max(items.read_index(batch, paths.STEP)) > after else iter(())
+            return (
+                record_batches.decode_rows(batch)
+                if max(record_batches.read_index(batch, paths.STEP)) > after
+                else iter(())
+            )
 
         return (row for row in self._unique(paths.ROWS, later, lambda row: row.chain) if row.step > after)
 
@@ -170,7 +173,9 @@ class Recording:
 
     def keyframes(self) -> Iterator[Keyframe]:
         """Yield the keyframes in order of steps, each once."""
-        return self._unique(paths.KEYFRAMES, items.decode_keyframes, lambda keyframe: (keyframe.step, keyframe.chain))
+        return self._unique(
+            paths.KEYFRAMES, record_batches.decode_keyframes, lambda keyframe: (keyframe.step, keyframe.chain)
+        )
 
     def states(self) -> Iterator[RecordedState]:
         """Yield the states of all bodies at the state rate, in order of time.
@@ -185,12 +190,12 @@ class Recording:
         """
         # By steps, not times: the state of the row before a scene is later than that row, by the duration of the step.
         # A scene that was loaded before the first row has time 0.
-        scenes = (scene for _, scene in self._items(paths.MODELS, items.decode_models))
+        scenes = (scene for _, scene in self._items(paths.MODELS, record_batches.decode_models))
         loaded = [(scene.step if scene.session_time else -1, scene.bodies) for scene in scenes]
         loaded.sort(key=lambda scene: scene[0])
         before = [step for step, _ in loaded]  # for each scene, the newest step before it was loaded
         bodies = [self.header.bodies, *(bodies for _, bodies in loaded)]
-        for state in self._unique(paths.STATE, items.decode_states, lambda state: state.session_time):
+        for state in self._unique(paths.STATE, record_batches.decode_states, lambda state: state.session_time):
             yield state._replace(bodies=bodies[bisect_left(before, state.step)])
 
     def model(self, model_hash: str) -> bytes:
@@ -206,22 +211,25 @@ class Recording:
             LookupError: The recording holds no such model.
             zlib.error: The stored model is damaged.
         """
-        for _, scene in self._items(paths.MODELS, items.decode_models):
+        for _, scene in self._items(paths.MODELS, record_batches.decode_models):
             if scene.model_hash == model_hash:
                 return unpack_model(scene.model)
         raise LookupError(f"the recording does not hold the model {model_hash[:12]} of a scene that was loaded")
 
     def events(self) -> Iterator[Event]:
         """Yield the events of the shared history in order of `event_seq`, each once."""
-        return self._unique(paths.EVENTS, items.decode_events, lambda event: event.event_seq)
+        return self._unique(paths.EVENTS, record_batches.decode_events, lambda event: event.event_seq)
 
     def denials(self) -> Iterator[DenialRecord]:
         """Yield the denials that participants received, in order, each once."""
-        return (record for _, record in self._unique(paths.DENIALS, items.numbered_denial_decoder(), lambda pair: pair))
+        return (
+            record
+            for _, record in self._unique(paths.DENIALS, record_batches.numbered_denial_decoder(), lambda pair: pair)
+        )
 
     def samples(self) -> Iterator[RawSample]:
         """Yield the raw messages of clients, undecoded, in the order of receipt."""
-        return (sample for _, sample in self._items(paths.SAMPLES, items.decode_samples))
+        return (sample for _, sample in self._items(paths.SAMPLES, record_batches.decode_samples))
 
     def metrics(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
         """Return the plotted values by name.
@@ -234,7 +242,7 @@ class Recording:
             NotARecordingError: A file can no longer be read.
         """
         found: dict[str, tuple[list[int], list[float]]] = {}
-        for _, scalar in self._items(f"{paths.METRICS}/**", items.decode_scalars):
+        for _, scalar in self._items(f"{paths.METRICS}/**", record_batches.decode_scalars):
             times, values = found.setdefault(scalar.entity.removeprefix(paths.METRICS + "/"), ([], []))
             times.append(scalar.session_time)
             values.append(scalar.value)
@@ -251,7 +259,7 @@ class Recording:
             NotARecordingError: A file can no longer be read.
         """
         marks: dict[int, list[rrd_file.Mark]] = {}
-        for part, mark in self._items(paths.MARKS, items.decode_marks):
+        for part, mark in self._items(paths.MARKS, record_batches.decode_marks):
             marks.setdefault(part, []).append(mark)
         return [
             f"{os.path.basename(self.files[part])}: {line}"
@@ -380,7 +388,7 @@ class Recording:
     def _header(self, path: str) -> SessionHeader:
         for _, batch in self._headers():
             try:
-                blob, intact = open_blob(items.read_values(batch, "blob")[0])
+                blob, intact = open_blob(record_batches.read_values(batch, "blob")[0])
                 header = decode_header(blob)
             except UNREADABLE as error:
                 raise NotARecordingError(f"the header of {path} is damaged: {_said(error)}") from error
@@ -401,7 +409,7 @@ class Recording:
         """Leave out parts with another header: files of another session that were moved into this folder."""
         for i, batch in reversed(list(self._headers())):
             with suppress(*UNREADABLE):
-                blob, intact = open_blob(items.read_values(batch, "blob")[0])
+                blob, intact = open_blob(record_batches.read_values(batch, "blob")[0])
                 if intact and blob_root(blob) != self.root:
                     self._harmed(f"{os.path.basename(self.files[i])} is of another session, and left out")
                     del self.files[i], self._readable[i]

@@ -18,7 +18,7 @@ from typing import Any, Final, Protocol
 import msgspec
 
 from iris_session.protocol.entries import Entry, decode_entries
-from iris_session.recording import environment as versions
+from iris_session.recording import environment
 from iris_session.recording.errors import NotARecordingError
 from iris_session.recording.journal import (
     CRASHED,
@@ -172,7 +172,7 @@ def verify(
     with Recording.open(path, warn=False) as recording:
         header = recording.header
         report = VerifyReport(str(path), recording_class=header.recording_class, parts=len(recording.files))
-        report.version_differences = versions.compare_environment(header.versions)
+        report.version_differences = environment.compare_environment(header.versions)
         total = recording.count_rows() if progress else 0
         try:
             core = make_core(header, recording.model) if make_core else None

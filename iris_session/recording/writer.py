@@ -38,8 +38,7 @@ from iris_session.protocol.server_messages import (
     ParticipantLeft,
     SamplesRejected,
 )
-from iris_session.recording import paths
-from iris_session.recording import scene_geometry as scene
+from iris_session.recording import paths, scene_geometry
 from iris_session.recording.errors import WriteError
 from iris_session.recording.journal import SessionHeader, seal_blob
 from iris_session.recording.messages import (
@@ -106,7 +105,7 @@ class RrdWriter:
         self._log_static(paths.HEADER, rr.AnyValues(blob=pa.array([seal_blob(encode_header(header))], pa.binary())))
         self._log_static(paths.INFO, rr.TextDocument(describe_session(header), media_type="text/markdown"))
         self._set_bodies(header.bodies)
-        root = rr.Transform3D(parent_frame="tf#/", child_frame=scene.WORLD)  # tf#/: frame of the root entity
+        root = rr.Transform3D(parent_frame="tf#/", child_frame=scene_geometry.WORLD)  # tf#/: frame of the root entity
         self._log_static(paths.TRANSFORMS + "_static", root)
         self._log_static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         if header.model:
@@ -322,7 +321,7 @@ class RrdWriter:
             translation=values[:, :3],
             quaternion=values[:, [4, 5, 6, 3]],
             child_frame=names,
-            parent_frame=[scene.WORLD] * len(names),
+            parent_frame=[scene_geometry.WORLD] * len(names),
         )
         self._send_columns(paths.TRANSFORMS, _time_columns(times[:, frame]), [*columns])
 

@@ -191,9 +191,9 @@ class Owner:
             Participants and their leases, lateness of ticks, drops and restarts.
         """
         processes = self._processes
-        drops = {} if processes is None else processes.count_drops()
-        restarts = {} if processes is None else processes.count_restarts()
         with self._hold_steps():
+            drops = {} if processes is None else processes.count_drops()
+            restarts = {} if processes is None else processes.count_restarts()
             return make_session_status(self._stepper, self._pacer, drops, restarts, self._scheduling)
 
     def recent_events(self) -> list[Event]:

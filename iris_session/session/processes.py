@@ -38,7 +38,7 @@ from iris_session.recording.feed import SILENCE_S
 from iris_session.scene.composed import ComposedScene
 from iris_session.session.config import SessionConfig
 from iris_session.session.core import SessionCore
-from iris_session.session.deformables import DeformableMesh, DeformableStreams, list_flexes
+from iris_session.session.deformables import DeformableSourceMesh, DeformableStreams, list_flexes
 from iris_session.session.errors import StartError
 from iris_session.session.resume import (
     Listening,
@@ -74,7 +74,7 @@ class PublishedScene(NamedTuple):
     """A scene whose world MuJoCo does not simulate: its specification for clients, and its deformables."""
 
     scene: ComposedScene
-    deformables: tuple[DeformableMesh, ...]
+    deformables: tuple[DeformableSourceMesh, ...]
 
 
 class SessionProcesses:
