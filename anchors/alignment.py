@@ -1,12 +1,12 @@
-"""Estimates `T_world_tracking` of one headset from observations of anchors whose world pose is known.
+"""Estimate `T_world_tracking` of one headset from observations of anchors whose world pose is known.
 
 Yaw and translation are free; the tilt is held near zero by gravity, which headsets and worlds share to about 0.2 deg,
 and follows the data only as far as rotations or the baselines between several anchors measure it better (`dof` 6: no
 gravity). Robust against wrong detections, mirrored poses and moved sheets; the covariance counts what is common to a
 viewpoint once. Pure: time and observations are passed in. Mathematics and sources: docs/anchors.md.
 
-Noise models are optimistic, so every stage checks them against what is left over: residuals larger than stated widen
-the covariance (Birge ratio: chi-square per degree of freedom). Where no majority agrees there is no result.
+Noise models are optimistic, so every stage checks them against the residuals: those larger than stated widen the
+covariance (Birge ratio: chi-square per degree of freedom). Without a majority that agrees there is no result.
 """
 
 from __future__ import annotations
@@ -146,8 +146,8 @@ class AlignmentEstimate:
 class AlignmentEstimator:
     """Estimator of one headset: `add` observations, `estimate` from all of them. A new `tracking_epoch` resets it.
 
-    `anchors`: `T_world_anchor`. `sizes`: edge length [m] of printed sheets, where known. The counters tell why
-    observations were not used as they came; `unmirrored` ones were used with the mirrored pose.
+    `anchors`: `T_world_anchor`. `sizes`: edge length [m] of printed sheets, where known. The counters give the
+    reasons why observations were not used as received; `unmirrored` ones were used with the mirrored pose.
     """
 
     anchors: Mapping[str, PoseTuple]

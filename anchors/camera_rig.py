@@ -1,6 +1,6 @@
-"""Cameras that see the same sheets, solved together: where every camera and every sheet stands in one frame.
+"""Joint calibration of cameras that observe the same sheets: poses of all cameras and sheets in one frame.
 
-Sheets of known place fix the frame; cameras and other sheets follow from who sees what, by weighted robust least
+Sheets of known pose fix the frame; cameras and other sheets follow from the observations, by weighted robust least
 squares over all of them. A sheet that is carried through the room counts as a new one at every instant (`wand@3`).
 """
 
@@ -19,13 +19,13 @@ from anchors.pose import PoseTuple, compose, inverse
 from anchors.robot_world import CalibrationError
 
 Array = NDArray[np.float64]
-#: Of the print and its place, beside what a picture's covariance says: [m], [rad] per axis.
+#: Errors of the print and its pose, in addition to the covariance of a picture: [m], [rad] per axis.
 _FLOOR: Final = (0.0003, math.radians(0.05))
 
 
 @dataclass(frozen=True)
 class SheetView:
-    """One camera saw one sheet: `T_camera_sheet` with its covariance (36 values, camera frame)."""
+    """Observation of one sheet by one camera: `T_camera_sheet` with its covariance (36 values, camera frame)."""
 
     camera: str
     sheet: str
@@ -36,7 +36,7 @@ class SheetView:
 @dataclass(frozen=True)
 class CameraRig:
     """Poses in the common frame, covariances (36 values, common frame) beside them. `residuals`: per view, distance
-    [m] and angle [rad] between what was seen and what follows from the result."""
+    [m] and angle [rad] between the observation and the result."""
 
     cameras: dict[str, PoseTuple]
     sheets: dict[str, PoseTuple]

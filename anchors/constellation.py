@@ -177,7 +177,7 @@ def solve_constellation(
     weights = np.ones(len(edges))
     x = initial_guess(graph)
     covariance = np.zeros((0, 0))
-    for _ in range(3):  # what fits nowhere is left out for good, else it would still pull
+    for _ in range(3):  # outliers are left out for good, otherwise they would still pull
         x, covariance, distance2 = _least_squares(graph, x, weights, tilt_sigma_rad)
         now = (distance2 <= 30.0).astype(np.float64)  # chi-square of 6 degrees at 4e-5
         if bool(np.all(now == weights)):

@@ -98,7 +98,7 @@ class CorrectionFilter:
 
     def _slide_share(self, away: float, turn: float, seconds: float) -> float:
         needed = max(away / self.config.slide_m_per_s, turn / self.config.slide_rad_per_s, 1e-9)
-        return min(seconds, 1.0) / needed  # after a pause it goes on sliding, it does not leap
+        return min(seconds, 1.0) / needed  # after a pause it continues to slide and does not jump
 
 
 def interpolate_about_pivot(old: PoseTuple, new: PoseTuple, pivot_tracking: Vec3, share: float) -> PoseTuple:

@@ -2,7 +2,7 @@
 image.
 
 Markers first (OpenCV's detector; where some are missing, once more in the picture enlarged twice), all markers of one
-sheet as one board, then the whole print is laid over the picture (`anchors.photometric`). A plane seen from afar has
+sheet as one board, then the whole print is fitted to the picture (`anchors.photometric`). A plane seen from afar has
 two poses that look nearly alike (Collins and Bartoli 2014, IPPE): both are refined, the better one is the result, and
 `mirrored_ratio` says how much worse the other one fits. Bare codes: `detect_codes`.
 """
@@ -26,11 +26,11 @@ from anchors.sheet import Sheet, load_dictionary
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-#: A sheet is known by at least so many of its four markers: one alone may be a misread one of something else.
+#: Minimum number of its four markers by which a sheet is identified: a single one may be misread from clutter.
 MIN_MARKERS: Final = 2
 #: Corners of a marker that lie further than this from where the rest of the board puts them are not of this board [px].
 _MAX_CORNER_ERROR_PX: Final = 2.5
-#: Standard deviation of a corner as the detector finds it [px], where the print cannot be laid over the picture.
+#: Standard deviation of a detected corner [px], used if the print cannot be fitted to the picture.
 _CORNER_SIGMA_PX: Final = 0.6
 _CODE_CORNER_SIGMA_PX: Final = 1.2  # of a bare code, whose corners are not refined
 _ENLARGE: Final = 2
@@ -41,7 +41,7 @@ _CLEAR_RATIO: Final = 4.0
 #: Ratios of residuals below which both poses fit alike: of thousands of pixels, and of a few corners.
 _AMBIGUOUS_PRINT: Final = 1.05
 _AMBIGUOUS_CORNERS: Final = 2.0
-#: So many markers must agree where the print cannot be laid over the picture.
+#: Number of markers that must agree if the print cannot be fitted to the picture.
 _MIN_MARKERS_ALONE: Final = 3
 #: A registered print differs from the picture by at most this share of its contrast.
 _MAX_RMS: Final = 0.25
@@ -53,8 +53,8 @@ class SheetDetection:
 
     `covariance`: 36 values, 6x6 row-major, (x, y, z [m], rx, ry, rz [rad]), camera frame, at the sheet's origin.
     `mirrored`, `mirrored_ratio`: the other pose that a plane allows, and its residual over that of the result, at least
-    1: near 1 the two cannot be told apart (`ambiguous`). `reprojection_px`: rms of the corners
-    that the detector found. `registered`: whether the whole print was used.
+    1: near 1 the two cannot be distinguished (`ambiguous`). `reprojection_px`: rms of the
+    detected corners. `registered`: whether the whole print was used.
     """
 
     anchor_id: str

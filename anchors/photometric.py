@@ -1,9 +1,10 @@
 """Fit the known print to the photograph: the pose at which the rendered sheet resembles the picture most.
 
 Corners found by a detector are good to a few tenths of a pixel, and off in the same direction where a marker is a few
-pixels wide. Every edge of the print says more: this fits pose, brightness and contrast (both with a slope across the
-sheet, for uneven light) to all pixels at once by Gauss-Newton (Lucas and Kanade 1981; Baker and Matthews 2004), with
-Huber weights for what covers the sheet, and tries a few widths of blur. Text and ruler of the page are left out.
+pixels wide. All edges of the print together are more accurate: this fits pose, brightness and contrast (both with a
+slope across the sheet, for uneven light) to all pixels at once by Gauss-Newton (Lucas and Kanade 1981; Baker and
+Matthews 2004), with Huber weights against occlusions, and tries a few widths of blur. Text and ruler of the page are
+left out.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _ITERATIONS: Final = 15
 _BLURS: Final = (0.55, 0.85, 1.3, 2.0)
 _HUBER: Final = 2.0
 _MAX_TURN_RAD: Final = 0.1  # in one iteration: further away the picture is no longer linear in the pose
-#: What is left over is not white noise: neighbouring pixels err alike. Measured with `tools/detection_table.py`.
+#: The residual is not white noise: errors of adjacent pixels are correlated. Measured with `tools/detection_table.py`.
 _CORRELATED: Final = 3.0
 #: Error of camera and print that no picture shows, as if every corner were off by this [px].
 _FLOOR_PX: Final = 0.02
@@ -43,8 +44,8 @@ _FLOOR_PX: Final = 0.02
 
 @dataclass(frozen=True)
 class PhotometricFit:
-    """`covariance`: 6x6 of position of the sheet's origin [m] and rotation [rad], camera frame. `rms`: what is left
-    over, as a share of the contrast between paper and ink."""
+    """`covariance`: 6x6 of position of the sheet's origin [m] and rotation [rad], camera frame. `rms`: residual as a
+    share of the contrast between paper and ink."""
 
     T_camera_sheet: PoseTuple
     covariance: Array

@@ -1,11 +1,12 @@
-"""Where a camera stands in the frame of a robot, from a marker that robot and camera both see move.
+"""Robot-world calibration: the pose of a camera in the frame of a robot, from a marker on the moving hand.
 
-Two chains lead to the marker, `T_base_ee T_ee_marker = T_base_camera T_camera_marker`: kinematics knows the first
+Two chains lead to the marker, `T_base_ee T_ee_marker = T_base_camera T_camera_marker`: kinematics gives the first
 factor, the camera the last one, and many poses determine the other two. (Robot-world and hand-eye calibration: Park and
-Martin 1994 for the start, then weighted least squares over both, as in Dornaika and Horaud 1998, section V.)
+Martin 1994 for the initial guess, then weighted least squares over both, as in Dornaika and Horaud 1998, section V.)
 
-The same equation serves a camera on the hand (`camera_on_hand`), and a virtual robot that is to lie over its real twin:
-there the headset is the camera, and `T_base_world` is what `T_base_camera` is here (`T_world_base_of_twin`).
+The same equation holds for a camera on the hand (`solve_camera_on_hand`), and for a virtual robot that is placed over
+its real twin: there the headset is the camera, and `T_base_world` takes the place of `T_base_camera`
+(`solve_twin_base`).
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ _TURN_ADVICE: Final = (
 _MIXED_UP: Final = (
     "are the poses those of these pictures (metres, quaternion w first), and did the marker stay fixed on the hand?"
 )
-#: Median residual of the pictures used, [m] and [rad]: beyond this nothing fits, whatever the stated noise.
+#: Median residual of the pictures used, [m] and [rad]: beyond this the result is refused at any stated noise.
 MAX_RESIDUAL: Final = (0.02, math.radians(3.0))
 
 
@@ -44,8 +45,8 @@ class CalibrationError(ValueError):
 
 @dataclass(frozen=True)
 class CalibrationNoise:
-    """Standard deviations per axis of the robot's poses (repeatability and kinematics), and of what the camera saw
-    where no covariance came with it."""
+    """Standard deviations per axis of the robot's poses (repeatability and kinematics), and of the camera's poses
+    that have no covariance."""
 
     robot_m: float = 0.0005
     robot_rad: float = math.radians(0.05)
@@ -57,7 +58,7 @@ class CalibrationNoise:
 class RobotWorldCalibration:
     """`covariance`: 36 values, (x, y, z [m], rx, ry, rz [rad]) of the camera in the frame of the base; scaled up where
     residuals are larger than stated. `residuals`: per picture, distance [m] and angle [rad] between both chains.
-    `left_out`: pictures that contradict the others. `spread_rad`: how much the hand turned, about its second axis."""
+    `left_out`: pictures that contradict the others. `spread_rad`: rotation of the hand about its second axis."""
 
     T_base_camera: PoseTuple
     T_ee_marker: PoseTuple

@@ -1,12 +1,12 @@
-"""The printed sheet: a QR code that says the anchor id, framed by four square markers, as one board of known corners.
+"""The printed sheet: a QR code with the anchor id, framed by four square markers, as one board of known corners.
 
 Headsets track the code natively and report its edge and centre. Cameras find the markers from much further away, and
 measure the pose over the whole page. Every length is a fixed share of the edge of the code, so id and edge determine
-the sheet, whatever paper it is printed on. Which markers it has follows from a hash of the id: sheets are distinguished
+the sheet, independent of the paper. Which markers it has follows from a hash of the id: sheets are distinguished
 even where the code cannot be read.
 
 Sheet frame: origin in the centre of the code, x right, y up, z out of the paper towards the viewer [m].
-How it becomes a PDF or SVG: `anchors.sheet_print`.
+PDF and SVG output: `anchors.sheet_print`.
 """
 
 from __future__ import annotations

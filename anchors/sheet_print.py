@@ -1,6 +1,6 @@
 """A sheet as PDF or SVG at its exact size, with a ruler that shows whether the printer kept it.
 
-Both are a handful of vector shapes, written here by hand: one filled path per symbol (so that neighbouring modules have
+Both are a handful of vector shapes, written here by hand: one filled path per symbol (so that adjacent modules have
 no seam), a few lines, and text in a font that every viewer has. Lengths are millimetres from the upper left corner of
 the page until the very end.
 """

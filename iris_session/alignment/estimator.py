@@ -259,7 +259,7 @@ class TouchEstimator:
 
     @property
     def advice(self) -> str:
-        """How many points are missing for an estimate; empty if none."""
+        """The number of points still needed for an estimate, as text; empty if none are missing."""
         if not 0 < len(self._touches) < _MIN_POINTS:
             return ""
         return f"{len(self._touches)} points touched, {_MIN_POINTS} are needed"

@@ -1,8 +1,6 @@
-"""Alignments and constellations solved again from a recording, with what was seen before and after: the calculation
-behind `iris-session anchors solve`.
+"""Solve alignments and constellations again from a recording: the calculation behind `iris-session anchors solve`.
 
-An alignment of the live session rests on what was seen until then. Here what was seen after it counts too
-(`anchors_around`).
+An alignment of the live session uses the observations until then. Here later observations count too (see `smoother`).
 """
 
 from __future__ import annotations
@@ -36,14 +34,14 @@ from iris_session.alignment.smoother import (
 from iris_session.protocol.names import AlignmentKind, AnchorKind
 from iris_session.recording import AlignmentHistory, AlignmentPeriod, RecordedObservation, TrackingFrame
 
-#: Beyond the stated 95 % by this factor it is not chance.
+#: Differences above the stated 95 % bound times this factor are not attributed to chance.
 BEYOND: Final = 2.0
 SHEETS: Final = (AnchorKind.QR, AnchorKind.BOARD)
 
 
 @dataclass(frozen=True)
 class Outlier:
-    """A viewpoint from which a sheet was seen elsewhere than the solution and the noise allow. `at_ns`: when."""
+    """Viewpoint whose observations of a sheet differ from the solution by more than noise, at session time `at_ns`."""
 
     anchor_id: str
     viewpoint_id: int
@@ -56,10 +54,10 @@ class Outlier:
 
 @dataclass(frozen=True)
 class LiveComparison:
-    """A live alignment against the solution of the same moment, `None` where that is refused.
+    """Difference of a live alignment from the solution at the same moment; values are `None` if that is refused.
 
-    `off_m`, `off_rad`: when it came into force, at the sheet. `off_end_m`: when it ended. `stated_m`, `solved_m`: the
-    stated p95 at the sheet of both.
+    `off_m`, `off_rad`: when it came into force, at the sheet [m], [rad]. `off_end_m`: when it ended [m]. `stated_m`,
+    `solved_m`: the stated p95 at the sheet of the live alignment and of the solution [m].
     """
 
     live: AlignmentPeriod
@@ -70,13 +68,13 @@ class LiveComparison:
 
     @property
     def stated_m(self) -> float | None:
-        """None where a person placed or moved it: then nothing is stated."""
+        """Stated p95 [m]; None for an alignment that was set or moved by hand: it states no error."""
         a = self.live.alignment
         return a.error_at_anchor_m if a.kind == AlignmentKind.MEASURED and not a.offset else None
 
     @property
     def is_beyond_stated(self) -> bool:
-        """Further off than both stated errors explain."""
+        """True if the difference exceeds what both stated errors explain."""
         if self.off_m is None or self.solved_m is None or self.stated_m is None:
             return False
         return self.off_m > BEYOND * math.hypot(self.stated_m, self.solved_m)
@@ -84,7 +82,7 @@ class LiveComparison:
 
 @dataclass
 class FrameResult:
-    """One tracking frame. `last`: the solution at its last look."""
+    """Results of one tracking frame. `last`: the solution at its last observation. `looks`: number of observations."""
 
     frame: TrackingFrame
     looks: int
@@ -106,7 +104,7 @@ def resolve_frame(
     sizes: Mapping[str, float],
     on_progress: Callable[[], None] = lambda: None,
 ) -> FrameResult:
-    """Everything about one tracking frame. `told`: called for every moment that was solved."""
+    """Solve one tracking frame. `on_progress`: called after each live alignment that was compared."""
     resolver = AlignmentSmoother(looks, anchors, sizes)
     first_ns, last_ns = looks[0].observation.capture_ns, looks[-1].observation.capture_ns
     sheets: dict[str, int] = {}
@@ -124,13 +122,13 @@ def resolve_frame(
 
 
 def compare_live(live: AlignmentPeriod, resolver: AlignmentSmoother, last_ns: int) -> LiveComparison:
-    """A live alignment against the solution when it came into force, and when it ended."""
+    """Compare a live alignment with the solution when it came into force and when it ended."""
     begin = resolver.estimate_at(live.since_ns)
     end_ns = live.until_ns if live.until_ns >= 0 else max(last_ns, live.since_ns)
     off = _measure_difference(live, begin)
     end = _measure_difference(
         live, resolver.estimate_at(max(live.since_ns, end_ns - 1))
-    )  # what ended it may have moved an anchor
+    )  # the event that ended it may have moved an anchor
     return LiveComparison(
         live,
         None if off is None else off[0],
@@ -141,7 +139,7 @@ def compare_live(live: AlignmentPeriod, resolver: AlignmentSmoother, last_ns: in
 
 
 def _measure_difference(live: AlignmentPeriod, solved: AlignmentEstimate) -> tuple[float, float] | None:
-    """Distance at the sheet [m] and angle [rad] between a live alignment and a solution."""
+    """Return distance at the sheet [m] and angle [rad] between a live alignment and a solution."""
     if solved.refused:
         return None
     T: PoseTuple = (live.alignment.T_world_tracking.p, live.alignment.T_world_tracking.q)
@@ -152,7 +150,7 @@ def _measure_difference(live: AlignmentPeriod, solved: AlignmentEstimate) -> tup
 def find_outliers(
     looks: Sequence[RecordedObservation], resolver: AlignmentSmoother, anchors: AnchorHistory
 ) -> list[Outlier]:
-    """Viewpoints that contradict the solution of their time, the worst first."""
+    """Return viewpoints that contradict the solution of their time, the worst first."""
     groups: dict[tuple[str, int], list[RecordedObservation]] = {}
     for look in looks:
         if look.observation.kind != AnchorKind.TOUCH:
@@ -181,7 +179,7 @@ def find_outliers(
 
 
 def noise_p95(look: RecordedObservation) -> float:
-    """What 95 % of single looks like this one are better than [m]."""
+    """Return the 95 % bound [m] of the position error of a single observation like this one."""
     given = validate_covariance(observed_covariance(look.observation))
     if given:
         return length_p95(np.reshape(given, (6, 6))[:3, :3])
@@ -199,9 +197,10 @@ def noise_p95(look: RecordedObservation) -> float:
 
 @dataclass(frozen=True)
 class RelativePoses:
-    """Where sheets lie relative to each other by everything that was seen, or why that cannot be said (`advice`).
+    """Poses of sheets relative to each other from all observations, or the reason why they are unknown (`advice`).
 
-    `moved`: sheets that no longer lie where the session (or the file) has them; `unsaid`: why that cannot be told.
+    `moved`: sheets that are no longer at their pose in the session (or the file); `moved_advice`: the reason if that is
+    unknown.
     """
 
     solved: ConstellationSolution | None
@@ -211,7 +210,7 @@ class RelativePoses:
 
 
 def solve_relative_poses(looks: AlignmentHistory, saved: Constellation) -> RelativePoses:
-    """Of all sheets that were seen, configured or not. `saved`: where they ought to be, and which is the reference."""
+    """Solve the poses of all observed sheets, configured or not. `saved`: their expected poses and the reference."""
     seen = list(_list_sheet_observations(looks))
     names = {one.anchor_id for one in seen}
     if len(names) < 2:
@@ -239,14 +238,14 @@ def _list_sheet_observations(looks: AlignmentHistory) -> Iterable[SheetObservati
             key = (o.anchor_id, o.viewpoint_id)
             groups[key] = groups.get(key, 0) + 1
             if o.kind in SHEETS and groups[key] <= MAX_IN_GROUP and is_rigid(observed_pose(o)):
-                headset = f"{frame.participant} {frame.run} {frame.jumps}"  # a tracking frame of its own after each
+                headset = f"{frame.participant} {frame.run} {frame.jumps}"  # each jump begins another tracking frame
                 yield SheetObservation(
                     headset, o.tracking_epoch, o.viewpoint_id, o.anchor_id, observed_pose(o), look.p_tracking_head
                 )
 
 
 def _sizes(looks: AlignmentHistory, saved: Constellation) -> dict[str, float]:
-    """Of each sheet: as configured, else the median of what headsets measured."""
+    """Return the size [m] of each sheet: as configured, else the median of the headsets' measurements."""
     measured: dict[str, list[float]] = {}
     for every in looks.observations.values():
         for look in every:

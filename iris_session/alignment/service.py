@@ -47,7 +47,7 @@ _MAX_PIVOTS: Final = 64
 
 
 class HeadsetConnection(Protocol):
-    """What the service needs to know of a connection."""
+    """Interface of a connection that the service uses."""
 
     @property
     def number(self) -> int: ...

@@ -1,7 +1,7 @@
-"""The alignment of one headset at any moment of a recording, by what was seen before it and after it.
+"""Alignment of one headset at any moment of a recording, from the observations before and after it.
 
-What came before is solved forwards in time, what came after backwards, each by the estimator of the live session with
-its model of drift; the two are then weighted by their covariances (a two-filter smoother, Fraser and Potter 1969).
+Observations before the moment are solved forwards in time, those after it backwards, each by the estimator of the live
+session with its model of drift; both are weighted by their covariances (two-filter smoother, Fraser and Potter 1969).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from iris_session.recording import AlignmentHistory, RecordedObservation
 
 Array = NDArray[np.float64]
 AROUND_NS: Final = 600_000_000_000
-#: Of one viewpoint, and viewpoints: those nearest to the moment.
+#: Maximum number of observations of one viewpoint, and of viewpoints: the nearest to the moment are used.
 MAX_IN_GROUP: Final = 120
 MAX_GROUPS: Final = 200
 #: Moments closer than this share a solution: tracking frames drift by less than a millimetre meanwhile.
@@ -48,7 +48,7 @@ CHI2_6_999: Final = 22.458
 
 
 class AnchorHistory:
-    """Where anchors were, over time: as configured, then as directors moved them; or by a file, always the same."""
+    """Poses of anchors over time: as configured, then as moved by directors; or constant, by a file (`given`)."""
 
     def __init__(
         self, looks: AlignmentHistory, configured: Mapping[str, PoseTuple], given: Constellation | None
@@ -59,7 +59,7 @@ class AnchorHistory:
             self._eras.append((moved.session_time, {**self._eras[-1][1], moved.anchor_id: pose}))
 
     def find_period(self, now_ns: int) -> int:
-        """Number of the period in which none was moved."""
+        """Return the index of the period, between two moves of anchors, that contains `now_ns`."""
         return max(i for i, (since, _) in enumerate(self._eras) if i == 0 or since <= now_ns)
 
     def get_poses(self, era: int) -> dict[str, PoseTuple]:
@@ -71,7 +71,7 @@ class AnchorHistory:
 
 
 class AlignmentSmoother:
-    """Solutions of one tracking frame at any moment, each computed once. `looks`: in order of capture."""
+    """Smoothed alignments of one tracking frame at any moment, each computed once. `looks`: in order of capture."""
 
     def __init__(
         self, looks: Sequence[RecordedObservation], anchors: AnchorHistory, sizes: Mapping[str, float]
@@ -81,7 +81,7 @@ class AlignmentSmoother:
         self._known: dict[tuple[int, int], AlignmentEstimate] = {}
 
     def estimate_at(self, now_ns: int) -> AlignmentEstimate:
-        """What was seen around `now_ns` as one alignment, with the anchors of then."""
+        """Return the alignment from all observations around `now_ns`, with the anchor poses of that time."""
         moment = (now_ns // GRAIN_NS) * GRAIN_NS + GRAIN_NS // 2
         key = (moment, self._anchors.find_period(now_ns))
         if key not in self._known:
@@ -96,7 +96,7 @@ class AlignmentSmoother:
     def _without_one(
         self, moment: int, places: Mapping[str, PoseTuple], seen: Sequence[str]
     ) -> AlignmentEstimate | None:
-        """Of three or more sheets all but one may agree: then that one was moved."""
+        """Return the best solution without one sheet: of three or more, all but a moved one may agree."""
         tried = []
         for name in seen:
             solved = self._solve(moment, {k: pose for k, pose in places.items() if k != name})
@@ -106,7 +106,7 @@ class AlignmentSmoother:
         return min(tried, key=lambda one: one.error_at_anchor_m, default=None)
 
     def count_unused(self) -> dict[str, int]:
-        """How many observations are of no use at all, by reason."""
+        """Return the number of observations that cannot be used, by reason."""
         e = AlignmentEstimator(self._anchors.last_poses, AlignmentConfig(), self._sizes)
         touched = 0
         for look in self._looks:
@@ -140,8 +140,10 @@ class AlignmentSmoother:
         return fuse_estimates(before, after)
 
     def _sides(self, moment: int) -> tuple[list[RecordedObservation], list[RecordedObservation]]:
-        """The looks that count, before the moment and after it. What was seen from one viewpoint stays together: its
-        errors are common."""
+        """Return the observations used, before and after the moment.
+
+        Observations from one viewpoint stay on one side: their errors are common.
+        """
         away = np.abs(self._times - moment)
         groups: dict[tuple[str, int], list[RecordedObservation]] = {}
         for i in np.argsort(away, kind="stable").tolist():
@@ -168,7 +170,7 @@ def _config() -> AlignmentConfig:
 
 
 def _later(e: AlignmentEstimate, seconds: float) -> AlignmentEstimate:
-    """The same so long after its newest look: what the frame may have drifted meanwhile is added to its covariance."""
+    """Return the estimate `seconds` after its newest observation, with the possible drift added to its covariance."""
     if e.refused or seconds <= 0.0:
         return e
     prior = _config().prior
@@ -182,7 +184,7 @@ def _with(e: AlignmentEstimate, T: PoseTuple, C: Array) -> AlignmentEstimate:
 
 
 def fuse_estimates(a: AlignmentEstimate, b: AlignmentEstimate) -> AlignmentEstimate:
-    """Both as one, at the pivot of `a`: means weighted by covariances, wider where they differ by more than these."""
+    """Fuse two estimates at the pivot of `a`, weighted by covariances; wider if they differ by more than these."""
     p_tracking = apply(inverse(a.T_world_tracking), a.pivot_world)
     p_b = apply(b.T_world_tracking, p_tracking)
     turn = quat_to_rotvec(quat_mul(b.T_world_tracking[1], quat_conj(a.T_world_tracking[1])))
@@ -212,7 +214,7 @@ def fuse_estimates(a: AlignmentEstimate, b: AlignmentEstimate) -> AlignmentEstim
 
 
 def _carried(e: AlignmentEstimate, p_world: Vec3) -> Array:
-    """Covariance (6, 6) of an estimate at another point: d(point) = d(pivot) + rot x (point - pivot)."""
+    """Return the covariance (6, 6) of an estimate at another point: d(point) = d(pivot) + rot x (point - pivot)."""
     x, y, z = (p_world[i] - e.pivot_world[i] for i in range(3))
     J = np.eye(6)
     J[:3, 3:] = -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -220,7 +222,7 @@ def _carried(e: AlignmentEstimate, p_world: Vec3) -> Array:
 
 
 def add_observation(estimator: AlignmentEstimator, look: RecordedObservation, capture_ns: int) -> bool:
-    """As the front does it."""
+    """Add an observation like the live session does; return whether it is used."""
     seen = look.observation
     try:
         return estimator.add(
@@ -240,7 +242,7 @@ def add_observation(estimator: AlignmentEstimator, look: RecordedObservation, ca
 
 
 def estimate_or_refuse(estimator: AlignmentEstimator) -> AlignmentEstimate:
-    """The solution; refused for numbers that nobody can solve."""
+    """Return the estimate, a refused one if it fails numerically."""
     try:
         return estimator.estimate()
     except NUMERICAL_ERRORS:
@@ -254,7 +256,7 @@ def observed_pose(seen: Observation) -> PoseTuple:
 
 
 def observed_covariance(seen: Observation) -> tuple[float, ...]:
-    """As stated; that of a tracked controller where its client states none."""
+    """Return the stated covariance; that of a tracked controller if its client states none."""
     if seen.kind == AnchorKind.CONTROLLER and not seen.covariance:
         return controller_covariance()
     return seen.covariance

@@ -1,4 +1,4 @@
-"""Recording room: journal, the feed to the recorder process, reading back, verification. See docs/architecture.md.
+"""Recording room: journal, feed to the recorder process, reading back, verification. See docs/architecture.md.
 
 Rerun is imported only where files are written or read, so that the authority stays light.
 """
@@ -34,7 +34,7 @@ from iris_session.recording.supervise import RecorderProcess
 from iris_session.recording.verify import Core, Problem, VerifyReport, verify
 
 __all__ = [
-    # making one
+    # write a recording
     "SessionHeader",
     "Settings",
     "Continues",
@@ -50,7 +50,7 @@ __all__ = [
     "RecorderProcess",
     "RecorderFeed",
     "FeedStats",
-    # reading one
+    # read a recording
     "Recording",
     "RecordedState",
     "RawSample",
@@ -68,7 +68,7 @@ __all__ = [
     "RecordingError",
     "RecorderError",
     "NotARecordingError",
-    # who has one in use
+    # locks
     "RecordingLock",
     "RecordingInUseError",
 ]

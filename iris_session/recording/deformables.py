@@ -1,6 +1,6 @@
-"""What bends, in the picture of a recording: topology once, then the vertices whenever frames of them came.
+"""Deformables in the picture of a recording: topology once, then vertices with every frame received.
 
-Cloths and surfaces of soft bodies are meshes, ropes are lines. The viewer shades by normals and computes none, so these
+Cloths and surfaces of soft bodies are meshes, ropes are lines. The viewer shades by normals but computes none, so they
 are in the file beside the positions.
 """
 
@@ -26,7 +26,7 @@ Ints = NDArray[np.int64]
 
 
 class DrawnDeformable:
-    """One deformable. `arrays`: of its asset. Raises `AssetDecodeError` for another one's."""
+    """One deformable. `arrays`: arrays of its asset. Raises `AssetDecodeError` if they do not fit the deformable."""
 
     def __init__(
         self,
@@ -58,11 +58,11 @@ class DrawnDeformable:
             self._form = _Surface(elements, uv, texture)
 
     def build_components(self) -> list[Any]:
-        """Rerun components that stay, and the vertices at rest."""
+        """Return the Rerun components that do not change, and the vertices at rest."""
         return [rr.CoordinateFrame(WORLD), self._form.build_components(self._rest, self._colour, self._radius)]
 
     def decode_frame(self, frame: bytes) -> Floats | None:
-        """Vertices of a frame of the stream; `None`: the same as before. Raises `StreamError`."""
+        """Decode a frame of the stream: vertices (n, 3) [m], `None` if unchanged. Raises `StreamError`."""
         vertices = np.nan_to_num(self._decoder.decode(frame), copy=False, nan=0.0, posinf=0.0, neginf=0.0)
         if np.array_equal(vertices, self._last):
             return None
@@ -70,12 +70,12 @@ class DrawnDeformable:
         return vertices
 
     def build_columns(self, rows: list[Floats]) -> Any:
-        """What `taken` gave, a row each, as `rerun.send_columns` has it."""
+        """Return the columns for `rerun.send_columns`, one row per result of `decode_frame`."""
         return self._form.build_columns(np.stack(rows))
 
 
 class _Lines:
-    """A rope: a line for every edge."""
+    """A rope: one line per edge."""
 
     def __init__(self, edges: Ints) -> None:
         self._edges = edges
@@ -90,7 +90,7 @@ class _Lines:
 
 
 class _Surface:
-    """Triangles. Where texture coordinates differ between triangles, a vertex is there several times."""
+    """A surface of triangles. A vertex whose texture coordinates differ between triangles is repeated."""
 
     def __init__(self, triangles: Ints, uv: Floats | None, texture: Pixels | None) -> None:
         self._uv, self._texture = uv, texture
@@ -130,7 +130,7 @@ class _Surface:
         return (vertices, normal) if self._source is None else (vertices[self._source], normal[self._source])
 
     def _normals(self, vertices: Floats) -> Floats:
-        """The mean of the triangles at a vertex, by their area."""
+        """Return vertex normals: the area-weighted mean of the normals of adjacent triangles."""
         normal = np.zeros_like(vertices)
         if len(self._starts):
             a, b, c = (vertices[self._corners[:, k]] for k in range(3))

@@ -1,9 +1,9 @@
-"""Errors of the recording room. Every text is one line for the person who reads it.
+"""Errors of the recording room. Every message is one line.
 
 RecordingError
  +-- RecorderError        the recorder process cannot start
  |    +-- RecordingInUseError   (lock.py) another process writes or continues it
- +-- WriteError           a file that was begun can no longer be written
+ +-- WriteError           an open file can no longer be written
  +-- NotARecordingError   the file cannot be read as a recording
 """
 
@@ -15,11 +15,11 @@ class RecordingError(Exception):
 
 
 class RecorderError(RecordingError):
-    """The recorder cannot write where it was told to, or did not start."""
+    """The recorder cannot write to the given path, or did not start."""
 
 
 class WriteError(RecordingError):
-    """The disk is full, or the file system refuses: the file is good up to an earlier write."""
+    """The disk is full or the file system reports an error: the file is valid up to an earlier write."""
 
 
 class NotARecordingError(RecordingError):

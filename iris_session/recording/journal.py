@@ -1,8 +1,8 @@
-"""The journal of a session: header, one row per step, keyframes, and the checks that name what was changed. Pure.
+"""Journal of a session: header, one row per step, keyframes, and the checks that identify changes. Pure.
 
-A step is `(now_ns, entries, n_ticks)`; its row also holds the digest of what came out and a hash chained over all
-rows. Every field has its own CRC-32, every entry too, so that damage is attributed to a field, or to an entry, even
-when the bytes no longer decode. CRCs find accidents; the chain finds rows that were left out, moved or rewritten.
+A step is `(now_ns, entries, n_ticks)`; its row also holds the digest of the step's result and a hash chained over all
+rows. Every field and every entry has its own CRC-32, so that damage is attributed to a field or an entry even if the
+bytes no longer decode. CRCs detect accidents; the chain detects rows that were left out, moved or rewritten.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from iris_session.protocol.entries import Entry, encode_entry
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 
-#: Of recordings. It changes with what rows, snapshots or their simulation mean: others could only be misread.
+#: Format of recordings. It changes with the meaning of rows, snapshots or their simulation; others are not read.
 FORMAT: Final = 3
-CLOSED: Final = "closed"  # all code ours: re-simulated bit for bit
-OPEN: Final = "open"  # a user's loop or a real robot: the plant's state comes from the rows
+CLOSED: Final = "closed"  # all code is part of iris-session: re-simulated bit for bit
+OPEN: Final = "open"  # a user loop or a real robot: the plant's state comes from the rows
 HASH_BYTES: Final = 16
-#: `JournalRow.digest` of a step that raised an error: it gave nothing, and no step follows.
+#: `JournalRow.digest` of a step that raised an error: it has no result, and no step follows.
 CRASHED: Final = b""
 
 #: Fields of a row with a CRC of their own, in the order of `JournalRow.field_crcs`. `entry_index` is the array header
@@ -37,9 +37,9 @@ _encoder = msgspec.msgpack.Encoder()
 
 
 class Continues(msgspec.Struct, frozen=True):
-    """What a resumed session goes on from: its state after `step` of the recording whose first file is `file`.
+    """Point that a resumed session continues: the state after `step` of the recording whose first file is `file`.
 
-    `chain`: of that row (of the root when no step was taken). `file`: its name in the same folder.
+    `chain`: that of the row (the root chain if no step was taken). `file`: name in the same folder.
     """
 
     file: str
@@ -48,10 +48,10 @@ class Continues(msgspec.Struct, frozen=True):
 
 
 class Settings(msgspec.Struct, frozen=True):
-    """Of the process that recorded, not of the simulation: what a resumed session takes over.
+    """Settings of the recording process, not of the simulation, which a resumed session adopts.
 
-    `state_hz`: rate of state frames. `keyframe_s`: distance of keyframes [s]. `realtime`: a real-time priority was
-    asked for. `adapt_media`: slow links get fewer media. `anchor_sizes`: edge of the printed sheets [m].
+    `state_hz`: rate of state frames [Hz]. `keyframe_s`: interval of keyframes [s]. `realtime`: a real-time priority was
+    requested. `adapt_media`: slow links receive fewer media frames. `anchor_sizes`: edge of the printed sheets [m].
     """
 
     state_hz: float
@@ -62,14 +62,14 @@ class Settings(msgspec.Struct, frozen=True):
 
 
 class SessionHeader(msgspec.Struct, frozen=True):
-    """What a recording needs to be understood and re-simulated. Holds no key, secret or token.
+    """Header of a recording: all that is needed to understand and re-simulate it. Holds no key, secret or token.
 
     `recording_class`: `closed` or `open`. `config`: the session's configuration as its composer encodes it. `model`:
     `pack_model` of the MuJoCo model's binary form (mjb). `bodies`: the streamed bodies in the order of state poses.
-    `versions`: of Python, the libraries and the platform, see `versions.py`. `continues`: the recording that this one
-    goes on from, None for a session's first. `origin_ns`, `boot_id`: session time zero on CLOCK_MONOTONIC, and which
-    boot of which machine that clock is of. `anchors`: `T_world_anchor` of each sheet that headsets are aligned to.
-    `settings`: None when nobody noted them.
+    `versions`: of Python, the libraries and the platform, see `environment.py`. `continues`: the recording that this
+    one continues, None for the first of a session. `origin_ns`, `boot_id`: session time zero on CLOCK_MONOTONIC, and
+    the boot of the machine that this clock belongs to. `anchors`: `T_world_anchor` of each sheet that headsets are
+    aligned to. `settings`: None if not recorded.
     """
 
     session_id: Name
@@ -93,7 +93,7 @@ class SessionHeader(msgspec.Struct, frozen=True):
 
     @property
     def begins_after(self) -> int:
-        """The step before the first row: -1, or the one that a resumed session continues."""
+        """The step before the first row: -1, or the step that a resumed session continues."""
         return -1 if self.continues is None else self.continues.step
 
 
@@ -102,7 +102,7 @@ class JournalRow(msgspec.Struct, frozen=True, array_like=True):
 
     `entries`: MessagePack array of `iris_session.protocol.entries.Entry`; `entry_lengths` and `entry_crcs`: bytes and
     CRC-32 of each. `plant`: in class `open`, the plant's `mjSTATE_INTEGRATION` at the start of this step. `digest`:
-    16 bytes over everything the step gave, or `CRASHED`. `chain`: 16 bytes over the previous row's chain and this
+    16 bytes over the whole result of the step, or `CRASHED`. `chain`: 16 bytes over the previous row's chain and this
     whole row.
     """
 
@@ -119,10 +119,10 @@ class JournalRow(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Keyframe(msgspec.Struct, frozen=True, array_like=True):
-    """Snapshots after step `step`: what `restore` needs.
+    """Snapshots after step `step`, from which the session can be restored.
 
-    `step` -1: the initial state. `status`: the control report that the next step's authority sees, as its composer
-    encodes it. `chain` (of row `step`) and `crcs` (see `SNAPSHOTS`) are filled in by `seal`.
+    `step` -1: the initial state. `status`: the control report that the authority receives in the next step, as its
+    composer encodes it. `chain` (of row `step`) and `crcs` (see `SNAPSHOTS`) are filled in by `seal_keyframe`.
     """
 
     step: int
@@ -139,7 +139,7 @@ SNAPSHOTS: Final = ("plant", "authority", "controller", "status")
 
 
 class RowProblem(msgspec.Struct, frozen=True):
-    """What is wrong with a row. `entry`: index of the changed entry, -1 when it is not an entry."""
+    """A change found in a row. `entry`: index of the changed entry, -1 if it is not an entry."""
 
     step: int
     field: str
@@ -148,38 +148,38 @@ class RowProblem(msgspec.Struct, frozen=True):
 
 
 def header_root(header: SessionHeader) -> bytes:
-    """The chain value before the first row: 16 bytes that bind the rows to this header."""
+    """Return the chain value before the first row: 16 bytes that bind the rows to this header."""
     return blob_root(_encoder.encode(header))
 
 
 def blob_root(blob: bytes) -> bytes:
-    """`header_root` of an encoded header, also of one with fewer fields than ours."""
+    """Return `header_root` of an encoded header, also of one with fewer fields than this version writes."""
     return hashlib.blake2b(blob, digest_size=HASH_BYTES).digest()
 
 
 def seal_blob(blob: bytes) -> bytes:
-    """`blob` behind its CRC-32 (4 bytes, little-endian)."""
+    """Return `blob` preceded by its CRC-32 (4 bytes, little-endian)."""
     return zlib.crc32(blob).to_bytes(4, "little") + blob
 
 
 def open_blob(sealed: bytes) -> tuple[bytes, bool]:
-    """The blob, and whether it is as `seal_blob` got it."""
+    """Return the blob of `seal_blob`, and whether its CRC-32 is correct."""
     blob = sealed[4:]
     return blob, zlib.crc32(blob).to_bytes(4, "little") == sealed[:4]
 
 
 def pack_model(mjb: bytes) -> bytes:
-    """Compresses a binary MuJoCo model for `SessionHeader.model`."""
+    """Compress a binary MuJoCo model for `SessionHeader.model`."""
     return zlib.compress(mjb, 6)
 
 
 def unpack_model(packed: bytes) -> bytes:
-    """Inverse of `pack_model`. Raises `zlib.error` for damaged bytes."""
+    """Decompress the result of `pack_model`. Raises `zlib.error` for damaged bytes."""
     return zlib.decompress(packed)
 
 
 def array_header(n: int) -> bytes:
-    """The MessagePack header of an array of `n` items."""
+    """Return the MessagePack header of an array of `n` items."""
     if n < 16:
         return bytes((0x90 | n,))
     return struct.pack(">BH", 0xDC, n) if n < 65536 else struct.pack(">BI", 0xDD, n)
@@ -194,7 +194,7 @@ def make_row(
     digest: bytes,
     plant: bytes = b"",
 ) -> JournalRow:
-    """The row of one step. `prev_chain`: `chain` of the previous row, `header_root(header)` for the first."""
+    """Return the row of one step. `prev_chain`: `chain` of the previous row, `header_root(header)` for the first."""
     if entries:
         encoded = [encode_entry(entry) for entry in entries]
         head = array_header(len(encoded))
@@ -210,7 +210,7 @@ def make_row(
 
 
 def check_row(prev_chain: bytes, row: JournalRow) -> RowProblem | None:
-    """None when `row` is what was written after the row with `prev_chain`; else the changed field or entry."""
+    """Return the changed field or entry of `row`; None if it is as written after the row with `prev_chain`."""
     if _rechain(prev_chain, row) == row.chain:
         return None
     problem = _field_problem(prev_chain, row) or _entry_problem(row)
@@ -221,22 +221,22 @@ def check_row(prev_chain: bytes, row: JournalRow) -> RowProblem | None:
 
 
 def compute_chain(prev_chain: bytes, row: JournalRow) -> bytes:
-    """The chain value that `row` ought to have; to go on checking after a row whose `chain` was changed."""
+    """Return the correct chain value of `row`, to continue checking after a row whose `chain` was changed."""
     return _rechain(prev_chain, row)
 
 
 def check_fields(row: JournalRow) -> RowProblem | None:
-    """`check_row` without the chain, for a row whose predecessor is lost."""
+    """Check a row like `check_row` but without the chain, if its predecessor is missing."""
     return _field_problem(None, row) or _entry_problem(row)
 
 
 def seal_keyframe(keyframe: Keyframe, chain: bytes) -> Keyframe:
-    """`keyframe` with the chain value of its row and its CRCs."""
+    """Return `keyframe` with the chain value of its row and its CRCs."""
     return msgspec.structs.replace(keyframe, chain=chain, crcs=_keyframe_crcs(keyframe, chain))
 
 
 def check_keyframe(keyframe: Keyframe) -> str:
-    """The name of the first field that differs from its CRC, empty when all are as written."""
+    """Return the name of the first field that differs from its CRC, empty if all are as written."""
     now = _keyframe_crcs(keyframe, keyframe.chain)
     if len(keyframe.crcs) != len(now):
         return "crcs"
@@ -261,7 +261,7 @@ def _chain(prev_chain: bytes, ints: bytes, blob: bytes, digest: bytes, plant: by
 
 
 def _packed(numbers: tuple[int, ...]) -> bytes:
-    """As int64. What damage has made larger fits no checksum either, so its form does not matter."""
+    """Pack numbers as int64. Larger ones, made by damage, fit no checksum either, so their encoding does not matter."""
     try:
         return struct.pack(f"<{len(numbers)}q", *numbers)
     except struct.error:
@@ -271,7 +271,7 @@ def _packed(numbers: tuple[int, ...]) -> bytes:
 def _field_crcs(
     ints: bytes, digest: bytes, plant: bytes, head: bytes, lengths: tuple[int, ...], crcs: tuple[int, ...]
 ) -> tuple[int, ...]:
-    """CRCs of `FIELDS`. `ints`: step, now_ns, n_ticks as three int64."""
+    """Return the CRCs of `FIELDS`. `ints`: step, now_ns, n_ticks as three int64."""
     crc = zlib.crc32
     index = head if not lengths else head + _packed((*lengths, *crcs))
     return (crc(ints[:8]), crc(ints[8:16]), crc(ints[16:]), crc(digest), crc(plant), crc(index))

@@ -1,7 +1,7 @@
-"""Who has a recording in use: authority and recorder share a lock on its first file, who continues it has it alone.
+"""Lock on the first file of a recording: shared by authority and recorder, exclusive for a process that continues it.
 
 The locks are those of the system (`flock`): they end with the process that holds them, however it ends. Readers take
-none. A file system without locks refuses nobody.
+none. On a file system without locks every process gets the lock.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from typing import Final
 
 from iris_session.recording.errors import RecorderError
 
-#: A recorder whose session was killed writes what it has and ends: it gets this long.
+#: Time in which a recorder whose session was killed can write its data and end.
 PATIENCE_S: Final = 15.0
 _BUSY: Final = (errno.EAGAIN, errno.EACCES)
 
 
 class RecordingInUseError(RecorderError):
-    """Another process writes this recording, or continues it."""
+    """Another process writes or continues this recording."""
 
 
 class RecordingLock:
-    """A lock on the file at `path`, until `release` or the end of the process. The file must exist.
+    """Lock on the file at `path`, until `release` or the end of the process. The file must exist.
 
-    Alone (`shared` false) it waits up to `patience_s` for others to be done. Raises `RecordingInUseError`, which says
-    who they are, and `RecorderError` when the file cannot be opened.
+    Waits up to `patience_s` [s] for other processes to release theirs. Raises `RecordingInUseError`, which names these
+    processes, and `RecorderError` if the file cannot be opened.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, shared: bool, patience_s: float = PATIENCE_S) -> None:
@@ -60,7 +60,7 @@ class RecordingLock:
             return True
 
     def release(self) -> None:
-        """Gives the lock back. May be called twice."""
+        """Release the lock. May be called twice."""
         fd, self._fd = self._fd, -1
         if fd >= 0:
             with suppress(OSError):
@@ -68,7 +68,7 @@ class RecordingLock:
 
 
 def _who(fd: int) -> str:
-    """Who has the lock that we did not get, as far as the system tells; Linux does, for processes of the same user."""
+    """Describe the holders of the lock as far as the system lists them: on Linux, processes of the same user."""
     holders = _holders(os.fstat(fd))
     alone = [pid for pid, kind in holders if kind == "WRITE"]
     if alone:
@@ -79,8 +79,10 @@ def _who(fd: int) -> str:
 
 
 def _holders(file: os.stat_result) -> list[tuple[int, str]]:
-    """Process and kind (`READ`, `WRITE`) of each lock on `file`. What `/proc/locks` calls its device is not always
-    that of `stat`, so a process counts when it has the file open."""
+    """Return process and kind (`READ`, `WRITE`) of each lock on `file`.
+
+    The device in `/proc/locks` is not always that of `stat`, so a process counts if it has the file open.
+    """
     try:
         with open("/proc/locks", encoding="ascii", errors="replace") as locks:
             lines = [line.split() for line in locks]

@@ -1,11 +1,11 @@
-"""What travels between the authority's feed and the recorder process. Pure.
+"""Messages between the authority's feed and the recorder process. Pure.
 
-Authority -> recorder: `HEADER` with the number of the batch that follows it, the header, and a batch that says which
-scene was loaded last, if one was, and where its assets lie; or `BATCH` with its own number, and the body. Recorder ->
-authority: `RecorderStatus`. The feed keeps every batch until a status says that it is in the file; a new recorder
-process asks for the header (`expecting` -1) and gets everything since.
+Authority -> recorder: `HEADER` with the number of the batch that follows it, the header, and a batch with the scene
+loaded last, if any, and the location of its assets; or `BATCH` with its own number, and the body. Recorder ->
+authority: `RecorderStatus`. The feed keeps every batch until a status confirms that it is in the file; a new recorder
+process requests the header (`expecting` -1) and receives everything that is not confirmed.
 
-Beside it, by a socket of their own that forgets what does not fit: `VertexFrame`, for the picture only.
+Vertices (`VertexFrame`, for the picture only) have a socket of their own, which drops frames when it is full.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from iris_session.protocol.common import Applied, Count, Denial, Name, Nanosecon
 from iris_session.protocol.server_messages import BodyInfo, Event, PresenceItem
 from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader
 
-#: Begins the line on standard error that says why the recorder ended; other lines are Rerun's.
+#: Prefix of the line on standard error with the reason why the recorder ended; other lines are Rerun's.
 FAULT_PREFIX: Final = "recorder: "
 
 
 class RecorderConfig(msgspec.Struct, frozen=True):
     """Configuration of the recorder process.
 
-    `path`: the recording; `part`: which of its files to begin with, none of them may exist. Endpoints: `ipc://` sockets
-    that it binds. `origin_ns`: session time zero on CLOCK_MONOTONIC. `parent`: process that it outlives only to finish.
-    Without `vertices_endpoint` nothing bends.
+    `path`: the recording; `part`: number of the file to write, which must not exist. Endpoints: `ipc://` sockets that
+    the recorder binds; without `vertices_endpoint` deformables are drawn at rest. `origin_ns`: session time zero on
+    CLOCK_MONOTONIC. `parent`: id of the parent process; the recorder ends after it, once the file is finished.
     """
 
     path: str
@@ -43,7 +43,7 @@ class RecorderConfig(msgspec.Struct, frozen=True):
 
 
 class EndMark(msgspec.Struct, frozen=True, array_like=True):
-    """The last thing in a file that was closed. `step`, `chain`: of its newest row."""
+    """Mark at the end of a closed file: `step` and `chain` of its newest row."""
 
     step: int
     chain: bytes
@@ -67,7 +67,7 @@ class StateFrame(msgspec.Struct, frozen=True, array_like=True):
 
 
 class DenialRecord(msgspec.Struct, frozen=True, array_like=True):
-    """A typed no that a participant got."""
+    """A denial that a participant received."""
 
     step: Count
     session_time: Nanoseconds
@@ -85,10 +85,10 @@ class MetricRecord(msgspec.Struct, frozen=True, array_like=True):
 
 
 class SceneModel(msgspec.Struct, frozen=True, array_like=True):
-    """The model of a scene that was loaded in a session; it comes before the row that loads it.
+    """Model of a scene that was loaded in a session; it is sent before the row that loads it.
 
-    `step`, `session_time`: of the newest row before that one. `model_hash`: as in `SceneLoaded`. `model`: `pack_model`
-    of its binary form (mjb). `bodies`: the streamed bodies from then on.
+    `step`, `session_time`: those of the newest row before that one. `model_hash`: as in `SceneLoaded`. `model`:
+    `pack_model` of its binary form (mjb). `bodies`: the streamed bodies from then on.
     """
 
     step: int
@@ -99,8 +99,10 @@ class SceneModel(msgspec.Struct, frozen=True, array_like=True):
 
 
 class SceneAssets(msgspec.Struct, frozen=True, array_like=True):
-    """What the picture is drawn from, since about `step`: the store `root` has the specification, which is its asset
-    `scene_hash`, and all others. Empty: nothing is shared, and the picture is made of the model.
+    """Assets of the picture, valid from about `step`.
+
+    `root`: folder of the asset store; `scene_hash`: asset that is the specification. If empty, no assets are shared
+    and the picture is made from the model.
     """
 
     step: int = -1
@@ -110,8 +112,10 @@ class SceneAssets(msgspec.Struct, frozen=True, array_like=True):
 
 
 class VertexFrame(msgspec.Struct, frozen=True, array_like=True):
-    """Vertices of one deformable as they were published with the state of `session_time`. `frame`: `full` of its media
-    stream, see docs/deformables.md."""
+    """Vertices of one deformable as published with the state of `session_time`.
+
+    `frame`: level `full` of its media stream, see docs/deformables.md.
+    """
 
     stream: Name
     session_time: Nanoseconds
@@ -119,8 +123,11 @@ class VertexFrame(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Batch(msgspec.Struct, array_like=True):
-    """Everything of about 20 ms. `dropped_rows`: rows lost before this batch since the feed began. `scenes` come before
-    everything else in it, then `assets`: of the newest of these scenes, or a patch of the present one."""
+    """Records of about 20 ms.
+
+    `dropped_rows`: rows dropped before this batch since the feed began. `scenes` precede all other records of the
+    batch, then `assets`: those of the newest of these scenes, or a patch of the present one.
+    """
 
     rows: list[JournalRow] = []
     states: list[StateFrame] = []
@@ -147,14 +154,15 @@ class _Essence(msgspec.Struct, array_like=True):
 
 
 class RecorderStatus(msgspec.Struct, frozen=True, array_like=True):
-    """Sent after every write, and at least every half second. `written`: newest batch that is in the file, -1 for none.
+    """Status of the recorder, sent after every write and at least every half second.
 
-    `expecting`: number of the next batch, -1 until a header came. `cpu_ns`: processor time of the recorder so far.
-    `lag_ns`: age of the newest row when it was written. `samples_refused`: messages of the front that are none, and
-    batches of which only the journal could be read. `vertices_refused`: frames of vertices that are not in the picture,
-    because too many waited, they do not decode, or are of another scene.
-    `fault`: one line when the file can no longer be written; the process then ends. `disk_free`: bytes that its disk
-    has left, at least 1, 0 when that is not known.
+    `instance`: differs for every recorder process. `expecting`: number of the next batch, -1 until a header arrived.
+    `written`: newest batch that is in the file, -1 for none. `bytes`: size of the file. `cpu_ns`: processor time of the
+    recorder so far. `lag_ns`: age of the newest row when it was written. `samples`: number of raw messages received.
+    `samples_refused`: number of invalid messages of the front, and of batches of which only the journal could be read.
+    `vertices_refused`: number of vertex frames that are not in the picture, because the queue was full, they do not
+    decode, or are of another scene. `fault`: one line if the file can no longer be written; the process then ends.
+    `disk_free`: free bytes on its disk, at least 1; 0 if unknown.
     """
 
     instance: int
@@ -184,6 +192,6 @@ decode_status = make_decoder(RecorderStatus)
 
 
 def decode_journal(data: bytes) -> Batch:
-    """What verification needs of a batch that `decode_batch` cannot read as a whole. Raises `msgspec.DecodeError`."""
+    """Decode the part of a batch that verification needs, if `decode_batch` fails. Raises `msgspec.DecodeError`."""
     essence = _decode_essence(data)
     return Batch(rows=essence.rows, keyframes=essence.keyframes, scenes=essence.scenes)

@@ -1,8 +1,8 @@
-"""Reads back what headsets saw of anchors, where their heads were, and which alignments were in force meanwhile.
+"""Read back the observations of anchors, the head poses, and the alignments in force from a recording.
 
-Observations and samples lie in the recording as they came, by connection. Whose connection that was is told by the
-joins in the journal and the events of the same step; when a tracking frame jumped, by the alarms likewise. A step is
-known by its session time, which strictly grows: rows of the journal and events number steps differently.
+Observations and samples are recorded as received, by connection. The participant of a connection follows from the joins
+in the journal and the events of the same step; the time of a jump of a tracking frame follows from the alarms likewise.
+A step is identified by its session time, which strictly grows: rows of the journal and events number steps differently.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from iris_session.protocol.server_messages import (
 )
 from iris_session.recording.reader import Recording
 
-#: A head pose further from an observation in time says nothing about it.
+#: Maximum time between an observation and the head pose assigned to it.
 NEAR_NS: Final = 50_000_000
-#: Capability by which a client says that its tracking frame is the one from before.
+#: Prefix of the capability by which a client states that it continues an earlier tracking frame.
 RUN_PREFIX: Final = "run:"
-#: Items between two calls of `told`.
+#: Items between two calls of `on_progress`.
 TOLD_EVERY: Final = 20_000
 _KINDS: Final = (
     ParticipantJoined,
@@ -50,8 +50,10 @@ _decode = msgspec.msgpack.Decoder(Sample | Observation).decode
 
 
 class TrackingFrame(NamedTuple):
-    """One tracking frame: of a participant, in one run of its app (counted from 1), in one tracking epoch. `jumps`: how
-    often in this run an alarm said that the frame had moved, which a client that did not notice tells by no epoch."""
+    """Key of one tracking frame: participant, run of its app (counted from 1), and tracking epoch.
+
+    `jumps`: number of jump alarms in this run before it: a client that did not notice the jump keeps its epoch.
+    """
 
     participant: str
     run: int
@@ -60,14 +62,14 @@ class TrackingFrame(NamedTuple):
 
 
 class RecordedObservation(NamedTuple):
-    """One observation, and where the head was then, in the same tracking frame; None where no sample is near."""
+    """One observation and the position of the head at that time [m], same tracking frame; None if no sample is near."""
 
     observation: Observation
     p_tracking_head: Vec3 | None
 
 
 class AlignmentPeriod(NamedTuple):
-    """An alignment and from when to when it held, session time; `until_ns` -1: to the end."""
+    """An alignment and the session time in which it was in force [ns]; `until_ns` -1: until the end."""
 
     frame: TrackingFrame
     alignment: Alignment
@@ -76,7 +78,7 @@ class AlignmentPeriod(NamedTuple):
 
 
 class AnchorMove(NamedTuple):
-    """A director moved an anchor."""
+    """A change of the pose of an anchor by a director."""
 
     session_time: int
     anchor_id: str
@@ -85,7 +87,7 @@ class AnchorMove(NamedTuple):
 
 @dataclass
 class RecordedParticipant:
-    """`aligned`: has a headset that is to be aligned. `runs`: what its clients called the runs of their tracking."""
+    """A participant. `aligned`: it has a headset that needs an alignment. `runs`: names of its clients' runs."""
 
     id: str
     name: str
@@ -96,8 +98,12 @@ class RecordedParticipant:
 
 @dataclass
 class AlignmentHistory:
-    """`people`: everybody who joined, by id. `looks`: by tracking frame, in order of capture. `unreadable`: messages
-    that do not decode; `unowned`: observations over connections whose join is not in this recording."""
+    """Observations and alignments of a recording.
+
+    `participants`: all that joined, by id. `observations`: by tracking frame, in order of capture. `unreadable`:
+    number of messages that do not decode; `unowned`: number of observations over connections whose join is not in this
+    recording.
+    """
 
     participants: dict[str, RecordedParticipant] = field(default_factory=dict)
     observations: dict[TrackingFrame, list[RecordedObservation]] = field(default_factory=dict)
@@ -109,8 +115,11 @@ class AlignmentHistory:
 
 @dataclass
 class _Roster:
-    """`owners`: participant and run, by connection. `jumps`: times of capture of jumps, sorted, by participant and run.
-    `present`: alignments in force, by participant."""
+    """State while events are replayed.
+
+    `owners`: participant and run, by connection. `jumps`: capture times of jumps, sorted, by participant and run.
+    `present`: alignments in force, by participant.
+    """
 
     owners: dict[int, tuple[str, int]] = field(default_factory=dict)
     jumps: dict[tuple[str, int], list[int]] = field(default_factory=dict)
@@ -119,14 +128,14 @@ class _Roster:
 
 @dataclass
 class _Said:
-    """What the journal says of one step that no event has answered yet, with connections."""
+    """Joins and jump alarms in the journal of one step, with connections, that no event has been matched to yet."""
 
     joins: list[tuple[int, Join]] = field(default_factory=list)
     jumps: list[tuple[int, AlignmentAlarm]] = field(default_factory=list)
 
 
 class _Heads:
-    """Where one head was, over time."""
+    """Positions of one head over time."""
 
     def __init__(self) -> None:
         self._times, self._places = array("q"), array("d")
@@ -137,14 +146,14 @@ class _Heads:
         self._places.extend(p)
 
     def sort(self) -> None:
-        """By time: clocks are slewed, and messages overtake each other."""
+        """Sort by time: clocks are slewed, and messages overtake each other."""
         order = sorted(range(len(self._times)), key=self._times.__getitem__)
         places = self._places
         self._times = array("q", [self._times[i] for i in order])
         self._places = array("d", [c for i in order for c in places[3 * i : 3 * i + 3]])
 
     def at(self, capture_ns: int) -> Vec3 | None:
-        """The place nearest in time."""
+        """Return the position nearest in time; None if it is further than `NEAR_NS`."""
         i = bisect_left(self._times, capture_ns)
         near = min(
             (k for k in (i - 1, i) if 0 <= k < len(self._times)),
@@ -160,7 +169,18 @@ class _Heads:
 def read_alignment_history(
     recording: Recording, on_progress: Callable[[int, int], None] | None = None
 ) -> AlignmentHistory:
-    """Everything that `Looks` has. `told(done, total)` hears how far it is."""
+    """Read the observations of anchors and the alignments in force from a recording.
+
+    Args:
+        recording: An open recording.
+        on_progress: Called as `on_progress(done, total)` with counts of rows and raw messages.
+
+    Returns:
+        Participants, observations by tracking frame, periods of alignments and moves of anchors.
+
+    Raises:
+        NotARecordingError: A file can no longer be read.
+    """
     n_rows, n_samples = recording.count_rows(), recording.count_samples()
     say = on_progress or (lambda done, total: None)
     events = [event for event in recording.events() if isinstance(event.body, _KINDS)]
@@ -172,7 +192,7 @@ def read_alignment_history(
 
 
 def _roster(recording: Recording, events: list[Event], found: AlignmentHistory, say: Callable[[int], None]) -> _Roster:
-    """Fills in people, alignments and moved anchors."""
+    """Replay the events: add participants, alignments and anchor moves to `found`; return owners of connections."""
     wanted = {e.session_time for e in events if isinstance(e.body, ParticipantJoined) or _is_jump(e.body)}
     said: dict[int, _Said] = {}
     for done, row in enumerate(recording.rows()):
@@ -200,13 +220,13 @@ def _said(entries: bytes) -> _Said:
                 said.joins.append((entry.connection, entry.message))
             elif isinstance(entry.message, AlignmentAlarm) and _is_jump(entry.message):
                 said.jumps.append((entry.connection, entry.message))
-    except msgspec.DecodeError:  # damaged: those who came in this step stay unknown
+    except msgspec.DecodeError:  # damaged: participants that joined in this step stay unknown
         return _Said()
     return said
 
 
 def _take(event: Event, said: _Said, roster: _Roster, found: AlignmentHistory) -> None:
-    """One event of the history. `said`: by the journal, in its step."""
+    """Apply one event of the history. `said`: joins and alarms in the journal row of its step."""
     body, now_ns, present = event.body, event.session_time, roster.present
     if isinstance(body, AnchorMoved):
         found.anchor_moves.append(AnchorMove(now_ns, body.anchor_id, body.T_world_anchor))
@@ -241,8 +261,10 @@ def _own(
     joins: list[tuple[int, Join]],
     owners: dict[int, tuple[str, int]],
 ) -> None:
-    """The join that this person came with, by its name and role (`info`), as who resumes may have another name. Those
-    of one step are answered in their order, but for refused ones."""
+    """Match a joined participant to its join by the name and role in `info`: one that resumes may have a new name.
+
+    Joins of one step are answered in their order, except refused ones.
+    """
     for i, (connection, join) in enumerate(joins):
         if (join.name, join.role) == (info.name, info.role):
             run = next((c for c in join.capabilities if c.startswith(RUN_PREFIX)), f"connection {connection}")
@@ -255,7 +277,7 @@ def _own(
 
 
 def _jump(participant: str, run: int, now_ns: int, alarms: list[tuple[int, AlignmentAlarm]], roster: _Roster) -> None:
-    """Notes when it was captured, as the alarm in the journal says: the event is later by what messages take."""
+    """Note the capture time of a jump as in the journal's alarm: the event is later by the latency of messages."""
     at_ns = now_ns
     for i, (connection, alarm) in enumerate(alarms):
         if roster.owners.get(connection, ("", 0))[0] == participant:
@@ -272,7 +294,7 @@ def _end(participant: str, now_ns: int, present: dict[str, AlignmentPeriod], fou
 
 
 def _messages(recording: Recording, roster: _Roster, found: AlignmentHistory, say: Callable[[int], None]) -> None:
-    """Fills in the looks: observations with the head pose nearest in time."""
+    """Add the observations to `found`, each with the head position nearest in time."""
     heads: dict[TrackingFrame, _Heads] = {}
     seen: dict[TrackingFrame, list[Observation]] = {}
     for done, raw in enumerate(recording.samples()):

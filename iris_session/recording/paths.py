@@ -1,4 +1,4 @@
-"""Names of entities, timelines and columns in the file: what the writer and the reader agree on."""
+"""Names of entities and timelines in the file, and of the files of a recording, shared by writer and reader."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ SESSION_TIME: Final = "session_time"
 
 
 def split_part(path: str) -> tuple[str, int]:
-    """Inverse of `part_path`: path of the first file, and the number of this one."""
+    """Split a path made by `part_path` into the path of the first file and the number of the part."""
     found = _PART.fullmatch(path)
     return (found["stem"] + (found["suffix"] or ""), int(found["part"])) if found else (path, 1)
 
 
 def part_path(path: str, part: int) -> str:
-    """File of part `part` (1, 2, ...) of the recording `path`: `session.rrd`, `session.part2.rrd`."""
+    """Return the file of part `part` (1, 2, ...) of the recording `path`: `session.rrd`, `session.part2.rrd`."""
     if part == 1:
         return path
     stem, dot, suffix = path.rpartition(".")
@@ -47,13 +47,13 @@ def part_path(path: str, part: int) -> str:
 
 
 def split_resume(path: str) -> tuple[str, int]:
-    """Inverse of `resume_path`, of the first file of a recording: that of the session's beginning, and its number."""
+    """Split a path made by `resume_path` into the first file of the session and the number of the recording."""
     found = _RESUME.fullmatch(path)
     return (found["stem"] + (found["suffix"] or ""), int(found["number"])) if found else (path, 1)
 
 
 def resume_path(path: str, number: int) -> str:
-    """First file of the `number`-th recording of a session that began with `path`: `session.resume2.rrd`."""
+    """Return the first file of the `number`-th recording of a session that began with `path`: `session.resume2.rrd`."""
     if number == 1:
         return path
     stem, dot, suffix = path.rpartition(".")

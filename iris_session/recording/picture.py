@@ -1,7 +1,7 @@
-"""The picture of the scene in a recording: geometry in named frames, from the moment on from which it is so.
+"""Picture of the scene in a recording: geometry in named frames, each valid from a moment on.
 
-Nothing of it is static, because Rerun shows static things at all times: scenes follow one another, patches change how
-things look, and what bends moves. A scene is drawn at its first state, below `/scene/<number>`.
+None of it is logged as static, because Rerun shows static data at all times: scenes replace one another, patches change
+the look of visuals, and deformables move. A scene is drawn at its first state, below `/scene/<number>`.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from iris_session.scene import SceneBuildError
 
 #: Step, tick, simulated time [ns], session time [ns].
 Moment = tuple[int, int, int, int]
-#: Names of things that cannot be drawn, in the line that says so.
+#: Maximum number of entities named in an error line about entities that cannot be drawn.
 NAMED: Final = 5
-#: What keeps a scene or a part of it from being drawn. The journal is worth more than its picture: it goes on.
+#: Errors that keep a scene or a part of it from being drawn. Recording continues: the journal matters more.
 _NOT_DRAWN: Final = (ValueError, LookupError, TypeError, OSError, zlib.error, SceneBuildError)
 
 
 class SceneSource(NamedTuple):
-    """What a scene is drawn from. `packed_model`: for where nothing is shared."""
+    """Source of the picture of a scene. `packed_model`: used if no assets are shared."""
 
     packed_model: bytes
     bodies: Sequence[BodyInfo]
@@ -42,7 +42,7 @@ class SceneSource(NamedTuple):
 
 
 class _Drawn(NamedTuple):
-    """A visual as it is in the picture now; `shown`: to be seen."""
+    """A visual as it is in the picture now; `shown`: it is visible."""
 
     visual: Visual
     entity: str
@@ -52,8 +52,11 @@ class _Drawn(NamedTuple):
 
 
 class ScenePicture:
-    """Geometry of the scenes of one file. `bending`: what has vertices of its own, by stream. `since_ns`: session time
-    from which on the present scene is drawn."""
+    """Geometry of the scenes of one file.
+
+    `deformables`: deformables of the present scene, by stream. `since_ns`: session time [ns] from which the present
+    scene is drawn.
+    """
 
     def __init__(self, recording: rr.RecordingStream) -> None:
         self._rec = recording
@@ -68,11 +71,11 @@ class ScenePicture:
         self.since_ns = 0
 
     def set_scene(self, source: SceneSource) -> None:
-        """The scene that the session began with. It is drawn by `draw`."""
+        """Set the scene to be drawn by the next `draw`."""
         self._source, self._waits = source, True
 
     def replace_scene(self, source: SceneSource, moment: Moment) -> None:
-        """Another scene from `moment` on."""
+        """Replace the scene from `moment` on."""
         begun = not self._waits and self._source is not None
         self.set_scene(source)
         if begun:
@@ -81,7 +84,7 @@ class ScenePicture:
             self.draw(moment)
 
     def patch_scene(self, assets: SceneAssets, moment: Moment) -> None:
-        """The present scene looks like this from `moment` on."""
+        """Update the present scene to the specification in `assets` from `moment` on."""
         if self._source is None:
             return
         self._source = self._source._replace(assets=assets)
@@ -91,7 +94,7 @@ class ScenePicture:
             self._rec.reset_time()
 
     def draw(self, moment: Moment) -> None:
-        """Draws what `begin` was given, once, as it is from `moment` on."""
+        """Draw the scene given to `set_scene`, once, from `moment` on."""
         if not self._waits:
             return
         self._waits = False
@@ -109,7 +112,7 @@ class ScenePicture:
         return f"{paths.SCENE}/{self._number}"
 
     def _with_scene(self, work: Any) -> None:
-        """`work(spec, reader)` on the present scene; what is wrong is said where the viewer shows it."""
+        """Call `work(spec, reader)` on the present scene; log errors where the viewer shows them."""
         assert self._source is not None
         self._failed = []
         try:
@@ -148,7 +151,7 @@ class ScenePicture:
                 self._rec.log(entity, *bending.build_components(), strict=True)
 
     def _update(self, spec: SceneSpec, reader: SceneReader) -> None:
-        """What differs from what is drawn. Deformables do not: patches concern visuals."""
+        """Draw the visuals that differ from the picture. Deformables do not: patches concern visuals."""
         for gone in sorted(self._visuals.keys() - {visual.id for visual in spec.visuals}):
             self._clear(gone)
         for visual in spec.visuals:
@@ -174,7 +177,7 @@ class ScenePicture:
         )
 
     def _redraw(self, reader: SceneReader, old: _Drawn, visual: Visual) -> None:
-        """Says what has changed, and not the mesh again."""
+        """Log the changes of a visual, without its mesh unless that changed."""
         was = old.visual
         alike = msgspec.structs.replace(was, rgba=visual.rgba, group=visual.group, T_body_visual=visual.T_body_visual)
         if alike != visual:
@@ -197,14 +200,14 @@ class ScenePicture:
         self._rec.log(self._visuals.pop(visual).entity, rr.Clear(recursive=False), strict=True)
 
     def _entity(self, body: str, name: str) -> str:
-        """Where something is drawn: nothing else is."""
+        """Return a unique entity path for an element of the scene."""
         entity = f"{self._folder}/{escape_entity_part(body)}/{escape_entity_part(name)}"
         self._names[entity] += 1
         return entity if self._names[entity] == 1 else self._entity(body, f"{name} ({self._names[entity]})")
 
 
 def build_components(form: VisualShape, rgba: scene.Rgba8, frame: str, T_frame_visual: PoseTuple) -> list[Any]:
-    """Rerun components of one visual: its frame, its pose in that frame, and its form."""
+    """Return the Rerun components of one visual: its frame, its pose in that frame, and its shape."""
     drawn: Any
     solid = rr.components.FillMode.Solid
     radius, _, half = form.size
@@ -231,10 +234,10 @@ def build_components(form: VisualShape, rgba: scene.Rgba8, frame: str, T_frame_v
 
 
 def build_pose(kind: str, half: float, T_frame_visual: PoseTuple, *, shown: bool = True) -> Any:
-    """Where a visual is drawn in its frame. Hidden, it has no extent: so its mesh need not be written again."""
+    """Return the pose of a visual in its frame. A hidden one has scale 0, so its mesh need not be written again."""
     p, (w, x, y, z) = T_frame_visual
     if kind == scene.CAPSULE:
-        # Rerun's capsule begins at the origin and ours is centred there: back by half a length along its axis.
+        # Rerun's capsule begins at the origin and ours is centred there: shift it by half a length along its axis.
         axis = (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y))
         p = (p[0] - half * axis[0], p[1] - half * axis[1], p[2] - half * axis[2])
     scales = None if shown else [(0.0, 0.0, 0.0)]
@@ -242,7 +245,7 @@ def build_pose(kind: str, half: float, T_frame_visual: PoseTuple, *, shown: bool
 
 
 def build_colour(kind: str, rgba: scene.Rgba8) -> Any:
-    """The colour alone."""
+    """Return the component of the colour alone."""
     if kind == scene.MESH:
         return rr.Mesh3D.from_fields(albedo_factor=rgba)
     primitives: dict[str, Any] = {
@@ -255,5 +258,5 @@ def build_colour(kind: str, rgba: scene.Rgba8) -> Any:
 
 
 def escape_entity_part(name: str) -> str:
-    """`name` as one part of an entity path (names may hold slashes and spaces)."""
+    """Escape `name` as one part of an entity path (names may hold slashes and spaces)."""
     return str(rr.escape_entity_path_part(name))

@@ -1,8 +1,8 @@
-"""`python -m iris_session.recording.probe`: says for each question on standard input what Rerun can read of a file.
+"""Child process that tests what Rerun can read of a file: `python -m iris_session.recording.probe`.
 
-In a process of its own because Rerun's decoder may abort on damaged bytes. `Prober` is the other side. A question is
-a line of JSON, since names of files may hold anything: what is asked, and the path. To import Rerun takes longer than
-to read most files: a process that has answered well stays for the next `Prober`, for seconds.
+It is a process of its own because Rerun's decoder may abort on damaged bytes. `Prober` is the parent's side. A question
+is a line of JSON on standard input (file names may hold any character): the kind of question and the path. Importing
+Rerun takes longer than reading most files, so a child that has answered stays for the next `Prober`, for `IDLE_S`.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from iris_session.system.process import DEVNULL, PIPE, ChildProcess
 
 READABLE: Final = "readable"
 RECORDINGS: Final = "recordings"
-#: A child that nobody asks anything for so long ends.
+#: A child without a question for this long ends.
 IDLE_S: Final = 5.0
 
 
 class _Child:
-    """The process that is asked."""
+    """The child process that answers questions."""
 
     def __init__(self) -> None:
         self._process = ChildProcess("iris_session.recording.probe", stdout=PIPE, stderr=DEVNULL)
 
     def ask(self, what: str, path: str | Path) -> str:
-        """Its answer; empty when it has died, over this question or before."""
+        """Return the answer; empty if the child has died, from this question or before."""
         with suppress(BrokenPipeError, EOFError):
             self._process.write(json.dumps([what, str(Path(path).absolute())]).encode() + b"\n")
             return self._process.read_line().decode().strip()
@@ -45,7 +45,7 @@ class _Child:
 
 
 class _Spare:
-    """At most one child that waits for the next `Prober` of this process."""
+    """Holder of at most one idle child for the next `Prober` of this process."""
 
     def __init__(self) -> None:
         self._lock = Lock()
@@ -68,7 +68,7 @@ class _Spare:
             child.end()
 
     def forget(self) -> None:
-        """In a fork of this process: a child answers only the process that started it."""
+        """Discard the child in a fork of this process: a child answers only the process that started it."""
         self._lock, self._child = Lock(), None
 
 
@@ -78,17 +78,17 @@ os.register_at_fork(after_in_child=_spare.forget)
 
 
 class Prober:
-    """Asks a child process about files; a child that dies over one means that the file is not readable."""
+    """Ask a child process about files; if the child dies from a file, the file is not readable."""
 
     def __init__(self) -> None:
         self._child: _Child | None = None
 
     def is_readable(self, path: str | Path) -> bool:
-        """True when every message of the first recording in `path` decodes."""
+        """Return whether every message of the first recording in `path` decodes."""
         return self._asked(READABLE, path) > 0
 
     def count_recordings(self, path: str | Path) -> int:
-        """How many recordings are in `path`, 0 when that cannot be told. Quick only for a file with an index."""
+        """Return the number of recordings in `path`, 0 if unknown. Quick only for a file with an index."""
         return self._asked(RECORDINGS, path)
 
     def _asked(self, what: str, path: str | Path) -> int:
@@ -98,7 +98,7 @@ class Prober:
             if answer:
                 self._child = earlier
                 return int(answer)
-            earlier.end()  # over this file, or before, as nobody asked for a while: a fresh one tells
+            earlier.end()  # died from this file, or ended before as idle: a new child decides
         child = _Child()
         answer = child.ask(what, path)
         if answer:
@@ -116,7 +116,7 @@ class Prober:
         child, self._child = self._child, None
         if child is not None and error is None:
             _spare.give(child)
-        elif child is not None:  # it may still be at an answer that nobody has read
+        elif child is not None:  # it may still be writing an unread answer
             child.end()
 
 
@@ -130,13 +130,13 @@ def _answer(what: str, path: str) -> int:
                 return len(RrdReader(path).recordings())
             for _ in RrdReader(path).stream():
                 pass
-    except BaseException:  # Rerun's panics are no `Exception`; this process has nothing else to do
+    except BaseException:  # Rerun's panics are not an `Exception`; this process has no other task
         return 0
     return 1
 
 
 def main() -> None:
-    """Answers with a number, a line per question, until the input ends or nobody asks any more."""
+    """Answer each question with a number on a line, until the input ends or is idle for `IDLE_S`."""
     asked = select.poll()
     asked.register(sys.stdin, select.POLLIN)
     while asked.poll(IDLE_S * 1e3) and (line := sys.stdin.readline()):

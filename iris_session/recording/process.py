@@ -1,9 +1,9 @@
 """The recorder process: `python -m iris_session.recording.process`, configuration as MessagePack on standard input.
 
-Takes batches from the authority and raw samples from the front, and writes them into one Rerun file about seven times
-a second, so that a killed process of any kind costs at most 0.25 s. Vertices come last: what there is no time for is
-left out. Says `ready` or `failed: <one line>` on standard
-output. Ends by SIGTERM, or when its parent is gone, after writing everything that was received; SIGINT is the parent's.
+Receives batches from the authority and raw samples from the front, and writes them into one Rerun file about seven
+times a second, so that killing any process loses at most 0.25 s. Vertices come last: they are dropped when time is
+short. Prints `ready` or `failed: <one line>` on standard output. Ends on SIGTERM, or when its parent process has ended,
+after writing everything that was received; SIGINT is left to the parent.
 """
 
 from __future__ import annotations
@@ -42,30 +42,30 @@ from iris_session.recording.paths import part_path
 from iris_session.recording.writer import RrdWriter
 from iris_session.system.log import configure_logging
 
-#: Sockets are drained at this period instead of at every message: one wake-up for some twenty messages.
+#: Period at which sockets are drained, instead of at every message: one wake-up for some twenty messages.
 DRAIN_S: Final = 0.03
 FLUSH_S: Final = 0.14
 SYNC_S: Final = 1.0
 STATUS_S: Final = 0.5
-#: Messages taken per drain, so that a flood cannot keep the file from being written.
+#: Maximum number of messages per drain, so that a flood cannot keep the file from being written.
 DRAIN_MESSAGES: Final = 4096
-#: Frames of vertices taken per drain.
+#: Maximum number of vertex frames per drain.
 DRAIN_VERTICES: Final = 32
-#: After SIGTERM or the parent's end: quiet for this long means that everything was received.
+#: After SIGTERM or the end of the parent: without a message for this long, everything was received.
 QUIET_S: Final = 0.1
 FINISH_S: Final = 10.0
-#: An orphan whose file did not grow for so long has no disk to finish on: a write to one that hangs has no end.
+#: An orphaned recorder whose file does not grow for this long exits: a write to a hung disk never returns.
 ORPHAN_S: Final = 20.0
 ORPHANED: Final = 4
 MIN_FREE_BYTES: Final = 16 << 20
-#: A file begins with some 22 KB, mostly the blueprint.
+#: Bytes written to test a new file. A file begins with about 22 KB, mostly the blueprint.
 TRIAL_BYTES: Final = 128 << 10
 
 _decode_sample = msgspec.msgpack.Decoder(tuple[int, int, bytes]).decode
 
 
 class RecorderLoop:
-    """The loop of the process. `stop` may be called from a signal handler."""
+    """Main loop of the recorder process. `stop` may be called from a signal handler."""
 
     def __init__(self, config: RecorderConfig) -> None:
         self._config = config
@@ -75,14 +75,14 @@ class RecorderLoop:
         vertices = config.vertices_endpoint
         self._vertices = self._bind(zmq.PULL, vertices, DRAIN_VERTICES) if vertices else None
         self._begin_part()
-        if os.path.exists(config.path):  # somebody may have moved the first file away
+        if os.path.exists(config.path):  # the first file may have been moved away
             try:
                 self._lock = RecordingLock(config.path, shared=True, patience_s=0.0)
             except RecorderError:
-                self._remove()  # of a recording that somebody else continues, no part without content
+                self._remove()  # another process continues this recording: leave no empty part behind
                 raise
         self._header: SessionHeader | None = None
-        self._instance = time.monotonic_ns()  # differs from that of every recorder before it
+        self._instance = time.monotonic_ns()  # differs from that of every earlier recorder
         self._expecting = -1
         self._received = -1
         self._newest_ns = 0  # session time of the newest row received
@@ -93,7 +93,7 @@ class RecorderLoop:
         self._stopping = False
 
     def run(self) -> int:
-        """Records until told to stop. Returns the exit status of the process."""
+        """Record until stopped. Return the exit status of the process."""
         threading.Thread(target=self._give_up_as_orphan, name="orphan", daemon=True).start()
         try:
             self._say(-1)
@@ -111,12 +111,12 @@ class RecorderLoop:
         finally:
             self._syncer.stop()
             self._context.destroy(linger=500)
-            if os.getppid() != self._config.parent:  # killed: nobody else removes the folder of the sockets
+            if os.getppid() != self._config.parent:  # the parent was killed: it cannot remove the folder
                 shutil.rmtree(Path(self._config.feed_endpoint.removeprefix("ipc://")).parent, ignore_errors=True)
         return 0
 
     def _give_up_as_orphan(self) -> None:
-        """Thread: ends the process when its parent is gone and it cannot write on."""
+        """Exit the process when its parent has ended and the file cannot be written (runs in a thread)."""
         size, since = -1, time.monotonic()
         while True:
             time.sleep(SYNC_S)
@@ -130,7 +130,7 @@ class RecorderLoop:
                 os._exit(ORPHANED)
 
     def _remove(self) -> None:
-        """Of a session that never began (its port was in use) nothing stays behind: not the file, nor its folder."""
+        """Remove file and folder of a session that never began (its port was in use)."""
         path = Path(part_path(self._config.path, self._config.part))
         path.unlink(missing_ok=True)
         if self._made_folder:
@@ -138,7 +138,7 @@ class RecorderLoop:
                 path.parent.rmdir()
 
     def stop(self) -> None:
-        """Asks the loop to finish the file."""
+        """Ask the loop to finish the file."""
         self._stopping = True
 
     def _begin_part(self) -> None:
@@ -149,7 +149,7 @@ class RecorderLoop:
             self._writer.flush()
             self._syncer = _Syncer(path)
         except WriteError:
-            self._remove()  # the next attempt takes the same number
+            self._remove()  # the next attempt uses the same number
             raise
         except (OSError, RuntimeError, ValueError) as error:
             self._remove()
@@ -203,7 +203,7 @@ class RecorderLoop:
                 break
             m += 1
             self._take_sample(data)
-        if max(n, m) < DRAIN_MESSAGES:  # else behind with what matters: vertices wait, and are dropped at their source
+        if max(n, m) < DRAIN_MESSAGES:  # else behind with more important data: vertices are dropped at their source
             self._drain_vertices()
         return n + m
 
@@ -219,7 +219,7 @@ class RecorderLoop:
                 self._refused += 1
 
     def _take(self, frames: list[bytes]) -> None:
-        """Batches are taken in order only: what a new process gets before its header comes again after it."""
+        """Process a header or a batch. Batches count in order only; those before the header are sent again after it."""
         if len(frames) not in (2, 3) or len(frames[0]) != FRAME.size:
             self._refused += 1
             return
@@ -240,7 +240,7 @@ class RecorderLoop:
             self._expecting = number + 1
 
     def _decode(self, body: bytes) -> Batch:
-        """A recorder that ended at a batch it cannot read would be followed by others that get the same one."""
+        """Decode a batch, or only its journal if the rest is invalid: a restarted recorder would get the same batch."""
         try:
             return decode_batch(body)
         except msgspec.ValidationError:
@@ -275,9 +275,9 @@ class RecorderLoop:
 
 
 class _Syncer:
-    """Makes the file durable once a second from its own thread: a slow disk delays no write. Rerun never syncs.
+    """Thread that syncs the file to disk once a second, so that a slow disk delays no write. Rerun never syncs.
 
-    It also sees that the file is still there: what is written into one that was removed is lost without an error.
+    It also checks that the file still exists: data written into a removed file is lost without an error.
     """
 
     def __init__(self, path: str) -> None:
@@ -289,7 +289,7 @@ class _Syncer:
         self._thread.start()
 
     def check(self) -> None:
-        """Raises `WriteError` when the disk reported an error, or the file is gone."""
+        """Check the last sync. Raises `WriteError` if the disk reported an error or the file was removed."""
         if self._fault:
             raise WriteError(self._fault)
 
@@ -313,9 +313,9 @@ class _Syncer:
 
 
 def claim_file(path: Path) -> bool:
-    """Creates the folder and the empty file. True: there was no such folder.
+    """Create the folder and the empty file. Return whether the folder was created.
 
-    Raises `RecorderError`: no right, no space, or a file that exists.
+    Raises `RecorderError`: permission denied, no space, or the file exists.
     """
     if path.exists():
         raise RecorderError(f"{path} exists, and recordings are never overwritten: choose another file")
@@ -333,7 +333,7 @@ def claim_file(path: Path) -> bool:
 
 
 def _try_to_write(path: Path) -> None:
-    """Creates the empty file, after writing more than its beginning: said before the session begins."""
+    """Create the empty file after a trial write of `TRIAL_BYTES`, so that errors appear before the session begins."""
     fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
     try:
         left = bytes(TRIAL_BYTES)
@@ -348,7 +348,7 @@ def _try_to_write(path: Path) -> None:
 
 
 def get_free_bytes(path: Path) -> int:
-    """Bytes that we may still write on the disk of `path`, at least 1; 0 when the system does not tell."""
+    """Return the free bytes on the disk of `path`, at least 1; 0 if unknown."""
     try:
         free = os.statvfs(path)
     except OSError:
@@ -357,7 +357,7 @@ def get_free_bytes(path: Path) -> int:
 
 
 def main() -> int:
-    """Entry of the process."""
+    """Run the recorder process."""
     configure_logging()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     config = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=RecorderConfig)

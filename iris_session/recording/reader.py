@@ -1,7 +1,7 @@
-"""Reads a recording back exactly: header, journal, keyframes, states, events, raw samples; damaged files too.
+"""Read a recording back exactly: header, journal, keyframes, states, events, raw samples; also from damaged files.
 
-A recording is `session.rrd` and, when its recorder was started anew, `session.part2.rrd` and so on. `Recording.open`
-takes all of them; steps that two parts hold count once. Copies that Rerun's tools have made read like the original.
+A recording is `session.rrd` and, if its recorder was restarted, `session.part2.rrd` and so on. `Recording.open` reads
+all of them; steps that two parts hold count once. Copies made by Rerun's tools read like the original.
 """
 
 from __future__ import annotations
@@ -46,20 +46,29 @@ from iris_session.recording.record_batches import (
 )
 
 _T = TypeVar("_T")
-#: Lines of `damage` at most: a file may be damaged in any number of places.
+#: Maximum number of lines in `damage`: a file may be damaged in any number of places.
 MOST_DAMAGE: Final = 200
 MORE_DAMAGE: Final = "and more of it is damaged than is listed here"
-#: A new part repeats at most what the feed's window held: minutes of rows.
+#: Upper bound of the items that a new part repeats: the content of the feed's window, minutes of rows.
 REPEATED_ITEMS: Final = 200_000
 
 
 class Recording:
-    """An open recording. Use as a context manager, or `close` it: damaged parts have temporary copies.
+    """A recording open for reading, all parts in order. Make it with `Recording.open`.
 
-    `damage`: one line per thing that could not be read, `MOST_DAMAGE` at most. `missing`: one per part that ought to be
-    there. `notes`: parts in which nothing is, or more than one recording. `cuts`: parts that end in the middle of a
-    write, as a kill leaves them. `root`: the chain value before the first row. `end`: as noted when the last part was
-    closed, None when its recorder was killed or when a part is missing at the end.
+    Use it as a context manager, or call `close`: damaged parts have temporary copies. All times are session time in
+    nanoseconds unless noted otherwise, all poses are in the world frame.
+
+    Attributes:
+        header: What is needed to understand and re-simulate the session: configuration, model, bodies, versions.
+        files: Paths of the parts, in order; parts that cannot be read are left out.
+        root: Chain value (16 bytes) before the first row.
+        end: Step and chain of the newest row as noted when the last part was closed; None if its recorder was killed
+            or a part is missing at the end.
+        damage: One line per place that could not be read, at most `MOST_DAMAGE`. Reading on may add lines.
+        missing: One line per missing part, or range of parts.
+        notes: One line per empty part and per file that holds more than one recording.
+        cuts: One line per part that ends in the middle of a write, as a kill leaves it.
     """
 
     def __init__(self, files: list[str]) -> None:
@@ -89,16 +98,26 @@ class Recording:
 
     @property
     def finished(self) -> bool:
-        """False when the recorder was killed: the newest quarter of a second may be missing."""
+        """True if the recorder closed the last part; otherwise the last 0.25 s of the session may be missing."""
         return self.end is not None
 
     @classmethod
     def open(cls, path: str | Path, *, warn: bool = True) -> Recording:
-        """Opens the recording whose first file (or only surviving part) is `path`.
+        """Open a recording by its first file, or by the only part that is left of it.
 
-        Later parts are found by their names, also behind one that is missing. Warns (`UserWarning`) of damage.
+        Later parts are found by their names, also after a missing one. A damaged part is read from a temporary copy of
+        its readable messages; the file itself is never altered.
 
-        Raises `NotARecordingError` with one line: no such file, no Rerun file, no session in it.
+        Args:
+            path: First file of the recording, usually `session.rrd`.
+            warn: Issue a `UserWarning` if parts are damaged or missing.
+
+        Returns:
+            The open recording.
+
+        Raises:
+            NotARecordingError: There is no such file, it is not a Rerun file, it holds no session header, or it was
+                recorded in another format; the message is one line.
         """
         first = str(path)
         if os.path.isdir(first):
@@ -121,7 +140,18 @@ class Recording:
         return recording
 
     def rows(self, after: int | None = None) -> Iterator[JournalRow]:
-        """The journal in order, or what comes after a step of it. Where rows are missing, `step` jumps."""
+        """Yield the rows of the journal in order of steps.
+
+        Args:
+            after: Step after which to begin; None begins at the first row.
+
+        Returns:
+            Iterator over rows, one per step, each once. `step` jumps where rows are missing. Rows that do not decode
+            are left out and noted in `damage`.
+
+        Raises:
+            NotARecordingError: A file can no longer be read.
+        """
         if after is None:
             return self._unique(paths.ROWS, items.decode_rows, lambda row: row.chain)
 
@@ -131,50 +161,78 @@ class Recording:
         return (row for row in self._unique(paths.ROWS, later, lambda row: row.chain) if row.step > after)
 
     def count_rows(self) -> int:
-        """Number of rows in the files, for showing progress."""
+        """Return the number of journal rows in the files, for progress reports; repeated rows count again."""
         return self._count(paths.ROWS)
 
     def count_samples(self) -> int:
-        """Number of raw messages in the files, for showing progress."""
+        """Return the number of raw messages in the files, for progress reports."""
         return self._count(paths.SAMPLES)
 
     def keyframes(self) -> Iterator[Keyframe]:
-        """The keyframes in order."""
+        """Yield the keyframes in order of steps, each once."""
         return self._unique(paths.KEYFRAMES, items.decode_keyframes, lambda keyframe: (keyframe.step, keyframe.chain))
 
     def states(self) -> Iterator[RecordedState]:
-        """Poses of all bodies at the state rate, with presence and the applied samples."""
-        # By steps, not times: the state of the row before a scene is later than that row, by the time that it took.
-        # A scene from before the first row has time 0.
+        """Yield the states of all bodies at the state rate, in order of time.
+
+        Returns:
+            Iterator over states: `poses` (n_bodies, 7) float64, `x y z qw qx qy qz` ([m], unit quaternion), world
+            frame, in the order of the state's own `bodies`, which change when a scene is loaded; presence of the
+            participants and the applied samples with them.
+
+        Raises:
+            NotARecordingError: A file can no longer be read.
+        """
+        # By steps, not times: the state of the row before a scene is later than that row, by the duration of the step.
+        # A scene that was loaded before the first row has time 0.
         scenes = (scene for _, scene in self._items(paths.MODELS, items.decode_models))
         loaded = [(scene.step if scene.session_time else -1, scene.bodies) for scene in scenes]
         loaded.sort(key=lambda scene: scene[0])
-        before = [step for step, _ in loaded]  # the newest step that each was not yet there in
+        before = [step for step, _ in loaded]  # for each scene, the newest step before it was loaded
         bodies = [self.header.bodies, *(bodies for _, bodies in loaded)]
         for state in self._unique(paths.STATE, items.decode_states, lambda state: state.session_time):
             yield state._replace(bodies=bodies[bisect_left(before, state.step)])
 
     def model(self, model_hash: str) -> bytes:
-        """Binary form (mjb) of the model of a scene that was loaded in the session, else `LookupError`."""
+        """Return the MuJoCo model of a scene that was loaded in the session.
+
+        Args:
+            model_hash: As in `SceneLoaded`.
+
+        Returns:
+            The model in binary form (mjb).
+
+        Raises:
+            LookupError: The recording holds no such model.
+            zlib.error: The stored model is damaged.
+        """
         for _, scene in self._items(paths.MODELS, items.decode_models):
             if scene.model_hash == model_hash:
                 return unpack_model(scene.model)
         raise LookupError(f"the recording does not hold the model {model_hash[:12]} of a scene that was loaded")
 
     def events(self) -> Iterator[Event]:
-        """The shared history in order of `event_seq`."""
+        """Yield the events of the shared history in order of `event_seq`, each once."""
         return self._unique(paths.EVENTS, items.decode_events, lambda event: event.event_seq)
 
     def denials(self) -> Iterator[DenialRecord]:
-        """Every typed no, in order."""
+        """Yield the denials that participants received, in order, each once."""
         return (record for _, record in self._unique(paths.DENIALS, items.numbered_denial_decoder(), lambda pair: pair))
 
     def samples(self) -> Iterator[RawSample]:
-        """Raw messages of clients, in the order of receipt."""
+        """Yield the raw messages of clients, undecoded, in the order of receipt."""
         return (sample for _, sample in self._items(paths.SAMPLES, items.decode_samples))
 
     def metrics(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
-        """Per name: session times [ns] and values."""
+        """Return the plotted values by name.
+
+        Returns:
+            Per name, without the leading `/metrics/`: session times [ns], shape (n,) int64, and values, shape (n,)
+            float64, in the unit of the metric.
+
+        Raises:
+            NotARecordingError: A file can no longer be read.
+        """
         found: dict[str, tuple[list[int], list[float]]] = {}
         for _, scalar in self._items(f"{paths.METRICS}/**", items.decode_scalars):
             times, values = found.setdefault(scalar.entity.removeprefix(paths.METRICS + "/"), ([], []))
@@ -183,7 +241,15 @@ class Recording:
         return {name: (np.array(t, np.int64), np.array(v, np.float64)) for name, (t, v) in found.items()}
 
     def changed_spans(self) -> list[str]:
-        """Spans of bytes that were changed since the recorder wrote them, wherever in the file; a line each."""
+        """Compare the bytes of all parts with the recorder's checksums.
+
+        Returns:
+            One line per span of bytes that changed since the recorder wrote it, anywhere in the file. Empty for
+            files that another tool has rewritten.
+
+        Raises:
+            NotARecordingError: A file can no longer be read.
+        """
         marks: dict[int, list[rrd_file.Mark]] = {}
         for part, mark in self._items(paths.MARKS, items.decode_marks):
             marks.setdefault(part, []).append(mark)
@@ -194,7 +260,7 @@ class Recording:
         ]
 
     def close(self) -> None:
-        """Removes temporary copies."""
+        """Remove the temporary copies of damaged parts. May be called twice."""
         if self._folder is not None:
             self._folder.cleanup()
             self._folder = None
@@ -210,11 +276,13 @@ class Recording:
     def _unique(
         self, entity: str, decode: Callable[[Any], Iterator[_T]], key: Callable[[_T], Hashable]
     ) -> Iterator[_T]:
-        """Items of all parts; what a part repeats from the end of the one before counts once. A file that Rerun's tools
-        have rewritten may hold several parts: there, whatever comes again counts once."""
+        """Yield the items of all parts; what a part repeats from the end of the previous one counts once.
+
+        A file that Rerun's tools have rewritten may hold several parts: in it, every repeated item counts once.
+        """
         before: frozenset[Hashable] = frozenset()
         tail: deque[Hashable] = deque(maxlen=REPEATED_ITEMS)
-        seen: set[Hashable] = set()  # what of a rewritten file is in `tail`
+        seen: set[Hashable] = set()  # those keys in `tail` that came from a rewritten file
         part = 0
         for i, item in self._items(entity, decode):
             if i != part:
@@ -230,7 +298,7 @@ class Recording:
             yield item
 
     def _items(self, entity: str, decode: Callable[[Any], Iterator[_T]]) -> Iterator[tuple[int, _T]]:
-        """Part number and item. What does not decode is left out with the rest of its chunk, and said in `damage`."""
+        """Yield part number and item. Undecodable items are skipped with the rest of their chunk, see `damage`."""
         for i, pieces in self._spans(entity):
             try:
                 yield from ((i, item) for item in decode(join_pieces(pieces)))
@@ -242,13 +310,13 @@ class Recording:
         return sum(count_joined_rows(pieces) for _, pieces in self._spans(entity))
 
     def _spans(self, entity: str) -> Iterator[tuple[int, list[Any]]]:
-        """Part number (from 0) and the record batches of some rows of an entity, over all parts in order."""
+        """Yield part number (from 0) and the record batches of some rows of an entity, over all parts in order."""
         for i, path in enumerate(self._readable):
             for pieces in group_spans(chunk.to_record_batch() for chunk in rrd_file.read_chunks(path, entity)):
                 yield i, pieces
 
     def _add_part(self, path: str, prober: Prober) -> None:
-        """A part that holds nothing (its recorder ended before the first write) is said, not fatal."""
+        """Add a part, if readable. A part without content (its recorder ended before the first write) is only noted."""
         try:
             found = rrd_file.scan_file(path) if os.path.getsize(path) else None
             if found is None or not (found.messages or found.holes):
@@ -286,13 +354,13 @@ class Recording:
         return copy
 
     def _harmed(self, *lines: str) -> None:
-        """Each once, and no more than anybody reads."""
+        """Add lines to `damage`, each once, up to `MOST_DAMAGE`."""
         for line in lines:
             if len(self.damage) <= MOST_DAMAGE and line not in self.damage:
                 self.damage.append(line if len(self.damage) < MOST_DAMAGE else MORE_DAMAGE)
 
     def _find_missing(self, files: list[str]) -> None:
-        """`files`: what was found, in order. A name may hold any number, so gaps are not counted out."""
+        """Note gaps in the part numbers of `files` (in order). A name may hold any number, so a gap is one line."""
         base = os.path.basename(paths.split_part(files[0])[0])
         numbers = [paths.split_part(path)[1] for path in files]
         for before, after in pairwise(numbers):
@@ -303,7 +371,7 @@ class Recording:
                 self.missing.append(f"{first} to {last} are missing")
 
     def _headers(self) -> Iterator[tuple[int, Any]]:
-        """The header of each part that has one: a chunk near its beginning, so that nobody need read on."""
+        """Yield part number and header of each part that has one: a chunk near its beginning, so reading is short."""
         for i, path in enumerate(self._readable):
             chunk = next(rrd_file.read_chunks(path, paths.HEADER), None)
             if chunk is not None:
@@ -330,7 +398,7 @@ class Recording:
         raise NotARecordingError(f"{path} holds no session header{why}")
 
     def _leave_out_others(self) -> None:
-        """A part with another header is of another session, whose file has come to lie here."""
+        """Leave out parts with another header: files of another session that were moved into this folder."""
         for i, batch in reversed(list(self._headers())):
             with suppress(*UNREADABLE):
                 blob, intact = open_blob(items.read_values(batch, "blob")[0])

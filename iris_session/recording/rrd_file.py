@@ -1,7 +1,7 @@
-"""Damaged Rerun files: finds what can be read in a file that was cut short or changed, without altering it.
+"""Damaged Rerun files: find the readable messages of a file that was cut short or changed, without altering it.
 
 An RRD file is a 12-byte header and messages of a 16-byte head (kind, length; little-endian uint64) and a body. Rerun's
-reader stops at the first body it cannot decode, or aborts; this module makes a temporary copy of those that it can.
+reader stops or aborts at the first body it cannot decode; this module makes a temporary copy of the readable messages.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ KIND_END: Final = 0
 KIND_STORE_INFO: Final = 1
 KIND_ARROW: Final = 2
 KIND_LAST: Final = 3
-#: The last message of a file that was closed. Rerun's own has a footer as its body, and more behind it.
+#: The last message of a closed file. In Rerun's own files its body is a footer, followed by a tail.
 END_MESSAGE: Final = _HEAD.pack(KIND_END, 0)
 _ARROW_HEAD: Final = struct.pack("<Q", KIND_ARROW)
-#: Messages that are tried together; a group that fails is halved until the bad ones are alone.
+#: Number of messages tested together; a group that fails is halved until the bad messages are isolated.
 GROUP: Final = 256
-#: What is searched at once for messages behind a damaged one.
+#: Bytes searched at a time for messages after a damaged one.
 WINDOW_BYTES: Final = 1 << 20
 
 
 class RrdMessage(NamedTuple):
-    """`offset` of its head in the file, `length` of its body [bytes]."""
+    """One message: `offset` of its head in the file, `length` of its body [bytes]."""
 
     offset: int
     kind: int
@@ -45,11 +45,11 @@ class RrdMessage(NamedTuple):
 
 
 class Scan(NamedTuple):
-    """`holes`: spans between readable messages that are none. `good_bytes`: after the last readable message.
+    """Messages of a file. `holes`: unreadable spans between messages. `good_bytes`: end of the last readable message.
 
-    `cut`: the file ends in the middle of a message, as after a kill or a full disk. Behind the message that ends a file
-    nothing belongs to it, but the tail that Rerun's own files have. `indexed`: it ends with Rerun's index, which a
-    recorder does not write: one of Rerun's tools has made it, from one file or several.
+    `cut`: the file ends in the middle of a message, as after a kill or a full disk. Bytes after the end message do not
+    belong to the file, except the tail in Rerun's own files. `indexed`: the file ends with Rerun's index, which a
+    recorder does not write: it was made by one of Rerun's tools, from one file or several.
     """
 
     messages: list[RrdMessage]
@@ -61,7 +61,7 @@ class Scan(NamedTuple):
 
 
 class Mark(NamedTuple):
-    """The recorder's note about a span of its file: CRC-32 of the bytes from `begin` up to `end`."""
+    """Checksum of a span of the file, noted by the recorder: CRC-32 of the bytes from `begin` up to `end`."""
 
     begin: int
     end: int
@@ -69,7 +69,7 @@ class Mark(NamedTuple):
 
 
 def scan_file(path: str | Path) -> Scan:
-    """Walks over the messages of a file without decoding them. Raises `NotARecordingError`."""
+    """List the messages of a file without decoding them. Raises `NotARecordingError`."""
     size = os.path.getsize(path)
     found: list[RrdMessage] = []
     holes: list[tuple[int, int]] = []
@@ -97,7 +97,7 @@ def scan_file(path: str | Path) -> Scan:
 
 
 def end_of_messages(data: bytes) -> int:
-    """Where, in the bytes of a whole file, the message lies that ends it. Raises `ValueError`: no such file."""
+    """Return the offset of the end message in the bytes of a file. Raises `ValueError` if there is none."""
     at = FILE_HEAD
     while at + _HEAD.size <= len(data):
         kind, length = _HEAD.unpack_from(data, at)
@@ -117,7 +117,7 @@ def _message_at(file: BinaryIO, at: int, size: int) -> RrdMessage | None:
 
 
 def _next_message(file: BinaryIO, begin: int, size: int) -> int | None:
-    """Where messages go on behind a damaged head: an Arrow message that is followed by another one or by the end."""
+    """Return the offset of the next message after a damaged head: an Arrow message followed by another or the end."""
     overlap = len(_ARROW_HEAD) - 1
     for window in range(begin, size, WINDOW_BYTES):
         file.seek(window)
@@ -134,9 +134,9 @@ def _next_message(file: BinaryIO, begin: int, size: int) -> int | None:
 
 
 def changed_spans(path: str | Path, marks: Sequence[Mark]) -> list[str]:
-    """The spans of the file whose bytes are not those that the recorder noted, a line each.
+    """Return a line per span of the file whose bytes differ from the recorder's checksum.
 
-    None of a file that another tool has rewritten: there the marks end nowhere between messages.
+    Empty for a file that another tool has rewritten: in it the marks do not end between messages.
     """
     found = scan_file(path)
     if found.indexed:
@@ -153,7 +153,7 @@ def changed_spans(path: str | Path, marks: Sequence[Mark]) -> list[str]:
 
 
 def _crc(file: BinaryIO, mark: Mark) -> int:
-    """Of the bytes of `mark` as they are now."""
+    """Compute the CRC-32 of the span of `mark` as it is now."""
     file.seek(mark.begin)
     crc, left = 0, mark.end - mark.begin
     while left and (data := file.read(min(left, 1 << 20))):
@@ -162,9 +162,9 @@ def _crc(file: BinaryIO, mark: Mark) -> int:
 
 
 def read_chunks(path: str | Path, entity: str) -> Iterator[Any]:
-    """Chunks of one entity in the order of the file. It must be readable, see `Prober`.
+    """Yield the chunks of one entity in the order of the file. The file must be readable, see `Prober`.
 
-    Raises `NotARecordingError` when it is so no longer.
+    Raises `NotARecordingError` if the file can no longer be read.
     """
     from rerun.chunk import RrdReader
 
@@ -179,9 +179,9 @@ def read_chunks(path: str | Path, entity: str) -> Iterator[Any]:
 
 
 def salvage(path: str | Path, copy: str | Path, prober: Prober) -> list[str]:
-    """Writes the readable messages of `path` to `copy`. Returns what was left out, a line each.
+    """Write the readable messages of `path` to `copy`. Return a line per omission.
 
-    Raises `NotARecordingError` when nothing is readable.
+    Raises `NotARecordingError` if nothing is readable.
     """
     found = scan_file(path)
     damage = [f"bytes {begin} to {end} hold no message and are left out" for begin, end in found.holes]
@@ -204,7 +204,7 @@ def salvage(path: str | Path, copy: str | Path, prober: Prober) -> list[str]:
 
 
 class _Trial:
-    """Finds the messages of `file` that do not decode, by halving groups of them."""
+    """Search for the messages of `file` that do not decode, by halving groups of them."""
 
     def __init__(self, file: BinaryIO, infos: Sequence[RrdMessage], path: Path, prober: Prober) -> None:
         self._file = file

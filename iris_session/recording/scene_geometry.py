@@ -1,7 +1,7 @@
-"""What the Rerun viewer draws of a scene specification: visuals as primitives and meshes, each fixed in a named frame.
+"""Geometry of a scene specification for the Rerun viewer: visuals as primitives and meshes, fixed in named frames.
 
-A frame is `world` or the name of a streamed body that moves; the recording moves frames, never geometry. Where nothing
-is shared, the specification is made of the recorded model, here and not where physics runs.
+A frame is `world` or the name of a streamed body that moves; the recording moves frames, never geometry. If no assets
+are shared, the specification is made from the recorded model, here and not in the process that runs physics.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ WORLD: Final = "world"
 #: Half edge [m] at which an infinite plane is drawn, and half its drawn thickness.
 INFINITE_PLANE_M: Final = 10.0
 PLANE_HALF_THICKNESS_M: Final = 0.0005
-#: Textures come with the largest level within this side: each is in the file as often as it is worn. Of cubes it is the
-#: side of a face: six lie in one picture, which is then no larger.
+#: Maximum side [px] of the texture level that is used: each texture is in the file once per visual that has it. For
+#: cube maps it is the side of a face: six faces lie in one image, which is then no larger.
 TEXTURE_SIDE: Final = 512
 CUBE_SIDE: Final = 128
-#: A mesh of more triangles wears the mean colour of its cube: to cut a million of them takes seconds and a gigabyte,
-#: and the recorder has other things to do.
+#: A mesh of more triangles gets the mean colour of its cube map: cutting a million triangles takes seconds and a
+#: gigabyte, which would delay the recorder.
 MOST_BAKED: Final = 50_000
 
 BOX: Final = "box"
@@ -55,7 +55,7 @@ _FORMS: Final = {
     GeometryKind.CYLINDER: CYLINDER,
 }
 _WHITE: Final = (1.0, 1.0, 1.0)
-#: Any name that no file has.
+#: Name of the model in memory; no file has it.
 _BUFFER: Final = "recorded.mjb"
 
 Rgba8 = tuple[int, int, int, int]
@@ -63,8 +63,11 @@ Pixels = NDArray[np.uint8]
 
 
 class VisualShape(NamedTuple):
-    """How a visual is drawn. `size`: half sizes (box, ellipsoid), or radius twice and half length along z (capsule,
-    cylinder) [m]; unused for meshes. `tint`: to multiply its colour with, in place of a texture of one colour."""
+    """Drawn shape of a visual.
+
+    `size`: half sizes (box, ellipsoid), or radius twice and half length along z (capsule, cylinder) [m]; unused for
+    meshes. `tint`: factor of its colour, in place of a texture of one colour.
+    """
 
     kind: str
     size: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -75,7 +78,7 @@ class VisualShape(NamedTuple):
 
 
 class BodyPlacement(NamedTuple):
-    """`T`: of a body in the frame."""
+    """Frame of a body and its pose `T` in that frame."""
 
     frame: str
     T: PoseTuple
@@ -83,8 +86,10 @@ class BodyPlacement(NamedTuple):
 
 @contextmanager
 def open_scene(assets: SceneAssets, packed_model: bytes) -> Iterator[tuple[SceneSpec, AssetStore]]:
-    """Specification and store of a scene. Raises `SceneBuildError`, `OSError`, and `ValueError` for bytes that are no
-    specification or no model."""
+    """Open specification and asset store of a scene.
+
+    Raises `SceneBuildError`, `OSError`, and `ValueError` for an invalid specification or model.
+    """
     if assets.root:
         store = AssetStore(assets.root)
         yield decode_scene(store.get(assets.scene_hash)), store
@@ -108,8 +113,10 @@ def _made_of(packed_model: bytes, store: AssetStore) -> SceneSpec:
 
 
 class SceneReader:
-    """Reads what is drawn of one specification; each mesh and texture once. Raises `SceneBuildError` for what cannot
-    be read."""
+    """Reader of the drawn geometry of one specification; each mesh and texture is read once.
+
+    Raises `SceneBuildError` for geometry that cannot be read.
+    """
 
     def __init__(self, spec: SceneSpec, store: AssetStore, bodies: Sequence[BodyInfo]) -> None:
         self._spec = spec
@@ -121,16 +128,16 @@ class SceneReader:
         self._baked: dict[tuple[Geometry, int], MeshArrays] = {}
 
     def is_shown(self, thing: Visual | Deformable) -> bool:
-        """Whether it is drawn at all."""
+        """Return whether it is drawn: not fully transparent, and in a visible group."""
         return thing.rgba[3] > 0 and thing.group in self._spec.groups_shown
 
     def place_visual(self, visual: Visual) -> tuple[str, PoseTuple]:
-        """Frame, and T_frame_visual."""
+        """Return the frame of a visual and `T_frame_visual`."""
         frame, T_frame_body = self._places[visual.body]
         return frame, compose(T_frame_body, _tuple(visual.T_body_visual))
 
     def read_shape(self, visual: Visual) -> VisualShape:
-        """Shape and surface."""
+        """Return shape and surface of a visual."""
         geometry = visual.geometry
         cube = self._cubes.find(visual.material, geometry)
         atlas, tint = (None, _WHITE) if cube is None else (cube.atlas, cube.tint)
@@ -158,7 +165,7 @@ class SceneReader:
         return self._baked[key]
 
     def read_texture(self, material: int) -> Pixels | None:
-        """The 2d texture of a material, red, green, blue and perhaps alpha."""
+        """Return the 2d texture of a material, shape (height, width, 3 or 4) uint8; None if it has none."""
         index = -1 if material < 0 else self._spec.materials[material].find_texture()
         if index < 0:
             return None
@@ -167,7 +174,7 @@ class SceneReader:
         return self._textures[index]
 
     def read_arrays(self, deformable: Deformable) -> dict[str, NDArray[Any]]:
-        """The asset of a deformable, with texture coordinates as its material repeats them."""
+        """Return the arrays of a deformable, with texture coordinates repeated as its material demands."""
         arrays = decode_arrays(self._store.get(deformable.address), ArrayKind.DEFORMABLE)
         worn = None if deformable.material < 0 else self._spec.materials[deformable.material]
         uv = repeat_texture_coordinates(arrays.get("uv"), worn)
@@ -197,7 +204,7 @@ class SceneReader:
 
 
 def _with_colours(pixels: Pixels) -> Pixels:
-    """Red, green, blue of what is grey."""
+    """Return the pixels with grey expanded to red, green, blue."""
     return pixels if pixels.shape[2] >= 3 else np.repeat(pixels[:, :, :1], 3, axis=2)
 
 
@@ -207,7 +214,7 @@ def _mean_colour(pixels: Pixels) -> tuple[float, float, float]:
 
 
 def place_bodies(spec: SceneSpec, bodies: Sequence[BodyInfo]) -> dict[int, BodyPlacement]:
-    """For every body: the nearest moving streamed body at or above it, and where it is in that one's frame."""
+    """Return, per body, the nearest moving streamed body at or above it as frame, and the body's pose in that frame."""
     moving = {body.id: body.name for body in bodies if body.moving}
     found: dict[int, BodyPlacement] = {-1: BodyPlacement(WORLD, IDENTITY_POSE)}
     for body in spec.bodies:  # parents before their children
@@ -222,7 +229,7 @@ def place_bodies(spec: SceneSpec, bodies: Sequence[BodyInfo]) -> dict[int, BodyP
 
 
 def to_rgba8(rgba: Rgba, tint: tuple[float, float, float] = _WHITE) -> Rgba8:
-    """As Rerun has colours: 0 to 255."""
+    """Convert a colour (0 to 1) to Rerun's range 0 to 255, multiplied by `tint`."""
     r, g, b, a = (min(255, max(0, round(v * t * 255.0))) for v, t in zip(rgba, (*tint, 1.0), strict=True))
     return r, g, b, a
 
@@ -232,7 +239,7 @@ def _tuple(pose: Pose) -> PoseTuple:
 
 
 def _ended(geometry: Geometry) -> Geometry:
-    """A plane without end as it is drawn."""
+    """Return the geometry with the drawn size of an infinite plane."""
     if geometry.kind != GeometryKind.PLANE:
         return geometry
     x, y, z = geometry.size

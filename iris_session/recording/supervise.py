@@ -1,4 +1,4 @@
-"""The parent's side of the recorder process: start, watch, start anew on the next part of the file, end."""
+"""Supervision of the recorder process by its parent: start, monitor, restart on the next part of the file, close."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from iris_session.recording.messages import FAULT_PREFIX, RecorderConfig
 from iris_session.recording.paths import part_path
 from iris_session.system.process import PIPE, ChildProcess
 
-#: Half a second, on a machine with time to spare.
+#: Time limit of a start. It takes half a second on an idle machine.
 START_S: Final = 60.0
-#: Room is left for our own names, of folder and socket.
+#: Maximum length [bytes] of the folder for temporary files; the rest is for our folder and socket names.
 LONGEST_FOLDER: Final = 75
 
 
 class RecorderProcess:
-    """A recorder of the file `path`, started by exec, listening on sockets in a private temporary folder.
+    """Recorder process of the file `path`, started by exec, listening on sockets in a private temporary folder.
 
-    It runs in a session of its own, so that Ctrl-C of a terminal reaches only the parent. When it has ended, `restart`
-    begins the next part (`session.part2.rrd`); the feed hands it everything that was not written.
+    It runs in a session of its own, so that Ctrl-C of a terminal reaches only the parent. After it has ended, `restart`
+    begins the next part (`session.part2.rrd`); the feed sends it everything that was not written.
     """
 
     def __init__(self, path: str | Path, origin_ns: int) -> None:
@@ -54,26 +54,29 @@ class RecorderProcess:
 
     @property
     def pid(self) -> int:
-        """Process id of the recorder, 0 when none was started. May be asked while another thread restarts it."""
+        """Process id of the recorder, 0 if none was started. May be read while another thread restarts it."""
         process = self._process
         return 0 if process is None else process.pid
 
     @property
     def alive(self) -> bool:
-        """False before the start and once the process has ended. May be asked from another thread, as `pid`."""
+        """False before the start and after the process has ended. May be read from another thread, like `pid`."""
         process = self._process
         return process is not None and process.is_running
 
     @property
     def failure(self) -> str:
-        """One line about how the process ended, empty while it runs and after a clean end."""
+        """One line describing how the process ended, empty while it runs and after a clean end."""
         if self._process is None or not (code := self._process.exit_status):
             return ""
         how = f"killed by signal {-code}" if code < 0 else f"exit status {code}"
         return f"the recorder ended ({how}): {_reason(self._log) or 'no message'}"
 
     def start(self) -> None:
-        """Begins the recording and waits until it writes. Raises `RecorderError`: no right, no space, file exists."""
+        """Begin the recording and wait until the recorder writes.
+
+        Raises `RecorderError`: permission denied, no space, or the file exists.
+        """
         self.part = 1
         try:
             self._spawn()
@@ -86,9 +89,9 @@ class RecorderProcess:
             raise RecorderError(answer.removeprefix("failed: "))
 
     def restart(self) -> None:
-        """Begins the next part without waiting for it: look at `alive` and `failure` later, as after a crash.
+        """Begin the next part without waiting for it: check `alive` and `failure` later, as after a crash.
 
-        Raises `RecorderError` when the system gives no process, or no room for its log; it may be tried again.
+        Raises `RecorderError` if the process or its log cannot be created; it may be tried again.
         """
         self._end(0.0)
         while os.path.exists(part_path(self.path, self.part)):
@@ -96,7 +99,7 @@ class RecorderProcess:
         self._spawn()
 
     def close(self, timeout_s: float = 10.0) -> bool:
-        """Finishes the file. True: it ended by itself and well. Close the feed and the front before."""
+        """Finish the file. Return whether the process ended cleanly by itself. Close feed and front before."""
         clean = self._end(timeout_s)
         shutil.rmtree(self._folder, ignore_errors=True)
         return clean
@@ -132,7 +135,7 @@ class RecorderProcess:
         self.starts += 1
 
     def _answer(self) -> str:
-        """The first line on standard output: `ready`, or the reason why not."""
+        """Return the first line on standard output: `ready`, or the error."""
         process = self._process
         assert process is not None
         try:
@@ -149,7 +152,7 @@ class RecorderProcess:
 
 
 def _reason(log: Path) -> str:
-    """The recorder's own last word in its log, else the last line of it."""
+    """Return the recorder's last own line in its log, else the last line of the log."""
     try:
         lines = log.read_text(errors="replace").strip().splitlines()
     except OSError:

@@ -1,8 +1,8 @@
-"""Proves or refutes a recording: checks every row's bytes and chain, and simulates the session again from its journal.
+"""Verify a recording: check the bytes and the chain of every row, and simulate the session again from its journal.
 
-The first problem is named by step and field or entry. Begins at the initial state; after missing rows or a divergence
-it goes on from the next keyframe. What is simulated is composed elsewhere and handed in as `make_core`: this module
-knows no room but its own.
+The first problem is identified by step and field or entry. Verification begins at the initial state; after missing rows
+or a divergence it resumes at the next keyframe. The simulation is composed elsewhere and passed in as `make_core`: this
+module imports no other room but the protocol.
 """
 
 from __future__ import annotations
@@ -36,34 +36,37 @@ from iris_session.recording.journal import (
 from iris_session.recording.messages import EndMark
 from iris_session.recording.reader import Recording
 
-#: Problems kept in a report; more are counted.
+#: Maximum number of problems listed in a report; further ones are only counted.
 MAX_PROBLEMS: Final = 20
 PROGRESS_ROWS: Final = 500
 
 
 class Core(Protocol):
-    """The session as a function, made by `make_core(header, models)` in its initial state."""
+    """Interface of the simulated session, made by `make_core(header, models)` in its initial state."""
 
     def step(self, now_ns: int, entries: list[Entry], n_ticks: int, plant: bytes = b"") -> bytes:
-        """Takes one step and returns its digest. `plant`: of the row, in class `open`."""
+        """Take one step and return its digest. `plant`: that of the row, in class `open`."""
         ...
 
     def restore(self, keyframe: Keyframe) -> None:
-        """Takes the state of `keyframe`."""
+        """Set the state to that of `keyframe`."""
         ...
 
     def keyframe(self, step: int) -> Keyframe:
-        """The present state, after `step`."""
+        """Return the present state as the keyframe after `step`."""
         ...
 
 
-#: Binary form (mjb) of a scene's model by `SceneLoaded.model_hash`; raises `LookupError` for one that is not there.
+#: Returns a scene's model in binary form (mjb) by `SceneLoaded.model_hash`; raises `LookupError` if it is missing.
 Models = Callable[[str], bytes]
 
 
 class Problem(msgspec.Struct, frozen=True):
-    """`kind`: `changed` (bytes differ from what was written), `missing` (rows), `divergence` (the simulation gives
-    something else), `unreadable`. `field`: of the row or keyframe; `entry`: index, -1 when it is not an entry."""
+    """One problem found in a recording.
+
+    `kind`: `changed` (bytes differ from those written), `missing` (rows), `divergence` (the simulation gives another
+    result), `unreadable`. `field`: of the row or keyframe; `entry`: index, -1 if it is not an entry.
+    """
 
     step: int
     kind: str
@@ -73,13 +76,14 @@ class Problem(msgspec.Struct, frozen=True):
 
 
 class VerifyReport(msgspec.Struct):
-    """`ok`: every step was checked and simulated again with the same result.
+    """Result of a verification. `ok`: every step was checked and simulated again with the same result.
 
     `gaps`: `(first, last)` missing steps. `unverified_steps`: rows between a gap or divergence and the next keyframe.
-    `finished`: the recorder closed the file, so nothing can be missing at its end; else `ending` says so. `files`: the
-    parts. `cuts`, `missing`, `notes`: see `Recording`. `crash`: of the last step, when an error in it ended the
-    session. `continues`: what a resumed session goes on from. `keyframes`: how many were met and equal. `seconds`:
-    session time simulated. `problems`: the first ones, in order.
+    `finished`: the recorder closed the file, so nothing can be missing at its end; otherwise `ending` describes it.
+    `files`: the parts. `cuts`, `missing`, `notes`: see `Recording`. `crash`: description of the last step if an error
+    in it ended the session. `continues`: recording and step that a resumed session continues. `keyframes`: number of
+    keyframes compared and equal. `seconds`: session time simulated [s]; `wall_s`: duration of the verification [s].
+    `problems`: the first `MAX_PROBLEMS`, in order.
     """
 
     path: str
@@ -107,7 +111,7 @@ class VerifyReport(msgspec.Struct):
     version_differences: list[str] = []
 
     def line(self) -> str:
-        """The result on one line."""
+        """Return the result on one line."""
         speed = self.seconds / self.wall_s if self.wall_s > 0 else 0.0
         parts = [f"{self.steps} steps, {self.seconds:.1f} s of session in {self.wall_s:.1f} s ({speed:.1f}x)"]
         parts.append(f"{self.keyframes} keyframes equal, class {self.recording_class}")
@@ -136,12 +140,12 @@ class VerifyReport(msgspec.Struct):
         return f"FAILED at step {first.step}{entry}, {first.field}: {first.text}{more}; " + "; ".join(parts)
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything as plain values, `line` included."""
+        """Return all fields as plain values, including `line`."""
         fields: dict[str, Any] = msgspec.to_builtins(self)
         return {**fields, "line": self.line()}
 
     def json(self) -> str:
-        """`as_dict` as one JSON object."""
+        """Return `as_dict` as one JSON object."""
         return json.dumps(self.as_dict())
 
 
@@ -150,10 +154,19 @@ def verify(
     make_core: Callable[[SessionHeader, Models], Core] | None,
     progress: Callable[[int, int], None] | None = None,
 ) -> VerifyReport:
-    """Verifies the recording `path`; `progress(done, total)` is called with row counts, about every 500 rows.
+    """Verify a recording.
 
-    `make_core` None checks bytes, chain and completeness without simulating. Raises `NotARecordingError`; every other
-    finding is in the report.
+    Args:
+        path: First file of the recording.
+        make_core: Makes the simulated session in its initial state from the header and the models; None checks bytes,
+            chain and completeness without simulating.
+        progress: Called as `progress(done, total)` with row counts, about every 500 rows.
+
+    Returns:
+        The report; all findings are in it.
+
+    Raises:
+        NotARecordingError: `path` cannot be read as a recording.
     """
     began = time.perf_counter()
     with Recording.open(path, warn=False) as recording:
@@ -163,7 +176,7 @@ def verify(
         total = recording.count_rows() if progress else 0
         try:
             core = make_core(header, recording.model) if make_core else None
-        except Exception as error:  # a changed header, or another version of the rooms: said in the report
+        except Exception as error:  # a changed header, or another version of the code: reported
             text = f"the session cannot be built from the header: {_one_line(error)}"
             report.problems.append(Problem(-1, "divergence", "header", text))
             return report
@@ -198,7 +211,7 @@ def verify(
 
 
 class _Run:
-    """State of one pass over the rows. `simulating` is false between a gap or divergence and the next keyframe."""
+    """State of one verification. `simulating` is false between a gap or divergence and the next keyframe."""
 
     def __init__(self, recording: Recording, core: Core | None, report: VerifyReport) -> None:
         self.report = report
@@ -207,7 +220,7 @@ class _Run:
         self.simulating = recording.header.continues is None
         self._core = core
         self._chain: bytes | None = recording.root
-        self._stored_chain: bytes | None = None  # of the last row, when it is not what it ought to be
+        self._stored_chain: bytes | None = None  # of the last row, if it differs from the computed one
         self._now_ns: int | None = None
         self._keyframes = recording.keyframes()
         self._next_keyframe = next(self._keyframes, None)
@@ -215,7 +228,7 @@ class _Run:
         self._meet_keyframe(self._first)
 
     def take(self, row: JournalRow) -> None:
-        """Checks one row, simulates it, and meets the keyframe taken after it."""
+        """Check one row, simulate it, and compare the keyframe taken after it."""
         problem = self._check(row)
         expected = self.last_step + 1
         is_step = problem is not None and problem.field == "step"
@@ -227,7 +240,7 @@ class _Run:
         self.last_step = expected if is_step else row.step
         if problem is not None:
             self.found(Problem(self.last_step, "changed", problem.field, problem.text, problem.entry))
-        # A changed chain value follows from the one before it, unless it was that one that was changed: see `_check`.
+        # After a changed chain value the computed one is used, so that the next row is not blamed: see `_check`.
         bad_chain = problem is not None and problem.field == "chain" and self._chain is not None
         self._stored_chain = row.chain if bad_chain else None
         self._chain = compute_chain(self._chain, row) if bad_chain and self._chain is not None else row.chain
@@ -243,7 +256,7 @@ class _Run:
         return problem
 
     def end(self, mark: EndMark | None) -> None:
-        """Checks that the rows reach as far as the recorder noted at its end."""
+        """Check that the rows reach as far as the recorder noted when it closed the file."""
         if mark is None or not mark.chain:
             return
         if mark.step > self.last_step:
@@ -255,7 +268,7 @@ class _Run:
             self.found(Problem(self.last_step, "changed", "end", text))
 
     def _gap(self, first: int, last: int) -> None:
-        if last < first:  # the same or an earlier step again: not a gap, but never what was written
+        if last < first:  # the same or an earlier step again: not a gap, but never written so
             self.found(Problem(last + 1, "changed", "step", f"step {last + 1} comes after step {first - 1}"))
         else:
             self.report.gaps.append((first, last))
@@ -279,7 +292,7 @@ class _Run:
             self._step(self._core, row, compare)
 
     def _crashed(self, row: JournalRow) -> None:
-        """The step that ended the session: taken again, it says why."""
+        """Repeat the step that ended the session, to report its error."""
         self.report.crash = f"an error in step {row.step} ended the session"
         self.simulating = False
         if self._core is None:
@@ -294,7 +307,7 @@ class _Run:
     def _step(self, core: Core, row: JournalRow, compare: bool) -> None:
         try:
             digest = core.step(row.now_ns, decode_entries(row.entries), row.n_ticks, row.plant)
-        except Exception as error:  # changed bytes may mean anything to the core; what came of it is the finding
+        except Exception as error:  # changed bytes may cause any error in the core; the error is the finding
             self._diverged("entries", f"the step cannot be taken again: {_one_line(error)}")
             return
         if compare and digest != row.digest:
@@ -305,7 +318,7 @@ class _Run:
         self.simulating = False
 
     def _meet_keyframe(self, step: int) -> None:
-        """Compares the keyframe after `step`, or goes on from it when the simulation had stopped."""
+        """Compare the keyframe after `step`, or resume from it if the simulation had stopped."""
         while (keyframe := self._next_keyframe) is not None:
             changed = check_keyframe(keyframe)
             if not changed and keyframe.step > step:
@@ -331,7 +344,7 @@ class _Run:
         elif not self.simulating:
             try:
                 self._core.restore(keyframe)
-            except Exception as error:  # snapshots of another version may mean anything to the core
+            except Exception as error:  # snapshots of another version may cause any error in the core
                 self.found(
                     Problem(keyframe.step, "divergence", "keyframe", f"it cannot be restored: {_one_line(error)}")
                 )
@@ -347,7 +360,7 @@ class _Run:
         self.report.keyframes += 1
 
     def compare(self, past: Continues) -> None:
-        """Whether the recording that this one goes on from is the one beside it."""
+        """Check that the recording beside this one is the one that it continues."""
         if not re.fullmatch(r"[^/\0]{1,255}", past.file) or past.file in (".", ".."):
             text = f"the header names no file that it continues, but {past.file[:80]!r}"
             self.found(Problem(self._first, "changed", "header", text))
@@ -370,7 +383,7 @@ class _Run:
             self.found(Problem(past.step, "changed", "header", text))
 
     def found(self, problem: Problem) -> None:
-        """Adds to the report."""
+        """Add a problem to the report."""
         if len(self.report.problems) < MAX_PROBLEMS:
             self.report.problems.append(problem)
         else:
@@ -378,7 +391,7 @@ class _Run:
 
 
 def _ending(last_step: int) -> str:
-    """Of a file without an end mark. A kill of the recorder looks as a file does that was cut between two writes."""
+    """Describe a file without an end mark: a killed recorder and a file cut between two writes look the same."""
     return f"NOT FINISHED: nobody closed it after step {last_step}, and what may have followed is not there"
 
 

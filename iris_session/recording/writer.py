@@ -70,8 +70,11 @@ _encode = msgspec.msgpack.Encoder().encode
 
 
 class RrdWriter:
-    """One file. `add`, `add_sample` and `add_vertices` only collect; `flush` writes and returns when the bytes are with
-    the system. `vertices_refused`: frames of vertices that are not in the picture."""
+    """Writer of one file.
+
+    `add`, `add_sample` and `add_vertices` only collect; `flush` writes and returns when the operating system has the
+    bytes. `vertices_refused`: number of vertex frames that are not in the picture.
+    """
 
     def __init__(self, path: str | Path, recording_id: str) -> None:
         self.path = str(path)
@@ -98,7 +101,7 @@ class RrdWriter:
         self._devices: dict[tuple[str, str], int] = {}  # newest capture time drawn
 
     def write_header(self, header: SessionHeader) -> None:
-        """Writes the header and the scene. Must come before the first flush with data."""
+        """Write the header and the scene. Must be called before the first flush with data."""
         self._rec.send_recording_name(header.session_name)
         self._log_static(paths.HEADER, rr.AnyValues(blob=pa.array([seal_blob(encode_header(header))], pa.binary())))
         self._log_static(paths.INFO, rr.TextDocument(describe_session(header), media_type="text/markdown"))
