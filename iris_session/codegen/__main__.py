@@ -26,7 +26,7 @@ _DOCUMENT: Final = "docs/protocol.md"
 
 
 def document(text: str) -> str:
-    """`text` of the protocol document with every generated section replaced. Raises `ValueError` on lost markers."""
+    """Return `text` of the protocol document with new generated sections. Raises `ValueError` without their markers."""
     for name, table in tables.sections().items():
         begin, end = f"<!-- generated:{name} -->", f"<!-- end:{name} -->"
         if text.count(begin) != 1 or text.count(end) != 1:
@@ -36,7 +36,7 @@ def document(text: str) -> str:
     return text
 
 
-#: What is generated -> file and a function from its present text to the new one.
+#: Name of a target -> its file, and a function from its present text to the new one.
 TARGETS: Final[dict[str, tuple[str, Callable[[str], str]]]] = {
     "csharp": ("unity_client/Runtime/Protocol/Messages.g.cs", lambda _: csharp.csharp()),
     "typescript": ("web_client/src/protocol/messages.g.ts", lambda _: typescript.typescript()),
@@ -50,7 +50,7 @@ TARGETS: Final[dict[str, tuple[str, Callable[[str], str]]]] = {
 
 
 def outdated(root: Path, names: list[str]) -> list[tuple[Path, str]]:
-    """Files among the targets `names` below `root` whose text is not current, with the text they should have."""
+    """Return the files of the targets `names` below `root` that are not current, each with its new text."""
     found = []
     for name in names:
         relative, make = TARGETS[name]
@@ -63,7 +63,7 @@ def outdated(root: Path, names: list[str]) -> list[tuple[Path, str]]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Command line. Exit status 1 with `--check` when a file is not current."""
+    """Run the command line. Exit status 1 with `--check` when a file is not current."""
     parser = argparse.ArgumentParser(prog="python -m iris_session.codegen", description=__doc__)
     parser.add_argument("what", choices=[*TARGETS, "all"])
     parser.add_argument("--check", action="store_true", help="write nothing; fail when a file is not current")

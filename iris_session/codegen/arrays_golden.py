@@ -25,7 +25,7 @@ _NUMBERS: Final = np.array([[0, 1, 255], [7, 7, 7], [200, 3, 129], [128, 127, 0]
 
 
 def vectors() -> Iterator[tuple[str, str, bytes]]:
-    """Name, kind and bytes of every asset."""
+    """Return name, kind and bytes of every asset."""
     for filter_kind in (ArrayFilter.NONE, ArrayFilter.SHUFFLE, ArrayFilter.DELTA, ArrayFilter.UP):
         arrays = [
             StoredArray(dtype, values, filter_kind)
@@ -52,7 +52,7 @@ def vectors() -> Iterator[tuple[str, str, bytes]]:
 
 
 def malformed() -> Iterator[tuple[str, bytes]]:
-    """Name and bytes of what no reader may take for an asset of kind `mesh`."""
+    """Return name and bytes of the cases that a reader must reject as an asset of kind `mesh`."""
     good = encode_arrays(ArrayKind.MESH, [StoredArray("a", np.zeros(200, np.uint8))])
     yield "empty", b""
     yield "another magic", b"IRA2" + good[4:]
@@ -82,8 +82,8 @@ def malformed() -> Iterator[tuple[str, bytes]]:
 
 
 def golden() -> dict[str, list[dict[str, Any]]]:
-    """Content of the file. Values are flat, in C order: integers, or floats with the value of the float32, null where
-    they are not finite."""
+    """Return the content of the file. Values are flat, in C order: integers, or floats with the value of the float32,
+    null where they are not finite."""
     assets = []
     for name, kind, data in vectors():
         arrays = {
@@ -99,7 +99,7 @@ def golden() -> dict[str, list[dict[str, Any]]]:
 
 
 def text() -> str:
-    """The file, a vector a line."""
+    """Return the text of the file, a vector a line."""
     blocks = []
     for name, rows in golden().items():
         lines = ",\n".join("    " + json.dumps(row, allow_nan=False) for row in rows)
@@ -120,7 +120,7 @@ def _of_every_dtype() -> dict[str, NDArray[Any]]:
 
 
 def _mesh() -> MeshArrays:
-    """A strip of a cylinder, textured."""
+    """Return a textured strip of a cylinder."""
     angle, z = (part.ravel() for part in np.meshgrid(np.linspace(0, 1.5, 8), np.linspace(0, 0.3, 4), indexing="ij"))
     position = np.stack([np.cos(angle), np.sin(angle), z], axis=1).astype("f4")
     normal = (position * [1, 1, 0]).astype("f4")
@@ -132,7 +132,7 @@ def _mesh() -> MeshArrays:
 
 
 def _colors(corners: int) -> NDArray[np.uint8]:
-    """From red to blue, less and less opaque."""
+    """Return colours from red to blue, less and less opaque."""
     along = np.linspace(0, 255, corners).round().astype(np.uint8)
     return np.stack([255 - along, along // 2, along, 255 - along // 4], axis=1)
 

@@ -484,7 +484,7 @@ def _estop() -> list[Step]:
     ]
 
 
-#: Name of a conversation -> what it shows, and its steps.
+#: Name of a conversation -> its purpose, and its steps.
 CONVERSATIONS: Final[dict[str, tuple[str, Callable[[], list[Step]]]]] = {
     "join": ("hello, welcome, clock, snapshot, state, events, heartbeat, bye", _joining),
     "event gap": ("an event is missing: a new snapshot, and which events were missed", _event_gap),

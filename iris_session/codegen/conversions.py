@@ -12,24 +12,24 @@ PoseRow = tuple[float, float, float, float, float, float, float]
 
 
 def to_unity(pose: Sequence[float]) -> PoseRow:
-    """`x y z qw qx qy qz` in the world to `x y z qx qy qz qw` in Unity."""
+    """Convert `x y z qw qx qy qz` in the world to `x y z qx qy qz qw` in Unity."""
     x, y, z, qw, qx, qy, qz = pose
     return (-y, z, x, qy, -qz, -qx, qw)
 
 
 def to_three(pose: Sequence[float]) -> PoseRow:
-    """`x y z qw qx qy qz` in the world to `x y z qx qy qz qw` in WebXR and three.js."""
+    """Convert `x y z qw qx qy qz` in the world to `x y z qx qy qz qw` in WebXR and three.js."""
     x, y, z, qw, qx, qy, qz = pose
     return (-y, z, -x, -qy, qz, -qx, qw)
 
 
 def from_unity(pose: Sequence[float]) -> PoseRow:
-    """Inverse of `to_unity`."""
+    """Convert a pose of `to_unity` back."""
     x, y, z, qx, qy, qz, qw = pose
     return (z, -x, y, qw, -qz, qx, -qy)
 
 
 def from_three(pose: Sequence[float]) -> PoseRow:
-    """Inverse of `to_three`."""
+    """Convert a pose of `to_three` back."""
     x, y, z, qx, qy, qz, qw = pose
     return (-z, -x, y, qw, -qz, -qx, qy)

@@ -38,7 +38,7 @@ _READS: Final = {"bool": "ReadBool", "float": "ReadDouble"}
 
 
 def csharp() -> str:
-    """Text of Messages.g.cs."""
+    """Return the text of Messages.g.cs."""
     body = [*_constants(), *_enums(), READER, WRITER]
     for name, members in UNIONS.items():
         body.append(_union(name, [member.__name__ for member in members], members[0].__struct_config__.tag_field or ""))
@@ -49,7 +49,7 @@ def csharp() -> str:
 
 
 def pascal(name: str, struct: str = "") -> str:
-    """C# name of a field: `request_id` -> `RequestId`. Transforms keep theirs: their frames are in it."""
+    """Return the C# name of a field: `request_id` -> `RequestId`. Transforms keep theirs, which names their frames."""
     if name.startswith("T_"):
         return name
     text = "".join(part[:1].upper() + part[1:] for part in name.lower().split("_"))
@@ -196,7 +196,7 @@ def _read_items(kind: Type) -> str:
 
 
 def _range(kind: Type) -> str:
-    """Least and largest value, as C# writes them."""
+    """Return least and largest value, as C# writes them."""
     low = "long.MinValue" if kind.minimum in (None, -(2**63)) else str(kind.minimum)
     return f"{low}, {'long.MaxValue' if kind.maximum in (None, 2**63 - 1) else kind.maximum}"
 

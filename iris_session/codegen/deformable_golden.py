@@ -23,7 +23,7 @@ Floats = npt.NDArray[np.float64]
 
 
 def cloth(rows: int, cols: int, spacing_m: float = 0.01) -> tuple[DeformableTopology, Floats]:
-    """A wavy cloth, numbered along its rows: topology and vertices (n, 3) [m]."""
+    """Return a wavy cloth, numbered along its rows: topology and vertices (n, 3) [m]."""
     row, col = np.divmod(np.arange(rows * cols), cols)
     u, v = row * spacing_m, col * spacing_m
     vertices = np.stack([u - 0.2, v + 1.5, 0.8 + 0.02 * np.sin(40.0 * u) * np.cos(25.0 * v)], axis=1)
@@ -34,7 +34,7 @@ def cloth(rows: int, cols: int, spacing_m: float = 0.01) -> tuple[DeformableTopo
 
 
 def shell(side: int, spacing_m: float = 0.02) -> tuple[DeformableTopology, Floats]:
-    """The outside of a box of `side`^3 vertices that is squeezed: closed, and numbered without order."""
+    """Return the outside of a squeezed box of `side`^3 vertices: closed, and numbered without order."""
     grid = np.array(list(itertools.product(range(side), repeat=3)))
     number = {tuple(place): i for i, place in enumerate(grid.tolist())}
     faces = []
@@ -53,7 +53,7 @@ def shell(side: int, spacing_m: float = 0.02) -> tuple[DeformableTopology, Float
 
 
 def rope(n: int, spacing_m: float = 0.015) -> tuple[DeformableTopology, Floats]:
-    """A hanging rope whose vertices are numbered without order."""
+    """Return a hanging rope whose vertices are numbered without order."""
     shuffled = np.argsort(_scattered(n))
     x = (np.arange(n) - n / 2) * spacing_m
     vertices = np.empty((n, 3))
@@ -62,12 +62,12 @@ def rope(n: int, spacing_m: float = 0.015) -> tuple[DeformableTopology, Floats]:
 
 
 def _scattered(n: int) -> Floats:
-    """(n,) numbers in [0, 1) without visible order, none twice: multiples of the golden ratio."""
+    """Return (n,) different numbers in [0, 1) without visible order: multiples of the golden ratio."""
     return np.asarray(np.arange(n) * ((5.0**0.5 - 1.0) / 2.0) % 1.0)
 
 
 def meshes() -> Iterator[tuple[str, DeformableTopology, dict[str, Floats]]]:
-    """Name, topology, and vertices by the name of a frame."""
+    """Return name, topology, and vertices by the name of a frame."""
     topology, vertices = cloth(6, 5)
     broken = vertices.copy()
     broken[3], broken[17] = (np.nan, 0.0, np.inf), (0.25, -5e6, 1.0)
@@ -88,7 +88,7 @@ def meshes() -> Iterator[tuple[str, DeformableTopology, dict[str, Floats]]]:
 
 
 def golden() -> dict[str, Any]:
-    """Content of the file. Coordinates are JSON numbers with the value of the float32, null where it is not finite."""
+    """Return the content of the file. Coordinates are numbers with the value of the float32, null if not finite."""
     content = []
     for name, topology, frames in meshes():
         rows = []

@@ -1,7 +1,7 @@
 """Example values of every message, made from the schema, so that a new message has its golden vectors at once.
 
-`full`: every field differs from its default. `least`: only what must be given. `extreme`: the largest and oddest
-values that the schema lets through.
+`full`: every field differs from its default. `least`: required fields only. `extreme`: the largest and oddest values
+that the schema allows.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ _TEXT: Final = 'Zoë 机器人 🤖 "\\'
 
 
 def full(cls: type[msgspec.Struct]) -> Any:
-    """An instance of `cls` with a value of its own in every field."""
+    """Return an instance of `cls` with a different value in every field."""
     return cls(**{field.name: _full(field, n) for n, field in enumerate(_STRUCTS[cls.__name__].fields, start=1)})
 
 
 def least(cls: type[msgspec.Struct]) -> Any:
-    """An instance of `cls` from its required fields alone."""
+    """Return an instance of `cls` from its required fields alone."""
     fields = _STRUCTS[cls.__name__].fields
     return cls(**{field.name: _full(field, n) for n, field in enumerate(fields, start=1) if field.required})
 
 
 def extreme(cls: type[msgspec.Struct]) -> Any:
-    """An instance of `cls` with values at the edges of what may be sent."""
+    """Return an instance of `cls` with values at the edges of the allowed range."""
     return cls(**{field.name: _extreme(field.type, field) for field in _STRUCTS[cls.__name__].fields})
 
 
@@ -98,5 +98,5 @@ def _extreme(kind: Type, field: Field) -> Any:
 
 
 def _address(name: str) -> str:
-    """The address of the asset that holds `name`: the only pattern that a field asks for."""
+    """Return the address of the asset that holds `name`: the only pattern of a field."""
     return hashlib.sha256(name.encode()).hexdigest()

@@ -1,8 +1,8 @@
 """Golden vectors: bytes and value of every message, for tests of this and every other implementation.
 
 Written to docs/protocol/golden.json. Values are JSON as in MessagePack, except: byte strings are base64, and a float
-that is not finite is null. `decode_only` vectors are not what an encoder of this version makes (a field is missing or
-unknown), but must decode to the value. `malformed` must be refused with `code`.
+that is not finite is null. An encoder of this version does not make `decode_only` vectors (a field is missing or
+unknown), but they must decode to the value. `malformed` vectors must be rejected with `code`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ VERSIONED = (AssetRequest, AssetChunk, AssetRefused)
 
 
 def golden() -> str:
-    """Text of golden.json."""
+    """Return the text of golden.json."""
     content = {
         "protocol_version": PROTOCOL_VERSION,
         "client": list(_messages("client", codec.CLIENT_TYPES.values())),
@@ -100,7 +100,7 @@ def _values(name: str, kind: type[msgspec.Struct]) -> Iterator[dict[str, Any]]:
 
 
 def _decode_only() -> Iterator[dict[str, Any]]:
-    """What a client of another age may send: fields that are missing or unknown, other widths of numbers."""
+    """Yield messages that older or newer clients may send: fields missing or unknown, other widths of numbers."""
     hello = Hello(role="surgeon", name="Ada")
     yield _vector(
         "fields left out", _pack([1, 0, "", {"type": "hello", "role": "surgeon", "name": "Ada"}]), wrap_message(hello)
@@ -126,7 +126,7 @@ def _decode_only() -> Iterator[dict[str, Any]]:
 
 
 def _malformed() -> Iterator[dict[str, Any]]:
-    """What a server must refuse, with the code of the error."""
+    """Yield bytes that a server must reject, with the code of the error."""
     good = _pack(wrap_message(Bye("x")))
     bye = b"\x94\x01\x00\xa0\x82\xa4type\xa3bye"
     cases = {
@@ -154,7 +154,7 @@ def _malformed() -> Iterator[dict[str, Any]]:
 
 
 def _conversions() -> Iterator[dict[str, Any]]:
-    """World poses `x y z qw qx qy qz` and the same in engines, `x y z qx qy qz qw`."""
+    """Yield world poses `x y z qw qx qy qz` and the same poses in engines, `x y z qx qy qz qw`."""
     half = math.sqrt(0.5)
     for world in (
         (1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0),
@@ -167,7 +167,7 @@ def _conversions() -> Iterator[dict[str, Any]]:
 
 
 def _rigid() -> Iterator[dict[str, Any]]:
-    """Payloads of the state stream: `poses` by body, as decoded; a decoder's floats may differ by 1e-12."""
+    """Yield payloads of the state stream: `poses` by body, as decoded; a decoder's floats may differ by 1e-12."""
     half = math.sqrt(0.5)
     poses: list[tuple[float, ...]] = [
         (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0),

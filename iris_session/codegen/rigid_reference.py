@@ -1,7 +1,7 @@
 """Payload of the rigid-state stream in plain Python, written from docs/protocol.md, one body at a time.
 
-Slow and readable: the measure for `streams.rigid` (same bytes, tested) and for decoders in other languages. It knows
-the format only; which bodies a frame must hold is the business of the encoder.
+Slow and readable: the reference for `streams.rigid` (same bytes, tested) and for decoders in other languages. It
+implements the format only; the encoder chooses the bodies of a frame.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ PoseRow = Sequence[float]
 
 
 def encode_rotation(q: Sequence[float]) -> list[int]:
-    """Levels of a unit quaternion `[w, x, y, z]`."""
+    """Return the levels of a unit quaternion `[w, x, y, z]`."""
     norm = math.sqrt(sum(v * v for v in q))
     w = q[0] / norm
     scale = math.copysign(ROTATION_CENTRE / (1.0 + abs(w)), w)
@@ -36,7 +36,7 @@ def encode_rotation(q: Sequence[float]) -> list[int]:
 
 
 def decode_rotation(levels: Sequence[int]) -> tuple[float, ...]:
-    """Unit quaternion `[w, x, y, z]` of three levels. Raises `ValueError` for levels of no rotation."""
+    """Return the unit quaternion `[w, x, y, z]` of three levels. Raises `ValueError` for levels of no rotation."""
     m = [(level - ROTATION_CENTRE) / ROTATION_CENTRE for level in levels]
     squares = sum(v * v for v in m)
     if squares > (1.0 + math.sqrt(3.0) / 2.0 / ROTATION_CENTRE) ** 2 + 1e-12:
@@ -45,7 +45,7 @@ def decode_rotation(levels: Sequence[int]) -> tuple[float, ...]:
 
 
 def encode(n_bodies: int, quantised: Mapping[int, PoseRow], escaped: Mapping[int, PoseRow]) -> bytes:
-    """Payload of a frame that holds the bodies `quantised` and `escaped` (by index), of `n_bodies`."""
+    """Return the payload of a frame that holds the bodies `quantised` and `escaped` (by index), of `n_bodies`."""
     nodes = {body: [round(v / LATTICE_M) for v in pose[:3]] for body, pose in sorted(quantised.items())}
     levels = {body: encode_rotation(quantised[body][3:]) for body in nodes}
     origin = [min((node[axis] for node in nodes.values()), default=0) for axis in range(3)]
@@ -68,7 +68,7 @@ def encode(n_bodies: int, quantised: Mapping[int, PoseRow], escaped: Mapping[int
 
 
 def decode(payload: bytes) -> dict[int, tuple[float, ...]]:
-    """Poses in a payload, by body. For valid payloads: what a port must refuse is told in docs/protocol.md."""
+    """Return the poses of a valid payload, by body. docs/protocol.md lists the payloads that a port must reject."""
     _, layout, n_bodies, n, n_escaped, *origin = HEADER.unpack_from(payload)
     words = struct.unpack_from(f"<{3 * n}I", payload, HEADER.size)
     at = HEADER.size + 12 * n

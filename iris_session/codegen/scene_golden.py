@@ -1,4 +1,4 @@
-"""Golden vectors of the scene: every struct, whole specifications, patches and what they lead to, and what is refused.
+"""Golden vectors of the scene: every struct, whole specifications, patches with their results, and invalid bytes.
 
 Written to docs/protocol/scene.json. Values are written as in golden.json. Addresses are the SHA-256 of the bytes.
 """
@@ -67,7 +67,7 @@ _GREY: Final = (0.5, 0.5, 0.5, 1.0)
 
 
 def scene_golden() -> str:
-    """Text of scene.json: one vector a line."""
+    """Return the text of scene.json: one vector a line."""
     content = {
         "structs": list(_structs()),
         "scenes": list(_scenes()),
@@ -86,7 +86,7 @@ def _address(data: bytes) -> str:
 
 
 def _structs() -> Iterator[dict[str, Any]]:
-    """Every struct by itself; references in them lead nowhere."""
+    """Yield every struct by itself; their references have no target."""
     for group in ("scene", "arrays", "patch"):
         for kind in GROUPS[group]:
             nested = kind in (SceneSpec, AddMesh, AddMaterial, AddVisual)  # their parts have extremes of their own
@@ -97,7 +97,7 @@ def _structs() -> Iterator[dict[str, Any]]:
 
 
 def _scenes() -> Iterator[dict[str, Any]]:
-    """Whole specifications. `canonical`: the bytes are those that the encoder of this version makes of the value."""
+    """Yield whole specifications. `canonical`: the encoder of this version makes these bytes of the value."""
     for name, spec in (("every kind of thing", everything()), ("nothing", SceneSpec())):
         yield _scene(name, encode_scene(spec), spec, canonical=True)
     body = {"id": 0, "name": "", "parent": -1, "T_parent_body": _P, "T_world_body": _P, "moving": False, "mass": 1}
@@ -127,7 +127,7 @@ def _scene(name: str, data: bytes, spec: SceneSpec, canonical: bool = False) -> 
 
 
 def _patches() -> Iterator[dict[str, Any]]:
-    """Operations on the scene `before`, and the address of the specification after them."""
+    """Yield operations on the scene `before`, and the address of the specification after them."""
     before = everything()
     decoration = Visual(90, 0, "arrow", _UP, 0, Geometry(GeometryKind.MESH, (0.1, 0.1, 0.1), mesh=1), 2, _RED)
     cases: dict[str, tuple[PatchOp, ...]] = {
@@ -152,7 +152,7 @@ def _patches() -> Iterator[dict[str, Any]]:
 
 
 def _malformed() -> Iterator[dict[str, Any]]:
-    """What no reader may take for a specification. `checked`: types and bounds are right, what they say is not."""
+    """Yield bytes that a reader must reject. `checked`: types and bounds are right, but the content is not."""
     whole = everything()
     small = msgspec.structs.replace(
         whole, visuals=whole.visuals[-1:], materials=whole.materials[:1], textures=(), lights=(), deformables=(),
@@ -226,7 +226,7 @@ def _box() -> Geometry:
 
 
 def everything() -> SceneSpec:
-    """A scene that has every kind of thing, consistent in itself; what its assets hold is not said."""
+    """Return a consistent scene with every kind of element; the content of its assets is left open."""
     textures = (
         _texture("wood", TextureKind.IMAGE, 64, AssetEncoding.PNG, ColorSpace.SRGB),
         _texture("marble", TextureKind.CUBE, 32, AssetEncoding.ARRAYS),
@@ -275,7 +275,7 @@ _ROLES: Final = (TextureRole.RGB, TextureRole.NORMAL, TextureRole.ORM, TextureRo
 
 
 def _visuals() -> Iterator[Visual]:
-    """One of every geometry, and one of a kind that a later version may have."""
+    """Return one visual of every geometry, and one of a kind that a later version may have."""
     kinds = [value for key, value in vars(GeometryKind).items() if key.isupper() and isinstance(value, str)]
     for number, kind in enumerate([*kinds, "torus"]):
         mesh = 0 if kind in (GeometryKind.MESH, GeometryKind.SDF) else -1

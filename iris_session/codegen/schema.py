@@ -1,4 +1,4 @@
-"""The message definitions as plain data: what the generators of other languages and documents read.
+"""The message definitions as plain data, for the generators of other languages and documents.
 
 Structs are in the order of their definition, fields in the order of the wire. `array_like` structs are MessagePack
 arrays, all others maps with the field names as keys.
@@ -144,7 +144,7 @@ GROUPS: Final[dict[str, tuple[type[msgspec.Struct], ...]]] = {
     "patch": UNIONS["PatchOp"],
 }
 
-#: Which open enumeration a field takes its values from.
+#: Open enumeration of the values of a field.
 _ENUMS: Final[dict[str, str]] = {
     "Hello.role": "Role",
     "Hello.devices": "Device",
@@ -218,17 +218,17 @@ _SCALARS: Final[dict[type[msgspec.inspect.Type], str]] = {
 
 
 def structs(group: str) -> tuple[Struct, ...]:
-    """Structs of one of `GROUPS`."""
+    """Return the structs of one of `GROUPS`."""
     return tuple(_struct(cls) for cls in GROUPS[group])
 
 
 def all_structs() -> tuple[Struct, ...]:
-    """Every struct that travels, each once."""
+    """Return every struct of the wire, each once."""
     return tuple(struct for group in GROUPS for struct in structs(group))
 
 
 def enums() -> dict[str, dict[str, str]]:
-    """Open enumerations: name -> constant -> value, in the order of their definition."""
+    """Return the open enumerations: name -> constant -> value, in the order of their definition."""
     return {
         name: {key: text for key, text in vars(kind).items() if key.isupper() and isinstance(text, str)}
         for name, kind in _enum_classes().items()
@@ -236,7 +236,7 @@ def enums() -> dict[str, dict[str, str]]:
 
 
 def enum_doc(name: str) -> str:
-    """The docstring of an open enumeration, unindented, or empty."""
+    """Return the docstring of an open enumeration, unindented, or empty."""
     return inspect.getdoc(_enum_classes()[name]) or ""
 
 
@@ -263,7 +263,7 @@ def _struct(cls: type[msgspec.Struct]) -> Struct:
 
 
 def _doc(cls: type[msgspec.Struct]) -> str:
-    """The docstring of `cls` itself (not of its base), unindented."""
+    """Return the docstring of `cls` itself (not of its base), unindented."""
     return inspect.cleandoc(cls.__doc__) if cls.__doc__ else ""
 
 

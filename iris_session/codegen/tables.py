@@ -12,7 +12,7 @@ from iris_session.protocol import assets, limits
 
 
 def sections() -> dict[str, str]:
-    """Section name -> markdown, for `<!-- generated:NAME -->` ... `<!-- end:NAME -->` in docs/protocol.md."""
+    """Return Markdown by section name, for `<!-- generated:NAME -->` ... `<!-- end:NAME -->` in docs/protocol.md."""
     return {**{group: _group(group) for group in GROUPS}, "names": _names(), "limits": _limits()}
 
 

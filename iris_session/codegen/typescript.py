@@ -30,7 +30,7 @@ _SCALARS: Final = {"bool": "boolean", "int": "number", "float": "number", "str":
 
 
 def typescript() -> str:
-    """Text of messages.g.ts."""
+    """Return the text of messages.g.ts."""
     parts = [HEAD.rstrip("\n"), _constants(), *_enums()]
     parts.extend(_tuple(struct) if struct.array_like else _interface(struct) for struct in all_structs())
     parts.extend(_union(name, members) for name, members in UNIONS.items())
@@ -122,7 +122,7 @@ def _union(name: str, members: tuple[type[msgspec.Struct], ...]) -> str:
 
 
 def _defaults() -> str:
-    """Defaults of the optional fields of every message, event and operation, by tag."""
+    """Return the defaults of the optional fields of every message, event and operation, by tag."""
     rows = []
     for struct in all_structs():
         if struct.tag:
@@ -134,7 +134,7 @@ def _defaults() -> str:
 
 
 def _value_defaults() -> str:
-    """Defaults of the optional fields of maps without a tag, by name."""
+    """Return the defaults of the optional fields of maps without a tag, by name."""
     rows = []
     for struct in all_structs():
         values = {field.name: field.default for field in struct.fields if not field.required}

@@ -44,9 +44,13 @@ _BEHIND, _EYES = 0.45, 0.55
 
 @dataclass(frozen=True)
 class Demo:
-    """A demo ready to run. `objects`: objects that must be handed over. `goals`: goals for deformables. `notes`:
-    remarks
-    about the cast for the reader of the result."""
+    """A demo ready to run.
+
+    Attributes:
+        objects: Objects that must be handed over.
+        notes: Remarks about the cast for the reader of the result.
+        goals: Goals for deformables.
+    """
 
     name: str
     model: mujoco.MjModel

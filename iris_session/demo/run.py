@@ -97,9 +97,10 @@ class GoalStatus(msgspec.Struct, frozen=True):
 
 
 class DemoResult(msgspec.Struct, frozen=True):
-    """Result of a demo, as printed by `demo NAME --json`. `alignment_mm`: stated p95 and true error at the sheet, by
-    name
-    of the headset; without those that were never aligned."""
+    """Result of a demo, as printed by `demo NAME --json`.
+
+    `alignment_mm`: stated p95 and true error at the sheet [mm], by name of the headset, of the aligned ones only.
+    """
 
     ok: bool
     demo: str

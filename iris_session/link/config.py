@@ -1,6 +1,6 @@
-"""What the front process is told at its start: endpoints, limits, anchors, the scene. Plain data, no behaviour.
+"""Start configuration of the front process: endpoints, limits, anchors, the scene. Plain data, no behaviour.
 
-`FrontStart` travels as MessagePack on the standard input of the front, never in its arguments.
+The front reads `FrontStart` as MessagePack from its standard input, never from its arguments.
 """
 
 from __future__ import annotations
@@ -19,20 +19,30 @@ MEBIBYTE: Final = 1 << 20
 
 
 class FrontLimits(msgspec.Struct, frozen=True):
-    """Bounds of everything that a client can make the front hold or do. Sizes and rates per message type:
-    `protocol.limits`.
+    """Bounds of the memory and work that clients can cause in the front.
 
-    `hellos_per_second`, `hello_burst`: of everybody together, beside `hellos_per_source`, `hello_source_burst` that
-    every key has for itself. `pending_messages`, `pending_urgent`, `pending_devices`, `pending_samples`: waiting for
-    the authority, per connection (samples: per device). `unacknowledged`: batches on the way to the authority; urgent
-    ones may use as many again. `slow_drops`: messages in a row that a client's socket did not take before it counts as
-    lost. `receive_queue`, `send_queue`: messages in libzmq, per TCP connection. `excess_per_s`, `excess_burst`:
-    messages of one TCP connection that are not taken, before it is cut off. An honest client with a fault in its loop
-    is named by its rate limits long before. `strangers`: TCP connections that have not said hello, for at most
-    `hello_timeout_ns` each; as many again to the state socket that have not subscribed. `subscribers`: TCP connections
-    to the state socket that have, and to the media socket; `sources`: to the socket that takes media, of
-    each of which `source_bytes` may wait.
-    `memory_bytes`: what all queues together may hold (see `MemoryGuard`).
+    Sizes and rates per message type are in `protocol.limits`.
+
+    Attributes:
+        connections: Participants' connections at most.
+        hellos_per_second, hello_burst: Rate limit of `hello`, all peers together.
+        hellos_per_source, hello_source_burst: Rate limit of `hello` for each key.
+        pending_messages, pending_urgent, pending_devices: Entries queued for the authority, per connection.
+        pending_samples: Samples queued for the authority, per device.
+        batch_entries: Entries of one batch to the authority.
+        unacknowledged: Batches that the authority has not acknowledged; urgent batches may use as many again.
+        send_queue, receive_queue: Messages queued in libzmq, per TCP connection.
+        slow_drops: Messages in a row that find the send queue of a client full before it counts as disconnected.
+        resume_tokens: Resume tokens that are remembered.
+        excess_per_s, excess_burst: Rate limit of rejected messages of one TCP connection, which is closed above it. An
+            honest client with a fault in its loop is reported by its rate limits long before.
+        strangers: TCP connections that have not sent `hello`, and as many again to the state socket that have not
+            subscribed.
+        hello_timeout_ns: Longest time in that state [ns].
+        subscribers: TCP connections to the state socket that have subscribed, and TCP connections to the media socket.
+        sources: TCP connections to the media ingest socket.
+        source_bytes: Bytes queued for each of them.
+        memory_bytes: Bytes of all queues together (see `MemoryGuard`).
     """
 
     connections: int = 64
@@ -61,12 +71,18 @@ class FrontLimits(msgspec.Struct, frozen=True):
 
 
 class SceneInfo(msgspec.Struct, frozen=True):
-    """What the front adds to every `Snapshot`. `poses`: float64 (n_bodies, 7) `x y z qw qx qy qz`, little-endian,
-    used until the first state frame. `tick_period_ns`: simulated time of one tick. `patches`: how often it was drawn
-    otherwise since it was loaded; its bodies stay where they are then.
+    """Scene data that the front adds to every `Snapshot`.
 
-    `asset_root`: folder of a store (`ROOT/ab/abcd...`) that holds the `assets`, by address, which clients may fetch as
-    long as this scene or the next one is the present one, and the specification for moments more; empty for none.
+    Attributes:
+        scene_hash: Address of the specification; the hash of the model when the session shares no specification.
+        robots, bodies: Of the scene, in the order of the state.
+        poses: T_world_body, float64 (n_bodies, 7) `x y z qw qx qy qz` [m], little-endian; used until the first state
+            frame.
+        asset_root: Folder of an asset store (`ROOT/ab/abcd...`); empty for none.
+        assets: Addresses of the assets that clients may fetch while this scene or the next one is present; the
+            specification for some moments longer.
+        tick_period_ns: Simulated time of one tick [ns].
+        patches: Number of visual patches since the scene was loaded. A patch leaves the bodies where they are.
     """
 
     scene_hash: str
@@ -80,17 +96,30 @@ class SceneInfo(msgspec.Struct, frozen=True):
 
 
 class FrontConfig(msgspec.Struct, frozen=True):
-    """Configuration of the front. Port 0: any free one.
+    """Configuration of the front. Port 0 means any free one.
 
-    `host`: address to listen on; `listen`: several instead. `advertise`: the address that others are told, when it is
-    not ours. `beacon_port`: UDP port of the beacons, 0 for none. Any address but loopback is encrypted with CURVE,
-    loopback with `curve`. `key_home`: folder of the server's key and the allow-list, empty for that of the user;
-    `curve_secret_file`: another ZeroMQ certificate of the server (`*.key_secret`); `curve_clients_dir`: folder of
-    public certificates (`*.key`) instead of the allow-list. `origin_ns`: `time.monotonic_ns()` at session time 0.
-    `media_endpoint`: where processes of this session hand in media, empty for nowhere; `media_port`,
-    `media_ingest_port`, `assets_port`: taken when they are free, else any other. `adapt_media`: slow links get less.
-    `recorder_endpoint`: a PULL socket that takes raw samples, empty when nothing is recorded. `forward_observations`:
-    raw observations reach the authority too.
+    Connections are encrypted with CURVE on any address but loopback, and on loopback with `curve`.
+
+    Attributes:
+        host: Address to listen on.
+        listen: Several addresses to listen on, instead of `host`.
+        advertise: Address that beacons announce, when clients reach the front by an address of another machine.
+        beacon_port: UDP port of the beacons, 0 for none.
+        control_port, state_port: TCP ports, which must be free.
+        media_port, media_ingest_port, assets_port: TCP ports; the front uses another when one is in use.
+        media_endpoint: ZeroMQ endpoint to which processes of this session publish media, empty for none.
+        adapt_media: Send fewer media over slow links.
+        origin_ns: `time.monotonic_ns()` at session time 0.
+        heartbeat_ns, silence_ns, stall_ns, presence_period_ns, proposal_period_ns, state_period_ns: Periods and
+            timeouts [ns].
+        curve: Encrypt on loopback too.
+        key_home: Folder of the server's key and the allow-list, empty for that of the user.
+        curve_secret_file: ZeroMQ certificate of the server (`*.key_secret`), instead of the key in `key_home`.
+        curve_clients_dir: Folder of public certificates (`*.key`), instead of the allow-list.
+        anchors: `T_world_anchor` by anchor id.
+        anchor_sizes: Edge of the printed code by anchor id [m].
+        forward_observations: Send raw observations to the authority too.
+        recorder_endpoint: Endpoint of a PULL socket for raw samples, empty when nothing is recorded.
     """
 
     host: str = "127.0.0.1"
@@ -137,7 +166,7 @@ class FrontConfig(msgspec.Struct, frozen=True):
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address (or `localhost`) reaches no further than this machine."""
+    """Return whether only this machine can reach an address (or `localhost`)."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -145,8 +174,14 @@ def is_loopback(host: str) -> bool:
 
 
 class Ports(msgspec.Struct, frozen=True):
-    """Where the front listens. `host`: as in an address, IPv6 in brackets. `key_fingerprint`: of the server CURVE key,
-    empty without one. `reachable`: addresses under which others reach it, best first, without brackets."""
+    """Host and ports on which the front listens.
+
+    Attributes:
+        host: As in `HOST:PORT`, IPv6 in brackets.
+        control, state, media, media_ingest, assets: TCP ports, 0 for none.
+        key_fingerprint: Of the server's CURVE key, empty without encryption.
+        reachable: Addresses under which other machines reach the front, best first, without brackets.
+    """
 
     host: str
     control: int
@@ -164,7 +199,7 @@ class Ports(msgspec.Struct, frozen=True):
 
 
 class FrontStart(msgspec.Struct, frozen=True):
-    """Standard input of the front process. `handback`: opaque memory of a front that this one replaces."""
+    """Standard input of the front process. `handback`: opaque state of the front that this one replaces."""
 
     config: FrontConfig
     scene: SceneInfo
@@ -174,11 +209,11 @@ class FrontStart(msgspec.Struct, frozen=True):
 
 
 class FrontError(Exception):
-    """The front cannot run. The text is one line that says what to do."""
+    """The front cannot run. The message is one line that says what to do."""
 
 
 class PortInUseError(FrontError):
-    """Somebody else listens on a port of ours."""
+    """Another program listens on a port of the session."""
 
     def __init__(self, port: int, name: str) -> None:
         super().__init__(

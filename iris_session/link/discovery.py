@@ -1,7 +1,7 @@
-"""Beacons of sessions on the network: `BeaconListener`, and the check of what any host can send.
+"""Beacons of sessions on the network: `BeaconListener` receives and checks them, because any host can send one.
 
-Used by clients, and by a session that looks for others of its name. Not here: sending beacons (`front`), and which of
-the sessions found is trusted (`client`).
+Clients use it, and a session that checks whether its name is unique. Not here: sending beacons (`front`), and trust in
+the sessions found (`client`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from iris_session.protocol.discovery import DISCOVERY_PORT, Beacon
 from iris_session.protocol.errors import ProtocolError, ProtocolVersionError
 from iris_session.protocol.limits import MAX_BEACON_BYTES
 
-#: Sessions kept, and addresses of one session: any host can send beacons.
+#: Sessions remembered, and addresses of one session: any host can send beacons.
 MAX_SESSIONS: Final = 128
 MAX_ADDRESSES: Final = 4
 MAX_DRAIN: Final = 256
@@ -31,7 +31,7 @@ MAX_NAME: Final = 253
 
 
 class DiscoveryError(Exception):
-    """Beacons cannot be received. The text is one line that says what to do."""
+    """Beacons cannot be received. The message is one line that says what to do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,9 +56,13 @@ class FoundSession:
 
 
 class BeaconListener:
-    """Receives beacons of sessions; several listeners on one machine all get them. Only `wait` waits.
+    """Receiver of beacons. Several listeners on one machine all receive them. Only `wait` blocks.
 
-    `ignored`: datagrams that were no valid beacons, by reason. Raises `DiscoveryError` when the port cannot be used.
+    Attributes:
+        ignored: Number of datagrams that were no valid beacons, by reason.
+
+    Raises:
+        DiscoveryError: The port cannot be used.
     """
 
     def __init__(self, port: int = DISCOVERY_PORT) -> None:
@@ -67,7 +71,7 @@ class BeaconListener:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            with contextlib.suppress(AttributeError, OSError):  # exists where it is needed
+            with contextlib.suppress(AttributeError, OSError):  # only some systems have it, and only they need it
                 self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
             self._socket.setblocking(False)
             self._socket.bind(("", port))
@@ -97,7 +101,7 @@ class BeaconListener:
         return sorted(self._found.values(), key=lambda found: (found.name, found.session_id))
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until a datagram comes, at most `timeout_s` seconds."""
+        """Wait until a datagram arrives, at most `timeout_s` seconds."""
         with selectors.DefaultSelector() as selector:  # `select` takes no descriptor above 1023
             selector.register(self._socket, selectors.EVENT_READ)
             selector.select(max(0.0, timeout_s))

@@ -1,4 +1,4 @@
-"""The authority's side of the link to the front: entries in, decisions and state out. No thread, never waits."""
+"""`FrontLink`: the authority's side of the link to the front. Entries in, decisions and state out; it never waits."""
 
 from __future__ import annotations
 
@@ -21,25 +21,29 @@ from iris_session.protocol.server_messages import ParticipantLeft, PresenceItem,
 from iris_session.protocol.status import StatusReport
 from iris_session.protocol.steps import Decision
 
-#: Messages taken from the front in one `poll`; more than its credits allow cannot wait.
+#: Messages read from the front in one `poll`; its credits bound how many can be queued.
 _POLL_BOUND: Final = 64
 _SEND_QUEUE: Final = 256
-#: Decisions kept while the front does not read; when they are full the front is given up.
+#: Decisions queued while the front does not read; when the queue is full the front is replaced.
 _BACKLOG: Final = 4096
-#: Presence follows a state frame, so that clients are woken once for both; alone when no state came for so long.
+#: Presence is sent right after a state frame, so that clients wake up once for both; without one after this time.
 PRESENCE_ALONE_NS: Final = 50_000_000
-#: Longest time between two looks at the link that counts as silence of the front.
+#: Longest time between two polls of the link that counts as silence of the front.
 LOOKED_NS: Final = 100_000_000
-#: State frames come at tick times, so their distance varies by a tick.
+#: State frames are sent at tick times, so their distance varies by a tick.
 PRESENCE_SLACK_NS: Final = 4_000_000
 
 
 class FrontLink:
-    """Talks to one front process at a time; `open` starts over for a new one.
+    """Link to one front process at a time; `open` begins again for a new one.
 
-    `ports`: where the front listens, `None` until it is ready. `failure`: why it could not start. `status`: its
-    counters, and those of the fronts before it. `state_drops`: state frames that the front did not take. `overrun`:
-    it reads nothing any more.
+    Attributes:
+        ports: Ports of the front, `None` until it is ready.
+        failure: Reason why the front could not start, empty when it could.
+        status: Counters of the front, added to those of the fronts before it.
+        handback: Opaque state of the front, for its successor.
+        state_drops: State frames dropped because the front was not reading.
+        overrun: True when the queue of decisions is full: the front no longer reads.
     """
 
     def __init__(self, config: FrontConfig, monotonic_ns: Callable[[], int] = time.monotonic_ns) -> None:
@@ -61,14 +65,14 @@ class FrontLink:
         self.handback = b""
         self.state_drops = 0
         self.overrun = False
-        # Half of the front's credits are acknowledged at once: fewer wake-ups, and it is never left without credit.
+        # Half of the front's credits are acknowledged at once: fewer wake-ups, and the front never runs out of credit.
         self._acknowledge_at = max(1, config.limits.unacknowledged // 2)
         self._taken = 0
 
     def open(self, path: Path) -> str:
-        """Listens on a new ipc socket at `path` for the next front; gives its endpoint."""
+        """Listen for the next front on a new ipc socket at `path`. Return the endpoint."""
         if self._socket is not None:
-            self.receive()  # the last words of a front that died: an e-stop, the tokens it gave out
+            self.receive()  # the last messages of a front that died: an e-stop, the resume tokens it issued
             self._socket.close(linger=0)
             if self.ports is not None:
                 self._entries.append(Entry(HOST, HOST, self.now_ns, FrontRestarted()))
@@ -87,25 +91,25 @@ class FrontLink:
 
     @property
     def silence_ns(self) -> int:
-        """How long we have looked and a front that was ready has said nothing."""
+        """Time for which a front that was ready has sent nothing although the link was polled [ns]."""
         return self._silence_ns if self.ports is not None else 0
 
     @property
     def now_ns(self) -> int:
-        """Session time."""
+        """Session time [ns]."""
         return self._monotonic_ns() - self._config.origin_ns
 
     def poll(self) -> list[Entry]:
-        """Entries since the last call, in the order to be given to the authority. Never waits."""
+        """Return the entries since the last call, in the order for the authority. Never waits."""
         self.receive()
         entries, self._entries = self._entries, []
         return entries
 
     def receive(self) -> None:
-        """Takes what waits; `poll` hands out the entries. Bounded by the front's credits. Never waits."""
+        """Read the queued messages; `poll` returns the entries. Bounded by the front's credits. Never waits."""
         socket = self._socket
         now_ns = self._monotonic_ns()
-        # Only while we look: an authority that stood still itself accuses nobody.
+        # Only time between polls counts: a pause of the authority itself is not silence of the front.
         self._silence_ns += min(now_ns - self._received_ns, LOOKED_NS)
         self._received_ns = now_ns
         if socket is None or not readable(socket):
@@ -135,7 +139,7 @@ class FrontLink:
             self._taken = 0
 
     def send_decision(self, step: int, decision: Decision) -> None:
-        """Gives the front what leaves the process; call it in every step, it also says that the session lives."""
+        """Send the part of a decision that leaves the process. Call it in every step: it also keeps the link alive."""
         for item in decision.presence:
             self._presence[(item.participant, item.device)] = item
         for event in decision.events:
@@ -158,9 +162,13 @@ class FrontLink:
         self._send(messages.PRESENCE, messages.encoder.encode(items))
 
     def send_state(self, header: StateHeader, poses: npt.NDArray[np.float64]) -> None:
-        """State after a tick: `poses` (n, 7) float64 C-contiguous, `x y z qw qx qy qz`, world, in the order of the
-        scene's bodies. The front fills `published_ns`, `state_seq` and `base_seq`. A front that does not keep up
-        loses frames, counted in `state_drops`."""
+        """Send the state after a tick. Frames that the front has no room for are dropped and counted in `state_drops`.
+
+        Args:
+            header: Header of the frame; the front fills `published_ns`, `state_seq` and `base_seq`.
+            poses: T_world_body, float64 (n_bodies, 7) `x y z qw qx qy qz` [m], C-contiguous, in the order of the
+                scene's bodies.
+        """
         if self._socket is None or self.ports is None:
             return
         try:
@@ -174,21 +182,21 @@ class FrontLink:
             self._send_presence(self._sent_ns)
 
     def send_report(self, report: StatusReport) -> None:
-        """The authority's half of the status. Only the newest counts: a front that does not read gets none."""
+        """Send the authority's half of the status. Only the newest counts: a front that is not reading gets none."""
         if not self._backlog:
             self._send(messages.REPORT, messages.encoder.encode(report))
 
     def send_scene(self, scene: SceneInfo) -> None:
-        """Another scene: later snapshots and states are of its bodies. A front that is not ready yet gets it then."""
+        """Send another scene: later snapshots and states are of its bodies. A front that starts gets it when ready."""
         self._scene = messages.encoder.encode(scene)
         self._send(messages.SCENE, self._scene)
 
     def send_end(self) -> None:
-        """Asks the front to tell its clients that the session ends, and to exit."""
+        """Ask the front to notify its clients that the session ends, and to exit."""
         self._send(messages.END, b"")
 
     def _send(self, kind: bytes, payload: bytes) -> None:
-        """Sends in order; keeps a bounded backlog while the front does not read."""
+        """Send in order; queue a bounded number of messages while the front is not reading."""
         if self._socket is None or self.ports is None:
             return
         self._backlog.append((kind, payload))
@@ -204,7 +212,7 @@ class FrontLink:
         self._sent_ns = self._monotonic_ns()
 
     def close(self) -> None:
-        """Closes the socket. The front notices by its parent's end or by `send_end`."""
+        """Close the socket. The front notices it by `send_end`, or by the end of its parent."""
         if self._socket is not None:
             self._socket.close(linger=200)
             self._socket = None

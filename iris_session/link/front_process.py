@@ -1,6 +1,6 @@
-"""`FrontProcess`: the parent's side of the front process. Start, supervise, restart, end.
+"""`FrontProcess`: the parent's side of the front process, which starts, supervises, restarts and ends it.
 
-Its only thread lives for some milliseconds, while a front is replaced: ending a process that hangs and starting another
+Its only thread runs for some milliseconds while a front is replaced: ending a process that hangs and starting another
 takes longer than a tick.
 """
 
@@ -23,18 +23,18 @@ from iris_session.link.media_source import MediaSource
 from iris_session.protocol.common import Pose
 from iris_session.system.process import ChildProcess
 
-#: Longest folder that leaves room for our own names of folder and socket.
+#: Longest path of a folder that leaves room for the names of folder and socket in it [bytes].
 LONGEST_FOLDER: Final = 75
-#: A front sends something at least every `messages.BEAT_NS`, however busy; one that is silent for so long hangs.
+#: A front sends something at least every `messages.BEAT_NS`, even when busy; one that is silent for so long hangs.
 HANGING_NS: Final = 1_500_000_000
-#: Patience with a front that gets no processor.
+#: The same for a front that the system does not schedule.
 STARVED_NS: Final = 15_000_000_000
 #: From this silence on the processor time of the front is sampled.
 _QUIET_NS: Final = 500_000_000
 
 
 class FrontProcess:
-    """One front of a session, and its successors.
+    """The front process of a session, and its successors after a restart.
 
         process = FrontProcess(config, scene)
         ports = process.start()
@@ -50,7 +50,7 @@ class FrontProcess:
     def __init__(self, config: FrontConfig, scene: SceneInfo) -> None:
         self._scene = scene
         self._folder = tempfile.TemporaryDirectory(prefix="iris-", dir=_find_socket_folder())  # mode 0700
-        #: Where processes of this session publish media, to whichever front there is.
+        #: Endpoint to which processes of this session publish media; it is the same for every front.
         self.media_endpoint = f"ipc://{self._folder.name}/media"
         self._config = msgspec.structs.replace(config, media_endpoint=self.media_endpoint)
         self._generation = 0
@@ -63,7 +63,7 @@ class FrontProcess:
 
     @property
     def pid(self) -> int:
-        """Process id of the present front, 0 without one."""
+        """Process id of the present front, 0 when there is none."""
         return 0 if self._process is None else self._process.pid
 
     @property
@@ -73,14 +73,14 @@ class FrontProcess:
 
     @property
     def alive(self) -> bool:
-        """Return whether the front runs, reads its link and is heard from, or is being replaced."""
+        """True while the front runs, reads its link and sends, or is being replaced."""
         if self._replacing is not None and self._replacing.is_alive():
             return True
         return not self.fault
 
     @property
     def fault(self) -> str:
-        """Why the front is to be replaced, empty while it works."""
+        """Reason to replace the front, empty while it works."""
         process = self._process
         if process is None or not process.is_running:
             return "ended"
@@ -135,7 +135,7 @@ class FrontProcess:
 
     def _replace(self, old: ChildProcess | None, start: FrontStart) -> None:
         if old is not None:
-            old.close()  # dead, or silent: no step waits for its answer
+            old.close()  # dead or silent, so no step depends on it
         try:
             self._process = self._spawn(start)
         except FrontError as error:
@@ -152,7 +152,7 @@ class FrontProcess:
         self.link.send_scene(scene)
 
     def set_anchors(self, anchors: dict[str, Pose]) -> None:
-        """Set the present `T_world_anchor`, for successors of this front, which follows the events."""
+        """Set the present `T_world_anchor` for successors of this front; the running one gets them by events."""
         self._config = msgspec.structs.replace(self._config, anchors=anchors)
 
     def wait_ready(self, timeout_s: float) -> Ports:
@@ -192,7 +192,7 @@ class FrontProcess:
     def publish_media(
         self, stream: str, frames: bytes | Mapping[str, bytes], capture_ns: int, scene_epoch: int, encoding: str
     ) -> bool:
-        """Send a frame to whichever front there is; see `MediaSource.publish`."""
+        """Send a frame to the present front; see `MediaSource.publish`."""
         return self._source.publish(stream, frames, capture_ns, scene_epoch, encoding)
 
     def _stop_process(self, patience_s: float) -> None:
@@ -215,7 +215,7 @@ def _make_start_error(error: OSError | zmq.ZMQError) -> FrontError:
 
 
 def _find_socket_folder() -> str | None:
-    """Return a folder whose sockets fit: their path has at most 107 bytes, and some TMPDIR are too long."""
+    """Return a folder short enough for socket paths, which have at most 107 bytes; `None` when the default is."""
     return None if len(os.fsencode(tempfile.gettempdir())) <= LONGEST_FOLDER else "/tmp"
 
 
@@ -224,12 +224,13 @@ _STARVED_SHARE: Final = 0.5
 
 
 class StarvationDetector:
-    """Tells a process that hangs from one that gets no processor: only the first is worth replacing.
+    """Detects a silent process that does not hang but is not scheduled. Only a process that hangs is worth replacing.
 
-    The successor of a starved one would get no processor either, take longer than the old one to answer, and cost every
-    client its connection. Linux only; elsewhere, and for a process that has ended, nothing counts as starved.
+    The successor of a starved process would not be scheduled either, would take longer than the old one to answer, and
+    would cost every client its connection. Linux only; elsewhere, and for a process that has ended, nothing counts as
+    starved.
 
-    `sample` costs some 30 us: call it only while there is a reason, and `clear` when the reason is gone.
+    `sample` costs some 30 us: call it only while the process is silent, and `clear` when it is no longer.
     """
 
     def __init__(self) -> None:
@@ -253,7 +254,7 @@ class StarvationDetector:
             self._pid, self._first_ns, self._ran_ns, self._waited_ns = pid, now_ns, ran_ns, waited_ns
             return ready
         enough_ns = _STARVED_SHARE * (now_ns - self._first_ns)
-        # The kernel counts a wait when it ends: of one that goes on, only the state tells.
+        # The kernel counts a wait when it ends; a wait in progress shows only in the state.
         return waited_ns - self._waited_ns >= enough_ns or (ready and ran_ns - self._ran_ns < enough_ns)
 
 

@@ -1,4 +1,4 @@
-"""The networks of this machine: which addresses to listen on, where beacons go, what to call ourselves."""
+"""Network interfaces of this machine: addresses to listen on, to send beacons to, and to advertise."""
 
 from __future__ import annotations
 
@@ -11,18 +11,20 @@ import psutil
 
 from iris_session.link.config import FrontError
 
-#: Networks inside this machine (containers, virtual machines): others do not reach us by them.
+#: Networks inside this machine (containers, virtual machines): other machines cannot reach it by them.
 VIRTUAL: Final = ("br-", "cni", "docker", "lxc", "podman", "veth", "virbr", "vmnet")
-#: For a look at the routing table; nothing is sent. TEST-NET-3: nobody has it.
+#: Address by which the routing table is read; nothing is sent. TEST-NET-3 (RFC 5737), which no host has.
 _ELSEWHERE: Final = ("203.0.113.1", 9)
 WILDCARDS: Final = ("0.0.0.0", "::")
 LOOPBACK_BROADCAST: Final = "127.255.255.255"
 
 
 class Interface(NamedTuple):
-    """One address of one network interface that is up. `broadcast`: empty where there is none (IPv6, /32).
+    """One address of a network interface that is up.
 
-    `default`: the way to other networks begins here.
+    Attributes:
+        broadcast: Broadcast address, empty where there is none (IPv6, /32).
+        default: True for the interface of the default route.
     """
 
     name: str
@@ -36,7 +38,7 @@ class Interface(NamedTuple):
 
 
 def interfaces() -> list[Interface]:
-    """Every IPv4 and IPv6 address of the interfaces that are up, but link-local IPv6: those need a scope to be used."""
+    """Return the IPv4 and IPv6 addresses of interfaces that are up, without link-local IPv6, which needs a scope."""
     up, source = psutil.net_if_stats(), _source()
     found = []
     for name, addresses in sorted(psutil.net_if_addrs().items()):
@@ -53,9 +55,14 @@ def interfaces() -> list[Interface]:
 
 
 def addresses_of(wanted: Sequence[str], have: Sequence[Interface] | None = None) -> tuple[str, ...]:
-    """The addresses to listen on for `--interface` options: names like `eth0`, or addresses of this machine.
+    """Return the addresses to listen on for `--interface` options.
 
-    Raises `FrontError` that lists the interfaces for one that is not here.
+    Args:
+        wanted: Names such as `eth0`, or addresses of this machine.
+        have: Interfaces of this machine; `None` reads them from the system.
+
+    Raises:
+        FrontError: This machine has no such interface; the message lists those that it has.
     """
     have = interfaces() if have is None else have
     found: list[str] = []
@@ -69,8 +76,11 @@ def addresses_of(wanted: Sequence[str], have: Sequence[Interface] | None = None)
 
 
 def reachable(hosts: Sequence[str], have: Sequence[Interface]) -> list[Interface]:
-    """The interfaces that listening on `hosts` covers, best first: networks of people before those of containers,
-    IPv4 before IPv6, the one with the default route before others; loopback last."""
+    """Return the interfaces that listening on `hosts` covers, best first.
+
+    Physical networks come before those of containers, IPv4 before IPv6, the one with the default route before others;
+    loopback comes last.
+    """
     everything = any(host in WILDCARDS for host in hosts)
     named = {"127.0.0.1" if host == "localhost" else host for host in hosts}
     covered = [one for one in have if everything or one.address in named]
@@ -80,13 +90,13 @@ def reachable(hosts: Sequence[str], have: Sequence[Interface]) -> list[Interface
 
 
 def public_host(hosts: Sequence[str], have: Sequence[Interface]) -> str:
-    """The address that others are told when none is advertised: the first that they can reach."""
+    """Return the address to announce when none is advertised: the best one that other machines can reach."""
     covered = reachable(hosts, have)
     return covered[0].address if covered else hosts[0]
 
 
 def _broadcast(address: str, netmask: str | None) -> str:
-    """By the network mask: the system's own entry is missing or wrong on some interfaces."""
+    """Compute the broadcast address from the netmask: the system's own entry is missing or wrong on some interfaces."""
     if netmask is None:
         return ""
     network = ipaddress.ip_network(f"{address}/{netmask}", strict=False)
@@ -94,7 +104,7 @@ def _broadcast(address: str, netmask: str | None) -> str:
 
 
 def _source() -> str:
-    """Our address towards other networks, empty where no route leads there."""
+    """Return this machine's address towards other networks, empty when there is no route to them."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(_ELSEWHERE)

@@ -1,4 +1,4 @@
-"""Handing in media from a process of this machine: the authority, a camera. Never waits."""
+"""`MediaSource`: publish media from a process of this machine, such as the authority or a camera. Never waits."""
 
 from __future__ import annotations
 
@@ -11,18 +11,25 @@ import zmq
 from iris_session.protocol.codec import encode_media_frames
 from iris_session.protocol.media import MAX_STREAMS
 
-#: Frames on their way to the front, one of every stream; while it does not take them, new ones are dropped and counted.
+#: Frames queued for the front, one of every stream; when the queue is full new frames are dropped and counted.
 WAITING: Final = MAX_STREAMS
-#: And bytes, of all streams: one of the largest frames in all its classes (24 MiB), and some smaller ones.
+#: Bytes queued, of all streams: one of the largest frames in all its classes (24 MiB), and some smaller ones.
 WAITING_BYTES: Final = 32 * 1024 * 1024
 
 
 class MediaSource:
-    """May be used by several threads, also while it is closed by one of them. `endpoint`: of
-    `FrontProcess.media_endpoint`; fronts may come and go. Opens nothing before the first frame.
+    """Socket that publishes media frames to the front. Opens nothing before the first frame.
 
-    Large frames are not copied, which would take a tick loop milliseconds: libzmq's thread reads them, and says when
-    it has done so.
+    Several threads may use it, also while one of them closes it. The front may be restarted meanwhile.
+
+    Large frames are not copied, which would take a tick loop milliseconds: libzmq's thread reads them in place and
+    reports when it is done.
+
+    Args:
+        endpoint: `FrontProcess.media_endpoint`.
+
+    Attributes:
+        dropped: Number of frames dropped.
     """
 
     def __init__(self, endpoint: str) -> None:
@@ -31,20 +38,33 @@ class MediaSource:
         self._socket: zmq.Socket[bytes] | None = None
         self._lock = threading.Lock()
         self._closed = False
-        self._under_way: list[tuple[zmq.MessageTracker, int]] = []  # what libzmq still reads, and how long it is
+        self._under_way: list[tuple[zmq.MessageTracker, int]] = []  # frames that libzmq still reads, with their length
         self.dropped = 0
 
     @property
     def waiting(self) -> int:
-        """Bytes that libzmq has not handed on yet, of frames that were too large to be copied."""
+        """Bytes that libzmq has not sent yet, of frames that were too large to be copied."""
         with self._lock:
             return self._waiting()
 
     def publish(
         self, stream: str, frames: bytes | Mapping[str, bytes], capture_ns: int, scene_epoch: int, encoding: str
     ) -> bool:
-        """False: dropped, the front takes nothing now, or it is closed. Raises `ValueError` for what no front would
-        take."""
+        """Send one frame to the front.
+
+        Args:
+            stream: Name of the stream.
+            frames: Bytes of the frame, or bytes by class.
+            capture_ns: Session time of the capture [ns].
+            scene_epoch: Scene epoch to which the frame belongs.
+            encoding: Format of the bytes.
+
+        Returns:
+            False when the frame is dropped: the queue is full, or the source is closed.
+
+        Raises:
+            ValueError: The front would reject the frame: a wrong name or class, or too many bytes.
+        """
         message = encode_media_frames(stream, frames, capture_ns, scene_epoch, encoding)
         with self._lock:
             try:
@@ -59,7 +79,7 @@ class MediaSource:
         socket, waiting = self._open(), self._waiting()
         if socket is None or (waiting and waiting + sum(map(len, message)) > WAITING_BYTES):
             return False
-        # What could be changed while it is read (a bytearray) is copied.
+        # `bytes()` copies only mutable data (a bytearray), which could change while libzmq reads it.
         parts = [zmq.Frame(bytes(part), track=True, copy=None) for part in message]
         socket.send_multipart(parts, zmq.DONTWAIT, copy=False)
         self._under_way += [(part.tracker, len(part)) for part in parts if part.tracker is not None]
@@ -79,7 +99,7 @@ class MediaSource:
         return self._socket
 
     def close(self) -> None:
-        """May be called twice."""
+        """Close the socket and drop queued frames. May be called twice."""
         with self._lock:
             self._closed = True
             context, socket, self._context, self._socket = self._context, self._socket, None, None

@@ -1,9 +1,9 @@
-"""The link between authority and front: one ZeroMQ PAIR over ipc, messages of `[kind, payload, ...]` frames.
+"""Messages between authority and front: one ZeroMQ PAIR over ipc, messages of `[kind, payload, ...]` frames.
 
-Both ends are processes of the same session; what clients send has been checked before it comes here.
+Both ends are processes of the same session. The front has checked messages of clients before it sends them here.
 
-Flow control: the front numbers nothing but counts batches. Each `ENTRIES` batch uses one credit and comes back with
-one `ACK`; with all credits used the front waits and coalesces. Batches with urgent entries have credits of their own.
+Flow control: the front does not number batches but counts them. Each `ENTRIES` batch uses one credit, which an `ACK`
+returns; without credits the front waits and coalesces. Batches with urgent entries have credits of their own.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ FAILED: Final = b"F"  # utf-8, one line
 ENTRIES: Final = b"E"  # list[Entry]
 HANDBACK: Final = b"H"  # opaque bytes for the next front, sent before an entry that depends on it
 STATUS: Final = b"S"  # FrontStatus
-BEAT: Final = b"B"  # nothing to say, still there; not while the authority stands still
+BEAT: Final = b"B"  # empty: the front works but has nothing to send; not sent while the authority stands still
 
 # authority -> front
 DECIDED: Final = b"D"  # Decided
 STATE: Final = b"P"  # StateHeader, float64 poses
 PRESENCE: Final = b"I"  # list[PresenceItem]
-ACK: Final = b"A"  # one byte: how many batches were taken
-ALIVE: Final = b"K"  # nothing to say, still there
+ACK: Final = b"A"  # one byte: number of batches received
+ALIVE: Final = b"K"  # empty: the authority works but has nothing to send
 SCENE: Final = b"N"  # SceneInfo
 END: Final = b"Q"  # the session ends
 REPORT: Final = b"T"  # StatusReport, the authority's half; about once a second
 
-#: The authority says something at least this often; must be well below `FrontConfig.stall_ns`.
+#: The authority sends something at least this often; must be well below `FrontConfig.stall_ns`.
 KEEPALIVE_NS: Final = 20_000_000
-#: The front says something at least this often while it hears the authority.
+#: The front sends something at least this often while it receives from the authority.
 BEAT_NS: Final = 200_000_000
 
 
@@ -54,7 +54,9 @@ class Decided(msgspec.Struct, frozen=True, array_like=True):
 class FrontStatus(msgspec.Struct, frozen=True):
     """Counters of the front since its start, sent on change, at most twice a second.
 
-    `drops`: by reason, over all connections. `dropped_by`: by connection number, those with drops only.
+    Attributes:
+        drops: Dropped messages by reason, of all connections.
+        dropped_by: Dropped messages by connection number, of connections with drops only.
     """
 
     connections: int
@@ -66,7 +68,7 @@ class FrontStatus(msgspec.Struct, frozen=True):
 
 
 def add_status(before: FrontStatus, status: FrontStatus) -> FrontStatus:
-    """The counters of a front and of those before it: what was dropped does not come back with a new process."""
+    """Return the counters of a front added to those of the fronts before it, so that totals survive a restart."""
     return FrontStatus(
         status.connections,
         {

@@ -1,4 +1,4 @@
-"""Opening the sockets of the front: CURVE, bounded queues, errors that say what to do."""
+"""Sockets of the front: opened with CURVE and bounded queues, with errors that say what to do."""
 
 from __future__ import annotations
 
@@ -18,20 +18,21 @@ from iris_session.protocol.limits import MAX_CLIENT_BYTES, MAX_MEDIA_FRAME_BYTES
 from iris_session.security import KeyPair
 from iris_session.security.zap import ZAP_ASSETS, ZAP_CONTROL, ZAP_MEDIA, ZAP_STATE
 
-#: State sockets: two frames may wait for a client that is slow, then the newest is lost, not the oldest (libzmq).
+#: State sockets: two frames are queued for a slow client; then libzmq drops the newest, not the oldest.
 STATE_HWM = 2
 STATE_BUFFER_BYTES = 32_768
-#: A subscription. The handshake of CURVE has messages of up to 600 bytes.
+#: Fits a subscription. The handshake of CURVE has messages of up to 600 bytes.
 STATE_MESSAGE_BYTES = 1024
 STATE_RECEIVE_BYTES = 8192
 CONTROL_BUFFER_BYTES = 131_072
-#: Media: frames may be large, so few wait; more is refused to us, and the newest goes as soon as there is room.
+#: Media: frames may be large, so few are queued. With a full queue the send fails, and the front sends the newest frame
+#: as soon as there is room.
 MEDIA_HWM = 2
 MEDIA_BUFFER_BYTES = 65_536
 INGEST_HWM = 8
-#: Assets: chunks that wait in libzmq for one reader, mapped files all of them: as many as a reader asks for at once, as
-#: each that finds no room costs as much work as one that does. The system holds no more than a link of 300 Mbit/s and
-#: 7 ms: what waits there delays the state that shares the link.
+#: Assets: chunks queued in libzmq for one reader, all of them mapped files: as many as a reader requests at once,
+#: because a chunk that finds no room costs as much work as one that does. The system's send buffer fits a link of
+#: 300 Mbit/s and 7 ms and no more: bytes queued there delay the state that shares the link.
 ASSET_HWM = 8
 ASSET_BUFFER_BYTES = 262_144
 ASSET_MESSAGE_BYTES = 1024
@@ -39,22 +40,22 @@ ASSET_MESSAGE_BYTES = 1024
 IO_THREADS = 2
 MAIN_THREAD = 1
 MEDIA_THREAD = 2
-#: As plain integers: operations on the enumerations take longer than asking the socket.
+#: As plain integers: operations on the enumerations take longer than the query of the socket.
 _EVENTS = int(zmq.EVENTS)
 _POLLIN = int(zmq.POLLIN)
 #: Linux, `struct tcp_info`: `tcpi_bytes_acked`, and `tcpi_bytes_received` after it.
 _COUNTS_AT: Final = 120
-#: A peer that takes nothing of what waits for it for so long is cut off by the kernel, be it gone without a word or
-#: asleep: else its connection, and what waits in it, would stay for a quarter of an hour, or for ever.
+#: The kernel closes the connection of a peer that acknowledges no queued data for so long, because it vanished or
+#: sleeps. Else the connection and its queue would stay for a quarter of an hour, or for ever.
 STUCK_MS: Final = 30_000
-#: Connections that were opened and say nothing take a file descriptor each.
+#: Open connections that send nothing use a file descriptor each, too.
 FILE_DESCRIPTORS = 4096
 
 
 def open_control(
     context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, key: KeyPair | None, port: int
 ) -> zmq.Socket[bytes]:
-    """ROUTER for hello and everything after it."""
+    """Open the ROUTER of the control channel."""
     control = context.socket(zmq.ROUTER)
     control.setsockopt(zmq.ROUTER_MANDATORY, 1)
     control.setsockopt(zmq.MAXMSGSIZE, MAX_CLIENT_BYTES)
@@ -67,12 +68,12 @@ def open_control(
 
 
 def open_state(context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, key: KeyPair | None) -> zmq.Socket[bytes]:
-    """XPUB, a PUB that tells who subscribes, for rigid state and presence."""
+    """Open the XPUB of rigid state and presence. Unlike PUB, it reports subscriptions."""
     state = context.socket(zmq.XPUB)
     state.setsockopt(zmq.XPUB_VERBOSER, 1)
     state.setsockopt(zmq.SNDHWM, STATE_HWM)
     state.setsockopt(zmq.SNDBUF, STATE_BUFFER_BYTES)
-    # Subscriptions only. libzmq takes all that wait before it sends, in our thread: few may, and small ones.
+    # Subscriptions only. libzmq reads all queued ones before it sends, in this thread: so few and small ones.
     state.setsockopt(zmq.MAXMSGSIZE, STATE_MESSAGE_BYTES)
     state.setsockopt(zmq.RCVHWM, STATE_HWM)
     state.setsockopt(zmq.RCVBUF, STATE_RECEIVE_BYTES)
@@ -81,7 +82,7 @@ def open_state(context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, key
 
 
 def open_media(context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, key: KeyPair | None) -> zmq.Socket[bytes]:
-    """XPUB for media. The front decides who gets what, and is told when a connection takes no more."""
+    """Open the XPUB of media. The front chooses the receivers, and a send to a full connection fails."""
     media = context.socket(zmq.XPUB)
     media.setsockopt(zmq.XPUB_MANUAL, 1)
     media.setsockopt(zmq.XPUB_NODROP, 1)
@@ -94,7 +95,7 @@ def open_media(context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, key
 
 
 def open_assets(context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, key: KeyPair | None) -> zmq.Socket[bytes]:
-    """ROUTER for requests of assets, which are small, and their chunks, which are not."""
+    """Open the ROUTER of assets: small requests, large chunks."""
     assets = context.socket(zmq.ROUTER)
     assets.setsockopt(zmq.ROUTER_MANDATORY, 1)
     assets.setsockopt(zmq.MAXMSGSIZE, ASSET_MESSAGE_BYTES)
@@ -107,7 +108,7 @@ def open_assets(context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, ke
 
 
 def open_ingest(context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, key: KeyPair | None) -> zmq.Socket[bytes]:
-    """PULL for frames of cameras and other sources on other machines."""
+    """Open the PULL for media of cameras and other sources on other machines."""
     ingest = context.socket(zmq.PULL)
     ingest.setsockopt(zmq.MAXMSGSIZE, MAX_MEDIA_FRAME_BYTES)
     ingest.setsockopt(zmq.RCVHWM, INGEST_HWM)
@@ -116,7 +117,7 @@ def open_ingest(context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, ke
 
 
 def open_local_ingest(context: zmq.Context[zmq.Socket[bytes]], endpoint: str) -> zmq.Socket[bytes]:
-    """PULL for frames of processes of this session, in its private folder."""
+    """Open the PULL for media of processes of this session, in its private folder."""
     ingest = context.socket(zmq.PULL)
     ingest.setsockopt(zmq.AFFINITY, MEDIA_THREAD)
     ingest.setsockopt(zmq.MAXMSGSIZE, MAX_MEDIA_FRAME_BYTES)
@@ -126,24 +127,24 @@ def open_local_ingest(context: zmq.Context[zmq.Socket[bytes]], endpoint: str) ->
 
 
 def host_in_address(host: str) -> str:
-    """`host` as it stands before `:PORT`: IPv6 in brackets."""
+    """Return `host` as written before `:PORT`: IPv6 in brackets."""
     return f"[{host}]" if ":" in host and not host.startswith("[") else host
 
 
 def readable(socket: zmq.Socket[bytes]) -> bool:
-    """Whether a message waits. Cheaper than to poll, or to receive and catch `Again`."""
+    """Return whether a message can be received. Cheaper than a poll, or a receive that raises `Again`."""
     return bool(socket.get(_EVENTS) & _POLLIN)  # type: ignore[operator]
 
 
 def bound_port(bound: zmq.Socket[bytes]) -> int:
-    """The TCP port of a bound socket."""
+    """Return the TCP port of a bound socket."""
     return int(bound.getsockopt_string(zmq.LAST_ENDPOINT).rsplit(":", 1)[1])
 
 
 def watch_tcp(
     watched: zmq.Socket[bytes], name: str, events: int = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED
 ) -> zmq.Socket[bytes]:
-    """Socket that reports every TCP connection of `watched` that is opened or closed; see `next_tcp_event`."""
+    """Return a socket that reports every opened or closed TCP connection of `watched`; see `next_tcp_event`."""
     address = f"inproc://tcp-events-{name}"
     watched.monitor(address, events)
     monitor: zmq.Socket[bytes] = watched.context.socket(zmq.PAIR)
@@ -153,13 +154,13 @@ def watch_tcp(
 
 
 def next_tcp_event(monitor: zmq.Socket[bytes]) -> tuple[int, int]:
-    """What happened (`zmq.EVENT_*`) to which file descriptor. To be called when `monitor` is readable."""
+    """Return the next event (`zmq.EVENT_*`) and its file descriptor. Call it when `monitor` is readable."""
     event = parse_monitor_message(monitor.recv_multipart())
     return int(event["event"]), int(event["value"])
 
 
 class TcpCounts(NamedTuple):
-    """Bytes of one TCP connection since it was opened: that the other end has acknowledged, and that came from it."""
+    """Bytes of one TCP connection since it was opened: acknowledged by the peer, and received from it."""
 
     acknowledged: int
     received: int
@@ -167,8 +168,11 @@ class TcpCounts(NamedTuple):
 
 @contextlib.contextmanager
 def _borrowed(descriptor: int) -> Iterator[socket.socket]:
-    """A descriptor of libzmq as a socket of Python. Not a copy of it: with every descriptor in use there is no room for
-    one. Raises `OSError` when it is none, or not a socket."""
+    """Wrap a file descriptor of libzmq in a Python socket, which does not close it.
+
+    The descriptor is not duplicated: with every descriptor in use that would fail. Raises `OSError` when it is not a
+    socket.
+    """
     borrowed = socket.socket(socket.AF_INET, socket.SOCK_STREAM, 0, descriptor)
     try:
         yield borrowed
@@ -177,8 +181,16 @@ def _borrowed(descriptor: int) -> Iterator[socket.socket]:
 
 
 def close_tcp(descriptor: int, peer: tuple[str, int]) -> bool:
-    """Closes one peer's TCP connection: libzmq has no call for that. `peer`: its address when it said hello, so that
-    a descriptor that was given to somebody else since is left alone."""
+    """Close one TCP connection, for which libzmq has no call.
+
+    Args:
+        descriptor: File descriptor of the connection.
+        peer: Address and port of the peer at its `hello`. A connection with another peer, which has got the same
+            descriptor since, stays open.
+
+    Returns:
+        True when the connection was closed.
+    """
     try:
         with _borrowed(descriptor) as connection:
             if connection.getpeername()[:2] != peer:
@@ -190,7 +202,7 @@ def close_tcp(descriptor: int, peer: tuple[str, int]) -> bool:
 
 
 def peer_of(descriptor: int) -> tuple[str, int]:
-    """Address and port of the other end of a TCP connection, ("", 0) when it is gone."""
+    """Return address and port of the peer of a TCP connection, ("", 0) when it is closed."""
     try:
         with _borrowed(descriptor) as connection:
             host, port = connection.getpeername()[:2]
@@ -200,7 +212,7 @@ def peer_of(descriptor: int) -> tuple[str, int]:
 
 
 def tcp_counts(descriptor: int) -> TcpCounts | None:
-    """What the system counts of a TCP connection; `None` where it does not, or the connection is gone."""
+    """Return the system's byte counts of a TCP connection; `None` where there are none, or when it is closed."""
     try:
         with _borrowed(descriptor) as connection:
             info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _COUNTS_AT + 16)
@@ -210,7 +222,7 @@ def tcp_counts(descriptor: int) -> TcpCounts | None:
 
 
 def raise_descriptor_limit() -> None:
-    """Lets the front hold more open connections than the usual 1024 files, as far as the system allows."""
+    """Raise the limit of open files from the usual 1024 to `FILE_DESCRIPTORS`, as far as the system allows."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = FILE_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(FILE_DESCRIPTORS, hard)
     if soft != resource.RLIM_INFINITY and soft < wanted:
@@ -218,7 +230,7 @@ def raise_descriptor_limit() -> None:
 
 
 def _bind_or_any(bound: zmq.Socket[bytes], config: FrontConfig, key: KeyPair | None, port: int, name: str) -> None:
-    """On any free port when the wanted one is taken: clients are told which it is."""
+    """Bind to `port`, or to any free port when it is in use: clients learn the number in `Welcome`."""
     _prepare(bound, key, name)
     try:
         _listen(bound, config, port, name)

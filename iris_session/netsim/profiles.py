@@ -1,10 +1,10 @@
-"""What a link is like from moment to moment: profiles as data, and delays as a function of seed and time alone.
+"""Conditions of an impaired link over time: profiles as data, and delays as a function of seed and time alone.
 
-    weather = Weather(load_profile("busy-wifi"), seed=1)
-    weather.delay_ns("up", 3_000_000_000)      one-way delay of a byte that is sent 3 s after the start
-    weather.stalled("up", 3_000_000_000)       whether nothing passes then
+    conditions = LinkConditions(load_profile("busy-wifi"), seed=1)
+    conditions.compute_delay_ns("up", 3_000_000_000)      one-way delay of a byte that is sent 3 s after the start
+    conditions.is_stalled("up", 3_000_000_000)            True if nothing passes then
 
-Two runs with one profile and one seed have the same weather at the same moments, whatever was sent. Pure.
+Two runs with one profile and one seed have the same conditions at the same times, independent of the data sent. Pure.
 """
 
 from __future__ import annotations
@@ -35,11 +35,14 @@ class ProfileError(ValueError):
 
 
 class Direction(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One direction of a link. `delay_ms` +- `jitter_ms` (normal, at least 0), one way; `rate_mbit`: bandwidth that all
-    connections share [Mbit/s], 0 for unlimited; `stalled`: nothing passes.
+    """One direction of a link. Bytes of a TCP connection are never lost and keep their order.
 
-    Datagrams only: probability that one is lost, duplicated, or delayed by `reorder_ms` so that later ones overtake it.
-    Bytes of a TCP connection are never lost and keep their order.
+    Attributes:
+        delay_ms, jitter_ms: Mean and standard deviation of the one-way delay (normal, at least 0) [ms].
+        rate_mbit: Bandwidth that all connections share [Mbit/s], 0 for unlimited.
+        stalled: Nothing passes.
+        loss, duplicate: Probability that a datagram is lost, or duplicated.
+        reorder: Probability that a datagram is delayed by `reorder_ms`, so that later ones overtake it.
     """
 
     delay_ms: float = 0.0
@@ -53,11 +56,15 @@ class Direction(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 class ProfilePhase(Direction, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A stretch of time of a profile. Its own fields apply to both directions; `up`, `down` replace all of them.
+    """A period of a profile. The fields of `Direction` apply to both directions; `up` and `down` replace all of them.
 
-    `seconds`: 0 for ever. `at_start`: `cut` closes every connection, `reset` breaks them off (RST). `burst_*`: mean
-    time between bursts in which up to `burst_ms` is added to each delay, and how long one lasts. `stall_*`: the same
-    of stalls in which nothing passes; then everything arrives at once. Both affect both directions.
+    Attributes:
+        seconds: Length [s], 0 for ever.
+        at_start: `cut` closes every connection, `reset` aborts it (RST), empty does neither.
+        burst_every_s, burst_s: Mean time between bursts, and length of one, in both directions [s].
+        burst_ms: Delay added during a burst, drawn from 0 to this [ms].
+        stall_every_s, stall_s: The same of stalls, in which nothing passes; then everything arrives at once.
+        up, down: Settings of one direction.
     """
 
     seconds: float = 0.0

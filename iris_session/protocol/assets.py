@@ -21,9 +21,9 @@ from iris_session.protocol.names import ArrayCodec, ArrayFilter
 
 #: Bytes of one chunk at most. Smaller ones share a link more fairly, larger ones cost less per byte.
 MAX_ASSET_CHUNK_BYTES: Final = 1 << 20
-#: Bytes of one asset at most, the largest array and its header: whoever is told of more fetches nothing of it.
+#: Bytes of one asset at most: the largest array and its header. Clients fetch nothing of an asset listed as larger.
 MAX_ASSET_BYTES: Final = (1 << 30) + (1 << 20)
-#: What a client may have asked for and not been sent yet, at most, by one connection to the channel.
+#: Requests, and requested bytes, that one connection to the channel may have pending.
 MAX_ASSET_REQUESTS: Final = 64
 MAX_ASSET_WINDOW_BYTES: Final = 8 << 20
 _ADDRESS: Final = re.compile(r"[0-9a-f]{64}")
@@ -73,7 +73,7 @@ def is_address(text: str) -> bool:
 
 ARRAYS_MAGIC: Final = b"IRA1"
 MAX_ARRAY_HEADER_BYTES: Final = 16_384
-#: Largest array after decompression that a reader accepts unless told otherwise: a texture of 16,384 x 16,384 RGBA.
+#: Largest array after decompression that a reader accepts by default: a texture of 16,384 x 16,384 RGBA.
 MAX_ARRAY_BYTES: Final = 1 << 30
 MAX_ARRAYS: Final = 16
 

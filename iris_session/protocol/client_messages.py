@@ -128,7 +128,7 @@ class Consent(Message, frozen=True, tag="consent"):
 
 
 class Assign(Message, frozen=True, tag="assign"):
-    """Assign robots to a participant (empty: free them), whoever holds them. Directors only."""
+    """Assign robots to a participant (empty: free them), even if another one holds them. Directors only."""
 
     request_id: Count
     robots: Names

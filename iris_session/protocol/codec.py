@@ -1,6 +1,6 @@
 """Bytes to messages and back: the trust boundary. MessagePack by `msgspec`, checked against the schema and the sizes.
 
-Every `decode_*` raises a `ProtocolError` and nothing else, whatever the bytes are. What it lets through on purpose:
+For any bytes, every `decode_*` returns a value or raises a `ProtocolError`, nothing else. It accepts on purpose:
 unknown fields (ignored, so that a version can grow), unknown values of open enumerations and non-finite floats (the
 authority answers them with typed reasons).
 """
@@ -97,7 +97,7 @@ class _Event(msgspec.Struct, frozen=True):
 
 
 class _Tags(msgspec.Struct):
-    """The tags of a message, whatever its other fields are."""
+    """The tags of a message; its other fields are ignored."""
 
     type: str = ""
     body: _Event = _Event()
@@ -364,7 +364,7 @@ def _explain_failure(
     tags: msgspec.msgpack.Decoder[_ClientTags] | msgspec.msgpack.Decoder[_ServerTags],
     known: Mapping[str, type[Message]],
 ) -> ProtocolError:
-    """What to raise for an envelope that did not decode with `error`: wrong version first, then unknown type."""
+    """Return the error to raise for an envelope that failed with `error`: wrong version first, then unknown type."""
     try:
         version = peek_version(data)
     except MalformedError as no_envelope:

@@ -171,7 +171,7 @@ class SceneLoaded(Message, frozen=True, tag="scene_loaded"):
 
 
 class ScenePatched(Message, frozen=True, tag="scene_patched"):
-    """What is drawn changes in this step (host only). `scene_hash`: of the specification after `ops`."""
+    """A visual change of the scene in this step (host only). `scene_hash`: of the specification after `ops`."""
 
     ops: Annotated[tuple[PatchOp, ...], msgspec.Meta(max_length=MAX_OPS)]
     scene_hash: Name

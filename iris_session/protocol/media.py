@@ -1,7 +1,7 @@
-"""The media channel, version 1: headers, topics, and how a frame is handed in. Latest value per stream.
+"""The media channel, version 1: headers, topics, and the message by which a source sends a frame. Latest value wins.
 
-Of a stream there are classes (`BudgetClass`). `half` and `quarter` are what its source offers for them, and where it
-offers nothing of its own every second or fourth frame of the next better one.
+A stream has classes (`BudgetClass`). `half` and `quarter` are coarser forms offered by its source; without one, every
+second or fourth frame of the next better class.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import msgspec
 from iris_session.protocol.common import Count, Name, Nanoseconds
 from iris_session.protocol.names import BudgetClass, MediaEncoding
 
-#: From everything to nothing; the index is the level of a class.
+#: Classes from everything to nothing; the index is the level of a class.
 CLASSES: Final = (BudgetClass.FULL, BudgetClass.HALF, BudgetClass.QUARTER, BudgetClass.NONE)
 MAX_STREAMS: Final = 16
 _STREAM: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,47}")
@@ -22,7 +22,7 @@ _TOPIC: Final = re.compile(rb"media/([1-9][0-9]{0,18})/([A-Za-z0-9][A-Za-z0-9._-
 
 
 class StreamBudget(msgspec.Struct, frozen=True):
-    """One media stream, and what a client gets of it. `mbit_per_s`: of that class, as measured."""
+    """One media stream, and the class that a client gets. `mbit_per_s`: of that class, as measured."""
 
     stream: Name
     budget_class: Name = BudgetClass.FULL

@@ -106,8 +106,8 @@ class AlignmentKind:
 
 
 class AlignAction:
-    """Action of `align`. `start`: measure anew, from nothing; `stop`: keep the alignment in force whatever is
-    observed.
+    """Action of `align`. `start`: measure anew, from nothing; `stop`: keep the alignment in force, ignore further
+    observations.
     """
 
     START: Final = "start"
@@ -169,7 +169,7 @@ class HoldReason:
     DISCONNECTED: Final = "disconnected"
     GAP: Final = "gap"  # the session stood still; clutch again
     SCENE_CHANGED: Final = "scene_changed"  # reset or new epoch; clutch again
-    INTERVENTION: Final = "intervention"  # mode `priority`, told to the agent: a human has the robot
+    INTERVENTION: Final = "intervention"  # mode `priority`, sent to the agent: a human has the robot
     REARM: Final = "rearm"  # engagement ended (release, takeover, new tracking epoch); clutch again
 
 
@@ -224,7 +224,7 @@ class DenialReason:
     USER_OWNED: Final = "user_owned"  # e.g. pause or reset of a loop that the user drives
     POLICY: Final = "policy"  # the assignment policy leaves this to the configuration or a director
     INVALID: Final = "invalid"  # values out of range (non-finite pose, n_ticks < 1, ...)
-    TOO_FAR: Final = "too_far"  # more often a wrong number than meant: say that it is
+    TOO_FAR: Final = "too_far"  # more often a wrong number than intended: confirm with `force`
 
 
 class RefusalCode:
@@ -249,8 +249,8 @@ class FaultCode:
     MALFORMED: Final = "malformed"
     TOO_LARGE: Final = "too_large"
     RATE: Final = "rate"
-    HELLO: Final = "hello"  # this connection has not said hello, or the front was restarted: say it again
-    DROPPED: Final = "dropped"  # the session let this connection go
+    HELLO: Final = "hello"  # this connection has not sent `hello`, or the front was restarted: send it again
+    DROPPED: Final = "dropped"  # the session closed this connection
     STALLED: Final = "stalled"  # the session does not step: robots hold
     RECOVERED: Final = "recovered"
     SESSION_ENDED: Final = "session_ended"
@@ -289,7 +289,7 @@ class AuditKind:
     KEY_REVOKED: Final = "key_revoked"
     ROLE_REFUSED: Final = "role_refused"
     REMOVED: Final = "removed"
-    GATEWAY_REFUSED: Final = "gateway_refused"  # `on_behalf_of` from somebody who is no gateway
+    GATEWAY_REFUSED: Final = "gateway_refused"  # `on_behalf_of` from a participant that is no gateway
     TOKEN_REFUSED: Final = "token_refused"
     FLOOD: Final = "flood"  # a client sends more than its limits for seconds
 
@@ -314,7 +314,7 @@ class AssetRefusal:
     NOT_ALLOWED: Final = "not_allowed"  # the connection that the request names is not welcome, or not the sender's
     RATE: Final = "rate"
     BUSY: Final = "busy"
-    #: What time can change.
+    #: Refusals that may end with time.
     PASSING: Final = frozenset({"too_many_outstanding", "not_allowed", "rate", "busy"})
 
 
@@ -328,12 +328,12 @@ class MediaEncoding:
 class LateCause:
     """Part of a late tick that took the time."""
 
-    SCHEDULER: Final = "scheduler"  # the process did not run when it wanted to
+    SCHEDULER: Final = "scheduler"  # the process was ready but did not run
     PHYSICS: Final = "physics"
     CONTROL: Final = "control"
     AUTHORITY: Final = "authority"
     OUTPUT: Final = "output"  # sending state, decisions, and to the recorder
-    SUPERVISION: Final = "supervision"  # starting a process anew
+    SUPERVISION: Final = "supervision"  # restart of a process
     OWNER: Final = "owner"  # the user's loop
 
 
@@ -403,7 +403,7 @@ class Follow:
     FIXED: Final = "fixed"  # with its body, by its pose in the body
     TRACK: Final = "track"  # position with its body, orientation fixed in the world
     TRACK_COM: Final = "trackcom"  # as `track`, with the centre of mass of the body's subtree
-    TARGET_BODY: Final = "targetbody"  # position with its body, looks at the target's frame
+    TARGET_BODY: Final = "targetbody"  # position with its body, directed at the target's frame
     TARGET_BODY_COM: Final = "targetbodycom"  # as `targetbody`, at the centre of mass of the target's subtree
 
 
@@ -432,7 +432,7 @@ class ArrayName:
     POSITION: Final = "position"
     NORMAL: Final = "normal"
     UV: Final = "uv"
-    COLOR: Final = "color"  # of corners, 0..255: multiplies the colour of what wears the mesh
+    COLOR: Final = "color"  # of corners, 0..255: multiplies the colour of the visual that uses the mesh
     PIXELS: Final = "pixels"
     ELEVATION: Final = "elevation"
     ELEMENTS: Final = "elements"  # of a deformable: two vertices an edge, three a triangle

@@ -1,4 +1,4 @@
-"""Join codes: how a client and a session prove to each other that they know the same code, without sending it.
+"""Join codes: proofs by which a client and a session show each other that they know the same code, without sending it.
 
 A join code is twelve characters (60 bits), valid for minutes and for one client. Both sides stretch it once:
 
@@ -6,11 +6,11 @@ A join code is twelve characters (60 bits), valid for minutes and for one client
     client_proof = HMAC-SHA256(stretched, "client" || server_public || client_public)
     server_proof = HMAC-SHA256(stretched, "server" || server_public || client_public)
 
-Keys are the raw 32 bytes of the CURVE keys in use. So a code guards against somebody in the middle: whoever relays
-with keys of their own gets a proof that is good for nothing but to try codes on, each for the price of 200,000
-iterations; while a code lives, or beforehand for a key of their own, that is possible for a vanishing part of 2**60
-(docs/security.md has the numbers). PBKDF2 because every browser and .NET has it; a password-authenticated key exchange
-would make do with a shorter code, but none is in their standard libraries.
+Keys are the raw 32 bytes of the CURVE keys in use. So a code protects against a relay in the middle: one that uses its
+own keys gets a proof that allows nothing but testing guesses of the code, at 200,000 iterations each. While a code is
+valid, or beforehand for a key of the relay, that covers a vanishing part of 2**60 guesses (docs/security.md has the
+numbers). PBKDF2 because every browser and .NET has it; a password-authenticated key exchange would need a shorter code
+only, but none is in their standard libraries.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import hashlib
 import hmac
 from typing import Final
 
-#: Crockford's base 32: no I, L, O, U. Any of them, and lower case, is read as what it looks like.
+#: Crockford's base 32: no I, L, O, U. Any of them, and lower case, is read as the character that it resembles.
 ALPHABET: Final = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
 CODE_CHARACTERS: Final = 12
 #: Random bytes that a code is made from; it takes 60 bits of them.

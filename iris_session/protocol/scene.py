@@ -453,7 +453,7 @@ def check_scene(spec: SceneSpec) -> None:
         raise SceneError("a mesh or texture has no level")
 
 
-#: Of what the types bound, for specifications that are made and not read.
+#: Bounds from the types, for specifications that were made in memory and not decoded.
 _MOST: Final = {
     "bodies": MAX_BODIES,
     **dict.fromkeys(("materials", "textures", "meshes", "hfields", "lights", "cameras"), MAX_THINGS),
@@ -574,7 +574,7 @@ def merge_patches(before: Iterable[PatchOp], ops: Iterable[PatchOp]) -> tuple[Pa
 
 
 def _get_visual_id(op: PatchOp) -> int | None:
-    """Id of the visual that an operation is about; additions to lists are about themselves only."""
+    """Return the id of the visual that an operation changes; an addition to a list counts as its own."""
     if isinstance(op, AddVisual):
         return op.visual.id
     return op.visual if isinstance(op, SetVisual | RemoveVisual) else None

@@ -61,7 +61,7 @@ class Welcome(Message, frozen=True, tag="welcome"):
 
 
 class Refused(Message, frozen=True, tag="refused"):
-    """A `hello` that the front did not let through (`RefusalCode`), or that the authority denied (`DenialReason`)."""
+    """A `hello` that the front refused (`RefusalCode`), or that the authority denied (`DenialReason`)."""
 
     code: Name
     message: Text
@@ -417,8 +417,8 @@ class Snapshot(Message, frozen=True, tag="snapshot"):
     """Everything a late joiner needs; events with `event_seq` at or below its own are to be discarded.
 
     In the step of a reset `tick` and `sim_time` are still those before it. `tick_period_ns`: of this scene; 0: that of
-    `Welcome`. Bulk frame 1 (added by the front): float64
-    (n_bodies, 7) world poses `x y z qw qx qy qz` of `bodies` at `state_seq`.
+    `Welcome`. Bulk frame 1 (added by the front): float64 (n_bodies, 7) world poses `x y z qw qx qy qz` of `bodies` at
+    `state_seq`.
     """
 
     request_id: Count

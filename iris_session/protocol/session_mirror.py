@@ -31,8 +31,8 @@ from iris_session.protocol.server_messages import (
     Snapshot,
 )
 
-MAX_HELD_EVENTS: Final = 256  # kept while a snapshot is on its way; more than that and the next snapshot covers them
-#: Causes of `SceneChanged` that leave robots and bodies as they are; after any other a new snapshot tells them.
+MAX_HELD_EVENTS: Final = 256  # held while a snapshot is on its way; the next snapshot covers any further ones
+#: Causes of `SceneChanged` that leave robots and bodies as they are; after any other a new snapshot lists them.
 SAME_BODIES: Final = frozenset({"reset", "patch", "external"})
 _encoder = msgspec.msgpack.Encoder(order="deterministic")
 

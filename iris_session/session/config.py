@@ -43,7 +43,7 @@ class SessionConfig:
             same name makes it end in a number.
         host: Address to listen on. Everything but loopback is encrypted.
         interfaces: Names or addresses of the networks to listen on, instead of `host`.
-        advertise: Address that clients are told when it is none of this machine (a forwarding router).
+        advertise: Address to announce to clients that reach the session by another machine (a forwarding router).
         beacon_port: UDP port of the beacons by which clients find the session; 0 for no beacons.
         control_port: TCP port of the control channel; 0 for any free one.
         state_port: TCP port of the state channel; 0 for any free one. Media and assets use ports near it.

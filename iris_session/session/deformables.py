@@ -71,7 +71,7 @@ class DeformableStreams:
             for stream in self._streams:
                 stream.encoder.reset()
         for stream in self._streams:
-            if end_ns - stream.sent_ns >= REPEAT_NS:  # whatever the rate of the state is
+            if end_ns - stream.sent_ns >= REPEAT_NS:  # independent of the rate of the state
                 stream.encoder.reset()
             frames = stream.encoder.encode(stream.mesh.vertices())
             if frames is None:

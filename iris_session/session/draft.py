@@ -25,8 +25,8 @@ from iris_session.session.errors import PublishError, short_repr
 FARTHEST_M: Final = 1e6
 #: Tolerance of the length of a quaternion: it was rounded, and is normalised.
 UNIT: Final = 1e-3
-#: How far beyond its limits a joint is warned about, as a share of their range: encoders and limits of a description
-#: differ by less, degrees in place of radians by more.
+#: Excess over its limits at which a joint is warned about, as a share of their range: encoders and limits of a
+#: description differ by less, degrees in place of radians by more.
 BEYOND: Final = 0.05
 #: Most joints that `warnings` names; a robot in degrees has many.
 MAX_WARNINGS: Final = 4
@@ -99,7 +99,7 @@ class SceneDraft:
         with np.errstate(over="ignore"):  # infinite is no length of 1 either
             lengths = np.sqrt(np.einsum("ij,ij->i", q, q))
         if len(names) and (np.abs(p).max() > FARTHEST_M or np.abs(lengths - 1.0).max() > UNIT):
-            for row, name in enumerate(names):  # one of them is wrong, and this says which
+            for row, name in enumerate(names):  # raises for the one that is wrong
                 _check_position(p[row].tolist(), name)
                 _check_quaternion(q[row].tolist(), name)
         rows = [self._rows[name] if name in self._rows else self._find_row(name) for name in names]
@@ -179,7 +179,7 @@ class SceneDraft:
         """Return the poses of the bodies of an articulation. Raises `PublishError` when one is out of range."""
         try:
             placed = self._scene.articulations[name].compute_world_poses(root, joints, moved)
-        except ValueError:  # farther, or turned more often, than floats can tell
+        except ValueError:  # beyond the range in which floats can compute the pose
             placed = {}
         if not placed or not all(abs(v) <= FARTHEST_M for one in placed.values() for v in one.p):  # NaN is not
             raise PublishError(f"{name!r} would lie more than 1,000 km away: metres and radians are expected")
@@ -243,7 +243,7 @@ def _check_numbers(given: Sequence[float], n: int, what: str) -> list[float]:
 
 
 def _to_float(given: Any) -> float:
-    if isinstance(given, str | bytes):  # digits would be taken for numbers
+    if isinstance(given, str | bytes):  # `float` would parse digits
         raise TypeError("a text")
     return float(given)
 

@@ -1,4 +1,4 @@
-"""`SessionLedger`: who is in a session, what they hold and what happened, from the authority's own decisions.
+"""`SessionLedger`: participants of a session, their leases and recent events, from the authority's own decisions.
 
 It needs no snapshot and no question to the pure core. Reports for people and clients are made of it in `status`.
 """

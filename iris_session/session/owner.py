@@ -1,4 +1,4 @@
-"""`Owner`: what the program that embeds a session can do with it, however its world advances.
+"""`Owner`: operations of the program that embeds a session, common to all ways in which its world advances.
 
 `Session` (a MuJoCo scene) and `ScenePublisher` (any other world) add how the world advances.
 """
@@ -29,7 +29,7 @@ from iris_session.session.stepper import MAX_PENDING_SCENES, NextPatch, Stepper
 
 
 class Owner:
-    """One session, as the process that owns it sees it."""
+    """Base of `Session` and `ScenePublisher`: one session, as seen by the process that owns it."""
 
     config: SessionConfig
     clock: Callable[[], int]
@@ -77,7 +77,10 @@ class Owner:
 
     @contextmanager
     def signals(self) -> Iterator[None]:
-        """Make Ctrl-C and SIGTERM inside the context end `run()` in order, also before it. Main thread only."""
+        """Make Ctrl-C and SIGTERM inside the context set `stopping` and end `run()`, also before it. Main thread only.
+
+        A second Ctrl-C raises `KeyboardInterrupt`. In another thread the context does nothing.
+        """
         with stop_on_signals(self._stop):
             yield
 
@@ -88,15 +91,30 @@ class Owner:
 
         Args:
             reason: Text for participants and the recording; any text is accepted.
+
+        Raises:
+            OwnershipError: The session is closed; a `ScenePublisher` must be started, too.
         """
         self.post(EStop(reason=str(reason).encode("utf-8", "replace").decode()))
 
     def clear_estop(self) -> None:
-        """Allow motion again after an e-stop. Participants must clutch again."""
+        """Allow motion again after an e-stop. Participants must clutch again.
+
+        Raises:
+            OwnershipError: The queue of inputs is full, or the session is closed.
+        """
         self.post(ClearEStop(request_id=0))
 
     def marker(self, text: str) -> None:
-        """Put a note into the recording, and show it to participants."""
+        """Put a note into the recording, and show it to participants.
+
+        Args:
+            text: The note.
+
+        Raises:
+            ValueError: `text` is not a valid string.
+            OwnershipError: The queue of inputs is full, or the session is closed.
+        """
         self.post(Marker(request_id=0, text=text))
 
     def publish_media(
@@ -114,7 +132,7 @@ class Owner:
             frames: Bytes of the frame, or bytes by class: `full`, and the coarser `half` and `quarter`. For a class
                 that is left out, clients get every second or fourth frame of the next better one.
             capture_ns: Session time of the capture [ns], as of `session.clock()`. Default: now.
-            encoding: Format of the bytes, for those who read them.
+            encoding: Format of the bytes, for the subscribers.
 
         Returns:
             False when the frame is dropped: the front accepts none now, or the session is closing.
@@ -167,7 +185,11 @@ class Owner:
     # --- state of the session ----------------------------------------------------------------------------------------
 
     def status(self) -> SessionStatus:
-        """Return participants and what they hold, lateness of ticks, drops and restarts."""
+        """Return the status of the session. It may be called before `start` and after `close`.
+
+        Returns:
+            Participants and their leases, lateness of ticks, drops and restarts.
+        """
         processes = self._processes
         drops = {} if processes is None else processes.count_drops()
         restarts = {} if processes is None else processes.count_restarts()
@@ -175,13 +197,17 @@ class Owner:
             return make_session_status(self._stepper, self._pacer, drops, restarts, self._scheduling)
 
     def recent_events(self) -> list[Event]:
-        """Return the newest events, oldest first (at most 200; the recording has them all)."""
+        """Return the newest events.
+
+        Returns:
+            At most 200 events, oldest first; the recording has them all.
+        """
         with self._hold_steps():
             return [] if self._stepper is None else list(self._stepper.ledger.recent)
 
     @property
     def scene(self) -> SceneSpec | None:
-        """What clients draw, with all patches so far; `None` when the session shares no specification."""
+        """Specification from which clients draw the scene, with all patches; `None` when the session shares none."""
         newest = self._require_started().scenes.newest
         return None if newest is None else newest.spec
 
@@ -202,8 +228,8 @@ class Owner:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Messages for people about how the session started (another name, other addresses) and what clients do not see
-        of its present scene; one line each."""
+        """Notes for the user, one line each: how the session started (another name, other addresses), and which parts
+        of the present scene clients do not see."""
         live = self._processes
         return () if live is None else tuple(dict.fromkeys((*live.notes, *live.scenes.notes)))
 
@@ -233,7 +259,7 @@ def stop_on_signals(stop: threading.Event) -> Iterator[None]:
 
     def on_signal(number: int, _: FrameType | None) -> None:
         if stop.is_set() and number == signal.SIGINT:
-            raise KeyboardInterrupt  # the second Ctrl-C does not wait
+            raise KeyboardInterrupt  # the second Ctrl-C interrupts at once
         stop.set()
 
     previous = {s: signal.signal(s, on_signal) for s in (signal.SIGINT, signal.SIGTERM)}

@@ -71,7 +71,7 @@ _log = logging.getLogger(__name__)
 
 
 class PublishedScene(NamedTuple):
-    """A scene whose world is not MuJoCo's: what clients draw, and its deformables."""
+    """A scene whose world MuJoCo does not simulate: its specification for clients, and its deformables."""
 
     scene: ComposedScene
     deformables: tuple[DeformableMesh, ...]
@@ -124,7 +124,7 @@ class SessionProcesses:
         self.reporter = StatusReporter()
         self._next_supervise_ns = 0
         self._address = ""
-        # What MuJoCo had no room for: since the session began, and as the world counts it since its last reset.
+        # Contacts that MuJoCo had no room for: since the session began, and since the last reset of the world.
         self._overflows: dict[str, int] = {}
         self._world_overflows: dict[str, int] = {}
 
@@ -181,7 +181,7 @@ class SessionProcesses:
             others.close()
 
     def _save_resume_note(self) -> None:
-        """Offer to the disk what resuming needs and the journal lacks: the front's memory, and where it listens."""
+        """Queue for the disk the data that resuming needs and the journal lacks: the front's state and its ports."""
         if self._note_writer is None or self.front is None or self.front.link.ports is None:
             return
         config, ports = self._config, self.front.link.ports
@@ -230,7 +230,7 @@ class SessionProcesses:
 
     @property
     def front_ports(self) -> Ports:
-        """Where the front listens. The session must be started."""
+        """Ports of the front. The session must be started."""
         assert self.front is not None
         assert self.front.link.ports is not None
         return self.front.link.ports
@@ -313,7 +313,7 @@ class SessionProcesses:
             self.front.link.send_report(self.reporter.make_report(stepper, self.make_status()))
 
     def _announce(self, stepper: Stepper, text: str) -> None:
-        """Mark in the recording, for participants and in the log what befell the session itself."""
+        """Announce an event of the session itself in the recording, to participants and in the log."""
         _log.warning("%s", text)
         stepper.post_own(Marker(request_id=0, text=text))
 

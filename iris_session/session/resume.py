@@ -3,9 +3,9 @@
 The restored state is exactly that after the last row that replays with the same result. What comes after it (a file cut
 short, a step that crashed, rows that other versions of the libraries compute differently) is left out and reported.
 
-`resume.tokens` beside a recording holds what a running session knows and no journal has: the memory of its front
-(hashes of resume tokens, connection numbers) and where it listened. Only its owner can read it. A thread writes it
-whenever it changes, as a whole and durably, so a disk that hangs delays no step.
+`resume.tokens` beside a recording holds data of a running session that no journal has: the state of its front (hashes
+of resume tokens, connection numbers) and its addresses. Only its owner can read it. A thread writes it whenever it
+changes, as a whole and durably, so a disk that hangs delays no step.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ NOTE_FILE: Final = "resume.tokens"
 #: Changes of the note that come faster are written together.
 NOTE_PERIOD_S: Final = 0.05
 MAX_NOTE_BYTES: Final = 4_000_000
-#: After a reboot the clock does not tell the length of the gap: session time continues above everything that rows which
-#: did not reach the disk may have shown to clients.
+#: After a reboot the clock does not show the length of the gap. Session time then continues this far above the last
+#: row, beyond all rows that clients may have seen and that did not reach the disk.
 MARGIN_NS: Final = 10_000_000_000
 PORTS_S: Final = 3.0
 #: Keyframes that are tried.
@@ -293,7 +293,7 @@ class _UnusableError(Exception):
 
 
 class ReplayStop(msgspec.Struct, frozen=True):
-    """Why a replay ended before the last row; empty when it did not.
+    """Reason why a replay ended before the last row; empty when it did not.
 
     `has_stepped`: the core has taken `step` all the same, with another result.
     """
@@ -347,7 +347,7 @@ def make_core(header: SessionHeader, models: Models) -> SessionCore:
 
 
 def restore_core(header: SessionHeader, keyframe: Keyframe, models: Models) -> SessionCore:
-    """Return the core in the state of `keyframe`. Raises whatever damaged snapshots lead to."""
+    """Return the core in the state of `keyframe`. A damaged snapshot may raise any exception."""
     core = make_core(header, models)
     if keyframe.plant:
         core.restore(CoreState(keyframe.plant, keyframe.authority, keyframe.controller, keyframe.status))
@@ -392,7 +392,7 @@ def replay_rows(core: SessionCore, keyframe: Keyframe, rows: Iterator[JournalRow
 
 
 class Listening(msgspec.Struct, frozen=True):
-    """Where a session listened, as in `SessionConfig`; ports as they finally were."""
+    """Addresses on which a session listened, as in `SessionConfig`, with the ports that were used in the end."""
 
     host: str = ""
     interfaces: tuple[str, ...] = ()
@@ -406,7 +406,7 @@ class Listening(msgspec.Struct, frozen=True):
 
 
 class ResumeNote(msgspec.Struct, frozen=True):
-    """The content of `resume.tokens`. `handback`: opaque memory of the newest front."""
+    """The content of `resume.tokens`. `handback`: opaque state of the newest front."""
 
     session_id: str
     listening: Listening = Listening()

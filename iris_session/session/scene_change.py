@@ -1,4 +1,4 @@
-"""Another scene, or another look of it, in a running session: checked and prepared off the loop, swapped between steps.
+"""Changes of scene or drawing in a running session: checked and prepared off the loop, swapped between steps.
 
 Not here: the files that clients get (`shared_scene`), and the swap itself (`stepper`).
 """

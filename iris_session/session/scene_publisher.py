@@ -1,4 +1,4 @@
-"""`ScenePublisher`: a session whose world is not MuJoCo's: another simulator's, or a real robot's.
+"""`ScenePublisher`: a session whose world is not a MuJoCo simulation but another simulator or a real robot.
 
     scene = SceneBuilder("lab")
     scene.add_box("box", half_size=(0.1, 0.1, 0.1), movable=True)
@@ -7,8 +7,9 @@
             session.set_pose("box", position, quaternion)
             session.publish()
 
-The process that makes it is the authority, as of `Session`. People see, point, talk and mark; nobody drives anything or
-takes it in the hand: a robot that people drive is a `Session(model, data)` with `begin_tick()` and `end_tick()`.
+The process that creates it is the authority, as with `Session`. Participants see the scene, point, talk and set
+markers, but cannot drive robots or grasp objects: for that use `Session(model, data)` with `begin_tick()` and
+`end_tick()`.
 """
 
 from __future__ import annotations
@@ -37,11 +38,11 @@ from iris_session.session.processes import PublishedScene, SessionProcesses
 from iris_session.session.publish_loop import PublishedVertices, PublishLoop
 from iris_session.session.stepper import NextPatch, make_session_clock
 
-#: How often `run` asks `until`.
+#: Period at which `run` calls `until` [s].
 RUN_PERIOD_S: Final = 1.0 / 60.0
-#: Longest time that a publisher can give [s], 285 years: recordings count it in nanoseconds, in 63 bits.
+#: Largest `time_s` [s], 285 years: recordings store nanoseconds in 63 bits.
 LONGEST_S: Final = 9e9
-#: How far ahead of the session's clock a capture may lie: clocks are read one after the other.
+#: A capture may lie so far ahead of the session's clock, because the clocks are read one after the other.
 AHEAD_NS: Final = 1_000_000
 _NOT_DRIVEN: Final = (
     "a published scene has nothing that people drive; for a robot that they do, use Session(model, data) with "
@@ -50,12 +51,23 @@ _NOT_DRIVEN: Final = (
 
 
 class ScenePublisher(Owner):
-    """A shared session over a scene of a `SceneBuilder`; its bodies and vertices are where `publish` says.
+    """A shared session over a scene of a `SceneBuilder`, whose poses and vertices your program publishes.
 
-    `set_pose`, `set_poses`, `set_joints`, `set_vertices` and `publish` may be called from any thread: what was set by
-    whomever until a `publish` goes out with it. `start`, `close` and `signals` belong to one thread.
+    `set_pose`, `set_poses`, `set_joints`, `set_vertices` and `publish` may be called from any thread: a `publish` sends
+    everything that any thread has set before it. Call `start`, `close` and `signals` from one thread.
 
-    Raises `ConfigError`.
+    Args:
+        scene: The scene. Names added to it after `start` are not shown.
+        config: Settings; `None` for the defaults. `resume` is not possible, and `assets` cannot be False.
+
+    Attributes:
+        config: The settings.
+        origin_ns: `time.monotonic_ns()` at session time 0.
+        clock: Returns session time [ns].
+        recording_fault: After `close()`, why the recording is incomplete; empty when it is complete.
+
+    Raises:
+        ConfigError: An argument cannot be used.
     """
 
     def __init__(self, scene: SceneBuilder, config: SessionConfig | None = None) -> None:
@@ -63,26 +75,28 @@ class ScenePublisher(Owner):
         self.origin_ns = time.monotonic_ns()
         self.clock = make_session_clock(self.origin_ns)
         self._builder = scene
-        self._shown: frozenset[str] = frozenset()  # names that the builder had as the session began
+        self._shown: frozenset[str] = frozenset()  # names in the builder when the session began
         self._stop = threading.Event()
         self._draft: SceneDraft | None = None
         self._loop: PublishLoop | None = None
-        self._order = threading.Lock()  # of frames, and of what is said of the next one
+        self._order = threading.Lock()  # of frames; guards the times and the reset of the next one
         self._capture_ns = 0
         self._time_s: float | None = None
         self._own_time = False
         self._anew = False
-        self._early_patches = []  # none: the stepper is there as soon as anybody can ask
-        #: Why the recording is incomplete, known after `close()`; empty when it is not.
+        self._early_patches = []  # stays empty: the stepper exists before the session counts as started
+        #: After `close()`, why the recording is incomplete; empty when it is complete.
         self.recording_fault = ""
 
     # --- life --------------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Builds the scene, opens the sockets and the recording. Called by `with`. People can join from here on.
+        """Build the scene, open the sockets and the recording. Called by `with`. Participants can join from here on.
 
-        Raises `ConfigError` for a scene that cannot be built, `StartError` for a port in use or a folder that cannot be
-        written.
+        Raises:
+            ConfigError: The scene cannot be built.
+            StartError: A port is in use, a folder cannot be written, a key is missing.
+            OwnershipError: The session is closed.
         """
         if self._processes is not None:
             return
@@ -118,9 +132,12 @@ class ScenePublisher(Owner):
             raise
 
     def close(self) -> bool:
-        """Tells everyone that the session ends, finishes the recording, ends every process. Can be called twice.
+        """Publish the pending state, notify clients, finish the recording, end every child process.
 
-        False: the recording is incomplete, `recording_fault` says why.
+        May be called twice.
+
+        Returns:
+            False when the recording is incomplete; `recording_fault` says why.
         """
         self._stop.set()
         self._is_closed = True
@@ -134,7 +151,15 @@ class ScenePublisher(Owner):
         return not self.recording_fault
 
     def run(self, seconds: float | None = None, until: Callable[[], object] | None = None) -> None:
-        """Waits until `stop()`, Ctrl-C or SIGTERM, `seconds`, or `until()`, which is asked at 60 Hz and may publish."""
+        """Wait until `stop()`, Ctrl-C or SIGTERM, or until an argument ends the run. Your program keeps publishing.
+
+        Args:
+            seconds: Session time to run [s]; `None` for no limit.
+            until: Called at 60 Hz; a true result ends the run. It may set poses and publish.
+
+        Raises:
+            OwnershipError: The session is not started, or closed.
+        """
         loop = self._require_parts()[1]
         with self.signals():
             end_ns = None if seconds is None else self.clock() + int(seconds * 1e9)
@@ -148,37 +173,82 @@ class ScenePublisher(Owner):
     def set_pose(
         self, name: str, position: Sequence[float], quaternion: Sequence[float] = (1.0, 0.0, 0.0, 0.0)
     ) -> None:
-        """T_world_body of a movable thing, or of the root of an articulation: [m], unit quaternion (w, x, y, z).
+        """Set the pose of a movable body, or of the root of an articulation. The next `publish` sends it.
 
-        One whose length is off by up to 0.001 is normalised. Raises `PublishError`.
+        Args:
+            name: Name of the body or articulation, or of a body on a floating or planar joint of an articulation.
+            position: Position of the body in the world frame, (x, y, z) [m].
+            quaternion: Rotation from the body to the world frame, (w, x, y, z). It is normalised; its length may be off
+                by 0.001.
+
+        Raises:
+            PublishError: No such body, or a value that cannot be used; nothing has changed.
+            OwnershipError: The session is not started, or closed.
         """
         with self._explain_late_names(name):
             self._require_parts()[0].set_pose(name, position, quaternion)
 
     def set_poses(self, names: Sequence[str], positions: ArrayLike, quaternions: ArrayLike) -> None:
-        """`set_pose` for many bodies at once: (n, 3) and (n, 4). All or none: raises `PublishError`."""
+        """Set the poses of many bodies at once, all or none. The next `publish` sends them.
+
+        Args:
+            names: Names of n different movable bodies; roots of articulations are set with `set_pose`.
+            positions: Positions in the world frame, shape (n, 3) [m].
+            quaternions: Rotations from body to world frame as (w, x, y, z), shape (n, 4); normalised as by `set_pose`.
+
+        Raises:
+            PublishError: No such body, a name given twice, or a value that cannot be used; nothing has changed.
+            OwnershipError: The session is not started, or closed.
+        """
         with self._explain_late_names(*(names if isinstance(names, list | tuple) else ())):
             self._require_parts()[0].set_poses(names, positions, quaternions)
 
     def set_joints(self, name: str, positions: Mapping[str, float]) -> None:
-        """Positions [rad] or [m] of joints of an articulation, by name; others stay. Raises `PublishError`."""
+        """Set joint positions of an articulation. The next `publish` sends them.
+
+        Positions beyond the limits of a joint are accepted, as real robots report some. Those far beyond are named in
+        the warnings of the session's status.
+
+        Args:
+            name: Name of the articulation.
+            positions: Position by name of the joint, [rad] or, for prismatic joints, [m]. Other joints stay.
+
+        Raises:
+            PublishError: No such articulation or joint, or a value that cannot be used; nothing has changed.
+            OwnershipError: The session is not started, or closed.
+        """
         with self._explain_late_names(name):
             self._require_parts()[0].set_joints(name, positions)
 
     def set_vertices(self, name: str, vertices: ArrayLike) -> None:
-        """Vertices (n, 3) of a deformable [m], world frame, in the order it was added with. Raises `PublishError`."""
+        """Set the vertices of a deformable. The next `publish` sends them.
+
+        Args:
+            name: Name of the deformable.
+            vertices: Positions in the world frame, shape (n, 3) [m], in the order in which they were added.
+
+        Raises:
+            PublishError: No such deformable, another shape, or a value that cannot be used; nothing has changed.
+            OwnershipError: The session is not started, or closed.
+        """
         with self._explain_late_names(name):
             self._require_parts()[0].set_vertices(name, vertices)
 
     def publish(self, time_s: float | None = None, *, capture_ns: int | None = None) -> None:
-        """Everything as it is set now is one state of the world.
+        """Publish all poses, joints and vertices as they are set now, as one state of the world.
 
-        It goes out at `config.state_hz` at most: of states in between the newest wins, `superseded` counts the others.
-        `time_s`: time of the world, which clients see as `sim_time` (default: session time). When it goes back, the
-        world was reset: a new `scene_epoch`. Give it always or never. `capture_ns`: session time (as of `clock()`) when
-        the world was so (default: now); it never goes back.
+        States are sent at `config.state_hz` at most. Of states published faster than that the newest is sent;
+        `superseded` counts the others.
 
-        Raises `PublishError` for times that cannot be, `OwnershipError` when the session is not under way.
+        Args:
+            time_s: Time of the world [s], which clients see as `sim_time`; default: session time. A smaller value than
+                before means that the world was reset: a new `scene_epoch` begins. Give it in every call or in none.
+            capture_ns: Session time (as of `clock()`) at which the world was in this state [ns]; default: now. It must
+                not decrease.
+
+        Raises:
+            PublishError: A time that is out of range, out of order, or given only sometimes.
+            OwnershipError: The session is not started, or closed.
         """
         draft, loop = self._require_parts()
         loop.raise_if_ended()
@@ -186,7 +256,7 @@ class ScenePublisher(Owner):
         captured_ns = now_ns if capture_ns is None else _check_capture(capture_ns, now_ns)
         given_s = None if time_s is None else _check_time(time_s)
         with self._order:
-            if capture_ns is None:  # of two threads the second may have looked at the clock first
+            if capture_ns is None:  # of two threads the second may have read the clock first
                 captured_ns = max(captured_ns, self._capture_ns)
             elif captured_ns < self._capture_ns:
                 before_ms = (self._capture_ns - captured_ns) * 1e-6
@@ -202,58 +272,98 @@ class ScenePublisher(Owner):
             loop.offer(draft.make_frame(captured_ns, at_s, anew))
 
     def reset(self) -> None:
-        """The next `publish` is of a world that was put into another state: a new `scene_epoch`."""
+        """Declare that the world is reset before the next `publish`, which begins a new `scene_epoch`.
+
+        Raises:
+            OwnershipError: The session is not started, or closed.
+        """
         self._require_parts()
         with self._order:
             self._anew = True
 
     @property
     def superseded(self) -> int:
-        """States that did not go out because a newer one was published before it was their time."""
+        """Number of published states that were not sent because a newer one replaced them before they were due."""
         return 0 if self._loop is None else self._loop.superseded
 
-    # --- what the owner may do ---------------------------------------------------------------------------------------
+    # --- inputs of the owner -----------------------------------------------------------------------------------------
 
     def post(self, message: EntryMessage) -> None:
-        """Puts an input of the owner (connection 0, rights of a director) into the next step."""
+        """Queue an input of the owner (connection 0, rights of a director) for the next step. From any thread.
+
+        Args:
+            message: A message of `iris_session.protocol.client_messages`.
+
+        Raises:
+            ValueError: A value that the protocol does not allow.
+            OwnershipError: The queue is full, or the session is not started, or closed.
+        """
         self._require_started()
-        self._require_parts()[1].raise_if_ended()  # else nobody would take it
+        self._require_parts()[1].raise_if_ended()  # else the input would stay in the queue
         assert self._stepper is not None
         self._stepper.post(message)
 
     def pause(self) -> NoReturn:
-        """Your program advances the world: to pause it, publish nothing."""
+        """Not available: your program advances the world. To pause it, publish nothing.
+
+        Raises:
+            OwnershipError: Always.
+        """
         raise OwnershipError("pause: your own program advances the world; to pause it, publish nothing for a while")
 
     def resume(self) -> NoReturn:
-        """Your program advances the world: publish again."""
+        """Not available: your program advances the world. To continue, publish again.
+
+        Raises:
+            OwnershipError: Always.
+        """
         raise OwnershipError("resume: your own program advances the world; publish again")
 
     def begin_tick(self) -> NoReturn:
-        """Of `Session`."""
+        """Not available: `publish` takes the place of a tick.
+
+        Raises:
+            OwnershipError: Always.
+        """
         raise OwnershipError(f"begin_tick: publish() is the tick here. {_NOT_DRIVEN}")
 
     def end_tick(self) -> NoReturn:
-        """Of `Session`."""
+        """Not available: `publish` takes the place of a tick.
+
+        Raises:
+            OwnershipError: Always.
+        """
         raise OwnershipError(f"end_tick: publish() is the tick here. {_NOT_DRIVEN}")
 
     def assign(self, robots: Sequence[str], participant: str = "") -> NoReturn:
-        """Of `Session`."""
+        """Not available: a published scene has no robots that participants drive.
+
+        Raises:
+            OwnershipError: Always.
+        """
         raise OwnershipError(f"assign: {_NOT_DRIVEN}")
 
     def set_scale(self, robot: str, scale: float) -> NoReturn:
-        """Of `Session`."""
+        """Not available: a published scene has no robots that participants drive.
+
+        Raises:
+            OwnershipError: Always.
+        """
         raise OwnershipError(f"set_scale: {_NOT_DRIVEN}")
 
     def load_scene(self, scene: object) -> NoReturn:
-        """Of `Session`."""
+        """Not available: close this session and start another with the other scene.
+
+        Raises:
+            OwnershipError: Always.
+        """
         raise OwnershipError("load_scene: end this session and begin another with the other scene")
 
     # --- inside ------------------------------------------------------------------------------------------------------
 
     @contextmanager
     def _explain_late_names(self, *names: object) -> Iterator[None]:
-        """Explain a refused name that was added after the session had begun."""
+        """Add to a `PublishError` the reason when a name was added to the builder after the session began."""
         try:
             yield
         except PublishError as error:
@@ -281,7 +391,7 @@ class ScenePublisher(Owner):
 def _hold_assets(store: AssetStore, addresses: Sequence[str]) -> AbstractContextManager[object]:
     try:
         return store.hold(addresses)
-    except OSError:  # no locks, or no room: the session says so when it cannot hold them either
+    except OSError:  # no locks, or no room: the session reports it when it cannot hold them either
         return nullcontext()
 
 

@@ -168,7 +168,7 @@ class Session(Owner):
     # --- our loop ----------------------------------------------------------------------------------------------------
 
     def run(self, seconds: float | None = None, until: Callable[[], object] | None = None) -> None:
-        """Advance physics in real time until `stop()`, Ctrl-C or SIGTERM, or until an argument says so.
+        """Advance physics in real time until `stop()`, Ctrl-C or SIGTERM, or until an argument ends the run.
 
         Every step has one tick. A tick that misses its deadline is taken late and counted (`status().lateness`).
 

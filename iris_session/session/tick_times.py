@@ -2,8 +2,8 @@
 
 Between two waits of the pacing loop lies a chain of ticks: one while all is well, several while it catches up. A late
 tick is attributed to the part whose time in its chain exceeds its usual time the most. Time in which the thread was
-ready but did not run is the scheduler's, whatever part it fell into; time in which it waited for something, such
-as a disk, stays with its part.
+ready but did not run counts as the scheduler's, in any part; time in which it waited for something, such as a disk,
+stays with its part.
 
 Cost per tick: eight laps and one reading of what the system counts for the thread, about 3 us.
 """

@@ -30,11 +30,11 @@ MIN_BOUND_M: Final = 1e-5
 MAX_BOUND_M: Final = 1.0
 #: Calls after which a mesh at rest is sent again: a second at 60 Hz.
 REPEAT_AFTER: Final = 60
-#: Of the bound, what the lattice may take at most. The rest is what a vertex may drift before the mesh is sent again.
+#: Share of the bound for the error of the lattice. A vertex may drift by the rest before the mesh is sent again.
 _LATTICE_SHARE: Final = 0.9
 #: Farthest node from the world's origin: float32 has room for another bit. 4 km at a bound of 0.5 mm.
 MAX_NODE: Final = 2**23
-#: Planes are packed; else they are as they are.
+#: Flag: the planes are compressed.
 _PACKED: Final = 1
 #: format u8, flags u8, planes u8, exponent i8, bound f32 [m], vertices u32, identity u32, escaped u32, origin 3 x i32.
 _HEADER: Final = struct.Struct("<BBBbfIII3i")
@@ -84,7 +84,7 @@ class DeformableEncoder:
             raise ValueError(f"repeat_after is {repeat_after}: at least 1 call")
         self.topology = topology
         self.bound_m = bound_m
-        #: What a vertex may move before the mesh is sent again: the bound less the error of the lattice.
+        #: Distance that a vertex may move before the mesh is sent again: the bound less the error of the lattice.
         self.drift_m = 0.995 * bound_m - 2.0 ** exponent_for(bound_m) * math.sqrt(3.0) / 2.0
         self._repeat_after = repeat_after
         self._compressor = zstandard.ZstdCompressor(level=level)
@@ -99,9 +99,9 @@ class DeformableEncoder:
     def encode(
         self, vertices: npt.NDArray[np.floating], classes: Sequence[str] = (BudgetClass.FULL,)
     ) -> dict[str, bytes] | None:
-        """Return payloads by class, as `Session.publish_media` takes them; None while nothing has moved.
+        """Return payloads by class, for `Session.publish_media`; None while nothing has moved.
 
-        `vertices`: (n, 3) [m], world frame; any value is taken. The bound of `half` is twice that of `full`, of
+        `vertices`: (n, 3) [m], world frame; any value is accepted. The bound of `half` is twice that of `full`, of
         `quarter` four times.
         Raises `ValueError` for another shape or class.
         """
@@ -148,7 +148,7 @@ class DeformableEncoder:
         return b"".join((head, _encode_escapes(vertices, escaped), packed if flags else planes))
 
     def _to_nodes(self, vertices: Floats, exponent: int) -> tuple[Nodes, npt.NDArray[np.int64]]:
-        """Lattice nodes (3, n) in the order of the topology, and the vertices that have none."""
+        """Return lattice nodes (3, n) in the order of the topology, and the vertices that have none."""
         scaled = self._scaled
         with np.errstate(invalid="ignore", over="ignore"):
             np.multiply(vertices.T, 2.0**-exponent, out=scaled)
@@ -158,7 +158,7 @@ class DeformableEncoder:
         if not fits:
             inside = np.asarray((np.abs(scaled) <= MAX_NODE).all(axis=0))
             escaped = np.flatnonzero(~inside)
-            # A place in the lattice that costs little: that of any vertex which has one.
+            # A node that costs few bytes: that of any vertex which has one.
             scaled[:, escaped] = scaled[:, [int(np.argmax(inside))]] if inside.any() else 0.0
         nodes = scaled.astype(np.int32)
         return (nodes if self.topology.order is None else nodes[:, self.topology.order]), escaped
@@ -201,7 +201,7 @@ class DeformableDecoder:
         return positions
 
     def _unpack_planes(self, packed: memoryview, header: FrameHeader) -> npt.NDArray[np.uint32]:
-        """The numbers (3, n) whose bytes the planes hold."""
+        """Return the numbers (3, n) whose bytes the planes hold."""
         size = 3 * self.topology.n_vertices * header.planes
         planes: bytes | memoryview = packed
         if header.packed:
@@ -259,7 +259,7 @@ def _predict_residuals(topology: DeformableTopology, nodes: Nodes) -> Nodes:
 
 
 def _undo_prediction(topology: DeformableTopology, residuals: Nodes) -> Nodes:
-    """Inverse of `_predict_residuals`; may overwrite its argument."""
+    """Undo `_predict_residuals`; may overwrite the argument."""
     if topology.parents is not None:
         a, b, c = topology.parents
         for begin, end in topology.levels:
@@ -275,7 +275,7 @@ def _undo_prediction(topology: DeformableTopology, residuals: Nodes) -> Nodes:
 
 
 def _split_planes(coded: npt.NDArray[np.uint32], n_planes: int) -> bytes:
-    """The lowest bytes of all numbers, then the next ones."""
+    """Return the lowest bytes of all numbers, then the next ones."""
     if n_planes == 1:
         return coded.astype(np.uint8).tobytes()
     return coded.astype("<u4", copy=False).view(np.uint8).reshape(-1, 4)[:, :n_planes].T.tobytes()

@@ -1,4 +1,4 @@
-"""Topology of a deformable mesh: what is joined to what, and the order in which the codec predicts its vertices.
+"""Topology of a deformable mesh: its triangles and edges, and the order in which the codec predicts its vertices.
 
 Both ends hold the same topology, so frames (`deformable`) carry coordinates only. Its bytes (normative:
 docs/deformables.md) are sent once; a client needs no algorithm but to follow the tables. A plan is one of two:
@@ -48,9 +48,9 @@ class _Plan(NamedTuple):
 
 
 class DeformableTopology:
-    """`n_vertices`; `faces` (m, 3) and `edges` (k, 2): triangles and lines to draw, vertex numbers; read-only.
+    """Triangles `faces` (m, 3) and lines `edges` (k, 2) of vertex numbers, of a mesh of `n_vertices`; read-only.
 
-    `identity`: in every frame, so that no frame is taken for another mesh. Raises `ValueError` for what is no mesh.
+    `identity`: in every frame, so that no frame is decoded with another mesh. Raises `ValueError` for an invalid mesh.
     """
 
     def __init__(self, n_vertices: int, faces: npt.ArrayLike = (), edges: npt.ArrayLike = ()) -> None:
@@ -75,14 +75,14 @@ class DeformableTopology:
         return ROWS if self.parents is None else TREE
 
     def to_bytes(self) -> bytes:
-        """The topology as it is sent to clients."""
+        """Encode the topology for clients."""
         flags = 0 if self.order is None else _ORDERED
         tables = [table for table in (self.order, self.parents, self.faces, self.edges) if table is not None]
         sizes = (self.n_vertices, self.rows, self.cols, len(self.faces), len(self.edges))
         return _HEADER.pack(FORMAT, self.plan, flags, *sizes) + b"".join(t.astype("<u4").tobytes() for t in tables)
 
     def bare(self) -> DeformableTopology:
-        """The same plan without triangles and lines, for clients that have those from elsewhere. Another identity."""
+        """Return the same plan without triangles and lines, for clients that have them already. Another identity."""
         made = DeformableTopology.__new__(DeformableTopology)
         plan = _Plan(self.order, self.rows, self.cols, self.parents)
         made._settle(self.n_vertices, self.faces[:0], self.edges[:0], plan)
@@ -90,7 +90,7 @@ class DeformableTopology:
 
     @classmethod
     def from_bytes(cls, data: bytes | memoryview) -> DeformableTopology:
-        """Inverse of `to_bytes`. Raises `StreamError` for bytes that it does not make."""
+        """Decode the bytes of `to_bytes`. Raises `StreamError` for any other bytes."""
         if len(data) < _HEADER.size:
             raise StreamError(f"topology of {len(data)} bytes, shorter than its header of {_HEADER.size}")
         form, plan, flags, n, rows, cols, n_faces, n_edges = _HEADER.unpack_from(data)
@@ -120,7 +120,7 @@ class DeformableTopology:
 
 
 def used_vertices(n_vertices: int, faces: npt.ArrayLike) -> tuple[npt.NDArray[np.int64], Ints]:
-    """Vertices that `faces` name, ascending, and the faces numbered by their place among these.
+    """Return the vertices of `faces`, ascending, and the faces renumbered by their place among these.
 
     For a solid, of which only the shell is drawn: stream `vertices[used]`.
     """
@@ -154,7 +154,7 @@ def _plan(n_vertices: int, faces: Ints, edges: Ints) -> _Plan:
 
 
 def _columns(n_vertices: int, links: Edges) -> int:
-    """Length of the rows when every link joins adjacent vertices of a grid (also diagonally); 0 for other meshes."""
+    """Return the row length when every link joins adjacent vertices of a grid (also diagonally), 0 for other meshes."""
     strides = np.unique(np.abs(links[:, 0] - links[:, 1]))
     if len(strides) == 0 or len(strides) > 4:
         return 0
@@ -170,7 +170,7 @@ def _columns(n_vertices: int, links: Edges) -> int:
 
 
 def _walk(n_vertices: int, links: Edges) -> Ints | None:
-    """Every vertex once, along links as far as they go, from the ends of lines first. None: that is their order."""
+    """Return each vertex once, along links, from the ends of lines first; None when that is their order already."""
     both = np.concatenate([links, links[:, ::-1]])
     both = both[np.lexsort((both[:, 1], both[:, 0]))]
     degrees = np.bincount(both[:, 0], minlength=n_vertices)
@@ -191,14 +191,14 @@ def _walk(n_vertices: int, links: Edges) -> Ints | None:
 
 
 def _tree(n_vertices: int, faces: Ints) -> _Plan | None:
-    """Grows over the triangles from vertex to vertex, whole fronts at once. None: that takes too many levels."""
+    """Grow a tree over the triangles, a whole front of vertices at once; None when it takes too many levels."""
     across = _across(faces)
     known = np.zeros(n_vertices, np.bool_)
     in_face = np.zeros(n_vertices, np.bool_)
     in_face[faces] = True
     parents = np.zeros((n_vertices, 3), np.int64)
     root = int(faces[0, 0])
-    # What no triangle names comes directly after the root.
+    # Vertices without a triangle come directly after the root.
     parents[:] = root
     first = np.concatenate([[root], np.flatnonzero(~in_face)])
     known[first] = True
@@ -223,7 +223,7 @@ def _tree(n_vertices: int, faces: Ints) -> _Plan | None:
 def _front(
     faces: Ints, across: Ints, held: npt.NDArray[np.bool_], count: Edges, known: npt.NDArray[np.bool_], parents: Edges
 ) -> Edges:
-    """The vertices that come next; writes their `parents`. `held`: which corners of `faces` are known, `count` them."""
+    """Return the next vertices and write their `parents`. `held`: known corners of `faces`; `count`: their number."""
     ready = np.flatnonzero(count == 2)
     if not len(ready):
         touching = np.flatnonzero(count == 1)
@@ -247,7 +247,7 @@ def _front(
 
 
 def _across(faces: Ints) -> Ints:
-    """(m, 3): of the edge opposite to each corner, the opposite corner of another triangle there; -1 without one."""
+    """Return (m, 3): of the edge opposite each corner, the opposite corner of the other triangle there; -1 for none."""
     low = np.minimum(faces[:, [1, 2, 0]], faces[:, [2, 0, 1]]).astype(np.int64)
     high = np.maximum(faces[:, [1, 2, 0]], faces[:, [2, 0, 1]]).astype(np.int64)
     key = (low * MAX_VERTICES + high).ravel()
@@ -262,7 +262,7 @@ def _across(faces: Ints) -> Ints:
 
 
 def _levels(parents: Ints) -> tuple[tuple[int, int], ...]:
-    """Ranges of places whose parents all come before the range. Raises `StreamError` when there are none."""
+    """Return ranges of places whose parents all come before the range. Raises `StreamError` when there are none."""
     newest = parents.max(axis=0)
     n = len(newest)
     if newest[0] != 0 or (newest[1:] >= np.arange(1, n)).any():

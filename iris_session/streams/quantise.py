@@ -29,7 +29,7 @@ ROTATION_BITS: Final = 14
 #: Largest angle between a rotation and its code [rad], 0.0242 deg. A step `dm` of the parameters turns by
 #: 4 |dm| / (1 + |m|^2) <= 4 |dm|, and |dm| <= sqrt(3) half steps.
 ROTATION_QUANTUM_ERROR_RAD: Final = 4.0 * math.sqrt(3.0) * 0.5 / ROTATION_CENTRE
-#: Squared length of parameters: at most 1 before rounding. Above this no encoder made the levels.
+#: Squared length of parameters: at most 1 before rounding. No encoder makes levels above this.
 MAX_SQUARES: Final = (1.0 + math.sqrt(3.0) * 0.5 / ROTATION_CENTRE) ** 2 + 1e-12
 _STEP: Final = 1.0 / ROTATION_CENTRE
 

@@ -37,8 +37,8 @@ from iris_session.streams.quantise import (
 
 MAX_POSITION_ERROR_M: Final = 1e-4
 MAX_ROTATION_ERROR_RAD: Final = math.radians(0.05)
-#: What a pose may drift from its anchor before it is sent again: the bound less the quantisation error, less a little
-#: for rounding in float64. 46 um and 0.025 deg.
+#: Drift of a pose from its anchor before it is sent again: the bound less the quantisation error, less a little for
+#: rounding in float64. 46 um and 0.025 deg.
 DRIFT_ALLOWANCE_M: Final = 0.995 * MAX_POSITION_ERROR_M - POSITION_QUANTUM_ERROR_M
 DRIFT_ALLOWANCE_RAD: Final = 0.995 * MAX_ROTATION_ERROR_RAD - ROTATION_QUANTUM_ERROR_RAD
 
@@ -103,8 +103,8 @@ class RigidEncoder:
     def encode(self, poses: Floats, scene_epoch: int) -> EncodedFrame:
         """Encode one state.
 
-        `poses`: (n_bodies, 7) float64, world frame, `x y z qw qx qy qz` [m, unit quaternion]; any value is taken,
-        not finite ones are sent as they are. A new `scene_epoch` sends every body again.
+        `poses`: (n_bodies, 7) float64, world frame, `x y z qw qx qy qz` [m, unit quaternion]; any value is accepted,
+        non-finite ones are sent as they are. A new `scene_epoch` sends every body again.
         Raises `ValueError` for another shape.
         """
         if poses.shape != (self.n_bodies, 7):
@@ -130,7 +130,7 @@ class RigidEncoder:
         return self._next_seq - 1, np.ascontiguousarray(self._anchor.T)
 
     def _find_changed(self, rows: Floats, squares: Floats) -> Mask:
-        """Bodies that left their anchor, and those that cannot be compared (not finite, no anchor yet).
+        """Return the bodies that left their anchor, and those that cannot be compared (not finite, no anchor yet).
 
         `rows`: (7, n) poses. `squares`: of the length of their quaternions.
         """
@@ -141,7 +141,7 @@ class RigidEncoder:
         return ~near
 
     def _update_anchors(self, rows: Floats, squares: Floats, changed: Mask, seq: int) -> None:
-        """Make the present pose of the `changed` bodies their anchor and computes its code."""
+        """Make the present pose of the `changed` bodies their anchor and compute its code."""
         at: Ints | slice = slice(None)
         if not changed.all():
             at = np.flatnonzero(changed)
@@ -170,7 +170,7 @@ class RigidEncoder:
             self._refreshed = (self._refreshed + 1) % self.n_bodies
 
     def _pack(self, sent: Mask) -> bytes:
-        """Payload with the anchors of the bodies `sent`."""
+        """Return the payload with the anchors of the bodies `sent`."""
         quantised = sent & ~self._escapes
         index, levels = self._index, self._levels
         if not quantised.all():
@@ -197,7 +197,7 @@ class RigidEncoder:
         return b"".join((head, codes, mask, self._encode_escapes(escaped)))
 
     def _encode_escapes(self, bodies: Ints) -> bytes:
-        """The anchors of `bodies` as escapes."""
+        """Encode the anchors of `bodies` as escapes."""
         if not len(bodies):
             return b""
         escapes = np.empty(len(bodies), _ESCAPE)
@@ -218,8 +218,8 @@ class RigidDecoder:
 
     `poses`: (n_bodies, 7) float64, world frame, `x y z qw qx qy qz`, NaN until first received. Every frame makes a new
     array, so an earlier one may be kept.
-    `state_seq`: newest frame taken, 0 for none. `valid` (n_bodies,): which poses are within the bound at that frame.
-    `stale_frames`: frames ignored because a newer one was taken before.
+    `state_seq`: newest frame applied, 0 for none. `valid` (n_bodies,): True for poses within the bound at that frame.
+    `stale_frames`: frames ignored because a newer one had been applied.
     """
 
     def __init__(self, n_bodies: int) -> None:
@@ -271,7 +271,7 @@ class RigidDecoder:
         return self.complete
 
     def load_keyframe(self, state_seq: int, poses: Floats) -> bool:
-        """Takes the poses (n_bodies, 7) of a snapshot at `state_seq`; newer ones are kept. True: complete now.
+        """Load the poses (n_bodies, 7) of a snapshot at `state_seq`; newer poses are kept. Return True when complete.
 
         Raises `StreamError` for another shape.
         """
@@ -289,14 +289,14 @@ class RigidDecoder:
         return self.complete
 
     def _carry_over(self) -> None:
-        """What was within the bound at `base_seq` or later and is not in the newest frame has not changed since."""
+        """Mark as current the bodies known at `base_seq` or later: those not in the newest frame have not changed."""
         self._held[self._held >= max(self.base_seq, 1)] = self.state_seq
 
 
 def _unpack(payload: bytes | memoryview, n_bodies: int) -> tuple[Mask | None, Floats, npt.NDArray[np.void]]:
-    """Mask (n_bodies,) of the quantised bodies (None: all of them), their poses (n, 7), and the escapes.
+    """Return the mask (n_bodies,) of the quantised bodies (None: all of them), their poses (n, 7), and the escapes.
 
-    The poses are one coordinate after the other in memory: that is how they are decoded. Raises `StreamError`.
+    The poses are stored one coordinate after the other, as they are decoded. Raises `StreamError`.
     """
     if len(payload) < _HEADER.size:
         raise StreamError(f"payload of {len(payload)} bytes, shorter than its header of {_HEADER.size}")

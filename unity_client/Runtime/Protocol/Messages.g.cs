@@ -109,8 +109,8 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Action of align. start: measure anew, from nothing; stop: keep the alignment in force whatever is
-    /// observed.
+    /// Action of align. start: measure anew, from nothing; stop: keep the alignment in force, ignore further
+    /// observations.
     /// </summary>
     public static class AlignAction
     {
@@ -1594,7 +1594,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// One media stream, and what a client gets of it. mbit_per_s: of that class, as measured.
+    /// One media stream, and the class that a client gets. mbit_per_s: of that class, as measured.
     /// </summary>
     public sealed class StreamBudget : WireValue
     {
@@ -2706,7 +2706,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Assign robots to a participant (empty: free them), whoever holds them. Directors only.
+    /// Assign robots to a participant (empty: free them), even if another one holds them. Directors only.
     /// </summary>
     public sealed class Assign : ClientMessage
     {
@@ -3618,7 +3618,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// A hello that the front did not let through (RefusalCode), or that the authority denied (DenialReason).
+    /// A hello that the front refused (RefusalCode), or that the authority denied (DenialReason).
     /// </summary>
     public sealed class Refused : ServerMessage
     {
@@ -3909,8 +3909,8 @@ namespace IrisSession.Protocol
     /// Everything a late joiner needs; events with event_seq at or below its own are to be discarded.
     ///
     /// In the step of a reset tick and sim_time are still those before it. tick_period_ns: of this scene; 0: that of
-    /// Welcome. Bulk frame 1 (added by the front): float64
-    /// (n_bodies, 7) world poses x y z qw qx qy qz of bodies at state_seq.
+    /// Welcome. Bulk frame 1 (added by the front): float64 (n_bodies, 7) world poses x y z qw qx qy qz of bodies at
+    /// state_seq.
     /// </summary>
     public sealed class Snapshot : ServerMessage
     {

@@ -88,8 +88,8 @@ export const AlignmentKind = {
 export type AlignmentKind = (typeof AlignmentKind)[keyof typeof AlignmentKind] | (string & {});
 
 /**
- * Action of `align`. `start`: measure anew, from nothing; `stop`: keep the alignment in force whatever is
- * observed.
+ * Action of `align`. `start`: measure anew, from nothing; `stop`: keep the alignment in force, ignore further
+ * observations.
  */
 export const AlignAction = {
   START: "start",
@@ -549,7 +549,7 @@ export type Quantiles = [
   p99: number,
 ];
 
-/** One media stream, and what a client gets of it. `mbit_per_s`: of that class, as measured. */
+/** One media stream, and the class that a client gets. `mbit_per_s`: of that class, as measured. */
 export interface StreamBudget {
   stream: string;
   budget_class?: BudgetClass;
@@ -813,7 +813,7 @@ export interface Consent {
   grant: boolean;
 }
 
-/** Assign robots to a participant (empty: free them), whoever holds them. Directors only. */
+/** Assign robots to a participant (empty: free them), even if another one holds them. Directors only. */
 export interface Assign {
   type: "assign";
   request_id: number;
@@ -1025,7 +1025,7 @@ export interface Welcome {
   key_fingerprint?: string;
 }
 
-/** A `hello` that the front did not let through (`RefusalCode`), or that the authority denied (`DenialReason`). */
+/** A `hello` that the front refused (`RefusalCode`), or that the authority denied (`DenialReason`). */
 export interface Refused {
   type: "refused";
   code: RefusalCode;
@@ -1093,8 +1093,8 @@ export interface Event {
  * Everything a late joiner needs; events with `event_seq` at or below its own are to be discarded.
  *
  * In the step of a reset `tick` and `sim_time` are still those before it. `tick_period_ns`: of this scene; 0: that of
- * `Welcome`. Bulk frame 1 (added by the front): float64
- * (n_bodies, 7) world poses `x y z qw qx qy qz` of `bodies` at `state_seq`.
+ * `Welcome`. Bulk frame 1 (added by the front): float64 (n_bodies, 7) world poses `x y z qw qx qy qz` of `bodies` at
+ * `state_seq`.
  */
 export interface Snapshot {
   type: "snapshot";
