@@ -69,9 +69,9 @@ def rotation_error_p95(covariance: Sequence[float] | Array) -> float:
 
 
 # --- noise of observations --------------------------------------------------------------------------------------------
-# Covariances of
-# observations are 6x6, position [m] then rotation [rad], in the axes of the tracking frame. The part that is common to
-# all observations from one viewpoint is separate from the part that is new in each.
+#
+# Covariances of observations are 6x6, position [m] then rotation [rad], in the axes of the tracking frame. The part
+# that is common to all observations from one viewpoint is separate from the part that is new in each.
 
 #: No observation is better than this: printing and mounting of a sheet alone. [m^2], [rad^2]
 FLOOR: Final = np.diag([1e-8, 1e-8, 1e-8, 1e-7, 1e-7, 1e-7])

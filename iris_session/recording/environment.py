@@ -66,7 +66,7 @@ def read_boot_id() -> str:
 
 
 # --- BLAS threads -----------------------------------------------------------------------------------------------------
-# #
+#
 # OpenBLAS reads its environment when it is loaded, which is before any code of ours; so the libraries that are loaded
 # are configured directly. Linux only; elsewhere the environment counts.
 

@@ -1,8 +1,8 @@
-"""The authority's side of the recorder: hands over journal rows, states and events without ever blocking a step.
+"""Feed of the recorder: send journal rows, states and events of the authority without ever blocking a step.
 
-Batches of about 20 ms are numbered and kept until the recorder says that they are in the file: first in a window in
-memory, beyond it in a spill file. A recorder that was killed and started anew gets everything that was not yet in the
-file. Only when memory and spill are both full are rows dropped: they are counted and reported by `take_gap`.
+Batches of about 20 ms are numbered and kept until the recorder acknowledges that they are in the file: first in a
+window in memory, beyond it in a spill file. A restarted recorder receives everything that was not acknowledged. Rows
+are dropped only if memory and spill file are both full: they are counted and reported by `take_gap`.
 
 Vertices of deformables are for the picture only. They have a socket of their own and are not stored: frames that do not
 fit into its queue are dropped and counted, so they cost the journal nothing.
@@ -47,13 +47,13 @@ BATCH_NS: Final = 20_000_000
 #: Memory for batches that are not in the file yet. 2 operators, 50 bodies: about 0.5 MB/s, so 30 s.
 WINDOW_BYTES: Final = 16 << 20
 SPILL_BYTES: Final = 2 << 30
-#: Records taken from the spill file per flush: 20 ms of backlog 4 times over, so that a flush stays short.
+#: Maximum number of records read back from the spill file per flush: 4 batches of 20 ms, so that a flush stays short.
 UNSPILL_BATCHES: Final = 4
-#: A recorder that writes sends a status every half second. Closing does not wait longer than this for one.
+#: Maximum time without a status while closing. A recorder that writes sends one every half second.
 SILENCE_S: Final = 1.0
-#: Bound on each list of one batch. A flush comes long before; it holds when a caller never takes a step.
+#: Maximum length of each list of one batch. A flush comes long before, unless the caller never takes a step.
 BATCH_ITEMS: Final = 4096
-#: Frames of vertices in transit. The recorder receives them thirty times a second.
+#: Maximum number of vertex frames in transit. The recorder receives them thirty times a second.
 VERTEX_FRAMES: Final = 32
 
 
@@ -114,7 +114,7 @@ class RecorderFeed:
             self._vertices.connect(vertices_endpoint)
         self._vertex_limit = VertexRateLimit()
         self._header = b""
-        self._scene = Batch()  # the newest `SceneModel`, and what the picture is drawn from
+        self._scene = Batch()  # the newest `SceneModel`, and the assets of the picture
         self._next = 0
         self._window: deque[tuple[int, bytes]] = deque()
         self._instance = 0
@@ -352,8 +352,8 @@ _HEAD: Final = struct.Struct("<III")  # bytes of the record, rows in it, other i
 class SpillFile:
     """A bounded first-in first-out queue of byte records in a file, at most `limit_bytes` on disk.
 
-    The file has no name in its folder: nothing stays behind, however the process ends. `rows`, `others`: journal rows
-    and other items in the queue. `fault`: why the last `push` failed.
+    The file has no name in its folder, so the system frees it when the process ends, even if killed. `rows`, `others`:
+    number of journal rows and other items in the queue. `fault`: why the last `push` failed.
     """
 
     def __init__(self, path: Path, limit_bytes: int) -> None:
@@ -362,7 +362,7 @@ class SpillFile:
         self._fd = -1
         self._read_at = 0
         self._write_at = 0
-        self._wrap_at = -1  # where the records go on at the beginning of the file; -1: nowhere
+        self._wrap_at = -1  # where reading continues at the beginning of the file; -1: nowhere
         self.records = 0
         self.rows = 0
         self.others = 0
@@ -445,11 +445,11 @@ class SpillFile:
         self._read_at = self._write_at = self.records = self.rows = self.others = 0
 
 
-#: Frames a second of one deformable, as long as all of them together fit. People see this as smooth.
+#: Minimum time between frames of one deformable: 20 a second look smooth, if all deformables together fit.
 PERIOD_NS: Final = 50_000_000
-#: What vertices may add to the file [bytes/s]: about twice what two people and fifty bodies do.
+#: Maximum rate of vertices in the file [bytes/s]: about twice that of two operators and fifty bodies.
 BYTES_PER_S: Final = 1_000_000
-#: Of one vertex of one frame in the file: position and normal, float32.
+#: Bytes of one vertex of one frame in the file: position and normal, float32.
 VERTEX_BYTES: Final = 24
 
 

@@ -188,7 +188,7 @@ def _flatten(batch: Any, column: str) -> Any:
 
 
 # --- rows that Rerun's tools have split -------------------------------------------------------------------------------
-# #
+#
 # `rerun rrd optimize` puts large columns of an entity into chunks of their own, merges chunks, and fills in nulls where
 # a merged chunk had no such column; one chunk may hold a row twice then, with something in other columns each time.
 # What it keeps is the id of every row, which grows in the order of writing: the parts of one row have one id. As

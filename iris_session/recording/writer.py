@@ -60,11 +60,11 @@ from iris_session.streams.errors import StreamError
 
 #: Colours of participants in the order of their appearance.
 PALETTE = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167))
-#: A chunk per robot: once a second, because they can be had from `/state` again.
+#: Interval of latencies, a chunk per robot: once a second is enough, as `/state` holds what they are computed from.
 LATENCIES_NS = 1_000_000_000
-#: States whose moments are known to vertices that come later: 4 s at 60 Hz.
+#: Number of newest states whose times are kept for vertices that arrive later: 4 s at 60 Hz.
 KNOWN_MOMENTS = 256
-#: Frames of vertices that may wait for the states that they were published with.
+#: Maximum number of pending vertex frames whose states are not in the file yet.
 MAX_PENDING_VERTICES = 256
 _encode = msgspec.msgpack.Encoder().encode
 
@@ -87,7 +87,7 @@ class RrdWriter:
         self._vertices: deque[VertexFrame] = deque()
         self.vertices_refused = 0
         self._known: deque[Moment] = deque(maxlen=KNOWN_MOMENTS)  # of the newest states
-        self._last_step = -2  # whose state is still of the scene before; the initial state has step -1
+        self._last_step = -2  # newest step with a state of the previous scene; the initial state has step -1
         self._bodies: tuple[BodyInfo, ...] = ()
         self._moving: NDArray[np.intp] = np.empty(0, np.intp)
         self._frames: list[str] = []
@@ -393,7 +393,7 @@ class RrdWriter:
 
 
 def _time_columns(times: NDArray[np.int64]) -> list[Any]:
-    """`times` (4, rows): step, tick, sim_time [ns], session_time [ns]."""
+    """Return the time columns. `times` (4, rows): step, tick, sim_time [ns], session_time [ns]."""
     step, tick, sim_ns, session_ns = times
     return [
         sequence_index(paths.STEP, step),
@@ -417,15 +417,14 @@ def _build_blueprint() -> Any:
 
 
 # --- file -------------------------------------------------------------------------------------------------------------
-# #
+#
 # Rerun encodes the messages, `RrdStream` appends them to the file.
 #
 # Rerun's own file sink keeps some 4 KB in memory per chunk, for a footer with an index: 0.1-0.2 MiB/s of a session.
-# Here the encoded bytes are taken out of the stream at every write, and what is only for a footer is left out; so
-# memory does not grow, and an error of the disk is an error of ours. `rerun rrd optimize` makes a copy with such an
-# index.
+# Here the encoded bytes are read from the stream at every write, without the data for a footer; so memory does not
+# grow, and an error of the disk is raised here. `rerun rrd optimize` makes a copy with such an index.
 
-#: The stream's own batcher never acts: the writer sends whole columns, and `write` takes them.
+#: The stream's own batcher never acts: the writer sends whole columns, and `write` collects them.
 _BATCHER: Final = rr.ChunkBatcherConfig(flush_tick=3600.0, flush_num_bytes=1 << 30)
 
 
@@ -537,7 +536,7 @@ def duration_index(timeline: str, values: Any) -> Any:
 
 
 class LogLine(NamedTuple):
-    """`level`: a Rerun log level (`INFO`, `WARN`, `CRITICAL`)."""
+    """A line of the viewer's log. `level`: a Rerun log level (`INFO`, `WARN`, `CRITICAL`)."""
 
     level: str
     text: str
@@ -564,7 +563,7 @@ def describe_event(event: Event) -> LogLine:
 
 
 def describe_denial(record: DenialRecord) -> LogLine:
-    """Return who was denied what, why, and the advice."""
+    """Return the log line of a denial: connection, reason, message, holder and advice."""
     denial = record.denial
     parts = [f"connection {record.connection}: {denial.reason}: {denial.message}"]
     if denial.holder:
