@@ -36,7 +36,7 @@ from iris_session.session.errors import ConfigError
 
 MAX_OPERATORS: Final = 8
 MAX_OBSERVERS: Final = 16
-#: In the order in which they join.
+#: Names of operators, in the order in which they join.
 NAMES: Final = ("ann", "bob", "cem", "dia", "eli", "fay", "gus", "hoa")
 #: Distance of an operator behind the arm, and height of the eyes above the table [m].
 _BEHIND, _EYES = 0.45, 0.55

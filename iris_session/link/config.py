@@ -39,7 +39,8 @@ class FrontLimits(msgspec.Struct, frozen=True):
         strangers: TCP connections that have not sent `hello`, and as many again to the state socket that have not
             subscribed.
         hello_timeout_ns: Longest time in that state [ns].
-        subscribers: TCP connections to the state socket that have subscribed, and TCP connections to the media socket.
+        subscribers: TCP connections to the state socket that have subscribed; also connections to the media socket, and
+            to the assets socket.
         sources: TCP connections to the media ingest socket.
         source_bytes: Bytes queued for each of them.
         memory_bytes: Bytes of all queues together (see `MemoryGuard`).

@@ -224,7 +224,7 @@ _STARVED_SHARE: Final = 0.5
 
 
 class StarvationDetector:
-    """Detects a silent process that does not hang but is not scheduled. Only a process that hangs is worth replacing.
+    """Detector of a silent process that does not hang but is not scheduled. Only a hanging process should be replaced.
 
     The successor of a starved process would not be scheduled either, would take longer than the old one to answer, and
     would cost every client its connection. Linux only; elsewhere, and for a process that has ended, nothing counts as

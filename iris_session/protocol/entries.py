@@ -217,7 +217,7 @@ EntryMessage = (
 
 
 class Entry(msgspec.Struct, frozen=True, array_like=True):
-    """One input. `connection`: number of the connection it came by, unique in the session, growing, `HOST` for ours.
+    """One input. `connection`: number of its connection, unique in the session, growing, `HOST` for the owner's.
 
     `connection_epoch`: the epoch that the sender claimed in its envelope (equal to `connection` when honest; the
     authority rejects a mismatch). `receive_ns`: session time stamped by the front.

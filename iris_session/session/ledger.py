@@ -1,6 +1,6 @@
 """`SessionLedger`: participants of a session, their leases and recent events, from the authority's own decisions.
 
-It needs no snapshot and no question to the pure core. Reports for people and clients are made of it in `status`.
+It needs no snapshot and no query of the pure core. `status` makes reports for users and clients from it.
 """
 
 from __future__ import annotations

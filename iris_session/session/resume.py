@@ -66,7 +66,7 @@ from iris_session.session.errors import ConfigError, ResumeError
 from iris_session.system.files import Replacement
 
 NOTE_FILE: Final = "resume.tokens"
-#: Changes of the note that come faster are written together.
+#: Changes of the note within this time are written together.
 NOTE_PERIOD_S: Final = 0.05
 MAX_NOTE_BYTES: Final = 4_000_000
 #: After a reboot the clock does not show the length of the gap. Session time then continues this far above the last
@@ -289,7 +289,7 @@ def _is_port_free(host: str, port: int) -> bool:
 
 
 class _UnusableError(Exception):
-    """This file holds nothing to resume from; an earlier one may."""
+    """The session cannot be resumed from this file, but perhaps from an earlier one."""
 
 
 class ReplayStop(msgspec.Struct, frozen=True):
@@ -443,9 +443,9 @@ def read_note(recording: Path, session_id: str) -> tuple[ResumeNote | None, str]
 
 
 class ResumeNoteWriter:
-    """Writes the note of one session, from a thread of its own. `offer` never waits.
+    """Writer of the note of one session, with its own thread. `offer` never waits.
 
-    What is not written when `close` returns is not written at all: by then the note may be that of the next session.
+    Nothing is written after `close` returns: by then the note may be that of the next session.
     """
 
     def __init__(self, path: Path) -> None:

@@ -128,8 +128,8 @@ def make_session_status(
 class StatusReporter:
     """Builds the authority's half of the `StatusReport`s of one session.
 
-    The pacing loop, where it is ours, sets `pacer`, `times` and `scheduling`. `warning_sources` are asked for every
-    report: what a person should know now, though nothing has failed.
+    The pacing loop of `run()` sets `pacer`, `times` and `scheduling`. `warning_sources` are called for every report;
+    each returns warnings for the user about conditions that are no failure yet.
     """
 
     def __init__(self) -> None:
@@ -142,7 +142,7 @@ class StatusReporter:
         self._cpu_at_ns = time.monotonic_ns()
 
     def is_due(self, now_ns: int) -> bool:
-        """Return whether a report is to be built now, and if so begin to wait for the next."""
+        """Return whether a report is due now; if so, start the period of the next one."""
         if now_ns < self._next_ns:
             return False
         pacer = self.pacer
@@ -198,12 +198,12 @@ class StatusReporter:
 
 
 def make_anchor_reports(poses: Mapping[str, Pose], sizes: Mapping[str, float]) -> tuple[AnchorReport, ...]:
-    """Return where every anchor is now (`T_world_anchor`); `sizes`: edges of the printed sheets [m], where known."""
+    """Return the present `T_world_anchor` of every anchor; `sizes`: edges of the printed sheets [m], where known."""
     return tuple(AnchorReport(name, T, sizes.get(name, 0.0)) for name, T in poses.items())
 
 
 def make_robot_reports(stepper: Stepper) -> tuple[RobotReport, ...]:
-    """Return for each robot its holder, what it does, and how long its samples waited for their step."""
+    """Return for each robot its holder, its state, and the time that its samples waited for their step."""
     ledger = stepper.ledger
     names = ledger.names_by_id()
     commands = {c.robot: c for c in stepper.last.decision.commands} if stepper.last is not None else {}
@@ -229,7 +229,7 @@ def make_robot_reports(stepper: Stepper) -> tuple[RobotReport, ...]:
 def collect_warnings(
     stepper: Stepper, recorder: RecorderReport, scheduling: str, warnings: Sequence[str] = ()
 ) -> list[str]:
-    """Return what a person should know though nothing has failed yet, one line each; `warnings` come first."""
+    """Return warnings for the user about conditions that are no failure yet, one line each; `warnings` come first."""
     found = list(warnings)
     if stepper.last is not None and stepper.last.diverged:
         found.append(f"physics stands still until a reset: {stepper.last.diverged}"[:MAX_TEXT])

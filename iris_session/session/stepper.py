@@ -1,7 +1,7 @@
 """`Stepper`: one step of a live session. Gathers entries, runs the core, sends the results, journals. No pacing.
 
-Session time is stamped here, once per step, and handed to the pure core. Everything that goes out is bounded by the
-ports behind it (front link, recorder feed); what they drop they count.
+Session time is stamped here, once per step, and passed to the pure core. The ports (front link, recorder feed) bound
+everything that is sent, and count what they drop.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class NextScene(NamedTuple):
 
 
 class NextPatch(NamedTuple):
-    """A change of what is drawn. `shown`: the scene after it, for clients."""
+    """A visual change of the scene. `shown`: the scene after it, for clients."""
 
     message: ScenePatched
     shown: Shown
@@ -252,7 +252,7 @@ class Stepper:
         try:
             outcome = self.core.step(now_ns, entries, n_ticks, plant, digest=self.recorder is not None, lap=self.on_lap)
         except Exception:
-            if self.recorder is not None:  # what led to it is worth more than all before
+            if self.recorder is not None:  # the steps before the error matter most in the recording
                 self.recorder.add_row(make_row(self._chain, self.step_count, now_ns, n_ticks, entries, CRASHED, plant))
                 self.recorder.flush()
             raise
@@ -261,7 +261,7 @@ class Stepper:
             self.on_entries(entries)
         anew = self.last is None or not self.last.diverged
         if outcome.diverged and (anew or not (plant or outcome.decision.paused)):  # no resume but by a reset
-            if not plant:  # a user's loop is not ours to pause
+            if not plant:  # the session cannot pause a user's loop
                 self.post_own(Control(request_id=0, action="pause"))
             self.post_own(Marker(request_id=0, text=f"physics stands still until a reset: {outcome.diverged}"))
         self.last = outcome

@@ -16,7 +16,7 @@ from iris_session.recording import RecorderFeed, RecorderProcess, RecordingError
 from iris_session.system.backoff import Backoff
 
 RESTART_DELAYS_NS: Final = (0, 500_000_000, 1_000_000_000, 2_000_000_000, 5_000_000_000)
-#: A process that lived this long is taken as healthy again.
+#: A process that lived this long counts as healthy again.
 HEALTHY_NS: Final = 30_000_000_000
 #: A recorder reports twice a second. It is not ended when it hangs: a slow disk would delay its successor too.
 HANGING_NS: Final = 5_000_000_000

@@ -13,9 +13,9 @@ MAX_NAME: Final = 48  # as `SessionConfig.name`
 
 
 class NameFinder:
-    """Listens for beacons of other sessions while this one starts; never when `port` is 0.
+    """Listener for beacons of other sessions while this one starts; it does nothing when `port` is 0.
 
-    `notes`: messages for people, one line each.
+    `notes`: messages for the user, one line each.
     """
 
     def __init__(self, port: int) -> None:

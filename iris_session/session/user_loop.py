@@ -4,8 +4,8 @@ The session never touches the user's `MjData` but at a tick. It keeps a twin wor
 the plant's `mjSTATE_INTEGRATION` at every step; that state is journaled, so authority and control can be re-run exactly
 although the plant cannot (recordings of class `open`).
 
-The state handed in is always finite. While the user's is not, the last finite one replaces it and no tick is taken:
-robots hold, participants are notified, and must clutch again afterwards.
+The state passed to the core is always finite. While the user's is not, the last finite one replaces it and no tick is
+taken: robots hold, participants are notified, and must clutch again afterwards.
 
 A helper thread takes zero-tick steps, on the twin alone, when the user's loop is silent for 20 ms: leases, heartbeats
 and e-stops go on while a script plots, trains or waits at a prompt.

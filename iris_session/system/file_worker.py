@@ -46,7 +46,7 @@ class FileWorker(Generic[E]):
                 outcome = job()
             except self._expected as error:
                 outcome = error
-            except Exception as error:  # a fault of ours: it ends the front, as it would without the thread
+            except Exception as error:  # a bug: it ends the front, as it would without the thread
                 return _raise_later(error)
             return lambda now_ns: on_done(outcome, now_ns)
 

@@ -1,4 +1,4 @@
-"""Logging of our own commands and child processes. A program that embeds a session configures `logging` itself."""
+"""Logging of the package's commands and child processes. A program with a session configures `logging` itself."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _FORMAT: Final = "%(levelname)s %(name)s: %(message)s"
 
 
 class _StandardErrorHandler(logging.Handler):
-    """Writes to what `sys.stderr` is at the moment, so that redirecting it later has its effect."""
+    """Handler that looks up `sys.stderr` for each record, so that a later redirection has effect."""
 
     def emit(self, record: logging.LogRecord) -> None:
         try:
@@ -25,7 +25,7 @@ class _StandardErrorHandler(logging.Handler):
 def configure_logging() -> None:
     """Write the log of this package to standard error, one line `LEVEL name: text` a record.
 
-    For our own processes and commands, never on import. The level comes from the environment variable `IRIS_LOG`
+    For the package's processes and commands, never on import. The level comes from the environment variable `IRIS_LOG`
     (`DEBUG`, `INFO`, `WARNING`, `ERROR`), default `WARNING`; child processes inherit it. May be called twice.
     """
     name = os.environ.get(LEVEL_VARIABLE, "").strip().upper()

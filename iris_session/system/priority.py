@@ -1,6 +1,6 @@
 """Priority of threads: the tick loop runs before other work, and what can wait runs after it.
 
-On a busy machine the scheduler, not our code, decides whether a 2 ms tick is met. Linux: `SCHED_RR` needs root,
+On a busy machine the scheduler, not this code, decides whether a 2 ms tick is met. Linux: `SCHED_RR` needs root,
 `CAP_SYS_NICE` or an `rtprio` line in /etc/security/limits.d; without it nothing is changed. The result is shown in the
 session's status, so that late ticks can be explained.
 """
@@ -84,7 +84,7 @@ def tick_priority(enabled: bool = True) -> Iterator[str]:
 
 @contextlib.contextmanager
 def freeze_garbage_collector() -> Iterator[None]:
-    """Exempt what exists now from garbage collection: it lives as long as the loop inside."""
+    """Exempt all present objects from garbage collection inside: they live as long as the loop."""
     gc.collect()
     gc.freeze()
     try:

@@ -31,7 +31,7 @@ PIPE: Final = subprocess.PIPE
 DEVNULL: Final = subprocess.DEVNULL
 _DISTRIBUTION: Final = "iris-session"
 _READ_BYTES: Final = 65536
-#: Every system's pipe holds so much without a reader (Linux 64 KiB, macOS 16 KiB).
+#: A pipe of any system buffers at least so much without a reader (Linux 64 KiB, macOS 16 KiB).
 _PIPE_BYTES: Final = 16384
 _PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
 
