@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 import zmq
@@ -178,9 +177,7 @@ class Intake:
             text, advice = "this key is not on the session's list", "run `iris-session pair` there, join with its code"
             self._outbox.send_to_route(route, Refused(RefusalCode.UNPAIRED, text, advice))
 
-    def _handle_from_connection(
-        self, connection: FrontConnection, envelope: ClientEnvelope, now_ns: int
-    ) -> None:
+    def _handle_from_connection(self, connection: FrontConnection, envelope: ClientEnvelope, now_ns: int) -> None:
         message = envelope.message
         connection.last_heard_ns = now_ns
         if not connection.admitted and not isinstance(message, (GetStatus, EStop)):  # anyone may stop, however early
