@@ -49,8 +49,8 @@ _encode = msgspec.msgpack.Encoder().encode
 class RawFeed:
     """Forward samples and observations to the recorder: `[connection, receive_ns, message bytes]`.
 
-    Never blocks. Without an endpoint nothing is forwarded. Messages are encoded again rather than forwarded as received:
-    then the recording holds nothing that the schema does not have, however large or deep a client made it.
+    Never blocks. Without an endpoint nothing is forwarded. Messages are encoded again, not forwarded as received: so
+    the recording holds nothing that the schema does not have, however large or deep a client made it.
     """
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, drops: Drops) -> None:
