@@ -106,7 +106,7 @@ def _admit_participant(ctx: Context, p: Participant, connection: int, m: Join, r
 
 
 def _evict_disconnected(ctx: Context) -> bool:
-    """Makes room: forgets the first lost participant that holds nothing."""
+    """Make room: remove the first disconnected participant that holds nothing."""
     for p in ctx.state.participants.values():
         if p.connection == NO_CONNECTION and not ctx.list_leases(p):
             remove_participant(ctx, p, "expired")
@@ -115,7 +115,7 @@ def _evict_disconnected(ctx: Context) -> bool:
 
 
 def disconnect_participant(ctx: Context, p: Participant, reason: str, *, keeps_place: bool = False) -> None:
-    """The connection is gone: its robots hold, and the grace period begins."""
+    """Handle a disconnect: the participant's robots hold, and the grace period begins."""
     if p.connection == NO_CONNECTION or p.id == HOST_ID:
         return
     del ctx.by_connection[p.connection]

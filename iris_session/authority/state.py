@@ -30,7 +30,7 @@ class JointReading(msgspec.Struct, array_like=True):
 
 
 class DeviceState(msgspec.Struct):
-    """Newest usable payloads of one device, which the next ones are compared with, whatever was sent in between.
+    """Newest usable payloads of one device, which the next ones are compared with, regardless of samples in between.
 
     `pose`: in the tracking frame, sampled at `pose_ns`. `joints`: by their number.
     """

@@ -1,4 +1,4 @@
-"""Where a session is: `HOST:PORT` as typed, or the URI of a pairing QR code, which also carries key and join code."""
+"""Address of a session: `HOST:PORT` as typed, or the URI of a pairing QR code, which also carries key and join code."""
 
 from __future__ import annotations
 
@@ -20,8 +20,10 @@ _EXAMPLE: Final = f"127.0.0.1:{DEFAULT_CONTROL_PORT}"
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Control channel of a session. `host` without brackets. `server_key`: Z85; with `join_code` and `session` from a
-    URI, else empty."""
+    """Control channel of a session.
+
+    `host`: without brackets. `server_key`: Z85; like `join_code` and `session` only from a URI, else empty.
+    """
 
     host: str
     port: int
@@ -34,9 +36,9 @@ class Address:
 
     @classmethod
     def parse(cls, address: object) -> Address:
-        """`host`, `host:port`, `[ipv6]:port`, the same after `tcp://`, or `iris://host:port/?k=...&c=...&n=...`.
+        """Parse `host`, `host:port`, `[ipv6]:port`, the same after `tcp://`, or `iris://host:port/?k=...&c=...&n=...`.
 
-        Raises `ClientError` that shows what an address looks like.
+        Raises `ClientError` with examples of valid addresses.
         """
         if not isinstance(address, str):
             raise ClientError(f"address {address!r} is a {type(address).__name__}, not text like {_EXAMPLE!r}")
@@ -46,8 +48,10 @@ class Address:
 
 
 def pairing_uri(host: str, port: int, server_key: str, join_code: str = "", session: str = "") -> str:
-    """`iris://HOST:CONTROL/?k=KEY&c=CODE&n=NAME`: what a pairing QR code says. `server_key`: Z85; in the URI its 32 raw
-    bytes in base64url without padding."""
+    """Return `iris://HOST:CONTROL/?k=KEY&c=CODE&n=NAME`, the content of a pairing QR code.
+
+    `server_key`: Z85; in the URI its 32 raw bytes in base64url without padding.
+    """
     key = base64.urlsafe_b64encode(decode_key(server_key)).decode().rstrip("=")
     fields = {"k": key, "c": join_code, "n": session}
     query = "&".join(f"{name}={quote(value, safe='')}" for name, value in fields.items() if value)

@@ -21,7 +21,7 @@ POSE_FORM: Final = "((x, y, z), (w, x, y, z))"
 
 
 def to_text(value: object) -> str:
-    """Any value as a `Text`: what stops robots must not fail for want of a good reason."""
+    """Convert any value to a `Text`: an e-stop must not fail because of its reason."""
     try:
         text = str(value)
     except Exception:  # the object's own conversion may raise anything
@@ -30,7 +30,7 @@ def to_text(value: object) -> str:
 
 
 def to_names(field: str, names: str | Iterable[str]) -> tuple[str, ...]:
-    """Names as a tuple; a bare string is one name."""
+    """Convert names to a tuple; a bare string is one name."""
     if isinstance(names, str):
         return (names,)
     found = tuple(names) if isinstance(names, Iterable) else (names,)
@@ -41,7 +41,7 @@ def to_names(field: str, names: str | Iterable[str]) -> tuple[str, ...]:
 
 
 def to_numbers(field: str, values: Iterable[float], length: int | None = None) -> tuple[float, ...]:
-    """Numbers, or an array (n,), as floats."""
+    """Convert numbers, or an array (n,), to floats."""
     try:
         found = tuple(v if type(v) is float else _to_float(v) for v in values)
     except (TypeError, ValueError):
@@ -59,7 +59,7 @@ def _to_float(value: Any) -> float:
 
 
 def to_pose(field: str, pose: PoseLike) -> Pose:
-    """`((x, y, z), (w, x, y, z))` of tuples, lists or arrays, or a `Pose`."""
+    """Convert `((x, y, z) [m], (w, x, y, z))` of tuples, lists or arrays to a `Pose`; a `Pose` is returned as it is."""
     if isinstance(pose, Pose):
         return pose
     try:
@@ -70,7 +70,7 @@ def to_pose(field: str, pose: PoseLike) -> Pose:
 
 
 def to_python_scalar(value: Any) -> Any:
-    """A NumPy scalar as the number or truth value that it is."""
+    """Convert a NumPy scalar to a Python number or truth value."""
     return value.item() if isinstance(value, np.generic) else value
 
 

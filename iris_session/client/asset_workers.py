@@ -1,7 +1,7 @@
 """Two threads that read, hash and write assets, and decode them for the application.
 
-An asset belongs to one of them, so what is asked for one asset happens in that order. What became of it is taken by
-`results` in the thread that polls. On Linux they have a lower priority than the thread that polls: state comes first.
+Each asset belongs to one of them, so the jobs of one asset run in order. `poll_results` returns the results in the
+thread that polls. On Linux they have a lower priority than that thread: state comes first.
 """
 
 from __future__ import annotations
@@ -18,16 +18,19 @@ from iris_session.client.errors import AssetError
 from iris_session.system.priority import lower_thread_priority
 
 THREADS: Final = 2
-#: Who polls is woken after so many bytes, and not more often than this while there is more to do: to look at everything
-#: that may have come costs it as much as a chunk does.
+#: The polling thread is woken after this many bytes, and while there is more to do not more often than this: one round
+#: of polling costs as much as a chunk.
 WAKE_BYTES: Final = 1 << 20
 WAKE_NS: Final = 5_000_000
 Decode = Callable[[str, memoryview], Any]
 
 
 class AssetFound(NamedTuple):
-    """An asset is in the cache. `decoded`: functions, with what each made of it, or the `AssetError` that it ended
-    with. `fetched`: it was stored just now."""
+    """An asset is in the cache.
+
+    `decoded`: decode functions, each with its result or the `AssetError` that it raised. `fetched`: it was stored just
+    now.
+    """
 
     address: str
     size: int
@@ -36,27 +39,27 @@ class AssetFound(NamedTuple):
 
 
 class AssetMissing(NamedTuple):
-    """Its first `offset` bytes are there."""
+    """An asset is not complete in the cache; its first `offset` bytes are there."""
 
     address: str
     offset: int
 
 
 class BytesStored(NamedTuple):
-    """So many bytes were taken over."""
+    """This many bytes were written."""
 
     size: int
 
 
 class HashMismatch(NamedTuple):
-    """The bytes that came are not those of the address; they are thrown away. `size`: how many they were."""
+    """The received bytes do not have the hash of the address; they were removed. `size`: number of bytes."""
 
     address: str
     size: int
 
 
 class AssetFailed(NamedTuple):
-    """The asset will not come."""
+    """The asset cannot be stored or read."""
 
     error: AssetError
     address: str
@@ -67,8 +70,10 @@ _Job = tuple[str, Callable[[], Result], int]
 
 
 class AssetWorkers:
-    """`wake`: called from the threads when there is a result. How much waits is bounded by who asks: a window of bytes,
-    and a few assets at once."""
+    """Worker threads for assets. `wake`: called from the threads when there is a result.
+
+    The queues are bounded by the caller: by its window of bytes and its limit of assets at once.
+    """
 
     def __init__(self, cache: AssetStore, wake: Callable[[], None]) -> None:
         self.cache = cache
@@ -90,7 +95,7 @@ class AssetWorkers:
             yield self._results.get_nowait()
 
     def look_up(self, address: str, decodes: Iterable[Decode]) -> None:
-        """`Found` or `Missing`."""
+        """Search an asset in the cache; the result is `AssetFound` or `AssetMissing`."""
 
         def work() -> Result:
             view = self.cache.find(address)
@@ -102,7 +107,7 @@ class AssetWorkers:
         self._submit(address, work)
 
     def write(self, address: str, data: memoryview) -> None:
-        """The next bytes of an asset that was `Missing`: `Stored`."""
+        """Write the next bytes of a missing asset; the result is `BytesStored`."""
 
         def work() -> Result:
             part = self._parts.get(address)
@@ -113,7 +118,7 @@ class AssetWorkers:
         self._submit(address, work, len(data))
 
     def finish(self, address: str, decodes: Iterable[Decode]) -> None:
-        """All bytes were written: `Found` or `Wrong`."""
+        """Check an asset whose bytes are all written; the result is `AssetFound` or `HashMismatch`."""
 
         def work() -> Result:
             part = self._parts[address]
@@ -126,7 +131,7 @@ class AssetWorkers:
         self._submit(address, work)
 
     def restart(self, address: str) -> None:
-        """Throws away what is there: `Missing`."""
+        """Remove the stored bytes of an asset; the result is `AssetMissing`."""
 
         def work() -> Result:
             self._parts[address].restart()
@@ -135,7 +140,7 @@ class AssetWorkers:
         self._submit(address, work)
 
     def release(self, address: str) -> None:
-        """It is not wanted any more; what is there stays for another time."""
+        """Stop work on an asset that is not wanted any more; its stored bytes remain for a later fetch."""
 
         def work() -> Result:
             self._close(address)
@@ -144,7 +149,7 @@ class AssetWorkers:
         self._submit(address, work)
 
     def close(self) -> None:
-        """Waits for what is being done, writes what has come, and leaves parts for another time."""
+        """Finish the present jobs, write all received bytes, and keep partial assets for a later fetch."""
         self._closing = True
         for jobs in self._jobs:
             jobs.put(None)
@@ -161,7 +166,7 @@ class AssetWorkers:
         while (job := jobs.get()) is not None:
             address, work, size = job
             if self._closing and not size:
-                continue  # only bytes are worth it
+                continue  # while closing, only received bytes are still written
             result = self._run_job(address, work, size)
             self._results.put(result)
             untold += size
@@ -179,7 +184,7 @@ class AssetWorkers:
         except AssetStoreError as error:
             failure = AssetError.from_store(error)
             failure.__cause__ = error
-        except Exception as error:  # a fault of ours: it must not leave a fetch waiting
+        except Exception as error:  # an error of our own must not leave a fetch waiting
             failure = AssetError(address, "cache", f"asset {address}: {type(error).__name__}: {error}")
             failure.__cause__ = error
         self._close(address)
@@ -201,7 +206,7 @@ def _decode_found(address: str, view: memoryview, decodes: Iterable[Decode], *, 
     for decode in decodes:
         try:
             decoded.append((decode, decode(address, view)))
-        except Exception as error:  # of the application: whatever it is belongs to this asset
+        except Exception as error:  # raised by the application's function: any error fails this asset only
             text = f"asset {address} could not be decoded: {type(error).__name__}: {error}"
             failure = AssetError(address, "decode", text)
             failure.__cause__ = error

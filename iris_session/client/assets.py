@@ -67,12 +67,12 @@ class AssetFetch:
 
     @property
     def done(self) -> bool:
-        """True when nothing is to come any more; `failed` has what did not."""
+        """True when no asset is pending; `failed` has those that could not be fetched."""
         return not self.pending
 
     @property
     def bytes_done(self) -> int:
-        """Bytes of these assets that are here."""
+        """Bytes of these assets that are available."""
         return sum(self._done.values())
 
     @property
@@ -202,7 +202,7 @@ class ClientAssets:
                 `AssetError`.
 
         Returns:
-            The fetch; look at `done`.
+            The fetch; it is complete when its `done` is true.
 
         Raises:
             InvalidMessageError: One of `addresses` is not an address.
@@ -261,7 +261,9 @@ class ClientAssets:
         return self._workers is not None
 
     def poll(self) -> bool:
-        """Take results of the workers and chunks that came, and request more. True when there was something."""
+        """Process results of the workers and received chunks, and request more. Return true when there was
+        something.
+        """
         workers, loader = self._workers, self._loader
         if workers is None:
             return False
@@ -290,7 +292,7 @@ class ClientAssets:
                 fetch.on_progress(fetch)
 
     def close(self) -> AssetWorkers | None:
-        """Fail what has not come: the client is closed.
+        """Fail all pending assets, because the client is closed.
 
         Returns the workers, to be closed without the lock: their decode functions may wait for it.
         """
@@ -332,7 +334,7 @@ class ClientAssets:
         for chunk in self._loader.next_requests(now_ns):
             request = AssetRequest(PROTOCOL_VERSION, welcome.connection_epoch, *chunk)
             if not self._sockets.send_assets(encode_asset_request(request)):
-                self._close_link()  # it takes nothing, though little was requested: it is not there
+                self._close_link()  # the socket is full although little was requested: there is no peer
                 break
         return bool(messages)
 
@@ -374,7 +376,7 @@ class ClientAssets:
             for fetch in self._fetches:
                 fetch.on_found(result.address, result.size, result.decoded, fetched=result.fetched)
             if any(result.address in fetch.pending for fetch in self._fetches):
-                loader.add(result.address, result.size)  # a fetch came meanwhile that decodes it otherwise
+                loader.add(result.address, result.size)  # a new fetch decodes it by another function
         elif isinstance(result, AssetMissing):
             loader.on_missing(result.address, result.offset)
         elif isinstance(result, AssetFailed):

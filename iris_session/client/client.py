@@ -307,7 +307,7 @@ class Client:
 
     @property
     def worn(self) -> bool:
-        """Whether the headset is worn. Set it; heartbeats and samples carry it."""
+        """True while the headset is worn. Set it; heartbeats and samples carry it."""
         return self.connection.worn
 
     @worn.setter
@@ -418,7 +418,7 @@ class Client:
         if not self._polls_here:
             raise ClientError("poll() while the thread of start() polls: use wait_for(), callbacks and attributes")
         deadline = time.monotonic_ns() + int(timeout_s * 1e9)
-        # Loading assets bring something every moment: one round per call is enough, and what came since ends the wait.
+        # Assets arrive all the time: one round per call is enough, and anything that came since ends the wait.
         pumped = self._just_pumped and timeout_s > 0.0
         while True:
             progressed = not pumped and self._pump()
@@ -487,7 +487,7 @@ class Client:
 
     @property
     def has_state(self) -> bool:
-        """Whether state has come that `poll_state` would take."""
+        """True when state has arrived that `poll_state` would take."""
         return self._sockets.has_state
 
     @property
@@ -727,7 +727,7 @@ class Client:
         """Start or stop a measurement of the alignment. The one in force stays until there is a better one.
 
         Args:
-            action: `start`: measure anew, from nothing; `stop`: keep the one in force, whatever is observed.
+            action: `start`: measure again from the beginning; `stop`: keep the one in force.
             participant: Id of another participant, as director; empty: ourselves.
 
         Raises:
@@ -1041,7 +1041,7 @@ class Client:
         return self._thread is None or threading.current_thread() is self._thread
 
     def _check_thread(self) -> None:
-        """Raise what ended the thread of `start`: nothing is sent or received without it."""
+        """Raise the error that ended the thread of `start`: nothing is sent or received without it."""
         if isinstance(self._crash, ClientError):
             raise self._crash
         if self._crash is not None:
@@ -1061,7 +1061,7 @@ class Client:
                 raise NotConnectedError(self.connection.describe())
             phase = self.connection.phase
             if self.assets.has_workers:
-                self._sockets.clear_wake()  # before its reason is looked at: a later one is not lost
+                self._sockets.clear_wake()  # before its reason is checked, so that a later one is not lost
             self._joiner.step()
         progressed = self.poll_state()
         with self._lock:
@@ -1149,7 +1149,7 @@ class Client:
                 self.poll(0.1)
                 with self._changed:
                     self._changed.notify_all()
-        except BaseException as error:  # what ends the thread is raised in the calls that wait
+        except BaseException as error:  # raised again in the calls that wait
             if not isinstance(error, ClientError):  # those are one line, raised in the calls that wait
                 traceback.print_exception(error)
             with self._changed:

@@ -1,11 +1,11 @@
-"""Endpoint of a session: from an address, a name, a URI or a join code to a host, a port and keys that can say hello.
+"""Resolver of a session's endpoint: from an address, a name, a URI or a join code to a host, a port and keys.
 
     name --beacons--> address --introduction--> key --known?--> (join code: pair, store the key) --> hello
 
-Beacon and introduction may be sent by anybody. A key is trusted because it was given (URI, `CurveKeys`), was stored
-before, has proved the join code, or, without any of these, at first sight; then it is stored once the session has
-welcomed us. `EndpointResolver` takes these steps, `ServerTrust` decides on keys, `pair_key` pairs, and
-`SessionJoiner` drives a resolver for a connection and checks who answers.
+Any machine can send beacons and introductions. A key is trusted because it was given (URI, `CurveKeys`), was stored
+before, has proved the join code, or, without any of these, at first sight; then it is stored after the welcome.
+`EndpointResolver` takes these steps, `ServerTrust` decides on keys, `pair_key` pairs, and `SessionJoiner` drives a
+resolver for a connection and checks which session answers.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ RETRY_S: Final = 0.2
 #: Between two steps of a resolver: it is short-lived, and waits for different things.
 STEP_NS: Final = 5_000_000
 ANSWER_S: Final = 5.0
-#: While many clients pair at once the session says so, with a slow disk it is silent for a while: the same request is
-#: repeated at this period, for so long. A client that has paired gets the same answer again.
+#: Period and duration of repeating a pairing request: a session answers that many clients pair at once, or not at all
+#: while its disk is slow. A client that has paired gets the same answer again.
 PAIR_RETRY_S: Final = 1.0
 PAIR_PATIENCE_S: Final = 20.0
 MAX_NAME: Final = 64  # as `protocol.common.Name`
@@ -64,9 +64,10 @@ class ConnectRequest:
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """Control channel of a session, and the keys for it. `session_id`: as it introduced itself; empty: it did not.
+    """Control channel of a session, and the keys for it.
 
-    `store`: the key is trusted at first sight and is stored when the session welcomes us.
+    `session_id`: from the introduction, empty without one. `store`: the key is trusted at first sight and is stored
+    when the session welcomes us.
     """
 
     address: Address
@@ -76,7 +77,7 @@ class Endpoint:
     store: bool = False
 
     def store_key(self) -> None:
-        """Store the session's key, if it is to be. Raises `TrustError` when another one was stored meanwhile."""
+        """Store the session's key if `store` is set. Raises `TrustError` when another one was stored meanwhile."""
         if self.store and self.curve is not None:
             ServerTrust(KeyHome(), self.address).store(self.session, self.curve.server_public.decode())
 
@@ -96,10 +97,10 @@ def parse_connect_request(address: str, session: str, curve: CurveKeys | None, j
 
 
 class EndpointResolver:
-    """Resolves a `ConnectRequest` in steps that never wait, until it works or fails for good.
+    """Resolve a `ConnectRequest` in steps that never wait, until it succeeds or fails for good.
 
-    `note`: what it still waits for. `repair`: the session has refused our key as not paired, so pair although its key
-    is known.
+    `note`: what it waits for. `repair`: the session has refused our key as not paired, so pair although its key is
+    known.
     """
 
     def __init__(self, request: ConnectRequest, *, repair: bool = False) -> None:
@@ -120,7 +121,7 @@ class EndpointResolver:
         return None
 
     def close(self) -> None:
-        """Stop, and close what is open."""
+        """Stop, and close all sockets."""
         self._steps.close()
 
     def _resolve(self) -> Generator[None, None, Endpoint]:
@@ -139,7 +140,7 @@ class EndpointResolver:
             yield from _pause(RETRY_S)
 
     def _find_session(self, name: str) -> Generator[None, None, FoundSession]:
-        """Wait until a session of that name is heard, and as long as others of that name would be heard too."""
+        """Wait until a session of that name is heard, and long enough to hear others of that name too."""
         with open_listener() as listener:
             heard_at: float | None = None
             while True:
@@ -175,7 +176,7 @@ class EndpointResolver:
             return None
         if introduction.beacon.control != address.port:
             self.note = f"the session below {address} is another one, on port {introduction.beacon.control}"
-            return None  # a forwarded port, or one next to it
+            return None  # the port is forwarded, or is next to that of another session
         if not is_plausible(introduction.beacon):
             self.note = f"the introduction at {address} is not of a session"
             return None
@@ -184,7 +185,7 @@ class EndpointResolver:
     def _select_keys(
         self, address: Address, found: FoundSession | None, introduction: Introduction | None
     ) -> Generator[None, None, Endpoint | None]:
-        """Decide on the key, and pair where that is wanted; `None`: nothing can be decided yet."""
+        """Select the key, and pair where requested; `None`: there is no decision yet."""
         home, code = KeyHome(), self._request.join_code or address.join_code
         trust = ServerTrust(home, address, found.name if found is not None else "")
         offered = None if introduction is None else introduction.server_key
@@ -252,7 +253,7 @@ def _pause(seconds: float) -> Generator[None, None, None]:
 
 
 class SessionJoiner:
-    """Resolves the endpoint of one connection, opens it, and checks that the session that introduced itself answers.
+    """Resolve the endpoint of one connection, open it, and check that the session that introduced itself answers.
 
     `address`: `HOST:PORT`, as soon as it is known.
     """
@@ -299,14 +300,14 @@ class SessionJoiner:
             self._connection.open(time.monotonic_ns())
 
     def cancel(self) -> None:
-        """Stop to resolve."""
+        """Stop resolving."""
         if self._resolver is not None:
             self._resolver.close()
             self._resolver = None
             self._connection.wake_ns = 0
 
     def check_answer(self) -> None:
-        """After control messages: the first welcome must be of the session that introduced itself."""
+        """Check, after control messages, that the first welcome is from the session that introduced itself."""
         connection, endpoint = self._connection, self._endpoint
         if endpoint is None:
             return
@@ -314,15 +315,15 @@ class SessionJoiner:
             self._endpoint = None
             self._check_welcome(endpoint, connection.welcome)
         elif self._may_pair():
-            self._paired_anew = True  # once: a key that is taken off the list again stays off
+            self._paired_anew = True  # only once: a key that is revoked again stays revoked
             self.begin(repair=True)
         elif connection.retryable_refusal is not None:
-            return  # there is a session: `connection` says hello again
+            return  # a session answers: `connection` sends hello again
         elif connection.phase is ConnectionPhase.WAITING and not endpoint.session_id and self._request.curve is None:
             self.begin()  # there was no introduction before: there may be one now
 
     def describe_failure(self, when: str) -> str:
-        """Return a line for people: where we were not welcomed, `when`, and the reason as far as it is known."""
+        """Return a line for users: the address without a welcome, `when`, and the reason as far as it is known."""
         if self._connection.retryable_refusal is not None and self._resolver is None:
             return f"{self.address} {when}: {RefusedError(self._connection.retryable_refusal)}"
         note = self._note if self._resolver is None else self._resolver.note or self._note
@@ -356,9 +357,9 @@ class SessionJoiner:
 
 
 class ServerTrust:
-    """Keys that this user trusts for the session at `address`, called `session` (empty: not asked for by name).
+    """Keys that this user trusts for the session `session` at `address` (empty: not requested by name).
 
-    Nothing is overwritten in silence: a key that differs from the trusted one is an error that names both.
+    Nothing is overwritten silently: a key that differs from the trusted one raises an error that names both.
     """
 
     def __init__(self, home: KeyHome, address: Address, session: str = "") -> None:
@@ -369,7 +370,7 @@ class ServerTrust:
 
     @property
     def stored(self) -> str:
-        """The key (Z85) stored for the address, empty for none."""
+        """Key (Z85) stored for the address, empty without one."""
         return next((one.key for one in self._known if one.address == str(self._address)), "")
 
     def is_known(self, key: str) -> bool:
@@ -398,7 +399,7 @@ class ServerTrust:
         if not offered and not loopback:
             raise TrustError(f"the session at {self._address} is not encrypted: over a network it must be")
         if not offered and not given:
-            return ""  # on this machine the same port may serve with a key today and without tomorrow
+            return ""  # on this machine different sessions may use the port, with or without a key
         if pinned and offered != pinned:
             raise self._differs(pinned, offered, "what answers there")
         return offered
@@ -447,7 +448,7 @@ def default_key_name() -> str:
     """Return `USER@HOST`: the name of this user's key on allow-lists."""
     try:
         user = getpass.getuser()
-    except (KeyError, OSError):  # no such user in the system's files: containers
+    except (KeyError, OSError):  # in containers the user may be missing in the system's files
         user = "user"
     name = f"{user}@{socket.gethostname()}"
     return "".join(c for c in name if c.isprintable())[:MAX_NAME]
@@ -468,7 +469,7 @@ def pair_key(address: Address, server_key: str, own: KeyPair, code: str, name: s
 
     Raises:
         RefusedError: The code is wrong, used or expired.
-        TrustError: The session could not prove that it knows the code, so it is not the one that gave it out.
+        TrustError: The session could not prove that it knows the code, so it did not issue it.
         NotConnectedError: No answer.
     """
     server_public = decode_key(server_key)

@@ -1,18 +1,18 @@
-"""Everything the client raises.
+"""Exceptions of the client.
 
     ClientError
     +-- NotConnectedError      no connection to a session now; the client keeps trying unless it was closed or refused
-    +-- RefusedError           the session said no to `hello`: `code`, `message`, `advice`
+    +-- RefusedError           the session refused `hello`: `code`, `message`, `advice`
     |   +-- VersionError       it speaks other protocol versions: `supported_versions`
-    +-- DeniedError            the session said no to one request: `denial` (reason, holder, advice); nothing changed
+    +-- DeniedError            the session denied a request: `denial` (reason, holder, advice); nothing changed
     +-- RequestTimeoutError    no answer in time (also a `TimeoutError`); the request may still take effect
-    +-- InvalidMessageError    what was to be sent is not of the protocol (also a `ValueError`); nothing was sent
+    +-- InvalidMessageError    a message does not fit the protocol (also a `ValueError`); nothing was sent
     +-- IdentityError          the identity file cannot be used
-    +-- TrustError             the session's key is not the one that is trusted, or it could not prove the join code
+    +-- TrustError             the session's key is not the trusted one, or it could not prove the join code
     +-- AssetError             an asset could not be fetched: `address`, `reason`
-    +-- SessionNameError       no single session can be meant by that name
+    +-- SessionNameError       the name does not identify a single session
 
-Bytes that a server sends and that do not fit the protocol never raise: they are counted in `Client.counters`.
+Malformed messages from a server never raise: they are counted in `Client.counters`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class ClientError(Exception):
 
 
 def join_parts(*parts: str) -> str:
-    """Those that say something, as one line."""
+    """Join the non-empty parts to one line."""
     return "; ".join(part for part in parts if part)
 
 
@@ -68,7 +68,7 @@ class RequestTimeoutError(ClientError, TimeoutError):
 
 
 class InvalidMessageError(ClientError, ValueError):
-    """The protocol does not take this message, or a value cannot be what its field needs. Nothing was sent."""
+    """The message does not fit the protocol, or a value does not fit its field. Nothing was sent."""
 
 
 class IdentityError(ClientError):
@@ -76,18 +76,19 @@ class IdentityError(ClientError):
 
 
 class TrustError(ClientError):
-    """The session at an address is not, or cannot be shown to be, the one that is meant. Nothing was said to it."""
+    """The session at an address is not the trusted one, or could not prove that it is. Nothing was sent to it."""
 
 
 class SessionNameError(ClientError):
-    """Several sessions have that name, or another one answers where it was heard."""
+    """Several sessions have that name, or another one answered at its address."""
 
 
 class AssetError(ClientError):
-    """An asset could not be fetched. `address`: empty when it concerns all of them.
+    """An asset could not be fetched.
 
-    `reason`: an `AssetRefusal`, `hash` (twice the bytes were others than its address says), `protocol`, `decode`,
-    `cache` (the folder of the cache cannot be used), `gone` (taken away since), `no_channel`, `cancelled` or `closed`.
+    `address`: content hash; empty when the error concerns all assets. `reason`: an `AssetRefusal`, `hash` (the bytes
+    did not match the hash twice), `protocol`, `decode`, `cache` (the folder of the cache cannot be used), `gone`
+    (removed since), `no_channel`, `cancelled` or `closed`.
     """
 
     def __init__(self, address: str, reason: str, text: str) -> None:
@@ -97,5 +98,5 @@ class AssetError(ClientError):
 
     @classmethod
     def from_store(cls, error: AssetStoreError) -> AssetError:
-        """Return the error of a client whose asset store failed."""
+        """Return the client's error for an error of its asset store."""
         return cls(error.address, error.reason, str(error))

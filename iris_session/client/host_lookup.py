@@ -1,7 +1,7 @@
-"""Names of hosts to network addresses, without waiting: a thread asks the system, which may take many seconds.
+"""Resolution of host names without blocking: a thread asks the system, which may take many seconds.
 
-Whoever asks for a name that is being looked up waits for the same answer, so a name server that hangs costs one thread
-for each name, and those are few.
+All requests for a name that is being resolved share one answer, so a name server that hangs costs one thread per name,
+and there are few names.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ import time
 from collections.abc import Generator
 from typing import Final
 
-#: Names at a time.
+#: Maximum number of names at a time.
 MAX_LOOKUPS: Final = 16
-#: An answer that came after its asker had given up is there for the next attempt.
+#: Answers by name; one that came after the timeout serves the next attempt.
 KEPT_S: Final = 10.0
 
 
 class _Lookup:
-    """One name. `answer`: a network address, or the error; `None` while it is looked up."""
+    """Lookup of one name. `answer`: network address or error; `None` while it runs."""
 
     def __init__(self, host: str, family: socket.AddressFamily) -> None:
         self.answer: str | OSError | None = None
@@ -36,7 +36,7 @@ class _Lookup:
             answer: str | OSError = str(socket.getaddrinfo(self._host, None, self._family, socket.SOCK_STREAM)[0][4][0])
         except OSError as error:
             answer = error
-        except ValueError as error:  # no name at all, as the system's resolver sees it
+        except ValueError as error:  # the system's resolver does not accept it as a name
             answer = OSError(errno.EINVAL, str(error))
         self.done_s = time.monotonic()
         self.answer = answer
@@ -49,7 +49,7 @@ _lookups: dict[str, _Lookup] = {}
 def resolve_host(host: str, until_s: float) -> Generator[None, None, str]:
     """Resolve the network address of `host`; yields wherever it would wait, until `until_s` (`time.monotonic()`).
 
-    A name means IPv4, as on the sockets that say hello. Raises `OSError`: no such name, no answer.
+    Names are resolved to IPv4 only, as on the sockets of the session. Raises `OSError`: no such name, no answer.
     """
     with contextlib.suppress(ValueError):
         return str(ipaddress.ip_address(host))

@@ -22,18 +22,18 @@ from iris_session.security import KeysError, load_public, load_secret
 from iris_session.system.priority import run_at_low_priority
 
 STATE_HWM: Final = 2
-#: Small on purpose: what a stalled client finds when it comes back is at most this old, not seconds old.
+#: Small on purpose: after a stall a client receives only this many old messages, not those of seconds.
 STATE_RCVBUF: Final = 16_384
 CONTROL_HWM: Final = 64
-#: As much as a link of 20 Mbit/s and 50 ms holds: more would only wait there.
+#: Bytes in flight on a link of 20 Mbit/s and 50 ms: more would only be queued.
 MEDIA_RCVBUF: Final = 131_072
 MEDIA_HWM: Final = 2
-#: More than may be asked for at once.
+#: More than the maximum number of requests at once.
 ASSETS_SEND_HWM: Final = 128
-#: Chunks that wait to be looked at: more wait in the session.
+#: Queue of received chunks; further ones wait in the session.
 ASSETS_HWM: Final = 16
 MAX_MESSAGE_BYTES: Final = 64 * 1024 * 1024
-MAX_DRAIN: Final = 64  # messages taken in one go; more than the queues hold
+MAX_DRAIN: Final = 64  # messages received in one round; more than the queues hold
 LINGER_MS: Final = 200
 #: As plain integers: operations on the enumerations take longer than asking the socket.
 _EVENTS: Final = int(zmq.EVENTS)
@@ -131,8 +131,11 @@ class ClientSockets:
         self.version += 1
 
     def open_state(self, port: int, generation: int) -> None:
-        """Subscribes to the state channel, anew with every `generation` of the control connection: what cut that may
-        have left this one half open, and nothing would ever come. Does nothing when it is connected already."""
+        """Subscribe to the state channel, again with every `generation` of the control connection.
+
+        The cause of a disconnect may have left this connection half open, and it would never receive again. Does
+        nothing when it is connected already.
+        """
         if self._state is not None and self._state_of == (port, generation):
             return
         if self._state is not None:
@@ -154,7 +157,7 @@ class ClientSockets:
         return self._media is not None
 
     def subscribe_media(self, port: int, topics: Sequence[bytes]) -> None:
-        """Adds subscriptions. Port 0: the session has no media."""
+        """Add subscriptions. Port 0: the session has no media."""
         if self._media is None and port:
             media = self._media = self._new_socket(zmq.SUB)
             media.setsockopt(zmq.RCVHWM, MEDIA_HWM)
@@ -168,7 +171,7 @@ class ClientSockets:
                 self._media.setsockopt(zmq.SUBSCRIBE, topic)
 
     def unsubscribe_media(self, topic: bytes) -> None:
-        """Takes one back; none that there is not."""
+        """Remove a subscription; an unknown one is ignored."""
         if self._media is not None:
             with contextlib.suppress(zmq.ZMQError):
                 self._media.setsockopt(zmq.UNSUBSCRIBE, topic)
@@ -178,7 +181,7 @@ class ClientSockets:
         return _drain(self._media)
 
     def send_media(self, port: int, frames: Sequence[bytes]) -> bool:
-        """Publish a frame of a source. False: the link takes nothing now."""
+        """Publish a frame of a source. False: the socket is full."""
         if self._ingest is None:
             if not port:
                 return False
@@ -198,7 +201,7 @@ class ClientSockets:
         return self._assets is not None
 
     def open_assets(self, port: int) -> None:
-        """Connects to the assets channel, if it is not."""
+        """Connect to the assets channel unless it is open."""
         if self._assets is None:
             assets = self._assets = self._new_socket(zmq.DEALER, asset_context())
             assets.setsockopt(zmq.MAXMSGSIZE, MAX_ASSET_CHUNK_BYTES)
@@ -211,7 +214,7 @@ class ClientSockets:
             self.version += 1
 
     def send_assets(self, data: bytes) -> bool:
-        """Asks for a chunk without waiting. False: the socket cannot take it now."""
+        """Request a chunk without waiting. False: the socket is full."""
         if self._assets is None:
             return False
         try:
@@ -228,18 +231,18 @@ class ClientSockets:
         return messages
 
     def poll_assets_disconnect(self) -> bool:
-        """True once after the assets channel lost its peer, and with it what it had been asked."""
+        """Return true once after the assets channel lost its peer; its pending requests are lost too."""
         return _poll_monitor(self._assets_monitor)
 
     def close_assets(self) -> None:
-        """Ends the connection to the assets channel, and what was asked by it."""
+        """Close the connection to the assets channel; its pending requests are lost."""
         if self._assets is not None:
             _close_watched(self._assets, self._assets_monitor, linger_ms=0)
             self._assets = self._assets_monitor = None
             self.version += 1
 
     def close_media(self) -> None:
-        """Ends what was subscribed and handed in, with another connection."""
+        """Close the subscriptions and the ingest socket, which belong to one connection."""
         for one in (self._media, self._ingest):
             if one is not None:
                 one.close(linger=0)
@@ -247,7 +250,7 @@ class ClientSockets:
         self._media = self._ingest = None
 
     def send_control(self, data: bytes) -> bool:
-        """Sends without waiting. False: the socket cannot take it now."""
+        """Send without waiting. False: the socket is full."""
         if self._control is None:
             return False
         try:
@@ -270,11 +273,11 @@ class ClientSockets:
         return _readable(self._state)
 
     def poll_disconnect(self) -> bool:
-        """True once after the control socket lost its peer."""
+        """Return true once after the control socket lost its peer."""
         return _poll_monitor(self._monitor)
 
     def register(self, poller: zmq.Poller, *, sending: bool) -> zmq.Socket[bytes] | None:
-        """Adds the sockets that peers can wake to `poller`; `sending`: also that the control socket takes more.
+        """Add the sockets that peers can wake to `poller`; `sending`: also wake when the control socket has room.
 
         Returns the state socket.
         """
@@ -288,21 +291,21 @@ class ClientSockets:
         return self._state
 
     def register_wake(self, poller: zmq.Poller) -> None:
-        """Adds what `wake` wakes to `poller`."""
+        """Add the socket of `wake` to `poller`."""
         poller.register(self._wake_in.fileno(), zmq.POLLIN)
 
     def enable_wake_registration(self) -> None:
-        """From now on `wake` ends waits for our sockets in other loops too, not only our own `poll`."""
+        """Let `wake` end waits for our sockets in other loops too, not only in our own `poll`."""
         self._wakes_anybody = True
         self.version += 1
 
     def wake(self) -> None:
-        """Ends a wait that includes `register_wake`, from any thread."""
-        with contextlib.suppress(OSError):  # full: it is awake already; closed: there is no wait to end
+        """End a wait that includes `register_wake`, from any thread."""
+        with contextlib.suppress(OSError):  # full: a wake-up is pending already; closed: there is no wait to end
             self._wake_out.send(b"\0")
 
     def clear_wake(self) -> None:
-        """Takes back what `wake` left."""
+        """Clear pending wake-ups."""
         with contextlib.suppress(BlockingIOError):
             while self._wake_in.recv(4096):
                 pass
@@ -319,7 +322,7 @@ class ClientSockets:
                 self._state = None
 
     def close(self) -> None:
-        """Closes everything; a last bye still has `LINGER_MS` to leave."""
+        """Close everything; a last bye has `LINGER_MS` to be sent."""
         self.version += 1
         self.close_media()
         self.close_assets()
@@ -379,7 +382,9 @@ def _drain(sock: zmq.Socket[bytes] | None) -> list[list[bytes]]:
 
 
 def _receive(sock: zmq.Socket[bytes]) -> list[bytes]:
-    """The message that is there. Half the time of `recv_multipart`, which asks anew whether more frames follow."""
+    """Return the available message. Half the time of `recv_multipart`, which checks again whether more frames
+    follow.
+    """
     frame = sock.recv(_NOBLOCK, copy=False)
     frames = [frame.bytes]
     while frame.more:
@@ -393,7 +398,7 @@ _context: tuple[int, zmq.Context[zmq.Socket[bytes]]] | None = None
 
 
 def asset_context() -> zmq.Context[zmq.Socket[bytes]]:
-    """One per process; a forked child gets its own."""
+    """Return the ZeroMQ context of assets, one per process; a forked child gets its own."""
     global _context  # noqa: PLW0603
     with _lock:
         if _context is None or _context[0] != os.getpid():

@@ -211,7 +211,7 @@ class Controller:
         scale = clutch.clip_scale(command.scale, self._config.min_scale, self._config.max_scale)
         new = any(source.new for source in command.sources)
         if r.latch is None or not clutch.is_continued_by(r.latch, command):
-            self._hold_robot(i)  # whoever takes over does not inherit the motion of the one before
+            self._hold_robot(i)  # the next holder does not inherit the motion of the previous one
             self._engage_robot(i, command, scale)
             return
         if not clutch.has_same_sources(r.latch, command, scale):

@@ -83,7 +83,7 @@ class JointInterpolator:
         arrived = (np.abs(self.goal - self.q) < 1e-9) & (np.abs(self.v) <= self._dv)
         if arrived.any():
             self.q[arrived] = self.goal[arrived]
-            # The speed of arrival ends in the next tick, within the acceleration limit whatever is asked then.
+            # The speed of arrival ends in the next tick, within the acceleration limit for any next target.
             self.moving = not bool((arrived & (self.v == 0.0)).all())
 
     def save_state(self) -> list[bytes]:

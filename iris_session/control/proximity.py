@@ -56,7 +56,7 @@ class ProximityLimiter:
         factors = [1.0] * len(self._geoms)
         moves = [bool(joints.any()) for joints in wanted]
         for a, b in self._near_robots(data):
-            if not (moves[a] or moves[b]):  # nobody approaches
+            if not (moves[a] or moves[b]):  # neither robot approaches
                 continue
             for distance, geom_a, geom_b, p_a, p_b in self._near_geoms(data, a, b):
                 gap = p_b - p_a

@@ -188,7 +188,7 @@ class HelloRateLimiter:
     """Limit hellos per source and in total.
 
     A source is an allowed key, or an address in a session without keys. Each source has a few hellos of its own, so a
-    new client is admitted whatever other clients do. Beyond them it uses those that all sources share.
+    new client is admitted independently of other clients. Beyond them it uses those that all sources share.
     """
 
     def __init__(self, limits: FrontLimits) -> None:

@@ -34,7 +34,7 @@ class ContactTables:
         for index, item in enumerate(objects):
             for body in tree.list_subtree(find_element_id(model, "body", item.body, f"object {item.name!r}: ")):
                 body_object[body] = index
-        #: Robot index of each body: of nested robots the deeper one, of a shared base nobody in particular.
+        #: Robot index of each body: of nested robots the deeper one; a shared base belongs to no particular robot.
         self.body_robot = [_NONE] * model.nbody
         #: Rigid finger of each body: the id of the body it is welded to, -1 for what is no finger.
         self.body_finger = [_NONE] * model.nbody

@@ -46,7 +46,7 @@ class Pacer:
         self.max_backlog_ns = max_backlog_ns
         self.paused = False
         self._start_ns = start_ns
-        self._done = 0  # grid index of the last tick that was finished or given up
+        self._done = 0  # grid index of the last tick that was finished or skipped
         self._finished = self._late = self._missing = self._max_ns = 0
         self._buckets = [0] * ((_MAX_BITS - _SUB_BITS + 1) << _SUB_BITS)
 

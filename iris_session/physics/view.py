@@ -126,7 +126,7 @@ class Flexes:
         self._rows = [slice(start, start + count) for start, count in zip(starts, counts, strict=True)]
         self._robot_names = tuple(robot.name for robot in robots)
         robot_of_body = np.array(tables.body_robot, np.int64)
-        #: Robot of each geom; the last one, which the geom -1 of a flex hits, is nobody's.
+        #: Robot of each geom; the last entry, which the geom -1 of a flex hits, means none.
         self._geom_robot: NDArray[np.int64] = np.append(robot_of_body[model.geom_bodyid], -1)
 
     def read_vertices(self, name: str) -> NDArray[np.float64]:

@@ -237,7 +237,7 @@ class World:
         if len(saved.forces) != len(self._forces):
             raise SnapshotError(f"snapshot with {len(saved.forces)} robots, but this world has {len(self._forces)}")
         self._load_state(saved.state)
-        mujoco.mj_resetData(self.model, self.data)  # clears warnings and whatever is outside the state
+        mujoco.mj_resetData(self.model, self.data)  # clears warnings and everything outside the state
         mujoco.mj_setState(self.model, self.data, self._state, STATE)
         self._forces = saved.forces
         self._derive_state(saved.tick)

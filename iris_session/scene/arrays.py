@@ -25,14 +25,14 @@ from iris_session.scene.errors import AssetDecodeError, SceneBuildError
 
 Array = NDArray[Any]
 _DTYPES: Final = {name: np.dtype(f"<{name}") for name in ("u1", "i1", "u2", "u4", "f4")}
-#: Bytes of a number that was quantised.
+#: Bytes of a quantised number.
 _SCALED: Final = 4
-#: Rows of fewer bytes are added up as columns: one call for each row would take longer than it does.
+#: Rows of fewer bytes are summed by columns: the overhead of one call per row would dominate.
 _SHORT_ROW: Final = 256
 _PREFIX: Final = struct.Struct("<4sI")
 _encoder: Final = msgspec.msgpack.Encoder()
 _decode_header: Final = make_decoder(ArrayHeader)
-#: Fast, and on filtered data as small as slower levels.
+#: Compression level: fast, and on filtered data as small as slower levels.
 LEVEL: Final = 1
 
 
@@ -48,7 +48,7 @@ class StoredArray:
 
 
 def encode_arrays(kind: str, arrays: Sequence[StoredArray], max_error: float = 0.0) -> bytes:
-    """The asset. Arrays that do not shrink are stored as they are."""
+    """Return the asset of some arrays. Arrays that do not shrink are stored uncompressed."""
     infos, bodies = [], []
     for array in arrays:
         values = np.ascontiguousarray(array.values)
@@ -69,7 +69,9 @@ def encode_arrays(kind: str, arrays: Sequence[StoredArray], max_error: float = 0
 def decode_arrays(
     data: bytes | bytearray | memoryview, kind: str, max_bytes: int = MAX_ARRAY_BYTES
 ) -> dict[str, Array]:
-    """The arrays of an asset by name, quantised ones as float32. `max_bytes`: of all arrays, as they are returned."""
+    """Return the arrays of an asset by name, quantised ones as float32. `max_bytes`: limit of all decoded arrays
+    together.
+    """
     header, start = read_header(data)
     if header.kind != kind:
         raise AssetDecodeError(f"an asset of kind {header.kind!r}, where {kind!r} is expected")
@@ -86,7 +88,7 @@ def decode_arrays(
 
 
 def read_header(data: bytes | bytearray | memoryview) -> tuple[ArrayHeader, int]:
-    """The header, and where the first array begins. The lengths in it fit `data` exactly."""
+    """Return the header, and the offset of the first array. The lengths in it fit `data` exactly."""
     if len(data) < _PREFIX.size:
         raise AssetDecodeError(f"{len(data)} bytes are no asset of arrays")
     magic, length = _PREFIX.unpack_from(data)
@@ -109,7 +111,9 @@ def read_header(data: bytes | bytearray | memoryview) -> tuple[ArrayHeader, int]
 
 
 def require_array(arrays: Mapping[str, Array], name: str, dtypes: str, shape: Sequence[int | None]) -> Array:
-    """The array `name`, whose dtype is one of `dtypes` (`u2 u4`) and whose shape fits (`None`: any length)."""
+    """Return the array `name`, whose dtype must be one of `dtypes` (`u2 u4`) and whose shape must fit (`None`: any
+    length).
+    """
     array = arrays.get(name)
     if array is None:
         raise AssetDecodeError(f"the array {name!r} is missing; there are {', '.join(sorted(arrays)) or 'none'}")
@@ -125,7 +129,7 @@ def require_array(arrays: Mapping[str, Array], name: str, dtypes: str, shape: Se
 
 
 def apply_filter(values: Array, kind: str) -> memoryview:
-    """The bytes that are compressed, of an array in C order."""
+    """Return the filtered bytes of an array in C order, to be compressed."""
     if kind == ArrayFilter.NONE or not values.size:
         return _encode_bytes(values)
     if kind == ArrayFilter.UP:
@@ -171,7 +175,7 @@ def _stated_bytes(info: ArrayInfo) -> int:
     if info.dtype not in _DTYPES:
         raise AssetDecodeError(f"unknown dtype {info.dtype!r}, known: {', '.join(_DTYPES)}")
     size = math.prod(info.shape)
-    if not size and max(info.shape) > MAX_ARRAY_BYTES:  # which no array of nothing can be
+    if not size and max(info.shape) > MAX_ARRAY_BYTES:  # not even an empty array can have this shape
         raise AssetDecodeError(
             f"array {info.name!r} has the shape {info.shape}, at most {MAX_ARRAY_BYTES} along an axis"
         )
@@ -200,7 +204,7 @@ def _decode_array(info: ArrayInfo, packed: memoryview) -> Array:
 
 def _decompress(packed: memoryview, size: int) -> bytes:
     try:
-        # The frame says its size: checked before anything is allocated for it.
+        # The frame states its size, which is checked before allocation.
         if zstandard.get_frame_parameters(packed).content_size != size:
             raise AssetDecodeError("a Zstandard frame of another size than the array")
         return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size, allow_extra_data=False)

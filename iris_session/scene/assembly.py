@@ -1,7 +1,8 @@
-"""Scenes being composed: what a `SceneBuilder` has collected (`World`), and `assemble`, which makes the specification.
+"""Assembly of scenes: the content that a `SceneBuilder` has collected (`SceneContent`), and `assemble_scene`, which
+makes the specification.
 
-Every body, mesh, texture and material gets a number, equal ones only once; assets go to the store. The order of all
-lists follows from the order in which things were added, and from nothing else.
+Every body, mesh, texture and material gets a number; equal ones share it. Assets go to the store. The order of all
+lists follows only from the order in which content was added.
 """
 
 from __future__ import annotations
@@ -61,11 +62,11 @@ from iris_session.scene.mesh_processing import scale_mesh
 from iris_session.scene.meshes import MeshArrays, encode_deformable
 from iris_session.streams.deformable_topology import DeformableTopology
 
-#: Farthest that is drawn, at least [m], and times the extent of the scene.
+#: Minimum viewing distance [m], and viewing distance in extents of the scene.
 _FAR: Final = 50.0
 _FAR_EXTENTS: Final = 10.0
 _FACES: Final = 6
-#: Farthest vertex of a mesh in its own frame [m]. What is beyond is a mistake of units, and too far for float32.
+#: Maximum coordinate of a vertex in its own frame [m]. Larger ones are a mistake of units, and too large for float32.
 MAX_COORDINATE_M: Final = 1e6
 
 
@@ -134,7 +135,7 @@ def _encode_checked(spec: SceneSpec) -> bytes:
         raise SceneBuildError(f"{error}: join what stands still into fewer meshes") from None
     except (ValueError, TypeError, OverflowError) as error:
         raise SceneBuildError(f"the scene has something that cannot be sent: {error}") from None
-    try:  # by way of JSON, in which what is not finite is no number
+    try:  # by way of JSON, in which values that are not finite are no numbers
         msgspec.json.decode(msgspec.json.encode(spec), type=SceneSpec)
     except msgspec.ValidationError as error:
         raise SceneBuildError(f"the scene has something that cannot be drawn: {error}") from None
@@ -162,7 +163,7 @@ def _build_bodies(world: SceneContent) -> tuple[dict[int, int], tuple[Body, ...]
 def _build_meshes(
     items: Sequence[DrawnItem], rests: Sequence[Matrix | None], builder: AssetBuilder
 ) -> tuple[tuple[Mesh, ...], list[int]]:
-    """Return meshes, and the mesh of every item, -1 for a shape. Meshes that are equal to the bit are one."""
+    """Return the meshes, and the mesh of every item, -1 for a shape. Meshes that are equal to the bit are merged."""
     pieces: dict[tuple[object, ...], tuple[str, MeshArrays, Matrix | None]] = {}
     keys: list[tuple[object, ...] | None] = []
     for item, rest in zip(items, rests, strict=True):
@@ -171,7 +172,7 @@ def _build_meshes(
             continue
         mapped = item.mesh.uv is not None and bool(item.appearance.images)
         key: tuple[object, ...] = (id(item.mesh), None if rest is None else rest.tobytes(), mapped)
-        mesh = item.mesh if mapped else replace(item.mesh, uv=None)  # coordinates of nothing would keep levels out
+        mesh = item.mesh if mapped else replace(item.mesh, uv=None)  # unused coordinates would prevent levels
         pieces.setdefault(key, (item.name, mesh, rest))
         keys.append(key)
     _check_copies(pieces.values())
@@ -189,8 +190,10 @@ def _build_meshes(
 
 
 def _check_copies(pieces: Iterable[tuple[str, MeshArrays, Matrix | None]]) -> None:
-    """A scale is in the vertices, so every further one of a mesh is a mesh: a small file can ask for any number.
-    Raises `SceneBuildError`."""
+    """Raise `SceneBuildError` for too many scaled copies of meshes.
+
+    A scale is applied to the vertices, so each scale of a mesh is another mesh: a small file can request any number.
+    """
     seen: set[int] = set()
     copied = 0
     for name, mesh, _ in pieces:
@@ -213,7 +216,7 @@ def _mesh_work(builder: AssetBuilder, mesh: MeshArrays, rest: Matrix | None) -> 
 
 def _check_reach(mesh: MeshArrays) -> MeshArrays:
     """Return `mesh`. Raises `SceneBuildError` for coordinates that cannot be drawn."""
-    if not np.abs(mesh.position).max(initial=0.0) <= MAX_COORDINATE_M:  # NaN is not
+    if not np.abs(mesh.position).max(initial=0.0) <= MAX_COORDINATE_M:  # also true for NaN
         raise SceneBuildError(
             f"a mesh reaches farther than {MAX_COORDINATE_M:,.0f} m from its origin: scale it to metres, or move it"
         )
@@ -234,7 +237,9 @@ def _build_geometry(item: DrawnItem, mesh: int, meshes: Sequence[Mesh]) -> Geome
 def _build_materials(
     looks: Sequence[Appearance], skybox: TextureImage | None, builder: AssetBuilder
 ) -> tuple[tuple[Texture, ...], tuple[Material, ...], list[int], int]:
-    """Textures, materials, for every look its material (-1: its colour says all), and the texture of the skybox."""
+    """Return textures, materials, the material of every appearance (-1: a colour only), and the texture of the
+    skybox.
+    """
     pictures: dict[int, TextureImage] = {id(picture): picture for look in looks for _, picture in look.images}
     if skybox is not None:
         pictures[id(skybox)] = skybox
@@ -320,7 +325,7 @@ def _deformable_encoder(
 
 
 def _default_environment(spec: SceneSpec, sources: Sequence[DeformableSource]) -> Environment:
-    """Centre and extent of what is there at first, without planes; everything of it is near enough to be drawn."""
+    """Return an environment with centre and extent of the initial content without planes; all of it is within view."""
     box = compute_box_extent(spec, (source.vertices for source in sources))
     if box is None:
         return Environment()
@@ -461,7 +466,7 @@ def _nodes_with_content(loaded: LoadedFile) -> set[int]:
 
 
 def _place_light(matrix: Matrix, light: Light) -> Light:
-    """Return a light in the frame of its body, which `matrix` leads to; its direction is turned, mirrored or not."""
+    """Return a light in the frame of its body, given the matrix of its node; also for a mirrored one."""
     p = matrix @ [*light.p_body, 1.0]
     along = matrix[:3, :3] @ light.direction_body
     along /= np.linalg.norm(along)
@@ -469,7 +474,7 @@ def _place_light(matrix: Matrix, light: Light) -> Light:
 
 
 def _camera_pose(matrix: Matrix) -> Pose:
-    """T_body_camera of a camera that `matrix` leads from: it looks along its -z with its y up, mirrored or not."""
+    """Return T_body_camera for the matrix of its node: the camera looks along -z with y up, also for a mirrored one."""
     back, up = matrix[:3, 2] / np.linalg.norm(matrix[:3, 2]), matrix[:3, 1]
     up = up - (up @ back) * back
     up /= np.linalg.norm(up)

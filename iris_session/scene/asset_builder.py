@@ -1,8 +1,8 @@
 """`AssetBuilder`: encode raw content to assets in a store, with levels of detail, in threads, each content once.
 
 The key of a piece of work is the SHA-256 of its raw content, its options and `ENCODER_VERSION`; the store keeps the
-result. Hashing, Zstandard and large copies of numpy release the interpreter's lock, so threads help. Of work with more
-than `ALONE_BYTES` of raw content only one piece is in memory at a time.
+result. Hashing, Zstandard and large copies of numpy release the interpreter's lock, so threads help. Of the pieces with
+more than `ALONE_BYTES` of raw content only one is in memory at a time.
 """
 
 from __future__ import annotations
@@ -27,23 +27,26 @@ from iris_session.scene.images import Pixels, encode_image, halve
 from iris_session.scene.mesh_processing import simplify_mesh
 from iris_session.scene.meshes import MeshArrays, encode_mesh, encode_mesh_quantised
 
-#: Raised whenever the same content gives other assets.
+#: Increased whenever the encoding of the same content changes.
 ENCODER_VERSION: Final = 4
 ALONE_BYTES: Final = 16 << 20
-#: Meshes are made coarser by this factor, as long as as many triangles stay.
+#: Factor between levels of a mesh, and the minimum number of triangles of a level.
 _COARSER: Final = 4
 _FEWEST_TRIANGLES: Final = 500
-#: What a level may have of the triangles and bytes of the one before, to be worth fetching both.
+#: Maximum share of the triangles and bytes of the previous level for a level to be useful.
 _SAVED: Final = 2 / 3
-#: Textures are halved down to this side.
+#: Textures are halved down to this side [pixels].
 _SMALLEST_SIDE: Final = 256
-#: What files in a form of their own begin with. MuJoCo has each as one row of bytes that look like grey pixels.
+#: First bytes of image files. MuJoCo stores an unknown file as one row of bytes that look like grey pixels.
 _OWN_FORMS: Final = (b"\xabKTX 11\xbb\r\n", b"\xabKTX 20\xbb\r\n")
 
 
 class EncodeOptions(msgspec.Struct, frozen=True):
-    """`levels`: coarser levels too. `texture_encoding`: of level 0 and the others (`AssetEncoding`): `arrays` decodes
-    fastest, `png` needs no Zstandard, `jpeg` is small and not exact, with `jpeg_quality`; not for textures with alpha.
+    """Options of encoding.
+
+    `levels`: add coarser levels. `texture_encoding`: encoding of all levels (`AssetEncoding`): `arrays` decodes
+    fastest, `png` needs no Zstandard, `jpeg` is small and lossy, with `jpeg_quality`, and is not used for textures with
+    alpha.
     """
 
     levels: bool = True
@@ -87,7 +90,7 @@ class Work(Generic[Note]):
 class AssetBuilder:
     """Encoder of meshes, textures and other content into a store.
 
-    `built`, `recalled`: pieces of work that were done, and whose result the store had.
+    `built`, `recalled`: number of pieces of work that were done, and whose result the store already had.
     """
 
     def __init__(self, store: AssetStore, options: EncodeOptions | None = None, threads: int = 0) -> None:
@@ -111,11 +114,14 @@ class AssetBuilder:
         return [done[key][0] for key in keys]
 
     def mesh_work(self, raw: Sequence[NDArray[Any]], arrays: Callable[[], MeshArrays]) -> Work[MeshNote]:
-        """`raw`: what `arrays` is computed from."""
+        """Return the work of encoding a mesh. `raw`: the content that `arrays` computes it from."""
         return Work(MeshNote, raw, lambda: self._encode_mesh(arrays()))
 
     def texture_work(self, pixels: Pixels, kind: str) -> Work[TextureNote]:
-        """`pixels` (height, width, channels); cube and skybox have six square faces below each other."""
+        """Return the work of encoding a texture.
+
+        `pixels` (height, width, channels); cube and skybox have six square faces below each other.
+        """
         return Work(
             TextureNote,
             (kind.encode(), repr(pixels.shape).encode(), pixels),
@@ -123,7 +129,7 @@ class AssetBuilder:
         )
 
     def blob_work(self, raw: Sequence[bytes | NDArray[Any]], encode: Callable[[], bytes]) -> Work[BlobNote]:
-        """One asset, whose bytes `encode` gives."""
+        """Return the work of one asset, with the bytes that `encode` returns."""
 
         def make() -> BlobNote:
             data = encode()
@@ -137,7 +143,7 @@ class AssetBuilder:
         digest = hashlib.sha256(self._salt + piece.kind.__name__.encode())
         for part in piece.raw:
             content = np.ascontiguousarray(part).data if isinstance(part, np.ndarray) else memoryview(part)
-            # Parts cannot be mistaken for one another, nor arrays of one size for those of another shape.
+            # Lengths and shapes are hashed too, so that different parts or shapes never have the same key.
             digest.update(repr((content.format, content.shape)).encode())
             digest.update(content.cast("B") if content.nbytes else b"")
         return digest.hexdigest()
@@ -161,7 +167,7 @@ class AssetBuilder:
             return None
         try:
             note = msgspec.msgpack.decode(remembered, type=kind)
-        except msgspec.DecodeError:  # damaged: built anew
+        except msgspec.DecodeError:  # damaged: built again
             return None
         assets = (note,) if isinstance(note, BlobNote) else note.levels
         return note if all(self.store.mark_used(asset.address, asset.bytes) for asset in assets) else None

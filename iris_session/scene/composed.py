@@ -28,10 +28,11 @@ _NONE: Final[Mapping[str, Pose]] = {}
 
 @dataclass(frozen=True)
 class DeformableSource:
-    """A mesh whose vertices are published. `name`: as it was added. `stream`: its media stream.
+    """Mesh whose vertices are published.
 
-    `topology`: the plan of the stream, as `DeformableEncoder` takes it. `vertices`: the first ones, float32 (n, 3) [m],
-    world frame, read-only; all later ones have the same shape and order.
+    `name`: name in the scene. `stream`: its media stream. `topology`: the plan of the stream for `DeformableEncoder`.
+    `vertices`: initial vertices, float32 (n, 3) [m], world frame, read-only; all later ones have the same shape and
+    order.
     """
 
     name: str
@@ -42,13 +43,18 @@ class DeformableSource:
 
 @dataclass(frozen=True)
 class ComposedScene:
-    """A scene whose assets, the specification among them, are in the store: hold `addresses` there while it is served.
+    """Scene whose assets, the specification among them, are in the store: hold `addresses` there while it is served.
 
-    `moving`: names of the bodies that are streamed, each once; body `i + 1` is `moving[i]`. `poses`: their first poses,
-    T_world_body, in the same order. `articulations`, `deformables`: by the name they were added under. Bodies of an
-    articulation are in `moving` too; its root is moved by `Articulation.name`. `skipped`: what clients will not see, a
-    line each. `notes`: what looks like a mistake of units, a line each, with what would be right. `built`, `recalled`:
-    pieces of work that were done, and that the store remembered.
+    Attributes:
+        moving: Names of the streamed bodies, each once; body `i + 1` is `moving[i]`. Bodies of an articulation are
+            among them; its root is moved by `Articulation.name`.
+        poses: Initial poses T_world_body, in the order of `moving`.
+        articulations: Articulations by name.
+        deformables: Deformables by name.
+        skipped: Content that clients will not see, one line each.
+        notes: Likely mistakes of units, one line each, with the correction.
+        built: Number of pieces of work that were done.
+        recalled: Number of those whose result the store already had.
     """
 
     spec: SceneSpec
@@ -64,7 +70,7 @@ class ComposedScene:
 
     @property
     def addresses(self) -> tuple[str, ...]:
-        """All assets in the order in which they show something: to be held in the store, and served."""
+        """Addresses of all assets in the order in which they become visible, to be kept in the store and served."""
         return (self.scene_hash, *list_assets(self.spec))
 
 
@@ -72,8 +78,10 @@ class ComposedScene:
 
 
 class Joint(NamedTuple):
-    """One that is set. `kind`: revolute, continuous or prismatic. `low`, `high`: limits [rad] or [m], infinite for
-    none; beyond them is drawn as set. `rest`: position until it is set, the nearest to 0 within the limits.
+    """One joint that can be set.
+
+    `kind`: revolute, continuous or prismatic. `low`, `high`: limits [rad] or [m], infinite without any; positions
+    beyond them are drawn as set. `rest`: position until it is set, the nearest to 0 within the limits.
     """
 
     name: str
@@ -84,11 +92,11 @@ class Joint(NamedTuple):
 
 
 class ArticulatedBody(NamedTuple):
-    """One moving body on its joint. `parent`: an earlier part by its place, -1 for the root, which is part 0.
+    """One moving body on its joint. `parent`: index of an earlier part, -1 for the root, which is part 0.
 
-    `T_parent_joint`: of the joint in the parent's frame; at position 0 the body's frame is there. `axis`: unit vector
-    in the joint's frame. `sliding`: along the axis, else around it; a `joint` of -1 is fixed. The position is that of
-    `joint` (by its place in `Articulation.joints`) times `multiplier` plus `offset`: 1 and 0 unless it mimics another.
+    `T_parent_joint`: pose of the joint in the parent's frame, and of the body at position 0. `axis`: unit vector in the
+    joint's frame. `sliding`: along the axis, else around it; a `joint` of -1 is fixed. The position is that of `joint`
+    (index in `Articulation.joints`) times `multiplier` plus `offset`: 1 and 0 unless it mimics another joint.
     """
 
     body: str
@@ -103,11 +111,11 @@ class ArticulatedBody(NamedTuple):
 
 @dataclass(frozen=True)
 class Articulation:
-    """`name`: as it was added; the root is moved under it. `T_world_root`: its first pose.
+    """Tree of bodies on joints. `name`: name that the root is moved by. `T_world_root`: its initial pose.
 
-    `parts`: parents first. `joints`: those that can be set. `mimics`: joints that follow another, by name, and which:
-    they cannot be set. `loose`: floating and planar joints, and the body on each: it stands where the file has it until
-    its pose is set.
+    `parts`: parents first. `joints`: those that can be set. `mimics`: the joint that each mimic joint follows, by name;
+    mimic joints cannot be set. `loose`: floating and planar joints, each with its body, which stays at its initial pose
+    until its pose is set.
     """
 
     name: str
@@ -123,18 +131,20 @@ class Articulation:
         return tuple(part.body for part in self.parts)
 
     def compute_poses(self, q: Mapping[str, float]) -> dict[str, Pose]:
-        """T_articulation_body of every body, for positions of joints by name [rad] or [m].
+        """Return T_articulation_body of every body, for positions of joints by name [rad] or [m].
 
-        Joints that are not in `q` are at rest. Raises `SceneBuildError` for names that cannot be set, and for
-        positions that are no finite numbers.
+        Joints that are not in `q` are at rest. Raises `SceneBuildError` for names that cannot be set, and for positions
+        that are not finite.
         """
         return self.compute_world_poses(IDENTITY, q)
 
     def compute_world_poses(
         self, T_world_root: Pose, q: Mapping[str, float], loose: Mapping[str, Pose] = _NONE
     ) -> dict[str, Pose]:
-        """T_world_body of every body, as `poses`. `loose`: T_world_body of bodies on floating and planar joints, by
-        name; bodies below move with them."""
+        """Return T_world_body of every body, by `compute_poses`.
+
+        `loose`: T_world_body of bodies on floating and planar joints, by name; bodies below move with them.
+        """
         self.check_positions(q)
         at = [float(q.get(joint.name, joint.rest)) for joint in self.joints]
         placed: list[tuple[Vec3, tuple[float, float, float, float]]] = []
@@ -149,7 +159,7 @@ class Articulation:
         return {part.body: Pose(*T) for part, T in zip(self.parts, placed, strict=True)}
 
     def check_positions(self, q: Mapping[str, float]) -> None:
-        """Raises `SceneBuildError` unless every name is one of `joints` with a finite position."""
+        """Raise `SceneBuildError` unless every name is one of `joints` with a finite position."""
         known = {joint.name for joint in self.joints}
         for name, value in q.items():
             if name in self.mimics:
@@ -171,7 +181,7 @@ class Articulation:
 
 
 def _joint_motion(part: ArticulatedBody, position: float) -> tuple[Vec3, tuple[float, float, float, float]]:
-    """T_joint_body."""
+    """Return T_joint_body."""
     along = part.multiplier * position + part.offset
     x, y, z = part.axis
     step = (along * x, along * y, along * z)

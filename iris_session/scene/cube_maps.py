@@ -1,9 +1,9 @@
-"""Cube textures for formats that have none (glTF, Rerun): the six faces in one picture, and coordinates in it.
+"""Cube textures for formats without them (glTF, Rerun): the six faces in one image, and texture coordinates in it.
 
-What MuJoCo looks up by a direction at every pixel becomes texture coordinates at corners. Triangles are cut where the
-direction passes from one face of the cube to another, and split until straight lines in the picture are close to what
-MuJoCo draws. Adjacent triangles are cut and split alike, so that no gaps open between them.
-docs/scene.md has the formulas.
+MuJoCo looks up a direction at every pixel; here the directions become texture coordinates at corners. Triangles are cut
+where the direction crosses from one face of the cube to another, and split until straight lines in the image are close
+to what MuJoCo draws. Adjacent triangles are cut and split alike, so that no gaps open between them. docs/scene.md has
+the formulas.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from iris_session.scene.images import Pixels, decode_image, halve
 from iris_session.scene.mesh_processing import normalise
 from iris_session.scene.meshes import MeshArrays, index_corners
 
-#: Longest side of a face in an exported file [pixels]: six in one picture are then no more than headsets take.
+#: Maximum side of a face in an exported file [pixels]: headsets can load six of them in one image.
 CUBE_SIDE: Final = 2_048
-#: How far a coordinate may be from the exact one, in sides of a face.
+#: Maximum error of a texture coordinate, in sides of a face.
 TOLERANCE: Final = 1 / 128
-#: How often an edge is halved at most: where a surface passes the centre, its directions have no end of detail.
+#: Maximum number of times that an edge is halved: near the centre, directions vary without bound.
 _DEPTH: Final = 8
 _FACES: Final = 6
-#: Part of a direction's length below which it counts as on the edge between two faces, or as none at all.
+#: Share of a direction's length below which it counts as on the edge between two faces, or as zero.
 _EDGE: Final = 1e-6
-#: Per face the axis that leads, its sign, and the axes and signs of right and down: OpenGL's cube maps.
+#: Per face the dominant axis, its sign, and the axes and signs of right and down: OpenGL's cube maps.
 _AXES: Final = (
     (0, 1, 2, -1, 1, -1),
     (0, -1, 2, 1, 1, -1),
@@ -43,8 +43,12 @@ Floats = NDArray[np.float64]
 
 
 class Atlas(NamedTuple):
-    """`pixels`: two rows of three faces, each with a border of what is beyond its edges, so that what lies beside it in
-    the picture is not mixed in. `side`, `border`: of a face [pixels]. `plain`: every face has one colour only."""
+    """Six faces in one image.
+
+    `pixels`: two rows of three faces, each with a border that repeats the adjacent faces, so that filtering does not
+    mix in neighbouring faces of the image. `side`, `border`: of a face [pixels]. `plain`: every face has a single
+    colour.
+    """
 
     pixels: Pixels
     side: int
@@ -52,7 +56,7 @@ class Atlas(NamedTuple):
     single_colors: bool
 
     def to_uv(self, face: NDArray[np.int64], on_face: Floats) -> Floats:
-        """Coordinates in the picture of those on faces, 0..1 (..., 2)."""
+        """Convert coordinates on faces to coordinates in the image, 0..1 (..., 2)."""
         cell = self.side + 2 * self.border
         corner = np.stack([face % 3, face // 3], axis=-1) * cell + self.border
         return (corner + np.clip(on_face, 0.0, 1.0) * self.side) / [3 * cell, 2 * cell]
@@ -71,8 +75,11 @@ class CubeMap(NamedTuple):
 
 
 class CubeMapReader:
-    """The cube textures of a specification, each read once. `max_side`: of a face [pixels]; finer ones are taken in a
-    coarser level. Raises `SceneBuildError` for what the store lacks or what is damaged."""
+    """Reader of the cube textures of a specification, each read once.
+
+    `max_side`: maximum side of a face [pixels]; larger textures are read in a coarser level. Raises `SceneBuildError`
+    for missing or damaged assets.
+    """
 
     def __init__(self, spec: SceneSpec, store: AssetStore, max_side: int) -> None:
         self._spec = spec
@@ -104,13 +111,15 @@ class CubeMapReader:
 
 
 def find_cube_texture(spec: SceneSpec, material: int) -> int:
-    """The cube texture of a material's colour; -1 where there is none."""
+    """Return the cube texture of a material's colour, -1 without one."""
     index = -1 if material < 0 else spec.materials[material].find_texture()
     return -1 if index < 0 or spec.textures[index].kind == TextureKind.IMAGE else index
 
 
 def split_faces(pixels: Pixels) -> Pixels:
-    """(6, side, side, channels) of six faces below one another. Raises `AssetDecodeError` where they are not."""
+    """Split an image of six faces below one another to (6, side, side, channels). Raises `AssetDecodeError` for
+    others.
+    """
     if not len(pixels) == _FACES * pixels.shape[1] > 0:
         raise AssetDecodeError(
             f"a cube texture of {pixels.shape[1]} x {len(pixels)} pixels: expected six squares below one another"
@@ -123,7 +132,7 @@ def _with_atlas(cube: CubeMap, faces: Pixels, max_side: int) -> CubeMap:
     if plain and bool((faces == faces[:1]).all()) and (faces.shape[3] < 4 or faces[0, 0, 0, 3] == 255):
         red, green, blue = np.resize(faces[0, 0, 0, : 3 if faces.shape[3] >= 3 else 1] / 255.0, 3).tolist()
         return cube._replace(tint=(red, green, blue))
-    if plain and 0.5 / faces.shape[2] <= TOLERANCE:  # else what is mixed at edges is to be seen
+    if plain and 0.5 / faces.shape[2] <= TOLERANCE:  # otherwise mixed colours at edges would be visible
         cells = np.broadcast_to(faces[:, :1, :1], (_FACES, 5, 5, faces.shape[3]))
         return cube._replace(atlas=Atlas(_join_cells(cells), side=1, border=2, single_colors=True))
     while faces.shape[2] > max_side:
@@ -138,7 +147,7 @@ def _join_cells(cells: Pixels) -> Pixels:
 
 
 def _add_borders(faces: Pixels, border: int) -> Pixels:
-    """Faces with what directions beyond their edges see, which are on other faces."""
+    """Return faces with borders, which show the adjacent faces."""
     side = faces.shape[1]
     cells = np.pad(faces, ((0, 0), (border, border), (border, border), (0, 0)))
     at = (np.arange(-border, side + border) + 0.5) / side * 2 - 1
@@ -158,7 +167,7 @@ def direction_scale(spec: SceneSpec, geometry: Geometry, material: int) -> tuple
     """Return the factors that turn positions in a visual's frame into directions."""
     x, y, z = geometry.size
     uniform = spec.materials[material].uniform
-    if geometry.kind == GeometryKind.PLANE:  # 0: without end, and no direction then where both are
+    if geometry.kind == GeometryKind.PLANE:  # 0: infinite; no direction when both are
         return (x, y, 1.0) if uniform and (x or y) else (1.0, 1.0, 1.0)
     if geometry.hfield >= 0:
         _, _, top, base = spec.hfields[geometry.hfield].size
@@ -171,7 +180,7 @@ def direction_scale(spec: SceneSpec, geometry: Geometry, material: int) -> tuple
 
 
 def bake_cube_map(mesh: MeshArrays, geometry: Geometry, scale: tuple[float, float, float], atlas: Atlas) -> MeshArrays:
-    """`mesh` cut and split, with coordinates in `atlas`. `scale`: of `direction_scale`."""
+    """Return `mesh` cut and split, with coordinates in `atlas`. `scale`: result of `direction_scale`."""
     columns = np.concatenate([mesh.position, mesh.normal, *([] if mesh.color is None else [mesh.color])], axis=1)
     rest = columns[mesh.index].astype(np.float64)
     direction = rest[:, :, :3] * scale
@@ -187,7 +196,10 @@ def bake_cube_map(mesh: MeshArrays, geometry: Geometry, scale: tuple[float, floa
 
 
 def _capsule_directions(position: Floats, direction: Floats, size: tuple[float, float, float]) -> Floats:
-    """Caps are looked up as if cylinder and half spheres all had a half length of 1; `uniform` stretches them alike."""
+    """Return directions of a capsule: MuJoCo looks up caps as if cylinder and half spheres all had a half length of 1.
+
+    `uniform` stretches them alike.
+    """
     radius, _, half = size
     middle = position[:, :, 2].mean(axis=1)
     cap = np.abs(middle) > half
@@ -227,15 +239,17 @@ def _face_distances(corners: Floats, face: int) -> Floats:
 
 
 def _clip_polygons(polygon: Floats, count: NDArray[np.int64], distance: Floats) -> tuple[Floats, NDArray[np.int64]]:
-    """The part of convex polygons (n, m, columns) that has no negative distance. `count`: how many of the m corners
-    each polygon has."""
+    """Return the part of convex polygons (n, m, columns) with non-negative distance.
+
+    `count`: number of the m corners that each polygon has.
+    """
     m = polygon.shape[1]
     slot = np.arange(m)[None]
     after = np.where(slot + 1 < count[:, None], slot + 1, 0)
     beyond, following = np.take_along_axis(distance, after, 1), np.take_along_axis(polygon, after[:, :, None], 1)
     crossed = (slot < count[:, None]) & (distance * beyond < 0)
     gap = np.where(crossed, distance - beyond, 1.0)[:, :, None]
-    crossing = (distance[:, :, None] * following - beyond[:, :, None] * polygon) / gap  # the same from both ends
+    crossing = (distance[:, :, None] * following - beyond[:, :, None] * polygon) / gap  # symmetric in both ends
     used = np.stack([(slot < count[:, None]) & (distance >= 0), crossed], axis=2).reshape(-1, 2 * m)
     order = np.argsort(~used, axis=1, kind="stable")[:, : m + 1]
     points = np.stack([polygon, crossing], axis=2).reshape(-1, 2 * m, polygon.shape[2])
@@ -243,7 +257,7 @@ def _clip_polygons(polygon: Floats, count: NDArray[np.int64], distance: Floats) 
 
 
 def _face_coordinates(direction: Floats, face: NDArray[np.int64]) -> tuple[Floats, NDArray[np.bool_]]:
-    """Coordinates on their faces (n, k, 2), 0..1 right and down, and where there are any: the centre has none."""
+    """Return coordinates on faces (n, k, 2), 0..1 right and down, and a mask of the valid ones: the centre has none."""
     lead, sign, right, right_sign, down, down_sign = np.array(_AXES)[face].T
     row = np.arange(len(face))
     ahead = sign[:, None] * direction[row, :, lead]
@@ -256,8 +270,11 @@ def _face_coordinates(direction: Floats, face: NDArray[np.int64]) -> tuple[Float
 def _split_triangles(
     corners: Floats, face: NDArray[np.int64], tolerance: float
 ) -> tuple[Floats, NDArray[np.int64], Floats]:
-    """Triangles in whose edges' middles the coordinates are within `tolerance` of exact ones; with their faces, and the
-    coordinates of their corners. Judged by the edge alone, as its other triangle does."""
+    """Split triangles until the coordinates in the middles of their edges are within `tolerance` of exact ones.
+
+    Returns them with their faces, and the coordinates of their corners. Each edge is judged alone, as for its other
+    triangle.
+    """
     done: list[tuple[Floats, NDArray[np.int64], Floats]] = []
     for depth in range(_DEPTH + 1):
         on_face, there = _face_coordinates(corners[:, :, :3], face)
@@ -265,7 +282,7 @@ def _split_triangles(
         exact, _ = _face_coordinates(middles[:, :, :3], face)
         following, known = on_face[:, [1, 2, 0]], there & there[:, [1, 2, 0]]
         error = np.abs(exact - (on_face + following) / 2).max(axis=2)
-        # A corner at the centre takes the mean of the others: these may then not be far from each other.
+        # A corner at the centre takes the mean of the others, which must then be close to each other.
         fan = np.where(there.all(axis=1, keepdims=True), 0.0, np.abs(following - on_face).max(axis=2) / 2)
         error = np.where(known, np.maximum(error, fan), 0.0)
         cut = error > (tolerance if depth < _DEPTH else np.inf)
@@ -285,9 +302,9 @@ def _split_triangles(
 
 
 def _split_edges(corners: Floats, middles: Floats, cut: NDArray[np.bool_]) -> tuple[Floats, NDArray[np.int64]]:
-    """Triangles split at the middles of their cut edges (0-1, 1-2, 2-0), and of which one each is a part."""
+    """Split triangles at the middles of their cut edges (0-1, 1-2, 2-0); return them with the index of their source."""
     n_cut = cut.sum(axis=1)
-    # Turned so that of one cut edge it is the first, of two the last is whole.
+    # Corners are rotated so that a single cut edge is the first one, and of two cut edges the last one is uncut.
     first = np.where(n_cut == 1, cut.argmax(axis=1), np.where(n_cut == 2, ((~cut).argmax(axis=1) + 1) % 3, 0))
     turn = (first[:, None] + np.arange(3)) % 3
     points = np.concatenate(

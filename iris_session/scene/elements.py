@@ -1,7 +1,7 @@
 """Elements of a scene before it is built: nodes of files, surfaces, appearances, textures, drawn items; plain values.
 
-Frames: a node's matrix leads to the file's own frame, as the file has it, with its scale. Colours are those of the
-specification (as they are seen), texture coordinates too (v down).
+Frames: the matrix of a node leads to the frame of the file, with its scale. Colours are sRGB and texture coordinates
+have v down, as in the specification.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import Pixels
 from iris_session.scene.meshes import MeshArrays
 
-#: Largest file that is read, with each of the files that it refers to [bytes].
+#: Maximum size of a file, and of each file that it refers to [bytes].
 MAX_FILE_BYTES: Final = 512 << 20
-#: Most triangles of one file, and most nodes.
+#: Maximum number of triangles and of nodes of one file.
 MAX_TRIANGLES: Final = 20_000_000
 MAX_NODES: Final = 100_000
 #: Default colour.
 GREY: Final[Rgba] = (0.5, 0.5, 0.5, 1.0)
-#: Farther than this from the identity, a matrix's scale is put into the vertices.
+#: Scales further than this from the identity are applied to the vertices.
 _RIGID: Final = 1e-9
-#: Digits of a scale that count.
+#: Significant digits of a scale.
 _DIGITS: Final = 12
 Matrix = NDArray[np.float64]
 
@@ -88,7 +88,7 @@ class Surface:
 
 @dataclass(eq=False)
 class Node:
-    """A place in a file. `matrix` (4, 4): T_file_node. `parent`: an earlier node, -1 for none.
+    """Node of a file. `matrix` (4, 4): T_file_node. `parent`: index of an earlier node, -1 for none.
 
     The `lights` and `cameras` are in the node's frame; their bodies are not yet known.
     """
@@ -103,8 +103,11 @@ class Node:
 
 @dataclass(eq=False)
 class DrawnItem:
-    """Something drawn on body `body` (its place in a list of bodies, -1 for the world): a `mesh`, or a shape of `kind`
-    and `size` as in `Geometry`. `matrix` (4, 4): T_body_item, of meshes with scale."""
+    """Item drawn on body `body` (index in a list of bodies, -1 for the world): a `mesh`, or a shape of `kind` and
+    `size`.
+
+    Kind and size are as in `Geometry`. `matrix` (4, 4): T_body_item, of meshes with scale.
+    """
 
     body: int
     name: str
@@ -117,9 +120,9 @@ class DrawnItem:
 
 @dataclass(frozen=True)
 class LoadedFile:
-    """A file as it was read: nodes, parents first. `up`: the axis that it says is up, `y` or `z`.
+    """Content of a file: nodes, parents first. `up`: its up axis, `y` or `z`.
 
-    `unit`: one of its lengths in metres. `skipped`: what it has and the specification does not, a line each.
+    `unit`: its unit of length [m]. `skipped`: content that the specification cannot hold, one line each.
     """
 
     nodes: tuple[Node, ...]
@@ -129,8 +132,10 @@ class LoadedFile:
 
 
 def split_rigid(matrix: Matrix) -> tuple[Pose, Matrix | None]:
-    """`matrix` (4, 4) as a pose and what is left of its turning part (3, 3), to be applied before it: scale, shear,
-    reflection; `None` where nothing is left. Raises `SceneBuildError` for one that flattens or is not finite.
+    """Split `matrix` (4, 4) into a pose and the rest of its linear part (3, 3), which is applied first.
+
+    The rest is scale, shear or reflection, `None` when it is the identity. Raises `SceneBuildError` for a matrix that
+    flattens or is not finite.
     """
     if not is_solid(matrix):
         raise SceneBuildError("a scale is 0: give every axis one")
@@ -140,7 +145,7 @@ def split_rigid(matrix: Matrix) -> tuple[Pose, Matrix | None]:
     if np.linalg.det(R) < 0:
         R = -R
     digits = _DIGITS - math.floor(math.log10(float(scale[0])))
-    rest = np.round(R.T @ turn, digits) + 0.0  # so that one scale is the same at every angle, and its mesh is one
+    rest = np.round(R.T @ turn, digits) + 0.0  # so that equal scales at different angles share one mesh
     rigid = bool(np.abs(rest - np.eye(3)).max() <= _RIGID)
     return to_pose(R, matrix[:3, 3]), None if rigid else rest
 

@@ -20,9 +20,9 @@ from iris_session.scene.arrays import decode_arrays
 from iris_session.scene.elements import to_matrix, to_vec3
 from iris_session.scene.meshes import decode_mesh
 
-#: No part and no robot is larger, few rooms are; a part of a centimetre whose file counts in millimetres is.
+#: Larger than any part or robot and most rooms [m]; a part of a centimetre with a file in millimetres is larger.
 LARGEST_M: Final = 10.0
-#: Smaller things can hardly be seen or grasped; a part of two metres that was divided by 1,000 once too often is.
+#: Too small to be seen or grasped [m]; a part of two metres that was divided by 1,000 once too often is smaller.
 SMALLEST_M: Final = 0.002
 Points = NDArray[Any]
 
@@ -36,7 +36,7 @@ class Extent(msgspec.Struct, frozen=True):
 
 
 def compute_extent(spec: SceneSpec, store: AssetStore) -> Extent | None:
-    """Of what is drawn at first, by the vertices of its meshes; `None` where nothing is, planes apart.
+    """Return the extent of the initial content, by the vertices of its meshes; `None` when there are only planes.
 
     Raises `AssetMissingError` when the store lacks an asset of the scene.
     """
@@ -52,16 +52,21 @@ def compute_extent(spec: SceneSpec, store: AssetStore) -> Extent | None:
 
 
 def compute_box_extent(spec: SceneSpec, more: Iterable[Points] = ()) -> Extent | None:
-    """Of everything, meshes by the boxes around them: no asset is read, and what is turned counts as up to 1.7 times as
-    large. `more`: further points (n, 3) [m]."""
+    """Return the extent of everything, by the bounding boxes of meshes: no asset is read.
+
+    Rotated meshes count as up to 1.7 times as large. `more`: further points (n, 3) [m].
+    """
     return compute_bounds(spec, spec.visuals, lambda k: _box_corners(spec.meshes[k].low, spec.meshes[k].high), more)
 
 
-@np.errstate(all="ignore")  # a length that is not finite is refused with the specification
+@np.errstate(all="ignore")  # lengths that are not finite are rejected with the specification
 def compute_bounds(
     spec: SceneSpec, visuals: Iterable[Visual], points_of: Callable[[int], Points], more: Iterable[Points] = ()
 ) -> Extent | None:
-    """Box of `visuals` in the world, of meshes by `points_of` their number (n, 3), and of `more` points (n, 3)."""
+    """Return the bounding box in the world of `visuals` and of `more` points (n, 3).
+
+    `points_of`: returns the points (n, 3) of a mesh by its number.
+    """
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     T_world_body = {body.id: to_matrix(body.T_world_body) for body in spec.bodies}
     mesh, points = -1, np.empty((0, 3))
@@ -86,7 +91,7 @@ def compute_bounds(
 
 
 def largest_mesh_side(spec: SceneSpec) -> float:
-    """Longest side of a mesh that is drawn, in its own frame [m]; 0 without meshes."""
+    """Return the longest side of a drawn mesh, in its own frame [m]; 0 without meshes."""
     worn = {v.geometry.mesh for v in spec.visuals if v.rgba[3] > 0 and v.geometry.mesh >= 0}
     boxes = (spec.meshes[mesh] for mesh in worn)
     return max((b - a for box in boxes for a, b in zip(box.low, box.high, strict=True)), default=0.0)
@@ -105,7 +110,9 @@ def find_unit_mistake(side_m: float) -> tuple[float, str] | None:
 
 
 def format_unit_hint(side_m: float, remedy: str) -> str:
-    """The same as a line, empty where nothing is wrong. `remedy`: what to do, with `{factor}` where that stands."""
+    """Return the likely mistake of units as a line, empty without one. `remedy`: correction, with `{factor}` for the
+    factor.
+    """
     mistake = find_unit_mistake(side_m)
     if mistake is None:
         return ""
@@ -120,7 +127,9 @@ def format_size(extent: Extent) -> str:
 
 
 def format_coordinates(extent: Extent, values: Vec3) -> list[str]:
-    """Lengths of a box for people [m]: what is nothing beside its sides is rounding of its places, and 0."""
+    """Return coordinates of a box as text [m]; values that are negligible beside its sides are rounding errors,
+    shown as 0.
+    """
     least = 1e-9 * max(map(abs, (*extent.low, *extent.high)))
     return [f"{0.0 if abs(v) < least else v:.3g}" for v in values]
 
@@ -132,7 +141,7 @@ def format_length(metres: float) -> str:
 
 
 def _box_corners(low: Vec3, high: Vec3) -> Points:
-    """The eight corners of a box, (8, 3)."""
+    """Return the eight corners of a box, (8, 3)."""
     return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
 
 
@@ -143,7 +152,7 @@ def _extend_bounds(points: Points, low: Points, high: Points) -> tuple[Points, P
 
 
 def _field_corners(spec: SceneSpec, geometry: Geometry) -> Points:
-    """Of the box around a height field: its highest elevation is 1."""
+    """Return the corners of the box around a height field: its highest elevation is 1."""
     half_x, half_y, top, base = spec.hfields[geometry.hfield].size
     return _box_corners((-half_x, -half_y, -base), (half_x, half_y, top))
 

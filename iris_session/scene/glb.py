@@ -1,9 +1,9 @@
-"""A scene as a GLB file (glTF 2.0, one binary file), which viewers and editors open anywhere.
+"""A scene as a GLB file (glTF 2.0, one binary file), which viewers and editors can open.
 
-Y is up there, so a root node turns the scene. Every mesh and texture is in the file once, however many bodies wear
-it. 2d textures are kept, with normals, roughness and the like; cubes, which glTF does not have, become one picture each
-(`cubes`); skies leave nothing. Groups that are hidden stay out. Cameras come along, and lights that are lit.
-`report.not_in_glb` says what of a scene is not in the file.
+glTF has y up, so a root node rotates the scene. Every mesh and texture is in the file once, for any number of bodies.
+2d textures are kept, with normals, roughness and the like; cubes, which glTF does not have, become one image each
+(`cube_maps`); skies are left out, and so are hidden groups. Cameras are included, and lights that are on.
+`report.list_glb_differences` lists the content that is not in the file.
 """
 
 from __future__ import annotations
@@ -45,27 +45,30 @@ _FLOAT, _UINT = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963
 _REPEAT, _LINEAR, _MIPMAPS = 10497, 9729, 9987
 _LINES: Final = 1
-#: Lengths in a GLB have 32 bits; some are left for the heads of its parts.
+#: Lengths in a GLB have 32 bits; a margin is left for the headers of its chunks.
 _MAX_BYTES: Final = (1 << 32) - 64
-#: Turns z up into y up: -90 degrees around x, `[x, y, z, w]` as glTF has quaternions.
+#: Rotation from z up to y up: -90 degrees around x, `[x, y, z, w]` as in glTF.
 _Y_UP: Final = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
 _LIGHTS: Final = {LightKind.DIRECTIONAL: "directional", LightKind.SPOT: "spot", LightKind.POINT: "point"}
-#: Looked at is the place of the body: centres of mass are not in a specification.
+#: Tracking modes that follow a target body by its origin: a specification has no centres of mass.
 _WATCHING: Final = (Follow.TARGET_BODY, Follow.TARGET_BODY_COM)
 _EXTENSION: Final = "KHR_lights_punctual"
-#: Nearest that an exported camera sees [m].
+#: Near plane of exported cameras [m].
 _NEAR: Final = 0.01
-#: Width over height where the scene does not say.
+#: Width over height of cameras without a resolution.
 _ASPECT: Final = 4 / 3
-#: Widest cone that glTF has [rad].
+#: Maximum cone angle in glTF [rad].
 _WIDEST: Final = math.pi / 2
 
 
 def write_glb(spec: SceneSpec, store: AssetStore, path: Path) -> int:
-    """Writes the file, whole or not at all; returns its size. Raises `AssetMissingError` when the store lacks an asset
-    of the scene, `SceneBuildError` for a scene that is too large, and `OSError`."""
+    """Write the file completely or not at all; return its size [bytes].
+
+    Raises `AssetMissingError` when the store lacks an asset of the scene, `SceneBuildError` for a scene that is too
+    large, and `OSError`.
+    """
     data = _GlbWriter(spec, store).encode()
-    target = Path(os.path.realpath(path))  # a link stays one
+    target = Path(os.path.realpath(path))  # a link remains a link
     if target.exists() and not target.is_file():  # a pipe or a device; opening a folder raises
         target.write_bytes(data)
         return len(data)
@@ -157,7 +160,7 @@ class _GlbWriter:
     # --- geometry -----------------------------------------------------------------------------------------------------
 
     def _add_visual_mesh(self, visual: Visual) -> int | None:
-        """One glTF mesh per shape and look, however many visuals have it."""
+        """Add one glTF mesh per shape and appearance, shared by all visuals that have it."""
         key = (visual.geometry, visual.material, visual.rgba)
         if key not in self._meshes:
             primitives = self._build_primitive(visual)
@@ -209,7 +212,7 @@ class _GlbWriter:
         return build_primitive(geometry)
 
     def _add_deformable(self, index: int) -> int:
-        """The rest shape: surfaces, of cloths from both sides; ropes as lines."""
+        """Add the rest shape: surfaces, of cloths with both sides; ropes as lines."""
         deformable = self._spec.deformables[index]
         arrays = decode_arrays(self._store.get(deformable.address), ArrayKind.DEFORMABLE)
         both_sides, mapped = deformable.dim == 2, deformable.dim > 1 and "uv" in arrays
@@ -250,7 +253,7 @@ class _GlbWriter:
         return self._add_accessor_once(values.astype("<f4").tobytes(), _VERTICES, accessor)
 
     def _add_accessor_once(self, data: bytes, target: int, accessor: dict[str, Any]) -> int:
-        """An accessor of its own for `data`, however often it is asked for: two may not share a view."""
+        """Add an accessor for `data`, once for equal data: two accessors may not share a view."""
         key = (hashlib.sha256(data).digest(), target, accessor["type"], "min" in accessor)
         if key not in self._accessors:
             self._accessors[key] = self._add("accessors", {"bufferView": self._add_view(data, target), **accessor})
@@ -276,8 +279,12 @@ class _GlbWriter:
         blended: bool = False,
         cube: CubeMap | None = None,
     ) -> int:
-        """`mapped`: what wears it has texture coordinates, without which it wears no texture. `blended`: it is not
-        opaque, besides its own colour and textures. `cube`: worn by it; without one a material's cube is not drawn."""
+        """Add a material.
+
+        `mapped`: its meshes have texture coordinates, without which textures are not used. `blended`: the visual is not
+        opaque, apart from its own colour and textures. `cube`: cube texture of the visual; without it that of the
+        material is not drawn.
+        """
         key = (index, tuple(rgba), mapped, both_sides, blended, cube is not None)
         if key not in self._materials:
             look = self._build_material(index, rgba, mapped=mapped, cube=cube)
@@ -316,7 +323,7 @@ class _GlbWriter:
             ):
                 if mapped and texture is not None:
                     where[key] = {"index": texture}
-            if material.emission > 0:  # of what is seen, texture and all
+            if material.emission > 0:  # of the visible colour, including the texture
                 found["emissiveFactor"] = [_to_linear(material.emission * v) for v in colour]
                 if "baseColorTexture" in look:
                     found.setdefault("emissiveTexture", look["baseColorTexture"])
@@ -352,7 +359,7 @@ class _GlbWriter:
 
 
 def _normalise(normal: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Unit vectors; those that are as near to it as float32 gets stay as they are to the bit."""
+    """Return unit vectors; those that are as close to length 1 as float32 allows stay unchanged to the bit."""
     off = np.abs(np.linalg.norm(normal, axis=1) - 1.0) > 1e-6
     kept = normal.copy()
     kept[off] = normalise(normal[off])
@@ -360,7 +367,7 @@ def _normalise(normal: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _to_linear_colors(color: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Colours of vertices as they are seen, in bytes, to linear ones; alpha as it is."""
+    """Convert vertex colours from sRGB in bytes to linear ones; alpha stays unchanged."""
     v = color.astype(np.float64) / 255
     shone = np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
     shone[:, 3] = v[:, 3]
@@ -368,7 +375,7 @@ def _to_linear_colors(color: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def _initial_pose(body: Body, T_world_parent: Pose | None) -> Pose:
-    """In its parent, as the scene begins: joints need not be at zero then."""
+    """Return the initial pose in the parent: joints need not be at zero then."""
     T_world_body = body.T_world_body
     if T_world_parent is None:
         return T_world_body
@@ -380,7 +387,7 @@ def _initial_pose(body: Body, T_world_parent: Pose | None) -> Pose:
 
 
 def _to_linear(value: float) -> float:
-    """A colour as it is seen (sRGB) to glTF's linear factor."""
+    """Convert an sRGB colour to glTF's linear factor."""
     v = min(max(float(value), 0.0), 1.0)
     return v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4
 
@@ -389,7 +396,7 @@ def _to_linear(value: float) -> float:
 
 
 def add_viewpoints(document: dict[str, Any], spec: SceneSpec, nodes: Mapping[int, int]) -> None:
-    """Adds them below the nodes of their bodies; `nodes`: of bodies, by their ids."""
+    """Add cameras and lights below the nodes of their bodies. `nodes`: nodes by id of the body."""
     for k, camera in enumerate(spec.cameras):
         document["cameras"].append(_build_camera(camera))
         p, (w, x, y, z) = camera.T_body_camera.p, _seeing(camera, spec)
@@ -418,7 +425,7 @@ def _add_child_node(document: dict[str, Any], parent: int, node: dict[str, Any])
 def _build_camera(camera: Camera) -> dict[str, Any]:
     width, height = camera.resolution
     aspect = width / height if (width, height) != (1, 1) and height else _ASPECT
-    if camera.focal[0] > 0 and camera.focal[1] > 0:  # of pixels that are no squares
+    if camera.focal[0] > 0 and camera.focal[1] > 0:  # pixels need not be square
         aspect *= camera.focal[1] / camera.focal[0]
     if camera.orthographic:
         lens = {"xmag": aspect * camera.fovy / 2, "ymag": camera.fovy / 2, "znear": _NEAR, "zfar": 1_000.0}
@@ -430,7 +437,7 @@ def _build_camera(camera: Camera) -> dict[str, Any]:
 
 
 def _build_light(light: Light) -> dict[str, Any]:
-    """As bright as it is drawn: intensity 1 where the scene does not say, and the colour (sRGB) as a linear one."""
+    """Return a light as bright as it is drawn: intensity 1 by default, and its sRGB colour converted to linear."""
     color = [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in np.clip(light.diffuse, 0, 1).tolist()]
     lamp: dict[str, Any] = {"type": _LIGHTS[light.kind], "color": color, "intensity": light.intensity or 1.0}
     if light.range > 0 and light.kind != LightKind.DIRECTIONAL:
@@ -441,11 +448,11 @@ def _build_light(light: Light) -> dict[str, Any]:
 
 
 def _seeing(camera: Camera, spec: SceneSpec) -> Quat:
-    """Of T_body_camera, as the scene begins: one that follows a body with its eyes is turned to it, upright."""
+    """Return the rotation of T_body_camera at the beginning: a camera that tracks a body is turned to it, upright."""
     T_world_body = _place(camera.body, spec)
     back = -_to_target(camera, apply(T_world_body, camera.T_body_camera.p), spec)
     across = np.cross([0.0, 0.0, 1.0], back)
-    if not across.any():  # it follows nothing, or it looks straight up or down
+    if not across.any():  # it tracks no body, or looks straight up or down
         return camera.T_body_camera.q
     across /= np.linalg.norm(across)
     w, x, y, z = quat_from_matrix(np.stack([across, np.cross(back, across), back], axis=1)).tolist()
@@ -453,7 +460,7 @@ def _seeing(camera: Camera, spec: SceneSpec) -> Quat:
 
 
 def _to_target(watcher: Light | Camera, p_world: Vec3, spec: SceneSpec) -> NDArray[np.float64]:
-    """Unit vector from `p_world` to the body that it follows with its eyes; zero where there is none."""
+    """Return the unit vector from `p_world` to the tracked body, zero without one."""
     if watcher.follow not in _WATCHING or watcher.target < 0:
         return np.zeros(3)
     way = np.subtract(_place(watcher.target, spec)[0], p_world)
@@ -461,13 +468,13 @@ def _to_target(watcher: Light | Camera, p_world: Vec3, spec: SceneSpec) -> NDArr
 
 
 def _place(body: int, spec: SceneSpec) -> PoseTuple:
-    """T_world_body as the scene begins."""
+    """Return T_world_body at the beginning."""
     pose = next(one.T_world_body for one in spec.bodies if one.id == body)
     return pose.p, pose.q
 
 
 def _look_at(light: Light, spec: SceneSpec) -> list[float]:
-    """`[x, y, z, w]` of a frame whose -z is the light's direction, in that of its body."""
+    """Return `[x, y, z, w]` of a frame whose -z is the direction of the light, in the frame of its body."""
     T_world_body = _place(light.body, spec)
     to_target = _to_target(light, apply(T_world_body, light.p_body), spec)
     watched = quat_rotate(quat_conj(T_world_body[1]), to_vec3(to_target))

@@ -16,14 +16,14 @@ from iris_session.scene.errors import AssetDecodeError, SceneBuildError
 
 Pixels = NDArray[np.uint8]
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
-#: Rows of a large image that decide which filter suits it.
+#: Number of rows of a large image by which its filter is chosen.
 _SAMPLE_ROWS: Final = 128
-#: As Pillow calls them. Not all that it reads: it hands EPS to Ghostscript, by any file name.
+#: Accepted formats, by Pillow's names. Not all that it reads: it passes EPS to Ghostscript, under any file name.
 FORMATS: Final = ("PNG", "JPEG", "WEBP", "TGA", "BMP", "GIF", "TIFF", "PPM", "DDS")
-_JPEGS: Final = "MPO"  # JPEG with further pictures: cameras make them
-#: Most pixels of one image: larger ones are no texture, or a bomb.
+_JPEGS: Final = "MPO"  # JPEG with several images, as written by cameras
+#: Maximum number of pixels of one image: larger ones are no textures, or decompression bombs.
 MAX_PIXELS: Final = 1 << 26
-#: Most pixels of all pictures of a file: 2 GiB in memory. A file of a few MiB can have any number of large ones.
+#: Maximum number of pixels of all images of a file: 2 GiB in memory. A file of a few MiB can have many large ones.
 MAX_FILE_PIXELS: Final = 1 << 29
 
 
@@ -36,7 +36,7 @@ class EncodedImage(NamedTuple):
 
 
 def encode_image(pixels: Pixels, encoding: str = AssetEncoding.ARRAYS, quality: int = 92) -> EncodedImage:
-    """`pixels`: (height, width, channels), first row on top. `quality`: of JPEG, 1..100."""
+    """Encode `pixels` (height, width, channels), first row on top. `quality`: of JPEG, 1..100."""
     if encoding == AssetEncoding.ARRAYS:
         stored = StoredArray(ArrayName.PIXELS, pixels, _choose_filter(pixels))
         return EncodedImage(encode_arrays(ArrayKind.IMAGE, [stored]), encoding)
@@ -88,7 +88,10 @@ def decode_image(data: bytes | bytearray | memoryview, encoding: str, max_bytes:
 
 
 def halve(pixels: Pixels) -> Pixels:
-    """Half the width and height, at least one pixel each: means of two by two; an odd last row or column is lost."""
+    """Return an image of half the width and height, at least one pixel each: means of two by two pixels.
+
+    An odd last row or column is dropped.
+    """
     height, width = (max(1, n // 2) for n in pixels.shape[:2])
     tall = pixels if pixels.shape[0] > 1 else np.repeat(pixels, 2, axis=0)
     wide = tall if tall.shape[1] > 1 else np.repeat(tall, 2, axis=1)
@@ -98,7 +101,7 @@ def halve(pixels: Pixels) -> Pixels:
 
 
 def _choose_filter(pixels: Pixels) -> str:
-    """`up` suits pictures, none what is drawn in flat colours: whichever makes a middle part smaller."""
+    """Return the filter that makes a middle part smaller: `up` suits photographs, none suits flat colours."""
     middle = max(0, len(pixels) // 2 - _SAMPLE_ROWS // 2)
     sample = np.ascontiguousarray(pixels[middle : middle + _SAMPLE_ROWS])
     import zstandard
@@ -111,7 +114,7 @@ def _choose_filter(pixels: Pixels) -> str:
 
 
 def _read_stated_size(head: bytes, encoding: str) -> tuple[int, int]:
-    """Width and height as the file says, before anything is decoded."""
+    """Return width and height in the header of the file, before anything is decoded."""
     if encoding == AssetEncoding.PNG:
         if head[:8] != _PNG or len(head) < 24:
             raise AssetDecodeError("these bytes are no PNG")
@@ -122,12 +125,12 @@ def _read_stated_size(head: bytes, encoding: str) -> tuple[int, int]:
         raise AssetDecodeError("these bytes are no JPEG")
     while at + 9 <= len(head) and head[at] == 0xFF:
         marker, length = head[at + 1], int.from_bytes(head[at + 2 : at + 4], "big")
-        if marker == 0xFF:  # any number of them may stand before a marker
+        if marker == 0xFF:  # any number of fill bytes may precede a marker
             at += 1
             continue
-        if marker <= 0x01 or 0xD0 <= marker <= 0xDA:  # without a length, or the picture itself: none before its size
+        if marker <= 0x01 or 0xD0 <= marker <= 0xDA:  # no length, or image data: neither may precede the size
             break
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame, which has the size
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame, with the size
             height, width = struct.unpack(">HH", head[at + 5 : at + 9])
             return width, height
         at += 2 + length
@@ -135,7 +138,7 @@ def _read_stated_size(head: bytes, encoding: str) -> tuple[int, int]:
 
 
 def _swap_red_blue(pixels: Pixels) -> Pixels:
-    """Red and blue exchanged: OpenCV's order to ours, and back."""
+    """Exchange red and blue: OpenCV's order to ours, and back."""
     order = {1: [0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}.get(pixels.shape[2])
     if order is None:
         raise AssetDecodeError(f"an image of {pixels.shape[2]} channels has no PNG or JPEG: 1, 3 or 4")
@@ -154,14 +157,14 @@ def _import_opencv() -> Any:
 
 
 class PixelBudget:
-    """Counts the pixels of all pictures of the file `name`, each as often as it is kept."""
+    """Counter of the pixels of all images of the file `name`, each as often as it is kept."""
 
     def __init__(self, name: str) -> None:
         self._name = name
         self._used = 0
 
     def spend(self, pixels: Pixels) -> Pixels:
-        """`pixels`. Raises `SceneBuildError` when they are more than one file may have, with those before."""
+        """Count and return `pixels`. Raises `SceneBuildError` when the total exceeds the limit per file."""
         self._used += pixels.shape[0] * pixels.shape[1]
         if self._used > MAX_FILE_PIXELS:
             raise SceneBuildError(
@@ -171,7 +174,7 @@ class PixelBudget:
 
 
 def read_pixels(data: bytes, what: str) -> Pixels:
-    """(height, width, 1, 3 or 4), first row on top. Raises `SceneBuildError` with `what` in it."""
+    """Return pixels (height, width, 1, 3 or 4), first row on top. Raises `SceneBuildError` with `what` in it."""
     image_module = _import_pillow()
     try:
         return to_pixels(image_module.open(io.BytesIO(data), formats=FORMATS), what)
@@ -180,9 +183,11 @@ def read_pixels(data: bytes, what: str) -> Pixels:
 
 
 def to_pixels(image: Any, what: str) -> Pixels:
-    """Pixels of a Pillow image, 8 bits a channel; alpha only where something is not opaque. Raises `SceneBuildError`
-    for too many, before they are decoded."""
-    if image.format not in (None, *FORMATS, _JPEGS):  # None: made in memory
+    """Return the pixels of a Pillow image, 8 bits a channel; with alpha only when a pixel is not opaque.
+
+    Raises `SceneBuildError` for too many pixels, before they are decoded.
+    """
+    if image.format not in (None, *FORMATS, _JPEGS):  # None: created in memory
         raise SceneBuildError(f"{what} is a picture in the form {image.format}; {', '.join(FORMATS)} are read")
     width, height = image.size
     if width * height > MAX_PIXELS:
@@ -198,14 +203,14 @@ def to_pixels(image: Any, what: str) -> Pixels:
 
 
 def drop_alpha(pixels: Pixels, *, always: bool = False) -> Pixels:
-    """`pixels` with three channels when their alpha says nothing, or is not wanted."""
+    """Return `pixels` with three channels when all are opaque, or when `always` is set."""
     if pixels.shape[2] == 4 and (always or bool((pixels[:, :, 3] == 255).all())):
         return np.ascontiguousarray(pixels[:, :, :3])
     return pixels
 
 
 def check_pixels(pixels: Any, what: str) -> Pixels:
-    """A texture that a caller gave as an array. Raises `SceneBuildError` for what is none."""
+    """Return a texture given as an array. Raises `SceneBuildError` for invalid ones."""
     array = to_array(pixels, what)
     if array.ndim == 2:
         array = array[:, :, None]

@@ -1,9 +1,9 @@
-"""Coarser meshes with a stated error: vertices of one cell of a grid become one of them.
+"""Coarser meshes with a stated error: the vertices in one cell of a grid are merged to one of them.
 
-Not a quadric decimation, which keeps flat parts better: here the error is proven. No point of a triangle moves farther
-than the vertex that moves most. (fast-simplification states no error, and keeps global state: it may not run in
-threads.) Parts that fit into a cell vanish. Meshes with texture coordinates or colours are not made coarser: these
-would move across seams.
+Quadric decimation keeps flat parts better, but here the error is proven: no point of a triangle moves further than the
+vertex that moves most. (fast-simplification states no error, and keeps global state: it may not run in threads.) Parts
+that fit into a cell vanish. Meshes with texture coordinates or colours are not simplified: these would move across
+seams.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from iris_session.scene.meshes import MeshArrays, find_unique_rows, index_corner
 
 #: A corner whose smooth normal is farther than this (cosine) from the face's gets the face's: MuJoCo's rule for meshes.
 CREASE: Final = 0.8
-#: Attempts to meet the wanted number of triangles by another size of the cells.
+#: Maximum number of cell sizes tried to reach the wanted number of triangles.
 _TRIES: Final = 3
-#: How often cells are halved for what is long and thin.
+#: Maximum number of times that cells are halved for long and thin parts.
 _FINER: Final = 4
 Doubles = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
 def simplify_mesh(mesh: MeshArrays, triangles: int) -> tuple[MeshArrays, float] | None:
-    """A mesh of about `triangles`, and how far its points lie from `mesh` at most [m].
+    """Return a mesh of about `triangles`, and the maximum distance of its points from `mesh` [m].
 
-    `None` where that would gain less than a quarter, and when `mesh` is textured or coloured.
+    `None` when that would save less than a quarter, and when `mesh` is textured or coloured.
     """
     if mesh.uv is not None or mesh.color is not None or triangles <= 0 or mesh.triangles <= triangles:
         return None
@@ -52,10 +52,10 @@ def simplify_mesh(mesh: MeshArrays, triangles: int) -> tuple[MeshArrays, float] 
 
 
 def _cluster(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, Ints, float]:
-    """Points that stay, triangles between them, and the longest way that a point moved.
+    """Return the remaining points, the triangles between them, and the largest distance that a point moved.
 
-    What is long and thin, as rods and legs of tables, would be gone where its width fits into a cell: it is clustered
-    again in finer ones, at last in none.
+    Long and thin parts, such as rods and legs of tables, would vanish where their width fits into a cell: they are
+    clustered again in finer cells, at last in none.
     """
     found, faces, n_points, longest = [], [], 0, 0.0
     for finer in range(_FINER + 1):
@@ -72,7 +72,7 @@ def _cluster(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, Ints, 
 
 
 def _cluster_once(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, Ints, Ints, float]:
-    """As `_clustered`, for one size of cells; before the way the triangles that are lost."""
+    """Cluster as `_cluster`, for one cell size; the third result are the triangles of vanished parts."""
     used, index = _compact(index, len(points))
     points = points[used]
     cells = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
@@ -81,7 +81,7 @@ def _cluster_once(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, I
     mean = np.stack([np.bincount(cluster, points[:, k]) for k in range(3)], axis=1) / count[:, None]
     off = np.linalg.norm(points - mean[cluster], axis=1)
     order = np.lexsort((off, cluster))
-    keep = order[np.searchsorted(cluster[order], np.arange(len(count)))]  # of each cell the point nearest to the mean
+    keep = order[np.searchsorted(cluster[order], np.arange(len(count)))]  # the point nearest to the mean of each cell
     faces = cluster[index]
     whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     moved = float(np.linalg.norm(points - points[keep][cluster], axis=1).max(initial=0.0))
@@ -97,15 +97,18 @@ def _cluster_once(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, I
 
 
 def _compact(index: Ints, n_points: int) -> tuple[Ints, Ints]:
-    """The points that triangles have, in order, and the triangles between these."""
+    """Return the used points, in order, and the triangles renumbered to them."""
     has = np.zeros(n_points, bool)
     has[index] = True
     return np.flatnonzero(has), (np.cumsum(has) - 1)[index]
 
 
 def _find_lost(points: Doubles, flat: Ints, ends: Ints, faces: Ints, small: float) -> Ints:
-    """Of the triangles `flat`, which became lines or points between the clusters `ends`, those of parts larger than
-    `small` [m] of which nothing is left: no edge or corner of `faces` lies where they were."""
+    """Return the triangles of vanished parts larger than `small` [m].
+
+    `flat`: triangles that became lines or points between the clusters `ends`. A part has vanished when no edge or
+    corner of `faces` lies where it was.
+    """
     low, high = ends.min(axis=1), ends.max(axis=1)
     n = int(max(high.max(initial=0), faces.max(initial=0))) + 1
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
@@ -126,7 +129,7 @@ def _find_lost(points: Doubles, flat: Ints, ends: Ints, faces: Ints, small: floa
 
 
 def _connected_parts(faces: Ints, n_points: int) -> Ints:
-    """Of each triangle the part that it belongs to, with all that share corners: the least number of these."""
+    """Return the connected part of each triangle, named by the smallest index in it."""
     least = np.arange(n_points)
     while True:
         of_corners = least[faces]
@@ -141,8 +144,10 @@ def _connected_parts(faces: Ints, n_points: int) -> Ints:
 
 
 def sort_rows(rows: NDArray[Any]) -> tuple[Ints, Ints]:
-    """Of the different rows (n, 3), ordered by their columns: where each stands first; and for every row which of them
-    it is. As `np.unique` over an axis, which takes several times as long on large meshes."""
+    """Return the first index of each different row (n, 3), ordered by columns, and for every row which of these it is.
+
+    As `np.unique` over an axis, which takes several times as long on large meshes.
+    """
     order = np.lexsort(rows.T[::-1])
     ordered = rows[order]
     new = np.ones(len(rows), bool)
@@ -153,13 +158,13 @@ def sort_rows(rows: NDArray[Any]) -> tuple[Ints, Ints]:
 
 
 def build_smooth_mesh(points: Doubles, faces: Ints) -> MeshArrays:
-    """Corners with area-weighted normals, creased by `CREASE`."""
+    """Return a mesh with area-weighted normals at its corners, creased by `CREASE`."""
     corners = points[faces]
     return index_corners(corners.astype(np.float32), compute_creased_normals(points, faces).astype(np.float32), None)
 
 
 def compute_creased_normals(points: Doubles, faces: Ints) -> Doubles:
-    """Normals at the corners of faces, (m, 3, 3): area-weighted, those of the face itself across a crease."""
+    """Return normals at the corners of faces, (m, 3, 3): area-weighted, or that of the face across a crease."""
     face_normal = _face_vectors(points[faces])
     around, each = faces.T.reshape(-1), np.tile(face_normal, (3, 1))
     vertex_normal = np.stack([np.bincount(around, each[:, k], len(points)) for k in range(3)], axis=1)
@@ -171,13 +176,13 @@ def compute_creased_normals(points: Doubles, faces: Ints) -> Doubles:
 
 
 def _face_vectors(corners: Doubles) -> Doubles:
-    """Normals of triangles (n, 3, 3), as long as twice the area."""
+    """Return normals of triangles (n, 3, 3), of length twice the area."""
     normals: Doubles = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return normals
 
 
 def normalise(vectors: NDArray[Any]) -> NDArray[Any]:
-    """Vectors of length 1; those without length become +z, as MuJoCo's renderer has it."""
+    """Return vectors of length 1; vectors without length become +z, as in MuJoCo's renderer."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.where(length > 1e-15, vectors / np.maximum(length, 1e-15), np.array([0, 0, 1], vectors.dtype))
 
@@ -185,12 +190,12 @@ def normalise(vectors: NDArray[Any]) -> NDArray[Any]:
 # --- transformed meshes -----------------------------------------------------------------------------------------------
 
 
-@np.errstate(all="ignore")  # what gets out of reach is refused by its coordinates
+@np.errstate(all="ignore")  # coordinates that get too large are rejected later
 def scale_mesh(mesh: MeshArrays, scale: Matrix | None) -> MeshArrays:
-    """`mesh` with the matrix (3, 3) in its vertices; the triangles are turned over where that mirrors."""
+    """Return `mesh` with the matrix (3, 3) applied to its vertices; a mirroring matrix reverses the triangles."""
     if scale is None:
         return mesh
-    across = np.linalg.inv(scale)  # normals go with the inverse's transpose
+    across = np.linalg.inv(scale)  # normals transform by the transpose of the inverse
     position = (mesh.position.astype(np.float64) @ scale.T).astype(np.float32)
     normal = normalise(mesh.normal.astype(np.float64) @ across).astype(np.float32)
     if np.linalg.det(scale) > 0:
@@ -211,7 +216,7 @@ def is_closed(mesh: MeshArrays) -> bool:
 
 
 def add_back_sides(mesh: MeshArrays) -> MeshArrays:
-    """`mesh` with every triangle from behind too, unless it is closed."""
+    """Return `mesh` with the back side of every triangle added, unless it is closed."""
     if is_closed(mesh):
         return mesh
     n = np.uint32(mesh.vertices)
@@ -229,7 +234,7 @@ def add_back_sides(mesh: MeshArrays) -> MeshArrays:
 
 
 def merge_vertex_color(mesh: MeshArrays, rgba: Rgba) -> tuple[MeshArrays, Rgba]:
-    """A mesh whose corners all have one colour, without them and with that colour in `rgba`."""
+    """Return the mesh without vertex colours and the colour times theirs, when all corners have the same colour."""
     if mesh.color is None or not len(mesh.color) or bool((mesh.color != mesh.color[0]).any()):
         return mesh, rgba
     red, green, blue, alpha = (float(a) * float(b) / 255 for a, b in zip(rgba, mesh.color[0], strict=True))

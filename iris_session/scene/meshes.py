@@ -1,6 +1,6 @@
 """Meshes and deformables as assets: indexed corners, exact or quantised, and back.
 
-A corner is a vertex with its normal and texture coordinate as they are drawn; corners that agree in all bits are one.
+A corner is a vertex with its normal and texture coordinate as drawn; corners that agree in all bits are merged.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _POSITION_STEPS: Final = 65_535
 _NORMAL_STEPS: Final = 127
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
-#: Below this many vertices their numbers fit 16 bits.
+#: Fewer vertices than this are numbered with 16 bits.
 _SHORT: Final = 1 << 16
 
 
@@ -30,9 +30,13 @@ _SHORT: Final = 1 << 16
 class MeshArrays:
     """Triangles, counter-clockwise seen from outside.
 
-    `position` (n, 3) [m], `normal` (n, 3) unit vectors, `uv` (n, 2) or `None`: u to the right, v down from the upper
-    left corner of the image; `index` (m, 3) into the n corners. `color` (n, 4) or `None`: red, green, blue, alpha at
-    the corners, 0..255, which multiply the colour of what wears the mesh.
+    Attributes:
+        position: Positions (n, 3) [m].
+        normal: Unit vectors (n, 3).
+        uv: Texture coordinates (n, 2) or `None`: u to the right, v down from the upper left corner of the image.
+        index: Triangles (m, 3), indices of the n corners.
+        color: Red, green, blue, alpha (n, 4), 0..255, at the corners, multiplied with the colour of the visual; or
+            `None`.
     """
 
     position: Floats
@@ -51,11 +55,11 @@ class MeshArrays:
 
 
 def index_corners(position: Floats, normal: Floats, uv: Floats | None, color: Bytes | None = None) -> MeshArrays:
-    """Corners of triangles, shape (m, 3, ...), to indexed ones in the order of their first use."""
+    """Convert corners of triangles, shape (m, 3, ...), to indexed ones in the order of their first use."""
     parts = [position.reshape(-1, 3), normal.reshape(-1, 3)]
     if uv is not None:
         parts.append(uv.reshape(-1, 2))
-    if color is not None:  # its four bytes as one more column: rows are compared by bits
+    if color is not None:  # its four bytes become one more column: rows are compared by bits
         parts.append(np.ascontiguousarray(color).reshape(-1, 4).view(np.float32))
     rows = np.ascontiguousarray(np.concatenate(parts, axis=1), np.float32)
     first, inverse = find_unique_rows(rows)
@@ -73,14 +77,14 @@ def index_corners(position: Floats, normal: Floats, uv: Floats | None, color: By
 
 
 def find_unique_rows(rows: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First occurrence of each different row, and for every row which of these it is. By bits."""
+    """Return the first index of each different row, and for every row which of these it is. Compared by bits."""
     bits = rows.view(np.uint32)
     key = np.zeros(len(rows), np.uint64)
-    for column in bits.T:  # Fowler-Noll-Vo: 64 bits of a row, so that one fast sort finds equals
+    for column in bits.T:  # Fowler-Noll-Vo hash of 64 bits per row, so that one fast sort finds equal rows
         key = (key ^ column) * np.uint64(0x100000001B3) + np.uint64(0x9E3779B97F4A7C15)
         key ^= key >> np.uint64(29)
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
-    if not np.array_equal(bits[first[inverse]], bits):  # two rows of one key: once in 10^8 meshes
+    if not np.array_equal(bits[first[inverse]], bits):  # hash collision: once in 10^8 meshes
         whole = np.ascontiguousarray(bits).view(np.dtype((np.void, bits.shape[1] * 4))).reshape(-1)
         _, first, inverse = np.unique(whole, return_index=True, return_inverse=True)
     return first, inverse.reshape(-1)
@@ -126,7 +130,7 @@ def encode_mesh_quantised(mesh: MeshArrays) -> tuple[bytes, float]:
 
 
 def decode_mesh(data: bytes | bytearray | memoryview, max_bytes: int = MAX_ARRAY_BYTES) -> MeshArrays:
-    """Inverse of `encode_mesh` and `encode_mesh_quantised`. Raises `AssetDecodeError` for bytes that are no mesh."""
+    """Decode a mesh of `encode_mesh` or `encode_mesh_quantised`. Raises `AssetDecodeError` for other bytes."""
     arrays = decode_arrays(data, ArrayKind.MESH, max_bytes)
     position = require_array(arrays, ArrayName.POSITION, "f4", (None, 3))
     normal = require_array(arrays, ArrayName.NORMAL, "f4", (len(position), 3))
@@ -145,7 +149,7 @@ def _narrow_index(index: NDArray[np.uint32], vertices: int) -> NDArray[np.uint32
 
 
 def _lattice(values: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lowest value and step of 16 bits, per column."""
+    """Return the lowest value and the step of 16 bits, per column."""
     if not len(values):
         return np.zeros(values.shape[1]), np.ones(values.shape[1])
     low = values.min(axis=0).astype(np.float64)
@@ -173,9 +177,11 @@ def encode_deformable(
     topology: DeformableTopology,
     numbers: NDArray[Any] | None = None,
 ) -> bytes:
-    """`elements`: edges (m, 2) or triangles (m, 3); `uv` (m, corners, 2). `rest`: vertices (n, 3) [m], world frame.
+    """Encode a deformable.
 
-    `topology`: bare, its triangles are `elements`. `numbers`: of the vertices in the simulator, if some are left out.
+    `elements`: edges (m, 2) or triangles (m, 3); `uv` (m, corners, 2). `rest`: vertices (n, 3) [m], world frame.
+    `topology`: plan of the stream, without triangles, which are `elements`. `numbers`: numbers of the vertices in the
+    simulator, if some are left out.
     """
     narrow = elements.astype(np.uint16) if len(rest) <= _SHORT else elements
     arrays = [

@@ -16,7 +16,7 @@ from iris_session.protocol.common import MAX_TEXT, Pose, Vec3
 from iris_session.protocol.names import Follow, LightKind, TextureKind
 from iris_session.protocol.scene import Camera, Environment, Headlight, Light, Material, Rgb, Rgba, Texture, TextureUse
 
-#: MuJoCo's default colour: a geom that has it takes its material's.
+#: MuJoCo's default colour: a geom with it has the colour of its material.
 _DEFAULT_RGBA: Final = (0.5, 0.5, 0.5, 1.0)
 _ROLES: Final = {
     int(value): name.removeprefix("mjTEXROLE_").lower()
@@ -32,9 +32,9 @@ _FOLLOW: Final = {
     4: Follow.TARGET_BODY_COM,
 }
 _ORTHOGRAPHIC: Final = 1
-#: Values of `_FOLLOW` for what moves with a body and does not turn with it.
+#: Values of `_FOLLOW` for lights and cameras that move with a body without rotating with it.
 _TRACKING: Final = frozenset({1, 2})
-#: What differs by less [m, and parts of unit vectors] is where the model says, to the bit.
+#: Smaller differences [m, components of unit vectors] are ignored: the values of the model are used unchanged.
 _SAME: Final = 1e-6
 _TYPES: Final = {
     kind: int(getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"))
@@ -63,13 +63,13 @@ def to_pose(position: Any, quaternion: Any) -> Pose:
 
 
 def resolve_rgba(model: mujoco.MjModel, own: Any, material: int) -> Rgba:
-    """The colour that MuJoCo draws: its own, unless that is the default and there is a material."""
+    """Return the colour that MuJoCo draws: the own colour, unless that is the default and there is a material."""
     color = to_rgba(own)
     return to_rgba(model.mat_rgba[material]) if material >= 0 and color == _DEFAULT_RGBA else color
 
 
 def read_materials(model: mujoco.MjModel) -> tuple[Material, ...]:
-    """All materials, by id."""
+    """Return all materials, by id."""
     return tuple(
         Material(
             name=read_name(model, "material", i),
@@ -93,8 +93,10 @@ def read_materials(model: mujoco.MjModel) -> tuple[Material, ...]:
 
 
 def compute_tracked(model: mujoco.MjModel, data: Any) -> Any | None:
-    """A copy of `data` with places of lights and cameras, if any moves with its body and does not turn with it: where
-    such a one stands in its body's frame depends on the state. `None`: all stand as the model says."""
+    """Return a copy of `data` with poses of lights and cameras, if one moves with its body without rotating with it.
+
+    The pose of such a one in the frame of its body depends on the state. `None`: all poses are those of the model.
+    """
     if data is None or not {*model.light_mode.tolist(), *model.cam_mode.tolist()} & _TRACKING:
         return None
     own = copy.copy(data)
@@ -105,7 +107,7 @@ def compute_tracked(model: mujoco.MjModel, data: Any) -> Any | None:
 
 
 def _to_body_frame(at: Any, body: int, v_world: Any) -> Any:
-    """A vector of the world in the frame of a body."""
+    """Return a vector of the world in the frame of a body."""
     q_body_world, v_body = np.zeros(4), np.zeros(3)
     mujoco.mju_negQuat(q_body_world, at.xquat[body])
     mujoco.mju_rotVecQuat(v_body, v_world, q_body_world)
@@ -113,7 +115,7 @@ def _to_body_frame(at: Any, body: int, v_world: Any) -> Any:
 
 
 def _light_place(model: mujoco.MjModel, i: int, at: Any | None) -> tuple[Vec3, Vec3]:
-    """Place and direction in the frame of its body. `at`: of `tracked`."""
+    """Return position and direction in the frame of the body. `at`: result of `compute_tracked`."""
     rigid = to_vec3(model.light_pos[i]), to_vec3(model.light_dir[i])
     if at is None or int(model.light_mode[i]) not in _TRACKING:
         return rigid
@@ -124,7 +126,7 @@ def _light_place(model: mujoco.MjModel, i: int, at: Any | None) -> tuple[Vec3, V
 
 
 def _camera_place(model: mujoco.MjModel, i: int, at: Any | None) -> Pose:
-    """T_body_camera. `at`: of `tracked`."""
+    """Return T_body_camera. `at`: result of `compute_tracked`."""
     rigid = to_pose(model.cam_pos[i], model.cam_quat[i])
     if at is None or int(model.cam_mode[i]) not in _TRACKING:
         return rigid
@@ -138,7 +140,7 @@ def _camera_place(model: mujoco.MjModel, i: int, at: Any | None) -> Pose:
 
 
 def read_lights(model: mujoco.MjModel, at: Any | None = None) -> tuple[Light, ...]:
-    """All lights, by id. `at`: of `tracked`."""
+    """Return all lights, by id. `at`: result of `compute_tracked`."""
     places = [_light_place(model, i, at) for i in range(model.nlight)]
     return tuple(
         Light(
@@ -173,13 +175,13 @@ def _light_kind(model: mujoco.MjModel, index: int) -> str:
 
 
 def read_cameras(model: mujoco.MjModel, at: Any | None = None) -> tuple[Camera, ...]:
-    """All cameras, by id. `at`: of `tracked`."""
+    """Return all cameras, by id. `at`: result of `compute_tracked`."""
     found = []
     for i in range(model.ncam):
         width, height = (int(n) for n in model.cam_resolution[i])
         sensor = [float(v) for v in model.cam_sensorsize[i]]
         focal, principal = (0.0, 0.0), (0.0, 0.0)
-        if sensor[0] > 0 and sensor[1] > 0:  # lengths on the sensor to pixels
+        if sensor[0] > 0 and sensor[1] > 0:  # convert lengths on the sensor to pixels
             per_metre = (width / sensor[0], height / sensor[1])
             f_x, f_y, c_x, c_y = (float(v) for v in model.cam_intrinsic[i])
             focal = (f_x * per_metre[0], f_y * per_metre[1])
@@ -237,5 +239,5 @@ def _read_optional(model: mujoco.MjModel, field: str, index: int, default: float
 
 
 def read_name(model: mujoco.MjModel, kind: str, index: int) -> str:
-    """The name, or an empty text."""
+    """Return the name, or an empty text."""
     return (mujoco.mj_id2name(model, _TYPES[kind], index) or "")[:MAX_TEXT]

@@ -34,7 +34,7 @@ _FACES: Final = 6
 
 
 def read_meshes(model: mujoco.MjModel, builder: AssetBuilder) -> tuple[Mesh, ...]:
-    """All meshes, by id."""
+    """Return all meshes, by id."""
     notes = builder.run([_mesh_work(model, builder, i) for i in range(model.nmesh)])
     return tuple(
         Mesh(read_name(model, "mesh", i), note.low, note.high, int(model.mesh_texcoordadr[i]) >= 0, note.levels)
@@ -51,7 +51,9 @@ def _mesh_work(model: mujoco.MjModel, builder: AssetBuilder, index: int) -> Work
 
 
 def _mesh_views(model: mujoco.MjModel, index: int) -> tuple[Any, ...]:
-    """Views of one mesh: vertices, normals, texture coordinates or `None`, and per face three indices into each."""
+    """Return views of one mesh: vertices, normals, texture coordinates or `None`, and per face three indices into
+    each.
+    """
     v, n, f = (int(getattr(model, f"mesh_{name}adr")[index]) for name in ("vert", "normal", "face"))
     vertex = model.mesh_vert[v : v + int(model.mesh_vertnum[index])]
     normal = model.mesh_normal[n : n + int(model.mesh_normalnum[index])]
@@ -63,7 +65,7 @@ def _mesh_views(model: mujoco.MjModel, index: int) -> tuple[Any, ...]:
 
 
 def read_mesh_corners(model: mujoco.MjModel, index: int) -> MeshArrays:
-    """One mesh with a normal and a texture coordinate at every corner, as it is drawn."""
+    """Return one mesh with a normal and a texture coordinate at every corner, as it is drawn."""
     vertex, normals, texcoord, face, face_normal, face_texcoord = _mesh_views(model, index)
     position = vertex[face]
     normal = normals[face_normal].copy()
@@ -76,7 +78,7 @@ def read_mesh_corners(model: mujoco.MjModel, index: int) -> MeshArrays:
 
 
 def read_textures(model: mujoco.MjModel, builder: AssetBuilder) -> tuple[Texture, ...]:
-    """All textures, by id."""
+    """Return all textures, by id."""
     kinds = [_KINDS.get(int(kind), TextureKind.IMAGE) for kind in model.tex_type]
     images = [_read_pixels(model, i, kind) for i, kind in enumerate(kinds)]
     notes = builder.run([builder.texture_work(image, kind) for image, kind in zip(images, kinds, strict=True)])
@@ -101,7 +103,7 @@ def _color_space(model: mujoco.MjModel, index: int) -> str:
 
 
 def _read_pixels(model: mujoco.MjModel, index: int, kind: str) -> NDArray[np.uint8]:
-    """(height, width, channels); of cubes six faces. A cube that is one square wears it on every face."""
+    """Return pixels (height, width, channels), of cubes six faces. A cube of one square has it on every face."""
     shape = tuple(int(getattr(model, f"tex_{side}")[index]) for side in ("height", "width", "nchannel"))
     start = int(model.tex_adr[index])
     data = model.tex_data[start : start + shape[0] * shape[1] * shape[2]].reshape(shape)
@@ -112,7 +114,7 @@ def _read_pixels(model: mujoco.MjModel, index: int, kind: str) -> NDArray[np.uin
 
 
 def read_hfields(model: mujoco.MjModel, builder: AssetBuilder) -> tuple[HeightField, ...]:
-    """All height fields, by id."""
+    """Return all height fields, by id."""
     grids = []
     for i in range(model.nhfield):
         rows, columns, start = (int(getattr(model, f"hfield_{name}")[i]) for name in ("nrow", "ncol", "adr"))
@@ -139,12 +141,12 @@ def _encode_grid(grid: NDArray[np.float32]) -> Callable[[], bytes]:
 
 
 def stream_name(index: int) -> str:
-    """Media stream of a flex, by its id."""
+    """Return the name of a flex's media stream, by its id."""
     return f"flex-{index}"
 
 
 def read_deformables(model: mujoco.MjModel, data: Any, builder: AssetBuilder) -> tuple[Deformable, ...]:
-    """All flexes, by id; `data` has the initial state, with kinematics."""
+    """Return all flexes, by id; `data` has the initial state, with kinematics."""
     parts = [read_flex_mesh(model, i) for i in range(model.nflex)]
     rest = [np.array(data.flexvert_xpos[part.vertices], np.float32) for part in parts]
     notes = builder.run(
@@ -173,18 +175,20 @@ def read_deformables(model: mujoco.MjModel, data: Any, builder: AssetBuilder) ->
 
 
 def _flex_material(model: mujoco.MjModel, index: int) -> int:
-    """Since MuJoCo 4 every element has one: that of the first, as models give it to a flex."""
+    """Return the material of a flex. Since MuJoCo 4 every element has one; models give all the same, so the first is
+    used.
+    """
     by_element = len(model.flex_matid) == model.nflexelem
     return int(model.flex_matid[int(model.flex_elemadr[index]) if by_element else index])
 
 
 @dataclass(frozen=True)
 class FlexMesh:
-    """Drawn mesh of a flex: `elements`, edges (n, 2) of a rope, triangles (n, 3) of a cloth or of the surface of a
-    soft body; `uv`, texture coordinates of each element's corners, where it has them.
+    """Drawn mesh of a flex.
 
-    `vertices`: rows of `flexvert_xpos`, without those inside of a solid; `numbers`: theirs in the flex. `topology`: the
-    plan of the stream.
+    `elements`: edges (n, 2) of a rope, triangles (n, 3) of a cloth or of the surface of a soft body; `uv`: texture
+    coordinates at the corners of each element, if any. `vertices`: rows of `flexvert_xpos`, without those inside of a
+    solid; `numbers`: their numbers in the flex. `topology`: the plan of the stream.
     """
 
     elements: NDArray[np.uint32]
@@ -195,18 +199,18 @@ class FlexMesh:
 
     @property
     def raw(self) -> list[NDArray[Any]]:
-        """Content that the asset depends on, besides the vertices at rest."""
+        """Return the content that the asset depends on, besides the vertices at rest."""
         return [self.elements, self.numbers, *([] if self.uv is None else [self.uv])]
 
     def encode(self, rest: NDArray[np.float32]) -> Callable[[], bytes]:
-        """The asset, for vertices at rest (n, 3) [m], world frame."""
+        """Return a function that encodes the asset, for vertices at rest (n, 3) [m], world frame."""
 
         numbers = self.numbers if len(self.numbers) <= int(self.numbers.max()) else None  # the inside is left out
         return lambda: encode_deformable(self.elements, self.uv, rest, self.topology, numbers)
 
 
 def read_flex_mesh(model: mujoco.MjModel, index: int) -> FlexMesh:
-    """The mesh of one flex, by its id."""
+    """Return the mesh of one flex, by its id."""
     dim = int(model.flex_dim[index])
     if dim == 3:
         start, count = int(model.flex_shelldataadr[index]), int(model.flex_shellnum[index])

@@ -1,4 +1,4 @@
-"""`parse_mujoco`: a compiled MuJoCo model to a scene specification and its assets. Works with MuJoCo 3.3 to 4.
+"""`parse_mujoco`: convert a compiled MuJoCo model to a scene specification and its assets. For MuJoCo 3.3 to 4.
 
 The model is not changed. Left out: collision settings, actuators, sensors, contacts, and skins (see `skipped`).
 """

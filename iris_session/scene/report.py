@@ -1,4 +1,4 @@
-"""Report on a scene: its content, its heavy assets, and what exceeds the budget of a headset."""
+"""Report on a scene: its content, its heavy assets, and the limits of a headset that it exceeds."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from iris_session.scene.cube_maps import CUBE_SIDE, find_cube_texture
 from iris_session.scene.extent import Extent
 from iris_session.scene.shapes import ENDLESS
 
-#: How many heavy things are listed.
+#: Number of heavy assets that are listed.
 HEAVIEST: Final = 8
-#: A mesh of more triangles is better simplified before it is shared: a third of what a Quest 3 draws of all.
+#: Triangles above which a mesh should be simplified before it is shared: a third of the limit of a Quest 3.
 LARGE_MESH: Final = 250_000
 _MIB: Final = 1 << 20
 
 
 class HeavyAsset(msgspec.Struct, frozen=True):
-    """One mesh or texture that costs much. `uses`: visuals that draw it. `why`: in words."""
+    """Mesh or texture with a high cost. `uses`: number of visuals that draw it. `why`: reason, as text."""
 
     kind: str
     name: str
@@ -36,9 +36,12 @@ class HeavyAsset(msgspec.Struct, frozen=True):
 
 
 class SceneReport(msgspec.Struct, frozen=True):
-    """`extent`: of what is drawn at first. `struggles`: what a Quest 3 will, in words; empty when nothing.
-    `for_headset`: what the levels of detail make of it (triangles, texture bytes, objects drawn, visuals left out).
-    `skipped`: what clients are not given. `simplified`: what pictures of recordings and GLB files show otherwise.
+    """Report on a scene.
+
+    `extent`: of the initial content. `struggles`: limits of a Quest 3 that it exceeds, as text; empty when none.
+    `for_headset`: result of the levels of detail (triangles, texture bytes, objects drawn, visuals left out).
+    `skipped`: content that clients do not get. `simplified`: content that images of recordings and GLB files show
+    differently.
     """
 
     scene_hash: str
@@ -83,7 +86,7 @@ def build_report(
 
 
 def list_large_meshes(spec: SceneSpec) -> tuple[str, ...]:
-    """Advice on meshes that are better simplified before they are shared; a line each."""
+    """Return advice on meshes that should be simplified before they are shared; a line each."""
     return tuple(
         f"mesh {mesh.name} has {mesh.levels[0].triangles:,} triangles: over {LARGE_MESH:,}, simplify it in a program "
         "for meshes (Blender: Decimate), or it takes long to prepare and to fetch"
@@ -118,7 +121,7 @@ def list_glb_differences(spec: SceneSpec) -> tuple[str, ...]:
 
 
 def format_tree(spec: SceneSpec) -> Iterator[str]:
-    """One line per body, indented by depth: what it draws."""
+    """Yield one line per body, indented by depth, with the visuals that it has."""
     children: dict[int, list[Body]] = {}
     for body in spec.bodies:
         children.setdefault(body.parent, []).append(body)

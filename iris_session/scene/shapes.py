@@ -19,15 +19,15 @@ from iris_session.scene.meshes import MeshArrays, index_corners
 
 SLICES: Final = 28
 STACKS: Final = 16
-#: Half the side of a plane that has no end [m], where something has to be drawn.
+#: Half the side of an infinite plane [m] where it is drawn as a finite one.
 ENDLESS: Final = 50.0
 Floats = NDArray[np.float64]
-#: Distance from the axis, in radii, below which there is no angle around it.
+#: Distance from the axis, in radii, below which the angle around it is undefined.
 _POLE: Final = 1e-6
 
 
 def build_primitive(geometry: Geometry) -> MeshArrays | None:
-    """A shape that needs no asset, without texture coordinates; `None` for meshes, height fields, unknown kinds."""
+    """Return the mesh of a shape that needs no asset, without texture coordinates; `None` for other geometries."""
     x, y, z = geometry.size
     size = np.array(geometry.size)
     match geometry.kind:
@@ -52,7 +52,9 @@ def build_primitive(geometry: Geometry) -> MeshArrays | None:
 
 
 def build_height_field(field: HeightField, elevation: NDArray[np.float32]) -> MeshArrays:
-    """The surface, four walls and a floor. Two triangles a cell, split along the diagonal that MuJoCo takes."""
+    """Return the surface, four walls and a floor. Each cell has two triangles, split along the same diagonal as in
+    MuJoCo.
+    """
     half_x, half_y, top, base = field.size
     rows, columns = elevation.shape
     x = np.linspace(-half_x, half_x, columns)
@@ -83,7 +85,7 @@ _BOX: Final = np.array(
 
 
 def _quads(corners: Floats) -> Floats:
-    """(n, 4, 3) to triangles (2 n, 3, 3)."""
+    """Convert quads (n, 4, 3) to triangles (2 n, 3, 3)."""
     return np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
 
 
@@ -93,15 +95,17 @@ def _flat(triangles: Floats) -> MeshArrays:
 
 
 def _arc(points: int, low: float, high: float) -> Floats:
-    """(distance from the axis, height) on a half circle of radius 1, from `low` to `high` quarter turns."""
+    """Return (distance from the axis, height) on a half circle of radius 1, from `low` to `high` quarter turns."""
     angle = np.linspace(low, high, points) * np.pi / 2
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def _revolve(profile: Floats, normals: Floats, size: Floats) -> MeshArrays:
-    """A profile (distance, height), from below, turned around z and stretched by `size`; `normals` before that."""
+    """Revolve a profile (distance, height), from below, around z and scale it by `size`; `normals` are before
+    scaling.
+    """
     angle = np.linspace(0, 2 * np.pi, SLICES + 1)
-    angle[-1] = 0.0  # meets itself exactly
+    angle[-1] = 0.0  # closes exactly
     turn = np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
     def around(values: Floats) -> Floats:
@@ -118,7 +122,7 @@ def _revolve(profile: Floats, normals: Floats, size: Floats) -> MeshArrays:
 
 
 def _mesh(position: Floats, normal: Floats) -> MeshArrays:
-    """Without triangles that have no area (at poles)."""
+    """Return a mesh without triangles of zero area (at poles)."""
     area = np.linalg.norm(np.cross(position[:, 1] - position[:, 0], position[:, 2] - position[:, 0]), axis=1)
     some = area > 1e-12 * max(float(area.max(initial=0.0)), 1e-30)
     return index_corners(position[some].astype(np.float32), normal[some].astype(np.float32), None)
@@ -128,7 +132,7 @@ def _mesh(position: Floats, normal: Floats) -> MeshArrays:
 
 
 def add_texture_coordinates(mesh: MeshArrays, geometry: Geometry, material: Material) -> MeshArrays:
-    """`mesh`, which is that of `geometry`, with the coordinates that `material` gives it."""
+    """Return `mesh`, the mesh of `geometry`, with the texture coordinates that `material` gives it."""
     times = np.array(material.repeat) * (geometry.size[:2] if material.uniform else 1.0)
     if mesh.uv is not None:
         return mesh if (times == 1.0).all() else replace(mesh, uv=(mesh.uv * times).astype(np.float32))
@@ -136,7 +140,7 @@ def add_texture_coordinates(mesh: MeshArrays, geometry: Geometry, material: Mate
         return replace(mesh, uv=_project_along_z(mesh.position, geometry, material).astype(np.float32))
     position, normal = mesh.position[mesh.index], mesh.normal[mesh.index]
     uv = _shape_coordinates(position.astype(np.float64), normal, geometry) * times
-    if geometry.kind == GeometryKind.PLANE:  # along which it has no end
+    if geometry.kind == GeometryKind.PLANE:  # axes along which it is infinite
         endless = np.array(geometry.size[:2]) <= 0
         uv[..., endless] = _project_along_z(position, geometry, material)[..., endless]
     return index_corners(position, normal, uv.astype(np.float32))
@@ -148,7 +152,7 @@ def repeat_texture_coordinates(uv: NDArray[np.float32] | None, material: Materia
 
 
 def _project_along_z(position: NDArray[np.float32], geometry: Geometry, material: Material) -> Floats:
-    """Laid over it along z."""
+    """Return texture coordinates projected along z."""
     size = np.array(geometry.size[:2])
     per_metre = material.repeat / np.where(material.uniform | (size <= 0), 1.0, size)
     return position[..., :2] * per_metre * [0.5, -0.5] - 0.5
@@ -171,19 +175,19 @@ def _shape_coordinates(position: Floats, normal: NDArray[np.float32], geometry: 
             end = np.sign(middle) * (np.abs(middle) > half)
             cap = (end > 0) - 2 * _latitude((position[..., 2] - end * half) / radius)
             return np.stack([_angles_around_z(p), np.where(end == 0, 0.5 - p[..., 2] / 2, cap)], axis=-1)
-    across = np.abs(normal).argmax(axis=-1)[..., None]  # of boxes and planes: the axis that a side looks along
+    across = np.abs(normal).argmax(axis=-1)[..., None]  # boxes and planes: the axis of the normal
     right = np.take_along_axis(p, np.where(across == 0, 1, 0), axis=-1)
     up = np.take_along_axis(p, np.where(across == 2, 1, 2), axis=-1)
     return np.concatenate([1 + right, 1 - up], axis=-1) / 2
 
 
 def _latitude(height: Floats) -> Floats:
-    """Of points on a ball of radius 1, from -0.5 to 0.5."""
+    """Return the latitude of points on a unit sphere, from -0.5 to 0.5."""
     return np.arcsin(np.clip(height, -1.0, 1.0)) / np.pi
 
 
 def _angles_around_z(p: Floats) -> Floats:
-    """Angles around z from x, in turns: triangles that reach over the seam go on beyond 1, at poles lies the mean."""
+    """Return angles around z from x, in turns; triangles across the seam continue beyond 1, poles have the mean."""
     turns = (np.arctan2(p[..., 1], p[..., 0]) / (2 * np.pi)) % 1.0
     there = np.hypot(p[..., 0], p[..., 1]) > _POLE
     high = np.where(there, turns, 0.0).max(axis=1, keepdims=True)

@@ -1,7 +1,7 @@
 """ZeroMQ's authentication protocol (ZAP, RFC 27), answered in the front's own loop.
 
 The User-Id that a socket then reports for every message is the fingerprint of the client's key. A key that is not
-listed is admitted to the control socket only, with a User-Id that says so (`keyring.PAIRING_PREFIX`): it may pair.
+listed is admitted to the control socket only, with a User-Id that marks it (`keyring.PAIRING_PREFIX`): it may pair.
 """
 
 from __future__ import annotations

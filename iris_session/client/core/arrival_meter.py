@@ -1,4 +1,4 @@
-"""Report of a client about itself, once a second: how state arrives at the application."""
+"""Report of a client about itself, once a second: ages and gaps of the state at the application."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from iris_session.client.core.state_stream import SceneState
 from iris_session.protocol.status import ClientReport, Quantiles, compute_quantiles
 
 PERIOD_NS: Final = 1_000_000_000
-#: Ages kept of one period: more frames than are ever sent in a second.
+#: Maximum number of ages per period: more frames than are ever sent in a second.
 MAX_AGES: Final = 512
 
 

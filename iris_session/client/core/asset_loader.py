@@ -1,11 +1,11 @@
 """Order and window of chunk requests for wanted assets. Pure: no socket, file, clock or thread.
 
-    wanted --to_look--> looked up in the cache --missing(offset)--> asked for in chunks --whole--> hashed --again, drop
-                                               `--drop
+    wanted --next_lookups--> searched in the cache --on_missing(offset)--> requested in chunks --complete--> hashed
+       `--remove (found)                                                                     again, remove <--'
 
-Answers come in the order of the requests, so of one asset the bytes come in order too, and a request whose successor is
-answered was lost: it went with a TCP connection that ended, and is made again. A chunk that does not continue its asset
-is ignored. A window bounds what was requested and is not stored yet. Chunks are as large as the link is fast.
+Answers come in the order of the requests, so the bytes of one asset come in order too, and a request whose successor is
+answered was lost with a TCP connection, and is made again. A chunk that does not continue its asset is ignored. A
+window bounds the bytes that were requested and are not stored yet. The chunk size adapts to the speed of the link.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ MIN_CHUNK_BYTES: Final = 64 << 10
 MAX_CHUNK_BYTES: Final = MAX_ASSET_CHUNK_BYTES
 FAST_NS: Final = 100_000_000
 SLOW_NS: Final = 2_000_000_000
-#: Less than a session allows: enough for 400 Mbit/s and 100 ms.
+#: Window [bytes], less than a session allows: enough for 400 Mbit/s and 100 ms.
 WINDOW_BYTES: Final = 6 << 20
 WINDOW_REQUESTS: Final = MAX_ASSET_REQUESTS // 2
-#: Assets that are looked up, received or hashed at once: small ones must not wait for each other's round trips.
+#: Maximum number of assets in progress at once: small ones must not wait for each other's round trips.
 AT_ONCE: Final = 32
-#: After a refusal that passes, and after a connection that ended; doubled each time, until a chunk comes.
+#: Pauses after a temporary refusal and after a disconnect; doubled each time, until a chunk comes.
 FIRST_PAUSE_NS: Final = 50_000_000
 LONGEST_PAUSE_NS: Final = 2_000_000_000
-#: A request without an answer for so long, while nothing else comes either: the connection is made anew.
+#: Time without any answer after which the connection is replaced.
 PATIENCE_NS: Final = 15_000_000_000
 
 
@@ -51,7 +51,7 @@ class ChunkRequest(NamedTuple):
 
 
 class FailedAsset(NamedTuple):
-    """An asset that will not come."""
+    """An asset that cannot be fetched."""
 
     address: str
     reason: str
@@ -84,16 +84,16 @@ class _Item:
 
 
 class AssetLoader:
-    """`now_ns` are of one monotonic clock."""
+    """Scheduler of chunk requests. All `now_ns` are of one monotonic clock."""
 
     def __init__(self) -> None:
-        #: Why the session puts requests off, in its words; empty while bytes come.
+        #: Reason for which the session postpones requests, in its words; empty while bytes come.
         self.refusal = ""
-        self._wanted: dict[str, int] = {}  # not looked up yet; sizes as in `want`
-        self._busy: dict[str, int] = {}  # in the hands of the workers
-        self._items: dict[str, _Item] = {}  # of which bytes are to come, in their order
-        self._anew: set[str] = set()  # whose part was thrown away because the session has less: once
-        self._asked: dict[int, tuple[ChunkRequest, int]] = {}  # with the time
+        self._wanted: dict[str, int] = {}  # not looked up yet; sizes as in `add`
+        self._busy: dict[str, int] = {}  # in work by the workers
+        self._items: dict[str, _Item] = {}  # missing bytes, in the order of the assets
+        self._anew: set[str] = set()  # removed once because the session has fewer bytes
+        self._asked: dict[int, tuple[ChunkRequest, int]] = {}  # pending requests with their time
         self._chunk_bytes = CHUNK_BYTES
         self._unstored = 0
         self._next_id = 0
@@ -111,7 +111,9 @@ class AssetLoader:
         return bool(self._items)
 
     def add(self, address: str, size: int = -1) -> bool:
-        """Add an asset at the end of the order; `size` [bytes] if it is known. False: it is on its way already."""
+        """Add an asset at the end of the order; `size` [bytes] if it is known. Return false when it is in progress
+        already.
+        """
         if address in self._wanted or address in self._busy or address in self._items:
             return False
         self._wanted[address] = size
@@ -131,8 +133,10 @@ class AssetLoader:
             item.anew = address in self._anew
 
     def restart_asset(self, address: str) -> bool:
-        """Start an asset again whose bytes had another hash. False: that was the second time. Does nothing for an asset
-        that was removed meanwhile."""
+        """Start an asset again whose bytes had another hash. Return false when that was the second time.
+
+        Does nothing for an asset that was removed meanwhile.
+        """
         item = self._items.get(address)
         if item is None:
             return True
@@ -144,7 +148,7 @@ class AssetLoader:
         return True
 
     def remove(self, address: str) -> None:
-        """Remove an asset that is here, or will not come."""
+        """Remove an asset that is complete or failed."""
         for table in (self._wanted, self._busy, self._items):
             table.pop(address, None)
         self._anew.discard(address)
@@ -171,8 +175,11 @@ class AssetLoader:
         return self._unstored + sum(ask.length for ask, _ in self._asked.values())
 
     def process_chunk(self, chunk: AssetChunk, size: int, now_ns: int) -> bool | FailedAsset | None:
-        """`size` bytes came. True: they are the next ones, to be stored (then call `stored`). None: they are of no use
-        any more. False: nobody asked for them."""
+        """Process a chunk of `size` bytes.
+
+        Returns true for the next bytes, to be stored (then call `on_stored`); `None` for bytes that are of no use any
+        more; false for a chunk that was not requested.
+        """
         ask, asked_ns = self._asked.pop(chunk.request_id, (None, 0))
         if ask is None or ask.offset != chunk.offset or ask.address != chunk.address:
             return False
@@ -199,7 +206,7 @@ class AssetLoader:
         return True
 
     def _restore_lost_requests(self, request_id: int) -> None:
-        """This request was answered: those before it will not be, and are made again."""
+        """Request again what was requested before `request_id`: after this answer those will not be answered."""
         for lost in [earlier for earlier in self._asked if earlier < request_id]:
             ask, _ = self._asked.pop(lost)
             item = self._items.get(ask.address)
@@ -225,8 +232,11 @@ class AssetLoader:
         self._unstored -= size
 
     def process_refusal(self, refused: AssetRefused, now_ns: int) -> FailedAsset | str:
-        """A request was refused. A `Failed` when the asset will not come; an address when it is to begin anew, after
-        its part was thrown away (then call `missing` with 0); else empty: it is asked for again after a pause."""
+        """Process a refusal.
+
+        Returns a `FailedAsset` for a final one; an address when the asset must start again after its bytes were removed
+        (then call `on_missing` with 0); else an empty text: it is requested again after a pause.
+        """
         ask, _ = self._asked.pop(refused.request_id, (None, 0))
         if ask is None:
             return ""
@@ -242,7 +252,7 @@ class AssetLoader:
             return ""
         self.remove(ask.address)
         if refused.reason == AssetRefusal.BAD_RANGE and item.got and not item.anew:
-            self._busy[ask.address] = -1  # our part is longer than the asset: it was of something else
+            self._busy[ask.address] = -1  # more bytes are stored than the asset has: they belong to another one
             self._anew.add(ask.address)
             return ask.address
         text = f"asset {ask.address} was refused ({refused.reason}): {refused.advice}"
@@ -253,7 +263,7 @@ class AssetLoader:
         return now_ns < self._paused_until_ns
 
     def on_link_lost(self, now_ns: int) -> None:
-        """As `cut_off`, of a connection that the other end or the network ended: the next one is made after a pause."""
+        """Note that the connection ended, as `on_link_closed`, but not by us: the next one is made after a pause."""
         before_ns = self._pause_ns
         self.on_link_closed()
         self._pause(now_ns, before_ns)
@@ -263,7 +273,7 @@ class AssetLoader:
         self._paused_until_ns = now_ns + self._pause_ns
 
     def on_link_closed(self) -> None:
-        """We ended the connection: what was asked by it will not come, what came stays."""
+        """Note that we closed the connection: pending requests are lost, received bytes stay."""
         self._asked.clear()
         self._pause_ns = self._paused_until_ns = 0
         for item in self._items.values():

@@ -1,10 +1,10 @@
 """Estimate of session time from four-timestamp exchanges. Pure: the caller passes its own monotonic clock in.
 
-Each exchange gives an offset `((t1 - t0) + (t2 - t3)) / 2` whose error is at most half its round trip, whatever the
-path's asymmetry, and drift since. The estimate is the median offset of the quickest quarter of a window, kept within
-the intersection of those intervals (Marzullo), which is also the stated error bound. After the first exchange it is
-slewed, so that session time read from it does not run backwards. It is stepped only when what it says is impossible:
-the clock of a machine that slept stood still meanwhile.
+Each exchange gives an offset `((t1 - t0) + (t2 - t3)) / 2` whose error is at most half its round trip, for any
+asymmetry of the path, plus drift since. The estimate is the median offset of the quickest quarter of a window, kept
+within the intersection of those intervals (Marzullo), which is also the stated error bound. After the first exchange it
+is slewed, so that session time does not run backwards. It is stepped only when the exchanges prove it impossible, as
+after sleep of the machine, during which its clock stood still.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from typing import NamedTuple
 
 WINDOW = 32  # exchanges; a quarter of a minute at two per second
 MAX_AGE_NS = 60_000_000_000  # older exchanges no longer count
-SETTLED = 4  # exchanges before the estimate is used: a single one may have met a busy machine
+SETTLED = 4  # exchanges before the estimate is used: a single one may have been delayed by a busy machine
 SLEW = 0.01  # the estimate moves by 10 ms per second: invisible in 150 ms freshness, monotonic
-LARGE_NS = 5_000_000  # samples from so far in the future do not count: what is more moves ...
+LARGE_NS = 5_000_000  # samples from further in the future are rejected, so larger corrections are slewed ...
 SLEW_LARGE = 0.1  # ... by 100 ms per second, so that a busy link at the start does not prevent driving for seconds
 DRIFT = 100e-6  # two quartz clocks of +-50 ppm each
-JUMP = 4  # exchanges in a row that contradict all before: this clock has jumped, the old ones say nothing any more
+JUMP = 4  # exchanges in a row that contradict all earlier ones: the local clock has jumped, earlier ones are invalid
 BURST = 8  # exchanges at the start and after a reset ...
 BURST_PERIOD_NS = 5_000_000  # ... at this period, then
-PERIOD_NS = 500_000_000  # at this one; pongs also tell that the front lives
+PERIOD_NS = 500_000_000  # at this one; pongs also show that the front is alive
 
 
 class Exchange(NamedTuple):
@@ -45,18 +45,20 @@ class ClockSync:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: another session."""
+        """Clear everything, for another session."""
         self._target = 0
         self._offset = 0
         self._offset_at = 0
         self._rtt = 0
-        # Nothing agrees with this: the first exchange is taken as it is.
+        # No exchange agrees with this interval, so the first one is taken as it is.
         self._low, self._high = 2**62, -(2**62)
         self.restart()
 
     def restart(self) -> None:
-        """Another connection to the session: measures anew, for the machine may have slept. Until the first exchange
-        the old estimate stays, and after it too unless it has become impossible."""
+        """Measure again after a new connection to the session: the machine may have slept.
+
+        Until the first exchange the old estimate stays, and after it too unless it has become impossible.
+        """
         self._window: deque[Exchange] = deque(maxlen=WINDOW)
         self._contradicting: list[Exchange] = []
         self._next_ping = 0
@@ -64,12 +66,12 @@ class ClockSync:
 
     @property
     def synced(self) -> bool:
-        """At least one exchange has been counted."""
+        """True after the first exchange."""
         return bool(self._window)
 
     @property
     def settled(self) -> bool:
-        """Enough exchanges to stamp samples by."""
+        """True when there were enough exchanges to stamp samples."""
         return len(self._window) >= SETTLED
 
     @property
@@ -103,7 +105,7 @@ class ClockSync:
         if self._window and self._contradicts(exchange):
             self._contradicting.append(exchange)
             if len(self._contradicting) < JUMP:
-                self._sent = 0  # find out quickly
+                self._sent = 0  # another burst
                 self._next_ping = min(self._next_ping, t3_ns)
                 return
             self._window.clear()
@@ -134,13 +136,13 @@ class ClockSync:
         return local_ns + self._slewed_offset(local_ns)
 
     def local_ns(self, session_ns: int) -> int:
-        """The client's clock at session time `session_ns`, by the estimate as it stands."""
+        """Return the client's clock at session time `session_ns`, by the present estimate."""
         return session_ns - self._target
 
     def error_bound_ns(self, local_ns: int) -> int:
-        """Bound of the error of `session_ns(local_ns)`: round trips, drift, and slew still to do."""
+        """Return the bound of the error of `session_ns(local_ns)` [ns]: round trips, drift, and remaining slew."""
         offset = self._slewed_offset(local_ns)
-        doubts = [(e.offset_ns, _uncertainty(e, local_ns)) for e in self._contradicting]  # they may be right
+        doubts = [(e.offset_ns, _uncertainty(e, local_ns)) for e in self._contradicting]  # these may be right
         low = min(self._low, *(at - reach for at, reach in doubts)) if doubts else self._low
         high = max(self._high, *(at + reach for at, reach in doubts)) if doubts else self._high
         return max(high - offset, offset - low) + int(DRIFT * abs(local_ns - self._offset_at))
@@ -158,7 +160,9 @@ def _uncertainty(exchange: Exchange, now_ns: int) -> int:
 
 
 def _intersect(exchanges: list[Exchange], now_ns: int) -> tuple[int, int]:
-    """Offsets (lowest, highest) that agree with the exchanges, quickest first; one that contradicts is left out."""
+    """Return the lowest and highest offset that agree with the exchanges, quickest first, without contradicting
+    ones.
+    """
     low, high = -(2**63), 2**63
     for exchange in exchanges:
         reach = _uncertainty(exchange, now_ns)

@@ -153,7 +153,7 @@ class PendingRequests:
         self._replies.clear()
 
     def add_pending(self) -> None:
-        """Count the request `next_request` as sent. Beyond `MAX_PENDING` the oldest is given up."""
+        """Count the request `next_request` as sent. Beyond `MAX_PENDING` the oldest one is dropped."""
         if len(self._pending) >= MAX_PENDING:
             self._pending.discard(min(self._pending))
         self._pending.add(self.next_request)

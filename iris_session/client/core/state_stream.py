@@ -1,9 +1,9 @@
-"""State channel of a client: frames in, the newest scene out. Pure: bytes and times are passed in.
+"""State channel of a client: from frames to the newest scene. Pure: bytes and times are passed in.
 
-Bounded staleness: the caller drains its socket and passes everything that was there; only the newest rigid frame is
-decoded. When nothing came for a while (this client stood still, or its link), what comes then has waited in queues: it
-is thrown away until fresh frames come, so the first frame handed out is a fresh one. On a link where every frame is
-old, the newest there is counts as fresh.
+Bounded staleness: the caller drains its socket and passes all received messages; only the newest rigid frame is
+decoded. After a silence (this client or its link stood still) frames have waited in queues: they are dropped until a
+fresh one comes, so the first frame handed out is fresh. On a link where every frame is old, the newest one counts as
+fresh.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from iris_session.streams.rigid import RigidDecoder
 
 Poses = NDArray[np.float64]
 
-STALLED_NS: Final = 50_000_000  # no frame for this long: what comes now may have waited
+STALLED_NS: Final = 50_000_000  # no frame for this long: the next frames may have waited in queues
 QUEUED_NS: Final = 60_000_000  # a frame published this long ago waited in a queue ...
 FLUSH_NS: Final = 150_000_000  # ... but after this long without a fresher one it is the newest there is (slow link)
 _USUAL: Final = 8  # frames over which the usual age of frames on this link is averaged
 
-PRESENCE_WAITING: Final = 8  # presence messages that may wait to be looked at; decoding several at once is cheaper
+PRESENCE_WAITING: Final = 8  # presence messages that may wait to be decoded; decoding several at once is cheaper
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ class StateCounters:
     out_of_order: int = 0
     before_snapshot: int = 0
     other_epoch: int = 0  # of a scene whose event has not come yet, or of the one before
-    undecodable: int = 0  # base frame missing: a snapshot was asked for
+    undecodable: int = 0  # base frame missing: a snapshot was requested
     malformed: int = 0
     unknown_topic: int = 0
     bytes_received: int = 0
@@ -68,10 +68,10 @@ class StateCounters:
 
 
 class StateStream:
-    """Decodes the newest of each drain. `wants_snapshot` becomes true when the deltas have lost their base.
+    """Decoder of the newest frame of each drain. `wants_snapshot` becomes true when the deltas have lost their base.
 
-    `scene_epoch`: the newest epoch whose bodies the application knows, by events or snapshot; frames of another one are
-    decoded, and counted, but not handed out, because their bodies may be other ones.
+    `scene_epoch`: the newest epoch whose bodies the application knows, by events or snapshot. Frames of other epochs
+    are decoded and counted, but not handed out, because their bodies may differ.
     """
 
     def __init__(self) -> None:
@@ -85,7 +85,7 @@ class StateStream:
         self.restart()
 
     def reset(self) -> None:
-        """Another connection: frames may be numbered anew, nothing held is of use."""
+        """Clear all frames for another connection: its frames may be numbered from the beginning."""
         self._decoder = None
         self._presence = {}
         self._presence_ns = 0
@@ -94,23 +94,23 @@ class StateStream:
         self.restart()
 
     def restart(self) -> None:
-        """Frames come by another way from now on: nothing waits in queues yet, and the usual age may be another."""
-        self._came_ns = -1  # when a frame came last; on the client's own clock, as the next one
-        self._flush_until = 0  # old frames are thrown away until then
+        """Prepare for frames by another route: its queues are still empty, and the usual age may differ."""
+        self._came_ns = -1  # time of the last frame; on the client's own clock, as the next one
+        self._flush_until = 0  # old frames are dropped until then
         self._usual_age = 0
         self._was_late = False
 
     def load_keyframe(self, state_seq: int, poses: Poses) -> None:
-        """Takes the poses (n, 7) of a snapshot; poses that came in newer frames are kept."""
+        """Take the poses (n, 7) of a snapshot; poses of newer frames are kept."""
         if self._decoder is None or self._decoder.n_bodies != len(poses):
             self._decoder = RigidDecoder(len(poses))
         self._decoder.load_keyframe(state_seq, poses)
         self.wants_snapshot = False
 
     def drain(self, messages: Sequence[Sequence[bytes]], now_ns: int, local_ns: int) -> SceneState | None:
-        """Takes every message that was waiting, oldest first; returns the newest scene if there is one.
+        """Process all received messages, oldest first; return the newest scene if there is one.
 
-        `now_ns`: session time now, `local_ns`: the client's monotonic clock now.
+        `now_ns`: present session time, `local_ns`: the client's monotonic clock.
         """
         newest: tuple[StateHeader, bytes] | None = None
         for frames in messages:
@@ -137,10 +137,10 @@ class StateStream:
         return state
 
     def check_fresh(self, local_ns: int) -> bool:
-        """Return whether the state drained last is still to be passed on, at `local_ns` on the client's clock.
+        """Return whether the last drained state is still to be passed on, at `local_ns` on the client's clock.
 
-        Not when the client stood still since then: fresh frames are right behind. Only the first time in a row, for who
-        always takes so long to decode would never be handed anything.
+        It is not when the client stood still since then: fresh frames follow directly. This applies once in a row,
+        because an application that always decodes that slowly would never get any state.
         """
         late = local_ns - self._came_ns > STALLED_NS
         held_back = late and not self._was_late
@@ -152,18 +152,20 @@ class StateStream:
 
     @property
     def presence(self) -> dict[tuple[str, str], PresenceItem]:
-        """Heads and hands of everyone by `(participant, device)`. Decoded when looked at: the scene goes first."""
+        """Heads and hands of all participants by `(participant, device)`. Decoded on access: the scene has priority."""
         self._decode_presence()
         return self._presence
 
     def retain_presence(self, participants: Container[str]) -> None:
-        """Only these are here: what others sent before they left, and came after, is not shown."""
+        """Remove all participants but these: presence that they sent before leaving may arrive late and is not
+        shown.
+        """
         self._decode_presence()
         for key in [key for key in self._presence if key[0] not in participants]:
             del self._presence[key]
 
     def remove_presence(self, participant: str) -> None:
-        """This participant left: nothing of it is shown any more."""
+        """Remove a participant that left."""
         presence = self.presence
         for key in [key for key in presence if key[0] == participant]:
             del presence[key]
@@ -206,7 +208,7 @@ class StateStream:
             self._flush_until = local_ns + FLUSH_NS
         if old and local_ns < self._flush_until:
             return True
-        # Where nothing fresher came in time, this is how old frames are on this link from now on.
+        # No fresher frame came in time, so this is the usual age of frames on this link from now on.
         weight = 1 if (old and self._flush_until) or not self._usual_age else _USUAL
         self._usual_age += (age_ns - self._usual_age) // weight
         self._flush_until = 0
@@ -229,7 +231,7 @@ class StateStream:
 
 
 def poses_from_bytes(data: bytes, n_bodies: int) -> Poses | None:
-    """Bulk frame of a snapshot as (n, 7) float64; `None` when it is not that."""
+    """Return the bulk frame of a snapshot as (n, 7) float64, or `None` when its size is wrong."""
     if len(data) != n_bodies * 7 * 8:
         return None
     return np.frombuffer(data, dtype="<f8").reshape(n_bodies, 7).astype(np.float64)

@@ -68,7 +68,7 @@ class Behaviour(Protocol):
     failed: str
 
     def update(self, view: OperatorView) -> tuple[HandInput, ...]:
-        """Called once per headset frame or input sample (60-90 Hz)."""
+        """Return the inputs of the hands; called once per headset frame or input sample (60-90 Hz)."""
         ...
 
 
@@ -82,7 +82,7 @@ class CombinedBehaviour:
         self.failed = ""
 
     def update(self, view: OperatorView) -> tuple[HandInput, ...]:
-        """The inputs of all hands; see `Behaviour.update`."""
+        """Return the inputs of all hands; see `Behaviour.update`."""
         inputs = tuple(hand_input for hand in self._hands for hand_input in hand.update(view))
         self.phase = next((hand.phase for hand in self._hands if not hand.done), "done")
         self.done = all(hand.done for hand in self._hands)

@@ -36,8 +36,10 @@ def list_observed_vertices(deformable: str) -> tuple[int, ...]:
 
 
 class DeformablePerception(Perception):
-    """Watches the corners of one deformable and what is next to them, robots, and bodies. `missing`: which of them were
-    never seen so far."""
+    """Tracks the corners of one deformable with the vertices beside them, robots, and bodies.
+
+    `missing`: those that have not been in the scene so far.
+    """
 
     def __init__(
         self, deformable: str, robots: tuple[str, ...], bodies: tuple[str, ...] = (), arm: ArmKind = ARM
@@ -48,7 +50,7 @@ class DeformablePerception(Perception):
         self.deformable = deformable
         self._indices = list_observed_vertices(deformable)
         self._vertices: dict[int, TrackedPose] = {}
-        #: Session time of the picture, and at which the deformable was as it is shown [s].
+        #: Session time of the displayed frame, and of the displayed vertices [s].
         self.now_s = self.captured_s = 0.0
 
     def observe(self, view: OperatorView) -> None:
@@ -72,7 +74,9 @@ class DeformablePerception(Perception):
         return self._vertices[index].pose[0]
 
     def compute_inner_point(self, corner: int, cells: float) -> Vec3:
-        """A point so far from a corner towards the middle [m], in cells of the grid along both edges, 1 to 2."""
+        """Return a point this far from a corner towards the middle [m], in cells of the grid along both edges, 1 to
+        2.
+        """
         (ax, ay, az), (bx, by, bz) = (self._vertices[index].pose[0] for index in INNER[self.deformable][corner])
         w = cells - 1.0
         return (ax + w * (bx - ax), ay + w * (by - ay), az + w * (bz - az))
@@ -99,9 +103,9 @@ def compute_mean(points: Iterable[Vec3]) -> Vec3:
     return (sum(xs) / len(xs), sum(ys) / len(ys), sum(zs) / len(zs))
 
 
-#: The picture of a deformable may come so much later than that of the fingers which hold it [s].
+#: Maximum delay of the vertices of a deformable behind the poses of the fingers that hold it [s].
 PICTURE_LATE_S: float = 10.0
-#: So long a picture must go on showing that it is not held [s].
+#: Time for which the vertices must show that the deformable is not held [s].
 SEEN_S: float = 0.6
 
 
@@ -111,8 +115,8 @@ class DeformableTask(PhasedTask):
     def __init__(self, robot: str, device: str, eyes: DeformablePerception, arm: ArmKind) -> None:
         self.perception = eyes
         super().__init__(robot, device, eyes, arm)
-        self._lost_s: float | None = None  # since when it seems to stay behind; session time
-        self._phase_s = 0.0  # when the phase began; session time
+        self._lost_s: float | None = None  # session time since which it seems to stay behind
+        self._phase_s = 0.0  # session time of the start of the phase
 
     def _enter(self, phase: str) -> None:
         super()._enter(phase)

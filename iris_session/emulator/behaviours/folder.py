@@ -1,5 +1,6 @@
-"""Folds a cloth with a partner: each operator pinches the nearer corner on their side, and both carry
-these over the corners behind at the same time."""
+"""Fold a cloth with a partner: each operator pinches the closer corner on their side, and both carry these over the
+corners behind at the same time.
+"""
 
 from __future__ import annotations
 
@@ -11,44 +12,44 @@ from iris_session.emulator.behaviours.deformables import DeformablePerception, D
 from iris_session.emulator.behaviours.objects import DOWN, raise_pose
 from iris_session.protocol.names import Device
 
-#: The cloth is pinched so far from its corner, along both edges, in cells of 22.5 mm.
+#: Distance of the pinch from the corner of the cloth, along both edges, in cells of 22.5 mm.
 INSET_CELLS: float = 1.42
 #: Height of the tip above the table at which the finger tips, 12 mm below it, press the cloth of 8 mm onto the table
-#: [m]. The hand is only so steady, so it aims at the table itself; on every new attempt a little deeper.
+#: [m]. The hand is not steady enough for that, so it aims at the table itself; on every new attempt a little deeper.
 PRESS: float = 0.0115
 DEEPER: float = 0.0015
-#: How far the trigger is pulled when the fingers come down, 60 mm apart then: both must land on the cloth.
+#: Trigger while the fingers come down, which are 60 mm apart then: both must land on the cloth.
 TRIGGER_BEFORE: float = 0.25
-#: Height of the tip above the table at which the corner is released [m]: much lower, and cloth heaps up around the
-#: fingers; higher, and it swings back as it falls.
+#: Height of the tip above the table at which the corner is released [m]: much lower, the cloth would heap up around the
+#: fingers; higher, it would swing back as it falls.
 RELEASE: float = 0.036
-#: So far towards the partner a corner falls back when it is released, because it was pinched into a wrinkle [m].
+#: Distance by which a released corner falls back towards the partner, because it was pinched into a wrinkle [m].
 FALLS_BACK: float = 0.006
-#: So far at most the fingers are carried out from between the people [m]: a cloth that is drawn taut flies in when the
-#: first of them is released.
+#: Maximum distance by which the fingers are carried outwards [m]: a taut cloth flies inwards when its first corner is
+#: released.
 APART: float = 0.01
-#: So far at most the fingers go beyond the other corner [m]: the one that is tucked under them may unfold when it is
+#: Maximum distance of the fingers beyond the other corner [m]: a corner tucked under them may unfold when it is
 #: released.
 BEYOND: float = 0.01
-#: How far the trigger stays pulled when the corner is released: the fingers slide off the wrinkle upwards. Fingers that
-#: open wide sweep the cloth along.
+#: Trigger after the release of the corner: the fingers slide off the wrinkle upwards. Wide open fingers would sweep the
+#: cloth along.
 TRIGGER_AFTER: float = 0.75
 CLEAR_ABOVE: float = 0.10
 CAREFUL_SPEED: float = 0.12
 CARRY_SPEED: float = 0.22
-#: Corners that lie nearer to each other than this are folded onto each other [m]; when they are laid down they must lie
-#: nearer, because a cloth settles for a while.
+#: Corners closer to each other than this are folded [m]; when laid down they must be closer, because a cloth settles
+#: for a while.
 FOLDED: float = 0.049
 LAID: float = 0.044
-#: Distance of the finger pads below which a gripper is shut on cloth [m].
+#: Distance of the finger pads below which a gripper is closed on cloth [m].
 SHUT: float = 0.02
-#: A corner that stays so far above the table hangs on a finger [m]; so often it is laid down again.
+#: Height above the table at which a corner hangs on a finger [m], and number of times that it is laid down again.
 HANGING: float = 0.03
 SHAKES: int = 3
-#: A hand that is so far above the table is back where it began [m]; the cloth is looked at once more after this [s].
+#: Height above the table at which a hand is back at its start [m], and time after which the cloth is checked again [s].
 HOME_ABOVE: float = 0.22
 SETTLED_S: float = 1.5
-#: How long a partner is waited for [s]; and before the corners are released, which succeeds alone, too.
+#: Time to wait for a partner [s], and time to wait before the release, which also succeeds alone [s].
 PATIENCE_S: float = 60.0
 TOGETHER_S: float = 6.0
 
@@ -56,7 +57,7 @@ TOGETHER_S: float = 6.0
 class Folder(DeformableTask):
     """Folds `cloth` with `robot`, together with the operator of `partner`."""
 
-    most_attempts = 6  # corners that were laid down apart are soon brought together
+    most_attempts = 6  # later attempts are short: corners that lie apart are only brought together
 
     def __init__(
         self, robot: str, cloth: str, partner: str, device: str = Device.CONTROLLER_RIGHT, arm: ArmKind = ARM
@@ -64,13 +65,13 @@ class Folder(DeformableTask):
         super().__init__(robot, device, DeformablePerception(cloth, (robot, partner), arm=arm), arm)
         self.cloth, self.partner = cloth, partner
         self._slipped = f"the {cloth} slipped out of the gripper of {robot}"
-        self._mine = self._onto = self._other = -1  # vertices: to take, to bring it to, and the one the partner takes
+        self._mine = self._onto = self._other = -1  # vertices: own corner, its target, and the partner's corner
         self._pinch: Vec3 = (0.0, 0.0, 0.0)
         self._goal: Vec3 = (0.0, 0.0, 0.0)
         self._outward: Vec3 = (0.0, 0.0, 0.0)  # from the partner's corner to mine
-        self._ahead: Vec3 = (0.0, 0.0, 0.0)  # from my corner to where it goes
+        self._ahead: Vec3 = (0.0, 0.0, 0.0)  # from my corner to its target
         self._shakes = 0
-        self._since_s = 0.0  # since when both hands are back; session time
+        self._since_s = 0.0  # session time since which both hands are back
         self._mending = False  # the corners were laid down apart and are brought together
         self._alone = False  # the partner does not take part any more
         self._diagonal = 0.0  # yaw from my corner to the middle [rad]
@@ -102,7 +103,7 @@ class Folder(DeformableTask):
         self._enter("look")
 
     def _choose_pinch(self) -> None:
-        """Waits until the cloth lies still; chooses the corners on the own side."""
+        """Wait until the cloth lies still, and choose the corners on the own side."""
         if self.perception.corners_still_s < 0.3:
             return
         if self._mine < 0:
@@ -116,7 +117,7 @@ class Folder(DeformableTask):
         self._enter("approach")
 
     def _choose_corners(self) -> None:
-        """The corners on the own side, and the directions of the fold, while the cloth lies flat."""
+        """Choose the corners on the own side, and the directions of the fold, while the cloth lies flat."""
         corners, base = self.perception.corners, self.perception.get_base(self.robot)[0]
         near = sorted(corners, key=lambda index: distance(corners[index], base))[:2]
         self._mine, self._onto = sorted(near, key=lambda index: corners[index][1])
@@ -134,7 +135,7 @@ class Folder(DeformableTask):
             self._retry(f"{self.robot} cannot reach the corner of the {self.cloth}")
 
     def _descend(self) -> None:
-        """To a finger's breadth above the cloth."""
+        """Move down to a finger's breadth above the cloth."""
         if self._entering_now:
             self.hand.move_to(self._compute_tip(self._pinch, PRESS + 0.014), CAREFUL_SPEED)
         if self.hand.has_arrived(0.0025, 0.03) or (self._has_lasted(4.0) and self.hand.has_arrived(0.005, 0.06)):
@@ -143,7 +144,7 @@ class Folder(DeformableTask):
             self._retry(f"{self.robot} cannot reach down to the {self.cloth}")
 
     def _press(self) -> None:
-        """Down onto the cloth by what is still missing in height; the table stops the fingers."""
+        """Move down onto the cloth by the remaining height; the table stops the fingers."""
         if self._entering_now:
             (x, y, z), q = self.perception.get_tip(self.robot)
             self.hand.move_to(
@@ -155,7 +156,7 @@ class Folder(DeformableTask):
             self._enter("pinch")
 
     def _pinching(self) -> None:
-        """The closing fingers push a wrinkle up between them."""
+        """Close the fingers, which push a wrinkle up between them."""
         if self._entering_now:
             self.hand.hold_still()
             self.hand.trigger_goal = 1.0
@@ -170,7 +171,7 @@ class Folder(DeformableTask):
             self._fail(f"{self.partner} did not take the other corner within {PATIENCE_S:.0f} s")
 
     def _lift(self) -> None:
-        """Both at once: a corner that goes up alone drags the other from under the fingers that press on it."""
+        """Lift both corners at once: one alone would drag the other from under the fingers that press on it."""
         if self._entering_now:
             (x, y, _), q = self.perception.get_tip(self.robot)
             self.hand.move_to(((x, y, self._compute_table_height() + PRESS + 0.08), q), CAREFUL_SPEED, correct=False)
@@ -194,7 +195,7 @@ class Folder(DeformableTask):
             self._fail(f"{self.partner} did not lift the other corner within {PATIENCE_S:.0f} s")
 
     def _carry_over(self) -> None:
-        """Up to above the fold."""
+        """Move up to above the fold."""
         if self._entering_now:
             self.hand.move_to(self._compute_tip(_compute_middle(self._pinch, self._goal), 0.17), CARRY_SPEED)
         self._finish_carry("across", 0.02)
@@ -205,12 +206,12 @@ class Folder(DeformableTask):
         self._finish_carry("sight", 0.02)
 
     def _sight(self) -> None:
-        """Waits for a picture of the cloth that is younger than the movement."""
+        """Wait for vertices of the cloth that are newer than the movement."""
         if self._is_shown_for(0.2):
             self._finish_carry("aim", math.inf)
 
     def _aim(self) -> None:
-        """By sight: the corner itself over the other, which may have moved meanwhile."""
+        """Move by sight the corner itself over the other one, which may have moved meanwhile."""
         if self._entering_now:
             tip = self.perception.get_tip(self.robot)[0]
             mine, onto = self.perception.get_corner(self._mine), self.perception.get_corner(self._onto)
@@ -221,7 +222,9 @@ class Folder(DeformableTask):
         self._finish_carry("lower", 0.006)
 
     def _limit_goal(self, onto: Vec3) -> Vec3:
-        """The goal, a little outwards because the corner falls back, but so that the cloth is not drawn taut."""
+        """Return the goal, a little outwards because the corner falls back, but not so far that the cloth becomes
+        taut.
+        """
         (x, y, _), (ox, oy, _), (fx, fy, _) = self._goal, self._outward, self._ahead
         x, y = x + FALLS_BACK * ox, y + FALLS_BACK * oy
         apart = min(0.0, APART - (x - self._pinch[0]) * ox - (y - self._pinch[1]) * oy)
@@ -289,7 +292,7 @@ class Folder(DeformableTask):
         self._enter("watch")
 
     def _watch(self) -> None:
-        """Until the partner is back too: the partner may still move the own corner."""
+        """Wait until the partner is back too: the partner may still move the own corner."""
         busy = self.perception.get_tip(self.partner)[0][2] < self._compute_table_height() + HOME_ABOVE
         if self._entering_now or busy:
             self._since_s = self.perception.now_s
@@ -298,7 +301,7 @@ class Folder(DeformableTask):
             self._finish()
 
     def _shake(self) -> None:
-        """Down to where it belongs, and the fingers moved, so that it slips off."""
+        """Move down to the target and move the fingers, so that the corner slips off."""
         if self._entering_now:
             self.hand.trigger_goal = 0.0 if self._shakes % 2 else TRIGGER_AFTER
             self.hand.move_to(self._compute_tip(self._goal, RELEASE), CAREFUL_SPEED)
@@ -315,7 +318,7 @@ class Folder(DeformableTask):
     # --- geometry as seen ---------------------------------------------------------------------------------------------
 
     def _compute_table_height(self) -> float:
-        """Height of the table [m], world frame."""
+        """Return the height of the table [m], world frame."""
         return self.perception.get_base(self.robot)[0][2] - self.arm.above_table
 
     def _is_holding(self) -> bool:
@@ -327,7 +330,9 @@ class Folder(DeformableTask):
         )
 
     def _compute_tip(self, place: Vec3, height: float) -> PoseTuple:
-        """Fingers down, closing across the diagonal of the corner; `height` above the table. Turns the wrist least."""
+        """Return a tip pose `height` above the table, fingers down, closing across the diagonal, with the least
+        wrist turn.
+        """
         home = (self._home or self.perception.get_tip(self.robot))[1]
         turns = [quat_mul(quat_from_yaw(self._diagonal + half), DOWN) for half in (0.0, math.pi)]
         q = min(turns, key=lambda turn: quat_angle(turn, home))
@@ -335,7 +340,7 @@ class Folder(DeformableTask):
 
 
 def _compute_direction(a: Vec3, b: Vec3) -> Vec3:
-    """Horizontal unit vector from `a` to `b`."""
+    """Return the horizontal unit vector from `a` to `b`."""
     dx, dy = b[0] - a[0], b[1] - a[1]
     apart = max(math.hypot(dx, dy), 1e-6)
     return (dx / apart, dy / apart, 0.0)

@@ -21,14 +21,14 @@ from iris_session.emulator.behaviours.perception import Perception
 from iris_session.emulator.behaviours.phases import PhasedTask
 from iris_session.protocol.names import Device
 
-#: How far above a grasp the hand first goes, and how far it backs off afterwards [m].
+#: Distance above a grasp at which the approach begins, and distance of the retreat afterwards [m].
 CLEAR_ABOVE = 0.11
 #: Speed of the last centimetres before a grasp [m/s].
 CAREFUL_SPEED = 0.16
 
 
 class HandoverTask(PhasedTask):
-    """Takes a thing, and has a partner. A subclass adds its phases to `self._steps`, and says where to take it."""
+    """Base of both tasks: it grasps an object, and has a partner. A subclass adds its phases to `self._steps`."""
 
     def __init__(self, robot: str, object: str, partner: str, device: str, arm: ArmKind = ARM) -> None:
         self.perception = Perception(
@@ -47,14 +47,14 @@ class HandoverTask(PhasedTask):
             "step_back": self._step_back,
         }
         self._clutched_again = 0
-        self._take_x = 0.0  # where along the thing it is taken [m]
+        self._take_x = 0.0  # position of the grasp along the object [m]
         self._after_close = ""
 
     # --- phases that both know ----------------------------------------------------------------------------------------
 
     @abstractmethod
     def _first_phase(self) -> str:
-        """The phase in which taking the thing begins, and begins again after a failed attempt."""
+        """Return the phase in which grasping the object begins, also after a failed attempt."""
 
     def _wait(self) -> None:
         self._home = self.perception.get_tip(self.robot)
@@ -101,14 +101,14 @@ class HandoverTask(PhasedTask):
             self._enter("step_back")
 
     def _step_back(self) -> None:
-        """Back to where the hand began: nothing leans on the arm there, and both operators can see the object."""
+        """Move back to where the hand began: there nothing leans on the arm, and both operators can see the object."""
         if self._entering_now and self._home is not None:
             self.hand.move_to(self._home)
         if self.hand.has_arrived(0.02, 0.1) or self._has_lasted(4.0):
             self._enter(self._first_phase())
 
     def _open_gripper(self, then: str) -> None:
-        """Opens, goes on with `then`. A gripper that does not follow: the engagement was lost, clutch again."""
+        """Open the gripper and continue with `then`. If it does not follow, the engagement was lost: clutch again."""
         if self._entering_now:
             self._clutched_again = 0
         self.hand.hold_still()
@@ -127,7 +127,7 @@ class HandoverTask(PhasedTask):
     # --- geometry as seen ---------------------------------------------------------------------------------------------
 
     def _compute_grasp(self) -> PoseTuple:
-        """Tip pose that takes the thing where it is seen now, and turns the wrist least."""
+        """Return the tip pose that grasps the object where it is displayed, with the least turn of the wrist."""
         T_world_thing = self.perception.get_body(self.object)
         return min(
             compute_grasps(T_world_thing, self._take_x, self.arm.lean),
@@ -147,7 +147,7 @@ class HandoverTask(PhasedTask):
         return distance(taken_at, self.perception.get_tip(self.robot)[0]) > 0.05
 
     def _compute_tip(self, T_world_thing: PoseTuple) -> PoseTuple:
-        """Tip pose that brings the thing, as it now lies in the gripper, to `T_world_thing`."""
+        """Return the tip pose that brings the object, as it lies in the gripper, to `T_world_thing`."""
         T_tip_thing = compose(inverse(self.perception.get_tip(self.robot)), self.perception.get_body(self.object))
         return compose(T_world_thing, inverse(T_tip_thing))
 
@@ -162,20 +162,20 @@ class HandoverTask(PhasedTask):
         return (*place, (az + bz) / 2.0 + self.arm.exchange_height), ((bx - ax) / apart, (by - ay) / apart, 0.0)
 
     def _compute_table_height(self) -> float:
-        """Height of the table [m], world frame."""
+        """Return the height of the table [m], world frame."""
         return self.perception.get_base(self.robot)[0][2] - self.arm.above_table
 
 
-#: The other must be seen to hold the thing for so long [s] before the giver opens.
+#: Time for which the partner must be seen to hold the object before the giver opens [s].
 SURE_S = 0.35
-#: A thing that lies more askew than this is left alone [rad].
+#: Maximum tilt of an object that is picked up [rad].
 MOST_TILT = 0.3
 
 
 class Giver(HandoverTask):
     """Grasps `object` near its heavy end with `robot` and hands it to the operator of `partner`.
 
-    `patience_s`: how long the thing is offered before the giver gives up.
+    `patience_s`: time for which the object is offered before the giver fails [s].
     """
 
     def __init__(
@@ -204,7 +204,7 @@ class Giver(HandoverTask):
         return "look"
 
     def _choose_grasp(self) -> None:
-        """Waits until the thing lies still, and chooses the end to take: the one that turns the wrist least."""
+        """Wait until the object lies still, and choose the end to grasp: the one that turns the wrist least."""
         if self.perception.get_still_s(self.object) < 0.3:
             return
         if compute_tilt(self.perception.get_body(self.object)) > MOST_TILT:
@@ -241,13 +241,15 @@ class Giver(HandoverTask):
             self._enter("offer")
 
     def _compute_offer_pose(self) -> PoseTuple:
-        """Pose of the thing when it is offered: its free end towards the partner."""
+        """Return the pose of the object when it is offered: its free end towards the partner."""
         place, (dx, dy, _) = self._compute_exchange()
         towards = math.atan2(dy, dx) if self._take_x < 0.0 else math.atan2(-dy, -dx)
         return make_level_pose(place, towards, get_face_up(self.perception.get_body(self.object)))
 
     def _compute_turn(self, T_world_tip: PoseTuple, T_world_thing: PoseTuple) -> float:
-        """The same way has to do for offering it, and the turn between the two is work as well."""
+        """Return the turn of the wrist for a grasp. The same grasp must do for the offer, so the turn between the
+        two counts too.
+        """
         offered = self._compute_offer_pose()
         offering = compose(offered, compose(inverse(T_world_thing), T_world_tip))
         farthest = max(
@@ -283,17 +285,17 @@ class Giver(HandoverTask):
             self._enter("return")
 
 
-#: A thing nearer to the place of exchange than this is offered [m].
+#: An object closer to the place of exchange than this is offered [m].
 OFFERED_M = 0.10
-#: A giver whose tip is farther than this from where it held the thing has left [m].
+#: A giver whose tip is further than this from where it held the object has left [m].
 LEFT_M = 0.08
 
 
 class Receiver(HandoverTask):
     """Takes `object` with `robot` from the operator of `partner` and lays it on the table.
 
-    `place`: where (x, y [m] in the world); default: in front of the robot, on its freer side. `patience_s`: how long it
-    waits for an offer before it gives up.
+    `place`: position (x, y [m], world); default: in front of the robot, on its freer side. `patience_s`: time to wait
+    for an offer before it fails [s].
     """
 
     def __init__(
@@ -341,7 +343,7 @@ class Receiver(HandoverTask):
             self._fail(f"{self.partner} did not offer the {self.object} within {self._patience_s:.0f} s")
 
     def _raise_hand(self) -> None:
-        """Straight up to where the thing will be approached from: on a slant, the fingers could push it away."""
+        """Move straight up to the start of the approach: on a slant, the fingers could push the object away."""
         if self._entering_now:
             (x, y, z), q = self.perception.get_tip(self.robot)
             height = self._compute_grasp()[0][2] + CLEAR_ABOVE
@@ -359,7 +361,7 @@ class Receiver(HandoverTask):
         return max((x, -x), key=lambda end: distance(apply(thing, (end, 0.0, 0.0)), giver))
 
     def _secure(self) -> None:
-        """Keeps hold until the giver has opened and left. Both robots hold the thing: no corrections."""
+        """Keep hold until the giver has opened and left. Both robots hold the object, so there are no corrections."""
         if self._entering_now:
             self.hand.hold_still()
         given_at = apply(self.perception.get_body(self.object), (-self._take_x, 0.0, 0.0))
@@ -387,7 +389,7 @@ class Receiver(HandoverTask):
             self._enter("lower")
 
     def _lower(self) -> None:
-        """Down to a finger's breadth above the table, level again as the thing now hangs in the gripper."""
+        """Move down to a finger's breadth above the table, levelled for how the object now hangs in the gripper."""
         if self._entering_now and self._laid is not None:
             self.hand.move_to(self._compute_tip(raise_pose(self._laid, 0.015)), CAREFUL_SPEED)
         if self._has_lost_object():
@@ -396,7 +398,7 @@ class Receiver(HandoverTask):
             self._enter("put")
 
     def _touch_down(self) -> None:
-        """The last centimetre, by the height that is seen below the lowest point."""
+        """Move down the last centimetre, by the displayed height of the lowest point."""
         if self._entering_now:
             below = (
                 self.object_model.compute_lowest(self.perception.get_body(self.object)) - self._compute_table_height()
@@ -422,7 +424,7 @@ class Receiver(HandoverTask):
             self._enter("return")
 
     def _find_free_place(self) -> tuple[float, float]:
-        """A place in front of the robot, on the side of the shared table that is farther from other things."""
+        """Return a place in front of the robot, on the side of the shared table that is further from other objects."""
         base, q = self.perception.get_base(self.robot)
         dx, dy, _ = quat_rotate(q, (self.arm.reach, 0.0, 0.0))
         aside = 0.2 / self.arm.reach

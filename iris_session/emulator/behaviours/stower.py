@@ -1,4 +1,4 @@
-"""Stows a soft body: takes it from the table, lifts it clear, lays it into an open box and releases it."""
+"""Stow a soft body: pick it up from the table, lift it clear, lay it into an open box and release it."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from iris_session.protocol.names import Device
 
 #: The body of the box; its origin is in the middle of the inner floor.
 BOX: str = "box"
-#: Inside of the box: half length and half width [m], and how deep it is.
+#: Inside of the box: half length and half width, and depth [m].
 BOX_INSIDE: Vec3 = (0.240, 0.095, 0.070)
-#: So far its lowest corner is lifted above the table [m]: over the walls of the box, and more than 10 cm.
+#: Height of its lowest corner above the table when lifted [m]: above the walls of the box, and more than 10 cm.
 LIFTED: float = 0.12
-#: The body is released so far above the floor of the box [m].
+#: Height above the floor of the box at which the body is released [m].
 DROP: float = 0.006
-#: A body that is squeezed is narrower than this between the pads [m], one that is not there lets them close.
+#: Gap between the pads that hold the body [m]: squeezed, it is narrower than the first; without it they close below the
+#: second.
 SQUEEZED: float = 0.050
 EMPTY: float = 0.012
 
@@ -59,7 +60,7 @@ class Stower(DeformableTask):
         self._enter("look")
 
     def _choose_grip(self) -> None:
-        """Waits until it lies still."""
+        """Wait until the body lies still, and choose the grip."""
         if self.perception.corners_still_s >= 0.3:
             self._grip = (self.perception.middle, self._compute_grip_turn(self.perception.corners))
             self._enter("approach")
@@ -102,7 +103,7 @@ class Stower(DeformableTask):
         self._finish_carry("lower", 0.006)
 
     def _lower(self) -> None:
-        """Until its lowest corner is just above the floor of the box."""
+        """Lower the body until its lowest corner is just above the floor of the box."""
         if self._entering_now:
             lowest = min(corner[2] for corner in self.perception.corners.values())
             down = lowest - self.perception.get_body(BOX)[0][2] - DROP
@@ -147,7 +148,9 @@ class Stower(DeformableTask):
     # --- geometry as seen ---------------------------------------------------------------------------------------------
 
     def _compute_grip_turn(self, corners: dict[int, Vec3]) -> tuple[float, float, float, float]:
-        """Turn of a tip that takes it from above across its length, and turns the wrist least."""
+        """Return the rotation of a tip that grasps the body from above across its length, with the least turn of the
+        wrist.
+        """
         order = CORNERS[self.soft]
         (ax, ay, _), (bx, by, _) = (compute_mean(corners[i] for i in end) for end in (order[:4], order[4:]))
         yaw = math.atan2(by - ay, bx - ax)

@@ -31,7 +31,7 @@ class Wander:
         self._goals_left = 3
 
     def update(self, view: OperatorView) -> tuple[HandInput, ...]:
-        """One hand input; see `Behaviour.update`."""
+        """Return one hand input; see `Behaviour.update`."""
         seen, now_s = view.tip_pose(self._robot), view.session_time_ns * 1e-9
         if seen is not None and self._tip is None:
             self._tip = TrackedPose(seen, now_s)
@@ -70,5 +70,5 @@ class Idle:
         self._robot, self._device = robot, device
 
     def update(self, view: OperatorView) -> tuple[HandInput, ...]:
-        """The hand where it is, clutch open."""
+        """Return the hand in its present pose, clutch open."""
         return (HandInput(self._device, self._robot, view.device_pose(self._device), False, 0.0),)
