@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import signal
 import sys
@@ -24,7 +25,7 @@ from iris_session.cli import (
     verify,
 )
 from iris_session.cli.common import CommandError, join_negative_poses, list_expected_errors
-from iris_session.system.log import configure_logging
+from iris_session.system.log import LEVEL_VARIABLE, configure_logging
 
 _EPILOG = """examples:
   iris-session demo handover                 two emulated operators hand over a hammer
@@ -61,6 +62,10 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Run one command. Return the exit status."""
     configure_logging()
+    if LEVEL_VARIABLE not in os.environ:
+        # `serve` and `demo` show restarts, gaps and overruns as events. The log would repeat them, from the thread that
+        # takes steps, which must not wait for a terminal.
+        logging.getLogger("iris_session.session").setLevel(logging.ERROR)
     arguments = build_parser().parse_args(join_negative_poses(sys.argv[1:] if argv is None else argv))
     os.environ.setdefault("MUJOCO_GL", "disable")  # no command draws: MuJoCo need not load OpenGL, in no process
     from iris_session.physics import AmbiguousModelError

@@ -517,11 +517,12 @@ class Client:
             message: The message.
 
         Returns:
-            False: a sample was dropped, and counted, for want of a connection.
+            False: the message was dropped, and counted: the send queue is full, or it is a sample and there is no
+            connection. An e-stop is never dropped; False means that it waits for a connection.
 
         Raises:
             InvalidMessageError: A value does not fit the protocol.
-            NotConnectedError: There is no connection, and the message is not a sample.
+            NotConnectedError: There is no connection, and the message is neither sample nor e-stop.
         """
         with self._lock:
             if not isinstance(message, EStop):  # that one leaves as long as there is a socket

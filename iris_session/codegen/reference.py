@@ -7,10 +7,22 @@ from __future__ import annotations
 
 import inspect
 import re
+from importlib import import_module
 from typing import Any, Final
 
 import iris_session
 
+#: Classes that are reached through a public one, and stand behind it in the reference.
+REACHED: Final = {
+    "Session": ("iris_session.session.status.SessionStatus",),
+    "Client": (
+        "iris_session.client.scene.ClientScene",
+        "iris_session.client.media.ClientMedia",
+        "iris_session.client.media.MediaFeed",
+        "iris_session.client.assets.ClientAssets",
+        "iris_session.client.assets.AssetFetch",
+    ),
+}
 #: Title of each section and the first public name in it, in the order of `__all__`.
 SECTIONS: Final = (
     ("Sessions", "Session"),
@@ -35,6 +47,9 @@ def render_reference() -> str:
         if name in starts:
             lines += [f"## {starts[name]}", ""]
         lines += _render_name(name, getattr(iris_session, name))
+        for path in REACHED.get(name, ()):
+            module, _, reached = path.rpartition(".")
+            lines += _render_name(reached, getattr(import_module(module), reached))
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -75,19 +90,35 @@ def _render_signature(function: Any) -> str:
     except (TypeError, ValueError):
         return "()"
     parameters = [p for p in signature.parameters.values() if p.name not in ("self", "cls")]
-    text = str(signature.replace(parameters=parameters))
-    return re.sub(r"'([^']*)'", r"\1", text)
+    plain = [p.replace(annotation=_Plain(p.annotation)) if p.annotation is not p.empty else p for p in parameters]
+    returned = signature.return_annotation
+    signature = signature.replace(
+        parameters=plain, return_annotation=returned if returned is signature.empty else _Plain(returned)
+    )
+    return str(signature)
+
+
+class _Plain:
+    """An annotation that is shown without quotes."""
+
+    def __init__(self, annotation: Any) -> None:
+        self._text = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
+
+    def __repr__(self) -> str:
+        return self._text
 
 
 def _render_docstring(value: Any) -> list[str]:
     """Return the docstring with its sections as lists."""
     lines: list[str] = []
-    in_section = False
+    in_section = is_prose = False
     for line in (inspect.getdoc(value) or "").splitlines():
         heading = _HEADING.match(line)
         if heading:
-            in_section = True
+            in_section, is_prose = True, heading[1] in ("Returns", "Yields")
             lines += [f"*{heading[1]}*", ""]
+        elif in_section and is_prose and line.startswith("    "):
+            lines.append(line.strip())
         elif in_section and re.match(r"^ {4}\S", line):
             lines.append(f"- {line.strip()}")
         elif in_section and line.startswith("     "):

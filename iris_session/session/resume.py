@@ -63,7 +63,7 @@ from iris_session.security.resume_tokens import encode_handback
 from iris_session.session.config import SessionConfig, check_arguments, check_objects, check_robots
 from iris_session.session.core import CoreConfig, CoreState, SessionCore
 from iris_session.session.errors import ConfigError, ResumeError
-from iris_session.system.files import Replacement
+from iris_session.system.files import Replacement, sync_folder
 
 NOTE_FILE: Final = "resume.tokens"
 #: Changes of the note within this time are written together.
@@ -498,7 +498,8 @@ class ResumeNoteWriter:
                     if self._is_closed:
                         replacement.discard()
                     else:
-                        replacement.commit()
+                        replacement.commit(sync_folder_too=False)
+            sync_folder(self._path.parent)
         except OSError as error:
             if not self._warned:
                 text = "%s cannot be written (%s): clients cannot resume after a restart of the session"

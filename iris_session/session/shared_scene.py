@@ -87,7 +87,10 @@ class SharedScenes:
         self._store: AssetStore | None = None
         if where is not False:
             try:
-                self._store = AssetStore(None if where is True else where)
+                store = AssetStore(None if where is True else where)
+                store.root.mkdir(parents=True, exist_ok=True)
+                store.trim()  # a scan of the folder takes a while, and is not to happen in a running session
+                self._store = store
             except OSError as error:
                 self._add_note(f"{NO_SPECIFICATION}: {error.filename or where}: {error.strerror or error}")
 

@@ -57,7 +57,8 @@ class SessionStatus(msgspec.Struct, frozen=True):
         sim_time: Time of the simulation or of the published world [s].
         paused: Physics is paused by a director or the owner.
         estop: The e-stop is latched.
-        participants: One row each, as in a `StatusReport`, without what only the front knows.
+        participants: One row each, as in a `StatusReport`; fields that only the front knows have their defaults.
+            `alignment_error_m` [m, 95 %] means something only where `alignment` is `measured`.
         handovers: All handovers since the session began.
         lateness: Of the ticks of `run()`: `ticks`, `late`, `late_share`, `p50_ms`, `p99_ms`, `max_ms`. Empty in a loop
             of the owner's.

@@ -45,6 +45,8 @@ MAX_HOST_ENTRIES: Final = 256
 RESERVED_HOST_ENTRIES: Final = 64
 #: Pending scenes and patches; a step loads one.
 MAX_PENDING_SCENES: Final = 64
+#: Lost rows are logged at most this often; each loss is an event too.
+GAP_LOG_PERIOD_NS: Final = 10_000_000_000
 
 _log = logging.getLogger(__name__)
 
@@ -175,6 +177,7 @@ class Stepper:
         self._keyframe_period_ns = keyframe_period_ns
         self._next_state_ns = 0
         self._next_keyframe_ns = 0
+        self._lost_rows = self._next_gap_log_ns = 0
         self._chain = chain
         self.ledger = SessionLedger()
         self.lateness_ns = 0
@@ -357,7 +360,10 @@ class Stepper:
         recorder.add_row(row)
         lost = recorder.take_gap()
         if lost:
-            _log.warning("gap in the recording: %d rows are lost", lost)
+            self._lost_rows += lost
+            if now_ns >= self._next_gap_log_ns:
+                _log.warning("gap in the recording: %d rows are lost", self._lost_rows)
+                self._lost_rows, self._next_gap_log_ns = 0, now_ns + GAP_LOG_PERIOD_NS
             self.post_own(RecordingGap(lost))
         if recorder.wants_keyframe or now_ns >= self._next_keyframe_ns:
             self._record_keyframe(now_ns)

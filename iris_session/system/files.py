@@ -48,8 +48,12 @@ class Replacement:
                 os.fsync(self.file.fileno())
             self.file.close()
 
-    def commit(self) -> None:
-        """Replace the file with what was written."""
+    def commit(self, *, sync_folder_too: bool = True) -> None:
+        """Replace the file with what was written.
+
+        Args:
+            sync_folder_too: Of a durable file: wait until the folder is on the disk. Else call `sync_folder` later.
+        """
         try:
             self.finish()
             os.replace(self._temporary, self.path)
@@ -57,7 +61,7 @@ class Replacement:
         except BaseException:
             self.discard()
             raise
-        if self._durable:
+        if self._durable and sync_folder_too:
             sync_folder(self.path.parent)
 
     def discard(self) -> None:

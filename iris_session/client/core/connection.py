@@ -225,7 +225,8 @@ class ClientConnection:
             message: A message that expects no reply.
 
         Returns:
-            False: a sample was dropped, or an e-stop has no connection yet.
+            False: the message was dropped and counted (the send queue is full, or a sample has no connection), or it is
+            an e-stop that has no connection yet.
 
         Raises:
             InvalidMessageError: A value does not fit the protocol, connected or not.
