@@ -149,7 +149,7 @@ def test_a_file_is_shown_to_everybody_as_it_is(tmp_path: Path, serve: Callable[.
         assert visual.geometry.kind == "mesh"
         assert ann.scene.state is not None
         assert ann.scene.state.poses.shape == (0, 7), "nothing moves"
-        assert "nobody drives" in server.output
+        assert "without robots" in server.output
         assert server.finish()["ok"]
     finally:
         stage.close()

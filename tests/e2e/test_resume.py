@@ -174,8 +174,8 @@ def test_what_cannot_be_resumed_is_one_line(stage: Stage) -> None:
     cases: tuple[tuple[list[str], str], ...] = (
         (["--resume", str(folder)], "still runs"),
         (["--resume", str(folder / "nothing.rrd")], "there is no recording"),
-        (["--resume", str(folder), "--mode", "takeover"], "--mode cannot be given with --resume"),
-        ([], "which scene"),
+        (["--resume", str(folder), "--mode", "takeover"], "--mode cannot be combined with --resume"),
+        ([], "no scene is given"),
     )
     for arguments, expected in cases:
         done = iris("serve", *arguments, cwd=folder)

@@ -64,7 +64,7 @@ def test_a_client_draws_what_the_session_has(stage: Stage, tmp_path: Path) -> No
     balls = [v.geometry.mesh for v in spec.visuals if v.geometry.kind == "mesh"]
     assert balls == [0, 0], "one mesh, drawn twice"
     level = spec.meshes[0].levels[0]
-    mesh = decode_mesh(ann.assets.cache.read(level.address))
+    mesh = decode_mesh(ann.assets.cache.view(level.address))
     assert np.linalg.norm(mesh.position, axis=1) == pytest.approx(1.0, abs=0.05)
 
     scene = fetch_scene(ann, timeout_s=30.0)
@@ -72,7 +72,7 @@ def test_a_client_draws_what_the_session_has(stage: Stage, tmp_path: Path) -> No
     assert np.array_equal(scene.meshes[0].position, mesh.position)
 
     (cloth,) = spec.deformables
-    arrays = decode_arrays(ann.assets.cache.read(cloth.address), ArrayKind.DEFORMABLE)
+    arrays = decode_arrays(ann.assets.cache.view(cloth.address), ArrayKind.DEFORMABLE)
     shapes = Deformables(ann)
 
     def falls() -> bool:
