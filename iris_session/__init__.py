@@ -16,6 +16,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
+    from iris_session.assets.errors import AssetMissingError, AssetStoreError
     from iris_session.assets.store import AssetStore
     from iris_session.authority.config import AuthorityConfig
     from iris_session.client import (
@@ -99,6 +100,7 @@ _PUBLIC: Final = {
     "iris_session.scene.mujoco_scene": ("parse_mujoco",),
     "iris_session.scene.budget": ("Budget", "QUEST_3"),
     "iris_session.assets.store": ("AssetStore",),
+    "iris_session.assets.errors": ("AssetStoreError", "AssetMissingError"),
     "iris_session.protocol.common": ("Pose",),
     "iris_session.protocol.scene": (
         "Geometry",
@@ -162,6 +164,8 @@ __all__ = [
     "PublishError",
     "parse_mujoco",
     "AssetStore",
+    "AssetStoreError",
+    "AssetMissingError",
     "Pose",
     "Geometry",
     "Visual",
