@@ -62,21 +62,23 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Run one command. Return the exit status."""
     configure_logging()
-    if LEVEL_VARIABLE not in os.environ:
-        # `serve` and `demo` show restarts, gaps and overruns as events. The log would repeat them, from the thread that
-        # takes steps, which must not wait for a terminal.
-        logging.getLogger("iris_session.session").setLevel(logging.ERROR)
     arguments = build_parser().parse_args(join_negative_poses(sys.argv[1:] if argv is None else argv))
     os.environ.setdefault("MUJOCO_GL", "disable")  # no command draws: MuJoCo need not load OpenGL, in no process
     from iris_session.physics import AmbiguousModelError
 
+    session_log = logging.getLogger("iris_session.session")
     try:
+        if LEVEL_VARIABLE not in os.environ:
+            # `serve` and `demo` show restarts, gaps and overruns as events. The log would repeat them, from the thread
+            # that takes steps, which must not wait for a terminal.
+            session_log.setLevel(logging.ERROR)
         status: int = arguments.run(arguments)
+        sys.stdout.flush()  # a closed pipe is noticed here, not when the interpreter ends
     except KeyboardInterrupt:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C must not interrupt the interpreter's shutdown
         return 130
     except BrokenPipeError:  # the reader of the pipe has closed it (`| head`)
-        sys.stderr.close()
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left has nowhere to go
         return 1
     except CommandError as error:
         print(f"iris-session: {error}", file=sys.stderr)
@@ -86,6 +88,8 @@ def main(argv: list[str] | None = None) -> int:
         if isinstance(error, AmbiguousModelError):  # to standard output: `iris-session robots scene.xml > robots.toml`
             print(error.toml)
         return 2
+    finally:
+        session_log.setLevel(logging.NOTSET)
     return status
 
 
