@@ -133,7 +133,7 @@ class AssetStore:
         self.evicted = 0
         self._lock = threading.Lock()  # of the three below
         self._total = 0
-        self._scan_above = -1  # the first write scans the folder
+        self._scan_above = -(1 << 62)  # the first write scans the folder, also after a `discard`
         self._unscanned = 0
         self._is_scanning = False
 
