@@ -60,6 +60,9 @@ _SUBSCRIBE: Final = b"\x01"
 #: have over and over, or frames of a source without permission.
 MAX_COUNTED_MESSAGES: Final = 1024
 
+#: Reason of a connection that could not be closed.
+CLOSE_FAILED: Final = "close_failed"
+
 #: Sources of hellos that have a token bucket of their own.
 MAX_SOURCES: Final = 256
 
@@ -146,7 +149,7 @@ class TcpConnections:
             return ""
         closed = close_tcp(descriptor, connection.address)
         if not closed and peer_of(descriptor) == connection.address:
-            return "close_failed"
+            return CLOSE_FAILED
         del self._table[descriptor]
         return reason if closed else ""
 
@@ -387,7 +390,8 @@ class ChannelGuard:
         connection.counted_messages += counts
         if connection.counted_messages <= MAX_COUNTED_MESSAGES:
             return ""
-        return self.evict(descriptor, f"{self._name}_flood")
+        reason = self.evict(descriptor, f"{self._name}_flood")
+        return "" if reason == CLOSE_FAILED else reason  # it is open still, and tried again with its next message
 
     def tick(self, now_ns: int) -> list[str]:
         """Close flooding, silent and too many connections. Return a drop reason for each."""
