@@ -13,7 +13,7 @@ help:
 	@echo "make test     lint, strict types, every test: the four below"
 	@echo "  make check      lint, format, strict types"
 	@echo "  make test-unit  tests in one process;  make test-unit T=tests/control  those of one room"
-	@echo "  make test-e2e   tests that start real processes;  make test-e2e T=tests/e2e/test_people.py"
+	@echo "  make test-e2e   tests that start real processes;  make test-e2e T=tests/e2e/test_operators.py"
 	@echo "  make coverage   the bounds of coverage, after test-unit"
 	@echo "make test-random  the unit tests with other random examples than the usual ones"
 	@echo "make bench    the benchmarks of docs/benchmarks.md"
@@ -59,29 +59,16 @@ UNIT = $(BIN)/python -m pytest -q -m "not e2e" -n $(JOBS) --dist worksteal --cov
 # A file stays on one worker, because its tests share sessions; the longest begin first (tests/e2e/conftest.py).
 E2E = $(BIN)/python -m pytest -q -m e2e -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
-# Tests with real processes, sockets or threads (`live`, tests/conftest.py) run in real time: a machine that is taken away
-# for a second can fail one. When the run was whole and only such tests failed (status 1), they are named and judged once
-# more, alone; what fails twice fails, and processes left behind (status 7) fail at once.
-# $(1): the run; $(2): its marker; $(3): options of the second.
-LAST = --last-failed --last-failed-no-failures none
-define JUDGED
-$(1) $(T); status=$$?; \
-if [ $$status -eq 1 ] && ! $(BIN)/python -m pytest -q -m "$(2) and not live" $(LAST) --collect-only $(T) > /dev/null; then \
-  echo "FAILED AT FIRST, judged once more, alone:"; \
-  $(BIN)/python -m pytest -v -m "$(2)" $(LAST) $(3) $(T); status=$$?; \
-fi; exit $$status
-endef
-
 test: check
 	$(MAKE) --no-print-directory test-unit
 	$(MAKE) --no-print-directory test-e2e
 	$(MAKE) --no-print-directory coverage
 
 test-unit: install-dev
-	@$(call JUDGED,$(UNIT),not e2e,--cov --cov-append --cov-report=)
+	$(UNIT) $(T)
 
 test-e2e: install-dev
-	@$(call JUDGED,$(E2E),e2e,)
+	$(E2E) $(T)
 
 test-random: install-dev
 	HYPOTHESIS=random $(BIN)/python -m pytest -q -m "not e2e" -n $(JOBS) $(T)
@@ -92,7 +79,7 @@ coverage: install-dev
 
 # Every benchmark runs, whatever the one before says; the status is that of the worst.
 bench: install
-	@status=0; for bench in "state" "state --curve" "input" "slow-client" "alignment" "join" "deformable"; do \
+	@status=0; for bench in "state" "state --curve" "input" "slow-client" "alignment" "join" "deformable" "stop"; do \
 	  $(BIN)/iris-session bench $$bench --check || status=1; \
 	done; exit $$status
 

@@ -185,8 +185,8 @@ def _diagnose(
     order, best = min(fits, key=lambda one: one[1].chi2, default=((), None))
     if best is not None and best.good:
         mixed = [i for i in range(n) if order[i] != i]
-        told = ", ".join(f"'{names[i]}' was touched at '{names[order[i]]}'" for i in mixed)
-        return f"points are mixed up: {told}; touch them again by their names", tuple(names[i] for i in mixed)
+        swaps = ", ".join(f"'{names[i]}' was touched at '{names[order[i]]}'" for i in mixed)
+        return f"points are mixed up: {swaps}; touch them again by their names", tuple(names[i] for i in mixed)
     if n > 3:
         alone = []
         for i in range(n):
@@ -252,9 +252,9 @@ def _diagnose_distances(names: Sequence[str], world: Array, tip: Array, sigma: f
     if len(bad) > 1 and len(shared) == 1:
         return f"point '{names[shared[0]]}' does not fit the others: touch it again", (names[shared[0]],)
     worst = sorted(bad, key=lambda one: -abs(one[2]))[:_MAX_LISTED]
-    told = ", ".join(f"'{names[i]}'-'{names[j]}' by {off * 1e3:+.0f} mm" for i, j, off in worst)
+    pairs = ", ".join(f"'{names[i]}'-'{names[j]}' by {off * 1e3:+.0f} mm" for i, j, off in worst)
     return (
-        f"distances between points are wrong ({told or 'not any: the order is turned round'}): touch all of them again",
+        f"distances between points are wrong ({pairs or 'not any: the order is reversed'}): touch all of them again",
         tuple(names),
     )
 

@@ -1,4 +1,4 @@
-"""A loop of your own that says where a tick begins and ends, so that clients see exactly what `mj_step` made.
+"""Keep your own loop and mark its ticks: clients see exactly the states that `mj_step` computed.
 
 python examples/own_loop.py            then, elsewhere: iris-session emulate --behaviour wander
 """
@@ -21,7 +21,7 @@ def main(seconds: float) -> None:
         print(f"join at {session.address}", flush=True)
         begun = time.monotonic()
         while data.time < seconds:
-            session.begin_tick()  # writes data.ctrl of the robots that somebody drives, or that hold
+            session.begin_tick()  # writes data.ctrl of the robots that participants drive
             mujoco.mj_step(model, data)
             session.end_tick()  # publishes the new state
             time.sleep(max(0.0, begun + data.time - time.monotonic()))

@@ -1,4 +1,4 @@
-"""A policy joins as a participant like any other: it takes a robot, moves its end effector in a circle, and leaves.
+"""Join a policy as a participant: acquire a robot, move its end effector in a circle, leave.
 
 iris-session serve handover            then: python examples/policy.py [HOST:PORT] [SECONDS]
 """
@@ -10,7 +10,7 @@ import sys
 
 from iris_session import Client, ClientError, HoldReason
 
-#: Holds that end only when the clutch was opened and closed again; anything else needs no reaction.
+#: Holds that end only when the clutch is opened and closed again; others need no reaction.
 OPEN_CLUTCH = frozenset(
     {
         HoldReason.REARM,
@@ -24,7 +24,7 @@ OPEN_CLUTCH = frozenset(
 
 
 def may_close(client: Client, robot: str) -> bool:
-    """Whether to close the clutch now: nothing moves again by itself after a disturbance."""
+    """Return whether to close the clutch: after a disturbance it must be opened first."""
     feedback = client.feedback.get(robot)
     return feedback is not None and feedback.hold_reason not in OPEN_CLUTCH
 
@@ -34,7 +34,7 @@ def main(address: str, seconds: float) -> None:
         (lease,) = client.acquire()  # no name: the assignment policy of the session chooses
         robot = lease.target
         if not client.wait_for(lambda c: c.scene.tip_pose(robot) is not None):
-            raise SystemExit("no state came within 5 s")
+            raise SystemExit("no state arrived within 5 s")
         tip = client.scene.tip_pose(robot)
         assert tip is not None
         (x, y, z), q = tip

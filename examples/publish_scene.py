@@ -1,6 +1,6 @@
-"""A world that MuJoCo does not know, shared as it moves: a double pendulum and a cloth in the wind, both in numpy.
+"""Publish a simulation that is not MuJoCo: a double pendulum and a cloth in the wind, both in numpy.
 
-A part from a file stands beside them.
+A part from a file is shown beside them.
 
 python examples/publish_scene.py [SECONDS] [PART.glb]        then join at the address it prints
 """
@@ -50,7 +50,7 @@ class Pendulum:
         return np.concatenate([(va, vb), np.linalg.solve(mass, force)])
 
     def poses(self, pivot: Array) -> list[tuple[Array, Array]]:
-        """T_world_link of both, as position and quaternion (w, x, y, z)."""
+        """Return T_world_link of both, as position and quaternion (w, x, y, z)."""
         found, top = [], pivot
         for angle in self.state[:2]:
             down = np.array([np.sin(angle), 0.0, -np.cos(angle)])

@@ -1,4 +1,4 @@
-"""Reads a recording back: who was there, what happened, how far every body travelled.
+"""Read a recording: participants, events, and the distance that every body travelled.
 
 python examples/read_recording.py sessions/*/session.rrd
 """
@@ -24,7 +24,7 @@ def main(path: str) -> None:
         print(f"people: {', '.join(sorted(people)) or 'none'}")
         kinds = Counter(type(body).__name__ for body in events)
         print("events:", ", ".join(f"{n} {name}" for name, n in sorted(kinds.items())) or "none")
-        # Another scene has other bodies, which is why each state says of which ones its poses are.
+        # Scenes have different bodies, so each state names those of its poses.
         for bodies, states in groupby(recording.states(), key=lambda state: state.bodies):
             poses = np.array([state.poses for state in states])  # (frames, bodies, 7), exact float64
             path_m = np.linalg.norm(np.diff(poses[:, :, :3], axis=0), axis=2).sum(axis=0)

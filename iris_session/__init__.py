@@ -73,6 +73,8 @@ if TYPE_CHECKING:
     )
     from iris_session.session.scene_publisher import ScenePublisher
     from iris_session.session.session import Session
+    from iris_session.session.status import DataFault
+    from iris_session.session.stepper import OwnerRequest
     from iris_session.streams.deformable import DeformableDecoder, DeformableEncoder
     from iris_session.streams.deformable_topology import DeformableTopology
 
@@ -89,6 +91,8 @@ _PUBLIC: Final = {
         "PublishError",
     ),
     "iris_session.session.scene_publisher": ("ScenePublisher",),
+    "iris_session.session.stepper": ("OwnerRequest",),
+    "iris_session.session.status": ("DataFault",),
     "iris_session.authority.config": ("AuthorityConfig",),
     "iris_session.control.config": ("ControlConfig",),
     "iris_session.protocol.specs": ("RobotSpec", "ObjectSpec"),
@@ -152,6 +156,8 @@ __all__ = [
     "StartError",
     "ResumeError",
     "OwnershipError",
+    "OwnerRequest",
+    "DataFault",
     "load_model",
     "load_robots_toml",
     "scene_path",

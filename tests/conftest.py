@@ -1,22 +1,26 @@
-"""Settings of every test: hypothesis draws the same examples every time, and no process may stay behind.
+"""Settings of every test: hypothesis draws the same examples each time, and no process may stay.
 
-`HYPOTHESIS=random` draws others (`make test-random`): they find more, but what blocks a change must repeat. A twentieth
-of the values are constants that hypothesis finds in those of our modules that are loaded: these differ where a process
-has run other tests before. What failed is kept with `@example`.
+`HYPOTHESIS=random` draws others (`make test-random`): they find more, but a check that blocks changes must repeat. A
+twentieth of the values are constants that hypothesis finds in those of our modules that are loaded; these differ where
+a process has run other tests before. Failing examples are kept with `@example`.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import sys
 import uuid
 from collections.abc import Iterator
-from pathlib import Path
 
 import psutil
 import pytest
 from hypothesis import HealthCheck, settings
+
+# A run in the background inherits that Ctrl-C is ignored, and so would every process that a test starts and interrupts.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 #: A busy machine is slow in everything: no deadline, no complaint about slow examples.
 settings.register_profile(
@@ -26,81 +30,48 @@ settings.register_profile("random", settings.get_profile("same"), derandomize=Fa
 settings.load_profile(os.environ.get("HYPOTHESIS", "same"))
 
 #: In the environment of every process that the tests start, also of one whose parent has died.
-MARK = "IRIS_TEST_RUN"
-#: What ends by itself may take this long, on a machine that others keep busy.
+RUN_VARIABLE = "IRIS_TEST_RUN"
+#: Time for processes that end by themselves after the last test, on a busy machine [s].
 ENDING_S = 30.0
-#: Exit status where something was left behind: a second judgement of single tests (status 1) would not see it.
-LEFT_BEHIND = 7
-SAID = "processes were left behind"
-_left_behind: list[str] = []
-
-#: Rooms whose tests have processes, sockets or threads, and so a machine that may be taken away for a second.
-LIVE = {
-    "alignment", "assets", "bench", "cli", "client", "demo", "doctor", "e2e", "emulator", "front", "link", "netsim",
-    "recording", "security", "session", "system", "tools",
-}  # fmt: skip
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks what may be judged a second time (Makefile)."""
-    here = Path(__file__).parent
-    for item in items:
-        if item.path.relative_to(here).parts[0] in LIVE or item.get_closest_marker("e2e"):
-            item.add_marker("live")
-
-
-def pytest_runtest_logreport(report: pytest.TestReport) -> None:
-    """In the process that all workers report to."""
-    if report.when == "teardown" and report.failed and SAID in report.longreprtext:
-        _left_behind.append(report.nodeid)
-
-
-def pytest_sessionfinish(session: pytest.Session) -> None:
-    if _left_behind:
-        session.exitstatus = LEFT_BEHIND
-
-
-def _ours() -> list[psutil.Process]:
-    """Processes that were started by the tests of this one."""
+def _find_test_processes() -> list[psutil.Process]:
+    """Return the running processes that the tests of this process started."""
     found = []
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):
-            marked = process.pid != os.getpid() and process.environ().get(MARK) == os.environ[MARK]
+            marked = process.pid != os.getpid() and process.environ().get(RUN_VARIABLE) == os.environ[RUN_VARIABLE]
             if marked and process.status() != psutil.STATUS_ZOMBIE:
                 found.append(process)
     return found
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _no_process_stays() -> Iterator[None]:
-    """Ends with an error that names what still runs after the last test, and ends it."""
-    os.environ[MARK] = uuid.uuid4().hex
+def _check_processes_end() -> Iterator[None]:
+    """Fail after the last test with the processes that still run, and kill them."""
+    os.environ[RUN_VARIABLE] = uuid.uuid4().hex
     yield
-    _, alive = psutil.wait_procs(_ours(), ENDING_S)
+    _, alive = psutil.wait_procs(_find_test_processes(), ENDING_S)
     left = []
     for process in alive:
         with contextlib.suppress(psutil.Error):
             left.append(f"{process.pid} {' '.join(process.cmdline())}")
             process.kill()
-    assert not left, f"{SAID}: {left}"
+    assert not left, f"processes were left behind: {left}"
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _home_of_keys(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Keys of the tests, and of every process that they start, are not those of whoever runs them."""
-    before = os.environ.get("IRIS_HOME")
-    os.environ["IRIS_HOME"] = str(tmp_path_factory.mktemp("keys") / "home")
-    os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))  # assets of one run, shared by its tests
-    yield
-    if before is None:
-        del os.environ["IRIS_HOME"]
-    else:
-        os.environ["IRIS_HOME"] = before
+def _isolate_keys_and_assets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keep the keys and cached assets of the user from the tests and from the processes that they start."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("IRIS_HOME", str(tmp_path_factory.mktemp("keys") / "home"))
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))  # shared by the tests of one run
+        yield
 
 
 @pytest.fixture
 def untraced() -> Iterator[None]:
-    """Long plays of physics and control, which no bound of coverage needs: the recorder would double their time."""
+    """Disable coverage for long runs of physics and control: it doubles their time, and no bound needs it."""
     tracer = sys.gettrace()
     sys.settrace(None)
     yield

@@ -1,4 +1,4 @@
-"""The models of real robots that some tests need: in the folder `IRIS_DATA`, else beside the checkout."""
+"""Models of real robots that some tests need: in the folder `IRIS_DATA`, else beside the checkout."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ BESIDE = Path(__file__).parents[2] / "shared"
 
 @pytest.fixture
 def robot_models(monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder, which processes that the test starts see too. Its absence is a failure, not a skip."""
+    """The folder of models, visible to child processes too. Its absence is a failure, not a skip."""
     folder = Path(os.environ.get("IRIS_DATA") or BESIDE)
     for name in ("aloha/scene.xml", "kuka_iiwa_14/iiwa14.xml"):
         if not (folder / "models" / name).is_file():

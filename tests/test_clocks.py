@@ -1,6 +1,6 @@
-"""Nothing is decided by the wall clock: it jumps (daylight, NTP, a person). Session time is the monotonic clock's.
+"""No decision depends on the wall clock, which jumps (daylight saving, NTP, users). Session time is monotonic.
 
-The few readings there are stamp something for people, or measure what must outlive a reboot; each is listed here.
+The few readings stamp something for people, or measure what must survive a reboot; each is listed here.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ WALL = {
     *("time.time", "time.time_ns", "time.localtime", "time.gmtime", "time.ctime", "time.strftime"),
     *("datetime.now", "datetime.utcnow", "datetime.today", "date.today"),
 }
-#: Where it may be read, and for what.
+#: Where it may be read, and the reason.
 ALLOWED = {
     "iris_session/security/allow_list.py": "when a key was added or last seen, for people",
     "iris_session/security/join_codes.py": "when a join code ends: shared by processes, outlives a reboot",
-    "iris_session/front/pairing.py": "whether a join code is open, as join_codes.py says",
-    "iris_session/cli/pair.py": "how long a join code is shown, as join_codes.py says",
+    "iris_session/front/pairing.py": "whether a join code is open",
+    "iris_session/cli/pair.py": "how long a join code is shown",
     "iris_session/assets/store.py": "which files were used longest ago, as the file system stamps them",
     "iris_session/session/config.py": "name of a default folder",
     "iris_session/session/processes.py": "when a recording was made, for people",
@@ -30,7 +30,7 @@ ALLOWED = {
 
 
 def readings(path: Path) -> Iterator[int]:
-    """Lines of a module that read the wall clock."""
+    """Yield lines of a module that read the wall clock."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Call) and ".".join(ast.unparse(node.func).split(".")[-2:]) in WALL:
             yield node.lineno
@@ -49,7 +49,7 @@ def test_the_wall_clock_is_read_in_few_places_only() -> None:
 
 
 @pytest.mark.parametrize("text", ["import time\ntime.time()", "import datetime\ndatetime.datetime.now()"])
-def test_a_reading_is_found(tmp_path: Path, text: str) -> None:
+def test_readings_are_detected(tmp_path: Path, text: str) -> None:
     module = tmp_path / "module.py"
     module.write_text(text)
     assert list(readings(module)) == [2]

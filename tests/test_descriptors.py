@@ -1,4 +1,4 @@
-"""A session with many clients has descriptors above 1023, which `select.select` refuses: nothing of ours uses it."""
+"""A session with many clients has descriptors above 1023, which `select.select` rejects: our code never uses it."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ BEYOND = 1024
 
 
 @pytest.fixture
-def crowded() -> Iterator[None]:
-    """No descriptor below 1024 is free."""
+def no_low_descriptors() -> Iterator[None]:
+    """Occupy every descriptor below 1024."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 4 * BEYOND), hard))
     taken = [os.open(os.devnull, os.O_RDONLY)]
@@ -37,7 +37,7 @@ def crowded() -> Iterator[None]:
 
 
 class _Session:
-    """What `TerminalView` asks of a session; its status fills a pipe, so that the display must be waited for."""
+    """The part of a session that `TerminalView` uses; its status fills a pipe, so that writing must wait."""
 
     def recent_events(self) -> list[Event]:
         return [Event(1, 0, 0, MarkerAdded("p1", "hello"))]
@@ -54,7 +54,7 @@ def test_nothing_uses_select() -> None:
     assert users == []
 
 
-@pytest.mark.usefixtures("crowded")
+@pytest.mark.usefixtures("no_low_descriptors")
 def test_orders_are_read() -> None:
     read, write = os.pipe()
     assert read > BEYOND
@@ -65,8 +65,8 @@ def test_orders_are_read() -> None:
 
 
 @pytest.mark.e2e
-@pytest.mark.usefixtures("crowded")
-def test_processes_are_heard(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("no_low_descriptors")
+def test_processes_are_read(tmp_path: Path) -> None:
     recorder = RecorderProcess(tmp_path / "session.rrd", time.monotonic_ns())
     recorder.start()
     assert recorder.alive

@@ -1,5 +1,8 @@
-"""The documents tell the truth where a machine can check it: code runs, commands parse, links and files exist, no
-reason is missing from a table, and the command line reference has every option."""
+"""Documents against the code.
+
+Examples run, commands parse, links and files exist, every reason is explained, and the command line reference has every
+option.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,14 @@ import re
 import shlex
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from iris_session import SceneBuilder, ScenePublisher, Session, SessionConfig
+from iris_session import Client, SceneBuilder, ScenePublisher, Session, SessionConfig
 from iris_session.cli.main import build_parser
 from iris_session.demo.run import DemoResult
 from iris_session.demo.scenes import scene_path
@@ -26,13 +30,15 @@ from iris_session.protocol import names
 from tests.models import BESIDE
 
 ROOT = Path(__file__).parents[1]
-#: `docs/protocol.md` has tests of its own (tests/protocol); its links are checked here too.
+#: `docs/protocol.md` has its own tests (tests/protocol); only its links are checked here.
 PAGES = (ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md")))
 EXAMPLES = tuple(sorted((ROOT / "examples").glob("*.py")))
+#: Those that are a session with a loop of their own.
+LOOPS = ("share_a_script", "own_loop", "publish_scene")
 ADDRESS = "127.0.0.1:7721"
 TIMEOUT_S = 60.0
 
-#: Runs a block: sessions take free ports, and `run()` without an end takes 0.3 s. The text stays as printed.
+#: Changes for running a block: sessions use free ports, and `run()` without an end takes 0.3 s. Printed text stays.
 RUN = """
 from iris_session import Session, SessionConfig
 SessionConfig.__init__.__defaults__ = tuple(
@@ -47,7 +53,7 @@ runpy.run_path("block.py", run_name="__main__")
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block of a page. `line`: of its opening fence."""
+    """A fenced block of a page. `line` is that of its opening fence."""
 
     page: Path
     line: int
@@ -73,14 +79,14 @@ def blocks(page: Path) -> Iterator[Block]:
 
 
 BLOCKS = tuple(block for page in PAGES for block in blocks(page))
-#: A block with an address of a lab needs keys, and is run by `test_keys_of_the_network_page_work`.
+#: A block with a lab address needs keys, and is run by `test_key_files_of_the_network_page_work`.
 LAB_ADDRESS = "192.168.0.10"
 PYTHON = tuple(block for block in BLOCKS if block.language == "python" and LAB_ADDRESS not in block.text)
 SHELL = tuple(block for block in BLOCKS if block.language == "bash")
 
 
 def prose(page: Path) -> str:
-    """The page without its fenced blocks."""
+    """Return the page without its fenced blocks."""
     return re.sub(r"^\s*```.*?^\s*```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
 
 
@@ -89,7 +95,7 @@ def prose(page: Path) -> str:
 
 @contextlib.contextmanager
 def served(folder: Path, *options: str, scene: str = "handover") -> Iterator[str]:
-    """Address of a session of a scene, a process of its own."""
+    """Start a session of a scene in its own process; yield its address."""
     command = [sys.executable, "-m", "iris_session.cli.main", "serve", scene, "--no-record", *options]
     process = subprocess.Popen(
         [*command, "--control-port", "0", "--state-port", "0"],
@@ -124,7 +130,7 @@ def serve_cloth(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 @pytest.fixture
 def run_python(tmp_path: Path) -> Callable[..., str]:
-    """Runs a script in a process of its own in an empty folder; its output."""
+    """Run a script in its own process in an empty folder; return its output."""
 
     def run(script: str, *arguments: str) -> str:
         (tmp_path / "block.py").write_text(script, encoding="utf-8")
@@ -146,15 +152,15 @@ def run_python(tmp_path: Path) -> Callable[..., str]:
 @pytest.mark.e2e
 @pytest.mark.parametrize("block", PYTHON, ids=lambda block: block.name)
 def test_python_block_runs(block: Block, run_python: Callable[..., str], request: pytest.FixtureRequest) -> None:
-    text, bends = block.text, "Deformables(client)" in block.text
+    text, has_deformables = block.text, "Deformables(client)" in block.text
     if ADDRESS in text:
-        text = text.replace(ADDRESS, request.getfixturevalue("serve_cloth" if bends else "serve"))
+        text = text.replace(ADDRESS, request.getfixturevalue("serve_cloth" if has_deformables else "serve"))
     shown = run_python(text)
-    assert not bends or "cloth" in shown, "something that bends was seen"
+    assert not has_deformables or "cloth" in shown, "a deformable was seen"
 
 
 def _network_page(part: str) -> str:
-    """The one Python block of the network page that has `part` in it."""
+    """Return the one Python block of the network page that contains `part`."""
     (text,) = (b.text for b in BLOCKS if b.page.name == "network.md" and b.language == "python" and part in b.text)
     return text
 
@@ -165,7 +171,7 @@ def _network_command(part: str) -> list[str]:
 
 
 def _emulate(words: list[str], folder: Path) -> None:
-    """Runs an `emulate` that the network page shows; its people must see something."""
+    """Run an `emulate` command of the network page; its people must see something."""
     done = subprocess.run(
         [sys.executable, "-m", "iris_session.cli.main", *words, "--behaviour", "observer", "--seconds", "2", "--json"],
         cwd=folder,
@@ -188,7 +194,7 @@ def test_key_files_of_the_network_page_work(tmp_path: Path, run_python: Callable
 
 
 @pytest.mark.e2e
-def test_joining_by_code_as_on_the_network_page_works(tmp_path: Path, run_python: Callable[..., str]) -> None:
+def test_join_code_of_the_network_page_works(tmp_path: Path, run_python: Callable[..., str]) -> None:
     join = _network_page("join_code=")
     (shown,) = re.findall(r'join_code="(.+?)"', join)
     with served(tmp_path, "--curve") as address:
@@ -207,14 +213,36 @@ def test_joining_by_code_as_on_the_network_page_works(tmp_path: Path, run_python
 
 
 @pytest.mark.e2e
-def test_examples_of_user_loops_run(run_python: Callable[..., str]) -> None:
-    for name in ("share_a_script", "own_loop", "publish_scene"):
-        output = run_python((ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8"), "0.3")
-        assert re.search(r"join at 127\.0\.0\.1:[1-9]\d*", output), output
+@pytest.mark.parametrize("name", LOOPS)
+def test_example_of_a_user_loop_is_joined_until_it_ends(name: str, tmp_path: Path) -> None:
+    """By a client that holds a robot where there is one."""
+    (tmp_path / "block.py").write_text((ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8"))
+    output = tmp_path / "output"
+    with output.open("w") as file:
+        command = [sys.executable, "-W", "error", "-c", RUN, "5"]
+        environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+        process = subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=file, stderr=subprocess.STDOUT)
+    try:
+        deadline = time.monotonic() + TIMEOUT_S
+        while (found := re.search(r"join at (127\.0\.0\.1:[1-9]\d*)\n", output.read_text())) is None:
+            assert process.poll() is None, output.read_text()
+            assert time.monotonic() < deadline, output.read_text()
+            time.sleep(0.02)
+        with Client(found[1], role="agent", name="ann") as ann:
+            assert ann.wait_for(lambda c: c.scene.state is not None)
+            if ann.mirror.robots:
+                ann.acquire(["left"])
+            ann.start()
+            assert process.wait(TIMEOUT_S) == 0, output.read_text()
+    finally:
+        process.kill()
+        process.wait()
+    if name == "own_loop":
+        assert "ann (agent) drives left" in output.read_text()
 
 
 @pytest.mark.e2e
-def test_example_of_a_policy_moves_its_robot(serve: str, run_python: Callable[..., str]) -> None:
+def test_policy_example_moves_its_robot(serve: str, run_python: Callable[..., str]) -> None:
     output = run_python((ROOT / "examples" / "policy.py").read_text(encoding="utf-8"), serve, "1.5")
     moved = re.search(r"tip moved (\d+) mm", output)
     assert moved, output
@@ -222,7 +250,7 @@ def test_example_of_a_policy_moves_its_robot(serve: str, run_python: Callable[..
 
 
 @pytest.mark.e2e
-def test_examples_of_recordings_run(tmp_path: Path, run_python: Callable[..., str]) -> None:
+def test_recording_examples_run(tmp_path: Path, run_python: Callable[..., str]) -> None:
     path = tmp_path / "session.rrd"
     config = SessionConfig(control_port=0, state_port=0, record=path)
     with Session(scene_path("handover"), config=config) as session:
@@ -233,7 +261,7 @@ def test_examples_of_recordings_run(tmp_path: Path, run_python: Callable[..., st
 
 
 @pytest.mark.e2e
-def test_example_reads_recordings_of_published_worlds(tmp_path: Path, run_python: Callable[..., str]) -> None:
+def test_recording_example_reads_published_worlds(tmp_path: Path, run_python: Callable[..., str]) -> None:
     path, scene = tmp_path / "session.rrd", SceneBuilder("bench")
     scene.add_box("crate", half_size=(0.1, 0.1, 0.1), movable=True)
     with ScenePublisher(scene, SessionConfig(control_port=0, state_port=0, record=path)) as session:
@@ -246,16 +274,15 @@ def test_example_reads_recordings_of_published_worlds(tmp_path: Path, run_python
     assert re.search(r"crate: [1-9]\d* frames, travelled 1\.00 m", output), output
 
 
-def test_every_example_is_run_here() -> None:
-    loops = {"share_a_script", "own_loop", "publish_scene"}
-    assert {path.stem for path in EXAMPLES} == {*loops, "policy", "read_recording"}
+def test_every_example_is_run() -> None:
+    assert {path.stem for path in EXAMPLES} == {*LOOPS, "policy", "read_recording"}
 
 
 # --- commands ---
 
 
 def commands() -> Iterator[tuple[str, list[str]]]:
-    """Every `iris-session` command that a page shows, as `(where, arguments)`."""
+    """Return every `iris-session` command that a page shows, as `(where, arguments)`."""
     for block in SHELL:
         for line in block.text.replace("\\\n", " ").splitlines():
             words = shlex.split(line, comments=True)
@@ -273,7 +300,7 @@ def test_command_parses(where: str, arguments: tuple[str, ...]) -> None:
     parser = build_parser()
     kind = {"verify": ["FILE"], "serve": ["SCENE"], "robots": ["SCENE"], "demo": ["handover"]}
     bare = len(arguments) == 1 or (len(arguments) > 1 and arguments[1].startswith("--") and arguments[0] in kind)
-    # In running text a command may be named without its argument.
+    # In running text a command may be named without its arguments.
     completed = [arguments[0], *kind.get(arguments[0], []), *arguments[1:]] if bare and ":" not in where else arguments
     errors = io.StringIO()
     with contextlib.redirect_stderr(errors):
@@ -283,7 +310,7 @@ def test_command_parses(where: str, arguments: tuple[str, ...]) -> None:
             pytest.fail(f"{where}: iris-session {shlex.join(arguments)}: {errors.getvalue().splitlines()[-1]}")
 
 
-def test_commands_are_found() -> None:
+def test_command_search_finds_commands() -> None:
     found = {arguments[0] for _, arguments in commands()}
     assert found == set(_commands())
 
@@ -301,17 +328,20 @@ def test_make_targets_exist() -> None:
 def test_command_line_reference_has_every_option() -> None:
     page = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")
     common = _section(page, "Session options")
-    for name, parser in _commands().items():
-        text = _section(page, name)
+    commands = _commands()
+    sections = {title: title.split(", ") for title in re.findall(r"^## (.+)$", page, re.MULTILINE)}
+    assert set(commands) <= {name for together in sections.values() for name in together}
+    for title, together in sections.items():
+        text = _section(page, title)
         if "#session-options" in text:
             text += common
-        known = _options(parser) - {"-h", "--help", "--json"}
-        shown = set(re.findall(r"`(--[a-z-]+)", text)) - {"--json"}
-        assert shown == known, f"{name}: {sorted(shown ^ known)}"
+        known = set().union(*(_options(commands[name]) for name in together if name in commands))
+        shown = set(re.findall(r"`(--[a-z-]+)", text))
+        assert not known or shown - {"--json"} == known - {"-h", "--help", "--json"}, f"{title}: {shown ^ known}"
 
 
 def _commands() -> dict[str, argparse.ArgumentParser]:
-    """Every command of `iris-session` and its parser."""
+    """Return every command of `iris-session` and its parser."""
     actions = build_parser()._subparsers
     assert actions is not None
     subparsers = next(a for a in actions._group_actions if isinstance(a, argparse._SubParsersAction))
@@ -319,7 +349,7 @@ def _commands() -> dict[str, argparse.ArgumentParser]:
 
 
 def _options(parser: argparse.ArgumentParser) -> set[str]:
-    """Options of a command and of the actions below it (`keys allow`)."""
+    """Return options of a command and of the actions below it (`keys allow`)."""
     found: set[str] = set()
     for action in parser._actions:
         found.update(action.option_strings)
@@ -338,7 +368,7 @@ def _section(page: str, title: str) -> str:
 
 
 def slug(title: str) -> str:
-    """Anchor of a heading, as GitHub makes it."""
+    """Return the anchor of a heading, as GitHub makes it."""
     return re.sub(r"[^\w\- ]", "", title.strip().lower()).replace(" ", "-")
 
 
@@ -359,7 +389,7 @@ def test_links_resolve(page: Path) -> None:
             assert anchor in headings(file), f"{page.name}: {target}: no such heading"
 
 
-#: Written as code, a name with a folder and one of these endings is a file of ours.
+#: A name with a folder and one of these endings, written as code, is a file of the repository.
 FILE = re.compile(r"`((?:[\w.-]+/)+[\w.-]+\.(?:py|md|xml|toml|json|png))`")
 
 
@@ -371,7 +401,7 @@ def test_named_files_exist(page: Path) -> None:
         assert any((folder / name).is_file() for folder in folders), f"{page.name}: {name}"
 
 
-def test_files_are_named() -> None:
+def test_file_search_finds_files() -> None:
     assert any(FILE.findall(prose(page)) for page in PAGES)
 
 
@@ -406,7 +436,7 @@ def test_all_tables_of_reasons_are_there() -> None:
     }
 
 
-def test_every_key_of_a_demos_result_is_explained() -> None:
+def test_every_key_of_a_demo_result_is_explained() -> None:
     page = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")
     (table,) = re.findall(r"<!-- fields: demo -->\n(.*?)<!-- end -->", page, re.DOTALL)
     keys = [key for row in re.findall(r"^\| (`.+?) \|", table, re.MULTILINE) for key in re.findall(r"`(\w+)`", row)]

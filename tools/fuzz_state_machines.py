@@ -45,6 +45,7 @@ from iris_session.protocol.client_messages import ClientEnvelope, ClockPing, ESt
 from iris_session.protocol.codec import CLIENT_TYPES, decode_client, decode_server, encode_client, encode_server
 from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.errors import ProtocolError
+from iris_session.protocol.limits import KeyLimits
 from iris_session.protocol.media import make_topic
 from iris_session.protocol.names import PROTOCOL_VERSION, AssetRefusal
 from iris_session.protocol.server_messages import (
@@ -176,7 +177,10 @@ class FrontControl:
         from tests.front.harness import FrontSession
 
         self._rng = rng
-        limits = FrontLimits(hellos_per_second=1e4, hello_burst=10_000, excess_per_s=1e6, excess_burst=10**6)
+        many = dict.fromkeys(("messages", "requests", "events", "handshakes", "estops"), 10**6)
+        bursts = {name[:-1] + "_burst": 10**6 for name in many}
+        key = KeyLimits(connections=1000, bytes=1e9, byte_burst=10**9, **many, **bursts)
+        limits = FrontLimits(hellos_per_second=1e4, hello_burst=10_000, excess_per_s=1e6, excess_burst=10**6, key=key)
         self.session = FrontSession(limits=limits, silence_ns=10**12, **self.SETTINGS)
         self.process = psutil.Process(self.session.process.pid)
         self._corpus = Corpus(rng, client_messages())
@@ -235,7 +239,7 @@ class FrontControl:
         new = self.session.context.socket(zmq.DEALER)
         new.linger = 0
         new.sndhwm = 100
-        new.connect(f"tcp://127.0.0.1:{self.session.ports.control}")
+        new.connect(f"tcp://{self.session.host}:{self.session.ports.control}")
         if self._rng.random() < 0.9:
             new.send(encode_client(wrap_message(Hello("operator", "Ann", secret=self._rng.randbytes(16)))))
         if i < len(self._peers):
@@ -296,7 +300,7 @@ class FrontTcp(FrontControl):
         one = socket.socket()
         one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # leaves no port in TIME_WAIT
         one.settimeout(5.0)
-        one.connect(("127.0.0.1", port))
+        one.connect((self.session.host, port))
         try:
             one.sendall(data)
         except OSError:
@@ -361,7 +365,7 @@ class FrontMedia(FrontControl):
         self._corpora = (Corpus(rng, [make_media_topic]), Corpus(rng, [make_media_push]))
         self._viewer = self.session.context.socket(zmq.SUB)
         self._viewer.linger = 0
-        self._viewer.connect(f"tcp://127.0.0.1:{self.session.ports.media}")
+        self._viewer.connect(f"tcp://{self.session.host}:{self.session.ports.media}")
         self._viewer.subscribe(make_topic(self._honest.epoch, HONEST))
 
     def make(self) -> bytes:
@@ -411,7 +415,7 @@ class FrontMedia(FrontControl):
         new = self.session.context.socket(kind)
         new.linger = 0
         new.sndhwm = 100
-        new.connect(f"tcp://127.0.0.1:{port}")
+        new.connect(f"tcp://{self.session.host}:{port}")
         return new
 
     def _check_viewer(self) -> None:
@@ -594,7 +598,7 @@ class FrontAssets(FrontControl):
         new = self.session.context.socket(zmq.DEALER)
         new.linger = 0
         new.sndhwm = new.rcvhwm = 100
-        new.connect(f"tcp://127.0.0.1:{self.session.ports.assets}")
+        new.connect(f"tcp://{self.session.host}:{self.session.ports.assets}")
         return new
 
     def _check_fetch(self) -> None:

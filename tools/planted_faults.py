@@ -38,10 +38,10 @@ from iris_session.protocol.names import Role
 with Client(sys.argv[1], role=Role.DIRECTOR, alignment="not_needed", name="dora") as dora:
     dora.start()
     with Client(sys.argv[1], name="ann", devices=("head",)) as ann:
-        dora.place_alignment(ann.participant_id, ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
-        ann.wait_for(lambda c: c.alignment is not None and c.alignment.kind == "placed")
-        ann.new_tracking_frame()
-        ann.wait_for(lambda c: c.alignment is None or c.alignment.kind == "none")
+        dora.alignment.place(ann.participant_id, ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
+        ann.wait_for(lambda c: c.alignment.current is not None and c.alignment.current.kind == "placed")
+        ann.alignment.report_tracking_jump()
+        ann.wait_for(lambda c: c.alignment.current is None or c.alignment.current.kind == "none")
         print("recentred", flush=True)
         ann.sleep(60)
 """
@@ -66,13 +66,13 @@ import socket
 from iris_session.protocol.codec import encode_introduction
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.names import PROTOCOL_VERSION
-said = Introduction(Beacon(PROTOCOL_VERSION + 1, "s2", "future", "live", "10.77.2.1", 7751, 0, 0, 0, 0))
+introduction = Introduction(Beacon(PROTOCOL_VERSION + 1, "s2", "future", "live", "10.77.2.1", 7751, 0, 0, 0, 0))
 introducing, control = (socket.create_server(("10.77.2.1", port)) for port in (7750, 7751))
 print("listens", flush=True)
 while True:
     peer, _ = introducing.accept()
     with peer:
-        peer.sendall(encode_introduction(said))
+        peer.sendall(encode_introduction(introduction))
 """
 
 
@@ -90,13 +90,13 @@ Plant = Callable[[Lab], AbstractContextManager[DoctorCall]]
 
 @dataclass(frozen=True)
 class Fault:
-    """Fault to plant. `check` must be in `state` and its text have all of `says`. `follows`: checks that fail too."""
+    """Fault to plant. `check` must be in `state` with all `expected` texts. `follows`: checks that fail too."""
 
     name: str
     planted: str
     plant: Plant
     check: str
-    says: tuple[str, ...]
+    expected: tuple[str, ...]
     state: str = FAILED
     follows: tuple[str, ...] = ()
 
@@ -105,14 +105,14 @@ FAULTS: Final[list[Fault]] = []
 
 
 def fault(
-    planted: str, check: str, *says: str, state: str = FAILED, follows: tuple[str, ...] = ()
+    planted: str, check: str, *expected: str, state: str = FAILED, follows: tuple[str, ...] = ()
 ) -> Callable[[Callable[[Lab], Iterator[DoctorCall]]], Plant]:
     """Register a function that plants a fault. `planted`: its description in the table."""
 
     def decorate(function: Callable[[Lab], Iterator[DoctorCall]]) -> Plant:
         plant = contextmanager(function)
         name = function.__name__.replace("_", "-")
-        FAULTS.append(Fault(name, planted, plant, check, says, state, follows))
+        FAULTS.append(Fault(name, planted, plant, check, expected, state, follows))
         return plant
 
     return decorate
@@ -167,7 +167,7 @@ def by_name_without_broadcasts(lab: Lab) -> Iterator[DoctorCall]:
 
 @fault("a session of the next protocol version", "version", "version 2", "update this machine")
 def other_version(lab: Lab) -> Iterator[DoctorCall]:
-    with lab.server.running_process(sys.executable, "-c", FUTURE, says="listens"):
+    with lab.server.running_process(sys.executable, "-c", FUTURE, ready_line="listens"):
         yield DoctorCall(lab.client, (f"{lab.server.address}:7751",))
 
 
@@ -211,7 +211,7 @@ def role(lab: Lab) -> Iterator[DoctorCall]:
 def other_server(lab: Lab) -> Iterator[DoctorCall]:
     with lab.server.running_process(
         *COMMAND, "serve", "arm", "--no-record", "--host", lab.server.address, "--port-base", "7760",
-        says=r"on \S+:\d+,", keys="elsewhere",
+        ready_line=r"on \S+:\d+,", keys="elsewhere",
     ):  # fmt: skip
         known = lab.client.folder / "victim" / "known_servers.json"
         joined = lab.client.iris("doctor", lab.server.address, "--code", lab.create_code(), keys="victim")
@@ -224,11 +224,13 @@ def other_server(lab: Lab) -> Iterator[DoctorCall]:
 # --- the session -----------------------------------------------------------------------------------------------------
 
 
-def emulate(lab: Lab, says: str, *people: str, orders: bool = False) -> AbstractContextManager[Any]:
-    """Run emulated headsets, from when their output matches `says`."""
+def emulate(lab: Lab, ready_line: str, *people: str, orders: bool = False) -> AbstractContextManager[Any]:
+    """Run emulated headsets, from the time their output matches `ready_line`."""
     headsets = [word for person in people for word in ("--headset", person)]
     options = ["--orders"] if orders else []
-    return lab.client.running_process(*COMMAND, "emulate", lab.server.address, *headsets, *options, says=says)
+    return lab.client.running_process(
+        *COMMAND, "emulate", lab.server.address, *headsets, *options, ready_line=ready_line
+    )
 
 
 @fault(
@@ -245,7 +247,7 @@ def no_alignment(lab: Lab) -> Iterator[DoctorCall]:
 
 @fault("a headset was recentred", "alignment", "ann has no alignment (lost", "jumped", "bring the sheet into view")
 def recentred(lab: Lab) -> Iterator[DoctorCall]:
-    with lab.client.running_process(sys.executable, "-c", RECENTRED, lab.server.address, says="recentred"):
+    with lab.client.running_process(sys.executable, "-c", RECENTRED, lab.server.address, ready_line="recentred"):
         yield from_client(lab)
 
 
@@ -274,15 +276,15 @@ def robot_held(lab: Lab) -> Iterator[DoctorCall]:
     here = ("name=ann,behaviour=idle,robot=left", "name=bob,behaviour=idle,robot=right")
     both, wants = r"ann +work[\s\S]*bob +work|bob +work[\s\S]*ann +work", r"carl +\w+ +samples [1-9]"
     with emulate(lab, both, *here), emulate(lab, wants, "name=carl,behaviour=idle,robot=left"):
-        wait(lambda: has_no_robot(lab, "carl"), "carl, who wants one")
+        wait(lambda: lacks_robot(lab, "carl"), "carl without a robot")
         yield from_client(lab)
 
 
-def has_no_robot(lab: Lab, name: str) -> bool:
-    return any(one["name"] == name and not one["holds"] for one in people(lab))
+def lacks_robot(lab: Lab, name: str) -> bool:
+    return any(one["name"] == name and not one["holds"] for one in list_participants(lab))
 
 
-def people(lab: Lab) -> list[dict[str, Any]]:
+def list_participants(lab: Lab) -> list[dict[str, Any]]:
     """Return the participants in the status, disconnected ones too."""
     status = json.loads(lab.client.iris("status", lab.server.address, "--json").stdout)
     participants: list[dict[str, Any]] = status["participants"]
@@ -294,7 +296,7 @@ def frozen_client(lab: Lab) -> Iterator[DoctorCall]:
     with emulate(lab, r"ann +look +samples [1-9]", "name=ann,behaviour=observer") as ann:
         system("kill", "-STOP", str(ann.pid))
         yield from_client(lab)
-    wait(lambda: "ann" not in {one["name"] for one in people(lab)}, "the end of what is kept for ann")
+    wait(lambda: "ann" not in {one["name"] for one in list_participants(lab)}, "the removal of ann")
 
 
 @fault(
@@ -305,7 +307,7 @@ def frozen_client(lab: Lab) -> Iterator[DoctorCall]:
     state=WARNING,
 )
 def slow_link(lab: Lab) -> Iterator[DoctorCall]:
-    yield from behind(lab, "100ms")
+    yield from serve_behind(lab, "100ms")
 
 
 @fault(
@@ -316,19 +318,19 @@ def slow_link(lab: Lab) -> Iterator[DoctorCall]:
     "check the network",
 )
 def very_slow_link(lab: Lab) -> Iterator[DoctorCall]:
-    yield from behind(lab, "400ms")
+    yield from serve_behind(lab, "400ms")
 
 
-def behind(lab: Lab, profile: str) -> Iterator[DoctorCall]:
+def serve_behind(lab: Lab, profile: str) -> Iterator[DoctorCall]:
     """Give the server a second address behind a link of this profile."""
     words = (sys.executable, IMPAIR, "--link", f"{BEHIND}={profile}", "--target", lab.server.address)
-    with lab.server.addressed(f"{BEHIND}/24", additional=True), lab.server.running_process(*words, says="."):
+    with lab.server.addressed(f"{BEHIND}/24", additional=True), lab.server.running_process(*words, ready_line="."):
         yield DoctorCall(lab.client, (BEHIND,))
 
 
 @fault("physics takes 3 ms of a tick of 2 ms", "ticks", "physics takes longer than a tick", "a larger time step")
 def late_ticks(lab: Lab) -> Iterator[DoctorCall]:
-    with lab.server.running_process(sys.executable, "-c", SLOW_LOOP, says="on "):
+    with lab.server.running_process(sys.executable, "-c", SLOW_LOOP, ready_line="on "):
         time.sleep(5.0)  # most of the ten seconds that late ticks are counted over
         yield DoctorCall(lab.server, ("127.0.0.1:7741",))
 
@@ -338,10 +340,10 @@ def full_disk(lab: Lab) -> Iterator[DoctorCall]:
     disk = lab.small_disk(24)
     with lab.server.running_process(
         *COMMAND, "serve", "handover", "--port-base", "7730", "--no-beacon", "--record", str(disk / "session.rrd"),
-        says=r"on \S+:\d+,",
+        ready_line=r"on \S+:\d+,",
     ):  # fmt: skip
         system("sh", "-c", f"cat /dev/zero > {disk}/other 2>/dev/null || true")
-        time.sleep(3.0)  # until the recorder has met it
+        time.sleep(3.0)  # until the recorder has written
         yield DoctorCall(lab.server, ("127.0.0.1:7731",))
 
 
@@ -377,7 +379,7 @@ def call_doctor(visit: DoctorCall) -> tuple[list[Finding], int, float]:
     return [Finding(**one) for one in json.loads(done.stdout)["checks"]], done.returncode, took
 
 
-def screen(findings: list[Finding]) -> int:
+def count_screen_lines(findings: list[Finding]) -> int:
     """Return the number of screen lines of the findings."""
     columns, _ = SCREEN
     return sum(
@@ -391,18 +393,18 @@ def judge(one: Fault, findings: list[Finding], status: int) -> str:
     if one.check not in found or found[one.check].state != one.state:
         return f"`{one.check}` is {found[one.check].state if one.check in found else 'missing'}, not {one.state}"
     named = found[one.check]
-    told = f"{named.text} {named.why} {named.advice}"
-    if missing := [words for words in one.says if words not in told]:
-        return f"`{one.check}` does not say {missing}: {told}"
+    text = f"{named.text} {named.why} {named.advice}"
+    if missing := [words for words in one.expected if words not in text]:
+        return f"`{one.check}` lacks {missing}: {text}"
     if not named.advice:
-        return f"`{one.check}` does not say what to do"
+        return f"`{one.check}` has no advice"
     others = {finding.check for finding in findings if finding.failed} - {one.check, *one.follows}
     if others:
         return f"failed too: {', '.join(sorted(others))}"
     if status != (1 if one.state == FAILED else 0):
         return f"exit status {status}"
-    if screen(findings) > SCREEN[1]:
-        return f"{screen(findings)} lines are more than a screen"
+    if count_screen_lines(findings) > SCREEN[1]:
+        return f"{count_screen_lines(findings)} lines are more than a screen"
     return ""
 
 
@@ -415,14 +417,14 @@ def check_healthy(lab: Lab) -> None:
         if not bad and not status:
             return
         if time.monotonic() > until:
-            raise LabError(f"nothing is planted, and yet {'; '.join(bad) or f'exit status {status}'}")
+            raise LabError(f"no fault is planted, but {'; '.join(bad) or f'exit status {status}'}")
 
 
-def row(number: int, one: Fault, findings: list[Finding], status: int, took: float) -> str:
+def format_row(number: int, one: Fault, findings: list[Finding], status: int, took: float) -> str:
     """Return a row of the table, with the texts of the doctor."""
     named = next(finding for finding in findings if finding.check == one.check)
-    said = f"{named.text}. Why: {named.why}" if named.why else named.text
-    what = [part.translate(PLAIN) for part in (said, named.advice)]
+    message = f"{named.text}. Why: {named.why}" if named.why else named.text
+    what = [part.translate(PLAIN) for part in (message, named.advice)]
     return (
         f"| {number} | {one.planted} | `{named.check}`, {named.state} | {what[0]} | {what[1]} | {status} | {took:.1f} |"
     )
@@ -431,7 +433,7 @@ def row(number: int, one: Fault, findings: list[Finding], status: int, took: flo
 def examine_all(lab: Lab, chosen: list[Fault], *, verbose: bool) -> list[str]:
     """Print the table. Return a line for each fault that is not named."""
     unnamed = []
-    print("| | planted | check | what it says | what to do | status | s |\n|---|---|---|---|---|---|---|")
+    print("| | planted | check | message | advice | status | s |\n|---|---|---|---|---|---|---|")
     for number, one in enumerate(chosen, 1):
         try:
             with one.plant(lab) as visit:
@@ -446,7 +448,7 @@ def examine_all(lab: Lab, chosen: list[Fault], *, verbose: bool) -> list[str]:
             unnamed.append(f"{one.name}: {why}")
             print(f"| {number} | {one.planted} | **not named**: {why} | | | {status} | {took:.1f} |", flush=True)
         else:
-            print(row(number, one, findings, status, took), flush=True)
+            print(format_row(number, one, findings, status, took), flush=True)
     return unnamed
 
 

@@ -19,7 +19,7 @@ from typing import Any, Final
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the namespaces are those of the tests
 
-from tests.namespaces import Namespace, connect
+from tests.network_namespaces import Namespace, connect
 
 COMMAND: Final = (sys.executable, "-m", "iris_session.cli.main")
 DEADLINE_S: Final = 60.0
@@ -27,7 +27,7 @@ NETWORK: Final = "10.77.2"
 
 
 class LabError(Exception):
-    """The fault could not be planted. This says nothing about the doctor."""
+    """The fault could not be planted. The doctor was not tested."""
 
 
 def system(*words: str) -> str:
@@ -53,7 +53,7 @@ class Machine(Namespace):
     def iris(self, *arguments: str, keys: str = "keys") -> subprocess.CompletedProcess[str]:
         """Run one `iris-session` command to its end. `keys`: key folder; another folder is another user."""
         return subprocess.run(
-            self.words(*COMMAND, *arguments),
+            self.wrap_command(*COMMAND, *arguments),
             capture_output=True,
             text=True,
             check=False,
@@ -62,12 +62,12 @@ class Machine(Namespace):
             timeout=DEADLINE_S,
         )
 
-    def start(self, *command: str, says: str, keys: str = "keys") -> subprocess.Popen[bytes]:
-        """Start a process and wait until its output matches `says`. End it with `stop`."""
+    def start(self, *command: str, ready_line: str, keys: str = "keys") -> subprocess.Popen[bytes]:
+        """Start a process and wait until its output matches `ready_line`. End it with `stop`."""
         out = self.folder / f"{len(self.running)}.out"
         with out.open("wb") as file:
             process = subprocess.Popen(
-                self.words(*command),
+                self.wrap_command(*command),
                 stdin=subprocess.PIPE,
                 stdout=file,
                 stderr=subprocess.STDOUT,
@@ -79,15 +79,15 @@ class Machine(Namespace):
         def ready() -> bool:
             if process.poll() is not None:
                 raise LabError(f"{' '.join(command)} ended: {out.read_text(errors='replace')[-500:]}")
-            return re.search(says, out.read_text(errors="replace")) is not None
+            return re.search(ready_line, out.read_text(errors="replace")) is not None
 
-        wait(ready, f"{says!r} of {command}")
+        wait(ready, f"{ready_line!r} of {command}")
         return process
 
     @contextlib.contextmanager
-    def running_process(self, *command: str, says: str, keys: str = "keys") -> Iterator[subprocess.Popen[bytes]]:
+    def running_process(self, *command: str, ready_line: str, keys: str = "keys") -> Iterator[subprocess.Popen[bytes]]:
         """Start a process as `start` does, and stop it at the end."""
-        process = self.start(*command, says=says, keys=keys)
+        process = self.start(*command, ready_line=ready_line, keys=keys)
         try:
             yield process
         finally:
@@ -95,19 +95,19 @@ class Machine(Namespace):
 
     def serve(self, *arguments: str, keys: str = "keys") -> subprocess.Popen[bytes]:
         """Start a session."""
-        return self.start(*COMMAND, "serve", "handover", *arguments, says=r"on \S+:\d+,", keys=keys)
+        return self.start(*COMMAND, "serve", "handover", *arguments, ready_line=r"on \S+:\d+,", keys=keys)
 
     @contextlib.contextmanager
     def firewall(self, *rules: str) -> Iterator[None]:
         """Drop incoming packets that match the rules, such as `tcp dport 7722`, until the end."""
-        system(*self.words("nft", "add table inet planted"))
+        system(*self.wrap_command("nft", "add table inet planted"))
         try:
-            system(*self.words("nft", "add chain inet planted in { type filter hook input priority 0; }"))
+            system(*self.wrap_command("nft", "add chain inet planted in { type filter hook input priority 0; }"))
             for rule in rules:
-                system(*self.words("nft", f"add rule inet planted in {rule} drop"))
+                system(*self.wrap_command("nft", f"add rule inet planted in {rule} drop"))
             yield
         finally:
-            system(*self.words("nft", "delete table inet planted"))
+            system(*self.wrap_command("nft", "delete table inet planted"))
 
     @contextlib.contextmanager
     def addressed(self, address: str, *, additional: bool = False) -> Iterator[None]:
@@ -188,6 +188,7 @@ class Lab:
 
     def read_public_key(self, keys: str) -> str:
         """Return the public key of a user of the client."""
+        self.client.iris("keys", "allow", "me", keys=keys)  # creates the key
         shown: dict[str, Any] = json.loads(self.client.iris("keys", "show", "--json", keys=keys).stdout)
         return str(shown["identity"]["key"])
 

@@ -19,7 +19,7 @@ HZ = 50
 
 
 def compose(bodies: int, rows: int) -> tuple[SceneBuilder, np.ndarray]:
-    """Boxes, and a cloth of rows x rows vertices."""
+    """Return boxes and a cloth of rows x rows vertices."""
     scene = SceneBuilder("cost")
     for i in range(bodies):
         scene.add_box(f"box {i}", half_size=(0.05, 0.05, 0.05), movable=True)

@@ -24,7 +24,7 @@ from PIL import Image
 
 from iris_session.protocol.entries import decode_entries
 from iris_session.protocol.names import Device
-from iris_session.protocol.server_messages import Handover, LeaseChanged, PresenceItem
+from iris_session.protocol.server_messages import Handover, LeaseChanged, LeasesChanged, PresenceItem
 from iris_session.recording import CLOSED, Recording
 from iris_session.session.verification import ReplayCore
 
@@ -93,8 +93,10 @@ def choose_colours(recording: Recording) -> Colours:
     colours: Colours = {}
     for event in recording.events():
         body = event.body
-        if isinstance(body, LeaseChanged) and body.lease.holder and body.lease.target in robots:
-            colours.setdefault(body.lease.holder, COLOURS[robots.index(body.lease.target) % len(COLOURS)])
+        changes = body.to_single_changes() if isinstance(body, LeasesChanged) else (body,)
+        for change in changes:
+            if isinstance(change, LeaseChanged) and change.lease.holder and change.lease.target in robots:
+                colours.setdefault(change.lease.holder, COLOURS[robots.index(change.lease.target) % len(COLOURS)])
     return colours
 
 

@@ -109,8 +109,8 @@ class Soak:
             stderr=self._log("serve.out"),
         )
         self.stack.callback(self._end_server)
-        said = self._wait(lambda: re.search(r" on (\S+):(\d+),", self._read("serve.out")), "the session listens")
-        host, port = said[1], int(said[2])
+        listening = self._wait(lambda: re.search(r" on (\S+):(\d+),", self._read("serve.out")), "the session listens")
+        host, port = listening[1], int(listening[2])
         self.director = self._join(f"{host}:{port}", "director")
         self.thief = self._join(f"{host}:{port}", "operator")
         welcome = self.director.connection.welcome
@@ -179,13 +179,13 @@ class Soak:
 
     def run(self) -> None:
         """Disturb until the time is over, then wait for recovery."""
-        begun = due = said = time.monotonic()
+        begun = due = reported = time.monotonic()
         end = begun + self.options.seconds
         while (now := time.monotonic()) < end:
             self._poll()
             self._undo(now)
-            if now - said >= PROGRESS_EVERY_S:
-                said = now
+            if now - reported >= PROGRESS_EVERY_S:
+                reported = now
                 self._print_progress(now - begun)
             if now >= due:
                 due = now + self.random.expovariate(1.0 / EVERY_S)
@@ -422,18 +422,18 @@ def check_log(name: str, records: list[tuple[Any, ...]], recorded: dict[int, int
     Returns:
         The number of gaps that a snapshot filled on a connection that continued, and a line per problem.
     """
-    last_generation = last_told = last_seq = -1
+    last_generation = last_notified = last_seq = -1
     filled = 0
-    for generation, told, seq, crc in records:
+    for generation, notified, seq, crc in records:
         if last_seq >= 0 and seq != last_seq + 1:
-            if told == last_told:
+            if notified == last_notified:
                 return filled, [f"{name}: event {seq} came after {last_seq}, without a notification of those between"]
             filled += generation == last_generation
         if seq <= last_seq:
             return filled, [f"{name}: event {seq} came after {last_seq}"]
         if recorded.get(seq) != crc:
             return filled, [f"{name}: event {seq} is not that of the recording"]
-        last_generation, last_told, last_seq = generation, told, seq
+        last_generation, last_notified, last_seq = generation, notified, seq
     return filled, []
 
 
@@ -494,6 +494,7 @@ def main() -> int:
     parser.add_argument("--keep", type=Path, help="folder for recording and logs (default: a temporary one)")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
     options = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # ended by another program: the children end, too
     folder = options.keep or Path(tempfile.mkdtemp(prefix="iris-soak-"))
     folder.mkdir(parents=True, exist_ok=True)
     try:

@@ -7,7 +7,9 @@ headsets. It decides nothing: proposals and alarms go to the authority as entrie
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from types import MappingProxyType
 from typing import Final, Protocol
 
@@ -17,6 +19,7 @@ from anchors.pose import PoseTuple, Vec3, is_rigid
 from iris_session.alignment.cross_check import CrossCheckScheduler
 from iris_session.alignment.estimator import ConnectionEstimator
 from iris_session.alignment.monitor import AlignmentMonitor
+from iris_session.alignment.worker import InlineWorker, Worker
 from iris_session.protocol.client_messages import Observation, Sample
 from iris_session.protocol.common import Alignment, Pose
 from iris_session.protocol.entries import AlignmentProposal, Entry
@@ -44,6 +47,8 @@ _REMEMBERED_PER_CONNECTION: Final = 4
 #: Proposals whose pivot is remembered: 13 s at five per second, so that corrections that are announced first or slide
 #: in still find theirs.
 _MAX_PIVOTS: Final = 64
+#: Observations that wait while the estimate of their connection is computed: a second of them at the rate limit.
+_MAX_WAITING: Final = 64
 
 
 class HeadsetConnection(Protocol):
@@ -64,10 +69,23 @@ class _HeadsetState:
     `alarm_ns`, `proposal_ns`: session times of the last alarm and proposal; entries are stamped so that these times
     show their order. `last_jump`: tracking epoch and capture time of the last jump. An observation captured before it
     is in the old tracking frame, though it may arrive later (sheets are detected in pictures that are tenths of a
-    second old). `pivots`: pivot of each of the last proposals by its covariance, oldest first.
+    second old). `pivots`: pivot of each of the last proposals by its covariance, oldest first. While an estimate is
+    computed (`busy`), the estimator belongs to the worker: `waiting` holds what is to be done with it afterwards, and
+    `is_outdated` is set when the result will not count.
     """
 
-    __slots__ = ("alarm_ns", "connection", "estimator", "last_jump", "monitor", "pivots", "proposal_ns")
+    __slots__ = (
+        "alarm_ns",
+        "busy",
+        "connection",
+        "estimator",
+        "is_outdated",
+        "last_jump",
+        "monitor",
+        "pivots",
+        "proposal_ns",
+        "waiting",
+    )
 
     def __init__(
         self, connection: HeadsetConnection, estimator: ConnectionEstimator, monitor: AlignmentMonitor
@@ -78,6 +96,16 @@ class _HeadsetState:
         self.alarm_ns = self.proposal_ns = -1
         self.pivots: dict[tuple[float, ...], Vec3] = {}
         self.last_jump: tuple[int, int] | None = None
+        self.busy = self.is_outdated = False
+        self.waiting: deque[Callable[[], object]] = deque()
+
+    def change_estimator(self, change: Callable[[], object]) -> None:
+        """Do what invalidates earlier estimates; after the one that is being computed, which does not count then."""
+        if self.busy:
+            self.is_outdated = True
+            self.waiting.append(change)
+        else:
+            change()
 
     def remember_pivot(self, proposal: AlignmentProposal) -> None:
         self.pivots.pop(proposal.covariance, None)
@@ -112,6 +140,7 @@ class AlignmentService:
         anchor_sizes: Mapping[str, float] = _NO_SIZES,
         proposal_period_ns: int = 200_000_000,
         max_connections: int = 64,
+        worker: Worker | None = None,
     ) -> None:
         """Create the service of one session.
 
@@ -122,9 +151,11 @@ class AlignmentService:
             anchor_sizes: Edge length [m] of printed sheets, where known.
             proposal_period_ns: Least time between two proposals of one connection.
             max_connections: Most connections of the session; bounds the memory for disconnected participants.
+            worker: Computes estimates; by default at once.
         """
         self._offer = offer
         self._drops = drops
+        self._worker = InlineWorker() if worker is None else worker
         self._sizes = anchor_sizes
         self._proposal_period_ns = proposal_period_ns
         self._max_remembered = _REMEMBERED_PER_CONNECTION * max_connections
@@ -152,8 +183,15 @@ class AlignmentService:
 
     def process_observation(self, connection: HeadsetConnection, observation: Observation, now_ns: int) -> None:
         """Check an observation against the present alignment, then add it to the estimate and the cross-check."""
-        number = connection.number
-        state = self._states.get(number) or self._add_connection(connection)
+        state = self._states.get(connection.number) or self._add_connection(connection)
+        if not state.busy:
+            self._add_observation(connection.number, state, observation, now_ns)
+        elif len(state.waiting) < _MAX_WAITING:
+            state.waiting.append(partial(self._add_observation, connection.number, state, observation, now_ns))
+        else:
+            self._drops.count("observation_waiting", connection.number)
+
+    def _add_observation(self, number: int, state: _HeadsetState, observation: Observation, now_ns: int) -> None:
         if state.is_before_jump(observation):
             self._drops.count("observation_before_jump", number)
             return
@@ -216,7 +254,7 @@ class AlignmentService:
         if alarm.beside:
             self._cross_check.discard_target(alarm.anchor_id)
             return
-        state.estimator.reset()
+        state.change_estimator(state.estimator.reset)
         state.monitor.mute()
         self._cross_check.discard_observations(number)
 
@@ -291,10 +329,10 @@ class AlignmentService:
             _limit_size(self._stopped, self._max_remembered)
         for state in self._find_states(run.participant):
             if run.running:
-                state.estimator.start_run()
+                state.change_estimator(state.estimator.start_run)
                 state.monitor.start_run()
             else:
-                state.estimator.running = False
+                state.change_estimator(partial(setattr, state.estimator, "running", False))
 
     def _move_anchor(self, anchor_id: str, T_world_anchor: Pose) -> None:
         pose = (T_world_anchor.p, T_world_anchor.q)
@@ -303,7 +341,7 @@ class AlignmentService:
         self.anchors[anchor_id] = pose
         self._cross_check.discard_target(anchor_id)
         for state in self._states.values():
-            state.estimator.on_anchors_moved()
+            state.change_estimator(state.estimator.on_anchors_moved)
             state.monitor.on_anchor_moved(anchor_id)
 
     def _find_states(self, participant: str) -> list[_HeadsetState]:
@@ -312,7 +350,10 @@ class AlignmentService:
     # --- periodic work -----------------------------------------------------------------------------------------------
 
     def tick(self, now_ns: int) -> None:
-        """Compute at most one estimate or one cross-check: either takes up to milliseconds and delays state frames."""
+        """Begin at most one estimate, or compute one cross-check: either takes up to milliseconds."""
+        self._worker.poll()
+        if self._worker.is_busy:
+            return
         for number, state in self._states.items():
             if state.estimator.is_due(now_ns):
                 self._states[number] = self._states.pop(number)  # round robin
@@ -324,9 +365,27 @@ class AlignmentService:
             self._offer(entry)
 
     def _propose(self, number: int, state: _HeadsetState, now_ns: int) -> None:
-        proposal = state.estimator.propose(now_ns)
-        if proposal is None:
-            return
+        """Compute a proposal in the worker, and offer it when it is there."""
+        state.busy, state.is_outdated = True, False
+
+        def compute() -> Callable[[], None]:
+            proposal = state.estimator.propose(now_ns)
+            return lambda: self._finish_proposal(number, state, proposal, now_ns)
+
+        self._worker.submit(compute)
+
+    def _finish_proposal(
+        self, number: int, state: _HeadsetState, proposal: AlignmentProposal | None, now_ns: int
+    ) -> None:
+        state.busy = False
+        if self._states.get(number) is not state:
+            return  # the connection has ended
+        if proposal is not None and not state.is_outdated:
+            self._offer_proposal(number, state, proposal, now_ns)
+        while state.waiting and not state.busy:
+            state.waiting.popleft()()
+
+    def _offer_proposal(self, number: int, state: _HeadsetState, proposal: AlignmentProposal, now_ns: int) -> None:
         if state.estimator.newest is not None and not proposal.refused:
             state.monitor.set_estimate(state.estimator.newest)
             state.remember_pivot(proposal)
@@ -334,7 +393,8 @@ class AlignmentService:
         self._offer(Entry(number, number, state.proposal_ns, proposal))
 
     def close(self) -> None:
-        """Do nothing: the service holds no resources."""
+        """End the worker."""
+        self._worker.close()
 
     def complete_report(self, number: int, report: AlignmentReport | None, now_ns: int) -> AlignmentReport | None:
         """Return the authority's report on a participant, completed by the state of the estimator."""

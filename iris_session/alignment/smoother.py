@@ -175,10 +175,10 @@ def _later(e: AlignmentEstimate, seconds: float) -> AlignmentEstimate:
         return e
     prior = _config().prior
     drifted = (prior.drift_m_per_s * seconds) ** 2 + prior.walk_m_per_sqrt_s**2 * seconds
-    return _with(e, e.T_world_tracking, np.reshape(e.covariance, (6, 6)) + np.diag([drifted] * 3 + [0.0] * 3))
+    return _replace_pose(e, e.T_world_tracking, np.reshape(e.covariance, (6, 6)) + np.diag([drifted] * 3 + [0.0] * 3))
 
 
-def _with(e: AlignmentEstimate, T: PoseTuple, C: Array) -> AlignmentEstimate:
+def _replace_pose(e: AlignmentEstimate, T: PoseTuple, C: Array) -> AlignmentEstimate:
     C = 0.5 * (C + C.T)
     return replace(e, T_world_tracking=T, covariance=tuple(C.ravel().tolist()), error_at_anchor_m=length_p95(C[:3, :3]))
 
@@ -189,7 +189,7 @@ def fuse_estimates(a: AlignmentEstimate, b: AlignmentEstimate) -> AlignmentEstim
     p_b = apply(b.T_world_tracking, p_tracking)
     turn = quat_to_rotvec(quat_mul(b.T_world_tracking[1], quat_conj(a.T_world_tracking[1])))
     x = np.array([*(p_b[i] - a.pivot_world[i] for i in range(3)), *turn])
-    C_a, C_b = np.reshape(a.covariance, (6, 6)), _carried(b, p_b)
+    C_a, C_b = np.reshape(a.covariance, (6, 6)), _move_covariance(b, p_b)
     gain = C_a @ np.linalg.inv(C_a + C_b)
     step, C = gain @ x, C_a - gain @ C_a
     misfit = float(x @ np.linalg.solve(C_a + C_b, x))
@@ -200,7 +200,7 @@ def fuse_estimates(a: AlignmentEstimate, b: AlignmentEstimate) -> AlignmentEstim
     lever = quat_rotate(q, p_tracking)
     x0, y0, z0 = a.pivot_world
     p: Vec3 = (x0 + dx - lever[0], y0 + dy - lever[1], z0 + dz - lever[2])
-    both = _with(a, (p, q), C)
+    both = _replace_pose(a, (p, q), C)
     tilt = max(a.residual_tilt_rad, b.residual_tilt_rad)
     return replace(
         both,
@@ -213,7 +213,7 @@ def fuse_estimates(a: AlignmentEstimate, b: AlignmentEstimate) -> AlignmentEstim
     )
 
 
-def _carried(e: AlignmentEstimate, p_world: Vec3) -> Array:
+def _move_covariance(e: AlignmentEstimate, p_world: Vec3) -> Array:
     """Return the covariance (6, 6) of an estimate at another point: d(point) = d(pivot) + rot x (point - pivot)."""
     x, y, z = (p_world[i] - e.pivot_world[i] for i in range(3))
     J = np.eye(6)

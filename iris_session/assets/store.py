@@ -10,6 +10,8 @@ Layout below the root, where `<hash>` and `<key>` are 64 lower-case hex digits:
 
 Any number of processes and threads may share a folder. Above `max_bytes` the files that were used longest ago are
 removed, but none that a process holds and none used within `GRACE_S`. Other files below the root are never touched.
+A symbolic link, or anything else that is no regular file, counts as a missing file and is never followed: another user
+may have put it there.
 
 Sessions and clients have separate default folders. Nothing but verified content could get from a client into the
 folder of a session, so they may share one (`client.assets.cache = AssetStore()`), and an asset then lies on disk once.
@@ -26,6 +28,7 @@ import hashlib
 import mmap
 import os
 import re
+import stat
 import tempfile
 import threading
 import time
@@ -56,8 +59,19 @@ SCAN_EVERY_BYTES: Final = 64 << 20
 MAX_MAPPED_FILES: Final = 256
 
 _PART: Final = re.compile(r"([0-9a-f]{64})(\.\w[\w-]*)?\.part")
+#: A file that one process of an earlier version wrote.
+_OLD_PART: Final = re.compile(r"tmp\w+\.part")
 #: Of a hold: its note before it has its name, and a lock, which is of no use without the note.
 _HALF_MADE_HOLD: Final = re.compile(r"(tmp\w+\.new)(\.hold\.lock)?")
+#: Neither a link nor a pipe that another user put into the folder may be followed or waited for.
+_OPEN_FLAGS: Final = (
+    getattr(os, "O_CLOEXEC", 0)
+    | getattr(os, "O_BINARY", 0)
+    | getattr(os, "O_NOFOLLOW", 0)
+    | getattr(os, "O_NONBLOCK", 0)
+)
+#: Systems that set the times of links only through them.
+_FOLLOW_SYMLINKS: Final = os.utime not in os.supports_follow_symlinks
 _INDEX: Final = "index"
 _HOLDS: Final = "holds"
 _ADVICE: Final = "use another folder (client.assets.cache = AssetStore(folder)), or set XDG_CACHE_HOME"
@@ -150,7 +164,7 @@ class AssetStore:
         return self.root / address[:2] / address
 
     def __contains__(self, address: object) -> bool:
-        return isinstance(address, str) and is_address(address) and self.path(address).is_file()
+        return isinstance(address, str) and is_address(address) and _find_status(self.path(address)) is not None
 
     def size(self, address: str) -> int:
         """Return the size of an asset [bytes].
@@ -158,10 +172,10 @@ class AssetStore:
         Raises:
             AssetMissingError: The store does not have it.
         """
-        try:
-            return self.path(address).stat().st_size
-        except OSError as error:
-            raise self._missing_error(address) from error
+        status = _find_status(self.path(address))
+        if status is None:
+            raise self._missing_error(address)
+        return status.st_size
 
     def get(self, address: str) -> bytes:
         """Return the verified bytes of an asset. A damaged file is removed.
@@ -242,7 +256,7 @@ class AssetStore:
         """Return the note stored under `key`, a SHA-256 in hex, and mark it as used; `None` without one."""
         path = self._index_path(key)
         try:
-            note = path.read_bytes()
+            note = bytes(map_file(path)[0])
         except OSError:
             return None
         _touch(path)
@@ -269,16 +283,13 @@ class AssetStore:
     def mark_used(self, address: str, size: int) -> bool:
         """Mark an asset as used now. False without it, and when it has another size: a crash truncated it."""
         path = self.path(address)
-        with contextlib.suppress(FileNotFoundError):
-            return path.stat().st_size == size and _touch(path)
-        return False
+        status = _find_status(path)
+        return status is not None and status.st_size == size and _touch(path)
 
     def last_used_ns(self, address: str) -> int:
         """Return when an asset was last used [ns since 1970], for `discard`; 0 without it."""
-        try:
-            return self.path(address).stat().st_mtime_ns
-        except OSError:
-            return 0
+        status = _find_status(self.path(address))
+        return 0 if status is None else status.st_mtime_ns
 
     def discard(self, address: str, last_used_ns: int) -> bool:
         """Remove an asset that is of no more use, and return whether it was removed.
@@ -286,12 +297,11 @@ class AssetStore:
         It stays when a process holds it, or has used it after `last_used_ns`.
         """
         path = self.path(address)
-        with contextlib.suppress(OSError):
-            status = path.stat()
-            if status.st_mtime_ns == last_used_ns and address not in self._read_holds():
+        status = _find_status(path)
+        if status is not None and status.st_mtime_ns == last_used_ns and address not in self._read_holds():
+            with contextlib.suppress(OSError):
                 path.unlink()
-                with self._lock:
-                    self._total -= status.st_size
+                self._uncount(status.st_size)
                 return True
         return False
 
@@ -334,8 +344,9 @@ class AssetStore:
         if hashlib.sha256(view).hexdigest() == address:
             return view
         with contextlib.suppress(OSError):  # a disk that cannot be written
-            if os.path.samestat(status, os.stat(path)):  # not replaced by a good one meanwhile
+            if os.path.samestat(status, os.stat(path, follow_symlinks=False)):  # not replaced by a good one meanwhile
                 path.unlink()
+                self._uncount(status.st_size)
         return None
 
     def _index_path(self, key: str) -> Path:
@@ -345,14 +356,17 @@ class AssetStore:
 
     def _write(self, path: Path, data: bytes | bytearray | memoryview) -> None:
         self._make_room(len(data))
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f"{path.name}.", suffix=".part")
+        name = ""
         try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            handle, name = tempfile.mkstemp(dir=path.parent, prefix=f"{path.name}.", suffix=".part")
             with os.fdopen(handle, "wb") as file:
                 file.write(data)
             os.replace(name, path)
         except BaseException:
-            Path(name).unlink(missing_ok=True)
+            self._uncount(len(data))
+            if name:
+                Path(name).unlink(missing_ok=True)
             raise
 
     def _make_room(self, n_bytes: int) -> bool:
@@ -373,6 +387,11 @@ class AssetStore:
             self._is_scanning = False
         return True
 
+    def _uncount(self, n_bytes: int) -> None:
+        """Count `n_bytes` as no longer stored: they were removed, or could not be written."""
+        with self._lock:
+            self._total = max(0, self._total - n_bytes)
+
     def _scan(self, n_bytes: int) -> None:
         """Remove what processes left half-made, then the files used longest ago until `n_bytes` more fit.
 
@@ -385,7 +404,8 @@ class AssetStore:
         for entry, status in self._iterate_files():
             age_s = now - status.st_mtime
             part = _PART.fullmatch(entry.name)
-            if part and age_s > (GRACE_S if part[2] else STALE_PART_S) and _remove_part(entry.path):
+            is_private = bool(part[2]) if part else not is_address(entry.name)
+            if (part or is_private) and age_s > (GRACE_S if is_private else STALE_PART_S) and _remove_part(entry.path):
                 continue
             files.append((status.st_mtime, status.st_size, entry))
         total = n_bytes + sum(size for _, size, _ in files)
@@ -397,11 +417,10 @@ class AssetStore:
             with contextlib.suppress(OSError):
                 if os.stat(entry.path, follow_symlinks=False).st_mtime != used:  # used meanwhile
                     continue
-                if _PART.fullmatch(entry.name):
-                    if not _remove_part(entry.path):
-                        continue
-                else:
+                if is_address(entry.name):
                     os.unlink(entry.path)
+                elif not _remove_part(entry.path):
+                    continue
                 total -= size
                 self.evicted += 1
         with self._lock:
@@ -415,8 +434,9 @@ class AssetStore:
             for sub in _list_entries(folder):
                 if len(sub.name) == 2 and sub.is_dir(follow_symlinks=False):
                     for entry in _list_entries(sub.path):
-                        ours = is_address(entry.name) or _PART.fullmatch(entry.name)
-                        if ours and entry.name[:2] == sub.name and entry.is_file(follow_symlinks=False):
+                        in_place = is_address(entry.name) or _PART.fullmatch(entry.name)
+                        ours = entry.name[:2] == sub.name if in_place else _OLD_PART.fullmatch(entry.name)
+                        if ours and entry.is_file(follow_symlinks=False):
                             with contextlib.suppress(FileNotFoundError):  # removed by another process meanwhile
                                 yield entry, entry.stat(follow_symlinks=False)
 
@@ -480,6 +500,7 @@ class AssetPart:
             try:
                 written = self._file.write(rest)
             except OSError as error:
+                self._store._uncount(len(rest))
                 raise self._store._unusable_error(error) from error
             self._hash.update(rest[:written])
             self.offset += written
@@ -512,6 +533,7 @@ class AssetPart:
             self._file.truncate()
         except OSError as error:
             raise self._store._unusable_error(error) from error
+        self._store._uncount(self.offset)
         self._hash = hashlib.sha256()
         self.offset = 0
 
@@ -519,7 +541,8 @@ class AssetPart:
         """Keep a resumable part for the next download; remove an empty one, and one that cannot be resumed."""
         if not self.offset or self._path.name != f"{self._address}.part":
             with contextlib.suppress(OSError):
-                self._path.unlink(missing_ok=True)
+                self._path.unlink()  # raises for one that was finished
+                self._store._uncount(self.offset)
         self._file.close()
 
 
@@ -574,16 +597,36 @@ def map_file(path: Path) -> tuple[memoryview, os.stat_result]:
     """Return the bytes of a file, mapped, and its status. Processes that map the same file share its pages.
 
     Raises:
-        OSError: It cannot be read, or is a symbolic link.
+        FileNotFoundError: It is missing, or no regular file.
+        OSError: It cannot be read.
     """
-    flags = os.O_RDONLY | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0) | getattr(os, "O_NOFOLLOW", 0)
-    descriptor = os.open(path, flags)
+    try:
+        descriptor = os.open(path, os.O_RDONLY | _OPEN_FLAGS)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise _not_regular_error(path) from error
+        raise
     try:
         status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise _not_regular_error(path)
         size = status.st_size
         return memoryview(mmap.mmap(descriptor, size, access=mmap.ACCESS_READ) if size else b""), status
     finally:
         os.close(descriptor)
+
+
+def _not_regular_error(path: Path) -> FileNotFoundError:
+    return FileNotFoundError(errno.ENOENT, "a link, or no regular file", str(path))
+
+
+def _find_status(path: Path) -> os.stat_result | None:
+    """Return the status of a regular file; `None` when it is missing, a link, or anything else."""
+    try:
+        status = os.stat(path, follow_symlinks=False)
+    except OSError:
+        return None
+    return status if stat.S_ISREG(status.st_mode) else None
 
 
 def _open_part_file(path: Path) -> tuple[Path, int]:
@@ -592,10 +635,11 @@ def _open_part_file(path: Path) -> tuple[Path, int]:
     if fcntl is not None:
         descriptor = -1
         try:
-            descriptor = os.open(resumable, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+            descriptor = os.open(resumable, os.O_RDWR | os.O_CREAT | _OPEN_FLAGS, 0o600)
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             # It may have been finished, and so renamed, between opening and locking.
-            if os.path.samestat(os.fstat(descriptor), os.stat(resumable)):
+            status = _find_status(resumable)
+            if status is not None and os.path.samestat(os.fstat(descriptor), status):
                 return resumable, descriptor
         except FileNotFoundError:
             if descriptor < 0:
@@ -615,7 +659,7 @@ def _remove_part(path: str) -> bool:
     """Remove a part unless a process holds its lock, and return whether it was removed."""
     try:
         if fcntl is not None:
-            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            descriptor = os.open(path, os.O_RDONLY | _OPEN_FLAGS)
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             finally:
@@ -629,7 +673,7 @@ def _remove_part(path: str) -> bool:
 def _touch(path: Path) -> bool:
     """Mark a file as used now; false without it. A file that may only be read counts as present."""
     try:
-        os.utime(path)
+        os.utime(path, follow_symlinks=_FOLLOW_SYMLINKS)
     except FileNotFoundError:
         return False
     except OSError:

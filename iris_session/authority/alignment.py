@@ -1,6 +1,9 @@
 """Alignments: the gate for proposals, placements and tracking frames, corrections, stated errors, notices to the
 wearer.
 
+Who may drive: devices of a headset need an alignment. Others, and those that the configuration allows, do without when
+they said so at `hello` (`may_be_unaligned`).
+
 Gate: a proposal of the estimator is accepted when its stated p95 error at the robot (lever arm included) is within the
 bound, and when it differs enough from the alignment in force, or from the correction under way, to be worth a version.
 
@@ -30,6 +33,7 @@ from anchors.pose import (
     quat_to_rotvec,
 )
 from iris_session.authority import engagement
+from iris_session.authority.config import KEY_PREFIX
 from iris_session.authority.context import Context
 from iris_session.authority.state import Correction, Participant, Placement, WarningState
 from iris_session.protocol.client_messages import PlaceAlignment, TrackingEpoch
@@ -38,9 +42,20 @@ from iris_session.protocol.entries import AlignmentProposal
 from iris_session.protocol.names import AlignmentKind, DenialReason, HoldReason
 from iris_session.protocol.server_messages import AlignmentChanged, Notice
 
+#: For a participant that says `not_needed` and drives with a headset.
+UNALIGNED_ADVICE: Final = (
+    "join with alignment 'measured' and look at an anchor sheet, drive with device 'desktop', 'target' or 'joints', "
+    "or let the configuration of the session (`unaligned`) name this role, device or key"
+)
 #: 95 % quantile of the standard normal distribution.
 Z95: Final = 1.6448536269514722
 ADVICE: Final = "step closer to the sheet, look at it from a second place, or add a sheet near the robot"
+
+
+def may_be_unaligned(ctx: Context, role: str, key_id: str, device: str) -> bool:
+    """Return true when the configuration lets this role, key or device drive without an alignment."""
+    allowed = ctx.config.unaligned
+    return role in allowed or device in allowed or f"{KEY_PREFIX}{key_id}" in allowed
 
 
 def process_proposal(ctx: Context, p: Participant, m: AlignmentProposal) -> None:
@@ -51,13 +66,16 @@ def process_proposal(ctx: Context, p: Participant, m: AlignmentProposal) -> None
         return None  # made before the front knew of a jump, a new run, or where the anchors are now
     if m.refused or not _is_valid_proposal(ctx, m):
         text = "the anchor measurement is not good enough" if m.refused else "the measurement is not a valid pose"
+        if m.refused and _report_progress(ctx, p, m, text):
+            return None
         return _notify_refusal(ctx, p, text, m.advice or ADVICE)
     if m.tracking_epoch > p.tracking_epoch:
         # The announcement of the frame can arrive after the first observation in it.
         set_tracking_epoch(ctx, p, TrackingEpoch(m.tracking_epoch))
     error = compute_error_at_robots(ctx, p, m.covariance, m.pivot_world, m.error_at_anchor_m)
     if error > ctx.config.max_error_at_robot_m:
-        return refuse_large_error(ctx, p, "the robot", error, m.advice)
+        text = _describe_large_error(ctx, "the robot", error)
+        return None if _report_progress(ctx, p, m, text) else _notify_refusal(ctx, p, text, m.advice or ADVICE)
     tilted = m.residual_tilt_rad > ctx.config.max_residual_tilt_rad
     degrees = math.degrees(m.residual_tilt_rad)
     tilt = f"{p.name}: the anchor is tilted by {degrees:.1f} degrees, is the sheet level?"
@@ -105,9 +123,27 @@ def _is_news(ctx: Context, p: Participant, m: AlignmentProposal, error: float) -
 
 def refuse_large_error(ctx: Context, p: Participant, robot: str, error: float, advice: str = "") -> None:
     """Refuse an alignment whose stated error at the robot is too large."""
+    _notify_refusal(ctx, p, _describe_large_error(ctx, robot, error), advice or ADVICE)
+
+
+def _describe_large_error(ctx: Context, robot: str, error: float) -> str:
     bound = ctx.config.max_error_at_robot_m
-    text = f"predicted error {error * 1000:.0f} mm at {robot}, at most {bound * 1000:.0f} mm is allowed"
-    _notify_refusal(ctx, p, text, advice or ADVICE)
+    return f"predicted error {error * 1000:.0f} mm at {robot}, at most {bound * 1000:.0f} mm is allowed"
+
+
+def _report_progress(ctx: Context, p: Participant, m: AlignmentProposal, text: str) -> bool:
+    """Return true for one of the first refusals: more observations are likely to mend it, so the wearer is asked to
+    look for `patience_ns`. If nothing better comes in that time, `advance_corrections` makes it a warning.
+    """
+    if p.alignment is not None or not m.n_observations or p.refused_ns is not None:
+        return False
+    refusal = f"{text}; {m.advice or ADVICE}"
+    if not p.refusal:
+        p.refusal_from_ns = ctx.now_ns
+        seconds = ctx.config.patience_ns / 1e9
+        inform_wearer(ctx, p, f"alignment of {p.name}: look at the sheet for {seconds:g} more seconds ({text})")
+    p.refusal = refusal
+    return True
 
 
 def _notify_refusal(ctx: Context, p: Participant, text: str, advice: str) -> None:
@@ -212,12 +248,19 @@ def void_alignment(p: Participant) -> None:
     """Clear everything about the alignment, because the tracking frame is another one."""
     p.alignment = p.offset = p.T_world_tracking_measured = p.correction = p.placing = p.alarm = None
     p.placed = p.in_use = False
-    p.aligned_ns = None
+    p.aligned_ns = p.refused_ns = None
+    p.refusal = ""
 
 
 def advance_corrections(ctx: Context) -> None:
-    """Apply waiting placements and corrections where nothing is engaged. Once per step, after the samples."""
+    """Apply waiting placements and corrections where nothing is engaged, and report refusals that have lasted. Once per
+    step, after the samples.
+    """
     for p in ctx.state.participants.values():
+        if p.refusal and ctx.now_ns - p.refusal_from_ns >= ctx.config.patience_ns:
+            text, _, advice = p.refusal.partition("; ")
+            p.refusal = ""
+            _notify_refusal(ctx, p, text, advice)
         if p.correction is None and p.placing is None:
             continue
         if is_engaged(ctx, p):
@@ -355,7 +398,7 @@ def _set_alignment(
     offset: bool = False,
 ) -> None:
     p.alignment_version += 1
-    p.refused_ns = None
+    p.refused_ns, p.refusal = None, ""
     if p.aligned_ns is None:
         p.aligned_ns = ctx.now_ns
     p.alignment = Alignment(

@@ -59,6 +59,7 @@ def _start_run(ctx: Context, p: Participant) -> None:
     )  # the first of the new measurements must not startle a wearer who is engaged
     p.correction = p.placing = p.offset = None
     p.proposals_from_ns = ctx.now_ns
+    p.refused_ns, p.refusal = None, ""
     if p.alignment is not None and p.alignment.kind == AlignmentKind.MEASURED:
         p.T_world_tracking_measured = p.alignment.T_world_tracking
     _clear_alarm(ctx, p)

@@ -66,11 +66,17 @@ def _store_payload(p: Participant, s: Sample, usable: bool) -> None:
 
 
 def _update_latch(ctx: Context, p: Participant, lease: LeaseState, g: LeaseGrant, s: Sample) -> None:
-    """Update the clutch latch of a grant, and end an engagement that the sample itself ends."""
+    """Update the clutch latch of a grant, and end an engagement that the sample itself ends.
+
+    A human who opens the clutch gives the robot back to the agent: at once when that ends its engagement, else (the
+    clutch must open after an e-stop or a disconnect before it can engage) after `intervention_idle_ns`.
+    """
     mine = g.engagement != 0 and g.device == s.device
     if not (s.worn and s.tracked):
         if s.device in g.armed:
             g.armed.remove(s.device)
+        if g.device == s.device:
+            g.open_ns = 0
         if mine or not g.engagement:
             engagement.end_engagement(ctx, lease, g, HoldReason.UNTRACKED if s.worn else HoldReason.NOT_WORN)
     elif not s.clutch:
@@ -78,16 +84,20 @@ def _update_latch(ctx: Context, p: Participant, lease: LeaseState, g: LeaseGrant
             g.armed.append(s.device)
         if mine or not g.engagement:
             engagement.end_engagement(ctx, lease, g, HoldReason.CLUTCH_OPEN)
+        if g.device == s.device:
+            engagement.note_open_clutch(ctx, g)
+        if mine and lease.override == p.id:
+            engagement.end_intervention(ctx, lease)
     elif not g.engagement and s.device in g.armed and _may_engage(ctx, p, lease):
         engagement.begin_engagement(ctx, lease, g, p, s.device)
     elif not mine:
         # A closed clutch without an edge: it must open first.
         if s.device in g.armed:
             g.armed.remove(s.device)
+        if g.device == s.device:
+            g.open_ns = 0
         if not g.engagement and g.hold in _WAITING:
             g.hold = HoldReason.REARM
-    if not s.clutch and lease.override == p.id and g.device == s.device:
-        engagement.end_intervention(ctx, lease)
 
 
 def _may_engage(ctx: Context, p: Participant, lease: LeaseState) -> bool:
@@ -146,18 +156,16 @@ def _publish_presence(ctx: Context, p: Participant, s: Sample) -> None:
 
 def expire_samples(ctx: Context) -> None:
     """End every engagement without a counted sample within the freshness bound, by session time, and every intervention
-    whose human has not been engaged for a while.
+    whose human stands by.
     """
     oldest = ctx.now_ns - ctx.config.freshness_ns
     for lease in (*ctx.state.robots.values(), *ctx.held_objects):
         for g in lease.grants:
             if g.engagement and g.counted_ns < oldest:
                 engagement.rearm_grant(ctx, lease, g, HoldReason.STALE)
-            if g.participant == lease.override:
-                if g.engagement or ctx.state.paused or ctx.state.estop:
-                    lease.override_ns = ctx.now_ns
-                elif ctx.now_ns - lease.override_ns >= ctx.config.intervention_idle_ns:
-                    engagement.end_intervention(ctx, lease)
+            stopped = ctx.state.paused or ctx.state.estop  # a human who thinks meanwhile keeps the robot
+            if g.participant == lease.override and not stopped and engagement.is_standing_by(ctx, g):
+                engagement.end_intervention(ctx, lease)
 
 
 class CommandBuilder:

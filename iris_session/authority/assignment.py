@@ -7,16 +7,12 @@ unverified label: use keys where participants are not trusted to use their own. 
 
 from __future__ import annotations
 
-from typing import Final
-
 from anchors.pose import apply, distance
+from iris_session.authority.config import KEY_PREFIX
 from iris_session.authority.context import Context
 from iris_session.authority.state import Participant
 from iris_session.protocol.common import Denial
 from iris_session.protocol.names import AssignmentPolicy, DenialReason, Device, Role
-
-#: Before a key's fingerprint (`Join.key_id`) in `AuthorityConfig.assignments`.
-KEY_PREFIX: Final = "key:"
 
 
 def check_policy(ctx: Context, p: Participant, robots: tuple[str, ...]) -> Denial | None:

@@ -38,7 +38,7 @@ from iris_session.protocol.names import (
 from iris_session.protocol.scene import PatchOp
 from iris_session.protocol.server_messages import Audited, Gap, MarkerAdded, Reply
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
-from iris_session.protocol.status import AlignmentReport, CrossCheckReport
+from iris_session.protocol.status import AlignmentReport, CrossCheckReport, StopReport
 from iris_session.protocol.steps import ControlStatus, Decision, OutgoingMessage, WorldView
 
 #: Requests that only a director (or the host) may make.
@@ -55,12 +55,14 @@ DIRECTOR_ONLY: Final = (
 HOST_ONLY: Final = (
     em.ExternalReset,
     em.StalledGap,
+    em.PhysicsDiverged,
     em.FrontRestarted,
     em.RecordingGap,
     em.Audit,
     em.SessionResumed,
     em.SceneLoaded,
     em.ScenePatched,
+    em.OwnerListens,
 )
 #: Entries that the front itself makes for the participant of a connection: no envelope, quota or sign of life.
 FRONT_MADE: Final = (em.AlignmentProposal, em.AlignmentAlarm, em.CrossChecked)
@@ -185,6 +187,29 @@ class Authority:
         """`T_world_anchor` by id, as they are now."""
         return dict(self._ctx.state.anchors)
 
+    @property
+    def stop_seq(self) -> int:
+        """Number of the newest e-stop, 0 before the first."""
+        return self._ctx.state.stop_seq
+
+    @property
+    def pause_reason(self) -> str:
+        """Reason for which physics stands still until a reset, empty otherwise."""
+        return self._ctx.state.diverged
+
+    def build_stop_reports(self) -> tuple[StopReport, ...]:
+        """Return the e-stops in force, newest first, the newest of each participant."""
+        return session_control.build_stop_reports(self._ctx)
+
+    def find_sender(self, connection: int) -> tuple[str, str]:
+        """Return id and name of the participant of a connection; empty strings for one that has none any more."""
+        p = self._ctx.by_connection.get(connection)
+        return ("", "") if p is None else (p.id, p.name)
+
+    def list_holders(self) -> dict[str, tuple[str, ...]]:
+        """Return the participants that hold each robot, by robot."""
+        return {name: tuple(g.participant for g in lease.grants) for name, lease in self._ctx.state.robots.items()}
+
     def build_alignment_reports(self) -> dict[str, AlignmentReport]:
         """Return the state of the alignment of each participant that needs one, by participant id."""
         people = self._ctx.state.participants.values()
@@ -252,7 +277,7 @@ class Authority:
         if isinstance(m, cm.EStop):
             # An honest stop must not fail on a stale envelope, nor because its sender was just disconnected or is not
             # admitted yet: the front accepts it from every connection whose `hello` it has accepted.
-            session_control.latch_estop(ctx, p.id if p is not None else "", m)
+            session_control.latch_estop(ctx, entry.connection, m)
         elif p is None:
             if isinstance(m, (em.Lost, cm.Bye)):
                 self._ended_connections.append(entry.connection)
@@ -325,8 +350,13 @@ class Authority:
         ctx = self._ctx
         if isinstance(m, em.ExternalReset):
             session_control.begin_scene_epoch(ctx, "external")
+            session_control.start_rerecording(ctx)
+        elif isinstance(m, em.PhysicsDiverged):
+            session_control.record_divergence(ctx, m)
         elif isinstance(m, em.FrontRestarted):
             roster.disconnect_all(ctx, "front_restarted")
+        elif isinstance(m, em.OwnerListens):
+            ctx.state.owner_listens = True
         elif isinstance(m, em.RecordingGap):
             ctx.emit(Gap("recording", 0, m.rows))
         elif isinstance(m, em.Audit):
@@ -372,6 +402,7 @@ _HANDLERS: Final[dict[type, Callable[[Context, Participant, Any], None]]] = {
     cm.Heartbeat: _process_heartbeat,
     cm.GetSnapshot: _request_snapshot,
     cm.Acquire: requests.acquire_targets,
+    cm.Withdraw: requests.withdraw_request,
     cm.Consent: requests.answer_consent,
     cm.Assign: requests.assign_robots,
     cm.SetMode: requests.set_mode,

@@ -10,7 +10,7 @@ import msgspec
 
 from anchors.pose import is_rigid
 from iris_session.protocol.common import Name, Pose
-from iris_session.protocol.names import AssignmentPolicy, Device, LeaseMode
+from iris_session.protocol.names import AssignmentPolicy, Device, LeaseMode, Role
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 
 MS: Final = 1_000_000
@@ -38,6 +38,12 @@ SPEED_LIMITS: Final[dict[str, SpeedLimit]] = {
 }
 
 
+#: Roles and devices that may drive without an alignment: what they send is in the world already, or relative to what
+#: their user sees on a screen. A headset is worn in the room of the robots, and must be aligned to it.
+UNALIGNED: Final = (Role.AGENT, Role.LEADER, Device.JOINTS, Device.TARGET, Device.DESKTOP)
+#: Before a key's fingerprint (`Join.key_id`) in `AuthorityConfig.assignments` and `AuthorityConfig.unaligned`.
+KEY_PREFIX: Final = "key:"
+
 #: Settings without which nothing can work, or that something is divided by.
 POSITIVE: Final = (
     "freshness_ns",
@@ -60,7 +66,9 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Configuration of `Authority`. Times in nanoseconds of session time, lengths in metres, angles in radians.
 
     `assignments`: participant name, or `key:<fingerprint>`, -> robots (policy `config`). `leader_apart`: `ramp`
-    (control ramps) or `refuse`. `user_owned_loop`: the user drives physics, so pause, step and reset are denied.
+    (control ramps) or `refuse`. `unaligned`: roles, devices and keys (`key:<fingerprint>`) that may drive without an
+    alignment when they say that they need none. `user_owned_loop`: the user drives physics, so pause, step and reset
+    are denied.
     """
 
     # samples
@@ -87,13 +95,15 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_queue: int = 32
     max_consents: int = 16
     consent_timeout_ns: int = 15 * SECOND
-    intervention_idle_ns: int = 2 * SECOND  # a human who stands by this long gives the agent its robot back
+    intervention_idle_ns: int = 2 * SECOND  # a human whose clutch stays open this long lets agents have the robot
     max_sub_holders: int = 4  # people who share one robot, hands that hold one object
     min_scale: float = 0.05  # motion scaling that holders may set; those of `ControlConfig`
     max_scale: float = 5.0
     # alignment
+    unaligned: tuple[Name, ...] = UNALIGNED
     max_error_at_robot_m: float = 0.05  # stated p95; above it the alignment is refused with advice
     max_residual_tilt_rad: float = 0.01745  # 1 degree: a warning
+    patience_ns: int = 2 * SECOND  # of the first refusals of a participant: progress, then a warning
     min_change_m: float = 0.002  # smaller corrections of an accepted alignment are not worth a new version
     min_change_rad: float = 0.002
     max_anchor_move_m: float = 5.0  # at once, unless forced: catches wrong units
@@ -133,6 +143,9 @@ def check_config(config: AuthorityConfig, robots: Sequence[RobotSpec], objects: 
         raise ValueError(f"assignments name unknown robots {unknown}, robots: {names}")
     if config.leader_apart not in ("ramp", "refuse"):
         raise ValueError(f"leader_apart is {config.leader_apart!r}, must be 'ramp' or 'refuse'")
+    unknown = [who for who in config.unaligned if who not in Role.ALL | Device.ALL and not who.startswith(KEY_PREFIX)]
+    if unknown:
+        raise ValueError(f"unaligned names {unknown}, which are no roles, devices, or keys as {KEY_PREFIX}FINGERPRINT")
     missing = sorted(Device.ALL - config.speed_limits.keys())
     if missing:
         raise ValueError(f"speed_limits lacks {', '.join(missing)}; it must have every device")

@@ -9,14 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+import msgspec
+
 from iris_session.authority.config import AuthorityConfig
 from iris_session.authority.state import HOST_ID, NO_CONNECTION, AuthorityState, LeaseGrant, LeaseState, Participant
 from iris_session.protocol.common import Denial, Lease
 from iris_session.protocol.names import DenialReason, LeaseMode, Role, TargetKind
 from iris_session.protocol.server_messages import (
+    MAX_LEASES,
     Event,
     EventKind,
     LeaseChanged,
+    LeasesChanged,
     ParticipantChanged,
     ParticipantInfo,
     PresenceItem,
@@ -75,7 +79,8 @@ class Context:
         self.snapshots: dict[tuple[int, int], None] = {}  # (connection, request_id) in order
         self.reset = False
         self.step_ticks = 0
-        self.estop_arrived = False
+        #: Connections whose e-stop was counted in this step. For look-ups only.
+        self.stopped_by: set[int] = set()
 
     # --- effects ---
 
@@ -155,8 +160,14 @@ class Context:
         )
 
     def publish_lease(self, lease: LeaseState, cause: str, previous_holder: str = "") -> None:
-        """Publish the present state of a lease as an event."""
-        self.emit(LeaseChanged(self.to_lease(lease), cause, previous_holder))
+        """Publish the present state of a lease as an event, in one with those just before it of the same cause."""
+        change = LeaseChanged(self.to_lease(lease), cause, previous_holder)
+        last = self.events[-1] if self.events else None
+        merged = _merge_changes(last.body, change) if last is not None else None
+        if last is None or merged is None:
+            self.emit(change)
+        else:
+            self.events[-1] = msgspec.structs.replace(last, body=merged)
 
     def to_participant_info(self, p: Participant) -> ParticipantInfo:
         """Return one row of the roster."""
@@ -172,6 +183,18 @@ class Context:
         """Return every target that `p` holds, robots first, in the order of the specification."""
         held = [*self.state.robots.values(), *self.held_objects]
         return [lease for lease in held if any(g.participant == p.id for g in lease.grants)]
+
+
+def _merge_changes(before: EventKind, change: LeaseChanged) -> LeasesChanged | None:
+    """Return one event for both, `None` when `before` is no change of leases for the same cause, or full."""
+    if not isinstance(before, (LeaseChanged, LeasesChanged)) or before.cause != change.cause:
+        return None
+    singles = (before,) if isinstance(before, LeaseChanged) else before.to_single_changes()
+    changes = (*singles, change)
+    if len(changes) > MAX_LEASES:
+        return None
+    leases, holders = tuple(c.lease for c in changes), tuple(c.previous_holder for c in changes)
+    return LeasesChanged(leases, change.cause, holders)
 
 
 def build_unknown_denial(kind: str, name: str, known: Iterable[str]) -> Denial:

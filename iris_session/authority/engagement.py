@@ -28,6 +28,7 @@ def begin_engagement(ctx: Context, lease: LeaseState, g: LeaseGrant, p: Particip
     g.engagement = ctx.state.next_engagement
     ctx.state.next_engagement += 1
     g.device = device
+    g.open_ns = 0
     g.hold = ""
     p.in_use = True
     if p.alignment is not None:
@@ -50,6 +51,7 @@ def rearm_grant(ctx: Context, lease: LeaseState, g: LeaseGrant, reason: str) -> 
     """End the engagement and disarm every latch of `g`: the clutch must open and close again."""
     end_engagement(ctx, lease, g, reason)
     g.armed.clear()
+    g.open_ns = 0
 
 
 def rearm_participant(ctx: Context, p: Participant, reason: str) -> None:
@@ -67,11 +69,28 @@ def rearm_all(ctx: Context, reason: str) -> None:
             rearm_grant(ctx, lease, g, reason)
 
 
+def note_open_clutch(ctx: Context, g: LeaseGrant) -> None:
+    """Note a counted sample with an open clutch of the device that drove last."""
+    if not g.open_ns or ctx.now_ns - g.open_ns > ctx.config.freshness_ns:
+        g.open_from_ns = ctx.now_ns
+    g.open_ns = ctx.now_ns
+
+
+def is_standing_by(ctx: Context, g: LeaseGrant) -> bool:
+    """Return true when the holder has kept the clutch open for `intervention_idle_ns`, by samples without a pause.
+
+    Time in which it is disconnected, untracked, not worn, silent, or rejected says nothing about the hand.
+    """
+    if g.engagement or not g.open_ns or ctx.now_ns - g.open_ns > ctx.config.freshness_ns:
+        return False
+    return ctx.now_ns - g.open_from_ns >= ctx.config.intervention_idle_ns
+
+
 def preempt_agent(ctx: Context, lease: LeaseState, human: Participant) -> None:
     """Let `human` override the agent that drives the robot (mode `priority`)."""
     agent = lease.grants[0]
     rearm_grant(ctx, lease, agent, HoldReason.INTERVENTION)
-    lease.override, lease.override_ns = human.id, ctx.now_ns
+    lease.override = human.id
     ctx.publish_lease(lease, "priority", agent.participant)
     ctx.emit(Intervention(lease.target, human.id, agent.participant, True))
 

@@ -34,7 +34,13 @@ def revoke_grant(ctx: Context, lease: LeaseState, g: LeaseGrant) -> None:
 
 
 def grant_lease(
-    ctx: Context, lease: LeaseState, p: Participant, cause: str, weight: float = 1.0, hand: str = ""
+    ctx: Context,
+    lease: LeaseState,
+    p: Participant,
+    cause: str,
+    weight: float = 1.0,
+    hand: str = "",
+    request_id: int = NO_REPLY,
 ) -> None:
     """Grant `lease` to `p`; grants that exclude it are revoked in the same step. For a holder only the
     weight is set.
@@ -51,7 +57,7 @@ def grant_lease(
         revoke_all(ctx, lease)
     lease.version += 1
     scale = ctx.get_scale(lease) if lease.mode == LeaseMode.SHARED else ctx.default_scale
-    lease.grants.append(LeaseGrant(p.id, lease.version, weight, hand, scale))
+    lease.grants.append(LeaseGrant(p.id, lease.version, weight, hand, scale, request_id=request_id))
     if lease.kind == TargetKind.OBJECT:
         ctx.update_held_objects()
     ctx.publish_lease(lease, cause, previous if previous != p.id else "")
@@ -73,6 +79,18 @@ def release_target(ctx: Context, lease: LeaseState, p: Participant, cause: str) 
     ctx.publish_lease(lease, cause, previous)
 
 
+def release_request(ctx: Context, p: Participant, request_id: int) -> list[LeaseState]:
+    """End every grant that one `acquire` of `p` gave; return their leases."""
+    released = []
+    for lease in ctx.list_leases(p):
+        for g in [g for g in lease.grants if g.participant == p.id and g.request_id == request_id]:
+            previous = ctx.get_holder(lease)
+            revoke_grant(ctx, lease, g)
+            ctx.publish_lease(lease, "released", previous)
+            released.append(lease)
+    return released
+
+
 def release_everything(ctx: Context, p: Participant, cause: str) -> None:
     """End every grant and every pending request of `p`."""
     cancel_requests(ctx, p, "")
@@ -87,7 +105,7 @@ def renew_fencing_tokens(ctx: Context, p: Participant) -> None:
         for g in lease.grants:
             if g.participant == p.id:
                 engagement.rearm_grant(ctx, lease, g, HoldReason.REARM)
-                g.version = lease.version
+                g.version, g.request_id = lease.version, NO_REPLY  # another connection numbers its requests anew
         ctx.publish_lease(lease, "resumed")
 
 

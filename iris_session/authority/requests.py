@@ -1,7 +1,7 @@
 """Requests for leases: acquire (all or none), queue, consent, grasp, a director's assign and set_mode, motion scaling.
 
 No deadlock: a waiting request takes nothing until everything it wants is free, later requests do not overtake it, and
-no holder of a robot may wait for another. Every request gets exactly one reply, when it is decided.
+no holder of a robot may wait for another. Every request gets exactly one reply, when it is decided or withdrawn.
 
 Motion scaling is how far a robot moves as its holder's hand moves. It belongs to the grant, so it ends with it. The
 scale of a robot is that of the grant in charge (`Context.get_scale`). In mode `shared` one scale is set for all
@@ -14,11 +14,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from iris_session.authority import assignment, engagement, leases
+from iris_session.authority import alignment, assignment, engagement, leases
 from iris_session.authority.context import HUMAN, Context, build_unknown_denial, find_grant, join_names
 from iris_session.authority.leases import build_held_denial
 from iris_session.authority.state import NO_CONNECTION, NO_REPLY, LeaseGrant, LeaseState, Participant, Pending
-from iris_session.protocol.client_messages import Acquire, Assign, Consent, Grasp, SetMode, SetScale
+from iris_session.protocol.client_messages import Acquire, Assign, Consent, Grasp, SetMode, SetScale, Withdraw
 from iris_session.protocol.common import Denial
 from iris_session.protocol.names import DenialReason, Device, HoldReason, LeaseMode, Role
 from iris_session.protocol.server_messages import ConsentRequested, ScaleChanged
@@ -35,7 +35,8 @@ def acquire_targets(ctx: Context, p: Participant, m: Acquire) -> None:
     denial = _check_acquire(ctx, p, m, robots, objects)
     any_robot = not robots and not objects
     if denial is None and any_robot:
-        chosen = assignment.choose_robots(ctx, p, _list_free_robots(ctx, p))
+        reserved = [name for w in ctx.state.queue if w.participant != p.id for name in w.robots]
+        chosen = _choose_robots(ctx, p, reserved)
         if isinstance(chosen, Denial):
             denial = chosen
         elif not chosen and not m.wait:
@@ -87,9 +88,16 @@ def _build_none_free_denial(ctx: Context) -> Denial:
     return build_held_denial(ctx, robots[0], "no robot is free: ask a holder to release one")
 
 
-def _list_free_robots(ctx: Context, p: Participant) -> list[str]:
-    reserved = [name for waiting in ctx.state.queue if waiting.participant != p.id for name in waiting.robots]
-    return [n for n, lease in ctx.state.robots.items() if not lease.grants and n not in reserved]
+def _choose_robots(ctx: Context, p: Participant, reserved: list[str]) -> tuple[str, ...] | Denial:
+    """Return what the policy chooses for a participant that names no robot: one that is free and not `reserved`, else
+    one of an agent that `p` may preempt. Empty: there is none.
+    """
+    robots = [lease for name, lease in ctx.state.robots.items() if name not in reserved]
+    chosen = assignment.choose_robots(ctx, p, [lease.target for lease in robots if not lease.grants])
+    if chosen != ():
+        return chosen
+    preempted = [r.target for r in robots if r.mode == LeaseMode.PRIORITY and r.grants and _admits_at_once(ctx, p, r)]
+    return assignment.choose_robots(ctx, p, preempted)
 
 
 def _find_obstacles(
@@ -107,7 +115,8 @@ def _find_obstacles(
         elif lease.mode == LeaseMode.REQUEST:
             consent.append(lease)
         elif not _admits_at_once(ctx, p, lease):
-            return build_held_denial(ctx, lease), []
+            in_hand = lease.mode == LeaseMode.TAKEOVER
+            return (_build_in_hand_denial if in_hand else build_held_denial)(ctx, lease), []
     for name in pending.objects:
         lease = ctx.state.objects[name]
         if find_grant(lease, p.id) is None and len(lease.grants) >= ctx.config.max_sub_holders:
@@ -118,7 +127,7 @@ def _find_obstacles(
 def _admits_at_once(ctx: Context, p: Participant, lease: LeaseState) -> bool:
     """Return true when the mode of a held robot admits `p` at once."""
     if lease.mode == LeaseMode.TAKEOVER:
-        return True
+        return p.role in HUMAN or not _is_in_hand(ctx, lease)
     if lease.mode == LeaseMode.SHARED:
         return len(lease.grants) < ctx.config.max_sub_holders
     if lease.mode == LeaseMode.PRIORITY:
@@ -127,15 +136,32 @@ def _admits_at_once(ctx: Context, p: Participant, lease: LeaseState) -> bool:
     return False
 
 
+def _is_in_hand(ctx: Context, lease: LeaseState) -> bool:
+    """Return true while a human drives, or has not let go: the engagement ended otherwise than by an open clutch, or
+    that has been open for less than `intervention_idle_ns` (to reach further).
+
+    In mode `takeover` an agent waits for it: a human who has lost the robot cannot preempt the agent.
+    """
+    people = [g for g in lease.grants if ctx.state.participants[g.participant].role in HUMAN]
+    return any(g.device and not engagement.is_standing_by(ctx, g) for g in people)
+
+
+def _build_in_hand_denial(ctx: Context, lease: LeaseState) -> Denial:
+    seconds = ctx.config.intervention_idle_ns / 1e9
+    action = f"ask the holder to release it, or to keep the clutch open for {seconds:g} s"
+    return build_held_denial(ctx, lease, action)
+
+
 def _grant_request(ctx: Context, p: Participant, pending: Pending, cause: str) -> None:
     granted = []
     for name in pending.robots:
         lease = ctx.state.robots[name]
         taken = lease.mode == LeaseMode.TAKEOVER and lease.grants
-        leases.grant_lease(ctx, lease, p, "takeover" if taken else cause, pending.weight)
+        why = "takeover" if taken else cause
+        leases.grant_lease(ctx, lease, p, why, pending.weight, request_id=pending.request_id)
         granted.append(lease)
     for name in pending.objects:
-        leases.grant_lease(ctx, ctx.state.objects[name], p, "acquired")
+        leases.grant_lease(ctx, ctx.state.objects[name], p, "acquired", request_id=pending.request_id)
         granted.append(ctx.state.objects[name])
     if pending.request_id != NO_REPLY:
         ctx.accept(p, pending.request_id, granted)
@@ -203,7 +229,7 @@ def advance_requests(ctx: Context) -> None:
         p = ctx.state.participants[pending.participant]
         if pending.any_robot:
             reserved = [name for w in ahead for name in w.robots]
-            chosen = assignment.choose_robots(ctx, p, [n for n in _list_unheld_robots(ctx) if n not in reserved])
+            chosen = _choose_robots(ctx, p, reserved)
             pending.robots = () if isinstance(chosen, Denial) else chosen
             ready = bool(pending.robots)
         else:
@@ -216,8 +242,34 @@ def advance_requests(ctx: Context) -> None:
             ahead.append(pending)
 
 
-def _list_unheld_robots(ctx: Context) -> list[str]:
-    return [name for name, lease in ctx.state.robots.items() if not lease.grants]
+def withdraw_request(ctx: Context, p: Participant, m: Withdraw) -> None:
+    """Take back an `acquire` that has no reply yet, or whose reply its sender has not seen: what it granted is
+    released.
+    """
+    for pending in (*ctx.state.queue, *ctx.state.consents):
+        if pending.participant == p.id and pending.request_id == m.acquire_request_id:
+            denial = _build_withdrawn_denial(ctx, pending)
+            leases.remove_request(ctx, pending)
+            ctx.deny(p, pending.request_id, denial)
+            return ctx.accept(p, m.request_id)
+    return ctx.accept(p, m.request_id, leases.release_request(ctx, p, m.acquire_request_id))
+
+
+def _build_withdrawn_denial(ctx: Context, pending: Pending) -> Denial:
+    """Return the denial of a request that was withdrawn: what it waited for, and the holder."""
+    wanted = ctx.state.robots if pending.any_robot else pending.robots
+    held = next((lease for lease in map(ctx.state.robots.__getitem__, wanted) if lease.grants), None)
+    holder = "" if held is None else ctx.get_holder(held)
+    target = "" if held is None else held.target
+    if pending.consents:
+        text = f"withdrawn before the holder of {join_names(pending.consents.values())} has answered"
+    else:
+        line = [w for w in ctx.state.queue if w.any_robot or pending.any_robot or {*w.robots} & {*pending.robots}]
+        place = next((i for i, w in enumerate(line, 1) if w is pending), 0)
+        names = "any robot" if pending.any_robot else join_names(pending.robots or pending.objects)
+        text = f"withdrawn at place {place} of {len(line)} in the queue for {names}"
+    name = ctx.state.participants[holder].name if holder else ""
+    return Denial(DenialReason.WITHDRAWN, text, "ask the holder to release it", target, holder, name)
 
 
 # --- consent ---
@@ -297,6 +349,9 @@ def grasp_object(ctx: Context, p: Participant, m: Grasp) -> None:
         denial = Denial(DenialReason.UNKNOWN_VALUE, f"unknown device {m.device}", known)
     if denial is None and p.alignment is None:
         denial = Denial(DenialReason.UNALIGNED, "your headset is not aligned", "look at an anchor sheet", m.object)
+    if denial is None and not (p.needs_alignment or alignment.may_be_unaligned(ctx, p.role, p.key_id, m.device)):
+        text = f"you may not use {m.device} without an alignment"
+        denial = Denial(DenialReason.UNALIGNED, text, alignment.UNALIGNED_ADVICE, m.object)
     if denial is not None or lease is None:
         return ctx.deny(p, m.request_id, denial) if denial is not None else None
     own = any(g.participant == p.id and g.hand == m.device for g in lease.grants)

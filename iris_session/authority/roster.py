@@ -10,11 +10,13 @@ from iris_session.authority.state import HOST_ID, NO_CONNECTION, Participant
 from iris_session.protocol.client_messages import RemoveParticipant
 from iris_session.protocol.common import IDENTITY, MAX_TEXT, Alignment, Denial
 from iris_session.protocol.entries import HOST, Join
-from iris_session.protocol.names import AlignmentKind, AuditKind, DenialReason, HoldReason, RefusalCode, Role
+from iris_session.protocol.names import AlignmentKind, AuditKind, DenialReason, Device, HoldReason, RefusalCode, Role
 from iris_session.protocol.server_messages import AlignmentRun, Audited, ParticipantJoined, ParticipantLeft, Snapshot
 from iris_session.protocol.steps import Admitted, Dropped
 
 NOT_NEEDED: Final = Alignment(0, AlignmentKind.NOT_NEEDED, IDENTITY)
+#: Devices that a wearer of a headset drives with. The head alone is presence; its samples are judged one by one.
+HAND_DEVICES: Final = (Device.CONTROLLER_LEFT, Device.CONTROLLER_RIGHT, Device.HAND_LEFT, Device.HAND_RIGHT)
 #: A client sends the capability `run:<random>`, made anew at every start of its tracking, to keep its alignment when
 #: only the connection broke. A client that does not must be aligned again after a resume.
 RUN_PREFIX: Final = "run:"
@@ -42,6 +44,10 @@ def process_join(ctx: Context, connection: int, m: Join) -> None:
     if m.alignment not in (AlignmentKind.MEASURED, AlignmentKind.NOT_NEEDED):
         text, known = f"unknown alignment {m.alignment}", f"{AlignmentKind.MEASURED}, {AlignmentKind.NOT_NEEDED}"
         return ctx.refuse_hello(connection, DenialReason.UNKNOWN_VALUE, text, known)
+    worn = [d for d in m.devices if d in HAND_DEVICES]
+    if m.alignment == AlignmentKind.NOT_NEEDED and m.role in Role.DRIVING and worn and not _may_drive(ctx, m):
+        text = f"role {m.role} may not drive with {', '.join(worn)} without an alignment"
+        return ctx.refuse_hello(connection, DenialReason.UNALIGNED, text, alignment.UNALIGNED_ADVICE)
     if m.roles and m.role not in m.roles:
         ctx.emit(Audited(AuditKind.ROLE_REFUSED, m.key_id, m.name, "", m.role))
         text = f"this key may not join as {m.role}"
@@ -63,6 +69,11 @@ def process_join(ctx: Context, connection: int, m: Join) -> None:
     state.next_participant += 1
     state.participants[p.id] = p
     return _admit_participant(ctx, p, connection, m, resumed=False)
+
+
+def _may_drive(ctx: Context, m: Join) -> bool:
+    """Return true when one of the declared devices may drive without an alignment."""
+    return any(alignment.may_be_unaligned(ctx, m.role, m.key_id, device) for device in m.devices)
 
 
 def _resume_participant(ctx: Context, connection: int, m: Join, p: Participant) -> None:
@@ -115,7 +126,11 @@ def _evict_disconnected(ctx: Context) -> bool:
 
 
 def disconnect_participant(ctx: Context, p: Participant, reason: str, *, keeps_place: bool = False) -> None:
-    """Handle a disconnect: the participant's robots hold, and the grace period begins."""
+    """Handle a disconnect: the participant's robots hold, and the grace period begins.
+
+    A human who has preempted an agent stays in charge through it: the agent must not move a robot that was taken from
+    it and not given back.
+    """
     if p.connection == NO_CONNECTION or p.id == HOST_ID:
         return
     del ctx.by_connection[p.connection]
@@ -124,12 +139,9 @@ def disconnect_participant(ctx: Context, p: Participant, reason: str, *, keeps_p
     leases.cancel_requests(ctx, p, "", keeps_place=keeps_place)
     ctx.emit(ParticipantLeft(p.id, reason, grace=True))
     for lease in ctx.list_leases(p):
-        overrides = lease.override == p.id
         for g in lease.grants:
             if g.participant == p.id:
                 engagement.rearm_grant(ctx, lease, g, HoldReason.DISCONNECTED)
-        if overrides:
-            engagement.end_intervention(ctx, lease)
         ctx.publish_lease(lease, "left", p.id)
     _disconnect_clients(ctx, connection, reason, keeps_place=keeps_place)
 
@@ -246,6 +258,8 @@ def build_snapshot(ctx: Context, request_id: int) -> Snapshot:
         leases=tuple(ctx.to_lease(lease) for lease in (*state.robots.values(), *state.objects.values())),
         paused=state.paused,
         estop=state.estop,
+        stop_seq=state.stop_seq,
+        consent_timeout_ns=ctx.config.consent_timeout_ns,
         episode=state.episode,
         tick_period_ns=ctx.view.tick_period_ns,
     )

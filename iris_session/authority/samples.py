@@ -42,7 +42,7 @@ def check_sample(ctx: Context, p: Participant, entry: Entry, s: Sample, drives: 
     if not reason and s.targets:
         reason = _check_targets(ctx, p, s, drives)
     if not reason:
-        reason = _check_alignment(p, s, drives)
+        reason = _check_alignment(ctx, p, s, drives)
     if not reason:
         reason = _check_numbers(ctx, s)
     if not reason and s.tracked and s.worn:
@@ -78,10 +78,15 @@ def _check_targets(ctx: Context, p: Participant, s: Sample, drives: list[Drive])
     return ""
 
 
-def _check_alignment(p: Participant, s: Sample, drives: list[Drive]) -> str:
-    """Reject poses and twists in another alignment than the one in force, or the one frozen at this engagement."""
-    if not p.needs_alignment or s.kind == SampleKind.JOINTS:
+def _check_alignment(ctx: Context, p: Participant, s: Sample, drives: list[Drive]) -> str:
+    """Reject poses and twists in another alignment than the one in force, or the one frozen at this engagement, and
+    those that would drive without one and may not.
+    """
+    if s.kind == SampleKind.JOINTS:
         return ""
+    if not p.needs_alignment:
+        allowed = not drives or alignment.may_be_unaligned(ctx, p.role, p.key_id, s.device)
+        return "" if allowed else RejectReason.UNALIGNED
     if p.alignment is None:
         return RejectReason.UNALIGNED if drives else ""
     if s.alignment_version == p.alignment.version:
@@ -186,6 +191,9 @@ def reject_sample(ctx: Context, p: Participant, s: Sample, reason: str) -> None:
     if reason == RejectReason.UNALIGNED and p.alignment is None:
         advice = "look at an anchor sheet" if p.aligning else "start its alignment run"
         alignment.warn_wearer(ctx, p, "unaligned", f"{p.name} is not aligned and moves nothing: {advice}", same=advice)
+    if reason == RejectReason.UNALIGNED and not p.needs_alignment:
+        text = f"{p.name} may not drive with {s.device} without an alignment: {alignment.UNALIGNED_ADVICE}"
+        alignment.warn_wearer(ctx, p, "unaligned", text, same=s.device)
     for t in s.targets:
         lease = ctx.find_lease(t.kind, t.name)
         g = find_grant(lease, p.id, s.device) if lease is not None else None

@@ -12,10 +12,18 @@ from typing import Final
 
 from iris_session.authority import engagement, leases
 from iris_session.authority.context import Context, format_names, join_names
-from iris_session.authority.state import HOST_ID, NO_CONNECTION, NO_REPLY, LeaseState, Participant, Pending
+from iris_session.authority.state import (
+    HOST_ID,
+    NO_CONNECTION,
+    NO_REPLY,
+    LeaseState,
+    Participant,
+    Pending,
+    StopState,
+)
 from iris_session.protocol.client_messages import ClearEStop, Control, Episode, EStop
 from iris_session.protocol.common import Denial
-from iris_session.protocol.entries import SceneLoaded, ScenePatched
+from iris_session.protocol.entries import PhysicsDiverged, SceneLoaded, ScenePatched
 from iris_session.protocol.names import (
     ControlAction,
     DenialReason,
@@ -28,6 +36,7 @@ from iris_session.protocol.names import (
 from iris_session.protocol.scene import merge_patches
 from iris_session.protocol.server_messages import EpisodeChanged, EStopChanged, Gap, PauseChanged, SceneChanged
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.protocol.status import StopReport
 
 #: `EpisodeChanged.state` of a running episode.
 RUNNING: Final = "running"
@@ -37,31 +46,65 @@ VERDICTS: Final = {
     EpisodeAction.FAILURE: "failure",
     EpisodeAction.DISCARD: "discarded",
 }
+#: Stops in force that are kept for the status, the newest of each participant.
+MAX_STOPS: Final = 16
+#: Characters of a stop's reason in a denial.
+MAX_SHOWN_REASON: Final = 200
 #: `LeaseChanged.cause` of leases that end with its scene.
 SCENE_CHANGED: Final = "scene_changed"
 
 
-def latch_estop(ctx: Context, participant: str, m: EStop) -> None:
-    """Latch the e-stop; every robot holds from this step on. `participant`: empty for a sender that is no
-    participant.
+def latch_estop(ctx: Context, connection: int, m: EStop) -> None:
+    """Latch the e-stop; every robot holds from this step on.
+
+    Every stop is counted, also while stopped: a clear must know of all. Stops of one connection within one step are one
+    stop. `connection` may have no participant.
     """
-    ctx.estop_arrived = True
-    if not ctx.state.estop:
-        ctx.state.estop = True
-        ctx.emit(EStopChanged(True, participant, m.reason))
+    state = ctx.state
+    if connection in ctx.stopped_by:
+        return
+    ctx.stopped_by.add(connection)
+    p = ctx.by_connection.get(connection)
+    participant, name = (p.id, p.name) if p is not None else ("", "")
+    state.stop_seq += 1
+    stop = StopState(state.stop_seq, participant, name, m.reason, ctx.now_ns)
+    state.stops = [*[old for old in state.stops if old.participant != participant], stop][-MAX_STOPS:]
+    ctx.emit(EStopChanged(True, participant, m.reason, state.stop_seq))
+    if not state.estop:
+        state.estop = True
         engagement.rearm_all(ctx, HoldReason.ESTOP)
 
 
 def clear_estop(ctx: Context, p: Participant, m: ClearEStop) -> None:
-    """End the e-stop; robots hold until clutched again. Denied in a step in which an e-stop arrived."""
-    if ctx.estop_arrived:
-        denial = Denial(DenialReason.ESTOP, "somebody stopped the session in this very step", "look, then clear again")
-        return ctx.deny(p, m.request_id, denial)
-    if ctx.state.estop:
-        ctx.state.estop = False
-        ctx.emit(EStopChanged(False, p.id))
+    """End the e-stop; robots hold until clutched again. Denied when there is a stop that the sender has not seen."""
+    state = ctx.state
+    if m.stop_seq > state.stop_seq:
+        text = f"there is no stop {m.stop_seq}, the newest is {state.stop_seq}"
+        return ctx.deny(p, m.request_id, Denial(DenialReason.INVALID, text, "name the newest stop that you have seen"))
+    if state.estop and m.stop_seq < state.stop_seq:
+        return ctx.deny(p, m.request_id, _build_newer_stop_denial(state.stops[-1], m.stop_seq))
+    if state.estop:
+        state.estop, state.stops = False, []
+        ctx.emit(EStopChanged(False, p.id, "", state.stop_seq))
         engagement.rearm_all(ctx, HoldReason.ESTOP)
     return ctx.accept(p, m.request_id)
+
+
+def _build_newer_stop_denial(newest: StopState, seen: int) -> Denial:
+    who = newest.name or "a connection that has not joined"
+    reason = f" ({newest.reason[:MAX_SHOWN_REASON]})" if newest.reason else ""
+    text = f"stop {newest.stop_seq} of {who}{reason} is newer than stop {seen}, the newest that you have seen"
+    advice = f"look who has stopped the session, then clear stop {newest.stop_seq}"
+    return Denial(DenialReason.ESTOP, text, advice, "", newest.participant, newest.name)
+
+
+def build_stop_reports(ctx: Context) -> tuple[StopReport, ...]:
+    """Return the e-stops in force, newest first."""
+    now_ns = ctx.state.now_ns or 0
+    return tuple(
+        StopReport(s.stop_seq, s.participant, s.name, s.reason, now_ns - s.stopped_ns)
+        for s in reversed(ctx.state.stops)
+    )
 
 
 def control_session(ctx: Context, p: Participant, m: Control) -> None:
@@ -70,20 +113,47 @@ def control_session(ctx: Context, p: Participant, m: Control) -> None:
         known = f"actions: {', '.join(sorted(ControlAction.ALL))}"
         return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_VALUE, f"unknown action {m.action}", known))
     if ctx.config.user_owned_loop:
+        if m.action == ControlAction.RESET and ctx.state.owner_listens:
+            return ctx.accept(p, m.request_id)  # the owner hears of it, and resets
         return ctx.deny(p, m.request_id, build_user_owned_denial(m.action))
     if m.action == ControlAction.STEP:
         if not ctx.state.paused or not 1 <= m.ticks <= ctx.config.max_step_ticks:
             text = f"step needs a paused session and 1 to {ctx.config.max_step_ticks} ticks"
             return ctx.deny(p, m.request_id, Denial(DenialReason.INVALID, text, "pause first"))
+        if ctx.state.diverged:
+            text = f"physics stands still: {ctx.state.diverged}"
+            return ctx.deny(p, m.request_id, Denial(DenialReason.INVALID, text, "reset the session first"))
         ctx.step_ticks = min(ctx.step_ticks + m.ticks, ctx.config.max_step_ticks)
     elif m.action == ControlAction.RESET:
-        reset_scene(ctx)
-    elif ctx.state.paused != (m.action == ControlAction.PAUSE):
-        ctx.state.paused = not ctx.state.paused
-        ctx.emit(PauseChanged(ctx.state.paused, p.id))
-        # A hand moves on while physics stands still: motion must be latched anew.
-        engagement.rearm_all(ctx, HoldReason.GAP)
+        reset_scene(ctx, p.id)
+    elif m.action == ControlAction.RESUME:
+        if ctx.state.diverged:
+            reset_scene(ctx, p.id)  # nothing else can go on
+        _set_paused(ctx, p.id, False)
+    else:
+        ctx.state.paused_by_divergence = False  # a director wants it: a reset does not end it
+        _set_paused(ctx, p.id, True)
     return ctx.accept(p, m.request_id)
+
+
+def _set_paused(ctx: Context, by: str, paused: bool, reason: str = "") -> None:
+    if ctx.state.paused == paused:
+        return
+    ctx.state.paused = paused
+    ctx.emit(PauseChanged(paused, by, reason))
+    # A hand moves on while physics stands still: motion must be latched anew.
+    engagement.rearm_all(ctx, HoldReason.GAP)
+
+
+def record_divergence(ctx: Context, m: PhysicsDiverged) -> None:
+    """Record that physics stands still until a reset, and pause; the owner of a loop of its own resets it there."""
+    state = ctx.state
+    if m.scene_epoch != state.scene_epoch or state.diverged:
+        return  # a reset or another scene came before
+    state.diverged = m.text or "numbers that are not finite"
+    if not state.paused and not ctx.config.user_owned_loop:
+        state.paused_by_divergence = True
+        _set_paused(ctx, HOST_ID, True, state.diverged)
 
 
 def build_user_owned_denial(action: str) -> Denial:
@@ -91,15 +161,19 @@ def build_user_owned_denial(action: str) -> Denial:
     return Denial(DenialReason.USER_OWNED, f"{action}: the user's own loop drives physics", "do it in that program")
 
 
-def reset_scene(ctx: Context) -> None:
-    """Return to the initial state before the ticks of this step: a new scene epoch, leases stay."""
+def reset_scene(ctx: Context, by: str) -> None:
+    """Return to the initial state before the ticks of this step: a new scene epoch, leases stay. `by`: who wants it."""
     if not ctx.reset:
         ctx.reset = True
-        begin_scene_epoch(ctx, "reset")
+        begin_scene_epoch(ctx, "reset", by)
 
 
-def begin_scene_epoch(ctx: Context, cause: str) -> None:
-    """Begin a scene epoch: entries sent for the old one no longer count."""
+def begin_scene_epoch(ctx: Context, cause: str, by: str = HOST_ID) -> None:
+    """Begin a scene epoch: entries sent for the old one no longer count. Ends the pause of physics that diverged."""
+    was_paused, ctx.state.diverged = ctx.state.paused_by_divergence, ""
+    ctx.state.paused_by_divergence = False
+    if was_paused:
+        _set_paused(ctx, by, False)
     ctx.state.scene_epoch += 1
     ctx.state.handovers.clear()
     ctx.state.regrasps.clear()
@@ -128,8 +202,6 @@ def record_gap(ctx: Context, duration_ns: int, kind: str = "stalled") -> None:
                     ctx.publish_lease(lease, "left", p.id)
         else:
             p.heard_ns = max(p.heard_ns, ctx.now_ns)
-    for lease in ctx.state.robots.values():
-        lease.override_ns = ctx.now_ns  # the overriding human could not engage meanwhile
     ctx.emit(Gap(kind, max(0, duration_ns)))
     engagement.rearm_all(ctx, HoldReason.GAP)
 
@@ -139,7 +211,7 @@ def record_gap(ctx: Context, duration_ns: int, kind: str = "stalled") -> None:
 
 def control_episode(ctx: Context, p: Participant, m: Episode) -> None:
     """Process one action of a participant that may drive. `rerecord` discards, resets and starts the next number at
-    once.
+    once; in a user loop whose owner listens, the next number starts when the owner has reset the scene.
     """
     if m.action not in EpisodeAction.ALL:
         known = f"actions: {', '.join(sorted(EpisodeAction.ALL))}"
@@ -149,7 +221,8 @@ def control_episode(ctx: Context, p: Participant, m: Episode) -> None:
         return ctx.deny(p, m.request_id, denial)
     now = ctx.state.episode
     running = now is not None and now.state == RUNNING
-    if m.action in (EpisodeAction.RESET, EpisodeAction.RERECORD) and ctx.config.user_owned_loop:
+    resets = m.action in (EpisodeAction.RESET, EpisodeAction.RERECORD)
+    if resets and ctx.config.user_owned_loop and not ctx.state.owner_listens:
         return ctx.deny(p, m.request_id, build_user_owned_denial(m.action))
     if running == (m.action in (EpisodeAction.START, EpisodeAction.RESET)):
         text = "an episode is running" if running else "no episode is running"
@@ -160,11 +233,22 @@ def control_episode(ctx: Context, p: Participant, m: Episode) -> None:
         _set_episode(ctx, EpisodeChanged(number, VERDICTS[m.action], m.label, p.id))
     if m.action == EpisodeAction.RERECORD:
         _set_episode(ctx, EpisodeChanged(number, VERDICTS[EpisodeAction.DISCARD], m.label, p.id))
-    if m.action in (EpisodeAction.RESET, EpisodeAction.RERECORD):
-        reset_scene(ctx)
-    if m.action in (EpisodeAction.START, EpisodeAction.RERECORD):
-        _set_episode(ctx, EpisodeChanged(number + 1, RUNNING, m.label, p.id))
+    ctx.state.rerecording = None
+    following = EpisodeChanged(number + 1, RUNNING, m.label, p.id)
+    if resets and ctx.config.user_owned_loop:
+        ctx.state.rerecording = following if m.action == EpisodeAction.RERECORD else None
+    elif resets:
+        reset_scene(ctx, p.id)
+    if m.action == EpisodeAction.START or (m.action == EpisodeAction.RERECORD and not ctx.config.user_owned_loop):
+        _set_episode(ctx, following)
     return ctx.accept(p, m.request_id)
+
+
+def start_rerecording(ctx: Context) -> None:
+    """Start the episode that waited for the owner of a user loop to reset the scene."""
+    following, ctx.state.rerecording = ctx.state.rerecording, None
+    if following is not None:
+        _set_episode(ctx, following)
 
 
 def _set_episode(ctx: Context, episode: EpisodeChanged) -> None:

@@ -18,6 +18,8 @@ from iris_session.protocol.steps import CommandSource
 
 #: Participant id of the process that owns the session. It is not part of the roster.
 HOST_ID: Final = "host"
+#: `Pending.request_id` of a place in the queue that outlived its connection: no reply is sent.
+NO_REPLY: Final = -1
 #: `Participant.connection` while the connection is lost.
 NO_CONNECTION: Final = -1
 
@@ -101,7 +103,8 @@ class Participant(msgspec.Struct):
     active, `alignment_run` counts the starts. `placed`: a director's placement is in force, so measurements do not
     count. `in_use`: it has engaged in this run and tracking frame, first aligned in it at `aligned_ns`. Proposals that
     were made at `proposals_from_ns` or before do not count. `told_ns`: when a correction was last announced to its
-    wearer. `devices` empty: none declared, all known ones are accepted.
+    wearer. `refusal`: of a measurement, reported as progress since `refusal_from_ns`; empty: none, or it was reported
+    as a warning. `devices` empty: none declared, all known ones are accepted.
     """
 
     id: str
@@ -134,6 +137,8 @@ class Participant(msgspec.Struct):
     told_ns: int | None = None
     alarm: AlarmState | None = None
     refused_ns: int | None = None
+    refusal: str = ""
+    refusal_from_ns: int = 0
     warnings: dict[str, WarningState] = {}
     seen: dict[str, DeviceState] = {}
     rejected: dict[str, int] = {}
@@ -146,6 +151,9 @@ class LeaseGrant(msgspec.Struct):
     `version`: fencing token; tokens from it up to the lease's own are valid, so a second sharer does not fence the
     first. `hand`: the only device that may use it (objects taken with `grasp`). `scale`: motion scaling (robots).
     `armed`: devices whose clutch was seen open since the last rearm. `engagement` 0: not engaged, `hold` is the reason.
+    `open_from_ns` to `open_ns`: first and newest sample of the time in which the clutch of `device` is open; `open_ns`
+    0: not open, or not known. `request_id`: of the `acquire` of the present connection that granted it, else
+    `NO_REPLY`.
     """
 
     participant: str
@@ -162,13 +170,16 @@ class LeaseGrant(msgspec.Struct):
     T_world_tracking: Pose = IDENTITY
     counted_ns: int = 0
     counted_step: int = 0
+    open_from_ns: int = 0
+    open_ns: int = 0
     source: CommandSource | None = None
     gripper: float | None = None
+    request_id: int = NO_REPLY
 
 
 class LeaseState(msgspec.Struct):
-    """One robot or object. `override`: the human who has preempted the agent (mode `priority`), last engaged at
-    `override_ns`.
+    """One robot or object. `override`: the human who has preempted the agent (mode `priority`), also while it is
+    disconnected.
 
     Objects: `lead` is the engagement of the leading hand, `T_hand_object` its latched offset, `T_world_object` the
     last commanded pose.
@@ -180,14 +191,9 @@ class LeaseState(msgspec.Struct):
     version: int = 0
     grants: list[LeaseGrant] = []
     override: str = ""
-    override_ns: int = 0
     lead: int = 0
     T_hand_object: Pose = IDENTITY
     T_world_object: Pose = IDENTITY
-
-
-#: `Pending.request_id` of a place in the queue that outlived its connection: no reply is sent.
-NO_REPLY: Final = -1
 
 
 class Pending(msgspec.Struct):
@@ -240,12 +246,25 @@ class CrossCheckState(msgspec.Struct):
     compared_ns: int
 
 
+class StopState(msgspec.Struct, array_like=True):
+    """One e-stop that is in force. `name`: of the participant, as it was then."""
+
+    stop_seq: int
+    participant: str
+    name: str
+    reason: str
+    stopped_ns: int
+
+
 class AuthorityState(msgspec.Struct):
     """The authority's whole memory. `name_owners`: assigned name -> key that has it (policy `config`).
 
     `scene`: None while it is the one that the session began with. `patches`: all of its patches, merged. `anchors`:
     `T_world_anchor` by id, as they are since `anchors_ns`. `cross_checks`: by both participants, "a b". `handovers`:
-    objects on their way between people; `regrasps`: between two robots, of one person too.
+    objects on their way between people; `regrasps`: between two robots, of one person too. `stop_seq` counts the
+    e-stops, `stops` are those in force, oldest first. `diverged`: why physics stands still until a reset, which
+    also ends the pause that came of it (`paused_by_divergence`). `owner_listens`: the owner of a user loop takes
+    requests. `rerecording`: the episode that begins when that owner has reset the scene.
     """
 
     robots: dict[str, LeaseState]
@@ -265,9 +284,15 @@ class AuthorityState(msgspec.Struct):
     queue: list[Pending] = []
     consents: list[Pending] = []
     estop: bool = False
+    stop_seq: int = 0
+    stops: list[StopState] = []
     paused: bool = False
+    diverged: str = ""
+    paused_by_divergence: bool = False
     hold_expiry_until_ns: int = 0
     episode: EpisodeChanged | None = None
+    owner_listens: bool = False
+    rerecording: EpisodeChanged | None = None
     handovers: dict[str, HandoverTrack] = {}
     regrasps: dict[str, HandoverTrack] = {}
     handover_tick: int = -1

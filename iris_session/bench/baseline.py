@@ -74,7 +74,7 @@ def measure_baseline(receivers: int, seconds: float = SECONDS) -> dict[str, floa
 
 def _start_receiver(address: str, sockets: int) -> subprocess.Popen[bytes]:
     command = module_command("iris_session.bench.baseline", address, str(sockets))
-    return subprocess.Popen(command, stdout=subprocess.PIPE, env=child_environment())
+    return subprocess.Popen(command, stdout=subprocess.PIPE, env=child_environment(), process_group=0)
 
 
 def _read_ages(process: subprocess.Popen[bytes]) -> NDArray[np.float64]:

@@ -20,12 +20,14 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
+from iris_session.authority.config import UNALIGNED, AuthorityConfig
 from iris_session.bench.clients import ClientJob, Job
 from iris_session.bench.report import BenchError
 from iris_session.netsim.process import ImpairmentProcess, make_link_address
 from iris_session.physics import PacerStats
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.entries import Entry
+from iris_session.protocol.names import Role
 from iris_session.protocol.server_messages import StateHeader
 from iris_session.session.config import SessionConfig
 from iris_session.session.session import Session
@@ -34,6 +36,8 @@ from iris_session.system.process import PIPE, ChildProcess
 #: The bars are stated for at most four clients in one process.
 CLIENTS_PER_PROCESS: Final = 4
 WARM_UP_S: Final = 3.0
+#: Time in which client processes have to end after the measurement [s].
+EXIT_S: Final = 60.0
 CLIENTS: Final = "iris_session.bench.clients"
 Log = dict[str, NDArray[Any]]
 
@@ -92,7 +96,7 @@ class ClientProcess:
 
     def __init__(self, job: Job, module: str = CLIENTS) -> None:
         self.job = job
-        self._process = ChildProcess(module, stdout=PIPE)
+        self._process = ChildProcess(module, stdout=PIPE, own_group=True)  # Ctrl-C ends the benchmark, which ends it
         self._process.write(msgspec.json.encode(job) + b"\n")
 
     def is_ready(self) -> bool:
@@ -106,8 +110,11 @@ class ClientProcess:
 
     def read_result(self) -> dict[str, Log]:
         """Return the logs by client name, once the process has ended."""
-        if self._process.wait(60.0) != 0:
-            raise BenchError(f"a client process failed with status {self._process.exit_status}")
+        status = self._process.wait(EXIT_S)
+        if status is None:
+            raise BenchError(f"a client process still runs {EXIT_S:g} s after the end of the measurement")
+        if status != 0:
+            raise BenchError(f"a client process failed with exit status {status}")
         with np.load(self.job.log) as columns:
             logs: dict[str, Log] = {}
             for key in columns.files:
@@ -183,6 +190,8 @@ def measure(
             state_port=0,
             record=False,
             assets=assets,
+            # The tracking frames of the emulated operators are the world.
+            authority=AuthorityConfig(unaligned=(*UNALIGNED, Role.OPERATOR)),
             curve_key="" if keys is None else keys["server_file"],
             curve_clients="" if keys is None else str(folder / "clients"),
         )

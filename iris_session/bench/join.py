@@ -127,7 +127,7 @@ def _make_bars(results: dict[str, Any], sent: int) -> list[Any]:
 
 def _prepare_scene(model: Path, store: Path) -> PreparedScene:
     command = module_command("iris_session.bench.join_scene", str(model), str(store))
-    done = subprocess.run(command, stdout=PIPE, env=child_environment(), check=False)
+    done = subprocess.run(command, stdout=PIPE, env=child_environment(), check=False, process_group=0)
     if done.returncode:
         raise BenchError(f"preparing the scene failed with status {done.returncode}")
     return msgspec.json.decode(done.stdout, type=PreparedScene)
@@ -164,7 +164,7 @@ class _Joiner:
         if self._process is not None:
             return
         job = JoinJob(session.address, session.origin_ns, self._cache, self._bare_port)
-        self._process = ChildProcess("iris_session.bench.join_clients", stdout=PIPE)
+        self._process = ChildProcess("iris_session.bench.join_clients", stdout=PIPE, own_group=True)
         self._write_line(msgspec.json.encode(job))
 
     def start_join(self) -> None:

@@ -155,7 +155,10 @@ def run_align(arguments: argparse.Namespace) -> int:
         for person in people:
             denied = ""
             try:
-                client.align(arguments.what, person.id)
+                if arguments.what == AlignAction.START:
+                    client.alignment.start_run(person.id)
+                else:
+                    client.alignment.stop_run(person.id)
             except DeniedError as error:
                 if len(people) == 1:
                     raise
@@ -177,7 +180,7 @@ def run_place(arguments: argparse.Namespace) -> int:
     """Place the alignment of one participant."""
     with join_as_director(arguments) as client:
         (one,) = select_participants(client, arguments.participant, allow_all=False)
-        client.place_alignment(one.id, arguments.pose, offset=arguments.offset)
+        client.alignment.place(one.id, arguments.pose, offset=arguments.offset)
     if arguments.json:
         print_json({"ok": True, "participant": {"id": one.id, "name": one.name}, "offset": arguments.offset})
     else:
@@ -193,7 +196,7 @@ def run_move(arguments: argparse.Namespace) -> int:
         report = client.status()
         was = next((one.T_world_anchor.p for one in report.anchors if one.anchor_id == arguments.anchor), None)
         moved_m = 0.0 if was is None else distance(was, arguments.pose[0])  # the session denies an unknown anchor
-        client.move_anchor(arguments.anchor, arguments.pose, force=arguments.force)
+        client.alignment.move_anchor(arguments.anchor, arguments.pose, force=arguments.force)
     aligned = [p for p in list_headsets(report) if p.alignment in (AlignmentKind.MEASURED, AlignmentKind.PLACED)]
     stay = {
         p.id: f"{p.name} ({p.id}): {why}" for p in aligned if (why := explain_unaffected_alignment(p, arguments.anchor))

@@ -27,10 +27,11 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iris-session bench state --profile busy-wifi\n"
         "  iris-session bench alignment --pairs 2000 --seed 1 --check\n"
         "  iris-session bench deformable --check\n"
-        "  iris-session bench join --check",
+        "  iris-session bench join --check\n"
+        "  iris-session bench stop --check",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("bench", choices=("state", "input", "slow-client", "alignment", "deformable", "join"))
+    parser.add_argument("bench", choices=("state", "input", "slow-client", "alignment", "deformable", "join", "stop"))
     parser.add_argument(
         "--clients",
         type=int,
@@ -53,7 +54,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     parser.add_argument(
         "--assets-mb", type=float, default=200.0, help="join: size of the assets after compression (default: 200)"
     )
-    parser.add_argument("--seconds", type=parse_seconds, help="measured part (default: 20; slow-client: 50)")
+    parser.add_argument("--seconds", type=parse_seconds, help="measured part (default: 20; slow-client: 50; stop: 1)")
     parser.add_argument(
         "--profile",
         default="",
@@ -106,6 +107,10 @@ def _check_sizes(arguments: argparse.Namespace) -> None:
         limits = {"pairs": (10, 100_000)}
     elif arguments.bench == "deformable":
         limits = {"clients": (1, 64), "vertices": (16, 10_000)}
+    elif arguments.bench == "stop":
+        limits = {}
+        if arguments.curve or arguments.profile:
+            raise CommandError("bench stop cannot be combined with --curve or --profile: it uses no network")
     elif arguments.bench == "join":
         limits = {"clients": (1, 64), "objects": (1, 2000), "assets_mb": (1, 2000)}
         if arguments.curve or arguments.profile:
@@ -125,6 +130,10 @@ def _run_benchmark(arguments: argparse.Namespace, progress: Callable[[str], None
         from iris_session.bench.alignment import run_alignment
 
         return run_alignment(arguments.pairs, arguments.seed, progress)
+    if arguments.bench == "stop":
+        from iris_session.bench.stop import run_stop
+
+        return run_stop(min(arguments.seconds or 1.0, 60.0), progress)
     if arguments.bench == "join":
         from iris_session.bench.join import run_join
 

@@ -5,9 +5,14 @@ from __future__ import annotations
 import argparse
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from iris_session.cli.common import CommandError, add_json_option, print_json
 from iris_session.cli.pair import add_role_option, parse_roles
+from iris_session.protocol.names import Role
+
+if TYPE_CHECKING:
+    from iris_session.security import KeyPair
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -38,7 +43,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     one = actions.add_parser(
         "allow",
         help="allow a key",
-        description="Add a key to the list, or change its roles.",
+        description="Add a key to the list, or change its roles. Without a key: this user's own, to direct too.",
         epilog="examples:\n"
         "  iris-session keys allow ann ann.key --role operator\n"
         "  iris-session keys allow me --role any",
@@ -117,7 +122,10 @@ def run_allow(arguments: argparse.Namespace) -> int:
     home = KeyHome()
     given = arguments.key or home.load_identity().public
     key = load_public(given) if _is_key_file(given) else given
-    entry = home.clients.allow_key(arguments.name, key, parse_roles(arguments.role))
+    roles = parse_roles(arguments.role)
+    if not arguments.key and arguments.role is None:
+        roles = (*roles, Role.DIRECTOR)  # a user who can write this list can take every role anyway
+    entry = home.clients.allow_key(arguments.name, key, roles)
     print(f"{entry.name} may join ({entry.fingerprint}) as {', '.join(entry.roles) or 'any role'}")
     return 0
 
@@ -141,24 +149,26 @@ def run_revoke(arguments: argparse.Namespace) -> int:
 
 
 def run_show(arguments: argparse.Namespace) -> int:
-    """Print the user's own keys, without secrets."""
+    """Print the user's own keys, without secrets. Creates none."""
     from iris_session.security import KeyHome
 
     home = KeyHome()
-    server, own = home.load_server_key(), home.load_identity()
+    server, own = home.find_server_key(), home.find_identity()
     if arguments.json:
-        print_json(
-            {
-                "home": str(home.path),
-                "server": {"key": server.public, "fingerprint": server.fingerprint},
-                "identity": {"key": own.public, "fingerprint": own.fingerprint},
-            }
-        )
+        print_json({"home": str(home.path), "server": _key_to_dict(server), "identity": _key_to_dict(own)})
         return 0
     print(f"folder of keys    {home.path}")
-    print(f"your sessions     {server.fingerprint}    public key {server.public}")
-    print(f"you as a client   {own.fingerprint}    public key {own.public}")
+    print(f"your sessions     {_format_key(server, 'created when you serve an encrypted session')}")
+    print(f"you as a client   {_format_key(own, 'created when you join an encrypted session')}")
     return 0
+
+
+def _key_to_dict(pair: KeyPair | None) -> dict[str, str] | None:
+    return None if pair is None else {"key": pair.public, "fingerprint": pair.fingerprint}
+
+
+def _format_key(pair: KeyPair | None, when: str) -> str:
+    return f"no key yet, {when}" if pair is None else f"{pair.fingerprint}    public key {pair.public}"
 
 
 def run_forget(arguments: argparse.Namespace) -> int:

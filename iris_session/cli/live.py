@@ -78,7 +78,8 @@ def format_event(event: Event) -> str:
     if isinstance(body.get("alignment"), dict):
         alignment = body.pop("alignment")
         body["kind"] = alignment["kind"]
-        body["error_mm"] = round(alignment["error_at_robot_m"] * 1e3, 1)
+        stated = alignment["kind"] == "measured" and not alignment.get("offset")
+        body["error_mm"] = round(alignment["error_at_robot_m"] * 1e3, 1) if stated else "-"
     if isinstance(body.get("lease"), dict):
         lease = body.pop("lease")
         body = {"target": lease["target"], "holder": lease["holder"] or "-", **body}
@@ -93,10 +94,11 @@ class TerminalView:
     for which the display was too slow.
     """
 
-    def __init__(self, session: Owner, out: TextIO, title: str) -> None:
+    def __init__(self, session: Owner, out: TextIO, title: str, footer: str = "") -> None:
         self._session = session
         self._out = out
         self._title = title
+        self._footer = footer
         self._next_s = 0.0
         self._seen = 0
         self._noteworthy = EventFilter()
@@ -108,7 +110,7 @@ class TerminalView:
     def open(self) -> Iterator[Callable[[], None]]:
         """Start the display, yield `update`, and stop the display after the last line."""
         self._out.flush()
-        child = ChildProcess("iris_session.cli.live", [self._title], stdout=self._out)
+        child = ChildProcess("iris_session.cli.live", [self._title, self._footer], stdout=self._out)
         self._pipe = child.stdin_fd
         os.set_blocking(self._pipe, False)
         try:
@@ -150,7 +152,7 @@ class TerminalView:
         return True
 
 
-def _render_table(title: str, status: dict[str, Any], events: list[str]) -> RenderableType:
+def _render_table(title: str, status: dict[str, Any], events: list[str], footer: str = "") -> RenderableType:
     from rich.console import Group
     from rich.panel import Panel
     from rich.table import Table
@@ -167,13 +169,25 @@ def _render_table(title: str, status: dict[str, Any], events: list[str]) -> Rend
         table.add_row(*(Text(to_printable(cell)) for cell in cells))  # names are user input, never markup
     late = status["lateness"]
     state = "E-STOP" if status["estop"] else "paused" if status["paused"] else "running"
-    footer = (
+    line = (
         f"{state}  tick {status['tick']}  late {late.get('late_share', 0.0) * 100:.2f} %  "
         f"lateness p99 {late.get('p99_ms', 0.0):.2f} ms  handovers {status['handovers']}  "
         f"drops {sum(status['drops'].values())}"
     )
+    if reason := status.get("pause_reason"):
+        line += f"\nphysics stands still: {reason}; `iris-session reset` begins anew"
+    for stop in status.get("stops", ()):
+        why = f": {stop['reason']}" if stop["reason"] else ""
+        line += (
+            f"\ne-stop {stop['stop_seq']} by {stop['name'] or 'a connection'}, {stop['age_ns'] * 1e-9:.0f} s ago{why}"
+        )
     log = Text("\n".join(events[-8:]), style="dim", no_wrap=True, overflow="ellipsis")
-    return Panel(Group(table, Text(footer), log), title=f"{title}  {status['session_time_s']:.1f} s")
+    style = "bold red" if status["estop"] else ""
+    return Panel(
+        Group(table, Text("\n".join(map(to_printable, line.split("\n"))), style=style), log),
+        title=f"{title}  {status['session_time_s']:.1f} s",
+        subtitle=footer or None,
+    )
 
 
 def _parse_refreshes(lines: Iterator[str]) -> Iterator[dict[str, Any]]:
@@ -184,7 +198,7 @@ def _parse_refreshes(lines: Iterator[str]) -> Iterator[dict[str, Any]]:
             continue
 
 
-def main(title: str) -> int:
+def main(title: str, footer: str = "") -> int:
     """Draw refreshes until standard input ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session's process decides when this ends
     refreshes = _parse_refreshes(iter(sys.stdin))
@@ -198,7 +212,7 @@ def main(title: str) -> int:
             with Live(auto_refresh=False) as live:
                 for refresh in refreshes:
                     events = (events + refresh["events"])[-8:]
-                    live.update(_render_table(title, refresh["status"], events), refresh=True)
+                    live.update(_render_table(title, refresh["status"], events, footer), refresh=True)
             return 0
     for refresh in refreshes:
         for line in refresh["events"]:
@@ -207,4 +221,4 @@ def main(title: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1]))
+    sys.exit(main(*sys.argv[1:3]))

@@ -10,8 +10,10 @@ import sys
 from importlib.metadata import version
 
 from iris_session.cli import (
+    INTERRUPTED,
     anchors,
     bench,
+    control,
     demo,
     doctor,
     emulate,
@@ -25,6 +27,7 @@ from iris_session.cli import (
     verify,
 )
 from iris_session.cli.common import CommandError, join_negative_poses, list_expected_errors
+from iris_session.system.extras import describe_import_error
 from iris_session.system.log import LEVEL_VARIABLE, configure_logging
 
 _EPILOG = """examples:
@@ -38,10 +41,17 @@ _EPILOG = """examples:
   iris-session anchors print --size 160mm    a sheet for headsets and cameras, as PDF
   iris-session emulate --behaviour wander    one emulated headset joins the session on this machine
   iris-session status --watch                participants, robots, ages, late ticks, recorder of a session
+  iris-session estop                         stop every robot of the session; clear-estop, pause, assign, ... as well
   iris-session doctor 192.168.1.20           what is wrong, why, and what to do
   iris-session verify sessions/*/session.rrd re-simulate a recording and compare it bit for bit
   iris-session bench state --check           measure the state stream and compare it with its bars
 """
+
+
+#: In the order of `--help`.
+_MODULES = (
+    demo, serve, pair, keys, sessions, status, control, doctor, verify, emulate, robots, scene, anchors, bench,
+)  # fmt: skip
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -54,39 +64,64 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"iris-session {version('iris-session')}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (demo, serve, pair, keys, sessions, status, doctor, verify, emulate, robots, scene, anchors, bench):
+    for module in (
+        demo,
+        serve,
+        pair,
+        keys,
+        sessions,
+        status,
+        control,
+        doctor,
+        verify,
+        emulate,
+        robots,
+        scene,
+        anchors,
+        bench,
+    ):
         module.register(commands)
     return parser
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command. Return the exit status."""
-    configure_logging()
-    arguments = build_parser().parse_args(join_negative_poses(sys.argv[1:] if argv is None else argv))
-    os.environ.setdefault("MUJOCO_GL", "disable")  # no command draws: MuJoCo need not load OpenGL, in no process
-    from iris_session.physics import AmbiguousModelError
+    try:
+        return _run_command(argv)
+    except KeyboardInterrupt:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C must not interrupt the interpreter's shutdown
+        return INTERRUPTED
 
+
+def _run_command(argv: list[str] | None) -> int:
     session_log = logging.getLogger("iris_session.session")
     try:
+        configure_logging()
+        arguments = build_parser().parse_args(join_negative_poses(sys.argv[1:] if argv is None else argv))
+        os.environ.setdefault("MUJOCO_GL", "disable")  # no command draws: MuJoCo need not load OpenGL, in no process
         if LEVEL_VARIABLE not in os.environ:
             # `serve` and `demo` show restarts, gaps and overruns as events. The log would repeat them, from the thread
             # that takes steps, which must not wait for a terminal.
             session_log.setLevel(logging.ERROR)
         status: int = arguments.run(arguments)
         sys.stdout.flush()  # a closed pipe is noticed here, not when the interpreter ends
-    except KeyboardInterrupt:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C must not interrupt the interpreter's shutdown
-        return 130
     except BrokenPipeError:  # the reader of the pipe has closed it (`| head`)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left has nowhere to go
         return 1
     except CommandError as error:
         print(f"iris-session: {error}", file=sys.stderr)
         return error.status
+    except ImportError as error:
+        text = describe_import_error(error)
+        if not text:
+            raise
+        print(f"iris-session: {text}", file=sys.stderr)
+        return 2
     except list_expected_errors() as error:
         print(f"iris-session: {error}{_format_option_hint(error)}", file=sys.stderr)
-        if isinstance(error, AmbiguousModelError):  # to standard output: `iris-session robots scene.xml > robots.toml`
-            print(error.toml)
+        toml = getattr(error, "toml", "")  # of `AmbiguousModelError`
+        if toml:  # to standard output: `iris-session robots scene.xml > robots.toml`
+            print(toml)
         return 2
     finally:
         session_log.setLevel(logging.NOTSET)

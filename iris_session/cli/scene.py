@@ -286,7 +286,7 @@ def find_scene_file(scene: str) -> Path | None:
         CommandError: It is a folder, or a file that does not exist or has an unknown suffix.
     """
     from iris_session.scene import SceneBuildError
-    from iris_session.scene.importers.files import ENDINGS, present, xacro_advice
+    from iris_session.scene.importers.files import ENDINGS, check_present, xacro_advice
 
     path = expand_path(scene)
     kind = path.suffix.lower()
@@ -295,7 +295,7 @@ def find_scene_file(scene: str) -> Path | None:
     if not kind and not path.is_file() and (_is_scene_name(scene) or not path.is_dir()):
         return None
     try:
-        present(path)
+        check_present(path)
     except SceneBuildError as error:
         raise CommandError(str(error)) from None
     if kind == ".xacro":

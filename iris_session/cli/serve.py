@@ -7,6 +7,7 @@ import dataclasses
 import re
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
@@ -66,6 +67,13 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         help="robots of a participant, repeatable; implies --assignment config",
     )
     parser.add_argument(
+        "--unaligned",
+        action="append",
+        default=[],
+        metavar="WHO",
+        help="a role, device or key:FINGERPRINT that may drive without an alignment too, repeatable (remote VR)",
+    )
+    parser.add_argument(
         "--resume",
         type=Path,
         metavar="RECORDING",
@@ -91,6 +99,7 @@ def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConf
     if assigned and policy != AssignmentPolicy.CONFIG:
         raise CommandError(f"--assignment {policy}: --assign needs --assignment {AssignmentPolicy.CONFIG}")
     changes = {"policy": policy, "default_mode": arguments.mode, "assignments": assigned or None}
+    changes["unaligned"] = parse_unaligned(getattr(arguments, "unaligned", []))
     authority = msgspec.structs.replace(AuthorityConfig(), **{k: v for k, v in changes.items() if v is not None})
     if arguments.interface and arguments.host != defaults.host:
         raise CommandError("--interface and --host both set where to listen: give one of them")
@@ -128,6 +137,18 @@ def parse_assignments(options: list[str]) -> dict[str, tuple[str, ...]]:
     return found
 
 
+def parse_unaligned(options: list[str]) -> tuple[str, ...] | None:
+    """Return the roles, devices and keys that may drive without an alignment, `None` for those of the default."""
+    from iris_session.authority.config import KEY_PREFIX, UNALIGNED
+    from iris_session.protocol.names import Device, Role
+
+    for text in options:
+        if text not in Role.ALL | Device.ALL and not text.startswith(KEY_PREFIX):
+            known = ", ".join(sorted(Role.DRIVING | Device.ALL))
+            raise CommandError(f"--unaligned {text}: must be a role or device ({known}) or {KEY_PREFIX}FINGERPRINT")
+    return (*UNALIGNED, *options) if options else None
+
+
 def make_session_name(path: Path) -> str:
     """Return the default name of a session: that of its scene, with invalid characters replaced."""
     return re.sub(r"[^A-Za-z0-9._-]+", "-", path.stem).strip("._-")[:48] or "session"
@@ -152,7 +173,7 @@ def create_publisher(arguments: argparse.Namespace, path: Path) -> ScenePublishe
     """Return a publisher that shows a file in which nothing moves."""
     from iris_session.session.scene_publisher import ScenePublisher
 
-    drives = ("robots", "assign", "assignment", "mode")
+    drives = ("robots", "assign", "unaligned", "assignment", "mode")
     if given := [f"--{name}" for name in drives if getattr(arguments, name)]:
         raise CommandError(f"{', '.join(given)}: {path.name} has no robots, it is shown as it is")
     scene = make_builder(path, path.name, arguments)
@@ -164,7 +185,7 @@ def resume_session(arguments: argparse.Namespace) -> Session:
     """Return a session that continues a recording."""
     from iris_session.session.session import Session
 
-    had = ("robots", "assign", "assignment", "mode", "record", "no_record")
+    had = ("robots", "assign", "unaligned", "assignment", "mode", "record", "no_record")
     given = [f"--{name.replace('_', '-')}" for name in had if getattr(arguments, name)]
     if given:
         raise CommandError(f"{', '.join(given)} cannot be combined with --resume: the recording defines them")
@@ -247,8 +268,12 @@ def _serve(
 
 
 def _run_with_live_view(arguments: argparse.Namespace, session: Session | ScenePublisher, out: TextIO) -> None:
+    from iris_session.cli.keyboard import bind_session_keys, read_keys
     from iris_session.cli.live import TerminalView
 
-    view = TerminalView(session, out, f"iris-session {session.name} on {session.address}")
-    with view.open():
-        session.run(seconds=arguments.seconds, until=view.update)
+    keys = bind_session_keys(session)
+    with nullcontext(False) if arguments.json else read_keys(keys) as has_keys:
+        footer = "  ".join((*(one.text for one in keys.values()), "Ctrl-C end")) if has_keys else ""
+        view = TerminalView(session, out, f"iris-session {session.name} on {session.address}", footer)
+        with view.open():
+            session.run(seconds=arguments.seconds, until=view.update)

@@ -205,6 +205,12 @@ def _format_lines(report: StatusReport) -> Iterator[str]:
         f"session '{report.session_name}'  {state}  tick {report.tick}  {report.session_time * 1e-9:.1f} s  "
         f"{report.connections} connections  {report.entries_per_s:.0f} entries/s"
     )
+    if report.pause_reason:
+        yield f"physics stands still: {report.pause_reason}; `iris-session reset` begins anew"
+    for stop in report.stops:
+        who = f"{stop.name} ({stop.participant})" if stop.participant else "a connection that had not joined"
+        why = f": {stop.reason}" if stop.reason else ""
+        yield f"e-stop {stop.stop_seq} by {who}, {stop.age_ns * 1e-9:.1f} s ago{why}"
     yield ""
     yield (
         f"{'participant':20s} {'role':9s} {'alignment':22s} {'age p50/p99 ms':>15s} {'rtt ms':>7s} "
@@ -257,7 +263,9 @@ def _format_lines(report: StatusReport) -> Iterator[str]:
 def _format_participant(p: ParticipantReport) -> str:
     aligned = p.alignment
     if p.alignment_age_ns >= 0 and aligned in ("measured", "placed"):
-        aligned += f" {p.alignment_error_m * 1e3:.0f} mm, {p.alignment_age_ns * 1e-9:.0f} s"
+        stated = aligned == "measured" and not (p.alignment_report is not None and p.alignment_report.offset)
+        error = f"{p.alignment_error_m * 1e3:.0f} mm" if stated else "-"
+        aligned += f" {error}, {p.alignment_age_ns * 1e-9:.0f} s"
     elif p.alignment_void_ns >= 0:
         aligned = f"void for {p.alignment_void_ns * 1e-9:.0f} s"
     name = f"{p.name} ({p.id})" if p.connected else f"{p.name} OFFLINE {p.lost}"

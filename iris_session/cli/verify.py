@@ -15,10 +15,12 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "verify",
         help="re-simulate a recording and compare it bit for bit",
         description="Re-simulate recordings. Exit status 0 only if every step of every file is identical.",
-        epilog="example:\n  iris-session verify sessions/*/session.rrd",
+        epilog="examples:\n"
+        "  iris-session verify sessions/*/session.rrd\n"
+        "  iris-session verify sessions/20261121T093000.000000Z-handover    the recording in a folder",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    parser.add_argument("files", nargs="+", type=Path, metavar="RECORDING", help="a .rrd, or its folder")
     add_json_option(parser)
     parser.set_defaults(run=run)
 
@@ -26,6 +28,9 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 def run(arguments: argparse.Namespace) -> int:
     """Verify each file; the first problem of each is named with its step and entry."""
     from iris_session.recording import Problem, RecordingError, VerifyReport
+    from iris_session.system.extras import require_package
+
+    require_package("rerun", "verifying recordings")
     from iris_session.session.verification import verify_recording
 
     reports = []

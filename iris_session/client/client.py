@@ -11,19 +11,13 @@ import os
 import secrets
 import threading
 import time
-import traceback
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import Any, Final, Self
 
-import msgspec
-import zmq
-from numpy.typing import NDArray
-
-from anchors.pose import PoseTuple
-from iris_session.client.arguments import Numbers, PoseLike, to_names, to_numbers, to_pose, to_python_scalar, to_text
+from iris_session.client.alignment import ClientAlignment
+from iris_session.client.arguments import PoseLike, to_names, to_numbers, to_pose, to_python_scalar, to_text
 from iris_session.client.assets import ClientAssets
-from iris_session.client.core.arrival_meter import ArrivalMeter
-from iris_session.client.core.connection import ClientConnection, InboxMessage
+from iris_session.client.core.connection import ClientConnection
 from iris_session.client.core.outbox import encode_checked
 from iris_session.client.core.samples import SampleBuilder
 from iris_session.client.core.state_stream import SceneState
@@ -31,19 +25,17 @@ from iris_session.client.core.status import ConnectionPhase
 from iris_session.client.endpoint_resolver import SessionJoiner, parse_connect_request
 from iris_session.client.errors import (
     ClientError,
-    DeniedError,
-    InvalidMessageError,
     NotConnectedError,
     RequestTimeoutError,
 )
 from iris_session.client.identity import Identity
+from iris_session.client.loop import ClientLoop
 from iris_session.client.media import ClientMedia
+from iris_session.client.requests import ClientRequests
 from iris_session.client.scene import ClientScene
-from iris_session.client.sheet_observer import CAMERA_SIGMA, SheetObserver, to_observation
-from iris_session.client.sockets import ClientSockets, CurveKeys, to_milliseconds
+from iris_session.client.sockets import ClientSockets, CurveKeys
 from iris_session.protocol.client_messages import (
     Acquire,
-    Align,
     Assign,
     ClearEStop,
     ClientMessage,
@@ -54,26 +46,17 @@ from iris_session.protocol.client_messages import (
     Grasp,
     Hello,
     Marker,
-    MoveAnchor,
-    Observation,
-    PlaceAlignment,
     Release,
     Sample,
     Samples,
     SetMode,
     SetScale,
-    TrackingEpoch,
 )
-from iris_session.protocol.common import Alignment, Denial, Lease, Target
-from iris_session.protocol.names import AlignmentKind, AnchorKind, Role, TargetKind
+from iris_session.protocol.common import Denial, Lease, Target
+from iris_session.protocol.names import AlignmentKind, Role, TargetKind
 from iris_session.protocol.server_messages import Event, Feedback, Reply
-from iris_session.protocol.session_mirror import MissedEvents, SessionMirror
+from iris_session.protocol.session_mirror import SessionMirror
 from iris_session.protocol.status import StatusReport
-
-if TYPE_CHECKING:
-    from anchors.camera import CameraModel
-    from anchors.detection import SheetDetection
-    from anchors.sheet import Sheet
 
 DEFAULT_TIMEOUT_S: Final = 5.0
 #: A status request without an answer is repeated; twice a second is below the limit of its type.
@@ -99,8 +82,8 @@ class Client:
         scene: The scene as it is now: newest state, poses by name, presence.
         media: Media streams: subscribe, publish.
         assets: Assets: fetch, cancel, cache.
+        alignment: Alignment: the present one, observations of anchors, jumps of the tracking frame.
         connection: The connection without I/O: phase, counters, clock.
-        feedback: Newest `Feedback` by robot.
         on_state: Called with every `SceneState`; callbacks run in `poll`, or in the thread of `start`.
         on_event: Called with every `Event`.
         on_missed: Called with the first and last number of events that this client missed between two events, because
@@ -176,22 +159,16 @@ class Client:
         self.on_missed = on_missed
         self.on_feedback = on_feedback
         self.on_denial = on_denial
-        self.feedback: dict[str, Feedback] = {}
         self._samples = SampleBuilder(self.connection)
-        self._arrivals = ArrivalMeter()
-        self._generation = 0
         self._sockets = ClientSockets()
         self._lock = threading.RLock()
-        self._changed = threading.Condition(self._lock)
+        self._requests = ClientRequests(self, self._lock)
         self._joiner = SessionJoiner(request, self.connection, self._sockets)
         self.scene = ClientScene(self.connection, self._lock)
-        self.media = ClientMedia(self.connection, self._sockets, self._lock, lambda: self._polls_here)
+        self.media = ClientMedia(self.connection, self._sockets, self._lock, lambda: self._loop.polls_here)
         self.assets = ClientAssets(self.connection, self._sockets, self._lock)
-        self._sheets = SheetObserver()
-        self._thread: threading.Thread | None = None
-        self._stopping = False
-        self._crash: BaseException | None = None
-        self._just_pumped = False
+        self.alignment = ClientAlignment(self)
+        self._loop = ClientLoop(self, self._sockets, self._joiner, self._lock)
 
     # --- life ---------------------------------------------------------------------------------------------------------
 
@@ -241,21 +218,16 @@ class Client:
 
     def close(self) -> None:
         """Leave the session: leases are released at once, without grace. Stops the thread of `start`."""
-        with self._lock:
-            self._stopping = True
-            thread = self._thread
-        if thread is not None and thread is not threading.current_thread():
-            self._sockets.wake()
-            thread.join()
+        self._loop.stop_thread()
         workers = None
         with self._lock:
             if self.connection.phase is not ConnectionPhase.CLOSED:
                 self._joiner.cancel()
                 workers = self.assets.close()
                 self.connection.close()
-                self._flush()
+                self._loop.send_pending()
                 self._sockets.close()
-            self._changed.notify_all()
+            self._loop.changed.notify_all()
         if workers is not None:
             workers.close()
 
@@ -277,10 +249,7 @@ class Client:
         Returns:
             This client.
         """
-        with self._lock:
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name=f"iris-client-{self.name}", daemon=True)
-                self._thread.start()
+        self._loop.start_thread(f"iris-client-{self.name}")
         return self
 
     # --- identity and session -----------------------------------------------------------------------------------------
@@ -288,7 +257,7 @@ class Client:
     @property
     def ready(self) -> bool:
         """Joined, with snapshot and clock. False while reconnecting, and after the thread of `start` ended."""
-        return self.connection.phase is ConnectionPhase.READY and self._crash is None
+        return self.connection.phase is ConnectionPhase.READY and self._loop.crash is None
 
     @property
     def address(self) -> str:
@@ -315,19 +284,14 @@ class Client:
         self.connection.worn = worn
 
     @property
-    def tracking_epoch(self) -> int:
-        """Number of jumps of our tracking frame so far; `new_tracking_frame` counts one more."""
-        return self.connection.tracking_epoch
-
-    @property
     def mirror(self) -> SessionMirror:
         """The shared session state: `participants`, `leases`, `robots`, `bodies`, `paused`, `estop`, `event_seq`."""
         return self.connection.mirror
 
     @property
-    def alignment(self) -> Alignment | None:
-        """Our own `T_world_tracking` as accepted by the session, `None` before."""
-        return self.connection.mirror.find_alignment(self.participant_id)
+    def feedback(self) -> dict[str, Feedback]:
+        """Newest `Feedback` by robot; empty without a connection."""
+        return self._loop.feedback
 
     def lease_version(self, target: str) -> int | None:
         """Return our fencing token for a robot or object.
@@ -386,7 +350,7 @@ class Client:
                 again = connection.generation != asked or now_s - asked_s > STATUS_RETRY_S
                 if again and StatusReport not in connection.latest and connection.request_status():
                     asked, asked_s = connection.generation, now_s
-                    client._send_soon()
+                    client._loop.send_soon()
                 return StatusReport in connection.latest
 
         with self._lock:
@@ -415,22 +379,9 @@ class Client:
             RefusedError: The session has refused us for good.
             ClientError: The thread of `start` polls.
         """
-        if not self._polls_here:
+        if not self._loop.polls_here:
             raise ClientError("poll() while the thread of start() polls: use wait_for(), callbacks and attributes")
-        deadline = time.monotonic_ns() + int(timeout_s * 1e9)
-        # Assets arrive all the time: one round per call is enough, and anything that came since ends the wait.
-        pumped = self._just_pumped and timeout_s > 0.0
-        while True:
-            progressed = not pumped and self._pump()
-            self._just_pumped = progressed and self.connection.is_joined and self.assets.is_loading
-            pumped = False
-            now = time.monotonic_ns()
-            if progressed or now >= deadline:
-                break
-            self._wait(min(deadline, self.connection.next_deadline_ns(now)) - now)
-        if self.connection.failure is not None:
-            raise self.connection.failure
-        return progressed
+        return self._loop.poll(timeout_s)
 
     def sleep(self, seconds: float) -> None:
         """Poll for the whole time, where `poll` returns as soon as anything came: for the pace of a loop.
@@ -438,7 +389,7 @@ class Client:
         Args:
             seconds: Time to wait [s].
         """
-        if self._polls_here:
+        if self._loop.polls_here:
             self.poll()
         self.wait_for(lambda client: False, seconds)
 
@@ -461,52 +412,11 @@ class Client:
             remaining = deadline - time.monotonic()
             if remaining <= 0.0:
                 return False
-            if self._polls_here:
+            if self._loop.polls_here:
                 self.poll(remaining)
                 continue
-            with self._changed:
-                self._check_thread()
-                if self.connection.failure is not None:
-                    raise self.connection.failure
-                self._changed.wait(min(remaining, 0.1))
+            self._loop.wait_for_thread(min(remaining, 0.1))
         return True
-
-    def poll_state(self) -> bool:
-        """Take only the state that has come, and pass it to `on_state`; everything else is left to `poll`.
-
-        For a loop with several clients, as `ClientGroup`: all of them have their state before the rest of any.
-
-        Returns:
-            True when state came.
-        """
-        with self._lock:
-            state, progressed = self._drain_state()
-        if state is not None and self.on_state is not None:
-            self.on_state(state)
-        return progressed
-
-    @property
-    def has_state(self) -> bool:
-        """True when state has arrived that `poll_state` would take."""
-        return self._sockets.has_state
-
-    @property
-    def registration(self) -> tuple[int, bool]:
-        """Changes when `register` would add something else than before."""
-        return self._sockets.version, self.connection.peek_outgoing() is not None
-
-    def register(self, poller: zmq.Poller) -> zmq.Socket[bytes] | None:
-        """Add our sockets to a poller; `poll` is due when they wake it and at `connection.next_deadline_ns`.
-
-        Args:
-            poller: The poller of your loop.
-
-        Returns:
-            The state socket: `poll_state` is enough when only that wakes.
-        """
-        if self.connection.phase is ConnectionPhase.CLOSED:
-            return None
-        return self._sockets.register(poller, sending=self.connection.peek_outgoing() is not None)
 
     # --- messages -----------------------------------------------------------------------------------------------------
 
@@ -526,10 +436,10 @@ class Client:
         """
         with self._lock:
             if not isinstance(message, EStop):  # that one leaves as long as there is a socket
-                self._check_thread()
+                self._loop.check_thread()
             queued = self.connection.send(message)
-            self._send_soon()
-            self._check_thread()
+            self._loop.send_soon()
+            self._loop.check_thread()
             return queued
 
     def submit(self, message: Any) -> int:
@@ -546,9 +456,9 @@ class Client:
             NotConnectedError: There is no connection.
         """
         with self._lock:
-            self._check_thread()
+            self._loop.check_thread()
             request_id = self.connection.request(message)
-            self._send_soon()
+            self._loop.send_soon()
             return request_id
 
     def answer(self, request_id: int) -> Reply | None:
@@ -579,33 +489,7 @@ class Client:
             InvalidMessageError: A value does not fit the protocol.
             NotConnectedError: There is no connection, or it was lost meanwhile.
         """
-        with self._lock:
-            generation = self.connection.generation
-            fault_before = self.connection.last_protocol_fault
-            request_id = self.submit(message)
-        replies: list[Reply] = []
-
-        def is_over(client: Client) -> bool:
-            reply = client.answer(request_id)
-            if reply is not None:
-                replies.append(reply)
-            lost = client.connection.generation != generation or not client.connection.is_joined
-            return reply is not None or client.connection.last_protocol_fault is not fault_before or lost
-
-        self.wait_for(is_over, timeout_s)
-        with self._lock:
-            self.connection.requests.discard(request_id)
-        kind = type(message).__name__
-        if not replies:
-            if self.connection.generation != generation or not self.connection.is_joined:
-                raise NotConnectedError(f"connection lost while waiting for the answer to {kind}")
-            fault = self.connection.last_protocol_fault
-            if fault is not None and fault is not fault_before:
-                raise InvalidMessageError(f"the session rejected {kind}: {fault.message}")
-            raise RequestTimeoutError(f"no answer to {kind} within {timeout_s:g} s")
-        if replies[0].denial is not None:
-            raise DeniedError(self._add_holder_name(replies[0].denial))
-        return replies[0]
+        return self._requests.request(message, timeout_s)
 
     # --- requests: leases ---------------------------------------------------------------------------------------------
 
@@ -616,9 +500,12 @@ class Client:
         objects: str | Iterable[str] = (),
         wait: bool = False,
         weight: float = 1.0,
-        timeout_s: float = DEFAULT_TIMEOUT_S,
+        timeout_s: float | None = None,
     ) -> tuple[Lease, ...]:
         """Request control of robots and objects, all or none.
+
+        A call that gives up withdraws its request, so that nothing is granted unnoticed later. To wait without
+        blocking, `submit` an `Acquire` and look for its `answer`.
 
         Args:
             robots: Names of robots; without any names the assignment policy chooses one robot.
@@ -626,17 +513,21 @@ class Client:
             wait: Queue when another participant holds them. The reply then comes with the lease, as it does after a
                 holder's consent in mode `request`.
             weight: Our share in mode `shared`.
-            timeout_s: Seconds to wait for the reply.
+            timeout_s: Seconds to wait for the reply, by default 5; when the holder of one of the robots may be asked
+                for consent (mode `request`), 5 more than it may take to answer.
 
         Returns:
             The leases.
 
         Raises:
             DeniedError: They are not to be had; `denial` has reason, holder and advice.
-            RequestTimeoutError: No reply within `timeout_s`. With `wait` we stay in the queue; `release()` leaves it.
+            RequestTimeoutError: No reply within `timeout_s`, so the request was withdrawn; `denial` has the place in
+                the queue and the holder.
         """
         message = Acquire(0, to_names("robots", robots), to_names("objects", objects), wait, weight)
-        return self.request(message, timeout_s).leases
+        if timeout_s is None:
+            timeout_s = DEFAULT_TIMEOUT_S + self._requests.compute_consent_s(message)
+        return self._requests.acquire(message, timeout_s).leases
 
     def release(self, *names: str) -> None:
         """Give robots and objects back.
@@ -722,168 +613,6 @@ class Client:
         """
         return self.request(SetScale(0, to_names("robots", robots), scale)).leases
 
-    # --- requests: alignment ------------------------------------------------------------------------------------------
-
-    def align(self, action: str, participant: str = "") -> None:
-        """Start or stop a measurement of the alignment. The one in force stays until there is a better one.
-
-        Args:
-            action: `start`: measure again from the beginning; `stop`: keep the one in force.
-            participant: Id of another participant, as director; empty: ourselves.
-
-        Raises:
-            DeniedError: We may not.
-        """
-        self.request(Align(0, action, participant))
-
-    def place_alignment(self, participant: str, T_world_tracking: PoseLike, *, offset: bool = False) -> None:
-        """As director, align a participant by hand.
-
-        Args:
-            participant: Id of the participant.
-            T_world_tracking: Pose of its tracking frame in the world, `((x, y, z) [m], (w, x, y, z))`.
-            offset: The pose is an offset to the measured alignment.
-
-        Raises:
-            DeniedError: We are not a director, or there is no such participant.
-        """
-        self.request(PlaceAlignment(0, participant, to_pose("T_world_tracking", T_world_tracking), offset))
-
-    def move_anchor(self, anchor_id: str, T_world_anchor: PoseLike, *, force: bool = False) -> None:
-        """As director, set the pose of an anchor; the scene moves for every participant aligned to it.
-
-        Args:
-            anchor_id: Id of the anchor.
-            T_world_anchor: Its pose in the world, `((x, y, z) [m], (w, x, y, z))`.
-            force: Also further than 5 m from where it was.
-
-        Raises:
-            DeniedError: We are not a director, or it is too far (`too_far`).
-        """
-        self.request(MoveAnchor(0, anchor_id, to_pose("T_world_anchor", T_world_anchor), force))
-
-    def new_tracking_frame(self) -> int:
-        """Report that the tracking frame jumped: our alignment is void.
-
-        Returns:
-            The new tracking epoch.
-        """
-        epoch = self.connection.tracking_epoch = self.connection.tracking_epoch + 1
-        if self.connection.is_joined:  # else it follows the next welcome
-            self.send(TrackingEpoch(epoch))
-        return epoch
-
-    def observe(
-        self,
-        anchor_id: str,
-        T_tracking_anchor: PoseLike,
-        *,
-        kind: str = AnchorKind.QR,
-        capture_ns: int | None = None,
-        viewpoint_id: int = 0,
-        size_m: float = 0.0,
-        quality: float = 1.0,
-        device: str = "head",
-        covariance: Numbers = (),
-        tracking_epoch: int | None = None,
-    ) -> None:
-        """Report the observation of an anchor, in the tracking frame.
-
-        Args:
-            anchor_id: Id of the anchor.
-            T_tracking_anchor: Its pose in the tracking frame, `((x, y, z) [m], (w, x, y, z))`.
-            kind: An `AnchorKind`.
-            capture_ns: Session time of the observation [ns], default now.
-            viewpoint_id: The same number for observations from one place.
-            size_m: Measured edge length [m], 0 when not measured.
-            quality: 0 to 1.
-            device: The device that observed it.
-            covariance: 36 values, 6x6 row-major, (x, y, z [m], rx, ry, rz [rad]), tracking axes; without it the
-                session assumes that of a headset's camera.
-            tracking_epoch: Epoch of the tracking frame, default the present one.
-
-        Raises:
-            InvalidMessageError: A value does not fit the protocol.
-            NotConnectedError: There is no connection.
-        """
-        values = to_numbers("covariance", covariance)
-        if len(values) not in (0, 36):
-            raise InvalidMessageError(f"covariance: expected 36 numbers, 6x6 row-major, or none, got {len(values)}")
-        self.send(
-            Observation(
-                anchor_id=anchor_id,
-                kind=kind,
-                T_tracking_anchor=to_pose("T_tracking_anchor", T_tracking_anchor),
-                capture_ns=self.session_now_ns() if capture_ns is None else capture_ns,
-                tracking_epoch=self.connection.tracking_epoch if tracking_epoch is None else tracking_epoch,
-                viewpoint_id=viewpoint_id,
-                size_m=size_m,
-                quality=quality,
-                device=device,
-                covariance=values,
-            )
-        )
-
-    def observe_image(
-        self,
-        image: NDArray[Any],
-        camera: CameraModel,
-        sheets: Sequence[Sheet],
-        T_tracking_camera: PoseLike,
-        *,
-        capture_ns: int | None = None,
-        viewpoint_id: int | None = None,
-        device: str = "head",
-        camera_sigma: tuple[float, float] = CAMERA_SIGMA,
-        tracking_epoch: int | None = None,
-    ) -> list[SheetDetection]:
-        """Detect sheets in an image and report them as observations.
-
-        Sheets with an ambiguous pose (both poses of a plane fit) are left out. Takes tenths of a second: not for the
-        loop that sends samples.
-
-        Args:
-            image: (height, width[, 3]) uint8.
-            camera: Intrinsics of the camera.
-            sheets: Sheets to look for.
-            T_tracking_camera: Pose of the camera at `capture_ns` (x right, y down, z into the scene),
-                `((x, y, z) [m], (w, x, y, z))`.
-            capture_ns: Session time of the image [ns], default now.
-            viewpoint_id: By default counted by where the camera goes.
-            device: The device that observed it.
-            camera_sigma: Standard deviations ([m], [rad]) of `T_tracking_camera`.
-            tracking_epoch: Epoch of the tracking frame, default the present one at the call.
-
-        Returns:
-            The sightings that were reported.
-
-        Raises:
-            InvalidMessageError: Image, camera or pose cannot be.
-            NotConnectedError: There is no connection.
-            ClientError: OpenCV or SciPy is missing.
-        """
-        epoch = self.connection.tracking_epoch if tracking_epoch is None else tracking_epoch  # before the detection
-        now_ns = self.session_now_ns() if capture_ns is None else capture_ns
-        pose = to_pose("T_tracking_camera", T_tracking_camera)
-        T: PoseTuple = (pose.p, pose.q)
-        found = self._sheets.detect(image, camera, sheets)
-        if viewpoint_id is None:
-            with self._lock:
-                viewpoint_id = self._sheets.viewpoints.number_at(epoch, T)
-        for sighting in found:
-            self.send(
-                to_observation(
-                    sighting,
-                    T,
-                    capture_ns=now_ns,
-                    tracking_epoch=epoch,
-                    viewpoint_id=viewpoint_id,
-                    device=device,
-                    camera_sigma=camera_sigma,
-                )
-            )
-        return found
-
     # --- requests: session --------------------------------------------------------------------------------------------
 
     def estop(self, reason: object = "") -> bool:
@@ -903,13 +632,18 @@ class Client:
         """
         return self.send(EStop(to_text(reason)))
 
-    def clear_estop(self) -> None:
-        """End the e-stop; robots hold until they are clutched again.
+    def clear_estop(self, stop_seq: int | None = None) -> None:
+        """As director, end the e-stop; robots hold until they are clutched again.
+
+        Args:
+            stop_seq: Number of the newest stop that was looked at, by default of the newest that has arrived here
+                (`mirror.stop_seq`).
 
         Raises:
-            DeniedError: We may not.
+            DeniedError: We are not a director, or the session was stopped again since (reason `estop`): `denial` says
+                by which participant, and why.
         """
-        self.request(ClearEStop(0))
+        self.request(ClearEStop(0, self.mirror.stop_seq if stop_seq is None else stop_seq))
 
     def control(self, action: str, ticks: int = 1) -> None:
         """As director, control the simulation.
@@ -1028,131 +762,3 @@ class Client:
                 tracking_epoch=tracking_epoch,
                 **fields,
             )
-
-    # --- inside -------------------------------------------------------------------------------------------------------
-
-    def _add_holder_name(self, denial: Denial) -> Denial:
-        holder = self.connection.mirror.participants.get(denial.holder)
-        if holder is None or denial.holder_name:
-            return denial
-        return msgspec.structs.replace(denial, holder_name=holder.name)
-
-    @property
-    def _polls_here(self) -> bool:
-        return self._thread is None or threading.current_thread() is self._thread
-
-    def _check_thread(self) -> None:
-        """Raise the error that ended the thread of `start`: nothing is sent or received without it."""
-        if isinstance(self._crash, ClientError):
-            raise self._crash
-        if self._crash is not None:
-            text = f"the thread of start() was ended by {type(self._crash).__name__}: {self._crash}"
-            raise NotConnectedError(text) from self._crash
-
-    def _send_soon(self) -> None:
-        if self._polls_here or self._crash is not None:
-            self._flush()
-        else:
-            self._sockets.wake()
-
-    def _pump(self) -> bool:
-        """Take one round without waiting: state first, then control, timers, sending, callbacks."""
-        with self._lock:
-            if self.connection.phase is ConnectionPhase.CLOSED:
-                raise NotConnectedError(self.connection.describe())
-            phase = self.connection.phase
-            if self.assets.has_workers:
-                self._sockets.clear_wake()  # before its reason is checked, so that a later one is not lost
-            self._joiner.step()
-        progressed = self.poll_state()
-        with self._lock:
-            disconnected = self._sockets.poll_disconnect() and self._generation == self.connection.generation
-            progressed |= self._drain_control()  # the last messages of a session before its end
-            if disconnected and self._generation == self.connection.generation:
-                self.connection.handle_disconnect(time.monotonic_ns())
-            self._joiner.check_answer()
-            self.connection.tick(time.monotonic_ns())
-            report = self._arrivals.poll_report(self.connection, time.monotonic_ns())
-            if report is not None:
-                self.connection.send(self.media.extend_report(report, time.monotonic_ns()))
-            self._flush()
-            progressed |= self.media.poll()
-            progressed |= self.assets.poll()
-            if self.connection.phase is ConnectionPhase.REFUSED:
-                self._sockets.disconnect()
-            progressed |= self.connection.phase is not phase
-            inbox = [self.connection.inbox.popleft() for _ in range(len(self.connection.inbox))]
-            for message in inbox:
-                if isinstance(message, Feedback):
-                    self.feedback[message.robot] = message
-            if self.feedback and not self.connection.is_joined:
-                self.feedback = {}  # it would be out of date
-        for message in inbox:
-            self._call_back(message)
-        self.assets.call_back()
-        return progressed
-
-    def _drain_state(self) -> tuple[SceneState | None, bool]:
-        messages = self._sockets.drain_state()
-        local_ns = time.monotonic_ns()
-        state = self.connection.stream.drain(messages, self.connection.clock.session_ns(local_ns), local_ns)
-        local_ns = time.monotonic_ns()
-        if state is not None and not self.connection.stream.check_fresh(local_ns):
-            state = None
-        if state is not None:
-            now_ns = self.connection.clock.session_ns(local_ns)  # decoding is part of the age
-            state = SceneState(state.header, state.poses, now_ns, now_ns - state.header.session_time)
-            self.scene.on_state(state)
-            self._arrivals.record(state)
-        return state, bool(messages)
-
-    def _drain_control(self) -> bool:
-        messages = self._sockets.drain_control()
-        now_ns = time.monotonic_ns()  # after receiving: a pong stamped too early would understate its round trip
-        for frames in messages:
-            self.connection.receive(frames, now_ns)
-        if self.connection.is_joined and self.connection.welcome is not None:
-            self.scene.on_welcome()
-            self._sockets.open_state(self.connection.welcome.endpoints.state, self._generation)
-        return bool(messages)
-
-    def _flush(self) -> None:
-        if self._generation != self.connection.generation:
-            self._sockets.open_control()
-            self._generation = self.connection.generation
-        while (item := self.connection.peek_outgoing()) is not None:
-            droppable, data = item
-            sent = self._sockets.send_control(data)
-            if not sent and not droppable:
-                return
-            self.connection.pop_outgoing(sent=sent)
-
-    def _call_back(self, message: InboxMessage) -> None:
-        if isinstance(message, Event) and self.on_event is not None:
-            self.on_event(message)
-        elif isinstance(message, MissedEvents) and self.on_missed is not None:
-            self.on_missed(message.first, message.last)
-        elif isinstance(message, Feedback) and self.on_feedback is not None:
-            self.on_feedback(message)
-        elif isinstance(message, Reply) and self.on_denial is not None and message.denial is not None:
-            self.on_denial(message.denial)
-
-    def _wait(self, timeout_ns: int) -> None:
-        poller = zmq.Poller()
-        self.register(poller)
-        self._sockets.register_wake(poller)
-        poller.poll(to_milliseconds(timeout_ns))
-        self._sockets.clear_wake()
-
-    def _run(self) -> None:
-        try:
-            while not self._stopping:
-                self.poll(0.1)
-                with self._changed:
-                    self._changed.notify_all()
-        except BaseException as error:  # raised again in the calls that wait
-            if not isinstance(error, ClientError):  # those are one line, raised in the calls that wait
-                traceback.print_exception(error)
-            with self._changed:
-                self._crash = error
-                self._changed.notify_all()

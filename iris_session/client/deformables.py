@@ -185,7 +185,7 @@ class Deformables:
             session, scene_hash, epoch = now
             self._follow(scene_hash, (session, epoch))
         if self._fetch is not None and self._fetch.done:
-            self._take(self._fetch)
+            self._process_fetch(self._fetch)
         return [] if self._parked else [mesh.key for mesh in self._meshes if self._show(mesh)]
 
     def _follow(self, scene_hash: str, epoch: tuple[str, int]) -> None:
@@ -213,7 +213,7 @@ class Deformables:
         if is_address(self._asked):
             self._fetch = self._client.assets.fetch([self._asked])
         else:
-            self._use([], self._asked)
+            self._show_meshes([], self._asked)
             self._fault = "this session shares no specification of its scene"
 
     def _cancel(self) -> None:
@@ -221,8 +221,8 @@ class Deformables:
             self._client.assets.cancel(self._fetch)
         self._fetch = self._parts = None
 
-    def _take(self, fetch: AssetFetch) -> None:
-        """The specification, then the meshes that it names and that are not here."""
+    def _process_fetch(self, fetch: AssetFetch) -> None:
+        """Decode the specification, then fetch the meshes that it names and that are not here."""
         self._fetch = None
         try:
             fetch.check()
@@ -233,13 +233,13 @@ class Deformables:
                 if new := [part.address for key, part in named if _identity(key, part) not in here]:
                     self._fetch = self._client.assets.fetch(new)
                     return
-            self._use(self._made(self._parts, fetch), self._asked)
+            self._show_meshes(self._build_meshes(self._parts, fetch), self._asked)
         except (ClientError, AssetDecodeError, StreamError, KeyError, ValueError) as error:
             self._failed(error)
         self._parts = None
 
-    def _made(self, parts: Sequence[Deformable], fetch: AssetFetch) -> list[_Mesh]:
-        """The meshes of a scene: of those that are here already, the very same."""
+    def _build_meshes(self, parts: Sequence[Deformable], fetch: AssetFetch) -> list[_Mesh]:
+        """Return the meshes of a scene; those that are here already are kept."""
         here = {_identity(mesh.key, mesh): mesh for mesh in self._meshes}
         found = []
         for key, part in zip(deformable_keys(parts), parts, strict=True):
@@ -249,8 +249,8 @@ class Deformables:
             mesh.shape = mesh.shape.with_look(part)
         return found
 
-    def _use(self, meshes: list[_Mesh], scene_hash: str) -> None:
-        """Shows these and no others from now on."""
+    def _show_meshes(self, meshes: list[_Mesh], scene_hash: str) -> None:
+        """Show these meshes and no others from now on."""
         kept = [mesh for mesh in self._meshes if mesh in meshes]
         gone = [mesh for mesh in self._meshes if mesh not in meshes]
         for stream in {mesh.stream for mesh in gone} - {mesh.stream for mesh in kept}:
@@ -269,7 +269,7 @@ class Deformables:
         if self._client.mirror.scene_hash != self._asked:  # the newest is asked for at the next call
             return
         if self._parked:
-            self._use([], "")
+            self._show_meshes([], "")
         self._fault = str(error)
         self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
         self._retry_s = time.monotonic() + self._pause_s

@@ -278,6 +278,7 @@ class SessionJoiner:
         self._connection.phase = ConnectionPhase.IDLE
         self._connection.failure = None
         self._endpoint = None
+        self._connection.wake_ns = time.monotonic_ns()  # a loop over several clients must call `step` now
         self._resolver = EndpointResolver(self._request, repair=repair)
 
     def step(self) -> None:

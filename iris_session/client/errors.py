@@ -5,7 +5,8 @@
     +-- RefusedError           the session refused `hello`: `code`, `message`, `advice`
     |   +-- VersionError       it speaks other protocol versions: `supported_versions`
     +-- DeniedError            the session denied a request: `denial` (reason, holder, advice); nothing changed
-    +-- RequestTimeoutError    no answer in time (also a `TimeoutError`); the request may still take effect
+    +-- RequestTimeoutError    no answer in time (also a `TimeoutError`); the request may still take effect,
+    |                          but for an `acquire`, which is withdrawn
     +-- InvalidMessageError    a message does not fit the protocol (also a `ValueError`); nothing was sent
     +-- IdentityError          the identity file cannot be used
     +-- TrustError             the session's key is not the trusted one, or it could not prove the join code
@@ -57,14 +58,26 @@ class DeniedError(ClientError):
     """The session denied a request, and changed nothing."""
 
     def __init__(self, denial: Denial) -> None:
+        super().__init__(f"denied ({denial.reason}): {self.describe(denial)}")
+        self.denial = denial
+
+    @staticmethod
+    def describe(denial: Denial) -> str:
+        """Return message, holder and advice of a denial in one line."""
         name = denial.holder_name or denial.holder
         who = "" if not name or name in denial.message.split() else f"held by {name}"
-        super().__init__(f"denied ({denial.reason}): {join_parts(denial.message, who, denial.advice)}")
-        self.denial = denial
+        return join_parts(denial.message, who, denial.advice)
 
 
 class RequestTimeoutError(ClientError, TimeoutError):
-    """No answer came in time. The request may still take effect: check the leases before you ask again."""
+    """No answer came in time. The request may still take effect: check the leases before you ask again.
+
+    An `acquire` is withdrawn; `denial` then is the session's answer to it, with its place in the queue and the holder.
+    """
+
+    def __init__(self, text: str, denial: Denial | None = None) -> None:
+        super().__init__(text)
+        self.denial = denial
 
 
 class InvalidMessageError(ClientError, ValueError):

@@ -19,7 +19,7 @@ _ROUNDS: Final = 3
 class ClientGroup:
     """Several clients polled by one loop; closed ones are skipped.
 
-    Keeps its poller from wait to wait: making one anew costs more than waiting.
+    Keeps its poller from wait to wait: making one anew costs more than waiting. Shares the loops of its clients.
 
         group = ClientGroup(clients)
         while running:
@@ -55,9 +55,9 @@ class ClientGroup:
         state, rest = self._wait(timeout_s)
         for _ in range(_ROUNDS):
             for client in state:
-                client.poll_state()
+                client._loop.poll_state()
             # State comes to all within a millisecond: asking each socket costs a tenth of waiting anew.
-            state = [client for client in self.clients if client.has_state] if state else []
+            state = [client for client in self.clients if client._loop.has_state] if state else []
         for client in rest:
             client.poll(0.0)
 
@@ -67,7 +67,7 @@ class ClientGroup:
         clients = [client for client in self.clients if client.connection.phase is not ConnectionPhase.CLOSED]
         due = [client.connection.next_deadline_ns(now) for client in clients]
         deadline = min((now + int(timeout_s * 1e9), *due))
-        registered = [client.registration for client in self.clients]
+        registered = [client._loop.registration for client in self.clients]
         if registered != self._registered:
             self._register(registered)
         woken = [self._owners[_poller_key(sock)] for sock, _ in self._poller.poll(to_milliseconds(deadline - now))]
@@ -82,7 +82,7 @@ class ClientGroup:
         self._owners = {}
         for client in self.clients:
             first = len(self._poller.sockets)
-            state = client.register(self._poller)
+            state = client._loop.register(self._poller)
             for sock, _ in self._poller.sockets[first:]:
                 self._owners[_poller_key(sock)] = client, sock is state
 

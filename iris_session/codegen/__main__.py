@@ -26,9 +26,9 @@ from iris_session.codegen import (
 _DOCUMENT: Final = "docs/protocol.md"
 
 
-def document(text: str) -> str:
+def update_document(text: str) -> str:
     """Return `text` of the protocol document with new generated sections. Raises `ValueError` without their markers."""
-    for name, table in tables.sections().items():
+    for name, table in tables.render_sections().items():
         begin, end = f"<!-- generated:{name} -->", f"<!-- end:{name} -->"
         if text.count(begin) != 1 or text.count(end) != 1:
             raise ValueError(f"{_DOCUMENT} must hold {begin} and {end} once each")
@@ -39,19 +39,19 @@ def document(text: str) -> str:
 
 #: Name of a target -> its file, and a function from its present text to the new one.
 TARGETS: Final[dict[str, tuple[str, Callable[[str], str]]]] = {
-    "csharp": ("unity_client/Runtime/Protocol/Messages.g.cs", lambda _: csharp.csharp()),
-    "typescript": ("web_client/src/protocol/messages.g.ts", lambda _: typescript.typescript()),
-    "golden": ("docs/protocol/golden.json", lambda _: golden.golden()),
-    "scene": ("docs/protocol/scene.json", lambda _: scene_golden.scene_golden()),
+    "csharp": ("unity_client/Runtime/Protocol/Messages.g.cs", lambda _: csharp.render_csharp()),
+    "typescript": ("web_client/src/protocol/messages.g.ts", lambda _: typescript.render_typescript()),
+    "golden": ("docs/protocol/golden.json", lambda _: golden.render_golden()),
+    "scene": ("docs/protocol/scene.json", lambda _: scene_golden.render_scene_golden()),
     "conversations": ("docs/protocol/conversations.json", lambda _: conversations.render_conversations()),
-    "arrays": ("docs/protocol/arrays.json", lambda _: arrays_golden.text()),
-    "deformable": ("docs/protocol/deformable.json", lambda _: deformable_golden.text()),
-    "docs": (_DOCUMENT, document),
+    "arrays": ("docs/protocol/arrays.json", lambda _: arrays_golden.render_golden()),
+    "deformable": ("docs/protocol/deformable.json", lambda _: deformable_golden.render_golden()),
+    "docs": (_DOCUMENT, update_document),
     "reference": ("docs/reference.md", lambda _: reference.render_reference()),
 }
 
 
-def outdated(root: Path, names: list[str]) -> list[tuple[Path, str]]:
+def find_outdated(root: Path, names: list[str]) -> list[tuple[Path, str]]:
     """Return the files of the targets `names` below `root` that are not current, each with its new text."""
     found = []
     for name in names:
@@ -73,7 +73,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if not (options.root / _DOCUMENT).exists():
         parser.error(f"{options.root} is not a checkout: {_DOCUMENT} is missing")
-    files = outdated(options.root, list(TARGETS) if options.what == "all" else [options.what])
+    files = find_outdated(options.root, list(TARGETS) if options.what == "all" else [options.what])
     for path, text in files:
         if not options.check:
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -24,12 +24,12 @@ from iris_session.scene.meshes import MeshArrays, encode_mesh, encode_mesh_quant
 _NUMBERS: Final = np.array([[0, 1, 255], [7, 7, 7], [200, 3, 129], [128, 127, 0]])
 
 
-def vectors() -> Iterator[tuple[str, str, bytes]]:
+def iterate_vectors() -> Iterator[tuple[str, str, bytes]]:
     """Return name, kind and bytes of every asset."""
     for filter_kind in (ArrayFilter.NONE, ArrayFilter.SHUFFLE, ArrayFilter.DELTA, ArrayFilter.UP):
         arrays = [
             StoredArray(dtype, values, filter_kind)
-            for dtype, values in _of_every_dtype().items()
+            for dtype, values in _make_every_dtype().items()
             if dtype != "f4" or filter_kind != ArrayFilter.DELTA
         ]
         yield f"{filter_kind}: every dtype", ArrayKind.MESH, encode_arrays(ArrayKind.MESH, arrays)
@@ -37,10 +37,10 @@ def vectors() -> Iterator[tuple[str, str, bytes]]:
     for filter_kind in (ArrayFilter.NONE, ArrayFilter.UP):
         image = encode_arrays(ArrayKind.IMAGE, [StoredArray("pixels", ramp, filter_kind)])
         yield f"{filter_kind}: an image, packed", ArrayKind.IMAGE, image
-    mesh = _mesh()
+    mesh = _make_mesh()
     yield "a mesh, exact", ArrayKind.MESH, encode_mesh(mesh)
     yield "a mesh, quantised", ArrayKind.MESH, encode_mesh_quantised(mesh)[0]
-    coloured = replace(mesh, uv=None, color=_colors(mesh.vertices))
+    coloured = replace(mesh, uv=None, color=_make_colors(mesh.vertices))
     yield "a mesh with colours at its corners, exact", ArrayKind.MESH, encode_mesh(coloured)
     yield "a mesh with colours at its corners, quantised", ArrayKind.MESH, encode_mesh_quantised(coloured)[0]
     empty = [
@@ -51,7 +51,7 @@ def vectors() -> Iterator[tuple[str, str, bytes]]:
     yield "no arrays", ArrayKind.MESH, encode_arrays(ArrayKind.MESH, [])
 
 
-def malformed() -> Iterator[tuple[str, bytes]]:
+def iterate_malformed() -> Iterator[tuple[str, bytes]]:
     """Return name and bytes of the cases that a reader must reject as an asset of kind `mesh`."""
     good = encode_arrays(ArrayKind.MESH, [StoredArray("a", np.zeros(200, np.uint8))])
     yield "empty", b""
@@ -75,39 +75,39 @@ def malformed() -> Iterator[tuple[str, bytes]]:
         body = frame if info.codec != ArrayCodec.NONE else bytes(200)
         if 0 in info.shape:
             body = b""
-        yield name, _asset(ArrayHeader(ArrayKind.MESH, (msgspec.structs.replace(info, bytes=len(body)),)), body)
+        yield name, _pack_asset(ArrayHeader(ArrayKind.MESH, (msgspec.structs.replace(info, bytes=len(body)),)), body)
     yield "another kind", encode_arrays(ArrayKind.IMAGE, [])
     twice = ArrayInfo("a", "u1", (1,), 1)
-    yield "two arrays of one name", _asset(ArrayHeader(ArrayKind.MESH, (twice, twice)), b"ab")
+    yield "two arrays of one name", _pack_asset(ArrayHeader(ArrayKind.MESH, (twice, twice)), b"ab")
 
 
-def golden() -> dict[str, list[dict[str, Any]]]:
+def build_golden() -> dict[str, list[dict[str, Any]]]:
     """Return the content of the file. Values are flat, in C order: integers, or floats with the value of the float32,
     null where they are not finite."""
     assets = []
-    for name, kind, data in vectors():
+    for name, kind, data in iterate_vectors():
         arrays = {
             array_name: {
                 "dtype": values.dtype.str.lstrip("<|"),
                 "shape": list(values.shape),
-                "values": _numbers(values),
+                "values": _to_json_numbers(values),
             }
             for array_name, values in decode_arrays(data, kind).items()
         }
         assets.append({"name": name, "kind": kind, "hex": data.hex(), "arrays": arrays})
-    return {"assets": assets, "malformed": [{"name": name, "hex": data.hex()} for name, data in malformed()]}
+    return {"assets": assets, "malformed": [{"name": name, "hex": data.hex()} for name, data in iterate_malformed()]}
 
 
-def text() -> str:
+def render_golden() -> str:
     """Return the text of the file, a vector a line."""
     blocks = []
-    for name, rows in golden().items():
+    for name, rows in build_golden().items():
         lines = ",\n".join("    " + json.dumps(row, allow_nan=False) for row in rows)
         blocks.append(f'  "{name}": [\n{lines}\n  ]')
     return '{\n  "format": 1,\n' + ",\n".join(blocks) + "\n}\n"
 
 
-def _of_every_dtype() -> dict[str, NDArray[Any]]:
+def _make_every_dtype() -> dict[str, NDArray[Any]]:
     wide = _NUMBERS * 0x01010101 % 2**32
     floats = np.array([[0.0, -0.0, 1.5], [-2.25e-3, 3.4e38, 1e-45], [np.nan, np.inf, -np.inf], [1, 2, 3]], "<f4")
     return {
@@ -119,7 +119,7 @@ def _of_every_dtype() -> dict[str, NDArray[Any]]:
     }
 
 
-def _mesh() -> MeshArrays:
+def _make_mesh() -> MeshArrays:
     """Return a textured strip of a cylinder."""
     angle, z = (part.ravel() for part in np.meshgrid(np.linspace(0, 1.5, 8), np.linspace(0, 0.3, 4), indexing="ij"))
     position = np.stack([np.cos(angle), np.sin(angle), z], axis=1).astype("f4")
@@ -131,18 +131,18 @@ def _mesh() -> MeshArrays:
     return MeshArrays(position, normal, uv, index)
 
 
-def _colors(corners: int) -> NDArray[np.uint8]:
+def _make_colors(corners: int) -> NDArray[np.uint8]:
     """Return colours from red to blue, less and less opaque."""
     along = np.linspace(0, 255, corners).round().astype(np.uint8)
     return np.stack([255 - along, along // 2, along, 255 - along // 4], axis=1)
 
 
-def _asset(header: ArrayHeader, body: bytes) -> bytes:
+def _pack_asset(header: ArrayHeader, body: bytes) -> bytes:
     head = msgspec.msgpack.encode(header)
     return ARRAYS_MAGIC + len(head).to_bytes(4, "little") + head + body
 
 
-def _numbers(values: NDArray[Any]) -> list[Any]:
+def _to_json_numbers(values: NDArray[Any]) -> list[Any]:
     if values.dtype.kind != "f":
         plain: list[Any] = values.ravel().tolist()
         return plain

@@ -90,7 +90,7 @@ class ConversationPlayer:
         self._follower = SceneFollower(self._connection)
         self._samples = SampleBuilder(self._connection)
 
-    def do(self, step: Step) -> Step:
+    def play_step(self, step: Step) -> Step:
         """Take one step and return `sent`, `inbox`, `replies` and `state` after it."""
         connection, now_ns = self._connection, step["at_ns"]
         replies: list[Any] = []
@@ -128,7 +128,7 @@ class ConversationPlayer:
                 connection.send(sample)
             case unknown:
                 raise ValueError(f"step {unknown!r} is not of a conversation")
-        outcome: Step = {"sent": self._take_sent(), "inbox": self._take_inbox(), "state": self._describe(now_ns)}
+        outcome: Step = {"sent": self._take_sent(), "inbox": self._take_inbox(), "state": self._describe_core(now_ns)}
         return outcome | ({"replies": replies} if replies else {})
 
     def _take_sent(self) -> list[str]:
@@ -143,7 +143,7 @@ class ConversationPlayer:
         self._connection.inbox.clear()
         return messages
 
-    def _describe(self, now_ns: int) -> Step:
+    def _describe_core(self, now_ns: int) -> Step:
         """Return what an implementation must agree on after a step."""
         connection, mirror = self._connection, self._connection.mirror
         failure, waiting = connection.failure, connection.retryable_refusal
@@ -192,7 +192,7 @@ class AssetPlayer:
         self._loader = AssetLoader()
         self._bytes: dict[str, bytes] = {}
 
-    def do(self, step: Step) -> Step:
+    def play_step(self, step: Step) -> Step:
         """Take one step and return its `outcome` and the requests that are `sent` after it."""
         loader, now_ns = self._loader, step["at_ns"]
         outcome = ""
@@ -235,7 +235,6 @@ class AssetPlayer:
 
 # --- scripts ----------------------------------------------------------------------------------------------------------
 
-LEFT_POSE: Final = Pose((0.0, 0.0, 0.5), (1.0, 0.0, 0.0, 0.0))
 BODIES: Final = (BodyInfo(1, "left/hand", True), BodyInfo(2, "cup", True, True))
 ROBOT: Final = RobotInfo("left", ("j1",), 1, 1, Pose((0.0, 0.0, 0.1), (1.0, 0.0, 0.0, 0.0)), True)
 ALIGNMENT: Final = Alignment(3, "measured", Pose((1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
@@ -243,38 +242,38 @@ ANN: Final = ParticipantInfo("p1", "ann", Role.OPERATOR, True, ("right",), align
 BOB: Final = ParticipantInfo("p2", "bob", Role.OPERATOR, True)
 
 
-def _receive(at_ns: int, message: ServerMessage, *bulk: bytes, epoch: int = 1) -> Step:
+def _make_receive(at_ns: int, message: ServerMessage, *bulk: bytes, epoch: int = 1) -> Step:
     data = encode_server(ServerEnvelope(PROTOCOL_VERSION, epoch, message))
     return {"at_ns": at_ns, "do": "receive", "frames": [data.hex(), *(frame.hex() for frame in bulk)]}
 
 
-def _step(at_ns: int, do: str, **more: Any) -> Step:
+def _make_step(at_ns: int, do: str, **more: Any) -> Step:
     return {"at_ns": at_ns, "do": do, **more}
 
 
-def _welcome(at_ns: int, epoch: int = 1, token: bytes = b"token-1", *, resumed: bool = False) -> Step:
+def _make_welcome(at_ns: int, epoch: int = 1, token: bytes = b"token-1", *, resumed: bool = False) -> Step:
     endpoints = Endpoints(state=7722, media=7723, assets=7724)
     times = (at_ns + OFFSET_NS, SECOND, 2 * MS, 16 * MS)
-    return _receive(
+    return _make_receive(
         at_ns, Welcome("s1", "lab", "live", "p1", epoch, Role.OPERATOR, token, resumed, *times, endpoints), epoch=epoch
     )
 
 
-def _pongs(at_ns: int, epoch: int = 1, count: int = 4, one_way_ns: int = MS) -> list[Step]:
+def _make_pongs(at_ns: int, epoch: int = 1, count: int = 4, one_way_ns: int = MS) -> list[Step]:
     """Return pongs of pings that were sent 5 ms apart; the last is received at `at_ns`."""
     steps = []
     for i in range(count):
         t3 = at_ns - (count - 1 - i) * 5 * MS
         t0, t1 = t3 - 2 * one_way_ns, t3 - one_way_ns + OFFSET_NS
-        steps.append(_receive(t3, ClockPong(t0, t1, t1), epoch=epoch))
+        steps.append(_make_receive(t3, ClockPong(t0, t1, t1), epoch=epoch))
     return steps
 
 
-def _lease(holder: str, version: int) -> Lease:
+def _make_lease(holder: str, version: int) -> Lease:
     return Lease("left", "robot", LeaseMode.EXCLUSIVE, holder, version)
 
 
-def _poses(bodies: Sequence[BodyInfo], x: float) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _make_poses(bodies: Sequence[BodyInfo], x: float) -> np.ndarray[Any, np.dtype[np.float64]]:
     poses = np.zeros((len(bodies), 7))
     poses[:, 0] = x
     poses[:, 1] = [body.id for body in bodies]
@@ -282,7 +281,7 @@ def _poses(bodies: Sequence[BodyInfo], x: float) -> np.ndarray[Any, np.dtype[np.
     return poses
 
 
-def _snapshot(
+def _make_snapshot(
     at_ns: int,
     event_seq: int = 3,
     *,
@@ -294,30 +293,30 @@ def _snapshot(
     epoch: int = 1,
     state_seq: int = 10,
 ) -> Step:
-    leases = (_lease("", 1) if lease is None else lease,)
+    leases = (_make_lease("", 1) if lease is None else lease,)
     snapshot = Snapshot(
         0, event_seq, scene_epoch, 0, scene_hash, 100, 0.2, at_ns + OFFSET_NS, tuple(participants), leases, (ROBOT,),
         tuple(bodies), state_seq=state_seq,
     )  # fmt: skip
-    return _receive(at_ns, snapshot, _poses(bodies, 0.0).astype("<f8").tobytes(), epoch=epoch)
+    return _make_receive(at_ns, snapshot, _make_poses(bodies, 0.0).astype("<f8").tobytes(), epoch=epoch)
 
 
-def _event(at_ns: int, seq: int, body: Any, epoch: int = 1) -> Step:
-    return _receive(at_ns, Event(seq, 100 + seq, at_ns + OFFSET_NS, body), epoch=epoch)
+def _make_event(at_ns: int, seq: int, body: Any, epoch: int = 1) -> Step:
+    return _make_receive(at_ns, Event(seq, 100 + seq, at_ns + OFFSET_NS, body), epoch=epoch)
 
 
-def _join(at_ns: int = 0) -> list[Step]:
+def _make_join(at_ns: int = 0) -> list[Step]:
     """Return the steps from nothing to READY; the last is at `at_ns` + 30 ms."""
     return [
-        _step(at_ns, "open"),
-        _welcome(at_ns + 10 * MS),
-        *_pongs(at_ns + 29 * MS),
-        _snapshot(at_ns + 30 * MS),
+        _make_step(at_ns, "open"),
+        _make_welcome(at_ns + 10 * MS),
+        *_make_pongs(at_ns + 29 * MS),
+        _make_snapshot(at_ns + 30 * MS),
     ]
 
 
-def _state(encoder: RigidEncoder, bodies: Sequence[BodyInfo], x: float, scene_epoch: int, at_ns: int) -> list[str]:
-    frame = encoder.encode(_poses(bodies, x), scene_epoch)
+def _make_state(encoder: RigidEncoder, bodies: Sequence[BodyInfo], x: float, scene_epoch: int, at_ns: int) -> list[str]:
+    frame = encoder.encode(_make_poses(bodies, x), scene_epoch)
     time_ns = at_ns + OFFSET_NS - 2 * MS
     header = StateHeader(scene_epoch, 0, 101, 0.202, time_ns, time_ns + MS, frame.state_seq, frame.base_seq)
     return [part.hex() for part in (TOPIC_RIGID, encode_state_header(header), frame.payload)]
@@ -326,132 +325,136 @@ def _state(encoder: RigidEncoder, bodies: Sequence[BodyInfo], x: float, scene_ep
 def _joining() -> list[Step]:
     encoder = RigidEncoder(len(BODIES), first_seq=11)
     return [
-        *_join(),
-        _step(40 * MS, "receive_state", messages=[_state(encoder, BODIES, 0.125, 1, 40 * MS)]),
-        _event(50 * MS, 4, ParticipantJoined(BOB)),
-        _event(51 * MS, 5, LeaseChanged(_lease("p2", 2), "acquired")),
-        _step(520 * MS, "tick"),
-        _step(600 * MS, "close"),
+        *_make_join(),
+        _make_step(40 * MS, "receive_state", messages=[_make_state(encoder, BODIES, 0.125, 1, 40 * MS)]),
+        _make_event(50 * MS, 4, ParticipantJoined(BOB)),
+        _make_event(51 * MS, 5, LeaseChanged(_make_lease("p2", 2), "acquired")),
+        _make_step(520 * MS, "tick"),
+        _make_step(600 * MS, "close"),
     ]
 
 
 def _event_gap() -> list[Step]:
     return [
-        *_join(),
-        _event(40 * MS, 4, ParticipantJoined(BOB)),
-        _event(41 * MS, 7, Notice("info", "seven", "")),
-        _step(400 * MS, "tick"),
-        _step(550 * MS, "tick"),
-        _snapshot(560 * MS, 6, participants=(ANN, BOB)),
-        _event(570 * MS, 7, Notice("info", "seven", "")),
+        *_make_join(),
+        _make_event(40 * MS, 4, ParticipantJoined(BOB)),
+        _make_event(41 * MS, 7, Notice("info", "seven", "")),
+        _make_step(400 * MS, "tick"),
+        _make_step(550 * MS, "tick"),
+        _make_snapshot(560 * MS, 6, participants=(ANN, BOB)),
+        _make_event(570 * MS, 7, Notice("info", "seven", "")),
     ]
 
 
 def _clock() -> list[Step]:
-    slow = _pongs(60 * MS, count=1, one_way_ns=8 * MS)
-    impossible = _receive(65 * MS, ClockPong(70 * MS, OFFSET_NS, OFFSET_NS))
+    slow = _make_pongs(60 * MS, count=1, one_way_ns=8 * MS)
+    impossible = _make_receive(65 * MS, ClockPong(70 * MS, OFFSET_NS, OFFSET_NS))
     return [
-        _step(0, "open"),
-        _welcome(10 * MS),
-        *(_step(at, "tick") for at in (15 * MS, 20 * MS, 25 * MS)),
-        *_pongs(39 * MS, count=3),
+        _make_step(0, "open"),
+        _make_welcome(10 * MS),
+        *(_make_step(at, "tick") for at in (15 * MS, 20 * MS, 25 * MS)),
+        *_make_pongs(39 * MS, count=3),
         *slow,
         impossible,
-        _step(2 * SECOND, "tick"),
+        _make_step(2 * SECOND, "tick"),
     ]
 
 
 def _reconnect() -> list[Step]:
     back = 3 * SECOND
     return [
-        *_join(),
-        _event(40 * MS, 4, LeaseChanged(_lease("p1", 2), "acquired")),
-        _receive(1500 * MS, ProtocolFault("stalled", "")),
-        _step(2 * SECOND, "disconnect"),
-        _welcome(back, 2, b"token-2", resumed=True),
-        _event(back + MS, 9, Notice("info", "of the connection before", ""), epoch=1),
-        *_pongs(back + 25 * MS, 2),
-        _snapshot(back + 30 * MS, 6, lease=_lease("p1", 3), epoch=2, state_seq=40),
+        *_make_join(),
+        _make_event(40 * MS, 4, LeaseChanged(_make_lease("p1", 2), "acquired")),
+        _make_receive(1500 * MS, ProtocolFault("stalled", "")),
+        _make_step(2 * SECOND, "disconnect"),
+        _make_welcome(back, 2, b"token-2", resumed=True),
+        _make_event(back + MS, 9, Notice("info", "of the connection before", ""), epoch=1),
+        *_make_pongs(back + 25 * MS, 2),
+        _make_snapshot(back + 30 * MS, 6, lease=_make_lease("p1", 3), epoch=2, state_seq=40),
     ]
 
 
 def _denial() -> list[Step]:
     denial = Denial(DenialReason.HELD, "left is held", "ask for it", "left", "p2")
     return [
-        *_join(),
-        _step(40 * MS, "request", message="acquire", fields={"robots": ["left"]}),
-        _receive(50 * MS, Reply(1, False, denial)),
-        _step(51 * MS, "reply", request_id=1),
-        _step(52 * MS, "reply", request_id=1),
-        _receive(60 * MS, Reply(0, False, Denial(DenialReason.NOT_HOLDER, "not so"))),
-        _receive(61 * MS, Reply(77, True)),
+        *_make_join(),
+        _make_step(40 * MS, "request", message="acquire", fields={"robots": ["left"]}),
+        _make_receive(50 * MS, Reply(1, False, denial)),
+        _make_step(51 * MS, "reply", request_id=1),
+        _make_step(52 * MS, "reply", request_id=1),
+        _make_receive(60 * MS, Reply(0, False, Denial(DenialReason.NOT_HOLDER, "not so"))),
+        _make_receive(61 * MS, Reply(77, True)),
     ]
 
 
 def _sampling() -> list[Step]:
     sample = {"device": "right", "p": [0.25, -0.5, 1.0], "q": [1.0, 0.0, 0.0, 0.0], "robots": ["left"]}
     return [
-        *_join(),
-        _step(40 * MS, "sample", capture_ns=OFFSET_NS + 40 * MS, clutch=False, **sample),
-        _step(41 * MS, "request", message="acquire", fields={"robots": ["left"]}),
-        _receive(50 * MS, Reply(1, True, leases=(_lease("p1", 2),))),
-        _step(60 * MS, "sample", capture_ns=OFFSET_NS + 60 * MS, clutch=True, **sample),
-        _event(61 * MS, 4, LeaseChanged(_lease("p1", 2), "acquired")),
-        _event(62 * MS, 5, LeaseChanged(_lease("p2", 3), "assigned", "p1")),
-        _step(70 * MS, "sample", capture_ns=OFFSET_NS + 70 * MS, clutch=True, **sample),
+        *_make_join(),
+        _make_step(40 * MS, "sample", capture_ns=OFFSET_NS + 40 * MS, clutch=False, **sample),
+        _make_step(41 * MS, "request", message="acquire", fields={"robots": ["left"]}),
+        _make_receive(50 * MS, Reply(1, True, leases=(_make_lease("p1", 2),))),
+        _make_step(60 * MS, "sample", capture_ns=OFFSET_NS + 60 * MS, clutch=True, **sample),
+        _make_event(61 * MS, 4, LeaseChanged(_make_lease("p1", 2), "acquired")),
+        _make_event(62 * MS, 5, LeaseChanged(_make_lease("p2", 3), "assigned", "p1")),
+        _make_step(70 * MS, "sample", capture_ns=OFFSET_NS + 70 * MS, clutch=True, **sample),
     ]
 
 
 def _refused_version() -> list[Step]:
     refused = Refused(RefusalCode.VERSION, "this session speaks version 2", "update", (2,))
-    return [_step(0, "open"), _receive(10 * MS, refused, epoch=0), _step(5 * SECOND, "tick")]
+    return [_make_step(0, "open"), _make_receive(10 * MS, refused, epoch=0), _make_step(5 * SECOND, "tick")]
 
 
 def _busy_then_joined() -> list[Step]:
     return [
-        _step(0, "open"),
-        _receive(10 * MS, Refused(RefusalCode.RATE, "too many at once", "wait"), epoch=0),
-        _step(100 * MS, "tick"),
-        _step(110 * MS, "tick"),
-        _welcome(120 * MS),
+        _make_step(0, "open"),
+        _make_receive(10 * MS, Refused(RefusalCode.RATE, "too many at once", "wait"), epoch=0),
+        _make_step(100 * MS, "tick"),
+        _make_step(110 * MS, "tick"),
+        _make_welcome(120 * MS),
     ]
 
 
 def _full() -> list[Step]:
     return [
-        *_join(),
-        _step(2 * SECOND, "disconnect"),
-        _receive(2010 * MS, Refused(RefusalCode.FULL, "no room", "wait"), epoch=0),
-        _step(2110 * MS, "tick"),
-        _welcome(2120 * MS, 2, b"token-2", resumed=True),
+        *_make_join(),
+        _make_step(2 * SECOND, "disconnect"),
+        _make_receive(2010 * MS, Refused(RefusalCode.FULL, "no room", "wait"), epoch=0),
+        _make_step(2110 * MS, "tick"),
+        _make_welcome(2120 * MS, 2, b"token-2", resumed=True),
     ]
 
 
 def _lost_welcome() -> list[Step]:
     return [
-        _step(0, "open"),
-        _step(999 * MS, "tick"),
-        _step(1000 * MS, "tick"),
-        _step(1100 * MS, "tick"),
-        _step(3100 * MS, "tick"),
-        _step(3300 * MS, "tick"),
-        _welcome(3310 * MS),
+        _make_step(0, "open"),
+        _make_step(999 * MS, "tick"),
+        _make_step(1000 * MS, "tick"),
+        _make_step(1100 * MS, "tick"),
+        _make_step(3100 * MS, "tick"),
+        _make_step(3300 * MS, "tick"),
+        _make_welcome(3310 * MS),
     ]
 
 
 def _used_token() -> list[Step]:
-    return [_step(0, "open"), _receive(10 * MS, Refused(RefusalCode.RESUME_TOKEN, "used"), epoch=0), _welcome(20 * MS)]
+    return [
+        _make_step(0, "open"),
+        _make_receive(10 * MS, Refused(RefusalCode.RESUME_TOKEN, "used"), epoch=0),
+        _make_welcome(20 * MS),
+    ]
 
 
 def _malformed() -> list[Step]:
     notice = encode_server(ServerEnvelope(PROTOCOL_VERSION, 1, Event(4, 1, 1, Notice("info", "x", ""))))
-    short = _snapshot(40 * MS, 3)
+    short = _make_snapshot(40 * MS, 3)
     frames = [[], [""], ["c1"], [notice[:-1].hex()], [notice.hex() + "00"], ["ff" * 20]]
     return [
-        *_join(),
-        *(_step(40 * MS, "receive", frames=each) for each in frames),
+        *_make_join(),
+        *(_make_step(40 * MS, "receive", frames=each) for each in frames),
         short | {"frames": [short["frames"][0], "00" * 8]},
-        _receive(41 * MS, ProtocolFault("malformed", "acquire: robots is wrong")),
+        _make_receive(41 * MS, ProtocolFault("malformed", "acquire: robots is wrong")),
     ]
 
 
@@ -459,28 +462,28 @@ def _scene_change() -> list[Step]:
     other = (BODIES[1], BODIES[0], BodyInfo(3, "plate", True, True))
     encoder, new = RigidEncoder(2, first_seq=11), RigidEncoder(3, first_seq=20)
     return [
-        *_join(),
-        _step(40 * MS, "receive_state", messages=[_state(encoder, BODIES, 0.125, 1, 40 * MS)]),
-        _event(50 * MS, 4, SceneChanged(1, 1, "patch", "scene-b")),
-        _event(55 * MS, 5, SceneChanged(2, 0, "new_scene", "scene-c", MS)),
-        _step(56 * MS, "receive_state", messages=[_state(new, other, 0.25, 2, 56 * MS)]),
-        _step(531 * MS, "tick"),
-        _snapshot(540 * MS, 5, scene_epoch=2, scene_hash="scene-c", bodies=other, state_seq=20),
-        _step(550 * MS, "receive_state", messages=[_state(new, other, 0.5, 2, 550 * MS)]),
-        _event(560 * MS, 6, SceneChanged(3, 0, "reset")),
-        _step(570 * MS, "receive_state", messages=[_state(new, other, 0.0, 3, 570 * MS)]),
+        *_make_join(),
+        _make_step(40 * MS, "receive_state", messages=[_make_state(encoder, BODIES, 0.125, 1, 40 * MS)]),
+        _make_event(50 * MS, 4, SceneChanged(1, 1, "patch", "scene-b")),
+        _make_event(55 * MS, 5, SceneChanged(2, 0, "new_scene", "scene-c", MS)),
+        _make_step(56 * MS, "receive_state", messages=[_make_state(new, other, 0.25, 2, 56 * MS)]),
+        _make_step(531 * MS, "tick"),
+        _make_snapshot(540 * MS, 5, scene_epoch=2, scene_hash="scene-c", bodies=other, state_seq=20),
+        _make_step(550 * MS, "receive_state", messages=[_make_state(new, other, 0.5, 2, 550 * MS)]),
+        _make_event(560 * MS, 6, SceneChanged(3, 0, "reset")),
+        _make_step(570 * MS, "receive_state", messages=[_make_state(new, other, 0.0, 3, 570 * MS)]),
     ]
 
 
 def _estop() -> list[Step]:
     return [
-        *_join(),
-        _step(40 * MS, "estop", reason="stop"),
-        _step(2 * SECOND, "disconnect"),
-        _welcome(2010 * MS, 2, b"token-2", resumed=True),
-        _snapshot(2020 * MS, 3, epoch=2),
-        _event(2030 * MS, 4, EStopChanged(True, "p1"), epoch=2),
-        _step(5 * SECOND, "disconnect"),
+        *_make_join(),
+        _make_step(40 * MS, "estop", reason="stop"),
+        _make_step(2 * SECOND, "disconnect"),
+        _make_welcome(2010 * MS, 2, b"token-2", resumed=True),
+        _make_snapshot(2020 * MS, 3, epoch=2),
+        _make_event(2030 * MS, 4, EStopChanged(True, "p1", "stop", 1), epoch=2),
+        _make_step(5 * SECOND, "disconnect"),
     ]
 
 
@@ -503,9 +506,9 @@ CONVERSATIONS: Final[dict[str, tuple[str, Callable[[], list[Step]]]]] = {
 }
 
 
-def _chunk(at_ns: int, request_id: int, address: str, offset: int, total: int, data: bytes) -> Step:
+def _make_chunk(at_ns: int, request_id: int, address: str, offset: int, total: int, data: bytes) -> Step:
     head = encode_asset_header(AssetChunk(PROTOCOL_VERSION, request_id, address, offset, total))
-    return _step(at_ns, "receive", frames=[head.hex(), data.hex()])
+    return _make_step(at_ns, "receive", frames=[head.hex(), data.hex()])
 
 
 def _asset_steps() -> list[Step]:
@@ -513,16 +516,16 @@ def _asset_steps() -> list[Step]:
     address = hashlib.sha256(good).hexdigest()
     other = hashlib.sha256(b"never sent").hexdigest()
     return [
-        _step(0, "want", address=address, size=-1),
-        _chunk(10 * MS, 1, address, 0, len(good), good[:8]),
-        _chunk(20 * MS, 2, address, 8, len(good), bad[8:]),
-        _chunk(30 * MS, 3, address, 0, len(good), good),
-        _step(40 * MS, "want", address=other, size=4),
-        _step(50 * MS, "link_lost"),
-        _step(110 * MS, "tick"),
-        _chunk(120 * MS, 5, other, 0, 4, b"what"),
-        _chunk(130 * MS, 6, other, 0, 4, b"what"),
-        _chunk(140 * MS, 99, other, 0, 4, b"what"),
+        _make_step(0, "want", address=address, size=-1),
+        _make_chunk(10 * MS, 1, address, 0, len(good), good[:8]),
+        _make_chunk(20 * MS, 2, address, 8, len(good), bad[8:]),
+        _make_chunk(30 * MS, 3, address, 0, len(good), good),
+        _make_step(40 * MS, "want", address=other, size=4),
+        _make_step(50 * MS, "link_lost"),
+        _make_step(110 * MS, "tick"),
+        _make_chunk(120 * MS, 5, other, 0, 4, b"what"),
+        _make_chunk(130 * MS, 6, other, 0, 4, b"what"),
+        _make_chunk(140 * MS, 99, other, 0, 4, b"what"),
     ]
 
 
@@ -533,14 +536,14 @@ def render_conversations() -> str:
         token = b"token-0".hex() if name == "used token" else ""
         player = ConversationPlayer(SECRET.hex(), token)
         head = {"name": name, "core": "connection", "about": about, "secret": SECRET.hex(), "resume_token": token}
-        conversations.append((head, [step | player.do(step) for step in make()]))
+        conversations.append((head, [step | player.play_step(step) for step in make()]))
     loader = AssetPlayer()
     head = {
         "name": "assets",
         "core": "asset loader",
         "about": "chunks, bytes of another asset once and twice, a lost link",
     }
-    conversations.append((head, [step | loader.do(step) for step in _asset_steps()]))
+    conversations.append((head, [step | loader.play_step(step) for step in _asset_steps()]))
     blocks = []
     for head, steps in conversations:
         lines = ",\n".join("      " + json.dumps(step) for step in steps)

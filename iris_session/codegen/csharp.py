@@ -13,7 +13,7 @@ from typing import Any, Final
 from iris_session.codegen import rigid_reference
 from iris_session.codegen.csharp_reader import READER
 from iris_session.codegen.csharp_writer import WRITER
-from iris_session.codegen.schema import UNIONS, Field, Struct, Type, all_structs, enum_doc, enums
+from iris_session.codegen.schema import UNIONS, Field, Struct, Type, find_enum_doc, list_all_structs, list_enums
 from iris_session.protocol import assets, server_messages
 from iris_session.protocol.names import PROTOCOL_VERSION, SCENE_VERSION
 from iris_session.protocol.scene import MAX_SCENE_BYTES
@@ -37,18 +37,20 @@ _VALUES: Final = ("int", "float")
 _READS: Final = {"bool": "ReadBool", "float": "ReadDouble"}
 
 
-def csharp() -> str:
+def render_csharp() -> str:
     """Return the text of Messages.g.cs."""
-    body = [*_constants(), *_enums(), READER, WRITER]
+    body = [*_render_constants(), *_render_enums(), READER, WRITER]
     for name, members in UNIONS.items():
-        body.append(_union(name, [member.__name__ for member in members], members[0].__struct_config__.tag_field or ""))
+        body.append(
+            _render_union(name, [member.__name__ for member in members], members[0].__struct_config__.tag_field or "")
+        )
     bases = {member.__name__: name for name, members in UNIONS.items() for member in members}
-    body.extend(_class(struct, bases.get(struct.name, "")) for struct in all_structs())
+    body.extend(_render_class(struct, bases.get(struct.name, "")) for struct in list_all_structs())
     lines = "\n\n".join(part.strip("\n") for part in body).split("\n")
     return HEAD + "".join(f"    {line}\n" if line.strip() else "\n" for line in lines) + "}\n"
 
 
-def pascal(name: str, struct: str = "") -> str:
+def to_pascal_case(name: str, struct: str = "") -> str:
     """Return the C# name of a field: `request_id` -> `RequestId`. Transforms keep theirs, which names their frames."""
     if name.startswith("T_"):
         return name
@@ -56,7 +58,7 @@ def pascal(name: str, struct: str = "") -> str:
     return text + "Value" if text == struct else text  # a member may not be named like its class
 
 
-def _constants() -> Iterator[str]:
+def _render_constants() -> Iterator[str]:
     yield f"""/// <summary>Numbers of the protocol that are no messages.</summary>
 public static class Wire
 {{
@@ -73,14 +75,16 @@ public static class Wire
 }}"""
 
 
-def _enums() -> Iterator[str]:
-    for name, values in enums().items():
-        rows = [f"    public const string {pascal(key)} = {json.dumps(value)};" for key, value in values.items()]
-        doc = enum_doc(name) or f"Values of an open enumeration: {name}."
-        yield "\n".join([*_doc(doc), f"public static class {name}", "{", *rows, "}"])
+def _render_enums() -> Iterator[str]:
+    for name, values in list_enums().items():
+        rows = [
+            f"    public const string {to_pascal_case(key)} = {json.dumps(value)};" for key, value in values.items()
+        ]
+        doc = find_enum_doc(name) or f"Values of an open enumeration: {name}."
+        yield "\n".join([*_render_doc(doc), f"public static class {name}", "{", *rows, "}"])
 
 
-def _doc(text: str) -> list[str]:
+def _render_doc(text: str) -> list[str]:
     if not text:
         return []
     escaped = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace("`", "")
@@ -88,9 +92,9 @@ def _doc(text: str) -> list[str]:
     return ["/// <summary>", *lines, "/// </summary>"]
 
 
-def _union(name: str, members: list[str], field: str) -> str:
+def _render_union(name: str, members: list[str], field: str) -> str:
     cases = "\n".join(f"            case {member}.TagName: return {member}.Read(reader);" for member in members)
-    return f"""/// <summary>One of {len(members)} messages, told apart by the field "{field}".</summary>
+    return f"""/// <summary>One of {len(members)} messages, distinguished by the field "{field}".</summary>
 public abstract class {name} : WireValue
 {{
     public abstract string Tag {{ get; }}
@@ -107,66 +111,71 @@ public abstract class {name} : WireValue
 }}"""
 
 
-def _class(struct: Struct, base: str) -> str:
-    fields = [_member(field, struct) for field in struct.fields]
+def _render_class(struct: Struct, base: str) -> str:
+    fields = [_render_member(field, struct) for field in struct.fields]
     tag = []
     if base:
         tag = [
             f'    public const string TagName = "{struct.tag}";',
             "    public override string Tag { get { return TagName; } }",
         ]
-    read = _read_array(struct) if struct.array_like else _read_map(struct)
+    read = _render_read_array(struct) if struct.array_like else _render_read_map(struct)
     return "\n".join(
         [
-            *_doc(struct.doc),
+            *_render_doc(struct.doc),
             f"public sealed class {struct.name} : {base or 'WireValue'}",
             "{",
             *tag,
             *fields,
             "",
-            *(f"    {line}".rstrip() for line in [*read, "", *_write(struct)]),
+            *(f"    {line}".rstrip() for line in [*read, "", *_render_write(struct)]),
             "}",
         ]
     )
 
 
-def _member(field: Field, struct: Struct) -> str:
-    return f"    public {_name(field.type)} {pascal(field.name, struct.name)} = {_initial(field)};"
+def _render_member(field: Field, struct: Struct) -> str:
+    name = to_pascal_case(field.name, struct.name)
+    return f"    public {_render_type(field.type)} {name} = {_render_initial_value(field)};"
 
 
-def _name(kind: Type) -> str:
+def _render_type(kind: Type) -> str:
     if kind.base in _SCALARS:
         return _SCALARS[kind.base] + ("?" if kind.optional and kind.base in _VALUES else "")
     if kind.base == "array":
         assert kind.item is not None
-        return _name(kind.item) + "[]"
+        return _render_type(kind.item) + "[]"
     return "Dictionary<string, long>" if kind.base == "map" else kind.name
 
 
-def _initial(field: Field) -> str:
+def _render_initial_value(field: Field) -> str:
     kind, default = field.type, field.default
     if kind.optional or kind.base == "union":
         return "null"
     if kind.base in ("struct", "map"):
-        return f"new {_name(kind)}()"
+        return f"new {_render_type(kind)}()"
     if kind.base == "bytes":
         return "new byte[0]"
     if kind.base == "array":
         assert kind.item is not None
-        values = "" if field.required else ", ".join(_literal(value) for value in default)
-        return f"new {_name(kind.item)}[] {{ {values} }}" if values else f"new {_name(kind.item)}[{kind.length}]"
+        values = "" if field.required else ", ".join(_render_literal(value) for value in default)
+        return (
+            f"new {_render_type(kind.item)}[] {{ {values} }}"
+            if values
+            else f"new {_render_type(kind.item)}[{kind.length}]"
+        )
     zero = {"bool": False, "int": 0, "float": 0.0, "str": ""}[kind.base]
-    return _literal(zero if field.required else default)
+    return _render_literal(zero if field.required else default)
 
 
-def _literal(value: Any) -> str:
+def _render_literal(value: Any) -> str:
     return json.dumps(value)
 
 
-def _read_one(kind: Type) -> str:
+def _render_read_value(kind: Type) -> str:
     match kind.base:
         case "int":
-            return f"reader.ReadLong({_range(kind)})"
+            return f"reader.ReadLong({_render_range(kind)})"
         case "str":
             return "reader.ReadAddress()" if kind.pattern else f"reader.ReadString({kind.max_length})"
         case "bytes":
@@ -179,37 +188,37 @@ def _read_one(kind: Type) -> str:
             return f"{kind.name}.ReadAny(reader)"
         case "struct":
             return f"{kind.name}.Read(reader)"
-    return _read_items(kind)
+    return _render_read_items(kind)
 
 
-def _read_items(kind: Type) -> str:
+def _render_read_items(kind: Type) -> str:
     assert kind.item is not None
     item, most = kind.item, kind.max_length
     match item.base:
         case "float":
             return f"reader.ReadDoubles({kind.length}, {most})"
         case "int":
-            return f"reader.ReadLongs({kind.length}, {most}, {_range(item)})"
+            return f"reader.ReadLongs({kind.length}, {most}, {_render_range(item)})"
         case "str":
             return f"reader.ReadStrings({most}, {item.max_length})"
     return f"reader.ReadArray(Protocol.{item.name}.Read, {most})"  # qualified: a field may be named like its type
 
 
-def _range(kind: Type) -> str:
+def _render_range(kind: Type) -> str:
     """Return least and largest value, as C# writes them."""
     low = "long.MinValue" if kind.minimum in (None, -(2**63)) else str(kind.minimum)
     return f"{low}, {'long.MaxValue' if kind.maximum in (None, 2**63 - 1) else kind.maximum}"
 
 
-def _assign(field: Field, struct: Struct) -> str:
-    target = f"value.{pascal(field.name, struct.name)}"
+def _render_assignment(field: Field, struct: Struct) -> str:
+    target = f"value.{to_pascal_case(field.name, struct.name)}"
     if field.type.optional:
-        null = f"({_name(field.type)})null" if field.type.base in _VALUES else "null"
-        return f"{target} = reader.TryReadNil() ? {null} : {_read_one(field.type)};"
-    return f"{target} = {_read_one(field.type)};"
+        null = f"({_render_type(field.type)})null" if field.type.base in _VALUES else "null"
+        return f"{target} = reader.TryReadNil() ? {null} : {_render_read_value(field.type)};"
+    return f"{target} = {_render_read_value(field.type)};"
 
 
-def _read_array(struct: Struct) -> list[str]:
+def _render_read_array(struct: Struct) -> list[str]:
     required = sum(field.required for field in struct.fields)
     lines = [
         f"public static {struct.name} Read(WireReader reader)",
@@ -220,12 +229,12 @@ def _read_array(struct: Struct) -> list[str]:
     ]
     for k, field in enumerate(struct.fields):
         condition = "" if field.required else f"if (n > {k}) "
-        lines.append(f"    {condition}{_assign(field, struct)}")
+        lines.append(f"    {condition}{_render_assignment(field, struct)}")
     lines.append(f"    for (int i = {len(struct.fields)}; i < n; i++) reader.Skip();")
     return [*lines, "    return value;", "}"]
 
 
-def _read_map(struct: Struct) -> list[str]:
+def _render_read_map(struct: Struct) -> list[str]:
     wanted = sum(1 << k for k, field in enumerate(struct.fields) if field.required)
     lines = [
         f"public static {struct.name} Read(WireReader reader)",
@@ -239,7 +248,7 @@ def _read_map(struct: Struct) -> list[str]:
     ]
     for k, field in enumerate(struct.fields):
         mark = f" seen |= {1 << k}u;" if field.required else ""
-        lines.append(f'            case "{field.name}": {_assign(field, struct)}{mark} break;')
+        lines.append(f'            case "{field.name}": {_render_assignment(field, struct)}{mark} break;')
     lines += [
         "            default: reader.Skip(); break;",
         "        }",
@@ -252,7 +261,7 @@ def _read_map(struct: Struct) -> list[str]:
     return [*lines, "    return value;", "}"]
 
 
-def _write(struct: Struct) -> list[str]:
+def _render_write(struct: Struct) -> list[str]:
     count = len(struct.fields)
     lines = ["public override void WriteTo(WireWriter writer)", "{"]
     if struct.array_like:
@@ -265,5 +274,5 @@ def _write(struct: Struct) -> list[str]:
     for field in struct.fields:
         if not struct.array_like:
             lines.append(f'    writer.Write("{field.name}");')
-        lines.append(f"    writer.Write({pascal(field.name, struct.name)});")
+        lines.append(f"    writer.Write({to_pascal_case(field.name, struct.name)});")
     return [*lines, "}"]

@@ -22,7 +22,7 @@ from iris_session.streams.deformable_topology import DeformableTopology, used_ve
 Floats = npt.NDArray[np.float64]
 
 
-def cloth(rows: int, cols: int, spacing_m: float = 0.01) -> tuple[DeformableTopology, Floats]:
+def make_cloth(rows: int, cols: int, spacing_m: float = 0.01) -> tuple[DeformableTopology, Floats]:
     """Return a wavy cloth, numbered along its rows: topology and vertices (n, 3) [m]."""
     row, col = np.divmod(np.arange(rows * cols), cols)
     u, v = row * spacing_m, col * spacing_m
@@ -33,7 +33,7 @@ def cloth(rows: int, cols: int, spacing_m: float = 0.01) -> tuple[DeformableTopo
     return DeformableTopology(rows * cols, faces), vertices
 
 
-def shell(side: int, spacing_m: float = 0.02) -> tuple[DeformableTopology, Floats]:
+def make_shell(side: int, spacing_m: float = 0.02) -> tuple[DeformableTopology, Floats]:
     """Return the outside of a squeezed box of `side`^3 vertices: closed, and numbered without order."""
     grid = np.array(list(itertools.product(range(side), repeat=3)))
     number = {tuple(place): i for i, place in enumerate(grid.tolist())}
@@ -44,7 +44,7 @@ def shell(side: int, spacing_m: float = 0.02) -> tuple[DeformableTopology, Float
             a, b, c, d = (number[tuple(np.insert(np.array(place), axis, end).tolist())] for place in corners)
             faces += [(a, b, c), (a, c, d)]
     used, table = used_vertices(len(grid), faces)
-    shuffled = np.argsort(_scattered(len(used)))
+    shuffled = np.argsort(_scatter_numbers(len(used)))
     places = np.empty((len(used), 3))
     places[shuffled] = grid[used] * spacing_m
     height = places[:, 2:] / (side * spacing_m)
@@ -52,45 +52,45 @@ def shell(side: int, spacing_m: float = 0.02) -> tuple[DeformableTopology, Float
     return DeformableTopology(len(used), shuffled[table]), places + np.array((3.0, -2.0, 0.5))
 
 
-def rope(n: int, spacing_m: float = 0.015) -> tuple[DeformableTopology, Floats]:
+def make_rope(n: int, spacing_m: float = 0.015) -> tuple[DeformableTopology, Floats]:
     """Return a hanging rope whose vertices are numbered without order."""
-    shuffled = np.argsort(_scattered(n))
+    shuffled = np.argsort(_scatter_numbers(n))
     x = (np.arange(n) - n / 2) * spacing_m
     vertices = np.empty((n, 3))
     vertices[shuffled] = np.stack([x, 0.1 * x, 1.0 + 2.0 * x**2], axis=1)
     return DeformableTopology(n, edges=np.stack([shuffled[:-1], shuffled[1:]], axis=1)), vertices
 
 
-def _scattered(n: int) -> Floats:
+def _scatter_numbers(n: int) -> Floats:
     """Return (n,) different numbers in [0, 1) without visible order: multiples of the golden ratio."""
     return np.asarray(np.arange(n) * ((5.0**0.5 - 1.0) / 2.0) % 1.0)
 
 
-def meshes() -> Iterator[tuple[str, DeformableTopology, dict[str, Floats]]]:
+def iterate_meshes() -> Iterator[tuple[str, DeformableTopology, dict[str, Floats]]]:
     """Return name, topology, and vertices by the name of a frame."""
-    topology, vertices = cloth(6, 5)
+    topology, vertices = make_cloth(6, 5)
     broken = vertices.copy()
     broken[3], broken[17] = (np.nan, 0.0, np.inf), (0.25, -5e6, 1.0)
-    noise = 2.0 * _scattered(vertices.size).reshape(vertices.shape) - 1.0
+    noise = 2.0 * _scatter_numbers(vertices.size).reshape(vertices.shape) - 1.0
     crumpled, scattered = vertices + 0.2 * noise, 4000.0 * noise
     yield (
         "cloth",
         topology,
         {"wavy": vertices, "two escapes": broken, "crumpled": crumpled, "scattered over 8 km": scattered},
     )
-    topology, vertices = cloth(24, 24)
+    topology, vertices = make_cloth(24, 24)
     yield "larger cloth, packed", topology, {"wavy": vertices}
-    topology, vertices = shell(5)
+    topology, vertices = make_shell(5)
     yield "shell of a soft body", topology, {"squeezed": vertices}
-    topology, vertices = rope(16)
+    topology, vertices = make_rope(16)
     yield "rope", topology, {"hanging": vertices}
     yield "one vertex", DeformableTopology(1), {"alone": np.array([[0.1, -0.2, 0.3]])}
 
 
-def golden() -> dict[str, Any]:
+def build_golden() -> dict[str, Any]:
     """Return the content of the file. Coordinates are numbers with the value of the float32, null if not finite."""
     content = []
-    for name, topology, frames in meshes():
+    for name, topology, frames in iterate_meshes():
         rows = []
         for frame, vertices in frames.items():
             for budget_class in COARSER if name == "cloth" and frame == "wavy" else (BudgetClass.FULL,):
@@ -102,20 +102,20 @@ def golden() -> dict[str, Any]:
                         "name": f"{frame}/{budget_class}",
                         "bound_m": read_header(payload).bound_m,
                         "hex": payload.hex(),
-                        "vertices": _numbers(DeformableDecoder(topology).decode(payload)),
+                        "vertices": _to_json_numbers(DeformableDecoder(topology).decode(payload)),
                     }
                 )
         content.append({"name": name, "topology": topology.to_bytes().hex(), "frames": rows})
     return {"format": 1, "meshes": content}
 
 
-def _numbers(positions: npt.NDArray[np.float32]) -> list[list[float | None]]:
+def _to_json_numbers(positions: npt.NDArray[np.float32]) -> list[list[float | None]]:
     return [[v if np.isfinite(v) else None for v in row] for row in positions.astype(np.float64).tolist()]
 
 
-def text() -> str:
+def render_golden() -> str:
     """Return the text of the file, a frame a line."""
-    meshes_of = golden()["meshes"]
+    meshes_of = build_golden()["meshes"]
     blocks = []
     for mesh in meshes_of:
         frames = ",\n".join("      " + json.dumps(frame, allow_nan=False) for frame in mesh["frames"])

@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from iris_session.codegen import conversions, rigid_reference
-from iris_session.codegen.examples import extreme, full, least
+from iris_session.codegen.examples import iterate_examples
 from iris_session.protocol import codec
 from iris_session.protocol.assets import AssetChunk, AssetRefused, AssetRequest
 from iris_session.protocol.client_messages import Bye, ClientEnvelope, Hello, Sample, wrap_message
@@ -34,79 +34,81 @@ _pack = msgspec.msgpack.encode
 VERSIONED = (AssetRequest, AssetChunk, AssetRefused)
 
 
-def golden() -> str:
+def render_golden() -> str:
     """Return the text of golden.json."""
     content = {
         "protocol_version": PROTOCOL_VERSION,
-        "client": list(_messages("client", codec.CLIENT_TYPES.values())),
-        "server": [*_messages("server", codec.SERVER_TYPES.values()), *_events()],
-        "state_header": list(_values("state_header", StateHeader)),
-        "presence": list(_values("presence", Presence)),
-        "media_header": list(_values("media_header", MediaHeader)),
-        "media_push": list(_values("media_push", MediaPush)),
-        "asset_request": list(_values("asset_request", AssetRequest)),
-        "asset_chunk": list(_values("asset_chunk", AssetChunk)),
-        "asset_refused": list(_values("asset_refused", AssetRefused)),
-        "beacon": list(_values("beacon", Beacon)),
-        "decode_only": list(_decode_only()),
-        "malformed": list(_malformed()),
-        "conversions": list(_conversions()),
-        "rigid": list(_rigid()),
+        "client": list(_iterate_messages("client", codec.CLIENT_TYPES.values())),
+        "server": [*_iterate_messages("server", codec.SERVER_TYPES.values()), *_iterate_events()],
+        "state_header": list(_iterate_values("state_header", StateHeader)),
+        "presence": list(_iterate_values("presence", Presence)),
+        "media_header": list(_iterate_values("media_header", MediaHeader)),
+        "media_push": list(_iterate_values("media_push", MediaPush)),
+        "asset_request": list(_iterate_values("asset_request", AssetRequest)),
+        "asset_chunk": list(_iterate_values("asset_chunk", AssetChunk)),
+        "asset_refused": list(_iterate_values("asset_refused", AssetRefused)),
+        "beacon": list(_iterate_values("beacon", Beacon)),
+        "decode_only": list(_iterate_decode_only()),
+        "malformed": list(_iterate_malformed()),
+        "conversions": list(_iterate_conversions()),
+        "rigid": list(_iterate_rigid()),
     }
     lines = ["{"]
     for key, value in content.items():
         comma = "" if key == "rigid" else ","
         if isinstance(value, list):
-            rows = ",\n".join("    " + _json(row) for row in value)
+            rows = ",\n".join("    " + _dump_json(row) for row in value)
             lines.append(f"  {json.dumps(key)}: [\n{rows}\n  ]{comma}")
         else:
-            lines.append(f"  {json.dumps(key)}: {_json(value)}{comma}")
+            lines.append(f"  {json.dumps(key)}: {_dump_json(value)}{comma}")
     return "\n".join([*lines, "}", ""])
 
 
-def _json(value: Any) -> str:
+def _dump_json(value: Any) -> str:
     return json.dumps(value, ensure_ascii=True, allow_nan=False)
 
 
-def _vector(name: str, data: bytes, value: Any, **more: Any) -> dict[str, Any]:
+def _describe_vector(name: str, data: bytes, value: Any, **more: Any) -> dict[str, Any]:
     return {"name": name, **more, "hex": data.hex(), "value": msgspec.to_builtins(value)}
 
 
-def _wrap(side: str, message: Any) -> Any:
+def _put_in_envelope(side: str, message: Any) -> Any:
     return ClientEnvelope(PROTOCOL_VERSION, 7, "", message) if side == "client" else ServerEnvelope(1, 7, message)
 
 
-def _messages(side: str, kinds: Any) -> Iterator[dict[str, Any]]:
+def _iterate_messages(side: str, kinds: Any) -> Iterator[dict[str, Any]]:
     for kind in kinds:
-        for make in (full, least, extreme):
-            value = _wrap(side, make(kind))
-            yield _vector(f"{codec.get_tag(kind)}/{make.__name__}", _pack(value), value)
+        for name, message in iterate_examples(kind):
+            value = _put_in_envelope(side, message)
+            yield _describe_vector(f"{codec.get_tag(kind)}/{name}", _pack(value), value)
 
 
-def _events() -> Iterator[dict[str, Any]]:
+def _iterate_events() -> Iterator[dict[str, Any]]:
     for kind in codec.EVENT_TYPES.values():
-        for make in (full, least):
-            value = _wrap("server", Event(event_seq=5, step=1_000, session_time=2_000_000_000, body=make(kind)))
-            yield _vector(f"event/{codec.get_tag(kind)}/{make.__name__}", _pack(value), value)
+        for name, body in iterate_examples(kind, ("full", "least")):
+            event = Event(event_seq=5, step=1_000, session_time=2_000_000_000, body=body)
+            value = _put_in_envelope("server", event)
+            yield _describe_vector(f"event/{codec.get_tag(kind)}/{name}", _pack(value), value)
 
 
-def _values(name: str, kind: type[msgspec.Struct]) -> Iterator[dict[str, Any]]:
-    makes = (full, least) if kind is Beacon else (full, least, extreme)
-    for make in makes:
-        value = make(kind)
+def _iterate_values(group: str, kind: type[msgspec.Struct]) -> Iterator[dict[str, Any]]:
+    kinds = ("full", "least") if kind is Beacon else ("full", "least", "extreme")
+    for name, value in iterate_examples(kind, kinds):
         if kind in VERSIONED:
-            value = msgspec.structs.replace(value, version=PROTOCOL_VERSION)
-        yield _vector(f"{name}/{make.__name__}", _pack(value), value)
+            value = msgspec.structs.replace(value, version=PROTOCOL_VERSION)  # noqa: PLW2901
+        yield _describe_vector(f"{group}/{name}", _pack(value), value)
 
 
-def _decode_only() -> Iterator[dict[str, Any]]:
+def _iterate_decode_only() -> Iterator[dict[str, Any]]:
     """Yield messages that older or newer clients may send: fields missing or unknown, other widths of numbers."""
     hello = Hello(role="surgeon", name="Ada")
-    yield _vector(
+    yield _describe_vector(
         "fields left out", _pack([1, 0, "", {"type": "hello", "role": "surgeon", "name": "Ada"}]), wrap_message(hello)
     )
     grown = {"new": [{"deep": 1.5}], "type": "hello", "name": "Ada", "role": "surgeon", "newer": None}
-    yield _vector("unknown fields and another order", _pack([1, 0, "", grown, "later element"]), wrap_message(hello))
+    yield _describe_vector(
+        "unknown fields and another order", _pack([1, 0, "", grown, "later element"]), wrap_message(hello)
+    )
     sample = Sample("head", "pose", 1, 2, 3, 4, 5, gripper=1.0)
     bare = {
         "type": "sample",
@@ -119,13 +121,13 @@ def _decode_only() -> Iterator[dict[str, Any]]:
         "alignment_version": 5,
         "gripper": 1,
     }
-    yield _vector("an integer where a float is meant", _pack([1, 0, "", bare]), wrap_message(sample))
+    yield _describe_vector("an integer where a float is meant", _pack([1, 0, "", bare]), wrap_message(sample))
     wide = bytes.fromhex("94 d3 0000000000000001 cf 0000000000000000 d9 00 de 0002 d9 04") + b"type"
     wide += b"\xda\x00\x03bye\xa6reason\xdb\x00\x00\x00\x01x"
-    yield _vector("numbers and strings in wider forms", wide, wrap_message(Bye("x")))
+    yield _describe_vector("numbers and strings in wider forms", wide, wrap_message(Bye("x")))
 
 
-def _malformed() -> Iterator[dict[str, Any]]:
+def _iterate_malformed() -> Iterator[dict[str, Any]]:
     """Yield bytes that a server must reject, with the code of the error."""
     good = _pack(wrap_message(Bye("x")))
     bye = b"\x94\x01\x00\xa0\x82\xa4type\xa3bye"
@@ -153,7 +155,7 @@ def _malformed() -> Iterator[dict[str, Any]]:
         yield {"name": name, "code": code, "hex": data.hex()}
 
 
-def _conversions() -> Iterator[dict[str, Any]]:
+def _iterate_conversions() -> Iterator[dict[str, Any]]:
     """Yield world poses `x y z qw qx qy qz` and the same poses in engines, `x y z qx qy qz qw`."""
     half = math.sqrt(0.5)
     for world in (
@@ -166,7 +168,7 @@ def _conversions() -> Iterator[dict[str, Any]]:
         yield {"world": world, "unity": conversions.to_unity(world), "three": conversions.to_three(world)}
 
 
-def _rigid() -> Iterator[dict[str, Any]]:
+def _iterate_rigid() -> Iterator[dict[str, Any]]:
     """Yield payloads of the state stream: `poses` by body, as decoded; a decoder's floats may differ by 1e-12."""
     half = math.sqrt(0.5)
     poses: list[tuple[float, ...]] = [

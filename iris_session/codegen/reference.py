@@ -21,6 +21,7 @@ REACHED: Final = {
         "iris_session.client.media.MediaFeed",
         "iris_session.client.assets.ClientAssets",
         "iris_session.client.assets.AssetFetch",
+        "iris_session.client.alignment.ClientAlignment",
     ),
 }
 #: Title of each section and the first public name in it, in the order of `__all__`.

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import msgspec
 
-from iris_session.codegen.examples import extreme, full, least
+from iris_session.codegen.examples import iterate_examples
 from iris_session.codegen.schema import GROUPS
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.names import (
@@ -66,13 +66,13 @@ _RED: Final = (1.0, 0.0, 0.0, 1.0)
 _GREY: Final = (0.5, 0.5, 0.5, 1.0)
 
 
-def scene_golden() -> str:
+def render_scene_golden() -> str:
     """Return the text of scene.json: one vector a line."""
     content = {
-        "structs": list(_structs()),
-        "scenes": list(_scenes()),
-        "patches": list(_patches()),
-        "malformed": list(_malformed()),
+        "structs": list(_iterate_structs()),
+        "scenes": list(_iterate_scenes()),
+        "patches": list(_iterate_patches()),
+        "malformed": list(_iterate_malformed()),
     }
     blocks = []
     for name, rows in content.items():
@@ -81,30 +81,29 @@ def scene_golden() -> str:
     return f'{{\n  "scene_version": {SCENE_VERSION},\n' + ",\n".join(blocks) + "\n}\n"
 
 
-def _address(data: bytes) -> str:
+def _make_address(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def _structs() -> Iterator[dict[str, Any]]:
+def _iterate_structs() -> Iterator[dict[str, Any]]:
     """Yield every struct by itself; their references have no target."""
     for group in ("scene", "arrays", "patch"):
         for kind in GROUPS[group]:
             nested = kind in (SceneSpec, AddMesh, AddMaterial, AddVisual)  # their parts have extremes of their own
-            for make in (full, least) if nested else (full, least, extreme):
-                value = make(kind)
-                row = {"name": f"{kind.__name__}/{make.__name__}", "type": kind.__name__, "hex": _pack(value).hex()}
+            for name, value in iterate_examples(kind, ("full", "least") if nested else ("full", "least", "extreme")):
+                row = {"name": f"{kind.__name__}/{name}", "type": kind.__name__, "hex": _pack(value).hex()}
                 yield {**row, "value": msgspec.to_builtins(value)}
 
 
-def _scenes() -> Iterator[dict[str, Any]]:
+def _iterate_scenes() -> Iterator[dict[str, Any]]:
     """Yield whole specifications. `canonical`: the encoder of this version makes these bytes of the value."""
-    for name, spec in (("every kind of thing", everything()), ("nothing", SceneSpec())):
-        yield _scene(name, encode_scene(spec), spec, canonical=True)
+    for name, spec in (("every kind of thing", make_full_scene()), ("nothing", SceneSpec())):
+        yield _describe_scene(name, encode_scene(spec), spec, canonical=True)
     body = {"id": 0, "name": "", "parent": -1, "T_parent_body": _P, "T_world_body": _P, "moving": False, "mass": 1}
     grown = {"weather": {"rain": [1, 2.5, None]}, "bodies": [body], "lights": [_LIGHT], "groups_shown": [0]}
     light = Light("", "laser", 0, (0.0, 0.0, 2.0), (0.0, 0.0, -1.0), *((1.0, 1.0, 1.0),) * 3, range=5.0)
     spec = SceneSpec(bodies=(Body(0, "", -1, IDENTITY, IDENTITY, False),), lights=(light,), groups_shown=(0,))
-    yield _scene("another encoder: fields left out and unknown, integers for floats", _pack(grown), spec)
+    yield _describe_scene("another encoder: fields left out and unknown, integers for floats", _pack(grown), spec)
 
 
 _P: Final = [[0, 0, 0], [1, 0, 0, 0]]
@@ -121,39 +120,39 @@ _LIGHT: Final = {
 }
 
 
-def _scene(name: str, data: bytes, spec: SceneSpec, canonical: bool = False) -> dict[str, Any]:
-    row = {"name": name, "canonical": canonical, "address": _address(data), "hex": data.hex()}
+def _describe_scene(name: str, data: bytes, spec: SceneSpec, canonical: bool = False) -> dict[str, Any]:
+    row = {"name": name, "canonical": canonical, "address": _make_address(data), "hex": data.hex()}
     return {**row, "value": msgspec.to_builtins(spec)}
 
 
-def _patches() -> Iterator[dict[str, Any]]:
+def _iterate_patches() -> Iterator[dict[str, Any]]:
     """Yield operations on the scene `before`, and the address of the specification after them."""
-    before = everything()
+    before = make_full_scene()
     decoration = Visual(90, 0, "arrow", _UP, 0, Geometry(GeometryKind.MESH, (0.1, 0.1, 0.1), mesh=1), 2, _RED)
     cases: dict[str, tuple[PatchOp, ...]] = {
         "nothing": (),
         "every operation": (
             SetVisual(1, rgba=_RED, group=3, material=-1, T_body_visual=_TURNED),
-            AddMesh(Mesh("arrow", (-0.1, -0.1, 0.0), (0.1, 0.1, 0.5), False, (_mesh_level("arrow", 12),))),
+            AddMesh(Mesh("arrow", (-0.1, -0.1, 0.0), (0.1, 0.1, 0.5), False, (_make_mesh_level("arrow", 12),))),
             AddMaterial(Material("gold", (1.0, 0.8, 0.0, 1.0), reflectance=0.25)),
             AddVisual(decoration),
             RemoveVisual(2),
         ),
         "a visual that comes and goes": (
-            AddVisual(Visual(90, 0, "", _UP, 0, _box(), -1, _RED)),
+            AddVisual(Visual(90, 0, "", _UP, 0, _make_box(), -1, _RED)),
             SetVisual(90, group=1),
             RemoveVisual(90),
         ),
     }
     for name, ops in cases.items():
-        after = _address(encode_scene(apply_patch(before, ops)))
+        after = _make_address(encode_scene(apply_patch(before, ops)))
         row = {"name": name, "before": "every kind of thing", "after": after, "hex": _pack(ops).hex()}
         yield {**row, "value": msgspec.to_builtins(ops)}
 
 
-def _malformed() -> Iterator[dict[str, Any]]:
+def _iterate_malformed() -> Iterator[dict[str, Any]]:
     """Yield bytes that a reader must reject. `checked`: types and bounds are right, but the content is not."""
-    whole = everything()
+    whole = make_full_scene()
     small = msgspec.structs.replace(
         whole, visuals=whole.visuals[-1:], materials=whole.materials[:1], textures=(), lights=(), deformables=(),
         environment=Environment(),
@@ -208,37 +207,37 @@ _CHECKED: Final = {
 }
 
 
-def _mesh_level(what: str, triangles: int, max_error_m: float = 0.0) -> MeshLevel:
-    return MeshLevel(_address(what.encode()), 1_000, AssetEncoding.ARRAYS, 3 * triangles, triangles, max_error_m)
+def _make_mesh_level(what: str, triangles: int, max_error_m: float = 0.0) -> MeshLevel:
+    return MeshLevel(_make_address(what.encode()), 1_000, AssetEncoding.ARRAYS, 3 * triangles, triangles, max_error_m)
 
 
-def _texture(name: str, kind: str, side: int, encoding: str, colorspace: str = ColorSpace.AUTO) -> Texture:
+def _make_texture(name: str, kind: str, side: int, encoding: str, colorspace: str = ColorSpace.AUTO) -> Texture:
     sizes = (side, side // 2)
     levels = tuple(
-        TextureLevel(_address(f"{name}{size}".encode()), 500, encoding, size, size, index)
+        TextureLevel(_make_address(f"{name}{size}".encode()), 500, encoding, size, size, index)
         for index, size in enumerate(sizes)
     )
     return Texture(name, kind, side, side, 3, colorspace, levels)
 
 
-def _box() -> Geometry:
+def _make_box() -> Geometry:
     return Geometry(GeometryKind.BOX, (0.1, 0.2, 0.3))
 
 
-def everything() -> SceneSpec:
+def make_full_scene() -> SceneSpec:
     """Return a consistent scene with every kind of element; the content of its assets is left open."""
     textures = (
-        _texture("wood", TextureKind.IMAGE, 64, AssetEncoding.PNG, ColorSpace.SRGB),
-        _texture("marble", TextureKind.CUBE, 32, AssetEncoding.ARRAYS),
-        _texture("sky", TextureKind.SKYBOX, 128, AssetEncoding.JPEG, ColorSpace.LINEAR),
-        _texture("packed", TextureKind.IMAGE, 16, AssetEncoding.OPAQUE),
+        _make_texture("wood", TextureKind.IMAGE, 64, AssetEncoding.PNG, ColorSpace.SRGB),
+        _make_texture("marble", TextureKind.CUBE, 32, AssetEncoding.ARRAYS),
+        _make_texture("sky", TextureKind.SKYBOX, 128, AssetEncoding.JPEG, ColorSpace.LINEAR),
+        _make_texture("packed", TextureKind.IMAGE, 16, AssetEncoding.OPAQUE),
     )
     uses = tuple(TextureUse(role, index % 2) for index, role in enumerate(_ROLES))
     materials = (
         Material("plain", _GREY),
         Material("rich", _GREY, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, uses, (2.0, 3.0), True),
     )
-    levels = (_mesh_level("hammer", 1_000), _mesh_level("hammer, coarse", 250, 0.002))
+    levels = (_make_mesh_level("hammer", 1_000), _make_mesh_level("hammer, coarse", 250, 0.002))
     bodies = (
         Body(0, "world", -1, IDENTITY, IDENTITY, False),
         Body(2, "arm", 0, _UP, _UP, True),
@@ -248,21 +247,21 @@ def everything() -> SceneSpec:
         name="every kind of thing",
         source="golden vectors",
         bodies=bodies,
-        visuals=tuple(_visuals()),
+        visuals=tuple(_iterate_visuals()),
         materials=materials,
         textures=textures,
         meshes=(Mesh("hammer", (-0.1, -0.1, -0.2), (0.1, 0.1, 0.2), True, levels),),
-        hfields=(HeightField("hills", 20, 30, (2.0, 3.0, 0.5, 0.1), _address(b"hills"), 2_000),),
-        lights=tuple(_lights()),
-        cameras=tuple(_cameras()),
+        hfields=(HeightField("hills", 20, 30, (2.0, 3.0, 0.5, 0.1), _make_address(b"hills"), 2_000),),
+        lights=tuple(_iterate_lights()),
+        cameras=tuple(_iterate_cameras()),
         sites=(
             Site(0, 2, "tip", _UP, 4, Geometry(GeometryKind.SPHERE, (0.01, 0.01, 0.01)), 0, _RED),
-            Site(1, 5, "", _TURNED, 4, _box(), -1, _GREY),
+            Site(1, 5, "", _TURNED, 4, _make_box(), -1, _GREY),
         ),
         tendons=(Tendon("rope", 0, 0.003, (0, 1), 0, _RED),),
         deformables=tuple(
             Deformable(f"dim{dim}", dim, 0, 100, 180, 0.005, dim == 3, 1, _GREY, f"deform-{dim}", address, 4_000)
-            for dim, address in ((n, _address(f"dim{n}".encode())) for n in (1, 2, 3))
+            for dim, address in ((n, _make_address(f"dim{n}".encode())) for n in (1, 2, 3))
         ),
         environment=Environment(Headlight(False, (0.2, 0.2, 0.2)), 2, _RED, 0.4, _GREY, 5.0, 9.0, 0.02, 60.0, 2.5),
         groups_shown=(0, 2),
@@ -274,7 +273,7 @@ def everything() -> SceneSpec:
 _ROLES: Final = (TextureRole.RGB, TextureRole.NORMAL, TextureRole.ORM, TextureRole.EMISSIVE)
 
 
-def _visuals() -> Iterator[Visual]:
+def _iterate_visuals() -> Iterator[Visual]:
     """Return one visual of every geometry, and one of a kind that a later version may have."""
     kinds = [value for key, value in vars(GeometryKind).items() if key.isupper() and isinstance(value, str)]
     for number, kind in enumerate([*kinds, "torus"]):
@@ -284,7 +283,7 @@ def _visuals() -> Iterator[Visual]:
         yield Visual(number, (0, 2, 5)[number % 3], kind, _TURNED, number % 4, geometry, number % 3 - 1, _GREY)
 
 
-def _lights() -> Iterator[Light]:
+def _iterate_lights() -> Iterator[Light]:
     down, white = (0.0, 0.0, -1.0), (1.0, 1.0, 1.0)
     yield Light("", LightKind.DIRECTIONAL, 0, (0.0, 0.0, 0.0), down, white, white, white)
     attenuation, follow = (1.0, 0.1, 0.01), Follow.TARGET_BODY
@@ -296,7 +295,7 @@ def _lights() -> Iterator[Light]:
     yield Light("", LightKind.IMAGE, 0, (0.0, 0.0, 0.0), down, white, white, white, texture=2)
 
 
-def _cameras() -> Iterator[Camera]:
+def _iterate_cameras() -> Iterator[Camera]:
     focal: Vec2 = (600.0, 605.0)
     yield Camera("over", 0, _UP, 45.0)
     yield Camera("map", 0, _UP, 3.5, orthographic=True)

@@ -96,6 +96,7 @@ GROUPS: Final[dict[str, tuple[type[msgspec.Struct], ...]]] = {
         status.AlignmentReport,
         status.CrossCheckReport,
         status.AnchorReport,
+        status.StopReport,
         status.ParticipantReport,
         status.RobotReport,
         status.RecorderReport,
@@ -217,30 +218,30 @@ _SCALARS: Final[dict[type[msgspec.inspect.Type], str]] = {
 }
 
 
-def structs(group: str) -> tuple[Struct, ...]:
+def list_structs(group: str) -> tuple[Struct, ...]:
     """Return the structs of one of `GROUPS`."""
-    return tuple(_struct(cls) for cls in GROUPS[group])
+    return tuple(_describe_struct(cls) for cls in GROUPS[group])
 
 
-def all_structs() -> tuple[Struct, ...]:
+def list_all_structs() -> tuple[Struct, ...]:
     """Return every struct of the wire, each once."""
-    return tuple(struct for group in GROUPS for struct in structs(group))
+    return tuple(struct for group in GROUPS for struct in list_structs(group))
 
 
-def enums() -> dict[str, dict[str, str]]:
+def list_enums() -> dict[str, dict[str, str]]:
     """Return the open enumerations: name -> constant -> value, in the order of their definition."""
     return {
         name: {key: text for key, text in vars(kind).items() if key.isupper() and isinstance(text, str)}
-        for name, kind in _enum_classes().items()
+        for name, kind in _list_enum_classes().items()
     }
 
 
-def enum_doc(name: str) -> str:
+def find_enum_doc(name: str) -> str:
     """Return the docstring of an open enumeration, unindented, or empty."""
-    return inspect.getdoc(_enum_classes()[name]) or ""
+    return inspect.getdoc(_list_enum_classes()[name]) or ""
 
 
-def _enum_classes() -> dict[str, type]:
+def _list_enum_classes() -> dict[str, type]:
     return {
         name: value
         for name, value in vars(names).items()
@@ -248,35 +249,35 @@ def _enum_classes() -> dict[str, type]:
     }
 
 
-def _struct(cls: type[msgspec.Struct]) -> Struct:
+def _describe_struct(cls: type[msgspec.Struct]) -> Struct:
     info = msgspec.inspect.type_info(cls)
     assert isinstance(info, msgspec.inspect.StructType)
     return Struct(
         name=cls.__name__,
-        doc=_doc(cls),
+        doc=_clean_doc(cls),
         array_like=info.array_like,
         tag_field=info.tag_field or "",
         tag=str(info.tag) if info.tag_field else "",
-        fields=tuple(_fields(cls, info)),
+        fields=tuple(_describe_fields(cls, info)),
         cls=cls,
     )
 
 
-def _doc(cls: type[msgspec.Struct]) -> str:
+def _clean_doc(cls: type[msgspec.Struct]) -> str:
     """Return the docstring of `cls` itself (not of its base), unindented."""
     return inspect.cleandoc(cls.__doc__) if cls.__doc__ else ""
 
 
-def _fields(cls: type[msgspec.Struct], info: msgspec.inspect.StructType) -> Iterator[Field]:
+def _describe_fields(cls: type[msgspec.Struct], info: msgspec.inspect.StructType) -> Iterator[Field]:
     for field in info.fields:
         default = field.default
         if field.default_factory is not msgspec.NODEFAULT:
             default = field.default_factory()
         enum = _ENUMS.get(f"{cls.__name__}.{field.encode_name}", "")
-        yield Field(field.encode_name, _type(field.type), field.required, default, enum)
+        yield Field(field.encode_name, _describe_type(field.type), field.required, default, enum)
 
 
-def _type(node: msgspec.inspect.Type) -> Type:
+def _describe_type(node: msgspec.inspect.Type) -> Type:
     scalar = _SCALARS.get(type(node))
     if scalar:
         return Type(scalar)
@@ -288,26 +289,26 @@ def _type(node: msgspec.inspect.Type) -> Type:
         case msgspec.inspect.BytesType():
             return Type("bytes", max_length=node.max_length or 0)
         case msgspec.inspect.TupleType():
-            items = [_type(item) for item in node.item_types]
+            items = [_describe_type(item) for item in node.item_types]
             if items.count(items[0]) == len(items):
                 return Type("array", item=items[0], length=len(items))
         case msgspec.inspect.VarTupleType():
-            return Type("array", item=_type(node.item_type), max_length=node.max_length or 0)
+            return Type("array", item=_describe_type(node.item_type), max_length=node.max_length or 0)
         case msgspec.inspect.DictType():
-            return Type("map", item=_type(node.value_type))
+            return Type("map", item=_describe_type(node.value_type))
         case msgspec.inspect.StructType():
             return Type("struct", name=node.cls.__name__)
         case msgspec.inspect.UnionType():
-            return _union(node)
+            return _describe_union(node)
     raise TypeError(
         f"{node} has no form in the schema: use bool, int, float, str, bytes, dict, a Struct or a tuple of one type"
     )
 
 
-def _union(node: msgspec.inspect.UnionType) -> Type:
+def _describe_union(node: msgspec.inspect.UnionType) -> Type:
     members = [member for member in node.types if not isinstance(member, msgspec.inspect.NoneType)]
     if len(members) == 1:
-        inner = _type(members[0])
+        inner = _describe_type(members[0])
         return Type(**{**vars(inner), "optional": True})
     classes = {member.cls for member in members if isinstance(member, msgspec.inspect.StructType)}
     for name, union in UNIONS.items():

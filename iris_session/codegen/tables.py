@@ -7,20 +7,20 @@ from typing import Any
 
 import msgspec
 
-from iris_session.codegen.schema import GROUPS, Field, Struct, Type, enum_doc, enums, structs
+from iris_session.codegen.schema import GROUPS, Field, Struct, Type, find_enum_doc, list_enums, list_structs
 from iris_session.protocol import assets, limits
 
 
-def sections() -> dict[str, str]:
+def render_sections() -> dict[str, str]:
     """Return Markdown by section name, for `<!-- generated:NAME -->` ... `<!-- end:NAME -->` in docs/protocol.md."""
-    return {**{group: _group(group) for group in GROUPS}, "names": _names(), "limits": _limits()}
+    return {**{group: _render_group(group) for group in GROUPS}, "names": _render_names(), "limits": _render_limits()}
 
 
-def _group(group: str) -> str:
-    return "\n\n".join(_struct(struct) for struct in structs(group))
+def _render_group(group: str) -> str:
+    return "\n\n".join(_render_struct(struct) for struct in list_structs(group))
 
 
-def _struct(struct: Struct) -> str:
+def _render_struct(struct: Struct) -> str:
     form = "array" if struct.array_like else "map"
     tag = f', `{struct.tag_field}` = `"{struct.tag}"`' if struct.tag else ""
     lines = [f"#### {struct.name}", "", f"MessagePack {form}{tag}."]
@@ -30,21 +30,21 @@ def _struct(struct: Struct) -> str:
     lines += ["", f"{index}| field | type | default |", "|" + "---|" * (3 + struct.array_like)]
     for k, field in enumerate(struct.fields):
         index = f"| {k} " if struct.array_like else ""
-        lines.append(f"{index}| `{field.name}` | {_type(field)} | {_default(field)} |")
+        lines.append(f"{index}| `{field.name}` | {_render_field_type(field)} | {_render_default(field)} |")
     return "\n".join(lines)
 
 
-def _type(field: Field) -> str:
-    text = _kind(field.type)
+def _render_field_type(field: Field) -> str:
+    text = _render_type(field.type)
     if field.enum:
         text += f" of [{field.enum}](#{field.enum.lower()})"
     return text + (" or null" if field.type.optional else "")
 
 
-def _kind(kind: Type) -> str:
+def _render_type(kind: Type) -> str:
     match kind.base:
         case "int":
-            return _integer(kind)
+            return _render_integer(kind)
         case "str" if kind.pattern:
             return f"string `{kind.pattern}`"
         case "str" | "bytes":
@@ -53,7 +53,7 @@ def _kind(kind: Type) -> str:
             return f"{name}, at most {kind.max_length} {unit}" if kind.max_length else name
         case "array":
             assert kind.item is not None
-            item = _kind(kind.item)
+            item = _render_type(kind.item)
             if kind.length:
                 return f"array of {kind.length} {item}"
             limit = f", at most {kind.max_length}" if kind.max_length else ""
@@ -67,7 +67,7 @@ def _kind(kind: Type) -> str:
     return "float64" if kind.base == "float" else kind.base
 
 
-def _integer(kind: Type) -> str:
+def _render_integer(kind: Type) -> str:
     match kind.minimum, kind.maximum:
         case (0, None) | (0, 0x7FFF_FFFF_FFFF_FFFF):
             return "uint63"
@@ -79,28 +79,28 @@ def _integer(kind: Type) -> str:
             return f"int, {low} to {high}"
 
 
-def _default(field: Field) -> str:
+def _render_default(field: Field) -> str:
     if field.required:
         return "required"
     if isinstance(field.default, msgspec.Struct) and field.default == type(field.default)():
         return "`{}`"  # its own defaults
-    return f"`{_json(field.default)}`"
+    return f"`{_render_json(field.default)}`"
 
 
-def _json(value: Any) -> str:
+def _render_json(value: Any) -> str:
     return json.dumps(msgspec.to_builtins(value))
 
 
-def _names() -> str:
+def _render_names() -> str:
     blocks = []
-    for name, values in enums().items():
+    for name, values in list_enums().items():
         listed = ", ".join(f"`{value}`" for value in values.values())
-        doc = enum_doc(name)
+        doc = find_enum_doc(name)
         blocks.append(f"#### {name}\n\n{doc + ' ' if doc else ''}{listed}")
     return "\n\n".join(blocks)
 
 
-def _limits() -> str:
+def _render_limits() -> str:
     lines = ["| message | to | bytes | per second | burst |", "|---|---|---|---|---|"]
     for table, to in ((limits.LIMITS, "session"), (limits.SERVER_LIMITS, "client")):
         for kind, limit in table.items():

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from iris_session.control.arm_model import Floats, find_id
 from iris_session.control.config import ControlConfig, ControlError
+from iris_session.control.hold import Servos
 from iris_session.protocol.specs import RobotSpec
 
 GRAVITY_PD = "gravity_pd"
@@ -80,6 +81,7 @@ class ActuatorLaws:
         self._config = config
         rows = {POSITION: _Rows(), VELOCITY: _Rows(), TORQUE: _Rows()}
         bounds: list[tuple[float, float]] = []
+        servos: list[tuple[float, ...]] = []
         for robot in robots:
             if len(robot.actuators) != len(robot.joints):
                 raise ControlError(
@@ -97,18 +99,37 @@ class ActuatorLaws:
                 row.offset.append(offset)
                 row.joints.append(joint)
                 bounds.append(_find_bounds(model, kind, actuator, joint, scale, offset))
+                servos.append(_find_servo(model, kind, actuator, joint, config))
         limits = np.array(bounds, dtype=np.float64).reshape(-1, 2)
         self.lower, self.upper = limits[:, 0].copy(), limits[:, 1].copy()
+        #: Actuator of every joint, shape (n,).
+        self.actuators: NDArray[np.intp] = np.zeros(len(bounds), dtype=np.intp)
+        for row in rows.values():
+            self.actuators[row.columns] = row.actuators
         self._position = rows[POSITION].build_group(model)
         self._velocity = rows[VELOCITY].build_group(model)
         self._torque = rows[TORQUE].build_group(model)
+        # Integrated velocity actuators: their rows in the velocity group, and their activations.
+        dynamics = np.asarray(model.actuator_dyntype)[self._velocity.actuators]
+        self._integrators = np.flatnonzero(dynamics == _DYN_INTEGRATOR)
+        self._act = np.asarray(model.actuator_actadr, dtype=np.intp)[self._velocity.actuators[self._integrators]]
+        stiffness, lag, reach, slack, droops = np.array(servos, dtype=np.float64).reshape(-1, 5).T
+        integrators = self._velocity.columns[self._integrators]
+        self.servos = Servos(stiffness, lag, reach, slack, droops, integrators)
+        self._dt = float(model.opt.timestep)
         self._acceleration = np.zeros(model.nv)
         self._force = np.zeros(model.nv)
 
-    def write(self, data: mujoco.MjData, q: Floats, v: Floats, speed: Floats) -> None:
+    def read_activations(self, data: mujoco.MjData) -> Floats:
+        """Return the activations of integrated velocity actuators as joint positions, shape (n_integrators,)."""
+        act = data.act[self._act] / self._velocity.scale[self._integrators]
+        return np.where(np.isfinite(act), act, 0.0)
+
+    def write(self, data: mujoco.MjData, q: Floats, v: Floats, speed: Floats, act_range: Floats | None = None) -> None:
         """`ctrl` for commanded positions `q` and velocities `v` of all joints; velocity commands stay within `speed`.
 
-        All shape (n,). `data` must hold what MuJoCo computes from the present positions and velocities.
+        All shape (n,). `data` must hold what MuJoCo computes from the present positions and velocities. `act_range`:
+        joint positions between which the activations of integrators are kept, shape (2, n_integrators).
         """
         ctrl = data.ctrl
         g = self._position
@@ -120,9 +141,30 @@ class ActuatorLaws:
             dead = self._config.velocity_deadband
             correction = error - np.minimum(np.maximum(error, -dead), dead)
             wanted, limit = v[g.columns] + self._config.velocity_gain * correction, speed[g.columns]
+            if act_range is not None and self._integrators.size:
+                rows = self._integrators
+                low, high = (act_range - self.read_activations(data)) / self._dt
+                wanted[rows] = np.minimum(np.maximum(wanted[rows], low), high)
             ctrl[g.actuators] = np.minimum(np.maximum(wanted, -limit), limit) * g.scale
         if self._torque.columns.size:
             self._write_torque(data, q, v)
+
+    def find_commanded(self, ctrl: Floats, measured: Floats) -> Floats:
+        """Return the positions that joints with position actuators are commanded to by `ctrl` (nu,), and `measured`
+        for all others, shape (n,).
+        """
+        q, g = measured.copy(), self._position
+        q[g.columns] = (ctrl[g.actuators] - g.offset) / g.scale
+        return q
+
+    def compute_ctrl_rates(self, velocity: Floats, acceleration: Floats) -> Floats:
+        """Return how fast the `ctrl` of every joint may change [1/s] within joint velocity and acceleration, shape
+        (n,); infinite for torque actuators, whose `ctrl` has no such bound.
+        """
+        rates = np.full(len(self.actuators), np.inf)
+        for g, limit in ((self._position, velocity), (self._velocity, acceleration)):
+            rates[g.columns] = limit[g.columns] * np.abs(g.scale)
+        return rates
 
     def _write_torque(self, data: mujoco.MjData, q: Floats, v: Floats) -> None:
         g, w = self._torque, self._config.torque_frequency
@@ -160,6 +202,40 @@ def _find_law(model: mujoco.MjModel, robot: RobotSpec, actuator: int, joint: int
     raise ControlError(f"{what} must be a position, velocity, integrated velocity or motor actuator")
 
 
+def _find_servo(
+    model: mujoco.MjModel, kind: str, actuator: int, joint: int, config: ControlConfig
+) -> tuple[float, float, float, float, float]:
+    """Return stiffness, lag, reach, slack and droop of one servo: see `Servos`."""
+    gear, dof = float(model.actuator_gear[actuator, 0]), int(model.jnt_dofadr[joint])
+    bias = [float(b) for b in model.actuator_biasprm[actuator, :3]]
+    dynamics = int(model.actuator_dyntype[actuator])
+    damping, friction = float(np.max(model.dof_damping[dof])), float(model.dof_frictionloss[dof])
+    lag, dead, droops = 0.0, 0.0, 1.0
+    if kind == TORQUE:  # a PD about the measured joint whose gravity is compensated
+        stiffness, droops = config.torque_frequency**2 * float(model.dof_M0[dof]), 0.0
+        reach = config.joint_acceleration / config.torque_frequency**2
+    else:
+        reach = math.inf
+        if kind == VELOCITY and dynamics != _DYN_INTEGRATOR:
+            stiffness = -bias[2] * gear * gear * config.velocity_gain
+            dead = config.velocity_deadband
+        else:
+            stiffness = -bias[1] * gear * gear
+            damping -= bias[2] * gear * gear
+            if dynamics in _DYN_FILTERS:
+                lag = float(model.actuator_dynprm[actuator, 0])
+            if kind == VELOCITY:
+                dead, droops = config.velocity_deadband, 0.0
+    stiffness = max(abs(stiffness), 1e-9)
+    forces = []
+    if model.actuator_forcelimited[actuator]:
+        forces.append(float(np.abs(model.actuator_forcerange[actuator]).max()) * abs(gear))
+    if model.jnt_actfrclimited[joint]:
+        forces.append(float(np.abs(model.jnt_actfrcrange[joint]).max()))
+    reach = min([reach, *(force / stiffness for force in forces)])
+    return stiffness, lag + max(damping, 0.0) / stiffness, reach, friction / stiffness + dead, droops
+
+
 def _find_bounds(
     model: mujoco.MjModel, kind: str, actuator: int, joint: int, scale: float, offset: float
 ) -> tuple[float, float]:
@@ -193,6 +269,17 @@ class Grippers:
         """Hold the grippers at their present `ctrl`."""
         self.ctrl[:] = data.ctrl[self._actuators]
         self.goal[:] = self.ctrl
+
+    def place(self, robot: int, ctrl: Floats) -> None:
+        """Hold the gripper of one robot at its value in `ctrl` (nu,)."""
+        row = self._row.get(robot)
+        if row is not None:
+            self.ctrl[row] = self.goal[row] = ctrl[self._actuators[row]]
+
+    def find_output(self, robot: int, dt: float) -> tuple[list[int], list[float]]:
+        """Return the actuator of a robot's gripper and how fast its `ctrl` may change [1/s]; empty without one."""
+        row = self._row.get(robot)
+        return ([], []) if row is None else ([int(self._actuators[row])], [float(self._step[row]) / dt])
 
     def set_goal(self, robot: int, closed: float | None) -> None:
         """Set the closing share 0 (open) to 1 (closed); `None` leaves the goal as it is."""

@@ -22,6 +22,12 @@ _POSITIVE: Final = (
     "slide_velocity",
     "slide_acceleration",
     "lead_s",
+    "lead_bound_min_s",
+    "lead_bound_max_s",
+    "hold_release_s",
+    "target_lead_m",
+    "target_lead_rad",
+    "target_lag_s",
     "tip_speed",
     "tip_angular_speed",
     "min_scale",
@@ -72,6 +78,13 @@ class ControlConfig(msgspec.Struct, frozen=True):
     velocity_limits: dict[str, float] = {}  # by joint name, instead of the defaults above
     acceleration_limits: dict[str, float] = {}
     lead_s: float = 0.15  # an IK solution runs ahead of the commanded joints by at most this long at full speed
+    # --- commanded against measured (see `hold`)
+    lead_bound_min_s: float = 0.02  # a commanded joint may lead its measured position at rest, beyond gravity droop, by
+    lead_bound_max_s: float = 0.06  # force limit / stiffness, within these times at its speed limit: 0.05 to 0.15 rad
+    hold_release_s: float = 0.15  # a joint that is blocked when a hold begins yields for so long
+    target_lead_m: float = 0.05  # output `targets`: the target may lead the measured tip by so much at rest,
+    target_lead_rad: float = 0.25
+    target_lag_s: float = 0.2  # and by so much time at the tip's measured speed
     # --- end-effector target
     tip_speed: float = 1.5  # [m/s]
     tip_angular_speed: float = 5.0  # [rad/s]
@@ -114,6 +127,11 @@ class ControlConfig(msgspec.Struct, frozen=True):
             raise ValueError(f"solve_rate_hz is {self.solve_rate_hz}; it must be at most 100 Hz per robot")
         if not 1 <= self.max_solves_per_tick <= 3:
             raise ValueError(f"max_solves_per_tick is {self.max_solves_per_tick}; it must be 1 to 3")
+        if self.lead_bound_max_s < self.lead_bound_min_s:
+            raise ValueError(
+                f"lead_bound_max_s is {self.lead_bound_max_s}; "
+                f"it must be at least lead_bound_min_s {self.lead_bound_min_s}"
+            )
         if self.max_scale < self.min_scale:
             raise ValueError(f"max_scale is {self.max_scale}; it must be at least min_scale {self.min_scale}")
         if self.proximity_margin > 0.0 and not 0.0 <= self.proximity_stop < self.proximity_margin:

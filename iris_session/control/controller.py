@@ -10,9 +10,11 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from typing import Final, NamedTuple
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from anchors.pose import PoseTuple
 from iris_session.control import clutch
@@ -21,6 +23,7 @@ from iris_session.control.arm_model import ArmModel, Floats, has_moving_base, re
 from iris_session.control.clutch import compute_leader_goal, is_ramping
 from iris_session.control.config import OUTPUT_CTRL, ControlConfig, ControlError
 from iris_session.control.grasp import Grasps
+from iris_session.control.hold import HoldLaw
 from iris_session.control.ik import InverseKinematics
 from iris_session.control.interpolate import JointInterpolator, read_speed_limits
 from iris_session.control.proximity import ProximityLimiter
@@ -29,6 +32,20 @@ from iris_session.protocol.common import Applied, Pose
 from iris_session.protocol.names import CommandKind
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import Command, ControlStatus, Decision, WorldView
+
+#: Share of the bounds of an end-effector target that is no push when a hold begins; a lead that is as good as none.
+_DEAD_BAND: Final = 0.05
+_TINY: Final = 1e-6
+
+
+class RobotOutput(NamedTuple):
+    """Actuators whose `ctrl` one robot's control writes, joints first, then the gripper; none without `ctrl` output.
+
+    `rates`: how fast each `ctrl` may change [1/s]; infinite for torques.
+    """
+
+    actuators: NDArray[np.intp]
+    rates: Floats
 
 
 class Controller:
@@ -42,6 +59,7 @@ class Controller:
         config: ControlConfig | None = None,
     ) -> None:
         """Raise `ControlError` for robots, actuators or objects that cannot be driven, `ImportError` without mink."""
+        self._model = model
         self._config = config or ControlConfig()
         self._robots = tuple(robots)
         self._dt = float(model.opt.timestep)
@@ -57,6 +75,10 @@ class Controller:
         self._laws = ActuatorLaws(model, driven, self._config)
         self._bounds = (self._laws.lower, self._laws.upper) if driven else read_joint_ranges(model, self._arms)
         self._joints = JointInterpolator(*read_speed_limits(model, self._robots, self._arms, self._config), self._dt)
+        dof = np.array([model.jnt_dofadr[j] for arm in self._arms for j in arm.joint_ids], dtype=np.intp)
+        self._hold: HoldLaw | None = None
+        if self._writes_ctrl:
+            self._hold = HoldLaw(self._joints, self._laws.servos, self._qpos, dof, self._config)
         self._ik = InverseKinematics(self._robots, self._arms, self._columns, self._joints, self._bounds, self._config)
         self._grippers = Grippers(model, driven, self._config, self._dt)
         self._grasps = Grasps(model, objects, self._config)
@@ -68,6 +90,7 @@ class Controller:
         self._now_ns = 0
         self._tick = 0
         self._cursor = 0
+        self._estop = False
         self._ready = False
 
     # --- the contract -------------------------------------------------------------------------------------------------
@@ -75,10 +98,13 @@ class Controller:
     def reset(self, data: mujoco.MjData) -> None:
         """Clear all state; targets are where the robots stand now (kinematics of `data` must be current)."""
         self._joints.place(self._measure_joints(data))
+        if self._hold is not None:
+            self._hold.reset()
         self._ik.rest[:] = self._joints.q
         self._grippers.reset(data)
         self._grasps.reset(data)
         self._tick = self._cursor = self._now_ns = 0
+        self._estop = False
         self._ready = True
         before, self._states = self._states, [RobotState() for _ in self._robots]
         for i, arm in enumerate(self._arms):
@@ -87,13 +113,65 @@ class Controller:
             tip = None if self._writes_ctrl else _require_finite(read_site_pose(data, arm.site_id))
             r.commanded = tip or self._ik.compute_tip(i, r)
 
+    def follow_robots(self, data: mujoco.MjData, robots: Sequence[int]) -> None:
+        """Let robots without a command that the owner drives stand, for control, where they are measured."""
+        if not robots:
+            return
+        columns = np.concatenate([np.arange(self._columns[i].start, self._columns[i].stop) for i in robots])
+        self._joints.place_part(columns, self._measure_joints(data)[columns])
+        if self._hold is not None:
+            self._hold.forget(columns)
+        for i in robots:
+            r = self._states[i]
+            r.lagging = False
+            if not self._writes_ctrl:
+                r.commanded = _require_finite(read_site_pose(data, self._arms[i].site_id)) or r.commanded
+
+    def place_robot(self, i: int, data: mujoco.MjData, ctrl: Floats) -> None:
+        """Take a robot over from the owner, whose `ctrl` is given, shape (nu,): it stands where that commands it, and
+        the first tick leaves `ctrl` of position actuators as it is.
+
+        Where `ctrl` leads the measured joints by more than `tracking_error`, the robot stands that far ahead of them.
+        """
+        columns, measured = self._columns[i], self._measure_joints(data)
+        q = measured
+        if self._writes_ctrl:
+            lead = self._config.tracking_error
+            q = np.clip(self._laws.find_commanded(ctrl, measured), measured - lead, measured + lead)
+            self._grippers.place(i, ctrl)
+        self._joints.place_part(columns, q[columns])
+        if self._hold is not None:
+            self._hold.forget(columns)
+        self._ik.rest[columns] = q[columns]
+        r = self._states[i] = RobotState(T_world_root=self._states[i].T_world_root)
+        tip = None if self._writes_ctrl else _require_finite(read_site_pose(data, self._arms[i].site_id))
+        r.commanded = tip or self._ik.compute_tip(i, r)
+
+    def list_outputs(self) -> list[RobotOutput]:
+        """Return what this controller writes, by robot."""
+        if not self._writes_ctrl:
+            return [RobotOutput(np.zeros(0, np.intp), np.zeros(0)) for _ in self._robots]
+        rates = self._laws.compute_ctrl_rates(self._joints.velocity, self._joints.acceleration)
+        outputs = []
+        for i, columns in enumerate(self._columns):
+            gripper, gripper_rates = self._grippers.find_output(i, self._dt)
+            actuators = np.array([*self._laws.actuators[columns], *gripper], dtype=np.intp)
+            outputs.append(RobotOutput(actuators, np.array([*rates[columns], *gripper_rates])))
+        return outputs
+
+    def list_held_objects(self) -> list[str]:
+        """Return the objects whose `xfrc_applied` was written by the newest tick."""
+        return list(self._grasps.written)
+
     def begin(self, now_ns: int, n_ticks: int, decision: Decision, view: WorldView) -> None:
         """Read the commands of one step at session time `now_ns`. A robot without a command holds.
 
         Raises `ControlError` for an unknown robot or object. `n_ticks` ticks follow (or none).
         """
-        del n_ticks, view  # targets come from commanded motion alone, never from what was measured
+        del n_ticks, view  # what is measured is read from `data`, tick by tick
         self._now_ns = now_ns
+        if self._hold is not None:
+            self._hold.begin()
         commanded = 0
         for command in decision.commands:
             i = self._index.get(command.robot)
@@ -107,6 +185,11 @@ class Controller:
         for i in range(len(self._robots)):
             if not commanded >> i & 1:
                 self._hold_robot(i)
+        if decision.estop and not self._estop:
+            for i, r in enumerate(self._states):
+                if r.latch is None:  # held already, but maybe pressed against something since
+                    self._enter_hold(i)
+        self._estop = decision.estop
         self._grasps.set_goals(decision.objects)
 
     def tick(self, data: mujoco.MjData, crowded: bool = False) -> None:
@@ -125,7 +208,7 @@ class Controller:
                 if self._proximity.active:
                     self._slow_near_contact(data)
             self._joints.advance()
-            self._laws.write(data, self._joints.q, self._joints.v, self._joints.velocity)
+            self._follow_measured(data)
             self._grippers.tick(data)
         else:
             self._move_targets(data)
@@ -133,11 +216,13 @@ class Controller:
         self._tick += 1
 
     def write_rest(self, data: mujoco.MjData) -> None:
-        """Write the last `ctrl`, when no tick follows: robots at rest where they are commanded, no
-        wrench on objects.
+        """Write the last `ctrl`, when no tick follows: robots at rest where they are commanded, or where they stand if
+        they push against something; no wrench on objects.
         """
-        still = np.zeros_like(self._joints.q)
-        self._laws.write(data, self._joints.q, still, still)  # a speed of at most zero: velocity actuators stop
+        if self._hold is not None:
+            still = np.zeros_like(self._joints.q)
+            q = self._hold.find_rest(data, self._laws.read_activations(data))
+            self._laws.write(data, q, still, still)  # a speed of at most zero: velocity actuators stop
         self._grasps.commanded = {}
         self._grasps.tick(data)
 
@@ -154,7 +239,11 @@ class Controller:
         """Return the end-effector target in force per robot, `T_world_tip`, for environments with controllers of their
         own.
         """
-        return {robot.name: Pose(*r.commanded) for robot, r in zip(self._robots, self._states, strict=True)}
+        targets = {}
+        for i, (robot, r) in enumerate(zip(self._robots, self._states, strict=True)):
+            stands = self._writes_ctrl and r.latch is None
+            targets[robot.name] = Pose(*(self._ik.compute_tip(i, r) if stands else r.commanded))
+        return targets
 
     def snapshot(self) -> bytes:
         """Return the whole memory. `restore` of it in a controller made alike continues bit for bit."""
@@ -170,6 +259,10 @@ class Controller:
                 self._grippers.save_state(),
                 list(self._grasps.commanded.items()),
                 self._grasps.written,
+                [] if self._hold is None else self._hold.save_state(),
+                0 if self._hold is None else self._hold.stale,
+                0.0 if self._hold is None else self._hold.seen_time,
+                self._estop,
             )
         )
 
@@ -188,12 +281,19 @@ class Controller:
         self._grippers.restore_state(state.grippers)
         self._grasps.commanded = dict(state.grasp_poses)
         self._grasps.written = state.grasp_written
+        if self._hold is not None:
+            self._hold.restore_state(state.hold, state.stale, state.seen_time)
+        self._estop = state.estop
         self._ready = True
 
     # --- once a step --------------------------------------------------------------------------------------------------
 
     def _hold_robot(self, i: int) -> None:
-        """Decelerate to the last commanded target; the gripper stays as it is."""
+        """Enter the hold: the next tick decides from the measured joints where they stop; the gripper stays as it is.
+
+        Until then they stop from where they are commanded, which is what the next holder is latched against when the
+        robot changes hands within this step.
+        """
         r = self._states[i]
         if r.latch is None:
             return
@@ -204,7 +304,14 @@ class Controller:
         if self._writes_ctrl:
             self._joints.stop(self._columns[i])
             r.commanded = self._ik.compute_tip(i, r)
+        self._enter_hold(i)
         self._set_cap(i)
+
+    def _enter_hold(self, i: int) -> None:
+        if self._hold is None:
+            self._states[i].settle, self._states[i].learning = -1, False
+        else:
+            self._hold.enter(self._columns[i])
 
     def _drive_robot(self, i: int, command: Command) -> None:
         r = self._states[i]
@@ -233,8 +340,12 @@ class Controller:
     def _engage_robot(self, i: int, command: Command, scale: float) -> None:
         """Latch the clutch against the commanded target; nothing moves in this step."""
         r = self._states[i]
-        if self._writes_ctrl:
+        if self._hold is not None:
+            if self._hold.is_settling(self._columns[i]):
+                self._joints.stop(self._columns[i])
+            self._hold.leave(self._columns[i])
             r.commanded = self._ik.compute_tip(i, r)
+        r.settle, r.learning = 0, False
         r.latch = clutch.latch_sources(command, scale, r.commanded)
         r.fresh, r.want_solve, r.ramping, r.stalls = True, False, False, 0
         r.pending = _find_newest(command)
@@ -279,6 +390,13 @@ class Controller:
             elif r.pending is not None and not r.want_solve:
                 self._mark_applied(r)
 
+    def _follow_measured(self, data: mujoco.MjData) -> None:
+        """Bound the commanded joints by the measured ones, and write `ctrl`."""
+        assert self._hold is not None
+        joints = self._joints
+        self._hold.apply(data, self._laws.read_activations(data))
+        self._laws.write(data, joints.q, joints.v, joints.velocity, self._hold.act_range)
+
     def _follow_bases(self, data: mujoco.MjData) -> None:
         """Update the bases. A robot whose base is not finite (physics that diverged) holds at its last finite place."""
         for i in self._moving_bases:
@@ -302,7 +420,9 @@ class Controller:
 
     def _check_tracking(self, data: mujoco.MjData) -> None:
         """Flag robots whose joints are far from where they are commanded: blocked, overloaded, or far too slow."""
+        assert self._hold is not None
         far = np.abs(data.qpos[self._qpos] - self._joints.q) > self._config.tracking_error
+        far |= self._hold.take_strained()
         some = bool(far.any())
         for r, columns in zip(self._states, self._columns, strict=True):
             r.lagging = some and bool(far[columns].any())
@@ -336,15 +456,46 @@ class Controller:
                 joints.goal[columns] = joints.q[columns]
             elif r.ramping:
                 r.ramping = is_ramping(True, float(np.abs(joints.goal[columns] - joints.q[columns]).max()), config)
+            if r.latch is not None:
+                if not r.fresh and r.latch.kind == CommandKind.TWIST:
+                    self._integrate_twist(i, r, r.latch)
+                if not r.fresh:
+                    r.commanded = clutch.step_toward(
+                        r.commanded, r.latch.target, config.tip_speed * dt, config.tip_angular_speed * dt
+                    )
+                self._mark_applied(r)
+            self._bound_target(i, r, data)
+
+    def _bound_target(self, i: int, r: RobotState, data: mujoco.MjData) -> None:
+        """Bound the lead of the end-effector target on the measured tip; a hold that begins takes away its push.
+
+        The law of `hold.HoldLaw` for a servo of which only the bound is known.
+        """
+        config = self._config
+        tip = _require_finite(read_site_pose(data, self._arms[i].site_id))
+        if tip is None:
+            return
+        speed, angular_speed = _measure_site_speed(self._model, data, self._arms[i].site_id)
+        m, rad = config.target_lag_s * speed, config.target_lag_s * angular_speed
+        apart = clutch.measure_separation(tip, r.commanded)
+        at_rest = (_DEAD_BAND * config.target_lead_m, _DEAD_BAND * config.target_lead_rad)
+        if r.settle < 0:
+            blocked = any(
+                a > dead + carry + lag for a, dead, carry, lag in zip(apart, at_rest, r.carry, (m, rad), strict=True)
+            )
+            r.settle = max(1, round(config.hold_release_s / self._dt)) if blocked else 0
+            r.learning = blocked
+        if r.settle:
+            r.settle -= 1
+            m, rad = max(m + r.carry[0], _TINY), max(rad + r.carry[1], _TINY)
+        else:
             if r.latch is None:
-                continue
-            if not r.fresh and r.latch.kind == CommandKind.TWIST:
-                self._integrate_twist(i, r, r.latch)
-            if not r.fresh:
-                r.commanded = clutch.step_toward(
-                    r.commanded, r.latch.target, config.tip_speed * dt, config.tip_angular_speed * dt
-                )
-            self._mark_applied(r)
+                limits = (config.target_lead_m, config.target_lead_rad)
+                (a, b), (c, d) = apart, limits if r.learning else r.carry
+                r.carry = (min(a, c), min(b, d))
+            m, rad = m + config.target_lead_m, rad + config.target_lead_rad
+        r.lagging = apart[0] > m or apart[1] > rad
+        r.commanded = clutch.step_toward(tip, r.commanded, m, rad)
 
     # --- helpers ------------------------------------------------------------------------------------------------------
 
@@ -383,6 +534,14 @@ def _read_body_pose(data: mujoco.MjData, body: int) -> PoseTuple:
     x, y, z = data.xpos[body].tolist()
     w, i, j, k = data.xquat[body].tolist()
     return ((x, y, z), (w, i, j, k))
+
+
+def _measure_site_speed(model: mujoco.MjModel, data: mujoco.MjData, site: int) -> tuple[float, float]:
+    """Return linear [m/s] and angular [rad/s] speed of a site; zero if they are not finite."""
+    velocity = np.zeros(6)
+    mujoco.mj_objectVelocity(model, data, int(mujoco.mjtObj.mjOBJ_SITE), site, velocity, 0)
+    angular, linear = float(np.linalg.norm(velocity[:3])), float(np.linalg.norm(velocity[3:]))
+    return (linear, angular) if math.isfinite(linear + angular) else (0.0, 0.0)
 
 
 def _require_finite(T: PoseTuple) -> PoseTuple | None:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from iris_session.control.arm_model import ArmModel, Floats
 from iris_session.control.config import ControlConfig, ControlError
@@ -25,11 +26,13 @@ class JointInterpolator:
 
     `cap`: velocity limit in force now (ramps lower it); `near`: the one that proximity sets, apart from `cap` so that
     neither undoes the other; the lower of both counts. `remaining`: time to arrive in [s].
+    `before`, `before_v`: `q` and `v` before this tick.
     """
 
     def __init__(self, velocity: Floats, acceleration: Floats, dt: float) -> None:
         n = len(velocity)
         self.q, self.v, self.goal, self.remaining = np.zeros(n), np.zeros(n), np.zeros(n), np.full(n, dt)
+        self.before, self.before_v = np.zeros(n), np.zeros(n)
         self.velocity, self.cap, self.near = velocity, velocity.copy(), velocity.copy()
         self.acceleration = acceleration
         self.dt = dt
@@ -46,6 +49,14 @@ class JointInterpolator:
         self.cap[:] = self.near[:] = self.velocity
         self.moving = False
 
+    def place_part(self, joints: slice | NDArray[np.intp], q: Floats) -> None:
+        """Let some joints stand still at `q`, their positions; the others go on."""
+        self.q[joints] = q
+        self.goal[joints] = q
+        self.v[joints] = 0.0
+        self.remaining[joints] = self.dt
+        self.cap[joints] = self.near[joints] = self.velocity[joints]
+
     def set_goal(self, joints: slice, goal: Floats, interval: float) -> None:
         """Set a new goal for some joints, to arrive `ARRIVAL_INTERVALS` times `interval` [s] from now."""
         self.goal[joints] = goal
@@ -55,10 +66,7 @@ class JointInterpolator:
     def stop(self, joints: slice) -> None:
         """Set the goal to where these joints can stop, but not beyond the goal they already had."""
         q, v = self.q[joints], self.v[joints]
-        # Slowing down from the next tick on, by dv a tick: k dv, (k - 1) dv, ...
-        speed = np.maximum(np.abs(v) / self._dv[joints] - 1.0, 0.0)
-        ticks = np.floor(speed)
-        reach = (0.5 * ticks * (ticks + 1.0) + (speed - ticks) * (ticks + 1.0)) * self._unit[joints]
+        reach = self.find_stop_distance(self.v)[joints]
         distance = np.minimum(reach, np.abs(self.goal[joints] - q))
         ahead = np.sign(self.goal[joints] - q) == np.sign(v)
         # Standing joints finish the last step of their motion, if any is left, only when they already move.
@@ -66,8 +74,18 @@ class JointInterpolator:
         self.remaining[joints] = self.dt
         self.moving = True
 
+    def find_stop_distance(self, v: Floats) -> Floats:
+        """Return the distances in which joints stop from speeds `v` of either sign, shape (n,).
+
+        Slowing down from the next tick on, by dv a tick: k dv, (k - 1) dv, ...
+        """
+        speed = np.maximum(np.abs(v) / self._dv - 1.0, 0.0)
+        ticks = np.floor(speed)
+        return (0.5 * ticks * (ticks + 1.0) + (speed - ticks) * (ticks + 1.0)) * self._unit
+
     def advance(self) -> None:
         """Advance by one tick."""
+        self.before[:], self.before_v[:] = self.q, self.v
         if not self.moving:
             return
         error = self.goal - self.q

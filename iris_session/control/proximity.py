@@ -2,7 +2,8 @@
 
 Distances are measured on the whole scene between the robots' geoms, finger bodies exempt: grippers must meet to hand
 objects over. Broad phase: boxes around each robot's geoms; then bounding spheres; then `mj_geomDistance` for the
-nearest pairs. Only motion that closes the gap is slowed; motion that opens it never is.
+nearest pairs. Where many bounding spheres overlap (long links), oriented boxes bound the distances, and the nearest
+pair of all is always measured. Only motion that closes the gap is slowed; motion that opens it never is.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from iris_session.protocol.specs import RobotSpec
 _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 _HFIELD = int(mujoco.mjtGeom.mjGEOM_HFIELD)
 
-#: Of two robots, this many geom pairs, nearest by their bounding spheres, are measured; this many of the nearest bound
-#: the speed. Both bound the cost of a check.
+#: Of two robots, this many geom pairs, nearest by their bounds, are measured, and beyond them only those that may be
+#: the nearest of all; this many of the nearest bound the speed. Both bound the cost of a check.
 _MEASURED_PAIRS = 32
 _BOUNDED_PAIRS = 6
 
@@ -101,10 +102,19 @@ class ProximityLimiter:
         bound = between - radius[geoms_a][:, None] - radius[geoms_b][None, :]
         order = np.argsort(bound, axis=None, kind="stable")
         near = order[bound.ravel()[order] < margin]
+        if len(near) > _MEASURED_PAIRS:
+            rows, columns = np.divmod(near, len(geoms_b))
+            boxes = compute_box_bounds(self._model, data, geoms_a[rows], geoms_b[columns])
+            bound[rows, columns] = np.maximum(bound[rows, columns], boxes)
+            refined = bound[rows, columns]
+            order = np.argsort(refined, kind="stable")
+            near = near[order[refined[order] < margin]]
         found: list[tuple[float, int, int, Floats, Floats]] = []
         nearest: list[float] = []  # of those found, ascending
-        for flat in near[:_MEASURED_PAIRS].tolist():
+        for n, flat in enumerate(near.tolist()):
             i, j = divmod(flat, len(geoms_b))
+            if n >= _MEASURED_PAIRS and nearest and bound[i, j] >= nearest[0]:
+                break  # none of those that follow is the nearest
             if len(nearest) >= _BOUNDED_PAIRS and bound[i, j] > nearest[_BOUNDED_PAIRS - 1]:
                 break  # nor is any of those that follow nearer than the ones that count
             geom_a, geom_b = int(geoms_a[i]), int(geoms_b[j])
@@ -120,6 +130,29 @@ class ProximityLimiter:
         mujoco.mj_jac(self._model, data, self._jacobian, None, point, body)
         velocity: Floats = self._jacobian[:, self._dofs[robot]] @ joints
         return velocity
+
+
+def compute_box_bounds(
+    model: mujoco.MjModel, data: mujoco.MjData, geoms_a: NDArray[np.intp], geoms_b: NDArray[np.intp]
+) -> Floats:
+    """Return lower bounds (n,) [m] of the signed distances of geom pairs, from their oriented boxes.
+
+    The bound is the greatest gap along the six face normals of both boxes; a negative one of overlapping boxes is a
+    bound too, as a shift by it along that normal separates them.
+    """
+    rotation_a, rotation_b = (np.asarray(data.geom_xmat)[g].reshape(-1, 3, 3) for g in (geoms_a, geoms_b))
+    boxes_a, boxes_b = (np.asarray(model.geom_aabb)[g] for g in (geoms_a, geoms_b))
+    centre_a = np.asarray(data.geom_xpos)[geoms_a] + np.einsum("nij,nj->ni", rotation_a, boxes_a[:, :3])
+    centre_b = np.asarray(data.geom_xpos)[geoms_b] + np.einsum("nij,nj->ni", rotation_b, boxes_b[:, :3])
+    between = centre_b - centre_a
+    # Rows: axes of a. Columns: axes of b.
+    cosines = np.abs(np.einsum("nki,nkj->nij", rotation_a, rotation_b))
+    along_a = np.abs(np.einsum("nki,nk->ni", rotation_a, between))
+    along_b = np.abs(np.einsum("nki,nk->ni", rotation_b, between))
+    gap_a = along_a - boxes_a[:, 3:] - np.einsum("nij,nj->ni", cosines, boxes_b[:, 3:])
+    gap_b = along_b - boxes_b[:, 3:] - np.einsum("nij,ni->nj", cosines, boxes_a[:, 3:])
+    bounds: Floats = np.maximum(gap_a.max(axis=1), gap_b.max(axis=1))
+    return bounds
 
 
 def _guarded_geoms(model: mujoco.MjModel, robot: RobotSpec) -> NDArray[np.intp]:

@@ -18,6 +18,8 @@ class RobotState(msgspec.Struct, array_like=True):
     `fresh`: latched in this step, whose sample has not moved the target yet. `want_solve`: the target has moved, or is
     not reached yet. `pending`: newest sample in the target, not yet behind `ctrl`. `commanded`: end-effector target in
     force. `stalls`: solves in a row without progress. `lagging`: the measured joints are far from the commanded ones.
+    Output `targets`: `settle`: ticks for which a hold still moves the target, -1 when it has just begun; `carry`: lead
+    [m, rad] that the environment's controller needs at rest; `learning`: it may grow.
     """
 
     T_world_root: PoseTuple = IDENTITY_POSE
@@ -33,6 +35,9 @@ class RobotState(msgspec.Struct, array_like=True):
     proximity: float = 1.0
     lagging: bool = False
     solver_limits: tuple[str, ...] = ()
+    settle: int = 0
+    carry: tuple[float, float] = (0.0, 0.0)
+    learning: bool = False
 
 
 class ControllerState(msgspec.Struct, array_like=True):
@@ -48,6 +53,10 @@ class ControllerState(msgspec.Struct, array_like=True):
     grippers: list[bytes]
     grasp_poses: list[tuple[str, PoseTuple]]
     grasp_written: list[str]
+    hold: list[bytes]
+    stale: int
+    seen_time: float
+    estop: bool
 
 
 _encoder = msgspec.msgpack.Encoder()

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import socket
 import stat
-from pathlib import Path
+from collections.abc import Sequence
+from pathlib import Path, PurePath
 from typing import Any, Final
 
 import psutil
@@ -165,9 +166,23 @@ def _describe_process(pid: int | None) -> str:
         return "a program of another user"
     try:
         process = psutil.Process(pid)
-        return f"{' '.join(process.cmdline()[:5])[:80] or process.name()} (process {pid})"
+        return f"{_name_program(process.cmdline()) or process.name()} (process {pid})"
     except psutil.Error:
         return f"process {pid}"
+
+
+def _name_program(command: Sequence[str]) -> str:
+    """Return the name of the program of a command line, with module or script for Python; no folders, no options."""
+    name = PurePath(command[0]).name if command else ""
+    arguments = iter(command[1:] if name.startswith("python") else ())
+    for argument in arguments:
+        if argument == "-m":
+            return f"{name} -m {next(arguments, '')}"
+        if argument == "-c":
+            break
+        if not argument.startswith("-"):
+            return f"{name} {PurePath(argument).name}"
+    return name
 
 
 def check_interfaces() -> Finding:

@@ -104,9 +104,13 @@ def check_stepping(report: StatusReport) -> Finding:
             "check that program; if it does not recover, end it and restart the session",
         )
     if report.estop:
+        stops = "; ".join(f"{s.name or 'a connection'}{f' ({s.reason})' if s.reason else ''}" for s in report.stops[:4])
+        why = f"stopped by {stops}" if stops else ""
         return failed(
-            "session", "the emergency stop is active", "", "check that it is safe, then let a director clear it"
+            "session", "the emergency stop is active", why, "check that it is safe, then let a director clear it"
         )
+    if report.pause_reason:
+        return failed("session", "physics stands still", report.pause_reason, "reset it: `iris-session reset`")
     if report.paused:
         return warning("session", "physics is paused", "", "a director resumes it")
     if report.lateness is not None:

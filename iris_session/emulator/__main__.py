@@ -14,7 +14,7 @@ from typing import Any, Final
 import msgspec
 
 from iris_session.client import ClientError
-from iris_session.client.endpoint_resolver import ConnectRequest, parse_connect_request, resolve_blocking
+from iris_session.client.endpoint_resolver import parse_connect_request, resolve_blocking
 from iris_session.emulator.operator import load_curve_keys, make_spec_behaviour
 from iris_session.emulator.runner import JOIN_TIMEOUT_S, DisturbanceReader, run_headsets
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
@@ -36,21 +36,24 @@ def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
     except (msgspec.MsgspecError, OSError, ValueError, ClientError) as error:
         print(f"{prog}: {error}", file=sys.stderr)
         return 2
+    address = options.address or str(sought.address)
     try:
         if sought.address is None or sought.join_code or sought.address.join_code:
-            # All headsets here use the key of this user, which is paired once.
-            sought = ConnectRequest(resolve_blocking(sought, options.join_timeout).address)
+            # All headsets here use the key of this user, which is paired once. A session that revoked it refuses their
+            # `hello`; then they pair again with the same code.
+            found = resolve_blocking(sought, options.join_timeout).address
+            address = address if sought.address is not None else str(found)
     except ClientError as error:
         print(f"{prog}: {error}", file=sys.stderr)
         return 1
     stopped: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda received, _frame: stopped.append(received))
-    say = _print_json if options.json else _print_line
+    say = _print_json if options.json else _LinePrinter()
     orders = DisturbanceReader(sys.stdin.fileno(), [spec.name for spec in specs]) if options.orders else tuple
     try:
         reports = run_headsets(
-            str(sought.address), specs, options.seconds, say, lambda: bool(stopped), options.join_timeout, orders
+            address, specs, options.seconds, say, lambda: bool(stopped), options.join_timeout, orders, options.code
         )
         for report in reports:
             say(report, final=True)
@@ -142,15 +145,25 @@ def _print_json(report: HeadsetReport, *, final: bool = False) -> None:
     print(msgspec.json.encode({"final": final, **msgspec.to_builtins(report)}).decode(), flush=True)
 
 
-def _print_line(report: HeadsetReport, *, final: bool = False) -> None:
-    phase = next(reversed(report.phases), report.phase)
-    text = f"{report.name:<12} {phase:<20} samples {report.samples:<6} frames {report.frames:<6}"
-    text += (
-        f" age p99 {_format_value(report.age_ms_p99, 'ms')}, alignment {_format_value(report.alignment_error_mm, 'mm')}"
-    )
-    if report.failed:
-        text += f"  FAILED: {report.failed}"
-    print(("end  " if final else "     ") + text, flush=True)
+class _LinePrinter:
+    """Print one line per report, and one when a headset has joined a session."""
+
+    def __init__(self) -> None:
+        self._joined: dict[str, str] = {}  # session, by name of the headset
+
+    def __call__(self, report: HeadsetReport, *, final: bool = False) -> None:
+        if report.session and self._joined.get(report.name) != report.session:
+            self._joined[report.name] = report.session
+            print(f"     {report.name:<12} joined session {report.session!r} at {report.address}", flush=True)
+        phase = next(reversed(report.phases), report.phase)
+        if report.lost_s and not report.done:
+            phase = f"session lost {report.lost_s:.0f} s ago"
+        text = f"{report.name:<12} {phase:<20} samples {report.samples:<6} frames {report.frames:<6}"
+        age, error = _format_value(report.age_ms_p99, "ms"), _format_value(report.alignment_error_mm, "mm")
+        text += f" age p99 {age}, alignment {error}"
+        if report.failed:
+            text += f"  FAILED: {report.failed}"
+        print(("end  " if final else "     ") + text, flush=True)
 
 
 def _format_value(value: float, unit: str) -> str:

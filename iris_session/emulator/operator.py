@@ -48,6 +48,7 @@ ROUNDS: Final = 2  # around the sheet after an alarm; then the alignment in forc
 SETTLE_S: Final = 0.6  # after the last observation, for the estimate to arrive
 AGES_KEPT: Final = 4_000  # a minute of frames
 RETRY_S: Final = 1.0
+LOST_S: Final = 2.0  # without a session at the end for longer: a failure
 
 #: Denials that waiting does not change.
 FOR_GOOD: Final = frozenset({DenialReason.UNKNOWN_TARGET, DenialReason.ROLE, DenialReason.UNKNOWN_VALUE})
@@ -56,7 +57,8 @@ FOR_GOOD: Final = frozenset({DenialReason.UNKNOWN_TARGET, DenialReason.ROLE, Den
 class EmulatedOperator:
     """One emulated operator or observer; see the module docstring. `report` is kept up to date."""
 
-    def __init__(self, address: str, spec: HeadsetSpec, start_ns: int) -> None:
+    def __init__(self, address: str, spec: HeadsetSpec, start_ns: int, join_code: str = "") -> None:
+        curve = load_curve_keys(spec)
         self.spec = spec
         self.report = HeadsetReport(name=spec.name, rejected={}, phases={})
         self.headset = EmulatedHeadset(spec.model, spec.seed, start_ns)
@@ -71,7 +73,8 @@ class EmulatedOperator:
             name=spec.name,
             devices=(Device.HEAD, *hands),
             identity=spec.identity_file or None,
-            curve=load_curve_keys(spec),
+            curve=curve,
+            join_code="" if curve is not None else join_code,
             software="iris-session emulator",
             on_state=self._on_state,
             on_event=self._on_event,
@@ -85,6 +88,7 @@ class EmulatedOperator:
         self._ages_ms: deque[float] = deque(maxlen=AGES_KEPT)
         self.started_ns = start_ns
         self._joined_ns = 0
+        self._lost_ns = 0  # when the connection was lost, 0 while there is one
         self._now_ns = start_ns
         self._phase_ns = start_ns
         self._viewpoint = 0
@@ -121,6 +125,7 @@ class EmulatedOperator:
     def step(self, now_ns: int) -> None:
         """Run one round of the loop, after `client.poll`."""
         self._now_ns = now_ns
+        self._lost_ns = 0 if self.client.ready or not self._joined_ns else self._lost_ns or now_ns
         if self.display.wants_vertices:
             for name in self._deformables.update():
                 shapes = self._deformables
@@ -142,6 +147,13 @@ class EmulatedOperator:
         if timeout:
             self.fail(f"{self.report.phase} took too long: {self._refused_because or 'no answer'}", now_ns)
 
+    def check_session(self, now_ns: int) -> None:
+        """Fail if the session has been lost for `LOST_S`, unless the task is finished."""
+        if self.finished or not self._lost_ns or now_ns - self._lost_ns < LOST_S * 1e9:
+            return
+        text = f"{self.client.describe_failure(f'for {(now_ns - self._lost_ns) * 1e-9:.1f} s')}"
+        self.fail(f"no session at {text}", now_ns)
+
     def fail(self, why: str, now_ns: int) -> None:
         """End with a failure."""
         self.report.failed = why
@@ -151,7 +163,7 @@ class EmulatedOperator:
         """Disturb the tracking frame: `recentre`, `bump` (undetected by the headset), or `drift` until `steady`."""
         if kind == "recentre":
             self.headset.recentre_frame(now_ns)
-            self.client.new_tracking_frame()
+            self.client.alignment.report_tracking_jump()
             for clutch in self._clutches.values():
                 clutch.open_briefly()
         elif kind in ("drift", "steady"):
@@ -170,6 +182,10 @@ class EmulatedOperator:
             report.age_ms_p50 = ages[len(ages) // 2]
             report.age_ms_p99 = ages[min(len(ages) - 1, int(0.99 * len(ages)))]
         report.participant = client.participant_id
+        welcome = client.connection.welcome
+        if welcome is not None:
+            report.session, report.address = welcome.session_name, client.address
+        report.lost_s = round((self._now_ns - self._lost_ns) * 1e-9, 3) if self._lost_ns else 0.0
         report.rejected = self._count_rejected()
         report.reclutches = sum(clutch.reclutches for clutch in self._clutches.values())
         report.samples_not_sent = client.connection.counters.samples_not_sent
@@ -355,7 +371,7 @@ class EmulatedOperator:
 
     def _get_alignment(self) -> Alignment | None:
         """Return the own alignment, if it is valid for the present tracking frame."""
-        alignment = self.client.alignment
+        alignment = self.client.alignment.current
         if alignment is None or alignment.kind not in (AlignmentKind.MEASURED, AlignmentKind.PLACED):
             return None
         return alignment if alignment.tracking_epoch == self.headset.tracking_epoch else None
@@ -381,14 +397,14 @@ class EmulatedOperator:
     def _on_event(self, event: Event) -> None:
         if isinstance(event.body, Handover):
             self.report.handovers += 1
-        elif isinstance(event.body, Notice):
-            self._refused_because = event.body.text
+        elif isinstance(event.body, Notice) and event.body.participant == self.client.participant_id:
+            self._refused_because = event.body.text  # a notice for another participant is not our reason
         elif isinstance(event.body, AlignmentAlarmed | AlignmentRun):
             self._on_alignment_doubt(event.body)
 
     def _on_alignment_doubt(self, event: AlignmentAlarmed | AlignmentRun) -> None:
         """Plan another alignment after an alarm or at the start of a run. A jump voids the alignment by itself."""
-        alignment = self.client.alignment
+        alignment = self.client.alignment.current
         if event.participant != self.client.participant_id or alignment is None:
             return
         alarm = isinstance(event, AlignmentAlarmed)

@@ -31,18 +31,19 @@ def run_headsets(
     stop: Callable[[], bool] = lambda: False,
     join_timeout_s: float = JOIN_TIMEOUT_S,
     orders: Callable[[], Iterable[tuple[str, str]]] = tuple,
+    join_code: str = "",
 ) -> list[HeadsetReport]:
     """Run all `specs` until every task has finished, `seconds` have passed, or `stop()` is true.
 
-    `report`: called with each headset's report at every change of phase and once a second. `orders`: polled for
-    disturbances (kind for `EmulatedOperator.disturb_tracking`, name). Returns the final reports, in the order of
-    `specs`.
-    A headset that fails (for example cannot join within `join_timeout_s`) raises nothing: `HeadsetReport.failed` gives
-    the reason.
+    `address`: as for `Client`. `join_code`: used when the session refuses this user's key as not paired. `report`:
+    called with each headset's report at every change of phase and once a second. `orders`: polled for disturbances
+    (kind for `EmulatedOperator.disturb_tracking`, name). Returns the final reports, in the order of `specs`.
+    A headset that fails (for example cannot join within `join_timeout_s`, or has no session at the end) raises nothing:
+    `HeadsetReport.failed` gives the reason.
     """
     start = time.monotonic_ns()
     end = None if seconds is None else start + int(seconds * 1e9)
-    operators = [EmulatedOperator(address, spec, start) for spec in specs]
+    operators = [EmulatedOperator(address, spec, start, join_code) for spec in specs]
     reported: dict[str, tuple[str, int]] = {}
     ready = [operator.client for operator in operators]
     try:
@@ -65,6 +66,8 @@ def run_headsets(
             if end is not None:
                 wake = min(wake, end)
             ready = wait_any([operator.client for operator in operators], max(0.0, (wake - time.monotonic_ns()) / 1e9))
+        for operator in operators:
+            operator.check_session(time.monotonic_ns())
         return [operator.finish_report() for operator in operators]
     finally:
         for operator in operators:

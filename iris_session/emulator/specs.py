@@ -115,11 +115,15 @@ class HeadsetReport(msgspec.Struct, kw_only=True):
     `alignment_version`: version of the measured alignment. `T_true_shown`: a point that the session has at x is
     shown at `T_true_shown * x` of the true world; `None` while not aligned. `disturbed_ns`: session time of the last of
     each kind.
-    `alarms`: alarms of this alignment that were received, without jumps.
+    `alarms`: alarms of this alignment that were received, without jumps. `session`, `address`: the session that it
+    joined. `lost_s`: seconds since the connection to it was lost, 0 while there is one.
     """
 
     name: str
     participant: str = ""
+    session: str = ""
+    address: str = ""
+    lost_s: float = 0.0
     phase: str = "join"
     done: bool = False
     failed: str = ""

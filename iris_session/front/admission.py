@@ -11,10 +11,11 @@ from typing import Protocol
 from iris_session.front.connection_guard import HelloRateLimiter, max_connections_per_key
 from iris_session.front.connections import FrontConnection, Peer, Route
 from iris_session.front.context import FrontContext
+from iris_session.front.key_budgets import KeyBudget
 from iris_session.link.sockets import peer_of
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.entries import Entry, Join
-from iris_session.protocol.limits import RateLimiter
+from iris_session.protocol.limits import RateLimiter, count_events, weigh_request
 from iris_session.protocol.names import AuditKind, RefusalCode, Role
 from iris_session.protocol.server_messages import Endpoints, Refused, Welcome
 from iris_session.protocol.steps import Admitted
@@ -53,6 +54,7 @@ class Admission:
         self._keyring = context.keyring
         self._audit = context.audit
         self._guard = context.guard
+        self._budgets = context.budgets
         self._channels = channels
         self._hellos = HelloRateLimiter(context.config.limits)
         self._rates: dict[int, RateLimiter] = {}
@@ -79,17 +81,18 @@ class Admission:
                 RefusalCode.RATE, "this client was disconnected for flooding", "send less; try again soon"
             )
         roles = self._find_roles(key_id, gateway)
+        budget = self._take_budget(key_id, hello, gateway, now_ns)
         address = peer_of(peer.descriptor)
         resume_of = self._find_resumed(hello, key_id, address[0], now_ns)
         # A resuming client replaces a connection that may still be counted: twice the limit, so that it is bounded.
         limit = self._config.limits.connections
         if len(self._connections) >= (2 * limit if resume_of else limit):
             raise _RefusedError(RefusalCode.FULL, f"all {limit} connections are in use", "try again later")
-        share = max_connections_per_key(limit)
-        if not resume_of and self._count_connections(gateway.key_id if gateway else key_id) >= share:
-            raise _RefusedError(RefusalCode.FULL, f"this key has {share} connections already", "close some of them")
+        self._check_share(gateway.key_id if gateway else key_id, resumes=bool(resume_of))
         number = self._tokens.allocate_connection()
-        connection = FrontConnection(number, route, peer, address, key_id, hello, gateway.number if gateway else 0)
+        connection = FrontConnection(
+            number, route, peer, address, key_id, hello, gateway.number if gateway else 0, budget
+        )
         join = Join(
             key_id,
             hello.role,
@@ -112,6 +115,35 @@ class Admission:
             if not rates.allow(Hello, now_ns):
                 return False
         return self._hellos.allow(peer.user_id or peer_of(peer.descriptor)[0], now_ns)
+
+    def _take_budget(self, key_id: str, hello: Hello, gateway: FrontConnection | None, now_ns: int) -> KeyBudget:
+        """Return the budget of a key, less what a hello causes. Raises `_RefusedError` when it is used up."""
+        if gateway is not None:
+            budget = self._budgets.find(key_id, now_ns, parent=gateway.budget)
+        else:
+            encrypted = self._keyring.key is not None
+            is_gateway = self._keyring.may_be_gateway(key_id) if encrypted else hello.role == Role.GATEWAY
+            budget = self._budgets.find(key_id, now_ns, is_gateway=is_gateway)
+        reason = budget.take_request(now_ns, weigh_request(hello), count_events(hello))
+        if reason:
+            self._drops.count(reason)
+            raise _RefusedError(RefusalCode.RATE, "this key joins too often", "try again in some seconds")
+        return budget
+
+    def _check_share(self, key_id: str, *, resumes: bool) -> None:
+        """Raise `_RefusedError` when a key has as many connections as one key may have.
+
+        `resumes`: the connection replaces one that may still be counted, so twice as many are bounded.
+        """
+        share = max_connections_per_key(self._config.limits.connections)
+        if self._keyring.key is not None and not self._keyring.may_be_gateway(key_id):
+            share = min(share, self._config.limits.key.connections)
+        if self._count_connections(key_id) >= (2 * share if resumes else share):
+            advice = "close some of them, or give each device a key of its own"
+            raise _RefusedError(RefusalCode.FULL, f"this key has {share} connections already", advice)
+        if not resumes and self._tokens.count_participants(key_id) >= 2 * share:
+            advice = "wait until they have expired, or resume one of them"
+            raise _RefusedError(RefusalCode.FULL, f"this key has {2 * share} participants already", advice)
 
     def _count_connections(self, key_id: str) -> int:
         """Return the number of connections of one key, those behind it included."""

@@ -19,6 +19,7 @@ import zmq
 from iris_session.assets.chunk_scheduler import ADVICE, ChunkReader, ChunkScheduler
 from iris_session.assets.store import ServedAssets
 from iris_session.front.connection_guard import ChannelGuard
+from iris_session.front.memory_guard import PendingConnection
 from iris_session.link.config import MILLISECOND, FrontConfig
 from iris_session.link.sockets import open_assets, readable, watch_tcp
 from iris_session.protocol.assets import AssetChunk, AssetRefused
@@ -138,6 +139,10 @@ class AssetServer:
                 counts["bytes"], counts["chunks"], counts["requests"], self._scheduler.n_waiting, reasons
             )
 
+    def list_pending(self) -> list[PendingConnection]:
+        """Return the connections of readers and what is unread of them."""
+        return self._guard.list_pending()
+
     def close(self) -> None:
         """Wait for the end of the thread, then close the sockets."""
         self._stopping = True
@@ -239,7 +244,7 @@ class AssetServer:
                 continue
             self._read_connection_events()
             refused = self._handle_request(route, descriptor, user, frame, single=len(lengths) == 1)
-            self._count_reasons([self._guard.record_message(descriptor, user, lengths, counts=refused)])
+            self._count_reasons([self._guard.record_message(descriptor, user, lengths, counts=int(refused))])
 
     def _handle_request(self, route: bytes, descriptor: int, user: str, frame: zmq.Frame, *, single: bool) -> bool:
         """Handle one message. Return whether it was refused."""

@@ -1,33 +1,40 @@
-"""Limits on TCP connections, on hellos and on memory: who is rate limited, banned, or closed to make room.
+"""Limits on TCP connections and on hellos: who is rate limited, banned, or closed to make room.
 
 Every open connection costs a descriptor and buffers in libzmq, before a message is sent over it. So a connection that
 stays silent is closed after a while, the oldest silent ones make room when there are many, and a peer that sends far
 more than its limits is disconnected, banned for a moment and reported. Clients within their limits notice none of it.
 
 `ConnectionGuard` covers the control socket and, through `SubscriberGuard`, the state socket. `ChannelGuard` covers one
-socket of media or assets and belongs to the thread of that channel. `HelloRateLimiter` shares hellos between keys, and
-`MemoryGuard` bounds the memory of the process. What a connection may ask for is decided in `admission` and `intake`.
+socket of media or assets and belongs to the thread of that channel. `HelloRateLimiter` shares hellos between keys.
+What a connection may ask for is decided in `admission` and `intake`, what one key may in `key_budgets`, and what is
+closed when memory is short in `memory_guard`.
 """
 
 from __future__ import annotations
 
-import ctypes
 import heapq
+import logging
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from typing import Final, Protocol
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
+from typing import Final, NamedTuple, Protocol
 
-import psutil
 import zmq
 
 from iris_session.front.audit import AuditTrail
 from iris_session.front.connections import ConnectionTable, FrontConnection, Peer, TrafficCounter
+from iris_session.front.memory_guard import PendingConnection
 from iris_session.link.config import MEBIBYTE, MILLISECOND, SECOND, FrontLimits
 from iris_session.link.sockets import close_tcp, next_tcp_event, peer_of, readable, tcp_counts
 from iris_session.protocol.limits import Drops, TokenBucket
 from iris_session.protocol.names import AuditKind
+from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID
+
+log = logging.getLogger(__name__)
 
 CHECK_PERIOD_NS: Final = 250 * MILLISECOND
+#: Unread bytes of channels are looked at more often: a peer on this machine sends 100 MB in that time.
+BYTES_PERIOD_NS: Final = 20 * MILLISECOND
 #: A peer that was disconnected for a flood may say hello again after this.
 BAN_NS: Final = 3 * SECOND
 #: More new TCP connections of one address within a second are a flood.
@@ -39,10 +46,10 @@ SILENT_SHARE: Final = 0.25
 KEPT_NS: Final = 60 * SECOND
 #: A flood is listed in the status for so long.
 WARNING_NS: Final = 60 * SECOND
+#: A flood that goes on is logged again after so long without a report, so once.
+LOG_NS: Final = 10 * SECOND
 MAX_REMEMBERED: Final = 256
 MAX_WARNINGS: Final = 8
-#: Pending bytes of one client from which it is evicted when memory is short: more than an honest client leaves pending.
-MIN_EVICT_BYTES: Final = MEBIBYTE // 4
 #: Buffers and queues of libzmq for a connection that has said nothing.
 SILENT_CONNECTION_BYTES: Final = 16 * 1024
 BEFORE_HELLO: Final = "before hello"
@@ -50,11 +57,21 @@ BEFORE_HELLO: Final = "before hello"
 #: A subscriber sends its handshake and a few topics, no more.
 STATE_BYTES: Final = 65_536
 STATE_BYTES_PER_S: Final = 1024
+#: Subscriptions of one connection to the state socket. libzmq keeps each, at some 50 bytes for every byte of a topic.
+MAX_TOPICS: Final = 16
+#: A topic as long as this exists on no socket, so its sender is closed with the first one.
+MAX_TOPIC_BYTES: Final = 32
+#: Connections that end before they subscribed to anything, beyond which they are a flood.
+EARLY_PER_S: Final = 2.0
+EARLY_BURST: Final = 8
+#: What may be subscribed to: these, and every beginning of them (the empty one is everything).
+STATE_TOPICS: Final = (TOPIC_RIGID, TOPIC_PRESENCE)
 #: Subscribers examined in one tick, besides those that sent something.
 EXAMINED_PER_TICK: Final = 8
 #: Subscriptions read in one tick: about half a millisecond.
 SUBSCRIPTIONS_PER_TICK: Final = 128
 _SUBSCRIBE: Final = b"\x01"
+_UNSUBSCRIBE: Final = b"\x00"
 
 #: Counted messages of one connection to a channel before it is closed: repeated subscriptions, as many as a client can
 #: have over and over, or frames of a source without permission.
@@ -65,10 +82,6 @@ CLOSE_FAILED: Final = "close_failed"
 
 #: Sources of hellos that have a token bucket of their own.
 MAX_SOURCES: Final = 256
-
-MEMORY_PERIOD_NS: Final = 100 * MILLISECOND
-#: Pause after an eviction: libzmq frees what a closed connection held in its own thread.
-EVICTION_PAUSE_NS: Final = 500 * MILLISECOND
 
 
 class TcpConnection:
@@ -81,18 +94,31 @@ class TcpConnection:
         quiet_ns: Session time at which it last belonged to an admitted client, at first that of `opened_ns`.
         rejections: Token bucket of rejected messages, made with the first of them.
         is_established: A message came through after the handshake.
+        is_closed: It was closed for a flood, and messages that had arrived before may still come.
         counted_messages: Messages that count towards a flood.
+        topics: Topics that it is subscribed to.
     """
 
-    __slots__ = ("address", "counted_messages", "is_established", "opened_ns", "owner", "quiet_ns", "rejections")
+    __slots__ = (
+        "address",
+        "counted_messages",
+        "is_closed",
+        "is_established",
+        "opened_ns",
+        "owner",
+        "quiet_ns",
+        "rejections",
+        "topics",
+    )
 
     def __init__(self, address: tuple[str, int], now_ns: int) -> None:
         self.address = address
         self.owner = address[0]
         self.opened_ns = self.quiet_ns = now_ns
         self.rejections: TokenBucket | None = None
-        self.is_established = False
+        self.is_closed = self.is_established = False
         self.counted_messages = 0
+        self.topics: set[bytes] = set()
 
 
 class TcpConnections:
@@ -100,6 +126,7 @@ class TcpConnections:
 
     def __init__(self) -> None:
         self._table: dict[int, TcpConnection] = {}
+        self._ended: deque[TcpConnection] = deque(maxlen=MAX_REMEMBERED)
 
     def __len__(self) -> int:
         return len(self._table)
@@ -121,7 +148,15 @@ class TcpConnections:
 
     def remove(self, descriptor: int) -> None:
         """Remove a connection that has ended."""
-        self._table.pop(descriptor, None)
+        connection = self._table.pop(descriptor, None)
+        if connection is not None:
+            self._ended.append(connection)
+
+    def pop_ended(self) -> list[TcpConnection]:
+        """Return and forget connections that were removed since the last call, without those that were evicted."""
+        ended = list(self._ended)
+        self._ended.clear()
+        return ended
 
     def clear(self) -> None:
         """Remove all connections: their listening socket was closed."""
@@ -187,6 +222,22 @@ def max_connections_per_key(limit: int) -> int:
     return limit - limit // 4
 
 
+def select_share_evictions(
+    connections: Iterable[tuple[int, TcpConnection]], find_share: Callable[[str], int]
+) -> list[int]:
+    """Return the newest connections of every owner that has more than `find_share(owner)`.
+
+    `connections`: the newest first.
+    """
+    counts: dict[str, list[int]] = {}
+    for descriptor, connection in connections:
+        counts.setdefault(connection.owner, []).append(descriptor)
+    evicted: list[int] = []
+    for owner, descriptors in counts.items():
+        evicted += descriptors[: max(0, len(descriptors) - find_share(owner))]
+    return evicted
+
+
 class HelloRateLimiter:
     """Limit hellos per source and in total.
 
@@ -216,24 +267,32 @@ class SubscriberGuard:
     libzmq reports a finished handshake without its connection. A subscription comes after it and carries descriptor
     and key of its subscriber. So a connection counts as established once it has subscribed, and as silent before.
 
-    `on_flood(address, detail, now_ns)` reports a flood, `on_accept(address, now_ns)` counts a new connection.
+    libzmq keeps every subscription, whether or not anything is ever published under it. So a connection that subscribes
+    to topics that do not exist is closed.
+
+    `on_flood(address, detail, now_ns, key)` reports a flood, `on_accept(address, now_ns)` counts a new connection,
+    `find_share(owner)` returns how many connections one key may have.
     """
 
     def __init__(
         self,
         drops: Drops,
         limits: FrontLimits,
-        on_flood: Callable[[str, str, int], None],
+        on_flood: Callable[[str, str, int, str], None],
         on_accept: Callable[[str, int], None],
+        find_share: Callable[[str], int] | None = None,
     ) -> None:
         self._drops = drops
         self._limits = limits
         self._on_flood = on_flood
         self._on_accept = on_accept
+        self._find_share = find_share or (lambda _owner: limits.subscribers)
         self._tcp = TcpConnections()
         self._socket: zmq.Socket[bytes] | None = None
         self._monitor: zmq.Socket[bytes] | None = None
         self._examined = 0  # descriptor that was examined last
+        self._is_plain = False
+        self._early = TokenBucket(EARLY_PER_S, EARLY_BURST)
         self._next_ns = 0
 
     def __len__(self) -> int:
@@ -243,6 +302,7 @@ class SubscriberGuard:
         """Guard this socket from now on, instead of the one before."""
         self.close()
         self._socket, self._monitor = state, monitor
+        self._is_plain = not state.get(zmq.CURVE_SERVER)
 
     def close(self) -> None:
         """Forget the socket and its connections, and close its monitor. The socket is closed by its owner."""
@@ -258,15 +318,18 @@ class SubscriberGuard:
         if self._socket.closed:
             self.close()
             return
-        senders = self._read_subscriptions(self._socket)
+        received = self._read_subscriptions(self._socket)
         # After the subscriptions: by now libzmq has reported their connections.
         for _, accepted in self._tcp.read_events(self._monitor, now_ns):
             if accepted is not None:
                 self._on_accept(accepted.address[0], now_ns)
-        for descriptor, user in senders.items():
+        self._count_early_ends(now_ns)
+        senders = {descriptor for descriptor, _, _ in received}
+        for descriptor, user, data in received:
             connection = self._tcp.find(descriptor)
-            if connection is not None and user is not None:
-                connection.is_established, connection.owner = True, user or connection.owner
+            if connection is not None and not self._record_subscription(connection, user, data):
+                self._on_flood(connection.address[0], "subscriptions", now_ns, user)
+                self._evict(descriptor, "flood_cut")
         others = sorted(self._tcp, key=lambda descriptor: (descriptor <= self._examined, descriptor))
         others = others[:EXAMINED_PER_TICK]
         if others:
@@ -277,9 +340,33 @@ class SubscriberGuard:
             self._next_ns = now_ns + CHECK_PERIOD_NS
             self._evict_excess(now_ns)
 
-    def _read_subscriptions(self, state: zmq.Socket[bytes]) -> dict[int, str | None]:
-        """Return who sent something: user id (empty without keys) by descriptor, `None` if it was no subscription."""
-        senders: dict[int, str | None] = {}
+    def _count_early_ends(self, now_ns: int) -> None:
+        """Count connections that ended before they subscribed to anything, and report many of them: without encryption
+        libzmq closes a connection itself when its first message is too large. With it, keys that are not admitted end
+        like that, too, and are counted as such."""
+        for connection in self._tcp.pop_ended():
+            if self._is_plain and not connection.is_established:
+                self._drops.count("state_closed_early")
+                if not self._early.take(now_ns):
+                    self._on_flood(connection.address[0], "subscriptions", now_ns, "")
+
+    def _record_subscription(self, connection: TcpConnection, user: str, data: bytes) -> bool:
+        """Record a message of a subscriber. Return whether the connection may stay."""
+        topic = data[1:]
+        if data[:1] == _SUBSCRIBE and any(one.startswith(topic) for one in STATE_TOPICS):
+            connection.is_established, connection.owner = True, user or connection.owner
+            connection.topics.add(topic)
+            return len(connection.topics) <= MAX_TOPICS
+        if data[:1] == _UNSUBSCRIBE:
+            connection.topics.discard(topic)
+            return True
+        self._drops.count("state_topic_unknown")
+        connection.counted_messages += 1
+        return len(topic) <= MAX_TOPIC_BYTES and connection.counted_messages <= MAX_TOPICS
+
+    def _read_subscriptions(self, state: zmq.Socket[bytes]) -> list[tuple[int, str, bytes]]:
+        """Return what subscribers sent: descriptor, user id (empty without keys) and message."""
+        received: list[tuple[int, str, bytes]] = []
         for _ in range(SUBSCRIPTIONS_PER_TICK):
             if not readable(state):
                 break
@@ -288,11 +375,8 @@ class SubscriberGuard:
                 descriptor = int(frame.get(zmq.SRCFD))
             except zmq.ZMQError:  # a ZeroMQ of before 2013: without its connection
                 continue
-            if frame.bytes[:1] == _SUBSCRIBE:
-                senders[descriptor] = _read_user_id(frame)
-            else:
-                senders.setdefault(descriptor, None)
-        return senders
+            received.append((descriptor, _read_user_id(frame), frame.bytes))
+        return received
 
     def _evict(self, descriptor: int, reason: str) -> None:
         counted = self._tcp.evict(descriptor, reason)
@@ -305,7 +389,7 @@ class SubscriberGuard:
         if connection is None or counts is None:
             return
         if counts.received > STATE_BYTES + STATE_BYTES_PER_S * (now_ns - connection.opened_ns) // SECOND:
-            self._on_flood(connection.address[0], "subscriptions", now_ns)
+            self._on_flood(connection.address[0], "subscriptions", now_ns, connection.owner)
             self._evict(descriptor, "flood_cut")
 
     def _evict_excess(self, now_ns: int) -> None:
@@ -316,7 +400,8 @@ class SubscriberGuard:
             (established if one[1].is_established else silent).append(one)
         for descriptor in select_evictions(silent, limits.strangers):
             self._evict(descriptor, "strangers_too_many")
-        for descriptor in select_evictions(reversed(established), limits.subscribers):
+        excess = select_share_evictions(reversed(established), self._find_share)
+        for descriptor in (*excess, *select_evictions(reversed(established), limits.subscribers)):
             self._evict(descriptor, "subscribers_too_many")
         for descriptor, connection in silent:
             late = now_ns - connection.opened_ns > limits.hello_timeout_ns
@@ -331,17 +416,35 @@ def _read_user_id(frame: zmq.Frame) -> str:
         return ""
 
 
+class ChannelBounds(NamedTuple):
+    """Bounds of the connections to one socket of media or assets.
+
+    Attributes:
+        connections: Established connections at most, and silent connections at most.
+        pending_bytes: Received but unread bytes of one connection at most.
+        owner_bytes: The same of all connections of one owner, 0 for no bound.
+        total_bytes: The same of all connections, 0 for no bound.
+        find_share: Returns how many established connections one owner may have; `None`: as many as there may be.
+    """
+
+    connections: int
+    pending_bytes: int
+    owner_bytes: int = 0
+    total_bytes: int = 0
+    find_share: Callable[[str], int] | None = None
+
+
 class ChannelGuard:
     """Limit TCP connections of one socket of media or assets. Belongs to the thread of that channel.
 
     Closes connections that stay silent, that are too many, and that send more than is read: libzmq collects all frames
-    of a message, however many, before it delivers the first. Drop reasons begin with `name`.
+    of a message, however many, before it delivers the first. Drop reasons begin with `name`. `list_pending` is for
+    other threads.
 
     Args:
         monitor: Monitor of the socket.
         limits: Handshake timeout.
-        max_connections: Established connections at most, and silent connections at most.
-        max_pending_bytes: Received but unread bytes of one connection at most.
+        bounds: Of connections and unread bytes.
         curve: Whether the socket is encrypted.
         name: Prefix of the drop reasons.
     """
@@ -350,8 +453,7 @@ class ChannelGuard:
         self,
         monitor: zmq.Socket[bytes],
         limits: FrontLimits,
-        max_connections: int,
-        max_pending_bytes: int,
+        bounds: ChannelBounds,
         *,
         curve: bool,
         name: str = "media",
@@ -359,11 +461,16 @@ class ChannelGuard:
         self._monitor = monitor
         self._name = name
         self._limits = limits
-        self._max_connections = max_connections
-        self._max_pending_bytes = max_pending_bytes
+        self._bounds = bounds
+        self._pending: tuple[tuple[int, TcpConnection, int], ...] = ()
         self._traffic = TrafficCounter(curve=curve)
         self._tcp = TcpConnections()
-        self._next_ns = 0
+        self._next_ns = self._next_bytes_ns = 0
+
+    @property
+    def has_pending(self) -> bool:
+        """True while much of what was received is unread: `tick` should be called often."""
+        return sum(n_bytes for _, _, n_bytes in self._pending) > MEBIBYTE
 
     def read_events(self, now_ns: int) -> list[int]:
         """Read accepted and closed connections. Return descriptors that belong to no or to another connection now.
@@ -375,8 +482,8 @@ class ChannelGuard:
             self._traffic.reset(descriptor)
         return changed
 
-    def record_message(self, descriptor: int, user: str, lengths: Iterable[int], *, counts: bool) -> str:
-        """Record a message with frames of these lengths. `counts`: it counts towards a flood.
+    def record_message(self, descriptor: int, user: str, lengths: Iterable[int], *, counts: int) -> str:
+        """Record a message with frames of these lengths. `counts`: as how many it counts towards a flood.
 
         Returns:
             The drop reason if the connection was closed, else an empty string.
@@ -395,19 +502,58 @@ class ChannelGuard:
 
     def tick(self, now_ns: int) -> list[str]:
         """Close flooding, silent and too many connections. Return a drop reason for each."""
+        reasons: list[str] = []
+        if now_ns >= self._next_bytes_ns:
+            self._next_bytes_ns = now_ns + BYTES_PERIOD_NS
+            reasons += self._evict_for_bytes()
         if now_ns < self._next_ns:
-            return []
+            return reasons
         self._next_ns = now_ns + CHECK_PERIOD_NS
         established = [one for one in self._tcp.items() if one[1].is_established]
         silent = [one for one in self._tcp.items() if not one[1].is_established]
         oldest_ns = now_ns - self._limits.hello_timeout_ns
-        flooding = [fd for fd in self._tcp if self._traffic.pending_bytes(fd) > self._max_pending_bytes]
-        reasons = [self.evict(fd, f"{self._name}_flood") for fd in flooding]
         reasons += [self.evict(fd, f"{self._name}_silent") for fd, one in silent if one.opened_ns < oldest_ns]
-        excess = select_evictions(silent, self._max_connections)
-        excess += select_evictions(reversed(established), self._max_connections)
+        excess = select_evictions(silent, self._bounds.connections)
+        if self._bounds.find_share is not None:
+            excess += select_share_evictions(reversed(established), self._bounds.find_share)
+        excess += select_evictions(reversed(established), self._bounds.connections)
         reasons += [self.evict(fd, f"{self._name}_too_many") for fd in excess]
         return [reason for reason in reasons if reason]
+
+    def list_pending(self) -> list[PendingConnection]:
+        """Return the connections and what is unread of them, as of the last tick, for `MemoryGuard`."""
+        return [
+            PendingConnection(
+                connection.owner,
+                n_bytes,
+                f"a connection to {self._name} from {connection.address[0]}",
+                partial(close_tcp, descriptor, connection.address),
+            )
+            for descriptor, connection, n_bytes in self._pending
+        ]
+
+    def _evict_for_bytes(self) -> list[str]:
+        """Close connections with too many unread bytes, then the largest of the owner with most of them, until owners
+        and total are in bounds. Return a drop reason for each."""
+        bounds = self._bounds
+        pending = {fd: self._traffic.pending_bytes(fd) for fd in self._tcp}
+        chosen = [fd for fd, n_bytes in pending.items() if n_bytes > bounds.pending_bytes]
+        reasons = [self.evict(fd, f"{self._name}_flood") for fd in chosen]
+        left = {fd: (one, pending[fd]) for fd, one in self._tcp.items() if fd not in chosen}
+        while left and (bounds.owner_bytes or bounds.total_bytes):
+            sums: dict[str, int] = {}
+            for connection, n_bytes in left.values():
+                sums[connection.owner] = sums.get(connection.owner, 0) + n_bytes
+            owner = max(sums, key=sums.__getitem__)
+            if sums[owner] <= (bounds.owner_bytes or sums[owner]) and sum(sums.values()) <= (
+                bounds.total_bytes or sum(sums.values())
+            ):
+                break
+            largest = max((fd for fd, (one, _) in left.items() if one.owner == owner), key=lambda fd: left[fd][1])
+            reasons.append(self.evict(largest, f"{self._name}_flood"))
+            del left[largest]
+        self._pending = tuple((fd, connection, n_bytes) for fd, (connection, n_bytes) in left.items() if n_bytes)
+        return reasons
 
     def evict(self, descriptor: int, reason: str) -> str:
         """Close a connection. Return the drop reason, empty if it has ended already."""
@@ -430,6 +576,7 @@ class ConnectionGuard:
         audit: AuditTrail,
         limits: FrontLimits,
         traffic: TrafficCounter | None = None,
+        find_share: Callable[[str], int] | None = None,
     ) -> None:
         self._connections = connections
         self._drops = drops
@@ -437,7 +584,9 @@ class ConnectionGuard:
         self._limits = limits
         self._traffic = traffic or TrafficCounter()  # of the control socket
         self._tcp = TcpConnections()  # of the control socket
-        self._subscribers = SubscriberGuard(drops, limits, self.report_flood, self._count_accepted)
+        self._subscribers = SubscriberGuard(
+            drops, limits, self._report_subscriber_flood, self._count_accepted, find_share
+        )
         self._banned: dict[str, int] = {}  # key id -> session time until which it may not say hello
         self._flooded: dict[str, int] = {}  # address -> until when connections without hello have a lower limit
         self._warnings: dict[tuple[str, str], tuple[int, str]] = {}
@@ -468,19 +617,38 @@ class ConnectionGuard:
             connection.quiet_ns = now_ns
 
     def rate_limit(self, peer: Peer, connection: FrontConnection | None, detail: str, now_ns: int) -> bool:
-        """Count a rejected message. Return whether there were too many, so that the TCP connection was closed."""
+        """Count a rejected message, with those of the same key.
+
+        Returns:
+            Whether there were too many, so that the TCP connection was closed. That of a gateway stays open for the
+            others behind it; then only the connection ends.
+        """
         tcp = self._tcp.find(peer.descriptor) or self._tcp.add(peer.descriptor, now_ns)
-        if tcp.rejections is None:
-            share = 1.0 if connection is not None else SILENT_SHARE
-            if connection is None and now_ns < self._flooded.get(tcp.address[0], 0):
+        if connection is not None:
+            rejections = connection.budget.rejections
+        elif tcp.rejections is not None:
+            rejections = tcp.rejections
+        else:
+            share = SILENT_SHARE
+            if now_ns < self._flooded.get(tcp.address[0], 0):
                 share *= SILENT_SHARE  # connected again, and again without hello
             limits = self._limits
-            tcp.rejections = TokenBucket(limits.excess_per_s * share, int(limits.excess_burst * share), now_ns)
-        if tcp.rejections.take(now_ns):
+            rejections = TokenBucket(limits.excess_per_s * share, int(limits.excess_burst * share), now_ns)
+            tcp.rejections = rejections
+        if rejections.take(now_ns):
             return False
+        if tcp.is_closed or (
+            connection is not None and connection.gateway and self.is_banned(connection.key_id, now_ns)
+        ):
+            return True  # it is about to be disconnected
         self.report_flood(tcp.address[0], detail, now_ns, connection)
+        if connection is not None and connection.gateway:
+            self._drops.count("flood_cut")
+            _remember(self._banned, connection.key_id, now_ns + BAN_NS)
+            return True
         if not close_tcp(peer.descriptor, tcp.address):
             return False
+        tcp.is_closed = True
         self._drops.count("flood_cut")
         _remember(self._flooded, tcp.address[0], now_ns + BAN_NS)
         if connection is not None:
@@ -495,12 +663,20 @@ class ConnectionGuard:
         if connection is not None:
             name, subject = connection.hello.name, connection.participant_id
         self._drops.count("flood")
+        peer = " ".join(part for part in (address, f"({name})" if name else "") if part) or "an unknown address"
+        text = warning or f"flood from {peer}: {detail}"
+        if now_ns - self._warnings.get((address, detail), (-LOG_NS, ""))[0] >= LOG_NS:
+            log.warning("%s", text)
         self._audit.record(AuditKind.FLOOD, now_ns, subject=subject, name=name, address=address, detail=detail)
         self._warnings.pop((address, detail), None)
         while len(self._warnings) >= MAX_WARNINGS:
             del self._warnings[next(iter(self._warnings))]
-        peer = " ".join(part for part in (address, f"({name})" if name else "") if part) or "an unknown address"
-        self._warnings[address, detail] = (now_ns, warning or f"flood from {peer}: {detail}")
+        self._warnings[address, detail] = (now_ns, text)
+
+    def _report_subscriber_flood(self, address: str, detail: str, now_ns: int, key: str) -> None:
+        self.report_flood(address, detail, now_ns)
+        if key:
+            _remember(self._banned, key, now_ns + BAN_NS)
 
     def is_banned(self, key_id: str, now_ns: int) -> bool:
         """Return whether this key was disconnected for a flood a moment ago."""
@@ -520,40 +696,43 @@ class ConnectionGuard:
         self._next_ns = now_ns + CHECK_PERIOD_NS
         self._evict_silent(now_ns)
 
-    def evict_for_memory(self, release_media: Callable[[], str] = lambda: "") -> str:
-        """Close connections to free memory.
+    def list_pending(self) -> list[PendingConnection]:
+        """Return the connections of the control socket and what is pending in them, for `MemoryGuard`.
 
-        Closes the client with the most pending bytes in both directions, or a quarter of the connections without hello
-        if those hold more together. If no connection holds much, `release_media` may free memory elsewhere and returns
-        a text that names it. If that frees nothing either, the case is only counted: closing a connection would not
-        help.
-
-        Returns:
-            What was evicted, for the status; empty if nothing was.
+        Those without hello are one, of which a quarter is closed at a time, the largest first and of equal ones the
+        newest; of many participants behind one gateway it is the gateway's own.
         """
         owners = self._owners()
-        silent = [descriptor for descriptor in self._tcp if descriptor not in owners]
-        pending = {descriptor: self._traffic.pending_bytes(descriptor) for descriptor in (*owners, *silent)}
-        silent_bytes = sum(pending[descriptor] for descriptor in silent) + SILENT_CONNECTION_BYTES * len(silent)
-        most = max((pending[descriptor] for descriptor in owners), default=0)
-        if max(silent_bytes, most) < MIN_EVICT_BYTES:
-            released = release_media()
-            if not released:
-                self._drops.count("memory_elsewhere")
-            return released
-        if silent and most < silent_bytes:
-            silent.reverse()  # of equal ones the newest first
-            silent.sort(key=pending.__getitem__, reverse=True)
-            for descriptor in silent[: max(1, len(silent) // 4)]:
-                self._evict(descriptor, "memory")
-            return "connections without hello"
-        largest = max(owners, key=lambda descriptor: (pending[descriptor], owners[descriptor].number), default=None)
-        if largest is None or not close_tcp(largest, owners[largest].address):
-            return ""
-        client = owners[largest]
-        _remember(self._banned, client.key_id, client.last_heard_ns + BAN_NS)
-        self._drops.count("memory")
-        return f"{client.hello.name} from {client.address[0]}"
+        pending = [
+            PendingConnection(
+                one.key_id,
+                self._traffic.pending_bytes(descriptor),
+                f"{one.hello.name} from {one.address[0]}",
+                partial(self._close_for_memory, one),
+            )
+            for descriptor, one in sorted(owners.items(), key=lambda item: item[1].number)
+        ]
+        silent = {fd: self._traffic.pending_bytes(fd) for fd in self._tcp if fd not in owners}
+        if silent:
+            n_bytes = sum(silent.values()) + SILENT_CONNECTION_BYTES * len(silent)
+            pending.append(
+                PendingConnection(
+                    BEFORE_HELLO, n_bytes, "connections without hello", partial(self._close_silent_for_memory, silent)
+                )
+            )
+        return pending
+
+    def _close_for_memory(self, connection: FrontConnection) -> int:
+        if not close_tcp(connection.peer.descriptor, connection.address):
+            return 0
+        _remember(self._banned, connection.key_id, connection.last_heard_ns + BAN_NS)
+        return 1
+
+    def _close_silent_for_memory(self, silent: Mapping[int, int]) -> int:
+        newest_first = list(reversed(silent))
+        newest_first.sort(key=silent.__getitem__, reverse=True)
+        chosen = newest_first[: max(1, len(newest_first) // 4)]
+        return sum(self._tcp.evict(descriptor, "memory") == "memory" for descriptor in chosen)
 
     def close(self) -> None:
         self._subscribers.close()
@@ -602,68 +781,3 @@ def _remember(table: dict[str, int], key: str, until_ns: int) -> None:
     while len(table) >= MAX_REMEMBERED:
         del table[next(iter(table))]
     table[key] = until_ns
-
-
-class MemoryGuard:
-    """Bound the memory of the front: queues of libzmq, our own, and those of subscriptions. A `Service`.
-
-    libzmq does not report the size of its queues, and a sum of worst cases would admit no client. So the process is
-    measured: when it holds more than `max_bytes` above what it held once its sockets were open, connections with the
-    most pending bytes are evicted.
-    """
-
-    def __init__(
-        self,
-        max_bytes: int,
-        evict: Callable[[], str],
-        on_evicted: Callable[[str, int], None],
-        read_resident: Callable[[], int] | None = None,
-        trim: Callable[[], None] | None = None,
-    ) -> None:
-        self._max_bytes = max_bytes
-        self._evict = evict
-        self._on_evicted = on_evicted
-        self._read_resident = read_resident or _make_resident_reader()
-        self._trim = trim or _trim_heap
-        self._base = -1
-        self._next_ns = 0
-
-    def tick(self, now_ns: int) -> None:
-        """Measure, and evict a connection where memory is short."""
-        if now_ns < self._next_ns:
-            return
-        self._next_ns = now_ns + MEMORY_PERIOD_NS
-        if self._base < 0:
-            self._base = self._read_resident()
-        if self._read_resident() - self._base <= self._max_bytes:
-            return
-        self._trim()  # freed memory counts until the system has it back
-        if self._read_resident() - self._base <= self._max_bytes:
-            return
-        evicted = self._evict()
-        if evicted:
-            self._on_evicted(evicted, now_ns)
-        self._next_ns = now_ns + EVICTION_PAUSE_NS
-
-    def close(self) -> None:
-        """Do nothing: nothing was opened."""
-
-
-def _make_resident_reader() -> Callable[[], int]:
-    """Return a function that reads resident bytes without mapped files: assets are mapped, and the system takes those
-    pages back when it needs them."""
-    process = psutil.Process()
-
-    def read_resident() -> int:
-        info = process.memory_info()
-        return int(info.rss - getattr(info, "shared", 0))
-
-    return read_resident
-
-
-def _trim_heap() -> None:
-    """Return free memory of the C library to the system, where it can (glibc)."""
-    try:
-        ctypes.CDLL(None).malloc_trim(0)
-    except (OSError, AttributeError):
-        return

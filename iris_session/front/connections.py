@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 import msgspec
 import zmq
 
+from iris_session.front.key_budgets import KeyBudget
 from iris_session.link.config import SECOND, FrontLimits
 from iris_session.link.sockets import tcp_counts
 from iris_session.protocol.client_messages import Hello
@@ -54,18 +55,25 @@ class FrontConnection:
 
     Attributes:
         number: Connection number, which the protocol calls connection epoch.
+        budget: What its key may send and cause, shared by all connections of the key.
         gateway: Number of the gateway that speaks for this connection, 0 for none.
         participant_id: Assigned by the authority, empty before.
         confirmed: A message with this connection epoch has come, so the client has its `Welcome`.
         flood_last_ns, flood_since_ns: When a rate limit was last exceeded, and since when without a pause.
         late_epoch: The newest tracking epoch that came above its rate limit.
         prefix: Encoded start of every `ServerEnvelope` to this connection.
+        presence_due_ns: Session time of the next sample that counts, by device of an observer.
+        presence_worn: Whether the headset of an observer is worn, as its last sample that counted says.
         report: The client's newest report, and `reported_ns` when it came.
+        worn: Whether its headset is worn, as it said last.
+        clutches: Whether the clutch is closed, by device, as it said last.
     """
 
     __slots__ = (
         "address",
         "admitted",
+        "budget",
+        "clutches",
         "confirmed",
         "consecutive_drops",
         "denials",
@@ -81,14 +89,25 @@ class FrontConnection:
         "participant_id",
         "peer",
         "prefix",
+        "presence_due_ns",
+        "presence_worn",
         "rates",
         "report",
         "reported_ns",
         "route",
+        "worn",
     )
 
     def __init__(
-        self, number: int, route: Route, peer: Peer, address: tuple[str, int], key_id: str, hello: Hello, gateway: int
+        self,
+        number: int,
+        route: Route,
+        peer: Peer,
+        address: tuple[str, int],
+        key_id: str,
+        hello: Hello,
+        gateway: int,
+        budget: KeyBudget | None = None,
     ) -> None:
         self.number = number
         self.route = route
@@ -97,6 +116,7 @@ class FrontConnection:
         self.key_id = key_id
         self.hello = hello
         self.gateway = gateway
+        self.budget = budget if budget is not None else KeyBudget(FrontLimits())
         self.admitted = False
         self.participant_id = ""
         self.confirmed = False
@@ -108,8 +128,12 @@ class FrontConnection:
         self.late_epoch: Entry | None = None
         self.rates = RateLimiter()
         self.prefix = encode_envelope_prefix(number)
+        self.presence_due_ns: dict[str, int] = {}
+        self.presence_worn = True
         self.report: ClientReport | None = None
         self.reported_ns = 0
+        self.worn = True
+        self.clutches: dict[str, bool] = {}
 
     def recent_report(self, now_ns: int) -> ClientReport | None:
         """Return the client's newest report, `None` if it is older than `REPORT_EXPIRY_NS`."""
@@ -128,11 +152,13 @@ class ConnectionTable:
         return len(self.by_number)
 
     def add(self, connection: FrontConnection) -> None:
+        connection.budget.connections += 1
         self.by_number[connection.number] = connection
         self.by_route[connection.route] = connection
 
     def remove(self, connection: FrontConnection) -> None:
-        self.by_number.pop(connection.number, None)
+        if self.by_number.pop(connection.number, None) is not None:
+            connection.budget.connections -= 1
         if self.by_route.get(connection.route) is connection:
             del self.by_route[connection.route]
 

@@ -18,12 +18,13 @@ import zmq
 from iris_session.front.asset_server import AssetSockets, open_asset_sockets
 from iris_session.front.audit import AuditTrail
 from iris_session.front.coalescer import Coalescer
-from iris_session.front.connection_guard import ConnectionGuard
+from iris_session.front.connection_guard import ConnectionGuard, max_connections_per_key
 from iris_session.front.connections import ConnectionTable, ControlSender, FrontConnection, TrafficCounter
 from iris_session.front.discovery import Listeners, choose_address_host, list_reachable_hosts, open_with_introduction
+from iris_session.front.key_budgets import KeyBudgets
 from iris_session.front.state_publisher import StatePublisher
 from iris_session.link import messages as link
-from iris_session.link.config import MILLISECOND, FrontConfig, FrontError, FrontStart, Ports
+from iris_session.link.config import MILLISECOND, FrontConfig, FrontError, FrontLimits, FrontStart, Ports
 from iris_session.link.sockets import (
     IO_THREADS,
     bound_port,
@@ -75,13 +76,13 @@ class FrontSockets:
     Args:
         start: Configuration and the endpoint of the link.
         drops: Drop counters.
-        on_key_refused: Called with the fingerprint and the address of every key that was not admitted.
+        on_key_refused: Called with the fingerprint, the address and the channel of every key that was not admitted.
 
     Raises:
         FrontError: A socket cannot be opened. The authority was notified, and all sockets are closed.
     """
 
-    def __init__(self, start: FrontStart, drops: Drops, on_key_refused: Callable[[str, str], None]) -> None:
+    def __init__(self, start: FrontStart, drops: Drops, on_key_refused: Callable[[str, str, str], None]) -> None:
         self._config = start.config
         self._drops = drops
         self._state_sockets = 0
@@ -98,7 +99,7 @@ class FrontSockets:
             self.close()
             raise
 
-    def _open(self, on_key_refused: Callable[[str, str], None]) -> None:
+    def _open(self, on_key_refused: Callable[[str, str, str], None]) -> None:
         config = self._config
         self.keyring = self._open_keyring()
         key = self.keyring.key
@@ -154,7 +155,7 @@ class FrontSockets:
 
 
 class LinkState:
-    """State of the link to the authority, written by `Downlink` (the first four) and `Uplink`.
+    """State of the link to the authority, written by `Downlink` (the first four), `Front` (stalls) and `Uplink`.
 
     Attributes:
         heard_ns: Session time of its last message, 0 before the first.
@@ -182,6 +183,7 @@ class FrontContext:
 
     Attributes:
         now_ns: Returns session time [ns].
+        budgets: What each key may send and cause, over all its connections.
         publisher: The state socket's sender; it knows the present scene.
     """
 
@@ -195,6 +197,7 @@ class FrontContext:
     coalescer: Coalescer
     audit: AuditTrail
     guard: ConnectionGuard
+    budgets: KeyBudgets
     tokens: ResumeTokens
     publisher: StatePublisher
     traffic: TrafficCounter = field(default_factory=TrafficCounter)
@@ -209,6 +212,16 @@ class FrontContext:
         return connection.key_id if gateway is None else gateway.key_id
 
 
+def find_channel_share(keyring: Keyring, limits: FrontLimits, owner: str) -> int:
+    """Return how many connections to one channel beside control (state, media, assets) one owner may have.
+
+    `owner`: a key, or without encryption an address, which many may share.
+    """
+    if keyring.key is None or keyring.may_be_gateway(owner):
+        return max_connections_per_key(limits.subscribers)
+    return 2 * limits.key.connections if keyring.find_key(owner) is not None else limits.subscribers
+
+
 def open_front(start: FrontStart) -> tuple[FrontContext, FrontSockets]:
     """Open the sockets of a front and make its context.
 
@@ -220,15 +233,17 @@ def open_front(start: FrontStart) -> tuple[FrontContext, FrontSockets]:
     def now_ns() -> int:
         return time.monotonic_ns() - config.origin_ns
 
-    def audit_refused_key(fingerprint: str, address: str) -> None:
-        audit.record(AuditKind.KEY_REFUSED, now_ns(), subject=fingerprint, address=address, detail="state")
+    def audit_refused_key(fingerprint: str, address: str, channel: str) -> None:
+        audit.record(AuditKind.KEY_REFUSED, now_ns(), subject=fingerprint, address=address, detail=channel)
 
     drops, connections = Drops(), ConnectionTable()
     coalescer = Coalescer(limits, drops)
     audit = AuditTrail(coalescer.offer)
     sockets = FrontSockets(start, drops, audit_refused_key)
     traffic = TrafficCounter(curve=sockets.keyring.key is not None)
-    guard = ConnectionGuard(connections, drops, audit, limits, traffic)
+    guard = ConnectionGuard(
+        connections, drops, audit, limits, traffic, lambda key: find_channel_share(sockets.keyring, limits, key)
+    )
     guard.watch_state_socket(*sockets.state)
     first_seq = 1 + (now_ns() // SEQ_NS if start.handback else 0)
     context = FrontContext(
@@ -242,6 +257,7 @@ def open_front(start: FrontStart) -> tuple[FrontContext, FrontSockets]:
         coalescer=coalescer,
         audit=audit,
         guard=guard,
+        budgets=KeyBudgets(limits, coalescer.offer),
         tokens=ResumeTokens(limits.resume_tokens, start.handback),
         publisher=StatePublisher(sockets.state.socket, start.scene, now_ns, first_seq),
         traffic=traffic,

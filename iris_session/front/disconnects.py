@@ -76,7 +76,8 @@ class DisconnectHandler:
             slow = self._connections.by_number.get(number)
             if slow is not None:
                 self.report_lost(slow, reason)
-                close_tcp(slow.peer.descriptor, slow.address)
+                if not (slow.gateway and reason == "flood"):  # the others behind the gateway go on
+                    close_tcp(slow.peer.descriptor, slow.address)
 
     def _is_close_pending(self, descriptor: int, deadline_ns: int, drained: bool, now_ns: int) -> bool:
         """Return whether a closed TCP connection has to be examined again.

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from typing import Final
 
-import msgspec
-import zmq
-
 from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
 from iris_session.front.connection_guard import BEFORE_HELLO
 from iris_session.front.connections import FrontConnection, Peer, Route
 from iris_session.front.context import FrontContext
+from iris_session.front.key_budgets import ESTOPS_MERGED, describe_excess
 from iris_session.front.pairing import PairingService
+from iris_session.front.raw_feed import REQUEST_BYTES_PER_S, REQUEST_SHARE, PresenceLimiter, RawFeed
 from iris_session.front.status import StatusService
 from iris_session.link.sockets import peer_of
 from iris_session.protocol.client_messages import (
@@ -20,6 +19,7 @@ from iris_session.protocol.client_messages import (
     ClientMessage,
     ClockPing,
     EStop,
+    Heartbeat,
     Hello,
     Observation,
     Pair,
@@ -31,8 +31,8 @@ from iris_session.protocol.codec import decode_client, get_tag
 from iris_session.protocol.common import Denial
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.errors import MalformedError, ProtocolError, ProtocolVersionError, RateError
-from iris_session.protocol.limits import LIMITS, Drops, TokenBucket
-from iris_session.protocol.names import PROTOCOL_VERSION, AuditKind, DenialReason, FaultCode, RefusalCode
+from iris_session.protocol.limits import LIMITS, TokenBucket, count_events, weigh_request
+from iris_session.protocol.names import PROTOCOL_VERSION, AuditKind, DenialReason, FaultCode, RefusalCode, Role
 from iris_session.protocol.server_messages import ClockPong, ProtocolFault, Refused, Reply
 from iris_session.protocol.status import ClientReport, GetStatus
 from iris_session.security import compute_fingerprint, decode_key
@@ -40,35 +40,12 @@ from iris_session.security.keyring import parse_pairing_key
 
 #: Faults per second to peers without a connection, on which they could be limited.
 _UNKNOWN_PEER_FAULTS: Final = 20
-_RECORDER_HWM: Final = 20_000
 #: A client above a rate limit for longer is reported as flooding.
 FLOOD_NS: Final = 2_000_000_000
-_encode = msgspec.msgpack.Encoder().encode
-
-
-class RawFeed:
-    """Forward samples and observations to the recorder: `[connection, receive_ns, message bytes]`.
-
-    Never blocks. Without an endpoint nothing is forwarded. Messages are encoded again, not forwarded as received: so
-    the recording holds nothing that the schema does not have, however large or deep a client made it.
-    """
-
-    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, drops: Drops) -> None:
-        self._drops = drops
-        self._socket = context.socket(zmq.PUSH) if endpoint else None
-        if self._socket is not None:
-            self._socket.setsockopt(zmq.SNDHWM, _RECORDER_HWM)
-            self._socket.setsockopt(zmq.LINGER, 200)
-            self._socket.connect(endpoint)
-
-    def send(self, connection: int, receive_ns: int, message: Sample | Observation) -> None:
-        """Forward one message."""
-        if self._socket is None:
-            return
-        try:
-            self._socket.send(_encode((connection, receive_ns, _encode(message))), zmq.DONTWAIT)
-        except zmq.Again:
-            self._drops.count("recorder_queue_full", connection)
+#: Events of an edge that makes something happen and will be undone: a headset put on, a clutch closed.
+_EDGE_EVENTS: Final = 2
+#: Devices of one connection whose clutch is remembered: as many as a client may name in `hello`.
+_MAX_DEVICES: Final = 32
 
 
 class Intake:
@@ -94,12 +71,15 @@ class Intake:
         self._drops = context.drops
         self._audit = context.audit
         self._guard = context.guard
+        self._budgets = context.budgets
+        self._publisher = context.publisher
         self._now_ns = context.now_ns
         self._admission = admission
         self._pairing = pairing
         self._status = status
         self._alignment = alignment
         self._raw = raw
+        self._presence = PresenceLimiter(context.drops)
         self._unknown_peer_faults = TokenBucket(_UNKNOWN_PEER_FAULTS, _UNKNOWN_PEER_FAULTS)
         self.replaced: list[FrontConnection] = []
 
@@ -117,14 +97,14 @@ class Intake:
         if envelope.on_behalf_of:
             route = Route(routing_id, envelope.on_behalf_of)
             self._touch_gateway(Route(routing_id), peer, now_ns)
-        self._dispatch(route, peer, envelope, now_ns)
+        self._dispatch(route, peer, envelope, len(data), now_ns)
 
     def _touch_gateway(self, route: Route, peer: Peer, now_ns: int) -> None:
         gateway = self._connections.find(route, peer)
         if gateway is not None:
             gateway.last_heard_ns = now_ns
 
-    def _dispatch(self, route: Route, peer: Peer, envelope: ClientEnvelope, now_ns: int) -> None:
+    def _dispatch(self, route: Route, peer: Peer, envelope: ClientEnvelope, size: int, now_ns: int) -> None:
         message = envelope.message
         if isinstance(message, Pair):
             self._guard.touch(peer.descriptor, now_ns)
@@ -152,17 +132,29 @@ class Intake:
             self._count_rejection(peer, None, now_ns)
             self._send_fault(route, None, FaultCode.HELLO, "only a gateway speaks on behalf of others", now_ns)
         elif connection is None:
-            self._count_rejection(peer, None, now_ns)
+            # Behind a gateway, one that has not said hello must not use up what the gateway may send before hello.
+            self._count_rejection(peer, self._admission.find_gateway(route.routing_id, peer), now_ns)
             text = "this connection has not said hello: say hello (again)"
             self._send_fault(route, None, FaultCode.HELLO, text, now_ns)
         else:
-            self._handle_from_connection(connection, envelope, now_ns)
+            self._handle_from_connection(connection, envelope, size, now_ns)
 
     def _forward_late_estop(self, route: Route, peer: Peer, envelope: ClientEnvelope, now_ns: int) -> None:
         """Forward the e-stop of a client that was disconnected and does not know it yet."""
         kept = self._connections.find_kept(route, peer)
         if kept is not None:
-            self._coalescer.offer(Entry(kept.number, envelope.connection_epoch, now_ns, envelope.message))  # type: ignore[arg-type]
+            self._offer_estop(kept, envelope, now_ns)
+
+    def _offer_estop(self, connection: FrontConnection, envelope: ClientEnvelope, now_ns: int) -> bool:
+        """Offer an e-stop within the budget of its key. One above it is merged into the next one, half a second later
+        at most, and counted. Return whether it was offered."""
+        entry = Entry(connection.number, envelope.connection_epoch, now_ns, envelope.message)  # type: ignore[arg-type]
+        if connection.budget.take_estop(now_ns):
+            self._coalescer.offer(entry)
+            return True
+        self._budgets.hold_estop(connection.key_id, connection.budget, entry)
+        self._drops.count(ESTOPS_MERGED, connection.number)
+        return False
 
     def _reject_unpaired(self, route: Route, peer: Peer, message: ClientMessage, now_ns: int) -> None:
         """Reject a message other than `Pair` of a key that is not on the list."""
@@ -177,7 +169,9 @@ class Intake:
             text, advice = "this key is not on the session's list", "run `iris-session pair` there, join with its code"
             self._outbox.send_to_route(route, Refused(RefusalCode.UNPAIRED, text, advice))
 
-    def _handle_from_connection(self, connection: FrontConnection, envelope: ClientEnvelope, now_ns: int) -> None:
+    def _handle_from_connection(
+        self, connection: FrontConnection, envelope: ClientEnvelope, size: int, now_ns: int
+    ) -> None:
         message = envelope.message
         connection.last_heard_ns = now_ns
         if not connection.admitted and not isinstance(message, (GetStatus, EStop)):  # anyone may stop, however early
@@ -187,21 +181,18 @@ class Intake:
         if not connection.confirmed and envelope.connection_epoch == connection.number:
             connection.confirmed = True
             self._admission.confirm(connection)
-        kind = type(message)
-        late = connection.late_epoch
-        if late is not None and kind is not TrackingEpoch and connection.rates.allow(TrackingEpoch, now_ns):
-            connection.late_epoch = None
-            self._coalescer.offer(late)
-        if not connection.rates.allow(kind, now_ns) and kind is not EStop:
-            self._count_flood(connection, get_tag(kind), now_ns)
-            if isinstance(message, TrackingEpoch):  # the newest must get through: samples of the old frame would move
-                connection.late_epoch = Entry(connection.number, envelope.connection_epoch, now_ns, message)
-                return
-            limit = LIMITS[kind]
-            error = RateError(get_tag(kind), limit.per_second, limit.burst)
-            self._send_fault(connection.route, connection, error.code, str(error), now_ns)
-            self._send_denial(connection, message, str(error), now_ns)
+        if isinstance(message, EStop):
+            if not self._offer_estop(connection, envelope, now_ns):
+                self._count_flood(connection, get_tag(EStop), now_ns)
             return
+        kind = type(message)
+        self._offer_late_epoch(connection, kind, now_ns)
+        excess = self._find_excess(connection, message, size, now_ns)
+        if excess:
+            self._reject_excess(connection, envelope, excess, now_ns)
+            return
+        if isinstance(message, Heartbeat) and not self._take_worn(connection, message.worn, now_ns):
+            message = Heartbeat(connection.worn)  # it is alive, and as worn as before
         if isinstance(message, TrackingEpoch):
             connection.late_epoch = None
         if isinstance(message, GetStatus):
@@ -217,18 +208,90 @@ class Intake:
             self._outbox.send(connection, ClockPong(message.t0_ns, now_ns, self._now_ns()))
             return
         if isinstance(message, Sample):
-            self._raw.send(connection.number, now_ns, message)
-            self._observe_sample(connection, message, now_ns)
-        elif isinstance(message, Observation):
-            self._raw.send(connection.number, now_ns, message)
+            self._offer_sample(connection, envelope.connection_epoch, message, now_ns)
+            return
+        if isinstance(message, Observation):
+            self._raw.send(connection, now_ns, message)
             self._alignment.process_observation(connection, message, now_ns)
             if not self._config.forward_observations:
                 return
         entry = Entry(connection.number, envelope.connection_epoch, now_ns, message)  # type: ignore[arg-type]
-        if not self._coalescer.offer(entry) and not isinstance(message, Sample):
+        if not self._coalescer.offer(entry):
             text = f"{get_tag(kind)}: queue to the session full: send less"
             if not self._send_denial(connection, message, text, now_ns):
                 self._send_fault(connection.route, connection, FaultCode.RATE, text, now_ns)
+
+    def _offer_late_epoch(self, connection: FrontConnection, kind: type, now_ns: int) -> None:
+        """Offer the tracking epoch that was above a limit, unless `kind`, the message at hand, is a newer one."""
+        late = connection.late_epoch
+        if (
+            late is not None
+            and kind is not TrackingEpoch
+            and connection.rates.allow(TrackingEpoch, now_ns)
+            and not connection.budget.take_request(now_ns, 0, 1)
+        ):
+            connection.late_epoch = None
+            self._coalescer.offer(late)
+
+    def _find_excess(self, connection: FrontConnection, message: ClientMessage, size: int, now_ns: int) -> str:
+        """Return which limit of its type or of its key a message exceeds, or an empty string."""
+        kind = type(message)
+        if not connection.rates.allow(kind, now_ns):
+            limit = LIMITS[kind]
+            return str(RateError(get_tag(kind), limit.per_second, limit.burst))
+        n_messages = 1 + len(message.samples) if isinstance(message, Samples) else 1
+        reason = connection.budget.take_message(now_ns, n_messages, size)
+        if not reason and not isinstance(message, (Sample, Samples)):
+            scene = self._publisher.scene
+            units, events = weigh_request(message, len(scene.bodies)), count_events(message, len(scene.robots))
+            reason = connection.budget.take_request(now_ns, units, events)
+            if not reason and connection.hello.role == Role.OBSERVER and not isinstance(message, Observation):
+                reason = self._presence.take_request(connection, size, now_ns)
+        if not reason:
+            return ""
+        self._drops.count(reason, connection.number)
+        if reason == REQUEST_SHARE:
+            return f"the requests of the observers of this key are above {REQUEST_BYTES_PER_S} bytes a second"
+        return describe_excess(reason, self._config.limits.key)
+
+    def _reject_excess(self, connection: FrontConnection, envelope: ClientEnvelope, excess: str, now_ns: int) -> None:
+        message = envelope.message
+        self._count_flood(connection, get_tag(type(message)), now_ns)
+        if isinstance(message, TrackingEpoch):  # the newest must get through: samples of the old frame would move
+            connection.late_epoch = Entry(connection.number, envelope.connection_epoch, now_ns, message)
+            return
+        self._send_fault(connection.route, connection, FaultCode.RATE, excess, now_ns)
+        self._send_denial(connection, message, excess, now_ns)
+
+    def _take_worn(self, connection: FrontConnection, worn: bool, now_ns: int) -> bool:
+        """Return whether a headset may be worn or not as a message says. Putting it on is an event, as is taking it off
+        later, which passes always."""
+        if worn and not connection.worn and not self._take_edge(connection, now_ns):
+            return False
+        connection.worn = worn
+        return True
+
+    def _take_edge(self, connection: FrontConnection, now_ns: int) -> bool:
+        """Take an edge that makes something happen and will be undone from the budget of the key."""
+        reason = connection.budget.take_request(now_ns, 0, _EDGE_EVENTS)
+        if reason:
+            self._drops.count(reason, connection.number)
+            self._count_flood(connection, get_tag(Sample), now_ns)
+        return not reason
+
+    def _take_edges(self, connection: FrontConnection, sample: Sample, now_ns: int) -> bool:
+        """Return whether the events that a sample causes are within the budget of its key.
+
+        It causes some when the headset is put on or the clutch closes. The opposite passes always: it stops a robot.
+        """
+        if not self._take_worn(connection, sample.worn, now_ns):
+            return False
+        closes = bool(sample.targets) and sample.clutch and not connection.clutches.get(sample.device, False)
+        if closes and not self._take_edge(connection, now_ns):
+            return False
+        if sample.device in connection.clutches or len(connection.clutches) < _MAX_DEVICES:
+            connection.clutches[sample.device] = sample.clutch
+        return True
 
     def _send_denial(self, connection: FrontConnection, message: ClientMessage, text: str, now_ns: int) -> bool:
         """Deny a request that was rejected, at a bounded rate, because its client waits for a reply.
@@ -245,22 +308,29 @@ class Intake:
         """Handle each sample within the rate limit of single samples."""
         for sample in samples.samples:
             if connection.rates.allow(Sample, now_ns):
-                self._raw.send(connection.number, now_ns, sample)
-                self._observe_sample(connection, sample, now_ns)
-                self._coalescer.offer(Entry(connection.number, epoch, now_ns, sample))
+                self._offer_sample(connection, epoch, sample, now_ns)
             else:
                 self._drops.count(FaultCode.RATE, connection.number)
                 self._count_flood(connection, "sample", now_ns)
 
-    def _observe_sample(self, connection: FrontConnection, sample: Sample, now_ns: int) -> None:
-        """Pass every sample on to status and alignment, before samples are coalesced."""
+    def _offer_sample(self, connection: FrontConnection, epoch: int, sample: Sample, now_ns: int) -> None:
+        """Offer a sample to the authority and the recorder; status and alignment get it before it is limited."""
         self._status.record_sample(connection.number, sample, now_ns)
         self._alignment.process_sample(connection, sample, now_ns)
+        if not self._take_edges(connection, sample, now_ns):
+            return
+        if connection.hello.role == Role.OBSERVER:
+            presence = self._presence.limit(connection, sample, now_ns)
+            if presence is None:
+                return
+            sample = presence
+        self._raw.send(connection, now_ns, sample)
+        self._coalescer.offer(Entry(connection.number, epoch, now_ns, sample))
 
     def _count_rejection(
         self, peer: Peer, connection: FrontConnection | None, now_ns: int, detail: str = BEFORE_HELLO
     ) -> None:
-        """Count a rejected message. Too many of them close the TCP connection."""
+        """Count a rejected message. Too many of them end the connection, and close its TCP connection."""
         if self._guard.rate_limit(peer, connection, detail, now_ns) and connection is not None:
             self._outbox.failed.setdefault(connection.number, "flood")
 

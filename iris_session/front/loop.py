@@ -8,24 +8,29 @@ from __future__ import annotations
 
 import gc
 import time
+from functools import partial
 from typing import Final
 
 import zmq
 
 from iris_session.alignment.service import AlignmentService
+from iris_session.alignment.worker import ThreadWorker
 from iris_session.front.admission import Admission
 from iris_session.front.asset_server import REQUEST_BYTES, AssetServer
 from iris_session.front.asset_service import AssetService
-from iris_session.front.connection_guard import ChannelGuard, MemoryGuard
+from iris_session.front.connection_guard import ChannelBounds, ChannelGuard
 from iris_session.front.connections import Peer
-from iris_session.front.context import FrontContext, FrontSockets, Service, open_front
+from iris_session.front.context import FrontContext, FrontSockets, Service, find_channel_share, open_front
 from iris_session.front.disconnects import DisconnectHandler
 from iris_session.front.discovery import SessionFacts, SessionRegistration, make_discovery_services
 from iris_session.front.downlink import Downlink
-from iris_session.front.intake import Intake, RawFeed
+from iris_session.front.intake import Intake
+from iris_session.front.key_budgets import HandshakeLimiter
 from iris_session.front.media.proxy import MediaProxy
 from iris_session.front.media.service import MediaService
+from iris_session.front.memory_guard import MemoryGuard
 from iris_session.front.pairing import PairingService
+from iris_session.front.raw_feed import RawFeed
 from iris_session.front.revocation import RevocationService
 from iris_session.front.status import StatusService
 from iris_session.front.uplink import Uplink
@@ -71,7 +76,8 @@ class Front:
         self._link, self._control = sockets.link, sockets.control.socket
         proxy = _make_media_proxy(context, sockets)
         media = MediaService(context, proxy)
-        assets = AssetService(context, _make_asset_server(context, sockets))
+        asset_server = _make_asset_server(context, sockets)
+        assets = AssetService(context, asset_server)
         alignment = _make_alignment_service(context)
         status = StatusService(context, media, assets, alignment)
         admission = Admission(context, (media, assets))
@@ -85,14 +91,23 @@ class Front:
         self._authenticator = sockets.authenticator
         if self._authenticator is not None:
             self._authenticator.is_revoked = context.tokens.is_revoked
+            handshakes = HandshakeLimiter(
+                context.config.limits.key, context.drops, context.keyring.may_be_gateway, context.guard.is_banned
+            )
+            self._authenticator.is_rate_limited = lambda domain, mark: (
+                not handshakes.allow(domain, mark, context.now_ns())
+            )
         memory = MemoryGuard(
             context.config.limits.memory_bytes,
-            lambda: context.guard.evict_for_memory(proxy.release_memory),
+            (context.guard.list_pending, proxy.list_pending, asset_server.list_pending),
+            proxy.release_memory,
             self._report_eviction,
+            context.drops,
         )
         #: In the order of their ticks.
-        self._services: list[Service] = [context.keyring, status, media, context.guard, memory, pairing, revocation]
-        self._services += [context.audit, assets, *self._make_announcements(pairing), alignment]
+        self._services: list[Service] = [context.keyring, status, media, context.guard, context.budgets, memory]
+        self._services += [pairing, revocation]
+        self._services += [context.audit, assets, *self._make_announcements(pairing), alignment, raw]
         self._next_services_ns = self._next_collect_ns = 0
 
     def _make_announcements(self, pairing: PairingService) -> list[Service]:
@@ -234,15 +249,19 @@ def _make_alignment_service(context: FrontContext) -> AlignmentService:
         anchor_sizes=config.anchor_sizes,
         proposal_period_ns=config.proposal_period_ns,
         max_connections=config.limits.connections,
+        worker=ThreadWorker(),
     )
 
 
 def _make_media_proxy(context: FrontContext, sockets: FrontSockets) -> MediaProxy:
     limits, curve = context.config.limits, context.keyring.key is not None
+    share = partial(find_channel_share, context.keyring, limits)
+    viewers = ChannelBounds(limits.subscribers, SUBSCRIBER_BYTES, find_share=share)
+    sources = ChannelBounds(limits.sources, limits.source_bytes, limits.source_bytes, limits.ingest_bytes, share)
     return MediaProxy(
         sockets.media.socket,
-        ChannelGuard(sockets.media.monitor, limits, limits.subscribers, SUBSCRIBER_BYTES, curve=curve),
-        ChannelGuard(sockets.ingest.monitor, limits, limits.sources, limits.source_bytes, curve=curve),
+        ChannelGuard(sockets.media.monitor, limits, viewers, curve=curve),
+        ChannelGuard(sockets.ingest.monitor, limits, sources, curve=curve),
         sockets.local_ingest,
         sockets.ingest.socket,
         context.now_ns,
@@ -252,5 +271,7 @@ def _make_media_proxy(context: FrontContext, sockets: FrontSockets) -> MediaProx
 
 def _make_asset_server(context: FrontContext, sockets: FrontSockets) -> AssetServer:
     limits, curve, monitor = context.config.limits, context.keyring.key is not None, sockets.assets.monitor
-    guard = ChannelGuard(monitor, limits, limits.subscribers, REQUEST_BYTES, curve=curve, name="assets")
+    share = partial(find_channel_share, context.keyring, limits)
+    bounds = ChannelBounds(limits.subscribers, REQUEST_BYTES, find_share=share)
+    guard = ChannelGuard(monitor, limits, bounds, curve=curve, name="assets")
     return AssetServer(sockets.assets, guard, context.now_ns)

@@ -3,26 +3,38 @@
 from __future__ import annotations
 
 import gc
+import logging
 import shutil
 import signal
 import sys
 from pathlib import Path
 from types import FrameType
+from typing import Final
 
 import msgspec
 
 from iris_session.front.loop import ENDED, ORPHANED, Front
 from iris_session.link.config import FrontError, FrontStart
-from iris_session.link.sockets import raise_descriptor_limit
+from iris_session.link.sockets import fit_limits, raise_descriptor_limit
 from iris_session.system.log import configure_logging
 from iris_session.system.process import die_with_parent, is_parent, wait_for_parent_exit
+
+log = logging.getLogger(__name__)
+
+#: Longest time for which another thread (assets, estimates) keeps the loop from running, without more to wait for.
+SWITCH_S: Final = 0.0005
 
 
 def main() -> int:
     """Serve one session. The exit status is 1 if the front cannot start; the authority was notified over the link."""
     configure_logging()
     start = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=FrontStart)
-    raise_descriptor_limit()
+    limits = fit_limits(start.config.limits, raise_descriptor_limit())
+    if limits is not start.config.limits:
+        text = "few file descriptors (ulimit -n): at most %d subscribers, and %d connections that have said nothing"
+        log.warning(text, limits.subscribers, limits.strangers)
+        start = msgspec.structs.replace(start, config=msgspec.structs.replace(start.config, limits=limits))
+    sys.setswitchinterval(SWITCH_S)
     try:
         front = Front(start)
     except FrontError:

@@ -38,8 +38,6 @@ ADDRESS_BURST: Final = 12
 #: How long an attempt may be pending, and how many may: a client waits 5 s for the answer.
 PATIENCE_NS: Final = 2 * SECOND
 MAX_PENDING: Final = 32
-#: Recent pairings whose answer is sent again when it is requested again.
-MAX_RECENTLY_PAIRED: Final = 32
 #: Wrong codes of one address within `WINDOW_NS`: as many as two codes have.
 ADDRESS_ATTEMPTS: Final = 10
 WINDOW_NS: Final = 600 * SECOND
@@ -71,7 +69,6 @@ class PairingService:
         self._refusals = TokenBucket(PER_SECOND, BURST)
         self._pending: deque[_PendingAttempt] = deque()
         self._trying = False
-        self._recently_paired: dict[str, tuple[bytes, Paired]] = {}  # proof and answer by fingerprint
         self._rates: dict[str, TokenBucket] = {}
         self._wrong: dict[str, tuple[int, int]] = {}  # network -> wrong attempts, since when [ns]
         self._signature: object = None
@@ -81,20 +78,24 @@ class PairingService:
     @property
     def has_open_code(self) -> bool:
         """True if a join code can be used now."""
+        now_s = time.time()
+        return any(code.is_open(now_s) for code in self._list_codes())
+
+    def _list_codes(self) -> tuple[JoinCode, ...]:
+        """Return the codes of this session, read again if their file has changed."""
         home, key = self._keyring.home, self._keyring.key
         if home is None or key is None:
-            return False
+            return ()
         signature = home.join_codes.signature
         if signature != self._signature or (self._read_error and time.monotonic() >= self._retry_s):
             self._signature = signature
             self._read_codes(home, key)
-        now_s = time.time()
-        return any(code.is_open(now_s) for code in self._codes)
+        return self._codes
 
     def _read_codes(self, home: KeyHome, key: KeyPair) -> None:
         """Read the join codes. Codes that cannot be read are tried again a second later, and logged once."""
         try:
-            self._codes, read_error = home.join_codes.list_open(key.fingerprint), ""
+            self._codes, read_error = home.join_codes.list_for_server(key.fingerprint), ""
         except KeysError as error:
             self._codes, read_error = (), str(error)
             self._retry_s = time.monotonic() + RETRY_S
@@ -142,25 +143,29 @@ class PairingService:
     def _find_earlier_answer(self, key: str, pair: Pair) -> Paired | None:
         """Return the answer to an attempt that succeeded and is repeated, because the first answer was lost or late.
 
-        `None` for another attempt, and for a key that has been allowed off the list since.
+        The file of codes keeps it, so a front that was restarted since gives the same answer. `None` for another
+        attempt, and for a key that has been taken off the list since.
         """
-        mark = compute_fingerprint(decode_key(key))
-        proof, answer = self._recently_paired.get(mark, (b"", None))
-        return answer if pairing.is_same_proof(proof, pair.proof) and self._keyring.find_key(mark) is not None else None
+        entry = self._keyring.find_key(compute_fingerprint(decode_key(key)))
+        for code in self._list_codes() if entry is not None else ():
+            paired = code.paired is not None and code.paired.key == key
+            if entry is not None and paired and pairing.is_same_proof(code.proof, pair.proof):
+                return Paired(code.answer, entry.roles)
+        return None
 
     def tick(self, now_ns: int) -> None:
         """Start the next attempt when the one before is done."""
         pending, self._pending = self._pending, deque()
         for one in pending:
             self._recheck_pending(one, now_ns)
-        if self._trying or not self._pending:
+        if self._trying or not self._pending or self._keyring.is_missing:  # a new list would have no other key
             return
         home, key = self._keyring.home, self._keyring.key
         assert home is not None
         assert key is not None
         first = self._pending[0]
         self._trying = self._keyring.files.submit(
-            partial(_run_attempt, home, key, first), partial(self._on_attempt_done, first, key)
+            partial(_run_attempt, home, key, first), partial(self._on_attempt_done, first)
         )
         if self._trying:
             self._pending.popleft()
@@ -173,15 +178,15 @@ class PairingService:
             self._refuse(one.route, REVOKED, "ask for another join code")
         elif self._has_exhausted_attempts(one.address, now_ns):
             self._refuse(one.route, TOO_MANY_WRONG, "wait ten minutes")
+        elif (earlier := self._find_earlier_answer(one.key, one.pair)) is not None:
+            self._outbox.send_to_route(one.route, earlier)  # another process of this user has paired meanwhile
         else:
             self._pending.append(one)
 
-    def _on_attempt_done(
-        self, pending: _PendingAttempt, key: KeyPair, outcome: RedeemResult | KeysError, now_ns: int
-    ) -> None:
+    def _on_attempt_done(self, pending: _PendingAttempt, outcome: RedeemResult | KeysError, now_ns: int) -> None:
         self._trying = False
         if isinstance(outcome, RedeemResult):
-            self._answer(pending, outcome, key, now_ns)
+            self._answer(pending, outcome, now_ns)
         elif isinstance(outcome, KeysBusyError):
             self._refuse_busy(pending.route)
         else:
@@ -192,9 +197,8 @@ class PairingService:
     def close(self) -> None:
         """Do nothing: nothing was opened."""
 
-    def _answer(self, pending: _PendingAttempt, attempt: RedeemResult, key: KeyPair, now_ns: int) -> None:
-        client = decode_key(pending.key)
-        mark = compute_fingerprint(client)
+    def _answer(self, pending: _PendingAttempt, attempt: RedeemResult, now_ns: int) -> None:
+        mark = compute_fingerprint(decode_key(pending.key))
         entry = attempt.entry
         if entry is not None:
             self._wrong.pop(_network_prefix(pending.address), None)
@@ -206,12 +210,7 @@ class PairingService:
             self._audit.record(
                 AuditKind.PAIRED, now_ns, subject=mark, name=entry.name, address=pending.address, detail=roles
             )
-            paired = Paired(pairing.make_server_proof(attempt.secret, key.raw_public, client), entry.roles)
-            self._recently_paired.pop(mark, None)
-            while len(self._recently_paired) >= MAX_RECENTLY_PAIRED:
-                del self._recently_paired[next(iter(self._recently_paired))]
-            self._recently_paired[mark] = pending.pair.proof, paired
-            self._outbox.send_to_route(pending.route, paired)
+            self._outbox.send_to_route(pending.route, Paired(attempt.answer, entry.roles))
             return
         self._count_wrong(pending.address, now_ns)
         kind = AuditKind.CODE_EXHAUSTED if attempt.exhausted else AuditKind.CODE_REFUSED

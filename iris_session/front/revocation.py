@@ -165,7 +165,7 @@ class RevocationService:
             keyring.pending_revocations.clear()
             return
         due = bool(keyring.last_seen) and now_ns >= self._next_seen_ns
-        if self._writing or not (keyring.pending_revocations or due):
+        if self._writing or not (keyring.pending_revocations or due) or keyring.is_missing:
             return
         marks, seen = tuple(keyring.pending_revocations), keyring.last_seen if due else {}
         job = partial(_change_allow_list, keyring.home.clients, marks, seen)

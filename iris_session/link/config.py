@@ -11,6 +11,7 @@ from typing import Final
 import msgspec
 
 from iris_session.protocol.common import Pose
+from iris_session.protocol.limits import KeyLimits
 from iris_session.protocol.server_messages import BodyInfo, RobotInfo
 
 MILLISECOND: Final = 1_000_000
@@ -42,8 +43,11 @@ class FrontLimits(msgspec.Struct, frozen=True):
         subscribers: TCP connections to the state socket that have subscribed; also connections to the media socket, and
             to the assets socket.
         sources: TCP connections to the media ingest socket.
-        source_bytes: Bytes queued for each of them.
+        source_bytes: Unread bytes of all media ingest connections of one key, or of one address before a connection
+            has handed in its first frame.
+        ingest_bytes: Unread bytes of all media ingest connections together.
         memory_bytes: Bytes of all queues together (see `MemoryGuard`).
+        key: What one key may send and cause, over all its connections.
     """
 
     connections: int = 64
@@ -68,7 +72,9 @@ class FrontLimits(msgspec.Struct, frozen=True):
     subscribers: int = 512
     sources: int = 64
     source_bytes: int = 64 * MEBIBYTE
+    ingest_bytes: int = 128 * MEBIBYTE
     memory_bytes: int = 256 * MEBIBYTE
+    key: KeyLimits = KeyLimits()
 
 
 class SceneInfo(msgspec.Struct, frozen=True):

@@ -9,20 +9,23 @@ import struct
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
+import msgspec
 import zmq
 from zmq.utils.monitor import parse_monitor_message
 
-from iris_session.link.config import FrontConfig, FrontError, PortInUseError
+from iris_session.link.config import FrontConfig, FrontError, FrontLimits, PortInUseError
 from iris_session.protocol.assets import MAX_ASSET_REQUESTS
 from iris_session.protocol.limits import MAX_CLIENT_BYTES, MAX_MEDIA_FRAME_BYTES
 from iris_session.security import KeyPair
-from iris_session.security.zap import ZAP_ASSETS, ZAP_CONTROL, ZAP_MEDIA, ZAP_STATE
+from iris_session.security.zap import ZAP_ASSETS, ZAP_CONTROL, ZAP_INGEST, ZAP_MEDIA, ZAP_STATE
 
 #: State sockets: two frames are queued for a slow client; then libzmq drops the newest, not the oldest.
 STATE_HWM = 2
 STATE_BUFFER_BYTES = 32_768
-#: Fits a subscription. The handshake of CURVE has messages of up to 600 bytes.
+#: Fits a subscription. The handshake of CURVE has messages of up to 600 bytes. Larger ones, which libzmq would keep as
+#: topics, close the connection before they come to the front.
 STATE_MESSAGE_BYTES = 1024
+PLAIN_STATE_MESSAGE_BYTES = 128
 STATE_RECEIVE_BYTES = 8192
 CONTROL_BUFFER_BYTES = 131_072
 #: Media: frames may be large, so few are queued. With a full queue the send fails, and the front sends the newest frame
@@ -48,8 +51,14 @@ _COUNTS_AT: Final = 120
 #: The kernel closes the connection of a peer that acknowledges no queued data for so long, because it vanished or
 #: sleeps. Else the connection and its queue would stay for a quarter of an hour, or for ever.
 STUCK_MS: Final = 30_000
-#: Open connections that send nothing use a file descriptor each, too.
-FILE_DESCRIPTORS = 4096
+#: Open connections that send nothing use a file descriptor each, too: enough for all limits of the front.
+FILE_DESCRIPTORS: Final = 8192
+#: Descriptors for everything but connections: listeners, files, assets that are being sent.
+RESERVED_DESCRIPTORS: Final = 256
+#: Channels whose connections count as strangers before they have said or subscribed anything: control, state, media,
+#: media ingest, assets.
+_CHANNELS: Final = 5
+_WITH_SUBSCRIBERS: Final = 3  # state, media, assets
 
 
 def open_control(
@@ -74,7 +83,7 @@ def open_state(context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, key
     state.setsockopt(zmq.SNDHWM, STATE_HWM)
     state.setsockopt(zmq.SNDBUF, STATE_BUFFER_BYTES)
     # Subscriptions only. libzmq reads all queued ones before it sends, in this thread: so few and small ones.
-    state.setsockopt(zmq.MAXMSGSIZE, STATE_MESSAGE_BYTES)
+    state.setsockopt(zmq.MAXMSGSIZE, STATE_MESSAGE_BYTES if key is not None else PLAIN_STATE_MESSAGE_BYTES)
     state.setsockopt(zmq.RCVHWM, STATE_HWM)
     state.setsockopt(zmq.RCVBUF, STATE_RECEIVE_BYTES)
     _bind(state, config, key, config.state_port, "state")
@@ -88,7 +97,7 @@ def open_media(context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, key
     media.setsockopt(zmq.XPUB_NODROP, 1)
     media.setsockopt(zmq.SNDHWM, MEDIA_HWM)
     media.setsockopt(zmq.SNDBUF, MEDIA_BUFFER_BYTES)
-    media.setsockopt(zmq.MAXMSGSIZE, STATE_MESSAGE_BYTES)
+    media.setsockopt(zmq.MAXMSGSIZE, STATE_MESSAGE_BYTES if key is not None else PLAIN_STATE_MESSAGE_BYTES)
     media.setsockopt(zmq.RCVBUF, STATE_RECEIVE_BYTES)
     _bind_or_any(media, config, key, config.media_port, "media")
     return media
@@ -221,12 +230,35 @@ def tcp_counts(descriptor: int) -> TcpCounts | None:
     return TcpCounts(*struct.unpack_from("=QQ", info, _COUNTS_AT)) if len(info) >= _COUNTS_AT + 16 else None
 
 
-def raise_descriptor_limit() -> None:
-    """Raise the limit of open files from the usual 1024 to `FILE_DESCRIPTORS`, as far as the system allows."""
+def raise_descriptor_limit() -> int:
+    """Raise the limit of open files from the usual 1024 to `FILE_DESCRIPTORS`, as far as the system allows.
+
+    Returns the limit in force.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = FILE_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(FILE_DESCRIPTORS, hard)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+        soft = wanted
+    return FILE_DESCRIPTORS if soft == resource.RLIM_INFINITY else soft
+
+
+def fit_limits(limits: FrontLimits, descriptors: int) -> FrontLimits:
+    """Return limits whose connections together fit into a number of file descriptors.
+
+    Participants keep their places; what has less room are connections that have said nothing, subscribers and sources.
+    """
+    wanted = _CHANNELS * limits.strangers + _WITH_SUBSCRIBERS * limits.subscribers + limits.sources
+    room = descriptors - RESERVED_DESCRIPTORS - limits.connections
+    if wanted <= room:
+        return limits
+    share = max(0.0, room / wanted)
+    return msgspec.structs.replace(
+        limits,
+        strangers=max(8, int(share * limits.strangers)),
+        subscribers=max(8, int(share * limits.subscribers)),
+        sources=max(2, int(share * limits.sources)),
+    )
 
 
 def _bind_or_any(bound: zmq.Socket[bytes], config: FrontConfig, key: KeyPair | None, port: int, name: str) -> None:
@@ -258,7 +290,7 @@ def _prepare(bound: zmq.Socket[bytes], key: KeyPair | None, name: str) -> None:
     bound.setsockopt(zmq.HANDSHAKE_IVL, 5000)
     bound.setsockopt(zmq.BACKLOG, 512)
     if key is not None:
-        domains = {"control": ZAP_CONTROL, "state": ZAP_STATE, "assets": ZAP_ASSETS}
+        domains = {"control": ZAP_CONTROL, "state": ZAP_STATE, "assets": ZAP_ASSETS, "media ingest": ZAP_INGEST}
         bound.setsockopt(zmq.ZAP_DOMAIN, domains.get(name, ZAP_MEDIA))
         bound.setsockopt(zmq.CURVE_SERVER, 1)
         bound.setsockopt(zmq.CURVE_PUBLICKEY, key.public.encode())

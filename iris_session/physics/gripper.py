@@ -152,5 +152,5 @@ def describe_problem(tree: KinematicTree, gripper: GripperActuation) -> str:
     if gripper.range is None:
         return f"gripper actuator {names[0]!r} has no ctrlrange"
     if gripper.open is None:
-        return f"it cannot be told which end of gripper actuator {names[0]!r} is open"
+        return f"the open end of gripper actuator {names[0]!r} is unknown"
     return ""

@@ -122,7 +122,8 @@ class World:
         data = mujoco.MjData(self.model)
         self._reset_data(data)
         if state:
-            mujoco.mj_setState(self.model, data, np.frombuffer(state, np.float64), STATE)
+            # A copy: MuJoCo 3.3 refuses arrays that are read-only.
+            mujoco.mj_setState(self.model, data, np.frombuffer(state, np.float64).copy(), STATE)
         mujoco.mj_fwdPosition(self.model, data)
         return data
 

@@ -119,6 +119,15 @@ class Release(Message, frozen=True, tag="release"):
     targets: Targets = ()
 
 
+class Withdraw(Message, frozen=True, tag="withdraw"):
+    """Take back the `acquire` with this request id. It is denied (`withdrawn`, with its place in the queue and the
+    holder); if it was granted before, what it has granted is released.
+    """
+
+    request_id: Count
+    acquire_request_id: Count
+
+
 class Consent(Message, frozen=True, tag="consent"):
     """Answer of a holder or director to a `ConsentRequested` event (mode `request`)."""
 
@@ -238,14 +247,17 @@ class EStop(Message, frozen=True, tag="estop"):
 
 
 class ClearEStop(Message, frozen=True, tag="clear_estop"):
-    """End the e-stop. Directors only."""
+    """End the e-stop. Directors only. `stop_seq`: the newest stop that the sender has seen (`EStopChanged`); denied
+    when there is a newer one.
+    """
 
     request_id: Count
+    stop_seq: Count = 0
 
 
 class Control(Message, frozen=True, tag="control"):
     """Control the session, `ControlAction`: pause, resume, step (`ticks` physics ticks while paused), reset. Directors
-    only.
+    only. When physics has diverged, both reset and resume begin anew from the initial state.
     """
 
     request_id: Count
@@ -291,6 +303,7 @@ ClientMessage = (
     | Samples
     | Acquire
     | Release
+    | Withdraw
     | Consent
     | Assign
     | SetMode

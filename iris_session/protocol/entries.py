@@ -33,6 +33,7 @@ from iris_session.protocol.client_messages import (
     SetMode,
     SetScale,
     TrackingEpoch,
+    Withdraw,
 )
 from iris_session.protocol.codec import make_decoder
 from iris_session.protocol.common import Count, Message, Name, Names, Nanoseconds, Pose, Text, Vec3
@@ -126,6 +127,15 @@ class StalledGap(Message, frozen=True, tag="stalled_gap"):
     duration_ns: Nanoseconds
 
 
+class PhysicsDiverged(Message, frozen=True, tag="physics_diverged"):
+    """Physics of this scene epoch has numbers that are not finite and stands still until a reset (host only). `text`:
+    the reason, for people.
+    """
+
+    scene_epoch: Count
+    text: Text = ""
+
+
 class FrontRestarted(Message, frozen=True, tag="front_restarted"):
     """The front process was replaced (host only): every connection is closed."""
 
@@ -177,6 +187,10 @@ class ScenePatched(Message, frozen=True, tag="scene_patched"):
     scene_hash: Name
 
 
+class OwnerListens(Message, frozen=True, tag="owner_listens"):
+    """The owner's loop takes requests of directors from here on: to reset, to record an episode again (host only)."""
+
+
 EntryMessage = (
     Join
     | Lost
@@ -186,6 +200,7 @@ EntryMessage = (
     | Sample
     | Acquire
     | Release
+    | Withdraw
     | Consent
     | Assign
     | SetMode
@@ -206,6 +221,7 @@ EntryMessage = (
     | Marker
     | ExternalReset
     | StalledGap
+    | PhysicsDiverged
     | FrontRestarted
     | RecordingGap
     | RemoveParticipant
@@ -213,6 +229,7 @@ EntryMessage = (
     | SessionResumed
     | SceneLoaded
     | ScenePatched
+    | OwnerListens
 )
 
 

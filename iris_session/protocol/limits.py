@@ -1,8 +1,9 @@
 """Size and rate limits of every message, the token bucket that applies rates, and the counters of dropped messages.
 
 `codec` checks sizes when it decodes. Rates are per connection and message type; the front applies them with a
-`RateLimiter` and counts drops in `Drops`. A limit is generous for an honest client: it bounds memory and work, not use.
-Pure: time is an argument, in nanoseconds.
+`RateLimiter` and counts drops in `Drops`. What one key may send and cause over all its connections is in `KeyLimits`;
+`weigh_request` and `count_events` state what a message costs. A limit is generous for an honest client: it bounds
+memory and work, not use. Pure: time is an argument, in nanoseconds.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ from iris_session.protocol.client_messages import (
     SetMode,
     SetScale,
     TrackingEpoch,
+    Withdraw,
 )
 from iris_session.protocol.common import Message
 from iris_session.protocol.server_messages import (
@@ -82,6 +84,7 @@ LIMITS: Final[Mapping[type[Message], Limit]] = MappingProxyType(
         Samples: Limit(48_000, 200, 100),
         Acquire: _REQUEST,
         Release: _REQUEST,
+        Withdraw: Limit(512, 20, 40),
         Consent: _REQUEST,
         Assign: _REQUEST,
         SetMode: _REQUEST,
@@ -137,6 +140,96 @@ MAX_BEACON_BYTES: Final = 1_400
 MAX_INTRODUCTION_BYTES: Final = 4_000
 
 
+class KeyLimits(msgspec.Struct, frozen=True):
+    """Budgets of one key, over all its connections: each allows a burst at once and a rate per second on average.
+
+    A key that may be a gateway has `gateway_factor` times as much, and each participant behind it the budgets of a key
+    of its own besides.
+
+    Attributes:
+        connections: Connections to the control channel at most; twice as many to each other channel.
+        messages, message_burst: Messages; each sample of `Samples` is one.
+        bytes, byte_burst: Bytes of these messages.
+        requests, request_burst: Work that requests cause, as stated by `weigh_request`.
+        events, event_burst: Events that messages may cause, as stated by `count_events`: everyone gets each of them.
+        handshakes, handshake_burst: TCP connections that finish a handshake, for each channel.
+        estops, estop_burst: E-stops that reach the authority; those above are merged into the next one.
+        gateway_factor: Share of a gateway's key in everything but connections.
+    """
+
+    connections: int = 8
+    messages: float = 2400.0
+    message_burst: int = 2400
+    bytes: float = 4.0 * 1024 * 1024
+    byte_burst: int = 8 * 1024 * 1024
+    requests: float = 200.0
+    request_burst: int = 800
+    events: float = 20.0
+    event_burst: int = 80
+    handshakes: float = 4.0
+    handshake_burst: int = 24
+    estops: float = 2.0
+    estop_burst: int = 4
+    gateway_factor: int = 8
+
+
+#: Units of work of a request: a status report and a hello cost several times as much as another request, a snapshot
+#: grows with the scene (`BODIES_PER_UNIT`).
+_REQUEST_UNITS: Final[Mapping[type[Message], int]] = MappingProxyType(
+    {Hello: 20, GetSnapshot: 20, GetStatus: 10, Observation: 2, Heartbeat: 0, ClockPing: 0, ClientReport: 1}
+)
+_UNITS: Final = 5
+BODIES_PER_UNIT: Final = 50
+#: Half of the burst, so that a scene of any size can be joined.
+_MAX_UNITS: Final = 400
+#: Events of a message that causes more than one, those of its end included: a participant joins and leaves, a lease is
+#: acquired and released. So nothing that ends something is ever above the budget of its key.
+_EVENTS: Final[Mapping[type[Message], int]] = MappingProxyType(
+    {Hello: 4, Acquire: 2, Grasp: 2, Align: 2, Consent: 2, Episode: 2}
+)
+#: Messages that cause no further event. `Heartbeat` and samples do at the edges that `front.intake` looks for.
+_WITHOUT_EVENT: Final = (
+    Bye,
+    Release,
+    Heartbeat,
+    ClockPing,
+    GetSnapshot,
+    GetStatus,
+    ClientReport,
+    Sample,
+    Samples,
+    Observation,
+)
+#: An event that carries several leases counts as one more for every two of them.
+_LEASES_PER_EVENT: Final = 2
+
+
+def weigh_request(message: Message, n_bodies: int = 0) -> int:
+    """Return the units of work that a message causes. `n_bodies`: of the scene, listed in every snapshot."""
+    if isinstance(message, (Sample, Samples, EStop)):
+        return 0
+    units = _REQUEST_UNITS.get(type(message), _UNITS)
+    if isinstance(message, GetSnapshot):
+        units += n_bodies // BODIES_PER_UNIT
+    return min(units, _MAX_UNITS)
+
+
+def count_events(message: Message, n_robots: int = 0) -> int:
+    """Return the number of events that a message may cause, those of the release after an `Acquire` included.
+
+    `n_robots`: of the scene; a request for any of them may wait for all.
+    """
+    if isinstance(message, _WITHOUT_EVENT):
+        return 0
+    n = _EVENTS.get(type(message), 1)
+    if isinstance(message, Acquire):
+        named = len(message.robots) + len(message.objects)
+        n += (named or (n_robots if message.wait else 1)) // _LEASES_PER_EVENT
+    elif isinstance(message, Assign):
+        n += len(message.robots) // _LEASES_PER_EVENT
+    return n
+
+
 class TokenBucket:
     """A token bucket: allows `burst` at once and `rate` per second on average.
 
@@ -151,14 +244,14 @@ class TokenBucket:
         self._tokens = self._full
         self._last_ns = now_ns
 
-    def take(self, now_ns: int) -> bool:
-        """Use one token; return false when there is none. A time before the last one adds nothing."""
+    def take(self, now_ns: int, n: int = 1) -> bool:
+        """Use `n` tokens; return false, and use none, when there are fewer. A time before the last one adds nothing."""
         if now_ns > self._last_ns:
             self._tokens = min(self._full, self._tokens + int((now_ns - self._last_ns) * self._rate))
             self._last_ns = now_ns
-        if self._tokens < _TOKEN:
+        if self._tokens < n * _TOKEN:
             return False
-        self._tokens -= _TOKEN
+        self._tokens -= n * _TOKEN
         return True
 
 

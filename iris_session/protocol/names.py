@@ -224,6 +224,7 @@ class DenialReason:
     USER_OWNED: Final = "user_owned"  # e.g. pause or reset of a loop that the user drives
     POLICY: Final = "policy"  # the assignment policy leaves this to the configuration or a director
     INVALID: Final = "invalid"  # values out of range (non-finite pose, n_ticks < 1, ...)
+    WITHDRAWN: Final = "withdrawn"  # the sender took the request back
     TOO_FAR: Final = "too_far"  # more often a wrong number than intended: confirm with `force`
 
 

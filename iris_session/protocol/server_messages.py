@@ -6,6 +6,8 @@ and `Presence`, of which only the latest counts. World frame: right-handed, Z up
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import msgspec
 
 from iris_session.protocol.common import (
@@ -179,6 +181,26 @@ class LeaseChanged(EventBody, frozen=True, tag="lease_changed"):
     previous_holder: Name = ""
 
 
+#: Leases of one `LeasesChanged`: as many as one request can name.
+MAX_LEASES = 64
+
+
+class LeasesChanged(EventBody, frozen=True, tag="leases_changed"):
+    """Several leases changed in one step for the same `cause`, as `LeaseChanged` for each, in this order.
+
+    `previous_holders` has the length of `leases`.
+    """
+
+    leases: Annotated[tuple[Lease, ...], msgspec.Meta(max_length=MAX_LEASES)]
+    cause: Name
+    previous_holders: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MAX_LEASES)]
+
+    def to_single_changes(self) -> tuple[LeaseChanged, ...]:
+        """Return the same as one `LeaseChanged` per lease."""
+        pairs = zip(self.leases, self.previous_holders, strict=True)
+        return tuple(LeaseChanged(lease, self.cause, previous) for lease, previous in pairs)
+
+
 class ConsentRequested(EventBody, frozen=True, tag="consent_requested"):
     """`requester` asks `holder` for a robot (mode `request`); answered by `Consent` with this `consent_id`."""
 
@@ -284,18 +306,26 @@ class SceneChanged(EventBody, frozen=True, tag="scene_changed"):
 
 
 class EStopChanged(EventBody, frozen=True, tag="estop_changed"):
-    """The e-stop was latched (`active`) or cleared by `participant`."""
+    """The session was stopped (`active`), also when it was stopped already, or the e-stop was cleared by `participant`.
+
+    `stop_seq` counts the stops from 1; of a clear: the newest stop that it ended. `participant`: empty for a stop of a
+    connection that has not joined.
+    """
 
     active: bool
     participant: Name
     reason: Text = ""
+    stop_seq: Count = 0
 
 
 class PauseChanged(EventBody, frozen=True, tag="pause_changed"):
-    """The session was paused or resumed by `participant`."""
+    """The session was paused or resumed by `participant`. `reason`: of a pause that only a reset ends (physics that
+    diverged).
+    """
 
     paused: bool
     participant: Name = ""
+    reason: Text = ""
 
 
 class EpisodeChanged(EventBody, frozen=True, tag="episode_changed"):
@@ -381,6 +411,7 @@ EventKind = (
     | ParticipantChanged
     | ParticipantLeft
     | LeaseChanged
+    | LeasesChanged
     | ConsentRequested
     | Intervention
     | EngagementChanged
@@ -417,8 +448,9 @@ class Snapshot(Message, frozen=True, tag="snapshot"):
     """Everything a late joiner needs; events with `event_seq` at or below its own are to be discarded.
 
     In the step of a reset `tick` and `sim_time` are still those before it. `tick_period_ns`: of this scene; 0: that of
-    `Welcome`. Bulk frame 1 (added by the front): float64 (n_bodies, 7) world poses `x y z qw qx qy qz` of `bodies` at
-    `state_seq`.
+    `Welcome`. `stop_seq`: of the newest stop (`EStopChanged`). `consent_timeout_ns`: time that a holder has to answer
+    `ConsentRequested`. Bulk frame 1 (added by the front): float64 (n_bodies, 7) world poses `x y z qw qx qy qz` of
+    `bodies` at `state_seq`.
     """
 
     request_id: Count
@@ -438,6 +470,8 @@ class Snapshot(Message, frozen=True, tag="snapshot"):
     episode: EpisodeChanged | None = None
     state_seq: Count = 0
     tick_period_ns: Nanoseconds = 0
+    stop_seq: Count = 0
+    consent_timeout_ns: Nanoseconds = 0
 
 
 class Paired(Message, frozen=True, tag="paired"):

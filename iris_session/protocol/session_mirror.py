@@ -20,6 +20,7 @@ from iris_session.protocol.server_messages import (
     EStopChanged,
     Event,
     LeaseChanged,
+    LeasesChanged,
     ParticipantChanged,
     ParticipantInfo,
     ParticipantJoined,
@@ -49,8 +50,9 @@ class SessionMirror:
 
     `body_index` and `index_of_id` give the row of a body in state frames, by name and by `BodyInfo.id`. `synced` is
     false before the first snapshot and after a gap; the other attributes then show the last known state. `bodies` are
-    those of the epochs from `bodies_since` to `bodies_until`, as far as is known. Counters: `gaps`, `discarded` (events
-    older than the snapshot or repeated), `held_overflow`.
+    those of the epochs from `bodies_since` to `bodies_until`, as far as is known. `stop_seq`: number of the newest
+    stop, which `ClearEStop` names. Counters: `gaps`, `discarded` (events older than the snapshot or repeated),
+    `held_overflow`.
     """
 
     def __init__(self) -> None:
@@ -70,6 +72,8 @@ class SessionMirror:
         self.tick_period_ns = 0
         self.paused = False
         self.estop = False
+        self.stop_seq = 0
+        self.consent_timeout_ns = 0
         self.episode: EpisodeChanged | None = None
         self.participants: dict[str, ParticipantInfo] = {}
         self.leases: dict[str, Lease] = {}
@@ -92,7 +96,7 @@ class SessionMirror:
             return []
         held = {event.event_seq: event for event in self._held}
         self._held = deque(maxlen=MAX_HELD_EVENTS)
-        told = self._list_covered_events(held, snapshot.event_seq) if self._has_snapshot else []
+        covered = self._list_covered_events(held, snapshot.event_seq) if self._has_snapshot else []
         self.event_seq = snapshot.event_seq
         self.scene_epoch = snapshot.scene_epoch
         self.scene_revision = snapshot.scene_revision
@@ -100,6 +104,8 @@ class SessionMirror:
         self.tick_period_ns = snapshot.tick_period_ns
         self.paused = snapshot.paused
         self.estop = snapshot.estop
+        self.stop_seq = snapshot.stop_seq
+        self.consent_timeout_ns = snapshot.consent_timeout_ns
         self.episode = snapshot.episode
         self.participants = {p.id: p for p in snapshot.participants}
         self.leases = {lease.target: lease for lease in snapshot.leases}
@@ -110,23 +116,23 @@ class SessionMirror:
         self.body_index = {body.name: i for i, body in enumerate(snapshot.bodies)}
         self.index_of_id = {body.id: i for i, body in enumerate(snapshot.bodies)}
         self.synced = self._has_snapshot = True
-        self.discarded += 0 if told else sum(seq <= snapshot.event_seq for seq in held)
-        return told + [held[seq] for seq in sorted(held) if seq > snapshot.event_seq and self.apply_event(held[seq])]
+        self.discarded += 0 if covered else sum(seq <= snapshot.event_seq for seq in held)
+        return covered + [held[seq] for seq in sorted(held) if seq > snapshot.event_seq and self.apply_event(held[seq])]
 
     def _list_covered_events(self, held: dict[int, Event], last: int) -> list[Event | MissedEvents]:
         """Return the events up to `last`, which a snapshot contains, with `MissedEvents` for those that did not
         arrive.
         """
-        told: list[Event | MissedEvents] = []
+        covered: list[Event | MissedEvents] = []
         next_seq = self.event_seq + 1
         for seq in sorted(seq for seq in held if next_seq <= seq <= last):
             if seq > next_seq:
-                told.append(MissedEvents(next_seq, seq - 1))
-            told.append(held[seq])
+                covered.append(MissedEvents(next_seq, seq - 1))
+            covered.append(held[seq])
             next_seq = seq + 1
         if next_seq <= last:
-            told.append(MissedEvents(next_seq, last))
-        return told
+            covered.append(MissedEvents(next_seq, last))
+        return covered
 
     def apply_event(self, event: Event) -> bool:
         """Apply the next event. Return false when it was discarded, or held until a snapshot comes (`synced` is then
@@ -184,6 +190,7 @@ class SessionMirror:
             self.tick_period_ns,
             self.paused,
             self.estop,
+            self.stop_seq,
             self.episode,
             [self.participants[key] for key in sorted(self.participants)],
             [self.leases[key] for key in sorted(self.leases)],
@@ -205,6 +212,8 @@ class SessionMirror:
                 self._apply_left(name, grace)
             case LeaseChanged(lease=lease):
                 self.leases[lease.target] = lease
+            case LeasesChanged(leases=leases):
+                self.leases.update((lease.target, lease) for lease in leases)
             case ScaleChanged(robot=robot, scale=scale):
                 if robot in self.leases:
                     self.leases[robot] = msgspec.structs.replace(self.leases[robot], scale=scale)
@@ -220,8 +229,8 @@ class SessionMirror:
                 self.synced = cause in SAME_BODIES
                 if self.synced:
                     self.bodies_until = epoch
-            case EStopChanged(active=active):
-                self.estop = active
+            case EStopChanged(active=active, stop_seq=stop_seq):
+                self.estop, self.stop_seq = active, stop_seq
             case PauseChanged(paused=paused):
                 self.paused = paused
             case EpisodeChanged() as episode:

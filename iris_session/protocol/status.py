@@ -173,6 +173,19 @@ class ParticipantReport(msgspec.Struct, frozen=True):
     alignment_report: AlignmentReport | None = None
 
 
+class StopReport(msgspec.Struct, frozen=True):
+    """One e-stop that is in force: its number, and who stopped the session `age_ns` ago, for which reason.
+
+    `participant`, `name`: empty for a connection that had not joined.
+    """
+
+    stop_seq: Count
+    participant: Name
+    name: Name
+    reason: Text
+    age_ns: Nanoseconds
+
+
 class RobotReport(msgspec.Struct, frozen=True):
     """One robot: its holder, its state, and the reason why it holds."""
 
@@ -232,7 +245,8 @@ class StatusReport(Message, frozen=True, tag="status_report"):
     last five seconds; null below 25 states in them. `drops`: by reason, all messages dropped anywhere. `restarts`: of
     front and recorder. `authority_silent_ns`: since the authority's last message to the front; its part (ticks, roster,
     robots, recorder) is as old. -1: it has sent none yet. `cpu_share`: of one processor, by the authority's process;
-    `load`: of the machine, over a minute.
+    `load`: of the machine, over a minute. `stops`: the e-stops in force, newest first, the newest of each participant.
+    `pause_reason`: why physics stands still until a reset, empty otherwise.
     """
 
     request_id: Count
@@ -267,3 +281,5 @@ class StatusReport(Message, frozen=True, tag="status_report"):
     anchors: tuple[AnchorReport, ...] = ()
     cross_checks: tuple[CrossCheckReport, ...] = ()
     assets: AssetsReport | None = None
+    stops: tuple[StopReport, ...] = ()
+    pause_reason: Text = ""

@@ -2,7 +2,8 @@
 
 Batches of about 20 ms are numbered and kept until the recorder acknowledges that they are in the file: first in a
 window in memory, beyond it in a spill file. A restarted recorder receives everything that was not acknowledged. Rows
-are dropped only if memory and spill file are both full: they are counted and reported by `take_gap`.
+are dropped only if memory and spill file are both full, states and metrics before: they are counted and reported by
+`take_gap`.
 
 Vertices of deformables are for the picture only. They have a socket of their own and are not stored: frames that do not
 fit into its queue are dropped and counted, so they cost the journal nothing.
@@ -49,6 +50,8 @@ WINDOW_BYTES: Final = 16 << 20
 SPILL_BYTES: Final = 2 << 30
 #: Maximum number of records read back from the spill file per flush: 4 batches of 20 ms, so that a flush stays short.
 UNSPILL_BATCHES: Final = 4
+#: Share of the spill file above which only what verification needs is kept: rows, keyframes, scenes.
+JOURNAL_SHARE: Final = 0.75
 #: Maximum time without a status while closing. A recorder that writes sends one every half second.
 SILENCE_S: Final = 1.0
 #: Maximum length of each list of one batch. A flush comes long before, unless the caller never takes a step.
@@ -98,6 +101,7 @@ class RecorderFeed:
         self._lost = False
         self._complete = False
         self._window_limit = window_bytes
+        self._spill_limit = spill_bytes
         self._spill = SpillFile(Path(spill_dir) / f"feed-{os.getpid()}.spill", spill_bytes)
         self._context = zmq.Context(io_threads=1)
         self._socket = self._context.socket(zmq.DEALER)
@@ -219,7 +223,9 @@ class RecorderFeed:
 
         Frames beyond `VertexRateLimit` are left out, and frames that do not fit into the queue are dropped.
         """
-        if self._vertices is None or not self._vertex_limit.take(stream, read_header(frame).n_vertices, session_time):
+        if self._vertices is None or not self._vertex_limit.admit_frame(
+            stream, read_header(frame).n_vertices, session_time
+        ):
             return
         try:
             self._vertices.send(messages.encode_vertices(VertexFrame(stream, session_time, frame)), zmq.NOBLOCK)
@@ -237,6 +243,8 @@ class RecorderFeed:
         batch = self._batch
         lists: tuple[list[Any], ...] = (batch.states, batch.events, batch.denials, batch.metrics, batch.keyframes)
         lists += (batch.scenes, batch.assets)
+        if self._spill.pending_bytes > JOURNAL_SHARE * self._spill_limit:
+            self._leave_out_picture(batch)
         if batch.rows or any(lists):
             self._batch = Batch(dropped_rows=self.stats.dropped_rows)
             self._enqueue(messages.encode_batch(batch), len(batch.rows), sum(len(items) for items in lists))
@@ -278,6 +286,12 @@ class RecorderFeed:
         self._socket.close(0)
         self._context.term()
         return self._complete
+
+    def _leave_out_picture(self, batch: Batch) -> None:
+        """Leave what the file shows, but verification does not need, out of a batch: the rest is for the journal."""
+        for items in (batch.states, batch.metrics):
+            self.stats.dropped_items += len(items)
+            items.clear()
 
     def _add(self, items: list[_T], item: _T) -> None:
         if len(items) < BATCH_ITEMS:
@@ -470,7 +484,7 @@ class VertexRateLimit:
         self._due_ns.clear()
         self._period_ns = PERIOD_NS
 
-    def take(self, stream: str, count: int, session_time: int) -> bool:
+    def admit_frame(self, stream: str, count: int, session_time: int) -> bool:
         """Return whether a frame of `count` vertices is recorded."""
         if self._counts.get(stream) != count:
             self._counts[stream] = count

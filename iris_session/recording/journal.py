@@ -21,10 +21,15 @@ from iris_session.protocol.server_messages import BodyInfo
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 
 #: Format of recordings. It changes with the meaning of rows, snapshots or their simulation; others are not read.
-FORMAT: Final = 3
+FORMAT: Final = 4
+#: The newest iris-session that verifies and resumes recordings of an earlier format. Format 4 came with the control law
+#: that holds from measured joints.
+VERIFIERS: Final = {3: "iris-session 0.1.0 at commit 804ab72"}
 CLOSED: Final = "closed"  # all code is part of iris-session: re-simulated bit for bit
 OPEN: Final = "open"  # a user loop or a real robot: the plant's state comes from the rows
 HASH_BYTES: Final = 16
+#: Largest MuJoCo model that is read from a recording, uncompressed.
+MAX_MODEL_BYTES: Final = 1 << 30
 #: `JournalRow.digest` of a step that raised an error: it has no result, and no step follows.
 CRASHED: Final = b""
 
@@ -174,8 +179,16 @@ def pack_model(mjb: bytes) -> bytes:
 
 
 def unpack_model(packed: bytes) -> bytes:
-    """Decompress the result of `pack_model`. Raises `zlib.error` for damaged bytes."""
-    return zlib.decompress(packed)
+    """Decompress the result of `pack_model`, at most `MAX_MODEL_BYTES`.
+
+    Raises `zlib.error` for damaged bytes, and for a model above the limit: a foreign file must not use up the memory.
+    """
+    decompressor = zlib.decompressobj()
+    mjb = decompressor.decompress(packed, MAX_MODEL_BYTES)
+    if not decompressor.eof:
+        large = len(mjb) >= MAX_MODEL_BYTES
+        raise zlib.error(f"the model has more than {MAX_MODEL_BYTES >> 20} MiB" if large else "the model is cut")
+    return mjb
 
 
 def array_header(n: int) -> bytes:

@@ -35,18 +35,18 @@ class RecordingLock:
         try:
             self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
         except (OSError, ValueError) as error:
-            raise RecorderError(f"{os.fspath(path)} cannot be opened: {_said(error)}") from error
+            raise RecorderError(f"{os.fspath(path)} cannot be opened: {_format_error(error)}") from error
         try:
-            taken = self._take(fcntl.LOCK_SH if shared else fcntl.LOCK_EX, patience_s)
+            taken = self._acquire(fcntl.LOCK_SH if shared else fcntl.LOCK_EX, patience_s)
         except BaseException:
             self.release()
             raise
         if not taken:
-            text = _who(self._fd)
+            text = _describe_holders(self._fd)
             self.release()
             raise RecordingInUseError(f"{os.fspath(path)} is in use: {text}")
 
-    def _take(self, kind: int, patience_s: float) -> bool:
+    def _acquire(self, kind: int, patience_s: float) -> bool:
         until = time.monotonic() + patience_s
         while True:
             try:
@@ -67,18 +67,35 @@ class RecordingLock:
                 os.close(fd)
 
 
-def _who(fd: int) -> str:
+def find_writers(path: str | os.PathLike[str]) -> list[int]:
+    """Return the processes that write the recording whose first file is `path`.
+
+    Takes no lock. Only what the system lists: on Linux, processes of the same user. Empty without such a file.
+    """
+    try:
+        file = os.stat(path)
+    except OSError:
+        return []
+    return [pid for pid, kind in _list_holders(file) if kind == "READ"]
+
+
+def describe_writers(pids: list[int]) -> str:
+    """Return a phrase such as `is being written by process 12`."""
+    return f"is being written by {_format_processes(pids)}"
+
+
+def _describe_holders(fd: int) -> str:
     """Describe the holders of the lock as far as the system lists them: on Linux, processes of the same user."""
-    holders = _holders(os.fstat(fd))
+    holders = _list_holders(os.fstat(fd))
     alone = [pid for pid, kind in holders if kind == "WRITE"]
     if alone:
-        return f"it is being resumed by {_named(alone)}"
+        return f"it is being resumed by {_format_processes(alone)}"
     if holders:
-        return f"the session that it is of still runs: {_named([pid for pid, _ in holders])}"
+        return f"the session that it is of still runs: {_format_processes([pid for pid, _ in holders])}"
     return "the session that it is of still runs, or is being resumed"
 
 
-def _holders(file: os.stat_result) -> list[tuple[int, str]]:
+def _list_holders(file: os.stat_result) -> list[tuple[int, str]]:
     """Return process and kind (`READ`, `WRITE`) of each lock on `file`.
 
     The device in `/proc/locks` is not always that of `stat`, so a process counts if it has the file open.
@@ -88,11 +105,11 @@ def _holders(file: os.stat_result) -> list[tuple[int, str]]:
             lines = [line.split() for line in locks]
     except OSError:
         return []
-    found = [(int(words[4]), words[3]) for words in lines if words[1] == "FLOCK" and _is_of(words[5], file)]
+    found = [(int(words[4]), words[3]) for words in lines if words[1] == "FLOCK" and _is_lock_on(words[5], file)]
     return sorted({(pid, kind) for pid, kind in found if pid > 0 and _has_open(pid, file)})
 
 
-def _is_of(lock: str, file: os.stat_result) -> bool:
+def _is_lock_on(lock: str, file: os.stat_result) -> bool:
     return lock.rpartition(":")[2] == str(file.st_ino)
 
 
@@ -108,9 +125,9 @@ def _has_open(pid: int, file: os.stat_result) -> bool:
     return False
 
 
-def _named(pids: list[int]) -> str:
+def _format_processes(pids: list[int]) -> str:
     return f"process{'es' if len(pids) > 1 else ''} {', '.join(map(str, pids))}"
 
 
-def _said(error: Exception) -> str:
+def _format_error(error: Exception) -> str:
     return (isinstance(error, OSError) and error.strerror) or str(error)

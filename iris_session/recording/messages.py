@@ -162,7 +162,8 @@ class RecorderStatus(msgspec.Struct, frozen=True, array_like=True):
     `samples_refused`: number of invalid messages of the front, and of batches of which only the journal could be read.
     `vertices_refused`: number of vertex frames that are not in the picture, because the queue was full, they do not
     decode, or are of another scene. `fault`: one line if the file can no longer be written; the process then ends.
-    `disk_free`: free bytes on its disk, at least 1; 0 if unknown.
+    `disk_free`: free bytes on its disk, at least 1; 0 if unknown. `samples_left_out`: raw messages that are not in the
+    file, because time and room of the disk were left to the journal.
     """
 
     instance: int
@@ -176,6 +177,7 @@ class RecorderStatus(msgspec.Struct, frozen=True, array_like=True):
     fault: str = ""
     disk_free: int = 0
     vertices_refused: int = 0
+    samples_left_out: int = 0
 
 
 encode_batch = msgspec.msgpack.Encoder().encode

@@ -127,7 +127,7 @@ class _Roster:
 
 
 @dataclass
-class _Said:
+class _StepEntries:
     """Joins and jump alarms in the journal of one step, with connections, that no event has been matched to yet."""
 
     joins: list[tuple[int, Join]] = field(default_factory=list)
@@ -152,7 +152,7 @@ class _Heads:
         self._times = array("q", [self._times[i] for i in order])
         self._places = array("d", [c for i in order for c in places[3 * i : 3 * i + 3]])
 
-    def at(self, capture_ns: int) -> Vec3 | None:
+    def find_nearest(self, capture_ns: int) -> Vec3 | None:
         """Return the position nearest in time; None if it is further than `NEAR_NS`."""
         i = bisect_left(self._times, capture_ns)
         near = min(
@@ -185,24 +185,26 @@ def read_alignment_history(
     say = on_progress or (lambda done, total: None)
     events = [event for event in recording.events() if isinstance(event.body, _KINDS)]
     found = AlignmentHistory()
-    roster = _roster(recording, events, found, lambda done: say(done, n_rows + n_samples))
-    _messages(recording, roster, found, lambda done: say(n_rows + done, n_rows + n_samples))
+    roster = _replay_events(recording, events, found, lambda done: say(done, n_rows + n_samples))
+    _read_messages(recording, roster, found, lambda done: say(n_rows + done, n_rows + n_samples))
     say(n_rows + n_samples, n_rows + n_samples)
     return found
 
 
-def _roster(recording: Recording, events: list[Event], found: AlignmentHistory, say: Callable[[int], None]) -> _Roster:
+def _replay_events(
+    recording: Recording, events: list[Event], found: AlignmentHistory, say: Callable[[int], None]
+) -> _Roster:
     """Replay the events: add participants, alignments and anchor moves to `found`; return owners of connections."""
     wanted = {e.session_time for e in events if isinstance(e.body, ParticipantJoined) or _is_jump(e.body)}
-    said: dict[int, _Said] = {}
+    said: dict[int, _StepEntries] = {}
     for done, row in enumerate(recording.rows()):
         if done % TOLD_EVERY == 0:
             say(done)
         if row.now_ns in wanted:
-            said[row.now_ns] = _said(row.entries)
+            said[row.now_ns] = _decode_step(row.entries)
     roster = _Roster()
     for event in events:
-        _take(event, said.get(event.session_time, _Said()), roster, found)
+        _apply_event(event, said.get(event.session_time, _StepEntries()), roster, found)
     found.in_force.extend(roster.present.values())
     found.in_force.sort(key=lambda one: one.since_ns)
     return roster
@@ -212,8 +214,8 @@ def _is_jump(body: object) -> bool:
     return isinstance(body, AlignmentAlarmed | AlignmentAlarm) and body.kind == AlarmKind.JUMP
 
 
-def _said(entries: bytes) -> _Said:
-    said = _Said()
+def _decode_step(entries: bytes) -> _StepEntries:
+    said = _StepEntries()
     try:
         for entry in decode_entries(entries):
             if isinstance(entry.message, Join):
@@ -221,17 +223,17 @@ def _said(entries: bytes) -> _Said:
             elif isinstance(entry.message, AlignmentAlarm) and _is_jump(entry.message):
                 said.jumps.append((entry.connection, entry.message))
     except msgspec.DecodeError:  # damaged: participants that joined in this step stay unknown
-        return _Said()
+        return _StepEntries()
     return said
 
 
-def _take(event: Event, said: _Said, roster: _Roster, found: AlignmentHistory) -> None:
+def _apply_event(event: Event, said: _StepEntries, roster: _Roster, found: AlignmentHistory) -> None:
     """Apply one event of the history. `said`: joins and alarms in the journal row of its step."""
     body, now_ns, present = event.body, event.session_time, roster.present
     if isinstance(body, AnchorMoved):
         found.anchor_moves.append(AnchorMove(now_ns, body.anchor_id, body.T_world_anchor))
     elif isinstance(body, AlignmentChanged):
-        _end(body.participant, now_ns, present, found)
+        _end_period(body.participant, now_ns, present, found)
         person = found.participants.get(body.participant)
         run = len(person.runs) if person else 0
         jumps = len(roster.jumps.get((body.participant, run), ()))
@@ -239,23 +241,23 @@ def _take(event: Event, said: _Said, roster: _Roster, found: AlignmentHistory) -
         present[body.participant] = AlignmentPeriod(frame, body.alignment, now_ns)
     elif isinstance(body, AlignmentAlarmed):
         if _is_jump(body):
-            _end(body.participant, now_ns, present, found)
+            _end_period(body.participant, now_ns, present, found)
             person = found.participants.get(body.participant)
-            _jump(body.participant, len(person.runs) if person else 0, now_ns, said.jumps, roster)
+            _record_jump(body.participant, len(person.runs) if person else 0, now_ns, said.jumps, roster)
     elif isinstance(body, ParticipantLeft):
         if not body.grace:
-            _end(body.participant, now_ns, present, found)
+            _end_period(body.participant, now_ns, present, found)
     elif isinstance(body, ParticipantJoined | ParticipantChanged):
         info = body.participant
         if info.alignment is None:
-            _end(info.id, now_ns, present, found)
+            _end_period(info.id, now_ns, present, found)
         aligned = info.alignment is None or info.alignment.kind != AlignmentKind.NOT_NEEDED
         person = found.participants.setdefault(info.id, RecordedParticipant(info.id, info.name, info.role, aligned))
         if isinstance(body, ParticipantJoined):
-            _own(person, info, said.joins, roster.owners)
+            _match_join(person, info, said.joins, roster.owners)
 
 
-def _own(
+def _match_join(
     person: RecordedParticipant,
     info: ParticipantInfo,
     joins: list[tuple[int, Join]],
@@ -276,7 +278,9 @@ def _own(
     person.runs.append("unknown")
 
 
-def _jump(participant: str, run: int, now_ns: int, alarms: list[tuple[int, AlignmentAlarm]], roster: _Roster) -> None:
+def _record_jump(
+    participant: str, run: int, now_ns: int, alarms: list[tuple[int, AlignmentAlarm]], roster: _Roster
+) -> None:
     """Note the capture time of a jump as in the journal's alarm: the event is later by the latency of messages."""
     at_ns = now_ns
     for i, (connection, alarm) in enumerate(alarms):
@@ -287,13 +291,13 @@ def _jump(participant: str, run: int, now_ns: int, alarms: list[tuple[int, Align
     insort(roster.jumps.setdefault((participant, run), []), at_ns)
 
 
-def _end(participant: str, now_ns: int, present: dict[str, AlignmentPeriod], found: AlignmentHistory) -> None:
+def _end_period(participant: str, now_ns: int, present: dict[str, AlignmentPeriod], found: AlignmentHistory) -> None:
     was = present.pop(participant, None)
     if was is not None:
         found.in_force.append(was._replace(until_ns=now_ns))
 
 
-def _messages(recording: Recording, roster: _Roster, found: AlignmentHistory, say: Callable[[int], None]) -> None:
+def _read_messages(recording: Recording, roster: _Roster, found: AlignmentHistory, say: Callable[[int], None]) -> None:
     """Add the observations to `found`, each with the head position nearest in time."""
     heads: dict[TrackingFrame, _Heads] = {}
     seen: dict[TrackingFrame, list[Observation]] = {}
@@ -323,4 +327,4 @@ def _with_heads(observations: Iterable[Observation], heads: _Heads | None) -> li
     if heads is not None:
         heads.sort()
     ordered = sorted(observations, key=lambda one: one.capture_ns)
-    return [RecordedObservation(one, None if heads is None else heads.at(one.capture_ns)) for one in ordered]
+    return [RecordedObservation(one, None if heads is None else heads.find_nearest(one.capture_ns)) for one in ordered]

@@ -6,6 +6,8 @@ import re
 from typing import Final
 
 APPLICATION: Final = "iris-session"
+#: Name of the first file of a session in its folder.
+FIRST_FILE: Final = "session.rrd"
 
 HEADER: Final = "/session/header"
 INFO: Final = "/session"

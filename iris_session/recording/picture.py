@@ -78,7 +78,7 @@ class ScenePicture:
         begun = not self._waits and self._source is not None
         self.set_scene(source)
         if begun:
-            self._at(moment)
+            self._set_time(moment)
             self._rec.log(self._folder, rr.Clear(recursive=True), strict=True)
             self.draw(moment)
 
@@ -88,7 +88,7 @@ class ScenePicture:
             return
         self._source = self._source._replace(assets=assets)
         if not self._waits:
-            self._at(moment)
+            self._set_time(moment)
             self._with_scene(self._update)
             self._rec.reset_time()
 
@@ -102,7 +102,7 @@ class ScenePicture:
         self._names.clear()
         self.deformables.clear()
         self.since_ns = moment[3]
-        self._at(moment)
+        self._set_time(moment)
         self._with_scene(self._draw_all)
         self._rec.reset_time()
 
@@ -118,15 +118,15 @@ class ScenePicture:
             with scene_geometry.open_scene(self._source.assets, self._source.packed_model) as (spec, store):
                 work(spec, SceneReader(spec, store, self._source.bodies))
         except _NOT_DRAWN as error:
-            self._say(f"the scene is not drawn: {error}")
+            self._log_error(f"the scene is not drawn: {error}")
         if self._failed:
             more = f" and {len(self._failed) - NAMED} more" if len(self._failed) > NAMED else ""
-            self._say(f"{', '.join(self._failed[:NAMED])}{more} cannot be drawn")
+            self._log_error(f"{', '.join(self._failed[:NAMED])}{more} cannot be drawn")
 
-    def _say(self, text: str) -> None:
+    def _log_error(self, text: str) -> None:
         self._rec.log(f"{paths.EVENTS}/recorder", rr.TextLog(text, level="ERROR"), strict=True)
 
-    def _at(self, moment: Moment) -> None:
+    def _set_time(self, moment: Moment) -> None:
         step, tick, sim_ns, session_ns = moment
         self._rec.set_time(paths.STEP, sequence=step)
         self._rec.set_time(paths.TICK, sequence=tick)

@@ -51,30 +51,30 @@ class _Spare:
         self._lock = Lock()
         self._child: _Child | None = None
 
-    def take(self) -> _Child | None:
+    def pop_child(self) -> _Child | None:
         with self._lock:
             child, self._child = self._child, None
         return child
 
-    def give(self, child: _Child) -> None:
+    def put_child(self, child: _Child) -> None:
         with self._lock:
             before, self._child = self._child, child
         if before is not None:
             before.end()
 
     def end(self) -> None:
-        child = self.take()
+        child = self.pop_child()
         if child is not None:
             child.end()
 
-    def forget(self) -> None:
+    def forget_child(self) -> None:
         """Discard the child in a fork of this process: a child answers only the process that started it."""
         self._lock, self._child = Lock(), None
 
 
 _spare: Final = _Spare()
 atexit.register(_spare.end)
-os.register_at_fork(after_in_child=_spare.forget)
+os.register_at_fork(after_in_child=_spare.forget_child)
 
 
 class Prober:
@@ -92,7 +92,7 @@ class Prober:
         return self._asked(RECORDINGS, path)
 
     def _asked(self, what: str, path: str | Path) -> int:
-        earlier, self._child = self._child or _spare.take(), None
+        earlier, self._child = self._child or _spare.pop_child(), None
         if earlier is not None:
             answer = earlier.ask(what, path)
             if answer:
@@ -115,7 +115,7 @@ class Prober:
     ) -> None:
         child, self._child = self._child, None
         if child is not None and error is None:
-            _spare.give(child)
+            _spare.put_child(child)
         elif child is not None:  # it may still be writing an unread answer
             child.end()
 

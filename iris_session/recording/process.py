@@ -1,9 +1,10 @@
 """The recorder process: `python -m iris_session.recording.process`, configuration as MessagePack on standard input.
 
 Receives batches from the authority and raw samples from the front, and writes them into one Rerun file about seven
-times a second, so that killing any process loses at most 0.25 s. Vertices come last: they are dropped when time is
-short. Prints `ready` or `failed: <one line>` on standard output. Ends on SIGTERM, or when its parent process has ended,
-after writing everything that was received; SIGINT is left to the parent.
+times a second, so that killing any process loses at most 0.25 s. The journal comes first: raw samples are left out, and
+counted, while the disk is slow or nearly full, and vertices when time is short. Prints `ready` or `failed: <one line>`
+on standard output. Ends on SIGTERM, or when its parent process has ended, after writing everything that was received;
+SIGINT is left to the parent.
 """
 
 from __future__ import annotations
@@ -49,6 +50,8 @@ SYNC_S: Final = 1.0
 STATUS_S: Final = 0.5
 #: Maximum number of messages per drain, so that a flood cannot keep the file from being written.
 DRAIN_MESSAGES: Final = 4096
+#: Maximum number of batches of raw samples per drain (64 KiB each).
+DRAIN_SAMPLES: Final = 64
 #: Maximum number of vertex frames per drain.
 DRAIN_VERTICES: Final = 32
 #: After SIGTERM or the end of the parent: without a message for this long, everything was received.
@@ -58,10 +61,14 @@ FINISH_S: Final = 10.0
 ORPHAN_S: Final = 20.0
 ORPHANED: Final = 4
 MIN_FREE_BYTES: Final = 16 << 20
+#: Free bytes that are left to the journal: hours of it. Below, raw samples and vertices are left out.
+JOURNAL_RESERVE_BYTES: Final = 256 << 20
+#: A write that takes longer shows a disk that cannot keep up: raw samples are left out until one is shorter.
+SLOW_FLUSH_S: Final = 0.3
 #: Bytes written to test a new file. A file begins with about 22 KB, mostly the blueprint.
 TRIAL_BYTES: Final = 128 << 10
 
-_decode_sample = msgspec.msgpack.Decoder(tuple[int, int, bytes]).decode
+_decode_samples = msgspec.msgpack.Decoder(list[tuple[int, int, bytes]]).decode
 
 
 class RecorderLoop:
@@ -71,7 +78,7 @@ class RecorderLoop:
         self._config = config
         self._context = zmq.Context(io_threads=1)
         self._feed = self._bind(zmq.DEALER, config.feed_endpoint)
-        self._front = self._bind(zmq.PULL, config.samples_endpoint)
+        self._front = self._bind(zmq.PULL, config.samples_endpoint, DRAIN_SAMPLES)
         vertices = config.vertices_endpoint
         self._vertices = self._bind(zmq.PULL, vertices, DRAIN_VERTICES) if vertices else None
         self._begin_part()
@@ -88,6 +95,9 @@ class RecorderLoop:
         self._newest_ns = 0  # session time of the newest row received
         self._lag_ns = 0
         self._samples = 0
+        self._samples_left_out = 0
+        self._disk_free = get_free_bytes(Path(self._writer.path))
+        self._flush_s = 0.0  # duration of the last write
         self._refused = 0
         self._fault = ""
         self._stopping = False
@@ -96,16 +106,16 @@ class RecorderLoop:
         """Record until stopped. Return the exit status of the process."""
         threading.Thread(target=self._give_up_as_orphan, name="orphan", daemon=True).start()
         try:
-            self._say(-1)
+            self._send_status(-1)
             self._loop()
             self._drain_all()
             self._writer.close()
-            self._say(self._received)
+            self._send_status(self._received)
             if self._header is None:
                 self._remove()
         except WriteError as error:
             self._fault = str(error)
-            self._say(-1)
+            self._send_status(-1)
             sys.stderr.write(f"{FAULT_PREFIX}{self._fault}\n")
             return 3
         finally:
@@ -174,11 +184,12 @@ class RecorderLoop:
             if now >= flush_at:
                 flush_at = now + FLUSH_S
                 self._writer.flush()
+                self._flush_s = time.monotonic() - now
                 self._syncer.check()
                 self._lag_ns = time.monotonic_ns() - self._config.origin_ns - self._newest_ns
                 if n or now >= status_at:
                     status_at = now + STATUS_S
-                    self._say(self._received)
+                    self._send_status(self._received)
 
     def _drain_all(self) -> None:
         until = time.monotonic() + FINISH_S
@@ -187,25 +198,30 @@ class RecorderLoop:
             if self._drain():
                 quiet_at = time.monotonic() + QUIET_S
                 self._writer.flush()
-                self._say(self._received)
+                self._send_status(self._received)
             time.sleep(DRAIN_S)
 
     def _drain(self) -> int:
         n = 0
         while n < DRAIN_MESSAGES and int(self._feed.get(zmq.EVENTS)) & zmq.POLLIN:
-            self._take(self._feed.recv_multipart(zmq.NOBLOCK))
+            self._process_message(self._feed.recv_multipart(zmq.NOBLOCK))
             n += 1
         m = 0
-        while m < DRAIN_MESSAGES:
+        while m < DRAIN_SAMPLES:
             try:
                 data = self._front.recv(zmq.NOBLOCK)
             except zmq.Again:
                 break
             m += 1
-            self._take_sample(data)
-        if max(n, m) < DRAIN_MESSAGES:  # else behind with more important data: vertices are dropped at their source
-            self._drain_vertices()
+            self._process_samples(data)
+        if n < DRAIN_MESSAGES and m < DRAIN_SAMPLES and not self._is_short:
+            self._drain_vertices()  # else behind with more important data: vertices are dropped at their source
         return n + m
+
+    @property
+    def _is_short(self) -> bool:
+        """True while time or room of the disk are left to the journal."""
+        return self._flush_s > SLOW_FLUSH_S or 0 < self._disk_free < JOURNAL_RESERVE_BYTES
 
     def _drain_vertices(self) -> None:
         if self._vertices is None:
@@ -218,7 +234,7 @@ class RecorderLoop:
             except msgspec.DecodeError:
                 self._refused += 1
 
-    def _take(self, frames: list[bytes]) -> None:
+    def _process_message(self, frames: list[bytes]) -> None:
         """Process a header or a batch. Batches count in order only; those before the header are sent again after it."""
         if len(frames) not in (2, 3) or len(frames[0]) != FRAME.size:
             self._refused += 1
@@ -247,16 +263,21 @@ class RecorderLoop:
             self._refused += 1
             return decode_journal(body)
 
-    def _take_sample(self, data: bytes) -> None:
+    def _process_samples(self, data: bytes) -> None:
         try:
-            connection, receive_ns, sample = _decode_sample(data)
+            samples = _decode_samples(data)
         except msgspec.DecodeError:
             self._refused += 1
             return
-        self._samples += 1
-        self._writer.add_sample(connection, receive_ns, sample)
+        self._samples += len(samples)
+        if self._is_short:
+            self._samples_left_out += len(samples)
+            return
+        for sample in samples:
+            self._writer.add_sample(*sample)
 
-    def _say(self, written: int) -> None:
+    def _send_status(self, written: int) -> None:
+        self._disk_free = get_free_bytes(Path(self._writer.path))
         status = RecorderStatus(
             self._instance,
             self._expecting,
@@ -267,8 +288,9 @@ class RecorderLoop:
             self._samples,
             self._refused,
             self._fault,
-            get_free_bytes(Path(self._writer.path)),
+            self._disk_free,
             self._writer.vertices_refused,
+            self._samples_left_out,
         )
         with suppress(zmq.Again):
             self._feed.send(encode_status(status), zmq.NOBLOCK)

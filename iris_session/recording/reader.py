@@ -26,6 +26,7 @@ from iris_session.recording import paths, record_batches, rrd_file
 from iris_session.recording.errors import NotARecordingError
 from iris_session.recording.journal import (
     FORMAT,
+    VERIFIERS,
     JournalRow,
     Keyframe,
     SessionHeader,
@@ -33,6 +34,7 @@ from iris_session.recording.journal import (
     open_blob,
     unpack_model,
 )
+from iris_session.recording.lock import describe_writers, find_writers
 from iris_session.recording.messages import DenialRecord, decode_header
 from iris_session.recording.probe import Prober
 from iris_session.recording.record_batches import (
@@ -43,6 +45,7 @@ from iris_session.recording.record_batches import (
     group_spans,
     join_pieces,
 )
+from iris_session.system.extras import require_package
 
 _T = TypeVar("_T")
 #: Maximum number of lines in `damage`: a file may be damaged in any number of places.
@@ -68,6 +71,8 @@ class Recording:
         missing: One line per missing part, or range of parts.
         notes: One line per empty part and per file that holds more than one recording.
         cuts: One line per part that ends in the middle of a write, as a kill leaves it.
+        writers: Processes that were writing the recording when it was opened, as far as the system lists them. What
+            they have written so far is read, from a copy.
     """
 
     def __init__(self, files: list[str]) -> None:
@@ -78,6 +83,7 @@ class Recording:
         self.missing: list[str] = []
         self.notes: list[str] = []
         self.cuts: list[str] = []
+        self.writers: list[int] = find_writers(paths.split_part(files[0])[0])
         self._rewritten: set[str] = set()
         self._several: list[tuple[str, int]] = []  # files with more than one recording in them
         try:
@@ -108,7 +114,7 @@ class Recording:
         its readable messages; the file itself is never altered.
 
         Args:
-            path: First file of the recording, usually `session.rrd`.
+            path: First file of the recording, usually `session.rrd`, or the folder of that file.
             warn: Issue a `UserWarning` if parts are damaged or missing.
 
         Returns:
@@ -117,12 +123,18 @@ class Recording:
         Raises:
             NotARecordingError: There is no such file, it is not a Rerun file, it holds no session header, or it was
                 recorded in another format; the message is one line.
+            ImportError: Rerun is not installed; the message names the extra.
         """
         first = str(path)
         if os.path.isdir(first):
-            raise NotARecordingError(f"{first} is a folder: name the first file of the recording in it, session.rrd")
+            first = os.path.join(first, paths.FIRST_FILE)
+            if not os.path.isfile(first):
+                raise NotARecordingError(
+                    f"there is no {paths.FIRST_FILE} in the folder {path}: give the first file of the recording"
+                )
         if not os.path.isfile(first):
             raise NotARecordingError(f"there is no recording {first}")
+        require_package("rerun", "reading recordings")
         base, number = paths.split_part(first)
         folder = os.path.dirname(first)
         try:
@@ -312,7 +324,7 @@ class Recording:
                 yield from ((i, item) for item in decode(join_pieces(pieces)))
             except UNREADABLE as error:
                 place = f"{os.path.basename(self.files[i])}: {entity}"
-                self._harmed(f"{place} holds something damaged, which is left out: {_said(error)}")
+                self._harmed(f"{place} holds something damaged, which is left out: {_format_error(error)}")
 
     def _count(self, entity: str) -> int:
         return sum(count_joined_rows(pieces) for _, pieces in self._spans(entity))
@@ -329,6 +341,10 @@ class Recording:
             found = rrd_file.scan_file(path) if os.path.getsize(path) else None
             if found is None or not (found.messages or found.holes):
                 self.notes.append(f"{os.path.basename(path)}: nothing was written into it")
+                return
+            if self.writers:
+                self._readable.append(self._copied(path, found.good_bytes))
+                self.files.append(path)
                 return
             if found.cut:
                 self.cuts.append(f"{os.path.basename(path)}: ends in the middle of a write, at byte {found.good_bytes}")
@@ -347,17 +363,29 @@ class Recording:
         self._readable.append(readable)
         self.files.append(path)
 
-    def _salvaged(self, path: str, prober: Prober) -> str:
+    def _copied(self, path: str, n_bytes: int) -> str:
+        """Copy the whole messages of a part that is being written: they stay the same while it is read."""
+        copy = self._make_copy_path(path)
+        with open(path, "rb") as source, open(copy, "wb") as target:
+            while n_bytes > 0 and (data := source.read(min(n_bytes, 1 << 20))):
+                target.write(data)
+                n_bytes -= len(data)
+        return copy
+
+    def _make_copy_path(self, path: str) -> str:
         if self._folder is None:
             self._folder = tempfile.TemporaryDirectory(prefix="iris-recording-")
+        return os.path.join(self._folder.name, os.path.basename(path))
+
+    def _salvaged(self, path: str, prober: Prober) -> str:
+        copy = self._make_copy_path(path)
         name = os.path.basename(path)
-        copy = os.path.join(self._folder.name, name)
         try:
             self._harmed(*(f"{name}: {line}" for line in rrd_file.salvage(path, copy, prober)))
         except OSError as error:
             said = error.strerror or error
             raise NotARecordingError(
-                f"{name} is damaged, and cannot be copied to {self._folder.name}: {said}"
+                f"{name} is damaged, and cannot be copied to {os.path.dirname(copy)}: {said}"
             ) from error
         return copy
 
@@ -391,16 +419,21 @@ class Recording:
                 blob, intact = open_blob(record_batches.read_values(batch, "blob")[0])
                 header = decode_header(blob)
             except UNREADABLE as error:
-                raise NotARecordingError(f"the header of {path} is damaged: {_said(error)}") from error
+                raise NotARecordingError(f"the header of {path} is damaged: {_format_error(error)}") from error
             if header.format != FORMAT and intact:
                 had = f"{path} was recorded in format {header.format} on {header.created_utc[:10] or 'an unknown day'}"
-                raise NotARecordingError(f"{had}, this iris-session reads format {FORMAT}: use the one that made it")
+                right = VERIFIERS.get(header.format, "the one that made it")
+                raise NotARecordingError(
+                    f"{had}, this iris-session reads format {FORMAT}: verify or resume it with {right}"
+                )
             self.root = blob_root(blob)
             if intact:
                 self._leave_out_others()
             else:
                 self._harmed("header: its bytes were changed (checksum)")
             return header
+        if self.writers:
+            raise NotARecordingError(f"{path} {describe_writers(self.writers)}, and holds nothing to read yet")
         said = self.damage + self.notes
         why = f" ({said[0]})" if said else ": nothing was recorded, or it is not ours"
         raise NotARecordingError(f"{path} holds no session header{why}")
@@ -415,5 +448,5 @@ class Recording:
                     del self.files[i], self._readable[i]
 
 
-def _said(error: Exception) -> str:
+def _format_error(error: Exception) -> str:
     return " ".join(str(error).split())[:200] or type(error).__name__

@@ -96,10 +96,10 @@ def open_scene(assets: SceneAssets, packed_model: bytes) -> Iterator[tuple[Scene
     else:
         with tempfile.TemporaryDirectory(prefix="iris-picture-") as folder:
             store = AssetStore(folder)
-            yield _made_of(packed_model, store), store
+            yield _parse_packed_model(packed_model, store), store
 
 
-def _made_of(packed_model: bytes, store: AssetStore) -> SceneSpec:
+def _parse_packed_model(packed_model: bytes, store: AssetStore) -> SceneSpec:
     import mujoco
 
     from iris_session.scene.mujoco_scene import parse_mujoco

@@ -33,6 +33,7 @@ from iris_session.recording.journal import (
     check_row,
     compute_chain,
 )
+from iris_session.recording.lock import describe_writers
 from iris_session.recording.messages import EndMark
 from iris_session.recording.reader import Recording
 
@@ -83,7 +84,7 @@ class VerifyReport(msgspec.Struct):
     `files`: the parts. `cuts`, `missing`, `notes`: see `Recording`. `crash`: description of the last step if an error
     in it ended the session. `continues`: recording and step that a resumed session continues. `keyframes`: number of
     keyframes compared and equal. `seconds`: session time simulated [s]; `wall_s`: duration of the verification [s].
-    `problems`: the first `MAX_PROBLEMS`, in order.
+    `problems`: the first `MAX_PROBLEMS`, in order. `writers`: processes that were writing the recording meanwhile.
     """
 
     path: str
@@ -109,6 +110,7 @@ class VerifyReport(msgspec.Struct):
     crash: str = ""
     continues: str = ""
     version_differences: list[str] = []
+    writers: list[int] = []
 
     def line(self) -> str:
         """Return the result on one line."""
@@ -126,6 +128,8 @@ class VerifyReport(msgspec.Struct):
         parts += self.notes
         if self.ok and self.finished:
             return "ok: " + "; ".join(parts)
+        if self.ok and self.writers:
+            return f"ok so far, {self.ending}: " + "; ".join(parts)
         if self.ok:
             return f"ok as far as it goes, but {self.ending}: " + "; ".join(parts)
         if self.version_differences:
@@ -167,6 +171,7 @@ def verify(
 
     Raises:
         NotARecordingError: `path` cannot be read as a recording.
+        ImportError: A package that reading or simulating needs is not installed; the message names the extra.
     """
     began = time.perf_counter()
     with Recording.open(path, warn=False) as recording:
@@ -176,13 +181,15 @@ def verify(
         total = recording.count_rows() if progress else 0
         try:
             core = make_core(header, recording.model) if make_core else None
+        except ImportError:  # a package of an extra is missing: nothing is wrong with the recording
+            raise
         except Exception as error:  # a changed header, or another version of the code: reported
             text = f"the session cannot be built from the header: {_one_line(error)}"
             report.problems.append(Problem(-1, "divergence", "header", text))
             return report
         run = _Run(recording, core, report)
         for done, row in enumerate(recording.rows()):
-            run.take(row)
+            run.verify_row(row)
             if progress is not None and done % PROGRESS_ROWS == 0:
                 progress(done, total)
         if progress is not None:
@@ -191,7 +198,11 @@ def verify(
         changed = recording.changed_spans()
         report.finished = recording.finished
         report.last_step = run.last_step
-        report.ending = "" if recording.finished else _ending(run.last_step)
+        report.writers = list(recording.writers)
+        if recording.writers:
+            report.ending = f"the recording {describe_writers(recording.writers)}: read as far as step {run.last_step}"
+        elif not recording.finished:
+            report.ending = _ending(run.last_step)
         report.damage = list(recording.damage)
         report.cuts = list(recording.cuts)
         report.missing = list(recording.missing)
@@ -200,11 +211,11 @@ def verify(
         if header.continues is not None:
             run.compare(header.continues)
         for line in recording.missing:
-            run.found(Problem(run.last_step, "missing", "file", line))
+            run.add_problem(Problem(run.last_step, "missing", "file", line))
         for line in recording.damage:
-            run.found(Problem(run.last_step, "unreadable", "file", line))
+            run.add_problem(Problem(run.last_step, "unreadable", "file", line))
         for line in changed:
-            run.found(Problem(run.last_step, "changed", "file", line))
+            run.add_problem(Problem(run.last_step, "changed", "file", line))
     report.wall_s = round(time.perf_counter() - began, 3)
     report.ok = not report.problems and report.steps > 0 and not report.unverified_steps
     return report
@@ -227,7 +238,7 @@ class _Run:
         self._first = self.last_step
         self._meet_keyframe(self._first)
 
-    def take(self, row: JournalRow) -> None:
+    def verify_row(self, row: JournalRow) -> None:
         """Check one row, simulate it, and compare the keyframe taken after it."""
         problem = self._check(row)
         expected = self.last_step + 1
@@ -239,7 +250,7 @@ class _Run:
             problem = RowProblem(row.step, "now_ns", "session time goes back")
         self.last_step = expected if is_step else row.step
         if problem is not None:
-            self.found(Problem(self.last_step, "changed", problem.field, problem.text, problem.entry))
+            self.add_problem(Problem(self.last_step, "changed", problem.field, problem.text, problem.entry))
         # After a changed chain value the computed one is used, so that the next row is not blamed: see `_check`.
         bad_chain = problem is not None and problem.field == "chain" and self._chain is not None
         self._stored_chain = row.chain if bad_chain else None
@@ -265,15 +276,15 @@ class _Run:
             text = (
                 f"the end mark names step {mark.step}, the journal ends at step {self.last_step} or with another chain"
             )
-            self.found(Problem(self.last_step, "changed", "end", text))
+            self.add_problem(Problem(self.last_step, "changed", "end", text))
 
     def _gap(self, first: int, last: int) -> None:
         if last < first:  # the same or an earlier step again: not a gap, but never written so
-            self.found(Problem(last + 1, "changed", "step", f"step {last + 1} comes after step {first - 1}"))
+            self.add_problem(Problem(last + 1, "changed", "step", f"step {last + 1} comes after step {first - 1}"))
         else:
             self.report.gaps.append((first, last))
             text = f"{last - first + 1} rows are missing, steps {first} to {last}"
-            self.found(Problem(first, "missing", "step", text))
+            self.add_problem(Problem(first, "missing", "step", text))
         self.simulating = False
         self._chain = None
         self._meet_keyframe(last)
@@ -307,6 +318,8 @@ class _Run:
     def _step(self, core: Core, row: JournalRow, compare: bool) -> None:
         try:
             digest = core.step(row.now_ns, decode_entries(row.entries), row.n_ticks, row.plant)
+        except ImportError:
+            raise
         except Exception as error:  # changed bytes may cause any error in the core; the error is the finding
             self._diverged("entries", f"the step cannot be taken again: {_one_line(error)}")
             return
@@ -314,7 +327,7 @@ class _Run:
             self._diverged("digest", "the simulation gives another result than the recording")
 
     def _diverged(self, field: str, text: str) -> None:
-        self.found(Problem(self.last_step, "divergence", field, text))
+        self.add_problem(Problem(self.last_step, "divergence", field, text))
         self.simulating = False
 
     def _meet_keyframe(self, step: int) -> None:
@@ -326,7 +339,7 @@ class _Run:
             self._next_keyframe = next(self._keyframes, None)
             if changed:
                 text = f"keyframe: {changed} was changed"
-                self.found(Problem(step, "changed", changed, text))
+                self.add_problem(Problem(step, "changed", changed, text))
             elif keyframe.step == step:
                 self._use_keyframe(keyframe)
 
@@ -334,9 +347,9 @@ class _Run:
         if self._chain is not None and keyframe.chain != self._chain:
             if keyframe.step == self._first:
                 text = "the header is not the one that the journal was begun with"
-                self.found(Problem(keyframe.step, "changed", "header", text))
+                self.add_problem(Problem(keyframe.step, "changed", "header", text))
             else:
-                self.found(Problem(keyframe.step, "changed", "chain", "keyframe: it belongs to another journal"))
+                self.add_problem(Problem(keyframe.step, "changed", "chain", "keyframe: it belongs to another journal"))
             return
         self._chain = keyframe.chain
         if self._core is None:
@@ -344,8 +357,10 @@ class _Run:
         elif not self.simulating:
             try:
                 self._core.restore(keyframe)
+            except ImportError:
+                raise
             except Exception as error:  # snapshots of another version may cause any error in the core
-                self.found(
+                self.add_problem(
                     Problem(keyframe.step, "divergence", "keyframe", f"it cannot be restored: {_one_line(error)}")
                 )
                 return
@@ -355,7 +370,7 @@ class _Run:
             other = [name for name in SNAPSHOTS if getattr(mine, name) != getattr(keyframe, name)]
             if other:
                 text = f"keyframe: {', '.join(other)} is not what the simulation gives"
-                self.found(Problem(keyframe.step, "divergence", other[0], text))
+                self.add_problem(Problem(keyframe.step, "divergence", other[0], text))
                 return
         self.report.keyframes += 1
 
@@ -363,10 +378,11 @@ class _Run:
         """Check that the recording beside this one is the one that it continues."""
         if not re.fullmatch(r"[^/\0]{1,255}", past.file) or past.file in (".", ".."):
             text = f"the header names no file that it continues, but {past.file[:80]!r}"
-            self.found(Problem(self._first, "changed", "header", text))
+            self.add_problem(Problem(self._first, "changed", "header", text))
             return
         self.report.continues = f"{past.file} after step {past.step}"
-        path = Path(self.report.path).with_name(past.file)
+        given = Path(self.report.path)
+        path = (given if given.is_dir() else given.parent) / past.file
         if not path.is_file():
             self.report.notes.append(f"{past.file} is not there to compare with")
             return
@@ -380,9 +396,9 @@ class _Run:
             return
         if chain != past.chain:
             text = f"it does not continue the {past.file} beside it: that has another step {past.step}"
-            self.found(Problem(past.step, "changed", "header", text))
+            self.add_problem(Problem(past.step, "changed", "header", text))
 
-    def found(self, problem: Problem) -> None:
+    def add_problem(self, problem: Problem) -> None:
         """Add a problem to the report."""
         if len(self.report.problems) < MAX_PROBLEMS:
             self.report.problems.append(problem)
@@ -392,7 +408,7 @@ class _Run:
 
 def _ending(last_step: int) -> str:
     """Describe a file without an end mark: a killed recorder and a file cut between two writes look the same."""
-    return f"NOT FINISHED: nobody closed it after step {last_step}, and what may have followed is not there"
+    return f"NOT FINISHED: it was not closed after step {last_step}, and what may have followed is missing"
 
 
 def _one_line(error: Exception) -> str:

@@ -290,7 +290,7 @@ def _build_deformables(
     for k, one in enumerate(flexibles):
         ends = {"edges": one.elements} if one.elements.shape[1] == 2 else {"faces": one.elements}
         try:
-            topology = DeformableTopology(len(one.vertices), **ends).bare()
+            topology = DeformableTopology(len(one.vertices), **ends).without_faces()
         except ValueError as error:
             raise SceneBuildError(f"deformable {one.name!r}: {error}") from None
         sources.append(DeformableSource(one.name, f"deformable-{k}", topology, one.vertices))

@@ -26,7 +26,7 @@ from iris_session.scene.composed import ComposedScene
 from iris_session.scene.elements import GREY, Appearance, DrawnItem, Matrix, TextureImage, to_matrix, truncate_name
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.importers.files import load_file
-from iris_session.scene.importers.units import file_question, side_of
+from iris_session.scene.importers.units import file_question, measure_side
 from iris_session.scene.importers.urdf import read_urdf
 from iris_session.scene.validation import (
     check_mesh,
@@ -455,7 +455,7 @@ class SceneBuilder:
             body, T_parent_body = self._place(name, position, quaternion, movable=movable, on=on, named=True)
             self._content.add_nodes(loaded, body, T_parent_body @ T_body_file, appearance, flat=self._is_moving(body))
             placed = [(surface.mesh, T_body_file @ node.matrix) for node in loaded.nodes for surface in node.surfaces]
-            self._content.add_notes(file_question(where.name, side_of(placed), factors))
+            self._content.add_notes(file_question(where.name, measure_side(placed), factors))
         return name
 
     def add_urdf(

@@ -104,21 +104,21 @@ class _GlbWriter:
             for body in self._spec.bodies
         }
         for body in self._spec.bodies:
-            self._children_of(nodes.get(body.parent, 0)).append(nodes[body.id])
+            self._get_children(nodes.get(body.parent, 0)).append(nodes[body.id])
         for visual in self._spec.visuals:
             if visual.rgba[3] > 0 and visual.group in self._spec.groups_shown:
                 mesh = self._add_visual_mesh(visual)
                 if mesh is not None:
                     node = self._add_node(visual.name or f"visual_{visual.id}", visual.T_body_visual)
                     self._json["nodes"][node]["mesh"] = mesh
-                    self._children_of(nodes[visual.body]).append(node)
+                    self._get_children(nodes[visual.body]).append(node)
         for index, deformable in enumerate(self._spec.deformables):
             if deformable.rgba[3] > 0 and deformable.group in self._spec.groups_shown:
                 node = self._add_node(
                     deformable.name or f"deformable_{index}", Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
                 )
                 self._json["nodes"][node]["mesh"] = self._add_deformable(index)
-                self._children_of(0).append(node)
+                self._get_children(0).append(node)
         add_viewpoints(self._json, self._spec, nodes)
         return self._pack()
 
@@ -143,7 +143,7 @@ class _GlbWriter:
             chunks += struct.pack("<I4s", len(body), b"BIN\0") + body
         return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
-    def _children_of(self, node: int) -> list[int]:
+    def _get_children(self, node: int) -> list[int]:
         children: list[int] = self._json["nodes"][node].setdefault("children", [])
         return children
 

@@ -226,7 +226,7 @@ def read_flex_mesh(model: mujoco.MjModel, index: int) -> FlexMesh:
         _texture_coordinates(model, index, start, corners),
         int(model.flex_vertadr[index]) + used,
         used,
-        DeformableTopology(len(used), **ends).bare(),
+        DeformableTopology(len(used), **ends).without_faces(),
     )
 
 

@@ -102,6 +102,11 @@ def load_or_create_pair(folder: PrivateFolder, name: str) -> KeyPair:
     return load_secret(folder.path / name)
 
 
+def find_pair(folder: PrivateFolder, name: str) -> KeyPair | None:
+    """Return the key pair in a file of a private folder, `None` without one. Nothing is created."""
+    return None if folder.read(name) is None else load_secret(folder.path / name)
+
+
 def _read_certificate(path: Path, *, private: bool = False) -> tuple[str, str]:
     """Return both keys of a certificate, the secret one empty when it has none.
 

@@ -1,7 +1,8 @@
 """`join_codes.json`: codes with which a new key can pair. Stores the stretched secret, never the code itself.
 
 A code admits one key, within minutes, and becomes void after five wrong attempts in total. Used and void codes are
-kept for a while without their secret, so that the command that created one can report its outcome.
+kept for a while without their secret, so that the command that created one can report its outcome, and so that a key
+that has paired gets the same answer again, also from a front that was restarted before it could answer.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class JoinCode(msgspec.Struct, frozen=True):
     `secret`: the stretched code, empty when it is used or void. `server`: fingerprint of the server key that it is
     bound to. `name`: name under which the key is listed, empty for the name that the client gives. `expires`, `made`:
     UTC seconds; a code is invalid before `made`, so setting a clock back by hours gives it no more time. `paired`: the
-    key that it admitted.
+    key that it admitted; `proof`: what this key proved, `answer`: the session's proof for it.
     """
 
     id: str
@@ -44,6 +45,8 @@ class JoinCode(msgspec.Struct, frozen=True):
     attempts_left: int = ATTEMPTS
     paired: AllowedKey | None = None
     made: float = 0.0
+    proof: bytes = b""
+    answer: bytes = b""
 
     def is_open(self, now_s: float) -> bool:
         """Return True while the code can be used."""
@@ -51,13 +54,13 @@ class JoinCode(msgspec.Struct, frozen=True):
 
 
 class RedeemResult(msgspec.Struct, frozen=True):
-    """Outcome of one attempt to redeem a code. `entry`: the key, now listed. `secret`: of the code that it proved.
+    """Outcome of one attempt to redeem a code. `entry`: the key, now listed. `answer`: the session's proof for it.
 
     Without an entry, `exhausted` codes became void by this attempt and `open_codes` can still be used.
     """
 
     entry: AllowedKey | None = None
-    secret: bytes = b""
+    answer: bytes = b""
     exhausted: int = 0
     open_codes: int = 0
 
@@ -109,11 +112,9 @@ class JoinCodes:
         """Return a code in its present state, `None` when it is not kept any more."""
         return next((one for one in self.read() if one.id == code_id), None)
 
-    def list_open(self, server: str) -> tuple[JoinCode, ...]:
-        """Return the codes that are not used, void or expired, for the server key with fingerprint `server`."""
-        now_s = time.time()
-        ours = (one for one in self.read() if one.server == server)
-        return tuple(one for one in ours if one.secret and one.attempts_left > 0 and now_s < one.expires)
+    def list_for_server(self, server: str) -> tuple[JoinCode, ...]:
+        """Return the stored codes for the server key with fingerprint `server`: open, used and void ones."""
+        return tuple(one for one in self.read() if one.server == server)
 
     def redeem(
         self,
@@ -141,17 +142,18 @@ class JoinCodes:
             if known is None:
                 return self._count_failed_attempt(codes, server, now_s)
             entry, listed = clients.plan_entry(known.name or name, client_key, known.roles, rename=True)
+            answer = pairing.make_server_proof(known.secret, server_public, decode_key(client_key))
+            used = msgspec.structs.replace(known, secret=b"", paired=entry, proof=proof, answer=answer)
             # The code first: a process that dies in between has admitted no key, and the code is used up all the same.
-            self._write_used(codes, known, entry)
+            self._write_used(codes, known, used)
             try:
                 clients.replace_all(listed)
             except KeysError:
-                self._write_used(codes, known, None)
+                self._write_used(codes, known, msgspec.structs.replace(known, secret=b""))
                 raise
-            return RedeemResult(entry, known.secret)
+            return RedeemResult(entry, answer)
 
-    def _write_used(self, codes: list[JoinCode], known: JoinCode, entry: AllowedKey | None) -> None:
-        used = msgspec.structs.replace(known, secret=b"", paired=entry)
+    def _write_used(self, codes: list[JoinCode], known: JoinCode, used: JoinCode) -> None:
         self._folder.write_json(FILE, [used if one is known else one for one in codes])
 
     def _count_failed_attempt(self, codes: list[JoinCode], server: str, now_s: float) -> RedeemResult:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from iris_session.security.allow_list import AllowList
-from iris_session.security.curve import KeyPair, load_or_create_pair
+from iris_session.security.curve import KeyPair, find_pair, load_or_create_pair
 from iris_session.security.join_codes import JoinCodes
 from iris_session.security.known_servers import KnownServers
 from iris_session.security.private_folder import KeysBusyError, KeysError, PrivateFolder
@@ -48,6 +48,14 @@ class KeyHome:
     def load_server_key(self) -> KeyPair:
         """Return the key pair of the sessions that this user serves, created on first use."""
         return load_or_create_pair(self.folder, SERVER_KEY)
+
+    def find_server_key(self) -> KeyPair | None:
+        """Return the key pair of the sessions that this user serves, `None` while there is none."""
+        return find_pair(self.folder, SERVER_KEY)
+
+    def find_identity(self) -> KeyPair | None:
+        """Return the key pair with which this user joins sessions, `None` while there is none."""
+        return find_pair(self.folder, IDENTITY)
 
     def load_identity(self) -> KeyPair:
         """Return the key pair with which this user joins sessions, created on first use."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import logging
 import os
-import sys
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Final
@@ -24,8 +24,14 @@ from iris_session.security import (
 from iris_session.security.allow_list import format_utc_now
 from iris_session.system.file_worker import FileWorker
 
+#: Roles whose keys may hand in media from other machines.
+MEDIA_ROLES: Final = frozenset({Role.CAMERA, Role.SOURCE})
+#: How long the file of the list may be missing: an editor or a network disk replaces it by another in between.
+ABSENCE_NS: Final = 2_000_000_000
 #: User-Id of a connection whose key is not listed: this prefix and the key in Z85. Never equal to a fingerprint.
 PAIRING_PREFIX: Final = "pair:"
+
+_log = logging.getLogger(__name__)
 
 
 def parse_pairing_key(user_id: str) -> str:
@@ -67,6 +73,8 @@ class Keyring:
         self._drops = drops or Drops()
         self._read_signature = signature()
         self._reported: object = None  # the fault of the list that was reported last
+        self._now_ns = 0
+        self._missing_ns: int | None = None  # since when the file is missing
         self._keys = read()
         self.removed: dict[str, AllowedKey] = {}
         self.added: dict[str, AllowedKey] = {}
@@ -77,11 +85,17 @@ class Keyring:
 
     def tick(self, now_ns: int) -> None:
         """Report finished changes of files to their callers."""
+        self._now_ns = now_ns
         self.files.tick(now_ns)
 
     def close(self) -> None:
         """Wait for queued changes of files."""
         self.files.close()
+
+    @property
+    def is_missing(self) -> bool:
+        """True while the file of the list is missing, and its keys still count: nothing may be written now."""
+        return bool(self._keys) and self._signature() is None
 
     @property
     def fingerprints(self) -> Collection[str]:
@@ -91,6 +105,16 @@ class Keyring:
     def find_key(self, mark: str) -> AllowedKey | None:
         """Return the allowed key with that fingerprint."""
         return self._keys.get(mark)
+
+    def may_be_gateway(self, mark: str) -> bool:
+        """Return whether a key is allowed in the role `gateway`: by name, or because it may join in any role."""
+        entry = self._keys.get(mark)
+        return entry is not None and (not entry.roles or Role.GATEWAY in entry.roles)
+
+    def may_hand_in_media(self, mark: str) -> bool:
+        """Return whether a key is allowed in a role whose frames the session takes: `camera`, `source`, or any."""
+        entry = self._keys.get(mark)
+        return entry is not None and (not entry.roles or not MEDIA_ROLES.isdisjoint(entry.roles))
 
     def record_join(self, mark: str) -> None:
         """Record that a key has joined."""
@@ -111,9 +135,14 @@ class Keyring:
     def reload_if_changed(self) -> None:
         """Reload the list if its file has changed. A damaged file changes nothing and is reported.
 
-        A file that cannot be opened now (no free descriptor, a network disk) is tried again.
+        A file that cannot be opened now (no free descriptor, a network disk) is tried again. A missing one is an empty
+        list after `ABSENCE_NS`, with a warning before.
         """
         signature = self._signature()
+        if signature is not None or not self._keys:
+            self._missing_ns = None
+        elif not self._has_been_missing():
+            return
         if signature == self._read_signature:
             return
         try:
@@ -124,8 +153,10 @@ class Keyring:
             if (signature, str(error)) != self._reported:
                 self._reported = signature, str(error)
                 self._drops.count("allow_list_unreadable")
-                print(f"iris-session: the allow-list is unchanged: {error}", file=sys.stderr, flush=True)
+                _log.error("allow-list unchanged: %s", error)
             return
+        if signature != self._signature():
+            return  # it was replaced or removed while it was read: the next check reads it again
         self._read_signature, self._reported = signature, None
         for mark, old in self._keys.items():
             new = keys.get(mark)
@@ -133,6 +164,19 @@ class Keyring:
                 self.removed[mark] = old
         self.added.update((mark, new) for mark, new in keys.items() if mark not in self._keys)
         self._keys = keys
+
+    def _has_been_missing(self) -> bool:
+        """Return whether the file has been missing for `ABSENCE_NS`, and report when it begins."""
+        if self._missing_ns is None:
+            self._missing_ns = self._now_ns
+            self._drops.count("allow_list_missing")
+            _log.warning(
+                "the allow-list is missing: its %d keys are revoked in %g s unless it comes back "
+                "(to revoke all keys at once, write an empty list)",
+                len(self._keys),
+                ABSENCE_NS * 1e-9,
+            )
+        return self._now_ns - self._missing_ns >= ABSENCE_NS
 
 
 def open_keyring(key_home: str, secret_file: str, clients_dir: str, drops: Drops) -> Keyring:
@@ -186,7 +230,7 @@ class _CertificateFolder:
         for name, text in wrong.items():
             if self._reported.get(name) != text:
                 self._drops.count("certificate_unusable")
-                print(f"iris-session: certificate {name} admits no key: {text}", file=sys.stderr, flush=True)
+                _log.error("certificate %s admits no key: %s", name, text)
         self._reported = wrong
         return keys
 

@@ -43,10 +43,6 @@ class KnownServers:
     def find_by_address(self, address: str) -> KnownServer | None:
         return next((one for one in self.read() if one.address == address), None)
 
-    def find_by_session(self, session: str) -> list[KnownServer]:
-        """Return the servers that had a session of that name, newest last."""
-        return [one for one in self.read() if one.session == session]
-
     def pin(self, address: str, session: str, key: str, *, replace: bool = False) -> KnownServer:
         """Store the key (Z85) of an address. Raises `KeysError` when another one is stored, unless `replace`."""
         new = KnownServer(address, session, key, compute_fingerprint(decode_key(key)), format_utc_now())

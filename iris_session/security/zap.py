@@ -18,11 +18,12 @@ from iris_session.security.keyring import PAIRING_PREFIX, Keyring
 
 ZAP_ENDPOINT: Final = "inproc://zeromq.zap.01"
 #: ZAP domains: keys that are not on the list may pair, on the control socket only; the state socket is opened again
-#: when a key is revoked that came in there.
+#: when a key is revoked that came in there; media are taken from keys of cameras and sources only.
 ZAP_CONTROL: Final = b"iris-control"
 ZAP_STATE: Final = b"iris-state"
 ZAP_MEDIA: Final = b"iris-media"
 ZAP_ASSETS: Final = b"iris-assets"
+ZAP_INGEST: Final = b"iris-ingest"
 #: As plain integers: operations on the enumerations take longer than asking the socket.
 _EVENTS: Final = int(zmq.EVENTS)
 _POLLIN: Final = int(zmq.POLLIN)
@@ -54,9 +55,13 @@ def _has_message(socket: zmq.Socket[bytes]) -> bool:
 
 
 class Authenticator:
-    """Answers ZAP requests for one context. Poll `socket` and call `answer` when it is readable.
+    """Answers ZAP requests for one context. Poll `socket` and call `answer_requests` when it is readable.
 
-    `on_refused`: called with the fingerprint and the address of every key that was refused.
+    Attributes:
+        socket: The socket of the requests.
+        on_refused: Called with the fingerprint, the address and the channel of every key that was refused.
+        is_revoked: Returns True for a key that was revoked in this session, also where the list could not be changed.
+        is_rate_limited: Returns True for a listed key that connects to a channel (its ZAP domain) too often.
     """
 
     def __init__(
@@ -64,7 +69,7 @@ class Authenticator:
         context: zmq.Context[zmq.Socket[bytes]],
         keyring: Keyring,
         drops: Drops,
-        refused: Callable[[str, str], None] = lambda _mark, _address: None,
+        refused: Callable[[str, str, str], None] = lambda _mark, _address, _channel: None,
     ) -> None:
         self.socket = context.socket(zmq.ROUTER)
         self.socket.setsockopt(zmq.LINGER, 0)
@@ -72,8 +77,8 @@ class Authenticator:
         self._keyring = keyring
         self._drops = drops
         self.on_refused = refused
-        #: Returns True for a key that was revoked in this session, also where the list could not be changed.
         self.is_revoked: Callable[[str], bool] = lambda _mark: False
+        self.is_rate_limited: Callable[[bytes, str], bool] = lambda _domain, _mark: False
 
     def answer_requests(self) -> None:
         """Answer every pending request."""
@@ -87,6 +92,15 @@ class Authenticator:
             self._drops.count("unknown_key")
             return ""
         mark = compute_fingerprint(request[6])
+        address = request[3].decode(errors="replace")
+        if self._keyring.find_key(mark) is not None and self.is_rate_limited(request[2], mark):
+            return ""
+        if request[2] == ZAP_INGEST and self._keyring.find_key(mark) is not None:
+            if self._keyring.may_hand_in_media(mark) and not self.is_revoked(mark):
+                return mark
+            self._drops.count("media_source_refused")
+            self.on_refused(mark, address, "media ingest")
+            return ""
         if self._keyring.find_key(mark) is not None and (request[2] == ZAP_CONTROL or not self.is_revoked(mark)):
             if request[2] == ZAP_STATE:
                 self._keyring.state_subscribers.add(mark)
@@ -94,5 +108,5 @@ class Authenticator:
         self._drops.count("unknown_key")
         if self._keyring.home is not None and request[2] == ZAP_CONTROL:
             return PAIRING_PREFIX + z85.encode(request[6]).decode()
-        self.on_refused(mark, request[3].decode(errors="replace"))
+        self.on_refused(mark, address, "media ingest" if request[2] == ZAP_INGEST else "state")
         return ""

@@ -24,6 +24,7 @@ from iris_session.protocol.names import LateCause
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import ControlStatus, Decision
 from iris_session.session.config import SessionConfig
+from iris_session.session.ctrl_sharing import CtrlSharing
 from iris_session.session.errors import ConfigError
 
 
@@ -36,6 +37,7 @@ def ignore_lap(cause: str) -> None:
 CROWDED_ENTRIES: Final = 6
 _encoder = msgspec.msgpack.Encoder()
 _decode_status = msgspec.msgpack.Decoder(tuple[ControlStatus, ...]).decode
+_decode_shared = msgspec.msgpack.Decoder(tuple[bytes, bytes]).decode
 
 
 class CoreConfig(msgspec.Struct, frozen=True):
@@ -63,7 +65,10 @@ class StepOutcome(msgspec.Struct, frozen=True):
 
 
 class CoreState(msgspec.Struct, frozen=True):
-    """Snapshots of the three stateful parts, and the encoded control report that the next step's authority sees."""
+    """Snapshots of the three stateful parts, and the encoded control report that the next step's authority sees.
+
+    In a user loop `controller` holds two: that of the controller, and that of `CtrlSharing`.
+    """
 
     plant: bytes
     authority: bytes
@@ -101,7 +106,10 @@ class SessionCore:
     """One session: robots and objects of one model, their authority and their control. Raises as `make_plant`.
 
     `models`: the model of a scene that was loaded later, by `SceneLoaded.model_hash`, unless it was `prepared`.
+    `sharing`: in a user loop, whose `ctrl` counts; `None` in ours, where control writes that of every robot.
     """
+
+    sharing: CtrlSharing | None
 
     def __init__(
         self,
@@ -134,8 +142,9 @@ class SessionCore:
         Without `digest` the outcome has an empty one: it takes a sixth of a step, and only a recording needs it.
         `lap` is called after each part with the `LateCause` that its time counts as; it has no influence.
 
-        `plant` (open sessions): `mjSTATE_INTEGRATION` of the user's plant at the start of this step. The ticks then
-        write `world.data.ctrl` for the caller to apply, and do not advance physics.
+        `plant` (open sessions): `mjSTATE_INTEGRATION` of the user's plant at the start of this step, with the owner's
+        `ctrl`. The ticks then write `world.data.ctrl` for the caller to apply, of the robots in `sharing.driven`, and
+        do not advance physics.
         """
         for entry in entries:
             if isinstance(entry.message, SceneLoaded) and entry.connection == entry.connection_epoch == HOST:
@@ -147,9 +156,12 @@ class SessionCore:
         lap(LateCause.AUTHORITY)
         if decision.reset:
             self._reset_world()
-            self.controller.reset(world.data)
+            self._reset_control()
         elif any(entry.connection == HOST and isinstance(entry.message, ExternalReset) for entry in entries):
-            self.controller.reset(world.data)  # the owner moved the robots: they hold where they stand now
+            self._reset_control()  # the owner moved the robots: they are where they stand now
+        owner_ctrl = world.ctrl if self.sharing is None else world.ctrl.copy()
+        if self.sharing is not None:
+            self.sharing.begin(decision, self.authority.list_holders(), world.data, owner_ctrl)
         self.controller.begin(now_ns, n_ticks, decision, world.view())
         is_crowded = len(entries) >= CROWDED_ENTRIES
         for _ in range(0 if world.diverged else n_ticks):
@@ -158,16 +170,21 @@ class SessionCore:
             if not plant and not self._tick():
                 break
             lap(LateCause.PHYSICS)
+        if self.sharing is not None and n_ticks:
+            self.sharing.apply(world.ctrl, owner_ctrl, n_ticks, estop=decision.estop)
         self._status = self.controller.get_status()
         return StepOutcome(decision, self._status, self._digest(decision) if digest else b"", world.diverged)
 
     def write_rest_controls(self, plant: bytes) -> None:
-        """Write the last `world.data.ctrl` for the plant in state `plant`: robots at rest, objects released.
+        """Write the last `world.data.ctrl` for the plant in state `plant`: driven robots at rest, objects released.
 
         No step may follow: this is in no journal.
         """
         self.world.restore_state(plant)
+        owner_ctrl = self.world.ctrl.copy()
         self.controller.write_rest(self.world.data)
+        if self.sharing is not None:
+            self.sharing.keep_owned(self.world.ctrl, owner_ctrl)
 
     def _tick(self) -> bool:
         """Advance physics by a tick; False when the state is no longer finite: physics stands still until a reset."""
@@ -197,7 +214,16 @@ class SessionCore:
 
     def _set_plant(self, plant: Plant) -> None:
         self.world, self.controller, self.scene = plant
+        self.sharing = None
+        if self.config.authority.user_owned_loop:
+            names = [robot.name for robot in self.scene.robots]
+            self.sharing = CtrlSharing(names, self.controller, float(self.world.model.opt.timestep))
+        self._reset_control()
+
+    def _reset_control(self) -> None:
         self.controller.reset(self.world.data)
+        if self.sharing is not None:
+            self.sharing.reset()
 
     def current_config(self) -> CoreConfig:
         """Return the configuration of a session that begins with the present scene."""
@@ -215,12 +241,10 @@ class SessionCore:
 
     def snapshot(self) -> CoreState:
         """Return the state after the last step; restoring it is invisible to everything that follows."""
-        return CoreState(
-            self.world.snapshot(),
-            self.authority.snapshot(),
-            self.controller.snapshot(),
-            _encoder.encode(self._status),
-        )
+        controller = self.controller.snapshot()
+        if self.sharing is not None:
+            controller = _encoder.encode((controller, self.sharing.snapshot()))
+        return CoreState(self.world.snapshot(), self.authority.snapshot(), controller, _encoder.encode(self._status))
 
     def restore(self, state: CoreState) -> None:
         """Restore a snapshot into a core that was built with the same model and configuration.
@@ -234,7 +258,11 @@ class SessionCore:
         elif scene is not None and scene != msgspec.structs.replace(self.scene, model_hash=self.world.scene_hash):
             self._load_scene(scene)
         self.world.restore(state.plant)
-        self.controller.restore(state.controller)
+        controller = state.controller
+        if self.sharing is not None:
+            controller, sharing = _decode_shared(controller)
+            self.sharing.restore(sharing)
+        self.controller.restore(controller)
         self._status = _decode_status(state.status)
 
 

@@ -28,6 +28,8 @@ from iris_session.protocol.session_mirror import SessionMirror
 from iris_session.protocol.status import AlignmentReport, ParticipantReport, Quantiles, compute_quantiles
 from iris_session.protocol.steps import ControlStatus, Decision
 
+#: Handovers listed by the status; the recording has them all.
+MAX_HANDOVERS: Final = 1000
 #: Events kept for display; the recording has them all.
 RECENT_EVENTS: Final = 200
 #: Samples per robot whose wait for a step is remembered: two to three seconds of one device.
@@ -59,7 +61,7 @@ class SessionLedger:
     def __init__(self) -> None:
         self.mirror = SessionMirror()
         self.mirror.apply_snapshot(Snapshot(0, 0, 1, 0, "", 0, 0.0, 0, participants=(), leases=()))
-        self.handovers: list[HandoverStatus] = []
+        self.handovers: deque[HandoverStatus] = deque(maxlen=MAX_HANDOVERS)
         self.recent: deque[Event] = deque(maxlen=RECENT_EVENTS)
         self.applied: dict[str, Applied] = {}
         self.connections: dict[int, str] = {}

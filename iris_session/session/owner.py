@@ -16,7 +16,7 @@ from typing import Self
 
 from iris_session.physics import Pacer
 from iris_session.protocol.client_messages import ClearEStop, EStop, Marker
-from iris_session.protocol.entries import EntryMessage, ScenePatched
+from iris_session.protocol.entries import EntryMessage, OwnerListens, ScenePatched
 from iris_session.protocol.names import MediaEncoding
 from iris_session.protocol.scene import PatchOp, SceneError, SceneSpec
 from iris_session.protocol.server_messages import Event
@@ -24,8 +24,8 @@ from iris_session.session.config import SessionConfig
 from iris_session.session.errors import ConfigError, OwnershipError
 from iris_session.session.processes import SessionProcesses
 from iris_session.session.scene_change import check_patch
-from iris_session.session.status import SessionStatus, make_session_status
-from iris_session.session.stepper import MAX_PENDING_SCENES, NextPatch, Stepper
+from iris_session.session.status import DataFault, SessionStatus, make_session_status
+from iris_session.session.stepper import MAX_PENDING_SCENES, NextPatch, OwnerRequest, Stepper
 
 
 class Owner:
@@ -41,6 +41,7 @@ class Owner:
     _scheduling = "normal"
     _recording: Path | None = None  # of the closed session
     _is_closed = False
+    _listens = False  # to requests
 
     # --- life --------------------------------------------------------------------------------------------------------
 
@@ -52,6 +53,10 @@ class Owner:
 
     @abstractmethod
     def post(self, message: EntryMessage) -> None: ...
+
+    def _find_data_fault(self) -> DataFault | None:
+        """Return what is not finite in the data of a user loop."""
+        return None
 
     @abstractmethod
     def _hold_steps(self) -> AbstractContextManager[object]:
@@ -100,10 +105,14 @@ class Owner:
     def clear_estop(self) -> None:
         """Allow motion again after an e-stop. Participants must clutch again.
 
+        It ends the stops of all steps so far. When another comes before the next step, the session stays stopped;
+        `status().stops` lists who has stopped it.
+
         Raises:
             OwnershipError: The queue of inputs is full, or the session is closed.
         """
-        self.post(ClearEStop(request_id=0))
+        seen = 0 if self._stepper is None else self._stepper.core.authority.stop_seq
+        self.post(ClearEStop(request_id=0, stop_seq=seen))
 
     def marker(self, text: str) -> None:
         """Put a note into the recording, and show it to participants.
@@ -116,6 +125,27 @@ class Owner:
             OwnershipError: The queue of inputs is full, or the session is closed.
         """
         self.post(Marker(request_id=0, text=text))
+
+    def poll_requests(self) -> list[OwnerRequest]:
+        """Return what participants ask of your loop, oldest first, each once: to reset, to record an episode again.
+
+        Until the first call such requests are denied (`user_owned`), because a loop that does not look would never
+        answer; they are returned all the same. `run()` resets by itself and leaves no requests.
+
+        Returns:
+            At most 64 requests since the last call. Fulfil them by resetting your world: the session sees by itself
+            that time goes back; call `reset()` where it does not.
+
+        Raises:
+            OwnershipError: The session is closed, or a `ScenePublisher` is not started.
+        """
+        if not self._listens:
+            self.post(OwnerListens())
+            self._listens = True
+        found: list[OwnerRequest] = []
+        while self._stepper is not None and self._stepper.requests:
+            found.append(self._stepper.requests.popleft())
+        return found
 
     def publish_media(
         self,
@@ -194,7 +224,8 @@ class Owner:
         with self._hold_steps():
             drops = {} if processes is None else processes.count_drops()
             restarts = {} if processes is None else processes.count_restarts()
-            return make_session_status(self._stepper, self._pacer, drops, restarts, self._scheduling)
+            fault = self._find_data_fault()
+            return make_session_status(self._stepper, self._pacer, drops, restarts, self._scheduling, fault)
 
     def recent_events(self) -> list[Event]:
         """Return the newest events.

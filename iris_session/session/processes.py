@@ -356,6 +356,7 @@ class SessionProcesses:
             last = self.feed.stats.recorder
             refused = 0 if last is None else last.vertices_refused
             drops["recorded_vertices"] = self.feed.stats.dropped_vertices + refused
+            drops["recorded_samples"] = 0 if last is None else last.samples_left_out
         drops |= self._overflows
         return {reason: count for reason, count in drops.items() if count}
 

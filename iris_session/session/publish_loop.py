@@ -54,7 +54,7 @@ class PublishedVertices:
 
 
 class PublishLoop:
-    """Drives a stepper by frames. `offer` may be called from any thread.
+    """Drives a stepper by frames. `offer` may be called from any thread; `start` starts the helper thread.
 
     Attributes:
         superseded: Frames that a newer one replaced before they were published.
@@ -95,7 +95,21 @@ class PublishLoop:
         with self.lock:
             self._take_idle_step()  # clients that join before the first frame see the scene as it was composed
         self._helper = threading.Thread(target=self._run_helper, name="iris-session-publish", daemon=True)
+
+    def start(self) -> None:
+        """Start the helper thread, which polls until `close`."""
         self._helper.start()
+
+    def poll(self) -> None:
+        """Publish the pending frame if it is due; without one, take a step without a tick if the last is long ago."""
+        with self.lock:
+            now_ns = self._stepper.clock()
+            if self._closed.is_set() or self._error is not None:
+                return
+            if self._pending is not None and now_ns >= self._due_ns:
+                self._publish_pending()
+            elif now_ns - self._step_ns > IDLE_AFTER_NS:
+                self._take_idle_step()
 
     def offer(self, frame: Frame) -> None:
         """Publish a frame now or when it is due. Raises `OwnershipError` after `close`, and what stopped the helper."""
@@ -134,7 +148,7 @@ class PublishLoop:
         """Publish the pending frame and end the helper. After an error no further step is taken."""
         self._closed.set()
         self._wake.set()
-        if self._helper is not threading.current_thread():
+        if self._helper.is_alive() and self._helper is not threading.current_thread():
             self._helper.join(timeout=2.0)
         with self.lock:
             self._publish_pending()
@@ -191,8 +205,7 @@ class PublishLoop:
             while not self._closed.is_set() and self._error is None:
                 self._wake.wait(self._compute_pause_s())
                 self._wake.clear()
-                with self.lock:
-                    self._poll()
+                self.poll()
         except BaseException as error:  # raised at the next `publish`, which may not come
             self._fail(error)
             _log.error("the session stands still after an error: %s: %s", type(error).__name__, error)
@@ -202,15 +215,6 @@ class PublishLoop:
         if self._pending is None:
             return IDLE_PERIOD_S
         return min(IDLE_PERIOD_S, max(0.0, (self._due_ns - self._stepper.clock()) * 1e-9))
-
-    def _poll(self) -> None:
-        now_ns = self._stepper.clock()
-        if self._closed.is_set() or self._error is not None:
-            return
-        if self._pending is not None and now_ns >= self._due_ns:
-            self._publish_pending()
-        elif now_ns - self._step_ns > IDLE_AFTER_NS:
-            self._take_idle_step()
 
 
 #: Shortest silence that is reported, and how many usual periods it must last.

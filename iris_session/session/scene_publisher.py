@@ -127,6 +127,7 @@ class ScenePublisher(Owner):
             self._draft = SceneDraft(composed)
             self._loop = PublishLoop(carrier, vertices, self._stepper, processes, processes.state_period_ns)
             processes.reporter.warning_sources += [self._loop.warnings, self._draft.warnings]
+            self._loop.start()
         except BaseException:
             self.close()
             raise

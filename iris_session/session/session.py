@@ -9,7 +9,7 @@
             mujoco.mj_step(model, data)
             session.end_tick()
 
-    session = Session.attach(model, data)      # one line in an existing script: MuJoCo's control callback
+    session = Session.attach(model, data)      # one line in an existing script: every mj_step of data is a tick
 
 The process that makes the `Session` is the authority. Front and recorder are child processes, which are restarted when
 they die (`session.processes`).
@@ -30,20 +30,24 @@ from typing import Final, Self
 
 import mujoco
 
-from iris_session.physics import Pacer, PacerStats, load_model
+from iris_session.control import ControlError
+from iris_session.physics import Pacer, PacerStats, PhysicsError, load_model
+from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.protocol.client_messages import Assign, Control, EStop, SetScale
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import EntryMessage
 from iris_session.protocol.names import ControlAction, LateCause
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.recording.environment import use_one_blas_thread
+from iris_session.session.attachment import Attachment, find_simulation
 from iris_session.session.config import SessionConfig, check_arguments, check_objects, check_robots, check_timestep
 from iris_session.session.core import SessionCore, make_session_core, read_plant_state
-from iris_session.session.errors import OwnershipError
+from iris_session.session.errors import ConfigError, OwnershipError
 from iris_session.session.owner import Owner
 from iris_session.session.processes import SessionProcesses
 from iris_session.session.resume import prepare_session
 from iris_session.session.scene_change import adopt_timestep, prepare_scene
+from iris_session.session.status import DataFault
 from iris_session.session.stepper import (
     MAX_HOST_ENTRIES,
     RESERVED_HOST_ENTRIES,
@@ -116,8 +120,7 @@ class Session(Owner):
         self._early_patches = []
         self._pacer: Pacer | None = None
         self._stop = threading.Event()
-        self._attached = False
-        self._callback: Callable[[mujoco.MjModel, mujoco.MjData], None] | None = None
+        self._attachment: Attachment | None = None
         self._requested_ticks = 0  # by a director, while paused
         self._scheduling = "normal"
         self._next_overrun_log_ns = 0
@@ -131,10 +134,12 @@ class Session(Owner):
         Raises:
             ControlError, PhysicsError, ConfigError: The robots cannot be driven; nothing was opened.
             StartError: A port is in use, a folder cannot be written, a key is missing.
-            OwnershipError: The session is closed.
+            OwnershipError: The session is closed, or MuJoCo's control callback is set.
         """
         if self._processes is None:
             self._require_open()
+            if mujoco.get_mjcb_control() is not None:  # called for the session's own data, and while models compile
+                raise OwnershipError("mjcb_control is set, for every data of this process: write ctrl before mj_step")
             core = self._make_core(user_owned=False)
             processes = SessionProcesses(self.config, core, self.origin_ns, self._past)
             processes.start()
@@ -143,19 +148,18 @@ class Session(Owner):
     def close(self) -> bool:
         """Notify clients, finish the recording, end every child process. May be called twice.
 
-        In a user loop the robots of `data` are left at rest where they are commanded (torque actuators: with the
-        torques that hold them now).
+        In a user loop the robots that participants drive are left at rest where they are commanded (torque actuators:
+        with the torques that hold them now); all others are the owner's as before.
 
         Returns:
             False when the recording is incomplete; `recording_fault` says why.
         """
         self._stop.set()
         self._is_closed = True
-        if self._attached:
-            if mujoco.get_mjcb_control() is self._callback:  # not replaced by another one since
-                mujoco.set_mjcb_control(None)
+        if self._attachment is not None:
+            self._attachment.close()
             atexit.unregister(self.close)
-            self._attached = False
+            self._attachment = None
         if self._user_loop is not None:
             self._user_loop.close()
         if self._processes is not None:
@@ -249,7 +253,8 @@ class Session(Owner):
     # --- user loop ---------------------------------------------------------------------------------------------
 
     def begin_tick(self) -> None:
-        """Process inputs of participants and write `data.ctrl` of the robots; call right before `mj_step`.
+        """Process inputs of participants and write `data.ctrl` of the robots that they drive; call right before
+        `mj_step`, after you have written yours.
 
         Raises:
             OwnershipError: The session is closed, or has no `data`, or is driven by `run()`.
@@ -264,62 +269,109 @@ class Session(Owner):
         """
         self._require_user_loop().end_tick()
 
+    def driven_robots(self) -> tuple[str, ...]:
+        """Return the robots whose `ctrl` the session writes in your own loop; all others are yours.
+
+        A participant holds them and has engaged, or they are on their way back to you.
+        """
+        with self._hold_steps():
+            return () if self._user_loop is None else self._user_loop.driven
+
     def targets(self) -> dict[str, Pose]:
-        """Return the end-effector targets `T_world_tip` by robot, for an environment's own controller [m]."""
+        """Return the end-effector targets `T_world_tip` by robot, for an environment's own controller [m].
+
+        In your own loop, use those of `driven_robots()`; for other robots they are where the robot is.
+        """
         self._require_started()
         with self._hold_steps():
             return {} if self._core is None else dict(self._core.controller.get_targets())
 
     @classmethod
-    def attach(cls, model: mujoco.MjModel, data: mujoco.MjData, config: SessionConfig | None = None) -> Self:
+    def attach(
+        cls,
+        model: mujoco.MjModel | None = None,
+        data: mujoco.MjData | None = None,
+        config: SessionConfig | None = None,
+        *,
+        environment: object = None,
+        step: str = "step",
+    ) -> Self:
         """Share a script's own simulation: every `mj_step(model, data)` after this line is one tick of the session.
 
-        Uses MuJoCo's control callback, which is global to the process. It acts on `data` only, once per new time, and
-        treats time that goes back as a reset. The session ends with `close()`, or with the script.
+        `mujoco.mj_step` and `mj_step2` are wrapped, in every module that uses them, and act as before on all other
+        data. Models and data that the script makes meanwhile are not touched. Time that goes back is a reset. The
+        session ends with `close()`, or with the script.
 
         Args:
-            model: The model that the script simulates.
-            data: The data that the script advances.
+            model: The model that the script simulates; `None` for that of `environment`.
+            data: The data that the script advances; `None` for that of `environment`.
             config: Settings; `None` for the defaults.
+            environment: Object that owns the simulation: a Gymnasium, robosuite or dm_control environment or physics,
+                or any object with `model` and `data`. The session follows it to the model and data that it builds at a
+                reset. Its step is a tick by itself where it does not call MuJoCo's functions in Python.
+            step: Name of its method that advances the simulation.
 
         Returns:
             The started session.
 
         Raises:
-            OwnershipError: The integrator is RK4, which calls the callback four times a step, or a callback is set.
+            OwnershipError: A session is attached to this data already, or `environment` has no such method.
+            ConfigError: No model and data are given, and `environment` shows none.
             StartError: A port is in use, a folder cannot be written, a key is missing.
         """
-        if int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4):
-            raise OwnershipError("attach() cannot be used with the RK4 integrator: set integrator='implicitfast'")
-        if mujoco.get_mjcb_control() is not None:
-            raise OwnershipError("MuJoCo's control callback is in use: call begin_tick() and end_tick() instead")
+        if model is None or data is None:
+            found = find_simulation(environment)
+            if found is None:
+                kind = type(environment).__name__
+                raise ConfigError(f"attach: no MjModel and MjData in {kind}: give model and data, too")
+            model, data = found
+        if environment is not None and not callable(getattr(environment, step, None)):
+            raise OwnershipError(f"environment of type {type(environment).__name__} has no method {step!r} to wrap")
         session = cls(model, data, config)
         try:
             session.start()
             loop = session._require_user_loop()
+            session._attachment = Attachment(loop, environment, step, session._change_model)
         except BaseException:
             session.close()
             raise
-
-        def on_control(_: mujoco.MjModel, callback_data: mujoco.MjData) -> None:
-            if callback_data is data:
-                loop.control_callback()
-
-        mujoco.set_mjcb_control(on_control)
-        session._attached, session._callback = True, on_control
         atexit.register(session.close)  # a script may simply end
         return session
+
+    def _change_model(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """Go on with another model and data of the attached environment."""
+        loop, stepper, scenes = self._require_user_loop(), self.stepper, self._require_started().scenes
+
+        def prepare(state: bytes) -> NextScene | None:
+            if compute_scene_hash(encode_model(model)) == stepper.core.world.scene_hash:
+                return None
+            try:
+                scene = prepare_scene(stepper.core, scenes, model, state, self.robots, self.objects)
+            except (PhysicsError, ControlError):  # other robots or objects
+                scene = prepare_scene(stepper.core, scenes, model, state, None, None)
+            with scenes.lock:
+                scenes.show(scene.shown)
+            return scene
+
+        loop.change_model(model, data, prepare)
+        self.model, self.data = model, data
+        self.robots, self.objects = stepper.core.scene.robots, stepper.core.scene.objects
 
     def _hold_steps(self) -> AbstractContextManager[object]:
         """Return a context in which the helper thread of a user loop takes no step."""
         return nullcontext() if self._user_loop is None else self._user_loop.lock
+
+    def _find_data_fault(self) -> DataFault | None:
+        return None if self._user_loop is None else self._user_loop.fault
 
     def _require_user_loop(self) -> UserLoop:
         if self._user_loop is None:
             if self.data is None:
                 raise OwnershipError("begin_tick() needs the data that your loop advances: Session(model, data)")
             stepper = self._make_stepper(user_owned=True)
-            self._user_loop = UserLoop(self.model, self.data, stepper, self._require_started())
+            processes = self._require_started()
+            self._user_loop = UserLoop(self.model, self.data, stepper, processes)
+            processes.reporter.warning_sources.append(self._user_loop.list_warnings)
         return self._user_loop
 
     # --- inputs of the owner ---------------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from iris_session.protocol.status import (
     RecorderReport,
     RobotReport,
     StatusReport,
+    StopReport,
 )
 from iris_session.session.ledger import HandoverStatus
 from iris_session.session.stepper import Stepper
@@ -48,6 +49,23 @@ class ProcessStatus(msgspec.Struct, frozen=True):
     sheet_sizes: dict[str, float] = {}
 
 
+class DataFault(msgspec.Struct, frozen=True):
+    """Numbers in the owner's `MjData` that are not finite. While they last the session takes no tick.
+
+    Attributes:
+        arrays: Names of the arrays of the data that hold them.
+        since_s: Session time at which they were first seen [s].
+    """
+
+    arrays: tuple[str, ...]
+    since_s: float
+
+    @property
+    def text(self) -> str:
+        """One line for people."""
+        return f"data.{', data.'.join(self.arrays)}: numbers that are not finite; robots hold until the next reset"
+
+
 class SessionStatus(msgspec.Struct, frozen=True):
     """State of a session for its owner, from `Session.status()`.
 
@@ -66,6 +84,9 @@ class SessionStatus(msgspec.Struct, frozen=True):
         drops: By reason, everything that was not delivered.
         restarts: Of `front` and `recorder`.
         scheduling: `realtime` or `normal`.
+        data_fault: What is not finite in the data of a user loop now; `None` while all is well.
+        stops: The e-stops in force, newest first, the newest of each participant.
+        pause_reason: Why physics stands still until a reset (`reset()` or `resume()`), empty otherwise.
     """
 
     session_time_s: float
@@ -80,6 +101,9 @@ class SessionStatus(msgspec.Struct, frozen=True):
     drops: dict[str, int]
     restarts: dict[str, int]
     scheduling: str = "normal"
+    data_fault: DataFault | None = None
+    stops: tuple[StopReport, ...] = ()
+    pause_reason: str = ""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the status as plain values for JSON."""
@@ -92,6 +116,7 @@ def make_session_status(
     drops: dict[str, int],
     restarts: dict[str, int],
     scheduling: str,
+    data_fault: DataFault | None = None,
 ) -> SessionStatus:
     """Return the status now, empty before the first step."""
     if stepper is None or stepper.last is None:
@@ -123,6 +148,9 @@ def make_session_status(
         drops,
         restarts,
         scheduling,
+        data_fault,
+        core.authority.build_stop_reports(),
+        core.authority.pause_reason,
     )
 
 
@@ -188,6 +216,8 @@ class StatusReporter:
             warnings=tuple(collect_warnings(stepper, processes.recorder, self.scheduling, warnings)),
             anchors=make_anchor_reports(core.authority.anchors, processes.sheet_sizes),
             cross_checks=core.authority.build_cross_check_reports(),
+            stops=core.authority.build_stop_reports(),
+            pause_reason=core.authority.pause_reason,
         )
 
     def _measure_cpu_share(self) -> float:

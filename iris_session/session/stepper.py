@@ -17,20 +17,21 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.protocol.client_messages import Control, EStop, GetSnapshot, Marker
+from iris_session.protocol.client_messages import Control, Episode, EStop, GetSnapshot, Marker
 from iris_session.protocol.common import MAX_TEXT, Applied, Pose
 from iris_session.protocol.entries import (
     HOST,
     Entry,
     EntryMessage,
+    PhysicsDiverged,
     RecordingGap,
     ScenePatched,
     SessionResumed,
     decode_entry,
     encode_entry,
 )
-from iris_session.protocol.names import LateCause
-from iris_session.protocol.server_messages import BodyInfo, StateHeader
+from iris_session.protocol.names import ControlAction, DenialReason, EpisodeAction, LateCause
+from iris_session.protocol.server_messages import BodyInfo, Reply, StateHeader
 from iris_session.protocol.steps import Decision
 from iris_session.recording.journal import CRASHED, JournalRow, Keyframe, make_row
 from iris_session.session.core import Plant, SessionCore, StepOutcome, ignore_lap
@@ -45,6 +46,8 @@ MAX_HOST_ENTRIES: Final = 256
 RESERVED_HOST_ENTRIES: Final = 64
 #: Pending scenes and patches; a step loads one.
 MAX_PENDING_SCENES: Final = 64
+#: Requests that wait for the owner of a user loop; more replace the oldest.
+MAX_REQUESTS: Final = 64
 #: Lost rows are logged at most this often; each loss is an event too.
 GAP_LOG_PERIOD_NS: Final = 10_000_000_000
 
@@ -118,6 +121,25 @@ class NextPatch(NamedTuple):
     shown: Shown
 
 
+class OwnerRequest(msgspec.Struct, frozen=True):
+    """A request of a participant that only the owner of a user loop can fulfil, from `Session.poll_requests`.
+
+    Attributes:
+        kind: `reset`: put the scene into its initial state. `rerecord`: the same; the running episode was discarded,
+            and the next one starts with the reset.
+        participant: Id of the participant.
+        name: Its name.
+        label: Text of an episode.
+        session_time_s: When it was asked [s].
+    """
+
+    kind: str
+    participant: str
+    name: str = ""
+    label: str = ""
+    session_time_s: float = 0.0
+
+
 class ResumedFrom(NamedTuple):
     """Newest step and session time of the recording that is resumed. `anchors`: new poses; empty: as they were."""
 
@@ -142,6 +164,7 @@ class Stepper:
     Attributes:
         last: Outcome of the newest step.
         ledger: Participants, leases and events so far.
+        requests: What participants ask of the owner of a user loop, oldest first.
         lateness_ns: Worst lateness of a tick since the last published state, set by the pacing loop.
         on_scene: Called with a scene or patch before the step that loads it.
         on_publish: Called after a state was published, with scene epoch and the times of `publish_now`.
@@ -180,6 +203,7 @@ class Stepper:
         self._lost_rows = self._next_gap_log_ns = 0
         self._chain = chain
         self.ledger = SessionLedger()
+        self.requests: deque[OwnerRequest] = deque(maxlen=MAX_REQUESTS)
         self.lateness_ns = 0
         self.on_publish: list[Callable[[int, int, int], None]] = []
         self.on_state: Callable[[StateHeader, NDArray[np.float64]], None] | None = None
@@ -262,10 +286,8 @@ class Stepper:
         end_ns = self.clock()
         if self.on_entries is not None:
             self.on_entries(entries)
-        anew = self.last is None or not self.last.diverged
-        if outcome.diverged and (anew or not (plant or outcome.decision.paused)):  # no resume but by a reset
-            if not plant:  # the session cannot pause a user's loop
-                self.post_own(Control(request_id=0, action="pause"))
+        if outcome.diverged and (self.last is None or not self.last.diverged):
+            self.post_own(PhysicsDiverged(outcome.decision.scene_epoch, outcome.diverged[:MAX_TEXT]))
             self.post_own(Marker(request_id=0, text=f"physics stands still until a reset: {outcome.diverged}"))
         self.last = outcome
         self.front.send_decision(self.step_count, outcome.decision)
@@ -273,6 +295,12 @@ class Stepper:
         if publish:
             self.publish(end_ns)
         self.ledger.apply_step(outcome.decision, outcome.status)
+        for outgoing in outcome.decision.outgoing:  # replies to requests of the owner, which does not wait for them
+            denial = outgoing.message.denial if isinstance(outgoing.message, Reply) else None
+            if outgoing.connection == HOST and denial is not None:
+                _log.warning("the session denied its owner: %s; %s", denial.message, denial.advice or denial.reason)
+        if entries and self.core.config.authority.user_owned_loop:
+            self._collect_requests(entries, outcome.decision)
         if self.recorder is not None:
             self._record(self.recorder, now_ns, n_ticks, entries, plant)
         self.step_count += 1
@@ -314,9 +342,39 @@ class Stepper:
             callback(scene)
         return messages
 
+    def _collect_requests(self, entries: Sequence[Entry], decision: Decision) -> None:
+        """Keep what the authority has left to the owner of a user loop: granted, or denied as `user_owned`."""
+        for entry in entries:
+            m = entry.message
+            if isinstance(m, Control) and m.action == ControlAction.RESET:
+                kind, label = m.action, ""
+            elif isinstance(m, Episode) and m.action in (EpisodeAction.RESET, EpisodeAction.RERECORD):
+                kind, label = m.action, m.label
+            else:
+                continue
+            for outgoing in decision.outgoing:
+                reply = outgoing.message
+                if outgoing.connection != entry.connection or not isinstance(reply, Reply):
+                    continue
+                denial = reply.denial
+                is_left = denial is None or denial.reason == DenialReason.USER_OWNED
+                if reply.request_id == m.request_id and is_left and entry.connection != HOST:
+                    sender = self.core.authority.find_sender(entry.connection)
+                    self.requests.append(OwnerRequest(kind, *sender, label, entry.receive_ns * 1e-9))
+                    break
+
+    @property
+    def has_pending_scenes(self) -> bool:
+        """Return whether scenes or patches wait for steps of their own."""
+        return bool(self._scenes)
+
+    def is_state_due(self, end_ns: int) -> bool:
+        """Return whether `publish` would publish now."""
+        return self.last is not None and end_ns >= self._next_state_ns
+
     def publish(self, end_ns: int) -> None:
         """Publish the rigid state if it is due. `end_ns`: session time of the end of the tick it belongs to."""
-        if self.last is None or end_ns < self._next_state_ns:
+        if not self.is_state_due(end_ns):
             return
         # Aims at a fixed rate; after a long gap it starts over instead of sending a burst.
         self._next_state_ns = max(self._next_state_ns + self._state_period_ns, end_ns)

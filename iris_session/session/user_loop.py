@@ -1,8 +1,14 @@
-"""`UserLoop`: a session inside a loop that the user owns, by `begin_tick()/end_tick()` or MuJoCo's control callback.
+"""`UserLoop`: a session inside a loop that the user owns, by `begin_tick()/end_tick()` or by wrapped steps of its data.
 
-The session never touches the user's `MjData` but at a tick. It keeps a twin world of its own whose state is set from
-the plant's `mjSTATE_INTEGRATION` at every step; that state is journaled, so authority and control can be re-run exactly
-although the plant cannot (recordings of class `open`).
+The session touches the user's `MjData` only at a tick, and there only what it drives: `ctrl` of robots that a
+participant has engaged (`ctrl_sharing`), and wrenches on objects that a hand holds. It keeps a twin world of its own
+whose state is set from the plant's `mjSTATE_INTEGRATION` at every step, with the owner's `ctrl` in place of the
+session's; that state is journaled, so authority and control can be re-run exactly although the plant cannot (recordings
+of class `open`).
+
+What the session has written stays in the data until the next tick. There, what the owner has written since is the
+owner's; where nothing was written the owner's value is the one from before the session took over. It comes back when
+the session gives the robot back, and at once after a reset.
 
 The state passed to the core is always finite. While the user's is not, the last finite one replaces it and no tick is
 taken: robots hold, participants are notified, and must clutch again afterwards.
@@ -11,24 +17,28 @@ A helper thread takes zero-tick steps, on the twin alone, when the user's loop i
 and e-stops go on while a script plots, trains or waits at a prompt.
 
 What one step computes is applied until the next `begin_tick`, however many `mj_step` lie between: control counts the
-ticks of the round before, so that robots keep their speed. At the end robots are left at rest.
+ticks of the rounds before, so that robots keep their speed. At the end robots that are driven are left at rest.
 """
 
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from types import TracebackType
 from typing import Final
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
+from iris_session.physics.world import STATE
 from iris_session.protocol.client_messages import Marker
 from iris_session.protocol.entries import ExternalReset, StalledGap
 from iris_session.session.core import read_plant_state
 from iris_session.session.errors import OwnershipError
 from iris_session.session.processes import SessionProcesses
-from iris_session.session.stepper import Stepper
+from iris_session.session.status import DataFault
+from iris_session.session.stepper import NextScene, Stepper
 
 #: Silence of the user's loop after which zero-tick steps begin, and their distance.
 IDLE_AFTER_NS: Final = 20_000_000
@@ -36,65 +46,154 @@ IDLE_PERIOD_S: Final = 0.01
 #: Silence after which robots must be clutched again (the freshness bound of samples). The authority cannot see it,
 #: because zero-tick steps go on meanwhile.
 GAP_NS: Final = 150_000_000
-#: Most ticks that control counts for one round of the user loop; a larger jump of time is no motion.
+#: A round that takes longer than that is a gap, too, unless rounds of this loop take so long: so many times the one
+#: before.
+LONG_ROUND: Final = 4
+#: Most ticks that control counts for one round of the user loop, and most time [s]; a larger jump of time is no motion.
 MAX_TICKS: Final = 100
+MAX_ROUND_S: Final = 0.1
+#: Time that an attached script simulates outside of the session's ticks before the owner is warned [s].
+UNSEEN_S: Final = 1.0
+#: Joints of a driven robot that differ by more than this [rad or m] from where the step has left them were moved by the
+#: owner.
+MOVED: Final = 1e-6
+
+_CTRL: Final = int(mujoco.mjtState.mjSTATE_CTRL)
+_XFRC: Final = int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
+_FIELDS: Final = {
+    "time": int(mujoco.mjtState.mjSTATE_TIME),
+    "qpos": int(mujoco.mjtState.mjSTATE_QPOS),
+    "qvel": int(mujoco.mjtState.mjSTATE_QVEL),
+    "act": int(mujoco.mjtState.mjSTATE_ACT),
+    "qacc_warmstart": int(mujoco.mjtState.mjSTATE_WARMSTART),
+    "ctrl": _CTRL,
+    "qfrc_applied": int(mujoco.mjtState.mjSTATE_QFRC_APPLIED),
+    "xfrc_applied": _XFRC,
+    "mocap_pos": int(mujoco.mjtState.mjSTATE_MOCAP_POS),
+    "mocap_quat": int(mujoco.mjtState.mjSTATE_MOCAP_QUAT),
+}
+
+Floats = NDArray[np.float64]
+
+
+class _Lent:
+    """Elements of an array of the user's data that the session writes for now, and the owner's values of them."""
+
+    def __init__(self, array: NDArray[np.float64]) -> None:
+        self.indices: NDArray[np.intp] = np.zeros(0, np.intp)
+        self._owner = self._written = array[self.indices].copy()
+
+    def read(self, array: Floats) -> None:
+        """Take over what the owner has written since `write`."""
+        if self.indices.size:
+            now = array[self.indices]
+            self._owner = np.where(now == self._written, self._owner, now)
+
+    def is_overwritten(self, array: Floats) -> bool:
+        """Return whether the array holds other values than those that were written last."""
+        return bool(self.indices.size and not np.array_equal(array[self.indices], self._written))
+
+    def put_owner(self, array: Floats) -> None:
+        """Put the owner's values into `array`."""
+        array[self.indices] = self._owner
+
+    def put_written(self, array: Floats) -> None:
+        """Put the session's values into `array` again."""
+        array[self.indices] = self._written
+
+    def write(self, array: Floats, indices: NDArray[np.intp], values: Floats) -> None:
+        """Give everything back to the owner, then write `values` (of the whole array) at `indices`. After `read`."""
+        if not self.indices.size and not indices.size:
+            return
+        array[self.indices] = self._owner
+        self.indices, self._owner = indices, array[indices].copy()
+        self._written = array[indices] = values[indices]
 
 
 class UserLoop:
     """Ties a stepper to the user's `model` and `data`. All methods but `close` and `reset` belong to the user's thread.
 
     `lock` is held while a step is taken; hold it to read what steps change.
+
+    Attributes:
+        fault: What is not finite in the user's data now, `None` while all is well.
+        overwritten: Rounds in which the owner has changed what the session had written, between the two ends of it.
+        is_attached: The loop is driven by the wrapped step of its data, so no time should pass outside of rounds.
+        unseen_s: Time of the simulation [s] that did.
     """
 
     def __init__(
         self, model: mujoco.MjModel, data: mujoco.MjData, stepper: Stepper, processes: SessionProcesses
     ) -> None:
-        self._model = model
-        self._data = data
         self._stepper = stepper
         self._processes = processes
-        config = stepper.core.config
-        names = [a for r in config.robots for a in (*r.actuators, r.gripper_actuator) if a]
-        self._actuators = [model.actuator(name).id for name in names]
-        self._objects = [model.body(spec.body).id for spec in config.objects]
         self.lock = threading.RLock()
         self._closed = threading.Event()
-        self._diverged = False
-        self._diverged_ns = 0
+        self.fault: DataFault | None = None
+        self._fault_ns = 0
+        self.overwritten = 0
+        self.is_attached = False
+        self.unseen_s = 0.0
+        self._use(model, data)
         #: The newest finite state of the user's data.
         self._plant = read_plant_state(model, data)
         self._last_tick_ns = stepper.clock()
+        self._began_ns = self._round_ns = self._usual_ns = 0  # newest round: begin, length; length of the one before
         self._last_time = -1.0
         self._began_time: float | None = None  # of the newest round, None after a reset
-        self._calls = -1  # of MuJoCo's functions on the data, at the last callback
+        self._ticks_before = 0  # of the round before the newest, 0 when there is none
         self._in_tick = False
         self._was_reset = False
-        self._wrote = False
         self._helper_error: BaseException | None = None
         self._helper_traceback: TracebackType | None = None
         self._helper = threading.Thread(target=self._run_helper, name="iris-session-idle", daemon=True)
         self._helper.start()
 
-    def begin_tick(self) -> None:
-        """One step: writes `ctrl` (and wrenches on hand-held objects) into the user's data. Ends a tick that began."""
+    def _use(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        self._model, self._data = model, data
+        scene = self._stepper.core.scene
+        self._objects = {spec.name: int(model.body(spec.body).id) for spec in scene.objects}
+        self._joints = {
+            spec.name: np.array([model.jnt_qposadr[model.joint(name).id] for name in spec.joints], np.intp)
+            for spec in scene.robots
+        }
+        self._ctrl, self._forces = _Lent(data.ctrl), _Lent(data.xfrc_applied)
+        self._ctrl_at = mujoco.mj_stateSize(model, STATE & (_CTRL - 1))
+        self._forces_at = mujoco.mj_stateSize(model, STATE & (_XFRC - 1))
+        self._left: dict[str, Floats] = {}  # joints of driven robots after the newest round in which time passed
+
+    @property
+    def data(self) -> mujoco.MjData:
+        """The data that the user advances now."""
+        return self._data
+
+    def begin_tick(self, n_ticks: int = 0) -> None:
+        """One step: writes `ctrl` (and wrenches on hand-held objects) into the user's data. Ends a tick that began.
+
+        Args:
+            n_ticks: Ticks of physics that follow; 0 for as many as in the rounds before.
+        """
         with self.lock:
             self._require_open()
             if self._in_tick:
                 self._finish_tick()
             self._in_tick = True
+            passed = float(self._data.time) - self._last_time if self._last_time >= 0.0 else 0.0
+            self.unseen_s += max(0.0, passed)
             self._detect_reset()
-            now_ns = self._stepper.clock()
-            silence_ns = now_ns - self._last_tick_ns
-            if silence_ns > GAP_NS:
-                self._stepper.post_own(StalledGap(silence_ns))
-            self._last_tick_ns = now_ns
+            if passed == 0.0:
+                self._detect_move()
+            self._post_gap()
+            self._ctrl.read(self._data.ctrl)
+            self._forces.read(self._data.xfrc_applied)
             if not self._read_plant():
                 self._stepper.step(0, self._plant)
+                self._ctrl.put_written(self._data.ctrl)
                 return
             self._post_reset()
-            self._stepper.step(self._count_ticks(), self._plant, publish=False)
+            counted = self._count_ticks()
+            self._stepper.step(n_ticks or counted, self._plant, publish=False)
             self._write_controls()
-            self._wrote = True
 
     def end_tick(self) -> None:
         """Publish the state after the user's `mj_step`. Raises `OwnershipError` when no tick has begun."""
@@ -105,32 +204,77 @@ class UserLoop:
             if self._finish_tick():
                 self._post_reset()  # the next step, be it the helper's, is on the state after it
             self._last_tick_ns = self._stepper.clock()
-
-    def control_callback(self) -> None:
-        """Begin a tick if time has moved since the last callback; MuJoCo calls it for `mj_forward` too."""
-        # A reset after exactly one step leaves the time of the last callback. MuJoCo counts its calls on the data and a
-        # reset begins anew, but so does the passive viewer at every sync; only a reset forgets the warm start too.
-        calls = int(self._data.timer.number.sum())
-        counted_anew, self._calls = calls <= self._calls, calls
-        if counted_anew and self._data.time == self._last_time and not self._data.qacc_warmstart.any():
-            self.reset()
-        if self._was_reset or self._data.time != self._last_time:
-            self.begin_tick()
+            self._round_ns = self._last_tick_ns - self._began_ns
 
     def reset(self) -> None:
-        """Note that the user resets the data before the next tick: robots hold where that tick finds them."""
+        """Note that the user resets the data before the next tick: robots are then where that tick finds them."""
         self._was_reset = True
 
+    @property
+    def driven(self) -> tuple[str, ...]:
+        """Robots that the session drives: a participant holds them and has engaged, or they are being given back."""
+        sharing = self._stepper.core.sharing
+        return () if sharing is None else sharing.driven
+
+    def change_model(
+        self, model: mujoco.MjModel, data: mujoco.MjData, prepare: Callable[[bytes], NextScene | None]
+    ) -> None:
+        """Go on with another model and data, which is a reset: the owner's program has built its world anew.
+
+        Args:
+            model: The model from now on.
+            data: The data from now on.
+            prepare: Makes the new scene from the state of `data`, and `None` when it is the present one. It takes long,
+                and steps without ticks go on meanwhile.
+        """
+        plant = read_plant_state(model, data)
+        scene = prepare(plant)
+        with self.lock:
+            if self._in_tick:
+                self._in_tick = False
+            self._ctrl.read(self._data.ctrl)
+            self._ctrl.put_owner(self._data.ctrl)
+            if scene is None:
+                self.reset()
+                self._use(model, data)
+            else:
+                while self._stepper.has_pending_scenes:  # patches of the present scene
+                    self._stepper.step(0, self._plant)
+                self._stepper.queue_scene(scene)
+                self._plant = plant
+                self._stepper.step(0, plant, publish=False)
+                self._use(model, data)
+                self._began_time = None
+            self._last_time = float(data.time)
+
     def close(self) -> None:
-        """End the helper thread and leave the robots of the user's data at rest, without our forces on objects."""
+        """End the helper thread and leave driven robots of the user's data at rest, without our forces on objects."""
         self._closed.set()
         if self._helper is not threading.current_thread():
             self._helper.join(timeout=2.0)
         with self.lock:
-            if self._wrote and self._read_plant():
-                self._wrote = False
+            self._ctrl.read(self._data.ctrl)
+            self._forces.read(self._data.xfrc_applied)
+            if (self._ctrl.indices.size or self._forces.indices.size) and self._read_plant():
                 self._stepper.core.write_rest_controls(self._plant)
                 self._write_controls()
+            self._ctrl = _Lent(self._data.ctrl)
+
+    def list_warnings(self) -> tuple[str, ...]:
+        """Return what the owner should know, one line each."""
+        found = [self.fault.text] if self.fault is not None else []
+        if self.overwritten:
+            found.append(
+                f"ctrl of driven robots was changed between begin and end of {self.overwritten} ticks: set ctrl before "
+                "begin_tick(), and not in a control callback"
+            )
+        # A loop of which nothing is seen has begun no round.
+        unseen_s = self.unseen_s + (float(self._data.time) if self._last_time < 0.0 else 0.0)
+        if self.is_attached and unseen_s > UNSEEN_S:
+            found.append(
+                f"{unseen_s:.1f} s were simulated outside of the session's ticks: give attach() the environment"
+            )
+        return tuple(found)
 
     def _require_open(self) -> None:
         if self._closed.is_set():
@@ -141,56 +285,105 @@ class UserLoop:
     def _finish_tick(self) -> bool:
         """Publish the state after a tick; return whether it is one after time went back."""
         self._in_tick = False
+        if self._ctrl.is_overwritten(self._data.ctrl):
+            self.overwritten += 1
+        passed = self._last_time < self._data.time
         went_back = self._detect_reset()
+        self._left = {name: self._data.qpos[self._joints[name]] for name in self.driven} if passed else {}
         good = self._read_plant()
-        if good and not self._was_reset:  # the epoch of a state after a reset is that of the next step
+        # The epoch of a state after a reset is that of the next step.
+        if good and not self._was_reset and self._stepper.is_state_due(self._stepper.clock()):
             self._stepper.core.world.restore_state(self._plant)
             self._stepper.publish(self._stepper.clock())
         self._processes.supervise(self._stepper)
         return good and went_back
 
     def _write_controls(self) -> None:
-        """Copy `ctrl` of the robots and wrenches on the objects from the twin into the user's data."""
-        twin = self._stepper.core.world.data
-        self._data.ctrl[self._actuators] = twin.ctrl[self._actuators]
-        self._data.xfrc_applied[self._objects] = twin.xfrc_applied[self._objects]
+        """Write `ctrl` of driven robots and wrenches on held objects; give back what is neither any more."""
+        core = self._stepper.core
+        assert core.sharing is not None
+        self._ctrl.write(self._data.ctrl, core.sharing.actuators, core.world.ctrl)
+        held = np.array([self._objects[name] for name in core.controller.list_held_objects()], np.intp)
+        self._forces.write(self._data.xfrc_applied, held, core.world.data.xfrc_applied)
 
     def _count_ticks(self) -> int:
-        """Return the ticks that this round stands for: as many as the one before took, if any time passed in it."""
+        """Return the ticks that this round stands for: those of the one before, at most those of the one before that.
+
+        So a single long round makes no leap.
+        """
         began, self._began_time = self._began_time, float(self._data.time)
         if began is None:
+            self._ticks_before = 0
             return 1
-        return min(MAX_TICKS, max(1, round((self._began_time - began) / float(self._model.opt.timestep))))
+        ticks = max(1, round((self._began_time - began) / float(self._model.opt.timestep)))
+        before, self._ticks_before = self._ticks_before, ticks
+        most = min(MAX_TICKS, max(1, int(MAX_ROUND_S / float(self._model.opt.timestep))))
+        return min(most, ticks, before or ticks)
+
+    def _post_gap(self) -> None:
+        """Announce a time without ticks: robots hold until clutched again."""
+        now_ns = self._stepper.clock()
+        silence_ns = now_ns - self._last_tick_ns
+        usual_ns, round_ns = self._usual_ns, self._round_ns
+        self._usual_ns, self._round_ns = max(round_ns, 1), 0
+        if round_ns > max(GAP_NS, LONG_ROUND * usual_ns):
+            silence_ns += round_ns
+        if silence_ns > GAP_NS:
+            self._stepper.post_own(StalledGap(silence_ns))
+        self._last_tick_ns = self._began_ns = now_ns
 
     def _detect_reset(self) -> bool:
         """Return whether time went back, which is a reset: by the user between ticks, or by MuJoCo within `mj_step`."""
         went_back = bool(self._data.time < self._last_time)
         if went_back:
             self.reset()
-        self._last_time = self._data.time
+        self._last_time = float(self._data.time)
         return went_back
 
+    def _detect_move(self) -> None:
+        """Take it for a reset, too, when the owner has put a driven robot elsewhere while time stood still.
+
+        Not where no time passes in rounds: there the owner advances the joints, as for a real robot.
+        """
+        if self._left and not self._was_reset:
+            for name, left in self._left.items():
+                if not np.allclose(self._data.qpos[self._joints[name]], left, rtol=0.0, atol=MOVED):
+                    self.reset()
+
     def _read_plant(self) -> bool:
-        """Read the user's state; return False, and announce it once, while it is not finite."""
-        plant = read_plant_state(self._model, self._data)
-        diverged = not np.isfinite(np.frombuffer(plant)).all()
-        if diverged and not self._diverged:
-            text = "the user's simulation has numbers that are not finite: robots hold until it is reset"
-            self._stepper.post_own(Marker(request_id=0, text=text))
-            self._diverged_ns = self._stepper.clock()
-        elif self._diverged and not diverged:
-            self._stepper.post_own(StalledGap(self._stepper.clock() - self._diverged_ns))
-        self._diverged = diverged
-        if diverged:
+        """Read the user's state with the owner's inputs; return False, and announce it once, while it is not finite."""
+        state = np.empty(mujoco.mj_stateSize(self._model, STATE))
+        mujoco.mj_getState(self._model, self._data, state, STATE)
+        self._ctrl.put_owner(state[self._ctrl_at :][: self._model.nu])
+        self._forces.put_owner(state[self._forces_at :][: 6 * self._model.nbody].reshape(-1, 6))
+        if not np.isfinite(state).all():
+            if self.fault is None:
+                self._fault_ns = self._stepper.clock()
+                self.fault = DataFault(self._find_bad_arrays(), self._fault_ns * 1e-9)
+                text = f"the user's simulation has numbers that are not finite: {self.fault.text}"
+                self._stepper.post_own(Marker(request_id=0, text=text))
             return False
-        self._plant = plant
+        if self.fault is not None:
+            self.fault = None
+            self._stepper.post_own(StalledGap(self._stepper.clock() - self._fault_ns))
+        self._plant = state.tobytes()
         return True
+
+    def _find_bad_arrays(self) -> tuple[str, ...]:
+        found = []
+        for name, part in _FIELDS.items():
+            values = np.empty(mujoco.mj_stateSize(self._model, part))
+            mujoco.mj_getState(self._model, self._data, values, part)
+            if not np.isfinite(values).all():
+                found.append(name)
+        return tuple(found) or ("plugin_state",)
 
     def _post_reset(self) -> None:
         """Queue a pending reset for the next step, which must be on the state after it."""
         if self._was_reset:
             self._was_reset = False
             self._began_time = None
+            self._left = {}
             self._stepper.post_own(ExternalReset())
 
     def _run_helper(self) -> None:

@@ -57,9 +57,9 @@ class DeformableTopology:
         if not 1 <= n_vertices <= MAX_VERTICES:
             raise ValueError(f"{n_vertices} vertices: a deformable stream has 1 to {MAX_VERTICES}")
         face_table, edge_table = _table(faces, 3, n_vertices), _table(edges, 2, n_vertices)
-        self._settle(n_vertices, face_table, edge_table, _plan(n_vertices, face_table, edge_table))
+        self._set_tables(n_vertices, face_table, edge_table, _plan(n_vertices, face_table, edge_table))
 
-    def _settle(self, n_vertices: int, faces: Ints, edges: Ints, plan: _Plan) -> None:
+    def _set_tables(self, n_vertices: int, faces: Ints, edges: Ints, plan: _Plan) -> None:
         self.n_vertices = n_vertices
         self.faces, self.edges = faces, edges
         self.order, self.rows, self.cols, self.parents = plan
@@ -81,11 +81,11 @@ class DeformableTopology:
         sizes = (self.n_vertices, self.rows, self.cols, len(self.faces), len(self.edges))
         return _HEADER.pack(FORMAT, self.plan, flags, *sizes) + b"".join(t.astype("<u4").tobytes() for t in tables)
 
-    def bare(self) -> DeformableTopology:
+    def without_faces(self) -> DeformableTopology:
         """Return the same plan without triangles and lines, for clients that have them already. Another identity."""
         made = DeformableTopology.__new__(DeformableTopology)
         plan = _Plan(self.order, self.rows, self.cols, self.parents)
-        made._settle(self.n_vertices, self.faces[:0], self.edges[:0], plan)
+        made._set_tables(self.n_vertices, self.faces[:0], self.edges[:0], plan)
         return made
 
     @classmethod
@@ -115,7 +115,7 @@ class DeformableTopology:
         if order is not None and (np.bincount(order, minlength=n) != 1).any():
             raise StreamError("the order of a topology is not one of all vertices, each once")
         made = cls.__new__(cls)
-        made._settle(n, tables[0], tables[1], _Plan(order, rows, cols, parents))
+        made._set_tables(n, tables[0], tables[1], _Plan(order, rows, cols, parents))
         return made
 
 
@@ -192,7 +192,7 @@ def _walk(n_vertices: int, links: Edges) -> Ints | None:
 
 def _tree(n_vertices: int, faces: Ints) -> _Plan | None:
     """Grow a tree over the triangles, a whole front of vertices at once; None when it takes too many levels."""
-    across = _across(faces)
+    across = _find_opposite_corners(faces)
     known = np.zeros(n_vertices, np.bool_)
     in_face = np.zeros(n_vertices, np.bool_)
     in_face[faces] = True
@@ -246,7 +246,7 @@ def _front(
     return new
 
 
-def _across(faces: Ints) -> Ints:
+def _find_opposite_corners(faces: Ints) -> Ints:
     """Return (m, 3): of the edge opposite each corner, the opposite corner of the other triangle there; -1 for none."""
     low = np.minimum(faces[:, [1, 2, 0]], faces[:, [2, 0, 1]]).astype(np.int64)
     high = np.maximum(faces[:, [1, 2, 0]], faces[:, [2, 0, 1]]).astype(np.int64)

@@ -16,7 +16,6 @@ from iris_session.streams.errors import StreamError
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-Words = npt.NDArray[np.uint32]
 
 #: Edge of the position lattice [m], 0.061 mm. A power of two: `index * LATTICE_M` is exact.
 LATTICE_M: Final = 2.0**-14

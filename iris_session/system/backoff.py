@@ -12,7 +12,7 @@ class Backoff(Generic[Delay]):
     """Delays before successive attempts; the last one repeats until `reset`.
 
     Args:
-        delays: In the caller's unit, at least one; see `doubling_delays`.
+        delays: In the caller's unit, at least one.
     """
 
     __slots__ = ("_delays", "failures")
@@ -31,14 +31,3 @@ class Backoff(Generic[Delay]):
     def reset(self) -> None:
         """Begin again with the first delay."""
         self.failures = 0
-
-
-def doubling_delays(first: Delay, limit: Delay) -> tuple[Delay, ...]:
-    """Return `first`, twice that, and so on, ending with `limit`."""
-    delays: list[Delay] = []
-    delay = first
-    while delay < limit:
-        delays.append(delay)
-        delay = delay * 2
-    delays.append(limit)
-    return tuple(delays)

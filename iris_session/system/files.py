@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -29,13 +28,14 @@ class Replacement:
     def __init__(self, path: Path, *, durable: bool = False, permissions: int | None = 0o600, suffix: str = "") -> None:
         self.path = path
         self._durable = durable
-        descriptor, name = tempfile.mkstemp(prefix=f".{path.name[:100]}-", suffix=suffix, dir=path.parent)
-        self._temporary = Path(name)
+        # The umask belongs to all threads, so the system applies it: it is not read by changing it for a moment.
+        mode = 0o666 if permissions is None else 0o600
+        descriptor, self._temporary = _create_file(path.parent, f".{path.name[:100]}-", suffix, mode)
         self._is_pending = True
         self.file: BinaryIO = os.fdopen(descriptor, "wb")
-        if permissions != 0o600:
+        if permissions is not None and permissions != 0o600:
             try:
-                os.chmod(self._temporary, _default_permissions() if permissions is None else permissions)
+                os.chmod(self._temporary, permissions)
             except BaseException:
                 self.discard()
                 raise
@@ -111,7 +111,11 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def _default_permissions() -> int:
-    mask = os.umask(0o077)
-    os.umask(mask)
-    return 0o666 & ~mask
+def _create_file(folder: Path, prefix: str, suffix: str, mode: int) -> tuple[int, Path]:
+    """Create a file under a name that cannot be guessed, with `mode` less the umask. Return its descriptor and path."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL
+    flags |= getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+    while True:
+        path = folder / f"{prefix}{os.urandom(8).hex()}{suffix}"
+        with suppress(FileExistsError):
+            return os.open(path, flags, mode), path

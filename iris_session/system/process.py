@@ -31,8 +31,6 @@ PIPE: Final = subprocess.PIPE
 DEVNULL: Final = subprocess.DEVNULL
 _DISTRIBUTION: Final = "iris-session"
 _READ_BYTES: Final = 65536
-#: A pipe of any system buffers at least so much without a reader (Linux 64 KiB, macOS 16 KiB).
-_PIPE_BYTES: Final = 16384
 _PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
 
 
@@ -75,6 +73,15 @@ def _is_editable_here(found: Distribution) -> bool:
     return bool(origin.get("dir_info", {}).get("editable")) and origin.get("url") == ROOT.as_uri()
 
 
+def _open_memory_file() -> IO[bytes]:
+    """Open a file without a name. Outside of Linux it lies on disk."""
+    if not hasattr(os, "memfd_create"):
+        return tempfile.TemporaryFile()
+    fd = os.memfd_create("iris-session")
+    os.fchmod(fd, 0o600)  # by default everybody may open it
+    return os.fdopen(fd, "w+b")
+
+
 class ChildProcess:
     """A process that runs a module of this package.
 
@@ -95,24 +102,26 @@ class ChildProcess:
         stderr: int | IO[Any] | None = None,
         environment: Mapping[str, str] | None = None,
         own_session: bool = False,
+        own_group: bool = False,
     ) -> None:
         """Start the process.
 
         Args:
             module: Name of the module to run, as for `python -m`.
             arguments: Its command line arguments.
-            config: Content of its standard input. The parent never waits for a child that does not read: what a pipe
-                may not hold comes from an unlinked file. `None` makes a pipe, for `write`.
+            config: Content of its standard input, as a file in memory: unlike a pipe, it holds any size, so the parent
+                never waits for a child that does not read, and unlike a file on disk, it needs no free space there.
+                `None` makes a pipe, for `write`.
             stdout: `PIPE` to read lines, an open file, or `None` to share the parent's.
             stderr: As `stdout`, or `DEVNULL`.
             environment: Variables beside those of this process.
             own_session: Run in a session of its own, so that Ctrl-C of a terminal reaches only the parent.
+            own_group: Run in a process group of its own, for the same. The scheduler groups by session, not by this.
 
         Raises:
-            OSError: No process, memory or temporary file can be had.
+            OSError: No process or memory can be had.
         """
-        is_large = config is not None and len(config) > _PIPE_BYTES
-        with tempfile.TemporaryFile() if is_large else nullcontext() as file:
+        with nullcontext() if config is None else _open_memory_file() as file:
             if file is not None and config is not None:
                 file.write(config)
                 file.seek(0)
@@ -123,13 +132,10 @@ class ChildProcess:
                 stderr=stderr,
                 env=child_environment(**(environment or {})),
                 start_new_session=own_session,
+                process_group=0 if own_group else None,
                 bufsize=0,
             )
         self._rest = b""
-        if config is not None and file is None:
-            with suppress(BrokenPipeError):  # the child ended before it read
-                self.write(config)
-            self.close_stdin()
 
     @property
     def pid(self) -> int:

@@ -14,7 +14,7 @@ from iris_session.protocol.common import Alignment, Pose
 from iris_session.protocol.entries import AlignmentAlarm, AlignmentProposal, CrossChecked, Entry
 from iris_session.protocol.limits import Drops
 from iris_session.protocol.server_messages import AlignmentChanged
-from tests.anchors.worlds import Look, around, headset, shifted
+from tests.anchors.worlds import Viewpoint, shifted, tracking_frame, viewpoint_around
 
 MS = 1_000_000
 SECOND = 1_000 * MS
@@ -33,56 +33,56 @@ class FakeConnection:
 
 
 class Wearer:
-    """One headset. `frame`: the true `T_world_tracking`, which a test may change without a new epoch."""
+    """One headset. `frame` is the true `T_world_tracking`, which a test may change without a new epoch."""
 
     def __init__(self, lab: Lab, number: int, seed: int) -> None:
         self.lab = lab
         self.rng = np.random.default_rng(seed)
-        self.frame = headset(self.rng)
+        self.frame = tracking_frame(self.rng)
         self.connection = FakeConnection(number, f"p{number}")
         self.viewpoint = self.seq = 0
         self.epoch = 1
 
-    def place(self, anchor: str = "sheet", d: float = 0.7, p_head_world: Vec3 | None = None) -> Look:
+    def place(self, anchor: str = "sheet", d: float = 0.7, p_head_world: Vec3 | None = None) -> Viewpoint:
         """Move to a new viewpoint."""
         self.viewpoint += 1
         self.lab.now_ns += 3 * SECOND
         T = self.lab.world[anchor]
-        return Look(self.rng, T, p_head_world or around(self.rng, T[0], d))
+        return Viewpoint(self.rng, T, p_head_world or viewpoint_around(self.rng, T[0], d))
 
-    def see(self, look: Look, anchor: str = "sheet", kind: str = "qr", head: bool = True) -> None:
+    def report_observation(self, view: Viewpoint, anchor: str = "sheet", kind: str = "qr", head: bool = True) -> None:
         """Send one observation and the head pose of that time."""
         if head:
-            self.head(inverse_head(self.frame, look))
-        p, q = look.new(self.frame, self.lab.world.get(anchor))
+            self.report_head(head_in_tracking(self.frame, view))
+        p, q = view.observe(self.frame, self.lab.world.get(anchor))
         self.observe(Observation(anchor, kind, Pose(p, q), self.lab.now_ns, self.epoch, self.viewpoint))
 
     def observe(self, observation: Observation) -> None:
         self.lab.service.process_observation(self.connection, observation, self.lab.now_ns)
 
-    def head(self, T_tracking_head: PoseTuple) -> None:
+    def report_head(self, T_tracking_head: PoseTuple) -> None:
         self.seq += 1
         pose = Pose(*T_tracking_head)
         sample = Sample("head", "pose", self.seq, self.lab.now_ns, 1, self.epoch, 0, pose=pose)
         self.lab.service.process_sample(self.connection, sample, self.lab.now_ns)
 
-    def watch(self, look: Look, n: int, anchor: str = "sheet") -> None:
+    def report_observations(self, view: Viewpoint, n: int, anchor: str = "sheet") -> None:
         for _ in range(n):
             self.lab.now_ns += PERIOD_NS
-            self.see(look, anchor)
-            self.lab.turn()
+            self.report_observation(view, anchor)
+            self.lab.poll()
 
     def survey(self, viewpoints: int = 3, anchors: tuple[str, ...] = ("sheet",)) -> None:
         """Observe the sheets from several sides and put the resulting proposal in force."""
         for _ in range(viewpoints):
             for anchor in anchors:
-                self.watch(self.place(anchor), 15, anchor)
+                self.report_observations(self.place(anchor), 15, anchor)
         self.accept()
 
     def accept(self) -> AlignmentProposal:
         """Put the newest proposal in force, as the authority does."""
         newest = self.proposals()[-1]
-        self.lab.put_in_force(self, newest)
+        self.lab.confirm(self, newest)
         return newest
 
     def bump(self, x: float, y: float = 0.0, z: float = 0.0) -> None:
@@ -101,7 +101,7 @@ class Wearer:
 
 
 class Lab:
-    """An `AlignmentService`, and the true poses of the anchors (`world`)."""
+    """An `AlignmentService` and the true poses of the anchors (`world`)."""
 
     def __init__(self, anchors: dict[str, PoseTuple] = ANCHORS, sizes: dict[str, float] | None = None) -> None:
         self.now_ns = SECOND
@@ -118,28 +118,28 @@ class Lab:
     def wearer(self, number: int = 1, seed: int | None = None) -> Wearer:
         return Wearer(self, number, number if seed is None else seed)
 
-    def turn(self, times: int = 8) -> None:
+    def poll(self, times: int = 8) -> None:
         """Run several passes of the front's loop; each computes one proposal at most."""
         for _ in range(times):
             self.now_ns += MS
             self.service.tick(self.now_ns)
 
-    def put_in_force(self, wearer: Wearer, got: AlignmentProposal, **fields: object) -> None:
+    def confirm(self, wearer: Wearer, got: AlignmentProposal, **fields: object) -> None:
         alignment = Alignment(
             1, "measured", got.T_world_tracking, got.tracking_epoch, got.covariance, got.error_at_anchor_m
         )
         alignment = msgspec.structs.replace(alignment, **fields)
         self.service.process_event(AlignmentChanged(wearer.connection.participant_id, alignment))
 
-    def compared(self) -> list[Entry]:
+    def cross_checks(self) -> list[Entry]:
         return [e for e in self.entries if isinstance(e.message, CrossChecked)]
 
 
-def inverse_head(frame: PoseTuple, look: Look) -> PoseTuple:
-    return compose(inverse(frame), (look.p_head_world, (1.0, 0.0, 0.0, 0.0)))
+def head_in_tracking(frame: PoseTuple, view: Viewpoint) -> PoseTuple:
+    return compose(inverse(frame), (view.p_head_world, (1.0, 0.0, 0.0, 0.0)))
 
 
-def misplaced_m(wearer: Wearer, proposal: AlignmentProposal, anchor: str = "sheet") -> float:
+def error_at_anchor(wearer: Wearer, proposal: AlignmentProposal, anchor: str = "sheet") -> float:
     """Return the error [m] of this proposal at an anchor."""
     p = wearer.lab.world[anchor][0]
     pose = proposal.T_world_tracking

@@ -1,4 +1,4 @@
-"""Live anchors in the front, without a network: synthetic headsets in, entries for the authority out."""
+"""`AlignmentService` without a network: emulated headsets in, entries for the authority out."""
 
 from __future__ import annotations
 
@@ -21,168 +21,168 @@ from iris_session.protocol.server_messages import (
     ParticipantLeft,
 )
 from iris_session.protocol.status import AlignmentReport
-from tests.alignment.emulated_headsets import ANCHORS, MS, SECOND, SHEET, Lab, Wearer, inverse_head, misplaced_m
+from tests.alignment.emulated_headsets import ANCHORS, MS, SECOND, SHEET, Lab, Wearer, error_at_anchor, head_in_tracking
 from tests.anchors.worlds import shifted
 
 
-def test_heads_make_the_noise_model_known() -> None:
-    """The same looks with and without head samples: what is known of the noise makes the stated error smaller."""
+def test_head_samples_reduce_the_stated_error() -> None:
+    """With head samples the noise model is known, so the stated error of the same observations is smaller."""
     errors = []
     for head in (True, False):
         lab = Lab()
         ann = lab.wearer()
         for _ in range(3):
-            look = ann.place(d=0.5)
+            view = ann.place(d=0.5)
             for _ in range(15):
                 lab.now_ns += 100 * MS
-                ann.see(look, head=head)
-                lab.turn()
+                ann.report_observation(view, head=head)
+                lab.poll()
         errors.append(ann.proposals()[-1].error_at_anchor_m)
-        assert misplaced_m(ann, ann.proposals()[-1]) < 0.01
+        assert error_at_anchor(ann, ann.proposals()[-1]) < 0.01
     assert errors[0] < 0.6 * errors[1]
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_bump_of_5_cm_is_a_jump_within_3_detections_and_starts_anew(seed: int) -> None:
+def test_bump_of_5_cm_raises_a_jump_alarm_within_3_detections_and_restarts_alignment(seed: int) -> None:
     lab = Lab()
     ann = lab.wearer(seed=seed)
     ann.survey()
-    look = ann.place(d=0.7)
-    ann.watch(look, 20)
+    view = ann.place(d=0.7)
+    ann.report_observations(view, 20)
     assert ann.alarms() == []
-    told = len(ann.entries())
+    before = len(ann.entries())
     ann.bump(0.03, 0.03, 0.026)
-    ann.watch(look, 3)
+    ann.report_observations(view, 3)
     (alarm,) = ann.alarms()
     assert (alarm.kind, alarm.anchor_id, alarm.tracking_epoch) == ("jump", "sheet", 1)
     assert alarm.size_m == pytest.approx(0.05, abs=0.01)
-    ann.watch(look, 20)
-    entries = ann.entries()[told:]
+    ann.report_observations(view, 20)
+    entries = ann.entries()[before:]
     at = [isinstance(e.message, AlignmentAlarm) for e in entries].index(True)
     later = [e for e in entries[at + 1 :] if isinstance(e.message, AlignmentProposal) and not e.message.refused]
     assert later
     for entry in later:
         assert entry.receive_ns > entries[at].receive_ns
-        assert misplaced_m(ann, entry.message) < 0.015, "only what was seen after the bump counts"
+        assert error_at_anchor(ann, entry.message) < 0.015, "only what was seen after the bump counts"
     assert all(e.receive_ns <= entries[at].receive_ns for e in entries[:at])
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_change_of_10_mm_is_told_within_2_s(seed: int) -> None:
+def test_change_of_10_mm_raises_an_alarm_within_2_s(seed: int) -> None:
     lab = Lab()
     ann = lab.wearer(seed=seed)
     ann.survey()
-    look = ann.place(d=0.7)
-    ann.watch(look, 25)
+    view = ann.place(d=0.7)
+    ann.report_observations(view, 25)
     since_ns = lab.now_ns
     way = ann.rng.normal(size=3)
     ann.bump(*(0.010 * way / math.sqrt(float(way @ way))).tolist())
-    ann.watch(look, 25)
+    ann.report_observations(view, 25)
     alarms = ann.alarms()
     assert [(a.kind, a.beside) for a in alarms] == [("changed", ())]
     assert alarms[0].capture_ns - since_ns <= 2 * SECOND
-    assert misplaced_m(ann, ann.proposals()[-1]) < 0.01
+    assert error_at_anchor(ann, ann.proposals()[-1]) < 0.01
 
 
-def test_a_sheet_that_was_moved_beside_another_is_told_and_nothing_starts_anew() -> None:
+def test_moved_sheet_is_reported_without_restarting_alignment() -> None:
     lab = Lab()
     ann = lab.wearer()
     ann.survey(3, ("sheet", "other"))
-    looks = {name: ann.place(name, p_head_world=(0.6, 0.0, 1.3)) for name in ANCHORS}
+    views = {name: ann.place(name, p_head_world=(0.6, 0.0, 1.3)) for name in ANCHORS}
     for i in range(50):
         if i == 25:
             lab.world["sheet"] = shifted(SHEET, (0.05, 0.0, 0.0))
         lab.now_ns += 100 * MS
-        for name, look in looks.items():
-            ann.see(look, name)
-        lab.turn()
+        for name, view in views.items():
+            ann.report_observation(view, name)
+        lab.poll()
     assert [(a.kind, a.anchor_id, a.beside) for a in ann.alarms()] == [("changed", "sheet", ("other",))]
     assert ann.proposals()[-1].n_observations > 100, "what was seen before the sheet was moved still counts"
-    ann.watch(ann.place("sheet", 0.5), 30)
-    assert len(ann.alarms()) == 1, "that it is elsewhere was told"
+    ann.report_observations(ann.place("sheet", 0.5), 30)
+    assert len(ann.alarms()) == 1, "the moved sheet was reported"
     there = ann.place("sheet", 0.5)
-    ann.watch(there, 25)
+    ann.report_observations(there, 25)
     lab.world["sheet"] = shifted(SHEET, (0.08, 0.0, 0.0))
-    ann.watch(there, 25)
-    assert len(ann.alarms()) == 2, "without another in sight it may be the headset: told again"
+    ann.report_observations(there, 25)
+    assert len(ann.alarms()) == 2, "without another sheet in sight it may be the headset: reported again"
 
 
-def test_what_was_seen_out_of_sight_differs_from_what_is_in_force_and_is_told_once() -> None:
+def test_change_while_out_of_sight_is_reported_once() -> None:
     lab = Lab()
     ann = lab.wearer()
     ann.survey()
     lab.now_ns += 60 * SECOND
     ann.bump(0.03)
-    ann.watch(ann.place(d=0.5), 40)
-    assert [a.kind for a in ann.alarms()] == ["differs"], "the correction waits: that is nothing new to tell"
-    assert misplaced_m(ann, ann.proposals()[-1]) < 0.01
+    ann.report_observations(ann.place(d=0.5), 40)
+    assert [a.kind for a in ann.alarms()] == ["differs"], "the correction waits: nothing new to report"
+    assert error_at_anchor(ann, ann.proposals()[-1]) < 0.01
 
 
 @pytest.mark.parametrize("fields", [{"offset": True}, {"kind": "placed"}])
-def test_what_a_director_placed_is_contradicted_by_no_sheet(fields: dict[str, object]) -> None:
+def test_placed_alignment_is_not_contradicted_by_a_sheet(fields: dict[str, object]) -> None:
     lab = Lab()
     ann = lab.wearer()
     ann.survey()
     got = ann.proposals()[-1]
     pose = Pose(*shifted((got.T_world_tracking.p, got.T_world_tracking.q), (0.3, 0.0, 0.0)))
-    lab.service.process_event(AlignmentRun("p1", False, 1))  # no estimate speaks for it
-    lab.put_in_force(ann, got, T_world_tracking=pose, **fields)
-    ann.watch(ann.place(d=0.5), 40)
+    lab.service.process_event(AlignmentRun("p1", False, 1))  # no estimate supports it
+    lab.confirm(ann, got, T_world_tracking=pose, **fields)
+    ann.report_observations(ann.place(d=0.5), 40)
     assert ann.alarms() == []
-    lab.put_in_force(ann, got, T_world_tracking=pose)
-    ann.watch(ann.place(d=0.5), 40)
+    lab.confirm(ann, got, T_world_tracking=pose)
+    ann.report_observations(ann.place(d=0.5), 40)
     assert [a.kind for a in ann.alarms()] == ["differs"], "had it been measured, it would be wrong"
 
 
-def test_a_head_that_jumps_is_told_at_once_and_no_more_than_once_a_second() -> None:
+def test_head_jump_alarms_are_immediate_and_limited_to_one_per_second() -> None:
     lab = Lab()
     ann = lab.wearer()
-    for i in range(200):  # 2 s, and a jump between any two
+    for i in range(200):  # 2 s with a jump between every two samples
         lab.now_ns += 10 * MS
-        ann.head(((0.5 * (i % 2), 0.0, 1.6), (1.0, 0.0, 0.0, 0.0)))
+        ann.report_head(((0.5 * (i % 2), 0.0, 1.6), (1.0, 0.0, 0.0, 0.0)))
     assert {a.kind for a in ann.alarms()} == {"jump"}
     assert 1 <= len(ann.alarms()) <= 3
     assert lab.drops.by_reason["alarms_repeated"] > 50
 
 
-def test_a_second_jump_is_told_at_once_when_something_came_into_force_between() -> None:
+def test_second_head_jump_is_reported_at_once_after_a_new_alignment() -> None:
     lab = Lab()
     ann = lab.wearer()
     ann.survey()
-    ann.head(((0.0, 0.0, 1.6), (1.0, 0.0, 0.0, 0.0)))
+    ann.report_head(((0.0, 0.0, 1.6), (1.0, 0.0, 0.0, 0.0)))
     for x in (1.0, 2.0):
         lab.now_ns += 10 * MS
-        ann.head(((x, 0.0, 1.6), (1.0, 0.0, 0.0, 0.0)))
+        ann.report_head(((x, 0.0, 1.6), (1.0, 0.0, 0.0, 0.0)))
         lab.now_ns += 10 * MS
-        ann.head(((x, 0.0, 1.6), (1.0, 0.0, 0.0, 0.0)))
+        ann.report_head(((x, 0.0, 1.6), (1.0, 0.0, 0.0, 0.0)))
         ann.accept()
     assert [a.kind for a in ann.alarms()][-2:] == ["jump", "jump"]
 
 
-def test_looks_from_before_a_jump_that_come_after_it_do_not_count() -> None:
-    """A sheet is found in a picture tenths of a second old; the head shows the jump within a frame."""
+def test_observations_from_before_a_jump_are_ignored_after_it() -> None:
+    """A detection is tenths of a second old when it arrives; the head shows the jump within a frame."""
     lab = Lab()
     ann = lab.wearer()
     ann.survey()
-    look = ann.place(d=0.6)
-    ann.watch(look, 5)
-    seen_at_ns, old_frame, told = lab.now_ns, ann.frame, len(ann.entries())
+    view = ann.place(d=0.6)
+    ann.report_observations(view, 5)
+    seen_at_ns, old_frame, before = lab.now_ns, ann.frame, len(ann.entries())
     lab.now_ns += 10 * MS
     ann.bump(0.5)
-    ann.head(inverse_head(ann.frame, look))
+    ann.report_head(head_in_tracking(ann.frame, view))
     assert [a.kind for a in ann.alarms()] == ["jump"]
     for i in range(10):
         lab.now_ns += 30 * MS
-        p, q = look.new(old_frame, lab.world["sheet"])
+        p, q = view.observe(old_frame, lab.world["sheet"])
         ann.observe(Observation("sheet", "qr", Pose(p, q), seen_at_ns + i * MS, ann.epoch, ann.viewpoint))
-        lab.turn()
+        lab.poll()
     assert lab.drops.by_reason["observation_before_jump"] == 10
-    assert not [e for e in ann.entries()[told:] if isinstance(e.message, AlignmentProposal)]
-    ann.watch(look, 15)
-    assert misplaced_m(ann, ann.proposals()[-1]) < 0.015
+    assert not [e for e in ann.entries()[before:] if isinstance(e.message, AlignmentProposal)]
+    ann.report_observations(view, 15)
+    assert error_at_anchor(ann, ann.proposals()[-1]) < 0.015
 
 
-def test_who_has_no_alignment_any_more_has_none_in_force_here() -> None:
+def test_removed_alignment_is_not_in_force() -> None:
     lab = Lab()
     ann = lab.wearer()
     ann.survey()
@@ -192,70 +192,70 @@ def test_who_has_no_alignment_any_more_has_none_in_force_here() -> None:
     assert lab.service._states[1].monitor.in_force is None
 
 
-def test_a_stopped_run_proposes_nothing_but_is_watched_and_a_new_one_forgets() -> None:
+def test_stopped_run_is_monitored_without_proposals_and_a_new_run_starts_empty() -> None:
     lab = Lab()
     ann = lab.wearer()
     ann.survey()
     lab.service.process_event(AlignmentRun("p1", False, 1))
-    look, before = ann.place(d=0.6), len(ann.proposals())
-    ann.watch(look, 20)
+    view, before = ann.place(d=0.6), len(ann.proposals())
+    ann.report_observations(view, 20)
     assert len(ann.proposals()) == before
     ann.bump(0.05, 0.05)
-    ann.watch(look, 5)
+    ann.report_observations(view, 5)
     assert [a.kind for a in ann.alarms()] == ["jump"]
     lab.service.process_event(AlignmentRun("p1", True, 2))
-    ann.watch(look, 3)
+    ann.report_observations(view, 3)
     assert len(ann.proposals()) == before, "too few observations in the new run"
-    ann.watch(look, 10)
+    ann.report_observations(view, 10)
     assert ann.proposals()[-1].n_observations <= 13
-    assert misplaced_m(ann, ann.proposals()[-1]) < 0.015
+    assert error_at_anchor(ann, ann.proposals()[-1]) < 0.015
 
 
-def test_a_stopped_run_stays_stopped_over_a_reconnect_until_its_owner_leaves() -> None:
+def test_stopped_run_stays_stopped_after_reconnect_until_participant_leaves() -> None:
     lab = Lab()
     ann = lab.wearer()
     ann.survey()
     before = len(ann.proposals())
     lab.service.process_event(AlignmentRun("p1", False, 1))
     lab.service.remove_connection(1)
-    ann.watch(ann.place(), 20)
+    ann.report_observations(ann.place(), 20)
     assert len(ann.proposals()) == before
     lab.service.process_event(ParticipantLeft("p1", "bye", False))
     lab.service.remove_connection(1)
-    ann.watch(ann.place(), 20)
+    ann.report_observations(ann.place(), 20)
     assert len(ann.proposals()) > before
 
 
-def test_an_anchor_that_a_director_moved_is_proposed_at_its_new_place_without_a_new_look() -> None:
+def test_moved_anchor_is_proposed_at_its_new_pose_without_a_new_observation() -> None:
     lab = Lab({"sheet": SHEET})
     ann = lab.wearer()
     ann.survey()
-    lab.turn(500)
+    lab.poll(500)
     before = ann.proposals()[-1]
     moved: PoseTuple = ((1.2, 0.4, 0.9), quat_from_yaw(2.5))
     lab.service.process_event(AnchorMoved("sheet", Pose(*moved)))
-    lab.turn(500)
+    lab.poll(500)
     after = ann.proposals()[-1]
     expected = compose(compose(moved, inverse(SHEET)), (before.T_world_tracking.p, before.T_world_tracking.q))
     assert math.dist(after.T_world_tracking.p, expected[0]) < 1e-3
     lab.world["sheet"] = moved
     ann.frame = (after.T_world_tracking.p, after.T_world_tracking.q)
-    ann.watch(ann.place(d=0.5), 20)  # the old alignment is still in force: known, and nothing to tell
+    ann.report_observations(ann.place(d=0.5), 20)  # the old alignment is still in force: nothing to report
     assert ann.alarms() == []
 
 
-def test_who_measures_no_more_is_not_alarmed_by_an_anchor_that_a_director_moved() -> None:
+def test_moved_anchor_raises_no_alarm_for_an_inactive_headset() -> None:
     lab = Lab({"sheet": SHEET})
     ann = lab.wearer()
     ann.survey()
     lab.service.process_event(AlignmentRun("p1", False, 1))
     ann.accept()
     lab.service.process_event(AnchorMoved("sheet", Pose(*shifted(SHEET, (0.5, 0.0, 0.0)))))
-    ann.watch(ann.place(d=0.5), 40)
+    ann.report_observations(ann.place(d=0.5), 40)
     assert ann.alarms() == []
 
 
-def test_a_controller_in_its_holder_is_an_anchor() -> None:
+def test_controller_in_its_holder_is_an_anchor() -> None:
     stated = {}
     for kind in ("controller", "qr"):
         lab = Lab()
@@ -267,9 +267,9 @@ def test_a_controller_in_its_holder_is_an_anchor() -> None:
                 p = (ann.rng.normal(0.0, 0.001, 3) + T_tracking_anchor[0]).tolist()
                 pose = Pose((p[0], p[1], p[2]), T_tracking_anchor[1])
                 ann.observe(Observation("sheet", kind, pose, lab.now_ns, 1, viewpoint))
-                lab.turn()
+                lab.poll()
         stated[kind] = ann.proposals()[-1].error_at_anchor_m
-        assert misplaced_m(ann, ann.proposals()[-1]) < 0.003
+        assert error_at_anchor(ann, ann.proposals()[-1]) < 0.003
     assert stated["controller"] < 0.4 * stated["qr"], "1.5 mm per axis, not the 5 mm of a sheet seen from nowhere"
 
 
@@ -286,15 +286,15 @@ def _touch(ann: Wearer, point: str, at: str = "", off: float = 0.0) -> None:
     x, y, z = apply(inverse(ann.frame), MARKS[at or point][0])
     pose = Pose((x + off, y, z), IDENTITY.q)
     ann.observe(Observation(point, "touch", pose, ann.lab.now_ns, ann.epoch))
-    ann.lab.turn()
+    ann.lab.poll()
 
 
-def _refusals(ann: Wearer) -> list[str]:
+def _failures(ann: Wearer) -> list[str]:
     messages = [e.message for e in ann.entries()]
     return [m.advice for m in messages if isinstance(m, AlignmentProposal) and m.refused]
 
 
-def test_three_touched_marks_align() -> None:
+def test_three_touched_points_align() -> None:
     lab = Lab(MARKS)
     ann = lab.wearer()
     for point in "ab":
@@ -302,26 +302,26 @@ def test_three_touched_marks_align() -> None:
     assert ann.entries() == []
     report = lab.service.complete_report(1, None, lab.now_ns)
     assert report is not None
-    assert "2 points touched, 3 are needed" in report.advice
+    assert "2 points touched, 3" in report.advice
     _touch(ann, "c")
     (got,) = ann.proposals()
-    assert misplaced_m(ann, got, "d") < 0.004  # the frame is tilted by 0.2 deg
+    assert error_at_anchor(ann, got, "d") < 0.004  # the frame is tilted by 0.2 deg
     assert "'a'" in got.advice
 
 
-def test_mixed_up_marks_are_refused_by_name_and_may_be_touched_again() -> None:
+def test_swapped_points_are_named_and_can_be_touched_again() -> None:
     lab = Lab(MARKS)
     ann = lab.wearer()
     for point, at in zip("abcd", "bacd", strict=True):
         _touch(ann, point, at)
     assert ann.proposals() == []
-    assert "'a' was touched at 'b'" in _refusals(ann)[-1]
+    assert "touched at 'b'" in _failures(ann)[-1]
     for point in "ab":
         _touch(ann, point)
-    assert misplaced_m(ann, ann.proposals()[-1], "d") < 0.004, "what was touched wrongly is replaced"
+    assert error_at_anchor(ann, ann.proposals()[-1], "d") < 0.004, "what was touched wrongly is replaced"
 
 
-def test_touches_of_an_old_tracking_frame_are_forgotten() -> None:
+def test_touches_of_an_old_tracking_frame_are_discarded() -> None:
     lab = Lab(MARKS)
     ann = lab.wearer()
     for point in "ab":
@@ -334,16 +334,16 @@ def test_touches_of_an_old_tracking_frame_are_forgotten() -> None:
     assert len(ann.proposals()) == 1
 
 
-def test_a_touched_alignment_is_not_replaced_by_a_worse_look() -> None:
+def test_touched_alignment_is_not_replaced_by_a_less_accurate_one() -> None:
     lab = Lab(MARKS)
     ann = lab.wearer()
     for point in "abcd":
         _touch(ann, point)
     touched = ann.proposals()
-    ann.watch(ann.place("a", 1.2), 20, "a")
+    ann.report_observations(ann.place("a", 1.2), 20, "a")
     assert ann.proposals() == touched
     ann.epoch = 2
-    ann.watch(ann.place("a", 0.6), 20, "a")
+    ann.report_observations(ann.place("a", 0.6), 20, "a")
     assert len(ann.proposals()) > len(touched)
 
 
@@ -351,28 +351,28 @@ def test_a_touched_alignment_is_not_replaced_by_a_worse_look() -> None:
 
 
 def _pair(lab: Lab, off: float) -> tuple[Wearer, Wearer]:
-    """Two that are aligned, the second by so much wrongly."""
+    """Two aligned headsets, the second wrong by `off` [m]."""
     ann, bob = lab.wearer(1), lab.wearer(2)
     for one in (ann, bob):
         one.survey(4)
     got = bob.proposals()[-1]
     pose = Pose(*shifted((got.T_world_tracking.p, got.T_world_tracking.q), (off, 0.0, 0.0)))
-    lab.put_in_force(bob, got, T_world_tracking=pose, offset=True)
+    lab.confirm(bob, got, T_world_tracking=pose, offset=True)
     return ann, bob
 
 
-def test_two_headsets_are_compared_and_a_planted_20_mm_are_found() -> None:
+def test_cross_check_measures_a_planted_difference_of_20_mm() -> None:
     lab = Lab()
     ann, bob = _pair(lab, 0.02)
     lab.entries.clear()
-    looks = ann.place(d=0.5), bob.place(d=0.5)
+    views = ann.place(d=0.5), bob.place(d=0.5)
     since_ns = lab.now_ns
     while lab.now_ns < since_ns + 21 * SECOND:
         lab.now_ns += 100 * MS
-        for one, look in zip((ann, bob), looks, strict=True):
-            one.see(look)
-        lab.turn(20)
-    found = lab.compared()
+        for one, view in zip((ann, bob), views, strict=True):
+            one.report_observation(view)
+        lab.poll(20)
+    found = lab.cross_checks()
     assert 3 <= len(found) <= 5, "every five seconds"
     for entry in found:
         message = entry.message
@@ -385,29 +385,29 @@ def test_two_headsets_are_compared_and_a_planted_20_mm_are_found() -> None:
     before = len(found)
     for _ in range(10):
         lab.now_ns += SECOND
-        lab.turn(20)
-    assert len(lab.compared()) <= before + 1, "nobody looked any more"
+        lab.poll(20)
+    assert len(lab.cross_checks()) <= before + 1, "nobody looked any more"
 
 
-def test_who_left_or_was_bumped_is_not_compared_by_what_it_saw_before() -> None:
+def test_old_observations_are_not_compared_after_disconnect_or_bump() -> None:
     lab = Lab()
     ann, bob = _pair(lab, 0.0)
-    lab.turn(2000)
+    lab.poll(2000)
     lab.entries.clear()
-    bob.head(((0.0, 0.0, 1.6), IDENTITY.q))
+    bob.report_head(((0.0, 0.0, 1.6), IDENTITY.q))
     lab.now_ns += 10 * MS
-    bob.head(((1.0, 0.0, 1.6), IDENTITY.q))
-    ann.watch(ann.place(), 10)
+    bob.report_head(((1.0, 0.0, 1.6), IDENTITY.q))
+    ann.report_observations(ann.place(), 10)
     lab.now_ns += 6 * SECOND
-    lab.turn(2000)
-    assert lab.compared() == []
+    lab.poll(2000)
+    assert lab.cross_checks() == []
     lab.service.process_event(AlignmentAlarmed("p2", "jump", "", 1.0))
     lab.service.remove_connection(1)
     lab.service.remove_connection(2)
     assert len(lab.service) == 0
 
 
-def test_a_controller_that_both_see_moves_and_is_compared_at_the_same_instants() -> None:
+def test_shared_controller_is_compared_at_equal_times() -> None:
     lab = Lab()
     ann, bob = _pair(lab, 0.02)
     lab.entries.clear()
@@ -418,8 +418,8 @@ def test_a_controller_that_both_see_moves_and_is_compared_at_the_same_instants()
             pose = Pose(*compose(inverse(one.frame), T))
             one.observe(Observation("anns-left", "controller", pose, lab.now_ns, 1))
     lab.now_ns += 6 * SECOND
-    lab.turn(1500)
-    (entry,) = lab.compared()
+    lab.poll(1500)
+    (entry,) = lab.cross_checks()
     assert isinstance(entry.message, CrossChecked)
     assert entry.message.error_m == pytest.approx(0.02, abs=0.012)
     assert not [m for m in (e.message for e in lab.entries) if isinstance(m, AlignmentProposal) and m.refused], (
@@ -427,8 +427,8 @@ def test_a_controller_that_both_see_moves_and_is_compared_at_the_same_instants()
     )
 
 
-def test_controllers_of_an_earlier_tracking_epoch_take_no_room() -> None:
-    """A headset may have four things that move; after it has recentred they may have other names."""
+def test_controllers_of_earlier_tracking_epochs_are_removed() -> None:
+    """A headset may have four tracked devices; after recentring they may have other names."""
     lab = Lab()
     ann, _ = _pair(lab, 0.0)
     for epoch in (1, 2, 3):
@@ -440,28 +440,28 @@ def test_controllers_of_an_earlier_tracking_epoch_take_no_room() -> None:
         assert lab.drops.by_reason["observation_unusable"] == epoch, "one in every epoch is one too many"
 
 
-def test_the_covariance_in_force_is_stated_where_it_was_proposed() -> None:
-    """Though looks at another sheet have moved the pivot of what is proposed meanwhile."""
+def test_covariance_in_force_is_stated_at_its_own_pivot() -> None:
+    """Observations of another sheet have moved the pivot of the next proposal meanwhile."""
     lab = Lab()
     ann = lab.wearer()
     ann.survey()
     accepted = ann.proposals()[-1]
     for _ in range(3):
-        ann.watch(ann.place("other"), 15, "other")
+        ann.report_observations(ann.place("other"), 15, "other")
     newest = ann.proposals()[-1]
     assert distance(newest.pivot_world, accepted.pivot_world) > 0.2
-    lab.put_in_force(ann, accepted)
+    lab.confirm(ann, accepted)
     in_force = lab.service._states[1].monitor.in_force
     assert in_force is not None
     assert in_force.pivot_world == accepted.pivot_world
     assert in_force.error_at(SHEET[0]) == pytest.approx(accepted.error_at_anchor_m)
-    lab.put_in_force(ann, newest, covariance=tuple(2.0 * c for c in newest.covariance))
+    lab.confirm(ann, newest, covariance=tuple(2.0 * c for c in newest.covariance))
     sliding = lab.service._states[1].monitor.in_force
     assert sliding is not None
     assert sliding.pivot_world == newest.pivot_world
 
 
-def test_a_front_that_was_started_anew_learns_from_a_snapshot_what_is_in_force() -> None:
+def test_restarted_front_restores_alignment_in_force_from_a_snapshot() -> None:
     lab = Lab()
     ann = lab.wearer()
     ann.survey()
@@ -471,29 +471,29 @@ def test_a_front_that_was_started_anew_learns_from_a_snapshot_what_is_in_force()
     bob.frame = ann.frame
     alignment = lab.service._in_force["p1"]
     fresh.service.process_snapshot([ParticipantInfo("p1", "Ann", "operator", True, alignment=alignment)])
-    bob.watch(bob.place(), 1)
+    bob.report_observations(bob.place(), 1)
     in_force = fresh.service._states[1].monitor.in_force
     assert in_force is not None
     assert in_force.T_world_tracking[0] == got.T_world_tracking.p
 
 
-# --- bounds and strangers --------------------------------------------------------------------------------------------
+# --- bounds and hostile input ----------------------------------------------------------------------------------------
 
 
 def test_memory_is_bounded() -> None:
     lab = Lab()
     ann = lab.wearer()
-    look = ann.place()
+    view = ann.place()
     for i in range(3000):
         lab.now_ns += 5 * MS
-        ann.see(look)
+        ann.report_observation(view)
         ann.observe(Observation(f"thing{i}", "controller", IDENTITY, lab.now_ns, 1))
         ann.observe(Observation(f"sheet{i}", "qr", IDENTITY, lab.now_ns, 1))
     person = lab.service._states[1]
     assert len(person.monitor.heads) <= 128
     assert len(lab.service._cross_check._moving[1]) <= 4
     assert len(lab.service._cross_check._check._observations) <= 5
-    assert all(len(looks) <= 100 for looks in lab.service._cross_check._check._observations.values())
+    assert all(len(views) <= 100 for views in lab.service._cross_check._check._observations.values())
     assert set(person.estimator._observed) == {"sheet"}
     assert len(person.estimator._estimator._memory) <= 600
     for n in range(2000):
@@ -506,7 +506,7 @@ BAD = (math.nan, math.inf, -math.inf, 1e308, 1e-308, 0.0)
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize("bad", BAD)
-def test_garbage_raises_nothing_and_makes_entries_that_can_be_sent(bad: float) -> None:
+def test_invalid_input_never_raises_and_entries_can_be_encoded(bad: float) -> None:
     lab = Lab()
     ann, bob = lab.wearer(1), lab.wearer(2)
     for one in (ann, bob):
@@ -529,16 +529,16 @@ def test_garbage_raises_nothing_and_makes_entries_that_can_be_sent(bad: float) -
                             one.observe(seen)
                             one.observe(msgspec.structs.replace(seen, T_tracking_anchor=IDENTITY, size_m=bad))
                 lab.now_ns += 300 * MS
-                lab.turn(50)
+                lab.poll(50)
     for one in (ann, bob):
         one.epoch = 2
         one.survey(2)
-    assert misplaced_m(ann, ann.proposals()[-1]) < 0.02
+    assert error_at_anchor(ann, ann.proposals()[-1]) < 0.02
     for entry in lab.entries:
         decode_entry(encode_entry(entry))
 
 
-def test_the_report_of_both_halves() -> None:
+def test_report_combines_front_and_authority() -> None:
     lab = Lab()
     ann = lab.wearer()
     half = AlignmentReport(version=7, pending_m=0.1)
@@ -559,14 +559,14 @@ def test_the_report_of_both_halves() -> None:
     assert alone.observations == 30
 
 
-def test_a_proposal_of_the_same_instant_as_an_alarm_is_later() -> None:
+def test_proposal_at_the_time_of_an_alarm_counts_as_later() -> None:
     lab = Lab()
     ann = lab.wearer()
     ann.survey()
     lab.now_ns += SECOND
     for x in (0.0, 1.0):
         lab.now_ns += 10 * MS
-        ann.head(((x, 0.0, 1.6), IDENTITY.q))
+        ann.report_head(((x, 0.0, 1.6), IDENTITY.q))
     ann.observe(Observation("sheet", "qr", IDENTITY, lab.now_ns, 1))
     lab.service.tick(lab.now_ns)
     alarm, refusal = ann.entries()[-2:]
@@ -575,22 +575,22 @@ def test_a_proposal_of_the_same_instant_as_an_alarm_is_later() -> None:
     assert refusal.receive_ns > alarm.receive_ns
 
 
-def test_looks_at_a_sheet_before_it_was_moved_blame_no_headset() -> None:
+def test_observations_of_a_sheet_before_it_was_moved_are_not_cross_checked() -> None:
     lab = Lab()
     ann, bob = _pair(lab, 0.0)
     for one in (ann, bob):
         one.survey(3, ("sheet", "other"))
-    looks = {name: ann.place(name, p_head_world=(0.6, 0.0, 1.3)) for name in ANCHORS}
+    views = {name: ann.place(name, p_head_world=(0.6, 0.0, 1.3)) for name in ANCHORS}
     for i in range(50):
         if i == 25:
             lab.world["sheet"] = shifted(SHEET, (0.05, 0.0, 0.0))
         lab.now_ns += 100 * MS
-        for name, look in looks.items():
-            ann.see(look, name)
-        lab.turn()
+        for name, view in views.items():
+            ann.report_observation(view, name)
+        lab.poll()
     assert [a.beside for a in ann.alarms()] == [("other",)]
     lab.entries.clear()
     lab.now_ns += 6 * SECOND
-    ann.watch(ann.place("sheet", 0.5), 10)
-    lab.turn(3000)
-    assert [e.message.anchor_id for e in lab.compared() if isinstance(e.message, CrossChecked)] in ([], ["other"])
+    ann.report_observations(ann.place("sheet", 0.5), 10)
+    lab.poll(3000)
+    assert [e.message.anchor_id for e in lab.cross_checks() if isinstance(e.message, CrossChecked)] in ([], ["other"])

@@ -1,4 +1,4 @@
-"""Several cameras and sheets in one frame: exact without noise, better together than alone, loose ends are named."""
+"""Several cameras and sheets in one frame: exact without noise, better with more views, unconnected cameras named."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_chain_of_cameras_is_exact_without_noise() -> None:
     assert set(rig.covariances) == set(CAMERAS)
 
 
-def test_more_views_make_it_better_and_the_statement_smaller() -> None:
+def test_more_views_reduce_error_and_stated_error() -> None:
     off: dict[int, list[float]] = {1: [], 8: []}
     stated = {}
     for seed in range(12):
@@ -62,8 +62,8 @@ def test_more_views_make_it_better_and_the_statement_smaller() -> None:
     assert 0.4 < np.sqrt(np.mean(np.square(off[1]))) / stated[1] < 1.6
 
 
-def test_what_nothing_connects_is_named() -> None:
-    with pytest.raises(CalibrationError, match="nothing connects camera left, wrist with a sheet of known place"):
+def test_unconnected_cameras_are_named() -> None:
+    with pytest.raises(CalibrationError, match="camera left, wrist"):
         solve_rig(_views([SEEN[0], SEEN[3], SEEN[4]]), {"table": SHEETS["table"]})
-    with pytest.raises(CalibrationError, match="no camera saw a sheet"):
+    with pytest.raises(CalibrationError, match="no camera"):
         solve_rig([], {"table": SHEETS["table"]})

@@ -1,4 +1,4 @@
-"""Tip of a controller by pivoting: found, robust, and refused with what to do."""
+"""Controller tip by pivoting: accurate, robust, and advice where the motion does not determine it."""
 
 from __future__ import annotations
 
@@ -22,53 +22,53 @@ def _poses(turns: Array, sigma_m: float = 0.001, seed: int = 1) -> list[PoseTupl
     return [(tuple(p), tuple(r)) for p, r in zip(t.tolist(), q.tolist(), strict=True)]
 
 
-def _cone(n: int = 150, angle: float = 0.6) -> Array:
+def _cone_rotations(n: int = 150, angle: float = 0.6) -> Array:
     phi = np.linspace(0.0, 4.0 * math.pi, n)
     return np.stack([angle * np.cos(phi), angle * np.sin(phi), 0.2 * np.sin(3.0 * phi)], axis=1)
 
 
-def _off(got: TipCalibration) -> float:
+def _tip_error(got: TipCalibration) -> float:
     return math.dist(got.p_controller_tip, TIP)
 
 
-def test_the_tip_is_found() -> None:
-    got = calibrate_tip(_poses(_cone()))
+def test_tip_is_accurate() -> None:
+    got = calibrate_tip(_poses(_cone_rotations()))
     assert not got.refused
     assert got.advice == ""
-    assert _off(got) < 4.0 * got.sigma_m < 0.002
+    assert _tip_error(got) < 4.0 * got.sigma_m < 0.002
     assert math.dist(got.p_tracking_pivot, PIVOT) < 0.001
     assert got.residual_m == pytest.approx(0.001 * math.sqrt(3.0), rel=0.2)
-    pose = _poses(_cone(), sigma_m=0.0)[7]
+    pose = _poses(_cone_rotations(), sigma_m=0.0)[7]
     assert math.dist(tip_position(pose, got.p_controller_tip), PIVOT) < 0.001
 
 
-def test_wrong_readings_are_left_out() -> None:
-    poses = _poses(_cone())
+def test_wrong_readings_are_excluded() -> None:
+    poses = _poses(_cone_rotations())
     for i in range(0, 150, 10):
         poses[i] = ((poses[i][0][0] + 0.3, poses[i][0][1], poses[i][0][2]), poses[i][1])
     got = calibrate_tip(poses)
     assert not got.refused
     assert got.n_used <= 135
-    assert _off(got) < 0.001
+    assert _tip_error(got) < 0.001
 
 
 @pytest.mark.parametrize(
     ("poses", "word"),
     [
-        (_poses(_cone(10)), "10 poses of at least 20"),
-        (_poses(_cone() * 0.1), "deg about the least used direction"),
-        (_poses(_cone() * np.array([1.0, 0.0, 0.0])), "to the front and to the side"),
-        (_poses(_cone(), sigma_m=0.01), "the tip slipped"),
-        (_poses(_cone(25), sigma_m=0.0034), "known to 1."),
+        (_poses(_cone_rotations(10)), "10 poses"),
+        (_poses(_cone_rotations() * 0.1), "least used direction"),
+        (_poses(_cone_rotations() * np.array([1.0, 0.0, 0.0])), "to the front"),
+        (_poses(_cone_rotations(), sigma_m=0.01), "the tip slipped"),
+        (_poses(_cone_rotations(25), sigma_m=0.0034), "known to 1."),
     ],
 )
-def test_what_does_not_fix_the_tip_is_refused_with_advice(poses: list[PoseTuple], word: str) -> None:
+def test_insufficient_motion_fails_with_advice(poses: list[PoseTuple], word: str) -> None:
     got = calibrate_tip(poses)
     assert got.refused
     assert word in got.advice
 
 
-def test_a_holder_is_an_anchor() -> None:
+def test_holder_becomes_an_anchor() -> None:
     T_world_holder: PoseTuple = ((1.0, 2.0, 0.8), quat_from_rotvec((0.0, 0.0, 0.5)))
     T_holder_controller: PoseTuple = ((0.0, 0.0, 0.05), quat_from_rotvec((0.4, 0.0, 0.0)))
     T = holder_anchor(T_world_holder, T_holder_controller)
@@ -76,8 +76,8 @@ def test_a_holder_is_an_anchor() -> None:
     assert len(controller_covariance()) == 36
 
 
-def test_readings_that_are_no_pose_are_left_out() -> None:
-    poses = _poses(_cone())
+def test_invalid_poses_are_excluded() -> None:
+    poses = _poses(_cone_rotations())
     lost: list[PoseTuple] = [((math.nan, 0.0, 0.0), poses[0][1]), (poses[0][0], (0.0, 0.0, 0.0, 0.0))]
     assert calibrate_tip([*lost, *poses]) == calibrate_tip(poses)
     assert calibrate_tip(lost * 20).refused

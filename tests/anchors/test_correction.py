@@ -1,4 +1,4 @@
-"""Corrections slide in slowly, wait while a clutch is engaged, and are announced when they are large."""
+"""Corrections are applied gradually, wait while a clutch is engaged, and need consent when large."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def _estimate(x: float = 0.0, yaw: float = 0.3, epoch: int = 0, refused: bool = 
     return AlignmentEstimate(T, epoch, (1e-6,) * 36, PIVOT, 0.004, 0.0, 60, 3, refused, "")
 
 
-def test_the_first_estimate_counts_at_once_and_none_is_none() -> None:
+def test_first_estimate_applies_at_once() -> None:
     smooth = CorrectionFilter()
     assert smooth.update(_estimate(refused=True), 0) is None
     got = smooth.update(_estimate(), 1)
@@ -28,7 +28,7 @@ def test_the_first_estimate_counts_at_once_and_none_is_none() -> None:
     assert (got.step, got.T_world_tracking) == ("first", _estimate().T_world_tracking)
 
 
-def test_a_small_correction_slides_in_no_faster_than_allowed() -> None:
+def test_small_correction_is_applied_at_the_speed_limit() -> None:
     smooth = CorrectionFilter(CorrectionConfig(slide_m_per_s=0.004))
     smooth.update(_estimate(), 0)
     last, steps = 0.0, 0
@@ -43,7 +43,7 @@ def test_a_small_correction_slides_in_no_faster_than_allowed() -> None:
     assert steps == pytest.approx(120, abs=2)
 
 
-def test_nothing_moves_while_engaged_and_after_release_it_slides_not_leaps() -> None:
+def test_correction_waits_while_engaged_and_is_gradual_after_release() -> None:
     smooth = CorrectionFilter()
     smooth.update(_estimate(), 0)
     for i in range(1, 10):
@@ -58,7 +58,7 @@ def test_nothing_moves_while_engaged_and_after_release_it_slides_not_leaps() -> 
 
 
 @pytest.mark.parametrize("estimate", [_estimate(0.05), _estimate(0.0, 0.3 + math.radians(3.0))])
-def test_a_large_correction_waits_until_it_is_accepted(estimate: AlignmentEstimate) -> None:
+def test_large_correction_waits_for_acceptance(estimate: AlignmentEstimate) -> None:
     smooth = CorrectionFilter()
     smooth.update(_estimate(), 0)
     got = smooth.update(estimate, SECOND)
@@ -70,7 +70,7 @@ def test_a_large_correction_waits_until_it_is_accepted(estimate: AlignmentEstima
     assert (got.step, got.T_world_tracking) == ("jump", estimate.T_world_tracking)
 
 
-def test_a_new_tracking_epoch_voids_it_and_a_refusal_within_one_does_not() -> None:
+def test_new_tracking_epoch_clears_the_correction_and_a_failure_within_one_keeps_it() -> None:
     smooth = CorrectionFilter()
     smooth.update(_estimate(), 0)
     kept = smooth.update(_estimate(refused=True), 1)
@@ -82,7 +82,7 @@ def test_a_new_tracking_epoch_voids_it_and_a_refusal_within_one_does_not() -> No
     assert got.step == "first"
 
 
-def test_on_the_way_the_pivot_moves_on_a_straight_line() -> None:
+def test_pivot_moves_on_a_straight_line() -> None:
     old: PoseTuple = ((0.0, 0.0, 0.0), quat_from_yaw(0.3))
     new: PoseTuple = ((0.02, -0.01, 0.0), quat_from_rotvec((0.01, 0.0, 0.33)))
     pivot = apply(inverse(new), PIVOT)

@@ -1,4 +1,4 @@
-"""Two headsets on one sheet or one controller: what they disagree by is measured, not stated."""
+"""Cross-check of two headsets on one sheet or one controller: the measured difference."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from anchors.alignment import AlignmentEstimate, AlignmentEstimator
 from anchors.cross_check import CrossCheck, CrossCheckConfig
 from anchors.pose import PoseTuple, compose, inverse, quat_from_yaw
-from tests.anchors.worlds import Look, around, headset, shifted
+from tests.anchors.worlds import Viewpoint, shifted, tracking_frame, viewpoint_around
 
 SHEET: PoseTuple = ((0.2, -0.4, 0.75), quat_from_yaw(0.5))
 PERIOD = 100_000_000
@@ -20,27 +20,29 @@ PERIOD = 100_000_000
 def _aligned(rng: np.random.Generator, T_world_tracking: PoseTuple) -> AlignmentEstimate:
     estimator = AlignmentEstimator({"sheet": SHEET})
     for viewpoint in range(3):
-        look = Look(rng, SHEET, around(rng, SHEET[0], rng.uniform(0.4, 1.0)))
+        view = Viewpoint(rng, SHEET, viewpoint_around(rng, SHEET[0], rng.uniform(0.4, 1.0)))
         for _ in range(20):
-            pose, head = look.new(T_world_tracking), look.head(T_world_tracking)
+            pose, head = view.observe(T_world_tracking), view.head_pose(T_world_tracking)
             estimator.add("sheet", pose, 0, 0, viewpoint, p_tracking_head=head)
     return estimator.estimate()
 
 
-def _see(check: CrossCheck, name: str, look: Look, T: PoseTuple, n: int = 20, epoch: int = 0, start: int = 1) -> None:
+def _observe(
+    check: CrossCheck, name: str, view: Viewpoint, T: PoseTuple, n: int = 20, epoch: int = 0, start: int = 1
+) -> None:
     for i in range(start, start + n):
-        check.add_observation(name, "sheet", look.new(T), look.head(T), i * PERIOD, epoch)
+        check.add_observation(name, "sheet", view.observe(T), view.head_pose(T), i * PERIOD, epoch)
 
 
-def test_headsets_that_agree_do_so_within_what_is_expected() -> None:
+def test_aligned_headsets_differ_within_expectation() -> None:
     sizes, expected = [], []
     for seed in range(25):
         rng = np.random.default_rng(seed)
         check, alignments = CrossCheck(), {}
         for name in "ab":
-            T = headset(rng)
+            T = tracking_frame(rng)
             alignments[name] = _aligned(rng, T)
-            _see(check, name, Look(rng, SHEET, around(rng, SHEET[0], 0.6)), T)
+            _observe(check, name, Viewpoint(rng, SHEET, viewpoint_around(rng, SHEET[0], 0.6)), T)
         (got,) = check.compare(alignments, 30 * PERIOD)
         assert (got.a, got.b, got.target, got.n) == ("a", "b", "sheet", 20)
         assert got.is_expected
@@ -51,21 +53,21 @@ def test_headsets_that_agree_do_so_within_what_is_expected() -> None:
     assert sum(s <= e for s, e in zip(sizes, expected, strict=True)) >= 21
 
 
-def test_a_headset_that_was_bumped_disagrees_by_as_much() -> None:
+def test_bumped_headset_differs_by_its_bump() -> None:
     rng = np.random.default_rng(1)
     check, alignments = CrossCheck(), {}
     for name, bump in (("a", 0.0), ("b", 0.05)):
-        T = headset(rng)
+        T = tracking_frame(rng)
         alignments[name] = _aligned(rng, T)
-        _see(check, name, Look(rng, SHEET, around(rng, SHEET[0], 0.6)), shifted(T, (bump, 0.0, 0.0)))
+        _observe(check, name, Viewpoint(rng, SHEET, viewpoint_around(rng, SHEET[0], 0.6)), shifted(T, (bump, 0.0, 0.0)))
     (got,) = check.compare(alignments, 30 * PERIOD)
     assert got.error_m == pytest.approx(0.05, abs=0.01)
     assert not got.is_expected
 
 
-def test_a_moving_controller_is_compared_at_the_same_instants() -> None:
+def test_moving_controller_is_compared_at_equal_times() -> None:
     rng = np.random.default_rng(2)
-    frames = {name: headset(rng) for name in "ab"}
+    frames = {name: tracking_frame(rng) for name in "ab"}
     exact = {name: replace(_aligned(rng, T), T_world_tracking=T) for name, T in frames.items()}
     check = CrossCheck(config=CrossCheckConfig(max_gap_ns=30_000_000))
     for i in range(200):
@@ -78,25 +80,25 @@ def test_a_moving_controller_is_compared_at_the_same_instants() -> None:
     assert check.compare(exact, 200 * 6_940_000 + 61 * 10**9, moving=frozenset({"controller"})) == []
 
 
-def test_a_recentred_refused_or_stale_headset_is_not_compared() -> None:
+def test_recentred_failed_or_stale_headset_is_not_compared() -> None:
     rng = np.random.default_rng(3)
-    T = headset(rng)
+    T = tracking_frame(rng)
     good = _aligned(rng, T)
     check = CrossCheck()
-    look = Look(rng, SHEET, around(rng, SHEET[0], 0.6))
-    _see(check, "a", look, T)
-    _see(check, "b", look, T)
+    view = Viewpoint(rng, SHEET, viewpoint_around(rng, SHEET[0], 0.6))
+    _observe(check, "a", view, T)
+    _observe(check, "b", view, T)
     refused = AlignmentEstimator({}).estimate()
     assert len(check.compare({"a": good, "b": good}, 30 * PERIOD)) == 1
     assert check.compare({"a": good, "b": refused}, 30 * PERIOD) == []
     assert check.compare({"a": good, "b": good}, 700 * 10**9) == [], "too long ago"
-    _see(check, "b", look, T, epoch=1, start=40)
+    _observe(check, "b", view, T, epoch=1, start=40)
     assert check.compare({"a": good, "b": good}, 60 * PERIOD) == [], "its alignment is of another tracking frame"
     check.discard_headset("a")
     assert check.compare({"a": good}, 60 * PERIOD) == []
 
 
-def test_memory_is_bounded_and_what_is_of_no_use_is_counted() -> None:
+def test_memory_is_bounded_and_unusable_input_is_counted() -> None:
     check = CrossCheck(config=CrossCheckConfig(max_targets=2, max_observations=10))
     pose, zero = SHEET, (0.0, 0.0, 0.0)
     for i in range(100):
@@ -108,19 +110,19 @@ def test_memory_is_bounded_and_what_is_of_no_use_is_counted() -> None:
     assert check.dropped == 98 + 1 + 2
 
 
-def test_what_comes_late_of_an_earlier_frame_forgets_nothing() -> None:
+def test_late_input_of_an_earlier_epoch_removes_nothing() -> None:
     rng = np.random.default_rng(2)
-    T, check = headset(rng), CrossCheck()
-    look = Look(rng, SHEET, around(rng, SHEET[0], 0.6))
+    T, check = tracking_frame(rng), CrossCheck()
+    view = Viewpoint(rng, SHEET, viewpoint_around(rng, SHEET[0], 0.6))
     alignments = {name: replace(_aligned(rng, T), tracking_epoch=1) for name in "ab"}
     for name in "ab":
-        _see(check, name, look, T, epoch=1)
-        _see(check, name, look, T, n=1, epoch=0, start=30)
+        _observe(check, name, view, T, epoch=1)
+        _observe(check, name, view, T, n=1, epoch=0, start=30)
     assert check.dropped == 2
     assert len(check.compare(alignments, 30 * PERIOD)) == 1
 
 
-def test_what_nobody_sees_any_more_makes_room() -> None:
+def test_anchors_out_of_sight_are_removed() -> None:
     check = CrossCheck(config=CrossCheckConfig(max_targets=2, max_age_ns=10 * PERIOD))
     for i, thing in enumerate("abcd"):
         check.add_observation("h", thing, SHEET, (0.0, 0.0, 1.0), i, 0)

@@ -1,4 +1,4 @@
-"""Sheets found in computed photographs of the printed page: where, how well, how honestly; and not where none is."""
+"""Sheets detected in rendered photographs of the printed page: pose accuracy, stated error, no false detections."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def pages() -> dict[str, Page]:
 
 
 def _facing(p: tuple[float, float, float], tilt_deg: float, roll_deg: float = 20.0) -> PoseTuple:
-    """A sheet in front of the camera, upright and facing it, then rolled, then tilted about the camera's x."""
+    """Pose of a sheet in front of the camera, upright and facing it, then rolled, then tilted about the camera's x."""
     facing = (p, quat_from_rotvec((math.pi, 0.0, 0.0)))
     rolled = compose(facing, ((0.0, 0.0, 0.0), quat_from_rotvec((0.0, 0.0, math.radians(roll_deg)))))
     turn = quat_from_rotvec((math.radians(tilt_deg), 0.0, 0.0))
     return (p, compose(((0.0, 0.0, 0.0), turn), ((0.0, 0.0, 0.0), rolled[1]))[1])
 
 
-def _off(seen: SheetDetection, true: PoseTuple) -> tuple[float, float]:
+def _errors(seen: SheetDetection, true: PoseTuple) -> tuple[float, float]:
     """Errors [mm], [deg]."""
     at = seen.T_camera_sheet
     return 1e3 * distance(at[0], true[0]), math.degrees(quat_angle(at[1], true[1]))
@@ -52,20 +52,20 @@ def _off(seen: SheetDetection, true: PoseTuple) -> tuple[float, float]:
 @pytest.mark.parametrize(
     ("distance_m", "tilt", "mm", "deg"), [(0.5, 40, 0.2, 0.1), (1.0, 0, 0.5, 0.3), (2.0, 30, 3, 0.5)]
 )
-def test_sheet_is_found_and_measured(
+def test_sheet_is_detected_and_measured(
     pages: dict[str, Page], distance_m: float, tilt: float, mm: float, deg: float
 ) -> None:
-    """Millimetres at 2 m with 640 x 480 pixels, where OpenCV hardly ever finds the bare code."""
+    """Accuracy of millimetres at 2 m with 640 x 480 pixels, where OpenCV rarely detects the bare code."""
     true = _facing((0.03 * distance_m, -0.04 * distance_m, distance_m), tilt)
     picture = photograph([(pages["table"], true)], CAMERA, CONDITIONS, np.random.default_rng(1))
     (seen,) = SheetDetector([TABLE, DOOR], CAMERA).detect(picture)
     assert (seen.anchor_id, seen.kind, seen.edge_m, seen.registered) == ("table", "board", 0.160, True)
-    position, angle = _off(seen, true)
+    position, angle = _errors(seen, true)
     assert position < mm
     assert angle < deg
     assert not seen.ambiguous
     assert replace(seen, mirrored=true, mirrored_ratio=1.01).ambiguous
-    if distance_m == 2.0:  # far and tilted: the plane's other pose is worth looking at, and fits worse
+    if distance_m == 2.0:  # far and tilted: the plane's second pose is considered and fits worse
         assert seen.mirrored is not None
         assert math.degrees(quat_angle(seen.mirrored[1], true[1])) > 20.0
         assert 1.5 < seen.mirrored_ratio < 20.0
@@ -75,8 +75,8 @@ def test_sheet_is_found_and_measured(
     assert math.sqrt(np.trace(covariance[:3, :3])) < 2e-3 * mm
 
 
-def test_what_is_found_from_afar_is_right(pages: dict[str, Page]) -> None:
-    """At the end of the range markers go missing and both poses of the plane fit the corners; the print decides."""
+def test_distant_detections_are_correct(pages: dict[str, Page]) -> None:
+    """At the end of the range markers are missed and both poses of the plane fit the corners; the print decides."""
     rng = np.random.default_rng(6)
     found = 0
     for distance_m, tilt in ((2.5, 20.0), (2.5, 40.0), (2.8, 30.0), (3.0, 10.0), (3.0, 25.0), (3.2, 20.0)):
@@ -85,35 +85,35 @@ def test_what_is_found_from_afar_is_right(pages: dict[str, Page]) -> None:
         for seen in SheetDetector([TABLE], CAMERA).detect(picture):
             if not seen.ambiguous:
                 found += 1
-                assert _off(seen, true)[0] < 15.0
-                assert _off(seen, true)[1] < 3.0
+                assert _errors(seen, true)[0] < 15.0
+                assert _errors(seen, true)[1] < 3.0
     assert found >= 3
 
 
-def test_bare_code_is_read_from_near_only(pages: dict[str, Page]) -> None:
+def test_bare_code_is_detected_at_short_range_only(pages: dict[str, Page]) -> None:
     rng = np.random.default_rng(2)
     true = _facing((0.0, 0.0, 0.5), 30.0)
     picture = photograph([(pages["table"], true)], CAMERA, CONDITIONS, rng)
     (seen,) = detect_codes(picture, CAMERA, {"table": 0.160})
     assert (seen.anchor_id, seen.kind, seen.registered) == ("table", "qr", False)
-    assert _off(seen, true)[0] < 8.0
+    assert _errors(seen, true)[0] < 8.0
     assert detect_codes(picture, CAMERA, {"door": 0.120}) == []
     far = photograph([(pages["table"], _facing((0.0, 0.0, 3.0), 30.0))], CAMERA, CONDITIONS, rng)
     assert detect_codes(far, CAMERA, {"table": 0.160}) == []
 
 
-def test_two_sheets_are_told_apart_and_a_covered_marker_is_not_needed(pages: dict[str, Page]) -> None:
+def test_two_sheets_are_identified_with_a_covered_marker(pages: dict[str, Page]) -> None:
     table, door = _facing((-0.2, 0.0, 1.0), 20.0), _facing((0.2, 0.05, 0.9), 35.0, 170.0)
     picture = photograph([(pages["table"], table), (pages["door"], door)], CAMERA, CONDITIONS, np.random.default_rng(3))
     u, v = CAMERA.project(TABLE.marker_corners[1], table).mean(axis=0).astype(int)
     cv2.circle(picture, (int(u), int(v)), 24, 60, -1)  # a hand on a corner of the sheet
     first, second = SheetDetector([TABLE, DOOR], CAMERA).detect(picture)
     assert (first.markers, second.markers) == (3, 4)
-    assert _off(first, table)[0] < 1.0
-    assert _off(second, door)[0] < 1.0
+    assert _errors(first, table)[0] < 1.0
+    assert _errors(second, door)[0] < 1.0
 
 
-def test_nothing_is_found_where_no_sheet_is() -> None:
+def test_image_without_sheets_has_no_detections() -> None:
     camera = CameraModel(640, 480, 585.0, 585.0, 320.0, 240.0)
     sheets = [Sheet(f"sheet-{k}", 0.160) for k in range(8)]
     frames = sorted(RGBD.glob("*.color.jpg"))[::12]
@@ -122,16 +122,16 @@ def test_nothing_is_found_where_no_sheet_is() -> None:
         assert SheetDetector(sheets, camera).detect(cv2.imread(str(path))) == []
 
 
-def test_sheet_in_a_real_room_is_found(pages: dict[str, Page]) -> None:
+def test_sheet_in_a_real_room_is_detected(pages: dict[str, Page]) -> None:
     room = cv2.imread(str(RGBD / "frame-000000.color.jpg"), cv2.IMREAD_GRAYSCALE)
     true = _facing((0.1, 0.1, 1.2), 35.0, -60.0)
     picture = photograph([(pages["table"], true)], CAMERA, CONDITIONS, np.random.default_rng(4), background=room)
     (seen,) = SheetDetector([TABLE], CAMERA).detect(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR))
-    assert _off(seen, true)[0] < 1.0
+    assert _errors(seen, true)[0] < 1.0
 
 
-def test_flat_scan_of_the_page_is_read_back(pages: dict[str, Page]) -> None:
-    """The rasterised PDF itself: seen square on, at the distance that its resolution stands for."""
+def test_flat_scan_of_the_page_is_detected(pages: dict[str, Page]) -> None:
+    """The rasterised PDF itself, seen frontally at the distance of its resolution."""
     page = pages["table"].levels[3]
     picture = np.round(255.0 * page).astype(np.uint8)
     per_m = picture.shape[1] / pages["table"].size_m[0]
@@ -139,13 +139,13 @@ def test_flat_scan_of_the_page_is_read_back(pages: dict[str, Page]) -> None:
         picture.shape[1], picture.shape[0], 1000.0, 1000.0, 0.5 * picture.shape[1] - 0.5, 0.5 * picture.shape[0] - 0.5
     )
     (seen,) = SheetDetector([TABLE], camera).detect(picture)
-    position, angle = _off(seen, ((0.0, 0.0, 1000.0 / per_m), (0.0, 1.0, 0.0, 0.0)))
+    position, angle = _errors(seen, ((0.0, 0.0, 1000.0 / per_m), (0.0, 1.0, 0.0, 0.0)))
     assert position < 2.0  # of 1.9 m
     assert angle < 0.5
 
 
-def test_corners_alone_agree_with_opencv() -> None:
-    """Golden case: exact corners through `solvePnP`, both poses of the plane among OpenCV's."""
+def test_poses_from_corners_agree_with_opencv() -> None:
+    """Golden case: exact corners through `solvePnP`; OpenCV returns both poses of the plane."""
     from anchors.detection import _plane_poses
 
     true = _facing((0.05, -0.1, 1.5), 30.0)
@@ -166,7 +166,7 @@ def test_corners_alone_agree_with_opencv() -> None:
     assert distance(mirrored[0], pose[0]) < 0.04
 
 
-def test_wrong_marker_is_outvoted() -> None:
+def test_wrong_marker_is_excluded() -> None:
     from anchors.detection import _find_consistent_markers
 
     true = _facing((0.0, 0.0, 1.0), 25.0)
@@ -180,7 +180,7 @@ def test_wrong_marker_is_outvoted() -> None:
     assert _find_consistent_markers(TABLE, {0: seen[0]}, CAMERA) is None
 
 
-def test_covariance_of_corners_is_that_of_their_noise() -> None:
+def test_covariance_matches_corner_noise() -> None:
     from anchors.detection import _CORNER_SIGMA_PX, _detect_by_corners, _plane_poses
 
     rng = np.random.default_rng(5)
@@ -195,14 +195,14 @@ def test_covariance_of_corners_is_that_of_their_noise() -> None:
         turn = quat_to_rotvec(compose(seen.T_camera_sheet, inverse(true))[1])
         d = np.concatenate([np.subtract(seen.T_camera_sheet[0], true[0]), turn])
         distances.append(float(d @ np.linalg.solve(np.reshape(seen.covariance, (6, 6)), d)))
-    assert 4.0 < float(np.mean(distances)) < 7.5  # 6 degrees of freedom, stated a little large
+    assert 4.0 < float(np.mean(distances)) < 7.5  # 6 degrees of freedom; the stated covariance is slightly large
 
 
-def test_pictures_of_another_camera_are_refused() -> None:
+def test_image_size_and_duplicate_ids_are_checked() -> None:
     detector = SheetDetector([TABLE], CAMERA)
-    with pytest.raises(DetectionError, match="the picture is 320 x 240, the intrinsics are for 640 x 480"):
+    with pytest.raises(DetectionError, match=r"320 x 240, .*640 x 480"):
         detector.detect(np.zeros((240, 320), np.uint8))
     with pytest.raises(DetectionError, match="uint8"):
         detector.detect(np.zeros((480, 640), np.float32))
-    with pytest.raises(DetectionError, match="two sheets have the same id"):
+    with pytest.raises(DetectionError, match="same id"):
         SheetDetector([TABLE, Sheet("table", 0.1)], CAMERA)

@@ -1,4 +1,4 @@
-"""Group operations as arrays: laws by hypothesis, golden cases against scipy and OpenCV, care near zero and pi."""
+"""Lie group operations on arrays: laws by hypothesis, cases against scipy and OpenCV, limits near zero and pi."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from anchors.pose import quat_mul, quat_rotate, quat_to_rotvec
 
 vectors = arrays(np.float64, 3, elements=st.floats(-3.0, 3.0))
 axes = vectors.filter(lambda v: bool(np.linalg.norm(v) > 1e-3)).map(lambda v: v / np.linalg.norm(v))
-#: Where series, square roots and signs go wrong.
+#: Angles where series, square roots and signs change.
 angles = st.one_of(
     st.floats(0.0, math.pi),
     st.sampled_from([0.0, 1e-300, 1e-12, 1e-8, 1e-7, 1e-4, math.pi - 1e-4, math.pi - 1e-8, math.pi]),
@@ -30,7 +30,7 @@ def _scipy(q: Array) -> Rotation:
     return Rotation.from_quat(np.roll(q, -1, axis=-1))
 
 
-def _turned_alike(a: Array, b: Array) -> bool:
+def _is_same_rotation(a: Array, b: Array) -> bool:
     return bool(abs(abs(float(a @ b)) - 1.0) < 1e-12)
 
 
@@ -42,8 +42,8 @@ def test_log_is_the_inverse_of_exp(axis: Array, angle: float) -> None:
     assert np.linalg.norm(back) <= math.pi + 1e-12
     if angle < math.pi - 1e-7:
         assert np.allclose(back, axis * angle, rtol=1e-9, atol=1e-12)
-    else:  # half a turn to either side is the same
-        assert _turned_alike(lie.quat_exp(back), q)
+    else:  # half a turn in either direction is the same rotation
+        assert _is_same_rotation(lie.quat_exp(back), q)
 
 
 @given(axes, angles)
@@ -58,13 +58,14 @@ def test_log_agrees_with_opencv(axis: Array, angle: float) -> None:
     R = Rotation.from_rotvec(axis * angle).as_matrix()
     ours = lie.quat_log(lie.quat_from_matrix(R))
     theirs = cv2.Rodrigues(R)[0].ravel()
-    assert np.allclose(lie.quat_to_matrix(lie.quat_exp(ours)), cv2.Rodrigues(theirs)[0], atol=1e-6)
+    atol = 1e-6 if angle > 2e-5 else 1.1e-5  # OpenCV returns zero up to 1e-5 rad
+    assert np.allclose(lie.quat_to_matrix(lie.quat_exp(ours)), cv2.Rodrigues(theirs)[0], atol=atol)
     if angle < math.pi - 1e-3:
-        assert np.allclose(ours, theirs, atol=1e-6)
+        assert np.allclose(ours, theirs, atol=atol)
 
 
 @given(vectors, vectors, vectors)
-def test_product_is_application_in_turn(a: Array, b: Array, v: Array) -> None:
+def test_product_applies_the_right_factor_first(a: Array, b: Array, v: Array) -> None:
     qa, qb = lie.quat_exp(a), lie.quat_exp(b)
     both = lie.quat_multiply(qa, qb)
     assert np.allclose(lie.quat_to_matrix(both) @ v, lie.quat_to_matrix(qa) @ (lie.quat_to_matrix(qb) @ v), atol=1e-9)
@@ -72,7 +73,7 @@ def test_product_is_application_in_turn(a: Array, b: Array, v: Array) -> None:
 
 
 @given(arrays(np.float64, (5, 3), elements=st.floats(-3.0, 3.0)))
-def test_many_at_once_are_as_one_by_one_and_as_plain_tuples(r: Array) -> None:
+def test_batches_agree_with_single_values_and_tuples(r: Array) -> None:
     q = lie.quat_exp(r)
     product = lie.quat_multiply(q, q[::-1])
     turned = lie.quat_to_matrix(q) @ np.array([1.0, -2.0, 0.5])
@@ -80,19 +81,19 @@ def test_many_at_once_are_as_one_by_one_and_as_plain_tuples(r: Array) -> None:
         a, b = tuple(q[i].tolist()), tuple(q[4 - i].tolist())
         assert np.allclose(product[i], quat_mul(a, b), atol=1e-12)
         assert np.allclose(turned[i], quat_rotate(a, (1.0, -2.0, 0.5)), atol=1e-9)
-        assert _turned_alike(lie.quat_exp(lie.quat_log(q[i])), lie.quat_exp(np.array(quat_to_rotvec(a))))
+        assert _is_same_rotation(lie.quat_exp(lie.quat_log(q[i])), lie.quat_exp(np.array(quat_to_rotvec(a))))
 
 
 @given(vectors)
-def test_matrix_and_back(r: Array) -> None:
+def test_matrix_round_trip(r: Array) -> None:
     q = lie.quat_exp(r)
-    assert _turned_alike(lie.quat_from_matrix(lie.quat_to_matrix(q)), q)
+    assert _is_same_rotation(lie.quat_from_matrix(lie.quat_to_matrix(q)), q)
 
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.6, 0.0, 0.8)])
 def test_matrix_to_quaternion_at_half_a_turn(axis: tuple[float, float, float]) -> None:
     q = np.array([0.0, *axis])
-    assert _turned_alike(lie.quat_from_matrix(lie.quat_to_matrix(q)), q)
+    assert _is_same_rotation(lie.quat_from_matrix(lie.quat_to_matrix(q)), q)
 
 
 @given(vectors, vectors)
@@ -110,7 +111,7 @@ def test_left_jacobian_is_the_derivative_of_exp(axis: Array, angle: float, way: 
 
 @settings(max_examples=30)
 @given(vectors, axes, st.floats(0.0, 3.0))
-def test_se3_exp_agrees_with_the_matrix_exponential_and_log_undoes_it(v: Array, axis: Array, angle: float) -> None:
+def test_se3_exp_agrees_with_the_matrix_exponential_and_log_inverts_it(v: Array, axis: Array, angle: float) -> None:
     xi = np.concatenate([v, axis * angle])
     generator = np.zeros((4, 4))
     generator[:3, :3], generator[:3, 3] = lie.skew(xi[3:]), v
@@ -122,7 +123,7 @@ def test_se3_exp_agrees_with_the_matrix_exponential_and_log_undoes_it(v: Array, 
 
 
 @given(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1))
-def test_swing_is_what_is_left_of_a_turn_about_the_vertical(x: float, y: float, yaw: float) -> None:
+def test_swing_removes_the_rotation_about_the_vertical(x: float, y: float, yaw: float) -> None:
     tilt = lie.quat_exp(np.array([x, y, 0.0]))
     q = lie.quat_multiply(tilt, lie.quat_exp(np.array([0.0, 0.0, yaw])))
     assert np.allclose(lie.swing(q), [x, y], atol=1e-9)

@@ -22,7 +22,7 @@ def _rotation(q: ps.Quat) -> Rotation:
 
 
 @given(poses, poses, vectors)
-def test_compose_is_application_in_turn(a: ps.PoseTuple, b: ps.PoseTuple, v: ps.Vec3) -> None:
+def test_compose_applies_the_right_factor_first(a: ps.PoseTuple, b: ps.PoseTuple, v: ps.Vec3) -> None:
     assert np.allclose(ps.apply(ps.compose(a, b), v), ps.apply(a, ps.apply(b, v)), atol=1e-9)
 
 
@@ -46,7 +46,7 @@ def test_exp_log_near_zero_and_pi(angle: float) -> None:
     assert back[1] == pytest.approx(angle, abs=1e-9)
 
 
-def test_normalize_refuses_what_has_no_direction() -> None:
+def test_normalize_rejects_zero_and_non_finite() -> None:
     for bad in [(0.0, 0.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 1.0), (math.inf, 0.0, 0.0, 0.0)]:
         with pytest.raises(ValueError, match="cannot be normalised"):
             ps.quat_normalize(bad)

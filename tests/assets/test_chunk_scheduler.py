@@ -1,4 +1,4 @@
-"""Whose turn it is, and what is refused: without sockets, files or time."""
+"""Order and limits of chunk requests, without sockets, files or time."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ def scheduler(people: int = 3) -> ChunkScheduler:
     return made
 
 
-def ask(
+def request(
     one: ChunkScheduler, who: int, address: str = "large", offset: int = 0, length: int = MIB, now_ns: int = 0
 ) -> str:
     request = AssetRequest(1, who, 7, address, offset, length)
     return one.request(b"route%d" % who, 100 + who, f"key{who}", request, now_ns)
 
 
-def served(one: ChunkScheduler, turns: int, now_ns: int = 0) -> list[int]:
-    """The participants whose chunks went out, turn by turn."""
+def serve(one: ChunkScheduler, turns: int, now_ns: int = 0) -> list[int]:
+    """Serve `turns` chunks and return their participants in order."""
     order = []
     for _ in range(turns):
         reader = one.next_reader(now_ns)
@@ -50,67 +50,67 @@ def served(one: ChunkScheduler, turns: int, now_ns: int = 0) -> list[int]:
     return order
 
 
-def test_turns_go_around_however_much_somebody_waits_for() -> None:
+def test_participants_are_served_in_rotation() -> None:
     one = scheduler()
     for _ in range(8):
-        assert ask(one, 1) == ""
+        assert request(one, 1) == ""
     for who in (2, 3):
-        assert ask(one, who) == ask(one, who) == ""
-    assert Counter(served(one, 6)) == {1: 2, 2: 2, 3: 2}
-    assert served(one, 100) == [1] * 6
+        assert request(one, who) == request(one, who) == ""
+    assert Counter(serve(one, 6)) == {1: 2, 2: 2, 3: 2}
+    assert serve(one, 100) == [1] * 6
     assert one.next_reader(0) is None
     assert one.next_due_ns() is None
 
 
-def test_a_window_of_bytes_and_one_of_requests() -> None:
+def test_windows_of_bytes_and_requests_are_limited() -> None:
     one = scheduler()
     for _ in range(MAX_ASSET_WINDOW_BYTES // MIB):
-        assert ask(one, 1) == ""
-    assert ask(one, 1, length=1) == AssetRefusal.TOO_MANY
-    assert ask(one, 2, "small") == ""
-    served(one, 2)
-    assert ask(one, 1, length=1) == ""
+        assert request(one, 1) == ""
+    assert request(one, 1, length=1) == AssetRefusal.TOO_MANY
+    assert request(one, 2, "small") == ""
+    serve(one, 2)
+    assert request(one, 1, length=1) == ""
     for _ in range(MAX_ASSET_REQUESTS - 1):
-        assert ask(one, 3, "small") == ""
-    assert ask(one, 3, "empty") == ""
-    assert ask(one, 3, "empty") == AssetRefusal.TOO_MANY
+        assert request(one, 3, "small") == ""
+    assert request(one, 3, "empty") == ""
+    assert request(one, 3, "empty") == AssetRefusal.TOO_MANY
 
 
-def test_a_length_counts_only_as_far_as_the_asset_goes() -> None:
+def test_length_is_cut_at_the_end_of_the_asset() -> None:
     one = scheduler()
     for _ in range(MAX_ASSET_REQUESTS):
-        assert ask(one, 1, "small", 40, MAX_ASSET_CHUNK_BYTES) == ""
+        assert request(one, 1, "small", 40, MAX_ASSET_CHUNK_BYTES) == ""
     reader = one.next_reader(0)
     assert reader is not None
     assert (reader.queue[0].length, reader.queue[0].total) == (60, 100)
 
 
-def test_what_is_refused_and_why() -> None:
+def test_refusals_have_their_reason() -> None:
     one = scheduler()
-    assert ask(one, 9) == AssetRefusal.NOT_ALLOWED
+    assert request(one, 9) == AssetRefusal.NOT_ALLOWED
     assert one.request(b"x", 1, "key2", AssetRequest(1, 1, 7, "large", 0, 1), 0) == AssetRefusal.NOT_ALLOWED
-    assert ask(one, 1, "nothing") == AssetRefusal.UNKNOWN
-    assert ask(one, 1, "small", 101) == AssetRefusal.BAD_RANGE
-    assert ask(one, 1, "small", 0, 0) == AssetRefusal.BAD_RANGE
-    assert ask(one, 1, "small", 0, MAX_ASSET_CHUNK_BYTES + 1) == AssetRefusal.BAD_RANGE
-    assert ask(one, 1, "small", 100) == ask(one, 1, "empty") == ""
+    assert request(one, 1, "nothing") == AssetRefusal.UNKNOWN
+    assert request(one, 1, "small", 101) == AssetRefusal.BAD_RANGE
+    assert request(one, 1, "small", 0, 0) == AssetRefusal.BAD_RANGE
+    assert request(one, 1, "small", 0, MAX_ASSET_CHUNK_BYTES + 1) == AssetRefusal.BAD_RANGE
+    assert request(one, 1, "small", 100) == request(one, 1, "empty") == ""
     reasons = {value for key, value in vars(AssetRefusal).items() if key.isupper() and isinstance(value, str)}
     assert reasons == set(ADVICE)
 
 
-def test_a_rate_that_no_window_bounds() -> None:
+def test_request_rate_is_limited_beside_the_window() -> None:
     one = scheduler()
     refused: list[str] = []
     for _ in range(REQUEST_BURST + 10):
-        refused.append(ask(one, 1, "empty"))
-        served(one, 1)
+        refused.append(request(one, 1, "empty"))
+        serve(one, 1)
     assert refused.count("") == REQUEST_BURST
     assert refused[-10:] == [AssetRefusal.RATE] * 10
-    assert ask(one, 2, "empty") == ""
-    assert ask(one, 1, "empty", now_ns=1_000_000_000) == ""
+    assert request(one, 2, "empty") == ""
+    assert request(one, 1, "empty", now_ns=1_000_000_000) == ""
 
 
-def test_a_participant_has_few_connections() -> None:
+def test_connections_per_participant_are_limited() -> None:
     one = scheduler()
     for i in range(MAX_READERS_EACH):
         assert one.request(b"%d" % i, i, "key1", AssetRequest(1, 1, 7, "large", 0, 1), 0) == ""
@@ -120,10 +120,10 @@ def test_a_participant_has_few_connections() -> None:
     assert one.request(b"late", 50, "key1", late, 0) == ""
 
 
-def test_a_full_connection_is_passed_over_for_longer_and_longer() -> None:
+def test_full_connection_is_skipped_with_growing_delay() -> None:
     one = scheduler()
-    ask(one, 1)
-    ask(one, 2)
+    request(one, 1)
+    request(one, 2)
     pauses, now_ns = [], 0
     for _ in range(10):
         reader = one.next_reader(now_ns)
@@ -136,67 +136,67 @@ def test_a_full_connection_is_passed_over_for_longer_and_longer() -> None:
         pauses.append(reader.retry_ns - now_ns)
         assert {one.next_reader(now_ns), one.next_reader(now_ns)} == {
             one.next_reader(now_ns)
-        }  # only the other one's turn
+        }  # only the other connection is served
         now_ns = reader.retry_ns
     assert pauses == sorted(pauses)
     assert pauses[0] < pauses[-1] == LONGEST_PAUSE_NS
     one.defer(reader, now_ns)
-    assert ask(one, 1, "small", now_ns=now_ns) == ""  # it reads again
+    assert request(one, 1, "small", now_ns=now_ns) == ""  # it reads again
     assert reader.retry_ns == 0
     one.confirm_sent(reader)
     one.defer(reader, now_ns)
     assert reader.retry_ns - now_ns == pauses[0], "what got through ends the long pauses"
 
 
-def test_who_left_waits_for_nothing() -> None:
+def test_disconnected_participant_has_no_pending_requests() -> None:
     one = scheduler()
     for who in (1, 2, 3):
-        ask(one, who)
+        request(one, who)
     assert one.set_listeners({2: "key2"}) == [101, 103]
-    assert served(one, 10) == [2]
-    ask(one, 2)
+    assert serve(one, 10) == [2]
+    request(one, 2)
     one.remove_descriptor(102)
-    assert (one.n_waiting, served(one, 1)) == (0, [])
+    assert (one.n_waiting, serve(one, 1)) == (0, [])
 
 
-def test_begun_anew_nobody_waits_and_everybody_may_ask() -> None:
+def test_reset_clears_requests_and_limits() -> None:
     one = scheduler()
-    ask(one, 1)
-    ask(one, 2)
+    request(one, 1)
+    request(one, 2)
     assert one.clear() == [101, 102]
     assert (one.n_waiting, one.next_reader(0), one.next_due_ns()) == (0, None, None)
-    assert ask(one, 1) == ""
-    assert served(one, 10) == [1]
+    assert request(one, 1) == ""
+    assert serve(one, 10) == [1]
 
 
-def test_another_peer_by_the_same_name_is_somebody_else() -> None:
+def test_reused_name_of_another_peer_starts_empty() -> None:
     one = scheduler()
-    ask(one, 1)
+    request(one, 1)
     assert one.request(b"route1", 999, "key2", AssetRequest(1, 2, 7, "small", 0, 1), 0) == ""
-    assert served(one, 10) == [2]
+    assert serve(one, 10) == [2]
 
 
-def test_refusals_wait_behind_chunks_and_are_bounded() -> None:
+def test_refusals_are_queued_behind_chunks_and_bounded() -> None:
     one = scheduler()
     assert not one.queue_refusal(b"route1", 1, "", AssetRefusal.UNKNOWN)
-    ask(one, 1)
+    request(one, 1)
     assert one.has_pending(b"route1")
     kept = [one.queue_refusal(b"route1", i, "", AssetRefusal.UNKNOWN) for i in range(MAX_QUEUED + 5)]
     assert kept.count(True) == MAX_QUEUED - 1
     reader = one.next_reader(0)
     assert reader is not None
     assert [pending.refusal for pending in reader.queue] == ["", *[AssetRefusal.UNKNOWN] * (MAX_QUEUED - 1)]
-    assert len(served(one, 1000)) == MAX_QUEUED
+    assert len(serve(one, 1000)) == MAX_QUEUED
 
 
-def test_whatever_happens_turns_and_windows_stay_in_step() -> None:
+def test_any_sequence_keeps_rotation_and_windows_consistent() -> None:
     rng = Random(5)
     one = scheduler(4)
     for now_ns in range(5000):
         who = rng.randrange(1, 6)
         match rng.randrange(6):
             case 0 | 1 | 2:
-                ask(one, who, rng.choice(list(SIZES)), 0, rng.randrange(0, MIB), now_ns)
+                request(one, who, rng.choice(list(SIZES)), 0, rng.randrange(0, MIB), now_ns)
             case 3:
                 reader = one.next_reader(now_ns)
                 if reader is not None:
@@ -214,8 +214,8 @@ def test_whatever_happens_turns_and_windows_stay_in_step() -> None:
             assert reader.queued_bytes == sum(pending.length for pending in reader.queue) <= MAX_ASSET_WINDOW_BYTES
 
 
-def test_one_connection_that_asks_for_several_participants_loses_nothing_and_gains_nothing() -> None:
-    """As that of a gateway. Each request is answered, in their order, and the limits are those of one connection."""
+def test_gateway_connection_is_served_in_order_within_the_limits_of_one() -> None:
+    """One connection that requests for several participants."""
     one = ChunkScheduler(SIZES.get)
     one.set_listeners({1: "gateway", 2: "gateway", 3: "gateway"})
     asked = [1, 1, 2, 3, 2, 1]

@@ -1,4 +1,4 @@
-"""The store: verified content, atomic files, downloads that resume, holds, a bounded size, several processes."""
+"""The content store: verified content, atomic files, resumable downloads, holds, bounded size, several processes."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ DATA = os.urandom(100_000)
 ADDRESS = hashlib.sha256(DATA).hexdigest()
 
 
-def age(store: AssetStore, address: str, seconds: float) -> None:
-    """As if it had been used `seconds` ago."""
+def set_age(store: AssetStore, address: str, seconds: float) -> None:
+    """Set the last use of an asset to `seconds` ago."""
     path = store.path(address)
     then = path.stat().st_mtime - seconds
     os.utime(path, (then, then))
@@ -43,7 +43,7 @@ def test_put_and_get(tmp_path: Path) -> None:
     assert other.get(address) == b"hello"
 
 
-def test_what_is_not_there(tmp_path: Path) -> None:
+def test_missing_assets(tmp_path: Path) -> None:
     store = AssetStore(tmp_path)
     missing = "0" * 64
     assert missing not in store
@@ -58,7 +58,7 @@ def test_what_is_not_there(tmp_path: Path) -> None:
             store.path(bad)
 
 
-def test_a_damaged_file_counts_as_missing(tmp_path: Path) -> None:
+def test_damaged_file_counts_as_missing(tmp_path: Path) -> None:
     store = AssetStore(tmp_path)
     address = store.put(b"hello")
     store.path(address).write_bytes(b"hellO")
@@ -69,7 +69,7 @@ def test_a_damaged_file_counts_as_missing(tmp_path: Path) -> None:
     assert store.get(address) == b"hello"
 
 
-def test_a_file_that_was_cut_off_by_a_crash_is_written_again(tmp_path: Path) -> None:
+def test_file_truncated_by_a_crash_is_written_again(tmp_path: Path) -> None:
     """A rename can reach the disk before the bytes do."""
     store = AssetStore(tmp_path)
     address = store.put(b"hello")
@@ -79,18 +79,72 @@ def test_a_file_that_was_cut_off_by_a_crash_is_written_again(tmp_path: Path) -> 
     assert (store.get(address), store.mark_used(address, 5)) == (b"hello", True)
 
 
-def test_room_is_made_from_what_was_used_longest_ago(tmp_path: Path) -> None:
+def test_links_and_pipes_in_the_folder_count_as_missing_and_are_replaced(tmp_path: Path) -> None:
+    """Another user of a shared folder puts them there: the asset behind a link may change at any time."""
+    store, elsewhere = AssetStore(tmp_path / "store"), tmp_path / "elsewhere"
+    elsewhere.write_bytes(b"hello")
+    os.utime(elsewhere, (1, 1))
+    address = hashlib.sha256(b"hello").hexdigest()
+    path = store.path(address)
+    path.parent.mkdir(parents=True)
+    for plant in (lambda: path.symlink_to(elsewhere), lambda: path.symlink_to(path), lambda: os.mkfifo(path)):
+        plant()
+        assert address not in store
+        assert (store.find(address), store.mark_used(address, 5), store.last_used_ns(address)) == (None, False, 0)
+        assert not store.discard(address, elsewhere.stat().st_mtime_ns)
+        for call in (store.get, store.view, store.size):
+            with pytest.raises(AssetMissingError):
+                call(address)
+        assert store.put(b"hello") == address
+        assert (store.get(address), path.is_symlink()) == (b"hello", False)
+        path.unlink()
+    note = tmp_path / "store" / "index" / address[:2] / address
+    note.parent.mkdir(parents=True)
+    note.symlink_to(elsewhere)
+    assert store.read_index(address) is None
+    store.write_index(address, b"note")
+    assert store.read_index(address) == b"note"
+    assert (elsewhere.read_bytes(), elsewhere.stat().st_mtime) == (b"hello", 1)
+
+
+def test_bytes_that_were_not_written_or_were_removed_do_not_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = AssetStore(tmp_path)
+    address = store.put(b"h" * 1_000)
+
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "no space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", fail)
+        for _ in range(3):
+            with pytest.raises(OSError, match="no space"):
+                store.put(b"x" * 5_000)
+    assert store._total == 1_000
+    part = store.open_part(ADDRESS)
+    part.append(b"?" * 4_000)
+    assert store._total == 5_000
+    assert not part.finish()
+    part.close()
+    assert store._total == 1_000
+    store.path(address).write_bytes(b"?" * 1_000)
+    assert store.find(address) is None
+    assert store._total == store.trim() == 0
+
+
+def test_least_recently_used_assets_are_evicted(tmp_path: Path) -> None:
     store = AssetStore(tmp_path, max_bytes=3_000)
     first, second, third = (store.put(bytes([k]) * 1_000) for k in range(3))
     for k, address in enumerate((first, second, third)):
-        age(store, address, GRACE_S + 300 - 100 * k)
+        set_age(store, address, GRACE_S + 300 - 100 * k)
     assert store.mark_used(first, 1_000)
     fresh = store.put(b"x" * 1_000)
     assert [a in store for a in (first, second, third, fresh)] == [True, False, True, True]
     assert store.evicted == 1
 
 
-def test_what_is_recalled_is_used(tmp_path: Path) -> None:
+def test_reading_counts_as_use(tmp_path: Path) -> None:
     store = AssetStore(tmp_path, max_bytes=2_000)
     keys = [f"{k:064x}" for k in range(2)]
     for k, key in enumerate(keys):
@@ -102,11 +156,11 @@ def test_what_is_recalled_is_used(tmp_path: Path) -> None:
     assert [store.read_index(key) is not None for key in keys] == [True, False]
 
 
-def test_what_is_held_or_fresh_stays(tmp_path: Path) -> None:
+def test_held_and_recent_assets_are_kept(tmp_path: Path) -> None:
     store = AssetStore(tmp_path, max_bytes=2_000)
     held, old, young = (store.put(bytes([k]) * 1_000) for k in range(3))
-    age(store, held, GRACE_S + 200)
-    age(store, old, GRACE_S + 100)
+    set_age(store, held, GRACE_S + 200)
+    set_age(store, old, GRACE_S + 100)
     with store.hold([held]):
         AssetStore(tmp_path, max_bytes=2_000).put(b"x" * 1_000)
         assert [a in store for a in (held, old, young)] == [True, False, True]
@@ -116,10 +170,10 @@ def test_what_is_held_or_fresh_stays(tmp_path: Path) -> None:
     assert not list((tmp_path / "holds").iterdir())
 
 
-def test_the_hold_of_a_dead_process_ends_with_it(tmp_path: Path) -> None:
+def test_hold_ends_with_its_process(tmp_path: Path) -> None:
     store = AssetStore(tmp_path, max_bytes=1_500)
     address = store.put(b"x" * 1_000)
-    age(store, address, GRACE_S + 100)
+    set_age(store, address, GRACE_S + 100)
     program = (
         "import os, sys; from iris_session.scene import AssetStore\n"
         "hold = AssetStore(sys.argv[1]).hold([sys.argv[2]]); os._exit(0)"
@@ -131,21 +185,19 @@ def test_the_hold_of_a_dead_process_ends_with_it(tmp_path: Path) -> None:
     assert not list((tmp_path / "holds").glob("*.hold"))
 
 
-def test_a_hold_is_whole_and_locked_from_the_moment_it_can_be_seen(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Another process makes room while a hold is being made: nothing of it may be taken for one of a dead process."""
+def test_hold_is_complete_and_locked_when_it_becomes_visible(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another process evicts while a hold is created: the hold must not look like that of a dead process."""
     store = AssetStore(tmp_path, max_bytes=100)
     held = store.put(b"h" * 60)
-    age(store, held, 10_000)
+    set_age(store, held, 10_000)
     replace, seen = os.replace, []
 
-    def looked_at_meanwhile(source: str, target: Path) -> None:
+    def evict_meanwhile(source: str, target: Path) -> None:
         AssetStore(tmp_path)._read_holds()
         replace(source, target)
         seen.append(target)
 
-    monkeypatch.setattr(os, "replace", looked_at_meanwhile)
+    monkeypatch.setattr(os, "replace", evict_meanwhile)
     with store.hold([held]):
         monkeypatch.undo()
         assert len(seen) == 1
@@ -155,20 +207,20 @@ def test_a_hold_is_whole_and_locked_from_the_moment_it_can_be_seen(
     assert held not in store
 
 
-def test_what_is_of_no_use_any_more_goes_unless_others_use_it(tmp_path: Path) -> None:
+def test_discard_removes_assets_that_no_other_session_uses(tmp_path: Path) -> None:
     store = AssetStore(tmp_path)
-    address = store.put(b"a look of long ago")
+    address = store.put(b"a replaced visual")
     at = store.last_used_ns(address)
     with store.hold([address]):
         assert not store.discard(address, at)
-    os.utime(store.path(address), ns=(at + 5, at + 5))  # another session has the same
+    os.utime(store.path(address), ns=(at + 5, at + 5))  # held by another session too
     assert not store.discard(address, at)
     assert store.discard(address, at + 5)
     assert (address in store, store.last_used_ns(address), store.discard(address, 0)) == (False, 0, False)
 
 
-def test_what_others_have_below_the_root_is_left_alone(tmp_path: Path) -> None:
-    """Somebody gives a folder that has folders of two letters, or links, of their own."""
+def test_foreign_files_below_the_root_are_kept(tmp_path: Path) -> None:
+    """The given folder has folders of two letters, or links, of its own."""
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (elsewhere / ("ab" + "0" * 62)).write_bytes(b"v" * 1_000)
@@ -182,7 +234,7 @@ def test_what_others_have_below_the_root_is_left_alone(tmp_path: Path) -> None:
     os.utime(mine, (0, 0))
     os.utime(elsewhere / ("ab" + "0" * 62), (0, 0))
     store = AssetStore(root, max_bytes=100)
-    left = root / "cd" / f"cd{0:062x}.x_y1.part"  # of a process that was killed while it wrote
+    left = root / "cd" / f"cd{0:062x}.x_y1.part"  # of a process that was killed while writing
     left.write_bytes(b"p" * 50)
     os.utime(left, (0, 0))
     store.put(b"x" * 60)
@@ -192,16 +244,16 @@ def test_what_others_have_below_the_root_is_left_alone(tmp_path: Path) -> None:
     assert store.evicted == 0
 
 
-def test_a_disk_that_cannot_be_written_still_gives_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_read_only_disk_serves_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = AssetStore(tmp_path)
     address = store.put(b"hello")
     store.write_index(address, b"note")
 
-    def refused(*_: object, **__: object) -> None:
+    def refuse(*_: object, **__: object) -> None:
         raise OSError(errno.EROFS, "read-only file system")
 
-    monkeypatch.setattr(os, "utime", refused)
-    monkeypatch.setattr(os, "replace", refused)
+    monkeypatch.setattr(os, "utime", refuse)
+    monkeypatch.setattr(os, "replace", refuse)
     assert (store.put(b"hello"), store.mark_used(address, 5), store.read_index(address)) == (address, True, b"note")
     assert not store.mark_used("0" * 64, 5)
     with pytest.raises(OSError, match="read-only"):
@@ -212,12 +264,12 @@ def test_a_disk_that_cannot_be_written_still_gives_what_it_has(tmp_path: Path, m
     assert not list((tmp_path / "holds").glob("*"))
 
 
-def test_a_file_that_goes_while_the_store_is_looked_through(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_removed_during_a_scan_is_skipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     address = AssetStore(tmp_path).put(b"hello")
     scan = os.scandir
 
-    class Gone:
-        """The entries of a folder whose files another process takes after they were listed."""
+    class VanishingFolder:
+        """The entries of a folder whose files another process removes after listing."""
 
         def __init__(self, path: str) -> None:
             with scan(path) as entries:
@@ -231,33 +283,31 @@ def test_a_file_that_goes_while_the_store_is_looked_through(tmp_path: Path, monk
 
         def __exit__(self, *_: object) -> None: ...
 
-    monkeypatch.setattr(os, "scandir", Gone)
+    monkeypatch.setattr(os, "scandir", VanishingFolder)
     store = AssetStore(tmp_path)
     assert store.trim() == 0
     assert address not in store
 
 
-def test_what_another_process_takes_up_while_room_is_made_stays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It marks as used what it has built before, and then holds it: both may come after we have looked."""
+def test_asset_used_by_another_process_during_eviction_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The other process marks an asset as used and then holds it; both may follow the scan."""
     store = AssetStore(tmp_path, max_bytes=1_500)
     taken, other = store.put(b"t" * 1_000), store.put(b"o" * 400)
     for address in (taken, other):
-        age(store, address, GRACE_S + 100)
+        set_age(store, address, GRACE_S + 100)
     files = store._iterate_files
 
-    def taken_up_after() -> Iterator[tuple[os.DirEntry[str], os.stat_result]]:
+    def use_afterwards() -> Iterator[tuple[os.DirEntry[str], os.stat_result]]:
         yield from files()
         AssetStore(tmp_path).mark_used(taken, 1_000)
 
-    monkeypatch.setattr(store, "_iterate_files", taken_up_after)
+    monkeypatch.setattr(store, "_iterate_files", use_afterwards)
     store.put(b"n" * 1_000)
     assert (taken in store, other in store, store.evicted) == (True, False, 1)
 
 
-def test_a_hold_ends_in_whatever_thread(tmp_path: Path) -> None:
-    """A scene is made by one thread and let go by another: a lock that stays open costs a descriptor each time."""
+def test_hold_can_be_released_in_another_thread(tmp_path: Path) -> None:
+    """A scene is built by one thread and released by another; an open lock would leak a descriptor each time."""
     store = AssetStore(tmp_path)
     with ThreadPoolExecutor(1) as other:
         hold = other.submit(store.hold, [store.put(b"x")]).result()
@@ -269,16 +319,14 @@ def test_a_hold_ends_in_whatever_thread(tmp_path: Path) -> None:
     assert not list((tmp_path / "holds").iterdir())
 
 
-def test_when_all_is_in_use_the_disk_is_not_looked_through_each_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_disk_is_not_rescanned_when_nothing_can_be_evicted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = AssetStore(tmp_path, max_bytes=64_000)
-    looks: list[None] = []
+    scans: list[None] = []
     held = store._read_holds
-    monkeypatch.setattr(store, "_read_holds", lambda: looks.append(None) or held())
+    monkeypatch.setattr(store, "_read_holds", lambda: scans.append(None) or held())
     for number in range(300):
         store.put(number.to_bytes(4, "little") * 250)
-    assert 0 < len(looks) <= 130
+    assert 0 < len(scans) <= 130
     assert store.evicted == 0
 
 
@@ -289,16 +337,16 @@ def test_default_roots(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.delenv("XDG_CACHE_HOME")
     assert default_root() == Path.home() / ".cache" / "iris-session" / "assets"
 
-    def homeless(_: Path) -> Path:
+    def fail(_: Path) -> Path:
         raise RuntimeError("Could not determine home directory.")
 
-    monkeypatch.setattr(Path, "expanduser", homeless)
+    monkeypatch.setattr(Path, "expanduser", fail)
     with pytest.raises(OSError, match="set XDG_CACHE_HOME"):
         default_root()
 
 
 def test_files_of_killed_processes_are_removed_by_the_next_scan(tmp_path: Path) -> None:
-    """A power cut between two files of a hold, or within one of an asset; what is young may be another's at work."""
+    """A crash between two files of a hold, or within an asset; recent files may belong to a running process."""
     store = AssetStore(tmp_path)
     address = store.put(b"hello")
     hold = store.hold([address])
@@ -308,9 +356,11 @@ def test_files_of_killed_processes_are_removed_by_the_next_scan(tmp_path: Path) 
         holds / "tmpb2.new.hold.lock",
         folder / f"{address}.c3.part",
         tmp_path / f"index/ab/ab{0:062x}.d4.part",
+        folder / "tmph8_x.part",  # as earlier versions named them
+        tmp_path / "index/ab/tmpi9.part",
     ]
     dead = [holds / "tmpe5.new.hold", holds / "tmpe5.new.hold.lock"]
-    young = [holds / "tmpf6.new", holds / "tmpf6.new.hold.lock", folder / f"{address}.g7.part"]
+    young = [holds / "tmpf6.new", holds / "tmpf6.new.hold.lock", folder / f"{address}.g7.part", folder / "tmpj0.part"]
     others = [holds / "notes.new", holds / "tmp.txt", folder / "mine.part"]
     living = list(holds.iterdir())
     for path in (*left, *dead, *young, *others):
@@ -329,7 +379,7 @@ def test_files_of_killed_processes_are_removed_by_the_next_scan(tmp_path: Path) 
 # --- downloads ---
 
 
-def test_what_was_stored_is_found_and_read(tmp_path: Path) -> None:
+def test_stored_asset_is_found_and_read(tmp_path: Path) -> None:
     cache = AssetStore(tmp_path)
     assert cache.find(ADDRESS) is None
     part = cache.open_part(ADDRESS)
@@ -345,7 +395,7 @@ def test_what_was_stored_is_found_and_read(tmp_path: Path) -> None:
     assert (cache.find(empty), cache.get(empty), bytes(cache.view(empty))) == (b"", b"", b"")
 
 
-def test_a_part_that_was_left_goes_on(tmp_path: Path) -> None:
+def test_partial_download_is_resumed(tmp_path: Path) -> None:
     part = AssetStore(tmp_path).open_part(ADDRESS)
     part.append(DATA[:40_000])
     part.close()
@@ -358,7 +408,7 @@ def test_a_part_that_was_left_goes_on(tmp_path: Path) -> None:
     assert len(list(tmp_path.glob("??/*"))) == 1
 
 
-def test_wrong_bytes_never_get_the_name(tmp_path: Path) -> None:
+def test_wrong_bytes_are_never_stored(tmp_path: Path) -> None:
     cache = AssetStore(tmp_path)
     part = cache.open_part(ADDRESS)
     part.append(DATA[:-1] + b"?")
@@ -369,7 +419,7 @@ def test_wrong_bytes_never_get_the_name(tmp_path: Path) -> None:
     assert part.finish()
 
 
-def test_damage_on_the_disk_is_found_and_taken_away(tmp_path: Path) -> None:
+def test_damage_on_disk_is_detected_and_removed(tmp_path: Path) -> None:
     cache = AssetStore(tmp_path)
     part = cache.open_part(ADDRESS)
     part.append(DATA)
@@ -388,13 +438,13 @@ OTHER = """
 import sys
 from iris_session.assets.store import AssetStore
 part = AssetStore(sys.argv[1]).open_part(sys.argv[2])
-part.append(b"of somebody else")
+part.append(b"of another process")
 print(part.offset, flush=True)
 sys.stdin.read()
 """
 
 
-def test_another_process_at_the_same_asset_does_no_harm(tmp_path: Path) -> None:
+def test_two_processes_can_download_the_same_asset(tmp_path: Path) -> None:
     command = [sys.executable, "-c", OTHER, str(tmp_path), ADDRESS]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdout is not None
@@ -405,13 +455,13 @@ def test_another_process_at_the_same_asset_does_no_harm(tmp_path: Path) -> None:
         ours.append(DATA)
         assert ours.finish()
         other.kill()
-    late = cache.open_part(ADDRESS)  # what the dead one left is nobody's
-    assert late.offset == len(b"of somebody else")
+    late = cache.open_part(ADDRESS)  # the part of the dead process is free
+    assert late.offset == len(b"of another process")
     late.close()
     assert cache.find(ADDRESS) == DATA
 
 
-def test_above_its_bound_the_longest_unused_goes(tmp_path: Path) -> None:
+def test_least_recently_used_asset_is_evicted_above_the_limit(tmp_path: Path) -> None:
     cache = AssetStore(tmp_path, max_bytes=100_000)
     addresses = []
     for i in range(4):
@@ -431,7 +481,7 @@ def test_above_its_bound_the_longest_unused_goes(tmp_path: Path) -> None:
     assert not (tmp_path / "00" / ("0" * 64 + ".part")).exists()
 
 
-def stored(cache: AssetStore, data: bytes) -> str:
+def store_part(cache: AssetStore, data: bytes) -> str:
     address = hashlib.sha256(data).hexdigest()
     part = cache.open_part(address)
     part.append(data)
@@ -453,7 +503,7 @@ except AssetStoreError as error:
 """
 
 
-def test_a_disk_that_takes_no_more_says_so_and_what_it_took_is_gone_on_with(tmp_path: Path) -> None:
+def test_full_disk_is_reported_and_the_part_is_resumed(tmp_path: Path) -> None:
     command = [sys.executable, "-c", FULL_DISK, str(tmp_path), ADDRESS]
     done = subprocess.run(command, input=DATA, stdout=subprocess.PIPE, check=True, timeout=120)
     assert done.stdout.startswith(b"cache ")
@@ -464,10 +514,10 @@ def test_a_disk_that_takes_no_more_says_so_and_what_it_took_is_gone_on_with(tmp_
     assert AssetStore(tmp_path).find(ADDRESS) == DATA
 
 
-def test_a_part_that_is_being_written_stays_however_old_it_is(tmp_path: Path) -> None:
-    """A link that stood still for longer than assets are kept: what then comes is not lost."""
+def test_open_part_is_kept_at_any_age(tmp_path: Path) -> None:
+    """A connection stalled for longer than the keeping time: what then arrives is not lost."""
     cache = AssetStore(tmp_path, max_bytes=100_000)
-    parts = [cache.open_part(ADDRESS), cache.open_part(ADDRESS)]  # the common one, and one of our own
+    parts = [cache.open_part(ADDRESS), cache.open_part(ADDRESS)]  # the shared part and a private one
     left = cache.open_part("1" * 64)
     for part in (*parts, left):
         part.append(DATA[:40_000])
@@ -481,7 +531,7 @@ def test_a_part_that_is_being_written_stays_however_old_it_is(tmp_path: Path) ->
     assert cache.find(ADDRESS) == DATA
 
 
-def test_only_the_common_part_is_left_for_another_time(tmp_path: Path) -> None:
+def test_only_the_shared_part_is_kept(tmp_path: Path) -> None:
     cache = AssetStore(tmp_path)
     common, own = cache.open_part(ADDRESS), cache.open_part(ADDRESS)
     for part in (common, own):
@@ -490,19 +540,19 @@ def test_only_the_common_part_is_left_for_another_time(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.glob("??/*")] == [f"{ADDRESS}.part"]
 
 
-def test_what_another_finishes_just_then_is_not_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Between the opening of its part and the lock on it: then it has the name of the asset."""
+def test_part_finished_by_another_process_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The other process finishes between opening and locking: the part is the asset then."""
     cache = AssetStore(tmp_path)
     other = cache.open_part(ADDRESS)
     other.append(DATA)
     lock = fcntl.flock
 
-    def finished_first(descriptor: int, how: int) -> None:
+    def finish_first(descriptor: int, how: int) -> None:
         monkeypatch.undo()
         assert other.finish()
         lock(descriptor, how)
 
-    monkeypatch.setattr(fcntl, "flock", finished_first)
+    monkeypatch.setattr(fcntl, "flock", finish_first)
     late = cache.open_part(ADDRESS)
     assert late.offset == 0
     late.append(b"other bytes")
@@ -510,8 +560,8 @@ def test_what_another_finishes_just_then_is_not_written_to(tmp_path: Path, monke
     assert cache.find(ADDRESS) == DATA
 
 
-def test_private_parts_of_processes_that_were_killed_do_not_pile_up(tmp_path: Path) -> None:
-    """Nobody can go on with them, so they need not wait a week as common ones do."""
+def test_private_parts_of_killed_processes_are_removed(tmp_path: Path) -> None:
+    """No other process can resume them, so they are not kept for a week as shared parts are."""
     cache = AssetStore(tmp_path)
     folder = cache.path(ADDRESS).parent
     folder.mkdir()
@@ -523,23 +573,23 @@ def test_private_parts_of_processes_that_were_killed_do_not_pile_up(tmp_path: Pa
     assert [path.exists() for path in (common, dead, young)] == [True, False, True]
 
 
-def test_more_than_twice_its_bound_is_never_stored(tmp_path: Path) -> None:
-    """All of it was used just now: a session cannot fill the disk by naming ever more."""
+def test_disk_use_never_exceeds_twice_the_limit(tmp_path: Path) -> None:
+    """All assets were just used: a session cannot fill the disk by naming more of them."""
     cache = AssetStore(tmp_path, max_bytes=1 << 20)
     for i in range(2):
-        stored(cache, bytes([i]) * (1 << 20))
+        store_part(cache, bytes([i]) * (1 << 20))
     part = cache.open_part(ADDRESS)
-    with pytest.raises(AssetStoreError, match=r"full.*more than 1 MiB") as caught:
+    with pytest.raises(AssetStoreError, match=r"full.* 1 MiB") as caught:
         part.append(DATA)
     assert caught.value.reason == "cache"
     part.close()
     for path in tmp_path.glob("??/*"):
         os.utime(path, (1, 1))
-    assert stored(cache, DATA[:-1]) != ADDRESS, "there is room again"
+    assert store_part(cache, DATA[:-1]) != ADDRESS, "there is room again"
 
 
-def test_what_another_session_left_under_a_name_costs_one_more_fetch_and_no_more(tmp_path: Path) -> None:
-    """A session that sends other bytes than those of the address, and is left in the middle of them."""
+def test_wrong_part_of_another_session_costs_one_repeated_download(tmp_path: Path) -> None:
+    """A session sends other bytes than those of the address and is closed halfway."""
     for lie in (b"x" * 40_000, DATA[:-1] + b"?", DATA + b"longer than the asset"):
         part = AssetStore(tmp_path).open_part(ADDRESS)
         part.append(lie)
@@ -551,21 +601,21 @@ def test_what_another_session_left_under_a_name_costs_one_more_fetch_and_no_more
         assert again.offset == 0
         assert AssetStore(tmp_path).find(ADDRESS) is None
         again.close()
-    assert stored(AssetStore(tmp_path), DATA) == ADDRESS
+    assert store_part(AssetStore(tmp_path), DATA) == ADDRESS
 
 
-def test_parts_of_other_people_in_a_shared_folder_do_no_harm(tmp_path: Path) -> None:
-    """Nor do links that somebody put there: nothing is written where they lead."""
+def test_foreign_parts_in_a_shared_folder_are_ignored(tmp_path: Path) -> None:
+    """Links of others are not followed for writing either."""
     cache, elsewhere = AssetStore(tmp_path / "cache"), tmp_path / "elsewhere"
     elsewhere.write_bytes(b"precious")
     path = cache.path(ADDRESS)
     path.parent.mkdir(parents=True)
     path.with_name(path.name + ".part").symlink_to(elsewhere)
-    assert stored(cache, DATA) == ADDRESS
+    assert store_part(cache, DATA) == ADDRESS
     assert elsewhere.read_bytes() == b"precious"
 
 
-def test_a_folder_that_cannot_be_used_says_so(tmp_path: Path) -> None:
+def test_unusable_folder_raises(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(AssetStoreError, match="cannot be used") as caught:
         AssetStore(tmp_path / "file").open_part(ADDRESS)
@@ -576,14 +626,14 @@ def test_a_folder_that_cannot_be_used_says_so(tmp_path: Path) -> None:
         AssetStore(tmp_path).path("../../etc/passwd")
 
 
-def test_a_client_and_a_session_can_share_a_folder(tmp_path: Path) -> None:
+def test_client_and_session_share_a_folder(tmp_path: Path) -> None:
     """The client finds what the session stored, and its downloads remove nothing that the session holds."""
     session, client = AssetStore(tmp_path, max_bytes=2_000), AssetStore(tmp_path, max_bytes=2_000)
     held, old = session.put(b"h" * 1_000), session.put(b"o" * 1_000)
     for address in (held, old):
-        age(session, address, GRACE_S + 100)
+        set_age(session, address, GRACE_S + 100)
     with session.hold([held]):
-        fetched = stored(client, b"f" * 1_000)
+        fetched = store_part(client, b"f" * 1_000)
         assert [address in session for address in (held, old, fetched)] == [True, False, True]
         assert client.find(held) == b"h" * 1_000
 
@@ -591,7 +641,7 @@ def test_a_client_and_a_session_can_share_a_folder(tmp_path: Path) -> None:
 # --- served assets ---
 
 
-def test_bytes_and_sizes(tmp_path: Path) -> None:
+def test_served_bytes_and_sizes(tmp_path: Path) -> None:
     files = ServedAssets()
     data, empty, other = put(tmp_path, b"0123456789"), put(tmp_path, b""), put(tmp_path, b"other")
     files.serve([(str(tmp_path), (data, empty, "../../secret", "0" * 64))])
@@ -599,11 +649,11 @@ def test_bytes_and_sizes(tmp_path: Path) -> None:
     assert bytes(files.chunk(data, 3, 4) or b"") == b"3456"
     assert files.chunk(data, 3, 8) is None
     assert bytes(files.chunk(empty, 0, 0) or b"") == b""
-    assert files.size("0" * 64) is None  # named, but not there
+    assert files.size("0" * 64) is None  # named, but missing
     assert files.size("../../secret") is None
 
 
-def test_several_stores_and_what_is_served_no_more(tmp_path: Path) -> None:
+def test_several_stores_and_end_of_serving(tmp_path: Path) -> None:
     files = ServedAssets()
     a, b = put(tmp_path / "1", b"a"), put(tmp_path / "2", b"b")
     files.serve([(str(tmp_path / "1"), (a,)), (str(tmp_path / "2"), (b,))])
@@ -611,10 +661,10 @@ def test_several_stores_and_what_is_served_no_more(tmp_path: Path) -> None:
     assert (files.size(a), files.size(b)) == (1, 1)
     files.serve([(str(tmp_path / "2"), (b,))])
     assert (files.size(a), files.size(b)) == (None, 1)
-    assert bytes(held or b"") == b"a"  # on its way to somebody
+    assert bytes(held or b"") == b"a"  # being sent
 
 
-def test_a_file_that_is_removed_or_no_file_at_all(tmp_path: Path) -> None:
+def test_removed_file_and_directory(tmp_path: Path) -> None:
     files = ServedAssets()
     a, link = put(tmp_path, b"a"), "ab" + "0" * 62
     (tmp_path / "ab").mkdir(exist_ok=True)
@@ -624,12 +674,12 @@ def test_a_file_that_is_removed_or_no_file_at_all(tmp_path: Path) -> None:
     files.serve([(str(tmp_path), (a, link, folder))])
     assert files.size(a) == 1
     (tmp_path / a[:2] / a).unlink()
-    assert bytes(files.chunk(a, 0, 1) or b"") == b"a"  # mapped: as it was
+    assert bytes(files.chunk(a, 0, 1) or b"") == b"a"  # still mapped
     assert files.size(link) is None
     assert files.size(folder) is None
 
 
-def test_many_files_are_not_open_at_once(tmp_path: Path) -> None:
+def test_number_of_open_files_is_bounded(tmp_path: Path) -> None:
     files = ServedAssets()
     addresses = [put(tmp_path, b"%d" % i) for i in range(MAX_MAPPED_FILES + 40)]
     files.serve([(str(tmp_path), addresses)])

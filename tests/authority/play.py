@@ -250,7 +250,8 @@ class Play:
         self.say(self.who(), self.rng.choice(messages))
 
     def recover(self) -> None:
-        self.host(cm.ClearEStop(1))
+        self.flush()  # stops that are on their way are to be seen
+        self.host(cm.ClearEStop(1, self.state.stop_seq))
         self.host(cm.Control(1, "resume"))
         for client in [c for c in self.people if self.still_here(c)]:
             self.say(client, cm.Heartbeat())
@@ -266,6 +267,7 @@ class Play:
                 cm.Release(1, tuple(Target(n, rng.randrange(4)) for n in names)),
                 cm.Release(1, tuple(Target(n, self.state.robots[n].version) for n in names[:1])),
                 cm.Consent(1, rng.choice(self.consents[-2:]), rng.random() < 0.7),
+                cm.Withdraw(1, max(0, self.request_id - rng.randrange(6))),
                 cm.SetScale(1, names, rng.choice([0.1, 1.0, 2.0, 9.0, math.nan])),
             ]
         )
@@ -275,6 +277,7 @@ class Play:
         rng = self.rng
         person = rng.choice(["", "nobody", *(c.id for c in self.people[-6:])])
         pose = Pose((0.0, 1.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+        seen = max(0, self.state.stop_seq - rng.randrange(2))
         message = rng.choice(
             [
                 cm.Assign(1, self.some(), person),
@@ -286,7 +289,7 @@ class Play:
                 cm.PlaceAlignment(1, person, pose, rng.random() < 0.5),
                 cm.Align(1, rng.choice(["start", "stop", "dance"]), person),
                 cm.MoveAnchor(1, rng.choice(["table", "moon"]), pose),
-                FrontRestarted() if rng.random() < 0.2 else cm.ClearEStop(1),
+                FrontRestarted() if rng.random() < 0.2 else cm.ClearEStop(1, seen),
             ]
         )
         self.host(message)

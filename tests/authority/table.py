@@ -11,7 +11,7 @@ from iris_session.authority import Authority, AuthorityConfig
 from iris_session.protocol.client_messages import Acquire, Sample
 from iris_session.protocol.common import IDENTITY, EventBody, Lease, Message, Pose, Target
 from iris_session.protocol.entries import AlignmentProposal, Entry, Join
-from iris_session.protocol.server_messages import Feedback, Reply
+from iris_session.protocol.server_messages import Feedback, LeasesChanged, Reply
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import Command, ControlStatus, Decision, FixedView
 
@@ -32,6 +32,11 @@ def make_view(**changes: Any) -> FixedView:
     q = dict.fromkeys(tips, (0.0,) * 7)
     view = FixedView(tips=tips, q=q, objects=objects)
     return msgspec.structs.replace(view, **changes)
+
+
+def single_changes(body: EventBody) -> tuple[EventBody, ...]:
+    """Return an event of several leases as one event of each, any other as it is."""
+    return body.to_single_changes() if isinstance(body, LeasesChanged) else (body,)
 
 
 class Table:
@@ -57,7 +62,7 @@ class Table:
         view = msgspec.structs.replace(self.view, tick=self.view.tick + n_ticks)
         self.decision = self.authority.step(self.now_ns, entries, n_ticks, self.view, self.control)
         self.view = view
-        self.events += [e.body for e in self.decision.events]
+        self.events += [body for e in self.decision.events for body in single_changes(e.body)]
         for out in self.decision.outgoing:
             if isinstance(out.message, Feedback) and out.connection in self.persons:
                 self.persons[out.connection].told[out.message.robot] = out.message
@@ -103,7 +108,8 @@ class Table:
 
     def since(self, kind: type) -> list[Any]:
         """Events of one kind in the last step."""
-        return [e.body for e in self.decision.events if isinstance(e.body, kind)]
+        bodies = [body for e in self.decision.events for body in single_changes(e.body)]
+        return [body for body in bodies if isinstance(body, kind)]
 
 
 class Person:

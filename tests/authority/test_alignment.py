@@ -101,6 +101,40 @@ def test_refusals_come_with_advice_and_not_too_often(changes: dict[str, Any]) ->
     assert not any(isinstance(e, AlignmentChanged) for e in t.events)
 
 
+def test_first_refusals_are_progress_and_only_later_ones_a_warning() -> None:
+    t = Table()
+    anna = t.join(name="anna")
+    poor = {"refused": True, "advice": "look at it from a second place", "n_observations": 4}
+    t.step(anna.says(proposal(**poor)))
+    (notice,) = t.since(Notice)
+    assert (notice.level, notice.participant, notice.reason) == ("info", anna.id, "")
+    assert "2 more seconds" in notice.text
+    for _ in range(95):
+        t.step(anna.says(proposal(**poor)), dt_ns=20 * MS)
+        assert all(n.level == "info" for n in t.since(Notice))
+    t.events.clear()
+    for _ in range(10):
+        t.step(anna.says(Heartbeat()), dt_ns=20 * MS)
+    (notice,) = [e for e in t.events if isinstance(e, Notice)]
+    assert (notice.level, notice.reason) == ("warning", "alignment_refused"), "the front repeats no refusal"
+    assert "second place" in notice.text
+    t.wait(SECOND)
+    t.step(anna.says(proposal(**{**poor, "advice": "step closer"})))
+    assert t.since(Notice)[0].level == "warning"
+
+
+def test_progress_that_ends_well_is_no_warning() -> None:
+    t = Table()
+    anna = t.join()
+    t.step(anna.says(proposal(refused=True, advice="look longer", n_observations=4)))
+    t.step(anna.says(proposal(n_observations=9)))
+    assert t.last(AlignmentChanged).alignment.kind == "measured"
+    t.events.clear()
+    for _ in range(200):
+        t.step(anna.says(Heartbeat()), dt_ns=20 * MS)
+    assert [e for e in t.events if isinstance(e, Notice)] == []
+
+
 def test_error_counts_at_the_robots_one_holds() -> None:
     lever = covariance(0.001, 0.02)
     t = Table()

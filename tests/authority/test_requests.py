@@ -11,28 +11,32 @@ from iris_session.authority.state import Pending
 from iris_session.protocol.client_messages import (
     Acquire,
     Assign,
+    ClearEStop,
     Consent,
     Control,
+    EStop,
     GetSnapshot,
     Grasp,
     Heartbeat,
     Release,
     SetMode,
     SetScale,
+    Withdraw,
 )
 from iris_session.protocol.common import Message, Target
-from iris_session.protocol.entries import Lost
+from iris_session.protocol.entries import FrontRestarted, Lost
 from iris_session.protocol.server_messages import (
     ConsentRequested,
     Feedback,
     Intervention,
     LeaseChanged,
+    LeasesChanged,
     SamplesRejected,
     ScaleChanged,
     Snapshot,
 )
 
-from .table import MS, SECOND, Person, Table, robot
+from .table import MS, SECOND, Person, Table, proposal, robot
 
 
 def with_mode(mode: str, **config: int) -> Table:
@@ -190,6 +194,85 @@ def test_release_with_an_old_token_is_denied() -> None:
     assert anna.asks(Release(1, (Target("left", anna.versions["left"]),) * 2)).ok
 
 
+# --- withdrawn requests ---
+
+
+def test_a_request_that_is_withdrawn_is_never_granted() -> None:
+    t = Table()
+    anna, bert, carl = t.operator("left"), t.join(), t.join()
+    bert.does(Acquire(7, ("left",), wait=True))
+    carl.does(Acquire(8, ("left",), wait=True))
+    carl.does(Withdraw(9, 8))
+    denied, done = carl.replies()
+    assert (denied.request_id, done.request_id, done.ok, done.leases) == (8, 9, True, ())
+    assert denied.denial is not None
+    assert (denied.denial.reason, denied.denial.target) == ("withdrawn", "left")
+    assert (denied.denial.holder, denied.denial.holder_name) == (anna.id, anna.name)
+    assert "place 2 of 2" in denied.denial.message
+    assert t.last(LeaseChanged).lease.queue == (bert.id,)
+    t.step(anna.says(Release()), bert.says(Release()))
+    assert t.hold() == "no_lease"
+
+
+def test_a_request_for_any_robot_is_withdrawn_with_its_place() -> None:
+    t = Table()
+    anna, bert, carl = t.operator("left"), t.operator("right"), t.join()
+    carl.does(Acquire(3, wait=True))
+    carl.does(Withdraw(4, 3))
+    denial = carl.replies()[0].denial
+    assert denial is not None
+    assert denial.holder == anna.id
+    assert "place 1 of 1" in denial.message
+    bert.does(Release())
+    assert t.hold("right") == "no_lease"
+
+
+def test_a_withdrawn_question_is_over() -> None:
+    t = with_mode("request")
+    anna, bert = t.operator("left"), t.join()
+    bert.does(Acquire(3, ("left",)))
+    asked = t.last(ConsentRequested).consent_id
+    bert.does(Withdraw(4, 3))
+    assert [(r.request_id, r.ok) for r in bert.replies()] == [(3, False), (4, True)]
+    assert bert.replies()[0].denial.holder == anna.id  # type: ignore[union-attr]
+    assert anna.denied(Consent(1, asked, True)) == "unknown_request"
+
+
+def test_a_request_that_was_granted_meanwhile_is_given_back() -> None:
+    """The reply with the lease and the withdrawal have crossed on their way."""
+    t = Table()
+    anna, bert = t.operator(), t.operator()
+    anna.acquire("right")
+    assert anna.asks(Acquire(5, ("left", "right"), ("hammer",))).ok
+    bert.does(Acquire(6, ("left",), wait=True))
+    reply = anna.asks(Withdraw(6, 5))
+    assert (reply.ok, [(lease.target, lease.holder) for lease in reply.leases]) == (
+        True, [("left", ""), ("hammer", "")],
+    )  # fmt: skip
+    assert bert.replies()[0].ok
+    assert t.hold("right") == "no_sample", "an earlier request had granted that one"
+    assert anna.asks(Withdraw(7, 5)).leases == ()
+
+
+def test_a_withdrawal_is_of_one_connection() -> None:
+    """Another program that resumes the participant counts its requests from one again."""
+    t = Table()
+    anna = t.operator()
+    assert anna.asks(Acquire(1, ("left",))).ok
+    t.step(anna.says(Lost()))
+    back = t.join(key_id=f"key{anna.connection}", name=anna.name, resume_of=anna.id)
+    assert back.asks(Withdraw(2, 1)).leases == ()
+    assert t.last(LeaseChanged).lease.holder == anna.id
+
+
+def test_acquire_and_withdraw_in_one_step_leave_nothing() -> None:
+    t = Table()
+    anna = t.operator()
+    t.step(anna.says(Acquire(1, ("left",))), anna.says(Withdraw(2, 1)))
+    assert [(r.request_id, r.ok) for r in anna.replies()] == [(1, True), (2, True)]
+    assert t.hold() == "no_lease"
+
+
 # --- request ---
 
 
@@ -283,6 +366,53 @@ def test_takeover_is_granted_at_once_and_the_old_holder_is_told() -> None:
     assert t.command().sources[0].participant == bert.id
 
 
+def test_an_agent_takes_no_robot_out_of_an_engaged_hand() -> None:
+    t = with_mode("takeover")
+    anna, agent = t.operator("left"), t.join("agent", alignment="not_needed")
+    anna.engage("left")
+    denial = agent.acquire("left").denial
+    assert denial is not None
+    assert (denial.reason, denial.holder, denial.holder_name, denial.target) == ("held", anna.id, anna.name, "left")
+    assert "2 s" in denial.advice
+    assert agent.denied(Acquire(1, ("right", "left"))) == "held"
+    assert t.command().sources[0].participant == anna.id
+    assert t.operator().acquire("left").ok, "people take from people"
+
+
+@pytest.mark.parametrize("why", ["untracked", "stale", "estop", "disconnected"])
+def test_an_agent_takes_no_robot_from_a_human_who_cannot_drive_for_a_moment(why: str) -> None:
+    t = with_mode("takeover")
+    anna, agent, boss = t.operator("left"), t.join("agent", alignment="not_needed"), t.join("director")
+    anna.engage("left")
+    if why == "untracked":
+        anna.sends("left", tracked=False)
+    elif why == "estop":
+        boss.does(EStop())
+    elif why == "disconnected":
+        t.step(anna.says(Lost()))
+    for _ in range(250):
+        t.step(*(p.says(Heartbeat()) for p in (anna, boss)), agent.says(Heartbeat()), dt_ns=20 * MS)
+    assert t.hold() == why
+    assert agent.denied(Acquire(1, ("left",))) == "held"
+
+
+def test_an_agent_takes_a_robot_whose_holder_stands_by_or_never_drove() -> None:
+    t = with_mode("takeover")
+    anna, agent = t.operator("left", "right"), t.join("agent", alignment="not_needed")
+    assert agent.acquire("right").ok
+    anna.engage("left")
+    stand_by(t, anna, 50, agent)
+    assert agent.denied(Acquire(1, ("left",))) == "held", "it opens the clutch to reach further"
+    agent.does(Acquire(2, ("left",), wait=True))
+    assert agent.replies()[0].denial is not None  # it holds another
+    agent.does(Release())
+    agent.does(Acquire(3, ("left",), wait=True))
+    stand_by(t, anna, 20, agent)
+    assert t.last(LeaseChanged).lease.holder == anna.id
+    stand_by(t, anna, 60, agent)
+    assert t.last(LeaseChanged).lease.holder == agent.id
+
+
 # --- priority ---
 
 
@@ -315,55 +445,153 @@ def test_human_preempts_agent_and_the_agent_gets_the_robot_back() -> None:
     assert t.last(Intervention).active
 
 
-@pytest.mark.parametrize("leaving", ["human", "agent", "human_lost", "mode"])
+@pytest.mark.parametrize("leaving", ["human", "agent", "mode"])
 def test_an_intervention_ends_when_either_side_leaves(leaving: str) -> None:
-    t = with_mode("priority")
-    agent, human = t.join("agent", alignment="not_needed"), t.operator()
+    t, agent, human = intervened()
     boss = t.join("director")
-    agent.acquire("left")
-    human.acquire("left")
-    human.engage("left")
     if leaving == "human":
         human.does(Release())
         assert t.hold() == "rearm"
     elif leaving == "agent":
         agent.does(Release())
         assert t.command().sources[0].participant == human.id
-    elif leaving == "human_lost":
-        t.step(human.says(Lost()))
-        assert t.hold() == "rearm"
     else:
         boss.does(SetMode(1, "left", "exclusive"))
         assert t.last(LeaseChanged).lease.holder == human.id
         assert t.hold() == "rearm"
     assert not t.last(Intervention).active
-    if leaving != "human_lost":
-        assert len(t.last(LeaseChanged).lease.sub_holders) == 0
+    assert len(t.last(LeaseChanged).lease.sub_holders) == 0
 
 
-def test_an_intervention_ends_when_its_human_is_silent_for_two_seconds() -> None:
+def intervened() -> tuple[Table, Person, Person]:
+    """An agent and a human who has taken over from it, in mode `priority`."""
     t = with_mode("priority")
     agent, human = t.join("agent", alignment="not_needed"), t.operator()
     agent.acquire("left")
+    agent.engage("left", device="target")
     human.acquire("left")
     human.engage("left")
+    assert t.last(Intervention) == Intervention("left", human.id, agent.id, True)
+    assert t.command().sources[0].participant == human.id
+    return t, agent, human
 
-    def wait(duration_ns: int) -> None:
-        for _ in range(duration_ns // (20 * MS)):
-            t.step(agent.says(Heartbeat()), human.says(Heartbeat()), dt_ns=20 * MS)
 
-    wait(100 * MS)
-    assert (agent.told["left"].state, agent.told["left"].hold_reason) == ("hold", "intervention")
-    assert human.told["left"].state == "pose"
-    wait(1900 * MS)
-    assert t.last(Intervention).active, "it counts from the last engagement"
-    assert (t.hold(), human.told["left"].hold_reason) == ("stale", "stale")
-    wait(400 * MS)
-    assert t.last(Intervention) == Intervention("left", human.id, agent.id, False)
-    agent.engage("left", device="target")
+def drive_on(t: Table, agent: Person, duration_ns: int, *others: Person, n_ticks: int = 1) -> None:
+    """The agent tries to drive all the time; the others are silent but connected."""
+    for i in range(duration_ns // (20 * MS)):
+        sample = agent.says(agent.sample("left", device="target", clutch=i % 2 == 1))
+        t.step(sample, *(p.says(Heartbeat()) for p in others), dt_ns=20 * MS, n_ticks=n_ticks)
+
+
+def stand_by(t: Table, human: Person, samples: int, *others: Person) -> None:
+    """The human sends samples with an open clutch; the others are silent but connected."""
+    for _ in range(samples):
+        t.step(human.says(human.sample("left")), *(p.says(Heartbeat()) for p in others), dt_ns=20 * MS)
+
+
+def test_an_intervention_lasts_through_the_grace_period_of_a_lost_human() -> None:
+    t, agent, human = intervened()
+    t.step(human.says(Lost("net")))
+    lease = t.last(LeaseChanged).lease
+    assert (lease.holder, lease.expires_ns) == (human.id, t.now_ns + 30 * SECOND)
+    assert t.hold() == "disconnected"
+    drive_on(t, agent, 29 * SECOND)
+    assert t.hold() == "disconnected", "the agent waits"
+    assert t.last(Intervention).active
+    assert agent.told["left"].hold_reason == "intervention"
+    drive_on(t, agent, 2 * SECOND)
+    assert t.last(Intervention) == Intervention("left", human.id, agent.id, False), "the grace period has ended"
     assert t.command().sources[0].participant == agent.id
-    human.engage("left")
-    assert t.last(Intervention).active, "and the human may step in again"
+
+
+def test_a_human_who_comes_back_is_still_in_charge() -> None:
+    t, agent, human = intervened()
+    t.step(human.says(Lost("net")))
+    drive_on(t, agent, 5 * SECOND)
+    back = resume(t, human)
+    assert t.last(LeaseChanged).lease.holder == human.id
+    drive_on(t, agent, 5 * SECOND, back)
+    assert t.last(Intervention).active, "nothing of its hand is known yet"
+    back.sends("left")
+    back.sends("left", clutch=True)
+    assert t.command().sources[0].participant == human.id, "it opened the clutch to close it again"
+    back.sends("left")
+    assert not t.last(Intervention).active, "it let go"
+
+
+def resume(t: Table, human: Person) -> Person:
+    """A new connection of a participant that was lost, with the fencing token of its robot and a new alignment."""
+    back = t.join(key_id=f"key{human.connection}", name=human.name, resume_of=human.id)
+    assert back.id == human.id
+    t.step(back.says(proposal()))
+    back.versions = {"left": t.last(LeaseChanged).lease.lease_version}
+    back.alignment_version = 2
+    return back
+
+
+def test_the_restart_of_the_front_does_not_give_the_robot_back() -> None:
+    t, agent, human = intervened()
+    t.step(t.host(FrontRestarted()))
+    t.wait(5 * SECOND)
+    assert (t.hold(), t.last(Intervention).active) == ("disconnected", True)
+    assert t.last(LeaseChanged).lease.holder == human.id
+    assert agent.id
+
+
+@pytest.mark.parametrize("why", ["untracked", "not_worn", "stale", "estop", "rejected"])
+def test_a_human_who_cannot_drive_is_not_idle(why: str) -> None:
+    """Only its own open clutch counts: for two seconds, when something else has ended its engagement."""
+    t, agent, human = intervened()
+    boss = t.join("director")
+    if why == "untracked":
+        human.sends("left", tracked=False)
+        drive_on(t, agent, SECOND, human, boss)
+        human.sends("left", tracked=False)
+    elif why == "not_worn":
+        human.sends("left", worn=False)
+    elif why == "estop":
+        boss.does(EStop())
+        assert boss.asks(ClearEStop(1, 1)).ok
+    elif why == "rejected":
+        human.sends("left", clutch=True, scene_epoch=7)
+    drive_on(t, agent, 10 * SECOND, human, boss)
+    assert t.last(Intervention).active
+    if why != "estop":
+        assert t.hold() == why
+    stand_by(t, human, 95, agent)
+    assert t.last(Intervention).active, "an open clutch arms the robot first"
+    human.sends("left", clutch=True)
+    assert t.command().sources[0].participant == human.id
+    human.does(Heartbeat(worn=False))
+    stand_by(t, human, 105, agent)
+    assert not t.last(Intervention).active, "it stood by with an open clutch"
+
+
+def test_an_open_clutch_while_tracking_is_lost_is_no_word_of_the_human() -> None:
+    t, agent, human = intervened()
+    for _ in range(200):
+        lost = human.says(human.sample("left", tracked=False, clutch=False))
+        t.step(lost, agent.says(Heartbeat()), dt_ns=20 * MS)
+    assert (t.hold(), t.last(Intervention).active) == ("untracked", True)
+
+
+def test_open_clutches_far_apart_are_no_idle_time() -> None:
+    """One sample in a second says nothing of the time between."""
+    t, agent, human = intervened()
+    human.sends("left", tracked=False)
+    for _ in range(6):
+        human.sends("left")
+        drive_on(t, agent, SECOND, human)
+    assert t.last(Intervention).active
+
+
+def test_a_director_gives_the_robot_of_a_lost_human_back() -> None:
+    t, agent, human = intervened()
+    boss = t.join("director")
+    t.step(human.says(Lost()))
+    assert boss.asks(Assign(1, ("left",), agent.id)).ok
+    assert not t.last(Intervention).active
+    assert t.last(LeaseChanged).lease.holder == agent.id
 
 
 def test_an_intervention_outlasts_a_standstill_and_a_pause() -> None:
@@ -378,6 +606,45 @@ def test_an_intervention_outlasts_a_standstill_and_a_pause() -> None:
     for _ in range(200):
         t.step(*(p.says(Heartbeat()) for p in (agent, human, boss)), dt_ns=20 * MS, n_ticks=0)
     assert t.last(Intervention).active, "who looks and thinks keeps the robot"
+
+
+@pytest.mark.parametrize("policy", ["join-order", "nearest"])
+def test_a_human_without_a_wish_gets_the_robot_of_an_agent(policy: str) -> None:
+    t = Table(AuthorityConfig(policy=policy), robots=(robot("left", "priority"),))
+    agent, human, other = t.join("agent", alignment="not_needed"), t.operator(), t.operator()
+    agent.acquire()
+    agent.engage("left", device="target")
+    t.step(*(p.says(p.sample(device="head")) for p in (human, other)))
+    reply = human.asks(Acquire(1, wait=True))
+    assert reply.leases[0].sub_holders == (agent.id, human.id)
+    assert t.command().sources[0].participant == agent.id, "it stands by"
+    human.engage("left")
+    assert t.command().sources[0].participant == human.id
+    other.does(Acquire(2, wait=True))
+    assert other.replies() == []
+    agent.does(Release())
+    human.does(Release())
+    assert other.replies()[0].leases[0].holder == other.id
+
+
+def test_a_free_robot_comes_before_that_of_an_agent() -> None:
+    t = with_mode("priority")
+    agent = t.join("agent", alignment="not_needed")
+    agent.acquire("left")
+    human, other = t.operator(), t.operator()
+    assert [lease.target for lease in human.acquire().leases] == ["right"]
+    assert [lease.target for lease in other.acquire().leases] == ["left"]
+    assert t.join("agent").denied(Acquire(1)) == "held"
+
+
+def test_a_human_who_waits_gets_a_robot_that_an_agent_has_got_meanwhile() -> None:
+    t = Table(robots=(robot("left", "priority"),))
+    agent, first, second, boss = t.join("agent"), t.operator("left"), t.operator(), t.join("director")
+    second.does(Acquire(5, wait=True))
+    assert second.replies() == []
+    boss.asks(Assign(1, ("left",), agent.id))
+    assert second.replies()[0].leases[0].sub_holders == (agent.id, second.id)
+    assert first.denied(Acquire(1, ("left",))) == "held"
 
 
 def test_a_leader_arm_is_a_human_hand() -> None:
@@ -747,3 +1014,29 @@ def test_a_new_participant_of_the_same_name_begins_at_one() -> None:
     t.step(again.says(Acquire(1, ("left",))))
     assert t.last(LeaseChanged).lease.holder == again.id
     assert t.last(LeaseChanged).lease.scale == 1.0
+
+
+def test_leases_of_one_request_are_one_event() -> None:
+    """Everyone gets every event: a request that names forty targets must not make forty of them."""
+    objects = [f"part{i}" for i in range(30)]
+    t = Table(robots=[robot(f"arm{i}") for i in range(10)], objects=objects)
+    anna = t.join()
+    t.step(anna.says(Acquire(1, tuple(lease.name for lease in t.robots), tuple(objects))))
+    (acquired,) = t.decision.events
+    assert isinstance(acquired.body, LeasesChanged)
+    assert acquired.body.cause == "acquired"
+    assert [lease.holder for lease in acquired.body.leases] == [anna.id] * 40
+    assert acquired.body.previous_holders == ("",) * 40
+    t.step(anna.says(Release(2)))
+    (released,) = t.decision.events
+    assert isinstance(released.body, LeasesChanged)
+    assert [
+        (lease.holder, who) for lease, who in zip(released.body.leases, released.body.previous_holders, strict=True)
+    ] == [("", anna.id)] * 40
+
+
+def test_one_lease_of_a_request_is_an_event_of_its_own() -> None:
+    t = Table()
+    anna = t.join()
+    anna.acquire("left")
+    assert [type(e.body) for e in t.decision.events] == [LeaseChanged]

@@ -57,6 +57,8 @@ def test_join_admits_and_tells_everyone() -> None:
         ({"alignment": "guessed"}, "unknown_value"),
         ({"gateway": 1}, "gateway_only"),
         ({"gateway": 5}, "gateway_only"),
+        ({"alignment": "not_needed", "devices": ("head", "controller/right")}, "unaligned"),
+        ({"alignment": "not_needed", "devices": ("hand/left",), "role": "director"}, "unaligned"),
     ],
 )
 def test_refused_joins(fields: dict[str, Any], code: str) -> None:

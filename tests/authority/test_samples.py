@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from iris_session.authority import AuthorityConfig
-from iris_session.protocol.client_messages import Sample
+from iris_session.protocol.client_messages import Grasp, Sample
 from iris_session.protocol.common import Pose, Target
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.server_messages import Notice, SamplesRejected
@@ -25,6 +25,57 @@ def engaged() -> tuple[Table, Person]:
     op.engage("left")
     assert t.command().kind == "pose"
     return t, op
+
+
+@pytest.mark.parametrize("device", ["controller/right", "hand/left", "head"])
+@pytest.mark.parametrize("role", ["operator", "director"])
+def test_whoever_says_that_it_needs_no_alignment_moves_nothing_with_a_headset(role: str, device: str) -> None:
+    t = Table()
+    anna = t.join(role, alignment="not_needed")
+    assert anna.acquire("left").ok
+    anna.engage("left", device=device)
+    assert t.hold() == "unaligned"
+    assert t.last(SamplesRejected).reason == "unaligned"
+    notice = t.last(Notice)
+    assert (notice.level, notice.participant) == ("warning", anna.id)
+    assert device in notice.text
+    assert "measured" in notice.text
+    assert anna.denied(Grasp(2, "hammer", "hand/left")) == "unaligned"
+    twist = {"kind": "twist", "pose": None, "twist": (0.1, 0.0, 0.0, 0.0, 0.0, 0.0)}
+    anna.engage("left", device=device, **twist)
+    assert t.hold() == "unaligned"
+
+
+@pytest.mark.parametrize(
+    ("role", "device"),
+    [("operator", "desktop"), ("operator", "target"), ("director", "desktop"), ("agent", "hand/left")],
+)
+def test_desks_and_policies_need_no_alignment(role: str, device: str) -> None:
+    t = Table()
+    anna = t.join(role, alignment="not_needed", devices=(device, "head"))
+    anna.acquire("left")
+    anna.engage("left", device=device)
+    assert t.command().kind == "pose"
+
+
+def test_presence_needs_no_alignment() -> None:
+    t = Table()
+    anna = t.join("observer", alignment="not_needed", devices=("head", "controller/right"))
+    anna.sends()
+    assert [item.participant for item in t.decision.presence] == [anna.id]
+
+
+@pytest.mark.parametrize("entry", ["operator", "controller/right", "key:key1"])
+def test_the_configuration_decides_who_may_be_unaligned(entry: str) -> None:
+    t = Table(AuthorityConfig(unaligned=(entry,)))
+    anna = t.join(alignment="not_needed", devices=("controller/right",))
+    anna.acquire("left")
+    anna.engage("left")
+    assert t.command().kind == "pose"
+    bert = t.join(alignment="not_needed")
+    bert.acquire("right")
+    bert.engage("right", device="desktop" if entry == "controller/right" else "controller/right")
+    assert (t.command("right").kind == "pose") == (entry == "operator")
 
 
 CASES: list[tuple[str, dict[str, Any]]] = [

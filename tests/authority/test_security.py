@@ -162,7 +162,7 @@ def test_two_directors_at_once_both_act_and_the_last_word_wins() -> None:
 def test_two_directors_stop_and_start_without_deadlock() -> None:
     t = Table()
     one, two = t.join("director"), t.join("director")
-    t.step(one.says(EStop("stop")), two.says(ClearEStop(1)))
+    t.step(one.says(EStop("stop")), two.says(ClearEStop(1, 0)))
     t.wait(SECOND)
-    assert one.asks(ClearEStop(2)) is not None
+    assert one.asks(ClearEStop(2, 1)).ok
     assert not t.decision.estop

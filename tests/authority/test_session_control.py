@@ -12,11 +12,22 @@ from iris_session.protocol.client_messages import (
     Control,
     Episode,
     EStop,
+    GetSnapshot,
     Grasp,
     Heartbeat,
     Release,
 )
-from iris_session.protocol.entries import Entry, ExternalReset, Join, Lost, RecordingGap, SceneLoaded, StalledGap
+from iris_session.protocol.entries import (
+    Entry,
+    ExternalReset,
+    Join,
+    Lost,
+    OwnerListens,
+    PhysicsDiverged,
+    RecordingGap,
+    SceneLoaded,
+    StalledGap,
+)
 from iris_session.protocol.server_messages import (
     EpisodeChanged,
     EStopChanged,
@@ -26,6 +37,7 @@ from iris_session.protocol.server_messages import (
     PauseChanged,
     Reply,
     SceneChanged,
+    Snapshot,
 )
 from iris_session.protocol.specs import ObjectSpec
 
@@ -46,11 +58,9 @@ def test_anyone_stops_everything_in_the_same_step_however_long_the_batch() -> No
     t.step(*flood, watcher.says(EStop("fire")))
     assert t.decision.estop
     assert t.hold() == "estop"
-    assert t.since(EStopChanged) == [EStopChanged(True, watcher.id, "fire")]
+    assert t.since(EStopChanged) == [EStopChanged(True, watcher.id, "fire", 1)]
     op.engage("left")
     assert t.hold() == "estop"
-    watcher.does(EStop())
-    assert t.since(EStopChanged) == []
 
 
 def test_an_estop_with_an_old_envelope_still_stops() -> None:
@@ -62,10 +72,12 @@ def test_an_estop_with_an_old_envelope_still_stops() -> None:
 def test_clearing_needs_a_director_and_a_new_clutch() -> None:
     t, op, boss = playing()
     op.does(EStop())
-    assert op.denied(ClearEStop(1)) == "role"
+    assert op.denied(ClearEStop(1, 1)) == "role"
     op.engage("left")
-    assert boss.asks(ClearEStop(1)).ok
-    assert boss.asks(ClearEStop(1)).ok
+    assert boss.asks(ClearEStop(1, 1)).ok
+    assert t.since(EStopChanged) == [EStopChanged(False, boss.id, "", 1)]
+    assert boss.asks(ClearEStop(1, 1)).ok
+    assert t.since(EStopChanged) == []
     assert t.hold() == "estop"
     op.sends("left", clutch=True)
     assert t.hold() == "estop"
@@ -76,9 +88,75 @@ def test_clearing_needs_a_director_and_a_new_clutch() -> None:
 def test_a_stop_in_the_same_step_beats_the_clear() -> None:
     t, op, boss = playing()
     op.does(EStop())
-    t.step(boss.says(ClearEStop(1)), op.says(EStop()))
+    t.step(boss.says(ClearEStop(1, 1)), op.says(EStop()))
     assert not boss.replies()[0].ok
     assert t.decision.estop
+
+
+def test_every_stop_is_counted_and_announced_also_while_stopped() -> None:
+    t, op, boss = playing()
+    watcher = t.join("observer")
+    op.does(EStop("sparks"))
+    t.step(watcher.says(EStop("smoke")), boss.says(EStop("fire")), watcher.says(EStop("still smoke")))
+    assert t.since(EStopChanged) == [EStopChanged(True, watcher.id, "smoke", 2), EStopChanged(True, boss.id, "fire", 3)]
+    assert t.authority.stop_seq == 3
+    stops = t.authority.build_stop_reports()
+    assert [(s.stop_seq, s.participant, s.name, s.reason) for s in stops] == [
+        (3, boss.id, boss.name, "fire"),
+        (2, watcher.id, watcher.name, "smoke"),
+        (1, op.id, op.name, "sparks"),
+    ]
+    t.wait(SECOND)
+    assert stops[0].age_ns == 0
+    assert t.authority.build_stop_reports()[0].age_ns == SECOND
+
+
+def test_a_clear_lifts_no_stop_that_its_sender_has_not_seen() -> None:
+    t, op, boss = playing()
+    watcher = t.join("observer")
+    op.does(EStop("sparks"))
+    watcher.does(EStop("a hand is in the cell"))
+    for seen in (0, 1):
+        reply = boss.asks(ClearEStop(1, seen))
+        assert reply.denial is not None
+        assert (reply.denial.reason, reply.denial.holder, reply.denial.holder_name) == (
+            "estop", watcher.id, watcher.name,
+        )  # fmt: skip
+        assert "a hand is in the cell" in reply.denial.message
+        assert "2" in reply.denial.advice
+        assert t.decision.estop
+    assert boss.denied(ClearEStop(1, 3)) == "invalid", "nobody has seen a stop that has not come"
+    assert t.decision.estop
+    assert boss.asks(ClearEStop(1, 2)).ok
+    assert not t.decision.estop
+    assert t.authority.build_stop_reports() == ()
+    op.does(EStop("again"))
+    assert t.since(EStopChanged) == [EStopChanged(True, op.id, "again", 3)], "numbers go on"
+
+
+def test_stops_are_in_snapshots_and_survive_a_restore() -> None:
+    t, op, _ = playing()
+    op.does(EStop("sparks"))
+    op.does(GetSnapshot(1))
+    (snapshot,) = [o.message for o in t.decision.outgoing if isinstance(o.message, Snapshot)]
+    assert (snapshot.estop, snapshot.stop_seq) == (True, 1)
+    twin = Authority(t.config, t.robots, t.objects)
+    twin.restore(t.authority.snapshot())
+    assert twin.build_stop_reports() == t.authority.build_stop_reports()
+
+
+def test_the_stops_on_the_list_are_bounded_and_each_sender_is_there_once() -> None:
+    t, op, boss = playing()
+    crowd = [t.join("observer") for _ in range(20)]
+    for i in range(50):
+        t.step(*(p.says(EStop(f"stop {i}")) for p in crowd))
+    op.does(EStop("the last"))
+    stops = t.authority.build_stop_reports()
+    assert len(stops) == 16
+    assert len({s.participant for s in stops}) == 16
+    assert stops[0].reason == "the last"
+    assert t.authority.stop_seq == 1001
+    assert boss.asks(ClearEStop(1, 1001)).ok
 
 
 def test_pause_and_resume_rearm() -> None:
@@ -108,6 +186,56 @@ def test_pause_and_resume_rearm() -> None:
     assert t.command().kind == "pose"
 
 
+def diverged() -> tuple[Table, Person, Person]:
+    t, op, boss = playing()
+    t.step(t.host(PhysicsDiverged(1, "NaN in QPOS at DOF 3")))
+    assert t.decision.paused
+    assert [(e.paused, e.participant) for e in t.since(PauseChanged)] == [(True, "host")]
+    assert "NaN in QPOS" in t.last(PauseChanged).reason
+    assert "NaN in QPOS" in t.authority.pause_reason
+    return t, op, boss
+
+
+@pytest.mark.parametrize("action", ["reset", "resume"])
+def test_one_command_mends_physics_that_diverged(action: str) -> None:
+    t, op, boss = diverged()
+    assert boss.asks(Control(1, action)).ok
+    assert (t.decision.reset, t.decision.paused, t.decision.scene_epoch) == (True, False, 2)
+    assert t.since(PauseChanged) == [PauseChanged(False, boss.id)]
+    assert t.authority.pause_reason == ""
+    op.scene_epoch = 2
+    op.engage("left")
+    assert t.command().kind == "pose"
+
+
+def test_an_episode_that_is_reset_mends_physics_that_diverged() -> None:
+    t, op, _ = diverged()
+    op.asks(Episode(1, "reset"))
+    assert (t.decision.reset, t.decision.paused) == (True, False)
+
+
+def test_physics_that_diverged_takes_no_ticks_and_stays_paused_when_a_director_wants_it() -> None:
+    t, _, boss = diverged()
+    denial = boss.asks(Control(1, "step", 1)).denial
+    assert denial is not None
+    assert "NaN in QPOS" in denial.message
+    assert "reset" in denial.advice
+    boss.asks(Control(2, "pause"))
+    boss.asks(Control(3, "reset"))
+    assert (t.decision.reset, t.decision.paused, t.authority.pause_reason) == (True, True, "")
+    boss.asks(Control(4, "resume"))
+    assert (t.decision.reset, t.decision.paused) == (False, False)
+
+
+def test_what_diverged_before_a_reset_is_over() -> None:
+    t, op, boss = playing()
+    boss.asks(Control(1, "reset"))
+    t.step(t.host(PhysicsDiverged(1, "NaN")))
+    assert not t.decision.paused
+    t.step(op.says(PhysicsDiverged(2, "NaN")))
+    assert not t.decision.paused, "only the owner says so"
+
+
 def test_reset_starts_a_scene_epoch_and_keeps_leases() -> None:
     t, op, boss = playing()
     t.step(boss.says(Control(1, "reset")), boss.says(Control(2, "reset")))
@@ -129,6 +257,35 @@ def test_a_loop_of_the_user_is_not_paused_or_reset() -> None:
     for action in ("pause", "resume", "step", "reset"):
         assert boss.denied(Control(1, action)) == "user_owned"
     assert boss.denied(Episode(1, "reset")) == "user_owned"
+
+
+def test_an_owner_that_listens_is_asked_to_reset() -> None:
+    t = Table(AuthorityConfig(user_owned_loop=True))
+    boss, op = t.join("director"), t.operator("left")
+    op.does(OwnerListens())
+    assert boss.denied(Control(1, "reset")) == "user_owned", "only the host says that it listens"
+    t.step(t.host(OwnerListens()))
+    assert boss.denied(Control(1, "pause")) == "user_owned"
+    assert boss.asks(Control(2, "reset")).ok
+    assert not t.decision.reset
+    assert boss.asks(Episode(3, "start")).ok
+    assert boss.asks(Episode(4, "rerecord", "once more")).ok
+    assert t.since(EpisodeChanged)[-1].state == "discarded"
+    t.step()
+    t.step(t.host(ExternalReset()))
+    assert t.last(EpisodeChanged) == EpisodeChanged(2, "running", "once more", boss.id)
+    t.step(t.host(ExternalReset()))
+    assert t.since(EpisodeChanged) == []
+
+
+def test_an_episode_that_starts_by_hand_is_not_started_again_by_the_reset() -> None:
+    t = Table(AuthorityConfig(user_owned_loop=True))
+    boss = t.join("director")
+    t.step(t.host(OwnerListens()))
+    for message in (Episode(1, "start"), Episode(2, "rerecord"), Episode(3, "start", "mine")):
+        assert boss.asks(message).ok
+    t.step(t.host(ExternalReset()))
+    assert t.last(EpisodeChanged) == EpisodeChanged(2, "running", "mine", boss.id)
 
 
 def test_a_gap_between_steps_holds_until_clutched_again() -> None:
@@ -232,7 +389,8 @@ def test_one_who_was_just_given_up_still_stops_everything() -> None:
     t.step(Entry(lost.connection, lost.connection, t.now_ns, Lost("net")))
     lost.does(EStop("from afar"))
     assert t.hold() == "estop"
-    assert t.since(EStopChanged) == [EStopChanged(True, "", "from afar")]
+    assert t.since(EStopChanged) == [EStopChanged(True, "", "from afar", 1)]
+    assert t.authority.build_stop_reports()[0].participant == ""
 
 
 def test_a_stop_that_comes_with_its_senders_hello_or_before_it_stops() -> None:

@@ -1,4 +1,4 @@
-"""`bench alignment`: every key and bar, equal results for equal seeds. Accuracy is measured by the benchmark itself."""
+"""`bench alignment`: every key and bar, equal results for equal seeds. The benchmark itself measures accuracy."""
 
 from __future__ import annotations
 
@@ -41,18 +41,18 @@ def test_every_case_has_every_key_and_bar(report: BenchReport) -> None:
     assert "one_sheet.sheet_mm_p95" in report.format()
 
 
-def test_ours_is_better_than_naive_ways(report: BenchReport) -> None:
+def test_estimator_is_better_than_naive_methods(report: BenchReport) -> None:
     got = report.results["one_sheet"]
     assert got["sheet_mm_p95"] < 0.5 * min(got["naive_last_sheet_mm_p95"], got["naive_mean_sheet_mm_p95"])
 
 
-def test_the_same_seed_gives_the_same_figures(report: BenchReport) -> None:
+def test_same_seed_gives_the_same_figures(report: BenchReport) -> None:
     again = run_alignment(pairs=5, seed=5)
     assert {case: again.results[case] for case in CASES} == {case: report.results[case] for case in CASES}
 
 
-def test_headsets_report_with_the_noise_that_is_fixed() -> None:
-    """Standard deviations of 150 looks; wrong detections told by their size."""
+def test_headsets_report_with_the_stated_noise() -> None:
+    """Standard deviations of 150 observations; wrong detections identified by their size."""
     errors, turns, wrong, n = [], [], 0, 0
     for seed in range(150):
         headset = SimulatedHeadset(np.random.default_rng(seed))
@@ -78,8 +78,8 @@ def test_headsets_report_with_the_noise_that_is_fixed() -> None:
     assert np.std(errors) == pytest.approx(1.0, rel=0.15)
 
 
-def test_half_of_each_variance_is_constant_per_viewpoint_and_a_third_of_the_sigma_is_across() -> None:
-    """Variances of the means of looks and about them, along the view (without the error of scale) and across it."""
+def test_variance_shares_per_viewpoint_and_across_the_view() -> None:
+    """Half of each variance is constant per viewpoint, a third of the sigma is across the view."""
     means, about = [], []
     for seed in range(200):
         headset = SimulatedHeadset(np.random.default_rng(seed))
@@ -97,7 +97,7 @@ def test_half_of_each_variance_is_constant_per_viewpoint_and_a_third_of_the_sigm
     assert np.var([m[1] for m in means]) == pytest.approx(0.5 + 0.5 / 19, rel=0.25)
 
 
-def test_a_touch_is_where_the_mark_is() -> None:
+def test_touch_is_at_the_mark() -> None:
     rng = np.random.default_rng(0)
     off = []
     for _ in range(200):

@@ -12,7 +12,7 @@ from iris_session.bench.baseline import measure_baseline
 from iris_session.bench.report import BenchError
 
 
-def test_every_receiver_is_measured_and_none_is_left() -> None:
+def test_every_receiver_is_measured_and_ended() -> None:
     found = measure_baseline(5, seconds=1.5)
     assert 0.0 < found["bare_age_ms_p50"] <= found["bare_age_ms_p99"]
     assert 0.0 <= found["bare_late_tick_share"] <= 1.0
@@ -20,17 +20,17 @@ def test_every_receiver_is_measured_and_none_is_left() -> None:
 
 
 def test_blocked_loop_is_late() -> None:
-    class Slow:
+    class SlowSocket:
         """A socket that takes 5 ms for every frame."""
 
         def send(self, _: bytes) -> None:
             room.time.sleep(0.005)
 
-    lateness = room._run_loop(Slow(), 0.2)  # type: ignore[arg-type]
-    assert sum(ns > room.PERIOD_NS for ns in lateness) >= 8  # each of about 12 frames holds up its own tick
+    lateness = room._run_loop(SlowSocket(), 0.2)  # type: ignore[arg-type]
+    assert sum(ns > room.PERIOD_NS for ns in lateness) >= 8  # each of about 12 frames delays its own tick
 
 
-def test_a_receiver_that_fails_is_named() -> None:
+def test_failed_receiver_is_named() -> None:
     dead = subprocess.Popen([sys.executable, "-c", "raise SystemExit(3)"], stdout=subprocess.PIPE)
     with pytest.raises(BenchError, match="failed with status 3"):
         room._read_ages(dead)

@@ -57,7 +57,7 @@ def test_report(tmp_path: Path) -> None:
     assert {one["key"] for one in result["bars"]} == set(KEYS)
 
 
-def test_the_same_seed_gives_the_same_motion_and_another_another() -> None:
+def test_motion_depends_on_the_seed_only() -> None:
     one, same, other = simulate_cloth(6, 1), simulate_cloth(6, 1), simulate_cloth(6, 2)
     assert np.array_equal(one.nodes, same.nodes)
     assert not np.array_equal(one.nodes, other.nodes)
@@ -70,23 +70,23 @@ def test_the_same_seed_gives_the_same_motion_and_another_another() -> None:
 
 
 def test_motion_is_cached_and_damaged_file_is_replaced(home: Path) -> None:
-    said: list[str] = []
-    made = load_cloth_motion(5, 0, said.append)
+    messages: list[str] = []
+    made = load_cloth_motion(5, 0, messages.append)
     (file,) = home.iterdir()
-    assert any("simulated" in text for text in said)
-    said.clear()
-    kept = load_cloth_motion(5, 0, said.append)
-    assert not said
+    assert any("simulated" in text for text in messages)
+    messages.clear()
+    kept = load_cloth_motion(5, 0, messages.append)
+    assert not messages
     assert np.array_equal(kept.nodes, made.nodes)
     assert (kept.scale, kept.origin.tolist()) == (made.scale, made.origin.tolist())
     file.write_bytes(file.read_bytes()[:1000])
-    again = load_cloth_motion(5, 0, said.append)
-    assert "simulating again" in said[0]
+    again = load_cloth_motion(5, 0, messages.append)
+    assert "simulating again" in messages[0]
     assert np.array_equal(again.nodes, made.nodes)
-    assert np.array_equal(load_cloth_motion(5, 0, said.append).faces, made.faces)
+    assert np.array_equal(load_cloth_motion(5, 0, messages.append).faces, made.faces)
 
 
-def test_the_motion_runs_to_its_end_and_back() -> None:
+def test_motion_runs_forward_and_back() -> None:
     motion = ClothMotion(np.zeros((4, 9, 3), np.uint16), np.zeros(3), 1.0, np.zeros((0, 3), np.int32))
     assert [motion.frame_index(frame) for frame in range(8)] == [0, 1, 2, 3, 2, 1, 0, 1]
 
@@ -111,7 +111,7 @@ def test_errors_are_relative_to_motion_and_wrong_decoding_is_detected() -> None:
     assert 0.0 < _compute_max_error_m({"a": log}, source) <= 0.0005
     source.frames = {700: 1}
     assert _compute_max_error_m({"a": log}, source) > 0.1
-    with pytest.raises(BenchError, match="b decoded other vertices"):
+    with pytest.raises(BenchError, match=r"^b decoded"):
         _compute_max_error_m({"a": log, "b": {**log, "checksums": log["checksums"] + 1}}, source)
 
 

@@ -15,7 +15,7 @@ KEYS = {
 
 
 @pytest.mark.e2e
-def test_join_at_the_size_of_a_toy(tmp_path: Path) -> None:
+def test_join_of_a_small_scene(tmp_path: Path) -> None:
     options = ("--objects", "70", "--assets-mb", "3", "--clients", "1", "--seconds", "10")
     result = _bench(tmp_path, "join", *options)
     _check(result, "join", KEYS)

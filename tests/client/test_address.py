@@ -1,4 +1,4 @@
-"""Addresses as people type them, and the URI of a pairing code."""
+"""Addresses as typed, and the URI of a pairing code."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ KEY = "rY5P4[G=Mu()uIR1{6xjIHL7utHv9:LKIMvLkp?v"
 
 
 @pytest.mark.parametrize("host", ["10.0.0.5", "::1", "lab.local"])
-def test_a_uri_says_everything_and_reads_back(host: str) -> None:
+def test_complete_uri_round_trips(host: str) -> None:
     uri = pairing_uri(host, 7731, KEY, "7KQ2-M4XD-9PTR", "lab 1/2")
     assert uri.startswith(f"iris://{host_port(host, 7731)}/?k=")
     assert Address.parse(uri) == Address(host, 7731, KEY, "7KQ2M4XD9PTR", "lab 1/2")
     assert str(Address.parse(uri)) == host_port(host, 7731)
 
 
-def test_every_key_survives_a_uri() -> None:
+def test_every_key_round_trips_in_a_uri() -> None:
     for _ in range(50):
         key = KeyPair.generate().public
         assert Address.parse(pairing_uri("h", 1, key)).server_key == key
 
 
-def test_a_server_may_be_called_as_the_scheme() -> None:
+def test_host_may_be_named_like_the_scheme() -> None:
     assert Address.parse("iris:7731") == Address("iris", 7731)
 
 
-def test_a_uri_may_say_less_and_more() -> None:
+def test_uri_may_lack_parts_or_have_unknown_ones() -> None:
     assert Address.parse("iris://10.0.0.5") == Address("10.0.0.5", 7721)
     assert Address.parse("IRIS://10.0.0.5:7731/?later=1&c=7kq2-m4xd-9ptr") == Address(
         "10.0.0.5", 7731, "", "7KQ2M4XD9PTR"
@@ -41,7 +41,7 @@ def test_a_uri_may_say_less_and_more() -> None:
     "uri",
     ["iris://", "iris://h:x/", "iris://h/?k=abc", "iris://h/?k=%20", "iris://h/?c=ABC", "iris://h/?k=" + "A" * 44],
 )
-def test_a_damaged_uri_says_what_one_looks_like(uri: str) -> None:
+def test_damaged_uri_is_rejected_with_an_example(uri: str) -> None:
     with pytest.raises(ClientError, match="iris://HOST:PORT") as error:
         Address.parse(uri)
     assert "\n" not in str(error.value)
@@ -50,7 +50,7 @@ def test_a_damaged_uri_says_what_one_looks_like(uri: str) -> None:
 @pytest.mark.parametrize(
     "host", ["10.0.0.5", "lab", "lab-1.local", "a_b.", "xn--bcher-kva.example", "::1", "fe80::1%eth0"]
 )
-def test_hosts(host: str) -> None:
+def test_valid_hosts_are_accepted(host: str) -> None:
     assert is_host(host)
     assert Address.parse(f"[{host}]:7731" if ":" in host else f"{host}:7731").host == host
 
@@ -58,7 +58,7 @@ def test_hosts(host: str) -> None:
 @pytest.mark.parametrize(
     "host", ["a..b", ".a", "-", "a b", "*", "a/b", "x" * 64, "a." * 200, "bücher", "a\0b", "\ud800", "::1::2"]
 )
-def test_what_cannot_be_a_host_is_one_line_and_no_error_of_the_resolver(host: str) -> None:
+def test_invalid_host_is_a_one_line_error(host: str) -> None:
     assert not is_host(host)
     with pytest.raises(ClientError, match="is not HOST:PORT"):
         Address.parse(host)

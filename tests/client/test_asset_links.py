@@ -1,4 +1,4 @@
-"""Connections to the assets channel that end while the session goes on: nothing waits, nothing comes for ever."""
+"""Connections to the assets channel that end while the session continues: nothing blocks, nothing repeats for ever."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from iris_session.client import AssetStore, Client
 from iris_session.client.core import asset_loader as asset_loading
 from iris_session.protocol.assets import AssetRequest
 from tests.client.harness import LiveSession
-from tests.client.test_assets import Liar, chunk
+from tests.client.test_assets import HostileSession, chunk
 from tests.front.asset_rig import noise, put
 
 MIB = 1 << 20
@@ -25,8 +25,10 @@ DEADLINE_S = 30.0
 
 
 class Relay:
-    """Between clients and a port. Each time that so many bytes have come from there, in all, it ends every connection,
-    with what was under way."""
+    """Between clients and a port.
+
+    After each given total of bytes from the port it closes every connection with the data under way.
+    """
 
     def __init__(self, port: int, cuts: list[int]) -> None:
         self._to, self._cuts = port, cuts
@@ -35,9 +37,9 @@ class Relay:
         self._threads: list[threading.Thread] = []
         self.port = self._listening.getsockname()[1]
         self.accepted = self.came = 0
-        self._begin(self._accept)
+        self._start(self._accept)
 
-    def _begin(self, work: Callable[..., None], *of: object) -> None:
+    def _start(self, work: Callable[..., None], *of: object) -> None:
         self._threads.append(threading.Thread(target=work, args=of, daemon=True))
         self._threads[-1].start()
 
@@ -48,34 +50,34 @@ class Relay:
                 far = socket.create_connection(("127.0.0.1", self._to))
                 self.accepted += 1
                 self._ends += [near, far]
-                self._begin(self._pass_on, near, far, False)
-                self._begin(self._pass_on, far, near, True)
+                self._start(self._forward, near, far, False)
+                self._start(self._forward, far, near, True)
 
-    def _pass_on(self, source: socket.socket, sink: socket.socket, counts: bool) -> None:
+    def _forward(self, source: socket.socket, sink: socket.socket, counts: bool) -> None:
         with contextlib.suppress(OSError):
             while data := source.recv(65_536):
                 self.came += counts * len(data)
                 if counts and self._cuts and self.came >= self._cuts[0]:
                     self._cuts.pop(0)
-                    self._cut()
+                    self._close_connections()
                 sink.sendall(data)
-        _end(sink)
+        _close_socket(sink)
 
-    def _cut(self) -> None:
+    def _close_connections(self) -> None:
         for end in self._ends:
-            _end(end)
+            _close_socket(end)
 
     def close(self) -> None:
-        _end(self._listening)
+        _close_socket(self._listening)
         self._threads[0].join()
-        self._cut()
+        self._close_connections()
         for thread in self._threads:
             thread.join()
         for one in (self._listening, *self._ends):
             one.close()
 
 
-def _end(one: socket.socket) -> None:
+def _close_socket(one: socket.socket) -> None:
     with contextlib.suppress(OSError):
         one.shutdown(socket.SHUT_RDWR)
 
@@ -89,10 +91,10 @@ def live(tmp_path: Path) -> Iterator[LiveSession]:
 
 
 @pytest.mark.parametrize("cuts", [[200], [5 * MIB], [6 * MIB, 9 * MIB, 12 * MIB]], ids=["at first", "once", "often"])
-def test_a_connection_that_ends_costs_what_was_under_way_and_no_time(
+def test_lost_connection_costs_only_data_under_way(
     live: LiveSession, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cuts: list[int]
 ) -> None:
-    monkeypatch.setattr(asset_loading, "PATIENCE_NS", 10**18)  # whatever helps, it is not that one
+    monkeypatch.setattr(asset_loading, "PATIENCE_NS", 10**18)  # the reconnect must not come from the patience
     addresses, n_cuts = live.front.scene.assets, len(cuts)
     client = Client(live.address, role="observer", alignment="not_needed")
     client.assets.cache = AssetStore(tmp_path / "cache")
@@ -117,7 +119,7 @@ def test_a_connection_that_ends_costs_what_was_under_way_and_no_time(
         relay.close()
 
 
-def test_a_function_that_decodes_may_use_the_client_until_it_is_closed(live: LiveSession, tmp_path: Path) -> None:
+def test_decode_function_may_use_the_client_until_it_is_closed(live: LiveSession, tmp_path: Path) -> None:
     client = Client(live.address, role="observer", alignment="not_needed")
     client.assets.cache = AssetStore(tmp_path / "cache")
     client.connect(DEADLINE_S)
@@ -134,7 +136,7 @@ def test_a_function_that_decodes_may_use_the_client_until_it_is_closed(live: Liv
     closing = threading.Thread(target=client.close, daemon=True)
     closing.start()
     until = time.monotonic() + DEADLINE_S
-    while not fetch.done and time.monotonic() < until:  # it has had the lock, and gives it back
+    while not fetch.done and time.monotonic() < until:  # it had the lock and releases it
         time.sleep(0.001)
     lets_go.set()
     closing.join(DEADLINE_S)
@@ -143,7 +145,7 @@ def test_a_function_that_decodes_may_use_the_client_until_it_is_closed(live: Liv
     assert seen == [(300_000, {})]
 
 
-def test_a_connection_without_answers_is_made_anew(
+def test_connection_without_answers_is_replaced(
     live: LiveSession, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(asset_loading, "PATIENCE_NS", 100_000_000)
@@ -156,7 +158,7 @@ def test_a_connection_without_answers_is_made_anew(
     client = Client(live.address, role="observer", alignment="not_needed")
     client.assets.cache = AssetStore(tmp_path / "cache")
     client.connect(DEADLINE_S)
-    other, welcome = Liar(answers), client.connection.welcome
+    other, welcome = HostileSession(answers), client.connection.welcome
     assert welcome is not None
     endpoints = msgspec.structs.replace(welcome.endpoints, assets=other.port)
     client.connection.welcome = msgspec.structs.replace(welcome, endpoints=endpoints)

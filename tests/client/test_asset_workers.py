@@ -1,4 +1,4 @@
-"""The threads that store assets: what came and could not be stored fills the window no more."""
+"""The threads that store assets: failed bytes leave the window."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from iris_session.client.asset_workers import AssetFailed, AssetMissing, AssetWo
 from tests.assets.test_store import ADDRESS, DATA
 
 
-def test_bytes_that_cannot_be_stored_are_let_go_of_before_it_is_told_why(tmp_path: Path) -> None:
+def test_bytes_that_cannot_be_stored_are_released_before_the_failure_is_reported(tmp_path: Path) -> None:
     news = threading.Event()
     workers = AssetWorkers(AssetStore(tmp_path, max_bytes=1), news.set)
     found: list[Result] = []
 
-    def until(kind: type[Result]) -> None:
+    def wait_for(kind: type[Result]) -> None:
         while not any(isinstance(one, kind) for one in found):
             assert news.wait(30.0)
             news.clear()
             found.extend(workers.poll_results())
 
     workers.look_up(ADDRESS, ())
-    until(AssetMissing)
-    workers.write(ADDRESS, memoryview(DATA))  # more than twice what the cache may hold
-    until(AssetFailed)
+    wait_for(AssetMissing)
+    workers.write(ADDRESS, memoryview(DATA))  # more than twice the cache limit
+    wait_for(AssetFailed)
     workers.close()
     assert [type(one) for one in found] == [AssetMissing, BytesStored, AssetFailed]
     assert found[1] == BytesStored(len(DATA))

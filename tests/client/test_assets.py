@@ -1,7 +1,8 @@
-"""Assets of a client at a real front: in order, over lost connections, out of the cache, and what goes wrong."""
+"""Assets of a client at a real front: order, lost connections, cache, and faults."""
 
 from __future__ import annotations
 
+import mmap
 import os
 import signal
 import threading
@@ -18,17 +19,18 @@ from iris_session.client.group import ClientGroup
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, AssetChunk, AssetRequest
 from iris_session.protocol.codec import decode_asset_request, encode_asset_header
 from iris_session.protocol.names import AssetRefusal
+from tests.assets.test_store import store_part
 from tests.client.harness import LiveSession
 from tests.front.asset_rig import noise, put
 
 MIB = 1 << 20
-#: More than may be on its way, so that it can be looked at in the middle.
+#: More than may be under way, so that a test can act in the middle.
 LARGE = 24 * MIB + 3
 DEADLINE_S = 60.0
 
 
 class Store:
-    """What the session has, by address."""
+    """The assets of the session by address."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -77,7 +79,7 @@ def until_done(client: Client, fetch: AssetFetch) -> None:
     assert client.wait_for(lambda _: fetch.done, DEADLINE_S), (fetch.bytes_done, fetch.bytes_total, fetch.pending)
 
 
-def test_everything_comes_and_a_second_time_nothing(store: Store, join: Callable[..., Client]) -> None:
+def test_everything_is_fetched_once_and_then_cached(store: Store, join: Callable[..., Client]) -> None:
     client = join()
     seen: list[int] = []
 
@@ -106,10 +108,10 @@ def test_everything_comes_and_a_second_time_nothing(store: Store, join: Callable
     assert report.bytes_sent == store.bytes
 
 
-def test_a_front_that_is_killed_costs_no_byte_twice(
+def test_killed_front_costs_no_byte_twice(
     store: Store, live: LiveSession, join: Callable[..., Client], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(asset_loading, "PATIENCE_NS", 10**18)  # the connection to control tells that it is gone
+    monkeypatch.setattr(asset_loading, "PATIENCE_NS", 10**18)  # the control connection notices the loss
     client = join()
     killed: list[int] = []
 
@@ -127,7 +129,7 @@ def test_a_front_that_is_killed_costs_no_byte_twice(
     assert fetch.bytes_received == store.bytes
 
 
-def test_a_client_that_comes_back_goes_on_where_it_was(store: Store, join: Callable[..., Client]) -> None:
+def test_reconnecting_client_resumes_its_downloads(store: Store, join: Callable[..., Client]) -> None:
     large = store.addresses[1]
     first = join()
     begun = first.assets.fetch([large])
@@ -141,7 +143,7 @@ def test_a_client_that_comes_back_goes_on_where_it_was(store: Store, join: Calla
     assert 0 < fetch.bytes_received <= len(store.data[large]) - 2 * MIB
 
 
-def test_what_will_not_come_says_why_and_the_rest_comes(store: Store, join: Callable[..., Client]) -> None:
+def test_failed_assets_have_a_reason_and_the_rest_arrives(store: Store, join: Callable[..., Client]) -> None:
     client = join()
     damaged, good = store.addresses[3], store.addresses[0]
     path = store.root / damaged[:2] / damaged
@@ -161,7 +163,7 @@ def test_what_will_not_come_says_why_and_the_rest_comes(store: Store, join: Call
         store.addresses[4]: "decode",
     }
     assert fetch.read(good) == store.data[good]
-    assert fetch.bytes_received == 2 * 700_000 + 2000 + 1000  # the damaged one was asked for once more, and only once
+    assert fetch.bytes_received == 2 * 700_000 + 2000 + 1000  # the damaged one was requested once more, and only once
     with pytest.raises(AssetError, match="twice"):
         fetch.read(damaged)
     with pytest.raises(AssetError, match="refused"):
@@ -176,8 +178,8 @@ def test_what_will_not_come_says_why_and_the_rest_comes(store: Store, join: Call
         client.assets.fetch([good])
 
 
-def test_several_at_once_by_thread_and_by_group(store: Store, join: Callable[..., Client]) -> None:
-    """One with a thread of its own, two in one loop, of which one shares the cache of the first."""
+def test_concurrent_clients_by_thread_and_by_group(store: Store, join: Callable[..., Client]) -> None:
+    """One with its own thread, two in one loop, one of which shares the cache of the first."""
     threaded, ann, bob = join("eve"), join("ann"), join("bob", "another")
     threaded.start()
     fetches = [client.assets.fetch(store.addresses) for client in (threaded, ann, bob)]
@@ -188,7 +190,7 @@ def test_several_at_once_by_thread_and_by_group(store: Store, join: Callable[...
         assert {address: fetch.read(address) for address in store.addresses} == store.data
 
 
-def test_a_session_without_assets_refuses_and_a_cache_that_cannot_be_used_says_so(
+def test_session_without_assets_refuses_and_an_unusable_cache_raises(
     store: Store, join: Callable[..., Client], tmp_path: Path
 ) -> None:
     client = join()
@@ -203,7 +205,7 @@ def test_a_session_without_assets_refuses_and_a_cache_that_cannot_be_used_says_s
     fetch.check()
 
 
-def test_what_is_cancelled_is_not_fetched_any_more_and_goes_on_later(store: Store, join: Callable[..., Client]) -> None:
+def test_cancelled_fetch_stops_and_resumes_later(store: Store, join: Callable[..., Client]) -> None:
     client = join()
     large, small = store.addresses[1], store.addresses[0]
     fetch = client.assets.fetch([large, small])
@@ -223,7 +225,7 @@ def test_what_is_cancelled_is_not_fetched_any_more_and_goes_on_later(store: Stor
     assert client.assets.malformed == 0
 
 
-def test_what_another_still_waits_for_is_not_cancelled_with_it(store: Store, join: Callable[..., Client]) -> None:
+def test_asset_of_another_fetch_is_not_cancelled(store: Store, join: Callable[..., Client]) -> None:
     client = join()
     large = store.addresses[1]
     fetch, other = client.assets.fetch([large]), client.assets.fetch([large])
@@ -234,7 +236,7 @@ def test_what_another_still_waits_for_is_not_cancelled_with_it(store: Store, joi
     assert other.bytes_received == len(store.data[large])
 
 
-def test_each_fetch_gets_what_its_own_function_makes_of_an_asset(store: Store, join: Callable[..., Client]) -> None:
+def test_each_fetch_gets_the_result_of_its_own_decode_function(store: Store, join: Callable[..., Client]) -> None:
     client = join()
     address = store.addresses[0]
 
@@ -260,9 +262,7 @@ def test_each_fetch_gets_what_its_own_function_makes_of_an_asset(store: Store, j
     assert [[error.reason for error in fetch.failed.values()] for fetch in fetches] == [[], [], ["decode"], []]
 
 
-def test_the_cache_is_not_exchanged_under_what_is_on_its_way(
-    store: Store, join: Callable[..., Client], tmp_path: Path
-) -> None:
+def test_cache_is_not_replaced_during_a_fetch(store: Store, join: Callable[..., Client], tmp_path: Path) -> None:
     client = join()
     fetch = client.assets.fetch(store.addresses)
     client.assets.cache = AssetStore(tmp_path / "another")
@@ -273,10 +273,10 @@ def test_the_cache_is_not_exchanged_under_what_is_on_its_way(
     assert {address: fetch.read(address) for address in store.addresses} == store.data
 
 
-# --- a session that means harm ---------------------------------------------------------------------------------------
+# --- hostile session -------------------------------------------------------------------------------------------------
 
 
-class Liar:
+class HostileSession:
     """Answers requests for assets in a thread: `answers(request)` makes the frames of each message."""
 
     def __init__(self, answers: Callable[[AssetRequest], list[list[bytes]]]) -> None:
@@ -309,11 +309,11 @@ def chunk(request: AssetRequest, total: int, data: bytes, **other: int) -> list[
 
 
 @pytest.fixture
-def turn_to(join: Callable[..., Client]) -> Iterator[Callable[..., tuple[Client, Liar]]]:
-    liars: list[Liar] = []
+def redirect_to(join: Callable[..., Client]) -> Iterator[Callable[..., tuple[Client, HostileSession]]]:
+    liars: list[HostileSession] = []
 
-    def make(answers: Callable[[AssetRequest], list[list[bytes]]], name: str = "ann") -> tuple[Client, Liar]:
-        liars.append(Liar(answers))
+    def make(answers: Callable[[AssetRequest], list[list[bytes]]], name: str = "ann") -> tuple[Client, HostileSession]:
+        liars.append(HostileSession(answers))
         client = join(name)
         welcome = client.connection.welcome
         assert welcome is not None
@@ -341,14 +341,14 @@ def turn_to(join: Callable[..., Client]) -> Iterator[Callable[..., tuple[Client,
     ],
     ids=["other bytes", "without end", "another size each time", "nothing", "for something else", "no protocol"],
 )
-def test_lies_end_with_a_reason_and_leave_nothing_under_a_name(
+def test_wrong_answers_end_with_a_reason_and_store_nothing(
     store: Store,
     join: Callable[..., Client],
-    turn_to: Callable[..., tuple[Client, Liar]],
+    redirect_to: Callable[..., tuple[Client, HostileSession]],
     answers: Callable[[AssetRequest], list[list[bytes]]],
     reason: str,
 ) -> None:
-    client, _ = turn_to(answers)
+    client, _ = redirect_to(answers)
     address = store.addresses[0]
     fetch = client.assets.fetch([address])
     until_done(client, fetch)
@@ -360,22 +360,41 @@ def test_lies_end_with_a_reason_and_leave_nothing_under_a_name(
     assert again.read(address) == store.data[address], "what the liar left in the cache does no harm"
 
 
-def test_a_frame_larger_than_any_is_not_taken_into_memory(
-    store: Store, turn_to: Callable[..., tuple[Client, Liar]]
+def test_oversized_frame_is_not_read_into_memory(
+    store: Store, redirect_to: Callable[..., tuple[Client, HostileSession]]
 ) -> None:
-    """libzmq ends the connection; the client asks again by another."""
+    """libzmq closes the connection; the client asks again by another."""
     address, data = store.addresses[0], store.data[store.addresses[0]]
-    told: list[int] = []
+    offsets: list[int] = []
 
     def answers(request: AssetRequest) -> list[list[bytes]]:
-        told.append(request.offset)
+        offsets.append(request.offset)
         large = bytes(MAX_ASSET_CHUNK_BYTES + 1)
-        return [chunk(request, len(large), large) if len(told) == 1 else chunk(request, len(data), data)]
+        return [chunk(request, len(large), large) if len(offsets) == 1 else chunk(request, len(data), data)]
 
-    client, _ = turn_to(answers)
+    client, _ = redirect_to(answers)
     fetch = client.assets.fetch([address])
-    assert client.wait_for(lambda _: len(told) == 1, DEADLINE_S)
+    assert client.wait_for(lambda _: len(offsets) == 1, DEADLINE_S)
     client.assets._close_link()  # as after `PATIENCE_NS`
     until_done(client, fetch)
-    assert told == [0, 0]
+    assert offsets == [0, 0]
     assert (fetch.read(address), fetch.bytes_received, client.assets.malformed) == (data, len(data), 0)
+
+
+LOST, WAITED = "0" * 64, "1" * 64
+
+
+def test_stored_asset_is_read_or_mapped_and_others_raise(tmp_path: Path) -> None:
+    cache = AssetStore(tmp_path)
+    here = store_part(cache, b"bytes of an asset")
+    fetch = AssetFetch(cache, [here, LOST, WAITED], {here: 17}, None, None)
+    fetch.on_found(here, 17, (), fetched=True)
+    fetch.fail(LOST, AssetError(LOST, "unknown", "nobody has it"))
+    assert fetch.read(here) == fetch.view(here) == b"bytes of an asset"
+    assert isinstance(fetch.view(here).obj, mmap.mmap), "a large one is not in memory twice"
+    for access in (fetch.read, fetch.view):
+        with pytest.raises(AssetError, match="nobody has it"):
+            access(LOST)
+        with pytest.raises(AssetError, match="not come yet"):
+            access(WAITED)
+    assert not fetch.done

@@ -12,11 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from zmq.auth import create_certificates
 
 from iris_session.client import (
     Client,
     ClientError,
+    CurveKeys,
     DeniedError,
+    IdentityError,
     NotConnectedError,
     RefusedError,
     RequestTimeoutError,
@@ -39,7 +42,7 @@ def has_state(client: Client) -> bool:
     return client.scene.state is not None
 
 
-def test_joins_and_sees_the_session(session: LiveSession, join: Join) -> None:
+def test_client_joins_and_sees_the_session(session: LiveSession, join: Join) -> None:
     ann = join(devices=(Device.CONTROLLER_RIGHT,))
     bob = join("bob", role="observer")
     assert ann.ready
@@ -50,7 +53,7 @@ def test_joins_and_sees_the_session(session: LiveSession, join: Join) -> None:
     assert ann.mirror.leases["left"].holder == ""
 
 
-def test_session_time_is_that_of_the_session_within_the_stated_error(session: LiveSession, join: Join) -> None:
+def test_session_time_is_within_the_stated_error(session: LiveSession, join: Join) -> None:
     ann = join()
     ann.wait_for(lambda c: c.counters()["control"]["received"] > 8)
     before = session.now_ns
@@ -60,7 +63,7 @@ def test_session_time_is_that_of_the_session_within_the_stated_error(session: Li
     assert ann.clock_error_ns() < 20_000_000
 
 
-def test_state_is_fresh_decoded_and_aged_where_it_is_handed_over(session: LiveSession, join: Join) -> None:
+def test_state_is_fresh_decoded_and_aged_at_delivery(session: LiveSession, join: Join) -> None:
     states: list[SceneState] = []
     ann = join(on_state=states.append)
     assert ann.wait_for(lambda c: len(states) >= 10)
@@ -68,7 +71,7 @@ def test_state_is_fresh_decoded_and_aged_where_it_is_handed_over(session: LiveSe
         assert state.poses.shape == (len(BODIES), 7)
         moved = 0.1 * state.header.session_time / 1e9
         assert np.abs(state.poses[:, 0] - moved).max() < 2e-3
-        assert -20_000_000 < state.age_ns < 2_000_000_000  # less than nothing only by the error of the clock
+        assert -20_000_000 < state.age_ns < 2_000_000_000  # negative only by the error of the clock
     assert all(a.header.state_seq < b.header.state_seq for a, b in itertools.pairwise(states))
     tip, body = ann.scene.tip_pose("left"), ann.scene.body_pose("left/hand")
     assert tip is not None
@@ -78,12 +81,12 @@ def test_state_is_fresh_decoded_and_aged_where_it_is_handed_over(session: LiveSe
     assert ann.scene.body_pose("nothing") is None
 
 
-def test_leases_pass_between_two_people(session: LiveSession, join: Join) -> None:
+def test_leases_pass_between_two_participants(session: LiveSession, join: Join) -> None:
     events: list[Event] = []
     ann, bob = join(on_event=events.append), join("bob")
     (lease,) = ann.acquire(["left"])
     assert lease.holder == ann.participant_id
-    assert ann.lease_version("left") == lease.lease_version  # at once, whether or not the event has come
+    assert ann.lease_version("left") == lease.lease_version  # at once, before or after the event
     with pytest.raises(DeniedError, match="ann") as denied:
         bob.acquire(["left", "right"])
     assert denied.value.denial.reason == DenialReason.HELD
@@ -119,20 +122,20 @@ def test_samples_engage_the_robot_and_estop_stops_it(session: LiveSession, join:
     assert ann.wait_for(lambda c: c.feedback["left"].hold_reason == HoldReason.ESTOP)
 
 
-def test_samples_name_epochs_versions_and_tokens(session: LiveSession, join: Join) -> None:
+def test_samples_have_epochs_versions_and_tokens(session: LiveSession, join: Join) -> None:
     ann = join(devices=(Device.HEAD, Device.CONTROLLER_RIGHT))
     first = ann.make_sample(Device.CONTROLLER_RIGHT, HERE, robots=["left"], clutch=True)
-    assert first.targets == ()  # not ours: presence only
+    assert first.targets == ()  # not our robot: presence only
     (lease,) = ann.acquire(["left"])
     second = ann.make_sample(Device.CONTROLLER_RIGHT, HERE, robots=["left", "right"], gripper=0.5)
     assert [(t.name, t.lease_version) for t in second.targets] == [("left", lease.lease_version)]
     assert second.seq == first.seq + 1
     assert second.scene_epoch == ann.mirror.scene_epoch
-    assert ann.new_tracking_frame() == 1
+    assert ann.alignment.report_tracking_jump() == 1
     assert ann.make_sample(Device.HEAD, HERE).tracking_epoch == 1
 
 
-def test_reset_changes_the_epoch_and_state_goes_on(session: LiveSession, join: Join) -> None:
+def test_reset_changes_the_epoch_and_state_continues(session: LiveSession, join: Join) -> None:
     ann = join()
     ann.wait_for(has_state)
     session.reset()
@@ -144,8 +147,8 @@ def test_reset_changes_the_epoch_and_state_goes_on(session: LiveSession, join: J
 def test_late_joiner_has_the_same_mirror(session: LiveSession, join: Join) -> None:
     early = join()
     early.acquire(["left"])
-    gone = join("gone")
-    gone.close()
+    leaver = join("gone")
+    leaver.close()
     early.acquire(objects=["hammer"]) if early.mirror.leases.get("hammer") else None
     late = join("late", role="observer")
     same = [False]
@@ -159,7 +162,7 @@ def test_late_joiner_has_the_same_mirror(session: LiveSession, join: Join) -> No
     assert early.mirror.mirror_hash() == late.mirror.mirror_hash()
 
 
-def test_killed_front_comes_back_with_everything_kept(session: LiveSession, join: Join) -> None:
+def test_killed_front_is_replaced_and_everything_kept(session: LiveSession, join: Join) -> None:
     ann = join()
     (lease,) = ann.acquire(["left"])
     participant = ann.participant_id
@@ -188,19 +191,19 @@ def test_restarted_process_resumes_with_its_identity_file(session: LiveSession, 
     killed.connection.phase = killed.connection.phase.CLOSED
 
 
-def test_a_second_client_with_the_same_identity_takes_over_for_good(
+def test_second_client_with_the_same_identity_takes_over_permanently(
     session: LiveSession, join: Join, tmp_path: Path
 ) -> None:
     first = join(identity=tmp_path / "identity")
     second = join(identity=tmp_path / "identity")
-    with pytest.raises(RefusedError, match="identity of its own"):
+    with pytest.raises(RefusedError, match="identity"):
         first.wait_for(lambda c: False, 5.0)
     assert second.participant_id == first.participant_id
     first.close()
     assert second.acquire(["left"])[0].holder == second.participant_id, "it took nothing back"
 
 
-def test_a_stalled_session_is_noticed_and_comes_back(session: LiveSession, join: Join) -> None:
+def test_stalled_session_is_detected_and_recovers(session: LiveSession, join: Join) -> None:
     ann = join()
     session.pause_steps(True)
     assert ann.wait_for(lambda c: c.connection.stalled)
@@ -211,12 +214,12 @@ def test_a_stalled_session_is_noticed_and_comes_back(session: LiveSession, join:
     assert ann.ready
 
 
-def test_after_standing_still_the_first_state_is_fresh_and_the_lease_is_kept(session: LiveSession, join: Join) -> None:
+def test_first_state_after_a_client_stall_is_fresh_and_the_lease_is_kept(session: LiveSession, join: Join) -> None:
     states: list[SceneState] = []
     ann = join(on_state=states.append)
     (lease,) = ann.acquire(["left"])
     ann.wait_for(has_state)
-    session.wait_lost(ann.participant_id)  # nobody polls meanwhile
+    session.wait_lost(ann.participant_id)  # no polls meanwhile
     states.clear()
     assert ann.wait_for(lambda c: len(states) >= 3)
     assert min(state.age_ns for state in states[:3]) < 1_000_000_000, "one may have lain in the socket all the while"
@@ -224,7 +227,7 @@ def test_after_standing_still_the_first_state_is_fresh_and_the_lease_is_kept(ses
     assert ann.counters()["control"]["reconnects"] == 1
 
 
-def test_bye_frees_at_once(session: LiveSession, join: Join) -> None:
+def test_bye_frees_robots_at_once(session: LiveSession, join: Join) -> None:
     ann, bob = join(), join("bob")
     ann.acquire(["left"])
     ann.close()
@@ -234,23 +237,23 @@ def test_bye_frees_at_once(session: LiveSession, join: Join) -> None:
         ann.connect()
 
 
-def test_refused_and_unreachable_say_what_to_do(session: LiveSession, join: Join) -> None:
+def test_refused_and_unreachable_sessions_raise_with_advice(session: LiveSession, join: Join) -> None:
     with pytest.raises(RefusedError, match="operator") as refused:
         join(role="chef")
     assert refused.value.code == DenialReason.UNKNOWN_VALUE
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        nobody = Client(f"127.0.0.1:{free.getsockname()[1]}")
+        unreachable = Client(f"127.0.0.1:{free.getsockname()[1]}")
         with pytest.raises(NotConnectedError, match="iris-session serve"):
-            nobody.connect(0.2)
-        nobody.close()
+            unreachable.connect(0.2)
+        unreachable.close()
     client = Client(session.address)
     with pytest.raises(NotConnectedError, match="connect"):
         client.request(Acquire(0))
     client.close()
 
 
-def test_a_thread_can_poll_instead(session: LiveSession, join: Join) -> None:
+def test_polling_in_a_thread(session: LiveSession, join: Join) -> None:
     with join() as ann:
         ann.start()
         with pytest.raises(ClientError, match="thread"):
@@ -261,12 +264,12 @@ def test_a_thread_can_poll_instead(session: LiveSession, join: Join) -> None:
         assert ann.wait_for(has_state)
         assert ann.send_sample(Device.HEAD, HERE)
         deadline = time.monotonic() + 30.0
-        while not session.kinds(Sample):
+        while not session.messages_of(Sample):
             assert time.monotonic() < deadline
             time.sleep(0.01)
 
 
-def test_a_callback_that_raises_ends_the_thread_and_everybody_is_told(
+def test_raising_callback_ends_the_thread_and_reaches_every_caller(
     session: LiveSession, join: Join, capfd: pytest.CaptureFixture[str]
 ) -> None:
     def fail(_: Event) -> None:
@@ -284,30 +287,30 @@ def test_a_callback_that_raises_ends_the_thread_and_everybody_is_told(
     with pytest.raises(NotConnectedError):
         ann.estop("nevertheless")
     deadline = time.monotonic() + 30.0
-    while not session.kinds(EStop):
+    while not session.messages_of(EStop):
         assert time.monotonic() < deadline
         time.sleep(0.01)
     assert capfd.readouterr().err.count("ZeroDivisionError: mine") == 1
 
 
-def test_a_stop_during_a_restart_of_the_front_arrives(session: LiveSession, join: Join) -> None:
+def test_estop_during_a_restart_of_the_front_arrives(session: LiveSession, join: Join) -> None:
     ann = join()
     os.kill(session.front.pid, signal.SIGKILL)
     assert ann.wait_for(lambda c: not c.ready)
-    ann.estop("while nobody listens")
+    ann.estop("while the front restarts")
     assert ann.wait_for(lambda c: c.ready and c.mirror.estop, 10.0)
-    assert ann.connection.pending_estop.message is None
+    assert ann.wait_for(lambda c: c.connection.pending_estop.message is None)
 
 
-def test_a_stop_into_a_connection_that_is_cut_arrives_after_it(session: LiveSession, join: Join) -> None:
+def test_estop_into_a_dead_connection_arrives_after_reconnect(session: LiveSession, join: Join) -> None:
     ann = join()
-    ann._sockets._close_control(linger_ms=0)  # the network is gone, and nobody has noticed
+    ann._sockets._close_control(linger_ms=0)  # the network is cut, and not detected yet
     ann.estop("into the void")
     ann.connection.handle_disconnect(time.monotonic_ns())
     assert ann.wait_for(lambda c: c.mirror.estop)
 
 
-def test_who_comes_back_reads_state_by_a_new_socket(session: LiveSession, join: Join) -> None:
+def test_reconnected_client_reads_state_from_a_new_socket(session: LiveSession, join: Join) -> None:
     ann = join()
     assert ann.wait_for(has_state)
     half_open = ann._sockets._state
@@ -317,14 +320,14 @@ def test_who_comes_back_reads_state_by_a_new_socket(session: LiveSession, join: 
     assert ann._sockets._state is not half_open
 
 
-def test_a_client_that_cannot_join_leaves_nothing_open(session: LiveSession) -> None:
+def test_client_that_cannot_join_closes_everything(session: LiveSession) -> None:
     chef = Client(session.address, role="chef")
     with pytest.raises(RefusedError), chef:
         pass
     assert chef.connection.phase is ConnectionPhase.CLOSED
 
 
-def test_presence_shows_only_who_is_here(session: LiveSession, join: Join) -> None:
+def test_presence_shows_connected_participants_only(session: LiveSession, join: Join) -> None:
     ann = join()
     ghost = PresenceItem("p99", "head", IDENTITY)
     ann.connection.stream._presence["p99", "head"] = ghost
@@ -332,12 +335,12 @@ def test_presence_shows_only_who_is_here(session: LiveSession, join: Join) -> No
     assert ann.scene.presence is not ann.scene.presence
 
 
-def test_closing_wakes_a_client_in_its_thread(session: LiveSession, join: Join) -> None:
+def test_close_wakes_the_client_thread(session: LiveSession, join: Join) -> None:
     ann = join()
     ann.start()
     ann.close()  # would not come back: an idle thread waits until its next heartbeat, and then again
-    assert ann._thread is not None
-    assert not ann._thread.is_alive()
+    assert ann._loop._thread is not None
+    assert not ann._loop._thread.is_alive()
 
 
 @pytest.mark.parametrize(
@@ -351,12 +354,46 @@ def test_closing_wakes_a_client_in_its_thread(session: LiveSession, join: Join) 
         ("[::1]", ("::1", 7721)),
     ],
 )
-def test_addresses(text: str, expected: tuple[str, int]) -> None:
+def test_addresses_are_parsed(text: str, expected: tuple[str, int]) -> None:
     address = Address.parse(text)
     assert (address.host, address.port) == expected
 
 
 @pytest.mark.parametrize("text", ["", ":7721", "host:", "host:x", "host:70000", "[]:1"])
-def test_bad_addresses_say_what_is_right(text: str) -> None:
+def test_invalid_addresses_are_rejected(text: str) -> None:
     with pytest.raises(ClientError, match="HOST:PORT"):
         Address.parse(text)
+
+
+def test_listed_keys_join_and_others_do_not(tmp_path: Path) -> None:
+    allowed = tmp_path / "clients"
+    allowed.mkdir()
+    server_public, server_secret = create_certificates(tmp_path, "server")
+    _, ann_secret = create_certificates(allowed, "ann")
+    _, eve_secret = create_certificates(tmp_path, "eve")
+    for secret in (server_secret, ann_secret, eve_secret):
+        Path(secret).chmod(0o600)
+    session = LiveSession(curve_secret_file=server_secret, curve_clients_dir=str(allowed))
+    try:
+        with Client(session.address, name="ann", curve=CurveKeys.from_files(server_public, ann_secret)) as ann:
+            assert ann.wait_for(lambda c: c.scene.state is not None)
+        eve = Client(session.address, name="eve", curve=CurveKeys.from_files(server_public, eve_secret))
+        plain = Client(session.address, name="plain")
+        for unlisted in (eve, plain):
+            with pytest.raises(NotConnectedError):
+                unlisted.connect(0.5)
+            unlisted.close()
+    finally:
+        session.close()
+
+
+def test_invalid_key_files_are_rejected(tmp_path: Path) -> None:
+    public, secret = create_certificates(tmp_path, "ann")
+    with pytest.raises(IdentityError, match=r"chmod 600 .*ann.key_secret"):
+        CurveKeys.from_files(public, secret)
+    Path(secret).chmod(0o600)
+    assert CurveKeys.from_files(public, secret).public == CurveKeys.from_files(public, secret).server_public
+    with pytest.raises(IdentityError, match="key_secret"):
+        CurveKeys.from_files(public, public)
+    with pytest.raises(IdentityError, match="cannot be used"):
+        CurveKeys.from_files(tmp_path / "missing.key", public)

@@ -1,4 +1,4 @@
-"""What bends, as a client sees it: told apart whatever it is called, and nothing that a session says is an error."""
+"""Deformables of a client: distinct keys whatever their names, and faults of a session that raise nothing."""
 
 from __future__ import annotations
 
@@ -25,33 +25,33 @@ from tests.scene.models import flexes
 DEADLINE_S = 60.0
 
 
-class Shared:
-    """A scene of three deformables, as changed by `change`, and a session that shares it."""
+class SharedScene:
+    """A scene of three deformables and sessions that share variants of it."""
 
     def __init__(self, folder: Path) -> None:
         self.store = AssetStore(folder)
         self.spec = parse_mujoco(flexes(), self.store).spec
 
-    def begin(self, parts: list[Deformable]) -> LiveSession:
-        address, assets = self.of(parts)
+    def start_session(self, parts: list[Deformable]) -> LiveSession:
+        address, assets = self.store_variant(parts)
         return LiveSession(asset_root=str(self.store.root), assets=assets, scene_hash=address)
 
-    def of(self, parts: Iterable[Deformable], name: str = "scene") -> tuple[str, tuple[str, ...]]:
-        """Address of a specification with these, and all that it needs."""
+    def store_variant(self, parts: Iterable[Deformable], name: str = "scene") -> tuple[str, tuple[str, ...]]:
+        """Return the address of a specification with these deformables, and the assets it needs."""
         spec: SceneSpec = msgspec.structs.replace(self.spec, deformables=tuple(parts), name=name)
         address = self.store.put(encode_scene(spec))
         return address, (address, *list_assets(spec))
 
-    def rest(self, part: Deformable) -> tuple[DeformableEncoder, np.ndarray]:
-        """Encoder of one, and its vertices at rest."""
+    def rest_state(self, part: Deformable) -> tuple[DeformableEncoder, np.ndarray]:
+        """Return the encoder of one deformable and its vertices at rest."""
         arrays = decode_arrays(self.store.get(part.address), ArrayKind.DEFORMABLE)
         topology = DeformableTopology.from_bytes(arrays["plan"].tobytes())
         return DeformableEncoder(topology, 0.0005), arrays["position"].astype(np.float64)
 
 
 @pytest.fixture
-def shared(tmp_path: Path) -> Shared:
-    return Shared(tmp_path / "store")
+def shared(tmp_path: Path) -> SharedScene:
+    return SharedScene(tmp_path / "store")
 
 
 @pytest.fixture
@@ -69,15 +69,15 @@ def watch(live: LiveSession, joined: list[Client], cache: Path) -> tuple[Client,
     return client.connect(DEADLINE_S), Deformables(client)
 
 
-def test_deformables_of_one_name_or_none_are_told_apart(shared: Shared, joined: list[Client], tmp_path: Path) -> None:
+def test_equal_or_empty_names_have_distinct_keys(shared: SharedScene, joined: list[Client], tmp_path: Path) -> None:
     names = ("", "rope", "rope")
     parts = [msgspec.structs.replace(p, name=n) for p, n in zip(shared.spec.deformables, names, strict=True)]
-    live = shared.begin(parts)
+    live = shared.start_session(parts)
     try:
         client, shapes = watch(live, joined, tmp_path / "cache")
-        rests = {part.stream: shared.rest(part) for part in parts}
+        rests = {part.stream: shared.rest_state(part) for part in parts}
 
-        def told(_: Client) -> bool:
+        def is_complete(_: Client) -> bool:
             for stream, (encoder, rest) in rests.items():
                 encoder.reset()
                 frames = encoder.encode(rest)
@@ -87,24 +87,24 @@ def test_deformables_of_one_name_or_none_are_told_apart(shared: Shared, joined: 
             assert not shapes.fault
             return len(shapes.vertices) == len(parts)
 
-        assert client.wait_for(told, DEADLINE_S), shapes.vertices.keys()
+        assert client.wait_for(is_complete, DEADLINE_S), shapes.vertices.keys()
         assert set(shapes.vertices) == {"flex-0", "flex-1", "flex-2"}
         assert [len(shapes.vertices[f"flex-{i}"]) for i in range(3)] >= [20, 6, 50]
     finally:
         live.close()
 
 
-def test_what_is_drawn_of_each_comes_with_it(shared: Shared, joined: list[Client], tmp_path: Path) -> None:
-    """Triangles and lines name rows of the vertices; those inside of a soft body are rows that nothing names."""
+def test_mesh_data_is_fetched_with_each_deformable(shared: SharedScene, joined: list[Client], tmp_path: Path) -> None:
+    """Triangles and lines name rows of the vertices; no triangle names the inner vertices of a soft body."""
     parts = shared.spec.deformables
-    live = shared.begin(list(parts))
+    live = shared.start_session(list(parts))
     try:
         client, shapes = watch(live, joined, tmp_path / "cache")
         assert client.wait_for(lambda _: (shapes.update(), shapes.scene_hash)[1] != "", DEADLINE_S), shapes.fault
         assert {name: mesh.look for name, mesh in shapes.meshes.items()} == {part.name: part for part in parts}
-        rests = {part.name: (part.stream, *shared.rest(part)) for part in parts}
+        rests = {part.name: (part.stream, *shared.rest_state(part)) for part in parts}
 
-        def told(_: Client) -> bool:
+        def is_complete(_: Client) -> bool:
             for stream, encoder, rest in rests.values():
                 encoder.reset()
                 frames = encoder.encode(rest)
@@ -113,7 +113,7 @@ def test_what_is_drawn_of_each_comes_with_it(shared: Shared, joined: list[Client
             shapes.update()
             return len(shapes.vertices) == len(parts)
 
-        assert client.wait_for(told, DEADLINE_S), shapes.fault
+        assert client.wait_for(is_complete, DEADLINE_S), shapes.fault
         cloth, rope, soft = (shapes.meshes[name] for name in ("cloth", "rope", "soft"))
         assert (cloth.faces.shape, cloth.edges.shape, rope.faces.shape, rope.edges.shape) == (
             (24, 3),
@@ -151,7 +151,7 @@ def test_what_is_drawn_of_each_comes_with_it(shared: Shared, joined: list[Client
     ],
     ids=["none", "beyond the vertices", "lines of a cloth", "uv of other triangles"],
 )
-def test_triangles_that_cannot_be_are_refused(tmp_path: Path, name: str, values: np.ndarray | None) -> None:
+def test_invalid_triangles_are_rejected(tmp_path: Path, name: str, values: np.ndarray | None) -> None:
     store = AssetStore(tmp_path)
     part = parse_mujoco(flexes(), store).spec.deformables[0]
     arrays = decode_arrays(store.get(part.address), ArrayKind.DEFORMABLE)
@@ -161,136 +161,136 @@ def test_triangles_that_cannot_be_are_refused(tmp_path: Path, name: str, values:
         _Mesh("cloth", part, memoryview(bad))
 
 
-class Play:
-    """A session whose deformables go up, and a client that looks at them."""
+class LiveDeformables:
+    """A session whose deformables rise, and a client that reads them."""
 
-    def __init__(self, shared: Shared, joined: list[Client], cache: Path) -> None:
+    def __init__(self, shared: SharedScene, joined: list[Client], cache: Path) -> None:
         self.parts = list(shared.spec.deformables)
-        self.live = shared.begin(self.parts)
-        self.client, self.shapes = watch(self.live, joined, cache)
+        self.session = shared.start_session(self.parts)
+        self.client, self.shapes = watch(self.session, joined, cache)
         self.epoch = 1
         self.faults: set[str] = set()
-        self._rests = {part.stream: shared.rest(part) for part in self.parts}
+        self._rests = {part.stream: shared.rest_state(part) for part in self.parts}
         self._height = 0.0
 
-    def look(self) -> list[str]:
-        """All go up by a millimetre, in the present epoch."""
+    def step(self) -> list[str]:
+        """Raise all deformables by a millimetre in the present epoch, and return those that moved in the client."""
         self._height += 0.001
         for stream, (encoder, rest) in self._rests.items():
             frames = encoder.encode(rest + np.array((0.0, 0.0, self._height)))
             assert frames is not None
-            self.live.front.publish_media(stream, frames, self.live.now_ns, self.epoch, MediaEncoding.DEFORMABLE)
+            self.session.front.publish_media(stream, frames, self.session.now_ns, self.epoch, MediaEncoding.DEFORMABLE)
         moved = self.shapes.update()
         self.faults.add(self.shapes.fault)
         return moved
 
-    def until(self, condition: Callable[[], bool]) -> set[str]:
-        """Looks until something is so. What has moved meanwhile."""
+    def step_until(self, condition: Callable[[], bool]) -> set[str]:
+        """Step until the condition holds; return what moved meanwhile."""
         moved: set[str] = set()
 
-        def so(_: Client) -> bool:
-            moved.update(self.look())
+        def check(_: Client) -> bool:
+            moved.update(self.step())
             return condition()
 
-        assert self.client.wait_for(so, DEADLINE_S), (self.shapes.fault, moved)
+        assert self.client.wait_for(check, DEADLINE_S), (self.shapes.fault, moved)
         return moved
 
-    def until_moved(self, names: set[str]) -> None:
+    def step_until_moved(self, names: set[str]) -> None:
         moved: set[str] = set()
 
-        def so(_: Client) -> bool:
-            moved.update(self.look())
+        def check(_: Client) -> bool:
+            moved.update(self.step())
             return moved >= names
 
-        assert self.client.wait_for(so, DEADLINE_S), (self.shapes.fault, moved)
+        assert self.client.wait_for(check, DEADLINE_S), (self.shapes.fault, moved)
 
 
 @pytest.fixture
-def play(shared: Shared, joined: list[Client], tmp_path: Path) -> Iterator[Play]:
-    play = Play(shared, joined, tmp_path / "cache")
-    yield play
-    play.live.close()
+def live(shared: SharedScene, joined: list[Client], tmp_path: Path) -> Iterator[LiveDeformables]:
+    live = LiveDeformables(shared, joined, tmp_path / "cache")
+    yield live
+    live.session.close()
 
 
-def test_after_a_patch_all_go_on_and_what_is_the_same_is_not_begun_anew(play: Play, shared: Shared) -> None:
-    first, second, third = deformable_keys(play.parts)
-    play.until_moved({first, second, third})
-    feeds = {part.stream: play.client.media.subscribe(part.stream) for part in play.parts}
-    kept = {mesh.key: mesh for mesh in play.shapes._meshes}
-    renamed = msgspec.structs.replace(play.parts[1], name="other")
-    recoloured = msgspec.structs.replace(play.parts[0], rgba=(0.5, 0.0, 1.0, 1.0))
-    address, assets = shared.of([recoloured, renamed], "patched")
-    seen_ns = dict(play.shapes.capture_ns)
-    play.live.show(address, assets)
+def test_patch_keeps_unchanged_deformables_subscribed(live: LiveDeformables, shared: SharedScene) -> None:
+    first, second, third = deformable_keys(live.parts)
+    live.step_until_moved({first, second, third})
+    feeds = {part.stream: live.client.media.subscribe(part.stream) for part in live.parts}
+    kept = {mesh.key: mesh for mesh in live.shapes._meshes}
+    renamed = msgspec.structs.replace(live.parts[1], name="other")
+    recoloured = msgspec.structs.replace(live.parts[0], rgba=(0.5, 0.0, 1.0, 1.0))
+    address, assets = shared.store_variant([recoloured, renamed], "patched")
+    seen_ns = dict(live.shapes.capture_ns)
+    live.session.change_scene(address, assets)
 
     def patched() -> bool:
-        here = play.shapes.scene_hash == address
-        assert play.shapes.vertices.keys() >= {first} if here else {first, second, third}
+        here = live.shapes.scene_hash == address
+        assert live.shapes.vertices.keys() >= {first} if here else {first, second, third}
         return here
 
-    play.until(patched)
-    assert play.shapes.capture_ns.keys() >= {first}
-    assert play.shapes.capture_ns[first] >= seen_ns[first]
-    assert not {second, third} & play.shapes.vertices.keys(), "they are gone"
-    play.until_moved({first, "other"})
-    assert [mesh is kept.get(mesh.key) for mesh in play.shapes._meshes] == [True, False]
-    assert {name: mesh.look for name, mesh in play.shapes.meshes.items()} == {first: recoloured, "other": renamed}
-    assert play.client.media.subscribe(play.parts[0].stream) is feeds[play.parts[0].stream]
-    assert play.client.media._feeds.keys() == {part.stream for part in play.parts[:2]}
-    assert play.faults == {""}
+    live.step_until(patched)
+    assert live.shapes.capture_ns.keys() >= {first}
+    assert live.shapes.capture_ns[first] >= seen_ns[first]
+    assert not {second, third} & live.shapes.vertices.keys(), "they are removed"
+    live.step_until_moved({first, "other"})
+    assert [mesh is kept.get(mesh.key) for mesh in live.shapes._meshes] == [True, False]
+    assert {name: mesh.look for name, mesh in live.shapes.meshes.items()} == {first: recoloured, "other": renamed}
+    assert live.client.media.subscribe(live.parts[0].stream) is feeds[live.parts[0].stream]
+    assert live.client.media._feeds.keys() == {part.stream for part in live.parts[:2]}
+    assert live.faults == {""}
 
 
-def test_while_a_patched_scene_does_not_come_all_go_on_and_it_is_taken_when_it_does(play: Play, shared: Shared) -> None:
-    names = set(deformable_keys(play.parts))
-    play.until_moved(names)
-    address, assets = shared.of(play.parts, "patched")
-    play.live.show(address, assets[1:])
-    play.until(lambda: "unknown_asset" in play.shapes.fault)
-    play.until_moved(names)
-    assert play.shapes.scene_hash != address
-    play.live.show(address, assets, "")
-    play.until(lambda: not play.shapes.fault)
-    assert play.shapes.scene_hash == address
-    assert play.shapes.vertices.keys() == names
+def test_deformables_continue_until_a_late_patch_arrives(live: LiveDeformables, shared: SharedScene) -> None:
+    names = set(deformable_keys(live.parts))
+    live.step_until_moved(names)
+    address, assets = shared.store_variant(live.parts, "patched")
+    live.session.change_scene(address, assets[1:])
+    live.step_until(lambda: "unknown_asset" in live.shapes.fault)
+    live.step_until_moved(names)
+    assert live.shapes.scene_hash != address
+    live.session.change_scene(address, assets, "")
+    live.step_until(lambda: not live.shapes.fault)
+    assert live.shapes.scene_hash == address
+    assert live.shapes.vertices.keys() == names
 
 
-def test_patches_that_come_faster_than_their_assets_stop_nothing(play: Play, shared: Shared) -> None:
-    names = set(deformable_keys(play.parts))
-    play.until_moved(names)
+def test_patches_faster_than_their_assets_interrupt_nothing(live: LiveDeformables, shared: SharedScene) -> None:
+    names = set(deformable_keys(live.parts))
+    live.step_until_moved(names)
     for number in range(5):  # none of them is served
         address = f"{number:064x}"
-        play.live.show(address, ())
-        play.until(lambda address=address: play.client.mirror.scene_hash == address)  # type: ignore[misc]
-        assert play.shapes.vertices.keys() == names
-    address, assets = shared.of(play.parts, "the last one")
-    play.live.show(address, assets)
-    play.until(lambda: play.shapes.scene_hash == address)
-    play.until_moved(names)
-    assert play.shapes.fault == ""
+        live.session.change_scene(address, ())
+        live.step_until(lambda address=address: live.client.mirror.scene_hash == address)  # type: ignore[misc]
+        assert live.shapes.vertices.keys() == names
+    address, assets = shared.store_variant(live.parts, "the last one")
+    live.session.change_scene(address, assets)
+    live.step_until(lambda: live.shapes.scene_hash == address)
+    live.step_until_moved(names)
+    assert live.shapes.fault == ""
 
 
-def test_of_another_scene_nothing_is_shown_before_it_is_known(play: Play, shared: Shared) -> None:
-    """Nor frames of the scene before, whatever comes first."""
-    first, second, third = deformable_keys(play.parts)
-    play.until_moved({first, second, third})
-    address, assets = shared.of(play.parts[:2], "another")
-    play.live.show(address, assets[1:], "new_scene")
-    play.until(lambda: play.client.mirror.synced and play.client.mirror.scene_epoch == 2)
-    play.until(lambda: "unknown_asset" in play.shapes.fault)
-    assert (play.shapes.vertices, play.shapes.capture_ns, play.shapes.meshes) == ({}, {}, {})
-    assert not play.client.media._feeds
-    play.live.show(address, assets, "")
-    play.until(lambda: play.shapes.scene_hash == address)
-    feed = play.client.media.subscribe(play.parts[0].stream)
+def test_new_scene_shows_nothing_before_it_is_loaded(live: LiveDeformables, shared: SharedScene) -> None:
+    """Nor frames of the previous scene, in any order of arrival."""
+    first, second, third = deformable_keys(live.parts)
+    live.step_until_moved({first, second, third})
+    address, assets = shared.store_variant(live.parts[:2], "another")
+    live.session.change_scene(address, assets[1:], "new_scene")
+    live.step_until(lambda: live.client.mirror.synced and live.client.mirror.scene_epoch == 2)
+    live.step_until(lambda: "unknown_asset" in live.shapes.fault)
+    assert (live.shapes.vertices, live.shapes.capture_ns, live.shapes.meshes) == ({}, {}, {})
+    assert not live.client.media._feeds
+    live.session.change_scene(address, assets, "")
+    live.step_until(lambda: live.shapes.scene_hash == address)
+    feed = live.client.media.subscribe(live.parts[0].stream)
     had = feed.received
-    play.until(lambda: feed.received > had + 5)
-    assert play.shapes.vertices == {}, "all that came was of the epoch before"
-    play.epoch = 2
-    play.until_moved({first, second})
-    assert play.shapes.fault == ""
+    live.step_until(lambda: feed.received > had + 5)
+    assert live.shapes.vertices == {}, "all that came was of the epoch before"
+    live.epoch = 2
+    live.step_until_moved({first, second})
+    assert live.shapes.fault == ""
 
 
-def test_names_that_are_names_stay() -> None:
+def test_unique_names_are_kept_as_keys() -> None:
     def part(name: str, stream: str) -> Deformable:
         return Deformable(name, 2, 0, 1, 1, 0.0, False, -1, (1.0, 1.0, 1.0, 1.0), stream, "0" * 64, 1)
 
@@ -307,14 +307,14 @@ def test_names_that_are_names_stay() -> None:
     [np.zeros(3, np.float32), np.zeros(3, np.uint32), np.full(1000, 2**31, np.uint32)],
     ids=["fractions", "another length", "too large"],
 )
-def test_numbers_of_vertices_that_cannot_be_are_a_fault(
-    shared: Shared, joined: list[Client], tmp_path: Path, numbers: np.ndarray
+def test_invalid_vertex_counts_are_a_fault(
+    shared: SharedScene, joined: list[Client], tmp_path: Path, numbers: np.ndarray
 ) -> None:
     good = shared.spec.deformables[0]
     arrays = decode_arrays(shared.store.get(good.address), ArrayKind.DEFORMABLE)
     kept = [StoredArray(name, values) for name, values in arrays.items() if name != "vertex"]
     bad = encode_arrays(ArrayKind.DEFORMABLE, [*kept, StoredArray("vertex", numbers[: max(3, good.vertices)])])
-    live = shared.begin([good, msgspec.structs.replace(good, address=shared.store.put(bad), bytes=len(bad))])
+    live = shared.start_session([good, msgspec.structs.replace(good, address=shared.store.put(bad), bytes=len(bad))])
     try:
         client, shapes = watch(live, joined, tmp_path / "cache")
         assert client.wait_for(lambda _: (shapes.update(), bool(shapes.fault))[1], DEADLINE_S)
@@ -324,8 +324,8 @@ def test_numbers_of_vertices_that_cannot_be_are_a_fault(
         live.close()
 
 
-def test_a_small_asset_that_becomes_large_is_refused(tmp_path: Path) -> None:
-    """A few kilobytes of nothing, which `poll` would unpack for a second and keep."""
+def test_small_asset_that_decompresses_large_is_rejected(tmp_path: Path) -> None:
+    """A few kilobytes of zeros, which `poll` would unpack for a second and keep."""
     store = AssetStore(tmp_path)
     part = parse_mujoco(flexes(), store).spec.deformables[0]
     arrays = decode_arrays(store.get(part.address), ArrayKind.DEFORMABLE)
@@ -336,8 +336,8 @@ def test_a_small_asset_that_becomes_large_is_refused(tmp_path: Path) -> None:
         _Mesh("a", part, memoryview(bomb))
 
 
-def test_another_session_shows_nothing_of_the_one_before() -> None:
-    """A server that was started anew at the same address: both count their scenes from 1."""
+def test_new_session_shows_nothing_of_the_previous_one() -> None:
+    """A server restarted at the same address: both count their scenes from 1."""
     client = Client("127.0.0.1:1", role="observer", name="screen")
     shapes = Deformables(client)
     shapes._follow("one", ("a", 1))
@@ -349,27 +349,27 @@ def test_another_session_shows_nothing_of_the_one_before() -> None:
     client.close()
 
 
-def test_what_stays_of_two_on_one_stream_goes_on(tmp_path: Path) -> None:
+def test_remaining_deformable_of_a_shared_stream_continues(tmp_path: Path) -> None:
     store = AssetStore(tmp_path)
     part = parse_mujoco(flexes(), store).spec.deformables[0]
     client = Client("127.0.0.1:1", role="observer", name="screen")
     shapes = Deformables(client)
     both = [_Mesh(key, part, memoryview(store.get(part.address))) for key in ("one", "two")]
-    shapes._use(both, "1" * 64)
+    shapes._show_meshes(both, "1" * 64)
     feed = client.media.subscribe(part.stream)
-    shapes._use(both[:1], "2" * 64)
+    shapes._show_meshes(both[:1], "2" * 64)
     assert client.media._feeds == {part.stream: feed}
     assert both[0].feed is feed
-    shapes._use([], "3" * 64)
+    shapes._show_meshes([], "3" * 64)
     assert client.media._feeds == {}
     client.close()
 
 
-def test_a_scene_that_comes_back_is_shown_and_one_that_failed_is_asked_for_after_a_pause(tmp_path: Path) -> None:
+def test_repeated_scene_is_shown_and_a_failed_one_is_retried_after_a_pause(tmp_path: Path) -> None:
     client = Client("127.0.0.1:1", role="observer", name="screen")
     client.assets.cache = AssetStore(tmp_path)
     shapes, (one, two, three) = Deformables(client), ("1" * 64, "2" * 64, "3" * 64)
-    shapes._use([], one)
+    shapes._show_meshes([], one)
     shapes._follow(one, ("a", 1))
     shapes._follow(two, ("a", 2))
     assert shapes._parked

@@ -1,4 +1,4 @@
-"""From an address, a name or a code to a session that lets us in: against a real front with keys of its own."""
+"""From an address, a name or a code to a session that admits the client: against a real front with its own keys."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import msgspec
 import pytest
 import zmq
 
+from iris_session.cli.main import main
 from iris_session.client import Client, ClientError, NotConnectedError, RefusedError, SessionNameError, TrustError
 from iris_session.client import endpoint_resolver as meeting_module
 from iris_session.client import endpoint_resolver as resolver_module
@@ -28,7 +29,7 @@ from tests.client.harness import LiveSession
 
 
 class Lab:
-    """A session with keys, and the home of keys of somebody new."""
+    """A session with keys, and the key home of a new user."""
 
     def __init__(self, folder: Path) -> None:
         self.server = KeyHome(folder / "server")
@@ -63,7 +64,7 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Lab]:
     lab.session.close()
 
 
-def test_a_code_is_needed_once(lab: Lab) -> None:
+def test_code_is_needed_once(lab: Lab) -> None:
     with pytest.raises(RefusedError, match="iris-session pair") as refused:
         lab.join(lab.address)
     assert refused.value.code == RefusalCode.UNPAIRED
@@ -73,10 +74,10 @@ def test_a_code_is_needed_once(lab: Lab) -> None:
     assert (stored.address, stored.session, stored.key) == (lab.address, lab.name, lab.server.load_server_key().public)
     assert [entry.key for entry in lab.server.clients.read().values()] == [lab.mine.load_identity().public]
     lab.join(lab.address).close()
-    lab.join(lab.address, join_code=code).close()  # the same command again: its code is not needed any more
+    lab.join(lab.address, join_code=code).close()  # the same command again: its code is ignored now
 
 
-def test_a_uri_has_all_of_it_and_a_name_finds_it(lab: Lab) -> None:
+def test_uri_is_complete_and_a_name_resolves(lab: Lab) -> None:
     host = Address.parse(lab.address)
     lab.join(pairing_uri(host.host, host.port, lab.server.load_server_key().public, lab.code(), lab.name)).close()
     client = lab.join(session=lab.name)
@@ -84,7 +85,7 @@ def test_a_uri_has_all_of_it_and_a_name_finds_it(lab: Lab) -> None:
     client.close()
 
 
-def test_a_key_that_was_taken_off_the_list_pairs_again_with_a_new_code_only(lab: Lab) -> None:
+def test_revoked_key_pairs_again_with_a_new_code_only(lab: Lab) -> None:
     lab.join(lab.address, join_code=lab.code()).close()
     lab.server.clients.revoke_key(lab.mine.load_identity().fingerprint)
     with pytest.raises(RefusedError) as refused:
@@ -93,17 +94,31 @@ def test_a_key_that_was_taken_off_the_list_pairs_again_with_a_new_code_only(lab:
     lab.join(lab.address, join_code=lab.code()).close()
 
 
-def test_a_wrong_code_stores_nothing(lab: Lab) -> None:
+@pytest.mark.parametrize("form", ["code", "uri"])
+def test_emulated_headsets_pair_again_after_a_revocation(
+    lab: Lab, form: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lab.join(lab.address, join_code=lab.code()).close()
+    lab.server.clients.revoke_key(lab.mine.load_identity().fingerprint)
+    host = Address.parse(lab.address)
+    uri = pairing_uri(host.host, host.port, lab.server.load_server_key().public, lab.code(), lab.name)
+    where = [lab.address, "--code", lab.code()] if form == "code" else [uri]
+    options = ["--behaviour", "observer", "--count", "2", "--seconds", "5", "--join-timeout", "10"]
+    assert main(["emulate", *where, *options]) == 0, capsys.readouterr()
+    assert [one.key for one in lab.server.clients.read().values()] == [lab.mine.load_identity().public]
+
+
+def test_wrong_code_stores_nothing(lab: Lab) -> None:
     lab.code()
     with pytest.raises(RefusedError) as refused:
         lab.join(lab.address, join_code="0000-0000-0000")
     assert refused.value.code == RefusalCode.CODE
     assert lab.mine.known_servers.read() == []
-    with pytest.raises(ClientError, match="not a join code"):
+    with pytest.raises(ClientError, match="join code"):
         Client(lab.address, join_code="ABC")
 
 
-def test_another_key_than_the_stored_one_is_an_error(lab: Lab) -> None:
+def test_changed_server_key_is_an_error(lab: Lab) -> None:
     other = KeyPair.generate().public
     lab.mine.known_servers.pin(lab.address, lab.name, other)
     for options in ({}, {"join_code": lab.code()}):
@@ -114,18 +129,18 @@ def test_another_key_than_the_stored_one_is_an_error(lab: Lab) -> None:
     assert [one.key for one in lab.mine.known_servers.read()] == [other]
     lab.mine.known_servers.remove(lab.address)
     host = Address.parse(lab.address)
-    with pytest.raises(TrustError, match="known with the key"):
+    with pytest.raises(TrustError, match="with the key"):
         lab.join(pairing_uri(host.host, host.port, other, lab.code()))
 
 
-def test_an_impostor_with_a_known_name_needs_a_code(lab: Lab) -> None:
+def test_unknown_key_under_a_known_name_needs_a_code(lab: Lab) -> None:
     lab.mine.known_servers.pin("10.0.0.7:7721", lab.name, KeyPair.generate().public)
     with pytest.raises(TrustError, match="another key"):
         lab.join(session=lab.name)
     lab.join(session=lab.name, join_code=lab.code()).close()
 
 
-def test_two_sessions_of_one_name_are_told_by_address(lab: Lab) -> None:
+def test_two_sessions_of_one_name_need_an_address(lab: Lab) -> None:
     twin = LiveSession(session_name=lab.name, session_id=f"twin of {lab.name}", beacon_port=DISCOVERY_PORT)
     try:
         with pytest.raises(SessionNameError) as error:
@@ -136,8 +151,8 @@ def test_two_sessions_of_one_name_are_told_by_address(lab: Lab) -> None:
         twin.close()
 
 
-def test_a_name_that_nobody_has_lists_those_that_were_heard(lab: Lab) -> None:
-    with pytest.raises(NotConnectedError, match=rf"'no-such' was not heard.*{lab.name} \({lab.address}\)"):
+def test_unknown_name_lists_the_sessions_heard(lab: Lab) -> None:
+    with pytest.raises(NotConnectedError, match=rf"'no-such'.*{lab.name} \({lab.address}\)"):
         resolve_blocking(parse_connect_request("", "no-such", None, ""), 0.6)
     client = Client(session="no-such")
     with pytest.raises(NotConnectedError, match="was not heard"):
@@ -148,8 +163,8 @@ def test_a_name_that_nobody_has_lists_those_that_were_heard(lab: Lab) -> None:
 Ask = Callable[[str, int, float], Generator[None, None, Introduction]]
 
 
-def introduced_as(change: Callable[[Introduction], Introduction]) -> Ask:
-    """`ask_introduction` with another answer: somebody else on the port below the control port."""
+def introduce_as(change: Callable[[Introduction], Introduction]) -> Ask:
+    """Return an `ask_introduction` with another answer, as of another program below the control port."""
 
     def ask(host: str, port: int, timeout_s: float) -> Generator[None, None, Introduction]:
         return change((yield from request_introduction(host, port, timeout_s)))
@@ -157,31 +172,31 @@ def introduced_as(change: Callable[[Introduction], Introduction]) -> Ask:
     return ask
 
 
-def test_who_lets_us_in_must_be_who_introduced_himself(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_admitting_session_must_be_the_introduced_one(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     lab.join(lab.address, join_code=lab.code()).close()
 
-    def other_id(said: Introduction) -> Introduction:
-        return msgspec.structs.replace(said, beacon=msgspec.structs.replace(said.beacon, session_id="other"))
+    def other_id(message: Introduction) -> Introduction:
+        return msgspec.structs.replace(message, beacon=msgspec.structs.replace(message.beacon, session_id="other"))
 
-    monkeypatch.setattr(meeting_module, "request_introduction", introduced_as(other_id))
-    with pytest.raises(SessionNameError, match="where another introduced itself"):
+    monkeypatch.setattr(meeting_module, "request_introduction", introduce_as(other_id))
+    with pytest.raises(SessionNameError, match="another introduced itself"):
         lab.join(lab.address)
     with pytest.raises(SessionNameError, match="heard there"):
         lab.join(session=lab.name)
 
 
-def test_the_introduction_of_a_neighbouring_port_is_not_taken(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_introduction_for_another_port_is_ignored(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     lab.join(lab.address, join_code=lab.code()).close()
 
-    def other_port(said: Introduction) -> Introduction:
-        beacon = msgspec.structs.replace(said.beacon, control=said.beacon.control + 1, session_id="other")
+    def other_port(message: Introduction) -> Introduction:
+        beacon = msgspec.structs.replace(message.beacon, control=message.beacon.control + 1, session_id="other")
         return Introduction(beacon, KeyPair.generate().public)
 
-    monkeypatch.setattr(meeting_module, "request_introduction", introduced_as(other_port))
+    monkeypatch.setattr(meeting_module, "request_introduction", introduce_as(other_port))
     lab.join(lab.address).close()  # by the stored key
 
 
-def test_the_session_must_prove_the_code_too(tmp_path: Path) -> None:
+def test_session_must_prove_the_code_too(tmp_path: Path) -> None:
     server, own = KeyPair.generate(), KeyPair.generate()
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     impostor = context.socket(zmq.ROUTER)
@@ -196,14 +211,14 @@ def test_the_session_must_prove_the_code_too(tmp_path: Path) -> None:
     thread = threading.Thread(target=say_yes)
     thread.start()
     steps = pair_key(Address("127.0.0.1", port), server.public, own, "7KQ2-M4XD-9PTR", "ann")
-    with pytest.raises(TrustError, match="does not know the join code"):
+    with pytest.raises(TrustError, match="join code"):
         deque(steps, maxlen=0)
     thread.join()
     context.destroy(linger=0)
 
 
-def test_a_session_where_many_pair_at_once_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As when a class puts on its headsets: nobody has to type the code again."""
+def test_busy_pairing_is_retried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As when a class puts on its headsets: the code need not be typed again."""
     monkeypatch.setattr(resolver_module, "PAIR_RETRY_S", 0.01)
     monkeypatch.setattr(resolver_module, "ANSWER_S", 1.0)
     monkeypatch.setattr(pairing, "ITERATIONS", 1)
@@ -218,11 +233,11 @@ def test_a_session_where_many_pair_at_once_is_asked_again(monkeypatch: pytest.Mo
     asked: list[bytes] = []
 
     def answer() -> None:
-        for said in (busy, None, busy, yes):
+        for message in (busy, None, busy, yes):
             route, request = session.recv_multipart()
             asked.append(request)
-            if said is not None:
-                session.send_multipart([route, encode_server(ServerEnvelope(1, 0, said))])
+            if message is not None:
+                session.send_multipart([route, encode_server(ServerEnvelope(1, 0, message))])
 
     thread = threading.Thread(target=answer, daemon=True)
     thread.start()
@@ -233,7 +248,7 @@ def test_a_session_where_many_pair_at_once_is_asked_again(monkeypatch: pytest.Mo
     context.destroy(linger=0)
 
 
-def test_a_session_of_this_machine_needs_no_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_local_session_needs_no_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("IRIS_HOME", str(tmp_path / "mine"))
     plain = LiveSession()
     try:
@@ -244,7 +259,7 @@ def test_a_session_of_this_machine_needs_no_keys(tmp_path: Path, monkeypatch: py
     assert not (tmp_path / "mine").exists()
 
 
-def test_a_client_may_come_before_its_session(lab: Lab) -> None:
+def test_client_may_start_before_its_session(lab: Lab) -> None:
     lab.join(lab.address, join_code=lab.code()).close()
     port = Address.parse(lab.address).port
     lab.session.close()
@@ -261,6 +276,6 @@ def test_a_client_may_come_before_its_session(lab: Lab) -> None:
         client.close()
 
 
-def test_what_does_not_go_together_is_told() -> None:
+def test_contradicting_arguments_are_rejected() -> None:
     with pytest.raises(ClientError, match="not both"):
         Client("127.0.0.1:1", session="lab")

@@ -1,4 +1,4 @@
-"""The scene as arrays, from a real front: whole, within a budget, replaced meanwhile, or not there."""
+"""The scene as arrays from a real front: complete, within a budget, replaced meanwhile, or missing."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from iris_session.scene import AssetStore
 from iris_session.scene.budget import Budget
 from iris_session.scene.mujoco_scene import parse_mujoco
 from tests.client.harness import LiveSession
-from tests.client.test_assets import Liar
+from tests.client.test_assets import HostileSession
 
 pytestmark = pytest.mark.e2e
 
@@ -50,7 +50,7 @@ def store(tmp_path: Path) -> AssetStore:
 
 @pytest.fixture
 def sessions() -> list[LiveSession]:
-    """Those that were begun."""
+    """Sessions started by the test."""
     return []
 
 
@@ -72,7 +72,7 @@ def join(tmp_path: Path, store: AssetStore, sessions: list[LiveSession]) -> Iter
         one.close()
 
 
-def test_everything_or_what_a_budget_allows(store: AssetStore, join: Callable[..., Client]) -> None:
+def test_scene_is_complete_or_within_a_budget(store: AssetStore, join: Callable[..., Client]) -> None:
     parsed = parse_mujoco(mujoco.MjModel.from_xml_string(SCENE), store)
     client = join(parsed.scene_hash, *parsed.addresses)
     whole = fetch_scene(client)
@@ -85,7 +85,7 @@ def test_everything_or_what_a_budget_allows(store: AssetStore, join: Callable[..
     assert len(coarse.hidden) == 1
 
 
-def test_what_cannot_be_had_is_said(
+def test_unavailable_scenes_raise_with_reason(
     store: AssetStore, join: Callable[..., Client], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def copied(*_: object) -> bytes:
@@ -99,9 +99,9 @@ def test_what_cannot_be_had_is_said(
     parsed = parse_mujoco(mujoco.MjModel.from_xml_string(SCENE), store)
     with pytest.raises(AssetError):
         fetch_scene(join("0" * 64, *parsed.addresses))
-    for data, says in ((b"no scene", "the scene cannot be read"), (bytes(MAX_SCENE_BYTES + 1), "at most")):
+    for data, reason in ((b"no scene", "the scene cannot be read"), (bytes(MAX_SCENE_BYTES + 1), "at most")):
         address = store.put(data)
-        with pytest.raises(ClientError, match=says):
+        with pytest.raises(ClientError, match=reason):
             fetch_scene(join(address, address))
     lonely = store.put(encode_scene(parsed.spec))
     part = fetch_scene(join(lonely, lonely))
@@ -109,7 +109,7 @@ def test_what_cannot_be_had_is_said(
     assert len(part.failed) == 2, "the session does not offer them"
 
 
-def test_a_scene_that_is_refused_is_asked_for_again_and_one_that_stays_refused_is_an_error(
+def test_refused_scene_is_retried_and_permanent_refusal_raises(
     store: AssetStore, join: Callable[..., Client], sessions: list[LiveSession], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     parsed = parse_mujoco(mujoco.MjModel.from_xml_string(SCENE), store)
@@ -120,18 +120,18 @@ def test_a_scene_that_is_refused_is_asked_for_again_and_one_that_stays_refused_i
         fetching = other.submit(fetch_scene, client, timeout_s=DEADLINE_S)
         while live.front.link.status.drops.get(f"assets_{AssetRefusal.UNKNOWN}", 0) < 2 and not fetching.done():
             time.sleep(0.01)
-        live.show(parsed.scene_hash, parsed.addresses, "")
+        live.change_scene(parsed.scene_hash, parsed.addresses, "")
         assert fetching.result().spec == parsed.spec
 
     monkeypatch.setattr(fetched_scene, "REFUSED_S", 0.2)
-    live.show("0" * 64, parsed.addresses)
+    live.change_scene("0" * 64, parsed.addresses)
     assert client.wait_for(lambda c: c.mirror.scene_hash == "0" * 64, DEADLINE_S)
-    with pytest.raises(AssetError) as told:
+    with pytest.raises(AssetError) as raised:
         fetch_scene(client)
-    assert (told.value.address, told.value.reason) == ("0" * 64, AssetRefusal.UNKNOWN)
+    assert (raised.value.address, raised.value.reason) == ("0" * 64, AssetRefusal.UNKNOWN)
 
 
-def test_a_scene_that_is_replaced_meanwhile_is_left_for_the_newest_which_gets_what_is_new(
+def test_replaced_scene_is_abandoned_for_the_newest(
     store: AssetStore,
     join: Callable[..., Client],
     sessions: list[LiveSession],
@@ -144,18 +144,18 @@ def test_a_scene_that_is_replaced_meanwhile_is_left_for_the_newest_which_gets_wh
     fetches: list[AssetFetch] = []
     wait = fetched_scene._wait
 
-    def replaced_meanwhile(client: Client, fetch: AssetFetch, until: float) -> AssetFetch:
+    def replace_meanwhile(client: Client, fetch: AssetFetch, until: float) -> AssetFetch:
         fetches.append(fetch)
         if fetch.addresses == (refused,):
-            sessions[0].show(newest, (newest, *parsed.addresses))
+            sessions[0].change_scene(newest, (newest, *parsed.addresses))
             assert client.wait_for(lambda c: c.mirror.scene_hash == newest, DEADLINE_S)
         result = wait(client, fetch, until)
-        if len(fetches) == 2:  # the meshes are here
-            sessions[0].show(refused, parsed.addresses)
+        if len(fetches) == 2:  # the meshes are stored
+            sessions[0].change_scene(refused, parsed.addresses)
             assert client.wait_for(lambda c: c.mirror.scene_hash == refused, DEADLINE_S)
         return result
 
-    monkeypatch.setattr(fetched_scene, "_wait", replaced_meanwhile)
+    monkeypatch.setattr(fetched_scene, "_wait", replace_meanwhile)
     scene = fetch_scene(client, timeout_s=DEADLINE_S)
     assert (scene.spec, scene.scene_hash) == (plain, newest)
     assert (scene.meshes.keys(), scene.textures.keys()) == ({0}, {0})
@@ -165,7 +165,7 @@ def test_a_scene_that_is_replaced_meanwhile_is_left_for_the_newest_which_gets_wh
 
 
 @pytest.mark.parametrize("cause", ["patch", "new_scene"])
-def test_a_scene_that_is_patched_without_end_comes_and_one_that_is_replaced_does_not(
+def test_endlessly_patched_scene_arrives_and_endlessly_replaced_one_does_not(
     store: AssetStore,
     join: Callable[..., Client],
     sessions: list[LiveSession],
@@ -174,19 +174,19 @@ def test_a_scene_that_is_patched_without_end_comes_and_one_that_is_replaced_does
 ) -> None:
     parsed = parse_mujoco(mujoco.MjModel.from_xml_string(SCENE), store)
     client = join(parsed.scene_hash, *parsed.addresses)
-    looks = [store.put(encode_scene(msgspec.structs.replace(parsed.spec, name=str(n)))) for n in range(20)]
+    variants = [store.put(encode_scene(msgspec.structs.replace(parsed.spec, name=str(n)))) for n in range(20)]
     shown = [parsed.scene_hash]
     wait = fetched_scene._wait
 
-    def replaced_meanwhile(client: Client, fetch: AssetFetch, until: float) -> AssetFetch:
+    def replace_meanwhile(client: Client, fetch: AssetFetch, until: float) -> AssetFetch:
         result = wait(client, fetch, until)
-        if fetch.addresses == (shown[-1],) and len(shown) < len(looks):
-            shown.append(looks[len(shown)])
-            sessions[0].show(shown[-1], (shown[-1], *parsed.addresses), cause)
+        if fetch.addresses == (shown[-1],) and len(shown) < len(variants):
+            shown.append(variants[len(shown)])
+            sessions[0].change_scene(shown[-1], (shown[-1], *parsed.addresses), cause)
             assert client.wait_for(lambda c: c.mirror.synced and c.mirror.scene_hash == shown[-1], DEADLINE_S)
         return result
 
-    monkeypatch.setattr(fetched_scene, "_wait", replaced_meanwhile)
+    monkeypatch.setattr(fetched_scene, "_wait", replace_meanwhile)
     monkeypatch.setattr(fetched_scene, "CATCH_UP_S", 0.0)
     scene = fetch_scene(client, timeout_s=DEADLINE_S)
     assert scene.meshes.keys() == {0}
@@ -194,29 +194,29 @@ def test_a_scene_that_is_patched_without_end_comes_and_one_that_is_replaced_does
         assert len(shown) == 3, "what is here is returned after a while"
         assert scene.scene_hash == shown[1]
     else:
-        assert scene.scene_hash == shown[-1] == looks[-1], "of another scene nothing is of use"
+        assert scene.scene_hash == shown[-1] == variants[-1], "of another scene nothing is of use"
 
 
-def test_what_did_not_come_in_time_is_not_fetched_any_more(join: Callable[..., Client]) -> None:
+def test_late_assets_are_not_fetched_after_the_timeout(join: Callable[..., Client]) -> None:
     client = join("1" * 64)
     fetch = client.assets.fetch(["2" * 64])
-    with pytest.raises(NotConnectedError, match="has not come in time"):
+    with pytest.raises(NotConnectedError, match="in time"):
         fetched_scene._wait(client, fetch, time.monotonic() - 1.0)
     assert fetch.failed["2" * 64].reason == "cancelled"
 
 
-def test_who_is_put_off_all_the_time_is_told_why(join: Callable[..., Client]) -> None:
-    def put_off(request: AssetRequest) -> list[list[bytes]]:
+def test_permanently_busy_session_is_named_as_the_reason(join: Callable[..., Client]) -> None:
+    def refuse_busy(request: AssetRequest) -> list[list[bytes]]:
         refused = AssetRefused(1, request.request_id, request.address, AssetRefusal.NOT_ALLOWED, "join first")
         return [[encode_asset_header(refused)]]
 
-    client, session = join("1" * 64), Liar(put_off)
+    client, session = join("1" * 64), HostileSession(refuse_busy)
     try:
         welcome = client.connection.welcome
         assert welcome is not None
         endpoints = msgspec.structs.replace(welcome.endpoints, assets=session.port)
         client.connection.welcome = msgspec.structs.replace(welcome, endpoints=endpoints)
-        with pytest.raises(NotConnectedError, match="MB are here; the session says not_allowed: join first"):
+        with pytest.raises(NotConnectedError, match="not_allowed"):
             fetch_scene(client, timeout_s=2.0)
     finally:
         session.close()

@@ -1,4 +1,4 @@
-"""Waiting for several clients: those with something to do are named, and only those."""
+"""Waiting for several clients: only those with events are returned."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.client.harness import LiveSession
 Join = Callable[..., Client]
 
 
-def test_only_those_with_something_to_do_are_named(session: LiveSession, join: Join) -> None:
+def test_only_clients_with_events_are_returned(session: LiveSession, join: Join) -> None:
     ann, idle = join(), Client(session.address)
     deadline = time.monotonic() + 30.0
     seen: list[Client] = []
@@ -33,11 +33,11 @@ def test_polling_all_keeps_all_alive(session: LiveSession, join: Join) -> None:
     assert all(client.counters()["control"]["reconnects"] == 0 for client in clients)
 
 
-def test_a_group_passes_over_those_that_were_closed(session: LiveSession, join: Join) -> None:
-    ann, gone = join(), join("gone")
-    group = ClientGroup([gone, ann])
+def test_group_skips_closed_clients(session: LiveSession, join: Join) -> None:
+    ann, closed = join(), join("gone")
+    group = ClientGroup([closed, ann])
     group.poll(0.1)
-    gone.close()
+    closed.close()
     deadline = time.monotonic() + 30.0
     before = ann.counters()["state"]["delivered"]
     while ann.counters()["state"]["delivered"] < before + 3:

@@ -1,4 +1,4 @@
-"""Looking up names while a client goes on with everything else."""
+"""Host lookups that do not block a client."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PATIENCE_S = 30.0
 
 
 class NameServer:
-    """Instead of the system's: answers when the test says so."""
+    """Replaces the system's resolver: answers when the test allows it."""
 
     def __init__(self) -> None:
         self.may_answer = threading.Event()
@@ -54,23 +54,23 @@ def end(asking: Generator[None, None, str]) -> str:
         time.sleep(0.001)
 
 
-def test_addresses_need_nobody(names: NameServer) -> None:
+def test_addresses_need_no_lookup(names: NameServer) -> None:
     assert [end(steps(host)) for host in ("10.0.0.5", "::1", "fe80::1%eth0")] == ["10.0.0.5", "::1", "fe80::1%eth0"]
     assert names.asked == []
 
 
-def test_a_name_server_that_hangs_holds_up_nobody(names: NameServer) -> None:
+def test_hanging_name_server_blocks_nothing(names: NameServer) -> None:
     first, second = steps("lab"), steps("lab")
     for _ in range(5):
-        next(first)  # would not come back if it waited
+        next(first)  # would not return if it waited
         next(second)
     names.may_answer.set()
     assert end(first) == end(second) == "192.0.2.1"
     assert names.asked == ["lab"]
 
 
-def test_an_answer_that_comes_too_late_is_there_for_the_next_attempt(names: NameServer) -> None:
-    with pytest.raises(TimeoutError, match="lab is still looked up"):
+def test_late_answer_is_used_at_the_next_attempt(names: NameServer) -> None:
+    with pytest.raises(TimeoutError, match="name lab"):
         end(steps("lab", 0.0))
     names.may_answer.set()
     assert end(steps("lab")) == "192.0.2.1"
@@ -78,7 +78,7 @@ def test_an_answer_that_comes_too_late_is_there_for_the_next_attempt(names: Name
     assert names.asked == ["lab"]
 
 
-def test_names_that_hang_are_bounded(names: NameServer) -> None:
+def test_hanging_lookups_are_bounded(names: NameServer) -> None:
     waiting = [steps(f"lab{i}") for i in range(MAX_LOOKUPS)]
     for one in waiting:
         next(one)
@@ -88,7 +88,7 @@ def test_names_that_hang_are_bounded(names: NameServer) -> None:
 
 
 @pytest.mark.parametrize("error", [socket.gaierror(socket.EAI_NONAME, "not known"), UnicodeError("label too long")])
-def test_no_such_name_is_an_error_of_the_system_and_asked_again(names: NameServer, error: Exception) -> None:
+def test_unknown_name_is_a_system_error_and_retried(names: NameServer, error: Exception) -> None:
     names.may_answer.set()
     names.error = error
     for n in (1, 2):

@@ -1,4 +1,4 @@
-"""Identity: in memory, or in a file that only its owner may read."""
+"""Identity: in memory, or in a file that only its owner can read."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import pytest
 from iris_session.client import Identity, IdentityError
 
 
-def test_every_identity_in_memory_is_another_one() -> None:
+def test_identities_in_memory_differ() -> None:
     assert Identity.in_memory().secret != Identity.in_memory().secret
     assert len(Identity.in_memory().secret) == 16
 
 
-def test_file_survives_with_the_newest_token(tmp_path: Path) -> None:
+def test_file_keeps_the_newest_token(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "identity.json"
     first = Identity.from_file(path)
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
@@ -27,7 +27,7 @@ def test_file_survives_with_the_newest_token(tmp_path: Path) -> None:
     assert [p.name for p in path.parent.iterdir()] == ["identity.json"]
 
 
-def test_file_readable_by_others_is_refused(tmp_path: Path) -> None:
+def test_file_readable_by_others_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / "identity.json"
     Identity.from_file(path)
     path.chmod(0o644)
@@ -35,8 +35,8 @@ def test_file_readable_by_others_is_refused(tmp_path: Path) -> None:
         Identity.from_file(path)
 
 
-def test_nobody_can_prepare_the_file_that_the_secret_is_written_to(tmp_path: Path) -> None:
-    """In a folder that others may write to: a file that is there already, or a link to one of theirs."""
+def test_prepared_file_is_not_used_for_the_secret(tmp_path: Path) -> None:
+    """In a folder writable by others: an existing file, or a link to one of theirs."""
     path, theirs = tmp_path / "identity.json", tmp_path / "theirs"
     theirs.write_text("")
     theirs.chmod(0o666)
@@ -49,16 +49,16 @@ def test_nobody_can_prepare_the_file_that_the_secret_is_written_to(tmp_path: Pat
     assert not path.is_symlink()
 
 
-def test_a_file_of_somebody_else_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_of_another_user_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "identity.json"
     Identity.from_file(path)
     monkeypatch.setattr(os, "geteuid", lambda: path.stat().st_uid + 1)
-    with pytest.raises(IdentityError, match="belongs to another user"):
+    with pytest.raises(IdentityError, match="another user"):
         Identity.from_file(path)
 
 
 @pytest.mark.parametrize("content", [b"", b"{}", b'{"secret": "AAAA"}', b"\xff"])
-def test_damaged_file_says_what_to_do(tmp_path: Path, content: bytes) -> None:
+def test_damaged_file_is_reported_with_advice(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "identity.json"
     path.write_bytes(content)
     path.chmod(0o600)
@@ -66,7 +66,7 @@ def test_damaged_file_says_what_to_do(tmp_path: Path, content: bytes) -> None:
         Identity.from_file(path)
 
 
-def test_unwritable_place_is_a_typed_error(tmp_path: Path) -> None:
+def test_unwritable_folder_is_a_typed_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(IdentityError, match="cannot be"):
         Identity.from_file(tmp_path / "file" / "identity.json")

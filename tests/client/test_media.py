@@ -1,4 +1,4 @@
-"""Media of a client: subscriptions, what is dropped, sources, and what people get wrong."""
+"""Media of a client: subscriptions, drops, sources, and misuse."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def cloud(session: LiveSession) -> Iterator[threading.Event]:
 
 
 @pytest.mark.usefixtures("cloud")
-def test_the_newest_frame_is_taken_once(join: Callable[..., Client]) -> None:
+def test_newest_frame_is_delivered_once(join: Callable[..., Client]) -> None:
     ann = join()
     feed = ann.media.subscribe("cloud")
     assert ann.media.subscribe("cloud") is feed
@@ -48,9 +48,7 @@ def test_the_newest_frame_is_taken_once(join: Callable[..., Client]) -> None:
 
 
 @pytest.mark.usefixtures("cloud")
-def test_only_the_thread_that_polls_touches_the_socket(
-    join: Callable[..., Client], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_the_polling_thread_uses_the_socket(join: Callable[..., Client], monkeypatch: pytest.MonkeyPatch) -> None:
     ann = join()
     touched: list[tuple[str, threading.Thread]] = []
     sockets = ann._sockets
@@ -70,12 +68,12 @@ def test_only_the_thread_that_polls_touches_the_socket(
     assert ann.wait_for(lambda _: cloud.received >= 1, DEADLINE_S)
     ann.media.unsubscribe("depth")
     assert ann.wait_for(lambda _: "unsubscribe_media" in dict(touched), DEADLINE_S)
-    assert {thread for _, thread in touched} == {ann._thread}
+    assert {thread for _, thread in touched} == {ann._loop._thread}
     assert depth.newest is None
 
 
 @pytest.mark.usefixtures("cloud")
-def test_subscriptions_outlive_the_front(session: LiveSession, join: Callable[..., Client]) -> None:
+def test_subscriptions_survive_a_restart_of_the_front(session: LiveSession, join: Callable[..., Client]) -> None:
     ann = join()
     feed = ann.media.subscribe("cloud")
     assert ann.wait_for(lambda _: feed.received >= 1, DEADLINE_S)
@@ -90,20 +88,20 @@ def test_subscriptions_outlive_the_front(session: LiveSession, join: Callable[..
 
 
 @pytest.mark.usefixtures("cloud")
-def test_a_limit_of_the_client_holds(join: Callable[..., Client]) -> None:
+def test_level_limit_of_the_client_applies(join: Callable[..., Client]) -> None:
     ann = join()
     feed = ann.media.subscribe("cloud")
     assert ann.wait_for(lambda _: feed.received >= 1, DEADLINE_S)
     ann.media.limit_mbit_per_s = 0.0001
     assert ann.wait_for(lambda _: feed.budget_class == "none", DEADLINE_S)
     assert ann.media.delivery is not None
-    assert ann.media.delivery.reason == "the client asked for no more"
+    assert "client" in ann.media.delivery.reason
 
 
-def test_names_that_cannot_be(join: Callable[..., Client]) -> None:
+def test_invalid_stream_names_are_rejected(join: Callable[..., Client]) -> None:
     ann = join(connect=False)
     for name in ("", "a/b", "-a", "x" * 49, "ä"):
-        with pytest.raises(InvalidMessageError, match="cannot be the name of a media stream"):
+        with pytest.raises(InvalidMessageError, match="media stream"):
             ann.media.subscribe(name)
     with pytest.raises(NotConnectedError):
         ann.media.publish("cloud", b"")
@@ -112,7 +110,7 @@ def test_names_that_cannot_be(join: Callable[..., Client]) -> None:
         ann.media.publish("cloud", {"half": b""})
 
 
-def test_a_source_hands_in_frames(join: Callable[..., Client]) -> None:
+def test_source_publishes_frames(join: Callable[..., Client]) -> None:
     camera, ann = join("cam", role="camera"), join("ann")
     feed = ann.media.subscribe("depth")
 
@@ -127,12 +125,12 @@ def test_a_source_hands_in_frames(join: Callable[..., Client]) -> None:
 
 
 @pytest.mark.usefixtures("cloud")
-def test_frames_of_a_stream_that_was_dropped_are_late_and_not_malformed(join: Callable[..., Client]) -> None:
+def test_frames_of_an_unsubscribed_stream_are_late_and_not_malformed(join: Callable[..., Client]) -> None:
     ann = join()
     feed = ann.media.subscribe("cloud")
     assert ann.wait_for(lambda _: feed.received >= 3, DEADLINE_S)
     assert ann._sockets._media is not None
-    assert ann._sockets._media.poll(30_000)  # one is there already
+    assert ann._sockets._media.poll(30_000)  # one has arrived already
     ann.media.unsubscribe("cloud")
     assert ann.wait_for(lambda one: one.media.late > 0, DEADLINE_S)
     assert ann.media.malformed == 0

@@ -1,4 +1,4 @@
-"""What people get wrong: it is taken as it was meant, or raises at once in one line that names the field."""
+"""Misuse: accepted where the meaning is clear, else an immediate one-line error that names the field."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ class Unspeakable:
 
 
 @pytest.mark.parametrize("reason", [5, None, "x" * 5000, "\ud800", "\U0001f6d1" * 600, Unspeakable(), ["a", 1]])
-def test_an_estop_fits_the_protocol_whatever_its_reason_is(reason: object) -> None:
+def test_any_estop_reason_fits_the_protocol(reason: object) -> None:
     message = decode_client(encode_checked(EStop(to_text(reason)))).message
     assert isinstance(message, EStop)
     assert len(message.reason) <= 512
 
 
-def test_an_estop_with_a_number_for_a_reason_stops(session: LiveSession, join: Join) -> None:
+def test_estop_with_a_numeric_reason_stops(session: LiveSession, join: Join) -> None:
     ann = join()
     ann.estop(5)
     assert ann.wait_for(lambda c: c.mirror.estop)
     assert not ann.connection.counters.faults
 
 
-def test_requests_that_cannot_be_sent_raise_at_once_and_name_the_field(session: LiveSession, join: Join) -> None:
+def test_invalid_requests_raise_at_once_and_name_the_field(session: LiveSession, join: Join) -> None:
     ann = join(role="director")
     calls: list[tuple[str, Callable[[], object]]] = [
         (r"robots: .*names", lambda: ann.acquire([5])),  # type: ignore[list-item]
@@ -56,7 +56,7 @@ def test_requests_that_cannot_be_sent_raise_at_once_and_name_the_field(session: 
         (r"robots\[0\]: .*64", lambda: ann.acquire(["x" * 65])),
         (r"release: .*names", lambda: ann.release(["left"])),  # type: ignore[arg-type]
         (r"Marker.*text: .*surrog|Marker.*text: str", lambda: ann.marker("\ud800")),
-        (r"T_world_tracking: .*\(x, y, z\)", lambda: ann.place_alignment("p1", (1.0, 2.0))),  # type: ignore[arg-type]
+        (r"T_world_tracking: .*\(x, y, z\)", lambda: ann.alignment.place("p1", (1.0, 2.0))),  # type: ignore[arg-type]
     ]
     sent = ann.connection.counters.sent
     started = time.monotonic()
@@ -71,7 +71,7 @@ def test_requests_that_cannot_be_sent_raise_at_once_and_name_the_field(session: 
     assert ann.acquire("left")[0].target == "left"
 
 
-def test_samples_that_cannot_be_sent_raise_at_once_and_name_the_field(session: LiveSession, join: Join) -> None:
+def test_invalid_samples_raise_at_once_and_name_the_field(session: LiveSession, join: Join) -> None:
     ann = join(devices="target")
     assert ann.connection.hello.devices == ("target",)
     bad: list[tuple[str, tuple[object, ...], dict[str, object]]] = [
@@ -94,11 +94,11 @@ def test_samples_that_cannot_be_sent_raise_at_once_and_name_the_field(session: L
             ann.send_sample(*arguments, **fields)  # type: ignore[arg-type]
         assert "\n" not in str(raised.value)
     ann.marker("after")
-    assert not session.kinds(Sample)
+    assert not session.messages_of(Sample)
     assert not ann.connection.counters.faults
 
 
-def test_arrays_and_numpy_scalars_are_taken(session: LiveSession, join: Join) -> None:
+def test_arrays_and_numpy_scalars_are_accepted(session: LiveSession, join: Join) -> None:
     ann = join(devices=("target", "joints"))
     p, q = np.array([0.1, 0.2, 0.3], dtype=np.float32), np.array([1, 0, 0, 0])
     assert ann.send_sample("target", (p, q), clutch=np.bool_(True), gripper=np.float32(0.5), buttons=np.int64(3))
@@ -106,9 +106,9 @@ def test_arrays_and_numpy_scalars_are_taken(session: LiveSession, join: Join) ->
     sample = ann.make_sample("joints", q=np.array([0.5, 1.0]), qd=np.zeros(2))
     assert (sample.q, sample.qd) == ((0.5, 1.0), (0.0, 0.0))
     assert ann.make_sample("target", twist=np.arange(6)).twist == (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
-    ann.observe("table", (p, q))
-    assert ann.wait_for(lambda c: len(session.kinds(Sample)) == 2)
-    taken = session.kinds(Sample)[0].message
+    ann.alignment.observe("table", (p, q))
+    assert ann.wait_for(lambda c: len(session.messages_of(Sample)) == 2)
+    taken = session.messages_of(Sample)[0].message
     assert isinstance(taken, Sample)
     assert taken.pose is not None
     assert taken.pose.p == pytest.approx(HERE[0])
@@ -116,7 +116,7 @@ def test_arrays_and_numpy_scalars_are_taken(session: LiveSession, join: Join) ->
     assert not ann.connection.counters.faults
 
 
-def test_the_kind_follows_from_what_is_given(session: LiveSession, join: Join) -> None:
+def test_kind_of_sample_follows_from_its_arguments(session: LiveSession, join: Join) -> None:
     ann = join()
     assert ann.make_sample("target", HERE).kind == SampleKind.POSE
     assert ann.make_sample("joints", q=(1.0,)).kind == SampleKind.JOINTS
@@ -125,7 +125,7 @@ def test_the_kind_follows_from_what_is_given(session: LiveSession, join: Join) -
     assert ann.make_sample("target", HERE, q=(1.0,), kind=SampleKind.POSE).kind == SampleKind.POSE
 
 
-def test_one_name_is_one_name_and_what_is_not_ours_is_counted(session: LiveSession, join: Join) -> None:
+def test_single_name_and_foreign_robots(session: LiveSession, join: Join) -> None:
     ann = join()
     assert ann.make_sample("target", HERE, robots="left").targets == ()
     assert ann.counters()["control"]["samples_without_lease"] == 1
@@ -136,27 +136,27 @@ def test_one_name_is_one_name_and_what_is_not_ours_is_counted(session: LiveSessi
     assert to_names("robots", (n for n in ("a", "b"))) == ("a", "b")
 
 
-def test_a_fault_ends_the_wait_for_an_answer(session: LiveSession, join: Join) -> None:
+def test_fault_ends_the_wait_for_an_answer(session: LiveSession, join: Join) -> None:
     ann = join()
-    session.pause_steps(True)  # no answer comes
+    session.pause_steps(True)  # no answer arrives
     ann.connection.last_protocol_fault = ProtocolFault(FaultCode.MALFORMED, "an older one")
-    told: list[bool] = []
+    sent: list[bool] = []
 
-    def tell(_: Client) -> bool:
-        if not told:
-            told.append(True)
+    def send_fault(_: Client) -> bool:
+        if not sent:
+            sent.append(True)
             ann.connection._process_fault(
                 ProtocolFault(FaultCode.MALFORMED, "acquire: robots is wrong"), time.monotonic_ns()
             )
         return False
 
-    polling, ann.poll = ann.poll, lambda timeout_s=0.0: tell(ann) or polling(min(timeout_s, 0.01))  # type: ignore[method-assign]
-    with pytest.raises(InvalidMessageError, match="Acquire: acquire: robots is wrong"):
+    polling, ann.poll = ann.poll, lambda timeout_s=0.0: send_fault(ann) or polling(min(timeout_s, 0.01))  # type: ignore[method-assign]
+    with pytest.raises(InvalidMessageError, match="acquire: robots"):
         ann.request(Acquire(0, ("left",)), timeout_s=30.0)
     session.pause_steps(False)
 
 
-def test_a_session_that_stands_or_is_dead_is_visible(session: LiveSession, join: Join) -> None:
+def test_stalled_or_dead_session_is_visible(session: LiveSession, join: Join) -> None:
     ann = join(role="agent", devices="target")
     ann.acquire("left")
     assert ann.wait_for(lambda c: c.scene.state is not None and "left" in c.feedback)
@@ -176,7 +176,7 @@ def test_a_session_that_stands_or_is_dead_is_visible(session: LiveSession, join:
     assert ann.wait_for(lambda c: (c.scene.data_age_ns() or 10**9) < 200_000_000)
 
 
-def test_there_is_no_age_before_the_first_scene(session: LiveSession, join: Join) -> None:
+def test_age_is_undefined_before_the_first_state(session: LiveSession, join: Join) -> None:
     assert join(connect=False).scene.data_age_ns() is None
 
 
@@ -194,7 +194,7 @@ def test_sleep_polls_for_the_whole_time(session: LiveSession, join: Join, thread
     ann.sleep(-1.0)
 
 
-def test_denials_read_as_a_sentence(session: LiveSession, join: Join) -> None:
+def test_denials_have_a_readable_text(session: LiveSession, join: Join) -> None:
     ann, bob = join(), join("bob")
     ann.acquire("left")
     assert bob.wait_for(lambda c: c.mirror.leases["left"].holder == ann.participant_id)
@@ -204,25 +204,25 @@ def test_denials_read_as_a_sentence(session: LiveSession, join: Join) -> None:
     assert str(held.value).count("ann") == 1
     with pytest.raises(DeniedError) as not_ours:
         bob.release("left")
-    assert str(not_ours.value) == "denied (not_holder): you do not hold left; held by ann"
+    assert str(not_ours.value).startswith("denied (not_holder): ")
     assert not_ours.value.denial.holder == ann.participant_id
     assert str(DeniedError(Denial("role", "no"))) == "denied (role): no"
 
 
 @pytest.mark.parametrize("address", [7721, None, ("127.0.0.1", 7721), b"127.0.0.1:7721"])
-def test_an_address_of_another_type_is_told_in_one_line(address: object) -> None:
-    with pytest.raises(ClientError, match=r"address .* not text like '127\.0\.0\.1:7721'") as raised:
+def test_address_of_wrong_type_is_a_one_line_error(address: object) -> None:
+    with pytest.raises(ClientError, match=r"address .*'127\.0\.0\.1:7721'") as raised:
         Client(address)  # type: ignore[arg-type]
     assert "\n" not in str(raised.value)
 
 
-def test_a_hello_that_cannot_be_sent_raises_when_the_client_is_made() -> None:
+def test_invalid_hello_raises_at_construction() -> None:
     for settings in ({"name": 5}, {"devices": 5}, {"devices": [5]}, {"role": None, "name": "x"}):
         with pytest.raises(InvalidMessageError, match=r"name|role|devices"):
             Client("127.0.0.1:1", **settings)  # type: ignore[arg-type]
 
 
-def test_a_message_reads_back_as_what_was_said() -> None:
+def test_message_repr_round_trips() -> None:
     for message in (Acquire(1, ("left",)), Control(2, "pause"), Marker(3, "x"), PlaceAlignment(4, "p1", Pose(*HERE))):
         envelope = decode_client(encode_checked(message, 7))
         assert (envelope.message, envelope.connection_epoch) == (message, 7)
@@ -232,10 +232,8 @@ def test_a_message_reads_back_as_what_was_said() -> None:
 
 
 @pytest.mark.parametrize("budget", ["QUEST_3", 100_000, None])
-def test_what_is_no_budget_is_told_in_one_line(budget: object) -> None:
+def test_invalid_budget_is_a_one_line_error(budget: object) -> None:
     client = Client("127.0.0.1:1", role="observer", name="screen")
-    with pytest.raises(
-        TypeError, match=r"^budget is .*: a Budget is expected, as QUEST_3 of iris_session\.scene\.budget"
-    ):
+    with pytest.raises(TypeError, match=r"^budget is .* QUEST_3"):
         fetch_scene(client, budget)  # type: ignore[arg-type]
     client.close()

@@ -1,13 +1,15 @@
-"""Every request of a client reaches the session and its answer comes back, for people and for directors."""
+"""Every request of a client reaches the session and its answer returns, for operators and directors."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 import pytest
 
 from iris_session.client import Client, DeniedError, RequestTimeoutError, poll_all
-from iris_session.protocol.client_messages import Acquire, Observation
+from iris_session.client import client as client_module
+from iris_session.protocol.client_messages import Acquire, Observation, Withdraw
 from iris_session.protocol.names import DenialReason, Device, EpisodeAction, LeaseMode
 from iris_session.protocol.server_messages import (
     ConsentRequested,
@@ -28,7 +30,7 @@ def bodies(events: list[Event], kind: type) -> list[object]:
     return [event.body for event in events if isinstance(event.body, kind)]
 
 
-def test_a_director_directs(session: LiveSession, join: Join) -> None:
+def test_director_requests_are_executed(session: LiveSession, join: Join) -> None:
     events: list[Event] = []
     boss = join("boss", role="director", on_event=events.append)
     ann = join("ann", alignment="measured", devices=(Device.HEAD,))
@@ -36,16 +38,21 @@ def test_a_director_directs(session: LiveSession, join: Join) -> None:
     assert ann.wait_for(lambda c: c.lease_version("left") is not None)
     boss.set_mode("right", LeaseMode.TAKEOVER)
     assert boss.wait_for(lambda c: c.mirror.leases["right"].mode == LeaseMode.TAKEOVER)
-    boss.place_alignment(ann.participant_id, HERE)
-    assert ann.wait_for(lambda c: c.alignment is not None)
-    assert ann.alignment is not None
-    assert ann.alignment.T_world_tracking.p == HERE[0]
+    boss.alignment.place(ann.participant_id, HERE)
+    assert ann.wait_for(lambda c: c.alignment.current is not None)
+    assert ann.alignment.current is not None
+    assert ann.alignment.current.T_world_tracking.p == HERE[0]
     boss.control("pause")
     assert boss.wait_for(lambda c: c.mirror.paused)
     boss.control("resume")
     assert boss.wait_for(lambda c: not c.mirror.paused)
     boss.estop("drill")
     assert ann.wait_for(lambda c: c.mirror.estop)
+    ann.estop("not yet")
+    assert boss.wait_for(lambda c: c.mirror.stop_seq == 2)
+    with pytest.raises(DeniedError) as denied:
+        boss.clear_estop(1)
+    assert (denied.value.denial.reason, denied.value.denial.holder) == (DenialReason.ESTOP, ann.participant_id)
     boss.clear_estop()
     assert ann.wait_for(lambda c: not c.mirror.estop)
     boss.marker("look here")
@@ -55,7 +62,7 @@ def test_a_director_directs(session: LiveSession, join: Join) -> None:
     assert bodies(events, MarkerAdded) == [MarkerAdded(boss.participant_id, "look here")]
 
 
-def test_a_holder_scales_the_motion_of_its_robot_for_all_to_see(session: LiveSession, join: Join) -> None:
+def test_holder_scales_the_motion_of_its_robot(session: LiveSession, join: Join) -> None:
     events: list[Event] = []
     ann, bob = join(), join("bob", on_event=events.append)
     ann.acquire(["left"])
@@ -80,7 +87,7 @@ def test_a_holder_scales_the_motion_of_its_robot_for_all_to_see(session: LiveSes
     assert bob.wait_for(lambda c: c.mirror.leases["left"].scale == 1.0)
 
 
-def test_an_operator_may_not_direct(session: LiveSession, join: Join) -> None:
+def test_operator_requests_of_a_director_are_denied(session: LiveSession, join: Join) -> None:
     ann = join()
     for forbidden in (lambda: ann.control("pause"), lambda: ann.assign(["left"]), ann.clear_estop):
         with pytest.raises(DeniedError) as denied:
@@ -89,7 +96,7 @@ def test_an_operator_may_not_direct(session: LiveSession, join: Join) -> None:
 
 
 def answer_of(client: Client, request: int) -> Reply:
-    """The reply to a submitted request."""
+    """Return the reply to a submitted request."""
     replies: list[Reply] = []
 
     def come(_: Client) -> bool:
@@ -101,7 +108,7 @@ def answer_of(client: Client, request: int) -> Reply:
     return replies[0]
 
 
-def test_a_holder_is_asked_and_may_refuse_or_consent(session: LiveSession, join: Join) -> None:
+def test_holder_may_refuse_or_consent_to_a_handover(session: LiveSession, join: Join) -> None:
     asked: list[Event] = []
     boss, ann, bob = join("boss", role="director"), join(on_event=asked.append), join("bob")
     boss.set_mode("left", LeaseMode.REQUEST)
@@ -120,17 +127,64 @@ def test_a_holder_is_asked_and_may_refuse_or_consent(session: LiveSession, join:
     assert ann.wait_for(lambda c: c.lease_version("left") is None)
 
 
-def test_waiting_in_the_queue_ends_with_the_lease(session: LiveSession, join: Join) -> None:
+def test_queued_request_is_granted_when_the_lease_ends(session: LiveSession, join: Join) -> None:
     ann, bob = join(), join("bob")
     ann.acquire(["left"])
-    with pytest.raises(RequestTimeoutError):
-        bob.acquire(["left"], wait=True, timeout_s=0.3)
+    request = bob.submit(Acquire(0, ("left",), wait=True))
     assert ann.wait_for(lambda c: c.mirror.leases["left"].queue == (bob.participant_id,))
     ann.release()
-    assert bob.wait_for(lambda c: c.lease_version("left") is not None)
+    assert answer_of(bob, request).ok
+    assert bob.lease_version("left") is not None
 
 
-def test_releasing_what_is_not_ours_is_denied_and_frees_nothing(session: LiveSession, join: Join) -> None:
+def test_who_gives_up_waiting_is_never_granted_the_robot(session: LiveSession, join: Join) -> None:
+    ann, bob, carl = join(), join("bob"), join("carl")
+    ann.acquire(["left"])
+    carl.submit(Acquire(0, ("left",), wait=True))
+    assert ann.wait_for(lambda c: c.mirror.leases["left"].queue == (carl.participant_id,))
+    with pytest.raises(RequestTimeoutError, match=r"place 2 of 2 .* left.* held by ann") as late:
+        bob.acquire(["left"], wait=True, timeout_s=0.3)
+    assert late.value.denial is not None
+    assert late.value.denial.holder == ann.participant_id
+    assert ann.wait_for(lambda c: c.mirror.leases["left"].queue == (carl.participant_id,))
+    ann.release()
+    assert carl.wait_for(lambda c: c.lease_version("left") is not None)
+    carl.release()
+    assert bob.wait_for(lambda c: not c.mirror.leases["left"].holder)
+    assert bob.lease_version("left") is None
+
+
+def test_a_request_that_a_stalled_session_grants_later_is_given_back(session: LiveSession, join: Join) -> None:
+    ann = join()
+    session.pause_steps(True)
+    with pytest.raises(RequestTimeoutError, match="withdrawn"):
+        ann.acquire(["left"], timeout_s=0.2)
+    session.pause_steps(False)
+    assert ann.wait_for(lambda c: bool(session.messages_of(Withdraw)))
+    ann.marker("after it")
+    assert ann.lease_version("left") is None
+    assert not ann.mirror.leases["left"].holder
+
+
+def test_acquire_waits_as_long_as_a_holder_may_take_to_consent(
+    join: Join, session: LiveSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(client_module, "DEFAULT_TIMEOUT_S", 0.3)
+    boss, ann, bob = join("boss", role="director"), join(), join("bob")
+    boss.set_mode("left", LeaseMode.REQUEST)
+    ann.acquire(["left"])
+    assert bob.wait_for(lambda c: c.mirror.leases["left"].mode == LeaseMode.REQUEST and c.mirror.leases["left"].holder)
+    assert bob.mirror.consent_timeout_ns == session.authority._ctx.config.consent_timeout_ns
+    bob.mirror.consent_timeout_ns = 1_000_000_000
+    began = time.monotonic()
+    with pytest.raises(RequestTimeoutError):
+        bob.acquire(["left"])
+    assert 1.3 <= time.monotonic() - began < 4.0
+    with pytest.raises(RequestTimeoutError):
+        bob.acquire(["right", "left"], timeout_s=0.1)
+
+
+def test_release_of_a_foreign_robot_is_denied(session: LiveSession, join: Join) -> None:
     ann = join()
     ann.acquire(["left"])
     for name in ("right", "nothing"):
@@ -140,7 +194,7 @@ def test_releasing_what_is_not_ours_is_denied_and_frees_nothing(session: LiveSes
     assert ann.lease_version("left") is not None
 
 
-def test_a_hand_takes_an_object(session: LiveSession, join: Join) -> None:
+def test_hand_grasps_an_object(session: LiveSession, join: Join) -> None:
     events: list[Event] = []
     ann = join(devices=(Device.HEAD, Device.HAND_RIGHT), on_event=events.append)
 
@@ -159,7 +213,7 @@ def test_a_hand_takes_an_object(session: LiveSession, join: Join) -> None:
     assert ann.wait_for(lambda c: c.lease_version("hammer") is None)
 
 
-def test_people_see_each_other(session: LiveSession, join: Join) -> None:
+def test_participants_see_each_other(session: LiveSession, join: Join) -> None:
     ann, bob = join(devices=(Device.HEAD,)), join("bob")
 
     def seen(_: Client) -> bool:
@@ -173,16 +227,16 @@ def test_people_see_each_other(session: LiveSession, join: Join) -> None:
     assert bob.wait_for(lambda c: not c.scene.presence)
 
 
-def test_worn_and_observations_are_told(join: Join) -> None:
+def test_worn_and_observations_are_sent(join: Join) -> None:
     live = LiveSession(forward_observations=True)
     ann = Client(live.address, name="ann", devices=(Device.HEAD,))
     try:
         ann.connect()
         ann.worn = False
         assert ann.wait_for(lambda c: not c.mirror.participants[c.participant_id].worn)
-        ann.observe("table", HERE, viewpoint_id=3)
-        assert ann.wait_for(lambda c: bool(live.kinds(Observation)))
-        (entry,) = live.kinds(Observation)
+        ann.alignment.observe("table", HERE, viewpoint_id=3)
+        assert ann.wait_for(lambda c: bool(live.messages_of(Observation)))
+        (entry,) = live.messages_of(Observation)
         assert isinstance(entry.message, Observation)
         assert entry.message.T_tracking_anchor.p == HERE[0]
     finally:

@@ -1,4 +1,4 @@
-"""Poses by name while scenes are loaded: never those of another body, whatever comes first."""
+"""Poses by name while scenes are loaded: never those of another body, in any order of arrival."""
 
 from __future__ import annotations
 
@@ -14,18 +14,16 @@ from iris_session.protocol.server_messages import Event, SceneChanged, Snapshot
 from tests.client.harness import BODIES, LiveSession, scene
 
 ORDERS = list(itertools.permutations(BODIES))[1:]
-#: `LiveSession` puts them there, from its second scene on.
+#: `LiveSession` places them there from its second scene on.
 Y = {body.name: float(body.id) for body in scene().bodies}
 
 
-def test_bodies_of_another_scene_are_where_they_are_and_not_where_others_were(
-    session: LiveSession, join: Callable[..., Client]
-) -> None:
+def test_poses_by_name_never_belong_to_another_body(session: LiveSession, join: Callable[..., Client]) -> None:
     client = join()
     wrong: list[tuple[str, float, int, int]] = []
-    seen: list[int] = []  # epochs in which all were there
+    seen: list[int] = []  # epochs in which all were present
 
-    def look() -> None:
+    def record() -> None:
         poses = {name: client.scene.body_pose(name) for name in BODIES}
         state = client.scene.state
         if state is None or session._shown.bodies == scene().bodies:
@@ -38,14 +36,14 @@ def test_bodies_of_another_scene_are_where_they_are_and_not_where_others_were(
             seen.append(epoch)
 
     def on_state(_: SceneState) -> None:
-        look()
+        record()
 
     client.on_state = on_state
     for epoch, order in enumerate(ORDERS, start=2):
-        session.load_in_order(*order)
+        session.load_reordered(*order)
 
         def shown(_: Client, epoch: int = epoch) -> bool:
-            look()
+            record()
             return bool(seen) and seen[-1] == epoch
 
         assert client.wait_for(shown, 30.0), (epoch, seen[-1:], client.mirror.synced)
@@ -56,7 +54,7 @@ def test_bodies_of_another_scene_are_where_they_are_and_not_where_others_were(
     assert tip[0][1] == Y["left/hand"]
 
 
-def test_after_a_reset_bodies_are_where_they_were_until_the_next_state(
+def test_bodies_keep_their_poses_after_a_reset_until_the_next_state(
     session: LiveSession, join: Callable[..., Client]
 ) -> None:
     client = join()
@@ -72,7 +70,7 @@ def test_after_a_reset_bodies_are_where_they_were_until_the_next_state(
 
 
 class Slow(SessionMirror):
-    """Another thread is let in whenever the hash is read, and has time."""
+    """Yields to another thread whenever the hash is read."""
 
     meanwhile: Callable[[], None] | None = None
     _hash = ""
@@ -91,7 +89,7 @@ class Slow(SessionMirror):
         self._hash = scene_hash
 
 
-def test_hash_and_epoch_of_a_scene_go_together_whatever_the_thread_of_start_hears(
+def test_hash_and_epoch_of_a_scene_are_consistent_in_any_thread(
     session: LiveSession, join: Callable[..., Client], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     client = join()

@@ -1,4 +1,4 @@
-"""Which key is trusted: every combination of what was given, stored and offered."""
+"""Choice of the server key: every combination of given, stored and offered keys."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> KeyHome:
 @pytest.mark.parametrize(
     ("given", "stored", "offered", "loopback", "used"),
     [
-        ("", "", A, False, A),  # at first sight
+        ("", "", A, False, A),  # on first use
         ("", A, A, False, A),
         (A, "", A, False, A),
         (A, A, A, False, A),
-        ("", "", None, False, None),  # nothing known, nothing said: wait
+        ("", "", None, False, None),  # nothing known, nothing offered: wait
         ("", A, None, False, A),  # its introduction may be blocked by a firewall
         (A, "", None, False, A),
         ("", "", None, True, ""),
         ("", "", "", True, ""),
-        ("", A, "", True, ""),  # encrypted yesterday, a plain session of this machine today
+        ("", A, "", True, ""),  # encrypted yesterday, an unencrypted session of this machine today
         ("", "", A, True, A),
     ],
 )
-def test_the_key_that_is_used(
+def test_selected_key(
     home: KeyHome, given: str, stored: str, offered: str | None, loopback: bool, used: str | None
 ) -> None:
     if stored:
@@ -50,17 +50,17 @@ def test_the_key_that_is_used(
 @pytest.mark.parametrize(
     ("given", "stored", "offered", "loopback"),
     [
-        ("", A, B, False),  # somebody else answers
+        ("", A, B, False),  # another program answers
         ("", A, B, True),
         (A, "", B, False),
-        (A, B, A, False),  # the code belongs to another session than the one that is known
+        (A, B, A, False),  # the code belongs to another session than the known one
         (A, B, None, False),
         ("", "", "", False),  # not encrypted over a network
         ("", A, "", False),
         (A, "", "", True),
     ],
 )
-def test_another_key_is_an_error_and_never_stored(
+def test_mismatched_key_is_an_error_and_never_stored(
     home: KeyHome, given: str, stored: str, offered: str | None, loopback: bool
 ) -> None:
     if stored:
@@ -74,16 +74,16 @@ def test_another_key_is_an_error_and_never_stored(
     assert [one.key for one in home.known_servers.read()] == ([stored] if stored else [])
 
 
-def test_a_name_that_is_known_with_another_key_is_not_taken_at_first_sight(home: KeyHome) -> None:
+def test_known_name_with_another_key_is_not_trusted_on_first_use(home: KeyHome) -> None:
     home.known_servers.pin("10.0.0.7:7721", "lab-1", A)
     ServerTrust(home, LAB, "lab-1").check_name(A)  # the machine has another address today
     ServerTrust(home, LAB, "lab-2").check_name(B)
-    ServerTrust(home, LAB).check_name(B)  # not asked for by name
+    ServerTrust(home, LAB).check_name(B)  # not requested by name
     with pytest.raises(TrustError, match="another key"):
         ServerTrust(home, LAB, "lab-1").check_name(B)
 
 
-def test_known_by_whatever_address(home: KeyHome) -> None:
+def test_known_server_is_found_by_any_address(home: KeyHome) -> None:
     assert known_fingerprints() == frozenset()
     stored = home.known_servers.pin("10.0.0.7:7721", "lab-1", A)
     trust = ServerTrust(home, LAB)

@@ -1,4 +1,4 @@
-"""Sockets: the context of assets is one per process, and its I/O thread has a lower priority than others."""
+"""Sockets: one context of assets per process, whose I/O thread has a lower priority."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-#: Threads of libzmq with a lower priority (proc_pid_stat(5), field 19); they name themselves a moment after they began.
+#: Threads of libzmq with a lower priority (proc_pid_stat(5), field 19); they set their names a moment after starting.
 CODE = """
 import os, time
 from pathlib import Path
@@ -36,5 +36,5 @@ assert os.waitpid(child, 0)[1] == 0
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="threads have a priority on Linux only")
-def test_its_thread_has_a_lower_priority_in_every_process() -> None:
+def test_asset_thread_has_a_lower_priority_in_every_process() -> None:
     subprocess.run([sys.executable, "-c", CODE], check=True, timeout=90)

@@ -1,4 +1,4 @@
-"""E-stops of the client: none is lost between connections, and none comes back after it was heard or withdrawn."""
+"""E-stops of the client: none is lost between connections, none returns after it was acknowledged or withdrawn."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def stops(wire: Wire) -> int:
     return wire.sent().count(STOP)
 
 
-def test_a_stop_that_died_with_its_connection_goes_behind_the_next_hello_and_after_the_welcome(wire: Wire) -> None:
+def test_stop_lost_with_its_connection_is_sent_after_the_next_hello_and_the_welcome(wire: Wire) -> None:
     assert wire.connection.send(STOP)
     wire.connection.handle_disconnect(2 * SECOND)
     first, second = wire.sent()
@@ -33,12 +33,12 @@ def test_a_stop_that_died_with_its_connection_goes_behind_the_next_hello_and_aft
     wire.welcome(3 * SECOND)
     assert stops(wire) == 1
     wire.snapshot(3 * SECOND)
-    wire.get(Event(1, 0, 0, EStopChanged(True, "p1")), 3 * SECOND)
+    wire.receive(Event(1, 0, 0, EStopChanged(True, "p1", "now", 1)), 3 * SECOND)
     wire.connection.handle_disconnect(6 * SECOND)
     assert stops(wire) == 0, "the session has it"
 
 
-def test_a_stop_without_connection_is_kept_and_says_so(wire: Wire) -> None:
+def test_stop_without_connection_is_kept_and_reported(wire: Wire) -> None:
     wire.connection.handle_disconnect(MS)
     assert wire.connection.phase is ConnectionPhase.WAITING
     assert not wire.connection.send(STOP)
@@ -48,7 +48,7 @@ def test_a_stop_without_connection_is_kept_and_says_so(wire: Wire) -> None:
     assert stops(wire) == 1
 
 
-def test_a_stop_that_was_withdrawn_does_not_come_back(wire: Wire) -> None:
+def test_withdrawn_stop_does_not_return(wire: Wire) -> None:
     wire.connection.send(STOP)
     wire.connection.request(ClearEStop(0))
     wire.sent()
@@ -56,18 +56,27 @@ def test_a_stop_that_was_withdrawn_does_not_come_back(wire: Wire) -> None:
     assert stops(wire) == 0
 
 
-def test_in_a_stopped_session_the_answer_to_a_later_ping_proves_that_it_came(wire: Wire) -> None:
-    wire.get(Event(1, 0, 0, EStopChanged(True, "p2")), MS)
+def test_the_stop_of_another_is_no_receipt_for_ours(wire: Wire) -> None:
+    """It may be cleared before ours has arrived."""
     wire.connection.send(STOP)
-    wire.get(ClockPong(0, MS, MS), 2 * MS)  # of a ping that was sent before
+    wire.receive(Event(1, 0, 0, EStopChanged(True, "p2", "mine", 1)), MS)
     assert wire.connection.pending_estop.message == STOP
-    wire.connection.tick(SECOND)
-    (ping,) = (message for message in wire.sent() if isinstance(message, ClockPing))
-    wire.get(ClockPong(ping.t0_ns, SECOND, SECOND), SECOND + MS)
+    wire.receive(Event(2, 0, 0, EStopChanged(True, "p1", "now", 2)), MS)
     assert wire.connection.pending_estop.message is None
 
 
-def test_who_never_opened_or_was_closed_is_told() -> None:
+def test_stop_is_acknowledged_by_the_answer_to_a_later_ping(wire: Wire) -> None:
+    wire.receive(Event(1, 0, 0, EStopChanged(True, "p2")), MS)
+    wire.connection.send(STOP)
+    wire.receive(ClockPong(0, MS, MS), 2 * MS)  # of a ping that was sent before
+    assert wire.connection.pending_estop.message == STOP
+    wire.connection.tick(SECOND)
+    (ping,) = (message for message in wire.sent() if isinstance(message, ClockPing))
+    wire.receive(ClockPong(ping.t0_ns, SECOND, SECOND), SECOND + MS)
+    assert wire.connection.pending_estop.message is None
+
+
+def test_unopened_or_closed_client_raises() -> None:
     wire = Wire()
     with pytest.raises(NotConnectedError):
         wire.connection.send(STOP)
@@ -77,7 +86,7 @@ def test_who_never_opened_or_was_closed_is_told() -> None:
         wire.connection.send(STOP)
 
 
-def test_a_release_passes_samples_but_not_the_acquire_before_it(wire: Wire) -> None:
+def test_release_overtakes_samples_but_not_the_acquire_before_it(wire: Wire) -> None:
     wire.connection.send(SAMPLE)
     number = wire.connection.request(Acquire(0, ("left",)))
     wire.connection.send(SAMPLE)

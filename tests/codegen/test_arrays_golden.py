@@ -1,4 +1,4 @@
-"""docs/protocol/arrays.json decodes as it says, also by a reader that follows docs/scene.md word by word."""
+"""docs/protocol/arrays.json decodes as stated, also by a reader that follows docs/scene.md literally."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import zstandard
 
-from iris_session.codegen.arrays_golden import golden, text
+from iris_session.codegen.arrays_golden import build_golden, render_golden
 from iris_session.scene import AssetDecodeError, decode_arrays
 
 FILE = Path(__file__).parents[2] / "docs" / "protocol" / "arrays.json"
@@ -22,8 +22,8 @@ CODES = {"u1": "B", "i1": "b", "u2": "H", "u4": "I", "f4": "f"}
 assets = pytest.mark.parametrize("row", [pytest.param(row, id=row["name"]) for row in CONTENT["assets"]])
 
 
-def by_the_book(data: bytes) -> dict[str, tuple[list[int], list[float]]]:
-    """Shape and values of every array, without numpy."""
+def read_by_the_document(data: bytes) -> dict[str, tuple[list[int], list[float]]]:
+    """Return shape and values of every array, without numpy."""
     assert data[:4] == b"IRA1"
     (n,) = struct.unpack_from("<I", data, 4)
     at, found = 8 + n, {}
@@ -62,7 +62,7 @@ def expected(array: dict[str, Any]) -> np.ndarray[Any, np.dtype[Any]]:
 
 
 @assets
-def test_reader(row: dict[str, Any]) -> None:
+def test_decoder_agrees_with_the_vector(row: dict[str, Any]) -> None:
     found = decode_arrays(bytes.fromhex(row["hex"]), row["kind"])
     assert list(found) == list(row["arrays"])
     for name, values in found.items():
@@ -75,9 +75,9 @@ def test_reader(row: dict[str, Any]) -> None:
 
 
 @assets
-def test_another_reader(row: dict[str, Any]) -> None:
+def test_literal_reader_agrees_with_the_vector(row: dict[str, Any]) -> None:
     """Quantised values within a rounding of float32."""
-    for name, (shape, values) in by_the_book(bytes.fromhex(row["hex"])).items():
+    for name, (shape, values) in read_by_the_document(bytes.fromhex(row["hex"])).items():
         array = row["arrays"][name]
         assert shape == array["shape"]
         for value, wanted in zip(values, array["values"], strict=True):
@@ -85,16 +85,16 @@ def test_another_reader(row: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("row", [pytest.param(row, id=row["name"]) for row in CONTENT["malformed"]])
-def test_what_is_malformed_is_refused(row: dict[str, Any]) -> None:
+def test_malformed_arrays_are_rejected(row: dict[str, Any]) -> None:
     with pytest.raises(AssetDecodeError):
         decode_arrays(bytes.fromhex(row["hex"]), "mesh")
 
 
-def test_the_file_is_current() -> None:
+def test_file_is_current() -> None:
     """All but the packed bytes, which depend on the version of zstd."""
 
     def without_bytes(content: dict[str, Any]) -> list[Any]:
         return [(row["name"], row.get("arrays")) for part in ("assets", "malformed") for row in content[part]]
 
-    assert without_bytes(golden()) == without_bytes(CONTENT)
-    assert without_bytes(json.loads(text())) == without_bytes(CONTENT)
+    assert without_bytes(build_golden()) == without_bytes(CONTENT)
+    assert without_bytes(json.loads(render_golden())) == without_bytes(CONTENT)

@@ -1,4 +1,4 @@
-"""docs/protocol/conversations.json: the client core does what the file says, and the file covers its behaviour."""
+"""docs/protocol/conversations.json: the client core behaves as the file states, and the file covers its behaviour."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def play(conversation: dict[str, Any]) -> None:
     for number, step in enumerate(conversation["steps"]):
         expected = {name: step[name] for name in OUTCOMES if name in step}
         given = {name: value for name, value in step.items() if name not in OUTCOMES}
-        assert json.loads(json.dumps(player.do(given))) == expected, (
+        assert json.loads(json.dumps(player.play_step(given))) == expected, (
             f"{conversation['name']}, step {number}: {step['do']}"
         )
 
@@ -35,7 +35,7 @@ def test_core_plays_the_conversation(conversation: dict[str, Any]) -> None:
     play(conversation)
 
 
-def test_conversations_cover_what_every_client_must_do() -> None:
+def test_conversations_cover_required_behaviour() -> None:
     phases = {step["state"]["phase"] for each in CONVERSATIONS for step in each["steps"] if "state" in step}
     assert phases == {"joining", "syncing", "ready", "waiting", "refused", "closed"}
     times = [[step["at_ns"] for step in each["steps"]] for each in CONVERSATIONS]
@@ -59,7 +59,7 @@ def play_all() -> None:
         ("encode_client", lambda _: b""),
     ],
 )
-def test_another_behaviour_is_noticed(name: str, value: object, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_changed_behaviour_is_detected(name: str, value: object, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connection, name, value)
     with pytest.raises(AssertionError):
         play_all()

@@ -1,4 +1,4 @@
-"""docs/protocol/deformable.json decodes as it says, also by a reader that follows docs/deformables.md word by word."""
+"""docs/protocol/deformable.json decodes as stated, also by a reader that follows docs/deformables.md literally."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import zstandard
 
-from iris_session.codegen.deformable_golden import golden, text
+from iris_session.codegen.deformable_golden import build_golden, render_golden
 from iris_session.streams.deformable import DeformableDecoder, DeformableEncoder, read_header
 from iris_session.streams.deformable_topology import DeformableTopology
 
@@ -28,7 +28,7 @@ def expected(frame: dict[str, Any]) -> np.ndarray[Any, np.dtype[np.float32]]:
 
 
 @frames
-def test_decoder(mesh: dict[str, Any], frame: dict[str, Any]) -> None:
+def test_decoder_agrees_with_the_vector(mesh: dict[str, Any], frame: dict[str, Any]) -> None:
     topology = DeformableTopology.from_bytes(bytes.fromhex(mesh["topology"]))
     decoder = DeformableDecoder(topology)
     decoded = decoder.decode(bytes.fromhex(frame["hex"]))
@@ -38,15 +38,15 @@ def test_decoder(mesh: dict[str, Any], frame: dict[str, Any]) -> None:
 
 
 @frames
-def test_reader_that_follows_the_document(mesh: dict[str, Any], frame: dict[str, Any]) -> None:
-    read = reader(bytes.fromhex(mesh["topology"]), bytes.fromhex(frame["hex"]))
+def test_literal_reader_agrees_with_the_vector(mesh: dict[str, Any], frame: dict[str, Any]) -> None:
+    read = read_by_the_document(bytes.fromhex(mesh["topology"]), bytes.fromhex(frame["hex"]))
     for row, true in zip(read, frame["vertices"], strict=True):
         assert [v if math.isfinite(v) else None for v in row] == true
 
 
 @frames
-def test_encoder_of_what_was_decoded_makes_the_same_planes(mesh: dict[str, Any], frame: dict[str, Any]) -> None:
-    """Another zstd may pack them otherwise, so packed bytes are not compared."""
+def test_encoder_reproduces_the_planes(mesh: dict[str, Any], frame: dict[str, Any]) -> None:
+    """Another version of zstd may compress differently, so packed bytes are not compared."""
     payload = bytes.fromhex(frame["hex"])
     header = read_header(payload)
     topology = DeformableTopology.from_bytes(bytes.fromhex(mesh["topology"]))
@@ -66,10 +66,10 @@ def test_vectors_cover_every_part_of_the_format() -> None:
     assert {(t.plan, t.order is None) for t in topologies} == {(0, True), (0, False), (1, False)}
 
 
-def test_the_file_is_current_and_written_as_made() -> None:
-    names = [(m["name"], m["topology"], [f["name"] for f in m["frames"]]) for m in golden()["meshes"]]
+def test_file_is_current_and_written_as_generated() -> None:
+    names = [(m["name"], m["topology"], [f["name"] for f in m["frames"]]) for m in build_golden()["meshes"]]
     assert names == [(m["name"], m["topology"], [f["name"] for f in m["frames"]]) for m in MESHES]
-    assert json.loads(text()).keys() == {"format", "meshes"}
+    assert json.loads(render_golden()).keys() == {"format", "meshes"}
 
 
 def planes(payload: bytes) -> bytes:
@@ -81,8 +81,8 @@ def planes(payload: bytes) -> bytes:
 # --- docs/deformables.md, in the order of its steps, one number at a time -------------------------------------------
 
 
-def reader(topology: bytes, payload: bytes) -> list[list[float]]:
-    """Vertices of `payload`. Only struct, zlib and zstd: as a port to another language would be written."""
+def read_by_the_document(topology: bytes, payload: bytes) -> list[list[float]]:
+    """Return the vertices of `payload` with struct, zlib and zstd only, as a port to another language would."""
     _, plan, flags, n, rows, cols, _, _ = struct.unpack_from("<BBHIIIII", topology)
     words = struct.unpack(f"<{(len(topology) - 24) // 4}I", topology[24:])
     order = words[:n] if flags & 1 else range(n)
@@ -111,8 +111,8 @@ def reader(topology: bytes, payload: bytes) -> list[list[float]]:
                 value += node[i - 1] if c else 0
                 value += node[i - cols] if r else 0
                 value -= node[i - cols - 1] if r and c else 0
-            node[i] = wrapped(value)
-            out[order[i]][axis] = wrapped(node[i] + origin[axis]) * step
+            node[i] = wrap_int32(value)
+            out[order[i]][axis] = wrap_int32(node[i] + origin[axis]) * step
     assert plan == 1 or rows * cols == n
     for k in range(n_escaped):
         vertex, *position = struct.unpack_from("<I3f", payload, 32 + 16 * k)
@@ -120,6 +120,6 @@ def reader(topology: bytes, payload: bytes) -> list[list[float]]:
     return out
 
 
-def wrapped(value: int) -> int:
-    """As int32."""
+def wrap_int32(value: int) -> int:
+    """Return the value wrapped to int32."""
     return (value + 2**31) % 2**32 - 2**31

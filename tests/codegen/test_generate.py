@@ -1,4 +1,4 @@
-"""Generated files are current, and hold what the definitions hold."""
+"""Generated files are current and contain the definitions."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from iris_session.protocol import assets, client_messages, codec, names, scene, 
 ROOT = Path(__file__).parents[2]
 
 
-# Packed bytes of arrays and deformables depend on the version of zstd: their own tests compare what they decode to.
+# Packed bytes of arrays and deformables depend on the version of zstd: their own tests compare decoded values.
 @pytest.mark.parametrize("target", [name for name in generate.TARGETS if name not in ("arrays", "deformable")])
 def test_generated_files_are_current(target: str) -> None:
-    outdated = [str(path.relative_to(ROOT)) for path, _ in generate.outdated(ROOT, [target])]
+    outdated = [str(path.relative_to(ROOT)) for path, _ in generate.find_outdated(ROOT, [target])]
     assert outdated == [], f"run: python -m iris_session.codegen {target}"
 
 
@@ -52,25 +52,25 @@ def test_check_fails_for_a_stale_file_and_writing_repairs_it(
 def test_generator_needs_a_checkout_and_its_markers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         generate.main(["all", "--root", str(tmp_path)])
-    assert "is not a checkout" in capsys.readouterr().err
+    assert "checkout" in capsys.readouterr().err
     with pytest.raises(ValueError, match="must hold <!-- generated:values -->"):
-        generate.document("# Protocol\n")
+        generate.update_document("# Protocol\n")
 
 
 def test_every_struct_is_in_the_schema() -> None:
     """A struct that is defined for the wire and not listed would be missing in every generated file."""
-    listed = {struct.name for struct in schema.all_structs()}
+    listed = {struct.name for struct in schema.list_all_structs()}
     for module in (client_messages, server_messages, scene, assets):
         for name, value in vars(module).items():
             if isinstance(value, type) and issubclass(value, msgspec.Struct) and value.__module__ == module.__name__:
                 assert name in listed | {"Message", "EventBody"}, name
-    assert len(listed) == len(schema.all_structs())
+    assert len(listed) == len(schema.list_all_structs())
 
 
-def test_open_enumerations_are_explained_whole() -> None:
+def test_descriptions_of_open_enumerations_are_complete() -> None:
     """Not up to the first line, which may end within a sentence."""
-    for name in schema.enums():
-        doc = schema.enum_doc(name)
+    for name in schema.list_enums():
+        doc = schema.find_enum_doc(name)
         kind = getattr(names, name)
         assert doc.split() == (kind.__doc__ or "").split()
         assert not doc or doc.endswith("."), name
@@ -85,7 +85,7 @@ def test_open_enumerations_are_explained_whole() -> None:
 
 
 def test_schema_follows_the_definitions() -> None:
-    by_name = {struct.name: struct for struct in schema.all_structs()}
+    by_name = {struct.name: struct for struct in schema.list_all_structs()}
     sample = {field.name: field for field in by_name["Sample"].fields}
     assert [field.name for field in by_name["Sample"].fields] == list(client_messages.Sample.__struct_fields__)
     assert sample["q"].type == schema.Type("array", item=schema.Type("float"), max_length=64)
@@ -105,36 +105,38 @@ def test_schema_follows_the_definitions() -> None:
 
 
 def test_enumerations_of_fields_exist() -> None:
-    known = schema.enums()
-    used = {field.enum for struct in schema.all_structs() for field in struct.fields if field.enum}
+    known = schema.list_enums()
+    used = {field.enum for struct in schema.list_all_structs() for field in struct.fields if field.enum}
     assert used <= set(known)
     assert known["Role"] == {
         role.upper(): role for role in sorted(names.Role.ALL, key=list(known["Role"].values()).index)
     }
-    fields = {f"{struct.name}.{field.name}" for struct in schema.all_structs() for field in struct.fields}
+    fields = {f"{struct.name}.{field.name}" for struct in schema.list_all_structs() for field in struct.fields}
     assert set(schema._ENUMS) <= fields
 
 
 @pytest.mark.parametrize("kind", [list[int], set[str], int | str, tuple[int, str] | None])
-def test_types_without_a_form_are_refused(kind: object) -> None:
-    with pytest.raises(TypeError, match=r"has no form|none of the unions"):
-        schema._type(msgspec.inspect.type_info(kind))
+def test_unsupported_types_are_rejected(kind: object) -> None:
+    with pytest.raises(TypeError, match=r"no form|none of"):
+        schema._describe_type(msgspec.inspect.type_info(kind))
 
 
 def test_csharp_has_every_message_field_and_tag() -> None:
-    text = csharp.csharp()
-    for struct in schema.all_structs():
+    text = csharp.render_csharp()
+    for struct in schema.list_all_structs():
         body = re.search(rf"public sealed class {struct.name} : \w+\n    \{{\n(.*?)\n    \}}\n", text, re.DOTALL)
         assert body, struct.name
         assert (f'TagName = "{struct.tag}"' in body[1]) == bool(struct.tag)
         for field in struct.fields:
-            assert re.search(rf"public \S+(, long>)? {csharp.pascal(field.name, struct.name)} = ", body[1]), field.name
-    for value in (value for values in schema.enums().values() for value in values.values()):
+            assert re.search(rf"public \S+(, long>)? {csharp.to_pascal_case(field.name, struct.name)} = ", body[1]), (
+                field.name
+            )
+    for value in (value for values in schema.list_enums().values() for value in values.values()):
         assert f'= "{value}";' in text
 
 
-def test_csharp_reads_within_the_bounds_of_the_schema() -> None:
-    text = csharp.csharp()
+def test_csharp_checks_the_bounds_of_the_schema() -> None:
+    text = csharp.render_csharp()
     for line in (
         "value.Material = reader.ReadLong(-1, 2147483647);",
         "value.Resolution = reader.ReadLongs(2, 0, -2147483648, 2147483647);",
@@ -151,8 +153,8 @@ def test_csharp_reads_within_the_bounds_of_the_schema() -> None:
         assert line in text, line
 
 
-def test_typescript_has_the_defaults_of_maps_without_a_tag() -> None:
-    text = typescript.typescript().split("export const VALUE_DEFAULTS")[1]
+def test_typescript_has_defaults_of_untagged_maps() -> None:
+    text = typescript.render_typescript().split("export const VALUE_DEFAULTS")[1]
     light = text.split("  Light: {\n")[1].split("  },")[0]
     assert '    follow: "fixed",\n' in light
     assert "    attenuation: [1.0, 0.0, 0.0],\n" in light
@@ -160,15 +162,15 @@ def test_typescript_has_the_defaults_of_maps_without_a_tag() -> None:
 
 
 def test_csharp_names() -> None:
-    assert csharp.pascal("request_id", "Acquire") == "RequestId"
-    assert csharp.pascal("T_world_tracking", "Alignment") == "T_world_tracking"
-    assert csharp.pascal("tracking_epoch", "TrackingEpoch") == "TrackingEpochValue"
-    assert csharp.pascal("CONTROLLER_LEFT") == "ControllerLeft"
+    assert csharp.to_pascal_case("request_id", "Acquire") == "RequestId"
+    assert csharp.to_pascal_case("T_world_tracking", "Alignment") == "T_world_tracking"
+    assert csharp.to_pascal_case("tracking_epoch", "TrackingEpoch") == "TrackingEpochValue"
+    assert csharp.to_pascal_case("CONTROLLER_LEFT") == "ControllerLeft"
 
 
 def test_typescript_has_every_message_field_and_union() -> None:
-    text = typescript.typescript()
-    for struct in schema.all_structs():
+    text = typescript.render_typescript()
+    for struct in schema.list_all_structs():
         form = rf"type {struct.name} = \[" if struct.array_like else rf"interface {struct.name} \{{"
         body = re.search(rf"export {form}\n(.*?)\n[\]}}]", text, re.DOTALL)
         assert body, struct.name
@@ -179,7 +181,7 @@ def test_typescript_has_every_message_field_and_union() -> None:
 
 
 def test_tables_have_every_type_and_limit() -> None:
-    sections = tables.sections()
+    sections = tables.render_sections()
     for tag in (*codec.CLIENT_TYPES, *codec.SERVER_TYPES):
         assert f"| `{tag}` |" in sections["limits"]
         assert f'`type` = `"{tag}"`' in sections["client"] + sections["server"]
@@ -187,7 +189,7 @@ def test_tables_have_every_type_and_limit() -> None:
         assert f"#### {kind.__name__}\n" in sections["events"]
 
 
-def test_links_of_the_document_lead_somewhere() -> None:
+def test_links_of_the_document_resolve() -> None:
     text = (ROOT / "docs/protocol.md").read_text()
     headings = {
         re.sub(r"[^\w -]", "", line.lstrip("# ")).strip().lower().replace(" ", "-")

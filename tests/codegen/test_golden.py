@@ -1,4 +1,4 @@
-"""docs/protocol/golden.json is complete and true both ways; the reference payload is that of the encoder."""
+"""docs/protocol/golden.json is complete and round-trips; the reference payload equals that of the encoder."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ CODECS: dict[str, tuple[Any, Any, Any]] = {
 
 
 @pytest.mark.parametrize("section", CODECS)
-def test_vectors_hold_both_ways(section: str) -> None:
+def test_vectors_round_trip(section: str) -> None:
     kind, encode, decode = CODECS[section]
     for vector in GOLDEN[section]:
         value = msgspec.convert(vector["value"], kind)
@@ -66,7 +66,7 @@ def test_decode_only_vectors_decode_to_their_value() -> None:
         assert codec.encode_client(expected) != data, vector["name"]
 
 
-def test_malformed_vectors_are_refused_with_their_code() -> None:
+def test_malformed_vectors_are_rejected_with_their_code() -> None:
     for vector in GOLDEN["malformed"]:
         with pytest.raises(ProtocolError) as caught:
             codec.decode_client(bytes.fromhex(vector["hex"]))
@@ -108,15 +108,15 @@ def test_reference_and_encoder_agree_on_escapes() -> None:
     assert payload == rigid_reference.encode(10, rows, escaped)
 
 
-def test_reference_refuses_codes_of_no_rotation() -> None:
+def test_reference_rejects_levels_outside_the_unit_ball() -> None:
     with pytest.raises(ValueError, match="no rotation"):
         rigid_reference.decode_rotation((16383, 8191, 8191))
     with pytest.raises(ValueError, match="no rotation"):
         rigid_reference.decode_rotation((0, 0, 0))
 
 
-def test_conversions_turn_vectors_like_poses() -> None:
-    """Converting a turned vector is the same as turning the converted one, in both engines; and the way back."""
+def test_conversions_transform_vectors_like_poses() -> None:
+    """Converting a rotated vector equals rotating the converted one, in both engines and in both directions."""
     rng = np.random.default_rng(14)
     for row in random_poses(rng, 50).tolist():
         q = quat_normalize((row[3], row[4], row[5], row[6]))
@@ -136,7 +136,7 @@ def test_axes_of_the_engines() -> None:
     assert [to_three(axis)[:3] for axis in (forward, left, up)] == [(0, 0, -1), (-1, 0, 0), (0, 1, 0)]
 
 
-def test_conversion_vectors_are_those_of_the_functions() -> None:
+def test_conversion_vectors_agree_with_the_functions() -> None:
     for vector in GOLDEN["conversions"]:
         assert list(to_unity(vector["world"])) == vector["unity"]
         assert list(to_three(vector["world"])) == vector["three"]

@@ -1,5 +1,7 @@
-"""Any MessagePack library reads our wire, and we read what it writes: the golden vectors go through `msgpack`, which
-shares no code with the encoder that made them."""
+"""Golden vectors through another MessagePack library: it reads our wire, and we read what it writes.
+
+`msgpack` shares no code with the encoder that made the vectors.
+"""
 
 from __future__ import annotations
 
@@ -32,17 +34,17 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
 VECTORS = [pytest.param(section, vector, id=vector["name"]) for section in DECODERS for vector in GOLDEN[section]]
 
 
-def same(packed: Any, value: Any) -> bool:
-    """Whether a value of MessagePack is the JSON value beside it, exactly."""
+def is_same_value(packed: Any, value: Any) -> bool:
+    """Return whether a value of MessagePack equals the JSON value beside it exactly."""
     match packed:
         case dict():
             return (
                 isinstance(value, dict)
                 and list(packed) == list(value)
-                and all(same(packed[key], value[key]) for key in packed)
+                and all(is_same_value(packed[key], value[key]) for key in packed)
             )
         case list():
-            return isinstance(value, list) and len(packed) == len(value) and all(map(same, packed, value))
+            return isinstance(value, list) and len(packed) == len(value) and all(map(is_same_value, packed, value))
         case bytes():
             return isinstance(value, str) and base64.b64decode(value, validate=True) == packed
         case float() if not math.isfinite(packed):
@@ -57,41 +59,41 @@ def unpack(data: bytes) -> Any:
     return msgpack.unpackb(data, raw=False, strict_map_key=True)
 
 
-def reordered(value: Any) -> Any:
-    """The same with the keys of every map in the opposite order: the tag comes last."""
+def reverse_keys(value: Any) -> Any:
+    """Return the value with the keys of every map reversed: the tag comes last."""
     if isinstance(value, dict):
-        return {key: reordered(item) for key, item in reversed(value.items())}
-    return [reordered(item) for item in value] if isinstance(value, list) else value
+        return {key: reverse_keys(item) for key, item in reversed(value.items())}
+    return [reverse_keys(item) for item in value] if isinstance(value, list) else value
 
 
 @pytest.mark.parametrize(("section", "vector"), VECTORS)
 def test_another_library_reads_every_vector_and_writes_the_same_bytes(section: str, vector: dict[str, Any]) -> None:
-    """Shortest integers, floats of 64 bits, text and bytes apart: the encoding of every library by default."""
+    """Shortest integers, floats of 64 bits, text apart from bytes: the default encoding of every library."""
     packed = unpack(bytes.fromhex(vector["hex"]))
-    assert same(packed, vector["value"])
+    assert is_same_value(packed, vector["value"])
     assert msgpack.packb(packed, use_bin_type=True).hex() == vector["hex"]
 
 
 @pytest.mark.parametrize(("section", "vector"), VECTORS)
-def test_what_another_library_writes_is_read_in_any_order_of_keys(section: str, vector: dict[str, Any]) -> None:
+def test_maps_of_another_library_are_read_in_any_key_order(section: str, vector: dict[str, Any]) -> None:
     data = bytes.fromhex(vector["hex"])
-    other: bytes = msgpack.packb(reordered(unpack(data)), use_bin_type=True)
+    other: bytes = msgpack.packb(reverse_keys(unpack(data)), use_bin_type=True)
     assert DECODERS[section](other) == DECODERS[section](data)
 
 
 def test_vectors_of_other_encoders_are_messagepack() -> None:
-    """Fields that are missing or unknown, wide integers, short floats: all of it is readable elsewhere too."""
+    """Missing or unknown fields, wide integers, short floats: all readable elsewhere too."""
     assert GOLDEN["decode_only"]
     for vector in GOLDEN["decode_only"]:
         version, epoch, _, message = unpack(bytes.fromhex(vector["hex"]))[:4]
         assert [version, epoch, message["type"]] == [*vector["value"][:2], vector["value"][3]["type"]], vector["name"]
 
 
-def test_a_difference_would_be_seen() -> None:
+def test_comparison_detects_differences() -> None:
     pairs: list[tuple[Any, Any]] = [(1, 1.0), (0.0, -0.0), (True, 1), ("1", 1), ({"a": 1, "b": 2}, {"b": 2, "a": 1})]
     for packed, value in pairs:
-        assert not same(packed, value)
-        assert same(packed, packed)
-    assert same(b"x", "eA==")
-    assert not same(b"x", "eQ==")
-    assert same(math.nan, None)
+        assert not is_same_value(packed, value)
+        assert is_same_value(packed, packed)
+    assert is_same_value(b"x", "eA==")
+    assert not is_same_value(b"x", "eQ==")
+    assert is_same_value(math.nan, None)

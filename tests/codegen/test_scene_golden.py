@@ -1,4 +1,4 @@
-"""docs/protocol/scene.json is complete, true both ways, read the same by another library, refused where it must be."""
+"""docs/protocol/scene.json is complete, round-trips, reads the same in another library, is rejected where stated."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from iris_session.protocol.scene import (
     decode_scene,
     encode_scene,
 )
-from tests.codegen.test_interop import reordered, same, unpack
+from tests.codegen.test_interop import is_same_value, reverse_keys, unpack
 
 GOLDEN = json.loads((Path(__file__).parents[2] / "docs" / "protocol" / "scene.json").read_text())
 KINDS = {kind.__name__: kind for group in ("scene", "arrays", "patch") for kind in schema.GROUPS[group]}
@@ -39,14 +39,14 @@ def named(rows: list[dict[str, Any]]) -> list[Any]:
 
 
 @pytest.mark.parametrize("row", named(GOLDEN["structs"]))
-def test_every_struct_holds_both_ways_and_in_another_library(row: dict[str, Any]) -> None:
+def test_every_struct_round_trips_also_in_another_library(row: dict[str, Any]) -> None:
     kind, data = KINDS[row["type"]], bytes.fromhex(row["hex"])
     value: Any = msgspec.convert(row["value"], kind)
     assert msgspec.msgpack.encode(value) == data
     assert msgspec.msgpack.decode(data, type=kind) == value
     packed = unpack(data)
-    assert same(packed, row["value"])
-    assert msgspec.msgpack.decode(msgpack.packb(reordered(packed)), type=kind) == value
+    assert is_same_value(packed, row["value"])
+    assert msgspec.msgpack.decode(msgpack.packb(reverse_keys(packed)), type=kind) == value
 
 
 @pytest.mark.parametrize("row", named(GOLDEN["scenes"]))
@@ -57,14 +57,14 @@ def test_scenes_decode_to_their_value(row: dict[str, Any]) -> None:
     assert hashlib.sha256(data).hexdigest() == row["address"]
     assert (encode_scene(spec) == data) == row["canonical"]
     if row["canonical"]:
-        assert same(unpack(data), row["value"])
+        assert is_same_value(unpack(data), row["value"])
 
 
 @pytest.mark.parametrize("row", named(GOLDEN["patches"]))
-def test_patches_lead_to_the_scene_that_they_say(row: dict[str, Any]) -> None:
+def test_patches_produce_the_stated_scene(row: dict[str, Any]) -> None:
     data = bytes.fromhex(row["hex"])
     ops: tuple[PatchOp, ...] = msgspec.msgpack.decode(data, type=tuple[PatchOp, ...])
-    assert same(unpack(data), row["value"])
+    assert is_same_value(unpack(data), row["value"])
     assert msgspec.msgpack.encode(ops) == data
     before = decode_scene(bytes.fromhex(SCENES[row["before"]]["hex"]))
     after = encode_scene(apply_patch(before, ops))
@@ -74,8 +74,8 @@ def test_patches_lead_to_the_scene_that_they_say(row: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("row", named(GOLDEN["malformed"]))
-def test_what_is_malformed_is_refused(row: dict[str, Any]) -> None:
-    """By types and bounds, which generated readers check, or by what it says."""
+def test_malformed_scenes_are_rejected(row: dict[str, Any]) -> None:
+    """By types and bounds, which generated readers check, or by content."""
     data = bytes.fromhex(row["hex"])
     with pytest.raises(SceneError):
         decode_scene(data)
@@ -87,33 +87,33 @@ def test_what_is_malformed_is_refused(row: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "expected"),
     [
-        ("version 2", "version 2, this side reads 1"),
-        ("a body that is not there", "on body 77: no such body"),
-        ("a target that is not there", "looks at body 77: no such body"),
+        ("version 2", "version 2"),
+        ("a body that is not there", "body 77"),
+        ("a target that is not there", "body 77"),
         ("two bodies of one id", "two bodies have the same id"),
-        ("two visuals of one id", "two visuals have the same id"),
-        ("a child before its parent", "not listed before it"),
-        ("a tendon through a site that is not there", "a site that is not there"),
+        ("two visuals of one id", "two visuals"),
+        ("a child before its parent", "before it"),
+        ("a tendon through a site that is not there", "a site"),
         ("a mesh without a level", "no level"),
         ("33 levels of detail", "length <= 32"),
     ],
 )
-def test_refusals_say_what_is_wrong(name: str, said: str) -> None:
-    with pytest.raises(SceneError, match=said):
+def test_rejections_name_the_fault(name: str, expected: str) -> None:
+    with pytest.raises(SceneError, match=expected):
         decode_scene(bytes.fromhex(MALFORMED[name]["hex"]))
 
 
-def test_what_is_deep_or_long_is_refused_before_it_costs_anything() -> None:
+def test_deep_or_long_scenes_are_rejected_early() -> None:
     with pytest.raises(SceneError):
         decode_scene(b"\x81\xa4deep" + b"\x91" * 100_000 + b"\xc0")
-    with pytest.raises(SceneError, match="at most 32000000 are read"):
+    with pytest.raises(SceneError, match="at most 32000000"):
         decode_scene(bytes(MAX_SCENE_BYTES + 1))
 
 
-def test_many_small_things_are_refused_before_they_take_memory() -> None:
-    """32 MB may hold two million materials, which would take 600 MiB."""
+def test_many_small_items_are_rejected_before_allocation() -> None:
+    """32 MB may contain two million materials, which would take 600 MiB."""
     one = msgspec.msgpack.encode({"name": "", "rgba": [0, 0, 0, 0]})
     data = b"\x81\xa9materials\xdd" + (MAX_THINGS + 1).to_bytes(4, "big") + one * (MAX_THINGS + 1)
     with pytest.raises(SceneError, match="length <= 65536"):
@@ -122,26 +122,26 @@ def test_many_small_things_are_refused_before_they_take_memory() -> None:
         check_scene(SceneSpec(materials=(Material("", (0.0, 0.0, 0.0, 0.0)),) * (MAX_THINGS + 1)))
 
 
-def test_what_nobody_would_read_is_not_written() -> None:
+def test_unreadable_scenes_are_not_written() -> None:
     whole = decode_scene(bytes.fromhex(SCENES["every kind of thing"]["hex"]))
     many = msgspec.structs.replace(whole, visuals=whole.visuals * 15_000)
-    with pytest.raises(SceneError, match=r"150000 visuals, 3 bodies\), at most 32000000"):
+    with pytest.raises(SceneError, match=r"150000 visuals, .* 32000000"):
         encode_scene(many)
 
 
-def test_every_struct_and_kind_of_thing_has_a_vector() -> None:
+def test_every_struct_and_kind_has_a_vector() -> None:
     listed = {row["name"] for row in GOLDEN["structs"]}
     assert listed >= {f"{name}/{make}" for name in KINDS for make in ("full", "least")}
     whole = decode_scene(bytes.fromhex(SCENES["every kind of thing"]["hex"]))
     for field in whole.__struct_fields__:
         assert getattr(whole, field) != getattr(SceneSpec(), field) or field == "version", field
     kinds = names.GeometryKind.ALL
-    assert {visual.geometry.kind for visual in whole.visuals} - kinds == {"torus"}, "and one that nobody knows"
+    assert {visual.geometry.kind for visual in whole.visuals} - kinds == {"torus"}, "and an unknown one"
     assert {visual.geometry.kind for visual in whole.visuals} >= kinds
     assert {light.kind for light in whole.lights} == names.LightKind.ALL
     assert {texture.kind for texture in whole.textures} == names.TextureKind.ALL
     assert {part.dim for part in whole.deformables} == {1, 2, 3}
     encodings = {level.encoding for texture in whole.textures for level in texture.levels}
-    assert encodings == set(schema.enums()["AssetEncoding"].values())
+    assert encodings == set(schema.list_enums()["AssetEncoding"].values())
     done = {op["op"] for row in GOLDEN["patches"] for op in row["value"]}
-    assert done == {struct.tag for struct in schema.structs("patch")}
+    assert done == {struct.tag for struct in schema.list_structs("patch")}

@@ -30,7 +30,8 @@ from tests.control.rigs import (
     pose_command,
 )
 
-TARGETS = ControlConfig(output="targets")
+#: No environment moves the arm here, so that the target may lead it by any distance; see `test_hold` for the bound.
+TARGETS = ControlConfig(output="targets", target_lead_m=9.0, target_lead_rad=9.0)
 
 
 def iiwa(config: ControlConfig | None = None) -> Rig:
@@ -316,6 +317,8 @@ def test_targets_without_ik_move_at_bounded_speed_and_need_no_mink(monkeypatch: 
     with pytest.raises(ImportError, match=r"iris-session\[control\]"):
         Controller(iiwa_model(), [iiwa_spec()])
     rig = iiwa(TARGETS)
+    rig.data.ctrl[:] = IIWA_HOME
+    rig.hold(500)
     start, ctrl = rig.target(), rig.data.ctrl.copy()
     drive(rig, rig.source((0.0, 0.0, 0.0)))
     assert rig.target() == start

@@ -148,17 +148,21 @@ def test_no_drift_in_hold_after_a_drag(make: str, bound: float) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_hold_stops_a_fast_drag_within_the_limits(kind: str) -> None:
+    """The measured joints: 40 rad/s^2, and what servos add when it begins and ends. Never back by more than 10 mrad."""
     rig = iiwa(kind)
     drag(rig, 400, 1, speed=0.8)
-    joints = rig.controller._joints
-    q, v = joints.q.copy(), joints.v.copy()
+    q, v = rig.data.qpos.copy(), rig.data.qvel.copy()
     assert np.abs(v).max() > 0.5
-    for _ in range(60):
+    way, farthest, last = np.zeros(7), np.zeros(7), v.copy()
+    for _ in range(150):
         rig.hold(1)
-        now = (joints.q - q) / 0.002
-        assert (np.abs(now - v) <= 40.0 * 0.002 + 1e-9).all()
-        q, v = joints.q.copy(), now
-    assert (v == 0.0).all()
+        assert (np.abs(rig.data.qvel - last) <= 100.0 * 0.002).all()
+        last = rig.data.qvel.copy()
+        way = np.sign(v) * (rig.data.qpos - q)
+        farthest = np.maximum(farthest, way)
+    assert (farthest <= v * v / 80.0 + 0.02).all()
+    assert (farthest - way <= 0.01).all()
+    assert (rig.controller._joints.v == 0.0).all()
 
 
 @pytest.mark.parametrize("kind", KINDS)

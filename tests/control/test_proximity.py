@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from iris_session.control import ControlConfig, Controller
-from iris_session.control.proximity import ProximityLimiter
+from iris_session.control.proximity import ProximityLimiter, compute_box_bounds
 from iris_session.protocol.specs import RobotSpec
 from iris_session.protocol.steps import Command
 from tests.control.rigs import IIWA_HOME, Rig, decision, iiwa_arms, pose_command
@@ -180,3 +180,53 @@ def test_nothing_to_check_for_one_robot_or_without_geoms() -> None:
     assert not ProximityLimiter(model, robots, ControlConfig(proximity_margin=0.0)).active
     assert not ProximityLimiter(model, [], ControlConfig()).active
     assert ProximityLimiter(model, robots, ControlConfig()).active
+
+
+def hidden_pair(gap_m: float) -> tuple[mujoco.MjModel, list[RobotSpec]]:
+    """Two sliding robots: 7 long plates each, half a metre apart, whose bounding spheres all overlap, and one small
+    ball each, `gap_m` apart, whose spheres do not.
+    """
+
+    def body(name: str, x: float, side: float) -> str:
+        plates = "".join(
+            f'<geom type="box" size="0.002 0.6 0.6" pos="{-side * 0.25:g} {0.01 * k:g} 0"/>' for k in range(7)
+        )
+        ball = f'<geom type="sphere" size="0.01" pos="{side * 0.01:g} 0 0.9"/>'
+        joint = f'<joint name="{name}/x" type="slide" axis="1 0 0" range="-1 1"/>'
+        return f'<body name="{name}" pos="{x:g} 0 1">{joint}{plates}{ball}<site name="{name}/tip"/></body>'
+
+    bodies = body("a", 0.0, 1.0) + body("b", 0.04 + gap_m, -1.0)
+    actuators = "".join(f'<position name="{n}/x" joint="{n}/x" kp="100" ctrlrange="-1 1"/>' for n in ("a", "b"))
+    xml = f"<mujoco><worldbody>{bodies}</worldbody><actuator>{actuators}</actuator></mujoco>"
+    robots = [RobotSpec(n, (f"{n}/x",), (f"{n}/x",), f"{n}/tip", n) for n in ("a", "b")]
+    return mujoco.MjModel.from_xml_string(xml), robots
+
+
+def test_the_nearest_pair_cannot_hide_behind_49_others() -> None:
+    model, robots = hidden_pair(0.03)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    proximity = ProximityLimiter(model, robots, ControlConfig())
+    assert len(proximity._geoms[0]) == 8
+    towards = [np.array([0.4]), np.array([-0.4])]
+    # 30 mm apart, 20 mm are kept: the closing speed is at most 4 * 10 mm/s of 0.8 m/s.
+    assert proximity.compute_speed_factors(data, towards) == pytest.approx([0.05, 0.05])
+
+
+def test_box_bounds_are_no_greater_than_the_distance() -> None:
+    rng = np.random.default_rng(0)
+    shapes = ("sphere", "capsule", "ellipsoid", "cylinder", "box")
+    for _ in range(200):
+        geoms = ""
+        for name in ("a", "b"):
+            p, q = rng.uniform(-0.3, 0.3, 3), rng.normal(size=4)
+            size = " ".join(f"{v:.4f}" for v in rng.uniform(0.02, 0.3, 3))
+            pose = f'pos="{p[0]:.4f} {p[1]:.4f} {p[2]:.4f}" quat="{q[0]:.4f} {q[1]:.4f} {q[2]:.4f} {q[3]:.4f}"'
+            geoms += f'<geom name="{name}" type="{shapes[rng.integers(5)]}" size="{size}" {pose}/>'
+        model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{geoms}</worldbody></mujoco>")
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        distance = mujoco.mj_geomDistance(model, data, 0, 1, 5.0, None)
+        (bound,) = compute_box_bounds(model, data, np.array([0]), np.array([1]))
+        if distance > 0.0:
+            assert bound <= distance + 1e-6

@@ -12,7 +12,8 @@ from iris_session.protocol.steps import Command
 from tests.control.rigs import IIWA_HOME, Rig, decision, iiwa_model, iiwa_spec, pose_command
 from tests.control.test_diverged import on_a_rail
 
-TARGETS = ControlConfig(output="targets")
+#: Nothing recomputes the tip here, so that the target may lead it by any distance; see `test_hold` for the bound.
+TARGETS = ControlConfig(output="targets", target_lead_m=9.0, target_lead_rad=9.0)
 
 
 def lead(rig: Rig, q: np.ndarray, steps: int, engagement: int = 1) -> list[tuple[str, ...]]:

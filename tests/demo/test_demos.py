@@ -1,4 +1,4 @@
-"""Who plays what in the demos, and that it fits the scene."""
+"""Casts of the demos, and that they fit their scenes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def play(request: pytest.FixtureRequest) -> Demo:
     return make_demo(name, operators, observers=3, seed=7)
 
 
-def test_everybody_has_robots_that_are_there_and_nobody_elses(play: Demo) -> None:
+def test_robots_of_each_person_exist_and_are_exclusive(play: Demo) -> None:
     robots = {robot.name for robot in find_robots(play.model)}
     taken = [task.robot for person in play.headsets for task in person.tasks]
     assert sorted(taken) == sorted(set(taken))
@@ -60,7 +60,7 @@ def test_every_object_goes_from_one_person_to_another(play: Demo) -> None:
         assert tasks[giver.robot][0] != tasks[receiver.robot][0]
 
 
-def test_every_goal_is_somebodys_task_and_its_corners_are_those_of_the_scene(play: Demo) -> None:
+def test_every_goal_is_a_task_with_the_corners_of_the_scene(play: Demo) -> None:
     world = World(play.model, find_robots(play.model), find_objects(play.model))
     for goal in play.goals:
         assert goal.deformable in {task.object for person in play.headsets for task in person.tasks}
@@ -74,15 +74,15 @@ def test_every_goal_is_somebodys_task_and_its_corners_are_those_of_the_scene(pla
         np.testing.assert_allclose(np.add(BOX_HIGH, BOX_LOW)[:2] / 2.0, world.data.body(BOX).xpos[:2], atol=1e-9)
 
 
-def test_the_first_corners_of_a_soft_body_are_those_of_one_end(play: Demo) -> None:
+def test_first_corners_of_a_soft_body_are_those_of_one_end(play: Demo) -> None:
     world = World(play.model, find_robots(play.model), ())
     for name in {goal.deformable for goal in play.goals} - {"cloth"}:
         corners = world.flexes.read_vertices(name)[list(CORNERS[name])]
         assert (corners[:4, 0] < corners[4:, 0]).all()
 
 
-def test_what_people_know_of_their_arms_is_true(play: Demo) -> None:
-    """Bodies have the names that they look for, and closed pads meet at the tip."""
+def test_robot_descriptions_match_the_scene(play: Demo) -> None:
+    """Body names exist, and closed pads meet at the tip."""
     data = mujoco.MjData(play.model)
     mujoco.mj_resetDataKeyframe(play.model, data, 0)
     mujoco.mj_forward(play.model, data)
@@ -99,7 +99,7 @@ def test_what_people_know_of_their_arms_is_true(play: Demo) -> None:
         assert abs(across @ tip.xmat.reshape(3, 3)[:, 1]) == pytest.approx(1.0, abs=1e-3)
 
 
-def test_the_sheet_lies_where_the_session_believes(play: Demo) -> None:
+def test_sheet_is_at_its_configured_pose(play: Demo) -> None:
     data = mujoco.MjData(play.model)
     mujoco.mj_resetDataKeyframe(play.model, data, 0)
     mujoco.mj_forward(play.model, data)
@@ -117,25 +117,25 @@ def test_aloha_gives_each_person_two_hands() -> None:
     assert play.objects == ("red_board", "blue_board")
 
 
-def test_who_is_left_over_moves_freely_and_it_is_said() -> None:
+def test_people_without_a_partner_move_freely_and_are_reported() -> None:
     play = make_demo("handover", 5)
     assert [p.behaviour for p in play.headsets] == ["giver", "receiver", "giver", "receiver", "wander"]
     assert play.headsets[-1].endless
-    assert "eli has no partner" in play.notes[0]
+    assert "eli has" in play.notes[0]
 
 
 @pytest.mark.parametrize(
     ("demo", "operators", "observers", "why"),
     [
-        ("handover", 1, 0, "takes 2 to 8 operators, not 1.*it takes two"),
-        ("iiwa", 9, 0, "takes 2 to 8 operators, not 9"),
-        ("aloha", 4, 0, "two stations with two arms each: 2 operators, not 4"),
-        ("handover", 2, 17, "--observers 17 is out of range: 0 to 16"),
-        ("cloth", 3, 0, "two arms at one table: 2 operators, not 3"),
-        ("soft", 8, 0, "two arms at one table: 2 operators, not 8"),
-        ("juggle", 2, 0, "there is no demo 'juggle': handover, iiwa, aloha, cloth, soft"),
+        ("handover", 1, 0, "2 to 8 operators, not 1"),
+        ("iiwa", 9, 0, "2 to 8 operators, not 9"),
+        ("aloha", 4, 0, "2 operators, not 4"),
+        ("handover", 2, 17, "--observers 17 .*0 to 16"),
+        ("cloth", 3, 0, "2 operators, not 3"),
+        ("soft", 8, 0, "2 operators, not 8"),
+        ("juggle", 2, 0, "'juggle': handover, iiwa, aloha, cloth, soft"),
     ],
 )
-def test_people_that_a_demo_cannot_use_are_explained(demo: str, operators: int, observers: int, why: str) -> None:
+def test_unsuitable_casts_are_rejected_with_reason(demo: str, operators: int, observers: int, why: str) -> None:
     with pytest.raises(ConfigError, match=why):
         make_demo(demo, operators, observers)

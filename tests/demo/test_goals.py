@@ -1,4 +1,4 @@
-"""When a cloth counts as folded and a soft body as stowed: criteria, begun before, let go, and at rest."""
+"""Criteria of a folded cloth and a stowed soft body: shape, started before, released, and at rest."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FLAT: Vertices = np.array([[-0.2, -0.2, 0.0], [-0.2, 0.2, 0.0], [0.2, -0.2, 0.0]
 
 
 def folded(gap: float) -> Vertices:
-    """Both corners brought over, `gap` [m] from the others."""
+    """Return both corners brought over, `gap` [m] from the others."""
     there = FLAT.copy()
     there[[0, 2]] = FLAT[[1, 3]] + [0.0, -gap, 0.0]
     return there
@@ -25,25 +25,25 @@ def loaf(x: float, y: float, z: float) -> Vertices:
 
 
 def play(watch: GoalMonitor, seconds: float, vertices: Vertices, now_s: float, touching: tuple[str, ...] = ()) -> float:
-    """Shows the same world for some time; returns the time afterwards."""
+    """Show the same world for some time; return the time afterwards."""
     for _ in range(round(seconds / TICK_S)):
         now_s += TICK_S
         watch.update(now_s, vertices, touching)
     return now_s
 
 
-def test_a_cloth_is_folded_when_both_pairs_of_corners_meet_and_rest() -> None:
+def test_cloth_is_folded_when_both_pairs_of_corners_meet_and_rest() -> None:
     watch = GoalMonitor(FOLD)
     now_s = play(watch, 0.1, FLAT, 0.0)
     now_s = play(watch, 2 * STILL_S, folded(0.049), now_s)
     assert watch.at_s == pytest.approx(0.1 + TICK_S + STILL_S, abs=2 * TICK_S)
 
 
-def test_it_is_told_once() -> None:
+def test_success_is_reported_once() -> None:
     watch = GoalMonitor(FOLD)
     watch.update(0.0, FLAT, ())
-    told = [watch.update(0.1 + k * TICK_S, folded(0.01), ()) for k in range(300)]
-    assert told.count(True) == 1
+    reported = [watch.update(0.1 + k * TICK_S, folded(0.01), ()) for k in range(300)]
+    assert reported.count(True) == 1
 
 
 @pytest.mark.parametrize(
@@ -58,14 +58,14 @@ def test_it_is_told_once() -> None:
         pytest.param(STOW, loaf(0.0, 0.2, 0.12), loaf(0.0, 0.2, 0.03), id="sticks out above"),
     ],
 )
-def test_what_is_no_success(goal: Goal, first: Vertices, then: Vertices) -> None:
+def test_incomplete_goals_are_no_success(goal: Goal, first: Vertices, then: Vertices) -> None:
     watch = GoalMonitor(goal)
     now_s = play(watch, 1.0, first, 0.0, ("left",))
     play(watch, 3.0, then, now_s)
     assert watch.at_s is None
 
 
-def test_a_soft_body_is_stowed_when_it_was_lifted_and_lies_in_the_box() -> None:
+def test_soft_body_is_stowed_when_it_was_lifted_and_lies_in_the_box() -> None:
     watch = GoalMonitor(STOW)
     now_s = play(watch, 0.5, loaf(0.0, 0.0, 0.12), 0.0, ("left",))
     play(watch, 1.0, loaf(0.1, 0.2, 0.01), now_s)
@@ -73,10 +73,10 @@ def test_a_soft_body_is_stowed_when_it_was_lifted_and_lies_in_the_box() -> None:
 
 
 @pytest.mark.parametrize("hindrance", ["touched", "moving"])
-def test_it_does_not_count_before_it_is_let_go_and_still(hindrance: str) -> None:
+def test_success_waits_for_release_and_rest(hindrance: str) -> None:
     watch = GoalMonitor(FOLD)
     now_s = play(watch, 0.1, FLAT, 0.0)
-    for k in range(600):  # a vertex of the folded cloth wanders, or somebody's finger lies on it
+    for k in range(600):  # a vertex of the folded cloth moves, or a finger rests on it
         now_s += TICK_S
         vertices = folded(0.02)
         if hindrance == "moving":
@@ -90,7 +90,7 @@ def test_it_does_not_count_before_it_is_let_go_and_still(hindrance: str) -> None
         assert watch.at_s is not None
 
 
-def test_trembling_within_the_bound_is_rest() -> None:
+def test_vibration_within_the_bound_is_rest() -> None:
     watch = GoalMonitor(FOLD)
     watch.update(0.0, FLAT, ())
     for k in range(300):

@@ -11,7 +11,7 @@ from iris_session.physics import ModelNotFoundError, find_robots
 from iris_session.session.errors import ConfigError
 
 
-def test_the_names_of_the_help_are_those_that_can_be_made() -> None:
+def test_names_in_the_help_are_available() -> None:
     assert list(SCENES) == list(SCENE_NAMES)
 
 
@@ -19,7 +19,7 @@ def test_the_names_of_the_help_are_those_that_can_be_made() -> None:
     ("name", "robots"),
     [("handover", 2), ("arm", 1), ("arms", 8), ("arms3", 3), ("iiwa", 2), ("iiwa1", 1), ("aloha", 4), ("bodies", 0)],
 )
-def test_a_scene_has_its_robots_and_a_sheet_of_known_size(name: str, robots: int) -> None:
+def test_scene_has_its_robots_and_a_sheet_of_known_size(name: str, robots: int) -> None:
     scene = scene_by_name(name)
     assert len(find_robots(scene.model)) == robots
     assert scene.anchor_sizes == {DEFAULT_ANCHOR_ID: DEFAULT_SHEET_M}
@@ -31,18 +31,18 @@ def test_a_scene_has_its_robots_and_a_sheet_of_known_size(name: str, robots: int
 @pytest.mark.parametrize(
     ("name", "text"),
     [
-        ("alohas", "expected one of handover, arm, arms, iiwa, aloha, cloth, soft, bodies"),
-        ("handover2", "expected one of handover"),
+        ("alohas", "handover, arm, arms, iiwa, aloha, cloth, soft, bodies"),
+        ("handover2", "one of handover"),
         ("arms0", "scene 'arms0': .* 1 to 12"),
         ("iiwa9", "1 to 8"),
     ],
 )
-def test_an_unknown_name_says_which_there_are(name: str, text: str) -> None:
+def test_unknown_name_lists_the_known(name: str, text: str) -> None:
     with pytest.raises(ConfigError, match=text):
         scene_by_name(name)
 
 
-def test_without_the_models_it_says_where_they_belong(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_models_are_reported_with_their_location(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("IRIS_DATA", raising=False)
     with pytest.raises(ModelNotFoundError, match="set IRIS_DATA"):
         scene_by_name("aloha")

@@ -27,7 +27,7 @@ def _settled(model: mujoco.MjModel, steps: int = 500) -> mujoco.MjData:
     return data
 
 
-def _only_friction_holds(model: mujoco.MjModel) -> bool:
+def _is_held_by_friction_only(model: mujoco.MjModel) -> bool:
     """No weld, connect, adhesion or mocap body: equalities couple the two fingers of a gripper only."""
     fingers = all(int(kind) == int(mujoco.mjtEq.mjEQ_JOINT) for kind in model.eq_type)
     no_adhesion = int(mujoco.mjtTrn.mjTRN_BODY) not in {int(kind) for kind in model.actuator_trntype}
@@ -39,7 +39,7 @@ def aloha() -> mujoco.MjModel:
     return aloha_scene().compile()
 
 
-def test_aloha_has_four_arms_that_are_found_with_their_grippers(aloha: mujoco.MjModel) -> None:
+def test_aloha_has_four_arms_with_grippers(aloha: mujoco.MjModel) -> None:
     robots = find_robots(aloha)
     assert [r.name for r in robots] == ["south/left", "south/right", "north/left", "north/right"]
     for robot in robots:
@@ -48,7 +48,7 @@ def test_aloha_has_four_arms_that_are_found_with_their_grippers(aloha: mujoco.Mj
         assert (robot.gripper_open, robot.gripper_closed) == (0.037, 0.002)
         assert robot.finger_bodies == (f"{robot.name}/left_finger_link", f"{robot.name}/right_finger_link")
     assert [o.name for o in find_objects(aloha)] == ["red_board", "blue_board"]
-    assert _only_friction_holds(aloha)
+    assert _is_held_by_friction_only(aloha)
 
 
 def test_aloha_rests_at_home(aloha: mujoco.MjModel) -> None:
@@ -65,11 +65,11 @@ def test_aloha_rests_at_home(aloha: mujoco.MjModel) -> None:
     np.testing.assert_allclose(tips[0] * (-1, 1, 1), tips[1], atol=1e-3)  # the stations are mirrored ...
     np.testing.assert_allclose(tips[1] * (-1, -1, 1), tips[3], atol=1e-3)  # ... and turned
     fingers = data.site("south/left/tcp").xmat.reshape(3, 3)[:, 2]
-    assert math.degrees(math.acos(-fingers[2])) == pytest.approx(20.0, abs=4.0)  # its servos give way a little
+    assert math.degrees(math.acos(-fingers[2])) == pytest.approx(20.0, abs=4.0)  # its servos yield slightly
     assert fingers[1] > 0.0
 
 
-def test_aloha_keeps_the_meshes_of_the_stations_once(aloha: mujoco.MjModel) -> None:
+def test_aloha_shares_the_meshes_of_its_stations(aloha: mujoco.MjModel) -> None:
     assert aloha.nmesh < 30
     assert all(aloha.geom(f"{station}/table").id > 0 for station in ("south", "north"))
 
@@ -80,7 +80,7 @@ def test_iiwa_arms_stand_around_a_table_and_hold_still(n: int) -> None:
     robots = find_robots(model)
     assert len(robots) == n
     assert [o.name for o in find_objects(model)] == [f"object{k + 1}" for k in range(n // 2)]
-    assert _only_friction_holds(model)
+    assert _is_held_by_friction_only(model)
     data = _settled(model)
     for robot in robots:
         base, tip = data.body(robot.base_body), data.site(robot.site)
@@ -90,11 +90,11 @@ def test_iiwa_arms_stand_around_a_table_and_hold_still(n: int) -> None:
         inward = base.xmat.reshape(3, 3).T @ (tip.xpos - base.xpos)
         np.testing.assert_allclose(inward, (0.5, 0.0, 0.35), atol=5e-3)  # gravity is compensated
         assert tip.xmat.reshape(3, 3)[2, 2] == pytest.approx(-1.0, abs=1e-3)
-    assert {_rests_free(model, data, o.name) for o in find_objects(model)} == {True}
+    assert {_rests_on_table_only(model, data, o.name) for o in find_objects(model)} == {True}
 
 
-def _rests_free(model: Any, data: Any, name: str) -> bool:
-    """Whether the thing touches nothing but the table."""
+def _rests_on_table_only(model: Any, data: Any, name: str) -> bool:
+    """Return whether the object touches nothing but the table."""
     body = model.body(name).id
     partners = {int(model.geom_bodyid[g]) for c in data.contact for g in c.geom if body in model.geom_bodyid[c.geom]}
     return partners <= {0, body}
@@ -106,15 +106,15 @@ def test_iiwa_has_room_for_eight(n: int) -> None:
         iiwa_scene(n)
 
 
-def test_the_same_arguments_give_the_same_scene() -> None:
+def test_same_arguments_give_the_same_scene() -> None:
     assert iiwa_scene(3).to_xml() == iiwa_scene(3).to_xml()
     assert aloha_scene().to_xml() == aloha_scene().to_xml()
 
 
-def test_without_the_models_it_is_said_what_to_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_models_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("IRIS_DATA", str(tmp_path))
-    with pytest.raises(ModelNotFoundError, match=r"has no models/aloha/scene\.xml.*MuJoCo Menagerie"):
+    with pytest.raises(ModelNotFoundError, match=r"models/aloha/scene\.xml.*Menagerie"):
         aloha_scene()
     monkeypatch.delenv("IRIS_DATA")
-    with pytest.raises(ModelNotFoundError, match=r"set IRIS_DATA to a folder that has models/kuka_iiwa_14/iiwa14\.xml"):
+    with pytest.raises(ModelNotFoundError, match=r"IRIS_DATA .*models/kuka_iiwa_14/iiwa14\.xml"):
         iiwa_scene()

@@ -25,13 +25,13 @@ def _settled(model: mujoco.MjModel, steps: int = 500) -> mujoco.MjData:
 
 
 def test_unknown_scene_lists_the_available_ones() -> None:
-    with pytest.raises(FileNotFoundError, match="arm, cloth, handover, soft"):
+    with pytest.raises(FileNotFoundError, match=r"arm, .*handover, soft"):
         scene_path("kitchen")
     with pytest.raises(FileNotFoundError):
         scene_path("../physics")
 
 
-def test_handover_has_the_names_that_others_rely_on() -> None:
+def test_handover_scene_has_its_documented_names() -> None:
     model = _handover()
     for arm in ("left", "right"):
         for part in [f"joint{i}" for i in range(1, 8)]:
@@ -47,7 +47,7 @@ def test_handover_has_the_names_that_others_rely_on() -> None:
     assert model.key("home").id == 0
 
 
-def test_nothing_but_friction_can_hold_a_thing() -> None:
+def test_objects_are_held_by_friction_only() -> None:
     """No weld, connect or adhesion anywhere: the only equalities couple the two fingers of a gripper."""
     model = _handover()
     assert {int(kind) for kind in model.eq_type} == {int(mujoco.mjtEq.mjEQ_JOINT)}
@@ -55,7 +55,7 @@ def test_nothing_but_friction_can_hold_a_thing() -> None:
     assert not model.body_mocapid[model.body("hammer").id] >= 0
 
 
-def test_home_stands_still() -> None:
+def test_home_is_at_rest() -> None:
     model = _handover()
     data = _settled(model)
     home = model.key("home").qpos
@@ -69,7 +69,7 @@ def test_home_stands_still() -> None:
 
 
 def test_hammer_held_at_its_end_does_not_creep() -> None:
-    """Held 19 cm from its centre of mass for 3 s: settles within 0.5 deg, and then does not slip at all."""
+    """Held 19 cm from its centre of mass for 3 s: settles within 0.5 deg and then does not slip."""
     model = _handover()
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
@@ -109,15 +109,15 @@ def test_arms_around_a_table(n: int) -> None:
         assert tip[2] == pytest.approx(0.28, abs=2e-3)
     touching = {int(model.geom_bodyid[g]) for c in data.contact for g in (c.geom1, c.geom2)}
     things = {model.body(f"object{i + 1}").id for i in range((n + 1) // 2)}
-    assert touching <= things | {0}  # nothing but things on the table
+    assert touching <= things | {0}  # only objects on the table
 
 
-def test_arms_out_of_range() -> None:
+def test_number_of_arms_is_checked() -> None:
     with pytest.raises(ValueError, match="1 to 12"):
         n_arms_scene(13)
 
 
-def test_same_arguments_same_model() -> None:
+def test_same_arguments_give_the_same_model() -> None:
     assert n_arms_scene(3).to_xml() == n_arms_scene(3).to_xml()
     assert free_bodies_scene(20, seed=3).to_xml() == free_bodies_scene(20, seed=3).to_xml()
     assert free_bodies_scene(20, seed=3).to_xml() != free_bodies_scene(20, seed=4).to_xml()

@@ -1,4 +1,4 @@
-"""Checks of the machine that serves, run on this machine."""
+"""Checks of the serving machine, run on this machine."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from iris_session.security import KeyHome
 from iris_session.session.processes import INGEST_OFFSET, MEDIA_OFFSET
 
 
-def test_every_check_says_something(tmp_path: Path) -> None:
+def test_every_check_has_a_finding(tmp_path: Path) -> None:
     found = host_checks.check_host(tmp_path / "sessions")
     names = [one.check for one in found]
     assert names == [
@@ -30,7 +30,7 @@ def test_every_check_says_something(tmp_path: Path) -> None:
     assert all(one.text and one.state in ("ok", "warning", "failed") for one in found)
 
 
-def test_ports_name_who_has_them() -> None:
+def test_used_ports_name_their_process() -> None:
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         listener.listen(1)
@@ -42,7 +42,7 @@ def test_ports_name_who_has_them() -> None:
 
 
 def test_ports_used_by_a_session_are_ok(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each program is told once, with all its ports."""
+    """Each program is reported once, with all its ports."""
     monkeypatch.setattr(host_checks, "_is_port_in_use", lambda port: port != 7725)
     monkeypatch.setattr(host_checks, "_list_connections", list)
     assert host_checks.check_ports(7721).state == "warning"
@@ -55,6 +55,23 @@ def test_ports_used_by_a_session_are_ok(monkeypatch: pytest.MonkeyPatch) -> None
     assert found.state == "ok"
     assert found.text.count("process 1") == 1
     assert "7720 (introduction), 7721 (control), " in found.text
+
+
+@pytest.mark.parametrize(
+    ("command", "program"),
+    [
+        (
+            ["/a/long/path/.venv/bin/python", "-P", "-m", "iris_session.front.main", "ipc:///tmp/x"],
+            "python -m iris_session.front.main",
+        ),
+        (["/usr/bin/python3.11", "/home/ann/robot.py", "-m", "x"], "python3.11 robot.py"),
+        (["python3", "-c", "import secret"], "python3"),
+        (["/usr/sbin/nginx", "-c", "/etc/nginx.conf"], "nginx"),
+        ([], ""),
+    ],
+)
+def test_programs_are_named_without_folders_and_options(command: list[str], program: str) -> None:
+    assert host_checks._name_program(command) == program
 
 
 def test_every_port_of_a_session_is_checked() -> None:
@@ -72,9 +89,9 @@ def test_every_port_of_a_session_is_checked() -> None:
     assert host_checks.PORT_OFFSETS[1 + INGEST_OFFSET] == "media ingest"
 
 
-def test_key_home_that_others_may_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_key_home_readable_by_others_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("IRIS_HOME", str(tmp_path / "home"))
-    assert host_checks.check_key_home().state == "ok"  # not there yet
+    assert host_checks.check_key_home().state == "ok"  # does not exist yet
     KeyHome().load_server_key()
     assert host_checks.check_key_home().state == "ok"
     (tmp_path / "home" / "server.key_secret").chmod(0o644)
@@ -84,7 +101,7 @@ def test_key_home_that_others_may_read(tmp_path: Path, monkeypatch: pytest.Monke
     assert "chmod" in found.advice
 
 
-def test_key_home_that_is_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_damaged_key_home_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("IRIS_HOME", str(tmp_path / "home"))
     KeyHome().load_server_key()
     path = tmp_path / "home" / "clients.json"
@@ -93,13 +110,13 @@ def test_key_home_that_is_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert host_checks.check_key_home().failed
 
 
-def test_folder_for_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_recording_folder_is_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert str(tmp_path) in host_checks.check_disk_space(tmp_path / "deep" / "below").text
     monkeypatch.setattr(host_checks, "FULL_DISK", 1 << 60)
     assert host_checks.check_disk_space(tmp_path).failed
 
 
-def test_findings_keep_their_order_and_one_per_check() -> None:
+def test_findings_are_ordered_with_one_per_check() -> None:
     findings = Findings()
     findings.add(ok("b", "fine"), warning("a", "hm"), failed("c", "no"))
     findings.add(ok("c", "fine after all"))

@@ -32,6 +32,7 @@ from iris_session.protocol.status import (
     RecorderReport,
     RobotReport,
     StatusReport,
+    StopReport,
 )
 
 S = 1_000_000_000
@@ -82,13 +83,13 @@ def with_ann(**fields: object) -> StatusReport:
     return report
 
 
-def troubles(report: StatusReport) -> dict[str, Finding]:
+def problems(report: StatusReport) -> dict[str, Finding]:
     return {one.check: one for one in check_session_report(report, "p9") if one.state != "ok"}
 
 
-def only(report: StatusReport, check: str, state: str, *texts: str) -> None:
-    """That exactly this check is not well."""
-    found = troubles(report)
+def assert_only(report: StatusReport, check: str, state: str, *texts: str) -> None:
+    """Assert that exactly this check is not ok."""
+    found = problems(report)
     assert list(found) == [check]
     one = found[check]
     assert one.state == state
@@ -96,46 +97,48 @@ def only(report: StatusReport, check: str, state: str, *texts: str) -> None:
 
 
 def test_healthy_session_has_no_problems() -> None:
-    assert troubles(WELL) == {}
+    assert problems(WELL) == {}
 
 
 def test_doctor_itself_is_excluded() -> None:
     unwell = change(DOCTOR, role="operator", alignment="none", heard_ns=5 * S)
-    assert troubles(change(WELL, participants=(ANN, unwell))) == {}
+    assert problems(change(WELL, participants=(ANN, unwell))) == {}
 
 
 @pytest.mark.parametrize(
     ("fields", "state", "text"),
     [
-        ({"stalled": True, "authority_silent_ns": 3 * S}, "failed", "not taken a step for 3.0 s"),
-        ({"authority_silent_ns": 2 * S}, "failed", "not taken a step for 2.0 s"),
-        ({"authority_silent_ns": -1}, "failed", "has not taken a step yet"),
+        ({"stalled": True, "authority_silent_ns": 3 * S}, "failed", "3.0 s"),
+        ({"authority_silent_ns": 2 * S}, "failed", "2.0 s"),
+        ({"authority_silent_ns": -1}, "failed", "step yet"),
         ({"estop": True}, "failed", "emergency stop"),
+        ({"estop": True, "stops": (StopReport(4, "p2", "bob", "smoke", 2 * S),)}, "failed", "bob"),
         ({"paused": True}, "warning", "paused"),
+        ({"paused": True, "pause_reason": "NaN in QPOS"}, "failed", "NaN in QPOS"),
     ],
 )
-def test_session(fields: dict[str, object], state: str, text: str) -> None:
-    only(change(WELL, **fields), "session", state, text)
+def test_state_of_the_session_is_reported(fields: dict[str, object], state: str, text: str) -> None:
+    assert_only(change(WELL, **fields), "session", state, text)
 
 
 def test_stalled_session_has_no_client_findings() -> None:
-    """What its people and ticks did before says nothing about now."""
+    """The state of its clients and ticks before the stall has no meaning now."""
     blind = with_ann(state_age=None, missed_share=1.0, capture_to_receive=Quantiles(900.0, 900.0))
-    only(change(blind, stalled=True, authority_silent_ns=3 * S), "session", "failed")
+    assert_only(change(blind, stalled=True, authority_silent_ns=3 * S), "session", "failed")
 
 
 def test_late_step_is_not_a_stall() -> None:
-    assert troubles(change(WELL, stalled=True, authority_silent_ns=S // 5)) == {}
+    assert problems(change(WELL, stalled=True, authority_silent_ns=S // 5)) == {}
 
 
 def test_driver_needs_an_alignment() -> None:
-    only(with_ann(alignment="none"), "alignment", "failed", "ann has no alignment", "bring the sheet into view")
+    assert_only(with_ann(alignment="none"), "alignment", "failed", "ann has no alignment", "bring the sheet into view")
 
 
 def test_advice_lists_sheets_of_the_session() -> None:
     elsewhere = with_ann(alignment="none", alignment_report=AlignmentReport(unusable=12))
     report = change(elsewhere, anchors=(AnchorReport("table", ORIGIN), AnchorReport("shelf", ORIGIN)))
-    only(
+    assert_only(
         report,
         "alignment",
         "failed",
@@ -143,63 +146,63 @@ def test_advice_lists_sheets_of_the_session() -> None:
         "session: table, shelf",
     )
     seen = AlignmentReport(unusable=12, seen=(AnchorSeen("table", 3, S),))
-    assert "none usable" not in troubles(with_ann(alignment="none", alignment_report=seen))["alignment"].text
+    assert "none usable" not in problems(with_ann(alignment="none", alignment_report=seen))["alignment"].text
 
 
 def test_lost_alignment_is_distinguished() -> None:
-    only(with_ann(alignment="none", alignment_void_ns=4 * S), "alignment", "failed", "lost 4.0 s ago", "jumped")
+    assert_only(with_ann(alignment="none", alignment_void_ns=4 * S), "alignment", "failed", "lost 4.0 s ago", "jumped")
 
 
 def test_observer_without_alignment_is_a_warning() -> None:
     looking = change(ANN, alignment="none", role="observer", holds=())
     report = change(WELL, participants=(looking,), robots=(RIGHT,))
-    only(report, "alignment", "warning", "ann has no alignment")
+    assert_only(report, "alignment", "warning", "ann has no alignment")
 
 
 def test_screen_needs_no_alignment_without_robots() -> None:
     screen = change(ANN, alignment="none", role="observer", holds=(), alignment_report=AlignmentReport())
     shown = change(WELL, participants=(screen,), robots=())
-    assert "alignment" not in troubles(shown)
-    assert "alignment" not in troubles(change(shown, participants=(change(screen, role="operator"),)))
+    assert "alignment" not in problems(shown)
+    assert "alignment" not in problems(change(shown, participants=(change(screen, role="operator"),)))
     headset = change(screen, role="operator", alignment_report=AlignmentReport(unusable=3))
-    only(change(shown, participants=(headset,)), "alignment", "warning", "ann has no alignment (3 observations")
+    assert_only(change(shown, participants=(headset,)), "alignment", "warning", "ann has no alignment (3 observations")
 
 
-def test_no_lease_and_who_has_it() -> None:
+def test_missing_lease_names_the_holder() -> None:
     bob = change(ANN, id="p2", name="bob", holds=(), waits_for=("left",))
     taken = change(RIGHT, holder="p3", holder_name="carl")
     carl = change(ANN, id="p3", name="carl", holds=("right",))
     report = change(WELL, participants=(ANN, bob, carl), robots=(LEFT, taken))
-    only(report, "leases", "warning", "bob has no robot, waits for left", "left: ann", "right: carl", "ask the holder")
+    assert_only(report, "leases", "warning", "bob has no robot", "left: ann", "right: carl", "ask the holder")
 
 
-def test_a_free_robot_is_offered() -> None:
+def test_free_robot_is_suggested() -> None:
     bob = change(ANN, id="p2", name="bob", holds=())
-    only(change(WELL, participants=(ANN, bob)), "leases", "warning", "bob has no robot", "right is free")
+    assert_only(change(WELL, participants=(ANN, bob)), "leases", "warning", "bob has no robot", "right is free")
 
 
 def test_robot_kept_for_disconnected_holder() -> None:
-    gone = change(ANN, connected=False, lost="silent")
+    disconnected = change(ANN, connected=False, lost="silent")
     bob = change(ANN, id="p2", name="bob", holds=())
-    found = troubles(change(WELL, participants=(gone, bob), robots=(LEFT,)))
-    assert "ann is disconnected, left is kept" in found["leases"].why
+    found = problems(change(WELL, participants=(disconnected, bob), robots=(LEFT,)))
+    assert "ann is disconnected" in found["leases"].why
 
 
 def test_directors_need_no_robot() -> None:
     director = change(ANN, id="p2", name="dora", role="director", holds=())
-    assert troubles(change(WELL, participants=(ANN, director))) == {}
+    assert problems(change(WELL, participants=(ANN, director))) == {}
 
 
 @pytest.mark.parametrize("reason", sorted(HOLD_ADVICE))
-def test_robots_that_hold_unintentionally(reason: str) -> None:
+def test_unintentionally_holding_robots_are_reported(reason: str) -> None:
     held = change(LEFT, state="hold", hold_reason=reason)
     report = change(WELL, robots=(held, RIGHT), participants=(change(ANN, rejected={"stale": 7}),))
-    only(report, "robots", "warning", f"left (ann) holds: {reason}, rejected: stale 7", HOLD_ADVICE[reason])
+    assert_only(report, "robots", "warning", f"left (ann) holds: {reason}, rejected: stale 7", HOLD_ADVICE[reason])
 
 
 def test_open_clutch_is_not_a_problem() -> None:
     held = change(LEFT, state="hold", hold_reason=HoldReason.CLUTCH_OPEN)
-    assert troubles(change(WELL, robots=(held, RIGHT))) == {}
+    assert problems(change(WELL, robots=(held, RIGHT))) == {}
 
 
 @pytest.mark.parametrize(
@@ -207,30 +210,30 @@ def test_open_clutch_is_not_a_problem() -> None:
     [
         ({"connected": False, "lost": "silent"}, "failed", "disconnected (silent)"),
         ({"heard_ns": 3 * S // 2}, "failed", "silent for 1.5 s"),
-        ({"missed_share": 0.5}, "warning", "misses 50% of the frames"),
+        ({"missed_share": 0.5}, "warning", "50%"),
         ({"state_age": None}, "warning", "receives no state"),
     ],
 )
-def test_slow_clients(fields: dict[str, object], state: str, text: str) -> None:
-    only(with_ann(**fields), "clients", state, "ann: ", text)
+def test_slow_clients_are_reported(fields: dict[str, object], state: str, text: str) -> None:
+    assert_only(with_ann(**fields), "clients", state, "ann: ", text)
 
 
 def test_data_age_names_slow_stage() -> None:
-    only(
+    assert_only(
         with_ann(capture_to_receive=Quantiles(50.0, 90.0)), "age", "warning", "device -> front is slow", "90.0 ms (ann)"
     )
     slow = change(WELL, robots=(change(LEFT, receive_to_step=Quantiles(10.0, 60.0)), RIGHT))
-    only(slow, "age", "warning", "front -> authority is slow", "60.0 ms (left)")
-    only(change(WELL, step_to_publish=Quantiles(9.0, 40.0)), "age", "warning", "authority -> state is slow")
-    only(with_ann(state_age=Quantiles(90.0, 400.0)), "age", "warning", "state -> client is slow")
+    assert_only(slow, "age", "warning", "front -> authority is slow", "60.0 ms (left)")
+    assert_only(change(WELL, step_to_publish=Quantiles(9.0, 40.0)), "age", "warning", "authority -> state is slow")
+    assert_only(with_ann(state_age=Quantiles(90.0, 400.0)), "age", "warning", "state -> client is slow")
 
 
-def test_the_worst_stage_is_blamed_not_the_longest() -> None:
+def test_stage_with_the_worst_ratio_is_named_not_the_longest() -> None:
     report = change(with_ann(state_age=Quantiles(90.0, 160.0)), step_to_publish=Quantiles(1.0, 90.0))
-    assert "authority -> state is slow" in troubles(report)["age"].text
+    assert "authority -> state" in problems(report)["age"].text
 
 
-def test_ages_of_every_stage() -> None:
+def test_ages_of_every_stage_are_checked() -> None:
     assert set(measure_stages(WELL.participants, WELL)) == set(STAGES)
     assert measure_stages((), change(WELL, robots=(), step_to_publish=None)) == {}
 
@@ -238,11 +241,11 @@ def test_ages_of_every_stage() -> None:
 @pytest.mark.parametrize("cause", sorted(LATE_CAUSES))
 def test_late_ticks_name_their_cause(cause: str) -> None:
     report = change(WELL, late_share=0.01, late_causes={LateCause.SCHEDULER: 1, cause: 40})
-    only(report, "ticks", "warning", f"{cause}: {LATE_CAUSES[cause][0]}", LATE_CAUSES[cause][1])
+    assert_only(report, "ticks", "warning", f"{cause}: {LATE_CAUSES[cause][0]}", LATE_CAUSES[cause][1])
 
 
 def test_very_late_ticks_are_a_failure() -> None:
-    only(change(WELL, late_share=0.2, late_causes={"physics": 900}), "ticks", "failed", "20.00% late")
+    assert_only(change(WELL, late_share=0.2, late_causes={"physics": 900}), "ticks", "failed", "20.00% late")
 
 
 def test_every_cause_is_explained() -> None:
@@ -253,32 +256,32 @@ def test_every_cause_is_explained() -> None:
 @pytest.mark.parametrize(
     ("state", "text"), [("hangs", "does not answer"), ("failed", "no space left"), ("dead", "no space left")]
 )
-def test_recorder(state: str, text: str) -> None:
+def test_recorder_state_is_reported(state: str, text: str) -> None:
     report = change(WELL, recorder=change(WELL.recorder, state=state, text="no space left"))
-    only(report, "recorder", "failed", text)
+    assert_only(report, "recorder", "failed", text)
 
 
 def test_lost_rows_are_reported() -> None:
-    only(change(WELL, recorder=change(WELL.recorder, lost_rows=12)), "recorder", "warning", "12 rows lost")
+    assert_only(change(WELL, recorder=change(WELL.recorder, lost_rows=12)), "recorder", "warning", "12 rows lost")
 
 
-def test_disk() -> None:
+def test_disk_space_is_checked() -> None:
     full = change(WELL.recorder, disk_free_bytes=FULL_DISK - 1)
-    only(change(WELL, recorder=full), "disk", "failed", "full")
+    assert_only(change(WELL, recorder=full), "disk", "failed", "full")
     # 50 MB in ten minutes: 83 kB/s. 10 GB last for more than a day, at 100 times the rate for 20 minutes.
-    assert troubles(change(WELL, recorder=change(WELL.recorder, disk_free_bytes=10_000_000_000))) == {}
+    assert problems(change(WELL, recorder=change(WELL.recorder, disk_free_bytes=10_000_000_000))) == {}
     soon = change(WELL.recorder, bytes_written=5_000_000_000, disk_free_bytes=10_000_000_000)
-    only(change(WELL, recorder=soon), "disk", "warning", "about 20 minutes")
+    assert_only(change(WELL, recorder=soon), "disk", "warning", "about 20 minutes")
 
 
-def test_without_recording() -> None:
-    assert troubles(change(WELL, recorder=RecorderReport())) == {}
-    assert troubles(change(WELL, recorder=None)) == {}
+def test_check_without_recording() -> None:
+    assert problems(change(WELL, recorder=RecorderReport())) == {}
+    assert problems(change(WELL, recorder=None)) == {}
 
 
-def test_restarts_and_warnings() -> None:
-    only(change(WELL, restarts={"front": 2, "recorder": 0}), "drops", "warning", "front 2 times")
-    only(change(WELL, warnings=("physics stands still until a reset",)), "warnings", "warning", "physics stands still")
+def test_restarts_and_warnings_are_reported() -> None:
+    assert_only(change(WELL, restarts={"front": 2, "recorder": 0}), "drops", "warning", "front 2 times")
+    assert_only(change(WELL, warnings=("physics diverged",)), "warnings", "warning", "physics diverged")
 
 
 def test_drops_are_explained() -> None:
@@ -287,14 +290,12 @@ def test_drops_are_explained() -> None:
         for one in check_session_report(change(WELL, drops={"send_queue_full": 2, "odd": 1}), "p9")
         if one.check == "drops"
     )
-    assert (
-        found.text == "dropped so far: send_queue_full 2 (answers and events: the receiver did not read in time), odd 1"
-    )
+    assert re.search(r"send_queue_full 2 \(.+\), odd 1$", found.text)
     meaning = "refused requests for assets"
     assert explain_drops({"assets_unknown_asset": 3}) == f"assets_unknown_asset 3 ({meaning})"
 
 
-def test_every_reason_that_the_front_counts_is_explained() -> None:
+def test_every_drop_reason_of_the_front_is_explained() -> None:
     rooms = Path(session_checks.__file__).parents[1]
     counted: set[str] = set()
     for path in (
@@ -312,14 +313,16 @@ def test_every_reason_that_the_front_counts_is_explained() -> None:
 @pytest.mark.parametrize(
     ("tick", "text"),
     [
-        (0, "steps, but no tick was taken and no pose published yet"),
-        (7, "steps: tick 7, paced by the program that owns the session"),
+        (0, "no tick"),
+        (7, "tick 7"),
     ],
 )
 def test_tick_rate_of_user_loop_is_not_reported(tick: int, text: str) -> None:
-    """The carrier of a scene without physics has a tick of a millisecond: nobody steps at 1000 Hz."""
+    """The carrier of a scene without physics has a tick of a millisecond, but is not stepped at 1000 Hz."""
     report = change(WELL, lateness=None, tick=tick, tick_period_ns=1_000_000)
-    assert check_session_report(report, "p9")[0] == Finding("session", "ok", text)
+    found = check_session_report(report, "p9")[0]
+    assert (found.check, found.state) == ("session", "ok")
+    assert text in found.text
 
 
 def test_drivers_are_driving_roles_without_director() -> None:

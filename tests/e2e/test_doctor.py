@@ -1,8 +1,9 @@
-"""Planted faults, each of which `iris-session doctor` must name by its check."""
+"""`iris-session doctor` must name each planted fault by its check."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import socket
@@ -19,86 +20,132 @@ import pytest
 from iris_session.client import Client
 from iris_session.protocol.codec import encode_introduction
 from iris_session.protocol.discovery import Beacon, Introduction
+from iris_session.protocol.names import LateCause
 from iris_session.security import KeyHome, KeyPair
-from tests.e2e.clinic import doctor
-from tests.e2e.conftest import DEADLINE_S, Server, iris, serve_command, wait
+from tests.e2e.session_process import (
+    COMMAND,
+    DEADLINE_S,
+    SessionProcess,
+    kill_all,
+    make_serve_command,
+    run_command,
+    skip_unless_ci,
+    wait_until,
+)
 
 pytestmark = pytest.mark.e2e
 
 
+class Diagnosis:
+    """The result of one run of the doctor."""
+
+    def __init__(self, status: int, out: str) -> None:
+        self.status = status
+        self.document: dict[str, Any] = json.loads(out)
+        self.checks = {check["check"]: check for check in self.document["checks"]}
+
+    def assert_names(self, check: str, *values: str, state: str = "failed") -> None:
+        """Check that `check` has this state, names these values, and gives a cause or advice."""
+        found = self.checks[check]
+        assert found["state"] == state, self.troubles()
+        text = f"{found['text']} {found['why']} {found['advice']}"
+        assert all(value in text for value in values), text
+        assert found["advice"] or found["why"], "a failed check needs a cause or advice"
+
+    def troubles(self) -> list[dict[str, str]]:
+        return [check for check in self.checks.values() if check["state"] in ("failed", "warning")]
+
+    def failed(self) -> set[str]:
+        return {name for name, check in self.checks.items() if check["state"] == "failed"}
+
+
+def run_doctor(*arguments: str, home: Path | None = None) -> Diagnosis:
+    environment = {**os.environ, **({"IRIS_HOME": str(home)} if home is not None else {})}
+    done = subprocess.run(
+        [*COMMAND, "doctor", *arguments, "--json"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60.0,
+        env=environment,
+    )
+    assert done.returncode in (0, 1), done.stderr[-2000:]
+    return Diagnosis(done.returncode, done.stdout)
+
+
 @contextlib.contextmanager
-def block() -> Iterator[tuple[socket.socket, socket.socket]]:
-    """Two sockets on neighbouring ports, the lower first. Nobody else can have the ports, and nothing listens yet."""
+def reserve_two_ports() -> Iterator[tuple[socket.socket, socket.socket]]:
+    """Reserve two adjacent ports: yield their sockets, lower first. Nothing listens on them yet."""
     for _ in range(1000):
         with socket.socket() as upper, socket.socket() as lower:
             upper.bind(("127.0.0.1", 0))
             try:
-                lower.bind(("127.0.0.1", port_of(upper) - 1))
+                lower.bind(("127.0.0.1", get_port(upper) - 1))
             except OSError:
                 continue
             yield lower, upper
             return
-    pytest.fail("no two neighbouring ports are free")
+    pytest.fail("no two adjacent ports are free")
 
 
-def port_of(one: socket.socket) -> int:
+def get_port(one: socket.socket) -> int:
     return int(one.getsockname()[1])
 
 
-# --- the way ---------------------------------------------------------------------------------------------------------
+# --- network ---------------------------------------------------------------------------------------------------------
 
 
-def test_nothing_listens() -> None:
-    with block() as (_, upper):
-        found = doctor(f"127.0.0.1:{port_of(upper)}")
-    found.named("tcp", "nothing listens", "iris-session serve")
+def test_no_listener() -> None:
+    with reserve_two_ports() as (_, upper):
+        found = run_doctor(f"127.0.0.1:{get_port(upper)}")
+    found.assert_names("tcp")
     assert found.status == 1
     assert found.checks["join"]["state"] == "skipped"
     assert found.failed() == {"tcp"}
 
 
-def test_somebody_listens_who_never_answers() -> None:
+def test_listener_that_never_answers() -> None:
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         listener.listen(16)
-        found = doctor(f"127.0.0.1:{listener.getsockname()[1]}")
-    found.named("join", "no session answers")
+        found = run_doctor(f"127.0.0.1:{listener.getsockname()[1]}")
+    found.assert_names("join")
     assert found.checks["tcp"]["state"] == "ok"
 
 
-def test_no_session_of_that_name() -> None:
-    found = doctor("--session", "nobody-here")
-    found.named("beacon", "nobody-here", "give its address")
+def test_unknown_session_name() -> None:
+    found = run_doctor("--session", "nobody-here")
+    found.assert_names("beacon", "nobody-here")
     assert found.failed() == {"beacon"}
 
 
 def test_other_protocol_version() -> None:
-    """A session of version 2 introduces itself."""
-    with block() as (introducing, control):
-        port = port_of(control)
+    """A session of protocol version 2 introduces itself."""
+    with reserve_two_ports() as (introducing, control):
+        port = get_port(control)
         beacon = Beacon(2, "s2", "future", "live", "127.0.0.1", port, 0, 0, 0, 0)
         for listener in (introducing, control):
             listener.listen(4)
 
         def introduce() -> None:
             with contextlib.suppress(OSError):
-                visitor, _ = introducing.accept()
-                with visitor:
-                    visitor.sendall(encode_introduction(Introduction(beacon)))
+                peer, _ = introducing.accept()
+                with peer:
+                    peer.sendall(encode_introduction(Introduction(beacon)))
 
         thread = threading.Thread(target=introduce, daemon=True)
         thread.start()
-        found = doctor(f"127.0.0.1:{port}")
+        found = run_doctor(f"127.0.0.1:{port}")
         thread.join(5.0)
-    found.named("version", "version 2", "update this machine")
+    found.assert_names("version", "2")
     assert found.checks["join"]["state"] == "skipped"
 
 
-# --- the door --------------------------------------------------------------------------------------------------------
+# --- keys and roles --------------------------------------------------------------------------------------------------
 
 
-def lan_address() -> str:
-    """An address of this machine that is not loopback: encrypted sessions need one."""
+def find_lan_address() -> str:
+    """Return an address of this machine that is not loopback: encrypted sessions need one."""
     for addresses in psutil.net_if_addrs().values():
         for one in addresses:
             if one.family == socket.AF_INET and not one.address.startswith("127."):
@@ -107,72 +154,73 @@ def lan_address() -> str:
 
 
 @pytest.fixture(scope="module")
-def encrypted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """A session on the network, with keys."""
+def encrypted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SessionProcess]:
+    """A session on the network, encrypted."""
     folder = tmp_path_factory.mktemp("encrypted")
     recording = folder / "session.rrd"
-    server = Server(folder, recording, serve_command("arm", recording, "--host", lan_address()))
+    server = SessionProcess(folder, recording, make_serve_command("arm", recording, "--host", find_lan_address()))
     yield server
     server.stop()
 
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    """A home of keys of somebody else."""
+    """A home of keys that the session does not know."""
     return tmp_path / "home"
 
 
-def test_key_that_is_not_on_the_list(encrypted: Server, home: Path) -> None:
-    found = doctor(encrypted.address, home=home)
-    found.named("key", "not on the session's list", "iris-session pair")
+def test_key_that_is_not_on_the_allow_list(encrypted: SessionProcess, home: Path) -> None:
+    found = run_doctor(encrypted.address, home=home)
+    found.assert_names("key", "iris-session pair")
     assert found.failed() == {"key"}
 
 
-def test_wrong_code(encrypted: Server, home: Path) -> None:
-    found = doctor(encrypted.address, "--code", "7KQ2-M4XD-9PTR", home=home)
-    found.named("code", "join code")
+def test_wrong_join_code(encrypted: SessionProcess, home: Path) -> None:
+    found = run_doctor(encrypted.address, "--code", "7KQ2-M4XD-9PTR", home=home)
+    found.assert_names("code")
     assert found.failed() == {"code"}
 
 
-def test_role_that_the_key_may_not_have(encrypted: Server, home: Path) -> None:
+def test_role_that_the_key_does_not_allow(encrypted: SessionProcess, home: Path) -> None:
     KeyHome().clients.allow_key("looker", KeyHome(home).load_identity().public, ("observer",))
-    found = doctor(encrypted.address, "--role", "director", home=home)
-    found.named("role", "role")
+    found = run_doctor(encrypted.address, "--role", "director", home=home)
+    found.assert_names("role")
     assert found.failed() == {"role"}
-    well = doctor(encrypted.address, home=home)
+    well = run_doctor(encrypted.address, home=home)
     assert well.failed() == set(), well.troubles()
     assert well.checks["key"]["state"] == "ok"
 
 
-def test_another_key_than_the_known_one(encrypted: Server, home: Path) -> None:
+def test_changed_server_key(encrypted: SessionProcess, home: Path) -> None:
     KeyHome(home).known_servers.pin(encrypted.address, "arm", KeyPair.generate().public)
-    found = doctor(encrypted.address, home=home)
-    found.named("server_key", "is known for", "iris-session keys forget")
+    found = run_doctor(encrypted.address, home=home)
+    found.assert_names("server_key", "iris-session keys forget")
     assert found.failed() == {"server_key"}
 
 
-#: Sessions of other tests tell of themselves too.
-CLINIC = f"clinic-{os.getpid()}"
+#: Unique, because the beacons of other tests' sessions are heard, too.
+SESSION_NAME = f"doctor-{os.getpid()}"
 
 
-# --- the session -----------------------------------------------------------------------------------------------------
+# --- session and participants ----------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def plain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SessionProcess]:
     folder = tmp_path_factory.mktemp("plain")
     recording = folder / "session.rrd"
-    server = Server(folder, recording, serve_command("handover", recording, "--name", CLINIC))
+    options = ("--name", SESSION_NAME, "--host", "127.0.0.1")
+    server = SessionProcess(folder, recording, make_serve_command("handover", recording, *options))
     yield server
     server.stop()
 
 
 @contextlib.contextmanager
-def people(server: Server) -> Iterator[Callable[..., Client]]:
+def open_clients(server: SessionProcess) -> Iterator[Callable[..., Client]]:
     clients: list[Client] = []
 
     def join(name: str, **settings: Any) -> Client:
-        client = Client(server.address, name=name, devices=("controller/right", "head"), **settings)
+        client = Client(server.address, name=name, devices=("desktop", "head"), **settings)
         clients.append(client)
         return client.connect(DEADLINE_S).start()
 
@@ -181,23 +229,25 @@ def people(server: Server) -> Iterator[Callable[..., Client]]:
         client.close()
 
 
-def test_all_is_well_and_leaves_no_trace(plain: Server) -> None:
-    done = iris("doctor", plain.address, cwd=plain.folder)
+def test_healthy_session_passes_and_no_participant_stays(plain: SessionProcess) -> None:
+    done = run_command("doctor", plain.address, cwd=plain.folder)
     assert done.returncode == 0, done.stdout
     assert "FAILED" not in done.stdout
     with Client(plain.address, role="observer", alignment="not_needed", name="look") as client:
-        wait(lambda: [p.name for p in client.status().participants if p.connected] == ["look"], "nobody else is here")
+        wait_until(
+            lambda: [p.name for p in client.status().participants if p.connected] == ["look"], "no other participant"
+        )
 
 
-def test_a_session_by_its_name(plain: Server) -> None:
-    found = doctor("--session", CLINIC)
+def test_session_given_by_name(plain: SessionProcess) -> None:
+    found = run_doctor("--session", SESSION_NAME)
     assert found.failed() == set(), found.troubles()
     assert found.document["address"] == plain.address
-    assert found.document["report"]["session_name"] == CLINIC
+    assert found.document["report"]["session_name"] == SESSION_NAME
 
 
 class Forwarder:
-    """Lets one TCP port of this machine through to 127.0.0.2, as a firewall that knows of that port only."""
+    """Forward one TCP port of 127.0.0.2 to this machine, as a firewall that opens that port only."""
 
     def __init__(self, port: int) -> None:
         self._listener = socket.create_server(("127.0.0.2", port))
@@ -208,10 +258,10 @@ class Forwarder:
     def _accept(self) -> None:
         with contextlib.suppress(OSError):
             while True:
-                visitor, _ = self._listener.accept()
+                peer, _ = self._listener.accept()
                 inside = socket.create_connection(("127.0.0.1", self._port))
-                self._open += [visitor, inside]
-                for source, sink in ((visitor, inside), (inside, visitor)):
+                self._open += [peer, inside]
+                for source, sink in ((peer, inside), (inside, peer)):
                     threading.Thread(target=self._pump, args=(source, sink), daemon=True).start()
 
     @staticmethod
@@ -226,54 +276,54 @@ class Forwarder:
             one.close()
 
 
-def test_firewall_that_lets_the_control_port_through_only(plain: Server) -> None:
+def test_firewall_that_opens_only_the_control_port(plain: SessionProcess) -> None:
     port = int(plain.address.rsplit(":", 1)[1])
     with contextlib.closing(Forwarder(port)):
-        found = doctor(f"127.0.0.2:{port}")
-    found.named("state", "nothing listens", "(state)")
+        found = run_doctor(f"127.0.0.2:{port}")
+    found.assert_names("state", "(state)")
     assert found.checks["join"]["state"] == "ok"
     assert found.checks["introduction"]["state"] == "warning"
     assert found.failed() == {"state"}
 
 
-def test_no_alignment_no_lease_and_a_stopped_client(plain: Server) -> None:
-    with people(plain) as join, somebody(plain) as carl:
+def test_missing_alignment_missing_lease_and_stopped_client(plain: SessionProcess) -> None:
+    with open_clients(plain) as join, run_carl(plain) as carl:
         ann = join("ann", alignment="not_needed")
         ann.acquire(["left"])
         bob = join("bob")
-        wait(
+        wait_until(
             lambda: any(lease.target == "right" and lease.holder for lease in ann.mirror.leases.values()),
             "carl's robot",
         )
         carl.send_signal(signal.SIGSTOP)
-        found = doctor(plain.address)
-        found.named("alignment", "bob has no alignment", "bring the sheet into view")
-        found.named("leases", "bob has no robot", "left: ann", "right: carl", state="warning")
-        found.named("clients", "carl")
+        found = run_doctor(plain.address)
+        found.assert_names("alignment", "bob")
+        found.assert_names("leases", "bob", "left: ann", "right: carl", state="warning")
+        found.assert_names("clients", "carl")
         assert found.failed() == {"alignment", "clients"}, found.troubles()
         assert found.status == 1
         bob.close()
 
 
-def test_a_jumped_tracking_frame_and_a_slow_way_of_samples(plain: Server) -> None:
-    """eva's alignment is void since her tracking frame jumped; fay's samples come two seconds old."""
-    with people(plain) as join:
+def test_jumped_tracking_frame_and_late_samples(plain: SessionProcess) -> None:
+    """The alignment of eva is void since its tracking frame jumped; samples of fay arrive two seconds late."""
+    with open_clients(plain) as join:
         director = join("dora", role="director", alignment="not_needed")
         eva = join("eva", role="observer")
-        director.place_alignment(eva.participant_id, ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
-        wait(lambda: eva.alignment is not None and eva.alignment.kind == "placed", "an alignment")
-        eva.new_tracking_frame()
-        wait(lambda: eva.alignment is None or eva.alignment.kind == "none", "that it is void")
-        with sends_late(join("fay", role="observer", alignment="not_needed")):
-            found = doctor(plain.address)
-        found.named("alignment", "eva has no alignment (lost", "its tracking frame jumped", "sheet", state="warning")
-        found.named("age", "device -> front is slow", "(fay)", "network between the headset", state="warning")
+        director.alignment.place(eva.participant_id, ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
+        wait_until(lambda: eva.alignment.current is not None and eva.alignment.current.kind == "placed", "an alignment")
+        eva.alignment.report_tracking_jump()
+        wait_until(lambda: eva.alignment.current is None or eva.alignment.current.kind == "none", "a void alignment")
+        with sending_late(join("fay", role="observer", alignment="not_needed")):
+            found = run_doctor(plain.address)
+        found.assert_names("alignment", "eva", "lost", "tracking frame", state="warning")
+        found.assert_names("age", "device -> front", "(fay)", state="warning")
         assert "state -> client" in found.checks["age"]["text"]
 
 
 @contextlib.contextmanager
-def sends_late(client: Client) -> Iterator[None]:
-    """Meanwhile it sends what was captured two seconds ago; from when on the session has noticed."""
+def sending_late(client: Client) -> Iterator[None]:
+    """Send samples captured two seconds ago in the background; enter once the status shows their delay."""
     end = threading.Event()
 
     def send() -> None:
@@ -285,7 +335,7 @@ def sends_late(client: Client) -> Iterator[None]:
     thread = threading.Thread(target=send)
     thread.start()
     try:
-        wait(lambda: any(p.capture_to_receive for p in client.status().participants), "how late it comes")
+        wait_until(lambda: any(p.capture_to_receive for p in client.status().participants), "the delay in the status")
         yield
     finally:
         end.set()
@@ -302,8 +352,8 @@ with Client(sys.argv[1], name="carl", alignment="not_needed") as carl:
 
 
 @contextlib.contextmanager
-def somebody(server: Server) -> Iterator[subprocess.Popen[bytes]]:
-    """carl, who has the right robot, in a process of his own."""
+def run_carl(server: SessionProcess) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a client named carl, which holds the right robot, in a process."""
     process = subprocess.Popen([sys.executable, "-c", CARL, server.address])
     try:
         yield process
@@ -312,17 +362,17 @@ def somebody(server: Server) -> Iterator[subprocess.Popen[bytes]]:
         process.wait()
 
 
-def test_session_that_somebody_stopped(plain: Server) -> None:
-    with people(plain) as join:
+def test_emergency_stop(plain: SessionProcess) -> None:
+    with open_clients(plain) as join:
         director = join("dora", role="director", alignment="not_needed")
-        director.estop("look out")
-        wait(lambda: director.mirror.estop, "the stop")
-        doctor(plain.address).named("session", "emergency stop")
+        director.estop("test")
+        wait_until(lambda: director.mirror.estop, "the e-stop")
+        run_doctor(plain.address).assert_names("session", "emergency stop")
         director.clear_estop()
 
 
-def test_server_side(plain: Server) -> None:
-    found = doctor("--server", plain.address)
+def test_checks_of_the_server(plain: SessionProcess) -> None:
+    found = run_doctor("--server", plain.address)
     assert {"scheduling", "processors", "key_home", "ports", "interfaces", "clock_source", "disk"} <= set(found.checks)
     assert found.checks["session"]["state"] == "ok"
     ports = found.checks["ports"]
@@ -331,11 +381,90 @@ def test_server_side(plain: Server) -> None:
     assert "front.main" in ports["text"]
 
 
-def test_session_that_stands_still(plain: Server) -> None:
+def test_suspended_session(plain: SessionProcess) -> None:
     plain.process.send_signal(signal.SIGSTOP)
     try:
-        found = doctor(plain.address)
+        found = run_doctor(plain.address)
     finally:
         plain.process.send_signal(signal.SIGCONT)
-    found.named("session", "has not taken a step")
+    found.assert_names("session")
     assert {"session", "join"} <= found.failed()
+
+
+# --- the machine of the session --------------------------------------------------------------------------------------
+
+
+OVERLOADED = """
+import os, sys, time
+from iris_session import Session, SessionConfig
+from iris_session.demo.scenes import scene_path
+config = SessionConfig(control_port=0, state_port=0, record=False, realtime=False)
+with Session(scene_path("arm"), config=config) as session:
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # not of the front, which runs already
+    print(f"on {session.address}, recording to nothing", flush=True)
+    session.run()
+"""
+HOG = "import os\nos.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\nwhile True: pass\n"
+
+#: Late ticks of a few seconds of a session without enough processor time.
+MANY_LATE_TICKS = 50
+
+
+def test_late_ticks_name_their_cause(tmp_path: Path) -> None:
+    """Other programs occupy the processor of the session."""
+    with contextlib.ExitStack() as stack:
+        server = SessionProcess(tmp_path, tmp_path / "none", [sys.executable, "-c", OVERLOADED])
+        stack.callback(server.stop)
+        for _ in range(3):
+            hog = stack.enter_context(subprocess.Popen([sys.executable, "-c", HOG]))
+            stack.callback(hog.kill)
+        wait_for_late_ticks(server)
+        found = run_doctor(server.address)
+    state = found.checks["ticks"]["state"]
+    assert state in ("failed", "warning"), found.troubles()
+    found.assert_names("ticks", "scheduler", state=state)
+
+
+def wait_for_late_ticks(server: SessionProcess) -> None:
+    """Wait until more late ticks were counted than at a start, most of them of the scheduler."""
+    with Client(server.address, role="observer", name="watch", alignment="not_needed") as client:
+
+        def late() -> bool:
+            causes = client.status().late_causes
+            return (
+                sum(causes.values()) >= MANY_LATE_TICKS
+                and max(causes, key=lambda name: causes[name]) == LateCause.SCHEDULER
+            )
+
+        wait_until(late, "late ticks, most of them of the scheduler")
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 20 MB: the recorder begins with at least 16 free."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=20m", "tmpfs", str(folder)], capture_output=True, text=True, check=False
+    )
+    if mounted.returncode:
+        skip_unless_ci(f"needs the right to mount a small file system: {mounted.stderr.strip()}")
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)  # processes that are about to end may still use it
+
+
+def test_full_disk(small_disk: Path, tmp_path: Path) -> None:
+    recording = small_disk / "session.rrd"
+    server = SessionProcess(tmp_path, recording, make_serve_command("arm", recording))
+    filler = small_disk / "other-data"
+    filler.write_bytes(b"")
+    try:
+        with filler.open("wb") as file, contextlib.suppress(OSError):
+            while True:
+                file.write(bytes(1 << 16))
+                file.flush()
+        found = run_doctor(server.address)
+        found.assert_names("disk", "GB")
+        assert found.status == 1
+    finally:
+        kill_all([server])  # finishing the recording would wait for free space

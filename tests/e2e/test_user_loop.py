@@ -1,4 +1,4 @@
-"""Sessions inside a user's own script: with `begin_tick`/`end_tick`, attached by one line, and the one-line loop."""
+"""Sessions in a user's script: with `begin_tick`/`end_tick`, attached by one line, and with `Session.run`."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from pathlib import Path
 import pytest
 
 from anchors.pose import distance
-from iris_session.client import DeniedError
+from iris_session.client import Client, DeniedError
 from iris_session.protocol.names import CommandKind, DenialReason, HoldReason
-from iris_session.protocol.server_messages import Gap, MarkerAdded, SceneChanged
-from tests.e2e.conftest import Hand, Server, Stage, end_all, none_left, relatives, verify
+from iris_session.protocol.server_messages import Gap, SceneChanged
+from tests.e2e.scenario import Hand, Scenario
+from tests.e2e.session_process import SessionProcess, assert_all_end, kill_all, list_descendants, run_verify
 
 pytestmark = pytest.mark.e2e
 
-#: What every script begins with: the demo scene with one more actuated joint that belongs to no robot, and a file
-#: whose text the test changes to make the script do something.
+#: Beginning of every script: the handover scene with an actuated joint that belongs to no robot, and a file through
+#: which the test commands the script.
 HEAD = """
 import sys, time
 from pathlib import Path
@@ -34,16 +35,16 @@ motor = spec.add_actuator(name="fan_motor", target="fan", trntype=mujoco.mjtTrn.
 model = spec.compile()
 data = mujoco.MjData(model)
 mujoco.mj_resetDataKeyframe(model, data, 0)
-order = Path("order.txt")
+command = Path("command.txt")
 config = SessionConfig(name="mine", control_port=0, state_port=0, record="session.rrd")
 
-def say(session):
+def print_address(session):
     print(f"session on {session.address}, recording to {session.recording}", flush=True)
 
-def obey():
-    text = order.read_text() if order.exists() else ""
+def poll_commands():
+    text = command.read_text() if command.exists() else ""
     if text:
-        order.unlink()
+        command.unlink()
     if text == "block":
         time.sleep(5.0)
     elif text == "reset":
@@ -61,8 +62,8 @@ def paced(start):
 
 TICKS = """
 with Session(model, data, config) as session:
-    say(session)
-    while obey():
+    print_address(session)
+    while poll_commands():
         data.ctrl[model.actuator("fan_motor").id] = 0.25
         session.begin_tick()
         assert data.ctrl[model.actuator("fan_motor").id] == 0.25
@@ -72,11 +73,28 @@ with Session(model, data, config) as session:
 print("ended in order", flush=True)
 """
 
+#: A suite's own policy: it writes `ctrl` of every robot, and resets when a director asks for it.
+POLICY = """
+home = model.key_ctrl[0].copy()
+session = Session.attach(model, data, config)
+print_address(session)
+while poll_commands():
+    for request in session.poll_requests():
+        print(request.name, "asks for", request.kind, flush=True)
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+    data.ctrl[:] = home
+    data.ctrl[0] += 0.3 * min(1.0, data.time)
+    mujoco.mj_step(model, data)
+    time.sleep(0.0015)
+session.close()
+print("ended in order", flush=True)
+"""
+
 #: No `close()`: the session ends with the script.
 LAST_LINE = """
 session = Session.attach(model, data, config)
-say(session)
-while obey():
+print_address(session)
+while poll_commands():
     mujoco.mj_step(model, data)
     time.sleep(0.0015)
 print("ended in order", flush=True)
@@ -84,237 +102,253 @@ print("ended in order", flush=True)
 
 ATTACH = """
 session = Session.attach(model, data, config)
-say(session)
+print_address(session)
 twin = mujoco.MjData(model)
-while obey():
+while poll_commands():
     data.ctrl[model.actuator("fan_motor").id] = 0.25
     mujoco.mj_step(model, data)
     mujoco.mj_forward(model, twin)
     mujoco.mj_forward(model, data)
     time.sleep(0.0015)
-session.close()
 assert mujoco.get_mjcb_control() is None
+mujoco.MjModel.from_xml_string("<mujoco/>")
+session.close()
 assert data.ctrl[model.actuator("fan_motor").id] == 0.25
 print("ended in order", flush=True)
 """
 
 
-class Script(Server):
-    """A user's script; `order` makes it do something once."""
+class Script(SessionProcess):
+    """A user's script that obeys commands by a file."""
 
     def __init__(self, folder: Path, body: str) -> None:
         file = folder / "script.py"
         file.write_text(HEAD + body)
         super().__init__(folder, folder / "session.rrd", [sys.executable, str(file)])
 
-    def order(self, text: str) -> None:
-        file = self.folder / "order.new"
+    def command(self, text: str) -> None:
+        file = self.folder / "command.new"
         file.write_text(text)
-        file.rename(self.folder / "order.txt")
+        file.rename(self.folder / "command.txt")
 
 
 @pytest.fixture
-def script(tmp_path: Path) -> Iterator[Callable[[str], Stage]]:
-    """Starts a script and opens a stage for the people who join it."""
-    stages: list[Stage] = []
+def script(tmp_path: Path) -> Iterator[Callable[[str], Scenario]]:
+    """Start a script with a session."""
+    scenarios: list[Scenario] = []
 
-    def start(body: str) -> Stage:
-        stages.append(Stage(Script(tmp_path, body)))
-        return stages[-1]
+    def start(body: str) -> Scenario:
+        scenarios.append(Scenario(Script(tmp_path, body)))
+        return scenarios[-1]
 
     yield start
-    for stage in stages:
-        stage.close()
-    end_all([stage.server for stage in stages])
+    for scenario in scenarios:
+        scenario.close()
+    kill_all([scenario.server for scenario in scenarios])
 
 
-def _order(stage: Stage, text: str) -> None:
-    assert isinstance(stage.server, Script)
-    stage.server.order(text)
+def command_script(scenario: Scenario, text: str) -> None:
+    assert isinstance(scenario.server, Script)
+    scenario.server.command(text)
 
 
-def _drive(stage: Stage) -> None:
-    """Ann takes the left robot and moves it by 3 cm."""
-    hand = stage.hand(stage.join("ann"), "left")
-    hand.client.acquire(["left"])
-    stage.engage(hand)
+def drive_left_robot(scenario: Scenario) -> None:
+    """Ann acquires the left robot and moves it by 3 cm."""
+    hand = scenario.drive("ann", "left")
     before = hand.tip
     hand.velocity = (0.0, 0.1, 0.0)
-    stage.run(lambda: hand.tip[0][1] - before[0][1] > 0.03, "the robot in the user's loop follows")
+    scenario.run_until(lambda: hand.tip[0][1] - before[0][1] > 0.03, "the robot in the user's loop follows")
 
 
-def _end(stage: Stage) -> None:
-    """The script ends in order, and its recording of class `open` verifies."""
-    _order(stage, "end")
-    stage.run(lambda: stage.server.process.poll() is not None, "the script ends")
-    assert stage.server.process.wait() == 0, stage.server.output
-    assert "ended in order" in stage.server.output
-    report = verify(stage.server.recording)
+def end_script(scenario: Scenario) -> None:
+    """End the script in order; its recording of class `open` must verify."""
+    command_script(scenario, "end")
+    scenario.run_until(lambda: scenario.server.process.poll() is not None, "the script ends")
+    assert scenario.server.process.wait() == 0, scenario.server.output
+    assert "ended in order" in scenario.server.output
+    report = run_verify(scenario.server.recording)
     assert report["recording_class"] == "open"
     assert report["steps"] > 10
 
 
-def test_a_script_that_calls_begin_and_end_tick(script: Callable[[str], Stage]) -> None:
-    stage = script(TICKS)
-    _drive(stage)
-    director = stage.join("director", "director")
+def test_script_that_calls_begin_and_end_tick(script: Callable[[str], Scenario]) -> None:
+    scenario = script(TICKS)
+    drive_left_robot(scenario)
+    director = scenario.join("director", "director")
     for action in ("pause", "reset"):
         with pytest.raises(DeniedError) as denied:
             director.control(action)
         assert denied.value.denial.reason == DenialReason.USER_OWNED
-    _end(stage)
+    end_script(scenario)
 
 
-def test_an_attached_script(script: Callable[[str], Stage]) -> None:
-    """One line; `mj_forward` on the same or on other data is no tick."""
-    stage = script(ATTACH)
-    _drive(stage)
-    director = stage.join("director", "director")
-    stage.run(lambda: director.scene.state is not None, "a first picture")
+def test_attached_script(script: Callable[[str], Scenario]) -> None:
+    """`mj_forward` on the same or on other data is not a tick."""
+    scenario = script(ATTACH)
+    drive_left_robot(scenario)
+    director = scenario.join("director", "director")
+    scenario.run_until(lambda: director.scene.state is not None, "a first state")
     state = director.scene.state
     assert state is not None
     assert state.header.tick == round(state.header.sim_time / 0.002)
-    _end(stage)
+    end_script(scenario)
 
 
-def test_an_attached_script_that_simply_ends(script: Callable[[str], Stage]) -> None:
-    stage = script(LAST_LINE)
-    _drive(stage)
-    children = relatives(stage.server.process.pid)
-    _end(stage)
-    none_left(children)
-    assert verify(stage.server.recording)["finished"]
-    ann = stage.clients[0]
-    stage.run(lambda: "session_ended" in ann.connection.counters.faults, "everyone is told that it ended")
+def test_policy_drives_until_a_participant_engages_and_after_the_release(script: Callable[[str], Scenario]) -> None:
+    """A director's request to reset reaches the script, too."""
+    scenario = script(POLICY)
+    watcher = scenario.join("watcher", "director")
+    scenario.run_until(
+        lambda: watcher.scene.state is not None and watcher.scene.state.header.sim_time > 1.5, "the policy acts"
+    )
+    alone = watcher.scene.tip_pose("left")
+    assert alone is not None
+    drive_left_robot(scenario)
+    (hand,) = scenario.hands
+    hand.sending = False
+    hand.client.release("left")
+    scenario.run_until(lambda: has_come_to_rest(scenario, hand), "the policy has its robot again")
+    assert distance(alone[0], hand.tip[0]) < 2e-3
+    epoch = watcher.mirror.scene_epoch
+    watcher.control("reset")
+    scenario.run_until(lambda: watcher.mirror.scene_epoch == epoch + 1, "the script resets")
+    assert "watcher asks for reset" in scenario.server.output
+    end_script(scenario)
+
+
+def test_attached_script_without_close_ends_in_order(script: Callable[[str], Scenario]) -> None:
+    scenario = script(LAST_LINE)
+    drive_left_robot(scenario)
+    children = list_descendants(scenario.server.process.pid)
+    end_script(scenario)
+    assert_all_end(children)
+    assert run_verify(scenario.server.recording)["finished"]
+    ann = scenario.clients[0]
+    scenario.run_until(
+        lambda: "session_ended" in ann.connection.counters.faults, "ann is notified that the session ended"
+    )
 
 
 @pytest.mark.parametrize("body", [TICKS, ATTACH], ids=["ticks", "attach"])
-def test_a_loop_that_blocks_for_five_seconds(script: Callable[[str], Stage], body: str) -> None:
-    """Leases, heartbeats and the e-stop go on; the robot neither moves nor jumps afterwards, until clutched again."""
-    stage = script(body)
-    _drive(stage)
-    (hand,) = stage.hands
-    ann, director = hand.client, stage.join("director", "director")
+def test_loop_that_blocks_for_five_seconds(script: Callable[[str], Scenario], body: str) -> None:
+    """Leases, heartbeats and the e-stop work meanwhile; afterwards the robot holds until the clutch was opened."""
+    scenario = script(body)
+    drive_left_robot(scenario)
+    (hand,) = scenario.hands
+    ann, director = hand.client, scenario.join("director", "director")
     hand.velocity = (0.0, 0.0, 0.0)
-    stage.run(lambda: _resting(stage, hand), "the robot has come to rest")
-    _order(stage, "block")
-    stage.run(lambda: _standing(stage, director), "the loop stands still")
+    scenario.run_until(lambda: has_come_to_rest(scenario, hand), "the robot is at rest")
+    command_script(scenario, "block")
+    scenario.run_until(lambda: is_blocked(scenario, director), "the loop blocks")
     before, tick = hand.tip, director.scene.state.header.tick  # type: ignore[union-attr]
     director.acquire(["right"])
     assert ann.lease_version("right") is None
-    ann.estop("while the script sleeps")
-    stage.run(lambda: director.mirror.estop, "the e-stop is known")
+    ann.estop("test")
+    scenario.run_until(lambda: director.mirror.estop, "the e-stop is known")
     director.clear_estop()
-    hand.velocity = (0.0, 0.2, 0.0)  # the hand goes on, clutch closed
+    hand.velocity = (0.0, 0.2, 0.0)  # the hand moves on with its clutch closed
     assert director.scene.state is not None
-    assert director.scene.state.header.tick == tick, "the loop still stands"
-    stage.run(
-        lambda: director.scene.state is not None and director.scene.state.header.tick > tick + 100, "the loop goes on"
+    assert director.scene.state.header.tick == tick, "the loop still blocks"
+    scenario.run_until(
+        lambda: director.scene.state is not None and director.scene.state.header.tick > tick + 100, "the loop continues"
     )
     assert distance(before[0], hand.tip[0]) < 2e-3
     feedback = ann.feedback["left"]
     assert feedback.state == CommandKind.HOLD
     assert feedback.hold_reason in (HoldReason.GAP, HoldReason.ESTOP)
-    assert any(isinstance(event.body, Gap) for event in stage.events["ann"])
+    assert any(isinstance(event.body, Gap) for event in scenario.events["ann"])
     assert ann.lease_version("left") is not None
     assert ann.connection.counters.reconnects == 0
     hand.velocity = (0.0, 0.0, 0.0)
-    stage.engage(hand)
+    scenario.engage(hand)
     assert distance(before[0], hand.tip[0]) < 4e-3
-    _end(stage)
+    end_script(scenario)
 
 
-def _resting(stage: Stage, hand: Hand) -> bool:
-    """True once the tip has not moved for 0.3 s."""
+def has_come_to_rest(scenario: Scenario, hand: Hand) -> bool:
+    """Return whether the tip does not move for 0.3 s."""
     before = hand.tip
-    stage.seconds(0.3)
+    scenario.run_for(0.3)
     return distance(before[0], hand.tip[0]) < 1e-4
 
 
-def _standing(stage: Stage, client: object) -> bool:
-    """True once the tick has not changed for 0.3 s."""
-    from iris_session.client import Client
-
-    assert isinstance(client, Client)
+def is_blocked(scenario: Scenario, client: Client) -> bool:
+    """Return whether the tick does not change for 0.3 s."""
     tick = client.scene.state.header.tick if client.scene.state is not None else -1
-    stage.seconds(0.3)
+    scenario.run_for(0.3)
     return client.scene.state is not None and client.scene.state.header.tick == tick
 
 
-def test_a_reset_by_the_script_is_a_new_epoch(script: Callable[[str], Stage]) -> None:
-    """The robot holds where the reset put it; old samples do not count; clutching again drives."""
-    stage = script(TICKS)
-    watcher = stage.join("watcher", "observer")
-    stage.run(lambda: watcher.scene.tip_pose("left") is not None, "a first picture")
+def test_reset_by_the_script_begins_a_scene_epoch(script: Callable[[str], Scenario]) -> None:
+    """The robot holds where the reset put it; old samples are rejected; the clutch must be opened and closed."""
+    scenario = script(TICKS)
+    watcher = scenario.join("watcher", "observer")
+    scenario.run_until(lambda: watcher.scene.tip_pose("left") is not None, "a first state")
     start = watcher.scene.tip_pose("left")
     assert start is not None
-    _drive(stage)
-    (hand,) = stage.hands
+    drive_left_robot(scenario)
+    (hand,) = scenario.hands
     epoch = watcher.mirror.scene_epoch
     hand.sending = False
-    _order(stage, "reset")
-    stage.run(lambda: watcher.mirror.scene_epoch == epoch + 1, "a new scene epoch")
-    causes = [e.body.cause for e in stage.events["watcher"] if isinstance(e.body, SceneChanged)]
+    command_script(scenario, "reset")
+    scenario.run_until(lambda: watcher.mirror.scene_epoch == epoch + 1, "a new scene epoch")
+    causes = [e.body.cause for e in scenario.events["watcher"] if isinstance(e.body, SceneChanged)]
     assert causes == ["external"]
-    stage.run(
+    scenario.run_until(
         lambda: watcher.scene.state is not None and watcher.scene.state.header.scene_epoch == epoch + 1,
-        "its first picture",
+        "state of the new epoch",
     )
-    stage.seconds(1.0)
-    assert distance(start[0], hand.tip[0]) < 2e-3, "the robot must stay where the reset put it"
+    scenario.run_for(1.0)
+    assert distance(start[0], hand.tip[0]) < 2e-3, "the robot holds where the reset put it"
     hand.sending, hand.velocity = True, (0.0, 0.0, 0.0)
-    stage.engage(hand)
+    scenario.engage(hand)
     assert distance(start[0], hand.tip[0]) < 4e-3
-    _end(stage)
+    end_script(scenario)
 
 
-def test_a_simulation_that_diverges_does_not_end_the_session(script: Callable[[str], Stage]) -> None:
-    """Numbers that are not finite: everyone is told; MuJoCo's own reset in `mj_step` is a new epoch."""
-    stage = script(TICKS)
-    watcher = stage.join("watcher", "observer")
-    _order(stage, "diverge")
+def test_diverged_simulation_does_not_end_the_session(script: Callable[[str], Scenario]) -> None:
+    """Clients are notified; MuJoCo's own reset in `mj_step` begins a scene epoch."""
+    scenario = script(TICKS)
+    watcher = scenario.join("watcher", "observer")
+    command_script(scenario, "diverge")
 
-    def told() -> bool:
-        texts = [e.body.text for e in stage.events["watcher"] if isinstance(e.body, MarkerAdded)]
-        return any("not finite" in text for text in texts)
-
-    stage.run(told, "everyone is told")
-    stage.run(lambda: watcher.mirror.scene_epoch == 2, "MuJoCo's reset is a new epoch")
-    assert "Gap" in stage.bodies("watcher")
-    _order(stage, "reset")  # MuJoCo's reset leaves the arms stretched out, where they cannot follow
-    stage.run(lambda: watcher.mirror.scene_epoch == 3, "the script's reset is another")
-    _drive(stage)
-    _end(stage)
+    scenario.run_until(lambda: "MarkerAdded" in scenario.list_event_kinds("watcher"), "a marker of the divergence")
+    scenario.run_until(lambda: watcher.mirror.scene_epoch == 2, "the epoch of MuJoCo's reset")
+    assert "Gap" in scenario.list_event_kinds("watcher")
+    command_script(scenario, "reset")  # MuJoCo's reset leaves the arms stretched, where they cannot follow
+    scenario.run_until(lambda: watcher.mirror.scene_epoch == 3, "the epoch of the script's reset")
+    drive_left_robot(scenario)
+    end_script(scenario)
 
 
-def test_the_one_liner(script: Callable[[str], Stage]) -> None:
-    """`Session(model, data).run()` inside `with`: our loop, a closed recording."""
-    stage = script(
+def test_session_run_in_a_script(script: Callable[[str], Scenario]) -> None:
+    """The session owns the loop, so the recording is of class `closed`."""
+    scenario = script(
         """
 with Session(model, data, config) as session:
-    say(session)
-    session.run(until=lambda: not obey())
+    print_address(session)
+    session.run(until=lambda: not poll_commands())
 print("ended in order", flush=True)
 """
     )
-    _drive(stage)
-    _order(stage, "end")
-    stage.run(lambda: stage.server.process.poll() is not None, "the script ends")
-    assert "ended in order" in stage.server.output
-    assert verify(stage.server.recording)["recording_class"] == "closed"
+    drive_left_robot(scenario)
+    command_script(scenario, "end")
+    scenario.run_until(lambda: scenario.server.process.poll() is not None, "the script ends")
+    assert "ended in order" in scenario.server.output
+    assert run_verify(scenario.server.recording)["recording_class"] == "closed"
 
 
 @pytest.mark.parametrize(
     ("body", "expected"),
     [
-        ("model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4\nSession.attach(model, data, config)", "RK4"),
-        ("mujoco.set_mjcb_control(lambda m, d: None)\nSession.attach(model, data, config)", "begin_tick"),
+        ("Session.attach(config=config)", "give model and data"),
+        ("mujoco.set_mjcb_control(lambda m, d: None)\nSession.attach(model, data, config)", "mjcb_control"),
         ("Session(model, data, config).begin_tick()", "with Session"),
         ("Session(model, None, config).start()\nSession(model, None, config).end_tick()", "Session(model, data)"),
         ('model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP\nSession(model, data, config).start()', "sleep"),
     ],
 )  # fmt: skip
-def test_what_cannot_work_is_refused_in_one_line(tmp_path: Path, body: str, expected: str) -> None:
+def test_unsupported_use_is_refused_in_one_line(tmp_path: Path, body: str, expected: str) -> None:
     file = tmp_path / "script.py"
     file.write_text(HEAD + body)
     done = subprocess.run(

@@ -1,4 +1,4 @@
-"""Recordings of what is hard to replay are bit-identical, and one changed byte of a journal is found and named."""
+"""Recordings of sessions that are hard to replay verify bit for bit, and a changed byte of a journal is found."""
 
 from __future__ import annotations
 
@@ -22,50 +22,51 @@ from iris_session.protocol.entries import Lost, decode_entries
 from iris_session.recording import JournalRow, Recording
 from iris_session.recording.messages import Batch
 from iris_session.session.verification import verify_recording
-from tests.e2e.conftest import Server, Stage, verify
+from tests.e2e.scenario import Scenario
+from tests.e2e.session_process import run_verify
 from tests.recording.support import write
 
 pytestmark = pytest.mark.e2e
 
 
 @pytest.fixture
-def recorded(stage: Stage) -> Path:
-    """A short session in which somebody drives, drops out in the middle of a motion, and comes back."""
-    identity = str(stage.server.folder / "ann.identity")
-    hand = stage.hand(stage.join("ann", identity=identity), "left")
-    watcher = stage.join("watcher", "observer")
+def recorded(scenario: Scenario) -> Path:
+    """A short session in which an operator drives, disconnects in motion, and resumes."""
+    identity = str(scenario.server.folder / "ann.identity")
+    hand = scenario.add_hand(scenario.join("ann", identity=identity), "left")
+    watcher = scenario.join("watcher", "observer")
     hand.client.acquire(["left"])
-    stage.engage(hand)
+    scenario.engage(hand)
     hand.velocity = (0.0, 0.1, 0.0)
-    stage.seconds(0.5)
+    scenario.run_for(0.5)
     lease = watcher.mirror.leases["left"]
-    hand.client._sockets.close()  # the network is gone: no `bye`, the lease waits
-    stage.clients.remove(hand.client)
-    stage.hands.remove(hand)
-    stage.run(lambda: watcher.mirror.leases["left"].expires_ns > 0, "the lease is kept for a while")
-    back = stage.hand(stage.join("ann", identity=identity), "left")
-    stage.run(lambda: watcher.mirror.leases["left"].expires_ns == 0, "ann has come back to it")
+    hand.client._sockets.close()  # a lost network: no `bye`
+    scenario.clients.remove(hand.client)
+    scenario.hands.remove(hand)
+    scenario.run_until(lambda: watcher.mirror.leases["left"].expires_ns > 0, "the grace period of the lease begins")
+    back = scenario.add_hand(scenario.join("ann", identity=identity), "left")
+    scenario.run_until(lambda: watcher.mirror.leases["left"].expires_ns == 0, "ann has resumed the lease")
     assert watcher.mirror.leases["left"].holder == lease.holder
-    stage.engage(back)
-    stage.server.finish()
-    return stage.server.recording
+    scenario.engage(back)
+    scenario.server.finish()
+    return scenario.server.recording
 
 
-def _edited(path: Path, target: Path, change: Callable[[JournalRow], JournalRow]) -> Path:
-    """A copy of the journal at `path` in which `change` was made to every row."""
+def copy_edited(path: Path, target: Path, change: Callable[[JournalRow], JournalRow]) -> Path:
+    """Write a copy of the journal at `path` with `change` applied to every row."""
     with Recording.open(path) as recording:
         batch = Batch(rows=[change(row) for row in recording.rows()], keyframes=list(recording.keyframes()))
         return write(target, recording.header, batch)
 
 
-def test_a_disconnect_while_holding_and_one_changed_byte(recorded: Path, tmp_path: Path) -> None:
-    report = verify(recorded)
+def test_disconnect_verifies_and_one_changed_byte_is_located(recorded: Path, tmp_path: Path) -> None:
+    report = run_verify(recorded)
     assert report["recording_class"] == "closed"
     with Recording.open(recorded) as recording:
         rows = list(recording.rows())
     assert any(isinstance(e.message, Lost) for row in rows for e in decode_entries(row.entries))
-    victim = next(row for row in reversed(rows) if _sample_entry(row) >= 0)
-    entry = _sample_entry(victim)
+    victim = next(row for row in reversed(rows) if find_sample_entry(row) >= 0)
+    entry = find_sample_entry(victim)
 
     def change(row: JournalRow) -> JournalRow:
         if row.step != victim.step:
@@ -75,16 +76,15 @@ def test_a_disconnect_while_holding_and_one_changed_byte(recorded: Path, tmp_pat
         blob[at + row.entry_lengths[entry] // 2] ^= 0x01
         return msgspec.structs.replace(row, entries=bytes(blob))
 
-    same = verify_recording(_edited(recorded, tmp_path / "same.rrd", lambda row: row))
+    same = verify_recording(copy_edited(recorded, tmp_path / "same.rrd", lambda row: row))
     assert same.ok, same.line()
-    changed = verify(_edited(recorded, tmp_path / "changed.rrd", change), status=1)
-    assert f"FAILED at step {victim.step}, entry {entry}" in changed["line"]
+    changed = run_verify(copy_edited(recorded, tmp_path / "changed.rrd", change), status=1)
     first = changed["problems"][0]
     assert (first["step"], first["entry"], first["kind"]) == (victim.step, entry, "changed")
 
 
-def _sample_entry(row: JournalRow) -> int:
-    """Index of the first sample of a row, -1 without one."""
+def find_sample_entry(row: JournalRow) -> int:
+    """Return the index of the first sample of a row, -1 without one."""
     for i, entry in enumerate(decode_entries(row.entries)):
         if isinstance(entry.message, Sample):
             return i
@@ -92,7 +92,7 @@ def _sample_entry(row: JournalRow) -> int:
 
 
 class Leader:
-    """A leader robot of the same kind as the left arm: streams `q` and `qd` at 60 Hz."""
+    """A leader robot of the same model as the left arm: streams `q` and `qd` at 60 Hz."""
 
     def __init__(self, client: Client) -> None:
         self.client = client
@@ -107,26 +107,26 @@ class Leader:
         self._began = time.monotonic()
         self._next = 0.0
 
-    def step(self) -> None:
+    def send_if_due(self) -> None:
         now = time.monotonic()
         if now < self._next:
             return
         self._next = now + 1.0 / 60.0
-        q, qd = self.joints(now)
+        q, qd = self.compute_joints(now)
         self.client.send_sample(
             "joints", kind="joints", robots=["left"], clutch=self.clutch, q=tuple(q.tolist()), qd=tuple(qd.tolist())
         )
 
-    def joints(self, now: float) -> tuple[np.ndarray, np.ndarray]:
+    def compute_joints(self, now: float) -> tuple[np.ndarray, np.ndarray]:
         t = now - self._began
         q, qd = self.home + self.offset, np.zeros_like(self.home)
         q[3] += self.swing * math.sin(2.0 * t)
         qd[3] = 2.0 * self.swing * math.cos(2.0 * t)
         return q, qd
 
-    def tip(self) -> PoseTuple:
-        """Where the follower's tip is when it stands as the leader does now."""
-        self._data.qpos[self._columns] = self.joints(time.monotonic())[0]
+    def compute_tip(self) -> PoseTuple:
+        """Return the tip pose of a follower in the present joint positions of the leader."""
+        self._data.qpos[self._columns] = self.compute_joints(time.monotonic())[0]
         mujoco.mj_forward(self._model, self._data)
         robot = self.client.mirror.robots["left"]
         x, y, z = self._data.body(robot.site_body).xpos + self._data.body(robot.site_body).xmat.reshape(
@@ -135,54 +135,50 @@ class Leader:
         return (float(x), float(y), float(z)), (1.0, 0.0, 0.0, 0.0)
 
 
-def test_a_leader_robot_that_starts_apart_ramps_and_then_leads(serve: Callable[..., Server]) -> None:
-    """Kinesthetic teaching: 0.5 rad apart at the start gives no jump; then the arm follows within centimetres."""
-    stage = Stage(serve())
-    try:
-        client = stage.join("teacher", "leader")
-        client.acquire(["left"])
-        stage.run(lambda: client.scene.tip_pose("left") is not None, "a first picture")
-        leader = Leader(client)
-        leader.offset[0] = 0.5
-        stage.hands.append(leader)  # type: ignore[arg-type]
-        tips: list[tuple[int, PoseTuple]] = []
+def test_follower_ramps_to_a_distant_leader_and_then_follows(scenario: Scenario) -> None:
+    """Kinesthetic teaching: 0.5 rad of distance at the start cause no jump; then the arm follows within centimetres."""
+    client = scenario.join("teacher", "leader")
+    client.acquire(["left"])
+    scenario.run_until(lambda: client.scene.tip_pose("left") is not None, "a first state")
+    leader = Leader(client)
+    leader.offset[0] = 0.5
+    scenario.hands.append(leader)  # type: ignore[arg-type]
+    tips: list[tuple[int, PoseTuple]] = []
 
-        def note() -> None:
-            state, tip = client.scene.state, client.scene.tip_pose("left")
-            if state is not None and tip is not None and (not tips or tips[-1][0] != state.header.tick):
-                tips.append((state.header.tick, tip))
+    def record_tip() -> None:
+        state, tip = client.scene.state, client.scene.tip_pose("left")
+        if state is not None and tip is not None and (not tips or tips[-1][0] != state.header.tick):
+            tips.append((state.header.tick, tip))
 
-        closed_at = 0.0
+    closed_at = 0.0
 
-        def hold_on() -> None:
-            """Closes the clutch; again, as people do, when no sample counted while it was open."""
-            nonlocal closed_at
-            followed = client.scene.state is not None and bool(client.scene.state.header.applied)
-            if not followed and time.monotonic() > closed_at + 3.0:
-                leader.clutch = False
-                stage.seconds(0.3)
-                leader.clutch, closed_at = True, time.monotonic()
+    def close_clutch() -> None:
+        """Open and close the clutch; again when no sample counted while it was open."""
+        nonlocal closed_at
+        followed = client.scene.state is not None and bool(client.scene.state.header.applied)
+        if not followed and time.monotonic() > closed_at + 3.0:
+            leader.clutch = False
+            scenario.run_for(0.3)
+            leader.clutch, closed_at = True, time.monotonic()
 
-        def caught_up() -> bool:
-            note()
-            if closed_at:
-                hold_on()
-            return distance(tips[-1][1][0], leader.tip()[0]) < 0.01
+    def has_caught_up() -> bool:
+        record_tip()
+        if closed_at:
+            close_clutch()
+        return distance(tips[-1][1][0], leader.compute_tip()[0]) < 0.01
 
-        stage.seconds(0.2)
-        assert not caught_up(), "it must start apart"
-        hold_on()
-        stage.run(caught_up, "the follower has caught up")
-        leader.swing = 0.2
-        until = time.monotonic() + 2.0
-        errors: list[float] = []
-        while time.monotonic() < until:
-            stage.step()
-            note()
-            errors.append(distance(tips[-1][1][0], leader.tip()[0]))
-        assert sorted(errors)[len(errors) // 2] < 0.04, "it must follow the swinging leader"
-        for (tick0, a), (tick1, b) in itertools.pairwise(tips):
-            assert distance(a[0], b[0]) <= 1.5 * max(0.017, (tick1 - tick0) * 0.002), "a jump"
-        stage.server.finish()
-    finally:
-        stage.close()
+    scenario.run_for(0.2)
+    assert not has_caught_up(), "it starts apart"
+    close_clutch()
+    scenario.run_until(has_caught_up, "the follower has caught up")
+    leader.swing = 0.2
+    until = time.monotonic() + 2.0
+    errors: list[float] = []
+    while time.monotonic() < until:
+        scenario.poll()
+        record_tip()
+        errors.append(distance(tips[-1][1][0], leader.compute_tip()[0]))
+    assert sorted(errors)[len(errors) // 2] < 0.04, "it must follow the moving leader"
+    for (tick0, a), (tick1, b) in itertools.pairwise(tips):
+        assert distance(a[0], b[0]) <= 1.5 * max(0.017, (tick1 - tick0) * 0.002), "a jump"
+    scenario.server.finish()

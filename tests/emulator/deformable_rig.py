@@ -1,6 +1,6 @@
-"""Plays the demos with deformables without network: real physics and control, operators who see what is late and noisy.
+"""Demos with deformables without a network: real physics and control, operators with delayed and noisy views.
 
-`python -m tests.emulator.deformable_rig 10 cloth` plays many seeds and prints the share of successes.
+`python -m tests.emulator.deformable_rig 10 cloth` runs many seeds and prints the share of successes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from iris_session.emulator.behaviours import make_behaviour
 from iris_session.emulator.behaviours.deformables import list_observed_vertices
 from tests.emulator.handover_rig import Rig
 
-#: Deformables begin up to so far from their places, and turned by so much.
+#: Deformables start up to so far from their places, rotated by up to so much.
 MOVED_M, TURNED_RAD = 0.015, math.radians(8.0)
 
 
@@ -44,7 +44,7 @@ class SoftRig(Rig):
             )
 
     def _shift_deformable(self, name: str) -> None:
-        """Moves and turns it about its middle, by the slides of its vertices or nodes."""
+        """Move and rotate it about its centre by the slides of its vertices or nodes."""
         model, data = self.world.model, self.world.data
         flex = self.world.flexes.names.index(name)
         first, count = int(model.flex_nodeadr[flex]), int(model.flex_nodenum[flex])
@@ -63,7 +63,7 @@ class SoftRig(Rig):
         self.moved_by_hand()
 
     def verdict(self) -> str:
-        """Empty when everybody is done and every goal is reached, else what is wrong."""
+        """Return an empty text when every operator is done and every goal is reached, else the fault."""
         wrong = [
             f"{robot} ({b.phase}): {b.failed or 'not done'}"
             for robot, b in self.behaviours.items()
@@ -73,14 +73,14 @@ class SoftRig(Rig):
         return "; ".join(wrong)
 
     def over(self) -> bool:
-        """Whether everybody is done and every goal is reached, or somebody has given up."""
+        """Return whether every operator is done and every goal is reached, or an operator has stopped trying."""
         behaviours = self.behaviours.values()
         reached = all(watch.at_s is not None for watch in self.watches)
         return any(b.failed for b in behaviours) or (reached and all(b.done for b in behaviours))
 
 
 def soft_demo(play: Demo, seed: int, *, shift: bool = True) -> SoftRig:
-    """A rig with the cast of a demo."""
+    """Return a rig with the cast of a demo."""
     behaviours = {
         task.robot: make_behaviour(task.behaviour, task.robot, task.object, task.partner, task.device, seed)
         for person in play.headsets
@@ -92,13 +92,13 @@ def soft_demo(play: Demo, seed: int, *, shift: bool = True) -> SoftRig:
 
 
 def main(runs: int, name: str = "cloth", first: int = 0) -> None:
-    """Counts successes over `runs` seeds."""
+    """Count successes over `runs` seeds."""
     good, times = 0, []
     play = make_demo(name)
     for seed in range(first, first + runs):
         began = time.process_time()
         rig = soft_demo(play, seed)
-        rig.run(130.0, until=SoftRig.over)  # as long as a demo may take
+        rig.run(130.0, until=SoftRig.over)  # time limit of a demo
         wrong = rig.verdict()
         good += not wrong
         times.append(rig.now_s)

@@ -1,6 +1,6 @@
-"""A whole closed loop in one process: the real `World` and `Controller`, operators who see it late and noisily.
+"""A closed loop in one process: the real `World` and `Controller`, operators with delayed and noisy views.
 
-Stands in for network, headset and authority only: states reach the operators 30 to 60 ms old with 1 mm and 0.3 deg of
+Replaces network, headset and authority only: states reach the operators 30 to 60 ms old with 1 mm and 0.3 deg of
 noise and stalls, their samples reach the session 8 to 25 ms later with the same noise on the hand. `Referee` judges the
 handover from contacts alone. `python -m tests.emulator.handover_rig 50 iiwa` counts successes over 50 seeds of a demo
 (`handover`, `iiwa`, `aloha`; a third argument is the number of operators), or of `board`.
@@ -45,7 +45,7 @@ SAMPLE_S = 1.0 / 72.0
 DEVICE = "controller/right"
 
 
-def shaken(pose: PoseTuple, rng: random.Random, noise: tuple[float, float]) -> PoseTuple:
+def add_noise(pose: PoseTuple, rng: random.Random, noise: tuple[float, float]) -> PoseTuple:
     (x, y, z), q = pose
     metres, radians = noise
     turn = quat_from_rotvec((rng.gauss(0, radians), rng.gauss(0, radians), rng.gauss(0, radians)))
@@ -53,7 +53,7 @@ def shaken(pose: PoseTuple, rng: random.Random, noise: tuple[float, float]) -> P
 
 
 class LateView:
-    """`OperatorView` of one person: the newest state that has arrived, with noise; now and then the picture stalls."""
+    """`OperatorView` of one person: the newest delivered state, with noise; the picture stalls now and then."""
 
     def __init__(self, rng: random.Random, noise: tuple[float, float] = NOISE, stalls: bool = True) -> None:
         self.session_time_ns = 0
@@ -64,10 +64,10 @@ class LateView:
         self._frames: deque[tuple[float, float, dict[str, PoseTuple]]] = deque(maxlen=16)
         self._stalled_until_s = 0.0
         self._frame: dict[str, PoseTuple] = {}
-        self._shown: dict[str, PoseTuple] = {}  # of the frame, with noise: only what this person looked at
-        #: All of the frame at once. What bends is folded for most seeds, not for all: theirs keep their noise.
+        self._shown: dict[str, PoseTuple] = {}  # of the frame, with noise: only what was queried
+        #: Deformables of the whole frame. A cloth is folded for most seeds, not for all: they keep their noise.
         self.sees_all = False
-        #: The picture of what bends stands still for up to a second and a half, every four seconds or so.
+        #: The picture of deformables stalls for up to 1.5 s, about every four seconds.
         self.freezes = False
         self._frozen_until_s = 0.0
         self._bent: dict[str, PoseTuple] = {}
@@ -78,12 +78,12 @@ class LateView:
         self._frames.append((now_s + self._rng.uniform(0.030, 0.060), now_s, poses))
 
     def stalled(self, now_s: float) -> bool:
-        """Whether this person's computer stands still: 30 ms in every hundredth frame."""
+        """Return whether this operator's computer stalls: 30 ms in every hundredth frame."""
         if now_s >= self._stalled_until_s and self._stalls and self._rng.random() < 0.01:
             self._stalled_until_s = now_s + 0.030
         return now_s < self._stalled_until_s
 
-    def look(self, now_s: float) -> None:
+    def receive_frame(self, now_s: float) -> None:
         self.session_time_ns = round(now_s * 1e9)
         arrived = [(of_s, poses) for arrives_s, of_s, poses in self._frames if arrives_s <= now_s]
         if not arrived:
@@ -98,9 +98,9 @@ class LateView:
             self._vertices_s, self._bent, self._vertices = of_s, poses, self._shown
 
     def _seen(self, name: str, frame: dict[str, PoseTuple], shown: dict[str, PoseTuple]) -> PoseTuple | None:
-        """As often as it is looked at in a picture, it is at the same place."""
+        """Repeated queries within one picture return the same pose."""
         if name not in shown and name in frame:
-            shown[name] = shaken(frame[name], self._rng, self._noise)
+            shown[name] = add_noise(frame[name], self._rng, self._noise)
         return shown.get(name)
 
     def body_pose(self, name: str) -> PoseTuple | None:
@@ -124,12 +124,12 @@ class LateView:
 
 
 class Referee:
-    """Follows one object by contacts: every stretch of time in the air, and who held it."""
+    """Follows one object by contacts: every interval in the air, and its holders."""
 
     def __init__(self, object: str) -> None:
         self.object = object
-        self.flights: list[list[tuple[float, tuple[str, ...]]]] = []  # per flight: (from when, holders)
-        self.strangers: set[str] = set()  # robots that touched it in the air without being its holders
+        self.flights: list[list[tuple[float, tuple[str, ...]]]] = []  # per flight: (start, holders)
+        self.other_robots: set[str] = set()  # robots that touched it in the air without holding it
         self._in_air = False
         self.resting = True
 
@@ -149,7 +149,7 @@ class Referee:
         self.resting = bool(others) and not (contact and contact.touching)
 
     def handed_over(self, giver: str, receiver: str) -> bool:
-        """Whether one flight began in `giver`'s grip, passed through both, ended in `receiver`'s, never free."""
+        """Return whether one flight began in `giver`'s grip, passed through both, ended in `receiver`'s, never free."""
         return any(_is_handover(flight, giver, receiver) for flight in self.flights)
 
 
@@ -174,10 +174,10 @@ class Rig:
     seed: int = 0
     object: str = "hammer"
     also: tuple[str, ...] = ()  # other objects that change hands
-    vertices: Mapping[str, tuple[int, ...]] = field(default_factory=dict)  # of deformables, which people watch
+    vertices: Mapping[str, tuple[int, ...]] = field(default_factory=dict)  # of deformables that operators watch
     shift: bool = True  # start the objects up to 30 mm and 20 deg from their places
     noise: tuple[float, float] = NOISE
-    watch: Callable[[Rig, str], None] | None = None  # called at every change of an operator's phase
+    watch: Callable[[Rig, str], None] | None = None  # called at every phase change of an operator
     views: dict[str, LateView] = field(default_factory=dict)
     fastest_hand: float = 0.0  # m/s
     model: Any = None
@@ -209,7 +209,7 @@ class Rig:
         return self.world.view().sim_time
 
     def run(self, seconds: float, until: Callable[[Rig], bool] | None = None) -> None:
-        """Goes on until `until` holds (default: every operator is done), for at most `seconds` more."""
+        """Run until `until` holds (default: every operator is done), for at most `seconds` more."""
         stop = until or (lambda rig: all(b.done for b in rig.behaviours.values()))
         end_s = self.now_s + seconds
         while self.now_s < end_s and not stop(self):
@@ -229,16 +229,16 @@ class Rig:
 
     @property
     def referee(self) -> Referee:
-        """Of the first object."""
+        """Return the referee of the first object."""
         return self.referees[self.object]
 
     def end_engagement(self, robot: str) -> None:
-        """What the session does after a gap in the samples: the robot holds until the clutch was opened once."""
+        """Emulate the session after a gap in the samples: the robot holds until the clutch was opened once."""
         self._commands[robot] = Command(robot, CommandKind.HOLD, HoldReason.STALE)
         self._must_open.add(robot)
 
     def moved_by_hand(self) -> None:
-        """After `qpos` was written: poses and contacts are those of the new state."""
+        """Update poses and contacts after a write to `qpos`."""
         self.world.restore_state(self.world.save_state())
 
     def _publish(self) -> None:
@@ -265,14 +265,14 @@ class Rig:
         if view.stalled(self.now_s):
             return
         before, phase = view.session_time_ns, behaviour.phase
-        view.look(self.now_s)
+        view.receive_frame(self.now_s)
         for hand in behaviour.update(view):
             if hand.clutch and view.session_time_ns > before:
                 speed = distance(hand.pose_world[0], view.hand[0]) / ((view.session_time_ns - before) * 1e-9)
                 self.fastest_hand = max(self.fastest_hand, speed)
             view.hand = hand.pose_world
             noisy = HandInput(
-                hand.device, hand.robot, shaken(hand.pose_world, self.rng, self.noise), hand.clutch, hand.gripper
+                hand.device, hand.robot, add_noise(hand.pose_world, self.rng, self.noise), hand.clutch, hand.gripper
             )
             self._on_the_way.append((self.now_s + self.rng.uniform(0.008, 0.025), noisy))
         if self.watch is not None and behaviour.phase != phase:
@@ -312,7 +312,7 @@ class Rig:
 
 
 def _seen(command: Command) -> Command:
-    """The same command in a later step: its sample is not new any more."""
+    """Return the command for a later step: its sample is not new any more."""
     if command.kind != CommandKind.POSE or not command.sources[0].new:
         return command
     s = command.sources[0]
@@ -323,13 +323,13 @@ def _seen(command: Command) -> Command:
 
 
 def handover(seed: int, object: str = "hammer", giver: str = "left", receiver: str = "right", **options: Any) -> Rig:
-    """A rig with one giver and one receiver in the packaged handover scene."""
+    """Return a rig with one giver and one receiver in the packaged handover scene."""
     behaviours = {giver: Giver(giver, object, receiver), receiver: Receiver(receiver, object, giver)}
     return Rig(behaviours, seed, object, **options)
 
 
 def demo(play: Demo, seed: int, **options: Any) -> Rig:
-    """A rig with the cast of a demo, one behaviour per robot; who has no partner is left out."""
+    """Return a rig with the cast of a demo, one behaviour per robot; operators without a partner are left out."""
     behaviours = {}
     for task in (task for person in play.headsets for task in person.tasks if task.partner):
         args = (task.behaviour, task.robot, task.object, task.partner, task.device, seed, task.arm, task.place)
@@ -338,7 +338,7 @@ def demo(play: Demo, seed: int, **options: Any) -> Rig:
 
 
 def verdict(rig: Rig, giver: str, receiver: str) -> str:
-    """Empty when the handover succeeded, else what is wrong."""
+    """Return an empty text when the handover succeeded, else the fault."""
     for robot, behaviour in rig.behaviours.items():
         if behaviour.failed or not behaviour.done:
             return f"{robot} ({behaviour.phase}): {behaviour.failed or 'not done'}"
@@ -348,7 +348,7 @@ def verdict(rig: Rig, giver: str, receiver: str) -> str:
 
 
 def demo_verdict(rig: Rig) -> str:
-    """Empty when every object changed hands cleanly and rests, else what is wrong."""
+    """Return an empty text when every object changed hands cleanly and rests, else the fault."""
     wrong = [
         f"{robot} ({b.phase}): {b.failed or 'not done'}"
         for robot, b in rig.behaviours.items()
@@ -364,13 +364,13 @@ def demo_verdict(rig: Rig) -> str:
 
 
 def over(rig: Rig) -> bool:
-    """Whether everybody is done, or somebody has given up."""
+    """Return whether every operator is done, or one has stopped trying."""
     behaviours = rig.behaviours.values()
     return all(b.done for b in behaviours) or any(b.failed for b in behaviours)
 
 
 def main(runs: int, name: str = "handover", operators: int = 2, first: int = 0) -> None:
-    """Counts successes over `runs` seeds."""
+    """Count successes over `runs` seeds."""
     good, times = 0, []
     play = None if name == "board" else make_demo(name, operators)
     for seed in range(first, first + runs):

@@ -1,4 +1,4 @@
-"""Whole handovers on the real physics and control, and what operators do when something goes wrong."""
+"""Whole handovers with real physics and control, and recovery of operators from disturbances."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.emulator.handover_rig import DEVICE, Referee, Rig, handover, verdict
 pytestmark = pytest.mark.usefixtures("untraced")
 
 
-def _until(robot: str, phase: str):  # type: ignore[no-untyped-def]
+def _in_phase(robot: str, phase: str):  # type: ignore[no-untyped-def]
     return lambda rig: rig.behaviours[robot].phase == phase
 
 
@@ -23,7 +23,7 @@ def _until(robot: str, phase: str):  # type: ignore[no-untyped-def]
     [(1, "hammer", "left", "right"), (2, "hammer", "left", "right"), (3, "board", "right", "left")],
 )
 def test_handover_in_mid_air(seed: int, thing: str, giver: str, receiver: str) -> None:
-    """Friction alone holds the thing; between the two grips it touches nothing else; it ends on the table."""
+    """Friction alone holds the object; between the two grips it touches nothing else; it ends on the table."""
     rig = handover(seed, thing, giver, receiver)
     rig.run(25.0)
     assert verdict(rig, giver, receiver) == ""
@@ -33,8 +33,8 @@ def test_handover_in_mid_air(seed: int, thing: str, giver: str, receiver: str) -
     assert side * rig.world.view().object_pose(thing).p[0] > 0.1  # on the receiver's side of the table
 
 
-def test_four_operators_two_handovers_at_once() -> None:
-    """Four arms around a table: neighbours hand over a hammer and a board at the same time."""
+def test_two_handovers_of_four_operators_at_once() -> None:
+    """Four arms around a table: adjacent operators hand over a hammer and a board at the same time."""
     behaviours: dict[str, Behaviour] = {}
     for giver, receiver, thing in (("arm1", "arm2", "object1"), ("arm3", "arm4", "object2")):
         behaviours[giver] = Giver(giver, thing, receiver)
@@ -42,18 +42,18 @@ def test_four_operators_two_handovers_at_once() -> None:
     rig = Rig(behaviours, seed=15, object="object1", shift=False, model=n_arms_scene(4).compile())
     other = Referee("object2")
 
-    def look(r: Rig) -> bool:
+    def record(r: Rig) -> bool:
         other.tick(r.world)
         return all(b.done for b in r.behaviours.values())
 
-    rig.run(30.0, until=look)
+    rig.run(30.0, until=record)
     assert verdict(rig, "arm1", "arm2") == ""
     assert other.handed_over("arm3", "arm4")
     assert other.resting
 
 
-def test_nothing_moves_by_itself() -> None:
-    """The referee can fail: two people who hold their hands still hand nothing over."""
+def test_idle_operators_hand_nothing_over() -> None:
+    """Negative control of the referee."""
     rig = Rig({"left": Idle("left"), "right": Idle("right")}, seed=1)
     before = rig.world.view().object_pose("hammer").p
     rig.run(1.0)
@@ -61,10 +61,10 @@ def test_nothing_moves_by_itself() -> None:
     assert distance(before, rig.world.view().object_pose("hammer").p) < 1e-3
 
 
-def test_emergency_stop_in_the_middle() -> None:
-    """While stopped the clutch is open; after it the operators take hold again and finish."""
+def test_handover_finishes_after_an_emergency_stop() -> None:
+    """While stopped the clutch is open; afterwards the operators engage again and finish."""
     rig = handover(4)
-    rig.run(30.0, until=_until("left", "present"))
+    rig.run(30.0, until=_in_phase("left", "present"))
     rig.run(0.4, until=lambda r: False)
     for view in rig.views.values():
         view.estop = True
@@ -78,7 +78,7 @@ def test_emergency_stop_in_the_middle() -> None:
     assert verdict(rig, "left", "right") == ""
 
 
-def test_without_a_lease_the_operator_waits() -> None:
+def test_operator_without_a_lease_waits() -> None:
     rig = handover(5)
     rig.views["left"].lease = None
     rig.run(2.0, until=lambda r: False)
@@ -89,10 +89,10 @@ def test_without_a_lease_the_operator_waits() -> None:
 
 
 @pytest.mark.parametrize("phase", ["approach", "release"])
-def test_lost_engagement_of_the_giver_is_noticed(phase: str) -> None:
-    """The session ended the engagement (a gap in the samples): the giver sees it and clutches again."""
+def test_giver_clutches_again_after_a_lost_engagement(phase: str) -> None:
+    """The session ends the engagement after a gap in the samples."""
     rig = handover(6)
-    rig.run(30.0, until=_until("left", phase))
+    rig.run(30.0, until=_in_phase("left", phase))
     rig.run(0.1, until=lambda r: False)
     rig.end_engagement("left")
     rig.run(40.0)
@@ -101,19 +101,19 @@ def test_lost_engagement_of_the_giver_is_noticed(phase: str) -> None:
 
 
 @pytest.mark.parametrize("phase", ["carry", "put"])
-def test_lost_engagement_of_the_receiver_is_noticed(phase: str) -> None:
+def test_receiver_clutches_again_after_a_lost_engagement(phase: str) -> None:
     rig = handover(7)
-    rig.run(30.0, until=_until("right", phase))
+    rig.run(30.0, until=_in_phase("right", phase))
     rig.run(0.1, until=lambda r: False)
     rig.end_engagement("right")
     rig.run(40.0)
     assert verdict(rig, "left", "right") == ""
 
 
-def test_thing_moved_away_before_the_grasp() -> None:
+def test_giver_retries_when_the_object_moved_before_the_grasp() -> None:
     """The gripper closes on nothing; the giver sees it, opens and tries again."""
     rig = handover(8)
-    rig.run(30.0, until=_until("left", "close"))
+    rig.run(30.0, until=_in_phase("left", "close"))
     at = rig.world.model.joint("hammer").qposadr[0]
     rig.world.data.qpos[at : at + 2] += (0.02, 0.09)
     rig.moved_by_hand()
@@ -122,10 +122,10 @@ def test_thing_moved_away_before_the_grasp() -> None:
     assert rig.behaviours["left"].attempts == 2  # type: ignore[attr-defined]
 
 
-def test_thing_dropped_on_the_way_is_picked_up_again() -> None:
-    """The pads lose their grip for a moment in the air: the giver takes the thing from the table again."""
+def test_giver_picks_up_a_dropped_object() -> None:
+    """The pads lose their grip for a moment in the air; the giver grasps the object from the table again."""
     rig = handover(9)
-    rig.run(30.0, until=_until("left", "present"))
+    rig.run(30.0, until=_in_phase("left", "present"))
     model = rig.world.model
     pads = [model.geom(f"left/pad_{side}").id for side in ("left", "right")]
     rubber = model.geom_friction[pads].copy()
@@ -137,17 +137,17 @@ def test_thing_dropped_on_the_way_is_picked_up_again() -> None:
     assert rig.behaviours["left"].attempts >= 2  # type: ignore[attr-defined]
 
 
-def test_thing_that_leans_on_something_is_left_alone() -> None:
+def test_leaning_object_is_left_alone() -> None:
     rig = handover(9, shift=False)
     at = rig.world.model.joint("hammer").qposadr[0]
     rig.world.data.qpos[at + 2] = 0.17
-    rig.world.data.qpos[at + 3 : at + 7] = (math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0)  # on its head, handle upright
+    rig.world.data.qpos[at + 3 : at + 7] = (math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0)  # upside down, handle upright
     rig.moved_by_hand()
     rig.run(10.0, until=lambda r: r.behaviours["left"].done)
-    assert rig.behaviours["left"].failed == "the hammer does not lie flat, it cannot be taken from above"
+    assert rig.behaviours["left"].failed.startswith("the hammer ")
 
 
-def test_giver_gives_up_when_nobody_comes() -> None:
+def test_giver_stops_when_no_receiver_comes() -> None:
     rig = Rig({"left": Giver("left", "hammer", "right", patience_s=2.0), "right": Idle("right")}, seed=10)
     rig.run(30.0, until=lambda r: r.behaviours["left"].done)
     giver = rig.behaviours["left"]
@@ -156,18 +156,17 @@ def test_giver_gives_up_when_nobody_comes() -> None:
     assert rig.world.view().object_contacts()[0].grippers == ("left",)  # it does not drop it
 
 
-def test_receiver_gives_up_when_nothing_is_offered() -> None:
+def test_receiver_stops_when_nothing_is_offered() -> None:
     rig = Rig({"left": Idle("left"), "right": Receiver("right", "hammer", "left", patience_s=1.0)}, seed=11)
     rig.run(5.0, until=lambda r: r.behaviours["right"].done)
     assert rig.behaviours["right"].failed.startswith("left did not offer the hammer")
 
 
-def test_operator_says_what_is_not_in_the_scene() -> None:
+def test_missing_scene_names_are_reported() -> None:
     rig = Rig({"left": Giver("left", "object1", "third")}, seed=11)
     rig.run(12.0)
-    assert rig.behaviours["left"].failed == (
-        "missing in the scene: object1, third/finger_left, third/finger_right, third/base, tip third"
-    )
+    missing = rig.behaviours["left"].failed.partition(": ")[2]
+    assert missing.split(", ") == ["object1", "third/finger_left", "third/finger_right", "third/base", "tip third"]
 
 
 def test_wander_stays_near_and_cycles_the_clutch() -> None:
@@ -175,19 +174,19 @@ def test_wander_stays_near_and_cycles_the_clutch() -> None:
     home = rig.world.view().tip_pose("left").p
     clutches, farthest = set(), 0.0
 
-    def look(r: Rig) -> bool:
+    def record(r: Rig) -> bool:
         nonlocal farthest
         farthest = max(farthest, distance(home, r.world.view().tip_pose("left").p))
         clutches.add(r.behaviours["left"].phase)
         return False
 
-    rig.run(12.0, until=look)
+    rig.run(12.0, until=record)
     assert clutches == {"wait", "move", "clutch"}
     assert 0.05 < farthest < 0.2
     assert rig.fastest_hand < 0.5
 
 
-def test_same_seed_same_handover() -> None:
+def test_same_seed_gives_the_same_handover() -> None:
     """Operators use no clock and no hidden randomness."""
     first, second = handover(13), handover(13)
     first.run(3.0, until=lambda r: False)
@@ -195,14 +194,14 @@ def test_same_seed_same_handover() -> None:
     assert first.world.save_state() == second.world.save_state()
 
 
-def test_make_behaviour() -> None:
+def test_unknown_behaviours_and_objects_are_rejected() -> None:
     assert isinstance(make_behaviour("giver", "left"), Giver)
     assert make_behaviour("receiver", "right", "board").partner == "left"  # type: ignore[attr-defined]
     assert isinstance(make_behaviour("wander", "arm3", seed=5), Wander)
     assert isinstance(make_behaviour("idle", "arm3", device=DEVICE), Idle)
     with pytest.raises(ValueError, match="needs a partner"):
         make_behaviour("giver", "arm1")
-    with pytest.raises(ValueError, match="Available behaviours: giver, receiver, folder, stower, wander, idle"):
+    with pytest.raises(ValueError, match=r"giver, receiver, folder, .*idle"):
         make_behaviour("juggler", "left")
-    with pytest.raises(ValueError, match="Known objects: hammer, board"):
+    with pytest.raises(ValueError, match="objects: hammer, board"):
         make_behaviour("giver", "left", "teapot")

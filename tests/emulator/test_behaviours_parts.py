@@ -1,4 +1,4 @@
-"""The parts of the operators one by one: reaches, the clutched hand, eyes, and what they know of the things."""
+"""Parts of the operators: reaches, the clutched hand, perception, and their knowledge of objects."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class PerfectRobot:
         return self.hand
 
     def run(self, hand: ClutchedHand, seconds: float) -> list[bool]:
-        """Lets the hand act for a while; returns the clutch over time."""
+        """Run the hand for a while; return the clutch over time."""
         clutches = []
         for _ in range(round(seconds * 1e9 / STEP_NS)):
             self.session_time_ns += STEP_NS
@@ -81,7 +81,7 @@ class PerfectRobot:
             self.hand = given_input.pose_world
             clutches.append(given_input.clutch)
             if not given_input.clutch:
-                self.holds, self._latch = False, None  # an opened clutch arms the session again
+                self.holds, self._latch = False, None  # an opened clutch re-arms the session
             elif self._latch is None:
                 self._latch = (self.hand, self.tip)
             elif not self.holds:
@@ -91,7 +91,7 @@ class PerfectRobot:
         return clutches
 
 
-def test_min_jerk_begins_and_ends_at_rest() -> None:
+def test_min_jerk_starts_and_ends_at_rest() -> None:
     assert compute_min_jerk(-1.0) == compute_min_jerk(0.0) == 0.0
     assert compute_min_jerk(1.0) == compute_min_jerk(2.0) == 1.0
     assert compute_min_jerk(0.5) == pytest.approx(0.5)
@@ -120,14 +120,14 @@ def test_reach_keeps_its_speed_limits(start: PoseTuple, goal: PoseTuple) -> None
 
 @settings(max_examples=12, deadline=None)
 @given(_poses, _poses, _poses)
-def test_hand_brings_the_tip_to_the_goal_from_anywhere(tip: PoseTuple, hand_at: PoseTuple, goal: PoseTuple) -> None:
-    """Wherever the hand is and however it is turned: relative motion takes the tip there."""
+def test_hand_brings_the_tip_to_the_goal_from_any_pose(tip: PoseTuple, hand_at: PoseTuple, goal: PoseTuple) -> None:
+    """Relative motion moves the tip there at any position and orientation of the hand."""
     robot, hand = PerfectRobot(tip, hand_at), ClutchedHand("controller/right", "left")
     hand.move_to(goal)
     robot.run(hand, 16.0)
     assert distance(robot.tip[0], goal[0]) < 1e-3
     assert quat_angle(robot.tip[1], goal[1]) < 5e-3
-    assert not hand.has_arrived()  # seen there for the first time
+    assert not hand.has_arrived()  # first observation there
     robot.run(hand, 0.2)
     assert hand.has_arrived()
     assert hand.reclutches == 0
@@ -144,7 +144,7 @@ def test_engaging_moves_nothing() -> None:
     assert robot.hand == before
 
 
-def test_hand_closes_the_clutch_again_when_the_robot_does_not_follow() -> None:
+def test_hand_clutches_again_when_the_robot_does_not_follow() -> None:
     robot, hand = PerfectRobot(IDENTITY_POSE, IDENTITY_POSE), ClutchedHand("controller/right", "left")
     hand.move_to(((0.3, 0.0, 0.0), IDENTITY_QUAT))
     robot.run(hand, 0.2)
@@ -156,7 +156,7 @@ def test_hand_closes_the_clutch_again_when_the_robot_does_not_follow() -> None:
     assert distance(robot.tip[0], (0.3, 0.0, 0.0)) < 1e-3
 
 
-def test_short_moves_that_are_not_followed_are_noticed_too() -> None:
+def test_short_moves_that_are_not_followed_are_detected() -> None:
     robot, hand = PerfectRobot(IDENTITY_POSE, IDENTITY_POSE), ClutchedHand("controller/right", "left")
     robot.run(hand, 0.2)
     robot.holds = True
@@ -181,8 +181,8 @@ def test_estop_and_lost_lease_open_the_clutch() -> None:
     assert distance(robot.tip[0], (0.2, 0.0, 0.0)) < 1e-3
 
 
-def test_the_hand_does_not_jump_after_a_stall() -> None:
-    """The computer stood still for 2 s in the middle of a movement: the operator goes on where he was."""
+def test_hand_does_not_jump_after_a_stall() -> None:
+    """The computer stalled for 2 s in the middle of a movement: the operator continues from the same pose."""
     robot, hand = PerfectRobot(IDENTITY_POSE, IDENTITY_POSE), ClutchedHand("controller/right", "left")
     hand.move_to(((0.4, 0.0, 0.0), IDENTITY_QUAT))
     robot.run(hand, 0.8)
@@ -192,7 +192,7 @@ def test_the_hand_does_not_jump_after_a_stall() -> None:
     assert distance(before[0], robot.hand[0]) <= 0.4 * LONGEST_STEP_S + 0.4 * STEP_NS * 1e-9
 
 
-def test_trigger_takes_its_time() -> None:
+def test_trigger_moves_gradually() -> None:
     robot, hand = PerfectRobot(IDENTITY_POSE, IDENTITY_POSE), ClutchedHand("controller/right", "left")
     robot.run(hand, 0.1)
     hand.trigger_goal = 1.0
@@ -204,7 +204,7 @@ def test_trigger_takes_its_time() -> None:
     assert hand.is_trigger_done()
 
 
-def test_seen_smooths_noise_and_follows() -> None:
+def test_perceived_pose_is_smoothed_and_follows() -> None:
     seen, rng = TrackedPose(IDENTITY_POSE, 0.0), np.random.default_rng(1)
     errors = []
     for i in range(1, 720):
@@ -220,7 +220,7 @@ def test_seen_smooths_noise_and_follows() -> None:
     assert seen.still_s < 0.6
 
 
-class Picture:
+class FixedView:
     """`OperatorView` that shows fixed poses."""
 
     session_time_ns = 0
@@ -265,22 +265,22 @@ def _gripper_at(x: float, y: float, half_gap: float) -> dict[str, PoseTuple]:
         (0.08, 0.0, 0.0, False),  # closed on nothing
     ],
 )
-def test_eyes_see_who_holds_a_thing(x: float, y: float, half_gap: float, holds: bool) -> None:
+def test_holder_of_an_object_is_perceived(x: float, y: float, half_gap: float, holds: bool) -> None:
     eyes = Perception(("hammer",), ("left",))
-    eyes.observe(Picture(_gripper_at(x, y, half_gap)))
+    eyes.observe(FixedView(_gripper_at(x, y, half_gap)))
     assert eyes.is_complete
     assert eyes.compute_gap("left") == pytest.approx(2 * half_gap)
     assert eyes.is_holding("left", "hammer", find_object("hammer").half_width) is holds
 
 
-def test_eyes_say_what_is_missing() -> None:
+def test_perception_names_missing_bodies() -> None:
     eyes = Perception(("hammer",), ("left",), perhaps=("board",))
     poses = _gripper_at(0.0, 0.0, 0.04)
     base = poses.pop("left/base")
-    eyes.observe(Picture(poses))
+    eyes.observe(FixedView(poses))
     assert eyes.missing == ("left/base",)
     assert eyes.list_obstacles() == []
-    eyes.observe(Picture(poses | {"left/base": base, "board": ((1.0, 2.0, 3.0), IDENTITY_QUAT)}))
+    eyes.observe(FixedView(poses | {"left/base": base, "board": ((1.0, 2.0, 3.0), IDENTITY_QUAT)}))
     assert eyes.is_complete
     assert eyes.list_obstacles() == [(1.0, 2.0, 3.0)]
 
@@ -300,7 +300,7 @@ def _outline(model: mujoco.MjModel, body: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("body", ["hammer", "board", "object1", "object2"])
-def test_what_people_know_of_the_things_is_true(body: str) -> None:
+def test_object_descriptions_match_the_scenes(body: str) -> None:
     """The operators' outlines and grasp places fit the geoms of the scenes."""
     if body.startswith("object"):
         model = n_arms_scene(4).compile()
@@ -321,7 +321,7 @@ def test_what_people_know_of_the_things_is_true(body: str) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.floats(-3.1, 3.1), st.booleans(), st.floats(-3.1, 3.1))
-def test_grasps_come_from_above_whichever_face_is_up(yaw: float, flipped: bool, gripper_yaw: float) -> None:
+def test_grasps_come_from_above_with_either_face_up(yaw: float, flipped: bool, gripper_yaw: float) -> None:
     thing = make_level_pose((0.1, 0.2, 0.016), yaw, -1.0 if flipped else 1.0)
     assert get_face_up(thing) == (-1.0 if flipped else 1.0)
     assert compute_tilt(thing) < 1e-6
@@ -335,7 +335,7 @@ def test_grasps_come_from_above_whichever_face_is_up(yaw: float, flipped: bool, 
     assert pose[0][2] == pytest.approx(0.019)
 
 
-def test_known_things() -> None:
+def test_described_objects_are_complete() -> None:
     assert set(COMMON_OBJECTS) >= {"hammer", "board", "object1"}
     assert find_object("object3") is find_object("hammer")
     with pytest.raises(ValueError, match="Known objects"):

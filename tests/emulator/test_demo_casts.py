@@ -1,4 +1,4 @@
-"""The casts of the demos on the real physics and control, late and noisy; and people with two hands."""
+"""Casts of the demos with real physics and control, delayed and noisy; and people with two hands."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ __all__ = ["robot_models"]
 
 
 @pytest.mark.usefixtures("robot_models", "untraced")
-def test_everything_changes_hands() -> None:
-    """By friction, in mid-air, and ends on a table. Two iiwa, and ALOHA: `tests/e2e/test_demos_paper.py`."""
+def test_every_object_is_handed_over() -> None:
+    """By friction, in mid-air, onto a table. Two iiwa, and ALOHA: `tests/e2e/test_demo_scenes.py`."""
     rig = demo(make_demo("iiwa", 4), seed=0)
     rig.run(60.0, until=over)
     assert demo_verdict(rig) == ""
@@ -30,7 +30,7 @@ def test_eight_arms_around_a_table() -> None:
     assert demo_verdict(rig) == ""
 
 
-class Scripted:
+class ScriptedHand:
     """One hand that is done after some updates."""
 
     def __init__(self, robot: str, updates: int, failed: str = "") -> None:
@@ -48,8 +48,8 @@ def view() -> LateView:
     return LateView(random.Random(1))
 
 
-def test_both_hands_work_side_by_side_until_both_are_done() -> None:
-    hands = CombinedBehaviour([Scripted("left", 2), Scripted("right", 3)])
+def test_both_hands_work_in_parallel_until_both_are_done() -> None:
+    hands = CombinedBehaviour([ScriptedHand("left", 2), ScriptedHand("right", 3)])
     assert [i.robot for i in hands.update(view())] == ["left", "right"]
     assert (hands.phase, hands.done) == ("busy", False)
     hands.update(view())
@@ -58,8 +58,8 @@ def test_both_hands_work_side_by_side_until_both_are_done() -> None:
     assert (hands.phase, hands.done, hands.failed) == ("done", True, "")
 
 
-def test_a_failure_of_one_hand_is_one_of_the_person() -> None:
-    hands = CombinedBehaviour([Scripted("left", 9), Scripted("right", 1, "dropped it")])
+def test_failure_of_one_hand_is_a_failure_of_the_person() -> None:
+    hands = CombinedBehaviour([ScriptedHand("left", 9), ScriptedHand("right", 1, "dropped it")])
     hands.update(view())
     assert hands.failed == "dropped it"
     assert not hands.done

@@ -1,4 +1,4 @@
-"""Where a head is over time: it keeps to the work, goes to the sheet as often as it should, and every stop counts."""
+"""Head motion: on the work, with glances at the sheet at the configured rate, and a viewpoint at every stop."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ SECOND = 1000 * MS
 AWAY = (0.0, -3.0, 0.6)  # behind the person
 
 
-def watch(gaze: Gaze, spec: HeadsetSpec, seconds: float) -> list[tuple[int, int]]:
-    """(time, viewpoint) at which the sheet is in view of a head at rest, 50 times a second at work."""
+def glances(gaze: Gaze, spec: HeadsetSpec, seconds: float) -> list[tuple[int, int]]:
+    """Return (time, viewpoint) at which the sheet is in view of a head at rest, sampled 50 times a second."""
     headset, seen = EmulatedHeadset(HeadsetModel(), 0), []
     for now_ns in range(SECOND, SECOND + int(seconds * SECOND), 20 * MS):
         gaze.look_at_work(now_ns)
@@ -24,15 +24,15 @@ def watch(gaze: Gaze, spec: HeadsetSpec, seconds: float) -> list[tuple[int, int]
     return seen
 
 
-def test_who_looks_at_the_work_sees_the_sheet_in_glances_only() -> None:
+def test_working_head_sees_the_sheet_in_glances_only() -> None:
     spec = HeadsetSpec(name="ann", gaze=AWAY, glance_every_s=3.0, glance_s=1.0)
-    seen = watch(Gaze(spec), spec, 20.0)
+    seen = glances(Gaze(spec), spec, 20.0)
     assert len({viewpoint for _, viewpoint in seen}) == 4
     assert len(seen) * 0.02 == pytest.approx(4.0, abs=0.2), "a second each"
-    assert watch(Gaze(HeadsetSpec(name="ann", gaze=AWAY)), spec, 20.0) == []
+    assert glances(Gaze(HeadsetSpec(name="ann", gaze=AWAY)), spec, 20.0) == []
 
 
-def test_glances_are_from_another_side_every_time() -> None:
+def test_glances_have_different_viewpoints() -> None:
     spec = HeadsetSpec(name="ann", gaze=AWAY, glance_every_s=1.0, glance_s=1.0)
     gaze, places = Gaze(spec), []
     for now_ns in range(0, 9 * SECOND, 20 * MS):
@@ -43,10 +43,10 @@ def test_glances_are_from_another_side_every_time() -> None:
     assert len(stops) >= 2
 
 
-def test_a_head_in_motion_detects_nothing_and_a_stop_is_a_viewpoint() -> None:
+def test_moving_head_detects_nothing_and_a_stop_is_a_viewpoint() -> None:
     spec = HeadsetSpec(name="ann")
     gaze = Gaze(spec)
-    assert watch(gaze, spec, 1.0), "by default the sheet is in view of those who work"
+    assert glances(gaze, spec, 1.0), "by default the sheet is in view of those who work"
     at_rest = gaze.viewpoint_id
     now_ns = 10 * SECOND
     gaze.move_to_viewpoint(0, now_ns)

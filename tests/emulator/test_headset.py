@@ -1,4 +1,4 @@
-"""The emulated headset: its noise is what it says, its frame is its own, and it is reproducible."""
+"""The emulated headset: its stated noise, its own tracking frame, and reproducibility."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ from iris_session.netsim.latency import DelayLine, LinkModel
 SECOND = 1_000_000_000
 MINUTE = 60 * SECOND
 SHEET = DEFAULT_T_WORLD_ANCHOR
-#: No drift, no wrong detections, no error of scale: what is left is the noise of single looks.
+#: No drift, no wrong detections, no scale error: only the noise of single observations.
 STILL = HeadsetModel(drift_m_per_min=0.0, drift_rad_per_min=0.0, sheet=SheetNoise(wrong_share=0.0, scale=0.0))
 
 
 def above(d: float, aside: float = 0.2) -> PoseTuple:
-    """A head at distance `d` from the sheet, looking at it from above and a little aside."""
+    """Return a head pose at distance `d` from the sheet, looking at it from above and slightly aside."""
     x, y, z = SHEET[0]
     return compute_look_at((x, y - d * math.sin(aside), z + d * math.cos(aside)), SHEET[0])
 
 
 def errors(headset: EmulatedHeadset, head: PoseTuple, n: int, viewpoint: int | None = None) -> np.ndarray:
-    """(n, 4): position error along and across (2) the view, angle about one axis; each from another viewpoint."""
+    """Return (n, 4): position error along and across (2) the view, angle about one axis; one viewpoint each."""
     rows = []
     e1 = np.subtract(SHEET[0], head[0]) / distance(SHEET[0], head[0])
     e2 = np.cross(e1, (1.0, 0.0, 0.0))
@@ -65,7 +65,7 @@ def errors(headset: EmulatedHeadset, head: PoseTuple, n: int, viewpoint: int | N
 
 
 @pytest.mark.parametrize(("d", "along_mm", "degrees"), [(0.5, 1.5, 0.3), (1.0, 4.8, 0.6)])
-def test_sheet_noise_is_that_of_the_model(d: float, along_mm: float, degrees: float) -> None:
+def test_sheet_noise_matches_the_model(d: float, along_mm: float, degrees: float) -> None:
     spread = errors(EmulatedHeadset(STILL, seed=1), above(d), 3000).std(axis=0)
     assert spread[0] == pytest.approx(along_mm * 1e-3, rel=0.06)
     assert spread[1] == pytest.approx(along_mm * 1e-3 / 3.0, rel=0.06)
@@ -73,13 +73,13 @@ def test_sheet_noise_is_that_of_the_model(d: float, along_mm: float, degrees: fl
     assert spread[3] == pytest.approx(math.radians(degrees), rel=0.06)
 
 
-def test_half_of_the_variance_is_the_same_for_one_viewpoint() -> None:
+def test_half_of_the_variance_is_constant_per_viewpoint() -> None:
     headset = EmulatedHeadset(STILL, seed=2)
     within = np.mean([errors(headset, above(0.5), 40, viewpoint)[:, 0].var(ddof=1) for viewpoint in range(60)])
     assert within == pytest.approx(0.5 * 0.0015**2, rel=0.1)
 
 
-def test_the_error_of_scale_is_that_of_the_viewpoint() -> None:
+def test_scale_error_is_constant_per_viewpoint() -> None:
     scaled = msgspec.structs.replace(STILL, sheet=SheetNoise(wrong_share=0.0, scale=0.2))
     headset = EmulatedHeadset(scaled, seed=2)
     means = [errors(headset, above(0.5), 10, viewpoint)[:, 0] for viewpoint in range(400)]
@@ -100,7 +100,7 @@ def test_some_detections_are_wrong_and_half_of_those_mirrored() -> None:
     assert sum(b > 0.05 for b in back) == pytest.approx(200, abs=40)
 
 
-def test_same_seed_same_readings() -> None:
+def test_same_seed_gives_the_same_readings() -> None:
     a, b, c = (EmulatedHeadset(HeadsetModel(), seed) for seed in (3, 3, 4))
     for headset in (a, b, c):
         headset.recentre_frame(SECOND)
@@ -119,7 +119,7 @@ def test_same_seed_same_readings() -> None:
     ],
     ids=["far", "from the side", "looking away", "from below"],
 )
-def test_the_sheet_is_not_always_seen(head: PoseTuple) -> None:
+def test_sheet_out_of_view_is_not_detected(head: PoseTuple) -> None:
     assert EmulatedHeadset(HeadsetModel(), 0).observe(head, SHEET, 0, 0) is None
 
 
@@ -135,7 +135,7 @@ def test_drift_and_tilt_are_small_and_stated() -> None:
     assert np.sqrt(np.mean(np.square(tilts))) == pytest.approx(math.radians(0.2) * math.sqrt(2.0), rel=0.15)
 
 
-def test_recentring_is_another_frame_and_epoch() -> None:
+def test_recentring_changes_frame_and_epoch() -> None:
     headset = EmulatedHeadset(HeadsetModel(), seed=6)
     before = headset.get_T_world_tracking(SECOND)
     headset.recentre_frame(SECOND)
@@ -144,7 +144,7 @@ def test_recentring_is_another_frame_and_epoch() -> None:
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.1])
-def test_a_bump_moves_the_frame_about_the_head_and_keeps_the_epoch(yaw: float) -> None:
+def test_bump_moves_the_frame_about_the_head_and_keeps_the_epoch(yaw: float) -> None:
     headset, head = EmulatedHeadset(HeadsetModel(drift_m_per_min=0.06), seed=6), above(0.5)
     before = headset.get_T_world_tracking(MINUTE)
     tracked = compose(inverse(before), SHEET)
@@ -162,7 +162,7 @@ def test_a_bump_moves_the_frame_about_the_head_and_keeps_the_epoch(yaw: float) -
     assert distance(after[0], later[0]) == pytest.approx(0.06), "it drifts on from there"
 
 
-def test_a_drift_that_begins_later_begins_where_the_frame_is() -> None:
+def test_delayed_drift_starts_at_the_current_frame() -> None:
     headset = EmulatedHeadset(HeadsetModel(drift_m_per_min=0.0), seed=6)
     before = headset.get_T_world_tracking(3 * MINUTE)
     headset.start_drift(0.03, 3 * MINUTE)
@@ -172,7 +172,7 @@ def test_a_drift_that_begins_later_begins_where_the_frame_is() -> None:
     assert distance(headset.get_T_world_tracking(5 * MINUTE)[0], before[0]) == pytest.approx(0.06)
 
 
-def test_tracking_is_the_inverse_of_the_truth_with_little_noise() -> None:
+def test_tracking_is_the_inverse_of_the_true_frame_with_little_noise() -> None:
     headset = EmulatedHeadset(HeadsetModel(), seed=7)
     seen = [headset.track(above(0.5), SECOND) for _ in range(500)]
     back = [compose(headset.get_T_world_tracking(SECOND), pose) for pose in seen]
@@ -180,7 +180,7 @@ def test_tracking_is_the_inverse_of_the_truth_with_little_noise() -> None:
     assert offsets.std() == pytest.approx(headset.model.position_sigma_m, rel=0.1)
 
 
-def test_samples_come_at_the_rate_and_missed_ones_are_counted() -> None:
+def test_samples_have_the_configured_rate_and_missed_ones_are_counted() -> None:
     headset = EmulatedHeadset(HeadsetModel(rate_hz=90.0), seed=8)
     assert sum(headset.is_sample_due(t) for t in range(0, 10 * SECOND, SECOND // 1000)) == pytest.approx(900, abs=1)
     assert headset.late_samples == 0
@@ -189,7 +189,7 @@ def test_samples_come_at_the_rate_and_missed_ones_are_counted() -> None:
 
 
 def aligned_error(seed: int, model: HeadsetModel) -> float:
-    """Error [m] at the sheet after looking at it from six viewpoints."""
+    """Return the error [m] at the sheet after observing it from six viewpoints."""
     headset = EmulatedHeadset(model, seed)
     estimator = AlignmentEstimator({DEFAULT_ANCHOR_ID: SHEET})
     spec = HeadsetSpec(name="ann")
@@ -205,12 +205,12 @@ def aligned_error(seed: int, model: HeadsetModel) -> float:
 
 
 @pytest.mark.parametrize("wrong", [0.0, 0.15])
-def test_what_it_sees_aligns_it(wrong: float) -> None:
+def test_observations_align_the_headset(wrong: float) -> None:
     worst = sorted(aligned_error(seed, HeadsetModel(sheet=SheetNoise(wrong_share=wrong))) for seed in range(20))
     assert worst[18] < 0.005
 
 
-def test_heads_look_where_they_should_and_move_smoothly() -> None:
+def test_heads_follow_their_target_smoothly() -> None:
     spec = HeadsetSpec(name="ann")
     poses = [compute_viewpoint_pose(spec, i) for i in range(spec.viewpoints)]
     for pose in poses:
@@ -237,7 +237,7 @@ def test_link_keeps_order_and_delays() -> None:
     assert delays.mean() == pytest.approx(0.0155, abs=0.002)
 
 
-def test_stalls_hold_everything_and_let_go_at_once() -> None:
+def test_stalls_delay_all_messages_and_release_them_together() -> None:
     model = LinkModel(latency_s=0.001, jitter_s=0.0, stall_every_s=0.5, stall_s=0.1)
     line: DelayLine[int] = DelayLine(model, np.random.default_rng(1))
     bursts = []

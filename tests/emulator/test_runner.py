@@ -1,4 +1,4 @@
-"""Emulated people in a live session: they align, drive, jump and come back, and say how it went."""
+"""Emulated people in a live session: they align, drive, jump, recover, and report."""
 
 from __future__ import annotations
 
@@ -16,13 +16,17 @@ import numpy as np
 import pytest
 
 from iris_session import SceneBuilder, ScenePublisher, SessionConfig
+from iris_session.client import Client
+from iris_session.emulator.__main__ import _LinePrinter
 from iris_session.emulator.headset import DEFAULT_ANCHOR_ID, DEFAULT_T_WORLD_ANCHOR
+from iris_session.emulator.operator import EmulatedOperator
 from iris_session.emulator.runner import run_headsets
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
 from iris_session.protocol.client_messages import Observation, Sample, TrackingEpoch
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import AlignmentAlarm
 from iris_session.protocol.names import Device
+from iris_session.protocol.server_messages import Event, Notice
 from tests.client.harness import LiveSession
 
 QUICK = {"viewpoints": 4, "observations_per_viewpoint": 4}
@@ -42,7 +46,7 @@ def run_until(
     timeout_s: float = 40.0,
     orders: Callable[[], list[tuple[str, str]]] = list,
 ) -> list[HeadsetReport]:
-    """Runs the people until each has reached the phase of the same place."""
+    """Run the people until each has reached the phase at the same index."""
     reached: dict[str, set[str]] = {spec.name: set() for spec in specs}
     wanted = {spec.name: phase for spec, phase in zip(specs, phases, strict=True)}
     deadline = time.monotonic() + timeout_s
@@ -57,7 +61,7 @@ def run_until(
     return run_headsets(session.address, specs, report=note, stop=stop, orders=orders)
 
 
-def test_two_people_align_and_drive_while_one_watches(session: LiveSession) -> None:
+def test_two_people_align_and_drive_while_one_observes(session: LiveSession) -> None:
     specs = [
         HeadsetSpec(name="ann", behaviour="wander", robot="left", seed=1, **QUICK),
         HeadsetSpec(name="bob", behaviour="wander", robot="right", seed=2, **QUICK),
@@ -71,15 +75,15 @@ def test_two_people_align_and_drive_while_one_watches(session: LiveSession) -> N
         assert report.observations >= 12
         assert report.samples > 100
         assert report.frames > 50
-        assert set(report.rejected) <= {"alignment_version", "stale"}  # stale: this machine stood still
-    samples = [(e.connection, e.receive_ns, e.message.device) for e in session.kinds(Sample)]  # type: ignore[union-attr]
+        assert set(report.rejected) <= {"alignment_version", "stale"}  # stale: this machine stalled
+    samples = [(e.connection, e.receive_ns, e.message.device) for e in session.messages_of(Sample)]  # type: ignore[union-attr]
     heads = {(connection, at) for connection, at, device in samples if device == Device.HEAD}
     hands = {(connection, at) for connection, at, device in samples if device != Device.HEAD}
     assert len({connection for connection, _ in heads}) == 3
-    assert len(heads & hands) > 50  # what is sampled together travels in one message
+    assert len(heads & hands) > 50  # samples of one time are sent in one message
 
 
-def test_a_jump_of_the_tracking_frame_is_told_and_measured_anew(session: LiveSession) -> None:
+def test_jump_of_the_tracking_frame_raises_an_alarm_and_restarts_alignment(session: LiveSession) -> None:
     spec = HeadsetSpec(name="ann", behaviour="wander", robot="left", **QUICK)
     began: list[str] = []
     jumped: list[tuple[str, str]] = []
@@ -97,17 +101,17 @@ def test_a_jump_of_the_tracking_frame_is_told_and_measured_anew(session: LiveSes
     (report,) = run_headsets(session.address, [spec], 40.0, note, lambda: began.count("work") == 2, orders=orders)
     assert [p for p in began if p in ("look", "work")] == ["look", "work", "look", "work"]
     assert report.alignment_error_mm < 5.0
-    assert [e.message.tracking_epoch for e in session.kinds(TrackingEpoch)] == [1]  # type: ignore[union-attr]
-    epochs = [e.message.tracking_epoch for e in session.kinds(Observation)]  # type: ignore[union-attr]
+    assert [e.message.tracking_epoch for e in session.messages_of(TrackingEpoch)] == [1]  # type: ignore[union-attr]
+    epochs = [e.message.tracking_epoch for e in session.messages_of(Observation)]  # type: ignore[union-attr]
     assert epochs == sorted(epochs)
     assert set(epochs) == {0, 1}
 
 
-def test_what_is_seen_travels_with_the_head_pose_of_that_moment(session: LiveSession) -> None:
+def test_observations_are_sent_with_the_head_pose_of_their_time(session: LiveSession) -> None:
     jumped: list[tuple[str, str]] = []
 
     def orders() -> list[tuple[str, str]]:
-        if jumped or not session.kinds(Observation):
+        if jumped or not session.messages_of(Observation):
             return []
         jumped.append(("recentre", "eve"))
         return jumped
@@ -115,19 +119,19 @@ def test_what_is_seen_travels_with_the_head_pose_of_that_moment(session: LiveSes
     run_until(session, [HeadsetSpec(name="eve", **QUICK)], "watch", orders=orders)
     heads = np.array([s.capture_ns for s in samples_of(session, Device.HEAD)])
     epochs = [s.tracking_epoch for s in samples_of(session, Device.HEAD)]
-    seen = session.kinds(Observation)
+    seen = session.messages_of(Observation)
     assert {e.message.tracking_epoch for e in seen} == {0, 1}  # type: ignore[union-attr]
     near = 0
     for entry in seen:
         away_ns = np.abs(heads - entry.message.capture_ns)  # type: ignore[union-attr]
-        if away_ns.min() < 50_000_000:  # of samples between two steps, long on a busy machine, one stays
+        if away_ns.min() < 50_000_000:  # of samples between two steps, long on a busy machine, one is kept
             assert epochs[int(away_ns.argmin())] == entry.message.tracking_epoch  # type: ignore[union-attr]
             near += 1
     assert near > len(seen) / 2
 
 
-def test_a_bump_moves_head_and_hand_and_the_hand_is_brought_back(session: LiveSession) -> None:
-    """An idle hand: it jumps with the tracking frame, and returns to where it is shown in its place. Nobody is told."""
+def test_bump_moves_head_and_hand_and_the_hand_returns(session: LiveSession) -> None:
+    """An idle hand jumps with the tracking frame and returns to its shown place. No alarm is raised."""
     spec = HeadsetSpec(name="ann", behaviour="idle", robot="left", bump_m=(0.0, 0.0, 0.05), **QUICK)
     phase: list[str] = [""]
     bumped_ns: list[int] = []
@@ -146,7 +150,7 @@ def test_a_bump_moves_head_and_hand_and_the_hand_is_brought_back(session: LiveSe
 
     (report,) = run_headsets(session.address, [spec], 40.0, note, over, orders=orders)
     assert over(), report
-    assert not session.kinds(TrackingEpoch)
+    assert not session.messages_of(TrackingEpoch)
     at = report.disturbed_ns["bump"]
     hand = [s for s in samples_of(session, Device.CONTROLLER_RIGHT) if s.capture_ns > at - 200_000_000]
     up = [s.pose.p[2] for s in hand if s.pose is not None]  # the frame rose: what is tracked sank
@@ -156,8 +160,8 @@ def test_a_bump_moves_head_and_hand_and_the_hand_is_brought_back(session: LiveSe
 
 
 @pytest.mark.parametrize("beside", [(), ("shelf",)], ids=["headset", "sheet"])
-def test_who_hears_of_an_alarm_looks_at_the_sheet_before_going_on(session: LiveSession, beside: tuple[str]) -> None:
-    """Unless it is the sheet that was moved."""
+def test_person_looks_at_the_sheet_after_an_alarm(session: LiveSession, beside: tuple[str]) -> None:
+    """Unless the sheet itself was moved."""
     spec = HeadsetSpec(name="ann", behaviour="wander", robot="left", viewpoints=2, observations_per_viewpoint=4)
     began: list[str] = []
     alarmed_ns: list[int] = []
@@ -167,7 +171,7 @@ def test_who_hears_of_an_alarm_looks_at_the_sheet_before_going_on(session: LiveS
             began.append(report.phase)
         if report.phase == "work" and not alarmed_ns:
             alarmed_ns.append(session.now_ns)
-            session.say(AlignmentAlarm("changed", 0, DEFAULT_ANCHOR_ID, 0.012, 0, beside))
+            session.submit_from_front(AlignmentAlarm("changed", 0, DEFAULT_ANCHOR_ID, 0.012, 0, beside))
 
     def over() -> bool:
         if beside:
@@ -185,7 +189,7 @@ def samples_of(session: LiveSession, device: str) -> list[Sample]:
     return [e.message for e in session.entries if isinstance(e.message, Sample) and e.message.device == device]
 
 
-def test_a_killed_front_costs_a_reconnect_and_nothing_else(session: LiveSession) -> None:
+def test_killed_front_costs_only_a_reconnect(session: LiveSession) -> None:
     spec = HeadsetSpec(name="ann", behaviour="wander", robot="left", **QUICK)
     phase = [""]
     killed: list[int] = []
@@ -208,24 +212,63 @@ def test_a_killed_front_costs_a_reconnect_and_nothing_else(session: LiveSession)
     assert report.failed == ""
 
 
-def test_who_gets_no_robot_says_why(session: LiveSession) -> None:
+def test_lost_session_is_shown_and_fails() -> None:
+    live = LiveSession(session_name="lab-7")
+    reports: list[tuple[str, str, float]] = []
+
+    def note(report: HeadsetReport) -> None:
+        if report.frames > 20:
+            live.close()
+        reports.append((report.session, report.address, report.lost_s))
+
+    (report,) = run_headsets(live.address, [HeadsetSpec(name="eve", **QUICK)], seconds=7.0, report=note)
+    assert {one[:2] for one in reports if one[0]} == {("lab-7", live.address)}
+    assert max(one[2] for one in reports) > 2.0
+    assert report.phase == "failed"
+    assert live.address in report.failed
+
+
+def test_notice_for_another_participant_is_not_the_own_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Client, "participant_id", "p-1")
+    operator = EmulatedOperator("127.0.0.1:1", HeadsetSpec(name="ann", behaviour="wander"), 0)
+    for number, participant in enumerate(("p-2", "", "p-1", "p-2")):
+        operator.client.on_event(Event(number, 0, 0, Notice("warning", f"for {participant}", participant)))  # type: ignore[misc]
+        assert operator._refused_because == ("for p-1" if number >= 2 else "")
+    operator.client.close()
+
+
+def test_lines_name_the_session_once(capsys: pytest.CaptureFixture[str]) -> None:
+    show = _LinePrinter()
+    report = HeadsetReport(name="ann")
+    show(report)
+    report.session, report.address, report.phases = "lab\x1b1", "10.0.0.5:7721", {"watch": 1.0}
+    show(report)
+    report.lost_s = 3.0
+    show(report, final=True)
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.count("10.0.0.5:7721") for line in lines] == [0, 1, 0, 0]
+    assert [line.count("session lost") for line in lines] == [0, 0, 0, 1]
+    assert all(line.isprintable() for line in lines)
+
+
+def test_person_without_a_robot_reports_the_reason(session: LiveSession) -> None:
     specs = [HeadsetSpec(name="ann", behaviour="wander", robot="nothing", phase_timeout_s=6.0, **QUICK)]
     (report,) = run_headsets(session.address, specs, seconds=30.0)
     assert "nothing" in report.failed
     assert report.phase == "failed"
 
 
-def test_where_no_robot_is_nobody_waits_for_one() -> None:
+def test_session_without_robots_is_joined_without_waiting() -> None:
     scene = SceneBuilder()
     scene.add_box(half_size=(0.1, 0.1, 0.1))
     anchors = {DEFAULT_ANCHOR_ID: DEFAULT_T_WORLD_ANCHOR}
     config = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False, anchors=anchors)
     with ScenePublisher(scene, config) as shown:
         (report,) = run_headsets(shown.address, [HeadsetSpec(name="ann", behaviour="wander", **QUICK)], seconds=60.0)
-    assert "no robots to drive" in report.failed
+    assert "no robots" in report.failed
 
 
-def test_who_names_no_robot_gets_one_of_the_policy_and_drives_it(session: LiveSession) -> None:
+def test_person_without_a_requested_robot_drives_the_assigned_one(session: LiveSession) -> None:
     specs = [HeadsetSpec(name="ann", behaviour="wander", **QUICK)]
     reports: list[str] = []
 
@@ -236,14 +279,14 @@ def test_who_names_no_robot_gets_one_of_the_policy_and_drives_it(session: LiveSe
     assert driving(), report
 
 
-def test_nobody_there_is_a_failure_not_an_exception() -> None:
+def test_missing_session_is_a_failure_not_an_exception() -> None:
     (report,) = run_headsets("127.0.0.1:1", [HeadsetSpec(name="ann")], seconds=0.3)
     assert report.phase == "failed"
-    assert "no session let us in at 127.0.0.1:1" in report.failed
+    assert "127.0.0.1:1" in report.failed
     assert report.participant == ""
 
 
-def test_json_lines_for_a_parent(session: LiveSession) -> None:
+def test_json_lines_are_printed(session: LiveSession) -> None:
     specs = msgspec.json.encode([HeadsetSpec(name="eve", **QUICK), HeadsetSpec(name="ann", seed=1, **QUICK)])
     command = [sys.executable, "-m", "iris_session.emulator", "--address", session.address, "--specs", "-", "--json"]
     result = subprocess.run([*command, "--seconds", "4"], input=specs, capture_output=True, check=False, timeout=60)
@@ -257,7 +300,7 @@ def test_json_lines_for_a_parent(session: LiveSession) -> None:
     ("arguments", "text"),
     [([], "no headset"), (["--headset", "name=a,colour=red"], "colour"), (["--specs", "missing.json"], "missing.json")],
 )
-def test_wrong_command_lines_say_what_is_wrong(arguments: list[str], text: str) -> None:
+def test_invalid_command_lines_are_rejected(arguments: list[str], text: str) -> None:
     command = [sys.executable, "-m", "iris_session.emulator", *arguments]
     result = subprocess.run(command, capture_output=True, check=False, timeout=60, text=True)
     assert result.returncode == 2

@@ -1,5 +1,4 @@
-"""The casts of `demo cloth` and `demo soft` on the real physics and control, late and noisy; and what they do when it
-goes wrong."""
+"""Casts of `demo cloth` and `demo soft` with real physics and control, delayed and noisy, and recovery from faults."""
 
 from __future__ import annotations
 
@@ -28,8 +27,8 @@ def test_two_people_fold_a_cloth() -> None:
 
 
 @pytest.mark.usefixtures("untraced")
-def test_two_people_stow_soft_bodies_and_take_again_what_they_lose() -> None:
-    """The first time, somebody opens a gripper half way."""
+def test_two_people_stow_soft_bodies_and_recover_dropped_ones() -> None:
+    """At the first attempt a gripper is opened halfway."""
     rig = soft_demo(make_demo("soft"), seed=2)
     left = rig.behaviours["left"]
     rig.run(20.0, until=lambda rig: left.phase == "carry")
@@ -42,32 +41,32 @@ def test_two_people_stow_soft_bodies_and_take_again_what_they_lose() -> None:
 
 
 @pytest.mark.parametrize("name", ["folder", "stower"])
-def test_a_deformable_that_is_not_to_be_seen_is_named(name: str) -> None:
+def test_deformable_that_is_not_visible_is_named(name: str) -> None:
     thing = {"folder": "cloth", "stower": "rose"}[name]
     behaviour = make_behaviour(name, "left", thing)
     view = LateView(random.Random(1))
     for k in range(int(SEARCH_S * 72) + 10):
-        view.look(k / 72.0)
+        view.receive_frame(k / 72.0)
         behaviour.update(view)
     assert behaviour.done
     assert thing in behaviour.failed
 
 
 @pytest.mark.parametrize("behaviour", [Folder, Stower])
-def test_nobody_knows_any_other_deformable(behaviour: type) -> None:
-    with pytest.raises(ValueError, match=r"deformable 'jelly'. Known: cloth, rose, mint"):
+def test_unknown_deformable_is_rejected(behaviour: type) -> None:
+    with pytest.raises(ValueError, match=r"'jelly'.*: cloth, rose, mint"):
         behaviour("left", "jelly", *(["right"] if behaviour is Folder else []))
 
 
 def stower(monkeypatch: pytest.MonkeyPatch) -> Stower:
-    """Its hand and the box are at the origin, and the fingers 3 cm apart; where the body is, a test says."""
+    """Hand and box are at the origin, the fingers 3 cm apart; the tests place the body."""
     made = Stower("left", "rose")
     for name, value in {"get_tip": IDENTITY_POSE, "get_body": IDENTITY_POSE, "compute_gap": 0.03}.items():
         monkeypatch.setattr(made.perception, name, lambda _, value=value: value)
     return made
 
 
-def test_a_late_picture_tells_nothing_of_what_began_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_old_picture_is_not_used_for_a_newer_phase(monkeypatch: pytest.MonkeyPatch) -> None:
     one = stower(monkeypatch)
     monkeypatch.setattr(one, "_is_holding", lambda: False)
     eyes = one.perception
@@ -85,7 +84,7 @@ def test_a_late_picture_tells_nothing_of_what_began_after_it(monkeypatch: pytest
     assert (one.phase, one.attempts) == ("back_off", 2)
 
 
-def test_a_soft_body_is_held_between_the_fingers_and_stowed_within_all_walls(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_soft_body_is_held_between_the_fingers_and_stowed_inside_all_walls(monkeypatch: pytest.MonkeyPatch) -> None:
     one = stower(monkeypatch)
     for away_m, held in ((0.0, True), (0.1, False)):
         one.perception._vertices = {
@@ -100,8 +99,8 @@ def test_a_soft_body_is_held_between_the_fingers_and_stowed_within_all_walls(mon
     assert not one._is_inside_box((0.0, 0.0, 1.1 * z))
 
 
-def test_the_rig_moves_deformables_as_a_whole() -> None:
-    """Otherwise it would play with a cloth that is pulled out of shape."""
+def test_rig_moves_deformables_rigidly() -> None:
+    """Otherwise it would play with a stretched cloth."""
     play = make_demo("cloth")
     moved = soft_demo(play, 5).world.flexes.read_vertices("cloth")
     still = soft_demo(play, 5, shift=False).world.flexes.read_vertices("cloth")

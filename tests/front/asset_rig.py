@@ -18,7 +18,7 @@ Curve = tuple[bytes, bytes, bytes]
 
 
 def put(root: Path, data: bytes) -> str:
-    """Stores an asset. Its address."""
+    """Store an asset. Return its address."""
     address = hashlib.sha256(data).hexdigest()
     path = root / address[:2] / address
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -31,7 +31,7 @@ def with_assets(root: Path, *assets: str) -> SceneInfo:
 
 
 class Fetcher:
-    """A DEALER on the assets port; requests by number, and what came of them."""
+    """A DEALER on the assets port; keeps the answers to its requests by number."""
 
     def __init__(self, session: FrontSession, epoch: int, curve: Curve | None = None, **options: int) -> None:
         self.session = session
@@ -43,7 +43,7 @@ class Fetcher:
             self.socket.setsockopt(zmq.RCVBUF, options["rcvbuf"])
         if curve:
             self.socket.curve_serverkey, self.socket.curve_publickey, self.socket.curve_secretkey = curve
-        self.socket.connect(f"tcp://127.0.0.1:{session.ports.assets}")
+        self.socket.connect(f"tcp://{session.host}:{session.ports.assets}")
         self.chunks: dict[int, tuple[AssetChunk, bytes]] = {}
         self.refusals: dict[int, AssetRefused] = {}
         self._next = 0
@@ -55,7 +55,7 @@ class Fetcher:
         return self._next
 
     def take(self) -> int:
-        """How many answers there are."""
+        """Read what arrived. Return the number of answers."""
         while self.socket.poll(0):
             frames = self.socket.recv_multipart()
             if len(frames) == 2:
@@ -67,7 +67,7 @@ class Fetcher:
         return len(self.chunks) + len(self.refusals)
 
     def answer(self, request_id: int) -> bytes | str:
-        """The bytes of a chunk, or the reason why none came."""
+        """Wait for a chunk, or for the reason of its refusal."""
 
         def there() -> bool:
             self.take()

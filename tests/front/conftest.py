@@ -13,7 +13,7 @@ from tests.front.lab import Lab, Open
 
 @pytest.fixture
 def open_session() -> Iterator[Callable[..., FrontSession]]:
-    """Starts front processes with a configuration; they end with the test."""
+    """Start front processes with a configuration; they end with the test."""
     opened: list[FrontSession] = []
 
     def start(**config: object) -> FrontSession:

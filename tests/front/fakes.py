@@ -11,8 +11,9 @@ from iris_session.front.coalescer import Coalescer
 from iris_session.front.connection_guard import ConnectionGuard
 from iris_session.front.connections import ConnectionTable, ControlSender
 from iris_session.front.context import FrontContext
+from iris_session.front.key_budgets import KeyBudgets
 from iris_session.front.status import StatusService
-from iris_session.link import FrontConfig, Ports
+from iris_session.link import FrontConfig, Ports, SceneInfo
 from iris_session.protocol.limits import Drops
 from iris_session.protocol.status import AssetsReport, MediaStreamReport
 from iris_session.security.keyring import Keyring
@@ -43,8 +44,9 @@ def make_context(
         coalescer=coalescer,
         audit=audit,
         guard=ConnectionGuard(connections, drops, audit, config.limits),
+        budgets=KeyBudgets(config.limits, coalescer.offer),
         tokens=ResumeTokens(max_tokens),
-        publisher=publisher,
+        publisher=publisher or FakePublisher(),
     )
 
 
@@ -55,6 +57,12 @@ def make_alignment(context: FrontContext) -> AlignmentService:
 def make_status(context: FrontContext, alignment: AlignmentService) -> StatusService:
     channel: Any = FakeChannel()
     return StatusService(context, channel, channel, alignment)
+
+
+class FakePublisher:
+    """In place of the sender of state."""
+
+    scene = SceneInfo("")
 
 
 class FakeChannel:

@@ -16,6 +16,7 @@ from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.entries import Entry, Join
 from iris_session.protocol.server_messages import BodyInfo, Event, Message, Notice, Snapshot, StateHeader, Welcome
 from iris_session.protocol.steps import Admitted, Decision, OutgoingMessage
+from tests.loopback import make_loopback_address
 
 N_BODIES = 3
 T = TypeVar("T", bound=Message)
@@ -41,7 +42,7 @@ class RawClient:
             self.socket.setsockopt(zmq.ROUTING_ID, routing_id)
         if curve:
             self.socket.curve_serverkey, self.socket.curve_publickey, self.socket.curve_secretkey = curve
-        self.socket.connect(f"tcp://127.0.0.1:{session.ports.control}")
+        self.socket.connect(f"tcp://{session.host}:{session.ports.control}")
 
     @property
     def epoch(self) -> int:
@@ -62,7 +63,7 @@ class RawClient:
         return [message for message, _ in self.inbox if isinstance(message, kind)]
 
     def wait_for(self, kind: type[T], n: int = 1) -> T:
-        """The `n`-th message of a kind."""
+        """Wait for the `n`-th message of a kind."""
         self.session.pump(lambda: len(self.got(kind)) >= n, f"{n} {kind.__name__}")
         return self.got(kind)[n - 1]
 
@@ -76,16 +77,19 @@ class RawClient:
 
 
 class FrontSession:
-    """Front process and an authority that admits everybody and answers snapshots. `entries`: all it was given."""
+    """A front process, and an authority that admits every client and answers snapshots. `entries`: all it received."""
 
     def __init__(self, *, start: bool = True, bodies: int = N_BODIES, **config: object) -> None:
         settings: dict[str, object] = {
+            "host": make_loopback_address(),
             "control_port": 0,
             "state_port": 0,
             "origin_ns": time.monotonic_ns(),
             "session_name": "test",
         }
         self.config = FrontConfig(**{**settings, **config})  # type: ignore[arg-type]
+        #: Address of the session's sockets for clients of this machine.
+        self.host = "127.0.0.1" if {"host", "listen"} & config.keys() else self.config.host
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self.process = FrontProcess(self.config, scene(bodies))
         self.entries: list[Entry] = []
@@ -111,13 +115,13 @@ class FrontSession:
         sub.setsockopt(zmq.RCVBUF, rcvbuf)
         if curve:
             sub.curve_serverkey, sub.curve_publickey, sub.curve_secretkey = curve
-        sub.connect(f"tcp://127.0.0.1:{self.ports.state}")
+        sub.connect(f"tcp://{self.host}:{self.ports.state}")
         sub.subscribe(b"")
         self.subscribers.append(sub)
         return sub
 
     def once(self, decision: Decision | None = None) -> None:
-        """One step of the authority."""
+        """Take one step of the authority."""
         entries = self.process.link.poll()
         self.entries += entries
         self.step += 1
@@ -145,7 +149,7 @@ class FrontSession:
         return Event(self.event_seq, self.step, 0, Notice("info", text))
 
     def pump(self, until: Callable[[], bool], what: str = "condition", timeout_s: float = 30.0) -> None:
-        """Steps until the condition holds."""
+        """Take steps until the condition holds."""
         deadline = time.monotonic() + timeout_s
         while not until():
             assert time.monotonic() < deadline, f"no {what} within {timeout_s} s; {self._seen()}"
@@ -153,12 +157,12 @@ class FrontSession:
             time.sleep(0.001)
 
     def _seen(self) -> str:
-        """What the front counted, and the newest that the authority and every client were told."""
+        """Return counters of the front, and the newest messages of authority and clients, for a failure."""
         told = [[message for message, _ in client.inbox[-5:]] for client in self.clients]
         return f"{self.process.link.status}, authority {self.entries[-5:]}, clients {told}"
 
     def wait_entries(self, kind: type, n: int = 1, connection: int | None = None) -> list[Entry]:
-        """All entries of a kind, at least `n`."""
+        """Wait for at least `n` entries of a kind. Return all of them."""
 
         def found() -> list[Entry]:
             return [e for e in self.entries if isinstance(e.message, kind) and connection in (None, e.connection)]

@@ -1,4 +1,4 @@
-"""An encrypted session at a real front process, with keys that are on its list and keys that are not."""
+"""An encrypted session at a real front process, with allowed and unknown keys."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Lab:
         return self.session.client(curve=self.curve(pair))
 
     def allowed(self, name: str, *roles: str) -> tuple[KeyPair, RawClient]:
-        """A key on the list, and a client with it that has joined."""
+        """Allow a new key, and join a client with it."""
         pair = KeyPair.generate()
         self.home.clients.allow_key(name, pair.public, roles)
         client = self.client(pair)
@@ -47,7 +47,7 @@ class Lab:
         return client.wait_for(Refused, n)
 
     def audits(self, kind: str, n: int = 1) -> list[Audit]:
-        """What was reported to the authority, at least `n` in all."""
+        """Wait for audits of a kind that count at least `n` in all."""
 
         def found() -> list[Audit]:
             messages = [e.message for e in self.session.entries]

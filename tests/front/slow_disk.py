@@ -14,7 +14,7 @@ DEADLINE_S = 30.0
 
 
 def turns(turn: Callable[[int], None], until: Callable[[], bool], now_ns: int = 0) -> None:
-    """Takes turns until the condition holds."""
+    """Call `turn` until the condition holds."""
     deadline = time.monotonic() + DEADLINE_S
     while not until():
         assert time.monotonic() < deadline
@@ -23,7 +23,7 @@ def turns(turn: Callable[[int], None], until: Callable[[], bool], now_ns: int = 
 
 
 class SlowDisk:
-    """`waits`: somebody has to wait for it now. It goes on after `go_on`."""
+    """`fsync` that sets `waits` and returns after `go_on`."""
 
     def __init__(self) -> None:
         self.waits = threading.Event()
@@ -40,7 +40,7 @@ class SlowDisk:
 
 @contextmanager
 def slow_disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[SlowDisk]:
-    """Replaces `os.fsync`."""
+    """Replace `os.fsync`."""
     disk = SlowDisk()
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", disk.fsync)

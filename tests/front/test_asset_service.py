@@ -70,7 +70,7 @@ def look(number: int) -> SceneInfo:
     return SceneInfo(f"look{number}", asset_root=ROOT, assets=(f"look{number}", f"mesh{number}"))
 
 
-def test_a_scene_is_served_at_once_and_of_those_before_the_last_only_what_was_their_specification() -> None:
+def test_current_and_previous_scene_are_served_and_of_older_ones_their_specifications() -> None:
     rig = AssetServiceRig()
     assert rig.show(look(0)) == {"look0", "mesh0"}
     assert rig.show(look(1)) == {"look0", "mesh0", "look1", "mesh1"}
@@ -82,7 +82,7 @@ def test_a_scene_is_served_at_once_and_of_those_before_the_last_only_what_was_th
     assert rig.show(look(4)) == {"look0", "look1", "look2", "look3", "mesh3", "look4", "mesh4"}, "it offers nothing"
 
 
-def test_specifications_that_were_replaced_long_ago_are_forgotten() -> None:
+def test_specifications_replaced_long_ago_are_not_served() -> None:
     rig = AssetServiceRig()
     rig.service.tick(0)
     for number in range(3):
@@ -97,7 +97,7 @@ def test_specifications_that_were_replaced_long_ago_are_forgotten() -> None:
     assert rig.server.served == {"look2", "mesh2", "look3", "mesh3"}
 
 
-def test_they_are_so_many_at_most() -> None:
+def test_replaced_specifications_are_bounded() -> None:
     rig = AssetServiceRig()
     n = MAX_REPLACED + 10
     for number in range(n):
@@ -105,7 +105,7 @@ def test_they_are_so_many_at_most() -> None:
     assert {name for name in served if name.startswith("look")} == {f"look{i}" for i in range(n - MAX_REPLACED - 2, n)}
 
 
-def test_with_keys_everybody_comes_by_his_own_or_that_of_his_gateway_and_revoked_ones_by_none() -> None:
+def test_access_is_by_own_key_or_gateway_key_and_never_by_revoked_keys() -> None:
     listed = {mark: AllowedKey(mark, "") for mark in ("ann", "gate", "eve")}
     rig = AssetServiceRig(Keyring(KeyPair.generate(), read=lambda: listed))
     rig.join(1, "ann")
@@ -120,12 +120,12 @@ def test_with_keys_everybody_comes_by_his_own_or_that_of_his_gateway_and_revoked
     assert rig.server.table.allowed_keys == {"gate"}
 
 
-def test_assets_hold_back_when_state_or_the_loop_was_late() -> None:
+def test_assets_yield_when_state_or_loop_is_late() -> None:
     rig = AssetServiceRig()
     now_ns, steps = 1, rig.publisher
 
     def yields(after_ns: int, *, delay_ns: int | None) -> bool:
-        """A turn so long after the last one, with a state that left so late, or none."""
+        """Poll so long after the last time, with a state sent so late, or without one."""
         nonlocal now_ns
         now_ns += after_ns
         if delay_ns is not None:

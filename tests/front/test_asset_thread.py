@@ -9,7 +9,7 @@ import pytest
 import zmq
 
 from iris_session.front.asset_server import CHUNKS, YIELD_MS, AssetAccess, AssetServer, open_asset_sockets
-from iris_session.front.connection_guard import MAX_COUNTED_MESSAGES, ChannelGuard
+from iris_session.front.connection_guard import MAX_COUNTED_MESSAGES, ChannelBounds, ChannelGuard
 from iris_session.link import FrontConfig, FrontLimits
 from iris_session.link.sockets import bound_port
 from iris_session.protocol.assets import AssetRequest
@@ -23,7 +23,7 @@ class Still:
 
     def __init__(self, root: Path) -> None:
         self.sockets = open_asset_sockets(FrontConfig(), None)
-        guard = ChannelGuard(self.sockets.monitor, FrontLimits(), 8, 65_536, curve=False, name="assets")
+        guard = ChannelGuard(self.sockets.monitor, FrontLimits(), ChannelBounds(8, 65_536), curve=False, name="assets")
         self.now_ns = 1
         self.server = AssetServer(self.sockets, guard, lambda: self.now_ns)
         self.address = put(root, b"asset")
@@ -33,7 +33,7 @@ class Still:
         self.dealer.connect(f"tcp://127.0.0.1:{bound_port(self.sockets.socket)}")
 
     def take(self, n: int) -> None:
-        """Asks so often, until all of it is taken."""
+        """Send so many requests, and poll until all are processed."""
         wanted = self.server.read_counters().requests + n
         for _ in range(n):
             self.dealer.send(encode_asset_request(AssetRequest(1, 1, 1, self.address, 0, 100)))
@@ -50,12 +50,12 @@ def still(tmp_path: Path) -> Iterator[Still]:
     still.server.close()
 
 
-def test_a_refusal_that_nobody_is_there_to_hear_is_counted(still: Still) -> None:
+def test_refusal_without_a_connection_is_counted(still: Still) -> None:
     still.server._queue_refusal(b"gone", 7, "", AssetRefusal.NOT_ALLOWED)
     assert still.server.read_counters().reasons == {"assets_not_allowed": 1, "assets_refusal_unsent": 1}
 
 
-def test_nobody_waits_who_is_gone(still: Still) -> None:
+def test_requests_of_closed_connections_are_removed(still: Still) -> None:
     still.take(1)
     assert still.server._scheduler.request(b"gone", 99, "", AssetRequest(1, 1, 7, still.address, 0, 100), 1) == ""
     assert still.server.read_counters().pending_readers == 2
@@ -63,7 +63,7 @@ def test_nobody_waits_who_is_gone(still: Still) -> None:
     assert (still.server.read_counters().chunks, still.server.read_counters().pending_readers) == (1, 0)
 
 
-def test_while_the_loop_is_late_one_chunk_goes_out_in_a_while(still: Still) -> None:
+def test_late_loop_sends_one_chunk_per_interval(still: Still) -> None:
     still.take(4)
     assert still.server.read_counters().reasons == {}, "whoever asks after a table was published is answered by it"
     still.server.late_until_ns = 2
@@ -74,7 +74,7 @@ def test_while_the_loop_is_late_one_chunk_goes_out_in_a_while(still: Still) -> N
     assert (still.server.read_counters().chunks, still.server._poll_timeout_ms()) == (1 + CHUNKS, 0)
 
 
-def test_only_what_is_refused_counts_as_a_flood(still: Still) -> None:
+def test_only_refused_requests_count_as_a_flood(still: Still) -> None:
     for n in range(1, MAX_COUNTED_MESSAGES + 10):
         still.now_ns += 10_000_000  # slower than any rate
         still.take(1)

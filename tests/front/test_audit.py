@@ -1,4 +1,4 @@
-"""Audit entries: the first at once, the rest counted, within the bounds, and none lost in the sum."""
+"""Audit entries: the first at once, the others counted, within bounds, with an exact sum."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Trail:
         return [message for message in messages if isinstance(message, Audit)]
 
 
-def test_the_first_is_told_at_once_and_those_of_a_second_together() -> None:
+def test_first_audit_is_sent_at_once_and_others_once_a_second() -> None:
     t = Trail()
     for i in range(5):
         t.trail.record("code_refused", i, address="10.0.0.9", detail=str(i))
@@ -43,7 +43,7 @@ def test_the_first_is_told_at_once_and_those_of_a_second_together() -> None:
 @given(
     st.lists(st.tuples(st.sampled_from(["a", "b"]), st.integers(0, 60), st.integers(0, 300_000_000)), max_size=300),
 )
-def test_bounded_and_nothing_is_lost_in_the_sum(steps: list[tuple[str, int, int]]) -> None:
+def test_audits_are_bounded_and_their_sum_is_exact(steps: list[tuple[str, int, int]]) -> None:
     t = Trail()
     now = 0
     for kind, address, dt in steps:
@@ -57,7 +57,7 @@ def test_bounded_and_nothing_is_lost_in_the_sum(steps: list[tuple[str, int, int]
     assert len(t.told) <= (MAX_PENDING + 2) * 2 * seconds
 
 
-def test_many_addresses_are_told_as_one() -> None:
+def test_many_addresses_are_audited_as_one() -> None:
     t = Trail()
     for i in range(1000):
         t.trail.record("key_refused", 0, address=f"10.0.{i // 256}.{i % 256}")

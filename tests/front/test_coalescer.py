@@ -54,7 +54,7 @@ def seqs(batch: list[Entry]) -> list[int]:
     return [e.message.seq for e in batch if isinstance(e.message, Sample)]
 
 
-def test_only_the_newest_pose_of_a_device_waits() -> None:
+def test_only_the_newest_pose_of_a_device_is_pending() -> None:
     waiting, _ = coalescer()
     for seq in (1, 2, 3):
         waiting.offer(entry(sample(seq)))
@@ -87,7 +87,7 @@ def test_every_edge_is_kept(change: dict[str, object]) -> None:
     assert seqs(waiting.take_batch()) == [1, 2, 4]
 
 
-def test_a_small_change_of_the_gripper_is_motion() -> None:
+def test_small_change_of_the_gripper_is_not_an_edge() -> None:
     waiting, _ = coalescer()
     waiting.offer(entry(sample(1, gripper=0.1)))
     waiting.offer(entry(sample(2, gripper=0.4)))
@@ -102,7 +102,7 @@ def test_old_sequence_numbers_and_forged_epochs_replace_nothing() -> None:
     assert seqs(waiting.take_batch()) == [5, 4, 6]
 
 
-def test_messages_keep_their_place_among_samples() -> None:
+def test_messages_keep_their_order_among_samples() -> None:
     waiting, _ = coalescer()
     waiting.offer(entry(sample(1)))
     waiting.offer(entry(Acquire(1, ("left",))))
@@ -130,7 +130,7 @@ def test_release_overtakes_no_acquire_of_its_own() -> None:
     assert [type(e.message) for e in waiting.take_batch(urgent_only=True)] == [Acquire, Release]
 
 
-def test_loss_comes_after_what_was_said_and_drops_the_samples() -> None:
+def test_disconnect_follows_pending_messages_and_drops_samples() -> None:
     waiting, _ = coalescer()
     waiting.offer(entry(Marker(1, "x")))
     waiting.offer(entry(sample(1)))
@@ -139,7 +139,7 @@ def test_loss_comes_after_what_was_said_and_drops_the_samples() -> None:
     assert [type(e.message) for e in waiting.take_batch()] == [Marker, Lost]
 
 
-def test_a_connection_that_ends_before_the_authority_heard_of_it_never_was() -> None:
+def test_connection_that_ends_before_its_join_was_sent_leaves_no_entry() -> None:
     waiting, _ = coalescer()
     waiting.offer(entry(Join("key", "operator", "Ann")))
     waiting.offer(entry(Lost("closed")))
@@ -148,8 +148,8 @@ def test_a_connection_that_ends_before_the_authority_heard_of_it_never_was() -> 
 
 
 @pytest.mark.parametrize("how", ["lost before it was let in", "let go by the authority"])
-def test_an_estop_counts_whatever_becomes_of_its_sender(how: str) -> None:
-    """Pressed, and the headset is switched off, or was given up in that very moment."""
+def test_estop_is_sent_although_its_sender_disconnected(how: str) -> None:
+    """The headset is switched off after the button, or was disconnected as silent at that moment."""
     waiting, _ = coalescer()
     if how == "lost before it was let in":
         waiting.offer(entry(Join("key", "operator", "Ann")))
@@ -166,7 +166,7 @@ def test_an_estop_counts_whatever_becomes_of_its_sender(how: str) -> None:
     assert not waiting
 
 
-def test_an_estop_always_has_room_and_is_said_once() -> None:
+def test_estop_always_has_room_and_is_sent_once() -> None:
     waiting, drops = coalescer(pending_urgent=2)
     for _ in range(5):
         waiting.offer(entry(Release(1)))
@@ -177,7 +177,7 @@ def test_an_estop_always_has_room_and_is_said_once() -> None:
     assert drops.by_reason == {"urgent_pending": 3}
 
 
-def test_bounds_are_counted_and_the_last_state_survives() -> None:
+def test_drops_are_counted_and_the_last_state_is_kept() -> None:
     waiting, drops = coalescer(pending_messages=2, pending_samples=3, pending_devices=2)
     for i in range(4):
         waiting.offer(entry(Marker(i, "x")))
@@ -190,7 +190,7 @@ def test_bounds_are_counted_and_the_last_state_survives() -> None:
     assert seqs(waiting.take_batch()) == [1, 2, 8, 1]
 
 
-def test_a_full_batch_leaves_the_rest_for_the_next_one() -> None:
+def test_full_batch_leaves_entries_for_the_next() -> None:
     waiting, _ = coalescer(batch_entries=4)
     for connection in (1, 2, 3):
         for i in range(3):
@@ -202,7 +202,7 @@ def test_a_full_batch_leaves_the_rest_for_the_next_one() -> None:
     assert not waiting.take_batch()
 
 
-def test_forget_drops_what_waits_of_one_connection() -> None:
+def test_remove_drops_pending_entries_of_one_connection() -> None:
     waiting, _ = coalescer()
     waiting.offer(entry(Bye(), 1))
     waiting.offer(entry(sample(1), 2))
@@ -229,7 +229,7 @@ def test_edges_and_final_state_survive_any_interleaving(steps: list[tuple[bool, 
     assert drops.by_reason == {}
 
 
-def test_a_tracking_epoch_replaces_the_one_before_and_is_never_dropped_for_want_of_room() -> None:
+def test_tracking_epoch_replaces_the_previous_one_and_is_never_dropped() -> None:
     waiting, drops = coalescer(pending_messages=1)
     waiting.offer(entry(Marker(1, "x")))
     for epoch in range(1, 100):
@@ -238,7 +238,7 @@ def test_a_tracking_epoch_replaces_the_one_before_and_is_never_dropped_for_want_
     assert not drops.by_reason
 
 
-def test_a_removal_passes_a_flood_of_audits_and_what_audits_lose_is_counted() -> None:
+def test_removal_is_sent_during_a_flood_of_audits_whose_drops_are_counted() -> None:
     waiting, drops = coalescer(pending_messages=4)
     audits = [Entry(HOST, HOST, 0, Audit("flood", detail=str(i))) for i in range(10)]
     assert [waiting.offer(audit) for audit in audits] == [True] * 4 + [False] * 6
@@ -252,7 +252,7 @@ def test_a_removal_passes_a_flood_of_audits_and_what_audits_lose_is_counted() ->
     assert drops.by_reason == {"audit_lost": 6}
 
 
-def test_removals_are_bounded_and_a_directors_word_is_a_request_like_others() -> None:
+def test_removals_are_bounded_and_those_of_directors_are_requests() -> None:
     waiting, drops = coalescer(resume_tokens=3)
     for i in range(5):
         waiting.offer(Entry(HOST, HOST, 1, RemoveParticipant(0, f"p{i}")))
@@ -266,7 +266,7 @@ def proposal(n: int, refused: bool = False) -> AlignmentProposal:
     return AlignmentProposal(IDENTITY, 1, (), (0.0, 0.0, 0.0), 0.0, n_observations=n, refused=refused)
 
 
-def test_of_proposals_and_comparisons_the_newest_waits_and_takes_no_room_from_requests() -> None:
+def test_newest_proposal_and_cross_check_are_pending_beside_the_queue() -> None:
     waiting, drops = coalescer(pending_messages=2)
     for n in range(100):
         assert waiting.offer(entry(proposal(n)))
@@ -281,7 +281,7 @@ def test_of_proposals_and_comparisons_the_newest_waits_and_takes_no_room_from_re
     assert drops.by_reason == {}
 
 
-def test_alarms_are_never_dropped_and_come_before_later_proposals() -> None:
+def test_alarms_are_never_dropped_and_precede_later_proposals() -> None:
     waiting, drops = coalescer(pending_messages=1, pending_urgent=1)
     waiting.offer(entry(Acquire(1)))
     for size in (0.01, 0.02):
@@ -298,7 +298,7 @@ def test_alarms_are_never_dropped_and_come_before_later_proposals() -> None:
     assert drops.by_reason == {}
 
 
-def test_a_jump_is_urgent_whatever_else_is() -> None:
+def test_jump_is_urgent() -> None:
     waiting, drops = coalescer(pending_urgent=2)
     for request in (1, 2):
         waiting.offer(entry(Release(request)))

@@ -14,7 +14,7 @@ HANDSHAKE = 2000
 
 
 def settled(traffic: TrafficCounter, descriptor: int, above: int, below: int) -> int:
-    """What is held, once it is within bounds: acknowledgements take their time."""
+    """Return the pending bytes once they are within bounds: acknowledgements take their time."""
     deadline = time.monotonic() + 30.0
     while not above <= (held := traffic.pending_bytes(descriptor)) <= below:
         assert time.monotonic() < deadline, held
@@ -23,7 +23,7 @@ def settled(traffic: TrafficCounter, descriptor: int, above: int, below: int) ->
 
 
 @pytest.mark.parametrize("curve", [False, True])
-def test_what_waits_is_known_to_the_byte_but_for_the_handshake(curve: bool) -> None:
+def test_pending_bytes_are_exact_except_for_the_handshake(curve: bool) -> None:
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     router, dealer = context.socket(zmq.ROUTER), context.socket(zmq.DEALER)
     router.linger = dealer.linger = 0

@@ -43,7 +43,7 @@ class DisconnectRig:
         self.sent.append(decode_server(frames[1]).message)
 
     def join(self, number: int, behind: FrontConnection | None = None) -> tuple[FrontConnection, socket.socket]:
-        """A connection over a new TCP connection, and our end of it in place of libzmq's."""
+        """Join over a new TCP connection, whose end at the front is ours in place of libzmq's."""
         if behind is not None:
             connection = FrontConnection(
                 number, Route(b"1", f"tab{number}"), behind.peer, behind.address, "key", HELLO, behind.number
@@ -84,7 +84,7 @@ def rig() -> Iterator[DisconnectRig]:
     context.destroy(linger=0)
 
 
-def test_who_has_got_the_descriptor_of_a_closed_connection_stays(rig: DisconnectRig) -> None:
+def test_connection_that_reuses_a_descriptor_stays(rig: DisconnectRig) -> None:
     first, ours = rig.join(1)
     descriptor = ours.fileno()
     ours.close()
@@ -101,7 +101,7 @@ def test_who_has_got_the_descriptor_of_a_closed_connection_stays(rig: Disconnect
     os.close(descriptor)
 
 
-def test_a_report_that_comes_before_the_descriptor_is_closed_is_not_forgotten(rig: DisconnectRig) -> None:
+def test_report_before_the_descriptor_is_closed_is_processed_later(rig: DisconnectRig) -> None:
     _, ours = rig.join(1)
     rig.report_closed(ours.fileno())
     assert rig.leave() == []
@@ -109,7 +109,7 @@ def test_a_report_that_comes_before_the_descriptor_is_closed_is_not_forgotten(ri
     assert rig.leave() == [(1, Lost("closed"))]
 
 
-def test_those_behind_a_gateway_that_is_let_go_leave_with_it_and_are_told(rig: DisconnectRig) -> None:
+def test_participants_of_a_closed_gateway_are_disconnected_and_notified(rig: DisconnectRig) -> None:
     gateway, _ = rig.join(1)
     rig.join(2, behind=gateway)
     rig.join(3)
@@ -122,7 +122,7 @@ def test_those_behind_a_gateway_that_is_let_go_leave_with_it_and_are_told(rig: D
 
 
 @pytest.mark.parametrize(("reason", "stops"), [("heartbeat", True), ("removed", False), ("bye", False)])
-def test_only_who_was_given_up_may_stop_after_the_end(rig: DisconnectRig, reason: str, stops: bool) -> None:
+def test_only_silent_clients_may_send_an_estop_after_their_end(rig: DisconnectRig, reason: str, stops: bool) -> None:
     connection, ours = rig.join(1)
     rig.disconnects.remove(connection, reason)
     assert (rig.clients.find_kept(connection.route, connection.peer) is connection) is stops

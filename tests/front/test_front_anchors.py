@@ -12,7 +12,7 @@ from iris_session.protocol.steps import Decision
 from tests.front.harness import FrontSession
 
 
-def test_a_moved_anchor_moves_who_looked_at_it_before_and_a_bumped_headset_is_an_alarm(
+def test_moved_anchor_realigns_observers_and_bump_is_an_alarm(
     open_session: Callable[..., FrontSession],
 ) -> None:
     session = open_session(anchors={"table": Pose((1.0, 0.0, 0.8), IDENTITY.q)})

@@ -19,7 +19,7 @@ from tests.front.lab import Lab
 
 
 class Gateway:
-    """A gateway that has joined, and the people behind it. `numbers`: of their connections, by name."""
+    """A gateway that has joined, and its participants. `numbers`: their connections by name."""
 
     def __init__(self, lab: Lab, *roles: str) -> None:
         self.lab = lab
@@ -31,7 +31,7 @@ class Gateway:
         self._secrets: dict[str, bytes] = {}
 
     def enter(self, name: str, role: str) -> Join:
-        """Somebody says hello through the gateway. What the authority hears of it."""
+        """Send a hello through the gateway. Return the entry of the authority."""
         secret = self._secrets.setdefault(name, os.urandom(16))
         seen, before = len(self.client.got(Welcome)), len(self.lab.session.wait_entries(Join))
         self.client.send(Hello(role, name, secret=secret), on_behalf_of=name)
@@ -42,17 +42,17 @@ class Gateway:
         return entry.message
 
     def faults(self) -> dict[str, ProtocolFault]:
-        """The newest fault for each of those behind it; the gateway's own under an empty name."""
+        """Return the newest fault for each participant; the gateway's own under an empty name."""
         told = [(m, frames) for m, frames in self.client.inbox if isinstance(m, ProtocolFault)]
         return {frames[0].decode() if frames else "": message for message, frames in told}
 
     def lost(self, n: int) -> dict[int, str]:
-        """Why connections were lost, `n` of them."""
+        """Wait for `n` disconnects. Return their reasons by connection."""
         entries = self.lab.session.wait_entries(Lost, n)
         return {e.connection: e.message.reason for e in entries if isinstance(e.message, Lost)}
 
     def removed(self, n: int) -> set[str]:
-        """Participants that the front had removed, at least `n`."""
+        """Wait for at least `n` removals by the front. Return the participants."""
         entries = self.lab.session.wait_entries(RemoveParticipant, n)
         return {e.message.participant for e in entries if isinstance(e.message, RemoveParticipant)}
 
@@ -61,7 +61,7 @@ class Gateway:
 
 
 @pytest.mark.parametrize("by", ["list", "director"])
-def test_a_revoked_gateway_takes_its_people_along_those_who_are_away_too(lab: Lab, by: str) -> None:
+def test_revoked_gateway_removes_connected_and_disconnected_participants(lab: Lab, by: str) -> None:
     gateway = Gateway(lab, "gateway", "operator", "observer")
     gateway.enter("tab1", "operator")
     gateway.enter("tab2", "observer")
@@ -85,7 +85,7 @@ def test_a_revoked_gateway_takes_its_people_along_those_who_are_away_too(lab: La
     lab.session.wait_entries(Marker)
 
 
-def test_people_behind_a_gateway_lose_the_role_that_its_key_loses(lab: Lab) -> None:
+def test_participants_of_a_gateway_lose_the_roles_of_its_key(lab: Lab) -> None:
     gateway = Gateway(lab, "gateway", "operator", "observer")
     gateway.enter("tab1", "operator")
     gateway.enter("tab2", "observer")
@@ -102,7 +102,7 @@ def test_people_behind_a_gateway_lose_the_role_that_its_key_loses(lab: Lab) -> N
     assert len(gateway.lost(1)) == 1
 
 
-def test_a_key_that_may_be_a_gateway_no_more_takes_its_people_along(lab: Lab) -> None:
+def test_key_without_gateway_role_disconnects_its_participants(lab: Lab) -> None:
     gateway = Gateway(lab)  # any role
     gateway.enter("tab1", "director")
     lab.home.clients.allow_key("web", gateway.pair.public, ("director",))
@@ -110,7 +110,7 @@ def test_a_key_that_may_be_a_gateway_no_more_takes_its_people_along(lab: Lab) ->
     assert set(gateway.lost(2).values()) == {"role"}
 
 
-def test_roles_that_a_key_gains_end_nothing(lab: Lab) -> None:
+def test_added_roles_end_no_connection(lab: Lab) -> None:
     gateway = Gateway(lab, "gateway", "observer")
     gateway.enter("tab1", "observer")
     lab.home.clients.allow_key("web", gateway.pair.public, ())
@@ -130,7 +130,7 @@ class Watcher:
         self._monitor = self.socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
 
     def frame(self) -> None:
-        """Waits for a state that is sent from now on."""
+        """Wait for a state that is sent after this call."""
         while self.socket.poll(0):
             self.socket.recv_multipart()
 
@@ -150,7 +150,7 @@ class Watcher:
 
 
 @pytest.mark.parametrize("who", ["behind a gateway", "without state", "with state"])
-def test_others_lose_their_state_only_for_a_revoked_key_that_may_have_it(lab: Lab, who: str) -> None:
+def test_subscribers_reconnect_only_when_a_subscribed_key_is_revoked(lab: Lab, who: str) -> None:
     bob, _ = lab.allowed("bob")
     watcher = Watcher(lab, bob)
     watcher.frame()

@@ -28,7 +28,7 @@ OpenSession = Callable[..., FrontSession]
 BODIES = 2000
 
 
-def test_garbage_is_answered_with_bounded_faults_and_harms_nobody(session: FrontSession) -> None:
+def test_garbage_is_answered_with_bounded_faults(session: FrontSession) -> None:
     joined, stranger = session.client(), session.client()
     joined.join()
     rng, began = random.Random(1), time.monotonic()
@@ -54,7 +54,7 @@ def test_garbage_is_answered_with_bounded_faults_and_harms_nobody(session: Front
     assert len(stranger.got(Refused)) < 40 + 25 * (time.monotonic() - began)
 
 
-def test_wrong_values_say_what_would_be_right(session: FrontSession) -> None:
+def test_invalid_values_are_named_in_the_fault(session: FrontSession) -> None:
     client = session.client()
     client.join()
     client.socket.send(msgspec.msgpack.encode([1, 1, "", {"type": "dance"}]))
@@ -63,7 +63,7 @@ def test_wrong_values_say_what_would_be_right(session: FrontSession) -> None:
     assert client.wait_for(ProtocolFault, 2).code in ("malformed", "too_large")
 
 
-def test_a_huge_frame_ends_only_its_sender(session: FrontSession) -> None:
+def test_huge_frame_disconnects_only_its_sender(session: FrontSession) -> None:
     honest, huge = session.client(), session.client()
     honest.join(name="Ann")
     huge.join(name="Bob")
@@ -75,7 +75,7 @@ def test_a_huge_frame_ends_only_its_sender(session: FrontSession) -> None:
 
 
 def test_three_hundred_connections_without_hello_leave_room(session: FrontSession) -> None:
-    crowd = [sockets.create_connection(("127.0.0.1", session.ports.control)) for _ in range(150)]
+    crowd = [sockets.create_connection((session.host, session.ports.control)) for _ in range(150)]
     peers = [session.client() for _ in range(150)]
     client = session.client()
     client.join()
@@ -90,7 +90,7 @@ def test_three_hundred_connections_without_hello_leave_room(session: FrontSessio
     assert not session.wait_entries(EStop)[0].connection > 1
 
 
-def test_a_full_house_and_hellos_too_fast_are_refused_with_advice(open_session: OpenSession) -> None:
+def test_hellos_above_capacity_or_rate_are_refused_with_advice(open_session: OpenSession) -> None:
     limits = FrontLimits(
         connections=2, hellos_per_second=0.001, hello_burst=3, hellos_per_source=0.001, hello_source_burst=1
     )
@@ -105,7 +105,7 @@ def test_a_full_house_and_hellos_too_fast_are_refused_with_advice(open_session: 
     assert third.wait_for(Refused, 3).code == "rate"
 
 
-def test_hellos_of_one_peer_use_up_nobody_elses(session: FrontSession) -> None:
+def test_hellos_of_one_peer_do_not_limit_others(session: FrontSession) -> None:
     knocking = session.client()
     for _ in range(200):
         knocking.send(Hello("operator", "Knock"))
@@ -128,9 +128,9 @@ def test_one_key_leaves_connections_to_others(open_session: OpenSession) -> None
     ann.join()
 
 
-def test_connections_that_never_subscribe_keep_no_subscriber_out(open_session: OpenSession) -> None:
+def test_connections_without_subscription_do_not_block_subscribers(open_session: OpenSession) -> None:
     session = open_session(limits=FrontLimits(subscribers=5))
-    crowd = [sockets.create_connection(("127.0.0.1", session.ports.state)) for _ in range(20)]
+    crowd = [sockets.create_connection((session.host, session.ports.state)) for _ in range(20)]
     sub = session.subscriber()
 
     def state_comes() -> bool:
@@ -142,7 +142,7 @@ def test_connections_that_never_subscribe_keep_no_subscriber_out(open_session: O
         tcp.close()
 
 
-def test_a_flood_of_one_does_not_delay_the_estop_of_another(session: FrontSession) -> None:
+def test_flood_does_not_delay_the_estop_of_another_client(session: FrontSession) -> None:
     flooder, other = session.client(), session.client()
     flooder.join("operator", "Flood")
     other.join("observer", "Eve")
@@ -164,7 +164,7 @@ def test_a_flood_of_one_does_not_delay_the_estop_of_another(session: FrontSessio
     assert stop.connection == 2
 
 
-def test_an_authority_that_stands_still_gets_a_bounded_batch_with_the_estop_first(session: FrontSession) -> None:
+def test_stalled_authority_gets_a_bounded_batch_with_the_estop_first(session: FrontSession) -> None:
     client, other = session.client(), session.client()
     client.join()
     other.join(name="Bob")
@@ -185,7 +185,7 @@ def test_an_authority_that_stands_still_gets_a_bounded_batch_with_the_estop_firs
     assert session.wait_drops("rate") > 0
 
 
-def test_a_client_that_takes_nothing_is_cut_off_as_slow(open_session: OpenSession) -> None:
+def test_client_that_reads_nothing_is_disconnected_as_slow(open_session: OpenSession) -> None:
     session = open_session(limits=FrontLimits(send_queue=64, slow_drops=16), silence_ns=60_000_000_000)
     honest = session.client()
     honest.join(name="Ann")
@@ -194,7 +194,7 @@ def test_a_client_that_takes_nothing_is_cut_off_as_slow(open_session: OpenSessio
     slow.rcvhwm = 1
     slow.setsockopt(zmq.RCVBUF, 4096)
     disconnects = slow.get_monitor_socket(zmq.EVENT_DISCONNECTED)
-    slow.connect(f"tcp://127.0.0.1:{session.ports.control}")
+    slow.connect(f"tcp://{session.host}:{session.ports.control}")
     slow.send(encode_client(wrap_message(Hello("observer", "Slow", secret=b"s" * 16))))
     session.pump(lambda: slow.poll(0) != 0, "welcome of the slow client")
     text = "x" * 500
@@ -222,7 +222,7 @@ def test_a_client_that_takes_nothing_is_cut_off_as_slow(open_session: OpenSessio
     slow.close()
 
 
-def test_what_waits_for_a_client_that_reads_nothing_is_bounded_in_memory(open_session: OpenSession) -> None:
+def test_pending_bytes_of_a_stalled_client_are_bounded(open_session: OpenSession) -> None:
     limits = FrontLimits(send_queue=100_000, slow_drops=10**9, memory_bytes=24 << 20)
     session = open_session(limits=limits, silence_ns=60_000_000_000, bodies=BODIES)
     slow, honest, waiting = session.client(), session.client(), session.client()
@@ -249,7 +249,7 @@ def test_what_waits_for_a_client_that_reads_nothing_is_bounded_in_memory(open_se
     slow.close()
 
 
-def test_another_peer_with_the_same_routing_id_is_a_stranger(session: FrontSession) -> None:
+def test_second_peer_with_the_same_routing_id_is_unknown(session: FrontSession) -> None:
     first = session.client(routing_id=b"headset")
     first.join()
     first.close()
@@ -270,7 +270,7 @@ def test_two_peers_with_one_routing_id_do_not_mix(session: FrontSession) -> None
     assert not [e for e in session.entries if isinstance(e.message, EStop)]
 
 
-def test_rates_are_per_type_and_named(session: FrontSession) -> None:
+def test_rate_limits_are_per_message_type(session: FrontSession) -> None:
     client = session.client()
     client.join()
     for _ in range(60):
@@ -282,8 +282,8 @@ def test_rates_are_per_type_and_named(session: FrontSession) -> None:
     assert "get_snapshot" in fault.message
 
 
-def test_state_goes_on_while_one_subscriber_reads_nothing(open_session: OpenSession) -> None:
-    """More than any queue or socket buffer on the way to the stuck one holds."""
+def test_state_continues_while_one_subscriber_reads_nothing(open_session: OpenSession) -> None:
+    """Sends more than all queues and socket buffers to the stalled one hold."""
     session = open_session(bodies=BODIES)
     stuck = session.subscriber(rcvhwm=1, rcvbuf=4096)
     sub = session.subscriber()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import zmq
 
-from iris_session.front.connection_guard import ChannelGuard
+from iris_session.front.connection_guard import ChannelBounds, ChannelGuard
 from iris_session.front.media import proxy as media_module
 from iris_session.front.media.proxy import MediaProxy
 from iris_session.front.media.scheduler import MediaSubscriber
@@ -32,7 +32,7 @@ Curve = tuple[bytes, bytes, bytes]
 
 
 class Viewer:
-    """A SUB socket on the media port, and what came by it."""
+    """A SUB socket on the media port, and the frames it received."""
 
     def __init__(self, session: FrontSession, topics: list[bytes], curve: Curve | None = None, hwm: int = 1000) -> None:
         self.socket = session.context.socket(zmq.SUB)
@@ -40,7 +40,7 @@ class Viewer:
         self.socket.rcvhwm = hwm
         if curve:
             self.socket.curve_serverkey, self.socket.curve_publickey, self.socket.curve_secretkey = curve
-        self.socket.connect(f"tcp://127.0.0.1:{session.ports.media}")
+        self.socket.connect(f"tcp://{session.host}:{session.ports.media}")
         for topic in topics:
             self.socket.subscribe(topic)
         self.got: list[tuple[bytes, MediaHeader, bytes]] = []
@@ -53,7 +53,7 @@ class Viewer:
 
 
 class Stage:
-    """Somebody who publishes `cloud` at every step, and those who watch, whom no slow machine silences."""
+    """A publisher of `cloud` at every step, and viewers, which are kept alive on slow machines, too."""
 
     def __init__(self, session: FrontSession) -> None:
         self.session = session
@@ -116,7 +116,7 @@ def budgets(client: RawClient) -> dict[str, str]:
     return {one.stream: one.budget_class for one in client.got(DeliveryBudget)[-1].streams}
 
 
-def test_a_subscriber_gets_the_newest_frames(media: Stage) -> None:
+def test_subscriber_gets_the_newest_frames(media: Stage) -> None:
     session = media.session
     ann = media.joined(session.client())
     viewer = media.viewer(ann)
@@ -130,7 +130,7 @@ def test_a_subscriber_gets_the_newest_frames(media: Stage) -> None:
     media.until(lambda: budgets(ann) == {"cloud": "full"}, "ann is told of the stream")
 
 
-def test_the_status_tells_who_gets_what(media: Stage) -> None:
+def test_status_lists_streams_of_each_client(media: Stage) -> None:
     session = media.session
     ann = media.joined(session.client())
     viewer = media.viewer(ann)
@@ -159,7 +159,7 @@ def test_the_status_tells_who_gets_what(media: Stage) -> None:
     media.until(told, "the stream and its subscriber")
 
 
-def test_topics_that_there_are_not_are_counted_and_give_nothing(media: Stage) -> None:
+def test_unknown_topics_are_counted(media: Stage) -> None:
     session = media.session
     ann = media.joined(session.client())
     bad = Viewer(session, [b"", b"media/", b"cloud", make_topic(ann.epoch + 7, "cloud")])
@@ -173,12 +173,12 @@ def test_topics_that_there_are_not_are_counted_and_give_nothing(media: Stage) ->
 
 
 @pytest.mark.parametrize("port", ["media", "media_ingest"])
-def test_who_says_nothing_is_closed_and_nobody_else(open_session: Open, port: str) -> None:
+def test_only_silent_media_connections_are_closed(open_session: Open, port: str) -> None:
     session = open_session(limits=FrontLimits(hello_timeout_ns=1_500_000_000))
     media = Stage(session)
     ann = media.joined(session.client())
     viewer = media.viewer(ann)
-    with socket.create_connection(("127.0.0.1", getattr(session.ports, port))) as silent:
+    with socket.create_connection((session.host, getattr(session.ports, port))) as silent:
         media.drops("media_silent")
         silent.settimeout(30.0)
         while silent.recv(4096):
@@ -189,7 +189,7 @@ def test_who_says_nothing_is_closed_and_nobody_else(open_session: Open, port: st
     media.close()
 
 
-def test_a_message_without_end_is_cut_off(open_session: Open) -> None:
+def test_endless_message_is_cut_off(open_session: Open) -> None:
     """libzmq would collect it in memory; its own sockets cannot send one."""
     session = open_session(limits=FrontLimits(source_bytes=1 << 20))
     media = Stage(session)
@@ -197,7 +197,7 @@ def test_a_message_without_end_is_cut_off(open_session: Open) -> None:
     greeting = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
     ready = b"\x05READY\x0bSocket-Type\x00\x00\x00\x04PUSH"
     frame = b"\x03" + (100_000).to_bytes(8, "big") + bytes(100_000)  # and more of the same message
-    with socket.create_connection(("127.0.0.1", session.ports.media_ingest)) as source:
+    with socket.create_connection((session.host, session.ports.media_ingest)) as source:
         source.settimeout(30.0)
         source.sendall(greeting + b"\x04" + bytes([len(ready)]) + ready)
         answer = b""
@@ -210,7 +210,7 @@ def test_a_message_without_end_is_cut_off(open_session: Open) -> None:
     media.close()
 
 
-def test_too_many_who_subscribe_are_closed_and_the_first_stay(open_session: Open) -> None:
+def test_excess_media_subscribers_are_closed_and_the_first_stay(open_session: Open) -> None:
     session = open_session(limits=FrontLimits(subscribers=2))
     media = Stage(session)
     ann = media.joined(session.client())
@@ -224,7 +224,7 @@ def test_too_many_who_subscribe_are_closed_and_the_first_stay(open_session: Open
     media.close()
 
 
-def test_who_never_reads_delays_nobody_and_gets_less(media: Stage) -> None:
+def test_stalled_viewer_delays_no_other_and_gets_less(media: Stage) -> None:
     session = media.session
     media.size = 100_000
     ann, bob = (media.joined(session.client(), name) for name in ("ann", "bob"))
@@ -240,7 +240,7 @@ def test_who_never_reads_delays_nobody_and_gets_less(media: Stage) -> None:
     assert stuck.take() >= 1
 
 
-def test_a_client_may_ask_for_less(media: Stage) -> None:
+def test_client_may_request_less_media(media: Stage) -> None:
     session = media.session
     media.size = 20_000
     ann = media.joined(session.client())
@@ -254,11 +254,11 @@ def test_a_client_may_ask_for_less(media: Stage) -> None:
         return budgets(ann) == {"cloud": BudgetClass.NONE}
 
     media.until(asks, "none")
-    assert ann.got(DeliveryBudget)[-1].reason == "the client asked for no more"
+    assert ann.got(DeliveryBudget)[-1].reason
 
 
-def test_who_gets_no_state_at_all_gets_less_media(media: Stage) -> None:
-    """A client that was delivered nothing knows of nothing missed; the front knows what it sent."""
+def test_client_without_state_gets_less_media(media: Stage) -> None:
+    """A client that received nothing cannot report missed state; the front knows what it sent."""
     session = media.session
     ann = media.joined(session.client())
     viewer = media.viewer(ann)
@@ -281,7 +281,7 @@ def test_who_gets_no_state_at_all_gets_less_media(media: Stage) -> None:
     media.until(starves, "less, for want of state")
 
 
-def test_a_front_that_is_replaced_takes_media_again(media: Stage) -> None:
+def test_restarted_front_accepts_media(media: Stage) -> None:
     session = media.session
     ann = media.joined(session.client())
     viewer = media.viewer(ann)
@@ -297,16 +297,16 @@ def test_a_front_that_is_replaced_takes_media_again(media: Stage) -> None:
     assert again.got[0][1].seq > old_seq
 
 
-def test_what_no_front_would_take_is_said_where_it_is_handed_in(media: Stage) -> None:
-    with pytest.raises(ValueError, match="cannot be the name of a media stream"):
+def test_invalid_media_are_an_error_of_the_publisher(media: Stage) -> None:
+    with pytest.raises(ValueError, match="name"):
         media.session.process.publish_media("a b", b"x", 0, 0, "bytes")
-    with pytest.raises(ValueError, match="has class 'full'"):
+    with pytest.raises(ValueError, match="'full'"):
         media.session.process.publish_media("a", {"half": b"x"}, 0, 0, "bytes")
-    with pytest.raises(ValueError, match="at most 8388608 for each class"):
+    with pytest.raises(ValueError, match="8388608"):
         media.session.process.publish_media("a", bytes(8_388_609), 0, 0, "bytes")
 
 
-def test_a_camera_thread_that_goes_on_when_the_session_ends_is_told_so(tmp_path: Path) -> None:
+def test_publishing_media_after_the_end_raises(tmp_path: Path) -> None:
     source = MediaSource(f"ipc://{tmp_path}/front")
     assert source.publish("a", b"x", 0, 0, "bytes")
     source.close()
@@ -318,7 +318,7 @@ def test_a_camera_thread_that_goes_on_when_the_session_ends_is_told_so(tmp_path:
 # --- keys ------------------------------------------------------------------------------------------------------------
 
 
-def test_only_the_own_key_opens_a_connections_media(locked: tuple[Lab, Stage]) -> None:
+def test_only_the_key_of_a_connection_opens_its_media(locked: tuple[Lab, Stage]) -> None:
     lab, stage = locked
     ann, client = lab.allowed("ann")
     bob, other = lab.allowed("bob")
@@ -340,7 +340,7 @@ def test_only_the_own_key_opens_a_connections_media(locked: tuple[Lab, Stage]) -
     assert bobs.got == []
 
 
-def test_a_revoked_key_gets_no_more_media_and_the_others_go_on(locked: tuple[Lab, Stage]) -> None:
+def test_revoked_key_gets_no_media_and_others_do(locked: tuple[Lab, Stage]) -> None:
     lab, stage = locked
     ann, client = lab.allowed("ann")
     bob, other = lab.allowed("bob")
@@ -360,12 +360,12 @@ def test_a_revoked_key_gets_no_more_media_and_the_others_go_on(locked: tuple[Lab
 
 
 def _quiet(viewer: Viewer) -> bool:
-    """Whether nothing comes for a while."""
+    """Return whether nothing is received for a while."""
     before = viewer.take()
     return not viewer.socket.poll(100) and viewer.take() == before
 
 
-def test_only_sources_hand_in_media_from_elsewhere(locked: tuple[Lab, Stage]) -> None:
+def test_only_sources_may_push_media(locked: tuple[Lab, Stage]) -> None:
     lab, stage = locked
     stage.publishing = False
     bob, viewing = lab.allowed("bob", "operator", "observer")
@@ -404,7 +404,7 @@ def _pusher(lab: Lab, pair: KeyPair) -> zmq.Socket[bytes]:
     pusher = lab.session.context.socket(zmq.PUSH)
     pusher.linger = 0
     pusher.curve_serverkey, pusher.curve_publickey, pusher.curve_secretkey = lab.curve(pair)
-    pusher.connect(f"tcp://127.0.0.1:{lab.session.ports.media_ingest}")
+    pusher.connect(f"tcp://{lab.session.host}:{lab.session.ports.media_ingest}")
     return pusher
 
 
@@ -415,7 +415,7 @@ def _send(pusher: zmq.Socket[bytes], data: bytes) -> None:
         return
 
 
-def test_a_frame_of_a_source_that_nobody_has_decided_about_is_not_refused(locked: tuple[Lab, Stage]) -> None:
+def test_first_frame_of_an_undecided_source_is_not_refused(locked: tuple[Lab, Stage]) -> None:
     lab, stage = locked
     stage.publishing = False
     camera = KeyPair.generate()
@@ -437,8 +437,8 @@ def test_a_frame_of_a_source_that_nobody_has_decided_about_is_not_refused(locked
     pusher.close()
 
 
-def test_what_waits_for_the_front_is_bounded_in_bytes(tmp_path: Path) -> None:
-    """Nobody takes it. What is large is not copied, and counted until it was handed on."""
+def test_pending_media_are_bounded_in_bytes(tmp_path: Path) -> None:
+    """No front reads. Large frames are not copied, and count until they were sent."""
     endpoint = f"ipc://{tmp_path}/media"
     source, frame = MediaSource(endpoint), bytes(MAX_MEDIA_FRAME_BYTES)
     largest = {"full": frame, "half": frame, "quarter": frame}
@@ -459,7 +459,7 @@ def test_what_waits_for_the_front_is_bounded_in_bytes(tmp_path: Path) -> None:
     assert not source.publish("late", b"x", 0, 1, "bytes")
 
 
-def test_what_is_changed_after_it_was_handed_in_is_sent_as_it_was(tmp_path: Path) -> None:
+def test_published_frame_is_sent_as_it_was_when_published(tmp_path: Path) -> None:
     endpoint, picture = f"ipc://{tmp_path}/media", bytearray(b"a" * 200_000)
     source = MediaSource(endpoint)
     assert source.publish("cloud", picture, 0, 1, "bytes")  # type: ignore[arg-type]
@@ -471,7 +471,7 @@ def test_what_is_changed_after_it_was_handed_in_is_sent_as_it_was(tmp_path: Path
     source.close()
 
 
-def test_a_fault_costs_what_was_under_way_and_is_told_once(
+def test_fault_of_the_thread_loses_pending_work_and_is_logged_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(media_module, "FAULT_S", 0.001)
@@ -483,7 +483,7 @@ def test_a_fault_costs_what_was_under_way_and_is_told_once(
         local.bind(endpoint)
         remote.bind_to_random_port("tcp://127.0.0.1")
         guard = [
-            ChannelGuard(watch_tcp(one, name), limits, 8, 1 << 20, curve=False)
+            ChannelGuard(watch_tcp(one, name), limits, ChannelBounds(8, 1 << 20), curve=False)
             for one, name in ((out, "fault-out"), (remote, "fault-in"))
         ]
         proxy = MediaProxy(out, *guard, local, remote, time.monotonic_ns, encrypted=False)

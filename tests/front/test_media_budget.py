@@ -1,4 +1,4 @@
-"""The budget controller against simulated links: which levels fall and rise, how often, and what never happens."""
+"""The budget controller against simulated links: which levels fall and rise, and how often."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ BOTH = {**CLOUD, "cloth": (2 * MBIT, 1 * MBIT, 0.5 * MBIT)}
 
 
 class Link:
-    """One way for state and media: what does not fit waits, up to 256 KiB, and state waits behind it."""
+    """A link for state and media: up to 256 KiB are queued, and state waits behind media."""
 
     def __init__(self, mbit: float, age_ms: float = 10.0) -> None:
         self.capacity = mbit * MBIT
@@ -41,7 +41,7 @@ class Link:
         self._taken = (0, 0)
 
     def play(self, seconds: float, rates: Rates = CLOUD, limit: float = 0.0) -> BudgetGrant:
-        """The last grant of that time. A report every second, a look every quarter."""
+        """Return the last grant of that time, with a report every second and a decision every quarter."""
         for _ in range(int(seconds * 4)):
             self.now_ns += STEP_NS
             levels = self.grants[-1][1].levels if self.grants else dict.fromkeys(rates, 0)
@@ -58,17 +58,17 @@ class Link:
         return self.grants[-1][1]
 
     def rises(self) -> list[int]:
-        """When a stream was given more."""
+        """Return the times at which a stream got more."""
         pairs = itertools.pairwise(self.grants)
         return [b[0] for a, b in pairs if any(b[1].levels[s] < a[1].levels.get(s, NONE_LEVEL) for s in b[1].levels)]
 
 
-def test_enough_for_everything_stays_so() -> None:
+def test_sufficient_link_keeps_full_level() -> None:
     grant = Link(100).play(60, BOTH)
     assert grant == BudgetGrant({"cloud": 0, "cloth": 0})
 
 
-def test_a_link_for_a_part_gets_a_part_within_two_seconds_and_no_more() -> None:
+def test_narrow_link_gets_a_lower_level_within_two_seconds() -> None:
     link = Link(8)
     link.play(1.75)
     assert link.grants[-1][1].levels["cloud"] > 0, "lowered within 1.75 s"
@@ -80,7 +80,7 @@ def test_a_link_for_a_part_gets_a_part_within_two_seconds_and_no_more() -> None:
     assert held.count(2) > 0.8 * len(held)
 
 
-def test_what_was_lowered_comes_back_when_the_link_does() -> None:
+def test_level_rises_when_the_link_recovers() -> None:
     link = Link(6)
     link.play(20)
     link.capacity = 100 * MBIT
@@ -88,7 +88,7 @@ def test_what_was_lowered_comes_back_when_the_link_does() -> None:
     assert link.grants[-1][1] == BudgetGrant({"cloud": 0})
 
 
-def test_a_dead_link_gets_nothing_and_a_silent_client_neither() -> None:
+def test_dead_link_and_silent_client_get_nothing() -> None:
     link = Link(8)
     link.play(5)
     link.capacity = 0.0
@@ -99,8 +99,8 @@ def test_a_dead_link_gets_nothing_and_a_silent_client_neither() -> None:
     assert (grant.levels, grant.reason) == ({"cloud": NONE_LEVEL}, "the client has not reported for 3 s")
 
 
-def test_trouble_that_media_do_not_make_is_learnt() -> None:
-    """The client has moved to a network with 200 ms: that is how it is now."""
+def test_delay_not_caused_by_media_becomes_the_baseline() -> None:
+    """The client has moved to a network with a delay of 200 ms."""
     link = Link(100)
     link.play(10)
     link.age_ms = 210.0
@@ -110,21 +110,21 @@ def test_trouble_that_media_do_not_make_is_learnt() -> None:
     assert link.grants[-1][1].levels == {"cloud": 0}
 
 
-def test_missed_state_counts() -> None:
+def test_missed_state_lowers_the_level() -> None:
     controller = BudgetController()
     controller.update(1, LinkMeasure(StateReport(10.0, 0.0)), CLOUD, 0)
     grant = controller.update(1, LinkMeasure(StateReport(10.0, 0.7)), CLOUD, SECOND)
     assert (grant.levels["cloud"], grant.reason) == (1, "70 % of state was missed")
 
 
-def test_a_display_of_30_hz_misses_half_of_it_always() -> None:
+def test_constant_share_of_missed_state_keeps_the_level() -> None:
     controller = BudgetController()
     for second in range(30):
         grant = controller.update(1, LinkMeasure(StateReport(18.0, 0.5)), CLOUD, second * SECOND)
     assert grant.levels["cloud"] == 0
 
 
-def test_a_client_may_ask_for_less_and_take_it_back() -> None:
+def test_client_may_lower_and_restore_its_level() -> None:
     link = Link(100)
     grant = link.play(10, limit=6 * MBIT)
     assert (grant.levels, grant.bytes_per_s, grant.reason) == (
@@ -135,7 +135,7 @@ def test_a_client_may_ask_for_less_and_take_it_back() -> None:
     assert link.play(20).levels == {"cloud": 0}
 
 
-def test_a_new_stream_waits_where_there_is_too_much() -> None:
+def test_new_stream_starts_low_on_a_full_link() -> None:
     link = Link(8)
     link.play(5)
     link.play(0.25, BOTH)
@@ -145,7 +145,7 @@ def test_a_new_stream_waits_where_there_is_too_much() -> None:
     assert controller.update(7, LinkMeasure(None), BOTH, link.now_ns).levels == {"cloud": 0, "cloth": 0}
 
 
-def test_the_ladder_begins_with_what_costs_most() -> None:
+def test_most_expensive_stream_is_lowered_first() -> None:
     steps = build_ladder(BOTH)
     assert (steps[0], steps[1], steps[-1]) == (
         {"cloth": 0, "cloud": 0},
@@ -163,7 +163,7 @@ rates_of_streams = st.dictionaries(
 
 @given(rates_of_streams, st.floats(0.0, 5e7), st.floats(0.0, 5e7))
 @settings(max_examples=40, deadline=None)
-def test_more_budget_is_never_less_of_any_stream(rates: dict[str, tuple[float, ...]], one: float, other: float) -> None:
+def test_larger_budget_lowers_no_stream(rates: dict[str, tuple[float, ...]], one: float, other: float) -> None:
     less, more = sorted((one, other))
     low, high = select_levels(rates, less), select_levels(rates, more)
     assert all(high[stream] <= low[stream] for stream in rates)
@@ -172,7 +172,7 @@ def test_more_budget_is_never_less_of_any_stream(rates: dict[str, tuple[float, .
 
 @given(st.floats(0.3, 60.0), st.floats(1.0, 120.0))
 @settings(max_examples=12, deadline=None)
-def test_a_constant_link_is_not_tried_often(mbit: float, age_ms: float) -> None:
+def test_constant_link_is_probed_rarely(mbit: float, age_ms: float) -> None:
     link = Link(mbit, age_ms)
     link.play(120)
     rises = link.rises()
@@ -186,7 +186,7 @@ def test_a_constant_link_is_not_tried_often(mbit: float, age_ms: float) -> None:
 
 @given(st.floats(0.3, 100.0), st.floats(2.0, 30.0))
 @settings(max_examples=12, deadline=None)
-def test_a_link_that_dies_gets_nothing(mbit: float, after_s: float) -> None:
+def test_link_that_dies_gets_nothing(mbit: float, after_s: float) -> None:
     link = Link(mbit)
     link.play(after_s)
     link.capacity = 0.0

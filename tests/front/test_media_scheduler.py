@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import pytest
 
 from iris_session.front.media.budget import NONE_LEVEL, SECOND
-from iris_session.front.media.scheduler import DeliveryCounters, MediaScheduler, MediaSubscriber
+from iris_session.front.media.scheduler import STUCK_BYTES, DeliveryCounters, MediaScheduler, MediaSubscriber
 from iris_session.protocol.codec import decode_media_header
 from iris_session.protocol.media import MAX_STREAMS, MediaHeader, MediaPush, make_topic, parse_topic
 
@@ -50,7 +50,7 @@ class Wire:
         return taken
 
 
-def test_subscribers_get_what_their_level_says() -> None:
+def test_subscribers_get_frames_of_their_level() -> None:
     wire = Wire(ann=0, bob=2)
     assert wire.hub.subscribe(ANN, "cloud", "a", 1)
     assert wire.hub.subscribe(BOB, "cloud", "b", 2)
@@ -64,7 +64,7 @@ def test_subscribers_get_what_their_level_says() -> None:
     assert [len(wire.got[who]) for who in (ANN, BOB)] == [8, 6]
 
 
-def test_a_coarser_form_comes_at_full_rate() -> None:
+def test_coarser_class_is_sent_at_full_rate() -> None:
     wire = Wire(ann=1, bob=2)
     wire.hub.subscribe(ANN, "cloud", "a", 1)
     wire.hub.subscribe(BOB, "cloud", "b", 2)
@@ -73,7 +73,7 @@ def test_a_coarser_form_comes_at_full_rate() -> None:
     assert [frame for _, frame in wire.got[BOB]] == [b"half"] * 2, "every second of the next better one"
 
 
-def test_a_full_connection_gets_the_newest_later_and_delays_nobody() -> None:
+def test_full_connection_gets_the_newest_frame_later_and_delays_no_other() -> None:
     wire = Wire()
     wire.hub.subscribe(ANN, "cloud", "a", 1)
     wire.hub.subscribe(BOB, "cloud", "b", 2)
@@ -97,7 +97,7 @@ def test_only_the_key_of_a_connection_may_subscribe_to_it() -> None:
     assert wire.hub.list_subscriptions(ANN) == []
 
 
-def test_who_is_gone_gets_nothing_any_more() -> None:
+def test_closed_connection_gets_nothing() -> None:
     wire = Wire()
     wire.hub.subscribe(ANN, "cloud", "a", 1)
     wire.full = {ANN}
@@ -109,7 +109,7 @@ def test_who_is_gone_gets_nothing_any_more() -> None:
     assert wire.hub.read_counters(ANN) == DeliveryCounters()
 
 
-def test_one_of_two_readers_of_a_client_leaves() -> None:
+def test_one_of_two_connections_of_a_client_closes() -> None:
     """It has connected again; the end of the connection before is noticed later."""
     wire = Wire()
     wire.hub.subscribe(ANN, "cloud", "a", 1)
@@ -124,7 +124,7 @@ def test_one_of_two_readers_of_a_client_leaves() -> None:
     assert wire.hub.read_counters(ANN).delivered == 1
 
 
-def test_nobody_takes_back_a_subscription_of_another() -> None:
+def test_unsubscribing_does_not_affect_other_clients() -> None:
     wire = Wire()
     wire.hub.subscribe(ANN, "cloud", "a", 1)
     assert not wire.hub.subscribe(ANN, "cloud", "b", 2)
@@ -134,13 +134,13 @@ def test_nobody_takes_back_a_subscription_of_another() -> None:
     assert len(wire.got[ANN]) == 1
 
 
-def test_when_memory_runs_short_media_let_go_of_everything_for_a_while() -> None:
+def test_memory_shortage_pauses_all_media() -> None:
     wire = Wire()
     wire.hub.subscribe(ANN, "cloud", "a", 1)
     wire.hub.subscribe(BOB, "cloud", "b", 2)
     assert not wire.hub.release_frames(wire.now_ns + SECOND), "there is nothing"
     wire.full = {BOB}
-    assert wire.push()
+    assert wire.push(frames={"full": bytes(STUCK_BYTES)})
     assert wire.hub.release_frames(wire.now_ns + SECOND)
     assert wire.hub.pop_stuck() == {2}
     assert wire.hub.pop_stuck() == set()
@@ -154,7 +154,7 @@ def test_when_memory_runs_short_media_let_go_of_everything_for_a_while() -> None
     assert [len(wire.got[who]) for who in (ANN, BOB)] == [2, 1]
 
 
-def test_after_a_fault_everybody_gets_what_comes_next() -> None:
+def test_next_frame_is_sent_to_all_after_a_fault() -> None:
     wire = Wire()
     assert wire.hub.subscribe(ANN, "cloud", "a", 11)
     assert wire.hub.subscribe(BOB, "cloud", "b", 12)
@@ -204,7 +204,7 @@ def test_streams_and_subscriptions_are_bounded() -> None:
     assert wire.push(stream="another")
 
 
-def test_a_stream_belongs_to_its_source_while_that_sends() -> None:
+def test_stream_belongs_to_its_source_while_it_sends() -> None:
     wire = Wire()
     assert wire.push(source="camera-1")
     assert not wire.push(source="camera-2")
@@ -215,7 +215,7 @@ def test_a_stream_belongs_to_its_source_while_that_sends() -> None:
     assert wire.hub.read_streams() == {}
 
 
-def test_rates_are_those_of_the_last_seconds() -> None:
+def test_rates_cover_the_last_seconds() -> None:
     wire = Wire()
     for _ in range(12):
         wire.push(16)
@@ -225,7 +225,7 @@ def test_rates_are_those_of_the_last_seconds() -> None:
     assert facts.rates == pytest.approx((6250.0, 3125.0, 1562.5))
 
 
-def test_a_restarted_front_numbers_above_its_predecessor() -> None:
+def test_restarted_front_numbers_frames_above_its_predecessor() -> None:
     wire, later = Wire(), Wire()
     wire.hub.subscribe(ANN, "cloud", "a", 1)
     later.hub.subscribe(ANN, "cloud", "a", 1)

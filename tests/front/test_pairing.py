@@ -77,7 +77,7 @@ class PairingRig:
         return list(self.outbox.sent.get(own.public.encode(), []))
 
     def answer(self, own: KeyPair) -> Any:
-        """The one answer that comes."""
+        """Wait for the one answer."""
         turns(self.turn, lambda: bool(self.answers(own)))
         (message,) = self.answers(own)
         return message
@@ -96,7 +96,7 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[PairingRig]
     rig.keyring.close()
 
 
-def test_a_slow_disk_does_not_block_the_loop(rig: PairingRig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_disk_does_not_block_the_loop(rig: PairingRig, monkeypatch: pytest.MonkeyPatch) -> None:
     own = KeyPair.generate()
     code, _ = rig.home.join_codes.create(rig.server)
     rig.asks(own, rig.proof(code, own))
@@ -111,7 +111,7 @@ def test_a_slow_disk_does_not_block_the_loop(rig: PairingRig, monkeypatch: pytes
     assert list(rig.home.clients.read()) == [own.fingerprint]
 
 
-def test_a_director_revokes_at_once_whatever_the_disk_does(rig: PairingRig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_revocation_by_a_director_does_not_wait_for_the_disk(rig: PairingRig, monkeypatch: pytest.MonkeyPatch) -> None:
     own = KeyPair.generate()
     rig.home.clients.allow_key("ann", own.public)
     rig.turn()
@@ -128,7 +128,7 @@ def test_a_director_revokes_at_once_whatever_the_disk_does(rig: PairingRig, monk
 
 
 @pytest.mark.parametrize("when", ["waiting", "writing", "written"])
-def test_a_revocation_while_the_key_pairs_counts(rig: PairingRig, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
+def test_revocation_during_pairing_takes_effect(rig: PairingRig, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
     own, first = KeyPair.generate(), KeyPair.generate()
     code, _ = rig.home.join_codes.create(rig.server)
     with slow_disk(monkeypatch) as disk:
@@ -154,7 +154,7 @@ def test_a_revocation_while_the_key_pairs_counts(rig: PairingRig, monkeypatch: p
     assert rig.tokens.is_revoked(own.fingerprint)
 
 
-def test_a_key_that_a_command_takes_off_while_it_pairs_is_off(rig: PairingRig) -> None:
+def test_key_removed_by_a_command_during_pairing_stays_removed(rig: PairingRig) -> None:
     own = KeyPair.generate()
     code, _ = rig.home.join_codes.create(rig.server)
     rig.asks(own, rig.proof(code, own))
@@ -162,14 +162,14 @@ def test_a_key_that_a_command_takes_off_while_it_pairs_is_off(rig: PairingRig) -
     turns(lambda _: None, lambda: bool(rig.home.clients.read()))  # written, and not told yet
     assert rig.home.clients.revoke_key("ann") is not None
     rig.keyring.reload_if_changed()
-    assert rig.answer(own).message == "this key was revoked just now"
+    assert "revoked" in rig.answer(own).message
     assert rig.keyring.find_key(own.fingerprint) is None
 
 
-def test_a_list_that_could_not_be_read_just_then_is_read_again(
-    rig: PairingRig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_unreadable_allow_list_is_read_again(
+    rig: PairingRig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Revoked while the system had no descriptor to spare: it counts as soon as there is one."""
+    """A revocation takes effect once a descriptor is free to read the list."""
     own = KeyPair.generate()
     rig.home.clients.allow_key("ann", own.public)
     rig.keyring.reload_if_changed()
@@ -179,15 +179,15 @@ def test_a_list_that_could_not_be_read_just_then_is_read_again(
         for _ in range(3):
             rig.keyring.reload_if_changed()
     assert rig.keyring.find_key(own.fingerprint) is not None
-    assert capsys.readouterr().err.count("Too many open files") == 1, "said once"
+    assert caplog.text.count("Too many open files") == 1, "reported once"
     rig.keyring.reload_if_changed()
     assert rig.keyring.find_key(own.fingerprint) is None
 
 
-def test_who_is_on_the_list_has_paired_though_it_cannot_be_read_just_then(
+def test_paired_key_is_accepted_although_the_list_is_unreadable(
     rig: PairingRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The code is used up: to be told that one was revoked would be wrong, and of no use."""
+    """The code is used up, so an answer that the key was revoked would be wrong."""
     own = KeyPair.generate()
     code, _ = rig.home.join_codes.create(rig.server)
 
@@ -202,8 +202,8 @@ def test_who_is_on_the_list_has_paired_though_it_cannot_be_read_just_then(
     assert rig.keyring.find_key(own.fingerprint) is not None
 
 
-def test_who_has_paired_and_did_not_hear_it_is_told_again(rig: PairingRig) -> None:
-    """The answer came too late, or its connection broke: the code is used up, and the key is on the list."""
+def test_lost_pairing_answer_is_sent_again(rig: PairingRig) -> None:
+    """The answer was late or its connection broke, while the code is used up and the key allowed."""
     own = KeyPair.generate()
     code, _ = rig.home.join_codes.create(rig.server)
     proof = rig.proof(code, own)
@@ -227,10 +227,65 @@ def test_who_has_paired_and_did_not_hear_it_is_told_again(rig: PairingRig) -> No
     assert rig.answers(own)[3].code == RefusalCode.CODE, "who was taken off the list needs another code"
 
 
-def test_a_folder_of_certificates_is_read_again_whatever_time_its_files_are_given(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_restarted_front_repeats_the_answer_of_a_pairing(rig: PairingRig) -> None:
+    """The front ended between writing the list and answering: the code is used up, and the client asks again."""
+    own = KeyPair.generate()
+    code, _ = rig.home.join_codes.create(rig.server)
+    proof = rig.proof(code, own)
+    rig.asks(own, proof)
+    first = rig.answer(own)
+    assert isinstance(first, Paired)
+    restarted = PairingRig(rig.home.path)
+    try:
+        restarted.asks(own, proof)
+        assert restarted.answer(own) == first
+        eve = KeyPair.generate()
+        restarted.asks(eve, proof, descriptor=2)
+        assert restarted.answer(eve).code == RefusalCode.CODE
+        restarted.asks(own, b"x" * 32)
+        turns(restarted.turn, lambda: len(restarted.answers(own)) == 2)
+        assert restarted.answers(own)[1].code == RefusalCode.CODE
+        rig.home.clients.revoke_key(own.fingerprint)
+        turns(restarted.turn, lambda: restarted.keyring.find_key(own.fingerprint) is None)
+        restarted.asks(own, proof)
+        assert restarted.answers(own)[2].code == RefusalCode.CODE, "a revoked key needs another code"
+    finally:
+        restarted.keyring.close()
+
+
+def test_pairing_waits_while_the_list_is_missing(rig: PairingRig) -> None:
+    """An editor replaces the list: one that is written meanwhile would have the new key alone."""
+    ann, bob = KeyPair.generate(), KeyPair.generate()
+    rig.home.clients.allow_key("bob", bob.public)
+    rig.keyring.reload_if_changed()
+    code, _ = rig.home.join_codes.create(rig.server)
+    away = (rig.home.path / "clients.json").rename(rig.home.path / "clients.json~")
+    rig.asks(ann, rig.proof(code, ann))
+    for _ in range(5):
+        rig.turn()
+    assert rig.answers(ann) == []
+    assert not (rig.home.path / "clients.json").exists()
+    away.rename(rig.home.path / "clients.json")
+    assert isinstance(rig.answer(ann), Paired)
+    assert set(rig.home.clients.read()) == {ann.fingerprint, bob.fingerprint}
+
+
+def test_attempts_of_one_key_with_one_code_are_answered_alike(rig: PairingRig) -> None:
+    """Several programs of one user pair at the same time, as emulated headsets do."""
+    own = KeyPair.generate()
+    code, _ = rig.home.join_codes.create(rig.server)
+    for _ in range(3):
+        rig.asks(own, rig.proof(code, own))
+    turns(rig.turn, lambda: len(rig.answers(own)) == 3)
+    first, *others = rig.answers(own)
+    assert isinstance(first, Paired)
+    assert others == [first, first]
+
+
+def test_certificates_are_read_again_with_any_modification_time(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """As by `cp -p` or rsync: a key that is replaced is out at once. A certificate that is damaged is said, once."""
+    """As with `cp -p` or rsync: a replaced key is revoked at once. A damaged certificate is logged once."""
     folder = tmp_path / "clients"
     folder.mkdir()
     first, second = KeyPair.generate(), KeyPair.generate()
@@ -255,15 +310,14 @@ def test_a_folder_of_certificates_is_read_again_whatever_time_its_files_are_give
     for _ in range(3):
         (folder / "other").touch()
         keyring.reload_if_changed()
-    said = capsys.readouterr().err
-    assert said.count("certificate bob.key") == 1
-    assert "it should be a ZeroMQ certificate" in said
+    reported = caplog.text
+    assert reported.count("certificate bob.key") == 1
     assert drops.by_reason["certificate_unusable"] == 1
     assert keyring.find_key(second.fingerprint) is not None
     keyring.close()
 
 
-def test_a_revoked_key_that_pairs_anew_may_join_though_the_list_looks_the_same(rig: PairingRig) -> None:
+def test_revoked_key_may_join_after_pairing_again(rig: PairingRig) -> None:
     own = KeyPair.generate()
     rig.home.clients.allow_key("ann", own.public)
     rig.turn()
@@ -276,7 +330,7 @@ def test_a_revoked_key_that_pairs_anew_may_join_though_the_list_looks_the_same(r
     assert not rig.tokens.is_revoked(own.fingerprint)
 
 
-def test_who_has_no_attempts_left_takes_nothing_from_others(rig: PairingRig) -> None:
+def test_exhausted_pairing_attempts_do_not_limit_others(rig: PairingRig) -> None:
     eve, ann = KeyPair.generate(), KeyPair.generate()
     for _ in range(2):
         rig.home.join_codes.create(rig.server)
@@ -294,8 +348,8 @@ def test_who_has_no_attempts_left_takes_nothing_from_others(rig: PairingRig) -> 
     assert isinstance(rig.answer(ann), Paired)
 
 
-def test_one_address_cannot_use_up_what_all_may_ask(rig: PairingRig) -> None:
-    """Not even while there is no code that it could be wrong about."""
+def test_one_address_cannot_exhaust_the_attempts_of_all(rig: PairingRig) -> None:
+    """Also while no code exists."""
     eve, ann = KeyPair.generate(), KeyPair.generate()
     for _ in range(200):
         rig.asks(eve)
@@ -304,7 +358,7 @@ def test_one_address_cannot_use_up_what_all_may_ask(rig: PairingRig) -> None:
     assert rig.drops.by_reason["pair_rate"] >= 180
 
 
-def test_attempts_that_wait_are_few_and_do_not_wait_for_ever(rig: PairingRig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pending_attempts_are_bounded_and_time_out(rig: PairingRig, monkeypatch: pytest.MonkeyPatch) -> None:
     code, _ = rig.home.join_codes.create(rig.server)
     first, *others = [KeyPair.generate() for _ in range(MAX_PENDING + 3)]
     rig.asks(first, rig.proof(code, first), descriptor=0)
@@ -324,7 +378,7 @@ def test_attempts_that_wait_are_few_and_do_not_wait_for_ever(rig: PairingRig, mo
     assert isinstance(rig.answer(first), Paired)
 
 
-def test_codes_that_could_not_be_read_are_read_again_and_complained_about_once(
+def test_unreadable_codes_are_read_again_and_logged_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """No descriptor is left for a while, and the file does not change meanwhile."""
@@ -337,7 +391,7 @@ def test_codes_that_could_not_be_read_are_read_again_and_complained_about_once(
             tries += 1
             raise KeysError("Too many open files")
 
-        patch.setattr(rig.home.join_codes, "list_open", fails)
+        patch.setattr(rig.home.join_codes, "list_for_server", fails)
         patch.setattr(pairing_service.time, "monotonic", lambda: now_s)
         for _ in range(3):
             assert not rig.pairing.has_open_code

@@ -22,7 +22,7 @@ from tests.front.harness import FrontSession
 from tests.front.lab import Lab, Open
 
 
-def test_an_unknown_key_can_only_pair(lab: Lab) -> None:
+def test_unknown_key_can_only_pair(lab: Lab) -> None:
     eve = KeyPair.generate()
     client = lab.client(eve)
     for n, message in enumerate((Hello("operator", "Eve", secret=b"s" * 16), EStop("Eve"), Marker(1, "x")), 1):
@@ -34,7 +34,7 @@ def test_an_unknown_key_can_only_pair(lab: Lab) -> None:
     assert {(a.subject, a.address) for a in audits} == {(eve.fingerprint, "127.0.0.1")}
 
 
-def test_an_unknown_key_gets_no_state(lab: Lab) -> None:
+def test_unknown_key_gets_no_state(lab: Lab) -> None:
     ann, client = lab.allowed("ann")
     subscribers = [lab.session.subscriber(curve=lab.curve(pair)) for pair in (ann, KeyPair.generate())]
     poses = np.zeros((3, 7))
@@ -50,7 +50,7 @@ def test_an_unknown_key_gets_no_state(lab: Lab) -> None:
     assert client.got(Refused) == []
 
 
-def test_a_code_pairs_one_key_which_then_joins_in_the_roles_of_the_code(lab: Lab) -> None:
+def test_code_pairs_one_key_with_the_roles_of_the_code(lab: Lab) -> None:
     ann = KeyPair.generate()
     code, _ = lab.home.join_codes.create(lab.server, roles=("operator", "observer"))
     client = lab.client(ann)
@@ -70,7 +70,7 @@ def test_a_code_pairs_one_key_which_then_joins_in_the_roles_of_the_code(lab: Lab
     assert lab.refused(lab.client(eve), Pair("eve", lab.proof(code, eve))).code == RefusalCode.CODE
 
 
-def test_wrong_codes_make_the_code_void_and_are_told_with_their_count(lab: Lab) -> None:
+def test_wrong_codes_void_the_code_and_are_audited_with_their_count(lab: Lab) -> None:
     eve = KeyPair.generate()
     code, made = lab.home.join_codes.create(lab.server)
     client = lab.client(eve)
@@ -88,8 +88,8 @@ def test_wrong_codes_make_the_code_void_and_are_told_with_their_count(lab: Lab) 
     assert len(refused) <= 3, "at most once a second"
 
 
-def test_an_address_has_few_attempts_whatever_the_codes(lab: Lab) -> None:
-    """An address that keeps guessing voids two codes, and then none any more."""
+def test_attempts_per_address_are_bounded_for_all_codes(lab: Lab) -> None:
+    """An address that keeps guessing voids two codes, and no further ones."""
     client = lab.client(KeyPair.generate())
     n = 0
     for _ in range(2):
@@ -101,10 +101,10 @@ def test_an_address_has_few_attempts_whatever_the_codes(lab: Lab) -> None:
     eve = KeyPair.generate()
     answer = lab.refused(lab.client(eve), Pair("eve", lab.proof(code, eve)))
     assert (answer.code, answer.message) == (RefusalCode.CODE, "too many wrong codes from this address")
-    assert len(lab.home.join_codes.list_open(lab.server.fingerprint)) == 1
+    assert sum(one.is_open(time.time()) for one in lab.home.join_codes.list_for_server(lab.server.fingerprint)) == 1
 
 
-def test_a_flood_of_pairing_is_cut(lab: Lab) -> None:
+def test_flood_of_pairing_is_cut_off(lab: Lab) -> None:
     lab.home.join_codes.create(lab.server)
     _, ann = lab.allowed("ann")
     client = lab.client(KeyPair.generate())
@@ -115,7 +115,7 @@ def test_a_flood_of_pairing_is_cut(lab: Lab) -> None:
     lab.session.wait_entries(Heartbeat)
 
 
-def test_an_expired_code_pairs_nobody(lab: Lab) -> None:
+def test_expired_code_pairs_no_key(lab: Lab) -> None:
     ann = KeyPair.generate()
     code, made = lab.home.join_codes.create(lab.server, minutes=0.0005)
     lab.session.pump(lambda: time.time() > made.expires, "the code expires")
@@ -124,7 +124,7 @@ def test_an_expired_code_pairs_nobody(lab: Lab) -> None:
     assert lab.home.clients.read() == {}
 
 
-def test_pairing_waits_for_a_busy_list_and_for_nobody_else(lab: Lab) -> None:
+def test_pairing_waits_only_for_a_locked_list(lab: Lab) -> None:
     ann = KeyPair.generate()
     code, _ = lab.home.join_codes.create(lab.server)
     _, bob = lab.allowed("bob")
@@ -137,13 +137,13 @@ def test_pairing_waits_for_a_busy_list_and_for_nobody_else(lab: Lab) -> None:
     client.wait_for(Paired)
 
 
-def test_plain_sessions_have_nothing_to_pair_with(session: FrontSession) -> None:
+def test_unencrypted_sessions_refuse_pairing(session: FrontSession) -> None:
     client = session.client()
     client.send(Pair("ann", b"x" * 32))
     assert client.wait_for(Refused).code == RefusalCode.CODE
 
 
-def test_a_revoked_key_is_out_at_once_and_everyone_else_has_state_within_a_second(lab: Lab) -> None:
+def test_revoked_key_is_disconnected_and_others_have_state_within_a_second(lab: Lab) -> None:
     ann, ann_client = lab.allowed("ann")
     bob, bob_client = lab.allowed("bob")
     ann_state, bob_state = (lab.session.subscriber(curve=lab.curve(pair)) for pair in (ann, bob))
@@ -185,8 +185,8 @@ def test_a_revoked_key_is_out_at_once_and_everyone_else_has_state_within_a_secon
     assert commands == []
 
 
-def test_a_revoked_connection_is_that_of_a_stranger_until_it_is_closed(lab: Lab) -> None:
-    """Its TCP connection was authenticated while the key was good."""
+def test_revoked_connection_is_unknown_until_it_is_closed(lab: Lab) -> None:
+    """Its TCP connection was authenticated while the key was valid."""
     _, client = lab.allowed("ann")
     monitor = client.socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
     lab.home.clients.revoke_key("ann")
@@ -202,7 +202,7 @@ def test_a_revoked_connection_is_that_of_a_stranger_until_it_is_closed(lab: Lab)
     assert not [e for e in lab.session.entries if isinstance(e.message, EStop)]
 
 
-def test_a_role_that_is_taken_away_ends_connections_in_that_role(lab: Lab) -> None:
+def test_removed_role_ends_connections_in_that_role(lab: Lab) -> None:
     pair, client = lab.allowed("ann", "operator", "observer")
     lab.home.clients.allow_key("ann", pair.public, ("observer",))
     (lost,) = lab.session.wait_entries(Lost)
@@ -214,7 +214,7 @@ def test_a_role_that_is_taken_away_ends_connections_in_that_role(lab: Lab) -> No
     assert client.got(ProtocolFault) == []
 
 
-def test_a_directors_word_revokes_the_key_and_stays(lab: Lab) -> None:
+def test_removal_by_a_director_revokes_the_key(lab: Lab) -> None:
     pair, client = lab.allowed("ann")
     lab.session.once(Decision((), dropped=(Dropped(1, "revoked", pair.fingerprint),)))
     assert client.wait_for(ProtocolFault).code == FaultCode.REVOKED
@@ -222,8 +222,8 @@ def test_a_directors_word_revokes_the_key_and_stays(lab: Lab) -> None:
     assert lab.refused(lab.client(pair), Hello("operator", "ann")).code == RefusalCode.UNPAIRED
 
 
-def test_a_director_revokes_even_where_the_list_cannot_be_changed(open_session: Open, tmp_path: Path) -> None:
-    """A folder of certificates is not ours to change: the key stays out of this session all the same."""
+def test_director_revokes_although_the_list_is_read_only(open_session: Open, tmp_path: Path) -> None:
+    """A folder of certificates is not changed; the key is refused by this session."""
     folder = tmp_path / "clients"
     folder.mkdir()
     server_file, _ = create_certificates(tmp_path, "server")
@@ -245,7 +245,7 @@ def test_a_director_revokes_even_where_the_list_cannot_be_changed(open_session: 
     assert late.wait_for(Refused).code == RefusalCode.UNPAIRED
 
 
-def test_a_revoked_key_that_is_let_in_anew_joins_again(lab: Lab) -> None:
+def test_revoked_key_joins_after_it_is_allowed_again(lab: Lab) -> None:
     pair, client = lab.allowed("ann")
     lab.home.clients.revoke_key("ann")
     client.wait_for(ProtocolFault)
@@ -256,7 +256,7 @@ def test_a_revoked_key_that_is_let_in_anew_joins_again(lab: Lab) -> None:
     lab.client(pair).join(name="ann")
 
 
-def test_a_removed_participant_is_told_and_may_come_back(lab: Lab) -> None:
+def test_removed_participant_is_notified_and_may_rejoin(lab: Lab) -> None:
     pair, client = lab.allowed("ann")
     lab.session.once(Decision((), dropped=(Dropped(1, "removed"),)))
     fault = client.wait_for(ProtocolFault)
@@ -264,7 +264,7 @@ def test_a_removed_participant_is_told_and_may_come_back(lab: Lab) -> None:
     lab.client(pair).join(name="ann")
 
 
-def test_who_is_revoked_on_plain_loopback_stays_out_as_long_as_the_secret_is_the_same(session: FrontSession) -> None:
+def test_revoked_secret_stays_refused_on_unencrypted_loopback(session: FrontSession) -> None:
     client = session.client()
     client.join()
     (entry,) = session.wait_entries(Join)
@@ -278,7 +278,7 @@ def test_who_is_revoked_on_plain_loopback_stays_out_as_long_as_the_secret_is_the
     session.client().join()
 
 
-def test_a_stolen_resume_token_is_refused_and_told(lab: Lab) -> None:
+def test_stolen_resume_token_is_refused_and_audited(lab: Lab) -> None:
     _, ann = lab.allowed("ann")
     assert ann.welcome is not None
     eve = KeyPair.generate()
@@ -292,7 +292,7 @@ def test_a_stolen_resume_token_is_refused_and_told(lab: Lab) -> None:
     lab.session.wait_entries(Marker)
 
 
-def test_only_a_gateway_speaks_for_others(lab: Lab) -> None:
+def test_only_gateways_may_send_for_others(lab: Lab) -> None:
     eve, client = lab.allowed("eve")
     client.send(EStop("forged"), on_behalf_of="ann")
     assert client.wait_for(ProtocolFault).message == "only a gateway speaks on behalf of others"
@@ -303,7 +303,7 @@ def test_only_a_gateway_speaks_for_others(lab: Lab) -> None:
     assert not [e for e in lab.session.entries if isinstance(e.message, EStop)]
 
 
-def test_people_behind_a_gateway_have_the_other_roles_of_its_key(lab: Lab) -> None:
+def test_participants_of_a_gateway_have_the_other_roles_of_its_key(lab: Lab) -> None:
     pair = KeyPair.generate()
     lab.home.clients.allow_key("web", pair.public, ("gateway", "observer"))
     gateway = lab.client(pair)
@@ -320,7 +320,7 @@ def test_people_behind_a_gateway_have_the_other_roles_of_its_key(lab: Lab) -> No
     assert "director" not in (joins[2].roles or ("director",))
 
 
-def test_audits_of_a_flood_are_few_and_add_up(lab: Lab) -> None:
+def test_audits_of_a_flood_are_bounded_and_add_up(lab: Lab) -> None:
     clients = [lab.client(KeyPair.generate()) for _ in range(5)]
     for _ in range(40):
         for client in clients:
@@ -331,7 +331,7 @@ def test_audits_of_a_flood_are_few_and_add_up(lab: Lab) -> None:
     assert len([m for client in clients for m in client.got(Refused)]) <= 60, "answers to strangers are bounded"
 
 
-def test_the_list_that_was_damaged_while_running_stays_as_it_was(lab: Lab) -> None:
+def test_damaged_list_keeps_the_previous_keys(lab: Lab) -> None:
     _, client = lab.allowed("ann")
     path = lab.home.path / "clients.json"
     good = path.read_bytes()
@@ -344,7 +344,7 @@ def test_the_list_that_was_damaged_while_running_stays_as_it_was(lab: Lab) -> No
     client.wait_for(ProtocolFault)
 
 
-def test_the_list_may_be_edited_by_hand_while_the_session_runs(lab: Lab) -> None:
+def test_list_may_be_edited_during_the_session(lab: Lab) -> None:
     _, ann = lab.allowed("ann")
     _, bob = lab.allowed("bob")
     path = lab.home.path / "clients.json"
@@ -363,8 +363,8 @@ def test_the_list_may_be_edited_by_hand_while_the_session_runs(lab: Lab) -> None
     assert bob.wait_for(ProtocolFault).code == FaultCode.REVOKED
 
 
-def test_strangers_that_never_finish_a_handshake_hold_nothing(lab: Lab) -> None:
-    sockets = [socket.create_connection(("127.0.0.1", lab.session.ports.control)) for _ in range(50)]
+def test_unfinished_handshakes_hold_no_resources(lab: Lab) -> None:
+    sockets = [socket.create_connection((lab.session.host, lab.session.ports.control)) for _ in range(50)]
     try:
         lab.allowed("ann")
     finally:

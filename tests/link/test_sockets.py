@@ -1,4 +1,4 @@
-"""Sockets of the front with real connections: what the kernel does about peers that take nothing."""
+"""Sockets of the front with real connections, and peers that do not read."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import pytest
 import zmq
 
 from iris_session.link import sockets
-from iris_session.link.config import FrontConfig
+from iris_session.link.config import FrontConfig, FrontLimits
+from iris_session.link.sockets import FILE_DESCRIPTORS, RESERVED_DESCRIPTORS, fit_limits
 
 
-def test_a_subscriber_that_takes_nothing_is_cut_off_and_the_others_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As a headset that has gone to another network, or sleeps while its kernel answers."""
+def test_stalled_subscriber_is_cut_off_and_others_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Like a headset that has moved to another network, or sleeps while its kernel answers."""
     monkeypatch.setattr(sockets, "STUCK_MS", 1000)
     with ExitStack() as stack:
         context = stack.enter_context(zmq.Context())
@@ -46,3 +47,15 @@ def _drain(reader: zmq.Socket[bytes]) -> list[bytes]:
     while reader.poll(0):
         got.append(reader.recv())
     return got
+
+
+@pytest.mark.parametrize("descriptors", [64, 256, 1024, 4096, 8192, 1 << 20])
+def test_limits_fit_into_the_descriptors_of_the_system(descriptors: int) -> None:
+    limits = FrontLimits()
+    fitted = fit_limits(limits, descriptors)
+    assert fitted.connections == limits.connections
+    assert (fitted is limits) == (descriptors >= FILE_DESCRIPTORS), "the limit that the front asks for is enough"
+    if descriptors >= 1024:
+        used = 5 * fitted.strangers + 3 * fitted.subscribers + fitted.sources + fitted.connections
+        assert used + RESERVED_DESCRIPTORS <= descriptors
+    assert min(fitted.strangers, fitted.subscribers, fitted.sources) > 0

@@ -1,4 +1,4 @@
-"""A process that hangs is told from one that gets no processor, with real processes."""
+"""A hanging process is distinguished from one without processor time, with real processes."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ def looks(starvation: StarvationDetector, pid: int, seconds: float = 1.0) -> boo
     return starvation.sample(pid, time.monotonic_ns())
 
 
-def test_a_process_that_others_keep_from_running_is_starved() -> None:
+def test_process_without_processor_time_is_starved() -> None:
     cpu = min(os.sched_getaffinity(0))
     with running(IDLE, cpu) as starved, running(BUSY, cpu):
         assert looks(StarvationDetector(), starved)
 
 
-def test_a_process_that_is_stopped_or_waits_is_not() -> None:
+def test_stopped_or_waiting_process_is_not_starved() -> None:
     cpu = min(os.sched_getaffinity(0))
     with running("print('up', flush=True); import time; time.sleep(60)", cpu) as waiting:
         assert not looks(StarvationDetector(), waiting)
@@ -62,7 +62,7 @@ def test_a_process_that_is_stopped_or_waits_is_not() -> None:
         assert not looks(StarvationDetector(), stopped)
 
 
-def test_one_that_is_gone_is_not() -> None:
+def test_ended_process_is_not_starved() -> None:
     with running("print('up', flush=True)", min(os.sched_getaffinity(0))) as pid:
         pass
     assert not StarvationDetector().sample(pid, 0)

@@ -1,4 +1,4 @@
-"""The impairment proxy: weather by seed, nothing lost on TCP, back-pressure, cut and reset, datagrams; one process."""
+"""The impairment proxy: conditions by seed, no loss on TCP, back-pressure, cut and reset, datagrams; one process."""
 
 from __future__ import annotations
 
@@ -35,29 +35,31 @@ MS = 1_000_000
 DEADLINE_S = 20.0
 
 
-# --- weather ---
+# --- conditions ---
 
 
 def _series(seed: int, profile: str = "busy-wifi", direction: str = DOWN) -> list[tuple[int, bool]]:
-    weather = LinkConditions(load_profile(profile), seed)
+    conditions = LinkConditions(load_profile(profile), seed)
     out = []
     for t in range(0, 60 * SECOND, 10 * MS):
-        weather.advance(t)
-        out.append((weather.compute_delay_ns(direction, t), weather.is_stalled(direction, t)))
+        conditions.advance(t)
+        out.append((conditions.compute_delay_ns(direction, t), conditions.is_stalled(direction, t)))
     return out
 
 
-def test_weather_is_a_function_of_seed_and_time() -> None:
+def test_conditions_are_a_function_of_seed_and_time() -> None:
     assert _series(1) == _series(1)
     assert _series(1) != _series(2)
     assert _series(1) != _series(1, direction=UP)
-    weather, sparse = (LinkConditions(PROFILES["busy-wifi"], 1) for _ in range(2))
-    dense = {t: (weather.compute_delay_ns(UP, t), weather.is_stalled(UP, t)) for t in range(0, 20 * SECOND, 5 * MS)}
-    for t in range(0, 20 * SECOND, 500 * MS):  # asked less often, it is the same
+    conditions, sparse = (LinkConditions(PROFILES["busy-wifi"], 1) for _ in range(2))
+    dense = {
+        t: (conditions.compute_delay_ns(UP, t), conditions.is_stalled(UP, t)) for t in range(0, 20 * SECOND, 5 * MS)
+    }
+    for t in range(0, 20 * SECOND, 500 * MS):  # queried less often, the conditions are the same
         assert dense[t] == (sparse.compute_delay_ns(UP, t), sparse.is_stalled(UP, t))
 
 
-def test_profiles_are_what_their_names_say() -> None:
+def test_profiles_match_their_names() -> None:
     good, busy = _series(0, "good-wifi"), _series(0)
     assert 1.8 < sum(d for d, _ in good) / len(good) / MS < 2.2
     assert max(d for d, _ in good) < 8 * MS
@@ -70,7 +72,7 @@ def test_profiles_are_what_their_names_say() -> None:
     assert blackout == [1000 <= i < 1500 for i in range(6000)]
 
 
-def test_phases_follow_each_other_and_repeat() -> None:
+def test_phases_are_sequential_and_repeat() -> None:
     profile = Profile(
         phases=(
             ProfilePhase(seconds=1.0, delay_ms=1.0),
@@ -78,20 +80,20 @@ def test_phases_follow_each_other_and_repeat() -> None:
         ),
         repeat=True,
     )
-    weather = LinkConditions(profile)
+    conditions = LinkConditions(profile)
     seen: list[tuple[int, str]] = []
     for t in range(0, 7 * SECOND, SECOND // 2):
-        weather.advance(t, lambda how, t=t: seen.append((t, how)))  # type: ignore[misc]
+        conditions.advance(t, lambda how, t=t: seen.append((t, how)))  # type: ignore[misc]
         late = t % (3 * SECOND) >= SECOND
-        assert weather.compute_delay_ns(DOWN, t) == (5 if late else 1) * MS
-        assert weather.compute_delay_ns(UP, t) == (9 if late else 1) * MS
-        assert weather.is_stalled(UP, t) is late
-        assert not weather.is_stalled(DOWN, t)
-        assert weather.find_next_change_ns(t) == t - t % (3 * SECOND) + (3 * SECOND if late else SECOND)
+        assert conditions.compute_delay_ns(DOWN, t) == (5 if late else 1) * MS
+        assert conditions.compute_delay_ns(UP, t) == (9 if late else 1) * MS
+        assert conditions.is_stalled(UP, t) is late
+        assert not conditions.is_stalled(DOWN, t)
+        assert conditions.find_next_change_ns(t) == t - t % (3 * SECOND) + (3 * SECOND if late else SECOND)
     assert seen == [(SECOND, "cut"), (4 * SECOND, "cut")]
 
 
-def test_profiles_from_files(tmp_path: Path) -> None:
+def test_profiles_are_read_from_files(tmp_path: Path) -> None:
     toml = tmp_path / "lab.toml"
     toml.write_text(
         'repeat = true\n[[phases]]\nseconds = 30\ndelay_ms = 5\njitter_ms = 2\nup = {delay_ms = 9}\n'
@@ -106,28 +108,28 @@ def test_profiles_from_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "expected"),
     [
         ("phases = []", "needs a phase"),
         ("[[phases]]\ndelay = 3", "unknown field `delay`"),
-        ("[[phases]]\ndelay_ms = -1", "delay_ms -1.0 is out of range"),
-        ("[[phases]]\nloss = 2.0", "loss 2.0 is out of range: 0 to 1"),
+        ("[[phases]]\ndelay_ms = -1", "delay_ms -1.0"),
+        ("[[phases]]\nloss = 2.0", "loss 2.0"),
         ('[[phases]]\nat_start = "burn"', "'cut' or 'reset'"),
         ("repeat = true\n[[phases]]\ndelay_ms = 3", "last phase"),
         ("window_kib = 1\n[[phases]]", "4 to 16384"),
         ("[[phases", "lab.toml"),
     ],
 )
-def test_unusable_profiles_say_why(tmp_path: Path, text: str, says: str) -> None:
+def test_invalid_profiles_are_rejected_with_reason(tmp_path: Path, text: str, expected: str) -> None:
     file = tmp_path / "lab.toml"
     file.write_text(text)
     with pytest.raises(ProfileError) as error:
         load_profile(str(file))
-    assert says in str(error.value)
+    assert expected in str(error.value)
 
 
 def test_unknown_profile_lists_the_known() -> None:
-    with pytest.raises(ProfileError, match=r"none, lan, wan, good-wifi, busy-wifi, blackout, 40ms, or a \.toml"):
+    with pytest.raises(ProfileError, match=r"none, lan, .*40ms"):
         load_profile("nice-wifi")
 
 
@@ -135,7 +137,7 @@ def test_unknown_profile_lists_the_known() -> None:
 
 
 class Echo:
-    """A server that sends everything back, and remembers how connections ended."""
+    """A server that returns all bytes and records how connections ended."""
 
     def __init__(self) -> None:
         self._listening = socket.create_server(("127.0.0.1", 0))
@@ -196,23 +198,24 @@ def _receive(connection: socket.socket, size: int) -> bytes:
     return data
 
 
-def _until(condition: Any, what: str) -> None:
+def _wait_until(condition: Any, what: str) -> None:
     deadline = time.monotonic() + DEADLINE_S
     while not condition():
         assert time.monotonic() < deadline, f"not within {DEADLINE_S:g} s: {what}"
         time.sleep(0.005)
 
 
-def _file(tmp_path: Path, **phase: Any) -> str:
+def _write_profile(tmp_path: Path, **phase: Any) -> str:
     path = tmp_path / f"profile{len(list(tmp_path.iterdir()))}.json"
     path.write_text(json.dumps({"phases": [phase], "window_kib": 64}))
     return str(path)
 
 
-def test_bytes_come_complete_in_order_and_not_early(echo: Echo, tmp_path: Path) -> None:
-    profile = _file(tmp_path, delay_ms=15.0, jitter_ms=10.0, stall_every_s=0.2, stall_s=0.03)
+def test_bytes_arrive_complete_in_order_and_not_early(echo: Echo, tmp_path: Path) -> None:
+    profile = _write_profile(tmp_path, delay_ms=15.0, jitter_ms=10.0, stall_every_s=0.2, stall_s=0.03)
+    constant = _write_profile(tmp_path, delay_ms=30.0)
     with (
-        ImpairmentProcess({"127.0.0.2": profile, "127.0.0.3": _file(tmp_path, delay_ms=30.0)}, [echo.port]) as proxy,
+        ImpairmentProcess({"127.0.0.2": profile, "127.0.0.3": constant}, [echo.port]) as proxy,
         _connect("127.0.0.2", echo.port) as wild,
         _connect("127.0.0.3", echo.port) as even,
     ):
@@ -230,8 +233,8 @@ def test_bytes_come_complete_in_order_and_not_early(echo: Echo, tmp_path: Path) 
         assert stats["127.0.0.2"]["bytes_up"] == stats["127.0.0.2"]["bytes_down"] == len(payload)
         assert stats["127.0.0.3"]["bytes_up"] == 20
         wild.shutdown(socket.SHUT_WR)
-        assert wild.recv(1) == b""  # the end comes last, both ways
-        _until(lambda: echo.ends == ["closed"], "the server sees an orderly end")
+        assert wild.recv(1) == b""  # the end arrives last, in both directions
+        _wait_until(lambda: echo.ends == ["closed"], "the server sees an orderly end")
 
 
 def test_stall_holds_the_sender_back_and_loses_nothing(echo: Echo) -> None:
@@ -257,9 +260,9 @@ def test_stall_holds_the_sender_back_and_loses_nothing(echo: Echo) -> None:
         assert _receive(connection, sent) == b"z" * sent
 
 
-def test_rate_is_kept(echo: Echo, tmp_path: Path) -> None:
-    """2 Mbit/s up: 125 kB take half a second, over however many connections."""
-    profile = _file(tmp_path, up={"rate_mbit": 2.0})
+def test_rate_is_limited(echo: Echo, tmp_path: Path) -> None:
+    """2 Mbit/s up: 125 kB take half a second over any number of connections."""
+    profile = _write_profile(tmp_path, up={"rate_mbit": 2.0})
     with (
         ImpairmentProcess({"127.0.0.2": profile}, [echo.port]),
         _connect("127.0.0.2", echo.port) as one,
@@ -277,7 +280,7 @@ def test_rate_is_kept(echo: Echo, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("command", "end"), [("cut", "closed"), ("reset", "reset")])
-def test_cut_and_reset(echo: Echo, command: str, end: str) -> None:
+def test_cut_and_reset_end_connections(echo: Echo, command: str, end: str) -> None:
     with ImpairmentProcess({"127.0.0.2": "none", "127.0.0.3": "none"}, [echo.port]) as proxy:
         hit, spared = _connect("127.0.0.2", echo.port), _connect("127.0.0.3", echo.port)
         with hit, spared:
@@ -290,15 +293,15 @@ def test_cut_and_reset(echo: Echo, command: str, end: str) -> None:
                     hit.recv(1)
             else:
                 assert hit.recv(1) == b""
-            _until(lambda: echo.ends == [end], f"the server's end is {end}")
+            _wait_until(lambda: echo.ends == [end], f"the server's end is {end}")
             spared.sendall(b"y")
             assert _receive(spared, 1) == b"y"
-            with _connect("127.0.0.2", echo.port) as again:  # the link is there for the next one
+            with _connect("127.0.0.2", echo.port) as again:  # the link accepts the next connection
                 again.sendall(b"z")
                 assert _receive(again, 1) == b"z"
 
 
-def test_roaming_leaves_the_server_in_the_dark(echo: Echo) -> None:
+def test_roaming_leaves_the_old_connection_open_at_the_server(echo: Echo) -> None:
     with (
         ImpairmentProcess({"127.0.0.2": "none"}, [echo.port]) as proxy,
         _connect("127.0.0.2", echo.port) as connection,
@@ -315,12 +318,12 @@ def test_roaming_leaves_the_server_in_the_dark(echo: Echo) -> None:
             assert echo.ends == []
 
 
-def test_nobody_listens_behind() -> None:
+def test_connection_without_a_server_is_closed() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:
         port = listening.getsockname()[1]
     with (
         ImpairmentProcess({"127.0.0.2": "none"}, [port]),
-        pytest.raises(ConnectionResetError),  # at once, or when it is used
+        pytest.raises(ConnectionResetError),  # at once, or at first use
         _connect("127.0.0.2", port) as connection,
     ):
         connection.recv(1)
@@ -329,8 +332,8 @@ def test_nobody_listens_behind() -> None:
 DATAGRAMS = 150  # they fit into the server's socket, which is read at the end
 
 
-def test_datagrams_are_lost_doubled_and_overtake(tmp_path: Path) -> None:
-    profile = _file(tmp_path, loss=0.2, duplicate=0.2, reorder=0.1, reorder_ms=30.0)
+def test_datagrams_are_lost_duplicated_and_reordered(tmp_path: Path) -> None:
+    profile = _write_profile(tmp_path, loss=0.2, duplicate=0.2, reorder=0.1, reorder_ms=30.0)
 
     def pass_through(seed: int) -> list[int]:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
@@ -343,7 +346,7 @@ def test_datagrams_are_lost_doubled_and_overtake(tmp_path: Path) -> None:
                 client.connect(("127.0.0.2", port))
                 for i in range(DATAGRAMS):
                     client.send(struct.pack("<I", i))
-                    time.sleep(0.0005)  # one by one, as a sender with a rate
+                    time.sleep(0.0005)  # one by one, as from a sender with a rate
                 server.settimeout(0.5)
                 got: list[int] = []
                 with contextlib.suppress(TimeoutError):
@@ -351,9 +354,9 @@ def test_datagrams_are_lost_doubled_and_overtake(tmp_path: Path) -> None:
                         data, peer = server.recvfrom(100)
                         got.append(struct.unpack("<I", data)[0])
                 assert got
-                server.sendto(b"down", peer)  # the other way finds its client
+                server.sendto(b"down", peer)  # the opposite direction finds its client
                 client.settimeout(0.2)
-                with contextlib.suppress(TimeoutError):  # it may be one of the lost
+                with contextlib.suppress(TimeoutError):  # it may be lost
                     assert client.recv(100) == b"down"
                 return got
 
@@ -367,13 +370,13 @@ def test_datagrams_are_lost_doubled_and_overtake(tmp_path: Path) -> None:
 
 def test_commands_and_errors(echo: Echo, tmp_path: Path) -> None:
     with ImpairmentProcess({"127.0.0.2": "none"}, [echo.port]) as proxy:
-        with pytest.raises(ImpairmentError, match="is not a command: stall, resume"):
+        with pytest.raises(ImpairmentError, match="command: stall, resume"):
             proxy.execute("explode")
-        with pytest.raises(ImpairmentError, match=r"no link 127\.0\.0\.9: there are 127\.0\.0\.2"):
+        with pytest.raises(ImpairmentError, match=r"127\.0\.0\.9: .*127\.0\.0\.2"):
             proxy.execute("stall @127.0.0.9")
         with pytest.raises(ImpairmentError, match="no profile"):
             proxy.execute("profile nice-wifi")
-        proxy.execute(f"profile {_file(tmp_path, delay_ms=20.0)}")
+        proxy.execute(f"profile {_write_profile(tmp_path, delay_ms=20.0)}")
         with _connect("127.0.0.2", echo.port) as connection:
             begin = time.monotonic()
             connection.sendall(b"x")
@@ -381,13 +384,11 @@ def test_commands_and_errors(echo: Echo, tmp_path: Path) -> None:
             assert time.monotonic() - begin >= 0.040
     with pytest.raises(ImpairmentError, match="no profile 'nice-wifi'"):
         ImpairmentProcess({"127.0.0.2": "nice-wifi"}, [echo.port])
-    with pytest.raises(
-        ImpairmentError, match=r"cannot listen on 127\.0\.0\.1: .*the session must listen on 127\.0\.0\.1 only"
-    ):
+    with pytest.raises(ImpairmentError, match=r"on 127\.0\.0\.1: .*127\.0\.0\.1 only"):
         ImpairmentProcess({"127.0.0.1": "none"}, [echo.port])
 
 
-def test_ends_with_its_parent(echo: Echo) -> None:
+def test_proxy_ends_with_its_parent(echo: Echo) -> None:
     command = [sys.executable, "-m", "iris_session.netsim.process", "--ports", str(echo.port)]
     with subprocess.Popen([*command, "--until-eof"], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None

@@ -39,6 +39,6 @@ def handover() -> mujoco.MjModel:
 
 
 @pytest.fixture(autouse=True)
-def _log_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _redirect_mujoco_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """MuJoCo writes MUJOCO_LOG.TXT into the current folder when it warns."""
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""MJCF text for the physics tests: clutter that makes contacts, and arms of every shape that `find_robots` meets."""
+"""MJCF text for the physics tests: boxes with many contacts, and every arm that `find_robots` distinguishes."""
 
 from __future__ import annotations
 

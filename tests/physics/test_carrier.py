@@ -1,4 +1,4 @@
-"""A model that carries poses of another world: its states show exactly what was put in, and can be restored."""
+"""A model that carries poses of another simulation: its states return exactly the poses set, and can be restored."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ NAMES = ("cup", "arm/link 1", "table top")
 FIRST = tuple(Pose((float(i), 0.0, 0.5), (1.0, 0.0, 0.0, 0.0)) for i in range(3))
 
 
-def shown(world: World) -> np.ndarray:
+def read_poses(world: World) -> np.ndarray:
     poses = np.zeros((len(world.bodies), 7))
     world.read_poses(poses)
     return poses
 
 
-def moved(seed: int) -> np.ndarray:
+def random_poses(seed: int) -> np.ndarray:
     poses = np.random.default_rng(seed).normal(size=(3, 7))
     poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
     return poses
@@ -31,30 +31,30 @@ def test_bodies_have_the_ids_and_first_poses_of_the_scene() -> None:
     assert [(body.id, body.name, body.moving) for body in world.bodies] == [
         (i + 1, n, True) for i, n in enumerate(NAMES)
     ]
-    assert shown(world) == pytest.approx(np.array([(*pose.p, *pose.q) for pose in FIRST]))
+    assert read_poses(world) == pytest.approx(np.array([(*pose.p, *pose.q) for pose in FIRST]))
     assert world.model.nv == 0
 
 
-def test_a_state_shows_the_poses_and_the_time_that_were_given() -> None:
+def test_state_has_the_poses_and_time_that_were_set() -> None:
     carrier = Carrier(NAMES, FIRST)
     world = World(carrier.model, (), ())
     for seed, time_s in ((1, 12.3456), (2, 0.0)):
-        world.restore_state(carrier.encode_state(time_s, moved(seed)))
-        assert np.allclose(shown(world), moved(seed), atol=1e-15)
+        world.restore_state(carrier.encode_state(time_s, random_poses(seed)))
+        assert np.allclose(read_poses(world), random_poses(seed), atol=1e-15)
         assert (world.view().tick, world.view().sim_time) == (round(time_s / TICK_S), time_s)
 
 
-def test_a_state_survives_a_snapshot_and_the_model_its_bytes() -> None:
+def test_state_and_model_survive_their_bytes() -> None:
     carrier = Carrier(NAMES, FIRST)
     world = World(carrier.model, (), ())
-    world.restore_state(carrier.encode_state(7.0, moved(3)))
+    world.restore_state(carrier.encode_state(7.0, random_poses(3)))
     again = World(decode_model(world.encode_model()), (), ())
     again.restore(world.snapshot())
     assert again.save_state() == world.save_state()
-    assert (shown(again) == shown(world)).all()
+    assert (read_poses(again) == read_poses(world)).all()
 
 
-def test_nothing_may_move() -> None:
+def test_carried_bodies_do_not_move() -> None:
     carrier = Carrier((), ())
     world = World(carrier.model, (), ())
     world.restore_state(carrier.encode_state(1.0, np.zeros((0, 7))))
@@ -62,6 +62,6 @@ def test_nothing_may_move() -> None:
 
 
 @pytest.mark.parametrize("names", [("cup", "cup"), ("world",)])
-def test_names_that_cannot_be_are_refused(names: tuple[str, ...]) -> None:
+def test_invalid_names_are_rejected(names: tuple[str, ...]) -> None:
     with pytest.raises(ModelInvalidError, match="cannot be published"):
         Carrier(names, FIRST[: len(names)])

@@ -1,4 +1,4 @@
-"""Files and bytes to models: every failure is one line that says what is wrong."""
+"""Files and bytes to models: every failure is a one-line error with its reason."""
 
 from __future__ import annotations
 
@@ -52,20 +52,20 @@ def test_errors_are_one_line(tmp_path: Path) -> None:
             load_model(tmp_path / name)
         assert text in str(caught.value)
         assert "\n" not in str(caught.value)
-    with pytest.raises(ModelInvalidError, match="these 4 bytes are no model of MuJoCo"):
+    with pytest.raises(ModelInvalidError, match="4 bytes"):
         decode_model(b"nope")
 
 
-def test_a_damaged_binary_is_one_line_and_nothing_else(
+def test_damaged_binary_is_a_one_line_error_without_a_log_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """MuJoCo prints a warning, and writes it into a file in the current folder."""
+    """MuJoCo itself prints a warning and writes it into a file in the current folder."""
     good = bytes(encode_model(clutter()))
     here = tmp_path / "here"
     here.mkdir()
     monkeypatch.chdir(here)
     heard: list[str] = []
-    mujoco.set_mju_user_warning(heard.append)  # somebody else's
+    mujoco.set_mju_user_warning(heard.append)  # of another program
     try:
         for data, reason in (
             (b"no model at all", "incomplete header|missing header"),
@@ -75,7 +75,7 @@ def test_a_damaged_binary_is_one_line_and_nothing_else(
             (good[:12] + b"\xff" + good[13:], "different MuJoCo version"),
         ):
             (tmp_path / "damaged.mjb").write_bytes(data)
-            with pytest.raises(ModelInvalidError, match=rf"^damaged.mjb: .*({reason}).*: save it again$") as caught:
+            with pytest.raises(ModelInvalidError, match=rf"^damaged.mjb: .*({reason})") as caught:
                 load_model(tmp_path / "damaged.mjb")
             assert "\n" not in str(caught.value)
             with pytest.raises(ModelInvalidError, match=reason):
@@ -88,8 +88,8 @@ def test_a_damaged_binary_is_one_line_and_nothing_else(
     assert list(here.iterdir()) == []
 
 
-def test_warnings_of_other_threads_are_not_caught(capfd: pytest.CaptureFixture[str]) -> None:
-    """A simulation that goes on while another thread loads a model."""
+def test_warnings_of_other_threads_are_not_captured(capfd: pytest.CaptureFixture[str]) -> None:
+    """One thread simulates while another loads a model."""
     model = mujoco.MjModel.from_xml_string(XML)
     data = mujoco.MjData(model)
     data.qpos[0] = np.nan
@@ -98,7 +98,7 @@ def test_warnings_of_other_threads_are_not_caught(capfd: pytest.CaptureFixture[s
         stepping.start()
         stepping.join()
         assert caught == []
-        data = mujoco.MjData(model)  # of one state MuJoCo warns once
+        data = mujoco.MjData(model)  # MuJoCo warns once per state
         data.qpos[0] = np.nan
         mujoco.mj_step(model, data)
         assert [text.startswith("Nan") for text in caught] == [True]
@@ -108,11 +108,11 @@ def test_warnings_of_other_threads_are_not_caught(capfd: pytest.CaptureFixture[s
     assert shown.err.startswith("WARNING: Nan")
 
 
-def test_names_that_are_not_text_are_said_at_once(tmp_path: Path) -> None:
-    """MuJoCo compiles them, and raises whenever somebody asks for the name."""
+def test_names_that_are_not_utf_8_are_reported_at_load(tmp_path: Path) -> None:
+    """MuJoCo compiles them and would raise when the name is read."""
     path = tmp_path / "latin.xml"
     path.write_bytes(b'<mujoco><worldbody><body name="Z\xf6e"><geom size=".1"/></body></worldbody></mujoco>')
-    with pytest.raises(ModelInvalidError, match="save the file as UTF-8"):
+    with pytest.raises(ModelInvalidError, match="as UTF-8"):
         load_model(path)
     path.write_text('<mujoco><worldbody><body name="Zöe"><geom size=".1"/></body></worldbody></mujoco>', "utf-8")
     assert load_model(path).body("Zöe").id == 1

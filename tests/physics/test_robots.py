@@ -1,4 +1,4 @@
-"""Robots found in real models and in every shape of arm and gripper that decides a rule."""
+"""Robot detection in real models and in every shape of arm and gripper that decides a rule."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.physics.models import FINGERS, GRIPPER_TENDON, arm, model, scene
 VIPERX = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate")
 
 
-def test_aloha(aloha: mujoco.MjModel) -> None:
+def test_aloha_has_two_arms(aloha: mujoco.MjModel) -> None:
     assert find_robots(aloha) == tuple(
         RobotSpec(
             name=side,
@@ -30,7 +30,7 @@ def test_aloha(aloha: mujoco.MjModel) -> None:
     )
 
 
-def test_iiwa(iiwa: mujoco.MjModel) -> None:
+def test_iiwa_has_one_arm(iiwa: mujoco.MjModel) -> None:
     assert find_robots(iiwa) == (
         RobotSpec(
             name="iiwa14",
@@ -42,7 +42,7 @@ def test_iiwa(iiwa: mujoco.MjModel) -> None:
     )
 
 
-def test_handover(handover: mujoco.MjModel) -> None:
+def test_handover_scene_has_two_arms(handover: mujoco.MjModel) -> None:
     left, right = find_robots(handover)
     assert (left.name, right.name) == ("left", "right")
     assert left.joints == tuple(f"left/joint{i}" for i in range(1, 8))
@@ -52,7 +52,7 @@ def test_handover(handover: mujoco.MjModel) -> None:
     assert left.gripper_open > left.gripper_closed
 
 
-def test_a_scene_without_robots() -> None:
+def test_scene_without_robots() -> None:
     assert find_robots(model("<mujoco><worldbody><geom size='.1'/></worldbody></mujoco>")) == ()
     assert find_robots(scene(*arm("door", joints=2))) == ()
 
@@ -69,20 +69,20 @@ def test_gripper_on_a_tendon_where_larger_ctrl_closes() -> None:
 
 @pytest.mark.parametrize(("slope", "axis", "opened"), [(1, "0 -1 0", 0.04), (-1, "0 1 0", 0.04), (1, "0 1 0", None)])
 def test_gripper_with_a_coupled_finger(slope: int, axis: str, opened: float | None) -> None:
-    """One finger is driven, the other follows by an equality; moving in parallel neither opens nor closes."""
+    """One finger is driven, the other follows by an equality; parallel motion neither opens nor closes."""
     fingers = FINGERS.replace('axis="0 -1 0" range="0 .04"', f'axis="{axis}" range="{min(0, slope) * 0.04} .04"')
     body, actuators = arm("a", end=fingers)
     equality = f'<equality><joint joint1="a/finger_r" joint2="a/finger_l" polycoef="0 {slope} 0 0 0"/></equality>'
     grip = '<position name="a/grip" joint="a/finger_l" ctrlrange="0 .04"/>'
     if opened is None:
-        with pytest.raises(AmbiguousModelError, match="which end of gripper actuator 'a/grip' is open"):
+        with pytest.raises(AmbiguousModelError, match="gripper actuator 'a/grip'"):
             find_robots(scene(body, actuators + grip, equality.replace("0 1 0 0 0", "0 1 0 0 0")))
         return
     (robot,) = find_robots(scene(body, actuators + grip, equality))
     assert (robot.gripper_open, robot.gripper_closed) == (opened, 0.0)
 
 
-def test_a_jaw_at_the_end_of_the_chain_belongs_to_the_gripper() -> None:
+def test_jaw_at_the_end_of_the_chain_belongs_to_the_gripper() -> None:
     jaw = """<site name="{p}grasp" pos="0 0 .1"/><body name="{p}moving" pos=".02 0 0">
       <joint name="{p}jaw" axis="0 1 0" range="0 1"/><geom type="box" size=".005 .01 .05" pos="0 0 .05"/></body>"""
     body, actuators = arm("so", joints=5, end=jaw)
@@ -91,12 +91,12 @@ def test_a_jaw_at_the_end_of_the_chain_belongs_to_the_gripper() -> None:
     assert len(robot.joints) == 5
     assert (robot.gripper_actuator, robot.gripper_open, robot.gripper_closed) == ("so/jaw", 1.0, 0.0)
     assert robot.finger_bodies == ("so/moving",)
-    # The same without a telling name: the site on the link before decides.
+    # The same without a descriptive name: the site on the previous link decides.
     (robot,) = find_robots(scene(body.replace("so/jaw", "so/j9"), actuators + jaw_actuator.replace("so/jaw", "so/j9")))
     assert (len(robot.joints), robot.gripper_actuator) == (5, "so/j9")
 
 
-def test_a_torso_with_two_arms_and_two_separate_arms() -> None:
+def test_torso_with_two_arms_and_two_separate_arms() -> None:
     left, right = arm("l"), arm("r", actuator="motor")
     torso = f"""<body name="torso"><joint name="yaw" axis="0 0 1"/><geom size=".1"/>{left[0]}{right[0]}</body>"""
     robots = find_robots(scene(torso, '<position name="yaw" joint="yaw"/>' + left[1] + right[1]))
@@ -105,7 +105,7 @@ def test_a_torso_with_two_arms_and_two_separate_arms() -> None:
     assert [r.name for r in robots] == ["l", "r"]
 
 
-def test_a_mobile_base_is_part_of_its_arm_and_a_camera_is_not() -> None:
+def test_mobile_base_is_part_of_its_arm_and_a_camera_is_not() -> None:
     body, actuators = arm("arm")
     camera = '<body name="cam"><joint name="pan" axis="0 0 1"/><geom size=".02"/></body>'
     cart = f"""<body name="cart"><joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>
@@ -134,21 +134,21 @@ def test_names_without_a_prefix() -> None:
 @pytest.mark.parametrize(
     ("kwargs", "extra", "text"),
     [
-        ({"end": ""}, "", "no end-effector site on its last link 'a/link3'"),
-        ({"end": '<site name="p1"/><site name="p2"/>'}, "", r"2 sites on its last link .* \(p1, p2\)"),
+        ({"end": ""}, "", "last link 'a/link3'"),
+        ({"end": '<site name="p1"/><site name="p2"/>'}, "", r"2 sites .* \(p1, p2\)"),
         ({"end": '<site name="l_tcp"/><site name="r_tcp"/><site name="x"/>'}, "", r"2 sites .* \(l_tcp, r_tcp\)"),
-        ({}, '<velocity name="twice" joint="a/j1"/>', r"joint 'a/j1' has 2 actuators \(a/a1, twice\)"),
+        ({}, '<velocity name="twice" joint="a/j1"/>', r"'a/j1' .*\(a/a1, twice\)"),
         ({"end": FINGERS}, "", ""),
         (
             {"end": FINGERS},
             '<position name="f1" joint="a/finger_l"/><position name="f2" joint="a/finger_r"/>',
-            r"2 actuators move its gripper \(f1, f2\)",
+            r"2 actuators .*\(f1, f2\)",
         ),
-        ({"end": FINGERS}, '<motor name="f1" joint="a/finger_l"/>', "gripper actuator 'f1' has no ctrlrange"),
-        ({"end": FINGERS}, '<position joint="a/finger_l" ctrlrange="0 .04"/>', "actuator 4 needs a name"),
+        ({"end": FINGERS}, '<motor name="f1" joint="a/finger_l"/>', "'f1' has no ctrlrange"),
+        ({"end": FINGERS}, '<position joint="a/finger_l" ctrlrange="0 .04"/>', "actuator 4 needs"),
     ],
 )
-def test_what_is_ambiguous_is_one_line_and_a_file_to_edit(kwargs: dict[str, str], extra: str, text: str) -> None:
+def test_ambiguous_models_are_refused_with_a_file_to_edit(kwargs: dict[str, str], extra: str, text: str) -> None:
     body, actuators = arm("a", **kwargs)  # type: ignore[arg-type]
     m = scene(body, actuators + extra)
     if not text:
@@ -158,63 +158,63 @@ def test_what_is_ambiguous_is_one_line_and_a_file_to_edit(kwargs: dict[str, str]
         find_robots(m)
     assert "\n" not in str(caught.value)
     assert str(caught.value).startswith("robot 'a': ")
-    assert '[[robot]]\nname = "a"\njoints = ["a/j0", "a/j1", "a/j2", "a/j3"]' in caught.value.toml
+    assert 'joints = ["a/j0", "a/j1", "a/j2", "a/j3"]' in caught.value.toml
 
 
-def test_the_file_in_the_error_works_once_completed() -> None:
+def test_file_in_the_error_is_valid_once_completed() -> None:
     body, actuators = arm("a", end='<site name="p1"/><site name="p2"/>')
     m = scene(body, actuators)
     with pytest.raises(AmbiguousModelError) as caught:
         find_robots(m)
-    assert "# choose one of: p1, p2" in caught.value.toml
+    assert "one of: p1, p2" in caught.value.toml
     (robot,) = load_robots_toml(caught.value.toml.replace('site = ""', 'site = "p2"'), m)
     assert robot.site == "p2"
     assert robot.base_body == "a/base"
 
 
-def test_a_hand_of_long_fingers_is_not_guessed() -> None:
+def test_hand_of_long_fingers_is_refused() -> None:
     fingers = "".join(arm(f"f{n}", joints=3, end="")[0] for n in range(2))
     acts = "".join(arm(f"f{n}", joints=3, end="")[1] for n in range(2))
     body, actuators = arm("a", end='<site name="tcp"/>' + fingers)
-    with pytest.raises(AmbiguousModelError, match="robot 'a': 6 actuators move its gripper"):
+    with pytest.raises(AmbiguousModelError, match="'a': 6 actuators"):
         find_robots(scene(body, actuators + acts))
 
 
 def test_unnamed_joints_are_refused() -> None:
     body, actuators = arm("a")
     unnamed = scene(body, actuators.replace('name="a/a2" ', ""))
-    with pytest.raises(AmbiguousModelError, match="actuator 2 needs a name of 1 to 64 characters"):
+    with pytest.raises(AmbiguousModelError, match="actuator 2 needs a name"):
         find_robots(unnamed)
 
 
-def test_a_hand_with_a_long_thumb_is_no_arm() -> None:
+def test_hand_with_a_long_thumb_is_no_arm() -> None:
     thumb = arm("thumb", joints=4, end='<site name="thumb/tip"/>')
     index = arm("index", joints=2, end="")
     body, actuators = arm("a", joints=6, end='<site name="tcp"/>' + thumb[0] + index[0])
-    with pytest.raises(AmbiguousModelError, match="robot 'a': 6 actuators move its gripper"):
+    with pytest.raises(AmbiguousModelError, match="'a': 6 actuators"):
         find_robots(scene(body, actuators + thumb[1] + index[1]))
 
 
-def test_a_three_joint_torso_carries_two_long_arms() -> None:
+def test_three_joint_torso_carries_two_long_arms() -> None:
     left, right = arm("l", joints=6), arm("r", joints=7)
     body, actuators = arm("torso", joints=3, end=left[0] + right[0])
     assert [r.name for r in find_robots(scene(body, actuators + left[1] + right[1]))] == ["l", "r"]
 
 
-def test_the_shortest_site_name_wins_among_equals() -> None:
+def test_shortest_site_name_is_preferred() -> None:
     body, actuators = arm("x", end='<site name="ee_x"/><site name="ee"/><site name="ee_y"/><site name="imu"/>')
     assert find_robots(scene(body, actuators))[0].site == "ee"
 
 
 @pytest.mark.parametrize(("joints", "name"), [("joint_{i}", "arm"), ("{p}joint_{i}", "b"), ("ur_joint_{i}", "ur")])
-def test_generic_joint_prefixes_are_no_names(joints: str, name: str) -> None:
+def test_generic_joint_prefixes_are_not_robot_names(joints: str, name: str) -> None:
     body, actuators = arm("b", joint_name=joints)
     m = scene(body.replace("b/base", "arm" if name == "arm" else "b/base"), actuators)
     assert [r.name for r in find_robots(m)] == [name]
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_a_jaw_opens_away_from_the_fixed_one(sign: int) -> None:
+def test_jaw_opens_away_from_the_fixed_jaw(sign: int) -> None:
     """Closed at 0, open at `sign` times a right angle, as on a Spot arm, whose jaw opens towards negative angles."""
     low, high = sorted((0.0, sign * 1.57))
     jaw = f"""<site name="{{p}}tcp" pos="0 0 .1"/><geom type="box" size=".005 .02 .05" pos="{-sign * 0.012} 0 .15"/>
@@ -225,7 +225,7 @@ def test_a_jaw_opens_away_from_the_fixed_one(sign: int) -> None:
     assert (robot.gripper_open, robot.gripper_closed) == (sign * 1.57, 0.0)
 
 
-# --- objects are the named free bodies that nothing drives ---
+# --- objects are the named free bodies without actuators ---
 
 
 def test_objects_of_real_scenes(handover: mujoco.MjModel, aloha: mujoco.MjModel, iiwa: mujoco.MjModel) -> None:

@@ -1,4 +1,4 @@
-"""The robots file: what it derives, and a one-line error that lists what would have been right for every mistake."""
+"""The robots file: derived fields, and a one-line error that lists the valid values for every mistake."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.physics.models import arm, scene
 
 
 @pytest.mark.parametrize("name", ["aloha", "iiwa", "handover"])
-def test_what_was_found_is_read_back(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+def test_detected_robots_round_trip(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     m = request.getfixturevalue(name)
     robots = find_robots(m)
     text = dump_robots_toml(robots)
@@ -68,9 +68,7 @@ MISTAKES = [
 
 
 @pytest.mark.parametrize(("change", "text"), MISTAKES)
-def test_every_mistake_says_what_would_have_been_right(
-    change: dict[str, str], text: str, handover: mujoco.MjModel
-) -> None:
+def test_mistakes_are_reported_with_valid_values(change: dict[str, str], text: str, handover: mujoco.MjModel) -> None:
     toml = "[[robot]]\n" + "".join(f"{k} = {v}\n" for k, v in {**GOOD, **change}.items())
     with pytest.raises(PhysicsError) as caught:
         load_robots_toml(toml, handover)
@@ -79,7 +77,7 @@ def test_every_mistake_says_what_would_have_been_right(
     assert "\n" not in str(caught.value)
 
 
-def test_two_robots_share_nothing(handover: mujoco.MjModel) -> None:
+def test_two_robots_share_no_joints_or_actuators(handover: mujoco.MjModel) -> None:
     left, right = (dict(_dumped(spec)) for spec in find_robots(handover))
     cases = [
         ({"name": left["name"]}, "name 'left' belongs to robot 'left' and to robot 'left'"),
@@ -99,21 +97,21 @@ def _dumped(spec: object) -> list[tuple[str, str]]:
     return [(k, v) for line in lines if " = " in line for k, v in [line.split(" = ", 1)]]
 
 
-def test_files_that_are_none(handover: mujoco.MjModel, tmp_path: Path) -> None:
-    with pytest.raises(RobotsFileError, match=r"robots file .*gone\.toml' cannot be read"):
+def test_invalid_files_are_rejected(handover: mujoco.MjModel, tmp_path: Path) -> None:
+    with pytest.raises(RobotsFileError, match=r"gone\.toml' cannot"):
         load_robots_toml(tmp_path / "gone.toml", handover)
     (tmp_path / "bad.toml").write_text("[[robot]\nname = 3")
     with pytest.raises(RobotsFileError, match=r"^bad\.toml: .*line 1"):
         load_robots_toml(tmp_path / "bad.toml", handover)
     for text, found in (("robot = 3", "robot"), ("[robots]\n", "robots"), ("[robot]\nname='x'", "robot")):
-        with pytest.raises(RobotsFileError, match=rf"expected only \[\[robot\]\] tables, found {found}$"):
+        with pytest.raises(RobotsFileError, match=rf"\[\[robot\]\] tables, found {found}$"):
             load_robots_toml(text, handover)
 
 
-def test_free_joints_and_strange_names() -> None:
+def test_free_joints_and_unusual_names() -> None:
     body, actuators = arm("é'", joints=3)
     m = scene(body + '<body name="b"><freejoint name="float"/><geom size=".1"/></body>', actuators)
     (robot,) = find_robots(m)
     assert load_robots_toml(dump_robots_toml([robot]), m) == (robot,)
-    with pytest.raises(RobotsFileError, match="joint 'float' is a free or ball joint"):
+    with pytest.raises(RobotsFileError, match="joint 'float' is"):
         load_robots_toml(dump_robots_toml([robot]).replace("joints = [", 'joints = ["float", '), m)

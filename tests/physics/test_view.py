@@ -1,4 +1,4 @@
-"""The live view against MuJoCo's own numbers: poses, contacts of objects, grip and its force."""
+"""The live view against MuJoCo: poses, contacts of objects, grip and its force."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import ObjectContact, WorldView
 from tests.physics.models import GRIPPER_TENDON, model
 
-#: A gripper that closes on a box which lies on a table; the plain arm `other` is a post that can be pushed over.
+#: A gripper that closes on a box on a table; the passive arm `other` is a post that can be pushed over.
 GRASP = (
     """<mujoco><compiler angle="radian"/><option timestep="0.002" cone="{cone}" gravity="0 0 -9.81"/>
   <worldbody>
@@ -62,7 +62,7 @@ def contacts_of(world: World) -> dict[str, ObjectContact]:
 
 
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
-def test_a_grasp_is_seen_with_its_force(cone: str) -> None:
+def test_grasp_is_reported_with_its_force(cone: str) -> None:
     world = grasp_world(cone)
     view: WorldView = world.view()
     for _ in range(50):
@@ -89,7 +89,7 @@ def test_a_grasp_is_seen_with_its_force(cone: str) -> None:
     assert restored.view().object_contacts() == view.object_contacts()
 
 
-def test_gripper_force_is_that_of_mj_contact_force() -> None:
+def test_gripper_force_agrees_with_mj_contact_force() -> None:
     world = grasp_world("elliptic")
     world.ctrl[3] = -20.0
     for _ in range(300):
@@ -106,7 +106,7 @@ def test_gripper_force_is_that_of_mj_contact_force() -> None:
     assert world.view().gripper_force("robot") == pytest.approx(expected, rel=1e-6)
 
 
-def test_one_finger_holds_only_when_it_is_the_only_one() -> None:
+def test_single_finger_grips_only_where_it_is_the_only_one() -> None:
     world = grasp_world("elliptic")
     m, robots, objects = world.model, find_robots(world.model), find_objects(world.model)
     push = lambda w: (w.data.qpos.__setitem__(slice(0, 3), (0.0, 0.026, 0.02)), w.restore_state(w.save_state()))  # noqa: E731
@@ -140,8 +140,8 @@ def test_objects_touch_each_other_the_world_and_cloth() -> None:
     assert "near" not in found, "within the gap, but not touching"
 
 
-def slow_contacts(world: World, robots: Sequence[RobotSpec], objects: Sequence[ObjectSpec]) -> set[tuple[str, str]]:
-    """Touching (object, body) pairs, one contact at a time."""
+def find_contacts(world: World, robots: Sequence[RobotSpec], objects: Sequence[ObjectSpec]) -> set[tuple[str, str]]:
+    """Return the touching (object, body) pairs, one contact at a time."""
     m, d = world.model, world.data
     pairs = set()
     for i in range(int(d.ncon)):
@@ -152,14 +152,14 @@ def slow_contacts(world: World, robots: Sequence[RobotSpec], objects: Sequence[O
     return pairs
 
 
-def test_contacts_match_a_plain_loop_in_the_handover_scene(handover: mujoco.MjModel) -> None:
+def test_contacts_match_a_simple_loop_in_the_handover_scene(handover: mujoco.MjModel) -> None:
     robots, objects = find_robots(handover), find_objects(handover)
     world = World(handover, robots, objects)
     seen = set()
     for k in range(600):
         world.ctrl[:7] = handover.key_ctrl[0][:7] + 0.7 * np.sin(0.01 * k) * np.array([1, 1, 0, -1, 0, 1, 0])
         world.tick()
-        pairs = slow_contacts(world, robots, objects)
+        pairs = find_contacts(world, robots, objects)
         found = {
             (c.object, other)
             for c in world.view().object_contacts()
@@ -189,18 +189,18 @@ def test_poses_and_joints(iiwa: mujoco.MjModel) -> None:
     assert view.tip_pose("iiwa14") != pose
 
 
-def test_unknown_names_are_listed(handover: mujoco.MjModel) -> None:
+def test_unknown_names_are_rejected_with_known_ones(handover: mujoco.MjModel) -> None:
     view = World(handover, find_robots(handover), find_objects(handover)).view()
-    with pytest.raises(UnknownNameError, match=r"robot 'lift' does not exist .* robots: left, right\."):
+    with pytest.raises(UnknownNameError, match=r"robot 'lift' .*: left, right\."):
         view.tip_pose("lift")
     with pytest.raises(UnknownNameError, match="robot 'lift'"):
         view.gripper_force("lift")
-    with pytest.raises(UnknownNameError, match=r"object 'nail' .* hammer, board"):
+    with pytest.raises(UnknownNameError, match=r"'nail' .* hammer, board"):
         view.object_pose("nail")
 
 
-def test_two_arms_on_a_shared_base_keep_their_contacts_apart() -> None:
-    """A robots file may give two arms the same base; each body still belongs to the arm whose joints move it."""
+def test_two_arms_on_a_shared_base_have_separate_contacts() -> None:
+    """A robots file may give two arms the same base; each body belongs to the arm whose joints move it."""
     arm = """<body name="{s}1" pos="{x} 0 1"><joint name="{s}j1" axis="0 1 0"/><geom size=".03"/>
       <body name="{s}2"><joint name="{s}j2" axis="1 0 0"/><geom size=".03"/>
       <body name="{s}3"><joint name="{s}j3" axis="0 0 1"/><geom name="{s}g" size=".05" pos="0 0 -.1"/>
@@ -268,8 +268,8 @@ def test_vertices_are_no_bodies_of_the_stream(flex_model: Any) -> None:
     assert len(names) < 30 < flex_model.nbody
 
 
-def test_a_deformed_world_is_restored_bit_for_bit(flex_model: Any) -> None:
-    """Flexes have caches outside of `mjSTATE_INTEGRATION`; nothing later may depend on them."""
+def test_deformed_world_is_restored_bit_for_bit(flex_model: Any) -> None:
+    """Flexes have caches outside of `mjSTATE_INTEGRATION`; later states must not depend on them."""
     world, other, rng = world_of(flex_model), world_of(flex_model), np.random.default_rng(3)
     for name in world.flexes.names:
         for at in slides_of(world, name):
@@ -279,7 +279,7 @@ def test_a_deformed_world_is_restored_bit_for_bit(flex_model: Any) -> None:
     saved = world.snapshot()
     for _ in range(15):
         world.tick()
-    for _ in range(5):  # another past
+    for _ in range(5):  # another history
         other.tick()
     other.restore(saved)
     for _ in range(15):
@@ -289,14 +289,14 @@ def test_a_deformed_world_is_restored_bit_for_bit(flex_model: Any) -> None:
         assert (other.flexes.read_vertices(name) == world.flexes.read_vertices(name)).all()
 
 
-def test_the_corners_that_fold_are_the_near_and_the_far_ones() -> None:
+def test_corners_to_fold_are_the_near_and_the_far_ones() -> None:
     vertices = world_of(cloth_scene().compile()).flexes.read_vertices("cloth")
     for near, far in FOLD_PAIRS:
         assert vertices[far] - vertices[near] == pytest.approx([0.0, 0.36, 0.0], abs=1e-6)
         assert abs(vertices[near][0]) == pytest.approx(0.18)
 
 
-def test_the_box_of_the_goal_is_that_of_the_scene(soft: Any) -> None:
+def test_box_of_the_goal_is_that_of_the_scene(soft: Any) -> None:
     world = world_of(soft)
     walls = {side: world.data.geom(f"box_{side}").xpos for side in ("west", "east", "south", "north")}
     thick = soft.geom("box_west").size[0]
@@ -307,7 +307,7 @@ def test_the_box_of_the_goal_is_that_of_the_scene(soft: Any) -> None:
     assert BOX_HIGH[2] == pytest.approx(walls["west"][2] + soft.geom("box_west").size[2])
 
 
-def test_who_touches_a_deformable_and_how_hard_the_gripper_holds_it(soft: Any) -> None:
+def test_contacts_and_grip_force_of_a_deformable(soft: Any) -> None:
     world = world_of(soft)
     tip = np.array(world.view().tip_pose("right").p)
     move(world, "mint", tip - world.flexes.read_vertices("mint").mean(axis=0))
@@ -322,7 +322,7 @@ def test_who_touches_a_deformable_and_how_hard_the_gripper_holds_it(soft: Any) -
     assert world.flexes.read_vertices("mint")[:, 2].mean() == pytest.approx(tip[2], abs=0.02)  # held by friction
 
 
-def test_an_unknown_deformable_says_which_there_are(soft: Any) -> None:
+def test_unknown_deformable_is_rejected_with_known_ones(soft: Any) -> None:
     world = world_of(soft)
     for ask in (world.flexes.read_vertices, world.flexes.find_touching_robots):
         with pytest.raises(UnknownNameError, match="rose"):

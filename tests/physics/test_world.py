@@ -1,4 +1,4 @@
-"""`World`: ticks equal plain `mj_step` bit for bit, and saving is invisible, in this process and in another one."""
+"""`World`: ticks equal `mj_step` bit for bit, and saving has no effect, in this process and in another one."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def state_of(m: mujoco.MjModel, d: mujoco.MjData) -> bytes:
 
 
 def drive(data: mujoco.MjData, k: int) -> None:
-    """The k-th inputs: actuators, and everything else that may be written between ticks."""
+    """Set the k-th inputs: actuators, and everything else that may be written between ticks."""
     data.ctrl[:] = np.sin(0.05 * k + np.arange(len(data.ctrl)))
     data.xfrc_applied[-2, :3] = (0.3 * np.cos(0.1 * k), 0.0, 0.2)
     data.qfrc_applied[0] = 0.1 * np.sin(0.2 * k)
@@ -54,7 +54,7 @@ def drive(data: mujoco.MjData, k: int) -> None:
 
 
 @pytest.mark.parametrize(("integrator", "option", "flag"), CASES)
-def test_ticks_are_mj_steps_bit_for_bit(integrator: str, option: str, flag: str) -> None:
+def test_ticks_equal_mj_steps_bit_for_bit(integrator: str, option: str, flag: str) -> None:
     names = {"EULER": "Euler", "RK4": "RK4"}
     m = clutter(names.get(integrator, integrator if integrator == "Euler" else integrator.lower()), option, flag)
     plain, world = mujoco.MjData(m), World(m, (), ())
@@ -94,8 +94,8 @@ def test_real_models_tick_like_mj_step_and_restore(name: str, request: pytest.Fi
     assert other.snapshot() == world.snapshot()
 
 
-def test_state_holds_every_input(handover: mujoco.MjModel) -> None:
-    """Everything that a person or a script may write into `MjData` is part of `save_state`."""
+def test_state_contains_every_input(handover: mujoco.MjModel) -> None:
+    """Everything that an application may write into `MjData` is part of `save_state`."""
     m = clutter()
     world = World(m, (), ())
     before = world.save_state()
@@ -113,8 +113,8 @@ def test_state_holds_every_input(handover: mujoco.MjModel) -> None:
 
 
 @pytest.mark.parametrize(("integrator", "option", "flag"), CASES)
-def test_restore_is_invisible(integrator: str, option: str, flag: str) -> None:
-    """A world saved and restored after every 37th tick, and one restored elsewhere, stay equal to an untouched one."""
+def test_restore_has_no_effect_on_later_ticks(integrator: str, option: str, flag: str) -> None:
+    """A world saved and restored every 37 ticks, and one restored elsewhere, stay equal to an untouched one."""
     names = {"EULER": "Euler", "RK4": "RK4"}
     m = clutter(names.get(integrator, integrator if integrator == "Euler" else integrator.lower()), option, flag)
     objects = find_objects(m)
@@ -197,7 +197,7 @@ def test_another_process_continues_bit_for_bit(handover: mujoco.MjModel, tmp_pat
     assert output.strip() == hashlib.blake2b(world.snapshot()).hexdigest()
 
 
-def test_derived_quantities_belong_to_the_new_state() -> None:
+def test_derived_quantities_follow_the_new_state() -> None:
     m = clutter()
     world = World(m, (), find_objects(m))
     for _ in range(150):
@@ -214,7 +214,7 @@ def test_derived_quantities_belong_to_the_new_state() -> None:
     assert (out[:, 3:] == fresh.xquat[1:]).all()
 
 
-def test_reset_takes_home_then_the_first_keyframe_then_the_default(aloha: mujoco.MjModel) -> None:
+def test_reset_uses_home_then_the_first_keyframe_then_the_default(aloha: mujoco.MjModel) -> None:
     xml = """<mujoco><worldbody><body><joint/><geom size=".1"/></body></worldbody>{}</mujoco>"""
     keys = '<keyframe><key name="up" qpos="1"/><key name="home" qpos="2" time="3"/></keyframe>'
     world = World(model(xml.format(keys)), (), ())
@@ -229,7 +229,7 @@ def test_reset_takes_home_then_the_first_keyframe_then_the_default(aloha: mujoco
     assert world.view().tick == 0
     assert World(model(xml.format(keys)), (), (), keyframe="up").data.qpos[0] == 1.0
     assert World(model(xml.format("")), (), ()).data.qpos[0] == 0.0
-    with pytest.raises(UnknownNameError, match=r"keyframe 'down' does not exist .* Available keyframes: up, home\."):
+    with pytest.raises(UnknownNameError, match=r"keyframe 'down' .*: up, home\."):
         World(model(xml.format(keys)), (), (), keyframe="down")
     assert (World(aloha, (), ()).data.qpos == aloha.key_qpos[0]).all()
 
@@ -278,12 +278,12 @@ def test_robot_infos(handover: mujoco.MjModel) -> None:
     assert np.allclose(body + turned, tip.p, atol=1e-12)
 
 
-def test_divergence_is_a_typed_error_until_reset() -> None:
+def test_divergence_raises_until_reset() -> None:
     m = clutter()
     world = World(m, (), ())
     good = world.snapshot()
     world.data.qvel[3] = 1e14
-    with pytest.raises(SimulationDivergedError, match=r"diverged at tick 1 .*huge"):
+    with pytest.raises(SimulationDivergedError, match=r"at tick 1 .*huge"):
         world.tick()
     with pytest.raises(SimulationDivergedError):
         world.tick()
@@ -314,7 +314,7 @@ def pile(memory: str) -> mujoco.MjModel:
     return model(f'<mujoco><size memory="{memory}"/><worldbody>{plane}{boxes}</worldbody></mujoco>')
 
 
-def test_full_memory_is_counted() -> None:
+def test_exhausted_memory_is_counted() -> None:
     world = World(pile("300K"), (), ())
     world.tick()
     assert sum(world.dropped_counts.values()) > 0
@@ -323,7 +323,7 @@ def test_full_memory_is_counted() -> None:
     assert world.diverged == ""
 
 
-def test_memory_that_is_too_small_for_a_tick_is_a_typed_error() -> None:
+def test_memory_too_small_for_a_tick_raises() -> None:
     errors: list[str] = []
     for kilobytes in range(20, 170, 10):
         try:
@@ -334,11 +334,11 @@ def test_memory_that_is_too_small_for_a_tick_is_a_typed_error() -> None:
     assert all("out of memory" in text and "\n" not in text for text in errors)
 
 
-def test_snapshots_of_others_are_refused(handover: mujoco.MjModel) -> None:
+def test_foreign_snapshots_are_rejected(handover: mujoco.MjModel) -> None:
     world = World(clutter(), (), ())
     with pytest.raises(SnapshotError, match="no world snapshot"):
         world.restore(b"nonsense")
-    with pytest.raises(SnapshotError, match=r"snapshot of scene [0-9a-f]{32}, but this world is scene"):
+    with pytest.raises(SnapshotError, match=r"of scene [0-9a-f]{32}, "):
         world.restore(World(handover, (), ()).snapshot())
     with pytest.raises(SnapshotError, match="state of 8 bytes"):
         world.restore_state(bytes(8))
@@ -347,17 +347,17 @@ def test_snapshots_of_others_are_refused(handover: mujoco.MjModel) -> None:
     with pytest.raises(SimulationDivergedError, match="not finite"):
         world.restore_state(state.tobytes())
     with_robots = World(handover, find_robots(handover), ())
-    with pytest.raises(SnapshotError, match="0 robots, but this world has 2"):
+    with pytest.raises(SnapshotError, match=r"0 robots, .* 2"):
         with_robots.restore(World(handover, (), ()).snapshot())
 
 
-def test_unknown_object_body_is_refused() -> None:
-    with pytest.raises(UnknownNameError, match=r"object 'x': body 'nope' does not exist .*box0, box1"):
+def test_unknown_object_body_is_rejected() -> None:
+    with pytest.raises(UnknownNameError, match=r"object 'x': body 'nope' .*box0, box1"):
         World(clutter(), (), (ObjectSpec("x", "nope"),))
 
 
 @pytest.mark.skipif(not SLEEPS, reason="this MuJoCo has no sleeping islands")
-def test_sleeping_islands_are_refused() -> None:
+def test_sleeping_islands_are_rejected() -> None:
     m = clutter(flag='<flag sleep="enable"/>')
     with pytest.raises(ModelUnsupportedError, match="sleeping islands"):
         World(m, (), ())
@@ -375,10 +375,10 @@ def test_scene_hash_does_not_depend_on_the_folder(data_dir: Path, tmp_path: Path
     assert World(clutter(), (), ()).scene_hash != first.scene_hash
 
 
-# --- a user's loop ----------------------------------------------------------------------------------------------------
+# --- user loop --------------------------------------------------------------------------------------------------------
 
 
-def test_a_twin_shows_the_new_state_of_a_users_data(handover: mujoco.MjModel) -> None:
+def test_twin_shows_the_new_state_of_user_data(handover: mujoco.MjModel) -> None:
     robots, objects = find_robots(handover), find_objects(handover)
     user = mujoco.MjData(handover)
     mujoco.mj_resetDataKeyframe(handover, user, 0)
@@ -398,7 +398,7 @@ def test_a_twin_shows_the_new_state_of_a_users_data(handover: mujoco.MjModel) ->
     assert view.object_contacts() == expected.object_contacts() != ()
 
 
-def test_nothing_belongs_to_two_robots(handover: mujoco.MjModel) -> None:
+def test_actuators_and_bodies_belong_to_one_robot(handover: mujoco.MjModel) -> None:
     left, right = find_robots(handover)
     (hammer, *_) = find_objects(handover)
     for change, named in (
@@ -411,12 +411,12 @@ def test_nothing_belongs_to_two_robots(handover: mujoco.MjModel) -> None:
             World(handover, (left, msgspec.structs.replace(right, **change)), ())
     with pytest.raises(SpecError, match="belongs to object"):
         World(handover, (), (hammer, ObjectSpec("again", hammer.body)))
-    with pytest.raises(UnknownNameError, match=r"robot 'left': body 'left/fingr'.*Available bodies: .*left"):
+    with pytest.raises(UnknownNameError, match=r"'left': body 'left/fingr'.*: .*left"):
         World(handover, (msgspec.structs.replace(left, finger_bodies=("left/fingr",)),), ())
 
 
-def test_a_shown_state_is_a_function_of_its_bytes(handover: mujoco.MjModel) -> None:
-    """What an open session shows does not depend on what was shown before, and keeps the bytes it was given."""
+def test_shown_state_depends_only_on_its_bytes(handover: mujoco.MjModel) -> None:
+    """The state of an open session does not depend on earlier states, and its bytes are kept."""
     robots, objects = find_robots(handover), find_objects(handover)
     source = World(handover, robots, objects)
     states = []
@@ -438,3 +438,19 @@ def test_a_shown_state_is_a_function_of_its_bytes(handover: mujoco.MjModel) -> N
     single.tick()
     source.tick()
     assert single.save_state() == source.save_state()
+
+
+def test_states_are_given_to_mujoco_as_arrays_that_it_may_write(monkeypatch: pytest.MonkeyPatch) -> None:
+    """MuJoCo 3.3 refuses others."""
+    world = World(clutter(), (), ())
+    state, put = world.save_state(), mujoco.mj_setState
+
+    def strict(m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray, kind: int) -> None:
+        assert values.flags.writeable
+        put(m, d, values, kind)
+
+    monkeypatch.setattr(mujoco, "mj_setState", strict)
+    data = world.make_initial_data(state)
+    assert np.array_equal(data.qpos, world.data.qpos)
+    world.restore_state(state)
+    world.restore(world.snapshot())

@@ -1,4 +1,4 @@
-"""The trust boundary: round trips, and bytes of strangers end in a typed error, never in another one."""
+"""The trust boundary: round trips, and typed errors for any foreign bytes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iris_session.codegen.examples import extreme, full, least
+from iris_session.codegen.examples import make_extreme, make_full, make_least
 from iris_session.protocol import codec
 from iris_session.protocol.client_messages import Acquire, Bye, ClientEnvelope, Hello, Sample, wrap_message
 from iris_session.protocol.common import Pose, Target
@@ -33,7 +33,7 @@ from iris_session.protocol.limits import (
 from iris_session.protocol.server_messages import Event, Presence, ProtocolFault, ServerEnvelope, StateHeader
 
 pack = msgspec.msgpack.encode
-MAKES = (full, least, extreme)
+MAKES = (make_full, make_least, make_extreme)
 BYE = b"\x94\x01\x00\xa0\x82\xa4type\xa3bye"
 
 
@@ -70,13 +70,13 @@ def test_state_channel_round_trips(make: object) -> None:
 
 
 def test_beacon_round_trips() -> None:
-    beacon = msgspec.structs.replace(full(Beacon), protocol=1)
+    beacon = msgspec.structs.replace(make_full(Beacon), protocol=1)
     assert codec.decode_beacon(codec.encode_beacon(beacon)) == beacon
 
 
 def test_introduction_round_trips_and_waits_for_its_end() -> None:
-    beacon = msgspec.structs.replace(full(Beacon), protocol=1)
-    introduction = msgspec.structs.replace(full(Introduction), beacon=beacon)
+    beacon = msgspec.structs.replace(make_full(Beacon), protocol=1)
+    introduction = msgspec.structs.replace(make_full(Introduction), beacon=beacon)
     data = codec.encode_introduction(introduction)
     assert codec.decode_introduction(data) == introduction
     assert codec.decode_introduction(bytearray(data)) == introduction
@@ -91,10 +91,10 @@ def test_introduction_round_trips_and_waits_for_its_end() -> None:
 
 
 @given(st.binary(max_size=200))
-def test_no_bytes_on_the_port_of_the_introduction_raise_anything_else(data: bytes) -> None:
-    for said in (data, len(data).to_bytes(4, "big") + data):
+def test_introduction_bytes_raise_protocol_errors_only(data: bytes) -> None:
+    for data_or_frame in (data, len(data).to_bytes(4, "big") + data):
         try:
-            codec.decode_introduction(said)
+            codec.decode_introduction(data_or_frame)
         except ProtocolError:
             continue
 
@@ -108,7 +108,7 @@ def test_non_finite_floats_pass_to_the_authority() -> None:
     assert decoded.message.pose.p[1:] == (math.inf, -math.inf)
 
 
-def test_unknown_names_and_fields_pass() -> None:
+def test_unknown_names_and_fields_are_accepted() -> None:
     data = pack([1, 0, "", {"type": "hello", "role": "juggler", "name": "A", "hat": {"colour": [1, 2]}}, "more"])
     assert codec.decode_client(data).message == Hello(role="juggler", name="A")
 
@@ -118,17 +118,17 @@ def test_unknown_names_and_fields_pass() -> None:
     [
         (b"", "truncated"),
         (b"\xc1", "no envelope"),
-        (pack({"version": 1}), "expected a MessagePack array"),
-        (pack("hello"), "expected a MessagePack array"),
+        (pack({"version": 1}), "MessagePack array"),
+        (pack("hello"), "MessagePack array"),
         (pack([]), "no envelope"),
         (pack([1.5, 0, "", {"type": "bye"}]), "no envelope"),
         (pack([1, 0, ""]), "length 4"),
         (pack([1, 0, "", 5]), "Expected `object`, got `int`"),
-        (pack([1, 0, "", {"type": "teleport"}]), "unknown message type 'teleport', expected one of hello, bye"),
-        (pack([1, 0, "", {"type": "welcome"}]), "unknown message type 'welcome'"),
-        (pack([1, 0, "", {"reason": "x"}]), "missing required field `type`"),
+        (pack([1, 0, "", {"type": "teleport"}]), "type 'teleport', .*hello, bye"),
+        (pack([1, 0, "", {"type": "welcome"}]), "type 'welcome'"),
+        (pack([1, 0, "", {"reason": "x"}]), "field `type`"),
         (pack([1, 0, "", {"type": 7}]), r"Expected `str`, got `int` - at `\$\[3\].type`"),
-        (pack([1, 0, "", {"type": "clock_ping"}]), "clock_ping: Object missing required field `t0_ns`"),
+        (pack([1, 0, "", {"type": "clock_ping"}]), "clock_ping: .*`t0_ns`"),
         (pack([1, 0, "", {"type": "clock_ping", "t0_ns": 1.5}]), "Expected `int`, got `float`"),
         (pack([1, 0, "", {"type": "clock_ping", "t0_ns": 2**63}]), "<= 9223372036854775807"),
         (pack([1, -1, "", {"type": "bye"}]), ">= 0"),
@@ -144,7 +144,7 @@ def test_unknown_names_and_fields_pass() -> None:
         (BYE + b"\x05\xa1z", "Expected `str`, got `int`"),
     ],
 )
-def test_malformed_messages_say_what_is_wrong(data: bytes, match: str) -> None:
+def test_malformed_messages_name_the_fault(data: bytes, match: str) -> None:
     with pytest.raises(MalformedError, match=match) as caught:
         codec.decode_client(data)
     assert caught.value.code == "malformed"
@@ -152,20 +152,20 @@ def test_malformed_messages_say_what_is_wrong(data: bytes, match: str) -> None:
 
 def test_unknown_event_and_server_type_are_named() -> None:
     event = {"type": "event", "event_seq": 1, "step": 1, "session_time": 1, "body": {"event": "fireworks"}}
-    with pytest.raises(MalformedError, match="unknown event 'fireworks', expected one of participant_joined"):
+    with pytest.raises(MalformedError, match=r"event 'fireworks', .*participant_joined"):
         codec.decode_server(pack([1, 0, event]))
-    with pytest.raises(MalformedError, match="missing required field `event`"):
+    with pytest.raises(MalformedError, match="field `event`"):
         codec.decode_server(pack([1, 0, {**event, "body": {}}]))
-    with pytest.raises(MalformedError, match="unknown message type 'hello', expected one of welcome"):
+    with pytest.raises(MalformedError, match=r"type 'hello', .*welcome"):
         codec.decode_server(pack([1, 0, {"type": "hello"}]))
 
 
 @pytest.mark.parametrize("version", [0, 2, -1, 2**64 - 1])
-def test_other_versions_are_told_whatever_their_schema(version: int) -> None:
+def test_other_versions_are_reported_before_the_schema(version: int) -> None:
     for rest in ([{"x": 1}], [0, "", {"type": "bye"}], [0, "", {"type": "new"}], [None] * 9):
         data = pack([version, *rest])
         assert codec.peek_version(data) == version
-        with pytest.raises(ProtocolVersionError, match=f"protocol version {version}, this side speaks 1") as caught:
+        with pytest.raises(ProtocolVersionError, match=f"version {version}, .* 1") as caught:
             codec.decode_client(data)
         assert caught.value.version == version
         assert caught.value.code == "version"
@@ -173,15 +173,15 @@ def test_other_versions_are_told_whatever_their_schema(version: int) -> None:
         codec.decode_server(pack([version, 0, {"type": "clock_pong", "t0_ns": 1, "t1_ns": 2, "t2_ns": 3}]))
 
 
-def test_peek_version_refuses_what_is_no_envelope() -> None:
-    with pytest.raises(MalformedError, match="starts with the version"):
+def test_peek_version_rejects_other_bytes() -> None:
+    with pytest.raises(MalformedError, match="the version"):
         codec.peek_version(pack({"version": 1}))
 
 
 @pytest.mark.parametrize("tag", codec.CLIENT_TYPES)
-def test_each_type_has_its_size(tag: str) -> None:
+def test_size_limit_of_each_type(tag: str) -> None:
     kind = codec.CLIENT_TYPES[tag]
-    message = msgspec.to_builtins(least(kind), builtin_types=(bytes,))
+    message = msgspec.to_builtins(make_least(kind), builtin_types=(bytes,))
     limit = LIMITS[kind].max_bytes
 
     def padded(size: int) -> bytes:
@@ -198,7 +198,7 @@ def test_each_type_has_its_size(tag: str) -> None:
     assert caught.value.code == "too_large"
 
 
-def test_no_message_may_be_larger_than_the_largest() -> None:
+def test_size_limit_of_all_messages() -> None:
     with pytest.raises(TooLargeError, match=f"at most {MAX_CLIENT_BYTES}"):
         codec.decode_client(b"\0" * (MAX_CLIENT_BYTES + 1))
     with pytest.raises(TooLargeError):
@@ -207,7 +207,7 @@ def test_no_message_may_be_larger_than_the_largest() -> None:
         codec.decode_server(pack([1, 0, {"type": "clock_pong", "t0_ns": 1, "t1_ns": 2, "t2_ns": 3, "z": b"x" * 600}]))
 
 
-def test_the_largest_honest_sample_fits() -> None:
+def test_largest_valid_sample_fits() -> None:
     """Full hands, a leader of 64 joints and two targets, names of 16 characters."""
     value = 1.2345678901234567
     pose = Pose((value,) * 3, (value,) * 4)
@@ -270,7 +270,7 @@ values = st.recursive(
 @settings(max_examples=300, deadline=None)
 @given(st.sampled_from(sorted(codec.CLIENT_TYPES)), st.data())
 def test_random_fields_raise_protocol_errors_only(tag: str, data: st.DataObject) -> None:
-    message = msgspec.to_builtins(full(codec.CLIENT_TYPES[tag]), builtin_types=(bytes,))
+    message = msgspec.to_builtins(make_full(codec.CLIENT_TYPES[tag]), builtin_types=(bytes,))
     for name in data.draw(st.sets(st.sampled_from(sorted(message)), max_size=3)):
         message[name] = data.draw(values)
     decode_all(pack([data.draw(st.just(1) | values), data.draw(st.just(1) | values), "", message]))
@@ -283,13 +283,13 @@ def test_random_fields_raise_protocol_errors_only(tag: str, data: st.DataObject)
     st.integers(0, 3),
 )
 def test_damaged_messages_raise_protocol_errors_only(tag: str, flips: list[tuple[int, int]], cut: int) -> None:
-    data = bytearray(pack(wrap_message(extreme(codec.CLIENT_TYPES[tag]), 1)))
+    data = bytearray(pack(wrap_message(make_extreme(codec.CLIENT_TYPES[tag]), 1)))
     for at, value in flips:
         data[at % len(data)] = value
     decode_all(bytes(data[: len(data) - cut]))
 
 
-def test_long_texts_of_strangers_are_cut() -> None:
+def test_long_foreign_texts_are_truncated() -> None:
     with pytest.raises(MalformedError) as caught:
         codec.decode_client(pack([1, 0, "", {"type": "é" * 5000}]))
     assert len(str(caught.value)) <= 400
@@ -303,34 +303,32 @@ def test_equal_values_give_equal_bytes() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "says"),
+    ("given", "expected"),
     [
-        ({"frames": 3}, "int: bytes are expected"),
-        ({"frames": "text"}, "str: bytes are expected"),
-        ({"frames": {"full": None}}, "NoneType: bytes are expected"),
+        ({"frames": 3}, "int: bytes"),
+        ({"frames": "text"}, "str: bytes"),
+        ({"frames": {"full": None}}, "NoneType: bytes"),
         ({"frames": {"half": b""}}, "has class 'full'"),
         ({"frames": array("d", bytes(MAX_MEDIA_FRAME_BYTES + 8))}, f"at most {MAX_MEDIA_FRAME_BYTES}"),
-        ({"stream": 3}, "3 cannot be the name"),
+        ({"stream": 3}, "^3 "),
         ({"capture_ns": "now"}, "capture_ns 'now'"),
         ({"capture_ns": 0.5}, "capture_ns 0.5"),
         ({"capture_ns": 10**30}, "capture_ns 1000"),
         ({"encoding": 3}, "encoding 3"),
     ],
 )
-def test_media_that_no_front_would_take_are_refused_where_they_are_handed_in(
-    given: dict[str, object], says: str
-) -> None:
-    """Else the call says that it was published, and nobody gets it."""
+def test_invalid_media_are_rejected_at_publishing(given: dict[str, object], expected: str) -> None:
+    """Otherwise the call would succeed and no front would accept the frame."""
     good = {"stream": "cloud", "frames": b"points", "capture_ns": 5, "scene_epoch": 1, "encoding": "bytes"}
     header, *data = codec.encode_media_frames(**good)  # type: ignore[arg-type]
     assert codec.decode_media_push(header).stream == "cloud"
     assert data == [b"points"]
-    with pytest.raises(ValueError, match=says):
+    with pytest.raises(ValueError, match=expected):
         codec.encode_media_frames(**(good | given))  # type: ignore[arg-type]
 
 
-def test_media_in_arrays_are_bytes_in_their_order() -> None:
-    """As a picture that was turned upside down is, which lies in memory in pieces: no socket takes it so."""
+def test_media_arrays_are_encoded_in_row_order() -> None:
+    """A flipped picture is not contiguous in memory; sockets need contiguous bytes."""
     rows = np.arange(6, dtype=np.uint8).reshape(3, 2)
     frames = {"full": rows[::-1], "half": array("H", [1, 2])}
     _, *data = codec.encode_media_frames("cloud", frames, 5, 1, "bytes")  # type: ignore[arg-type]

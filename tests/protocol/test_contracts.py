@@ -1,4 +1,4 @@
-"""Entries and decisions survive their journal exactly; a fixed view is a `WorldView`; wire and journal names agree."""
+"""Entries and decisions round-trip through the journal; a fixed view is a `WorldView`; wire and journal names agree."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import get_args
 import msgspec
 import pytest
 
-from iris_session.codegen.examples import extreme, full, least
+from iris_session.codegen.examples import make_extreme, make_full, make_least
 from iris_session.protocol import entries, specs, steps
 from iris_session.protocol.client_messages import Bye, ClientMessage, Hello, Sample
 from iris_session.protocol.codec import decode_server, encode_server
@@ -35,9 +35,9 @@ PROPOSAL = entries.AlignmentProposal(
 )
 
 
-@pytest.mark.parametrize("make", [full, least, extreme])
+@pytest.mark.parametrize("make", [make_full, make_least, make_extreme])
 @pytest.mark.parametrize("kind", [kind for kind in get_args(entries.EntryMessage) if kind in WIRE])
-def test_client_messages_survive_as_entries(kind: type[msgspec.Struct], make: object) -> None:
+def test_client_messages_round_trip_as_entries(kind: type[msgspec.Struct], make: object) -> None:
     entry = Entry(1, 2, 3, make(kind))  # type: ignore[operator]
     assert decode_entry(encode_entry(entry)) == entry
 
@@ -59,25 +59,34 @@ def test_client_messages_survive_as_entries(kind: type[msgspec.Struct], make: ob
     ],
     ids=lambda message: type(message).__name__,
 )
-def test_internal_messages_survive_as_entries(message: entries.EntryMessage) -> None:
+def test_internal_messages_round_trip_as_entries(message: entries.EntryMessage) -> None:
     batch = [Entry(entries.HOST, 0, 5, message), Entry(2, 2, 6, Bye())]
     assert decode_entries(encode_entries(batch)) == batch
     assert encode_entries(decode_entries(encode_entries(batch))) == encode_entries(batch)
 
 
-def test_every_internal_message_was_tried() -> None:
+def test_every_internal_message_is_covered() -> None:
     names = {"Join", "Lost", "AlignmentProposal", "ExternalReset", "StalledGap", "FrontRestarted", "RecordingGap"}
-    names |= {"Audit", "SessionResumed", "AlignmentAlarm", "CrossChecked", "SceneLoaded", "ScenePatched"}
+    names |= {
+        "Audit",
+        "SessionResumed",
+        "AlignmentAlarm",
+        "CrossChecked",
+        "SceneLoaded",
+        "ScenePatched",
+        "OwnerListens",
+        "PhysicsDiverged",
+    }
     assert {kind.__name__ for kind in INTERNAL} == names
 
 
-def test_a_client_cannot_speak_as_the_front() -> None:
-    """No tag of an internal message is one of the wire: what decodes at the front is never a `join` or `lost`."""
+def test_client_cannot_send_internal_messages() -> None:
+    """No tag of an internal message is one of the wire: the front never decodes a `join` or `lost`."""
     wire = {kind.__struct_config__.tag for kind in WIRE}
     assert not wire & {kind.__struct_config__.tag for kind in INTERNAL}
 
 
-def test_secrets_do_not_reach_the_journal() -> None:
+def test_secrets_are_not_in_the_journal() -> None:
     assert Hello not in get_args(entries.EntryMessage)
     for kind in get_args(entries.EntryMessage):
         assert not {"secret", "resume_token", "join_code"} & set(kind.__struct_fields__)
@@ -96,7 +105,7 @@ def test_urgent_messages_are_entries() -> None:
     assert Sample not in entries.URGENT
 
 
-def test_decision_survives_its_digest_bytes() -> None:
+def test_decision_digest_bytes_round_trip() -> None:
     source = steps.CommandSource("p1", "controller/right", 1, 2, 3, 4, pose_world=IDENTITY)
     decision = steps.Decision(
         commands=(

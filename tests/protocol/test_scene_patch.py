@@ -1,4 +1,4 @@
-"""Visual changes: applied whole or not at all, and merged without a difference."""
+"""Visual patches: atomic, and merged patches equal their sequence."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ SPEC = SceneSpec(
 )
 
 
-def test_a_patch_changes_what_it_names_and_nothing_else() -> None:
+def test_patch_changes_only_what_it_names() -> None:
     ops: list[PatchOp] = [
         SetVisual(1, rgba=RED),
         SetVisual(2, group=4, T_body_visual=UP),
@@ -56,18 +56,18 @@ def test_a_patch_changes_what_it_names_and_nothing_else() -> None:
 
 
 @pytest.mark.parametrize(
-    ("ops", "said"),
+    ("ops", "expected"),
     [
         ([SetVisual(1, rgba=RED), SetVisual(7, rgba=RED)], "no visual 7"),
         ([RemoveVisual(7)], "no visual 7"),
         ([AddVisual(box(2))], "already"),
-        ([AddVisual(box(9, material=1))], "reference to material 1, but there are 1"),
-        ([AddVisual(box(9, body=5))], "on body 5: no such body"),
+        ([AddVisual(box(9, material=1))], "material 1, .* 1"),
+        ([AddVisual(box(9, body=5))], "body 5"),
         ([RemoveVisual(1), SetVisual(1, rgba=RED)], "no visual 1"),
     ],
 )
-def test_what_does_not_fit_is_said_and_changes_nothing(ops: list[PatchOp], said: str) -> None:
-    with pytest.raises(SceneError, match=said):
+def test_invalid_patch_raises(ops: list[PatchOp], expected: str) -> None:
+    with pytest.raises(SceneError, match=expected):
         apply_patch(SPEC, ops)
 
 
@@ -82,9 +82,9 @@ OPS = st.one_of(
 
 
 @given(st.lists(OPS, max_size=12))
-def test_merged_patches_do_what_they_did_one_by_one(wished: list[PatchOp]) -> None:
+def test_merged_patches_equal_their_sequence(ops: list[PatchOp]) -> None:
     spec, done = SPEC, ()
-    for op in wished:
+    for op in ops:
         try:
             spec = apply_patch(spec, [op])
         except SceneError:

@@ -1,4 +1,4 @@
-"""Mirror of the session: snapshot plus events in any delivery give what the session has."""
+"""Mirror of the session: a snapshot and events in any delivery order give the state of the session."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from iris_session.protocol.server_messages import (
     Event,
     EventKind,
     LeaseChanged,
+    LeasesChanged,
     Notice,
     ParticipantChanged,
     ParticipantInfo,
@@ -37,10 +38,18 @@ bodies = st.one_of(
     st.builds(lambda p: ParticipantChanged(ParticipantInfo(p, "bob", "observer", True)), names),
     st.builds(ParticipantLeft, names, st.just("silent"), flags),
     st.builds(lambda p, v: LeaseChanged(Lease("left", "robot", "exclusive", p, v), "acquired"), names, counts),
+    st.builds(
+        lambda p, v, w: LeasesChanged(
+            (Lease("left", "robot", "exclusive", p, v), Lease("right", "robot", "exclusive", p, w)), "released", (p, p)
+        ),
+        names,
+        counts,
+        counts,
+    ),
     st.builds(lambda p, v: AlignmentChanged(p, Alignment(v, "measured", IDENTITY)), names, counts),
     st.builds(ScaleChanged, st.sampled_from(["left", "gone"]), st.sampled_from([0.1, 1.0]), names),
     st.builds(SceneChanged, counts, counts, st.just("reset"), tick_period_ns=st.sampled_from([0, 1_000_000])),
-    st.builds(EStopChanged, flags, names),
+    st.builds(EStopChanged, flags, names, st.just(""), counts),
     st.builds(PauseChanged, flags),
     st.builds(EpisodeChanged, counts, st.sampled_from(["running", "success"])),
     st.just(Notice("info", "hello")),
@@ -52,13 +61,14 @@ def event(seq: int, body: EventKind) -> Event:
 
 
 def snapshot(mirror: SessionMirror | None = None) -> Snapshot:
-    """What the session would send now, if `mirror` is what the session has."""
+    """Return the snapshot of a session whose state is `mirror`."""
     if mirror is None:
         return Snapshot(0, 0, 1, 0, "hash", 0, 0.0, 0, (), (), bodies=BODIES)
     return Snapshot(
         0, mirror.event_seq, mirror.scene_epoch, mirror.scene_revision, mirror.scene_hash, 0, 0.0, 0,
         tuple(mirror.participants.values()), tuple(mirror.leases.values()), tuple(mirror.robots.values()),
         mirror.bodies, mirror.paused, mirror.estop, mirror.episode, tick_period_ns=mirror.tick_period_ns,
+        stop_seq=mirror.stop_seq,
     )  # fmt: skip
 
 
@@ -68,7 +78,7 @@ def synced() -> SessionMirror:
     return mirror
 
 
-def test_the_scale_of_a_robot_is_followed_until_its_lease_changes() -> None:
+def test_scale_of_a_robot_is_kept_until_its_lease_changes() -> None:
     mirror = synced()
     lease = Lease("left", "robot", "exclusive", "p1", 3)
     for seq, body, scale in (
@@ -84,7 +94,7 @@ def test_the_scale_of_a_robot_is_followed_until_its_lease_changes() -> None:
 
 @given(st.lists(bodies, max_size=30), st.data())
 @settings(max_examples=150, deadline=None)
-def test_any_joining_moment_and_any_loss_end_in_the_same_state(kinds: list[EventKind], data: st.DataObject) -> None:
+def test_any_join_time_and_any_loss_give_the_same_state(kinds: list[EventKind], data: st.DataObject) -> None:
     events = [event(i + 1, kind) for i, kind in enumerate(kinds)]
     truth = synced()
     joined_at = data.draw(st.integers(0, len(events)))
@@ -106,7 +116,7 @@ def test_any_joining_moment_and_any_loss_end_in_the_same_state(kinds: list[Event
     assert lossy.mirror_hash() == truth.mirror_hash()
 
 
-def test_gap_waits_for_a_snapshot_and_goes_on_with_what_came_meanwhile() -> None:
+def test_gap_waits_for_a_snapshot_and_continues_with_later_events() -> None:
     mirror, truth = synced(), synced()
     events = [event(i, EStopChanged(i % 2 == 1, f"p{i}")) for i in range(1, 6)]
     mirror.apply_event(events[0])
@@ -116,8 +126,8 @@ def test_gap_waits_for_a_snapshot_and_goes_on_with_what_came_meanwhile() -> None
     mirror.apply_event(events[3])
     for one in events[:3]:
         truth.apply_event(one)
-    told = mirror.apply_snapshot(snapshot(truth))
-    assert told == [MissedEvents(2, 2), events[2], events[3]], "event 3 was in the snapshot, and came"
+    delivered = mirror.apply_snapshot(snapshot(truth))
+    assert delivered == [MissedEvents(2, 2), events[2], events[3]], "event 3 was in the snapshot, and came"
     assert mirror.synced
     assert mirror.event_seq == 4
     assert mirror.discarded == 0
@@ -125,33 +135,33 @@ def test_gap_waits_for_a_snapshot_and_goes_on_with_what_came_meanwhile() -> None
 
 @given(st.lists(st.sampled_from(["come", "lost", "twice", "snapshot"]), max_size=60), st.integers(0, 5))
 @settings(max_examples=300, deadline=None)
-def test_every_event_since_the_first_snapshot_is_handed_out_or_told_as_missed(fates: list[str], before: int) -> None:
-    """Exactly once, in order, whatever is lost or comes again, and whenever a snapshot comes."""
+def test_every_event_after_the_first_snapshot_is_delivered_or_reported_missed(fates: list[str], before: int) -> None:
+    """In order, at any loss, repetition and timing of snapshots."""
     mirror, truth = SessionMirror(), synced()
-    told: list[Event | MissedEvents] = []
+    delivered: list[Event | MissedEvents] = []
 
-    def come(one: Event) -> None:
+    def deliver(one: Event) -> None:
         if mirror.apply_event(one):
-            told.append(one)
+            delivered.append(one)
 
     for i, fate in enumerate([*["come"] * before, "snapshot", *fates, "snapshot"]):
         if fate == "snapshot":
-            told += mirror.apply_snapshot(snapshot(truth))
+            delivered += mirror.apply_snapshot(snapshot(truth))
             continue
         one = event(truth.event_seq + 1, Notice("info", str(i)))
         truth.apply_event(one)
         for _ in range({"come": 1, "twice": 2, "lost": 0}[fate]):
-            come(one)
+            deliver(one)
     seqs: list[int] = []
-    for one in told:
+    for one in delivered:
         seqs += range(one.first, one.last + 1) if isinstance(one, MissedEvents) else (one.event_seq,)
     assert seqs == list(range(before + 1, truth.event_seq + 1))
-    lost = {seq for one in told if isinstance(one, MissedEvents) for seq in range(one.first, one.last + 1)}
+    lost = {seq for one in delivered if isinstance(one, MissedEvents) for seq in range(one.first, one.last + 1)}
     numbers = [i for i, fate in enumerate([f for f in fates if f != "snapshot"], before + 1) if fate == "lost"]
     assert lost == set(numbers), "what came is handed out"
 
 
-def test_an_older_snapshot_is_discarded() -> None:
+def test_older_snapshot_is_discarded() -> None:
     mirror = synced()
     old = snapshot(mirror)
     mirror.apply_event(event(1, EStopChanged(True, "p1")))
@@ -160,7 +170,7 @@ def test_an_older_snapshot_is_discarded() -> None:
     assert mirror.discarded == 1
 
 
-def test_a_new_scene_needs_a_snapshot_but_a_reset_does_not() -> None:
+def test_new_scene_needs_a_snapshot_but_a_reset_does_not() -> None:
     mirror = synced()
     mirror.apply_event(event(1, SceneChanged(2, 0, "reset")))
     assert mirror.synced
@@ -172,19 +182,19 @@ def test_a_new_scene_needs_a_snapshot_but_a_reset_does_not() -> None:
     assert mirror.tick_period_ns == 1_000_000, "0: as it was"
 
 
-def test_bodies_are_of_the_epochs_that_have_them() -> None:
-    """Poses of an epoch go with the bodies of that one only; a reset changes none."""
+def test_bodies_belong_to_their_epochs() -> None:
+    """Poses of an epoch match the bodies of that epoch only; a reset changes none."""
     ball, box = (BodyInfo(1, name, True) for name in ("ball", "box"))
     mirror = synced()
-    told: list[tuple[int, int]] = []
+    delivered: list[tuple[int, int]] = []
 
     def snap(epoch: int, *bodies: BodyInfo) -> None:
         mirror.apply_snapshot(Snapshot(0, mirror.event_seq, epoch, 0, "", 0, 0.0, 0, (), (), bodies=bodies))
-        told.append((mirror.bodies_since, mirror.bodies_until))
+        delivered.append((mirror.bodies_since, mirror.bodies_until))
 
     def change(epoch: int, cause: str) -> None:
         mirror.apply_event(event(mirror.event_seq + 1, SceneChanged(epoch, 0, cause)))
-        told.append((mirror.bodies_since, mirror.bodies_until))
+        delivered.append((mirror.bodies_since, mirror.bodies_until))
 
     snap(3, ball)
     change(4, "reset")
@@ -194,10 +204,10 @@ def test_bodies_are_of_the_epochs_that_have_them() -> None:
     snap(6, box, ball)
     change(7, "new_scene")
     snap(7, box, ball)
-    assert told == [(3, 3), (3, 4), (3, 4), (5, 5), (5, 6), (5, 6), (5, 6), (5, 7)]
+    assert delivered == [(3, 3), (3, 4), (3, 4), (5, 5), (5, 6), (5, 6), (5, 6), (5, 7)]
 
 
-def test_hash_tells_different_states_apart_and_ignores_order() -> None:
+def test_hash_distinguishes_states_and_ignores_order() -> None:
     a, b = synced(), synced()
     for mirror, order in ((a, ("p1", "p2")), (b, ("p2", "p1"))):
         for i, name in enumerate(order):
@@ -208,7 +218,7 @@ def test_hash_tells_different_states_apart_and_ignores_order() -> None:
     assert a.mirror_hash() != b.mirror_hash()
 
 
-def test_lease_version_is_only_for_its_holders() -> None:
+def test_lease_version_is_visible_to_holders_only() -> None:
     mirror = synced()
     shared = Lease("left", "robot", "shared", "p1", 7, sub_holders=("p1", "p2"), weights=(0.5, 0.5))
     mirror.apply_event(event(1, LeaseChanged(shared, "acquired")))
@@ -216,8 +226,25 @@ def test_lease_version_is_only_for_its_holders() -> None:
     assert mirror.find_lease_version("right", "p1") is None
 
 
-def test_held_events_are_bounded() -> None:
+def test_pending_events_are_bounded() -> None:
     mirror = SessionMirror()
     for i in range(1000):
         mirror.apply_event(event(i + 1, Notice("info", "x")))
     assert mirror.held_overflow == 1000 - 256
+
+
+def test_one_event_carries_the_leases_of_a_request() -> None:
+    leases = (Lease("left", "robot", "exclusive", "p1", 4), Lease("hammer", "object", "exclusive", "p1", 2))
+    together, apart = SessionMirror(), SessionMirror()
+    for mirror in (together, apart):
+        mirror.apply_snapshot(snapshot())
+    body = LeasesChanged(leases, "acquired", ("", "p2"))
+    together.apply_event(event(1, body))
+    assert body.to_single_changes() == (
+        LeaseChanged(leases[0], "acquired"),
+        LeaseChanged(leases[1], "acquired", "p2"),
+    )
+    for seq, change in enumerate(body.to_single_changes(), 1):
+        apart.apply_event(event(seq, change))
+    assert together.leases == apart.leases == {"left": leases[0], "hammer": leases[1]}
+    assert together.find_lease_version("hammer", "p1") == 2

@@ -1,4 +1,4 @@
-"""A recorded session of headsets that look at sheets, without a session: for tests of what is read back of them."""
+"""Recordings of headsets that observe sheets, written without a session, for tests of the reader."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from iris_session.protocol.server_messages import (
 from iris_session.recording import Settings, header_root, make_row
 from iris_session.recording.messages import Batch
 from iris_session.recording.writer import RrdWriter
-from tests.anchors.worlds import Look, around
+from tests.anchors.worlds import Viewpoint, viewpoint_around
 from tests.recording.support import make_header
 
 S = 1_000_000_000
@@ -61,21 +61,21 @@ class Played:
         alignment: Alignment | None = None,
         refused: bool = False,
     ) -> None:
-        """`refused`: the session did not take it, so there is no event."""
+        """Add a join. `refused`: by the session, so without an event."""
         entry = Entry(connection, connection, self.now_ns, Join("key", role, name, capabilities=(run,) if run else ()))
         self._entries.setdefault(self.now_ns, []).append(entry)
         if not refused:
             self.event(ParticipantJoined(ParticipantInfo(id, name, role, True, alignment=alignment), resumed=False))
 
     def jumped(self, connection: int, id: str, late_s: float) -> None:
-        """The tracking frame jumps now; the session hears of it so much later."""
+        """Let the tracking frame jump; the session is notified later by `late_ns`."""
         alarm = AlignmentAlarm("jump", 0, "", 0.2, self.now_ns)
         self.wait(late_s)
         self._entries.setdefault(self.now_ns, []).append(Entry(connection, connection, self.now_ns, alarm))
         self.event(AlignmentAlarmed(id, "jump", "", 0.2))
 
     def aligned(self, id: str, version: int, T_world_tracking: PoseTuple, stated_m: float, epoch: int = 0) -> None:
-        """The session accepts an alignment."""
+        """Add an accepted alignment."""
         pose = Pose(*T_world_tracking)
         self.event(AlignmentChanged(id, Alignment(version, "measured", pose, epoch, (), stated_m, stated_m)))
 
@@ -94,11 +94,11 @@ class Played:
     ) -> None:
         """A headset looks at a sheet from a new place, `n` pictures in two seconds. `head_late_ns`: how long after a
         picture the nearest sample of the head was taken."""
-        look = Look(self.rng, T_world_anchor, around(self.rng, T_world_anchor[0], 0.6), noise)
+        look = Viewpoint(self.rng, T_world_anchor, viewpoint_around(self.rng, T_world_anchor[0], 0.6), noise)
         for _ in range(n):
             self.wait(2.0 / n)
             seen = Observation(
-                anchor_id, "qr", Pose(*look.new(T_world_tracking)), self.now_ns, epoch, viewpoint, size_m=0.16
+                anchor_id, "qr", Pose(*look.observe(T_world_tracking)), self.now_ns, epoch, viewpoint, size_m=0.16
             )
             self.sample(
                 connection, apply(inverse(T_world_tracking), look.p_head_world), self.now_ns + head_late_ns, epoch
@@ -113,7 +113,7 @@ class Played:
         self.samples.append((connection, self.now_ns, data))
 
     def write(self, path: Path) -> Path:
-        """The recording."""
+        """Write the recording."""
         writer = RrdWriter(path, "id")
         writer.write_header(self.header)
         chain, rows = header_root(self.header), []

@@ -47,7 +47,7 @@ XML = """<mujoco><option timestep="0.002"/><worldbody><light pos="0 0 3"/>
 
 
 class SmallCore:
-    """A session in a few lines: real physics, and a hash that every entry enters. Bit-exact, with snapshots."""
+    """A minimal session: real physics and a hash of every entry, bit-exact, with snapshots."""
 
     def __init__(self, header: SessionHeader | None = None, models: Models | None = None) -> None:
         self.model = mujoco.MjModel.from_xml_string(XML)
@@ -85,7 +85,7 @@ class SmallCore:
 
 
 def make_header(recording_class: str = CLOSED, versions: dict[str, str] | None = None) -> SessionHeader:
-    """Header of the small session, with its real model."""
+    """Return the header of the small session, with its real model."""
     model = mujoco.MjModel.from_xml_string(XML)
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
@@ -103,7 +103,7 @@ def make_header(recording_class: str = CLOSED, versions: dict[str, str] | None =
 
 
 def make_entries(step: int) -> list[Entry]:
-    """None to three entries, different in every step."""
+    """Return zero to three entries, different in every step."""
     sample = Sample(
         "controller/left", "pose", step, step * TICK_NS, 1, 1, 1, pose=Pose((step / 3, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
     )
@@ -111,7 +111,7 @@ def make_entries(step: int) -> list[Entry]:
 
 
 class SmallSession:
-    """Takes steps of a `SmallCore` and feeds them to a recorder as a session does."""
+    """Steps a `SmallCore` and feeds a recorder like a session."""
 
     def __init__(self, feed: RecorderFeed, keyframe_steps: int = 100, **header: object) -> None:
         self.feed = feed
@@ -156,7 +156,7 @@ class SmallSession:
 
 @contextmanager
 def recorder(path: Path) -> Iterator[tuple[RecorderProcess, RecorderFeed]]:
-    """A started recorder process with a feed; ended in any case."""
+    """Yield a started recorder process with a feed, and end it."""
     process = RecorderProcess(path, time.monotonic_ns())
     feed: RecorderFeed | None = None
     try:
@@ -170,7 +170,7 @@ def recorder(path: Path) -> Iterator[tuple[RecorderProcess, RecorderFeed]]:
 
 
 def record(path: Path, steps: int, **header: object) -> SmallSession:
-    """A finished recording of `steps` steps."""
+    """Record `steps` steps."""
     with recorder(path) as (process, feed):
         session = SmallSession(feed, **header)
         session.take(steps)
@@ -180,7 +180,7 @@ def record(path: Path, steps: int, **header: object) -> SmallSession:
 
 
 def wait_until(condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
-    """Polls `condition`; fails after `timeout_s`."""
+    """Poll `condition` until it holds; fail after `timeout_s`."""
     until = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < until, "the condition did not come true"
@@ -188,7 +188,7 @@ def wait_until(condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
 
 
 def journal(steps: int, recording_class: str = CLOSED, keyframe_steps: int = 50) -> tuple[SessionHeader, Batch]:
-    """Header, rows and keyframes of a session that was never written."""
+    """Return header, rows and keyframes of a session."""
     core, header = SmallCore(), make_header(recording_class)
     chain = header_root(header)
     batch = Batch(keyframes=[seal_keyframe(core.keyframe(-1), chain)])
@@ -206,7 +206,7 @@ def journal(steps: int, recording_class: str = CLOSED, keyframe_steps: int = 50)
 
 
 def write(path: Path, header: SessionHeader, batch: Batch, rows_per_chunk: int = 20) -> Path:
-    """A finished file with this content."""
+    """Write a finished file with this content."""
     writer = RrdWriter(path, "id")
     writer.write_header(header)
     for i in range(0, len(batch.rows), rows_per_chunk):
@@ -220,7 +220,7 @@ def write(path: Path, header: SessionHeader, batch: Batch, rows_per_chunk: int =
 
 
 def read(path: Path) -> dict[str, list[Any]]:
-    """What Rerun itself reads from a file: record batches by entity path."""
+    """Read a file with Rerun. Return its record batches by entity path."""
     from rerun.chunk import RrdReader
 
     found: dict[str, list[Any]] = {}
@@ -232,5 +232,5 @@ def read(path: Path) -> dict[str, list[Any]]:
 
 
 def column(batches: list[Any], name: str) -> list[Any]:
-    """Its values, a row each."""
+    """Return the values of a column by row."""
     return [value for batch in batches for value in batch.column(name).to_pylist()]

@@ -1,4 +1,4 @@
-"""What bends is in the file: topology once, vertices when they moved, on the timelines of the states they belong to."""
+"""Deformables in the file: topology once, vertices when they move, on the timelines of their states."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CLOTH, ROPE, SOFT = "/scene/1/world/cloth", "/scene/1/world/rope", "/scene/1/wor
 
 
 class World:
-    """The model with flexes, a file of a session with it, and encoders as the session has them."""
+    """A model with flexes, a file of a session with it, and encoders like those of the session."""
 
     def __init__(self, folder: Path) -> None:
         self.model = flexes()
@@ -50,7 +50,7 @@ class World:
         return self.data.flexvert_xpos[self.meshes[index].vertices].copy()
 
     def publish(self, step: int, index: int, vertices: np.ndarray) -> None:
-        """Vertices, and then the state they belong to: by two sockets, either may be first."""
+        """Send vertices, then their state: over two sockets, so either may arrive first."""
         self.encoders[index].reset()
         frames = self.encoders[index].encode(vertices)
         assert frames is not None
@@ -74,12 +74,12 @@ def world(tmp_path: Path) -> Iterator[World]:
 
 
 def told(batches: list[Any], name: str) -> dict[int, Any]:
-    """By step."""
+    """Return the vertices by step."""
     found = [batch for batch in batches if name in batch.schema.names]
     return dict(zip(column(found, "step"), column(found, name), strict=True))
 
 
-def test_topology_comes_once_and_vertices_as_they_move(world: World) -> None:
+def test_topology_is_written_once_and_vertices_as_they_move(world: World) -> None:
     first, then = world.vertices(0), world.vertices(0) + np.array((0.01, 0.02, 0.03))
     world.state(0)
     world.publish(8, 0, first)
@@ -102,7 +102,7 @@ def test_topology_comes_once_and_vertices_as_they_move(world: World) -> None:
     assert world.writer.vertices_refused == 0
 
 
-def test_normals_are_those_of_the_triangles_around(world: World) -> None:
+def test_normals_are_those_of_adjacent_triangles(world: World) -> None:
     """A tilted plane has one normal everywhere."""
     vertices = world.vertices(0)
     vertices[:, 2] = 1.0 + 0.5 * vertices[:, 0]
@@ -114,7 +114,7 @@ def test_normals_are_those_of_the_triangles_around(world: World) -> None:
     assert normals == pytest.approx(np.broadcast_to(expected, normals.shape), abs=0.02)
 
 
-def test_vertices_that_are_nowhere_are_numbers_in_the_file(world: World) -> None:
+def test_non_finite_vertices_are_finite_in_the_file(world: World) -> None:
     vertices = world.vertices(0)
     vertices[[0, 7]] = (np.nan, np.inf, -np.inf)
     world.state(0)
@@ -125,7 +125,7 @@ def test_vertices_that_are_nowhere_are_numbers_in_the_file(world: World) -> None
         assert np.isfinite(np.array(told(drawn, f"Mesh3D:vertex_{name}")[8])).all()
 
 
-def test_normals_of_what_is_crumpled_are_means_by_area(world: World) -> None:
+def test_normals_of_a_crumpled_mesh_are_weighted_by_area(world: World) -> None:
     rng = np.random.default_rng(2)
     vertices = world.vertices(0) + rng.uniform(-0.03, 0.03, (20, 3))
     world.state(0)
@@ -158,7 +158,7 @@ def test_ropes_are_lines_and_soft_bodies_surfaces(world: World) -> None:
     assert moved[indices] == pytest.approx(soft[world.meshes[2].elements], abs=BOUND_M)
 
 
-def test_without_a_specification_the_models_flexes_bend(world: World) -> None:
+def test_flexes_of_the_model_are_used_without_a_specification(world: World) -> None:
     world.writer.add(Batch(assets=[SceneAssets()]))
     world.state(0)
     world.publish(8, 0, world.vertices(0) + 0.1)
@@ -166,8 +166,8 @@ def test_without_a_specification_the_models_flexes_bend(world: World) -> None:
     assert sorted(told(world.read()[CLOTH], "Mesh3D:vertex_positions")) == [0, 8]
 
 
-def test_vertices_of_the_scene_before_are_refused(world: World) -> None:
-    """They may come late; and what is for the next scene waits for its states."""
+def test_vertices_of_the_previous_scene_are_rejected(world: World) -> None:
+    """They may arrive late; vertices of the next scene wait for its states."""
     vertices = world.vertices(0)
     world.state(0)
     hash_ = compute_scene_hash(bytes(encode_model(world.model)))
@@ -182,7 +182,7 @@ def test_vertices_of_the_scene_before_are_refused(world: World) -> None:
     assert world.writer.vertices_refused == 1
 
 
-def test_vertices_of_the_last_state_before_a_scene_are_refused(world: World) -> None:
+def test_vertices_of_the_last_state_before_a_scene_are_rejected(world: World) -> None:
     """That state is later than the row before the scene, by the time that its step took."""
     vertices = world.vertices(0)
     world.state(0)
@@ -199,7 +199,7 @@ def test_vertices_of_the_last_state_before_a_scene_are_refused(world: World) -> 
     assert world.writer.vertices_refused == 1
 
 
-def test_what_is_no_frame_is_refused_and_counted(world: World) -> None:
+def test_invalid_frames_are_rejected_and_counted(world: World) -> None:
     world.state(0)
     for data in (b"", b"\1" * 200):
         world.writer.add_vertices(VertexFrame("flex-0", 7, data))
@@ -212,7 +212,7 @@ def test_what_is_no_frame_is_refused_and_counted(world: World) -> None:
     assert world.writer.vertices_refused == 3
 
 
-def test_vertices_whose_states_do_not_come_are_bounded(world: World) -> None:
+def test_vertices_without_states_are_bounded(world: World) -> None:
     world.state(0)
     for i in range(MAX_PENDING_VERTICES + 5):
         world.writer.add_vertices(VertexFrame("flex-0", 8_000_000 + i, b""))
@@ -236,7 +236,7 @@ def test_vertices_are_split_where_texture_coordinates_differ(world: World) -> No
 
 
 @pytest.mark.parametrize("name", ["elements", "position", "plan"])
-def test_an_asset_that_is_damaged_is_an_error_of_assets(world: World, name: str) -> None:
+def test_damaged_asset_is_an_asset_error(world: World, name: str) -> None:
     (cloth, *_) = world.parsed.spec.deformables
     arrays = dict(decode_arrays(world.store.get(cloth.address), "deformable"))
     arrays[name] = arrays[name][:-1] if name == "position" else np.full_like(arrays[name], 200)

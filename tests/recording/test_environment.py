@@ -1,4 +1,4 @@
-"""One thread for sums, told to the libraries that are loaded, and written into every recording."""
+"""Loaded libraries compute with one thread, which every recording states."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ print(before, describe_environment()["blas_threads"], bool(describe_environment(
 """
 
 
-def test_the_loaded_libraries_use_one_thread() -> None:
+def test_loaded_libraries_use_one_thread() -> None:
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT],
         capture_output=True,

@@ -1,4 +1,4 @@
-"""The feed against a recorder played by the test: order, repetition, spill, and what is lost when nothing helps."""
+"""The feed against a recorder emulated by the test: order, repetition, spill and loss."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ ROOT = b"r" * 16
 
 
 class PlayedRecorder:
-    """The other end of the socket: what it got, and statuses as the test likes."""
+    """The other end of the socket: keeps what it received, and sends statuses."""
 
     def __init__(self, endpoint: str) -> None:
         self.context = zmq.Context()
@@ -51,7 +51,7 @@ class PlayedRecorder:
         feed.flush()
 
     def take(self, n: int) -> list[tuple[bytes, int, bytes]]:
-        """The next `n` messages as (kind, number, body)."""
+        """Receive the next `n` messages as (kind, number, body)."""
         out = []
         for _ in range(n):
             assert self.socket.poll(5000), f"only {len(out)} of {n} messages came"
@@ -88,7 +88,7 @@ def numbers(batch: Batch) -> list[int]:
     return [row.step for row in batch.rows]
 
 
-def test_nothing_is_sent_before_a_recorder_asks(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
+def test_nothing_is_sent_before_a_recorder_requests_it(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
     steps(feed, 0, 30)
     assert played[0].is_quiet()
     played[0].say(feed, 1, -1, -1)
@@ -99,7 +99,7 @@ def test_nothing_is_sent_before_a_recorder_asks(feed: RecorderFeed, played) -> N
     assert [step for _, _, body in kinds[1:] for step in numbers(decode_batch(body))] == list(range(30))
 
 
-def test_rows_go_out_after_ten_or_twenty_milliseconds(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
+def test_rows_are_sent_within_twenty_milliseconds(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
     played[0].say(feed, 1, -1, -1)
     played[0].take(1)
     steps(feed, 0, BATCH_ROWS - 1)
@@ -111,7 +111,7 @@ def test_rows_go_out_after_ten_or_twenty_milliseconds(feed: RecorderFeed, played
     assert numbers(decode_batch(played[0].take(1)[0][2])) == [10, 11]
 
 
-def test_what_is_written_is_forgotten_and_a_new_recorder_gets_the_rest(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
+def test_acknowledged_rows_are_removed_and_a_new_recorder_gets_the_others(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
     played[0].say(feed, 1, -1, -1)
     steps(feed, 0, 50)
     played[0].take(6)
@@ -128,7 +128,7 @@ def test_what_is_written_is_forgotten_and_a_new_recorder_gets_the_rest(feed: Rec
     assert feed.close(0.0)
 
 
-def test_a_full_window_spills_and_comes_back_in_order(played) -> None:  # type: ignore[no-untyped-def]
+def test_full_window_spills_and_is_read_back_in_order(played) -> None:  # type: ignore[no-untyped-def]
     recorder, endpoint, folder = played
     feed = RecorderFeed(endpoint, folder, window_bytes=2000)
     feed.send_header(make_header())
@@ -150,7 +150,7 @@ def test_a_full_window_spills_and_comes_back_in_order(played) -> None:  # type: 
     assert feed.close(0.0)
 
 
-def test_when_the_spill_is_full_rows_are_dropped_counted_and_told(played) -> None:  # type: ignore[no-untyped-def]
+def test_full_spill_drops_rows_counts_and_reports_them(played) -> None:  # type: ignore[no-untyped-def]
     recorder, endpoint, folder = played
     feed = RecorderFeed(endpoint, folder, window_bytes=3000, spill_bytes=3000)
     feed.send_header(make_header())
@@ -175,7 +175,7 @@ def test_when_the_spill_is_full_rows_are_dropped_counted_and_told(played) -> Non
     assert not feed.close(0.0)
 
 
-def test_what_nobody_took_before_the_end_is_counted(played) -> None:  # type: ignore[no-untyped-def]
+def test_rows_not_received_before_the_end_are_counted(played) -> None:  # type: ignore[no-untyped-def]
     _, endpoint, folder = played
     feed = RecorderFeed(endpoint, folder, window_bytes=2000)
     feed.send_header(make_header())
@@ -187,7 +187,7 @@ def test_what_nobody_took_before_the_end_is_counted(played) -> None:  # type: ig
     assert not feed.close(0.0), "asked again"
 
 
-def test_the_silence_of_a_recorder_that_has_something_to_write_is_measured(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
+def test_silence_of_a_busy_recorder_is_measured(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
     played[0].say(feed, 1, -1, -1)
     steps(feed, 0, 100)
     quiet_ns = feed.silence_ns
@@ -202,7 +202,7 @@ def test_the_silence_of_a_recorder_that_has_something_to_write_is_measured(feed:
     assert feed.silence_ns == 0
 
 
-def test_a_spill_file_that_cannot_be_read_back_is_a_gap_and_not_the_end(played) -> None:  # type: ignore[no-untyped-def]
+def test_unreadable_spill_file_is_a_gap(played) -> None:  # type: ignore[no-untyped-def]
     recorder, endpoint, folder = played
     feed = RecorderFeed(endpoint, folder, window_bytes=2000)
     feed.send_header(make_header())
@@ -220,7 +220,7 @@ def test_a_spill_file_that_cannot_be_read_back_is_a_gap_and_not_the_end(played) 
     feed.close(0.0)
 
 
-def test_states_events_and_denials_travel_with_the_rows(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
+def test_states_events_and_denials_are_sent_with_the_rows(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
     played[0].say(feed, 1, -1, -1)
     played[0].take(1)
     head = PresenceItem("p1", "head", Pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0)), 5)
@@ -239,13 +239,13 @@ def test_states_events_and_denials_travel_with_the_rows(feed: RecorderFeed, play
     assert batch.keyframes[0].chain == ROOT
 
 
-def test_lists_are_bounded_when_no_step_is_taken(feed: RecorderFeed) -> None:
+def test_lists_are_bounded_without_steps(feed: RecorderFeed) -> None:
     for i in range(BATCH_ITEMS + 10):
         feed.add_metric("m", i)
     assert feed.stats.dropped_items == 10
 
 
-def test_a_scene_comes_before_its_row_and_again_with_the_header_for_a_new_recorder(
+def test_scene_precedes_its_row_and_is_repeated_for_a_new_recorder(
     played: tuple[PlayedRecorder, str, Path], feed: RecorderFeed
 ) -> None:
     recorder, *_ = played
@@ -276,14 +276,14 @@ def test_a_scene_comes_before_its_row_and_again_with_the_header_for_a_new_record
 
 @pytest.fixture
 def square() -> bytes:
-    """A frame of four vertices."""
+    """Return a frame of four vertices."""
     encoder = DeformableEncoder(DeformableTopology(4, faces=[(0, 1, 3), (0, 3, 2)]))
     frames = encoder.encode(np.arange(12.0).reshape(4, 3))
     assert frames is not None
     return frames["full"]
 
 
-def test_vertices_go_by_a_socket_of_their_own_at_their_rate(played, tmp_path: Path, square: bytes) -> None:  # type: ignore[no-untyped-def]
+def test_vertices_have_their_own_socket_and_rate(played, tmp_path: Path, square: bytes) -> None:  # type: ignore[no-untyped-def]
     recorder, endpoint, folder = played
     vertices = recorder.context.socket(zmq.PULL)
     vertices.bind(f"ipc://{tmp_path}/v")
@@ -308,7 +308,7 @@ def test_vertices_go_by_a_socket_of_their_own_at_their_rate(played, tmp_path: Pa
     feed.close(0.0)
 
 
-def test_vertices_that_nobody_takes_are_dropped_and_counted_and_the_journal_goes_on(
+def test_unread_vertices_are_dropped_and_counted_and_the_journal_continues(
     played,  # type: ignore[no-untyped-def]
     tmp_path: Path,
     square: bytes,

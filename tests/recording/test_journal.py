@@ -1,7 +1,8 @@
-"""Rows and their checks: whatever is changed is named."""
+"""Rows and their checksums: every change is named."""
 
 from __future__ import annotations
 
+import zlib
 from typing import Any
 
 import msgspec
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 
 from iris_session.protocol.client_messages import Marker
 from iris_session.protocol.entries import HOST, Entry, decode_entries, encode_entries
+from iris_session.recording import journal
 from iris_session.recording.journal import (
     JournalRow,
     Keyframe,
@@ -39,7 +41,7 @@ def changed(row: JournalRow, **fields: Any) -> JournalRow:
     return msgspec.structs.replace(row, **fields)
 
 
-def test_a_row_is_what_was_written() -> None:
+def test_row_roundtrip() -> None:
     row = a_row()
     assert check_row(ROOT, row) is None
     assert check_fields(row) is None
@@ -68,13 +70,13 @@ def test_entries_blob_is_a_messagepack_array(n: int) -> None:
         ("chain", b"c" * 16),
     ],
 )
-def test_a_changed_field_is_named(field: str, value: object) -> None:
+def test_changed_field_is_named(field: str, value: object) -> None:
     problem = check_row(ROOT, changed(a_row(), **{field: value}))
     assert problem is not None
     assert problem.field == field
 
 
-def test_changed_checksums_are_told_from_changed_fields() -> None:
+def test_changed_checksum_is_distinguished_from_changed_field() -> None:
     row = a_row()
     problem = check_row(ROOT, changed(row, field_crcs=(row.field_crcs[0] ^ 1, *row.field_crcs[1:])))
     assert problem is not None
@@ -102,7 +104,7 @@ def test_any_flipped_bit_of_the_entries_is_found_at_its_entry(position: int, bit
     assert check_fields(changed(row, entries=bytes(blob))) == problem
 
 
-def test_a_row_of_another_history_breaks_the_chain() -> None:
+def test_row_of_another_history_breaks_the_chain() -> None:
     problem = check_row(b"s" * 16, a_row())
     assert problem is not None
     assert problem.field == "chain"
@@ -115,7 +117,7 @@ def test_the_first_chain_value_binds_the_header() -> None:
     assert header_root(msgspec.structs.replace(header, config=b"other")) != header_root(header)
 
 
-def test_a_changed_keyframe_is_named() -> None:
+def test_changed_keyframe_is_named() -> None:
     sealed = seal_keyframe(Keyframe(9, b"plant", b"authority", b"controller", b"status"), ROOT)
     assert check_keyframe(sealed) == ""
     for name in ("plant", "authority", "controller", "status"):
@@ -129,3 +131,14 @@ def test_models_are_packed_without_loss() -> None:
     data = bytes(range(256)) * 1000
     assert unpack_model(pack_model(data)) == data
     assert len(pack_model(data)) < len(data) / 10
+
+
+def test_model_of_a_foreign_recording_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A few kilobytes could unpack to any size."""
+    packed = pack_model(bytes(4_000_000))
+    assert len(packed) < 10_000
+    monkeypatch.setattr(journal, "MAX_MODEL_BYTES", 1_000_000)
+    with pytest.raises(zlib.error, match="MiB"):
+        unpack_model(packed)
+    with pytest.raises(zlib.error):
+        unpack_model(packed[:-1])

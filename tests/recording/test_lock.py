@@ -1,4 +1,4 @@
-"""Who has a recording in use: shared by a session's processes, alone for who continues it; and who is named."""
+"""Locks of recordings: shared by a session's processes, exclusive for a resume, with named holders."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Holders:
         self._stack = stack
 
     def hold(self, kind: str) -> int:
-        """Process id of one more."""
+        """Lock by one more process. Return its id."""
         command = [sys.executable, "-c", HOLDER, str(self.path), kind]
         process = self._stack.enter_context(
             subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -46,7 +46,7 @@ class Holders:
         return process.pid
 
     def refusal(self, *, shared: bool = False) -> str:
-        """What somebody is told who does not get the lock."""
+        """Return the error of a process that does not get the lock."""
         with pytest.raises(RecordingInUseError) as refused:
             RecordingLock(self.path, shared=shared, patience_s=0.0)
         text = str(refused.value)
@@ -62,40 +62,40 @@ def others(tmp_path: Path) -> Iterator[Holders]:
         yield Holders(path, stack)
 
 
-def test_a_session_shares_it_and_who_continues_it_is_told_whose_it_is(others: Holders) -> None:
+def test_lock_is_shared_by_a_session_and_refused_to_others_with_its_holder(others: Holders) -> None:
     first = others.hold("shared")
-    assert others.refusal() == f"the session that it is of still runs: process {first}"
+    assert others.refusal().endswith(f"process {first}")
     second = others.hold("shared")
     named = ", ".join(map(str, sorted((first, second))))
-    assert others.refusal() == f"the session that it is of still runs: processes {named}"
+    assert others.refusal().endswith(f"processes {named}")
     RecordingLock(others.path, shared=True, patience_s=0.0).release()
 
 
-def test_who_continues_it_has_it_alone_and_is_named(others: Holders) -> None:
+def test_exclusive_lock_names_its_holder(others: Holders) -> None:
     alone = others.hold("alone")
-    assert others.refusal() == f"it is being resumed by process {alone}"
-    assert others.refusal(shared=True) == f"it is being resumed by process {alone}"
+    assert others.refusal().endswith(f"resumed by process {alone}")
+    assert others.refusal(shared=True).endswith(f"resumed by process {alone}")
 
 
-def test_who_has_another_file_of_that_number_is_not_named(others: Holders, tmp_path: Path) -> None:
-    """`/proc/locks` names a file by its number, which is one file's on each of several file systems."""
+def test_holder_of_the_same_inode_elsewhere_is_not_named(others: Holders, tmp_path: Path) -> None:
+    """`/proc/locks` names files by inode, which is unique only within a file system."""
     holder = others.hold("shared")
     beside = tmp_path / "other.rrd"
     beside.write_bytes(b"another")
     with beside.open("rb") as file, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lock, "_is_of", lambda _lock, _file: True)
-        assert lock._holders(os.fstat(file.fileno())) == []
+        patch.setattr(lock, "_is_lock_on", lambda _lock, _file: True)
+        assert lock._list_holders(os.fstat(file.fileno())) == []
         with others.path.open("rb") as of_it:
-            assert (holder, "READ") in lock._holders(os.fstat(of_it.fileno()))
+            assert (holder, "READ") in lock._list_holders(os.fstat(of_it.fileno()))
 
 
-def test_where_the_system_does_not_tell_nobody_is_named(others: Holders, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_holder_is_not_named(others: Holders, monkeypatch: pytest.MonkeyPatch) -> None:
     others.hold("shared")
-    monkeypatch.setattr(lock, "_holders", lambda _file: [])
-    assert others.refusal() == "the session that it is of still runs, or is being resumed"
+    monkeypatch.setattr(lock, "_list_holders", lambda _file: [])
+    assert "process" not in others.refusal()
 
 
-def test_a_lock_ends_with_its_process_and_waits_for_it(others: Holders) -> None:
+def test_lock_ends_with_its_process(others: Holders) -> None:
     others.hold("shared")
     others._stack.close()
     held = RecordingLock(others.path, shared=False)
@@ -103,6 +103,6 @@ def test_a_lock_ends_with_its_process_and_waits_for_it(others: Holders) -> None:
     held.release()
 
 
-def test_a_file_that_is_not_there_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(RecorderError, match=r"nothing\.rrd cannot be opened: No such file"):
+def test_lock_of_a_missing_file_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(RecorderError, match=r"nothing\.rrd.*No such file"):
         RecordingLock(tmp_path / "nothing.rrd", shared=False)

@@ -1,4 +1,4 @@
-"""What headsets saw is read back: whose it was, in which tracking frame, where the head was, what was in force."""
+"""Observations read back: participant, tracking frame, head pose, and alignment in force."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def read(played: Played, folder: Path) -> AlignmentHistory:
         return read_alignment_history(recording)
 
 
-def test_looks_are_told_apart_by_whose_they_are(played: Played, tmp_path: Path) -> None:
-    """Several who join in one step, one of them refused, two of one name."""
+def test_observations_are_assigned_to_their_participants(played: Played, tmp_path: Path) -> None:
+    """Several participants join in one step, one is refused, two have one name."""
     played.join(1, "", "eve", refused=True)
     played.join(2, "p1", "ann")
     played.join(3, "p2", "ann")
@@ -52,7 +52,7 @@ def test_looks_are_told_apart_by_whose_they_are(played: Played, tmp_path: Path) 
     assert {id: one.aligned for id, one in found.participants.items()} == {"p1": True, "p2": True, "p3": False}
 
 
-def test_every_run_and_epoch_is_a_tracking_frame_of_its_own(played: Played, tmp_path: Path) -> None:
+def test_every_run_and_epoch_is_a_tracking_frame(played: Played, tmp_path: Path) -> None:
     played.join(1, "p1", "ann", run="run:a")
     played.look(1, "table", TABLE, HERE, 1, n=2)
     played.look(1, "table", TABLE, HERE, 2, n=3, epoch=1)
@@ -68,8 +68,8 @@ def test_every_run_and_epoch_is_a_tracking_frame_of_its_own(played: Played, tmp_
     }
 
 
-def test_a_jump_begins_a_tracking_frame(played: Played, tmp_path: Path) -> None:
-    """From its capture on, although the session hears of it later, and only in that run of that person."""
+def test_jump_begins_a_tracking_frame(played: Played, tmp_path: Path) -> None:
+    """From its capture on, although the session is notified later, and only in that run of that participant."""
     played.join(1, "p1", "ann", run="run:a")
     played.join(2, "p2", "bob")
     played.look(1, "table", TABLE, HERE, 1, n=2)
@@ -94,7 +94,7 @@ def test_a_jump_begins_a_tracking_frame(played: Played, tmp_path: Path) -> None:
     assert [one.frame for one in found.in_force] == [TrackingFrame("p1", 1, 0, 1)]
 
 
-def test_who_comes_back_under_another_name_is_the_same_person(played: Played, tmp_path: Path) -> None:
+def test_resumed_participant_with_another_name_is_the_same(played: Played, tmp_path: Path) -> None:
     played.join(1, "p1", "ann", run="run:a")
     played.look(1, "table", TABLE, HERE, 1, n=2)
     played.join(2, "p1", "anna", run="run:a")
@@ -105,9 +105,7 @@ def test_who_comes_back_under_another_name_is_the_same_person(played: Played, tm
 
 
 @pytest.mark.parametrize(("late_ns", "known"), [(5_000_000, True), (-50_000_000, True), (50_000_001, False)])
-def test_the_head_pose_nearest_in_time_goes_with_a_look(
-    played: Played, tmp_path: Path, late_ns: int, known: bool
-) -> None:
+def test_observation_has_the_nearest_head_pose(played: Played, tmp_path: Path, late_ns: int, known: bool) -> None:
     played.join(1, "p1", "ann")
     played.look(1, "table", TABLE, HERE, 1, n=1, head_late_ns=late_ns)
     played.sample(1, (9.0, 9.0, 9.0), played.now_ns + 2 * abs(late_ns))
@@ -117,7 +115,7 @@ def test_the_head_pose_nearest_in_time_goes_with_a_look(
         assert distance(look.p_tracking_head, look.observation.T_tracking_anchor.p) < 0.7
 
 
-def test_heads_of_another_tracking_epoch_say_nothing(played: Played, tmp_path: Path) -> None:
+def test_head_poses_of_another_tracking_epoch_are_ignored(played: Played, tmp_path: Path) -> None:
     played.join(1, "p1", "ann")
     played.look(1, "table", TABLE, HERE, 1, n=1, head_late_ns=S)
     played.sample(1, (1.0, 2.0, 3.0), played.now_ns, epoch=1)
@@ -156,14 +154,14 @@ def test_alignments_hold_until_something_ends_them(played: Played, tmp_path: Pat
     assert found[3].frame == TrackingFrame("p1", 1, 1, 1), "jumps are counted through a run, whatever epochs it tells"
 
 
-def test_moved_anchors_are_told(played: Played, tmp_path: Path) -> None:
+def test_moved_anchors_are_listed(played: Played, tmp_path: Path) -> None:
     played.wait(2.0)
     played.event(AnchorMoved("table", Pose(*HERE)))
     (moved,) = read(played, tmp_path).anchor_moves
     assert moved == (2 * S, "table", Pose(*HERE))
 
 
-def test_what_does_not_decode_is_counted(played: Played, tmp_path: Path) -> None:
+def test_undecodable_messages_are_counted(played: Played, tmp_path: Path) -> None:
     played.join(1, "p1", "ann")
     played.raw(1, b"\xc1")
     played.raw(1, b"\x81\xa4type\xa3bye")
@@ -173,12 +171,12 @@ def test_what_does_not_decode_is_counted(played: Played, tmp_path: Path) -> None
 
 
 def test_recordings_of_any_session_can_be_read(played: Played, tmp_path: Path) -> None:
-    """Nobody came, and no raw message was written at all."""
+    """A session without participants and without raw messages."""
     found = read(played, tmp_path)
     assert (found.participants, found.observations, found.in_force) == ({}, {}, [])
 
 
-def test_progress_comes_to_its_end(played: Played, tmp_path: Path) -> None:
+def test_progress_reaches_its_end(played: Played, tmp_path: Path) -> None:
     played.join(1, "p1", "ann")
     played.look(1, "table", TABLE, HERE, 1, n=2)
     told: list[tuple[int, int]] = []

@@ -1,4 +1,4 @@
-"""Asking a process of its own what Rerun can read: it is kept for the next who asks, and its end harms nobody."""
+"""The probe process that reads files with Rerun: reuse, end, restart."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def asked() -> list[psutil.Process]:
     return [p for p in psutil.Process().children() if "iris_session.recording.probe" in p.cmdline()]
 
 
-def test_a_process_that_answered_is_asked_again_and_at_most_one_is_kept(path: Path) -> None:
+def test_probe_process_is_reused_and_at_most_one_kept(path: Path) -> None:
     with Prober() as first, Prober() as second:
         assert asked() == []
         assert first.is_readable(path)
@@ -49,14 +49,14 @@ def test_a_process_that_answered_is_asked_again_and_at_most_one_is_kept(path: Pa
         assert asked() == []
 
 
-def test_one_that_ended_between_two_questions_is_not_taken_for_a_damaged_file(path: Path) -> None:
+def test_probe_that_ended_between_requests_is_restarted(path: Path) -> None:
     with Prober() as prober:
         assert prober.is_readable(path)
         asked()[0].kill()
         assert prober.is_readable(path)
 
 
-def test_one_that_ended_meanwhile_is_not_taken_for_a_damaged_file(path: Path) -> None:
+def test_probe_that_ended_during_a_request_is_restarted(path: Path) -> None:
     with Prober() as prober:
         assert prober.is_readable(path)
     (kept,) = asked()
@@ -66,7 +66,7 @@ def test_one_that_ended_meanwhile_is_not_taken_for_a_damaged_file(path: Path) ->
     assert kept not in asked()
 
 
-def test_it_ends_where_nobody_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_idle_probe_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(probe, "IDLE_S", 0.01)
     reading, writing = os.pipe()
     with open(reading) as questions, open(writing, "w"):
@@ -77,13 +77,13 @@ def test_it_ends_where_nobody_asks(monkeypatch: pytest.MonkeyPatch) -> None:
         assert not main.is_alive()
 
 
-def test_a_fork_does_not_ask_what_its_parent_started(path: Path) -> None:
+def test_forked_process_does_not_use_the_probe_of_its_parent(path: Path) -> None:
     with Prober() as prober:
         assert prober.is_readable(path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # other threads: the fork does nothing but look
         pid = os.fork()
     if pid == 0:
-        os._exit(0 if probe._spare.take() is None else 1)
+        os._exit(0 if probe._spare.pop_child() is None else 1)
     assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
     assert len(asked()) == 1

@@ -1,4 +1,4 @@
-"""Rows that were split into columns, and merged, are whole again; what contradicts itself is said."""
+"""Rows that were split into columns are joined again; contradictions are errors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ COLUMNS = ("a", "b", "c")
 
 
 def table(first: int, rows: int, columns: tuple[str, ...] = COLUMNS, entity: str = "/rows") -> Any:
-    """Rows `first` and so on, as Rerun has them: an id, a time, and a list in every column."""
+    """Return rows from `first`, as Rerun has them: an id, a time, and a list in every column."""
     fields = [pa.field(ROW_ID, pa.binary(16), nullable=False, metadata={"rerun:kind": "control"})]
     fields.append(pa.field("step", pa.int64(), metadata={"rerun:kind": "index"}))
     fields += [pa.field(name, pa.list_(pa.binary()), metadata={"rerun:kind": "data"}) for name in columns]
@@ -49,7 +49,7 @@ def test_columns_cut_at_any_place_are_joined(seed: int) -> None:
     assert sum(map(count_joined_rows, found)) == 100
 
 
-def test_no_more_is_waited_for_than_lies_side_by_side() -> None:
+def test_pending_rows_are_bounded_by_interleaving() -> None:
     taken = 0
 
     def thick_and_thin() -> Iterator[Any]:
@@ -79,8 +79,8 @@ def test_rows_out_of_order_within_a_batch_are_sorted() -> None:
     assert values(list(map(join_pieces, found))) == values([table(0, 6)])
 
 
-def test_a_row_that_stands_twice_in_a_batch_is_one() -> None:
-    """As when a batch of one column was merged with a batch of another, of the same rows."""
+def test_repeated_row_of_a_batch_is_merged() -> None:
+    """As when batches of two columns of the same rows were merged."""
     names = table(0, 1).schema
     first, second = (pa.Table.from_batches([batch]) for batch in (table(0, 6, ("a", "c")), table(0, 6, ("b",))))
     merged = (

@@ -1,4 +1,4 @@
-"""The file as Rerun and we write it together: memory that does not grow, and a disk that does not take everything."""
+"""The file written together with Rerun: bounded memory, and disks that fill up."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_memory_does_not_grow_with_chunks(tmp_path: Path) -> None:
     assert grown < 3 << 20, f"{grown >> 10} KiB for 5,000 chunks"
 
 
-def test_a_write_that_fails_leaves_no_half_message(tmp_path: Path) -> None:
+def test_failed_write_leaves_no_partial_message(tmp_path: Path) -> None:
     path = tmp_path / "w.rrd"
     writer = RrdWriter(path, "id")
     header, batch = journal(50)
@@ -47,7 +47,7 @@ def test_a_write_that_fails_leaves_no_half_message(tmp_path: Path) -> None:
     size = path.stat().st_size
     writer._stream._file = _FullDisk(writer._stream._file)
     writer.add(metrics(1))
-    with pytest.raises(WriteError, match=r"w\.rrd cannot be written: No space left on device$"):
+    with pytest.raises(WriteError, match=r"w\.rrd.*No space left"):
         writer.flush()
     assert path.stat().st_size == size
     assert not scan_file(path).cut

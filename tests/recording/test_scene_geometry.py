@@ -1,4 +1,4 @@
-"""Geometry for the viewer: every visible shape stands where MuJoCo has it, in its frame, as the specification says."""
+"""Geometry for the viewer: every visible shape is placed as in MuJoCo, in its frame, by the specification."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_the_small_scene(tmp_path: Path) -> None:
     ]
 
 
-def test_a_body_that_is_not_streamed_is_drawn_in_its_parents_frame(tmp_path: Path) -> None:
+def test_static_body_is_drawn_in_the_frame_of_its_parent(tmp_path: Path) -> None:
     model, store = mujoco.MjModel.from_xml_string(XML), AssetStore(tmp_path)
     spec = parse_mujoco(model, store).spec
     reader = scene.SceneReader(spec, store, [body for body in infos(model) if body.name != "tip"])
@@ -68,8 +68,8 @@ def test_a_body_that_is_not_streamed_is_drawn_in_its_parents_frame(tmp_path: Pat
     assert p == pytest.approx((0.4, 0.0, 0.0))
 
 
-def test_what_is_fixed_on_what_is_fixed_on_something_that_moves_goes_with_it(tmp_path: Path) -> None:
-    """Both are turned, so that their order tells."""
+def test_nested_fixed_bodies_move_with_their_root(tmp_path: Path) -> None:
+    """Both are rotated, so that their order matters."""
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><worldbody><body name="arm" pos="0 0 1" euler="20 30 0"><freejoint/><geom size=".1"/>
         <body name="wrist" pos=".1 .2 0" euler="90 0 20"><body name="hand" pos="0 .3 .1" euler="0 40 0">
@@ -86,7 +86,7 @@ def test_what_is_fixed_on_what_is_fixed_on_something_that_moves_goes_with_it(tmp
     assert apply(T_world_arm, T_arm_visual[0]) == pytest.approx(tuple(data.geom_xpos[1]))
 
 
-def test_one_shape_under_two_cubes_is_cut_for_each(tmp_path: Path) -> None:
+def test_shape_with_two_cube_maps_is_cut_for_each(tmp_path: Path) -> None:
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><asset><texture name="c" type="cube" builtin="checker" rgb1="1 0 0" width="60" height="60"/>
         <material name="along" texture="c"/><material name="uniform" texture="c" texuniform="true"/></asset><worldbody>
@@ -107,7 +107,7 @@ def test_one_shape_under_two_cubes_is_cut_for_each(tmp_path: Path) -> None:
     assert found[0] != found[1]
 
 
-def test_a_tall_texture_is_taken_as_small_as_a_wide_one(tmp_path: Path) -> None:
+def test_tall_texture_is_reduced_like_a_wide_one(tmp_path: Path) -> None:
     builder = SceneBuilder()
     pixels = np.random.default_rng(1).integers(0, 255, (2 * scene.TEXTURE_SIDE, scene.TEXTURE_SIDE, 3), np.uint8)
     corners, uvs = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 0], [1, 0], [0, 1]]
@@ -121,8 +121,8 @@ def test_a_tall_texture_is_taken_as_small_as_a_wide_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", ["aloha/scene.xml", "kuka_iiwa_14/scene.xml"])
-def test_every_geom_of_real_robots_is_where_mujoco_has_it(path: str, tmp_path: Path) -> None:
-    """In another configuration than the one that the specification was made in."""
+def test_every_geom_of_real_robots_is_placed_as_in_mujoco(path: str, tmp_path: Path) -> None:
+    """In another configuration than that of the specification."""
     model, store = mujoco.MjModel.from_xml_path(str(DATA / "models" / path)), AssetStore(tmp_path)
     spec = parse_mujoco(model, store).spec
     reader = scene.SceneReader(spec, store, infos(model))
@@ -141,7 +141,7 @@ def test_every_geom_of_real_robots_is_where_mujoco_has_it(path: str, tmp_path: P
         assert apply(T_world_visual, (0.1, 0.2, 0.3)) == pytest.approx(point, abs=1e-9)
 
 
-def test_every_shape_wears_its_texture(tmp_path: Path) -> None:
+def test_every_shape_has_its_texture(tmp_path: Path) -> None:
     model, store = every_shape(), AssetStore(tmp_path)
     spec = parse_mujoco(model, store).spec
     reader = scene.SceneReader(spec, store, infos(model))
@@ -169,7 +169,7 @@ def test_every_shape_wears_its_texture(tmp_path: Path) -> None:
     assert len(looks) >= len(SHAPES) * len(LOOKS)
 
 
-def test_a_large_mesh_wears_the_mean_colour_of_its_cube(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_mesh_has_the_mean_colour_of_its_cube_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model, store = every_shape(), AssetStore(tmp_path)
     spec = parse_mujoco(model, store).spec
     reader = scene.SceneReader(spec, store, infos(model))
@@ -184,7 +184,7 @@ def test_a_large_mesh_wears_the_mean_colour_of_its_cube(tmp_path: Path, monkeypa
         assert all(0.05 < part < 0.95 for part in form.tint)
 
 
-def test_a_cube_of_one_colour_tints_and_a_large_one_is_small(tmp_path: Path) -> None:
+def test_uniform_cube_map_is_a_colour_and_a_large_one_is_reduced(tmp_path: Path) -> None:
     """A shape that wears one colour stays the viewer's own; what is worn is in the file every time."""
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><asset>
@@ -205,7 +205,7 @@ def test_a_cube_of_one_colour_tints_and_a_large_one_is_small(tmp_path: Path) -> 
         assert scene.CUBE_SIDE < max(checked.texture.shape) <= scene.TEXTURE_SIDE
 
 
-def test_colours_at_corners_are_drawn(tmp_path: Path) -> None:
+def test_vertex_colours_are_drawn(tmp_path: Path) -> None:
     """The viewer multiplies them by the colour of the mesh, as clients do."""
     colors = np.array([[255, 0, 0, 255], [0, 255, 0, 255], [0, 0, 255, 128]], np.uint8)
     builder, store = SceneBuilder(), AssetStore(tmp_path)
@@ -222,7 +222,7 @@ def test_colours_at_corners_are_drawn(tmp_path: Path) -> None:
     assert drawn[1].vertex_colors is None
 
 
-def test_a_shape_that_nobody_knows_is_a_box_of_its_size(tmp_path: Path) -> None:
+def test_unknown_shape_is_a_box_of_its_size(tmp_path: Path) -> None:
     model, store = mujoco.MjModel.from_xml_string(XML), AssetStore(tmp_path)
     spec = parse_mujoco(model, store).spec
     reader = scene.SceneReader(spec, store, infos(model))
@@ -231,7 +231,7 @@ def test_a_shape_that_nobody_knows_is_a_box_of_its_size(tmp_path: Path) -> None:
     assert (form.kind, form.size) == (scene.BOX, (0.1, 0.2, 0.3))
 
 
-def test_the_specification_is_read_where_it_lies_and_made_where_there_is_none(tmp_path: Path) -> None:
+def test_specification_is_read_or_made_from_the_model(tmp_path: Path) -> None:
     model = mujoco.MjModel.from_xml_string(XML)
     store = AssetStore(tmp_path)
     parsed = parse_mujoco(model, store, name="shared")
@@ -252,7 +252,9 @@ def test_the_specification_is_read_where_it_lies_and_made_where_there_is_none(tm
         (False, pack_model(b"no model"), ValueError),
     ],
 )
-def test_what_cannot_be_read_is_said(tmp_path: Path, assets: bool, model: bytes, error: type[Exception]) -> None:
+def test_unreadable_specification_is_reported(
+    tmp_path: Path, assets: bool, model: bytes, error: type[Exception]
+) -> None:
     missing = SceneAssets(0, 0, str(tmp_path), "0" * 64) if assets else SceneAssets()
     with pytest.raises(error), scene.open_scene(missing, model):
         pass

@@ -1,4 +1,4 @@
-"""Lines for people, and what a re-simulation must have in common with the recording."""
+"""Text lines, and properties that a re-simulation must share with the recording."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from iris_session.recording.writer import describe_denial, describe_event, descr
 from tests.recording.support import make_header
 
 
-def test_events_say_kind_and_fields_without_what_is_empty() -> None:
+def test_event_text_has_kind_and_non_empty_fields() -> None:
     line = describe_event(Event(3, 1, 2, LeaseChanged(Lease("left", "robot", "exclusive", "p1", 4), "acquired")))
     assert line.level == "INFO"
     assert line.text.startswith("#3 lease_changed lease.target=left lease.kind=robot")
@@ -23,12 +23,12 @@ def test_events_say_kind_and_fields_without_what_is_empty() -> None:
     assert describe_event(Event(5, 1, 2, Gap("recording", 7))).level == "ERROR"
 
 
-def test_denials_say_who_holds_and_what_to_do() -> None:
+def test_denial_text_has_holder_and_advice() -> None:
     line = describe_denial(DenialRecord(1, 2, 3, Denial("role", "observers cannot drive", "join as operator")))
     assert line == ("WARN", "connection 3: role: observers cannot drive; join as operator")
 
 
-def test_the_session_page_names_class_and_versions() -> None:
+def test_session_page_names_class_and_versions() -> None:
     page = describe_session(make_header("open", {"mujoco": "4.0.0"}))
     assert "**open**" in page
     assert "| mujoco | 4.0.0 |" in page

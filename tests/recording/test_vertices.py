@@ -1,4 +1,4 @@
-"""Which vertices go into the picture: a bounded rate, a bounded number of bytes, the same for everybody."""
+"""Choice of vertices for the file: bounded rate, bounded bytes, fair among meshes."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ S = 1_000_000_000
 
 
 def taken(pace: VertexRateLimit, counts: dict[str, int], seconds: int, hz: float) -> dict[str, int]:
-    """Frames that go in of meshes that move in every state."""
+    """Return the number of written frames of meshes that move in every state."""
     found = dict.fromkeys(counts, 0)
     for i in range(round(seconds * hz)):
         for stream, count in counts.items():
-            found[stream] += pace.take(stream, count, round(i * S / hz))
+            found[stream] += pace.admit_frame(stream, count, round(i * S / hz))
     return found
 
 
 @pytest.mark.parametrize("hz", [60.0, 59.94, 30.0, 21.0])
-def test_a_small_mesh_comes_at_its_rate(hz: float) -> None:
+def test_small_mesh_is_written_at_its_rate(hz: float) -> None:
     n = taken(VertexRateLimit(), {"a": 1000}, 10, hz)["a"]
     assert 10 * S / PERIOD_NS * 0.75 <= n <= 10 * S / PERIOD_NS + 1
 
 
 @pytest.mark.parametrize("counts", [{"a": 10_000}, {"a": 20_000, "b": 20_000, "c": 100}, {"a": 262_144}])
-def test_large_meshes_share_the_bytes_and_none_starves(counts: dict[str, int]) -> None:
+def test_large_meshes_share_the_byte_budget(counts: dict[str, int]) -> None:
     found = taken(VertexRateLimit(), counts, 60, 60.0)
     size = sum(found[stream] * count * VERTEX_BYTES for stream, count in counts.items())
     first = sum(counts.values()) * VERTEX_BYTES  # goes in whatever its size
@@ -33,10 +33,10 @@ def test_large_meshes_share_the_bytes_and_none_starves(counts: dict[str, int]) -
     assert max(found.values()) - min(found.values()) <= 1
 
 
-def test_a_new_scene_is_seen_at_once() -> None:
+def test_new_scene_is_written_at_once() -> None:
     pace = VertexRateLimit()
-    assert pace.take("a", 100_000, 0)
-    assert not pace.take("a", 100_000, S)
+    assert pace.admit_frame("a", 100_000, 0)
+    assert not pace.admit_frame("a", 100_000, S)
     pace.reset()
-    assert pace.take("b", 100, S)
-    assert pace.take("b", 100, S + PERIOD_NS), "the rate is that of the new one"
+    assert pace.admit_frame("b", 100, S)
+    assert pace.admit_frame("b", 100, S + PERIOD_NS), "the rate is that of the new one"

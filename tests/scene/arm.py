@@ -1,6 +1,6 @@
 """A robot arm as a URDF package: seven joints, a gripper whose second finger follows the first, meshes of three kinds.
 
-Numbers are crooked on purpose: no axis is along another, no origin is upright.
+Numbers are irregular on purpose: no axis is parallel to another, no origin is upright.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _COMPILER = '<mujoco><compiler meshdir="meshes" discardvisual="false" fusestatic
 
 
 def write_arm(folder: Path, *, fuse: bool = False) -> Path:
-    """The package `arm_description` below `folder`; returns its URDF."""
+    """Write the package `arm_description` below `folder`; return its URDF."""
     package = folder / "arm_description"
     (package / "meshes").mkdir(parents=True)
     (package / "urdf").mkdir()
@@ -48,11 +48,11 @@ def _robot(fuse: str) -> str:
         shape = '<mesh filename="package://arm_description/meshes/link.stl" scale="1 0.8 1.2"/>'
         parts.append(_link(f"link{k}", shape, "orange", f"0.0{k} 0 0.1", f"0.{k} 0.2 0"))
         origin = f'<origin xyz="0.0{k} -0.03 0.15" rpy="0.{k} {0.2 - 0.1 * k} {0.3 * k}"/>'
-        # yourdfpy takes the axis of a slide as long as it is: that one has length 1
+        # yourdfpy uses the axis of a slide unnormalised: this one has length 1
         axis = "0 0.6 0.8" if kind == "prismatic" else f"0.{k + 1} {1 - 0.3 * k} 0.5"
         parts.append(_joint(name, kind, before, f"link{k}", origin, axis, low, high))
         before = f"link{k}"
-        if k == 3:  # a sensor that is fixed to it, as a link of its own
+        if k == 3:  # a fixed sensor, as a link of its own
             parts.append(_link("sensor", '<box size="0.03 0.04 0.05"/>', "steel", "0 0 0", "0 0 0"))
             parts.append(
                 _joint("mount", "fixed", before, "sensor", '<origin xyz="0.05 0 0.1" rpy="0.4 0.5 0.6"/>', "1 0 0")

@@ -1,4 +1,4 @@
-"""glTF documents made by hand, so that every corner of the format can be had."""
+"""glTF documents made by hand, to cover every corner of the format."""
 
 from __future__ import annotations
 

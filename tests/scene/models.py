@@ -7,7 +7,7 @@ import numpy as np
 
 #: A closed solid without symmetry, so that MuJoCo finds the same inertial frame for it again.
 WEDGE = "0 0 0  .5 0 0  0 .35 0  0 0 .2"
-#: A bent square from both sides, whose corners have other texture coordinates in every triangle (seams).
+#: A bent square from both sides; its corners have other texture coordinates in every triangle (seams).
 QUAD = """v -.3 -.3 0\nv .3 -.3 0\nv .3 .3 .1\nv -.3 .3 0
 vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvt .2 .4\nvt .9 .3\nvt .5 .6
 f 1/1 2/2 3/3\nf 1/5 3/6 4/7\nf 1/2 3/4 2/6\nf 1/7 4/1 3/3
@@ -28,7 +28,7 @@ LOOKS = ("", "image", "uniform", "cube", "cubeuniform", "plain")
 
 
 def every_shape() -> mujoco.MjModel:
-    """Every shape in every look, on a floor without end, under a sky, lit by spots and a sun."""
+    """Return every shape in every look, on an infinite floor, below a sky, lit by spots and a sun."""
     rng = np.random.default_rng(4)
     hills = " ".join(f"{v:.3f}" for v in rng.uniform(0, 1, 30))
     faces = " ".join(f'file{face}="{face}.png"' for face in ("right", "left", "up", "down", "front", "back"))
@@ -80,13 +80,14 @@ def _pictures(rng: np.random.Generator) -> dict[str, bytes]:
     files = {"image.png": png(image), "quad.obj": QUAD.encode()}
     for face in ("right", "left", "up", "down", "front", "back"):
         side = np.full((32, 32, 3), rng.integers(60, 255, 3), np.uint8)
-        side[:8, :16] = 0  # tells up from down, and left from right
+        side[:8, :16] = 0  # distinguishes up from down and left from right
         files[f"{face}.png"] = png(side)
     return files
 
 
 def many_objects(n: int, assets: int, triangles: int, side: int, seed: int = 0) -> mujoco.MjModel:
-    """`n` free objects that share `assets` meshes of about `triangles` and as many noisy textures of `side` pixels."""
+    """Return `n` free objects that share `assets` meshes of about `triangles` and as many noisy textures of `side`
+    pixels."""
     from tests.scene.rebuild import png
 
     rng = np.random.default_rng(seed)
@@ -111,7 +112,7 @@ def many_objects(n: int, assets: int, triangles: int, side: int, seed: int = 0) 
 
 
 def _ball(rng: np.random.Generator, rings: int) -> tuple[np.ndarray, np.ndarray]:
-    """A dented ball: closed, `2 * rings * rings` triangles."""
+    """Return a dented closed ball of `2 * rings * rings` triangles."""
     u = np.arange(rings) / rings * 2 * np.pi
     v = (np.arange(rings) + 0.5) / rings * np.pi
     radius = 0.1 * (1 + 0.1 * rng.normal(size=(rings, rings)))
@@ -135,7 +136,7 @@ def _ball(rng: np.random.Generator, rings: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def flexes() -> mujoco.MjModel:
-    """A rope, a cloth with texture coordinates, and a soft body."""
+    """Return a rope, a cloth with texture coordinates, and a soft body."""
     return mujoco.MjModel.from_xml_string(
         """<mujoco><option timestep="0.005" integrator="discrete" solver="CG"/><asset>
         <texture name="t" type="2d" builtin="checker" width="8" height="8" rgb1="1 0 0"/>

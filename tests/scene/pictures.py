@@ -1,4 +1,4 @@
-"""Pictures by MuJoCo's own renderer, without a display, and how far two of them agree."""
+"""Pictures by MuJoCo's own renderer, without a display, and their agreement."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ WIDTH, HEIGHT = 240, 180
 Image = NDArray[np.uint8]
 
 
-class Artist:
-    """Draws one model at its default state. Colour, and which geom each pixel shows (-1: none)."""
+class ModelRenderer:
+    """Draws one model at its default state: colour, and which geom each pixel shows (-1: none)."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         model.vis.quality.offsamples = 0
@@ -56,7 +56,7 @@ class Artist:
 
 @contextmanager
 def graphics() -> Iterator[None]:
-    """An OpenGL context without a display, by software. Only here: no other test draws."""
+    """Return a headless software OpenGL context. No other test draws."""
     before = os.environ.get("MUJOCO_GL")
     os.environ["MUJOCO_GL"] = "egl"
     from mujoco.egl import GLContext
@@ -74,7 +74,7 @@ def graphics() -> Iterator[None]:
 
 
 def cameras(model: mujoco.MjModel, views: int = 3) -> list[mujoco.MjvCamera]:
-    """Free cameras around the scene, and every camera of the model."""
+    """Return free cameras around the scene, and every camera of the model."""
     found = []
     for k in range(views):
         camera = mujoco.MjvCamera()
@@ -89,6 +89,6 @@ def cameras(model: mujoco.MjModel, views: int = 3) -> list[mujoco.MjvCamera]:
 
 
 def silhouette_iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
-    """Of what is drawn: intersection over union, 1 when both are empty."""
+    """Return intersection over union of the drawn pixels, 1 when both are empty."""
     union = int((a | b).sum())
     return 1.0 if union == 0 else int((a & b).sum()) / union

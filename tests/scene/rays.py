@@ -1,6 +1,6 @@
-"""Draws GLB files by casting rays, without a renderer: colour and alpha that a material has by itself, unlit.
+"""Draws GLB files by ray casting, without a renderer: unlit colour and alpha of the materials.
 
-Reads them with trimesh; nothing of the exporter takes part.
+Reads the files with trimesh; no code of the exporter is used.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _ROWS = 12_000
 
 
 def rays(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> tuple[Floats, Floats]:
-    """Origin (3), and a direction for every pixel (HEIGHT, WIDTH, 3), as MuJoCo has that camera; in the world."""
+    """Return origin (3) and a direction for every pixel (HEIGHT, WIDTH, 3) of that MuJoCo camera, in the world."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     scene = mujoco.MjvScene(model, 100)
@@ -37,12 +37,12 @@ def rays(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> tuple[Floats, Float
 
 
 def draw(path: Path, origin: Floats, direction: Floats, *, emitted: bool = False) -> tuple[Floats, NDArray[np.int64]]:
-    """Colour and alpha (HEIGHT, WIDTH, 4), 0..255 as seen, of the first thing on every ray, and which node that is: its
-    index in `names`, -1 for none. `emitted`: what glows, in place of the base colour."""
+    """Return colour and alpha (HEIGHT, WIDTH, 4), 0..255 sRGB, of the first hit of every ray, and the index of its node
+    in `names`, -1 for none. `emitted`: the emission in place of the base colour."""
     parts = _parts(path)
     for part in parts:
         if part["visual"].material.doubleSided:
-            continue  # others are seen from outside only
+            continue  # others are visible from outside only
         corners = part["vertices"][part["faces"]]
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         outside = np.einsum("fc,fc->f", across, origin - corners[:, 0]) > 0
@@ -62,7 +62,7 @@ def draw(path: Path, origin: Floats, direction: Floats, *, emitted: bool = False
 
 
 def _parts(path: Path) -> list[dict[str, Any]]:
-    """Meshes in the world, z up, with what their materials say."""
+    """Return the meshes in the world, z up, with their materials."""
     scene = trimesh.load_scene(path, process=False)
     found = []
     for name in scene.graph.nodes_geometry:
@@ -91,7 +91,7 @@ def _colour(part: dict[str, Any], face: Any, corners: Floats, *, emitted: bool) 
 
 
 def _sampled(image: Floats, uv: Floats) -> Floats:
-    """Between the four nearest pixels, repeating. trimesh has v upwards."""
+    """Sample between the four nearest pixels, repeating. trimesh has v upwards."""
     height, width = image.shape[:2]
     x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
     left, top = np.floor(x).astype(int), np.floor(y).astype(int)

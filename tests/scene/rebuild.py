@@ -1,6 +1,6 @@
-"""A MuJoCo model built back from a decoded scene, by MJCF, OBJ and PNG: none of the parser's own code takes part.
+"""A MuJoCo model rebuilt from a decoded scene by MJCF, OBJ and PNG: no code of the parser is used.
 
-Everything comes from bytes: the specification's and the assets'. Bodies stand at their rest pose, without joints.
+Everything comes from the bytes of the specification and the assets. Bodies are at their rest pose, without joints.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ FACES = ("right", "left", "up", "down", "front", "back")
 
 
 def rebuild(data: bytes, store: AssetStore) -> mujoco.MjModel:
-    """The model of a specification's bytes, with assets from `store`."""
+    """Return the model of a specification's bytes, with assets from `store`."""
     spec = decode_scene(data)
     assets: dict[str, bytes] = {}
     xml = "".join(

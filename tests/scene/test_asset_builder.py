@@ -1,4 +1,4 @@
-"""Building: nothing twice, levels of detail, damaged notes, and a warm start that encodes nothing."""
+"""Building assets: no duplicates, levels of detail, damaged cache notes, and a warm start that encodes nothing."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_equal_content_is_built_once_and_remembered(tmp_path: Path) -> None:
     assert other.built == 6
 
 
-def test_lost_assets_and_damaged_notes_are_built_anew(tmp_path: Path) -> None:
+def test_lost_assets_and_damaged_notes_are_rebuilt(tmp_path: Path) -> None:
     model = many_objects(3, 2, 1_000, 64)
     store = AssetStore(tmp_path)
     first = parse_mujoco(model, store)
@@ -59,8 +59,8 @@ def test_levels_of_a_mesh(tmp_path: Path) -> None:
     assert np.allclose((note.low, note.high), [(-1, -1, -1), (1, 1, 1)])
 
 
-def test_a_level_that_saves_little_is_left_out(tmp_path: Path) -> None:
-    """Faces of their own normals; texture coordinates, for which nothing is coarser; quarters that are hardly fewer."""
+def test_level_that_saves_little_is_left_out(tmp_path: Path) -> None:
+    """Faces with their own normals; texture coordinates, which prevent simplification; meshes that hardly shrink."""
     builder = AssetBuilder(AssetStore(tmp_path))
     smooth = ball(3)
     corners = smooth.position[smooth.index]
@@ -93,7 +93,7 @@ def test_levels_of_a_texture(tmp_path: Path, encoding: str) -> None:
     assert (error > 0) == (encoding == "jpeg")
 
 
-def test_faces_of_cubes_are_halved_one_by_one(tmp_path: Path) -> None:
+def test_cube_faces_are_halved_separately(tmp_path: Path) -> None:
     store = AssetStore(tmp_path)
     builder = AssetBuilder(store)
     faces = np.repeat(np.arange(6, dtype=np.uint8) * 40, 512)[:, None, None] * np.ones((1, 512, 3), np.uint8)
@@ -104,7 +104,7 @@ def test_faces_of_cubes_are_halved_one_by_one(tmp_path: Path) -> None:
     assert np.array_equal(half[255::256, 0, 0], np.arange(6) * 40)
 
 
-def test_textures_in_a_form_of_their_own_are_passed_on(tmp_path: Path) -> None:
+def test_textures_in_other_encodings_are_passed_on(tmp_path: Path) -> None:
     store = AssetStore(tmp_path)
     builder = AssetBuilder(store)
     blob = np.random.default_rng(0).integers(0, 255, (3, 100, 2), np.uint8)
@@ -113,7 +113,7 @@ def test_textures_in_a_form_of_their_own_are_passed_on(tmp_path: Path) -> None:
     assert store.get(note.levels[0].address) == blob.tobytes()
 
 
-def test_arrays_of_one_content_and_another_shape_are_not_the_same(tmp_path: Path) -> None:
+def test_arrays_of_equal_bytes_and_different_shape_differ(tmp_path: Path) -> None:
     """Two flat height fields, or the same numbers as edges and as triangles."""
     builder = AssetBuilder(AssetStore(tmp_path))
     grids = [np.zeros((2, 3), np.float32), np.zeros((3, 2), np.float32), np.zeros((2, 3), np.int32)]
@@ -122,7 +122,7 @@ def test_arrays_of_one_content_and_another_shape_are_not_the_same(tmp_path: Path
     assert builder.built == 3
 
 
-def test_what_a_crash_cut_off_is_built_again(tmp_path: Path) -> None:
+def test_truncated_assets_are_rebuilt(tmp_path: Path) -> None:
     store = AssetStore(tmp_path)
     pixels = picture(64, 64)
     (note,) = (builder := AssetBuilder(store)).run([builder.texture_work(pixels, "2d")])
@@ -133,7 +133,7 @@ def test_what_a_crash_cut_off_is_built_again(tmp_path: Path) -> None:
     assert np.array_equal(decode_image(store.get(note.levels[0].address), "arrays"), pixels)
 
 
-#: A mesh and a flex, and what they may differ in when all else is the same.
+#: A mesh and a flex, and one difference at a time.
 ALIKE = """<mujoco><asset><mesh name="m" file="m.obj" inertia="shell"/></asset>
     <worldbody><geom type="mesh" mesh="m"/></worldbody>
     <deformable><flex name="f" dim="2" body="world" radius=".01" vertex="{0}" element="0 1 2 2 1 3"
@@ -150,7 +150,7 @@ DIFFERENT = {
 }
 
 
-def test_nothing_that_is_remembered_of_a_model_is_taken_for_another(tmp_path: Path) -> None:
+def test_cached_parts_of_a_model_are_not_used_for_another(tmp_path: Path) -> None:
     hashes = set()
     for number, (vertex, texcoord, *obj) in enumerate(DIFFERENT.values()):
         model = mujoco.MjModel.from_xml_string(
@@ -162,7 +162,7 @@ def test_nothing_that_is_remembered_of_a_model_is_taken_for_another(tmp_path: Pa
     assert len(hashes) == len(DIFFERENT)
 
 
-def test_a_cloth_with_other_texture_coordinates_is_another(tmp_path: Path) -> None:
+def test_cloths_with_other_texture_coordinates_differ(tmp_path: Path) -> None:
     addresses = set()
     corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
     for uvs in ([[0, 0], [1, 0], [0, 1]], [[0, 0], [2, 0], [0, 2]]):
@@ -172,7 +172,7 @@ def test_a_cloth_with_other_texture_coordinates_is_another(tmp_path: Path) -> No
     assert len(addresses) == 2
 
 
-def test_what_is_seen_through_is_no_jpeg(tmp_path: Path) -> None:
+def test_transparent_textures_are_not_jpeg(tmp_path: Path) -> None:
     store = AssetStore(tmp_path)
     builder = AssetBuilder(store, EncodeOptions(texture_encoding="jpeg"))
     pixels = np.random.default_rng(1).integers(0, 255, (16, 16, 4), np.uint8)
@@ -181,7 +181,7 @@ def test_what_is_seen_through_is_no_jpeg(tmp_path: Path) -> None:
     np.testing.assert_array_equal(decode_image(store.get(note.levels[0].address), "png"), pixels)
 
 
-def test_the_stated_error_of_a_level_is_that_of_both_steps(tmp_path: Path) -> None:
+def test_stated_error_of_a_level_covers_both_steps(tmp_path: Path) -> None:
     mesh = ball(4)
     builder = AssetBuilder(AssetStore(tmp_path))
     (note,) = builder.run([builder.mesh_work([mesh.position, mesh.index], lambda: mesh)])

@@ -1,4 +1,4 @@
-"""Levels of detail for what a client can draw: finest that fit, coarsest where nothing does."""
+"""Levels of detail within a client's budget: the finest that fit, the coarsest where nothing fits."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_without_a_budget_everything_is_exact(spec: SceneSpec) -> None:
     assert choice.fits
 
 
-def test_what_bends_is_drawn_too(spec: SceneSpec) -> None:
+def test_deformables_are_drawn_too(spec: SceneSpec) -> None:
     """Hidden ones and ropes cost no triangles; none of them has levels, or is left out."""
     cloth = Deformable("", 2, 0, 60, 5_000, 0.01, False, -1, (1.0, 1.0, 1.0, 1.0), "flex-0", "0" * 64, 100)
     rope, hidden = msgspec.structs.replace(cloth, dim=1), msgspec.structs.replace(cloth, group=4)
@@ -62,14 +62,14 @@ def test_textures_fit(spec: SceneSpec) -> None:
     assert 0 < sum(choice.texture_levels) < 6
 
 
-def test_what_can_not_fit_is_as_coarse_as_it_gets(spec: SceneSpec) -> None:
+def test_scene_beyond_the_budget_uses_the_coarsest_levels(spec: SceneSpec) -> None:
     choice = choose_levels(spec, Budget(triangles=10, texture_bytes=10))
     assert choice.mesh_levels == tuple(len(mesh.levels) - 1 for mesh in spec.meshes)
     assert choice.texture_levels == tuple(len(texture.levels) - 1 for texture in spec.textures)
     assert (choice.fits, choice.objects) == (False, 30)
 
 
-def test_the_smallest_are_left_out_first(spec: SceneSpec) -> None:
+def test_smallest_visuals_are_left_out_first(spec: SceneSpec) -> None:
     choice = choose_levels(spec, Budget(objects=12))
     assert (choice.fits, choice.objects, len(choice.hidden)) == (True, 12, 18)
     sides = [max(b - a for a, b in zip(mesh.low, mesh.high, strict=True)) for mesh in spec.meshes]
@@ -77,7 +77,7 @@ def test_the_smallest_are_left_out_first(spec: SceneSpec) -> None:
     assert not any(visual.geometry.mesh == largest for visual in spec.visuals if visual.id in choice.hidden)
 
 
-def test_a_capsule_is_as_long_as_with_its_caps(tmp_path: Path) -> None:
+def test_capsule_length_includes_its_caps(tmp_path: Path) -> None:
     scene = SceneBuilder()
     scene.add_capsule("longer", radius=0.5, half_length=0.8)
     scene.add_box("shorter", half_size=(1.0, 0.1, 0.1))
@@ -86,7 +86,7 @@ def test_a_capsule_is_as_long_as_with_its_caps(tmp_path: Path) -> None:
     assert found.visuals[hidden].name == "shorter"
 
 
-def test_the_report_says_what_is_heavy(spec: SceneSpec) -> None:
+def test_report_names_heavy_parts(spec: SceneSpec) -> None:
     found = build_report(spec, "0" * 64)
     assert found.struggles == ()
     assert (found.bodies, found.moving, found.kinds) == (30, 30, {"mesh": 30})
@@ -95,8 +95,8 @@ def test_the_report_says_what_is_heavy(spec: SceneSpec) -> None:
     assert len(list(format_tree(spec))) == 31
 
 
-def test_the_report_says_what_a_headset_struggles_with(tmp_path: Path) -> None:
+def test_report_names_problems_of_a_headset(tmp_path: Path) -> None:
     heavy = parse_mujoco(many_objects(220, 2, 12_000, 64), AssetStore(tmp_path)).spec
     objects, triangles = build_report(heavy, "0" * 64).struggles
     assert "220 objects" in objects
-    assert "coarser levels bring it to" in triangles
+    assert "coarser levels" in triangles

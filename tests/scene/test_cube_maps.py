@@ -1,4 +1,4 @@
-"""Exported GLB files, drawn by casting rays, against MuJoCo's picture: cube and 2d textures on every shape."""
+"""Exported GLB files, drawn by ray casting, against MuJoCo's picture: cube and 2d textures on every shape."""
 
 from __future__ import annotations
 
@@ -23,30 +23,25 @@ from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.scene.report import list_glb_differences
 from iris_session.scene.shapes import build_primitive
 from tests.scene.models import QUAD, SHAPES, WEDGE
-from tests.scene.pictures import Artist, graphics
+from tests.scene.pictures import ModelRenderer, graphics
 from tests.scene.rays import draw, rays
 from tests.scene.rebuild import FACES, png
 from tests.scene.test_fidelity import MEAN_DIFFERENCE, VISIBLE, VISIBLE_SHARE
 from tests.scene.test_shapes import document
 
-#: Azimuth and elevation [degrees]: together they see all faces, but what looks down; planes are seen from above.
+#: Azimuth and elevation [degrees]: together they show all faces except the lower ones; planes from above.
 VIEWS = ((30.0, -25.0), (155.0, -32.0), (260.0, -40.0))
 FROM_BELOW = (70.0, 40.0)
 CLOTH = """<flexcomp name="cloth" type="grid" dim="2" count="5 4 1" spacing=".15 .15 .15" radius=".001" material="m">
 <edge equality="true"/></flexcomp>"""
-#: Mean difference of 255 where three colours are multiplied: linear ones in glTF, as they are in MuJoCo.
+#: Mean difference of 255 where three colours are multiplied: linear in glTF, not in MuJoCo.
 GLOW_DIFFERENCE = 1.5
-#: Nothing but what materials emit: colours as they are, without light.
+#: Only emission: colours without light.
 DARK = '<visual><headlight ambient="0 0 0" diffuse="0 0 0" specular="0 0 0"/></visual>'
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> AssetStore:
-    return AssetStore(tmp_path / "store")
-
-
 def painted(shape: str, texture: str, look: str = "", side: int = 16, cloth: str = "") -> mujoco.MjModel:
-    """One shape. `texture`: `cube` or `2d`; each face has a colour and a dark corner, which tells how it is turned."""
+    """One shape. `texture`: `cube` or `2d`; each face has a colour and a dark corner, which shows its rotation."""
     rng = np.random.default_rng(4)
     pictures = {}
     for face in FACES:
@@ -76,15 +71,15 @@ def views(model: mujoco.MjModel, angles: Iterable[tuple[float, float]]) -> list[
 
 
 def check(model: mujoco.MjModel, store: AssetStore, path: Path, *, emitted: bool = False) -> None:
-    """That MuJoCo's picture and the drawing of the exported file agree."""
+    """Assert that MuJoCo's picture and the drawing of the exported file agree."""
     write_glb(parse_mujoco(model, store).spec, store, path)
     flat = int(model.geom_type[0]) == int(mujoco.mjtGeom.mjGEOM_PLANE)
     with graphics():
-        artist = Artist(model)
+        artist = ModelRenderer(model)
         for camera in views(model, VIEWS if flat else (*VIEWS, FROM_BELOW)):
             exact = artist.colour(camera)
             drawn, shown = draw(path, *rays(model, camera), emitted=emitted)
-            assert np.mean(shown >= 0) > 0.02  # there is something to see
+            assert np.mean(shown >= 0) > 0.02  # the picture is not empty
             difference = np.abs(drawn[:, :, :3] - exact)
             assert difference.mean() <= (GLOW_DIFFERENCE if emitted else MEAN_DIFFERENCE)
             assert np.mean(difference.max(axis=2) > VISIBLE) <= VISIBLE_SHARE
@@ -93,26 +88,24 @@ def check(model: mujoco.MjModel, store: AssetStore, path: Path, *, emitted: bool
 
 @pytest.mark.parametrize("uniform", ["false", "true"])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_a_cube_is_drawn_as_mujoco_draws_it(tmp_path: Path, store: AssetStore, shape: str, uniform: str) -> None:
+def test_cube_texture_is_drawn_as_in_mujoco(tmp_path: Path, store: AssetStore, shape: str, uniform: str) -> None:
     model = painted(SHAPES[shape], "cube", f'texuniform="{uniform}" rgba="1 .9 .8 1"')
     check(model, store, tmp_path / "a.glb")
 
 
 @pytest.mark.parametrize("uniform", ["false", "true"])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_a_picture_is_repeated_as_mujoco_repeats_it(
-    tmp_path: Path, store: AssetStore, shape: str, uniform: str
-) -> None:
+def test_repeated_texture_is_drawn_as_in_mujoco(tmp_path: Path, store: AssetStore, shape: str, uniform: str) -> None:
     model = painted(SHAPES[shape], "2d", f'texrepeat="1.5 1" texuniform="{uniform}"')
     check(model, store, tmp_path / "a.glb")
 
 
-def test_a_cloth_repeats_its_picture(tmp_path: Path, store: AssetStore) -> None:
+def test_cloth_texture_is_repeated(tmp_path: Path, store: AssetStore) -> None:
     model = painted("size='.01' rgba='0 0 0 0'", "2d", 'texrepeat="1.5 2"', side=8, cloth=CLOTH)
     check(model, store, tmp_path / "a.glb")
 
 
-def test_what_has_no_coordinates_wears_no_picture(tmp_path: Path, store: AssetStore) -> None:
+def test_shapes_without_coordinates_have_no_texture(tmp_path: Path, store: AssetStore) -> None:
     flex = """<deformable><flex name="f" dim="2" body="b" radius=".001" material="m" element="0 1 2"
         vertex="-.3 -.3 0  .3 -.3 .1  .3 .3 .2"/></deformable>"""
     model = mujoco.MjModel.from_xml_string(
@@ -130,13 +123,13 @@ def test_what_has_no_coordinates_wears_no_picture(tmp_path: Path, store: AssetSt
 
 
 @pytest.mark.parametrize("texture", ["cube", "2d"])
-def test_what_glows_glows_in_its_texture(tmp_path: Path, store: AssetStore, texture: str) -> None:
+def test_emission_is_multiplied_by_the_texture(tmp_path: Path, store: AssetStore, texture: str) -> None:
     model = painted(SHAPES["box"], texture, 'rgba="1 .9 .8 1"')
     model.mat_emission[0] = 0.4
     check(model, store, tmp_path / "a.glb", emitted=True)
 
 
-def test_a_cube_may_be_seen_through(tmp_path: Path, store: AssetStore) -> None:
+def test_cube_texture_may_be_transparent(tmp_path: Path, store: AssetStore) -> None:
     spec = parse_mujoco(painted(SHAPES["sphere"], "cube", 'rgba="1 1 1 .4"'), store).spec
     write_glb(spec, store, tmp_path / "a.glb")
     (material,) = document(tmp_path / "a.glb")["materials"]
@@ -146,7 +139,7 @@ def test_a_cube_may_be_seen_through(tmp_path: Path, store: AssetStore) -> None:
 
 
 def images(path: Path) -> list[Image.Image]:
-    """The pictures of a GLB."""
+    """Return the pictures of a GLB."""
     data, found = path.read_bytes(), document(path)
     start = 20 + struct.unpack_from("<I", data, 12)[0] + 8
     pictures = []
@@ -171,7 +164,7 @@ def many() -> mujoco.MjModel:
     )
 
 
-def test_what_is_the_same_is_in_the_file_once(tmp_path: Path, store: AssetStore) -> None:
+def test_equal_content_is_in_the_file_once(tmp_path: Path, store: AssetStore) -> None:
     write_glb(parse_mujoco(many(), store).spec, store, tmp_path / "a.glb")
     found = document(tmp_path / "a.glb")
     assert [picture.size for picture in images(tmp_path / "a.glb")] == [(3 * 72, 2 * 72), (15, 10)]
@@ -179,10 +172,10 @@ def test_what_is_the_same_is_in_the_file_once(tmp_path: Path, store: AssetStore)
     assert corners[0] == corners[1]  # of one size, in two colours
     assert len(set(corners)) == 4
     counts = {k: found["accessors"][corner]["count"] for k, corner in enumerate(corners)}
-    assert counts[4] < counts[0]  # cut at edges of faces, but not split: there is nothing on them to be in place
+    assert counts[4] < counts[0]  # cut at face edges but not split: no texture coordinates are needed
 
 
-def test_a_cube_of_one_colour_needs_no_picture(tmp_path: Path, store: AssetStore) -> None:
+def test_uniform_cube_needs_no_picture(tmp_path: Path, store: AssetStore) -> None:
     write_glb(parse_mujoco(many(), store).spec, store, tmp_path / "a.glb")
     (look,) = (m for m in document(tmp_path / "a.glb")["materials"] if m["name"] == "one")
     factor = np.array(look["pbrMetallicRoughness"]["baseColorFactor"])
@@ -193,7 +186,7 @@ def test_a_cube_of_one_colour_needs_no_picture(tmp_path: Path, store: AssetStore
 
 
 @pytest.mark.parametrize("levels", [False, True])
-def test_large_cubes_are_made_smaller_and_jpeg_stays(
+def test_large_cubes_are_scaled_down_and_jpeg_is_kept(
     tmp_path: Path, store: AssetStore, monkeypatch: pytest.MonkeyPatch, *, levels: bool
 ) -> None:
     monkeypatch.setattr("iris_session.scene.glb.CUBE_SIDE", 32)
@@ -203,12 +196,11 @@ def test_large_cubes_are_made_smaller_and_jpeg_stays(
     write_glb(spec, store, tmp_path / "a.glb")
     (picture,) = images(tmp_path / "a.glb")
     assert (picture.size, picture.format) == ((3 * 36, 2 * 36), "JPEG")
-    assert list_glb_differences(spec) == (
-        "1 cube textures of more than 32 pixels a face: they are there in a smaller size",
-    )
+    (difference,) = list_glb_differences(spec)
+    assert difference.startswith("1 cube textures of more than 32 pixels")
 
 
-def test_a_cube_that_just_fits_is_taken_as_it_is(store: AssetStore) -> None:
+def test_cube_at_the_size_limit_is_unchanged(store: AssetStore) -> None:
     spec = parse_mujoco(painted(SHAPES["box"], "cube", side=512), store).spec
     visual = spec.visuals[0]
     sides = []
@@ -221,7 +213,7 @@ def test_a_cube_that_just_fits_is_taken_as_it_is(store: AssetStore) -> None:
 
 
 @pytest.mark.parametrize(("alpha", "pictured"), [(128, True), (255, False)])
-def test_one_colour_that_is_seen_through_needs_a_picture(alpha: int, *, pictured: bool) -> None:
+def test_uniform_transparent_texture_needs_a_picture(alpha: int, *, pictured: bool) -> None:
     faces = np.full((6, 8, 8, 4), (200, 100, 0, alpha), np.uint8)
     found = _with_atlas(CubeMap("", "png"), faces, 64)
     assert (found.atlas is not None) == pictured
@@ -229,7 +221,7 @@ def test_one_colour_that_is_seen_through_needs_a_picture(alpha: int, *, pictured
 
 
 def ball(store: AssetStore) -> tuple[SceneSpec, MeshArrays, MeshArrays]:
-    """A scene with a painted ball, its shape, and that with a cube."""
+    """A scene with a painted ball, its shape, and the shape with a cube."""
     spec = parse_mujoco(painted(SHAPES["sphere"], "cube"), store).spec
     geometry = spec.visuals[0].geometry
     cube = CubeMapReader(spec, store, 2_048).find(spec.visuals[0].material, geometry)
@@ -245,8 +237,8 @@ def edges(mesh: MeshArrays) -> list[tuple[Any, ...]]:
     return [(corner[t[k]], corner[t[(k + 1) % 3]]) for t in mesh.index for k in range(3)]
 
 
-def test_what_is_cut_and_split_has_no_gaps(store: AssetStore) -> None:
-    """Every edge runs once each way, to the bit, and the surface is the one that it was."""
+def test_cut_and_split_meshes_have_no_gaps(store: AssetStore) -> None:
+    """Every edge occurs once in each direction, bit for bit, and the surface is unchanged."""
     _, before, after = ball(store)
     there = edges(after)
     assert len(set(there)) == len(there)
@@ -261,8 +253,8 @@ def test_what_is_cut_and_split_has_no_gaps(store: AssetStore) -> None:
     assert area(after) == pytest.approx(area(before), rel=1e-6)
 
 
-def test_colours_at_corners_are_kept(store: AssetStore) -> None:
-    """Cut edges have what lies between their ends."""
+def test_vertex_colours_are_kept(store: AssetStore) -> None:
+    """Cut edges interpolate between their ends."""
     spec, before, _ = ball(store)
     cube = CubeMapReader(spec, store, 2_048).find(0, spec.visuals[0].geometry)
     assert cube is not None

@@ -1,4 +1,4 @@
-"""How large a scene is: exactly for what is turned, and what a mistake of units looks like."""
+"""Extent of a scene: exact for rotated parts, and suspected unit mistakes."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from iris_session.scene.shapes import build_primitive
 TURN = (0.8, 0.1, -0.3, 0.5)
 
 
-def test_shapes_that_are_turned(tmp_path: Path) -> None:
-    """By the triangles of the same shapes, which lie on it within their tessellation, and never outside."""
+def test_extent_of_rotated_shapes(tmp_path: Path) -> None:
+    """Against the triangles of the same shapes, which are inside and within their tessellation."""
     for kind in ("box", "sphere", "ellipsoid", "capsule", "cylinder"):
         scene = SceneBuilder()
         half = {"half_size": (0.3, 0.1, 0.2)}
@@ -46,8 +46,8 @@ def test_shapes_that_are_turned(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.subtract(found.high, found.low), found.size)
 
 
-def test_meshes_by_their_vertices(tmp_path: Path) -> None:
-    """A ball that is turned is as large as before; the box around it is not."""
+def test_extent_of_meshes_by_their_vertices(tmp_path: Path) -> None:
+    """A rotated ball keeps its size; the box around it does not."""
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
     scene = SceneBuilder()
     scene.add_mesh(vertices=ball.vertices, triangles=ball.faces, quaternion=(math.cos(0.4), 0, 0, math.sin(0.4)))
@@ -65,7 +65,7 @@ def test_meshes_by_their_vertices(tmp_path: Path) -> None:
     assert spec.environment.extent > 25
 
 
-def test_of_a_model(tmp_path: Path) -> None:
+def test_extent_of_a_model(tmp_path: Path) -> None:
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><asset><hfield name="h" nrow="3" ncol="3" size="1 2 0.5 0.25" elevation="0 0 0 0 1 0 0 0 0"/></asset>'
         '<worldbody><geom type="plane" size="9 9 1"/><geom type="hfield" hfield="h" pos="0 0 -3"/>'
@@ -78,7 +78,7 @@ def test_of_a_model(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.high, (1, 3.5, 0.5))
 
 
-def test_nothing_has_no_extent(tmp_path: Path) -> None:
+def test_empty_scene_has_no_extent(tmp_path: Path) -> None:
     scene, store = SceneBuilder(), AssetStore(tmp_path)
     scene.add_plane()
     spec = scene.build(store).spec
@@ -87,7 +87,7 @@ def test_nothing_has_no_extent(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("side", "says"),
+    ("side", "expected"),
     [
         (0.0, ""),
         (0.0021, ""),
@@ -97,9 +97,9 @@ def test_nothing_has_no_extent(tmp_path: Path) -> None:
         (0.0005, "0.5 mm large: divided by 1,000 once too often? --scale 1000 makes it 0.5 m"),
     ],
 )
-def test_what_looks_like_a_mistake_of_units(side: float, says: str) -> None:
-    assert format_unit_hint(side, "--scale {factor}") == says
+def test_unit_mistakes_are_suspected(side: float, expected: str) -> None:
+    assert format_unit_hint(side, "--scale {factor}") == expected
 
 
-def test_lengths_for_people() -> None:
+def test_lengths_are_readable() -> None:
     assert [format_length(v) for v in (0.1, 0.0999, 12.3456, 12_345.6)] == ["0.1 m", "99.9 mm", "12.35 m", "12,346 m"]

@@ -1,4 +1,4 @@
-"""A model built back from the decoded scene, drawn by MuJoCo, against MuJoCo's picture of the original."""
+"""A model rebuilt from the decoded scene, drawn by MuJoCo, against MuJoCo's picture of the original."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from iris_session.scene import AssetStore, EncodeOptions
 from iris_session.scene.mujoco_scene import parse_mujoco
 from tests.models import robot_models
 from tests.scene.models import every_shape
-from tests.scene.pictures import Artist, cameras, graphics, silhouette_iou
+from tests.scene.pictures import ModelRenderer, cameras, graphics, silhouette_iou
 from tests.scene.rebuild import rebuild
 
 __all__ = ["robot_models"]
 
-#: Of 255. Edges of textures may fall onto the neighbouring pixel, so few may differ by more than `VISIBLE`.
+#: Of 255. Edges of textures may fall onto the adjacent pixel, so a few may differ by more than `VISIBLE`.
 MEAN_DIFFERENCE, VISIBLE, VISIBLE_SHARE = 0.5, 24, 0.002
 PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 
@@ -30,15 +30,15 @@ def check(model: mujoco.MjModel, store: AssetStore, views: slice) -> None:
     pictures = []
     with graphics():
         for one in (model, copy):
-            artist = Artist(one)
+            artist = ModelRenderer(one)
             pictures.append([(artist.segments(c), artist.colour(c)) for c in cameras(one)[views]])
             artist.close()
     assert pictures[0]
-    solid = np.append(model.geom_type != PLANE, False)  # a floor without end fills every silhouette
+    solid = np.append(model.geom_type != PLANE, False)  # an infinite floor fills every silhouette
     for (shown, colour), (shown_copy, colour_copy) in zip(*pictures, strict=True):
         assert silhouette_iou(solid[shown], solid[shown_copy]) >= 0.99
         assert np.mean(shown == shown_copy) >= 0.99
-        assert colour.std() > 5  # there is something to see
+        assert colour.std() > 5  # the picture is not empty
         difference = np.abs(colour.astype(np.int16) - colour_copy)
         assert difference.mean() <= MEAN_DIFFERENCE
         assert np.mean(difference.max(axis=2) > VISIBLE) <= VISIBLE_SHARE
@@ -50,5 +50,5 @@ def test_real_robots_look_the_same(robot_models: Path, tmp_path: Path, name: str
     check(model, AssetStore(tmp_path), views)
 
 
-def test_every_shape_look_and_light_is_the_same(tmp_path: Path) -> None:
+def test_every_shape_material_and_light_looks_the_same(tmp_path: Path) -> None:
     check(every_shape(), AssetStore(tmp_path), slice(None))

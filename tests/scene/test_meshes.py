@@ -1,4 +1,4 @@
-"""Meshes: corners indexed without loss, quantised within the stated bound, made coarser within the stated bound."""
+"""Meshes: corners indexed without loss, quantised and simplified within the stated bounds."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from iris_session.scene.meshes import index_corners
 
 
 def soup(seed: int, faces: int, *, uv: bool) -> MeshArrays:
-    """Triangles whose corners repeat."""
+    """Return triangles with repeated corners."""
     rng = np.random.default_rng(seed)
     choose = rng.integers(0, max(1, faces), (faces, 3))
     points, normals, texture = (rng.normal(size=(max(1, faces), n)).astype(np.float32) for n in (3, 3, 2))
@@ -38,7 +38,7 @@ def ball(subdivisions: int) -> MeshArrays:
 
 
 @given(st.integers(0, 1000), st.integers(0, 60), st.booleans())
-def test_corners_are_kept_to_the_bit_and_each_once(seed: int, faces: int, uv: bool) -> None:
+def test_corners_are_exact_and_unique(seed: int, faces: int, uv: bool) -> None:
     mesh = soup(seed, faces, uv=uv)
     back = decode_mesh(encode_mesh(mesh))
     for name in ("position", "normal", "uv", "index"):
@@ -53,7 +53,7 @@ def test_more_than_65536_corners() -> None:
     mesh = index_corners(position, np.zeros_like(position), None)
     assert mesh.vertices == 90_000
     assert np.array_equal(decode_mesh(encode_mesh(mesh)).position[mesh.index], position)
-    for most in (65_535, 65_536):  # the last number that two bytes hold, and the first that they do not
+    for most in (65_535, 65_536):  # the last index that fits two bytes, and the first that does not
         points = np.zeros((most + 1, 3), np.float32)
         last = MeshArrays(points, points, None, np.array([[0, 1, most]], np.uint32))
         assert decode_mesh(encode_mesh(last)).index.max() == most
@@ -69,7 +69,7 @@ def test_quantised_positions_stay_within_the_bound(seed: int, scale: float, offs
     assert np.array_equal(back.index, moved.index)
 
 
-def test_coarser_meshes_stay_within_the_stated_error() -> None:
+def test_simplified_meshes_stay_within_the_stated_error() -> None:
     mesh = ball(4)
     coarse = simplify_mesh(mesh, mesh.triangles // 4)
     assert coarse is not None
@@ -88,7 +88,7 @@ def test_coarser_meshes_stay_within_the_stated_error() -> None:
 
 
 def cable(points: int) -> trimesh.Trimesh:
-    """A spiral 1.5 m long and 4 mm thick, finely divided."""
+    """Return a spiral 1.5 m long and 4 mm thick, finely divided."""
     along = np.linspace(0, 1, points)
     middle = np.stack([1.5 * along, 0.2 * np.sin(9 * along), 0.2 * np.cos(9 * along)], axis=1)
     turn = np.arange(8) / 8 * 2 * np.pi
@@ -108,7 +108,7 @@ def table() -> trimesh.Trimesh:
 
 @pytest.mark.parametrize("thin", [table, lambda: cable(1_500)], ids=["legs of a table", "cable"])
 @pytest.mark.parametrize("triangles", [4_000, 1_000])
-def test_what_is_long_and_thin_stays(thin: Callable[[], trimesh.Trimesh], triangles: int) -> None:
+def test_long_and_thin_parts_are_kept(thin: Callable[[], trimesh.Trimesh], triangles: int) -> None:
     """Where a cell is wider than they are, they would become lines: a table stood on three legs."""
     whole = trimesh.util.concatenate([trimesh.creation.icosphere(5, radius=0.3), thin()])
     coarse = simplify_mesh(build_smooth_mesh(np.array(whole.vertices), np.array(whole.faces, np.int64)), triangles)
@@ -121,13 +121,13 @@ def test_what_is_long_and_thin_stays(thin: Callable[[], trimesh.Trimesh], triang
     assert error < 0.1
 
 
-def test_textured_meshes_and_small_gains_are_left_alone() -> None:
+def test_textured_meshes_and_small_gains_are_unchanged() -> None:
     assert simplify_mesh(soup(0, 100, uv=True), 20) is None
     assert simplify_mesh(ball(1), 79) is None
     assert simplify_mesh(ball(1), 80) is None
 
 
-def test_edges_stay_sharp_and_round_things_smooth() -> None:
+def test_edges_stay_sharp_and_round_surfaces_smooth() -> None:
     box = trimesh.creation.box()
     mesh = build_smooth_mesh(np.array(box.vertices), np.array(box.faces, np.int64))
     across = np.cross(*(mesh.position[mesh.index[:, k]] - mesh.position[mesh.index[:, 0]] for k in (1, 2)))
@@ -143,10 +143,10 @@ def test_edges_stay_sharp_and_round_things_smooth() -> None:
         ([StoredArray("position", np.zeros((3, 2), np.float32))], "expected f4"),
         ([StoredArray("position", np.full((1, 3), np.nan, np.float32))], "not finite"),
         ([StoredArray("index", np.full((1, 3), 7, np.uint16))], "has the corner 7"),
-        ([StoredArray("index", np.full((1, 3), 1, np.uint16))], "has the corner 1, but there are 1"),
+        ([StoredArray("index", np.full((1, 3), 1, np.uint16))], "corner 1, .* 1"),
     ],
 )
-def test_what_is_no_mesh_is_refused(arrays: list[StoredArray], text: str) -> None:
+def test_invalid_meshes_are_rejected(arrays: list[StoredArray], text: str) -> None:
     whole = {
         "position": np.zeros((1, 3), np.float32),
         "normal": np.zeros((1, 3), np.float32),
@@ -160,7 +160,7 @@ def test_what_is_no_mesh_is_refused(arrays: list[StoredArray], text: str) -> Non
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.int64])
-def test_rows_are_those_of_numpy_in_their_order(kind: type) -> None:
+def test_unique_rows_agree_with_numpy(kind: type) -> None:
     rows = np.random.default_rng(5).integers(-3, 3, (2000, 3)).astype(kind)
     first, which = sort_rows(rows)
     unique, place, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)

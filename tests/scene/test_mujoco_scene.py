@@ -1,4 +1,4 @@
-"""What the parser says of a model: the tree, shapes, looks, names, lights, cameras, deformables."""
+"""Parsing of a model: tree, shapes, materials, names, lights, cameras, deformables."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def parse(xml: str, folder: Path, **options: Any) -> ParsedScene:
     return parse_mujoco(mujoco.MjModel.from_xml_string(xml), AssetStore(folder), **options)
 
 
-#: MuJoCo draws a geom in the frame of its body where no number of place and quaternion differs by 1e-6 or more:
+#: MuJoCo draws a geom in the frame of its body where no component of position and quaternion differs by 1e-6 or more:
 #: m, and radians in a matrix (three parts of a quaternion, each of them half an angle).
 TAKEN_FOR_ONE = 4e-6
 
 
 def check_tree(model: mujoco.MjModel, spec: SceneSpec) -> None:
-    """The specification says what the stream says, and poses that multiply up to MuJoCo's."""
+    """Assert that the specification agrees with the stream, and that its poses compose to MuJoCo's."""
     streamed = {info.id: info for info in World(model, (), ()).bodies}
     by_id = {body.id: body for body in spec.bodies}
     assert set(streamed) == set(by_id) - {0}
@@ -74,7 +74,7 @@ def geoms(draw: st.DrawFn, used: set[str]) -> str:
 
 
 def _name(draw: st.DrawFn, used: set[str], kind: str) -> str:
-    """A name that MuJoCo takes: none, or one that nothing else of this kind has."""
+    """Draw a name that MuJoCo accepts: none, or one unique for this kind."""
     name = draw(names)
     if not name or kind + name in used:
         return ""
@@ -178,7 +178,7 @@ def test_flexes_become_deformables_without_their_bodies(tmp_path: Path) -> None:
     assert decode_arrays(store.get(spec.deformables[0].address), "deformable")["uv"].shape == (24, 3, 2)
 
 
-def test_sites_and_tendons_on_request(tmp_path: Path) -> None:
+def test_sites_and_tendons_are_optional(tmp_path: Path) -> None:
     xml = """<mujoco><worldbody><body><joint/><geom size=".1"/><site name="a" size=".01"/></body>
     <site name="b" pos="1 0 0" type="box" size=".01 .02 .03"/><site name="c"/></worldbody>
     <tendon><spatial name="t" width=".02" rgba="1 0 0 1"><site site="a"/><site site="b"/></spatial></tendon></mujoco>"""
@@ -191,7 +191,7 @@ def test_sites_and_tendons_on_request(tmp_path: Path) -> None:
     assert (tendons.tendons[0].width, len(tendons.tendons[0].sites)) == (0.02, 2)
 
 
-def test_sites_and_tendons_that_mujoco_shows_are_named_as_left_out(tmp_path: Path) -> None:
+def test_visible_sites_and_tendons_are_reported_as_left_out(tmp_path: Path) -> None:
     xml = """<mujoco><worldbody><body><joint name="j"/><geom size=".1"/><site name="a"/></body>
     <site name="b" pos="1 0 0"/><site group="4"/><site rgba="0 0 0 0"/></worldbody>
     <tendon>{}<fixed><joint joint="j" coef="1"/></fixed></tendon></mujoco>"""
@@ -202,7 +202,7 @@ def test_sites_and_tendons_that_mujoco_shows_are_named_as_left_out(tmp_path: Pat
     assert parse(shown, tmp_path, sites=True, tendons=True).skipped == ()
 
 
-def test_a_texture_in_a_form_of_its_own_is_passed_on(tmp_path: Path) -> None:
+def test_texture_in_its_own_encoding_is_passed_on(tmp_path: Path) -> None:
     """Not as a picture of its bytes."""
     store, data = AssetStore(tmp_path), b"\xabKTX 20\xbb\r\n\x1a\n" + bytes(500)
     xml = """<mujoco><asset><texture name="t" type="2d" file="a.ktx"/><material name="m" texture="t"/></asset>
@@ -217,7 +217,7 @@ def test_a_texture_in_a_form_of_its_own_is_passed_on(tmp_path: Path) -> None:
     assert "KTX" in parsed.skipped[0]
 
 
-def test_an_image_that_lights_the_scene(tmp_path: Path) -> None:
+def test_image_based_light(tmp_path: Path) -> None:
     xml = """<mujoco><asset><texture name="sky" type="skybox" builtin="gradient" width="8" height="48"/></asset>
     <worldbody><light type="image" texture="sky" intensity="20"/></worldbody></mujoco>"""
     light = parse(xml, tmp_path).spec.lights[0]
@@ -236,13 +236,13 @@ WATCHED_CLOTH = """<mujoco><worldbody>
 
 
 @pytest.mark.parametrize("older", [False, True], ids=["as it is", "as before MuJoCo 3.4"])
-def test_bodies_are_those_of_the_state_stream(tmp_path: Path, older: bool) -> None:
-    """What one side leaves out and the other moves would stand still for everybody."""
+def test_bodies_agree_with_the_state_stream(tmp_path: Path, older: bool) -> None:
+    """A body that one side leaves out and the other moves would never move for clients."""
     parts = mujoco.MjSpec.from_string(WATCHED_CLOTH)
     parts.body("cloth_1").add_site(name="tip")
     model = parts.compile()
     if older:
-        model.body_weldid[1:3] = 0  # of a mocap body and what is fixed on it
+        model.body_weldid[1:3] = 0  # of a mocap body and its fixed children
     spec = parse_mujoco(model, AssetStore(tmp_path)).spec
     streamed = [(info.id, info.moving) for info in World(model, (), ()).bodies]
     assert [(body.id, body.moving) for body in spec.bodies] == [(0, False), *streamed]
@@ -263,8 +263,8 @@ def test_bodies_are_those_of_the_state_stream(tmp_path: Path, older: bool) -> No
     assert decode_scene(encode_scene(spec)) == spec
 
 
-def test_the_hash_of_a_scene_is_the_same_wherever_it_is_made(tmp_path: Path) -> None:
-    """With another number of threads, another order of sets, and nothing remembered."""
+def test_scene_hash_is_reproducible(tmp_path: Path) -> None:
+    """With another number of threads, another set order, and a cold cache."""
     program = (
         "import sys; from iris_session.scene import AssetStore\n"
         "from iris_session.scene.mujoco_scene import parse_mujoco; from tests.scene.models import every_shape, flexes\n"
@@ -281,14 +281,14 @@ def test_the_hash_of_a_scene_is_the_same_wherever_it_is_made(tmp_path: Path) -> 
     assert elsewhere.stdout.split() == here
 
 
-def test_skins_are_named_as_left_out(tmp_path: Path) -> None:
+def test_skins_are_reported_as_left_out(tmp_path: Path) -> None:
     xml = """<mujoco><asset/><deformable><skin name="s" vertex="0 0 0 1 0 0 0 1 0" face="0 1 2">
     <bone body="b" bindpos="0 0 0" bindquat="1 0 0 0" vertid="0 1 2" vertweight="1 1 1"/></skin></deformable>
     <worldbody><body name="b"><geom size=".1"/></body></worldbody></mujoco>"""
     assert "1 skins" in parse(xml, tmp_path).skipped[0]
 
 
-def test_flexes_that_no_stream_is_left_for_are_named(tmp_path: Path) -> None:
+def test_flexes_beyond_the_streams_are_reported(tmp_path: Path) -> None:
     ropes = [
         f'<flexcomp name="{k}" type="grid" dim="1" count="2 1 1" spacing=".1 .1 .1" pos="0 {k} 1" radius=".01">'
         '<edge equality="true"/></flexcomp>'
@@ -302,7 +302,7 @@ def test_flexes_that_no_stream_is_left_for_are_named(tmp_path: Path) -> None:
     assert all_streamed == ()
 
 
-def test_an_sdf_comes_as_its_mesh(tmp_path: Path) -> None:
+def test_sdf_is_read_as_its_mesh(tmp_path: Path) -> None:
     xml = """<mujoco><asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>
     <worldbody><geom type="sdf" mesh="m"/></worldbody></mujoco>"""
     geometry = parse(xml, tmp_path).spec.visuals[0].geometry
@@ -320,13 +320,13 @@ def test_an_sdf_comes_as_its_mesh(tmp_path: Path) -> None:
         ({"hfields": ()}, "reference to height field"),
     ],
 )
-def test_dangling_references_are_refused(tmp_path: Path, change: dict[str, Any], text: str) -> None:
+def test_dangling_references_are_rejected(tmp_path: Path, change: dict[str, Any], text: str) -> None:
     spec = parse_mujoco(every_shape(), AssetStore(tmp_path), options=EncodeOptions(levels=False)).spec
     with pytest.raises(SceneError, match=text):
         decode_scene(encode_scene(msgspec.structs.replace(spec, **change)))
 
 
-def test_bodies_may_not_go_in_circles(tmp_path: Path) -> None:
+def test_cyclic_bodies_are_rejected(tmp_path: Path) -> None:
     xml = "<mujoco><worldbody><body><geom size='1'/><body><geom size='1'/></body></body></worldbody></mujoco>"
     spec = parse(xml, tmp_path).spec
     world, outer, inner = spec.bodies
@@ -338,7 +338,7 @@ def test_bodies_may_not_go_in_circles(tmp_path: Path) -> None:
 
 
 @given(st.binary(max_size=100))
-def test_specifications_of_anybody(data: bytes) -> None:
+def test_random_specifications_raise_scene_errors_only(data: bytes) -> None:
     for candidate in (data, b"\x80" + data, encode_scene(SceneSpec())[:-1] + data):
         try:
             decode_scene(candidate)
@@ -346,8 +346,8 @@ def test_specifications_of_anybody(data: bytes) -> None:
             continue
 
 
-def test_what_tracks_a_body_stands_where_it_does_at_first(tmp_path: Path) -> None:
-    """It does not turn with its body, so its place in the body's frame depends on the state in which all begins."""
+def test_tracking_cameras_have_their_initial_pose(tmp_path: Path) -> None:
+    """They do not rotate with their body, so their pose in the body's frame depends on the initial state."""
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><worldbody><body name="t" pos="1 2 3" euler="10 20 30"><freejoint/><geom size=".1"/>
         <geom size=".1" pos="1 0 0"/>
@@ -377,8 +377,8 @@ def test_what_tracks_a_body_stands_where_it_does_at_first(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("dof", "count"), [("full", "3 3 1"), ("2d", "3 3 1"), ("radial", "2 2 2"), ("trilinear", "3 3 3")]
 )
-def test_bodies_of_vertices_are_nothing_that_moves_by_itself(tmp_path: Path, dof: str, count: str) -> None:
-    """MuJoCo gives them one to three slides; a link of a robot on one slide, with a flex on it, stays what it is."""
+def test_bodies_of_flex_vertices_are_not_movable(tmp_path: Path, dof: str, count: str) -> None:
+    """MuJoCo gives them one to three slides; a robot link on one slide, with a flex on it, stays a movable body."""
     dim = 2 if count.endswith("1") else 3
     xml = f"""<mujoco><worldbody><body name="lift" pos="0 0 1"><joint type="slide" axis="0 0 1"/>
       <inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>

@@ -43,7 +43,7 @@ def proof_of(code: str, server: KeyPair, client: KeyPair) -> bytes:
     return pairing.make_client_proof(secret, server.raw_public, client.raw_public)
 
 
-def test_the_home_is_where_the_environment_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_home_is_given_by_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("IRIS_HOME", str(tmp_path / "a"))
     assert KeyHome().path == tmp_path / "a"
     monkeypatch.delenv("IRIS_HOME")
@@ -55,7 +55,7 @@ def test_the_home_is_where_the_environment_says(monkeypatch: pytest.MonkeyPatch,
     assert not (tmp_path / "c").exists(), "nothing is made before it is needed"
 
 
-def test_keys_are_made_once_and_are_for_their_owner_only(home: KeyHome) -> None:
+def test_keys_are_made_once_and_readable_by_their_owner_only(home: KeyHome) -> None:
     old = os.umask(0)
     try:
         server, own = home.load_server_key(), home.load_identity()
@@ -72,10 +72,10 @@ def test_keys_are_made_once_and_are_for_their_owner_only(home: KeyHome) -> None:
     assert load_secret(home.path / "server.key_secret") == server
 
 
-def test_what_others_may_read_is_refused_with_the_remedy(home: KeyHome) -> None:
+def test_files_readable_by_others_are_refused_with_the_command(home: KeyHome) -> None:
     home.load_server_key()
     (home.path / "server.key_secret").chmod(0o644)
-    with pytest.raises(KeysError, match=r"can be used by other users of this machine: chmod 600 .*server\.key_secret"):
+    with pytest.raises(KeysError, match=r"chmod 600 .*server\.key_secret"):
         home.load_server_key()
     (home.path / "server.key_secret").chmod(0o600)
     home.path.chmod(0o755)
@@ -84,7 +84,7 @@ def test_what_others_may_read_is_refused_with_the_remedy(home: KeyHome) -> None:
 
 
 @pytest.mark.parametrize("name", ["clients.json", "join_codes.json", "known_servers.json", "server.key_secret"])
-def test_a_damaged_file_is_one_line_and_never_replaced(home: KeyHome, name: str) -> None:
+def test_damaged_file_is_an_error_and_never_replaced(home: KeyHome, name: str) -> None:
     own = home.load_identity()
     path = home.path / name
     path.write_text("[{half")
@@ -102,20 +102,20 @@ def test_a_damaged_file_is_one_line_and_never_replaced(home: KeyHome, name: str)
     assert path.read_text() == "[{half"
 
 
-def test_a_name_belongs_to_one_key(home: KeyHome) -> None:
+def test_name_belongs_to_one_key(home: KeyHome) -> None:
     ann, eve = KeyPair.generate(), KeyPair.generate()
     home.clients.allow_key("ann", ann.public, ("operator",))
-    with pytest.raises(KeysError, match="'ann' is taken by another key"):
+    with pytest.raises(KeysError, match="'ann'"):
         home.clients.allow_key("ann", eve.public)
     first = home.clients.read()[ann.fingerprint]
     home.clients.allow_key("anna", ann.public, ("observer", "observer"))
     assert home.clients.read() == {
         ann.fingerprint: msgspec.structs.replace(first, name="anna", roles=("observer",)),
     }
-    with pytest.raises(KeysError, match="unknown role 'king'"):
+    with pytest.raises(KeysError, match="'king'"):
         home.clients.allow_key("eve", eve.public, ("king",))
     for key in ("short", "x" * 40 + "y", "\u00e9" * 40, "#" * 40):
-        with pytest.raises(KeysError, match="not a CURVE key"):
+        with pytest.raises(KeysError, match="CURVE key"):
             home.clients.allow_key("eve", key)
 
 
@@ -132,7 +132,7 @@ def test_revoking_by_name_or_fingerprint(home: KeyHome) -> None:
     assert home.clients.read() == {}
 
 
-def test_a_name_that_looks_like_a_fingerprint_protects_nobody(home: KeyHome) -> None:
+def test_name_like_a_fingerprint_does_not_prevent_revocation(home: KeyHome) -> None:
     eve, bob = KeyPair.generate(), KeyPair.generate()
     home.clients.allow_key(bob.fingerprint, eve.public)
     home.clients.allow_key("bob", bob.public)
@@ -142,20 +142,21 @@ def test_a_name_that_looks_like_a_fingerprint_protects_nobody(home: KeyHome) -> 
     assert list(home.clients.read()) == [eve.fingerprint]
 
 
-def test_a_code_is_good_for_one_key_and_is_nowhere_to_be_read(home: KeyHome) -> None:
+def test_code_is_valid_for_one_key_and_not_stored_in_clear(home: KeyHome) -> None:
     server, ann, eve = home.load_server_key(), KeyPair.generate(), KeyPair.generate()
     code, made = home.join_codes.create(server, roles=("observer",))
     text = (home.path / "join_codes.json").read_text()
     assert code not in text
     assert code.replace("-", "") not in text
-    assert len(home.join_codes.list_open(server.fingerprint)) == 1
-    assert home.join_codes.list_open(eve.fingerprint) == ()
+    assert [one.is_open(time.time()) for one in home.join_codes.list_for_server(server.fingerprint)] == [True]
+    assert home.join_codes.list_for_server(eve.fingerprint) == ()
     good = home.join_codes.redeem(
         server.raw_public, ann.public, proof_of(code.lower(), server, ann), "ann", home.clients
     )
     assert good.entry is not None
     assert (good.entry.name, good.entry.roles, good.entry.key) == ("ann", ("observer",), ann.public)
-    assert good.secret == pairing.stretch_code(code, server.raw_public)
+    secret = pairing.stretch_code(code, server.raw_public)
+    assert good.answer == pairing.make_server_proof(secret, server.raw_public, ann.raw_public)
     again = home.join_codes.redeem(server.raw_public, eve.public, proof_of(code, server, eve), "eve", home.clients)
     assert again.entry is None
     kept = home.join_codes.find_code(made.id)
@@ -164,8 +165,8 @@ def test_a_code_is_good_for_one_key_and_is_nowhere_to_be_read(home: KeyHome) -> 
     assert list(home.clients.read()) == [ann.fingerprint]
 
 
-def test_a_proof_of_one_key_is_no_good_for_another(home: KeyHome) -> None:
-    """Somebody in the middle, with keys of their own, gains nothing from a proof."""
+def test_proof_is_bound_to_one_key(home: KeyHome) -> None:
+    """A man in the middle with own keys cannot use a proof."""
     server, middle, ann, eve = home.load_server_key(), KeyPair.generate(), KeyPair.generate(), KeyPair.generate()
     code, _ = home.join_codes.create(server)
     for stolen in (proof_of(code, server, ann), proof_of(code, middle, eve)):
@@ -174,8 +175,8 @@ def test_a_proof_of_one_key_is_no_good_for_another(home: KeyHome) -> None:
     assert home.clients.read() == {}
 
 
-def test_a_code_is_used_up_before_anybody_is_let_in(home: KeyHome, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A power cut between the two writes must not leave a code that lets a second key in."""
+def test_code_is_used_up_before_its_key_is_allowed(home: KeyHome, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A power cut between the two writes must not leave a code that allows a second key."""
     server, ann = home.load_server_key(), KeyPair.generate()
     code, made = home.join_codes.create(server)
     proof = proof_of(code, server, ann)
@@ -203,8 +204,8 @@ def test_a_code_is_used_up_before_anybody_is_let_in(home: KeyHome, monkeypatch: 
     assert (kept.secret, kept.paired) == (b"", None), "nobody is said to have paired"
 
 
-def test_two_codes_and_two_devices_at_once(home: KeyHome, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two people run `pair` together, and three devices use their codes: everybody but the third gets in, as meant."""
+def test_two_codes_and_three_devices_at_once(home: KeyHome, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two commands `pair` run at once, and three devices use their codes: all but the third are allowed."""
     monkeypatch.setattr(pairing, "ITERATIONS", 1)
     server = home.load_server_key()
     with ThreadPoolExecutor(3) as pool:
@@ -226,7 +227,7 @@ def test_two_codes_and_two_devices_at_once(home: KeyHome, monkeypatch: pytest.Mo
     assert len(home.clients.read()) == 2
 
 
-def test_five_wrong_attempts_make_every_open_code_void(home: KeyHome) -> None:
+def test_five_wrong_attempts_void_every_open_code(home: KeyHome) -> None:
     server, ann = home.load_server_key(), KeyPair.generate()
     codes = [home.join_codes.create(server)[0] for _ in range(2)]
     exhausted = [
@@ -240,7 +241,7 @@ def test_five_wrong_attempts_make_every_open_code_void(home: KeyHome) -> None:
     assert [one.secret for one in home.join_codes.read()] == [b"", b""]
 
 
-def test_an_expired_code_lets_nobody_in(home: KeyHome) -> None:
+def test_expired_code_allows_no_key(home: KeyHome) -> None:
     server, ann = home.load_server_key(), KeyPair.generate()
     code, made = home.join_codes.create(server, minutes=0.0005)
     while time.time() < made.expires:
@@ -253,7 +254,7 @@ def test_an_expired_code_lets_nobody_in(home: KeyHome) -> None:
     assert kept.secret == b"", "what has expired keeps no secret"
 
 
-def test_a_clock_that_is_put_back_does_not_bring_a_code_back(home: KeyHome, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_clock_set_back_does_not_renew_a_code(home: KeyHome, monkeypatch: pytest.MonkeyPatch) -> None:
     """A laptop without a network sets its clock when it gets one: hours back, after the code was shown."""
     monkeypatch.setattr(pairing, "ITERATIONS", 1)
     server, ann = home.load_server_key(), KeyPair.generate()
@@ -268,8 +269,8 @@ def test_a_clock_that_is_put_back_does_not_bring_a_code_back(home: KeyHome, monk
     assert home.join_codes.redeem(server.raw_public, ann.public, proof, "ann", home.clients).entry is not None
 
 
-def test_what_is_replaced_stays_replaced_after_a_power_cut(home: KeyHome, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The new file is made durable under its other name: the folder has to be, too."""
+def test_replaced_file_is_durable_after_a_power_cut(home: KeyHome, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The folder must be synced, too, for a new file to be durable under its name."""
     synced: list[bool] = []
     plain = os.fsync
 
@@ -282,7 +283,7 @@ def test_what_is_replaced_stays_replaced_after_a_power_cut(home: KeyHome, monkey
     assert synced == [False, True]
 
 
-def test_a_cancelled_code_is_void(home: KeyHome) -> None:
+def test_cancelled_code_is_void(home: KeyHome) -> None:
     server, ann = home.load_server_key(), KeyPair.generate()
     code, made = home.join_codes.create(server)
     home.join_codes.cancel(made.id)
@@ -299,11 +300,11 @@ def test_codes_are_bounded(home: KeyHome, monkeypatch: pytest.MonkeyPatch) -> No
         home.join_codes.create(server)
 
 
-def test_a_server_that_changes_its_key_is_not_taken_silently(home: KeyHome) -> None:
+def test_changed_server_key_is_an_error(home: KeyHome) -> None:
     old, new = KeyPair.generate(), KeyPair.generate()
     home.known_servers.pin("lab:7721", "lab", old.public)
     home.known_servers.pin("lab:7721", "lab-2", old.public)
-    with pytest.raises(KeysError, match=rf"another key \({new.fingerprint}\).*keys forget lab:7721"):
+    with pytest.raises(KeysError, match=rf"{new.fingerprint}.*lab:7721"):
         home.known_servers.pin("lab:7721", "lab", new.public)
     known = home.known_servers.find_by_address("lab:7721")
     assert known is not None
@@ -311,11 +312,11 @@ def test_a_server_that_changes_its_key_is_not_taken_silently(home: KeyHome) -> N
     assert home.known_servers.remove("lab:7721") == known
     assert home.known_servers.remove("lab:7721") is None
     home.known_servers.pin("lab:7721", "lab", new.public)
-    assert [one.key for one in home.known_servers.find_by_session("lab")] == [new.public]
+    assert [one.key for one in home.known_servers.read()] == [new.public]
 
 
-def test_processes_do_not_lose_each_others_changes(home: KeyHome) -> None:
-    """Three at once, each with its own keys: every one of them is on the list in the end."""
+def test_concurrent_processes_keep_each_others_changes(home: KeyHome) -> None:
+    """Three processes at once, each with its own keys: all are on the list in the end."""
     script = (
         "import sys\nfrom iris_session.security import KeyHome, KeyPair\nhome = KeyHome(sys.argv[1])\n"
         "for i in range(10):\n    home.clients.allow_key(f'{sys.argv[2]}-{i}', KeyPair.generate().public)\n"
@@ -331,7 +332,7 @@ def test_processes_do_not_lose_each_others_changes(home: KeyHome) -> None:
     assert len(keys) == 1, "the server key was made once"
 
 
-def test_who_may_not_wait_is_told_so(home: KeyHome) -> None:
+def test_locked_list_raises_without_waiting(home: KeyHome) -> None:
     ann = KeyPair.generate()
     home.clients.allow_key("ann", ann.public)
     with home.folder.lock(), pytest.raises(KeysBusyError):
@@ -339,7 +340,7 @@ def test_who_may_not_wait_is_told_so(home: KeyHome) -> None:
     assert home.clients.revoke_key("ann", timeout_s=0.0) is not None
 
 
-def test_notes_of_sessions_that_are_gone_are_passed_over(home: KeyHome) -> None:
+def test_notes_of_ended_sessions_are_ignored(home: KeyHome) -> None:
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     home.sessions.add(RegisteredSession("a", "old", gone.pid, ("10.0.0.1",), 7721, "key"))
@@ -357,7 +358,7 @@ def test_zeromq_certificates_are_read(tmp_path: Path) -> None:
     pair = load_secret(secret)
     assert load_public(public) == pair.public
     assert pair.fingerprint == compute_fingerprint(decode_key(pair.public))
-    with pytest.raises(KeysError, match="holds no secret key"):
+    with pytest.raises(KeysError, match="secret"):
         load_secret(public)
-    with pytest.raises(KeysError, match="cannot be used"):
+    with pytest.raises(KeysError, match="key"):
         load_public(tmp_path / "missing.key")

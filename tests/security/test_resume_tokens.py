@@ -5,7 +5,7 @@ from __future__ import annotations
 from iris_session.security.resume_tokens import ResumeTokens
 
 
-def test_a_token_stands_for_its_participant_and_key_until_retired() -> None:
+def test_token_is_valid_for_its_participant_and_key_until_retired() -> None:
     tokens = ResumeTokens(4)
     token = tokens.issue("key", "p1")
     assert tokens.find_participant(token, "key") == "p1"
@@ -15,13 +15,13 @@ def test_a_token_stands_for_its_participant_and_key_until_retired() -> None:
     assert tokens.find_participant(token, "key") is None
 
 
-def test_the_oldest_token_is_forgotten_when_the_table_is_full() -> None:
+def test_full_table_removes_the_oldest_token() -> None:
     tokens = ResumeTokens(2)
     issued = [tokens.issue("key", f"p{i}") for i in range(3)]
     assert [tokens.find_participant(token, "key") for token in issued] == [None, "p1", "p2"]
 
 
-def test_the_next_front_goes_on_with_tokens_and_numbers() -> None:
+def test_next_front_continues_with_tokens_and_numbers() -> None:
     tokens = ResumeTokens(4)
     assert [tokens.allocate_connection(), tokens.allocate_connection()] == [1, 2]
     token = tokens.issue("key", "p1")
@@ -32,7 +32,7 @@ def test_the_next_front_goes_on_with_tokens_and_numbers() -> None:
     assert successor.allocate_connection() == 3
 
 
-def test_with_a_gateways_key_go_the_tokens_of_those_behind_it_also_in_the_next_front() -> None:
+def test_revoked_gateway_key_removes_tokens_of_its_participants() -> None:
     tokens = ResumeTokens(8)
     tokens.issue("gateway", "p1")
     tab = tokens.issue("key of a tab", "p2", behind="gateway")
@@ -43,7 +43,7 @@ def test_with_a_gateways_key_go_the_tokens_of_those_behind_it_also_in_the_next_f
     assert successor.find_participant(other, "key of a tab") == "p3"
 
 
-def test_changed_tells_when_to_hand_back() -> None:
+def test_changed_is_true_after_a_change() -> None:
     tokens = ResumeTokens(4)
     assert not tokens.changed
     token = tokens.issue("key", "p1")
@@ -55,7 +55,7 @@ def test_changed_tells_when_to_hand_back() -> None:
     assert tokens.changed
 
 
-def test_who_comes_and_goes_pushes_out_nobody_who_is_here() -> None:
+def test_reconnecting_clients_do_not_remove_tokens_of_connected_ones() -> None:
     tokens = ResumeTokens(4)
     ann = tokens.issue("ann", "p1")
     for i in range(10):
@@ -64,7 +64,7 @@ def test_who_comes_and_goes_pushes_out_nobody_who_is_here() -> None:
     assert tokens.find_participant(ann, "ann") == "p1"
 
 
-def test_a_participant_keeps_the_token_it_came_with_and_the_newest() -> None:
+def test_participant_keeps_the_used_and_the_newest_token() -> None:
     tokens = ResumeTokens(4)
     ann, first = tokens.issue("ann", "p1"), tokens.issue("bob", "p2")
     second = tokens.issue("bob", "p2", first)

@@ -23,7 +23,7 @@ ANN = 1
 
 
 def make_core(model: mujoco.MjModel | None = None, **authority: object) -> SessionCore:
-    """The demo scene with default settings."""
+    """Make a core of the handover scene with default settings."""
     model = model or load_model(scene_path("handover"))
     config = CoreConfig(
         AuthorityConfig(**authority),  # type: ignore[arg-type]
@@ -39,17 +39,17 @@ def host(now_ns: int, message: EntryMessage) -> Entry:
 
 
 def entries(step: int, scene_epoch: int = 1) -> list[Entry]:
-    """Ann joins, takes the left robot, closes the clutch at step 50 and moves her hand by 0.2 m/s along y."""
+    """Return the entries of a step: ann joins, acquires the left robot, engages at step 50 and moves along y."""
     now_ns = (step + 1) * TICK_NS
     if step == 0:
-        join = Join("key", Role.OPERATOR, "ann", devices=("controller/right",), alignment="not_needed")
+        join = Join("key", Role.OPERATOR, "ann", devices=("desktop",), alignment="not_needed")
         return [Entry(ANN, ANN, now_ns, join)]
     if step == 1:
         return [Entry(ANN, ANN, now_ns, Acquire(1, ("left",)))]
     if step < 3 or step % SAMPLE_STEPS:
         return []
     sample = Sample(
-        device="controller/right",
+        device="desktop",
         kind="pose",
         seq=step,
         capture_ns=now_ns,
@@ -64,7 +64,7 @@ def entries(step: int, scene_epoch: int = 1) -> list[Entry]:
 
 
 def play(core: SessionCore, first: int, last: int) -> list[bytes]:
-    """Digests of steps `first` to `last` - 1, one tick each, a pause in between."""
+    """Take steps `first` to `last` - 1, one tick each, with a pause. Return their digests."""
     return [
         core.step((i + 1) * TICK_NS, entries(i) + _extras(i), int(not 120 <= i < 130)).digest
         for i in range(first, last)

@@ -17,7 +17,7 @@ CLOTH = np.array([(0, 0, 1), (0, 1, 1), (1, 0, 1), (1, 1, 1)], np.float32)
 
 
 def arm() -> Articulation:
-    """A turning upper arm of 1 m along x with a sliding fore arm at its end."""
+    """Return an arm: a revolute upper arm of 1 m along x with a prismatic fore arm at its end."""
     return Articulation(
         "arm",
         Pose((0.0, 0.0, 0.8), UNIT),

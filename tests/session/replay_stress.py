@@ -69,7 +69,7 @@ class Journal(msgspec.Struct, array_like=True):
 
 
 class Person(msgspec.Struct):
-    """What one participant believes of itself."""
+    """The state of one participant as it knows it."""
 
     connection: int
     role: str
@@ -120,7 +120,7 @@ class Stress:
 
     @property
     def state(self) -> Any:
-        """What honest clients learn from replies and events."""
+        """Apply replies and events as honest clients do."""
         return self.core.authority._ctx.state
 
     # --- one step ---
@@ -143,17 +143,19 @@ class Stress:
         self.take(n_ticks)
 
     def take(self, n_ticks: int) -> None:
-        """One step of the session with everything said since the last one."""
+        """Take one step with all entries since the last one."""
         blob = encode_entries(self.entries)
         self.entries = []
         plant = read_plant_state(self.model, self.user) if self.user is not None else b""
         before = self.core.controller._joints.q.copy(), self.core.controller._joints.v.copy()
+        drivers, ctrl = self.list_drivers(), self.core.world.ctrl.copy() if self.user is None else self.user.ctrl.copy()
         outcome = self.core.step(self.now_ns, decode_entries(blob), n_ticks, plant)
         self.journal.rows.append(Row(self.now_ns, blob, n_ticks, plant, outcome.digest))
         for admitted in outcome.decision.admitted:
             next(p for p in self.people if p.connection == admitted.connection).id = admitted.participant_id
         if not any(e.body.__class__.__name__ == "SceneChanged" for e in outcome.decision.events):
-            self.check_motion(*before, n_ticks)
+            self.check_motion(*before, n_ticks, drivers)
+            self.check_ctrl(ctrl, n_ticks)
         self.check_holds([c.kind == "hold" for c in outcome.decision.commands], n_ticks)
         self.kinds |= {c.kind for c in outcome.decision.commands}
         self.moved += sum(c.kind != "hold" for c in outcome.decision.commands)
@@ -165,14 +167,35 @@ class Stress:
             if self.rng.random() < 0.5:  # `end_tick` shows the new state before the next step, a callback does not
                 self.core.world.restore_state(read_plant_state(self.model, self.user))
 
-    def check_motion(self, q: Any, v: Any, n_ticks: int) -> None:
-        """Whatever people do, commanded joints keep their limits of velocity and acceleration."""
-        joints = self.core.controller._joints
-        assert (np.abs(joints.q - q) <= joints.velocity * joints.dt * n_ticks + 1e-9).all()
-        assert (np.abs(joints.v - v) <= joints.acceleration * joints.dt * n_ticks + 1e-9).all()
+    def list_drivers(self) -> list[bool]:
+        """Return whether control drives each robot; in a user loop some are the owner's."""
+        sharing = self.core.sharing
+        return [True] * len(self.config.robots) if sharing is None else [bool(r.drivers) for r in sharing._robots]
+
+    def check_motion(self, q: Any, v: Any, n_ticks: int, drivers: list[bool]) -> None:
+        """Check that commanded joints keep their limits of velocity and acceleration.
+
+        Only those that measured joints have left behind beyond their bound are taken along, and stop at once.
+        """
+        joints, x = self.core.controller._joints, self.core.world.data.qpos[self.core.controller._qpos]
+        jumped = np.abs(joints.q - q) > joints.velocity * joints.dt * n_ticks + 1e-9
+        good = ~jumped | (np.abs(joints.q - x) < np.abs(q - x))
+        slower = np.abs(joints.v) <= np.abs(v)
+        good &= slower | (np.abs(joints.v - v) <= joints.acceleration * joints.dt * n_ticks + 1e-9)
+        for columns, before, now in zip(self.core.controller._columns, drivers, self.list_drivers(), strict=True):
+            if before and now:
+                assert good[columns].all()
+
+    def check_ctrl(self, ctrl: Any, n_ticks: int) -> None:
+        """Check that `ctrl` never jumps: control keeps its limits, giving back adds at most as much."""
+        if self.user is None or not n_ticks:
+            return
+        for out in self.core.controller.list_outputs():
+            change = np.abs(self.core.world.ctrl - ctrl)[out.actuators]
+            assert (change <= 2.0 * out.rates * self.core.controller._dt + 1e-9).all()
 
     def check_holds(self, holds: list[bool], n_ticks: int) -> None:
-        """A robot that holds for 0.2 s stands still: at 2.5 rad/s and 40 rad/s^2 it stops within 32 ticks."""
+        """Check that a robot that holds for 0.2 s rests: at 2.5 rad/s and 40 rad/s^2 it stops within 32 ticks."""
         joints, columns = self.core.controller._joints, self.core.controller._columns
         for i, hold in enumerate(holds):
             self.held_ticks[i] = self.held_ticks[i] + n_ticks if hold else 0
@@ -180,7 +203,7 @@ class Stress:
                 assert not joints.v[columns[i]].any(), f"robot {i} moves after {self.held_ticks[i]} ticks of hold"
 
     def swap(self) -> None:
-        """The session goes on in a fresh core."""
+        """Continue the session in a fresh core."""
         state = self.core.snapshot()
         self.core = SessionCore(self.model, self.config)
         self.core.restore(state)
@@ -255,7 +278,7 @@ class Stress:
         return {"pose": Pose(p, quat_from_rotvec(person.turn))}
 
     def act(self) -> None:
-        """One random event."""
+        """Make one random event."""
         rng, person = self.rng, self.rng.choice(self.people)
         robots = [r.name for r in self.config.robots]
         choice = rng.choices(
@@ -281,7 +304,7 @@ class Stress:
             self.recover()
 
     def recover(self) -> None:
-        self.host(cm.ClearEStop(1))
+        self.host(cm.ClearEStop(1, self.core.authority.stop_seq))
         self.host(cm.Control(1, "resume"))
         for person in self.people:
             self.say(person, cm.Heartbeat())
@@ -352,7 +375,7 @@ def _state_kind() -> int:
 
 
 def play(seed: int, steps: int, *, open_loop: bool) -> Stress:
-    """A session of `steps` random steps."""
+    """Play a session of `steps` random steps."""
     stress = Stress(seed, open_loop=open_loop)
     for _ in range(steps):
         stress.step()
@@ -360,7 +383,7 @@ def play(seed: int, steps: int, *, open_loop: bool) -> Stress:
 
 
 def replay(journal: Journal, span: int) -> list[str]:
-    """Differences found: the whole journal once, then `span` steps from every frame."""
+    """Replay the whole journal, then `span` steps from every frame. Return the differences."""
     model = decode_model(journal.model)
     config = msgspec.msgpack.decode(journal.config, type=CoreConfig)
     found = []
@@ -383,12 +406,12 @@ def replay(journal: Journal, span: int) -> list[str]:
 
 
 def _same(a: CoreState, b: CoreState, *, with_plant: bool) -> bool:
-    """A plant that is advanced elsewhere was shown at another moment: the next step sets it anew."""
+    """Compare states except the plant of an open session, which the next step sets."""
     return a == (b if with_plant else msgspec.structs.replace(b, plant=a.plant))
 
 
 def replay_elsewhere(journal: Journal, span: int = 60) -> list[str]:
-    """`replay` in a fresh process with another hash seed."""
+    """Run `replay` in a fresh process with another hash seed."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "journal"
         path.write_bytes(msgspec.msgpack.encode(journal))

@@ -1,4 +1,4 @@
-"""The anchors file: what is written is read back, and every mistake is one line that says what would be right."""
+"""The anchors file: roundtrip, and errors of one line that name the entry."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PLACES: dict[str, PoseTuple] = {
 GOOD = 'format = 1\nreference = "a"\n[anchors.a]\nposition_m = [0, 0, 0]\nquaternion_wxyz = [1, 0, 0, 0]\n'
 
 
-def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+def test_anchors_file_roundtrip(tmp_path: Path) -> None:
     path = tmp_path / "anchors.toml"
     path.write_text(dump_anchors(PLACES, {"table": 0.16}))
     found = load_anchors(path)
@@ -27,33 +27,33 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "value"),
     [
-        ("anchors = [", "not a TOML file"),
-        ("", "format = None: this version reads format = 1"),
-        ("format = 1", r"it needs \[anchors.NAME\] tables"),
-        (GOOD.replace("[0, 0, 0]", "[0, 0]"), "anchors.a.position_m must be a list of 3 numbers"),
-        (GOOD.replace("[1, 0, 0, 0]", "[1, 1, 0, 0]"), "no unit quaternion"),
-        (GOOD.replace("[0, 0, 0]", "[0, -450, 0]"), "450 m away: are these metres"),
-        (GOOD + "size_m = 160\n", "160.0 is not the edge of a printed sheet in metres"),
+        ("anchors = [", "TOML"),
+        ("", "format"),
+        ("format = 1", r"\[anchors"),
+        (GOOD.replace("[0, 0, 0]", "[0, 0]"), "anchors.a.position_m"),
+        (GOOD.replace("[1, 0, 0, 0]", "[1, 1, 0, 0]"), "quaternion"),
+        (GOOD.replace("[0, 0, 0]", "[0, -450, 0]"), "450 m"),
+        (GOOD + "size_m = 160\n", "160.0"),
         (GOOD.replace('"a"', f'"{"x" * 65}"').replace(".a]", f".{'x' * 65}]"), "1 to 64 characters"),
         (GOOD.replace('"a"', '""').replace(".a]", '.""]'), "1 to 64 characters"),
     ],
 )
-def test_mistakes(text: str, said: str, tmp_path: Path) -> None:
+def test_invalid_anchors_file_names_the_entry(text: str, value: str, tmp_path: Path) -> None:
     path = tmp_path / "anchors.toml"
     path.write_text(text)
-    with pytest.raises(ConfigError, match=said) as caught:
+    with pytest.raises(ConfigError, match=value) as caught:
         load_anchors(path)
     assert str(caught.value).startswith("anchors.toml: ")
     assert "\n" not in str(caught.value)
 
 
-def test_files_that_cannot_be_read(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"none.toml' cannot be read: No such file.*; `iris-session anchors example`"):
+def test_unreadable_anchors_file_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none.toml.*No such file"):
         load_anchors(tmp_path / "none.toml")
     (tmp_path / "binary").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigError, match="not UTF-8 text"):
+    with pytest.raises(ConfigError, match="UTF-8"):
         load_anchors(tmp_path / "binary")
-    with pytest.raises(ConfigError, match="cannot be read"):
+    with pytest.raises(ConfigError, match=str(tmp_path)):
         load_anchors(tmp_path)

@@ -1,4 +1,4 @@
-"""Since when something is silent that came regularly: not before it could have been expected."""
+"""Detection of silence of a source with a period."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ def follow(monitor: ArrivalMonitor, first_ns: int, period_ns: int, count: int) -
     return first_ns + (count - 1) * period_ns
 
 
-def test_what_came_once_or_never_is_not_silent() -> None:
+def test_source_without_period_is_never_silent() -> None:
     monitor = ArrivalMonitor()
     assert not monitor.measure_silence_ns(3600 * SILENT_NS)
     monitor.note_arrival(0)
     assert not monitor.measure_silence_ns(3600 * SILENT_NS)
 
 
-def test_a_quick_source_is_silent_after_a_second_and_speaks_again() -> None:
+def test_quick_source_is_silent_after_a_second() -> None:
     monitor = ArrivalMonitor()
     last_ns = follow(monitor, 0, 16 * MS, 100)
     assert not monitor.measure_silence_ns(last_ns + SILENT_NS)
@@ -31,14 +31,14 @@ def test_a_quick_source_is_silent_after_a_second_and_speaks_again() -> None:
     assert monitor.measure_silence_ns(again_ns + 2 * SILENT_NS), "the long silence is not its rhythm"
 
 
-def test_a_slow_source_has_its_time() -> None:
+def test_slow_source_is_silent_after_ten_periods() -> None:
     monitor = ArrivalMonitor()
     last_ns = follow(monitor, 0, 5 * SILENT_NS, 20)
     assert not monitor.measure_silence_ns(last_ns + SILENT_PERIODS * 5 * SILENT_NS)
     assert monitor.measure_silence_ns(last_ns + (SILENT_PERIODS * 5 + 1) * SILENT_NS)
 
 
-def test_two_at_the_same_moment_are_a_rhythm_too() -> None:
+def test_two_arrivals_at_one_time_are_a_period() -> None:
     monitor = ArrivalMonitor()
     monitor.note_arrival(5)
     monitor.note_arrival(5)

@@ -1,4 +1,4 @@
-"""Settings that cannot work are refused with what would be right."""
+"""Invalid settings raise errors that name the argument."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from iris_session.protocol.specs import RobotSpec
         ({"name": "a/b"}, "letters, digits"),
         ({"name": ""}, "letters, digits"),
         ({"name": "x" * 49}, "1 to 48"),
-        ({"control_port": -1}, "control_port -1 is not a port"),
+        ({"control_port": -1}, "control_port -1"),
         ({"state_port": 65536}, "state_port 65536"),
         ({"beacon_port": 70000}, "beacon_port 70000"),
-        ({"advertise": "lab:pc/7"}, "an address without port"),
+        ({"advertise": "lab:pc/7"}, "advertise"),
         ({"state_hz": 0.5}, "1 to 240"),
         ({"state_hz": float("nan")}, "1 to 240"),
         ({"keyframe_s": 0.0}, "0.5 to 60"),
@@ -38,7 +38,7 @@ def test_values_out_of_range(settings: dict[str, Any], expected: str) -> None:
     assert isinstance(caught.value, SessionError)
 
 
-def test_where_it_records_to() -> None:
+def test_recording_path() -> None:
     assert SessionConfig(record=False).recording_path() is None
     assert SessionConfig(record="a/b.rrd").recording_path() == Path("a/b.rrd")
     path = SessionConfig(name="lab").recording_path()
@@ -56,27 +56,27 @@ def test_defaults_listen_on_loopback_only() -> None:
 @pytest.mark.parametrize(
     ("fields", "text"),
     [
-        ({"name": 5}, "name must be str, not int 5"),
-        ({"control_port": "7721"}, "control_port must be int"),
-        ({"state_hz": True}, "state_hz must be float"),
-        ({"record": 3}, r"record must be bool \| str \| Path"),
-        ({"interfaces": "eth0"}, "interfaces must be tuple"),
-        ({"authority": ControlConfig()}, "authority must be AuthorityConfig, not ControlConfig"),
-        ({"anchors": {"a": (0.0, 0.0, 0.0)}}, r"anchor 'a': .* must be T_world_anchor as"),
-        ({"anchors": {"a": ((0.0, 0.0), (1.0, 0.0, 0.0, 0.0))}}, "must be T_world_anchor as"),
+        ({"name": 5}, "name"),
+        ({"control_port": "7721"}, "control_port"),
+        ({"state_hz": True}, "state_hz"),
+        ({"record": 3}, "record"),
+        ({"interfaces": "eth0"}, "interfaces"),
+        ({"authority": ControlConfig()}, "authority"),
+        ({"anchors": {"a": (0.0, 0.0, 0.0)}}, "anchor 'a'"),
+        ({"anchors": {"a": ((0.0, 0.0), (1.0, 0.0, 0.0, 0.0))}}, "anchor 'a'"),
         ({"anchors": {"a": ((0.0, 0.0, math.nan), (1.0, 0.0, 0.0, 0.0))}}, "not finite"),
-        ({"anchors": {"a": ((0.0, 0.0, 0.0), (1.0, 1.0, 0.0, 0.0))}}, "has length 1.41, it must be 1"),
-        ({"anchor_sizes": {"b": 0.16}}, "no anchor 'b': 'table'"),
-        ({"anchor_sizes": {"table": 160}}, "160 is not the edge of a printed sheet in metres"),
-        ({"anchor_sizes": {"table": "16 cm"}}, "not the edge"),
+        ({"anchors": {"a": ((0.0, 0.0, 0.0), (1.0, 1.0, 0.0, 0.0))}}, "1.41"),
+        ({"anchor_sizes": {"b": 0.16}}, "'b'"),
+        ({"anchor_sizes": {"table": 160}}, "160"),
+        ({"anchor_sizes": {"table": "16 cm"}}, "16 cm"),
     ],
 )
-def test_wrong_types_and_anchors_say_what_is_right(fields: dict[str, Any], text: str) -> None:
+def test_invalid_types_and_anchors_are_named(fields: dict[str, Any], text: str) -> None:
     with pytest.raises(ConfigError, match=text):
         SessionConfig(**fields)
 
 
-def test_the_size_of_the_default_sheet_is_known_and_that_of_others_when_it_is_given() -> None:
+def test_sheet_size_is_known_for_the_default_and_given_ones() -> None:
     door = {"door": ((1.2, 0.0, 0.4), (1.0, 0.0, 0.0, 0.0))}
     assert SessionConfig().sheet_sizes() == {"table": 0.16}
     assert SessionConfig(anchor_sizes={"table": 0.2}).sheet_sizes() == {"table": 0.2}
@@ -84,16 +84,16 @@ def test_the_size_of_the_default_sheet_is_known_and_that_of_others_when_it_is_gi
     assert SessionConfig(anchors=door, anchor_sizes={"door": 1}).sheet_sizes() == {"door": 1.0}
 
 
-def test_what_is_no_scene_says_what_is_right() -> None:
+def test_invalid_scene_is_named() -> None:
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     other = mujoco.MjModel.from_xml_string(
         "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
     )
     for arguments, error, text in (
-        ((mujoco.MjSpec(),), TypeError, "call its compile"),
-        ((model, SessionConfig()), TypeError, "data must be MjData"),
-        ((model, None, {"name": "x"}), TypeError, "config must be a SessionConfig, not dict"),
-        ((model, mujoco.MjData(other)), ConfigError, "data is of another model: it has 7 positions"),
+        ((mujoco.MjSpec(),), TypeError, "compile"),
+        ((model, SessionConfig()), TypeError, "data"),
+        ((model, None, {"name": "x"}), TypeError, "config"),
+        ((model, mujoco.MjData(other)), ConfigError, "data .*7"),
     ):
         with pytest.raises(error, match=text):
             Session(*arguments)  # type: ignore[arg-type]
@@ -102,27 +102,27 @@ def test_what_is_no_scene_says_what_is_right() -> None:
 @pytest.mark.parametrize(
     ("given", "text"),
     [
-        ({"objects": ["hammer"]}, r"^objects\[0\] is 'hammer': a list of ObjectSpec .*ObjectSpec\(name="),
-        ({"objects": "hammer"}, "^objects is 'hammer': a list of ObjectSpec is expected"),
+        ({"objects": ["hammer"]}, r"^objects\[0\] is 'hammer'.*ObjectSpec"),
+        ({"objects": "hammer"}, "^objects is 'hammer'.*ObjectSpec"),
         (
             {"objects": [RobotSpec("left", (), (), "tcp", "base")]},
-            r"^objects\[0\] is RobotSpec.*ObjectSpec is expected",
+            r"^objects\[0\] is RobotSpec.*ObjectSpec",
         ),
-        ({"robots": ["left"]}, r"^robots\[0\] is 'left': a list of RobotSpec is expected; load_robots_toml"),
+        ({"robots": ["left"]}, r"^robots\[0\] is 'left'.*RobotSpec"),
         ({"robots": "robots.toml"}, "^robots is 'robots.toml': .*load_robots_toml"),
         ({"robots": Path("robots.toml")}, "^robots is .*load_robots_toml"),
-        ({"robots": {"name": "left"}}, "^robots is .*a list of RobotSpec is expected"),
-        ({"robots": 5}, "^robots is 5: a list of RobotSpec is expected"),
+        ({"robots": {"name": "left"}}, "^robots is .*RobotSpec"),
+        ({"robots": 5}, "^robots is 5.*RobotSpec"),
         ({"robots": [RobotSpec("left", "joint1", (), "tcp", "base")]}, r"^robots\[0\] is a RobotSpec .*joints"),  # type: ignore[arg-type]
     ],
 )
-def test_what_are_no_robots_or_objects_says_what_is_right(given: dict[str, Any], text: str) -> None:
+def test_invalid_robots_or_objects_are_named(given: dict[str, Any], text: str) -> None:
     with pytest.raises(ConfigError, match=text) as caught:
         Session(mujoco.MjModel.from_xml_string("<mujoco/>"), **given)
     assert "\n" not in str(caught.value)
 
 
-def test_recording_without_rerun_is_said_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_recording_without_rerun_is_an_error_at_start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "rerun" else find(name))

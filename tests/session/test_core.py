@@ -20,7 +20,7 @@ from iris_session.session.core import CROWDED_ENTRIES, SessionCore, read_plant_s
 from tests.session.play import TICK_NS, entries, host, make_core, play
 
 
-def test_the_same_journal_gives_the_same_digests() -> None:
+def test_same_journal_gives_the_same_digests() -> None:
     one, two = make_core(), make_core()
     digests = play(one, 0, 200)
     assert digests == play(two, 0, 200)
@@ -28,7 +28,7 @@ def test_the_same_journal_gives_the_same_digests() -> None:
     assert one.snapshot() == two.snapshot()
 
 
-def test_the_hand_moves_the_robot() -> None:
+def test_hand_moves_the_robot() -> None:
     core = make_core()
     before = core.world.view().tip_pose("left")
     play(core, 0, 300)  # clutched from step 50 to the pause at 120: 28 mm
@@ -37,8 +37,8 @@ def test_the_hand_moves_the_robot() -> None:
 
 
 @pytest.mark.parametrize("at", [0, 49, 120, 150])
-def test_restoring_a_snapshot_is_invisible(at: int) -> None:
-    """In the same core, and in another one that goes on from there."""
+def test_restoring_a_snapshot_changes_nothing(at: int) -> None:
+    """In the same core, and in another one that continues from it."""
     straight, restored, other = make_core(), make_core(), make_core()
     before = play(straight, 0, at)
     expected = play(straight, at, 200)
@@ -51,7 +51,7 @@ def test_restoring_a_snapshot_is_invisible(at: int) -> None:
 
 
 @pytest.mark.parametrize(("n", "crowded"), [(0, False), (CROWDED_ENTRIES - 1, False), (CROWDED_ENTRIES, True)])
-def test_a_step_with_many_entries_is_crowded(n: int, crowded: bool) -> None:
+def test_step_with_too_many_entries_is_marked(n: int, crowded: bool) -> None:
     core = make_core()
     told: list[bool] = []
     tick = core.controller.tick
@@ -65,7 +65,7 @@ def test_a_step_with_many_entries_is_crowded(n: int, crowded: bool) -> None:
     assert told == [crowded, crowded]
 
 
-def test_another_entry_gives_another_digest() -> None:
+def test_different_entry_gives_a_different_digest() -> None:
     core, other = make_core(), make_core()
     play(core, 0, 57)
     play(other, 0, 57)
@@ -73,7 +73,7 @@ def test_another_entry_gives_another_digest() -> None:
     assert core.step(now_ns, [], 1).digest != other.step(now_ns, [host(now_ns, Control(0, "pause"))], 1).digest
 
 
-def test_a_reset_is_the_initial_state_in_a_new_epoch() -> None:
+def test_reset_restores_the_initial_state_in_a_new_epoch() -> None:
     core = make_core()
     start = core.world.view().tip_pose("left")
     play(core, 0, 300)
@@ -87,7 +87,7 @@ def test_a_reset_is_the_initial_state_in_a_new_epoch() -> None:
     assert distance(core.world.view().tip_pose("left").p, start.p) < 1e-3
 
 
-def test_an_initial_state_is_where_it_begins_and_where_a_reset_leads() -> None:
+def test_initial_state_is_used_at_start_and_by_reset() -> None:
     model = load_model(scene_path("handover"))
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
@@ -101,7 +101,7 @@ def test_an_initial_state_is_where_it_begins_and_where_a_reset_leads() -> None:
     assert core.world.view().object_pose("hammer").p == moved
 
 
-def test_physics_that_diverges_stands_still_and_says_so_until_a_reset() -> None:
+def test_diverged_physics_stops_until_a_reset() -> None:
     core = make_core()
     play(core, 0, 10)
     core.world.data.qvel[0] = math.nan
@@ -132,7 +132,7 @@ class Plant:
         return read_plant_state(self.model, self.data)
 
 
-def test_an_open_session_writes_ctrl_and_leaves_physics_alone() -> None:
+def test_open_session_writes_ctrl_and_does_not_step_physics() -> None:
     plant = Plant()
     core = make_core(plant.model, user_owned_loop=True)
     states: list[bytes] = []
@@ -147,7 +147,7 @@ def test_an_open_session_writes_ctrl_and_leaves_physics_alone() -> None:
     assert [other.step((i + 1) * TICK_NS, entries(i), 1, states[i]).digest for i in range(200)] == digests
 
 
-def test_robots_hold_where_an_external_reset_put_them() -> None:
+def test_robots_hold_after_an_external_reset() -> None:
     plant = Plant()
     core = make_core(plant.model, user_owned_loop=True)
     for i in range(200):
@@ -166,15 +166,15 @@ def test_robots_hold_where_an_external_reset_put_them() -> None:
     np.testing.assert_allclose(core.world.data.ctrl[columns], plant.data.qpos[:7], atol=1e-9)
 
 
-def test_a_plant_that_is_not_finite_is_an_error_of_the_caller() -> None:
+def test_plant_state_that_is_not_finite_raises() -> None:
     plant = Plant()
     core = make_core(plant.model, user_owned_loop=True)
     plant.data.qvel[3] = math.inf
-    with pytest.raises(SimulationDivergedError, match="not finite"):
+    with pytest.raises(SimulationDivergedError, match="finite"):
         core.step(TICK_NS, [], 1, plant.state())
 
 
-def test_sleeping_islands_are_refused_with_the_flag_to_remove() -> None:
+def test_sleeping_islands_are_refused_with_the_flag() -> None:
     model = load_model(scene_path("handover"))
     model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     with pytest.raises(ModelUnsupportedError, match='<flag sleep="enable"/>'):

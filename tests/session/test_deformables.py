@@ -1,4 +1,4 @@
-"""Streams of what bends: at rest once a second, with the time of the state that they belong to."""
+"""Streams of deformables: repeated once a second at rest, with the time of their state."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.session.published import CLOTH, composed
 MS = 1_000_000
 
 
-def test_a_mesh_at_rest_is_sent_again_for_those_who_come_later_and_is_no_younger_for_it() -> None:
+def test_resting_mesh_is_repeated_with_its_original_time() -> None:
     vertices = CLOTH.copy()
     sent: list[tuple[str, int, int]] = []
     taken = True

@@ -1,4 +1,4 @@
-"""Whose looks they were is found in what a session itself records: rows and events, as the stepper gives them."""
+"""Owner and tracking frame of observations are found in rows and events that a session records."""
 
 from __future__ import annotations
 
@@ -75,8 +75,8 @@ class Recorder:
         return 0
 
 
-def test_looks_of_a_session_have_their_owners_and_frames(tmp_path: Path) -> None:
-    """Two join one after the other; the tracking of one of them jumps between its two looks."""
+def test_observations_of_a_session_have_owner_and_tracking_frame(tmp_path: Path) -> None:
+    """Two participants join; the tracking frame of one jumps between its two observations."""
     header, front, recorder, now_ns = make_header(), Front(), Recorder(), 0
     stepper = Stepper(make_core(), front, recorder, lambda: now_ns, 1 << 60, 1 << 60, header_root(header))
     jump_ns = 25 * TICK_NS

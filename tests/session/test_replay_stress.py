@@ -30,14 +30,14 @@ def test_any_snapshot_continues_bit_for_bit_in_another_process(seed: int, open_l
     assert replay_elsewhere(stress.journal, span=40) == [""]
 
 
-def test_a_changed_input_is_found() -> None:
+def test_changed_input_is_found() -> None:
     journal = play(0, 60, open_loop=False).journal
     row = journal.rows[50]
     journal.rows[50] = msgspec.structs.replace(row, n_ticks=row.n_ticks + 1)
     assert replay(journal, 20)[0] == "from 0: step 50 differs"
 
 
-def test_whole_numbers_in_a_configuration_are_those_of_the_recording() -> None:
+def test_integers_in_a_configuration_are_stored_as_floats() -> None:
     """`contact_step_n=1` would give whole newtons as integers live and as floats in the replay."""
     written = make_core(contact_step_n=1)
     replayed = SessionCore(written.world.model, msgspec.msgpack.decode(ENCODE(written.config), type=CoreConfig))
@@ -45,7 +45,7 @@ def test_whole_numbers_in_a_configuration_are_those_of_the_recording() -> None:
     assert ENCODE(written.config) == ENCODE(replayed.config)
 
 
-def test_what_the_owner_posts_is_used_as_it_is_journaled() -> None:
+def test_posted_messages_are_used_as_journaled() -> None:
     core = make_core()
     stepper = Stepper(core, Quiet(), None, iter(range(1, 100)).__next__, 10**9, 10**9)
     stepper.post(PlaceAlignment(1, "p1", Pose((1, 0, 0), (1, 0, 0, 0))))
@@ -56,7 +56,7 @@ def test_what_the_owner_posts_is_used_as_it_is_journaled() -> None:
 
 
 class Quiet:
-    """A front that nobody talks to."""
+    """A front without messages."""
 
     def poll(self) -> list[Entry]:
         return []

@@ -1,4 +1,4 @@
-"""The note beside a recording: written whole, to its end, and never over that of the next session."""
+"""The note beside a recording: written completely, and never over that of the next session."""
 
 from __future__ import annotations
 
@@ -12,9 +12,7 @@ import pytest
 from iris_session.session.resume import NOTE_FILE, Listening, ResumeNote, ResumeNoteWriter, read_note
 
 
-def test_the_last_note_is_written_also_when_the_end_comes_during_a_write(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_last_note_is_written_when_closed_during_a_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     keeper, disk = ResumeNoteWriter(tmp_path / NOTE_FILE), HangingDisk(monkeypatch)
     keeper.offer(ResumeNote("s1", Listening("first")))
     assert disk.reached.wait(30.0)
@@ -27,9 +25,7 @@ def test_the_last_note_is_written_also_when_the_end_comes_during_a_write(
     assert disk.synced_folders, "the new name is on the disk too"
 
 
-def test_a_note_that_comes_too_late_is_not_put_over_that_of_the_next_session(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_late_note_does_not_overwrite_that_of_the_next_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     keeper, disk = ResumeNoteWriter(tmp_path / NOTE_FILE), HangingDisk(monkeypatch)
     keeper.offer(ResumeNote("s1", Listening("too late")))
     assert disk.reached.wait(30.0)

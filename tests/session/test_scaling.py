@@ -15,13 +15,13 @@ from tests.session.play import ANN, SAMPLE_STEPS, TICK_NS, make_core
 
 
 class Ann:
-    """One person who holds the left robot and moves her hand about."""
+    """An operator that holds the left robot and moves its hand."""
 
     def __init__(self, core: SessionCore) -> None:
         self.core = core
         self.step_number = self.sampled = 0
         self.hand: Vec3 = (0.0, 0.0, 1.0)
-        self.step(Join("key", "operator", "ann", devices=("controller/right",), alignment="not_needed"))
+        self.step(Join("key", "operator", "ann", devices=("desktop",), alignment="not_needed"))
         self.step(Acquire(1, ("left",)))
         self.hold(20, clutch=False)
         self.hold(20)
@@ -32,7 +32,7 @@ class Ann:
         return self.core.step(now_ns, [Entry(ANN, ANN, now_ns, m) for m in messages], 1)  # type: ignore[arg-type]
 
     def hold(self, steps: int, velocity: Vec3 = (0.0, 0.0, 0.0), clutch: bool = True) -> None:
-        """Moves the hand at `velocity` [m/s] for some steps, sampling it at 71 Hz."""
+        """Move the hand at `velocity` [m/s] for some steps, with samples at 71 Hz."""
         for _ in range(steps):
             x, y, z = (p + v * TICK_NS * 1e-9 for p, v in zip(self.hand, velocity, strict=True))
             self.hand = (x, y, z)
@@ -42,7 +42,7 @@ class Ann:
     def sample(self, clutch: bool) -> Sample:
         self.sampled = self.step_number
         return Sample(
-            device="controller/right",
+            device="desktop",
             kind="pose",
             seq=self.step_number,
             capture_ns=(self.step_number + 1) * TICK_NS,
@@ -55,7 +55,7 @@ class Ann:
         )
 
     def tip(self) -> Vec3:
-        """Where the robot is commanded to, without the sag of the simulated arm."""
+        """Return the commanded tip, without the sag of the simulated arm."""
         return self.core.controller.get_targets()["left"].p
 
     def set_scale(self, scale: float) -> None:
@@ -64,7 +64,7 @@ class Ann:
         assert reply.ok
 
 
-def test_the_tip_moves_by_the_hands_path_times_the_scale() -> None:
+def test_tip_moves_by_the_path_of_the_hand_times_the_scale() -> None:
     ann = Ann(make_core())
     start = ann.tip()
     ann.hold(250, (0.0, 0.1, 0.0))  # 50 mm
@@ -78,8 +78,8 @@ def test_the_tip_moves_by_the_hands_path_times_the_scale() -> None:
 
 
 @pytest.mark.parametrize("scale", [0.05, 0.3, 5.0])
-def test_changing_the_scale_while_engaged_moves_the_tip_by_nothing(scale: float) -> None:
-    """The hand is far from where it engaged, and rests: what was latched there must not be scaled anew."""
+def test_changing_the_scale_while_engaged_does_not_move_the_tip(scale: float) -> None:
+    """The hand rests far from where it engaged: the latched offset must not be scaled again."""
     ann = Ann(make_core())
     ann.hold(500, (0.05, 0.1, 0.0))
     ann.hold(200)
@@ -92,7 +92,7 @@ def test_changing_the_scale_while_engaged_moves_the_tip_by_nothing(scale: float)
     assert distance(ann.core.world.view().tip_pose("left").p, plant) < 1e-4
 
 
-def test_a_change_in_motion_changes_speed_only() -> None:
+def test_changing_the_scale_in_motion_changes_only_speed() -> None:
     """In no tick does the arm move much faster than the hand at the largest of the scales, 0.2 m/s."""
     ann = Ann(make_core())
     ann.hold(250, (0.0, 0.1, 0.0))
@@ -106,7 +106,7 @@ def test_a_change_in_motion_changes_speed_only() -> None:
     assert fastest < 2.0 * 0.2 * TICK_NS * 1e-9
 
 
-def test_a_restored_session_goes_on_at_its_scale() -> None:
+def test_restored_session_keeps_its_scale() -> None:
     one, two = make_core(), make_core()
     ann = Ann(one)
     ann.hold(100, (0.0, 0.1, 0.0))
@@ -118,7 +118,7 @@ def test_a_restored_session_goes_on_at_its_scale() -> None:
     assert one.snapshot() == two.snapshot()
 
 
-def test_nobody_may_set_what_control_would_not_follow() -> None:
+def test_scale_out_of_range_is_denied() -> None:
     config = make_core().config
     narrow = CoreConfig(config.authority, ControlConfig(min_scale=0.5, max_scale=1.0), config.robots, config.objects)
     core = SessionCore(make_core().world.model, narrow)

@@ -1,4 +1,4 @@
-"""The authority's half of the status: what the ledger makes of events, when a report is due, what the recorder is."""
+"""The authority's half of the status: participants from events, when a report is due, state of the recorder."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def bob(now_ns: int) -> Entry:
     return Entry(BOB, BOB, now_ns, Join("key2", Role.OPERATOR, "bob", devices=("head",), alignment="measured"))
 
 
-def test_alignment_has_an_age_and_a_void(session: Session) -> None:
+def test_alignment_has_an_age_and_can_be_void(session: Session) -> None:
     session.step(bob(TICK_NS))
     row = session.people()["bob"]
     assert (row.alignment, row.alignment_age_ns, row.alignment_void_ns) == ("none", -1, -1)
@@ -78,7 +78,7 @@ def test_alignment_has_an_age_and_a_void(session: Session) -> None:
     assert session.people()["bob"].alignment_void_ns == -1
 
 
-def test_nothing_stays_of_who_left(session: Session) -> None:
+def test_participants_that_left_are_removed(session: Session) -> None:
     session.step(bob(TICK_NS))
     session.stepper.ledger.rejected[session.people()["bob"].id, "head", "stale"] = 3
     assert session.people()["bob"].rejected == {"stale": 3}
@@ -87,7 +87,7 @@ def test_nothing_stays_of_who_left(session: Session) -> None:
     assert session.stepper.ledger.rejected == {}
 
 
-def test_robots_and_who_drives_them(session: Session) -> None:
+def test_report_lists_robots_and_holders(session: Session) -> None:
     session.step()
     before = {row.name: row for row in make_robot_reports(session.stepper)}
     assert {row.mode for row in before.values()} == {"exclusive"}
@@ -103,7 +103,7 @@ def test_robots_and_who_drives_them(session: Session) -> None:
     assert session.people()["ann"].holds == ("left",)
 
 
-def test_a_report_waits_for_time_to_spare_but_not_for_ever() -> None:
+def test_report_waits_for_idle_time_up_to_a_limit() -> None:
     reporter = StatusReporter()
     assert reporter.is_due(0)
     assert not reporter.is_due(PERIOD_NS - 1)
@@ -114,12 +114,12 @@ def test_a_report_waits_for_time_to_spare_but_not_for_ever() -> None:
     assert reporter.is_due(3 * PERIOD_NS)
 
 
-def test_what_is_noticed_beside_ticks_is_among_the_warnings(session: Session) -> None:
+def test_warnings_of_other_sources_are_reported(session: Session) -> None:
     assert collect_warnings(session.stepper, RecorderReport(), "") == []
     assert collect_warnings(session.stepper, RecorderReport(), "", ["x" * 5000]) == ["x" * MAX_TEXT]
 
 
-def test_alignments_anchors_and_comparisons_are_in_the_report(session: Session) -> None:
+def test_alignments_anchors_and_cross_checks_are_in_the_report(session: Session) -> None:
     session.step(bob(TICK_NS))
     row = session.people()["bob"]
     session.step(host(session.now_ns, PlaceAlignment(0, row.id, IDENTITY)))
@@ -133,7 +133,7 @@ def test_alignments_anchors_and_comparisons_are_in_the_report(session: Session) 
     )
 
 
-def test_a_new_front_is_told_where_the_anchors_are_now() -> None:
+def test_new_front_gets_the_current_anchors() -> None:
     core = make_core(anchors={"table": IDENTITY})
     moved = Pose((1.0, 0.0, 0.0), IDENTITY.q)
     core.step(TICK_NS, [host(TICK_NS, MoveAnchor(0, "table", moved))], 0)

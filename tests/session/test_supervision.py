@@ -1,4 +1,4 @@
-"""When a process that died is started again, and that the tick loop waits for nothing of it."""
+"""Restarts of child processes, for which the tick loop does not wait."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ SECOND = 1_000 * MS
 
 
 def _restarts(timer: RestartTimer, start_ns: int, until_ns: int) -> list[int]:
-    """Times at which a process that dies at once is started again."""
+    """Return the times of restarts of a process that dies at once."""
     return [now for now in range(start_ns, until_ns, 50 * MS) if timer.is_due(now)]
 
 
-def test_the_first_restart_is_at_once_and_later_ones_wait_longer() -> None:
+def test_first_restart_is_immediate_and_later_ones_back_off() -> None:
     timer = RestartTimer()
     times = _restarts(timer, 60_000 * MS, 90_000 * MS)
     waits = [b - a for a, b in pairwise(times)]
@@ -35,7 +35,7 @@ def test_the_first_restart_is_at_once_and_later_ones_wait_longer() -> None:
     assert timer.restarts == len(times)
 
 
-def test_a_process_that_lived_long_is_started_at_once_again() -> None:
+def test_long_lived_process_is_restarted_at_once() -> None:
     timer = RestartTimer()
     now_ns = 60_000 * MS
     for _ in range(3):
@@ -78,7 +78,7 @@ class Recorder:
 
 
 def _until(look: Callable[[], list[str]]) -> list[str]:
-    """What is told first."""
+    """Wait for the first report."""
     until = time.monotonic() + 30.0
     while time.monotonic() < until:
         if told := look():
@@ -87,7 +87,7 @@ def _until(look: Callable[[], list[str]]) -> list[str]:
     raise AssertionError("nothing was told")
 
 
-def test_a_dead_recorder_is_replaced_while_the_loop_goes_on() -> None:
+def test_dead_recorder_is_replaced_while_the_loop_continues() -> None:
     recorder = Recorder()
     supervisor = RecorderSupervisor(recorder)
     assert supervisor.poll(SECOND, 0) == []
@@ -98,7 +98,8 @@ def test_a_dead_recorder_is_replaced_while_the_loop_goes_on() -> None:
     assert supervisor.restarts == 1
     recorder.disk.set()
     (told,) = _until(lambda: supervisor.poll(8 * SECOND, 0))
-    assert told == "the recorder ended (exit status 1): no space left; it was replaced"
+    assert "exit status 1" in told
+    assert "no space left" in told
     assert threading.main_thread() not in recorder.readers
     assert supervisor.alive
     assert "no space left" in supervisor.failure
@@ -106,13 +107,13 @@ def test_a_dead_recorder_is_replaced_while_the_loop_goes_on() -> None:
     assert supervisor.failure == ""  # its successor writes
 
 
-def test_a_recorder_that_cannot_be_started_is_tried_again_and_its_end_stays_told() -> None:
+def test_failed_start_of_a_recorder_is_retried_and_stays_reported() -> None:
     recorder = Recorder()
     recorder.disk.set()
     recorder.alive, recorder.refused = False, True
     supervisor = RecorderSupervisor(recorder)
     (told,) = _until(lambda: supervisor.poll(SECOND, 0))
-    assert told.endswith("it is not replaced: no room for its log")
+    assert "no room for its log" in told
     assert supervisor.poll(SECOND + 100 * MS, 0) == []
     (told,) = _until(lambda: supervisor.poll(SECOND + 3 * HANGING_NS, 0))
     assert "not replaced" in told
@@ -123,7 +124,7 @@ def test_a_recorder_that_cannot_be_started_is_tried_again_and_its_end_stays_told
     assert told.endswith("it was replaced")
 
 
-def test_a_recorder_that_hangs_is_told_once_and_the_end_waits_for_the_thread() -> None:
+def test_hanging_recorder_is_reported_once_and_close_waits_for_the_thread() -> None:
     recorder = Recorder()
     supervisor = RecorderSupervisor(recorder)
     (told,) = supervisor.poll(SECOND, HANGING_NS + 1)
@@ -139,7 +140,7 @@ def test_a_recorder_that_hangs_is_told_once_and_the_end_waits_for_the_thread() -
     assert not recorder.closed.is_set(), "it writes what is left"
 
 
-def test_the_end_does_not_wait_for_a_disk_that_hangs() -> None:
+def test_close_does_not_wait_for_a_hanging_disk() -> None:
     recorder = Recorder()
     supervisor = RecorderSupervisor(recorder)
     recorder.alive = False

@@ -1,4 +1,4 @@
-"""Blame for late ticks: a pacing loop with a clock of its own, in which one part after the other takes too long."""
+"""Causes of late ticks: a pacing loop with its own clock, whose parts take too long in turn."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Loop:
         self.delayed_ns += ns * delayed
 
     def tick(self, extra: dict[str, int] | None = None, *, delayed: bool = False, overslept_ns: int = 0) -> None:
-        """One turn; `extra` time per part, in which the thread worked or waited, or was kept from running."""
+        """Take one tick; `extra`: time per part in which the thread worked, waited or got no processor."""
         extra = extra or {}
         if self.now_ns < self.due_ns:
             self.now_ns = self.due_ns + overslept_ns
@@ -65,7 +65,7 @@ def loop() -> Loop:
 
 
 @pytest.mark.parametrize("cause", [c for c in CAUSES if c not in (LateCause.SCHEDULER, LateCause.OWNER)])
-def test_the_part_that_took_too_long_is_blamed(loop: Loop, cause: str) -> None:
+def test_slow_part_is_the_cause(loop: Loop, cause: str) -> None:
     loop.tick({cause: 7 * MS})
     for _ in range(50):
         loop.tick()
@@ -74,7 +74,7 @@ def test_the_part_that_took_too_long_is_blamed(loop: Loop, cause: str) -> None:
     assert loop.times.count_late_causes() == {cause: loop.late}
 
 
-def test_what_the_owner_does_between_ticks_is_theirs(loop: Loop) -> None:
+def test_time_between_ticks_is_of_the_owner(loop: Loop) -> None:
     loop.tick({LateCause.OWNER: 9 * MS})
     for _ in range(50):
         loop.tick()
@@ -82,7 +82,7 @@ def test_what_the_owner_does_between_ticks_is_theirs(loop: Loop) -> None:
     assert set(loop.times.count_late_causes()) == {LateCause.OWNER}
 
 
-def test_oversleeping_is_the_schedulers(loop: Loop) -> None:
+def test_oversleeping_is_of_the_scheduler(loop: Loop) -> None:
     loop.tick(overslept_ns=6 * MS)
     for _ in range(50):
         loop.tick()
@@ -91,7 +91,7 @@ def test_oversleeping_is_the_schedulers(loop: Loop) -> None:
 
 
 @pytest.mark.parametrize("cause", [c for c in CAUSES if c != LateCause.SCHEDULER])
-def test_a_part_that_was_interrupted_is_not_to_blame(loop: Loop, cause: str) -> None:
+def test_preempted_part_is_not_the_cause(loop: Loop, cause: str) -> None:
     loop.tick({cause: 7 * MS}, delayed=True)
     for _ in range(50):
         loop.tick()
@@ -99,7 +99,7 @@ def test_a_part_that_was_interrupted_is_not_to_blame(loop: Loop, cause: str) -> 
     assert set(loop.times.count_late_causes()) == {LateCause.SCHEDULER}
 
 
-def test_the_larger_share_decides(loop: Loop) -> None:
+def test_larger_share_is_the_cause(loop: Loop) -> None:
     loop.tick({LateCause.PHYSICS: 4 * MS}, delayed=True)
     loop.tick({LateCause.OUTPUT: 9 * MS})
     for _ in range(50):
@@ -109,7 +109,7 @@ def test_the_larger_share_decides(loop: Loop) -> None:
     assert causes[LateCause.OUTPUT] > causes[LateCause.SCHEDULER] > 0
 
 
-def test_physics_that_never_fits_is_blamed_throughout() -> None:
+def test_physics_that_is_always_slow_is_always_the_cause() -> None:
     loop = Loop()
     loop.mark()
     for _ in range(200):
@@ -119,7 +119,7 @@ def test_physics_that_never_fits_is_blamed_throughout() -> None:
     assert loop.times.compute_late_share() == pytest.approx(loop.late / 200)
 
 
-def test_ticks_that_were_given_up_have_the_cause_of_their_chain(loop: Loop) -> None:
+def test_skipped_ticks_have_the_cause_of_their_chain(loop: Loop) -> None:
     for _ in range(300):
         loop.tick({LateCause.CONTROL: 5 * MS})
     loop.times.count_skipped(500)
@@ -127,20 +127,20 @@ def test_ticks_that_were_given_up_have_the_cause_of_their_chain(loop: Loop) -> N
     assert loop.times.count_late_causes() == {LateCause.CONTROL: loop.late + 500}
 
 
-def test_a_process_that_stood_still_is_told_apart(loop: Loop) -> None:
+def test_suspended_process_is_a_cause_of_its_own(loop: Loop) -> None:
     loop.tick(overslept_ns=3_000 * MS)
     loop.times.count_skipped(1400)
     loop.mark(missing=1400)
     assert loop.times.count_late_causes() == {LateCause.SCHEDULER: 1, SKIPPED: 1400}
 
 
-def test_the_system_counts_how_long_we_did_not_run() -> None:
+def test_system_reports_the_time_without_processor() -> None:
     delayed = make_run_delay_reader()
     before = delayed()
     assert delayed() >= before >= 0
 
 
-def test_shares_are_of_the_last_ten_marks() -> None:
+def test_shares_cover_the_last_ten_marks() -> None:
     loop = Loop()
     loop.mark()
     loop.tick({LateCause.PHYSICS: 7 * MS})
@@ -155,7 +155,7 @@ def test_shares_are_of_the_last_ten_marks() -> None:
     assert loop.times.count_late_causes() == {}
 
 
-def test_lateness_is_of_the_newest_ticks(loop: Loop) -> None:
+def test_lateness_covers_the_newest_ticks(loop: Loop) -> None:
     usual_ms = sum(USUAL.values()) * 1e-6
     lateness = loop.times.compute_lateness()
     assert lateness is not None
@@ -167,12 +167,12 @@ def test_lateness_is_of_the_newest_ticks(loop: Loop) -> None:
     assert lateness.p50 == pytest.approx(usual_ms + 0.5)
 
 
-def test_nothing_is_known_at_first() -> None:
+def test_no_causes_at_first() -> None:
     times = Loop().times
     assert (times.compute_lateness(), times.compute_late_share(), times.count_late_causes()) == (None, 0.0, {})
 
 
-def test_a_pause_blames_nobody(loop: Loop) -> None:
+def test_pause_has_no_cause(loop: Loop) -> None:
     loop.now_ns += 5_000 * MS
     loop.times.restart_chain()
     loop.due_ns = loop.now_ns + PERIOD

@@ -3,61 +3,24 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import mujoco
 import numpy as np
 import pytest
 
-from iris_session import OwnershipError, Session
+from iris_session import DataFault, OwnerRequest, OwnershipError, Session
 from iris_session.demo.scenes import scene_path
 from iris_session.physics import load_model
-from iris_session.protocol.entries import Entry, ExternalReset, StalledGap
-from iris_session.protocol.server_messages import SceneChanged
-from iris_session.session.stepper import Stepper
-from iris_session.session.user_loop import UserLoop
-from tests.session.loops import Watch, wait_for
-from tests.session.play import TICK_NS, make_core
+from iris_session.protocol.client_messages import Control, Episode
+from iris_session.protocol.common import Pose
+from iris_session.protocol.entries import OwnerListens, StalledGap
+from iris_session.protocol.names import Role
+from iris_session.protocol.server_messages import EpisodeChanged, Reply, SceneChanged
+from tests.session.loops import Agent, Rig, wait_for
+from tests.session.play import TICK_NS
 from tests.session.test_session import QUIET
-from tests.session.test_stepper import MS, Front, Recorder
-
-
-class Rig:
-    """A user's loop over the demo scene whose clock the test moves; the helper thread is real."""
-
-    def __init__(self, model: mujoco.MjModel | None = None) -> None:
-        self.now_ns = 0
-        self.model = model or load_model(scene_path("handover"))
-        self.data = mujoco.MjData(self.model)
-        if self.model.nkey:
-            mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
-        self.front, self.recorder = Front(), Recorder()
-        core = make_core(self.model, user_owned_loop=True)
-        self.stepper = Stepper(core, self.front, self.recorder, lambda: self.now_ns, MS, 1000 * MS, b"root")
-        self.read: list[tuple[int, Entry, bytes]] = []  # step, entry and the plant of that step
-        self.stepper.on_entries = self._note
-        self.loop = UserLoop(self.model, self.data, self.stepper, Watch())  # type: ignore[arg-type]
-
-    def _note(self, entries: Sequence[Entry]) -> None:
-        plant = self.stepper.core.world.save_state()
-        self.read += [(self.stepper.step_count, entry, plant) for entry in entries]
-
-    def resets(self) -> list[bytes]:
-        return [plant for _, entry, plant in self.read if isinstance(entry.message, ExternalReset)]
-
-    def rounds(self, n: int, steps: int = 1) -> None:
-        for _ in range(n):
-            self.now_ns += TICK_NS
-            self.loop.begin_tick()
-            for _ in range(steps):
-                mujoco.mj_step(self.model, self.data)
-            self.loop.end_tick()
-
-    def idle(self) -> None:
-        """The user's loop is silent until the helper has taken a step."""
-        steps = self.stepper.step_count
-        self.now_ns += 40 * MS
-        wait_for(lambda: self.stepper.step_count > steps)
+from tests.session.test_stepper import MS
 
 
 @pytest.fixture
@@ -68,7 +31,7 @@ def rig() -> Iterator[Rig]:
 
 
 def test_a_reset_is_read_with_the_state_after_it(rig: Rig) -> None:
-    """The helper's steps between the word and the tick are on the old plant: robots would be driven back to it."""
+    """The helper's steps between the word and the tick are on the old plant."""
     rig.rounds(5)
     moved = rig.model.joint(rig.stepper.core.config.robots[0].joints[0]).qposadr[0]
     rig.loop.reset()
@@ -78,8 +41,7 @@ def test_a_reset_is_read_with_the_state_after_it(rig: Rig) -> None:
     rig.rounds(1)
     (plant,) = rig.resets()
     assert np.frombuffer(plant)[1 + moved] == pytest.approx(rig.data.qpos[moved], abs=0.01)
-    actuator = rig.model.actuator(rig.stepper.core.config.robots[0].actuators[0]).id
-    assert rig.data.ctrl[actuator] == pytest.approx(rig.data.qpos[moved], abs=0.02)
+    assert np.array_equal(rig.data.ctrl, rig.model.key_ctrl[0]), "nobody drives the robot: its ctrl is the owner's"
 
 
 def test_a_reset_without_finite_numbers_waits_for_them(rig: Rig) -> None:
@@ -128,7 +90,40 @@ def test_several_steps_between_begin_and_end_are_as_many_ticks(rig: Rig) -> None
     assert rig.front.states[-1].tick == 20
     rig.data.time += 1e6
     rig.rounds(1)
-    assert rig.recorder.rows[-1].n_ticks == 100, "a time that jumps is no motion"
+    assert rig.recorder.rows[-1].n_ticks == 5, "a time that jumps is no motion"
+
+
+def test_a_single_long_round_is_no_leap(rig: Rig) -> None:
+    rig.rounds(3)
+    rig.rounds(1, steps=400)
+    rig.rounds(2)
+    assert [row.n_ticks for row in rig.recorder.rows] == [1, 1, 1, 1, 1, 1]
+    rig.rounds(3, steps=400)
+    assert [row.n_ticks for row in rig.recorder.rows[6:]] == [1, 1, 50], "at most 0.1 s"
+
+
+def test_a_round_that_stands_still_is_a_gap(rig: Rig) -> None:
+    """A script that trains between `begin_tick` and `end_tick`."""
+    rig.rounds(3)
+    rig.now_ns += TICK_NS
+    rig.loop.begin_tick()
+    mujoco.mj_step(rig.model, rig.data)
+    rig.now_ns += 3000 * MS
+    rig.loop.end_tick()
+    rig.rounds(2)
+    gaps = [entry.message for _, entry, _ in rig.read if isinstance(entry.message, StalledGap)]
+    assert [gap.duration_ns for gap in gaps] == [3002 * MS]
+
+
+def test_rounds_that_always_take_long_are_no_gaps(rig: Rig) -> None:
+    for _ in range(5):
+        rig.now_ns += MS
+        rig.loop.begin_tick()
+        mujoco.mj_step(rig.model, rig.data)
+        rig.now_ns += 200 * MS
+        rig.loop.end_tick()
+    gaps = [entry.message for _, entry, _ in rig.read if isinstance(entry.message, StalledGap)]
+    assert len(gaps) == 1, "the first one, of which nobody knows yet that it is usual"
 
 
 def test_calls_that_do_not_fit(rig: Rig) -> None:
@@ -170,21 +165,26 @@ VELOCITY = """<mujoco><option timestep="0.002" gravity="0 0 0"/><worldbody>
 <velocity name="a3" joint="j3" kv="5"/></actuator></mujoco>"""
 
 
-def test_at_the_end_robots_rest_and_objects_are_free() -> None:
+def test_at_the_end_driven_robots_rest_and_objects_are_free() -> None:
     rig = Rig(mujoco.MjModel.from_xml_string(VELOCITY))
-    rig.rounds(3)
+    robot = rig.stepper.core.config.robots[0].name
+    agent = Agent(rig, robot=robot)
+    rig.round()
+    agent.acquire()
+    agent.engage()
+    here = agent.tip()
+    agent.drive(lambda t: Pose((here.p[0], here.p[1] + t, here.p[2]), here.q), 0.1)
     ball = rig.model.body("ball").id
-    controller = rig.stepper.core.controller
-    controller._joints.v[:] = 1.0  # as in the middle of a motion
-    controller._grasps.commanded = {"ball": ((0.5, 0.0, 2.0), (1.0, 0.0, 0.0, 0.0))}
-    twin = rig.stepper.core.world.data
-    controller.tick(twin)
-    rig.loop._write_controls()
+    rig.stepper.core.controller._grasps.commanded = {"ball": ((0.5, 0.0, 2.0), (1.0, 0.0, 0.0, 0.0))}
+    rig.data.xfrc_applied[ball] = 0.125
+    rig.now_ns += TICK_NS
+    rig.stepper.core.controller._grasps.set_goals = lambda commands: None  # type: ignore[method-assign]
+    rig.loop.begin_tick()
     assert rig.data.ctrl.any()
-    assert rig.data.xfrc_applied[ball].any()
+    assert np.abs(rig.data.xfrc_applied[ball]).max() > 0.2
     rig.loop.close()
     assert not rig.data.ctrl.any()
-    assert not rig.data.xfrc_applied.any()
+    assert (rig.data.xfrc_applied[ball] == 0.125).all(), "the owner's forces are back"
 
 
 def test_the_helper_never_steps_while_something_is_read() -> None:
@@ -220,61 +220,6 @@ def test_reset_before_the_first_tick_has_nothing_to_go_back_from() -> None:
         assert [type(event.body) for event in session.recent_events()] == [SceneChanged]
 
 
-def test_attach_sees_a_reset_after_exactly_one_step() -> None:
-    model = load_model(scene_path("handover"))
-    data = mujoco.MjData(model)
-    session = Session.attach(model, data, QUIET)
-    try:
-        mujoco.mj_step(model, data)
-        mujoco.mj_forward(model, data)
-        mujoco.mj_forward(model, data)
-        mujoco.mj_resetDataKeyframe(model, data, 0)
-        mujoco.mj_step(model, data)
-        assert [type(event.body) for event in session.recent_events()] == [SceneChanged]
-        mujoco.mj_step(model, data)
-        mujoco.mj_resetData(model, data)
-        for _ in range(3):
-            mujoco.mj_step(model, data)
-        assert [type(event.body) for event in session.recent_events()] == [SceneChanged] * 2
-    finally:
-        session.close()
-
-
-def test_attach_takes_no_viewer_for_a_reset() -> None:
-    """MuJoCo's passive viewer clears the timers of the data at every sync."""
-    model = load_model(scene_path("handover"))
-    data = mujoco.MjData(model)
-    session = Session.attach(model, data, QUIET)
-    try:
-        for step in range(60):
-            mujoco.mj_step(model, data)
-            if step % 8 == 0:
-                data.timer.number[:] = 0
-                mujoco.mj_forward(model, data)
-                data.timer.number[:] = 0
-                mujoco.mj_forward(model, data)
-        assert session.recent_events() == []
-        assert session.status().tick >= 59
-    finally:
-        session.close()
-
-
-def test_a_callback_of_somebody_else_stays() -> None:
-    model = load_model(scene_path("handover"))
-    session = Session.attach(model, mujoco.MjData(model), QUIET)
-
-    def other(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        pass
-
-    try:
-        mujoco.set_mjcb_control(other)
-        session.close()
-        assert mujoco.get_mjcb_control() is other
-    finally:
-        mujoco.set_mjcb_control(None)
-        session.close()
-
-
 def test_what_stopped_the_helper_is_raised_at_every_tick_and_does_not_fill_the_memory(rig: Rig) -> None:
     def broken(*_: object, **__: object) -> None:
         raise KeyError("the core is broken")
@@ -289,3 +234,53 @@ def test_what_stopped_the_helper_is_raised_at_every_tick_and_does_not_fill_the_m
             rig.rounds(1)
         depths.add(len(caught.traceback))
     assert len(depths) == 1
+
+
+def test_what_directors_ask_reaches_the_owner_once(rig: Rig) -> None:
+    boss, watcher = Agent(rig, role=Role.DIRECTOR), Agent(rig, connection=2, role=Role.OBSERVER)
+    rig.round()
+    watcher.say(Control(1, "reset"))
+    boss.say(Control(2, "pause"))
+    boss.say(Control(3, "reset"))
+    rig.round()
+    assert _replies(rig) == {1: "role", 2: "user_owned", 3: "user_owned"}
+    assert [(r.kind, r.name) for r in rig.stepper.requests] == [("reset", "p1")]
+    rig.stepper.post_own(OwnerListens())
+    boss.say(Control(4, "reset"))
+    boss.say(Episode(5, "start", "stack"))
+    rig.round()
+    boss.say(Episode(6, "rerecord", "again"))
+    rig.round()
+    assert _replies(rig) == {1: "role", 2: "user_owned", 3: "user_owned", 4: "", 5: "", 6: ""}
+    assert [(r.kind, r.label) for r in rig.stepper.requests] == [("reset", ""), ("reset", ""), ("rerecord", "again")]
+    assert _episodes(rig) == [(1, "running"), (1, "discarded")]
+    mujoco.mj_resetDataKeyframe(rig.model, rig.data, 0)
+    rig.round()
+    assert _episodes(rig) == [(1, "running"), (1, "discarded"), (2, "running")]
+
+
+def _replies(rig: Rig) -> dict[int, str]:
+    replies = [out.message for d in rig.front.decisions for out in d.outgoing if isinstance(out.message, Reply)]
+    return {r.request_id: "" if r.denial is None else r.denial.reason for r in replies}
+
+
+def _episodes(rig: Rig) -> list[tuple[int, str]]:
+    bodies = [event.body for d in rig.front.decisions for event in d.events]
+    return [(body.number, body.state) for body in bodies if isinstance(body, EpisodeChanged)]
+
+
+def test_polling_requests_is_known_to_the_authority_from_then_on() -> None:
+    model = load_model(scene_path("handover"))
+    data = mujoco.MjData(model)
+    with Session(model, data, QUIET) as session:
+        assert session.poll_requests() == []
+        session.begin_tick()
+        session.stepper.requests.append(OwnerRequest("reset", "p1", "ann"))
+        assert session.poll_requests() == [OwnerRequest("reset", "p1", "ann")]
+        assert session.poll_requests() == []
+        assert session.stepper.core.authority._ctx.state.owner_listens
+        assert session.driven_robots() == ()
+        assert session.status().data_fault is None
+        data.qvel[0] = np.nan
+        session.begin_tick()
+        assert session.status().data_fault == DataFault(("qvel",), pytest.approx(session.clock() * 1e-9, abs=60.0))

@@ -1,4 +1,4 @@
-"""Deformable stream: every vertex within the bound, whatever the mesh; hostile bytes get typed errors."""
+"""Deformable stream: every vertex within the bound for any mesh; hostile bytes raise typed errors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iris_session.codegen.deformable_golden import cloth, rope, shell
+from iris_session.codegen.deformable_golden import make_cloth, make_rope, make_shell
 from iris_session.protocol.names import BudgetClass
 from iris_session.streams.deformable import (
     COARSER,
@@ -28,22 +28,22 @@ from iris_session.streams.errors import StreamError
 
 Floats = npt.NDArray[np.float64]
 HEADER = 32
-MESHES = {"cloth": cloth(9, 7), "shell": shell(4), "rope": rope(20)}
+MESHES = {"cloth": make_cloth(9, 7), "shell": make_shell(4), "rope": make_rope(20)}
 
 
-def full(topology: DeformableTopology, vertices: npt.NDArray[np.floating], bound_m: float = 0.0005) -> bytes:
+def encode_full(topology: DeformableTopology, vertices: npt.NDArray[np.floating], bound_m: float = 0.0005) -> bytes:
     made = DeformableEncoder(topology, bound_m).encode(vertices)
     assert made is not None
     return made[BudgetClass.FULL]
 
 
-def worst(a: npt.NDArray[np.floating], b: npt.NDArray[np.floating]) -> float:
+def largest_error(a: npt.NDArray[np.floating], b: npt.NDArray[np.floating]) -> float:
     return float(np.linalg.norm(a.astype(np.float64) - b, axis=1).max())
 
 
 @st.composite
 def topologies(draw: st.DrawFn) -> DeformableTopology:
-    """Any mesh: pieces, loose vertices, triangles without area, edges shared by many, doubled lines."""
+    """Draw any mesh: pieces, loose vertices, triangles without area, edges of many triangles, repeated edges."""
     n = draw(st.integers(1, 40))
     vertex = st.integers(0, n - 1)
     faces = draw(st.lists(st.tuples(vertex, vertex, vertex), max_size=40))
@@ -53,7 +53,7 @@ def topologies(draw: st.DrawFn) -> DeformableTopology:
 
 @settings(max_examples=150, deadline=None)
 @given(topologies(), st.integers(0, 2**32 - 1), st.floats(-3.0, 3.5), st.floats(-4.5, -1.0))
-def test_any_mesh_anywhere_is_within_the_bound_of_every_class(
+def test_any_mesh_is_within_the_bound_of_every_class(
     topology: DeformableTopology, seed: int, log_extent: float, log_bound: float
 ) -> None:
     bound_m = 10.0**log_bound
@@ -65,7 +65,7 @@ def test_any_mesh_anywhere_is_within_the_bound_of_every_class(
     for name, factor in COARSER.items():
         decoded = decoder.decode(frames[name])
         assert decoded.dtype == np.float32
-        assert worst(decoded, vertices) <= bound_m * factor
+        assert largest_error(decoded, vertices) <= bound_m * factor
         assert decoder.bound_m == pytest.approx(bound_m * factor, rel=1e-6)
         on_lattice = decoded / 2.0 ** read_header(frames[name]).exponent
         assert not read_header(frames[name]).n_escaped
@@ -73,27 +73,27 @@ def test_any_mesh_anywhere_is_within_the_bound_of_every_class(
 
 
 @pytest.mark.parametrize("name", MESHES)
-def test_a_smooth_mesh_costs_little_more_than_a_byte_per_coordinate_at_most(name: str) -> None:
+def test_smooth_mesh_costs_about_a_byte_per_coordinate(name: str) -> None:
     topology, vertices = MESHES[name]
-    assert len(full(topology, vertices)) <= HEADER + 3 * topology.n_vertices
+    assert len(encode_full(topology, vertices)) <= HEADER + 3 * topology.n_vertices
 
 
-def test_prediction_pays_on_a_large_cloth() -> None:
-    topology, vertices = cloth(60, 60)
+def test_prediction_reduces_the_size_of_a_large_cloth() -> None:
+    topology, vertices = make_cloth(60, 60)
     unpredicted = DeformableTopology(3600, edges=np.random.default_rng(0).permutation(3600).reshape(-1, 2))
-    assert len(full(topology, vertices)) < 0.2 * len(full(unpredicted, vertices))
-    assert len(full(topology, vertices)) < 0.5 * 3 * 3600, "half a byte per coordinate"
+    assert len(encode_full(topology, vertices)) < 0.2 * len(encode_full(unpredicted, vertices))
+    assert len(encode_full(topology, vertices)) < 0.5 * 3 * 3600, "half a byte per coordinate"
 
 
-def test_float32_and_strided_vertices_are_taken() -> None:
+def test_float32_and_strided_vertices_are_accepted() -> None:
     topology, vertices = MESHES["cloth"]
     wide = np.zeros((len(vertices), 6), np.float32)
     wide[:, ::2] = vertices
-    assert worst(DeformableDecoder(topology).decode(full(topology, wide[:, ::2])), vertices) <= 0.0005
+    assert largest_error(DeformableDecoder(topology).decode(encode_full(topology, wide[:, ::2])), vertices) <= 0.0005
 
 
 @pytest.mark.parametrize("bound_m", [1e-5, 0.0005, 0.1, 1.0])
-def test_the_lattice_leaves_room_to_drift(bound_m: float) -> None:
+def test_lattice_leaves_room_to_drift(bound_m: float) -> None:
     encoder = DeformableEncoder(MESHES["rope"][0], bound_m)
     assert 0.05 * bound_m < encoder.drift_m < bound_m
     assert encoder.drift_m + 2.0 ** exponent_for(bound_m) * math.sqrt(3.0) / 2.0 <= bound_m
@@ -102,14 +102,14 @@ def test_the_lattice_leaves_room_to_drift(bound_m: float) -> None:
 # --- rest -----------------------------------------------------------------------------------------------------------
 
 
-def test_what_rests_is_sent_again_after_a_while_only() -> None:
+def test_resting_mesh_is_sent_again_after_an_interval() -> None:
     topology, vertices = MESHES["cloth"]
     encoder = DeformableEncoder(topology, repeat_after=10)
     sent = [encoder.encode(vertices) is not None for _ in range(31)]
     assert [i for i, was in enumerate(sent) if was] == [0, 10, 20, 30]
 
 
-def test_what_creeps_stays_within_the_bound_of_every_class_also_between_frames() -> None:
+def test_creeping_mesh_stays_within_the_bound_between_frames() -> None:
     topology, vertices = MESHES["shell"]
     encoder, decoder = DeformableEncoder(topology, repeat_after=10**6), DeformableDecoder(topology)
     shown: dict[str, npt.NDArray[np.float32]] = {}
@@ -122,7 +122,7 @@ def test_what_creeps_stays_within_the_bound_of_every_class_also_between_frames()
             sent += 1
             shown = {name: decoder.decode(payload) for name, payload in frames.items()}
         for name, factor in COARSER.items():
-            assert worst(shown[name], now) <= 0.0005 * factor
+            assert largest_error(shown[name], now) <= 0.0005 * factor
     assert 10 < sent < 40
 
 
@@ -136,7 +136,7 @@ def test_reset_and_movement_send_at_once() -> None:
     assert encoder.encode(vertices + 0.001) is not None
 
 
-def test_the_callers_array_may_be_overwritten() -> None:
+def test_callers_array_may_be_overwritten() -> None:
     topology, vertices = MESHES["rope"]
     encoder = DeformableEncoder(topology)
     buffer = vertices.copy()
@@ -145,25 +145,25 @@ def test_the_callers_array_may_be_overwritten() -> None:
     assert encoder.encode(buffer) is not None
 
 
-# --- what has no place in the lattice -------------------------------------------------------------------------------
+# --- outside the lattice --------------------------------------------------------------------------------------------
 
 
-def test_vertices_off_the_lattice_come_as_float32_and_the_others_within_the_bound() -> None:
+def test_vertices_outside_the_lattice_are_sent_as_float32() -> None:
     topology, vertices = MESHES["shell"]
     strange = vertices.copy()
     strange[0] = (np.nan, 1.0, -np.inf)
     strange[7] = (1e30, 0.1, 1e300)
     strange[20] = (0.1, 0.2, 4097.0)
-    payload = full(topology, strange)
+    payload = encode_full(topology, strange)
     decoded = DeformableDecoder(topology).decode(payload)
     assert read_header(payload).n_escaped == 3
     with np.errstate(over="ignore"):
         assert np.array_equal(decoded[[0, 7, 20]], strange[[0, 7, 20]].astype(np.float32), equal_nan=True)
     rest = np.setdiff1d(np.arange(len(vertices)), [0, 7, 20])
-    assert worst(decoded[rest], vertices[rest]) <= 0.0005
+    assert largest_error(decoded[rest], vertices[rest]) <= 0.0005
 
 
-def test_a_mesh_that_is_nowhere_is_sent_every_time() -> None:
+def test_non_finite_mesh_is_sent_every_time() -> None:
     topology, vertices = MESHES["rope"]
     encoder = DeformableEncoder(topology)
     nowhere = np.full_like(vertices, np.nan)
@@ -178,9 +178,9 @@ def test_a_mesh_that_is_nowhere_is_sent_every_time() -> None:
 
 @settings(max_examples=300, deadline=None)
 @given(st.sampled_from(sorted(MESHES)), st.data())
-def test_damaged_frames_are_refused_or_decode_to_some_vertices(name: str, data: st.DataObject) -> None:
+def test_damaged_frames_are_rejected_or_decode(name: str, data: st.DataObject) -> None:
     topology, vertices = MESHES[name]
-    damaged = bytearray(full(topology, vertices))
+    damaged = bytearray(encode_full(topology, vertices))
     for _ in range(data.draw(st.integers(1, 4))):
         at = data.draw(st.integers(0, len(damaged) - 1))
         damaged[at] = data.draw(st.integers(0, 255))
@@ -195,7 +195,7 @@ def test_damaged_frames_are_refused_or_decode_to_some_vertices(name: str, data: 
 
 @settings(max_examples=200, deadline=None)
 @given(st.binary(max_size=200))
-def test_arbitrary_bytes_are_refused(data: bytes) -> None:
+def test_arbitrary_bytes_are_rejected(data: bytes) -> None:
     topology = MESHES["rope"][0]
     with pytest.raises(StreamError):
         DeformableDecoder(topology).decode(data)
@@ -204,18 +204,18 @@ def test_arbitrary_bytes_are_refused(data: bytes) -> None:
 
 
 def _with_planes(payload: bytes, packed: bytes) -> bytes:
-    """`payload` of one plane and no escape, with other bytes in the place of its planes, marked as packed."""
+    """`payload` of one plane without escapes, its planes replaced by `packed` and marked as compressed."""
     return payload[:1] + b"\1\1" + payload[3:HEADER] + packed
 
 
 @pytest.mark.parametrize("more", [-1, 1, 2**34])
-def test_planes_of_another_length_are_refused_before_room_is_made_for_them(more: int) -> None:
+def test_planes_of_wrong_length_are_rejected_before_allocation(more: int) -> None:
     topology, vertices = MESHES["rope"]
-    payload = full(topology, vertices)
+    payload = encode_full(topology, vertices)
     size = 3 * topology.n_vertices
     if more < 2**30:
         packed = zstandard.compress(bytes(size + more))
-    else:  # a zstd frame that says that it holds 16 GiB
+    else:  # a zstd frame that declares 16 GiB
         packed = b"\x28\xb5\x2f\xfd" + bytes([0xE0]) + struct.pack("<Q", more) + zstandard.compress(bytes(size))[6:]
     with pytest.raises(StreamError, match="not 60 bytes long"):
         DeformableDecoder(topology).decode(_with_planes(payload, packed))
@@ -225,19 +225,19 @@ def test_planes_of_another_length_are_refused_before_room_is_made_for_them(more:
         DeformableDecoder(topology).decode(_with_planes(payload, good + good))
 
 
-def test_a_frame_of_another_mesh_is_refused() -> None:
-    topology, vertices = cloth(4, 6)
-    other, _ = cloth(6, 4)
+def test_frame_of_another_mesh_is_rejected() -> None:
+    topology, vertices = make_cloth(4, 6)
+    other, _ = make_cloth(6, 4)
     assert other.identity != topology.identity
-    with pytest.raises(StreamError, match="take the topology of the present scene"):
-        DeformableDecoder(other).decode(full(topology, vertices))
+    with pytest.raises(StreamError, match="topology"):
+        DeformableDecoder(other).decode(encode_full(topology, vertices))
 
 
-def test_escapes_out_of_order_or_range_are_refused() -> None:
+def test_escapes_out_of_order_or_range_are_rejected() -> None:
     topology, vertices = MESHES["rope"]
     vertices = vertices.copy()
     vertices[[3, 8]] = np.nan
-    payload = full(topology, vertices)
+    payload = encode_full(topology, vertices)
     assert struct.unpack_from("<I", payload, HEADER) == (3,)
     for wrong in (8, 9, 2**32 - 1):
         with pytest.raises(StreamError, match="ascending"):
@@ -248,21 +248,21 @@ def test_escapes_out_of_order_or_range_are_refused() -> None:
         DeformableDecoder(topology).decode(beyond)
 
 
-def test_numbers_of_five_bytes_are_refused() -> None:
+def test_varints_of_five_bytes_are_rejected() -> None:
     topology, vertices = MESHES["rope"]
-    head = bytearray(full(topology, vertices)[:HEADER])
+    head = bytearray(encode_full(topology, vertices)[:HEADER])
     head[1:3] = b"\0\5"  # not packed, five planes
     with pytest.raises(StreamError, match="5 planes"):
         DeformableDecoder(topology).decode(bytes(head) + bytes(3 * topology.n_vertices * 5))
 
 
 @pytest.mark.parametrize("bad", [{"bound_m": 0.0}, {"bound_m": math.nan}, {"bound_m": 2.0}, {"repeat_after": 0}])
-def test_impossible_settings_are_refused(bad: dict[str, float]) -> None:
+def test_invalid_settings_are_rejected(bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(bad))):
         DeformableEncoder(MESHES["rope"][0], **bad)  # type: ignore[arg-type]
 
 
-def test_other_shapes_and_classes_are_refused() -> None:
+def test_wrong_shapes_and_classes_are_rejected() -> None:
     topology, vertices = MESHES["rope"]
     with pytest.raises(ValueError, match=r"shape \(19, 3\), expected \(20, 3\)"):
         DeformableEncoder(topology).encode(vertices[1:])
@@ -273,12 +273,12 @@ def test_other_shapes_and_classes_are_refused() -> None:
 # --- between frames -------------------------------------------------------------------------------------------------
 
 
-def test_interpolation_goes_from_one_frame_to_the_other_and_not_beyond() -> None:
+def test_interpolation_is_clamped_to_its_two_frames() -> None:
     topology, vertices = MESHES["cloth"]
     decoder = DeformableDecoder(topology)
-    a, b = decoder.decode(full(topology, vertices)), decoder.decode(full(topology, vertices + 0.02))
+    a, b = decoder.decode(encode_full(topology, vertices)), decoder.decode(encode_full(topology, vertices + 0.02))
     assert np.array_equal(interpolate(a, b, 0.0), a)
     assert np.array_equal(interpolate(a, b, -1.0), a)
-    assert worst(interpolate(a, b, 1.5), b) < 1e-6
-    assert worst(interpolate(a, b, 0.25), vertices + 0.005) <= 0.0005 + 1e-6
+    assert largest_error(interpolate(a, b, 1.5), b) < 1e-6
+    assert largest_error(interpolate(a, b, 0.25), vertices + 0.005) <= 0.0005 + 1e-6
     assert interpolate(a, b, 0.5).dtype == np.float32

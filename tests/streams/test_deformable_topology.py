@@ -1,4 +1,4 @@
-"""Topologies: which plan a mesh gets, bytes that come back the same, and tables that no encoder makes are refused."""
+"""Topologies: the plan of each mesh, stable bytes, read-only tables, and rejection of tables no encoder makes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iris_session.codegen.deformable_golden import cloth, rope, shell
+from iris_session.codegen.deformable_golden import make_cloth, make_rope, make_shell
 from iris_session.streams.deformable import DeformableDecoder, DeformableEncoder
 from iris_session.streams.deformable_topology import (
     MAX_LEVELS,
@@ -43,8 +43,8 @@ SCENE = """
 """
 
 
-def test_flexes_of_mujoco_of_every_dimension() -> None:
-    """A rope is one row, a cloth rows, the shell of a solid a tree without inner vertices; decoded as they move."""
+def test_mujoco_flexes_of_every_dimension() -> None:
+    """A rope is one row, a cloth rows, the shell of a solid a tree without inner vertices; decoded in motion."""
     model = mujoco.MjModel.from_xml_string(SCENE)
     data = mujoco.MjData(model)
     plans = []
@@ -77,7 +77,7 @@ def test_flexes_of_mujoco_of_every_dimension() -> None:
 
 
 def test_plans() -> None:
-    assert (cloth(9, 7)[0].rows, cloth(9, 7)[0].cols) == (9, 7)
+    assert (make_cloth(9, 7)[0].rows, make_cloth(9, 7)[0].cols) == (9, 7)
     quads = np.arange(20).reshape(4, 5)
     lines = np.concatenate(
         [
@@ -87,24 +87,24 @@ def test_plans() -> None:
     )
     net = DeformableTopology(20, edges=lines)
     assert (net.plan, net.rows, net.cols) == (ROWS, 4, 5)
-    walked = rope(30)[0]
+    walked = make_rope(30)[0]
     assert (walked.plan, walked.rows, walked.cols) == (ROWS, 1, 30)
     assert walked.order is not None
     assert {frozenset(pair) for pair in zip(walked.order[:-1].tolist(), walked.order[1:].tolist(), strict=True)} == {
         frozenset(pair) for pair in walked.edges.tolist()
     }, "a rope is walked from end to end"
-    assert shell(4)[0].plan == TREE
+    assert make_shell(4)[0].plan == TREE
 
 
-def test_a_tree_predicts_almost_every_vertex_across_a_triangle() -> None:
-    topology, _ = shell(7)
+def test_tree_predicts_almost_every_vertex_across_a_triangle() -> None:
+    topology, _ = make_shell(7)
     assert topology.parents is not None
     a, b, c = topology.parents
     assert np.count_nonzero((a != b) & (b != c)) > 0.9 * topology.n_vertices
     assert len(topology.levels) < 3 * np.sqrt(topology.n_vertices)
 
 
-def test_pieces_loose_vertices_and_triangles_without_area() -> None:
+def test_pieces_loose_vertices_and_degenerate_triangles() -> None:
     faces = [(4, 5, 6), (5, 6, 7), (10, 11, 12), (11, 12, 13), (6, 6, 14), (2, 2, 2)]
     topology = DeformableTopology(16, faces)
     assert topology.plan == TREE
@@ -112,7 +112,7 @@ def test_pieces_loose_vertices_and_triangles_without_area() -> None:
     assert sorted(topology.order.tolist()) == list(range(16))
 
 
-def test_a_long_ribbon_is_walked_instead_of_a_tree_of_thousands_of_levels() -> None:
+def test_long_ribbon_uses_a_walk_instead_of_a_deep_tree() -> None:
     n = 4 * MAX_LEVELS
     shuffled = np.random.default_rng(0).permutation(n)
     ribbon = shuffled[np.stack([np.arange(n - 2) + k for k in range(3)], axis=1)]
@@ -130,8 +130,8 @@ def test_used_vertices() -> None:
     assert faces.tolist() == [[2, 0, 3], [3, 0, 1]]
 
 
-@pytest.mark.parametrize("made", [cloth(5, 4), shell(3), rope(9)], ids=["cloth", "shell", "rope"])
-def test_bytes_come_back_the_same_and_tables_cannot_be_written(made: tuple[DeformableTopology, Any]) -> None:
+@pytest.mark.parametrize("made", [make_cloth(5, 4), make_shell(3), make_rope(9)], ids=["cloth", "shell", "rope"])
+def test_bytes_are_stable_and_tables_read_only(made: tuple[DeformableTopology, Any]) -> None:
     topology = made[0]
     back = DeformableTopology.from_bytes(topology.to_bytes())
     assert back.to_bytes() == topology.to_bytes()
@@ -141,21 +141,24 @@ def test_bytes_come_back_the_same_and_tables_cannot_be_written(made: tuple[Defor
         assert table is None or not table.flags.writeable
 
 
-def test_a_bare_topology_has_the_plan_only() -> None:
-    grid, tree = cloth(100, 100)[0], shell(5)[0]
-    assert len(grid.bare().to_bytes()) == 24
-    assert len(tree.bare().to_bytes()) == 24 + 16 * tree.n_vertices
-    assert tree.bare().identity != tree.identity
-    vertices = shell(5)[1]
-    frames = DeformableEncoder(tree.bare()).encode(vertices)
+def test_topology_without_tables_has_only_the_plan() -> None:
+    grid, tree = make_cloth(100, 100)[0], make_shell(5)[0]
+    assert len(grid.without_faces().to_bytes()) == 24
+    assert len(tree.without_faces().to_bytes()) == 24 + 16 * tree.n_vertices
+    assert tree.without_faces().identity != tree.identity
+    vertices = make_shell(5)[1]
+    frames = DeformableEncoder(tree.without_faces()).encode(vertices)
     assert frames is not None
-    client = DeformableTopology.from_bytes(tree.bare().to_bytes())
+    client = DeformableTopology.from_bytes(tree.without_faces().to_bytes())
     assert np.linalg.norm(DeformableDecoder(client).decode(frames["full"]) - vertices, axis=1).max() <= 0.0005
 
 
 @settings(max_examples=300, deadline=None)
-@given(st.sampled_from([shell(3)[0].to_bytes(), rope(6)[0].to_bytes(), cloth(3, 3)[0].to_bytes()]), st.data())
-def test_damaged_topologies_are_refused_or_of_use(good: bytes, data: st.DataObject) -> None:
+@given(
+    st.sampled_from([make_shell(3)[0].to_bytes(), make_rope(6)[0].to_bytes(), make_cloth(3, 3)[0].to_bytes()]),
+    st.data(),
+)
+def test_damaged_topologies_are_rejected_or_usable(good: bytes, data: st.DataObject) -> None:
     damaged = bytearray(good)
     for _ in range(data.draw(st.integers(1, 3))):
         damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
@@ -169,7 +172,7 @@ def test_damaged_topologies_are_refused_or_of_use(good: bytes, data: st.DataObje
     assert np.linalg.norm(DeformableDecoder(topology).decode(frames["full"]) - vertices, axis=1).max() <= 0.0005
 
 
-def test_tables_that_do_not_fit_are_refused() -> None:
+def test_inconsistent_tables_are_rejected() -> None:
     chain = np.stack([np.arange(-1, 2 * MAX_LEVELS - 1)] * 3).clip(0)
     n = chain.shape[1]
     head = struct.pack("<BBHIIIII", 1, TREE, 0, n, 0, 0, 0, 0)
@@ -188,7 +191,7 @@ def test_tables_that_do_not_fit_are_refused() -> None:
         DeformableTopology.from_bytes(struct.pack("<BBHIIIII", 1, ROWS, 0, 2**18, 1, 2**18, 2**20, 2**20))
 
 
-def test_what_is_no_mesh_is_refused() -> None:
+def test_invalid_meshes_are_rejected() -> None:
     for n in (0, MAX_VERTICES + 1):
         with pytest.raises(ValueError, match="1 to"):
             DeformableTopology(n)

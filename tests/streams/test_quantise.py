@@ -1,4 +1,4 @@
-"""The number formats: worst-case errors are what the constants say, and are nearly reached."""
+"""Number formats: worst-case errors are those of the constants and are nearly reached."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from iris_session.streams.quantise import (
 from tests.streams.poses import random_poses, rotation_errors
 
 
-def there_and_back(q: Floats) -> Floats:
-    """Unit quaternions (m, 4) as they are decoded."""
+def round_trip(q: Floats) -> Floats:
+    """Unit quaternions (m, 4) after encoding and decoding."""
     return decoded(rotation_levels(np.ascontiguousarray(q.T))).T
 
 
@@ -35,7 +35,7 @@ def decoded(levels: Ints) -> Floats:
     return rows
 
 
-def test_lattice_is_exact_and_half_a_cell_is_the_bound() -> None:
+def test_lattice_points_are_exact_and_the_bound_is_half_a_cell() -> None:
     assert pytest.approx(5.29e-5, rel=1e-3) == POSITION_QUANTUM_ERROR_M
     index = np.array([2**31 - 1, -(2**31), 12_345_678])
     np.testing.assert_array_equal(index * LATTICE_M / LATTICE_M, index)
@@ -47,16 +47,16 @@ def test_levels_fit_their_bits() -> None:
 
 def test_rotation_error_is_bounded_everywhere() -> None:
     q = random_poses(np.random.default_rng(1), 200_000)[:, 3:]
-    assert rotation_errors(q, there_and_back(q)).max() <= ROTATION_QUANTUM_ERROR_RAD
+    assert rotation_errors(q, round_trip(q)).max() <= ROTATION_QUANTUM_ERROR_RAD
 
 
-def test_rotation_error_is_bounded_and_reached_next_to_the_identity() -> None:
-    """Half a step of rounding on all three parameters, where they are small."""
+def test_rotation_error_bound_is_reached_next_to_the_identity() -> None:
+    """Half a rounding step on all three parameters, where they are small."""
     rng = np.random.default_rng(2)
     m = (rng.integers(-30, 30, (20_000, 3)) + rng.uniform(0.49, 0.51, (20_000, 3))) / ROTATION_CENTRE
     squares = np.einsum("ij,ij->i", m, m)[:, None]
     q = np.hstack(((1.0 - squares) / (1.0 + squares), 2.0 * m / (1.0 + squares)))
-    errors = rotation_errors(q, there_and_back(q))
+    errors = rotation_errors(q, round_trip(q))
     assert errors.max() <= ROTATION_QUANTUM_ERROR_RAD
     assert errors.max() >= 0.98 * ROTATION_QUANTUM_ERROR_RAD
 
@@ -64,24 +64,24 @@ def test_rotation_error_is_bounded_and_reached_next_to_the_identity() -> None:
 def test_axes_and_half_turns_are_exact_or_bounded() -> None:
     q = np.array([v for v in itertools.product((-1.0, -0.0, 0.0, 1.0), repeat=4) if any(v)])
     q /= np.linalg.norm(q, axis=1)[:, None]
-    assert rotation_errors(q, there_and_back(q)).max() <= ROTATION_QUANTUM_ERROR_RAD
+    assert rotation_errors(q, round_trip(q)).max() <= ROTATION_QUANTUM_ERROR_RAD
     one = np.eye(4)
-    np.testing.assert_array_equal(np.abs(there_and_back(one)), one)
-    np.testing.assert_array_equal(there_and_back(-one[:1]), one[:1])
+    np.testing.assert_array_equal(np.abs(round_trip(one)), one)
+    np.testing.assert_array_equal(round_trip(-one[:1]), one[:1])
 
 
 def test_decoded_quaternions_have_unit_length() -> None:
-    q = there_and_back(random_poses(np.random.default_rng(4), 10_000)[:, 3:])
+    q = round_trip(random_poses(np.random.default_rng(4), 10_000)[:, 3:])
     np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1.0, rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("levels", [(2 * ROTATION_CENTRE + 1, 8191, 8191), (0, 0, 0), (2**16 - 1,) * 3])
-def test_levels_of_no_rotation_are_refused(levels: tuple[int, ...]) -> None:
+def test_levels_outside_the_unit_ball_are_rejected(levels: tuple[int, ...]) -> None:
     with pytest.raises(StreamError, match="rotation levels"):
         decoded(np.array([levels]).T)
 
 
-def test_every_second_code_is_reproduced() -> None:
+def test_codes_round_trip() -> None:
     """levels -> rotation -> levels is the identity away from half turns, where m and -m are the same rotation."""
     q = random_poses(np.random.default_rng(3), 50_000)[:, 3:]
     levels = rotation_levels(np.ascontiguousarray(q[np.abs(q[:, 0]) > math.sin(1e-3)].T))

@@ -1,4 +1,4 @@
-"""Rigid-state stream: error bounds over drops, drift, late joiners and wild poses; bytes; hostile payloads."""
+"""Rigid-state stream: error bounds over loss, drift, late joiners and extreme poses; hostile payloads."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_allowance_leaves_room_for_drift() -> None:
     assert math.degrees(DRIFT_ALLOWANCE_RAD) > 0.02
 
 
-def test_three_hundred_moving_bodies_are_small_and_exact() -> None:
+def test_three_hundred_moving_bodies_are_small_and_within_the_bound() -> None:
     rng = np.random.default_rng(0)
     poses = random_poses(rng, 300)
     encoder, decoder = RigidEncoder(300), RigidDecoder(300)
@@ -47,12 +47,12 @@ def test_three_hundred_moving_bodies_are_small_and_exact() -> None:
         poses[:, :3] = np.clip(poses[:, :3], 0.0, (10.0, 10.0, 3.0))
         frame = encoder.encode(poses, 1)
         assert len(frame.payload) == HEADER + 300 * BODY
-        assert frame.base_seq == 0  # complete in itself: nobody needs a snapshot
+        assert frame.base_seq == 0  # complete in itself: no snapshot needed
         assert decoder.apply(*frame)
         assert_within_bound(decoder.poses, poses)
 
 
-def test_resting_bodies_cost_their_bit_and_the_round_robin() -> None:
+def test_resting_bodies_cost_one_bit_and_the_refresh() -> None:
     poses = random_poses(np.random.default_rng(0), 300)
     encoder = RigidEncoder(300)
     frames = [encoder.encode(poses, 1) for _ in range(WINDOW + 2)]
@@ -61,7 +61,7 @@ def test_resting_bodies_cost_their_bit_and_the_round_robin() -> None:
     assert frames[-1].base_seq == frames[-1].state_seq - WINDOW
 
 
-def test_only_what_moves_is_sent() -> None:
+def test_only_moving_bodies_are_sent() -> None:
     rng = np.random.default_rng(4)
     poses = random_poses(rng, 100)
     encoder, decoder = RigidEncoder(100), RigidDecoder(100)
@@ -73,7 +73,7 @@ def test_only_what_moves_is_sent() -> None:
     assert_within_bound(decoder.poses, poses)
 
 
-def test_creeping_bodies_stay_within_the_bound_for_a_lossy_client() -> None:
+def test_creeping_bodies_stay_within_the_bound_despite_loss() -> None:
     """0.6 um and 0.6 mdeg a frame: far below the drift allowance in one frame, far above it in a second."""
     rng = np.random.default_rng(5)
     poses = random_poses(rng, 40)
@@ -93,8 +93,8 @@ def test_creeping_bodies_stay_within_the_bound_for_a_lossy_client() -> None:
             delivered = k
 
 
-def test_creeping_rotations_stay_within_the_bound_at_the_worst_place() -> None:
-    """Rotations half a step beside their codes, turning on away from them by a tenth of the allowance per frame."""
+def test_creeping_rotations_stay_within_the_bound_in_the_worst_case() -> None:
+    """Rotations half a step beside their codes, moving away from them by a tenth of the allowance per frame."""
     m = (np.arange(1, 20)[:, None] + 0.499) / 8191 * np.ones(3)
     squares = np.einsum("ij,ij->i", m, m)[:, None]
     q = np.hstack(((1.0 - squares) / (1.0 + squares), 2.0 * m / (1.0 + squares)))
@@ -122,16 +122,16 @@ def test_creeping_rotations_stay_within_the_bound_at_the_worst_place() -> None:
 def test_every_delivered_frame_is_within_the_bound(
     seed: int, n: int, size: float, step: float, lost: list[bool]
 ) -> None:
-    """Whatever is lost: a complete client is within the bound; one that was away too long says so."""
+    """At any loss a complete client is within the bound; one that missed too much reports it."""
     rng = np.random.default_rng(seed)
     poses = random_poses(rng, n, (size, size, size))
     encoder, decoder = RigidEncoder(n), RigidDecoder(n)
     away = 0
-    for k, gone in enumerate(lost):
+    for k, is_lost in enumerate(lost):
         active = rng.random(n) < 0.3
         poses[active] = moved(rng, poses[active], step, min(step, 0.1))
         frame = encoder.encode(poses, 1 + k // 60)
-        if gone:
+        if is_lost:
             away += 1
             continue
         complete = decoder.apply(*frame)
@@ -145,7 +145,7 @@ def test_every_delivered_frame_is_within_the_bound(
 
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 30), frames=st.integers(1, 20))
-def test_wild_poses_pass_as_they_are(seed: int, n: int, frames: int) -> None:
+def test_extreme_poses_are_sent_exactly(seed: int, n: int, frames: int) -> None:
     rng = np.random.default_rng(seed)
     wild = np.array([np.nan, np.inf, -np.inf, 0.0, 1e300, -1e9, 1e-320, 1e5])
     encoder, decoder = RigidEncoder(n), RigidDecoder(n)
@@ -161,7 +161,7 @@ def test_wild_poses_pass_as_they_are(seed: int, n: int, frames: int) -> None:
         np.testing.assert_array_equal(decoder.poses[strange], poses[strange])
 
 
-def test_far_bodies_escape_and_the_rest_stays_small() -> None:
+def test_distant_bodies_escape_and_the_rest_stays_small() -> None:
     poses = random_poses(np.random.default_rng(6), 300)
     poses[10, 2], poses[20, 0] = -4000.0, 1e9
     encoder, decoder = RigidEncoder(300), RigidDecoder(300)
@@ -171,7 +171,7 @@ def test_far_bodies_escape_and_the_rest_stays_small() -> None:
     assert_within_bound(decoder.poses, poses)
 
 
-def test_a_hall_takes_the_wide_layout_rather_than_escapes() -> None:
+def test_large_room_selects_the_wide_layout() -> None:
     poses = random_poses(np.random.default_rng(7), 300, (90.0, 90.0, 10.0))
     frame = RigidEncoder(300).encode(poses, 1)
     assert len(frame.payload) == HEADER + 300 * WIDE_BODY
@@ -192,7 +192,7 @@ def resting_stream(n: int = 50, frames: int = 100) -> tuple[Floats, RigidEncoder
 
 
 @pytest.mark.parametrize(("lost", "complete"), [(WINDOW - 1, True), (WINDOW, False)])
-def test_a_window_of_frames_may_be_lost_and_not_one_more(lost: int, complete: bool) -> None:
+def test_loss_of_one_window_is_tolerated_and_not_more(lost: int, complete: bool) -> None:
     poses, encoder, frames = resting_stream()
     decoder = RigidDecoder(50)
     for frame in frames:
@@ -204,7 +204,7 @@ def test_a_window_of_frames_may_be_lost_and_not_one_more(lost: int, complete: bo
     assert_within_bound(decoder.poses[decoder.valid], poses[decoder.valid])
 
 
-def test_late_joiner_needs_a_snapshot_and_is_complete_with_it() -> None:
+def test_late_joiner_is_complete_after_a_snapshot() -> None:
     poses, encoder, frames = resting_stream()
     decoder = RigidDecoder(50)
     assert not decoder.complete
@@ -229,7 +229,7 @@ def test_keyframe_older_than_the_stream_keeps_newer_poses() -> None:
     assert decoder.state_seq == frame.state_seq
 
 
-def test_keyframe_that_is_too_old_does_not_make_complete() -> None:
+def test_outdated_keyframe_does_not_complete() -> None:
     poses, _, frames = resting_stream(frames=200)
     decoder = RigidDecoder(50)
     decoder.apply(*frames[-1])
@@ -237,7 +237,7 @@ def test_keyframe_that_is_too_old_does_not_make_complete() -> None:
     assert decoder.load_keyframe(frames[-1].base_seq, poses)
 
 
-def test_exact_keyframe_of_the_state_is_as_good_as_the_encoders() -> None:
+def test_exact_keyframe_completes_like_the_encoders() -> None:
     poses, encoder, frames = resting_stream()
     decoder = RigidDecoder(50)
     assert decoder.load_keyframe(frames[-1].state_seq, poses)
@@ -261,7 +261,7 @@ def test_new_scene_epoch_sends_everything() -> None:
     assert decoder.apply(*encoder.encode(poses, 2))
 
 
-def test_encoder_that_replaces_another_goes_on_counting() -> None:
+def test_replacing_encoder_continues_the_sequence() -> None:
     frames = resting_stream()[2]
     decoder = RigidDecoder(50)
     for frame in frames:
@@ -270,7 +270,7 @@ def test_encoder_that_replaces_another_goes_on_counting() -> None:
     replacement = RigidEncoder(50, first_seq=frames[-1].state_seq + 1)
     for _ in range(WINDOW + 5):
         frame = replacement.encode(other, 1)
-    assert not decoder.apply(*frame)  # lost everything that the replacement sent: must not be taken for complete
+    assert not decoder.apply(*frame)  # lost everything from the replacement: must not count as complete
     assert decoder.apply(*replacement.encode(other, 2))
     assert_within_bound(decoder.poses, other)
 
@@ -292,14 +292,14 @@ def test_same_calls_give_the_same_bytes() -> None:
 
 
 @pytest.mark.parametrize("shape", [(3, 7), (2, 6), (14,)])
-def test_wrong_shapes_are_refused(shape: tuple[int, ...]) -> None:
+def test_wrong_shapes_are_rejected(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="expected"):
         RigidEncoder(2).encode(np.zeros(shape), 1)
     with pytest.raises(StreamError, match="expected"):
         RigidDecoder(2).load_keyframe(1, np.zeros(shape))
 
 
-def test_wrong_arguments_are_refused() -> None:
+def test_wrong_arguments_are_rejected() -> None:
     with pytest.raises(ValueError, match="65535"):
         RigidEncoder(65536)
     with pytest.raises(ValueError, match="first_seq"):
@@ -320,8 +320,8 @@ def valid_payload() -> bytes:
     return RigidEncoder(10).encode(poses, 1).payload
 
 
-def offer(payload: bytes) -> None:
-    """Applies `payload`; when it is refused, nothing may have changed."""
+def apply_atomically(payload: bytes) -> None:
+    """Apply `payload`; if it is rejected, nothing may have changed."""
     decoder = RigidDecoder(10)
     decoder.load_keyframe(1, np.ones((10, 7)))
     try:
@@ -335,18 +335,18 @@ def offer(payload: bytes) -> None:
 @settings(max_examples=300, deadline=None)
 @given(st.binary(max_size=400))
 def test_random_bytes_raise_stream_errors_only(payload: bytes) -> None:
-    offer(payload)
+    apply_atomically(payload)
 
 
 @settings(max_examples=300, deadline=None)
 @given(st.integers(0, 2), st.integers(0, 10), st.integers(0, 2), st.binary(min_size=400, max_size=400))
-def test_random_bodies_behind_a_fitting_header_raise_stream_errors_only(
+def test_random_bodies_after_a_valid_header_raise_stream_errors_only(
     layout: int, quantised: int, escaped: int, noise: bytes
 ) -> None:
     size = quantised * (WIDE_BODY if layout else BODY)
     bits = ((1 << quantised) - 1).to_bytes(2, "little") if quantised < 10 else b""
     head = struct.pack("<BBHHH", 2, layout, 10, quantised, escaped)
-    offer(head + noise[: 12 + size] + bits + noise[200 : 200 + escaped * ESCAPE])
+    apply_atomically(head + noise[: 12 + size] + bits + noise[200 : 200 + escaped * ESCAPE])
 
 
 @settings(max_examples=300, deadline=None)
@@ -355,31 +355,31 @@ def test_damaged_payloads_raise_stream_errors_only(flips: list[tuple[int, int]],
     payload = bytearray(valid_payload())
     for at, value in flips:
         payload[at % len(payload)] = value
-    offer(bytes(payload[:length] if length < 0 else payload + b"\0" * length))
+    apply_atomically(bytes(payload[:length] if length < 0 else payload + b"\0" * length))
 
 
-def test_each_check_refuses() -> None:
+def test_each_check_rejects() -> None:
     good = valid_payload()
     n = 10
 
-    def refused(payload: bytes, match: str) -> None:
+    def assert_rejected(payload: bytes, match: str) -> None:
         with pytest.raises(StreamError, match=match):
             RigidDecoder(n).apply(1, 0, payload)
 
     assert RigidDecoder(n).apply(1, 0, memoryview(good))
-    refused(good[:19], "shorter than its header")
-    refused(b"\x01" + good[1:], "format 1")
-    refused(good[:2] + b"\x0b\0" + good[4:], "for 11 bodies")
-    refused(good[:1] + b"\x02" + good[2:], "layout 2")
-    refused(good[:4] + b"\x0b\0" + good[6:], "of 11 bodies")
-    refused(good + b"\0", "header asks for")
+    assert_rejected(good[:19], "shorter than its header")
+    assert_rejected(b"\x01" + good[1:], "format 1")
+    assert_rejected(good[:2] + b"\x0b\0" + good[4:], "for 11 bodies")
+    assert_rejected(good[:1] + b"\x02" + good[2:], "layout 2")
+    assert_rejected(good[:4] + b"\x0b\0" + good[6:], "of 11 bodies")
+    assert_rejected(good + b"\0", "header asks for")
     last = len(good) - ESCAPE
     mask = last - ESCAPE - 2
-    refused(good[:mask] + b"\xff\xff" + good[mask + 2 :], "mask")
-    refused(good[: mask + 1] + bytes([good[mask + 1] | 0x80]) + good[mask + 2 :], "mask")
-    refused(good[:last] + b"\x03\0" + good[last + 2 :], "ascending")
-    refused(good[:last] + b"\x0a\0" + good[last + 2 :], "ascending")
-    refused(good[:last] + b"\x09\0" + good[last + 2 :], "ascending")
-    refused(good[:20] + b"\xff\xff\xff\xff" + good[24:], "rotation levels")
+    assert_rejected(good[:mask] + b"\xff\xff" + good[mask + 2 :], "mask")
+    assert_rejected(good[: mask + 1] + bytes([good[mask + 1] | 0x80]) + good[mask + 2 :], "mask")
+    assert_rejected(good[:last] + b"\x03\0" + good[last + 2 :], "ascending")
+    assert_rejected(good[:last] + b"\x0a\0" + good[last + 2 :], "ascending")
+    assert_rejected(good[:last] + b"\x09\0" + good[last + 2 :], "ascending")
+    assert_rejected(good[:20] + b"\xff\xff\xff\xff" + good[24:], "rotation levels")
     full = RigidEncoder(n).encode(random_poses(np.random.default_rng(11), n), 1).payload
-    refused(full[:6] + b"\x01\0" + full[8:] + good[last:], "ascending")
+    assert_rejected(full[:6] + b"\x01\0" + full[8:] + good[last:], "ascending")

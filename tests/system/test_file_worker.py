@@ -1,4 +1,4 @@
-"""The thread that changes files: order, bounds, exceptions, and that no caller waits for it."""
+"""The file worker thread: order, bounds, exceptions, and callers that never wait."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from tests.front.slow_disk import turns
 
 
 class DiskError(Exception):
-    """An error that jobs may end with."""
+    """An error that jobs may raise."""
 
 
-def test_jobs_run_in_order_and_report_in_the_thread_that_asks() -> None:
+def test_jobs_run_in_order_and_report_in_the_polling_thread() -> None:
     files, reports = FileWorker(DiskError), []
 
     def on_done(outcome: int | DiskError, now_ns: int) -> None:
@@ -48,7 +48,7 @@ def test_an_expected_exception_is_reported_and_any_other_is_raised() -> None:
     files.close()
 
 
-def test_a_job_that_hangs_blocks_no_caller_and_the_queue_is_bounded() -> None:
+def test_hanging_job_blocks_no_caller_and_the_queue_is_bounded() -> None:
     files, reports, disk = FileWorker(DiskError), [], threading.Event()
     begun = threading.Event()
 

@@ -1,4 +1,4 @@
-"""Files that are replaced as a whole: content, permissions, and what an error leaves."""
+"""Files that are replaced as a whole: content, permissions, and the state after an error."""
 
 from __future__ import annotations
 
@@ -21,7 +21,11 @@ def test_content_is_replaced_with_private_permissions(tmp_path: Path, durable: b
     assert os.listdir(tmp_path) == ["file"]
 
 
-def test_permissions_of_ordinary_files_follow_the_umask(tmp_path: Path) -> None:
+def test_permissions_of_ordinary_files_follow_the_umask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_mask: int) -> int:
+        raise AssertionError("the umask belongs to all threads")
+
+    monkeypatch.setattr(os, "umask", fail)
     write_atomic(tmp_path / "file", b"new", permissions=None)
     (tmp_path / "other").touch()
     assert (tmp_path / "file").stat().st_mode == (tmp_path / "other").stat().st_mode
@@ -42,7 +46,7 @@ def test_error_keeps_the_old_content_and_leaves_no_temporary_file(tmp_path: Path
     assert os.listdir(tmp_path) == ["file"]
 
 
-def test_target_that_cannot_be_replaced_leaves_no_temporary_file(tmp_path: Path) -> None:
+def test_irreplaceable_target_leaves_no_temporary_file(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     with pytest.raises(OSError, match="folder"):
         write_atomic(tmp_path / "folder", b"new")

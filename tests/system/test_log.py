@@ -1,4 +1,4 @@
-"""Logging of our own processes: one line a record on standard error, level from `IRIS_LOG`."""
+"""Logging of our processes: one line per record on standard error, level from `IRIS_LOG`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_warnings_are_one_line_on_standard_error(
 
 
 @pytest.mark.parametrize(("name", "level"), [("debug", 10), ("", 30), ("loud", 30)])
-def test_level_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch, name: str, level: int) -> None:
+def test_level_is_read_from_the_environment(monkeypatch: pytest.MonkeyPatch, name: str, level: int) -> None:
     monkeypatch.setenv("IRIS_LOG", name)
     configure_logging()
     assert logging.getLogger("iris_session").level == level

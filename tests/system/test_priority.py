@@ -40,7 +40,7 @@ def test_threads_started_at_low_priority_inherit_it() -> None:
     assert seen[-1] == ours
 
 
-def test_tick_priority_is_given_back() -> None:
+def test_tick_priority_is_restored() -> None:
     before = os.sched_getscheduler(0)
     with tick_priority() as reached:
         inside = os.sched_getscheduler(0)
@@ -61,7 +61,7 @@ print(reached, inside == os.SCHED_RR, os.sched_getscheduler(0) & ~os.SCHED_RESET
 """
 
 
-def test_tick_priority_is_given_back_without_the_capability() -> None:
+def test_tick_priority_is_restored_without_the_capability() -> None:
     done = subprocess.run(
         [sys.executable, "-c", WITHOUT_CAPABILITY], capture_output=True, text=True, check=True, timeout=60
     )

@@ -1,4 +1,4 @@
-"""Child processes: start, read, stop; no file of the working folder is imported, and a checkout finds itself."""
+"""Child processes: start, read, stop; files of the working folder are not imported; a checkout finds itself."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 TRAPS = ("queue", "zmq", "json", "random", "select", "selectors", "anchors", "msgspec", "numpy", "rerun", "rich")
 TRAP = "raise SystemExit('a file of the working folder was taken for a module')"
 SERVE = ("serve", "handover", "--no-beacon", "--control-port", "0", "--state-port", "0", "--seconds", "0.5")
-#: What the installed command does. An empty part of PYTHONPATH means the working folder, too.
+#: The code of the installed command. An empty part of PYTHONPATH means the working folder, too.
 INSTALLED = """
 import os
 from iris_session.cli.main import main
@@ -37,36 +37,36 @@ subprocess.run(module_command("iris_session.where", "a", "b"), env=child_environ
 
 
 @pytest.fixture
-def trapped(tmp_path: Path) -> Path:
-    """A working folder with files named as modules are."""
+def module_traps(tmp_path: Path) -> Path:
+    """A working folder with files named as standard modules."""
     for name in TRAPS:
         (tmp_path / f"{name}.py").write_text(TRAP)
     return tmp_path
 
 
-def test_session_imports_nothing_from_the_working_folder(trapped: Path) -> None:
-    """With its front, its recorder and its display: started as the installed command is, without that folder."""
+def test_session_imports_nothing_from_the_working_folder(module_traps: Path) -> None:
+    """With its front, recorder and display, started as the installed command is."""
     done = subprocess.run(
         [sys.executable, "-P", "-c", INSTALLED, *SERVE, "--record", "session.rrd"],
-        cwd=trapped, capture_output=True, text=True, timeout=120, check=False,
+        cwd=module_traps, capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "taken for a module" not in done.stdout + done.stderr
-    with Recording.open(trapped / "session.rrd") as recording:
+    assert "for a module" not in done.stdout + done.stderr
+    with Recording.open(module_traps / "session.rrd") as recording:
         assert recording.finished
 
 
-def test_probe_imports_nothing_from_the_working_folder(trapped: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(trapped)
+def test_probe_imports_nothing_from_the_working_folder(module_traps: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(module_traps)
     done = subprocess.run(
         process.module_command("iris_session.recording.probe"),
         env=process.child_environment(), input='["readable", "/none"]\n', capture_output=True, text=True, check=False,
     )  # fmt: skip
-    assert "taken for a module" not in done.stderr
+    assert "for a module" not in done.stderr
     assert (done.returncode, done.stdout) == (0, "0\n")
 
 
-def test_a_checkout_that_is_not_installed_starts_its_own_modules(tmp_path: Path) -> None:
+def test_uninstalled_checkout_starts_its_own_modules(tmp_path: Path) -> None:
     checkout, elsewhere = tmp_path / "checkout", tmp_path / "elsewhere"
     package = checkout / "iris_session"
     (package / "system").mkdir(parents=True)
@@ -83,7 +83,7 @@ def test_a_checkout_that_is_not_installed_starts_its_own_modules(tmp_path: Path)
     assert done.stdout.split() == [str(package / "where.py"), "a", "b"]
 
 
-def test_the_environment_keeps_folders_that_the_user_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_environment_keeps_folders_of_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(["", "/opt/mine", "", "/opt/yours"]))
     made = process.child_environment(RERUN="on")
     assert made["PYTHONPATH"].split(os.pathsep)[-2:] == ["/opt/mine", "/opt/yours"]
@@ -92,7 +92,7 @@ def test_the_environment_keeps_folders_that_the_user_named(monkeypatch: pytest.M
     assert made["PATH"] == os.environ["PATH"]
 
 
-def test_only_this_module_runs_the_interpreter() -> None:
+def test_only_one_module_runs_the_interpreter() -> None:
     calling = [path for path in (ROOT / "iris_session").rglob("*.py") if "sys.executable" in path.read_text()]
     assert calling == [Path(process.__file__)]
 
@@ -107,10 +107,12 @@ def module_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize("size", [0, 1000, 1_000_000])
 def test_child_reads_configuration_and_answers_in_lines(module_folder: Path, size: int) -> None:
     (module_folder / "echo_length.py").write_text(
-        "import sys; print(len(sys.stdin.buffer.read())); print('cut', end='')"
+        "import os, stat, sys; print(stat.filemode(os.fstat(0).st_mode), os.fstat(0).st_nlink)\n"
+        "print(len(sys.stdin.buffer.read())); print('cut', end='')"
     )
-    with ChildProcess("echo_length", config=bytes(1_000_000), stdout=PIPE) as child:
-        assert child.read_line(30.0) == b"1000000"
+    with ChildProcess("echo_length", config=bytes(size), stdout=PIPE) as child:
+        assert child.read_line(30.0) == b"-rw------- 0", "an unlinked file, which holds any size without a reader"
+        assert child.read_line(30.0) == b"%d" % size
         with pytest.raises(EOFError):
             child.read_line(30.0)
         assert child.wait(30.0) == 0
@@ -118,7 +120,7 @@ def test_child_reads_configuration_and_answers_in_lines(module_folder: Path, siz
         assert not child.is_running
 
 
-def test_child_that_writes_nothing_times_out_and_is_killed(module_folder: Path) -> None:
+def test_silent_child_times_out_and_is_killed(module_folder: Path) -> None:
     (module_folder / "deaf.py").write_text(
         "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(60)"
     )

@@ -1,4 +1,4 @@
-"""Findings of `tools/fuzz.py`, each with an input that showed it."""
+"""Findings of `tools/fuzz.py`, each with the input that showed it."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_inconsistent_row_counts_are_damage() -> None:
 
 
 @pytest.mark.parametrize("content", [b'[{"name": "\xff"}]', b"[" * 100_000, b'[{"pid": 1'])
-def test_damaged_files_of_keys_are_one_kind_of_error(tmp_path: Path, content: bytes) -> None:
+def test_damaged_key_files_raise_one_error_type(tmp_path: Path, content: bytes) -> None:
     tmp_path.chmod(0o700)
     for name, kind in (("clients.json", AllowList), ("sessions.json", SessionRegistry)):
         (tmp_path / name).touch(0o600)
@@ -90,30 +90,30 @@ def test_session_note_with_invalid_pid_is_ignored(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("line", [b"public-key", b"public-key = abc", b'public-key = "\xff\xff"', b"public-key ="])
-def test_damaged_certificates_are_one_kind_of_error(tmp_path: Path, line: bytes) -> None:
+def test_damaged_certificates_raise_one_error_type(tmp_path: Path, line: bytes) -> None:
     path = tmp_path / "x.key"
     path.write_bytes(b"metadata\ncurve\n    " + line + b"\n")
     with pytest.raises(KeysError):
         load_public(path)
 
 
-def joined(heartbeat_ns: int) -> ClientConnection:
+def joined_connection(heartbeat_ns: int) -> ClientConnection:
     connection = ClientConnection(Hello("operator", "Ann"), Identity(b"s" * 16))
     connection.open(10**12)
-    tell(
+    deliver(
         connection,
         Welcome("s", "lab", "live", "p1", 7, "operator", b"t", False, 0, heartbeat_ns, 1, 1, Endpoints(1, 2)),
     )
     return connection
 
 
-def tell(connection: ClientConnection, message: Message) -> None:
+def deliver(connection: ClientConnection, message: Message) -> None:
     connection.receive([encode_server(ServerEnvelope(1, 7, message))], 10**12)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("heartbeat_ns", [-(2**63), 0, 1])
 def test_heartbeat_interval_of_session_is_limited(heartbeat_ns: int) -> None:
-    connection = joined(heartbeat_ns)
+    connection = joined_connection(heartbeat_ns)
     heartbeats = 0
     for i in range(100):
         connection.tick(10**12 + i * MS)
@@ -125,7 +125,7 @@ def test_heartbeat_interval_of_session_is_limited(heartbeat_ns: int) -> None:
 
 
 def test_silent_session_is_detected_for_any_heartbeat() -> None:
-    connection = joined(2**63 - 1)
+    connection = joined_connection(2**63 - 1)
     now_ns = 10**12
     for _ in range(100):
         now_ns += 500 * MS
@@ -134,10 +134,10 @@ def test_silent_session_is_detected_for_any_heartbeat() -> None:
 
 
 def test_faults_and_leases_of_a_client_are_bounded() -> None:
-    connection = joined(500 * MS)
+    connection = joined_connection(500 * MS)
     for i in range(6000):
-        tell(connection, ProtocolFault(f"code{i}", "x"))
-        tell(connection, Reply(0, True, leases=(Lease(f"robot{i}", "robot", "exclusive", "p1", 1),)))
+        deliver(connection, ProtocolFault(f"code{i}", "x"))
+        deliver(connection, Reply(0, True, leases=(Lease(f"robot{i}", "robot", "exclusive", "p1", 1),)))
     assert len(connection.counters.faults) <= 65
     assert sum(connection.counters.faults.values()) == 6000
     assert len(connection.requests._granted) <= 4096
@@ -152,7 +152,7 @@ def test_frames_of_unknown_bodies_change_nothing() -> None:
 
 
 def test_idle_state_socket_processes_events() -> None:
-    """libzmq acts on what happened to connections when it is asked for something: also while no state is sent."""
+    """libzmq handles connection events only inside its calls: also while no state is sent."""
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     state = context.socket(zmq.XPUB)
     publisher = StatePublisher(state, SceneInfo("hash"), lambda: 0)
@@ -160,12 +160,12 @@ def test_idle_state_socket_processes_events() -> None:
     publisher.replace_socket(None)
     publisher.poll()
 
-    class Watched:
+    class CountingSocket:
         def get(self, option: int) -> int:
             asked.append(option)
             return 0
 
-    publisher._state = Watched()  # type: ignore[assignment]
+    publisher._state = CountingSocket()  # type: ignore[assignment]
     publisher.poll()
     assert asked == [int(zmq.EVENTS)]
     context.destroy(linger=0)

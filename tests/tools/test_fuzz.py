@@ -21,7 +21,7 @@ from iris_session.protocol.common import Lease  # noqa: E402
 
 
 @pytest.mark.parametrize("target", sorted(DECODERS))
-def test_no_decoder_raises_what_it_does_not_promise(target: str) -> None:
+def test_decoders_raise_only_documented_errors(target: str) -> None:
     result = fuzz.fuzz(target, 2000, seed=11)
     assert result.findings == []
     assert 0 < result.accepted < result.inputs == 2000
@@ -30,7 +30,7 @@ def test_no_decoder_raises_what_it_does_not_promise(target: str) -> None:
 @pytest.mark.parametrize(
     ("target", "inputs"), [("connection", 10_000), ("state-stream", 3000), ("core", 3000), ("asset-loader", 5000)]
 )
-def test_no_conversation_breaks_a_state_machine(target: str, inputs: int) -> None:
+def test_random_conversations_keep_state_machines_consistent(target: str, inputs: int) -> None:
     result = fuzz.fuzz(target, inputs, seed=11)
     assert result.findings == []
     assert result.inputs == inputs
@@ -40,14 +40,14 @@ def test_no_conversation_breaks_a_state_machine(target: str, inputs: int) -> Non
 @pytest.mark.parametrize(
     ("target", "inputs"), [("front", 10_000), ("front-tcp", 2000), ("front-media", 4000), ("front-assets", 4000)]
 )
-def test_no_peer_breaks_the_front(target: str, inputs: int) -> None:
-    """Whole and damaged messages of every type, and damaged handshakes, over real sockets."""
+def test_hostile_peers_do_not_stop_the_front(target: str, inputs: int) -> None:
+    """Valid and damaged messages of every type, and damaged handshakes, over real sockets."""
     result = fuzz.fuzz(target, inputs, seed=11)
     assert result.findings == []
     assert result.inputs == inputs
 
 
-def test_inputs_come_again_with_their_seed() -> None:
+def test_seed_reproduces_inputs() -> None:
     first, second, other = (DECODERS["client"](Random(seed)) for seed in ("1", "1", "2"))
     made = [first.make() for _ in range(500)]
     assert made == [second.make() for _ in range(500)]
@@ -71,7 +71,7 @@ def test_finding_is_reported_saved_and_exits_with_1(tmp_path: Path, monkeypatch:
     assert b"robot" in Path(found["saved"]).read_bytes()
 
 
-#: A process of its own: in one that freed memory before, growth is served from what the heap still holds.
+#: In a new process: after freed memory, growth would be served from the heap.
 LEAK = """
 import sys
 sys.path.insert(0, sys.argv[1])
@@ -88,14 +88,14 @@ print(*(found["text"] for found in fuzz.fuzz("planted", 8000, 1).findings))
 """
 
 
-def test_memory_that_grows_is_a_finding() -> None:
+def test_growing_memory_is_a_finding() -> None:
     done = subprocess.run(
         [sys.executable, "-c", LEAK, str(TOOLS)], capture_output=True, text=True, check=True, timeout=60
     )
     assert done.stdout.startswith("memory grew by 1")
 
 
-def test_the_command_gives_json() -> None:
+def test_command_prints_json() -> None:
     command = [sys.executable, str(TOOLS / "fuzz.py"), "--target", "beacon,rigid", "--inputs", "300", "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
     report = json.loads(done.stdout)

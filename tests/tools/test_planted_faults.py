@@ -1,5 +1,7 @@
-"""How `tools/planted_faults.py` judges: a doctor who does not name a fault fails. Planting them needs root and minutes:
-docs/evidence/doctor.md has what was seen."""
+"""How `tools/planted_faults.py` judges: a doctor that does not name a fault fails.
+
+Planting needs root and minutes: results are in docs/evidence/doctor.md.
+"""
 
 from __future__ import annotations
 
@@ -21,18 +23,18 @@ BLOCKED = next(one for one in FAULTS if one.name == "broadcasts-blocked")
 FULL = next(one for one in FAULTS if one.name == "full-disk")
 
 
-def told(one: Fault) -> Finding:
-    """A finding that names it."""
-    return Finding(one.check, one.state, "; ".join(one.says), advice="do")
+def matching_finding(one: Fault) -> Finding:
+    """Return a finding that names the fault."""
+    return Finding(one.check, one.state, "; ".join(one.expected), advice="do")
 
 
 @pytest.mark.parametrize("one", FAULTS, ids=lambda one: one.name)
 def test_every_fault_has_a_check_and_can_be_named_or_missed(one: Fault) -> None:
     assert one.check in ORDER
-    assert one.says
+    assert one.expected
     status = int(one.state == "failed")
-    assert judge(one, [told(one)], status) == ""
-    assert judge(one, [ok(one.check, "; ".join(one.says))], 0)
+    assert judge(one, [matching_finding(one)], status) == ""
+    assert judge(one, [ok(one.check, "; ".join(one.expected))], 0)
     assert f"| {one.planted} |" in (ROOT / "docs" / "evidence" / "doctor.md").read_text()
 
 
@@ -40,16 +42,16 @@ def test_every_fault_has_a_check_and_can_be_named_or_missed(one: Fault) -> None:
     ("one", "findings", "status", "why"),
     [
         (REVOKED, [], 1, "missing"),
-        (REVOKED, [failed("key", "this machine's key is not on the list", "", "pair")], 1, "does not say"),
-        (REVOKED, [failed("key", "; ".join(REVOKED.says))], 1, "what to do"),
-        (REVOKED, [told(REVOKED), failed("clients", "doctor: connection lost")], 1, "failed too: clients"),
-        (REVOKED, [told(REVOKED)], 0, "exit status 0"),
-        (REVOKED, [told(REVOKED), ok("age", "x" * 120 * 50)], 1, "screen"),
-        (BLOCKED, [told(BLOCKED)], 1, "exit status 1"),
-        (BLOCKED, [told(BLOCKED), warning("age", "old")], 0, ""),
-        (FULL, [told(FULL), failed("recorder", "ended")], 1, ""),
+        (REVOKED, [failed("key", "this machine's key is not on the list", "", "pair")], 1, "lacks"),
+        (REVOKED, [failed("key", "; ".join(REVOKED.expected))], 1, "advice"),
+        (REVOKED, [matching_finding(REVOKED), failed("clients", "doctor: connection lost")], 1, "failed too: clients"),
+        (REVOKED, [matching_finding(REVOKED)], 0, "exit status 0"),
+        (REVOKED, [matching_finding(REVOKED), ok("age", "x" * 120 * 50)], 1, "screen"),
+        (BLOCKED, [matching_finding(BLOCKED)], 1, "exit status 1"),
+        (BLOCKED, [matching_finding(BLOCKED), warning("age", "old")], 0, ""),
+        (FULL, [matching_finding(FULL), failed("recorder", "ended")], 1, ""),
     ],
 )
 def test_judge_rejects_unnamed_faults(one: Fault, findings: list[Finding], status: int, why: str) -> None:
-    said = judge(one, findings, status)
-    assert why in said if why else said == ""
+    verdict = judge(one, findings, status)
+    assert why in verdict if why else verdict == ""

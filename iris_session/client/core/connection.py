@@ -396,7 +396,8 @@ class ClientConnection:
         if not self.mirror.synced:
             # Another scene: its bodies are requested at once, however lately others were.
             self._snapshot_at = min(self._snapshot_at, now_ns)
-        if isinstance(event.body, EStopChanged) and event.body.active:
+        stop = event.body
+        if isinstance(stop, EStopChanged) and stop.active and stop.participant == self.participant_id:
             self.pending_estop.withdraw()
         self._deliver(event)
 
@@ -408,8 +409,6 @@ class ClientConnection:
         self.counters.snapshots += 1
         for message in self.mirror.apply_snapshot(snapshot):
             self._deliver(message)
-        if self.mirror.estop:
-            self.pending_estop.withdraw()
         self.stream.scene_epoch = self.mirror.bodies_until
         self.stream.retain_presence(self.mirror.connected)
         self.stream.load_keyframe(snapshot.state_seq, poses)
@@ -500,5 +499,5 @@ def final_refusal(fault: ProtocolFault) -> Refused | None:
         advice = "give every client that runs at the same time an identity of its own"
         return Refused(REPLACED, "another client took over with this identity", advice)
     if fault.code == FaultCode.REVOKED:
-        return Refused(fault.code, fault.message, "ask whoever runs the session")
+        return Refused(fault.code, fault.message, "ask the owner of the session")
     return None

@@ -193,8 +193,9 @@ class PendingRequests:
 class PendingEStop:
     """An e-stop of ours until the session is known to have it: a connection may end with it on the way.
 
-    The session has it when it reports that it is stopped, after our request. When it was stopped before, it has
-    nothing to report: then the pong of a ping that was sent after the e-stop proves that the e-stop arrived.
+    The session has it when it reports a stop of ours; the stop of another is no proof, as it may be cleared before ours
+    arrives. When the report was missed, the pong of a ping that was sent after the e-stop proves it too, if the session
+    is stopped.
     """
 
     def __init__(self) -> None:

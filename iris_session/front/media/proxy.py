@@ -17,6 +17,7 @@ import zmq
 
 from iris_session.front.connection_guard import ChannelGuard
 from iris_session.front.media.scheduler import MediaScheduler
+from iris_session.front.memory_guard import PendingConnection
 from iris_session.protocol.codec import decode_media_push
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.media import CLASSES, parse_topic
@@ -34,6 +35,8 @@ MAX_UNDECIDED: Final = 64
 PAUSE_NS: Final = 2_000_000_000
 #: Pause after a fault of the proxy: a repeated fault must not use a whole processor.
 FAULT_S: Final = 0.25
+#: A subscription to a topic that does not exist counts as so many: libzmq keeps it as long as the connection lives.
+UNKNOWN_TOPIC_WEIGHT: Final = 64
 _SUBSCRIBE: Final = 1
 
 
@@ -96,6 +99,10 @@ class MediaProxy:
         with self.lock:
             return "all media for 2 s" if self.scheduler.release_frames(self._now_ns() + PAUSE_NS) else ""
 
+    def list_pending(self) -> list[PendingConnection]:
+        """Return the connections of subscribers and sources and what is unread of them."""
+        return [*self._subscriber_guard.list_pending(), *self._source_guard.list_pending()]
+
     def close(self) -> None:
         """Wait for the end of the thread, then close the sockets."""
         self._stopping = True
@@ -131,7 +138,7 @@ class MediaProxy:
                 poller.register(one, zmq.POLLIN)
         waits = False
         while not self._stopping:
-            ready = dict(poller.poll(RETRY_MS if waits else IDLE_MS))
+            ready = dict(poller.poll(RETRY_MS if waits or self._source_guard.has_pending else IDLE_MS))
             self._read_connection_events()
             closed = [*self._subscriber_guard.tick(self._now_ns()), *self._source_guard.tick(self._now_ns())]
             if self._out in ready:
@@ -179,7 +186,8 @@ class MediaProxy:
                 continue  # libzmq unsubscribes a connection that has ended: its monitor reported that
             self._read_connection_events()
             user = self._read_user_id(frame)
-            cut = self._subscriber_guard.record_message(descriptor, user, (len(data),), counts=True)
+            weight = 1 if topic is not None else UNKNOWN_TOPIC_WEIGHT
+            cut = self._subscriber_guard.record_message(descriptor, user, (len(data),), counts=weight)
             with self.lock:
                 if cut:
                     self.scheduler.count_drop(cut)
@@ -222,7 +230,7 @@ class MediaProxy:
                 if user not in self.refused and len(self.undecided) < MAX_UNDECIDED:
                     self.undecided.add(user)
         self._source_guard.read_events(self._now_ns())
-        cut = self._source_guard.record_message(_read_descriptor(frames[0]), user, lengths, counts=not allowed)
+        cut = self._source_guard.record_message(_read_descriptor(frames[0]), user, lengths, counts=int(not allowed))
         with self.lock:
             self._count_reasons((cut,))
         if allowed:

@@ -17,6 +17,8 @@ from iris_session.protocol.media import CLASSES, MAX_STREAMS, MediaHeader, Media
 #: A stream without frames for `TAKEOVER_NS` may be taken over by another source; after `EXPIRE_NS` it is removed.
 TAKEOVER_NS: Final = 3 * SECOND
 EXPIRE_NS: Final = 60 * SECOND
+#: A reader without room for frames of this size holds much: closing it frees memory. One of smaller frames is slow.
+STUCK_BYTES: Final = 1 << 20
 #: Rates are computed from so many samples: two seconds, with four samples in each.
 RATE_SAMPLES: Final = 9
 #: `send(topic, header, frame)`: returns false if that connection has no room.
@@ -239,6 +241,7 @@ class MediaScheduler:
 
     def release_frames(self, until_ns: int) -> bool:
         """Release every frame, and drop frames until then. Return whether there were any."""
+        sizes = {name: max(map(len, one.frames.values())) for name, one in self._streams.items() if one.frames}
         held = [stream for stream in self._streams.values() if stream.frames]
         for stream in held:
             stream.push, stream.frames = None, {}
@@ -246,7 +249,8 @@ class MediaScheduler:
             subscription = self._subscriptions.get(key)
             if subscription is not None and subscription.pending:
                 subscription.pending = False
-                self._stuck |= subscription.readers
+                if sizes.get(key[1], 0) >= STUCK_BYTES:
+                    self._stuck |= subscription.readers
                 self._count_drop("media_memory")
         self._pending.clear()
         if held:
@@ -262,7 +266,8 @@ class MediaScheduler:
         self._pending.clear()
 
     def pop_stuck(self) -> set[int]:
-        """Return and clear the connections that had no room when frames were released: frames are pending in them."""
+        """Return and clear the connections that had no room for large frames when frames were released: some are
+        pending in them."""
         stuck, self._stuck = self._stuck, set()
         return stuck
 

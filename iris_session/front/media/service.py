@@ -19,15 +19,13 @@ from iris_session.front.media.budget import (
 from iris_session.front.media.proxy import MediaProxy
 from iris_session.front.media.scheduler import DeliveryCounters, MediaSubscriber, StreamStats
 from iris_session.protocol.media import CLASSES, StreamBudget
-from iris_session.protocol.names import BudgetClass, Role
+from iris_session.protocol.names import BudgetClass
 from iris_session.protocol.status import ClientReport, DeliveryBudget, MediaStreamReport
 
 PERIOD_NS: Final = 250 * MILLISECOND
 MBIT: Final = 125_000.0
 #: State frames between two reports of a client of which some should have arrived: a third of a second.
 MIN_EXPECTED_FRAMES: Final = 20
-#: Roles whose keys may hand in frames from other machines.
-SOURCES: Final = frozenset({Role.CAMERA, Role.SOURCE})
 #: Refused keys that are remembered.
 MAX_REFUSED: Final = 256
 
@@ -192,7 +190,7 @@ class MediaService:
     def _find_source_name(self, mark: str) -> str | None:
         """Return the name of a key that may hand in frames, `None` for any other."""
         entry = self._keyring.find_key(mark)
-        if entry is None or self._tokens.is_revoked(mark) or not (not entry.roles or SOURCES.intersection(entry.roles)):
+        if entry is None or self._tokens.is_revoked(mark) or not self._keyring.may_hand_in_media(mark):
             return None
         return entry.name
 

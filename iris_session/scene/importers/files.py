@@ -41,12 +41,12 @@ def load_file(path: Path, package_dirs: Sequence[str | PathLike[str]] = (), name
     Raises:
         SceneBuildError: The file is missing, damaged, or in another format.
     """
-    kind = ending(path)
-    present(path)
+    kind = get_ending(path)
+    check_present(path)
     if kind not in (*_GLTF, *MESHES):
         raise SceneBuildError(f"{path.name}: {_other_reader(path, kind)}")
     references = References(path, package_dirs)
-    found: LoadedFile = guarded(path, kind, lambda: _read(path, kind, references, name or path.stem))
+    found: LoadedFile = read_guarded(path, kind, lambda: _read(path, kind, references, name or path.stem))
     if not any(node.surfaces or node.lights or node.cameras for node in found.nodes):
         raise SceneBuildError(
             f"{path} has nothing that can be drawn" + "".join(f"; {text}" for text in found.skipped[:3])
@@ -54,7 +54,7 @@ def load_file(path: Path, package_dirs: Sequence[str | PathLike[str]] = (), name
     return found
 
 
-def present(path: Path) -> None:
+def check_present(path: Path) -> None:
     """Check that there is a file that is not empty. Raises `SceneBuildError`."""
     try:
         if _ADDRESS.match(str(path)):  # `Path` merges the two slashes of an address
@@ -62,14 +62,14 @@ def present(path: Path) -> None:
         if path.is_dir():
             raise SceneBuildError(f"{path} is a folder: name a file{readable_in(path, 'in it')}")
         if not path.is_file():
-            raise SceneBuildError(f"{path}: no such file{readable_in(path.parent, 'in its folder', ending(path))}")
+            raise SceneBuildError(f"{path}: no such file{readable_in(path.parent, 'in its folder', get_ending(path))}")
         if not path.stat().st_size:
             raise SceneBuildError(f"{path} is empty: 0 bytes")
     except (OSError, ValueError) as error:  # not a possible file name
         raise SceneBuildError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
 
-def guarded(path: Path, kind: str, read: Callable[[], Any]) -> Any:
+def read_guarded(path: Path, kind: str, read: Callable[[], Any]) -> Any:
     """Return the result of `read`; every error becomes `SceneBuildError`, as damaged files make libraries raise any
     kind.
     """
@@ -102,7 +102,7 @@ def _of_ours(error: BaseException) -> str:
     return f" (if other programs open it, please report: {type(error).__name__}: {said}, {place.name}:{last.lineno})"
 
 
-def ending(path: Path) -> str:
+def get_ending(path: Path) -> str:
     """Return the suffix in lower case, without the dot."""
     return path.suffix.lower().lstrip(".")
 
@@ -110,8 +110,8 @@ def ending(path: Path) -> str:
 def readable_in(folder: Path, where: str, wanted: str = "") -> str:
     """Return, for error messages, the readable files of a folder, those with suffix `wanted` first."""
     try:
-        found = [entry for entry in folder.iterdir() if ending(entry) in ENDINGS and entry.is_file()]
-        names = [entry.name for entry in sorted(found, key=lambda one: (ending(one) != wanted, one.name))]
+        found = [entry for entry in folder.iterdir() if get_ending(entry) in ENDINGS and entry.is_file()]
+        names = [entry.name for entry in sorted(found, key=lambda one: (get_ending(one) != wanted, one.name))]
     except OSError:
         return "" if folder.is_dir() else f"; there is no folder {folder} either"
     if not names:

@@ -49,7 +49,7 @@ _LIGHTS: Final = {
 }
 #: Lists whose content has no counterpart in the specification.
 _STILL: Final = {
-    "skins": "skins: drawn as they were modelled, they do not bend",
+    "skins": "skins: drawn as they were modelled, without deformation",
     "animations": "animations: nothing of the file moves by itself",
 }
 #: Share of a light's colour in specular highlights: MuJoCo's default.

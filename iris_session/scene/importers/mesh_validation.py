@@ -33,7 +33,7 @@ _SHOWN: Final = 60
 _WHAT: Final = ("vertex", "texture coordinate", "normal")
 
 
-def stl(name: str, data: bytes) -> bytes:
+def check_stl(name: str, data: bytes) -> bytes:
     """Check that a binary STL has as many triangles as its header states, and that a text STL has an end."""
     count = int.from_bytes(data[80:_STL_HEAD], "little")
     size = _STL_HEAD + count * _STL_TRIANGLE
@@ -51,7 +51,7 @@ def stl(name: str, data: bytes) -> bytes:
     return data[:size]  # some writers pad the last block
 
 
-def ply(name: str, data: bytes) -> bytes:
+def check_ply(name: str, data: bytes) -> bytes:
     """Check that a text PLY has as many lines as its header states."""
     head, found, _ = data[:_PLY_HEAD].partition(b"end_header")
     if not found or b"format ascii" not in head or b"\n" not in head:
@@ -64,14 +64,14 @@ def ply(name: str, data: bytes) -> bytes:
     return data
 
 
-def off(name: str, data: bytes) -> bytes:
+def check_off(name: str, data: bytes) -> bytes:
     """Check that an OFF has as many faces as its header states, and that the last face is complete.
 
     Comments are removed: trimesh reads everything but one line before the first comment twice.
     """
     if b"#" in data:
         data = b"\n".join(line.partition(b"#")[0] for line in data.splitlines())
-    if not _plain(data):
+    if not _is_plain_text(data):
         raise SceneBuildError(f"{name} is damaged, or no OFF: not all of it is text; export or download it again")
     rows = [row for line in data.partition(b"OFF")[2].splitlines() if (row := line.split())]
     try:
@@ -88,7 +88,7 @@ def off(name: str, data: bytes) -> bytes:
     return data
 
 
-def obj(name: str, data: bytes) -> bytes:
+def check_obj(name: str, data: bytes) -> bytes:
     """Check that faces have at least three corners and that all numbers are text: trimesh leaves out other lines.
 
     Comments behind faces are removed, because trimesh reads them as corners; zero and negative numbers are converted.
@@ -98,20 +98,25 @@ def obj(name: str, data: bytes) -> bytes:
         data = data.replace(b"\r", b"\n")
     if b"#" in data:
         data = _BEHIND.sub(rb"\1", data)
-    if not _plain(data) and (found := _NO_TEXT.search(data)):
-        where = _place(name, data, found.end() - 1)
+    if not _is_plain_text(data) and (found := _NO_TEXT.search(data)):
+        where = _format_place(name, data, found.end() - 1)
         raise SceneBuildError(f"{where}: not all of it is text: the file is damaged, or no OBJ; export it again")
     text = _one_line_each(data)
     if few := _FEW_CORNERS.search(text):
-        where = _place(name, text, few.start())
+        where = _format_place(name, text, few.start())
         raise SceneBuildError(f"{where}: a face with fewer than three corners: the file is cut; export it again")
     if _cut_corner(text):
-        where = _place(name, text, len(text))
+        where = _format_place(name, text, len(text))
         raise SceneBuildError(f"{where}: its last corner is not whole: the file is cut; export it again")
     return absolute_corners(name, data) if _ODD_CORNER.search(text) else data
 
 
-CHECKS: Final[Mapping[str, Callable[[str, bytes], bytes]]] = {"stl": stl, "ply": ply, "off": off, "obj": obj}
+CHECKS: Final[Mapping[str, Callable[[str, bytes], bytes]]] = {
+    "stl": check_stl,
+    "ply": check_ply,
+    "off": check_off,
+    "obj": check_obj,
+}
 
 
 def absolute_corners(name: str, data: bytes) -> bytes:
@@ -138,12 +143,12 @@ def absolute_corners(name: str, data: bytes) -> bytes:
     return b"\n".join(out) + (b"\nvt 0 0\n" if total[1] else b"")
 
 
-def _plain(data: bytes) -> bool:
+def _is_plain_text(data: bytes) -> bool:
     """Return whether the data are ASCII without zero bytes: a full disk leaves zeros in place of lost data."""
     return data.isascii() and b"\0" not in data
 
 
-def _place(name: str, data: bytes, at: int) -> str:
+def _format_place(name: str, data: bytes, at: int) -> str:
     number = data.count(b"\n", 0, at) + 1
     return f"{name}, line {number}"
 

@@ -26,7 +26,8 @@ from iris_session.scene.errors import SceneBuildError
 
 #: Number of parent folders that are searched for a package.
 _UP: Final = 8
-#: Sibling folders that belong to a file: most models refer to their meshes as `../meshes/link.stl`.
+#: Sibling folders that belong to a file in one of `MODEL_FOLDERS`: most models refer to their meshes as
+#: `../meshes/link.stl`.
 SIBLINGS: Final = (
     "assets",
     "collision",
@@ -42,6 +43,9 @@ SIBLINGS: Final = (
     "visual",
     "visuals",
 )
+#: Names, or parts of names, of folders that hold the models of a robot and nothing else. What lies beside another
+#: folder, such as one of downloads, need not belong to the file: it could be the user's own images.
+MODEL_FOLDERS: Final = ("urdf", "xacro", "robot", "sdf", "mjcf", "xml", "model", "description", "gltf", "scene", "mesh")
 #: Maximum number of files that an error message lists.
 _LISTED: Final = 8
 _PACKAGE: Final = "package.xml"
@@ -85,9 +89,10 @@ class References:
         for folder in self.given:
             if not folder.is_dir():
                 raise SceneBuildError(f"{folder}: no such folder, named in package_dirs")
-        package = next((up for up in self._above() if (up / _PACKAGE).is_file()), None)
+        package = next((up for up in self._list_parents() if (up / _PACKAGE).is_file()), None)
         here = self.path.parent
-        beside = (here.parent / name for name in SIBLINGS)  # not resolved: a link of that name leads elsewhere
+        names = SIBLINGS if any(part in here.name.lower() for part in MODEL_FOLDERS) else ()
+        beside = (here.parent / name for name in names)  # not resolved: a link of that name leads elsewhere
         self._roots = (here, *beside, *([package] if package else []), *self.given)
 
     def find(self, reference: str) -> Path:
@@ -100,12 +105,12 @@ class References:
         scheme, found, rest = reference.partition("://")
         if not found:
             plain = self.path.parent / reference.replace("\\", "/")
-            return self._allowed(reference, plain if plain.exists() else self.path.parent / _plain(reference))
+            return self._allowed(reference, plain if plain.exists() else self.path.parent / _decode_percent(reference))
         if scheme in ("package", "model"):
-            package, _, inside = _plain(rest).partition("/")
+            package, _, inside = _decode_percent(rest).partition("/")
             return self._in_package(reference, package, inside.lstrip("/"))
         if scheme == "file":
-            return self._allowed(reference, Path(_plain(rest)))
+            return self._allowed(reference, Path(_decode_percent(rest)))
         if scheme in ("http", "https", "ftp"):
             raise SceneBuildError(
                 f"{self.path.name} refers to {reference}: files are read, not addresses: download it first"
@@ -124,7 +129,7 @@ class References:
             )
         if not found.is_file():
             raise SceneBuildError(
-                f"{self.path.name} refers to {reference}: there is no file {found}{_similar(found, 0)}"
+                f"{self.path.name} refers to {reference}: there is no file {found}{_list_similar(found, 0)}"
             )
         return found
 
@@ -135,7 +140,7 @@ class References:
         if package in ("", ".", ".."):
             raise SceneBuildError(f"{self.path.name} refers to {reference}: no package is named there")
         tried, closed = [], None
-        places = (*self.given, *self._above())
+        places = (*self.given, *self._list_parents())
         for root in (*places, *(place / package for place in places)):
             if root.name != package and not _is_package(root, package):
                 continue
@@ -150,7 +155,7 @@ class References:
         if closed is None and within:
             raise SceneBuildError(
                 f"{self.path.name} refers to {reference}: package {package} is there, and has no file {within[0]}"
-                f"{_similar(within[0])}"
+                f"{_list_similar(within[0])}"
             )
         hint = f"looked in {', '.join(map(str, tried))}" if tried else "no such package above the file"
         if closed is not None:  # any folder could be named as a package, also one of private images or keys
@@ -164,12 +169,12 @@ class References:
         named = root in self.given or root.parent in self.given
         return named or (root / _PACKAGE).is_file() or any(found.is_relative_to(own) for own in self._roots)
 
-    def _above(self) -> tuple[Path, ...]:
+    def _list_parents(self) -> tuple[Path, ...]:
         """Return the folder of the file and its parents, without the root of the file system."""
         return tuple(up for up in self.path.parents if up != Path(up.anchor))[:_UP]
 
 
-def _similar(path: Path, others: int = _LISTED) -> str:
+def _list_similar(path: Path, others: int = _LISTED) -> str:
     """Return, for error messages, files with similar names, else at most `others` other files of that folder."""
     folder = path.parent
     try:
@@ -189,7 +194,7 @@ def _is_package(root: Path, name: str) -> bool:
     return f"<name>{name}</name>" in text.replace(" ", "")
 
 
-def _plain(address: str) -> str:
+def _decode_percent(address: str) -> str:
     """Decode percent-encoding (`%20`)."""
     data = re.sub(rb"%([0-9a-fA-F]{2})", lambda found: bytes.fromhex(found.group(1).decode()), address.encode())
     return data.decode("utf-8", "replace")

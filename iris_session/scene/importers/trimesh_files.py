@@ -63,7 +63,9 @@ def read_with_trimesh(path: Path, references: References, name: str) -> LoadedFi
             absolute_corners(path.name, data)  # raises with the line
         raise
     lost = _lost_materials(path.name, data, resolver) if kind == "obj" else ()
-    return LoadedFile(nodes, _up(kind, data), _unit(trimesh, scene), (*resolver.missing, *lost, *reader.skipped))
+    return LoadedFile(
+        nodes, _find_up_axis(kind, data), _find_unit(trimesh, scene), (*resolver.missing, *lost, *reader.skipped)
+    )
 
 
 def _checked(name: str, kind: str, data: bytes) -> bytes:
@@ -91,7 +93,7 @@ def _lost_materials(name: str, data: bytes, resolver: Any) -> tuple[str, ...]:
     return (*several, *([f"{name}: materials that its MTL file does not have: {names}"] if lost else []))
 
 
-def _up(kind: str, data: bytes) -> str:
+def _find_up_axis(kind: str, data: bytes) -> str:
     """Return the up axis: COLLADA states it, y by default; the other formats do not, and count as z up."""
     if kind != "dae":
         return "z"
@@ -99,7 +101,7 @@ def _up(kind: str, data: bytes) -> str:
     return found.group(1).decode().lower() if found else "y"
 
 
-def _unit(trimesh: Any, scene: Any) -> float:
+def _find_unit(trimesh: Any, scene: Any) -> float:
     return float(trimesh.units.unit_conversion(scene.units, "meters")) if scene.units else 1.0
 
 

@@ -43,7 +43,7 @@ class Drawn(NamedTuple):
     scale: tuple[float, float, float] | None = None
 
 
-def side_of(placed: Sequence[tuple[MeshArrays, Matrix]]) -> float:
+def measure_side(placed: Sequence[tuple[MeshArrays, Matrix]]) -> float:
     """Return the longest side of the bounding box of meshes with their poses (4, 4) [m]; 0 without meshes.
 
     When the size is clearly plausible, the bounding boxes of the meshes are used instead of their vertices.
@@ -57,7 +57,7 @@ def side_of(placed: Sequence[tuple[MeshArrays, Matrix]]) -> float:
 def file_question(name: str, side_m: float, scale: Sequence[float]) -> tuple[str, ...]:
     """Return a note when a file drawn `side_m` large, with the given `scale`, is likely in another unit."""
     mistake = find_unit_mistake(side_m)
-    return () if mistake is None else (f"{name} is {_told(side_m, mistake, _by_scale(scale, mistake[0]))}",)
+    return () if mistake is None else (f"{name} is {_describe_mistake(side_m, mistake, _by_scale(scale, mistake[0]))}",)
 
 
 def robot_question(name: str, reach_m: float, drawn: Sequence[Drawn], scale: float) -> tuple[str, ...]:
@@ -74,16 +74,18 @@ def robot_question(name: str, reach_m: float, drawn: Sequence[Drawn], scale: flo
     of_drawn, of_joints = find_unit_mistake(side_m), find_unit_mistake(reach_m)
     alike = of_drawn == of_joints or not reach_m
     if of_drawn is not None and (alike and (reach_m or scale != 1.0)):
-        return (f"{name} is {_told(max(side_m, reach_m), of_drawn, _by_scale([scale], of_drawn[0]))}",)
+        return (f"{name} is {_describe_mistake(max(side_m, reach_m), of_drawn, _by_scale([scale], of_drawn[0]))}",)
     if of_drawn is None and of_joints is not None and (scale != 1.0 or of_joints[0] < 1.0):
         remedy = _by_scale([scale], of_joints[0]) if scale != 1.0 else "xyz of their <origin> divided by 1,000"
-        return (f"{name}: its joints reach over {_told(reach_m, of_joints, remedy, large='')}",)
+        return (f"{name}: its joints reach over {_describe_mistake(reach_m, of_joints, remedy, large='')}",)
     if of_drawn is None:
         return ()
-    return (f"{name}: its largest {largest.what} is {_told(side_m, of_drawn, _in_file(largest, of_drawn[0]))}",)
+    return (
+        f"{name}: its largest {largest.what} is {_describe_mistake(side_m, of_drawn, _in_file(largest, of_drawn[0]))}",
+    )
 
 
-def reach_of(joints: Iterable[Any], root: str) -> float:
+def measure_reach(joints: Iterable[Any], root: str) -> float:
     """Return the longest side of the box around the origins of all links in the file, joints at 0 [m]."""
     below: dict[str, list[Any]] = {}
     for joint in joints:
@@ -132,7 +134,7 @@ def colour_question(name: str, material: str, rgba: Sequence[float]) -> tuple[st
     return (f"{said}; divided by 255 it is {' '.join(f'{v:.3g}' for v in right)}",)
 
 
-def _told(side_m: float, mistake: tuple[float, str], remedy: str, large: str = " large") -> str:
+def _describe_mistake(side_m: float, mistake: tuple[float, str], remedy: str, large: str = " large") -> str:
     factor, what = mistake
     return f"{format_length(side_m)}{large}: {what} {remedy} makes it {format_length(factor * side_m)}"
 

@@ -24,15 +24,23 @@ from iris_session.scene.composed import ArticulatedBody, Articulation, Joint
 from iris_session.scene.elements import Appearance, DrawnItem, LoadedFile, Matrix, TextureImage, to_pose, truncate_name
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import PixelBudget, read_pixels
-from iris_session.scene.importers.files import ENDINGS, ROBOTS, ending, guarded, load_file, present, xacro_advice
+from iris_session.scene.importers.files import (
+    ENDINGS,
+    ROBOTS,
+    check_present,
+    get_ending,
+    load_file,
+    read_guarded,
+    xacro_advice,
+)
 from iris_session.scene.importers.references import References, read_bounded
 from iris_session.scene.importers.units import (
     Drawn,
     colour_question,
     degrees_question,
-    reach_of,
+    measure_reach,
+    measure_side,
     robot_question,
-    side_of,
 )
 from iris_session.scene.importers.xml_files import no_xml
 
@@ -98,23 +106,25 @@ def read_urdf(
     Its bodies are called `name/link`. `collisions`: draw collision geometry instead of visuals. `scale`: size factor of
     the drawing; joints keep their positions, also sliding ones.
     """
-    present(path)
-    if ending(path) == "xacro":
+    check_present(path)
+    if get_ending(path) == "xacro":
         raise SceneBuildError(f"{path.name}: {xacro_advice(path)}")
-    if ending(path) in ENDINGS and ending(path) not in (*ROBOTS, "xml"):
-        raise SceneBuildError(f"{path.name} is no URDF: files that end in .{ending(path)} go with add_file, or Session")
+    if get_ending(path) in ENDINGS and get_ending(path) not in (*ROBOTS, "xml"):
+        raise SceneBuildError(
+            f"{path.name} is no URDF: files that end in .{get_ending(path)} go with add_file, or Session"
+        )
     references = References(path, package_dirs)
     data = read_bounded(path)
 
     def read() -> Robot:  # yourdfpy raises any kind of error for missing attributes
-        robot, skipped = parsed(path, data)
+        robot, skipped = parse_urdf(path, data)
         return _Reader(path, name, robot, references, package_dirs, skipped, collisions).robot(T_world_root, scale)
 
-    found: Robot = guarded(path, "urdf", read)
-    return found if scale == 1.0 else _scaled(found, scale)
+    found: Robot = read_guarded(path, "urdf", read)
+    return found if scale == 1.0 else _scale_robot(found, scale)
 
 
-def _scaled(robot: Robot, scale: float) -> Robot:
+def _scale_robot(robot: Robot, scale: float) -> Robot:
     """Return the robot in another size."""
 
     def at(pose: Pose) -> Pose:
@@ -182,7 +192,7 @@ class _Reader:
         waiting: list[tuple[str, int, Matrix]] = [(root, 0, np.eye(4))]
         while waiting:
             name, part, T_part_link = waiting.pop()
-            items += self._drawn(links[name], part, T_part_link)
+            items += self._collect_drawn(links[name], part, T_part_link)
             for joint in reversed(below.get(name, [])):
                 T_part_child = T_part_link @ _matrix(self._path.name, joint)
                 if joint.type == "fixed":
@@ -213,13 +223,13 @@ class _Reader:
             other = "visuals: leave out collisions=True" if self._collisions else "collisions: give collisions=True"
             self._skip(f"nothing of it is drawn; what it may have are {other}")
         articulation = Articulation(self._name, T_world_root, tuple(parts), table.joints, table.mimics, loose)
-        units = robot_question(self._path.name, reach_of(self._robot.joints, root), self._sizes, scale)
+        units = robot_question(self._path.name, measure_reach(self._robot.joints, root), self._sizes, scale)
         notes = (*units, *degrees_question(self._path.name, table.joints), *self._notes)
         return Robot(articulation, tuple(items), tuple(self._skipped), notes)
 
     # --- what is drawn ------------------------------------------------------------------------------------------------
 
-    def _drawn(self, link: Any, part: int, T_part_link: Matrix) -> list[DrawnItem]:
+    def _collect_drawn(self, link: Any, part: int, T_part_link: Matrix) -> list[DrawnItem]:
         found: list[DrawnItem] = []
         for shape in link.collisions if self._collisions else link.visuals:
             matrix = T_part_link @ (np.eye(4) if shape.origin is None else shape.origin)
@@ -261,7 +271,7 @@ class _Reader:
         if (path, given) not in self._measured:
             self._measured.add((path, given))
             placed = [(surface.mesh, scale @ node.matrix) for node in loaded.nodes for surface in node.surfaces]
-            self._sizes.append(Drawn(f"mesh, {path.name},", side_of(placed), given))
+            self._sizes.append(Drawn(f"mesh, {path.name},", measure_side(placed), given))
 
     def _appearance(self, material: Any) -> Appearance | None:
         """Return the appearance of a URDF material; one without colour refers to another one by name."""
@@ -464,7 +474,7 @@ def _repeated(names: list[str]) -> str:
 # --- document ---------------------------------------------------------------------------------------------------------
 
 
-def parsed(path: Path, data: bytes) -> tuple[Any, dict[str, None]]:
+def parse_urdf(path: Path, data: bytes) -> tuple[Any, dict[str, None]]:
     """Return the robot of yourdfpy, and a line for each element that was removed. Raises `SceneBuildError`."""
     try:
         import yourdfpy
@@ -539,7 +549,7 @@ def _check(path: Path, root: Any) -> None:
         if part.tag == "joint":
             for end in _ENDS:
                 if part.find(end) is None:
-                    raise SceneBuildError(f'{_at(path, part)} has no <{end} link="...">')
+                    raise SceneBuildError(f'{_format_place(path, part)} has no <{end} link="...">')
 
 
 def _check_element(path: Path, element: Any) -> None:
@@ -547,7 +557,7 @@ def _check_element(path: Path, element: Any) -> None:
     needed = _NEEDED.get(f"{above}/{element.tag}", _NEEDED.get(element.tag, ()) if above == "robot" else ())
     for name in needed:
         if not element.get(name):
-            raise SceneBuildError(f"{_at(path, element)} has no {name}")
+            raise SceneBuildError(f"{_format_place(path, element)} has no {name}")
     for name, count in _NUMBERS.get(element.tag, {}).items():
         text = element.get(name)
         if text is None:
@@ -560,10 +570,10 @@ def _check_element(path: Path, element: Any) -> None:
         endless = element.tag == "limit" and not any(map(math.isnan, values))
         if len(values) not in counts or not (endless or all(map(math.isfinite, values))):
             wanted = "one finite number" if counts == (1,) else f"{' or '.join(map(str, counts))} finite numbers"
-            raise SceneBuildError(f"{_at(path, element)}: {name} is {text[:60]!r} where {wanted} must stand")
+            raise SceneBuildError(f"{_format_place(path, element)}: {name} is {text[:60]!r} where {wanted} must stand")
 
 
-def _at(path: Path, element: Any) -> str:
+def _format_place(path: Path, element: Any) -> str:
     """Return the position of an element, for messages."""
     name = element.get("name") or ""
     return f"{path.name}, line {element.sourceline}: <{element.tag}>{f' {name}' if name else ''}"

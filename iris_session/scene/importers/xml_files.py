@@ -24,6 +24,8 @@ _BOM: Final = b"\xef\xbb\xbf"
 _MAX_DEPTH: Final = 64
 #: Minimum characters of a triangle in a DAE: three numbers of one digit with separators.
 _TRIANGLE_CHARACTERS: Final = 6
+#: The first file of a 3MF whose name has this in it, in any case, is the one that trimesh reads.
+_MAIN_MODEL: Final = "3d/3dmodel.model"
 #: A triangle of a 3MF, with any namespace prefix.
 _TRIANGLE: Final = re.compile(rb"<(?:[\w.-]+:)?triangle[\s/>]")
 
@@ -49,18 +51,29 @@ def check_3mf(name: str, data: bytes) -> None:
         places: dict[str, list[str]] = {}
         triangles: dict[str, int] = {}
         outside: list[str] = []
-        for entry in archive.infolist():
-            if entry.filename.lower().endswith(".model"):
-                model = archive.read(entry)
-                check_xml(name, model)
-                triangles[entry.filename] = len(_TRIANGLE.findall(model))
-                if "3d/3dmodel.model" in entry.filename.lower():  # the file that places the objects
+        names = archive.namelist()
+        if len(set(names)) < len(names):
+            raise SceneBuildError(f"{name} holds two files of one name: export it again")
+        for file in names:
+            if _MAIN_MODEL in file.lower() or file.lower().endswith(".model"):
+                model = _read_model(name, archive, file, triangles)
+                if _MAIN_MODEL in file.lower():  # the file that places the objects
                     for thing, parts, files in _3mf_places(model):
                         places.setdefault(thing, []).extend(parts)
                         outside += files
+        for file in {*outside} & {*names} - {*triangles}:  # files of any name may be referred to
+            _read_model(name, archive, file, triangles)
     things = {*places, *(part for parts in places.values() for part in parts)}
     _check_places(name, places, dict.fromkeys(sorted(things), 1.0), MAX_NODES, "parts")
     _check_outside(name, sum(triangles.get(file, 0) for file in outside))
+
+
+def _read_model(name: str, archive: zipfile.ZipFile, file: str, triangles: dict[str, int]) -> bytes:
+    """Return a file of a 3MF after its check, and note its triangles."""
+    model = archive.read(file)
+    check_xml(name, model)
+    triangles[file] = len(_TRIANGLE.findall(model))
+    return model
 
 
 def check_xml(name: str, data: bytes) -> None:

@@ -1,4 +1,4 @@
-"""What a client tells of itself, and what it can ask."""
+"""Reports of a client about arriving state, and the status it can request."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MS = 1_000_000
 
 @pytest.fixture
 def connection() -> ClientConnection:
-    """Of a client that is in."""
+    """Return a joined connection."""
     connection = ClientConnection(Hello("observer", "ann"), Identity.in_memory())
     connection.phase = ConnectionPhase.READY
     return connection
@@ -34,7 +34,7 @@ def frame(seq: int, age_ns: int) -> SceneState:
     return SceneState(StateHeader(1, 0, 0, 0.0, seq * MS, 0, seq, 0), np.zeros((0, 7)), age_ns, age_ns)
 
 
-def test_one_report_a_second(connection: ClientConnection) -> None:
+def test_one_report_per_second(connection: ClientConnection) -> None:
     meter = ArrivalMeter()
     assert meter.poll_report(connection, 0) is None
     for n, seq in enumerate((1, 2, 5, 6)):
@@ -47,8 +47,8 @@ def test_one_report_a_second(connection: ClientConnection) -> None:
     assert meter.poll_report(connection, 3 * PERIOD_NS) == ClientReport(0.0, 0.0, 0, 0, 0.0, 0.0)
 
 
-def test_states_that_are_sent_again_say_nothing_of_their_way(connection: ClientConnection) -> None:
-    """Their source is silent, and they are as old as that: no reason to give this client less, or to blame its link."""
+def test_repeated_states_are_not_measured(connection: ClientConnection) -> None:
+    """Their source is silent and they grow old: no reason to reduce this client's rate or to blame its link."""
     meter = ArrivalMeter()
     meter.poll_report(connection, 0)
     again = frame(2, 0).header
@@ -68,7 +68,7 @@ def test_states_that_are_sent_again_say_nothing_of_their_way(connection: ClientC
     assert report.age_ms_p50 == 7.0
 
 
-def test_who_joins_while_the_source_is_silent_has_no_slow_link(connection: ClientConnection) -> None:
+def test_joining_while_the_source_is_silent_is_no_slow_link(connection: ClientConnection) -> None:
     meter = ArrivalMeter()
     meter.poll_report(connection, 0)
     for seq in range(4):
@@ -79,7 +79,7 @@ def test_who_joins_while_the_source_is_silent_has_no_slow_link(connection: Clien
     assert (report.age_ms_p50, report.age_ms_p99, report.delivered) == (0.0, 0.0, 4)
 
 
-def test_another_session_numbers_its_frames_anew(connection: ClientConnection) -> None:
+def test_new_session_restarts_the_sequence(connection: ClientConnection) -> None:
     meter = ArrivalMeter()
     meter.record(frame(900, MS))
     connection.phase = ConnectionPhase.WAITING
@@ -112,7 +112,7 @@ def test_status_of_a_session(session: LiveSession, join: Callable[..., Client]) 
     assert client.status().session_time > report.session_time
 
 
-def test_status_while_the_session_stands_still(session: LiveSession, join: Callable[..., Client]) -> None:
+def test_status_while_the_session_stalls(session: LiveSession, join: Callable[..., Client]) -> None:
     join("bob")
     session.pause_steps(True)
     client = join("ann", connect=False)

@@ -1,4 +1,4 @@
-"""What is asked for, in which order and how much at once, against a session of plain values; and what it does wrong."""
+"""Order, number and size of chunk requests against a session of plain values, and its misbehaviour."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def started(*addresses: str, offset: int = 0) -> AssetLoader:
 def answer(
     loader: AssetLoader, ask: ChunkRequest, total: int, size: int = -1, now_ns: int = FAST_NS
 ) -> bool | FailedAsset | None:
-    """By default as fast as leaves the size of chunks as it is."""
+    """Answer, by default as fast as leaves the chunk size unchanged."""
     size = max(0, min(ask.length, total - ask.offset)) if size < 0 else size
     return loader.process_chunk(AssetChunk(1, ask.request_id, ask.address, ask.offset, total), size, now_ns)
 
@@ -46,7 +46,7 @@ def refuse(loader: AssetLoader, ask: ChunkRequest, reason: str, now_ns: int = 0)
     return loader.process_refusal(AssetRefused(1, ask.request_id, ask.address, reason, "advice"), now_ns)
 
 
-def test_first_a_chunk_of_each_then_the_rest_in_order() -> None:
+def test_first_a_chunk_of_each_asset_then_the_rest_in_order() -> None:
     loader = started("a", "b", "c")
     first = list(loader.next_requests(0))
     assert [(ask.address, ask.offset, ask.length) for ask in first] == [(name, 0, CHUNK_BYTES) for name in "abc"]
@@ -61,7 +61,7 @@ def test_first_a_chunk_of_each_then_the_rest_in_order() -> None:
     assert not loader.is_complete("a")
 
 
-def test_the_window_is_of_bytes_that_are_not_stored_yet() -> None:
+def test_window_counts_bytes_that_are_not_stored() -> None:
     loader = started("a")
     (ask,) = loader.next_requests(0)
     assert answer(loader, ask, 100 * WINDOW_BYTES) is True
@@ -74,7 +74,7 @@ def test_the_window_is_of_bytes_that_are_not_stored_yet() -> None:
     assert len(list(loader.next_requests(0))) == 1
 
 
-def test_chunks_are_as_large_as_the_link_is_fast() -> None:
+def test_chunk_size_follows_the_link_rate() -> None:
     loader = started("a")
     now_ns, lengths = 0, []
     for took_ns in (1, 1, FAST_NS, *[SLOW_NS + 1] * 6, 1):
@@ -91,7 +91,7 @@ def test_chunks_are_as_large_as_the_link_is_fast() -> None:
     assert ask.length == 2 * MIN_CHUNK_BYTES
 
 
-def test_known_sizes_are_all_that_is_asked_for() -> None:
+def test_known_sizes_are_requested_exactly() -> None:
     loader = AssetLoader()
     for name in "abc":
         loader.add(name, 1000)
@@ -99,13 +99,13 @@ def test_known_sizes_are_all_that_is_asked_for() -> None:
         loader.on_missing(name, 400 if name == "b" else 2000 if name == "c" else 0)
     a, b, c = loader.next_requests(0)
     assert [(ask.offset, ask.length) for ask in (a, b)] == [(0, 1000), (400, 600)]
-    assert (c.offset, c.length) == (2000, CHUNK_BYTES), "it was said to have less than is here: the session decides"
+    assert (c.offset, c.length) == (2000, CHUNK_BYTES), "the session states less than is cached: the session decides"
     assert answer(loader, a, 3000, 1000) is True, "so does it where there is more"
     (rest,) = loader.next_requests(0)
     assert (rest.offset, rest.length) == (1000, 2000)
 
 
-def test_an_asset_larger_than_any_is_not_begun() -> None:
+def test_asset_above_the_maximum_is_not_requested() -> None:
     loader = started("a", "b")
     a, b = loader.next_requests(0)
     failed = answer(loader, a, MAX_ASSET_BYTES + 1)
@@ -114,8 +114,8 @@ def test_an_asset_larger_than_any_is_not_begun() -> None:
     assert answer(loader, b, MAX_ASSET_BYTES) is True
 
 
-def test_requests_that_went_with_a_connection_are_made_again() -> None:
-    """libzmq connects anew, and sends what it had not sent: the answers to those tell that the others are lost."""
+def test_requests_lost_with_a_connection_are_repeated() -> None:
+    """libzmq reconnects and sends what it had not sent: answers to those show that the others are lost."""
     total = 6 * CHUNK_BYTES
     loader = started("a", "b")
     first, other = loader.next_requests(0)
@@ -133,14 +133,14 @@ def test_requests_that_went_with_a_connection_are_made_again() -> None:
     assert refuse(loader, again[5], AssetRefusal.UNKNOWN) != ""
 
 
-def test_a_refusal_tells_too_that_what_was_asked_before_is_lost() -> None:
+def test_refusal_shows_that_earlier_requests_are_lost() -> None:
     loader = started("a", "b")
     _, other = loader.next_requests(0)
     assert isinstance(refuse(loader, other, AssetRefusal.UNKNOWN), FailedAsset)
     assert [(ask.address, ask.offset) for ask in loader.next_requests(0)] == [("a", 0)]
 
 
-def test_small_ones_are_bounded_by_number() -> None:
+def test_number_of_small_assets_is_bounded() -> None:
     loader = AssetLoader()
     names = [f"{i}" for i in range(AT_ONCE + 10)]
     for name in names:
@@ -155,18 +155,18 @@ def test_small_ones_are_bounded_by_number() -> None:
     assert len(asks) == min(WINDOW_REQUESTS, WINDOW_BYTES // CHUNK_BYTES)
 
 
-def test_a_connection_that_ends_costs_nothing_that_came() -> None:
+def test_lost_connection_keeps_received_chunks() -> None:
     loader = started("a", offset=1000)
     (ask,) = loader.next_requests(0)
     assert ask.offset == 1000
     assert answer(loader, ask, 3 * CHUNK_BYTES) is True
     pending = list(loader.next_requests(0))
     loader.on_link_closed()
-    assert answer(loader, pending[0], 3 * CHUNK_BYTES) is False  # of the connection before
+    assert answer(loader, pending[0], 3 * CHUNK_BYTES) is False  # of the previous connection
     assert [ask.offset for ask in loader.next_requests(0)] == [ask.offset for ask in pending]
 
 
-def test_refusals_that_pass_are_waited_out_longer_and_longer() -> None:
+def test_temporary_refusals_are_retried_with_growing_delay() -> None:
     loader, now_ns = started("a"), 0
     for pause_ns in (FIRST_PAUSE_NS, 2 * FIRST_PAUSE_NS, 4 * FIRST_PAUSE_NS):
         (ask,) = loader.next_requests(now_ns)
@@ -179,12 +179,12 @@ def test_refusals_that_pass_are_waited_out_longer_and_longer() -> None:
     assert loader.refusal == "", "it comes"
     (ask,) = loader.next_requests(now_ns)
     assert refuse(loader, ask, AssetRefusal.BUSY, now_ns) == ""
-    (ask,) = loader.next_requests(now_ns + FIRST_PAUSE_NS)  # the short pause again, after something came
+    (ask,) = loader.next_requests(now_ns + FIRST_PAUSE_NS)  # the first delay again, after a chunk arrived
     assert answer(loader, ask, CHUNK_BYTES + 5) is True
     assert loader.is_complete("a")
 
 
-def test_a_new_connection_does_not_wait_out_a_refusal_of_the_one_before() -> None:
+def test_new_connection_does_not_wait_for_an_earlier_refusal() -> None:
     loader = started("a")
     (ask,) = loader.next_requests(0)
     assert refuse(loader, ask, AssetRefusal.BUSY) == ""
@@ -193,7 +193,7 @@ def test_a_new_connection_does_not_wait_out_a_refusal_of_the_one_before() -> Non
     assert [again.offset for again in loader.next_requests(0)] == [0]
 
 
-def test_one_refusal_in_the_middle_leaves_no_gap() -> None:
+def test_refusal_in_the_middle_leaves_no_gap() -> None:
     loader = started("a")
     (ask,) = loader.next_requests(0)
     answer(loader, ask, 4 * CHUNK_BYTES)
@@ -207,7 +207,7 @@ def test_one_refusal_in_the_middle_leaves_no_gap() -> None:
     assert loader.is_complete("a")
 
 
-def test_a_chunk_that_is_shorter_than_asked_leaves_no_gap() -> None:
+def test_short_chunk_leaves_no_gap() -> None:
     loader = started("a")
     (ask,) = loader.next_requests(0)
     answer(loader, ask, 3 * CHUNK_BYTES)
@@ -218,7 +218,7 @@ def test_a_chunk_that_is_shorter_than_asked_leaves_no_gap() -> None:
 
 
 @pytest.mark.parametrize("reason", [AssetRefusal.UNKNOWN, AssetRefusal.VERSION, "of a later version"])
-def test_refusals_that_do_not_pass_end_it(reason: str) -> None:
+def test_permanent_refusals_end_the_asset(reason: str) -> None:
     loader = started("a", "b")
     asks = list(loader.next_requests(0))
     failed = refuse(loader, asks[0], reason)
@@ -229,7 +229,7 @@ def test_refusals_that_do_not_pass_end_it(reason: str) -> None:
     assert loader.idle
 
 
-def test_a_part_of_something_else_is_thrown_away_once() -> None:
+def test_part_of_other_content_is_discarded_once() -> None:
     loader = started("a", offset=1000)
     (ask,) = loader.next_requests(0)
     assert refuse(loader, ask, AssetRefusal.BAD_RANGE) == "a"
@@ -239,7 +239,7 @@ def test_a_part_of_something_else_is_thrown_away_once() -> None:
     assert isinstance(refuse(loader, ask, AssetRefusal.BAD_RANGE), FailedAsset)
 
 
-def test_wrong_bytes_are_asked_for_once_more() -> None:
+def test_wrong_bytes_are_requested_once_more() -> None:
     loader = started("a")
     for expected in (True, False):
         (ask,) = loader.next_requests(0)
@@ -250,8 +250,8 @@ def test_wrong_bytes_are_asked_for_once_more() -> None:
     assert loader.idle
 
 
-def test_a_part_is_thrown_away_once_whatever_comes_then() -> None:
-    """A session that gives something and then says that there is less, for as long as somebody believes it."""
+def test_part_is_discarded_once_in_all() -> None:
+    """Otherwise a session could send something and then state a smaller size for ever."""
     loader = started("a", offset=1000)
     (ask,) = loader.next_requests(0)
     assert refuse(loader, ask, AssetRefusal.BAD_RANGE) == "a"
@@ -261,14 +261,14 @@ def test_a_part_is_thrown_away_once_whatever_comes_then() -> None:
     failed = refuse(loader, next(iter(loader.next_requests(0))), AssetRefusal.BAD_RANGE)
     assert isinstance(failed, FailedAsset)
     assert failed.reason == AssetRefusal.BAD_RANGE
-    assert loader.add("a"), "who asks anew begins anew"
+    assert loader.add("a"), "a repeated request starts again"
     assert list(loader.next_lookups()) == ["a"]
     loader.on_missing("a", 1000)
     (ask,) = loader.next_requests(0)
     assert refuse(loader, ask, AssetRefusal.BAD_RANGE) == "a"
 
 
-def test_wrong_bytes_of_what_was_let_go_of_are_not_asked_for_again() -> None:
+def test_wrong_bytes_of_a_cancelled_asset_are_not_requested_again() -> None:
     loader = started("a")
     (ask,) = loader.next_requests(0)
     assert answer(loader, ask, 5) is True
@@ -284,20 +284,20 @@ def test_wrong_bytes_of_what_was_let_go_of_are_not_asked_for_again() -> None:
     assert [ask.offset for ask in loader.next_requests(0)] == [3]
 
 
-def test_a_session_that_contradicts_itself() -> None:
+def test_contradicting_answers_are_rejected() -> None:
     loader = started("a", "b", "c")
     a, b, c = loader.next_requests(0)
     answer(loader, a, 4 * CHUNK_BYTES)
     a2 = next(iter(loader.next_requests(0)))
     assert isinstance(answer(loader, b, 100, size=0), FailedAsset)  # nothing, where there is something
-    assert isinstance(answer(loader, c, 2**40, size=CHUNK_BYTES + 1), FailedAsset)  # more than was asked for
-    assert isinstance(answer(loader, a2, 5 * CHUNK_BYTES), FailedAsset)  # another size than before
+    assert isinstance(answer(loader, c, 2**40, size=CHUNK_BYTES + 1), FailedAsset)  # more than requested
+    assert isinstance(answer(loader, a2, 5 * CHUNK_BYTES), FailedAsset)  # other size than before
     assert loader.idle
     assert answer(loader, c, 5) is False
     assert loader.process_refusal(AssetRefused(1, 999, "", AssetRefusal.UNKNOWN), 0) == ""
 
 
-def test_nothing_for_long_is_overdue() -> None:
+def test_long_silence_is_overdue() -> None:
     loader = started("a", "b")
     asks = list(loader.next_requests(1000))
     assert not loader.is_overdue(1000 + PATIENCE_NS)
@@ -308,8 +308,8 @@ def test_nothing_for_long_is_overdue() -> None:
     assert not loader.is_overdue(5001 + PATIENCE_NS)
 
 
-def test_whatever_happens_in_the_end_everything_is_there() -> None:
-    """A session that refuses, cuts off, sends less than was asked for, and a cache that is slow."""
+def test_all_assets_complete_despite_random_faults() -> None:
+    """A session that refuses, disconnects, sends less than requested, and a slow cache."""
     for seed in range(20):
         rng = Random(seed)
         sizes = {f"{i}": rng.choice((0, 5, CHUNK_BYTES, 3 * CHUNK_BYTES + 1, 2 * WINDOW_BYTES)) for i in range(40)}

@@ -16,7 +16,7 @@ OFFSET = 5 * SECOND  # session time - local time
 def exchange(
     clock: ClockSync, local_ns: int, out_ns: int, back_ns: int, offset_ns: int = OFFSET, held_ns: int = 0
 ) -> int:
-    """One exchange starting at `local_ns`; returns the local time of its end."""
+    """Run one exchange that starts at `local_ns`; return the local time of its end."""
     t1 = local_ns + out_ns + offset_ns
     end = local_ns + out_ns + held_ns + back_ns
     clock.process_pong(local_ns, t1, t1 + held_ns, end)
@@ -56,7 +56,7 @@ def test_error_stays_within_the_stated_bound(seed: int, drift: float, delay_ms: 
         last = now
 
 
-def test_a_slow_exchange_hardly_moves_the_estimate() -> None:
+def test_slow_exchange_hardly_moves_the_estimate() -> None:
     clock = ClockSync()
     local = 0
     for _ in range(16):
@@ -65,7 +65,7 @@ def test_a_slow_exchange_hardly_moves_the_estimate() -> None:
     assert abs(clock.session_ns(local + 10 * SECOND) - (local + 10 * SECOND + OFFSET)) < 1000
 
 
-def test_a_wrong_start_is_slewed_not_stepped() -> None:
+def test_wrong_start_is_slewed_not_stepped() -> None:
     clock = ClockSync()
     local = exchange(clock, 0, 100_000, 60_100_000)  # error 30 ms
     before = clock.session_ns(local)
@@ -75,8 +75,8 @@ def test_a_wrong_start_is_slewed_not_stepped() -> None:
     assert abs(clock.session_ns(local + 4 * SECOND) - (local + 4 * SECOND + OFFSET)) < 1000
 
 
-def test_a_start_on_a_busy_link_does_not_leave_samples_in_the_future_for_seconds() -> None:
-    """An uplink with 40 ms of queue puts our stamps 20 ms ahead; once it is quick they have to fit within 5 ms."""
+def test_start_on_a_busy_link_does_not_leave_samples_in_the_future_for_seconds() -> None:
+    """An uplink with a 40 ms queue puts our stamps 20 ms ahead; after it drains they must fit within 5 ms."""
     clock = ClockSync()
     local = 0
     for _ in range(BURST):
@@ -101,7 +101,7 @@ def test_impossible_exchanges_are_counted_and_ignored(stamps: tuple[int, int, in
     assert not clock.synced
 
 
-def test_pings_come_in_a_burst_then_slowly() -> None:
+def test_pings_start_as_a_burst_then_slow_down() -> None:
     clock = ClockSync()
     sent = [t for t in range(0, 3 * SECOND, 1_000_000) if clock.poll_ping(t)]
     assert sum(t < SECOND // 4 for t in sent) == BURST
@@ -110,18 +110,18 @@ def test_pings_come_in_a_burst_then_slowly() -> None:
     assert clock.poll_ping(0)
 
 
-def settled(clock: ClockSync, local_ns: int = 0) -> int:
+def synchronise(clock: ClockSync, local_ns: int = 0) -> int:
     for _ in range(16):
         local_ns = exchange(clock, local_ns, 300_000, 300_000) + SECOND // 2
     return local_ns
 
 
-def test_a_machine_that_slept_knows_the_time_again_after_four_exchanges() -> None:
+def test_suspended_machine_is_synchronised_after_four_exchanges() -> None:
     clock = ClockSync()
-    local = settled(clock)
-    slept = 3600 * SECOND  # our clock stood still, the session's went on
+    local = synchronise(clock)
+    slept = 3600 * SECOND  # our clock stopped, the session's continued
     for i in range(JUMP):
-        assert abs(clock.session_ns(local) - local - OFFSET) < 1_000_000, "one strange exchange alone says nothing"
+        assert abs(clock.session_ns(local) - local - OFFSET) < 1_000_000, "a single outlier changes nothing"
         local = exchange(clock, local, 300_000, 300_000, OFFSET + slept)
         truth = local + OFFSET + slept
         assert abs(clock.session_ns(local) - truth) <= clock.error_bound_ns(local), "the bound is honest throughout"
@@ -130,18 +130,18 @@ def test_a_machine_that_slept_knows_the_time_again_after_four_exchanges() -> Non
     assert clock.error_bound_ns(local) < 1_000_000
 
 
-def test_a_single_strange_exchange_moves_nothing_and_is_forgotten() -> None:
+def test_single_outlier_is_ignored() -> None:
     clock = ClockSync()
-    local = settled(clock)
+    local = synchronise(clock)
     local = exchange(clock, local, 300_000, 300_000, OFFSET + SECOND)
     local = exchange(clock, local, 300_000, 300_000)
     assert clock.session_ns(local) == local + OFFSET
     assert clock.error_bound_ns(local) < 1_000_000
 
 
-def test_a_new_connection_steps_only_to_what_is_else_impossible() -> None:
+def test_new_connection_steps_only_where_the_old_offset_is_impossible() -> None:
     clock = ClockSync()
-    local = settled(clock)
+    local = synchronise(clock)
     clock.restart()
     assert not clock.settled
     assert clock.session_ns(local) == local + OFFSET  # until something better is known

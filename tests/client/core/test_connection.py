@@ -1,4 +1,4 @@
-"""The sans-I/O core: every path through joining, losing and resuming, as plain bytes and numbers."""
+"""The sans-I/O core: every path through joining, losing and resuming a connection, with plain bytes and numbers."""
 
 from __future__ import annotations
 
@@ -59,28 +59,28 @@ SAMPLE = Sample("head", "pose", 1, 0, 1, 0, 0)
 
 
 class Wire:
-    """A connection and what it sent."""
+    """A connection and the messages it sent."""
 
     def __init__(self) -> None:
         self.connection = ClientConnection(Hello("operator", "ann"), Identity(b"s" * 16))
         self.epoch = 0
 
     def sent(self) -> list[ClientMessage]:
-        """Everything queued since the last call."""
+        """Return everything queued since the last call."""
         messages = []
         while (item := self.connection.peek_outgoing()) is not None:
             self.connection.pop_outgoing(sent=True)
             messages.append(decode_client(item[1]).message)
         return messages
 
-    def get(self, message: ServerMessage, now_ns: int, *bulk: bytes, epoch: int | None = None) -> None:
+    def receive(self, message: ServerMessage, now_ns: int, *bulk: bytes, epoch: int | None = None) -> None:
         envelope = ServerEnvelope(PROTOCOL_VERSION, self.epoch if epoch is None else epoch, message)
         self.connection.receive([encode_server(envelope), *bulk], now_ns)
 
     def welcome(self, now_ns: int, token: bytes = b"token", session: str = "s1") -> None:
         self.epoch += 1
         ports = Endpoints(state=1)
-        self.get(
+        self.receive(
             Welcome(session, "lab", "live", "p1", self.epoch, "operator", token, False, 0, SECOND, MS, MS, ports),
             now_ns,
         )
@@ -90,11 +90,11 @@ class Wire:
         poses = np.zeros((bodies, 7))
         poses[:, 3] = 1.0
         snapshot = Snapshot(0, event_seq, 1, 0, "hash", 0, 0.0, 0, (), (), bodies=infos)
-        self.get(snapshot, now_ns, poses.tobytes() if data is None else data)
+        self.receive(snapshot, now_ns, poses.tobytes() if data is None else data)
 
     def clock(self, now_ns: int) -> None:
         for _ in range(SETTLED):
-            self.get(ClockPong(now_ns, now_ns, now_ns), now_ns)
+            self.receive(ClockPong(now_ns, now_ns, now_ns), now_ns)
 
     def join(self, now_ns: int = 0) -> None:
         self.connection.open(now_ns)
@@ -110,7 +110,7 @@ def wire() -> Wire:
     return Wire()
 
 
-def test_join_says_hello_then_asks_for_clock_and_snapshot(wire: Wire) -> None:
+def test_join_sends_hello_then_requests_clock_and_snapshot(wire: Wire) -> None:
     assert wire.connection.phase is ConnectionPhase.IDLE
     wire.connection.open(0)
     (hello,) = wire.sent()
@@ -125,7 +125,7 @@ def test_join_says_hello_then_asks_for_clock_and_snapshot(wire: Wire) -> None:
     assert wire.connection.phase is ConnectionPhase.READY
 
 
-def test_hello_without_answer_is_said_again_on_a_fresh_socket_with_back_off(wire: Wire) -> None:
+def test_unanswered_hello_is_repeated_on_a_new_socket_with_back_off(wire: Wire) -> None:
     wire.connection.open(0)
     hellos, now = [0], 0
     while now < 60 * SECOND:
@@ -141,27 +141,27 @@ def test_hello_without_answer_is_said_again_on_a_fresh_socket_with_back_off(wire
     assert gaps[-1] == HELLO_TIMEOUT_MAX_NS + BACKOFF_MAX_NS
 
 
-def test_over_a_slow_link_an_answer_is_waited_for_longer_until_the_connection_is_lost(wire: Wire) -> None:
-    """Five ways there and back of 600 ms: the first two hellos are given up too early, the third is not."""
+def test_hello_timeout_grows_on_a_slow_link(wire: Wire) -> None:
+    """With a round trip of 5 x 600 ms the first two hellos time out, the third does not."""
     wire.connection.open(0)
-    said, now = 0, 0
+    sent_at, now = 0, 0
     while not wire.connection.is_joined:
         assert now < 60 * SECOND
         generation = wire.connection.generation
         now = wire.connection.next_deadline_ns(now)
-        if now > said + 3 * SECOND:
-            now = said + 3 * SECOND
+        if now > sent_at + 3 * SECOND:
+            now = sent_at + 3 * SECOND
             wire.welcome(now)
             break
         wire.connection.tick(now)
         if wire.connection.generation != generation:
-            said = now
+            sent_at = now
     assert wire.connection.generation == 3
     wire.connection.handle_disconnect(now + 10 * SECOND)
     assert wire.connection.next_deadline_ns(now + 10 * SECOND) == now + 10 * SECOND + HELLO_TIMEOUT_NS
 
 
-def test_timers_keep_a_quiet_connection_alive(wire: Wire) -> None:
+def test_timers_keep_an_idle_connection_alive(wire: Wire) -> None:
     wire.join()
     kinds: list[type] = []
     now = 0
@@ -171,7 +171,7 @@ def test_timers_keep_a_quiet_connection_alive(wire: Wire) -> None:
         for message in wire.sent():
             kinds.append(type(message))
             if isinstance(message, ClockPing):
-                wire.get(ClockPong(message.t0_ns, now, now), now)
+                wire.receive(ClockPong(message.t0_ns, now, now), now)
     assert wire.connection.phase is ConnectionPhase.READY
     assert kinds.count(Heartbeat) >= 19
     assert 15 <= kinds.count(ClockPing) <= 35
@@ -190,17 +190,17 @@ def test_silence_ends_the_connection_and_the_token_resumes_it(wire: Wire) -> Non
     assert hello.resume_token == b"token"
 
 
-def test_who_stood_still_first_reads_what_was_said_meanwhile(wire: Wire) -> None:
+def test_stalled_client_first_reads_pending_messages(wire: Wire) -> None:
     wire.join()
     wire.connection.tick(60 * SECOND)
     assert wire.connection.phase is ConnectionPhase.READY
     assert {type(message) for message in wire.sent()} == {ClockPing, Heartbeat}
     wire.connection.tick(60 * SECOND + 500 * MS)
-    wire.get(ProtocolFault("hello", "say hello"), 60 * SECOND + 600 * MS)
+    wire.receive(ProtocolFault("hello", "say hello"), 60 * SECOND + 600 * MS)
     assert [type(message) for message in wire.sent()][-1] is Hello
 
 
-def test_a_connection_that_breaks_at_once_is_retried_with_back_off(wire: Wire) -> None:
+def test_connection_that_breaks_at_once_is_retried_with_back_off(wire: Wire) -> None:
     wire.connection.open(0)
     now, waits = 0, []
     for _ in range(6):
@@ -214,24 +214,24 @@ def test_a_connection_that_breaks_at_once_is_retried_with_back_off(wire: Wire) -
     assert waits[-1] > 1.9 * SECOND
 
 
-def test_used_token_is_dropped_and_hello_said_again(wire: Wire) -> None:
+def test_used_token_is_dropped_and_hello_repeated(wire: Wire) -> None:
     wire.connection.identity.resume_token = b"old"
     wire.connection.open(0)
     wire.sent()
-    wire.get(Refused(RefusalCode.RESUME_TOKEN, "used"), MS, epoch=0)
+    wire.receive(Refused(RefusalCode.RESUME_TOKEN, "used"), MS, epoch=0)
     (hello,) = wire.sent()
     assert isinstance(hello, Hello)
     assert hello.resume_token == b""
     assert wire.connection.generation == 2
 
 
-def test_refusals_end_it_unless_they_pass(wire: Wire) -> None:
+def test_permanent_refusals_end_the_connection(wire: Wire) -> None:
     wire.join()
     wire.connection.handle_disconnect(SECOND)
-    wire.get(Refused(DenialReason.SESSION_FULL, "full"), 2 * SECOND, epoch=0)
+    wire.receive(Refused(DenialReason.SESSION_FULL, "full"), 2 * SECOND, epoch=0)
     assert wire.connection.phase is ConnectionPhase.WAITING
     wire.connection.tick(5 * SECOND)
-    wire.get(Refused(RefusalCode.VERSION, "other version", supported_versions=(7, 8)), 5 * SECOND, epoch=0)
+    wire.receive(Refused(RefusalCode.VERSION, "other version", supported_versions=(7, 8)), 5 * SECOND, epoch=0)
     assert wire.connection.phase is ConnectionPhase.REFUSED
     assert isinstance(wire.connection.failure, VersionError)
     assert wire.connection.failure.supported_versions == (7, 8)
@@ -240,12 +240,12 @@ def test_refusals_end_it_unless_they_pass(wire: Wire) -> None:
     assert wire.connection.failure is None
 
 
-def test_a_first_hello_that_is_one_of_too_many_is_said_again_with_back_off(wire: Wire) -> None:
+def test_rate_limited_hello_is_repeated_with_back_off(wire: Wire) -> None:
     wire.connection.open(0)
     now, waits = 0, []
     for _ in range(8):
         wire.sent()
-        wire.get(Refused(RefusalCode.RATE, "too many hellos at once", "try again in a second"), now, epoch=0)
+        wire.receive(Refused(RefusalCode.RATE, "too many hellos at once", "try again in a second"), now, epoch=0)
         assert wire.connection.phase is ConnectionPhase.WAITING
         assert "too many hellos" in wire.connection.describe()
         waits.append(wire.connection.next_deadline_ns(now) - now)
@@ -266,17 +266,17 @@ def test_a_first_hello_that_is_one_of_too_many_is_said_again_with_back_off(wire:
         ("hello", ConnectionPhase.JOINING),
     ],
 )
-def test_faults_that_end_the_connection(wire: Wire, code: str, phase: ConnectionPhase) -> None:
+def test_faults_end_the_connection(wire: Wire, code: str, phase: ConnectionPhase) -> None:
     wire.join()
-    wire.get(ProtocolFault(code, "the session let this connection go: heartbeat"), SECOND)
+    wire.receive(ProtocolFault(code, "the session let this connection go: heartbeat"), SECOND)
     assert wire.connection.phase is phase
     assert wire.connection.counters.faults == {code: 1}
 
 
-def test_another_session_makes_everything_anew_but_keeps_the_tracking_epoch(wire: Wire) -> None:
+def test_new_session_resets_everything_but_the_tracking_epoch(wire: Wire) -> None:
     wire.join()
     wire.connection.tracking_epoch = 3
-    wire.get(Event(1, 0, 0, Notice("info", "x")), MS)
+    wire.receive(Event(1, 0, 0, Notice("info", "x")), MS)
     assert wire.connection.mirror.event_seq == 1
     wire.connection.handle_disconnect(SECOND)
     wire.sent()
@@ -286,7 +286,7 @@ def test_another_session_makes_everything_anew_but_keeps_the_tracking_epoch(wire
     assert TrackingEpoch(3) in wire.sent()
 
 
-def test_samples_are_never_kept_for_later_and_other_messages_raise(wire: Wire) -> None:
+def test_samples_are_never_queued_offline_and_other_messages_raise(wire: Wire) -> None:
     assert not wire.connection.send(SAMPLE)
     with pytest.raises(NotConnectedError):
         wire.connection.send(EStop())
@@ -300,7 +300,7 @@ def test_samples_are_never_kept_for_later_and_other_messages_raise(wire: Wire) -
     assert wire.connection.counters.samples_not_sent == 2
 
 
-def test_urgent_messages_overtake_and_the_queue_is_bounded(wire: Wire) -> None:
+def test_urgent_messages_are_sent_first_and_the_queue_is_bounded(wire: Wire) -> None:
     wire.join()
     for _ in range(2 * MAX_OUTGOING):
         wire.connection.send(SAMPLE)
@@ -311,13 +311,13 @@ def test_urgent_messages_overtake_and_the_queue_is_bounded(wire: Wire) -> None:
     assert wire.connection.counters.samples_not_sent == MAX_OUTGOING + 1
 
 
-def test_replies_reach_who_asked_and_leases_count_at_once(wire: Wire) -> None:
+def test_replies_match_their_requests_and_leases_apply_at_once(wire: Wire) -> None:
     wire.join()
     number = wire.connection.request(Acquire(0, ("left",)))
     assert wire.sent() == [Acquire(number, ("left",))]
     lease = Lease("left", "robot", "exclusive", "p1", 4)
-    wire.get(Reply(number, True, leases=(lease,)), MS)
-    wire.get(Reply(number, True), MS)
+    wire.receive(Reply(number, True, leases=(lease,)), MS)
+    wire.receive(Reply(number, True), MS)
     assert wire.connection.counters.unexpected_replies == 1
     reply = wire.connection.requests.pop_reply(number)
     assert reply is not None
@@ -328,17 +328,17 @@ def test_replies_reach_who_asked_and_leases_count_at_once(wire: Wire) -> None:
     assert wire.connection.lease_version("left") is None
 
 
-def test_messages_for_an_earlier_connection_are_counted_not_applied(wire: Wire) -> None:
+def test_messages_of_an_earlier_connection_are_counted_not_applied(wire: Wire) -> None:
     wire.join()
-    wire.get(Event(1, 0, 0, Notice("info", "x")), MS, epoch=99)
+    wire.receive(Event(1, 0, 0, Notice("info", "x")), MS, epoch=99)
     assert wire.connection.mirror.event_seq == 0
     assert wire.connection.counters.other_connection == 1
 
 
-def test_gap_in_events_asks_for_a_snapshot_again_until_it_comes(wire: Wire) -> None:
+def test_event_gap_requests_a_snapshot_until_it_arrives(wire: Wire) -> None:
     wire.join()
-    wire.get(Event(1, 0, 0, Notice("info", "x")), MS)
-    wire.get(Event(3, 0, 0, Notice("info", "y")), MS)
+    wire.receive(Event(1, 0, 0, Notice("info", "x")), MS)
+    wire.receive(Event(3, 0, 0, Notice("info", "y")), MS)
     now, asked = MS, 0
     while now < 3 * SECOND:
         now = max(now + MS, wire.connection.next_deadline_ns(now))
@@ -346,62 +346,62 @@ def test_gap_in_events_asks_for_a_snapshot_again_until_it_comes(wire: Wire) -> N
         for message in wire.sent():
             asked += isinstance(message, GetSnapshot)
             if isinstance(message, ClockPing):
-                wire.get(ClockPong(message.t0_ns, now, now), now)
+                wire.receive(ClockPong(message.t0_ns, now, now), now)
     assert 4 <= asked <= 7
     wire.snapshot(now, event_seq=2)
     assert wire.connection.mirror.event_seq == 3
-    told = [
+    delivered = [
         e if isinstance(e, MissedEvents) else e.event_seq
         for e in wire.connection.inbox
         if isinstance(e, Event | MissedEvents)
     ]
-    assert told == [1, MissedEvents(2, 2), 3]
+    assert delivered == [1, MissedEvents(2, 2), 3]
 
 
-def test_a_snapshot_that_runs_ahead_says_which_events_are_missed(wire: Wire) -> None:
-    """The link took nothing for a while, and the snapshot is the first thing that came through."""
+def test_snapshot_ahead_of_events_reports_missed_events(wire: Wire) -> None:
+    """The link was blocked for a while, and the snapshot is the first message afterwards."""
     wire.join()
-    wire.get(Event(1, 0, 0, Notice("info", "x")), MS)
+    wire.receive(Event(1, 0, 0, Notice("info", "x")), MS)
     wire.snapshot(2 * MS, event_seq=1)
     assert not [m for m in wire.connection.inbox if isinstance(m, MissedEvents)], "none is missed"
     wire.snapshot(3 * MS, event_seq=7)
-    wire.get(Event(8, 0, 0, Notice("info", "y")), 4 * MS)
+    wire.receive(Event(8, 0, 0, Notice("info", "y")), 4 * MS)
     assert wire.connection.mirror.gaps == 0
-    told = [
+    delivered = [
         e if isinstance(e, MissedEvents) else e.event_seq
         for e in wire.connection.inbox
         if isinstance(e, Event | MissedEvents)
     ]
-    assert told == [1, MissedEvents(2, 7), 8]
+    assert delivered == [1, MissedEvents(2, 7), 8]
 
 
-def test_inbox_is_bounded_and_says_what_it_dropped(wire: Wire) -> None:
+def test_inbox_is_bounded_and_reports_drops(wire: Wire) -> None:
     wire.join()
     for i in range(MAX_INBOX + 10):
-        wire.get(Event(i + 1, 0, 0, Notice("info", "x")), MS)
+        wire.receive(Event(i + 1, 0, 0, Notice("info", "x")), MS)
     assert len(wire.connection.inbox) == MAX_INBOX
     assert wire.connection.counters.inbox_dropped == 11
     first, second = wire.connection.inbox[0], wire.connection.inbox[1]
-    assert first == MissedEvents(1, 11), "and the application is told"
+    assert first == MissedEvents(1, 11), "and the application is notified"
     assert isinstance(second, Event)
     assert second.event_seq == 12
 
 
-def test_events_held_while_a_snapshot_came_are_handed_out_and_not_told_as_missed(wire: Wire) -> None:
+def test_events_pending_during_a_snapshot_are_delivered_and_not_reported_missed(wire: Wire) -> None:
     wire.join()
     for seq in (1, 3, 5, 6):
-        wire.get(Event(seq, 0, 0, Notice("info", "x")), MS)
+        wire.receive(Event(seq, 0, 0, Notice("info", "x")), MS)
     wire.snapshot(2 * MS, event_seq=5)
-    told = [
+    delivered = [
         e if isinstance(e, MissedEvents) else e.event_seq
         for e in wire.connection.inbox
         if isinstance(e, Event | MissedEvents)
     ]
-    assert told == [1, MissedEvents(2, 2), 3, MissedEvents(4, 4), 5, 6]
+    assert delivered == [1, MissedEvents(2, 2), 3, MissedEvents(4, 4), 5, 6]
 
 
 @pytest.mark.parametrize("data", [b"", b"12345678", b"\0" * (3 * 56)])
-def test_snapshot_with_poses_of_another_size_is_malformed(wire: Wire, data: bytes) -> None:
+def test_snapshot_with_wrong_number_of_poses_is_malformed(wire: Wire, data: bytes) -> None:
     wire.connection.open(0)
     wire.welcome(0)
     wire.snapshot(MS, data=data)
@@ -409,7 +409,7 @@ def test_snapshot_with_poses_of_another_size_is_malformed(wire: Wire, data: byte
     assert not wire.connection.mirror.synced
 
 
-def test_close_says_bye_and_forgets_the_token(wire: Wire) -> None:
+def test_close_sends_bye_and_deletes_the_token(wire: Wire) -> None:
     wire.join()
     wire.connection.send(Marker(0, "note"))
     wire.connection.close()
@@ -419,20 +419,20 @@ def test_close_says_bye_and_forgets_the_token(wire: Wire) -> None:
         wire.connection.send(EStop())
 
 
-def test_a_client_whose_identity_was_taken_over_leaves_the_token_to_the_other(wire: Wire) -> None:
+def test_client_with_a_taken_over_identity_keeps_the_token_for_the_other(wire: Wire) -> None:
     wire.join()
-    wire.get(ProtocolFault("dropped", "let go", "replaced"), MS)
+    wire.receive(ProtocolFault("dropped", "let go", "replaced"), MS)
     assert wire.connection.phase is ConnectionPhase.REFUSED
     wire.connection.close()
     assert wire.connection.identity.resume_token == b"token"
 
 
-def test_answers_that_nobody_fetches_are_bounded(wire: Wire) -> None:
+def test_unread_replies_are_bounded(wire: Wire) -> None:
     wire.join()
     ids = []
     for _ in range(MAX_PENDING + 5):
         ids.append(wire.connection.request(Acquire(0)))
-        wire.get(Reply(ids[-1], True), MS)
+        wire.receive(Reply(ids[-1], True), MS)
     assert wire.connection.counters.inbox_dropped == 5
     assert wire.connection.requests.pop_reply(ids[4]) is None
     assert wire.connection.requests.pop_reply(ids[5]) == Reply(ids[5], True)
@@ -440,7 +440,7 @@ def test_answers_that_nobody_fetches_are_bounded(wire: Wire) -> None:
 
 @given(st.lists(st.lists(st.binary(max_size=80), max_size=3), max_size=20))
 @settings(max_examples=150, deadline=None)
-def test_any_bytes_from_a_server_are_counted_and_harm_nothing(messages: list[list[bytes]]) -> None:
+def test_any_server_bytes_are_counted_and_harmless(messages: list[list[bytes]]) -> None:
     wire = Wire()
     wire.join()
     for frames in messages:
@@ -449,7 +449,7 @@ def test_any_bytes_from_a_server_are_counted_and_harm_nothing(messages: list[lis
     assert wire.connection.counters.malformed == len(messages)
 
 
-def test_a_request_that_cannot_be_queued_raises(wire: Wire) -> None:
+def test_request_that_cannot_be_queued_raises(wire: Wire) -> None:
     wire.join()
     for _ in range(MAX_OUTGOING):
         wire.connection.send(Marker(0, "x"))
@@ -457,26 +457,26 @@ def test_a_request_that_cannot_be_queued_raises(wire: Wire) -> None:
         wire.connection.request(Acquire(0))
 
 
-def test_a_denial_that_nobody_waits_for_is_handed_out(wire: Wire) -> None:
+def test_denial_without_a_waiting_request_is_delivered(wire: Wire) -> None:
     wire.join()
     denied = Reply(0, False, Denial(DenialReason.UNALIGNED, "no"))
-    wire.get(denied, MS)
+    wire.receive(denied, MS)
     assert list(wire.connection.inbox) == [denied]
     assert wire.connection.counters.unasked_denials == 1
 
 
-def test_a_full_disk_ends_neither_joining_nor_closing(
+def test_full_disk_stops_neither_joining_nor_closing(
     wire: Wire, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def full() -> None:
+    def raise_full() -> None:
         raise IdentityError("no space left on device")
 
     wire.connection.identity.path = Path("identity")
-    monkeypatch.setattr(wire.connection.identity, "_write", full)
+    monkeypatch.setattr(wire.connection.identity, "_write", raise_full)
     wire.join()
     assert wire.connection.identity.resume_token == b"token"
     wire.connection.handle_disconnect(2 * SECOND)
-    wire.get(Refused(RefusalCode.RESUME_TOKEN, "used"), 2 * SECOND, epoch=0)
+    wire.receive(Refused(RefusalCode.RESUME_TOKEN, "used"), 2 * SECOND, epoch=0)
     wire.welcome(3 * SECOND, b"next")
     wire.connection.close()
     assert wire.connection.counters.identity_unwritten == 4

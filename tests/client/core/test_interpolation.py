@@ -1,4 +1,4 @@
-"""Display buffer: between frames, never beyond them, never back."""
+"""Display buffer: interpolates between frames, never extrapolates, never goes back."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ def frame(x: float, angle: float = 0.0) -> np.ndarray:
     return np.array([[x, 0.0, 0.0, *quat_from_rotvec((0.0, 0.0, angle))]])
 
 
-def test_slerp_is_of_constant_speed_and_takes_the_short_way() -> None:
+def test_slerp_has_constant_speed_and_takes_the_short_way() -> None:
     a, b = frame(0.0, 0.0), frame(1.0, 2.0)
-    b[:, 3:] *= -1.0  # the same orientation, the other sign
+    b[:, 3:] *= -1.0  # the same orientation, opposite sign
     for fraction in (0.0, 0.25, 0.5, 1.0):
         pose = interpolate(a, b, fraction)
         assert pose[0, 0] == pytest.approx(fraction)
@@ -31,7 +31,7 @@ def test_equal_orientations_do_not_divide_by_zero() -> None:
     assert np.array_equal(interpolate(frame(0.0, 1.0), frame(1.0, 1.0), 0.5)[0, 3:], frame(0.0, 1.0)[0, 3:])
 
 
-def test_shows_the_past_between_frames_with_its_age() -> None:
+def test_past_is_interpolated_with_its_age() -> None:
     buffer = PoseBuffer(delay_ns=30 * MS)
     assert buffer.poses_at(0) is None
     for i in range(6):
@@ -42,7 +42,7 @@ def test_shows_the_past_between_frames_with_its_age() -> None:
     assert (shown.session_time_ns, shown.age_ns, shown.starved) == (40 * MS, 30 * MS, False)
 
 
-def test_starved_display_keeps_the_newest_and_says_so() -> None:
+def test_starved_display_keeps_the_newest_frame_and_reports_it() -> None:
     buffer = PoseBuffer(delay_ns=10 * MS)
     buffer.add(0, frame(1.0))
     shown = buffer.poses_at(500 * MS)
@@ -53,7 +53,7 @@ def test_starved_display_keeps_the_newest_and_says_so() -> None:
     assert buffer.starvations == 1
 
 
-def test_time_shown_never_goes_back_and_old_frames_are_counted() -> None:
+def test_displayed_time_never_goes_back_and_old_frames_are_counted() -> None:
     buffer = PoseBuffer(delay_ns=10 * MS)
     for i in range(4):
         buffer.add(i * 10 * MS, frame(float(i)))
@@ -68,7 +68,7 @@ def test_time_shown_never_goes_back_and_old_frames_are_counted() -> None:
     assert buffer.poses_at(40 * MS) is None
 
 
-def test_large_batches_are_right() -> None:
+def test_large_batches_agree_with_single_values() -> None:
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(300, 7)), rng.normal(size=(300, 7))
     for poses in (a, b):

@@ -35,12 +35,12 @@ class Server:
         self.poses[:, 3] = 1.0
 
     def frame(self, now_ns: int, epoch: int = 1) -> list[bytes]:
-        """A frame in which everybody has moved."""
+        """A frame in which every body has moved."""
         self.poses[:, 0] += 0.001
         return self.rest(now_ns, epoch)
 
     def rest(self, now_ns: int, epoch: int = 1) -> list[bytes]:
-        """A frame as things stand."""
+        """A frame without further motion."""
         encoded = self.encoder.encode(self.poses, epoch)
         header = StateHeader(epoch, 0, 0, 0.0, now_ns - MS, now_ns, encoded.state_seq, encoded.base_seq)
         return [TOPIC_RIGID, encode_state_header(header), encoded.payload]
@@ -51,7 +51,7 @@ class Server:
 
 
 def drain(stream: StateStream, messages: Sequence[Sequence[bytes]], now_ns: int) -> SceneState | None:
-    """At session time `now_ns`; this client's own clock shows something else."""
+    """Drain at session time `now_ns`; the client's own clock differs."""
     return stream.drain(messages, now_ns, now_ns + LOCAL)
 
 
@@ -60,7 +60,7 @@ def server() -> Server:
     return Server()
 
 
-def test_newest_of_a_drain_is_decoded_and_the_rest_counted(server: Server) -> None:
+def test_newest_frame_of_a_drain_is_decoded_and_the_rest_counted(server: Server) -> None:
     stream = StateStream()
     server.frame(0)
     server.join(stream)
@@ -72,7 +72,7 @@ def test_newest_of_a_drain_is_decoded_and_the_rest_counted(server: Server) -> No
     assert (stream.counters.delivered, stream.counters.superseded) == (1, 2)
 
 
-def test_frames_before_the_snapshot_and_of_the_past_are_counted(server: Server) -> None:
+def test_frames_before_the_snapshot_and_old_frames_are_counted(server: Server) -> None:
     stream = StateStream()
     old = server.frame(0)
     assert drain(stream, [old], MS) is None
@@ -83,12 +83,12 @@ def test_frames_before_the_snapshot_and_of_the_past_are_counted(server: Server) 
     assert stream.counters.out_of_order == 1
 
 
-def test_losing_more_than_the_window_asks_for_a_snapshot(server: Server) -> None:
+def test_loss_beyond_the_window_requests_a_snapshot(server: Server) -> None:
     stream = StateStream()
     for i in range(40):
         server.frame(i)
     server.join(stream)
-    server.poses[:, 1] += 1.0  # everybody moves, unseen by this client, and rests from then on
+    server.poses[:, 1] += 1.0  # all bodies move, unseen by this client, and then rest
     for _ in range(WINDOW + 2):
         server.rest(0)
     assert drain(stream, [server.rest(MS)], MS) is None
@@ -99,7 +99,7 @@ def test_losing_more_than_the_window_asks_for_a_snapshot(server: Server) -> None
     assert drain(stream, [server.rest(2 * MS)], 2 * MS) is not None
 
 
-def test_a_new_epoch_is_handed_out_once_the_session_has_told_of_it(server: Server) -> None:
+def test_new_epoch_is_delivered_once_the_session_has_announced_it(server: Server) -> None:
     stream = StateStream()
     server.frame(0)
     server.join(stream)
@@ -111,7 +111,7 @@ def test_a_new_epoch_is_handed_out_once_the_session_has_told_of_it(server: Serve
     assert np.abs(state.poses - server.poses).max() < 1e-4
 
 
-def test_after_standing_still_the_first_frame_handed_out_is_fresh(server: Server) -> None:
+def test_first_frame_after_a_stall_is_fresh(server: Server) -> None:
     stream = StateStream()
     server.frame(0)
     server.join(stream)
@@ -125,7 +125,7 @@ def test_after_standing_still_the_first_frame_handed_out_is_fresh(server: Server
     assert state.age_ns == 2 * MS
 
 
-def test_on_a_slow_link_old_is_the_newest_there_is(server: Server) -> None:
+def test_slow_link_delivers_the_newest_available_frame(server: Server) -> None:
     stream = StateStream()
     server.frame(0)
     server.join(stream)
@@ -136,7 +136,7 @@ def test_on_a_slow_link_old_is_the_newest_there_is(server: Server) -> None:
 
 
 @pytest.mark.parametrize("period", [66 * MS, 100 * MS, 400 * MS])
-def test_a_slow_link_with_few_frames_shows_a_scene_to_who_looks_rarely(server: Server, period: int) -> None:
+def test_slow_link_with_few_frames_shows_a_scene_to_a_slow_poller(server: Server, period: int) -> None:
     stream = StateStream()
     server.frame(0)
     server.join(stream)
@@ -144,7 +144,7 @@ def test_a_slow_link_with_few_frames_shows_a_scene_to_who_looks_rarely(server: S
     assert all(state is not None for state in handed[len(handed) // 2 :])
 
 
-def test_few_frames_on_a_slow_link_are_all_handed_out(server: Server) -> None:
+def test_few_frames_on_a_slow_link_are_all_delivered(server: Server) -> None:
     stream = StateStream()
     server.frame(0)
     server.join(stream)
@@ -152,14 +152,14 @@ def test_few_frames_on_a_slow_link_are_all_handed_out(server: Server) -> None:
         assert drain(stream, [server.frame(t - 90 * MS)], t) is not None
 
 
-@pytest.mark.parametrize("looks", [True, False])
-def test_a_stall_is_noticed_whoever_stood_still(server: Server, looks: bool) -> None:
-    """The link stood still while the client went on looking, or the client while it waited in a poll for frames."""
+@pytest.mark.parametrize("polling", [True, False])
+def test_stall_of_link_or_client_is_detected(server: Server, polling: bool) -> None:
+    """The link stalled while the client polled, or the client stalled while waiting for frames."""
     stream = StateStream()
     server.frame(0)
     server.join(stream)
     assert drain(stream, [server.frame(MS)], MS) is not None
-    for t in range(20 * MS, 3000 * MS, 20 * MS) if looks else ():
+    for t in range(20 * MS, 3000 * MS, 20 * MS) if polling else ():
         assert drain(stream, [], t) is None
     assert drain(stream, [server.frame(20 * MS)], 3000 * MS) is None
     assert drain(stream, [server.frame(40 * MS)], 3001 * MS) is None
@@ -167,8 +167,8 @@ def test_a_stall_is_noticed_whoever_stood_still(server: Server, looks: bool) -> 
     assert stream.counters.queued_old == 2
 
 
-def test_a_frame_in_hand_when_the_client_stood_still_is_not_handed_out(server: Server) -> None:
-    """It was taken from the socket, then the process was stopped for three seconds."""
+def test_frame_in_hand_during_a_stall_is_not_delivered(server: Server) -> None:
+    """It was read from the socket, then the process was stopped for three seconds."""
     stream = StateStream()
     server.frame(0)
     server.join(stream)
@@ -176,13 +176,13 @@ def test_a_frame_in_hand_when_the_client_stood_still_is_not_handed_out(server: S
     assert stream.check_fresh(2 * MS + LOCAL)
     assert drain(stream, [server.frame(17 * MS)], 17 * MS) is not None
     assert not stream.check_fresh(3000 * MS + LOCAL)
-    assert drain(stream, [server.frame(33 * MS)], 3001 * MS) is None  # nor what waited meanwhile
+    assert drain(stream, [server.frame(33 * MS)], 3001 * MS) is None  # nor frames queued meanwhile
     assert drain(stream, [server.frame(3002 * MS)], 3003 * MS) is not None
     assert stream.check_fresh(3004 * MS + LOCAL)
     assert (stream.counters.delivered, stream.counters.queued_old) == (2, 2)
 
 
-def test_who_is_slow_with_every_frame_is_handed_them_all_but_the_first(server: Server) -> None:
+def test_client_slow_with_every_frame_gets_all_but_the_first(server: Server) -> None:
     stream = StateStream()
     server.frame(0)
     server.join(stream)
@@ -193,7 +193,7 @@ def test_who_is_slow_with_every_frame_is_handed_them_all_but_the_first(server: S
     assert kept == [False] + [True] * 9
 
 
-def test_a_link_that_became_slow_shows_what_there_is(server: Server) -> None:
+def test_link_that_becomes_slow_still_delivers(server: Server) -> None:
     """Frames a second old, four a second: nothing for a moment, then all of them."""
     stream = StateStream()
     server.frame(0)
@@ -204,8 +204,8 @@ def test_a_link_that_became_slow_shows_what_there_is(server: Server) -> None:
     assert all(state is not None for state in handed[1:])
 
 
-def test_a_late_frame_without_a_stall_is_handed_out(server: Server) -> None:
-    """Jitter: frames go on coming, some are late."""
+def test_late_frame_without_a_stall_is_delivered(server: Server) -> None:
+    """Jitter: frames keep arriving, some are late."""
     stream = StateStream()
     server.frame(0)
     server.join(stream)
@@ -214,7 +214,7 @@ def test_a_late_frame_without_a_stall_is_handed_out(server: Server) -> None:
         assert drain(stream, [server.frame(t - (100 if i % 7 == 3 else 5) * MS)], t) is not None
 
 
-def test_a_jump_of_session_time_is_not_standing_still(server: Server) -> None:
+def test_jump_of_session_time_is_no_stall(server: Server) -> None:
     stream = StateStream()
     server.frame(0)
     server.join(stream)
@@ -222,7 +222,7 @@ def test_a_jump_of_session_time_is_not_standing_still(server: Server) -> None:
     assert stream.drain([server.frame(3600_000 * MS)], 3600_090 * MS, MS) is not None
 
 
-def test_another_session_has_no_stall_to_make_up_for(server: Server) -> None:
+def test_new_session_has_no_earlier_stall(server: Server) -> None:
     stream = StateStream()
     server.join(stream)
     server.frame(0)
@@ -233,7 +233,7 @@ def test_another_session_has_no_stall_to_make_up_for(server: Server) -> None:
     assert drain(stream, [server.frame(2900 * MS)], 3001 * MS) is not None
 
 
-def test_presence_of_who_is_not_here_is_not_kept() -> None:
+def test_presence_of_unknown_participants_is_ignored() -> None:
     stream = StateStream()
     items = (PresenceItem("p1", "head", IDENTITY), PresenceItem("p2", "head", IDENTITY))
     drain(stream, [[TOPIC_PRESENCE, encode_presence(Presence(10, 11, items))]], 12)
@@ -241,7 +241,7 @@ def test_presence_of_who_is_not_here_is_not_kept() -> None:
     assert set(stream.presence) == {("p2", "head")}
 
 
-def test_presence_keeps_the_latest_per_device_and_forgets_who_left() -> None:
+def test_presence_keeps_the_latest_per_device_and_removes_participants_that_left() -> None:
     stream = StateStream()
     items = (PresenceItem("p1", "head", IDENTITY), PresenceItem("p2", "head", IDENTITY))
     drain(stream, [[TOPIC_PRESENCE, encode_presence(Presence(10, 11, items))]], 12)
@@ -252,7 +252,7 @@ def test_presence_keeps_the_latest_per_device_and_forgets_who_left() -> None:
     assert set(stream.presence) == {("p2", "head")}
 
 
-def test_presence_that_nobody_looks_at_does_not_pile_up() -> None:
+def test_unread_presence_is_bounded() -> None:
     stream = StateStream()
     message = [TOPIC_PRESENCE, encode_presence(Presence(10, 11, (PresenceItem("p1", "head", IDENTITY),)))]
     for _ in range(2 * PRESENCE_WAITING - 1):
@@ -266,7 +266,7 @@ def test_presence_that_nobody_looks_at_does_not_pile_up() -> None:
     st.lists(st.lists(st.binary(max_size=60) | st.sampled_from([TOPIC_RIGID, TOPIC_PRESENCE]), min_size=1, max_size=4))
 )
 @settings(max_examples=200, deadline=None)
-def test_any_bytes_are_counted_and_harm_nothing(messages: list[list[bytes]]) -> None:
+def test_any_bytes_are_counted_and_harmless(messages: list[list[bytes]]) -> None:
     server, stream = Server(), StateStream()
     server.frame(0)
     server.join(stream)

@@ -1,4 +1,4 @@
-"""OBJ, STL, PLY, OFF, DAE, 3MF: geometry, colours and textures as the files have them; what a file may refer to."""
+"""OBJ, STL, PLY, OFF, DAE, 3MF: geometry, colours, textures, and the files that a file may refer to."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ map_Kd picture.png
 """
 
 
-def built(path: Path, tmp_path: Path, **options: object) -> tuple[ComposedScene, AssetStore]:
+def build(path: Path, tmp_path: Path, **options: object) -> tuple[ComposedScene, AssetStore]:
     store = AssetStore(tmp_path / "store")
     scene = SceneBuilder("test")
     scene.add_file(path, **options)
@@ -57,7 +57,7 @@ def write_obj(folder: Path) -> Path:
 
 
 def test_obj_with_materials_and_a_texture(tmp_path: Path) -> None:
-    scene, store = built(write_obj(tmp_path), tmp_path)
+    scene, store = build(write_obj(tmp_path), tmp_path)
     assert scene.skipped == ()
     by_name = {visual.name: visual for visual in scene.spec.visuals}
     assert by_name["red"].rgba == pytest.approx((0.8, 0.2, 0.2, 0.4), abs=0.003)
@@ -75,18 +75,18 @@ def test_geometry_of_every_format(tmp_path: Path, kind: str) -> None:
     mesh = trimesh.creation.annulus(0.2, 0.5, 0.3)
     path = tmp_path / f"ring.{kind}"
     mesh.export(path)
-    scene, store = built(path, tmp_path, name="ring", movable=True, up="z")
+    scene, store = build(path, tmp_path, name="ring", movable=True, up="z")
     assert scene.moving == ("ring",)
     visual = scene.spec.visuals[0]
     found = decode_mesh(store.get(scene.spec.meshes[visual.geometry.mesh].levels[0].address))
     again = trimesh.Trimesh(found.position, found.index, process=True).apply_transform(to_matrix(visual.T_body_visual))
-    unit = 0.001 if kind == "3mf" else 1.0  # which counts in millimetres
+    unit = 0.001 if kind == "3mf" else 1.0  # which uses millimetres
     np.testing.assert_allclose(again.bounds, unit * mesh.bounds, atol=1e-6)
     assert again.volume == pytest.approx(unit**3 * mesh.volume, rel=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["stl", "ply", "off", "obj"])
-def test_what_has_no_name_in_its_file_has_that_it_is_added_with(tmp_path: Path, kind: str) -> None:
+def test_unnamed_part_gets_the_name_of_its_file(tmp_path: Path, kind: str) -> None:
     path = tmp_path / f"ring.{kind}"
     bare = trimesh.exchange.export.export_mesh(trimesh.creation.box(), path, file_type=kind)
     if kind == "obj":  # without the `o` of its exporter
@@ -103,19 +103,19 @@ def test_what_has_no_name_in_its_file_has_that_it_is_added_with(tmp_path: Path, 
     assert spec.meshes[0].name == "ring"
 
 
-def test_several_without_a_name_are_numbered(tmp_path: Path) -> None:
+def test_several_unnamed_parts_are_numbered(tmp_path: Path) -> None:
     facet = "facet normal 0 0 1\nouter loop\nvertex 0 0 {z}\nvertex 1 0 {z}\nvertex 0 1 {z}\nendloop\nendfacet\n"
     solids = [f"solid{name}\n{facet.format(z=z)}endsolid{name}\n" for z, name in enumerate(("", " lid", ""))]
     (tmp_path / "a.stl").write_text("".join(solids))
-    spec = built(tmp_path / "a.stl", tmp_path, name="case")[0].spec
+    spec = build(tmp_path / "a.stl", tmp_path, name="case")[0].spec
     assert [visual.name for visual in spec.visuals] == ["case_1", "lid", "case_2"]
     assert [body.name for body in spec.bodies] == ["world", "case", "case_1", "lid", "case_2"]
 
 
-def test_scale_and_the_axis_that_is_up(tmp_path: Path) -> None:
+def test_scale_and_up_axis(tmp_path: Path) -> None:
     trimesh.creation.box((1, 2, 3)).export(tmp_path / "a.stl")
     for up, size in ((None, (1, 2, 3)), ("z", (1, 2, 3)), ("y", (1, 3, 2))):
-        scene, _ = built(tmp_path / "a.stl", tmp_path, scale=0.01, up=up, position=(0, 0, 5))
+        scene, _ = build(tmp_path / "a.stl", tmp_path, scale=0.01, up=up, position=(0, 0, 5))
         assert scene.spec.environment.center == pytest.approx((0, 0, 5))
         mesh = scene.spec.meshes[0]
         T = to_matrix(scene.spec.visuals[0].T_body_visual)[:3, :3]
@@ -125,16 +125,16 @@ def test_scale_and_the_axis_that_is_up(tmp_path: Path) -> None:
     text = (tmp_path / "x.dae").read_text()
     assert "<up_axis>" in text
     (tmp_path / "x.dae").write_text(re.sub("[XYZ]_UP", "X_UP", text))
-    with pytest.raises(SceneBuildError, match=r"x\.dae says that x is up: give up='y' or up='z'"):
-        built(tmp_path / "x.dae", tmp_path)
-    built(tmp_path / "x.dae", tmp_path, up="z")
+    with pytest.raises(SceneBuildError, match=r"x\.dae .*up='y' or up='z'"):
+        build(tmp_path / "x.dae", tmp_path)
+    build(tmp_path / "x.dae", tmp_path, up="z")
     with pytest.raises(SceneBuildError, match="up is 'x'"):
-        built(tmp_path / "a.stl", tmp_path, up="x")
+        build(tmp_path / "a.stl", tmp_path, up="x")
     with pytest.raises(SceneBuildError, match="scale is 0"):
-        built(tmp_path / "a.stl", tmp_path, scale=0)
+        build(tmp_path / "a.stl", tmp_path, scale=0)
     for scale in (float("nan"), "big", (1, 2), [[1], [1, 2]], None):
         with pytest.raises(SceneBuildError, match="scale"):
-            built(tmp_path / "a.stl", tmp_path, scale=scale)
+            build(tmp_path / "a.stl", tmp_path, scale=scale)
 
 
 def test_colours_at_vertices_and_faces(tmp_path: Path) -> None:
@@ -142,7 +142,7 @@ def test_colours_at_vertices_and_faces(tmp_path: Path) -> None:
     colors = np.random.default_rng(1).integers(0, 255, (8, 4), dtype=np.uint8)
     box.visual.vertex_colors = colors
     box.export(tmp_path / "a.ply")
-    scene, store = built(tmp_path / "a.ply", tmp_path)
+    scene, store = build(tmp_path / "a.ply", tmp_path)
     mesh = decode_mesh(store.get(scene.spec.meshes[0].levels[0].address))
     assert mesh.color is not None
     for position, color in zip(mesh.position, mesh.color, strict=True):
@@ -152,25 +152,25 @@ def test_colours_at_vertices_and_faces(tmp_path: Path) -> None:
     box = trimesh.creation.box()
     box.visual.face_colors = [[255, 0, 0, 255]] * 6 + [[0, 0, 255, 255]] * 6
     box.export(tmp_path / "b.ply")
-    scene, store = built(tmp_path / "b.ply", tmp_path)
+    scene, store = build(tmp_path / "b.ply", tmp_path)
     mesh = decode_mesh(store.get(scene.spec.meshes[0].levels[0].address))
     assert mesh.color is not None
     assert sorted({tuple(c) for c in mesh.color[mesh.index].reshape(-1, 4).tolist()}) == [
         (0, 0, 255, 255),
         (255, 0, 0, 255),
     ]
-    # a colour that is given takes their place
-    scene, store = built(tmp_path / "b.ply", tmp_path, rgba=(0, 1, 0, 1))
+    # a given colour replaces them
+    scene, store = build(tmp_path / "b.ply", tmp_path, rgba=(0, 1, 0, 1))
     assert decode_mesh(store.get(scene.spec.meshes[0].levels[0].address)).color is None
     assert scene.spec.visuals[0].rgba == (0.0, 1.0, 0.0, 1.0)
 
 
-def test_what_a_material_does_not_say_is_not_made_up(tmp_path: Path) -> None:
+def test_missing_material_values_are_not_invented(tmp_path: Path) -> None:
     """A texture is not darkened, and a URDF colours a mesh that has coordinates but no material."""
     path = write_obj(tmp_path)
     (tmp_path / "parts.mtl").write_text("newmtl painted\nmap_Kd picture.png\n")
-    looks = {node.name: node.surfaces[0].appearance for node in load_file(path).nodes}
-    painted = next(look for look in looks.values() if look is not None and look.images)
+    appearances = {node.name: node.surfaces[0].appearance for node in load_file(path).nodes}
+    painted = next(appearance for appearance in appearances.values() if appearance is not None and appearance.images)
     assert painted.rgba == (1.0, 1.0, 1.0, 1.0)
     (tmp_path / "bare.obj").write_text(OBJ.replace("mtllib parts.mtl\n", "").replace("f 1 2 3\n", ""))
     (node,) = load_file(tmp_path / "bare.obj").nodes
@@ -178,67 +178,67 @@ def test_what_a_material_does_not_say_is_not_made_up(tmp_path: Path) -> None:
     assert node.surfaces[0].mesh.uv is not None
 
 
-def test_numbers_of_a_material_that_are_none_are_left_out(tmp_path: Path) -> None:
+def test_invalid_material_numbers_are_left_out(tmp_path: Path) -> None:
     """Clients and the picture of a recording would draw nothing of the scene."""
     path = write_obj(tmp_path)
     (tmp_path / "parts.mtl").write_text(MTL.replace("d 0.4", "d nan\nNs nan\nKs nan nan nan"))
-    scene, _ = built(path, tmp_path)
+    scene, _ = build(path, tmp_path)
     visual = next(visual for visual in scene.spec.visuals if visual.name == "red")
     assert visual.rgba == pytest.approx((0.8, 0.2, 0.2, 1.0), abs=0.003)
     assert visual.material == -1 or scene.spec.materials[visual.material].specular == 0.5
 
 
-def test_what_is_missing_is_told(tmp_path: Path) -> None:
+def test_missing_references_are_reported(tmp_path: Path) -> None:
     path = write_obj(tmp_path)
     (tmp_path / "picture.png").unlink()
-    scene, _ = built(path, tmp_path)
-    assert any("picture.png: there is no file" in line for line in scene.skipped)
+    scene, _ = build(path, tmp_path)
+    assert any("picture.png: " in line for line in scene.skipped)
     (tmp_path / "parts.mtl").write_text(MTL.replace("picture.png", "../../etc/passwd"))
-    scene, _ = built(path, tmp_path)
-    assert any("outside of its own folders" in line for line in scene.skipped)
+    scene, _ = build(path, tmp_path)
+    assert any("outside of" in line for line in scene.skipped)
 
 
 @pytest.mark.parametrize(
     ("name", "data", "text"),
     [
         ("a.stl", b"", "is empty: 0 bytes"),
-        ("a.stl", b"solid x\nfacet", "is cut: an STL of text ends with endsolid"),
-        ("a.stl", b"\x89PNG", "is cut, or no STL"),
-        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 9\nend_header\n", "cut: its head says 9 lines, and it has 0"),
-        ("a.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "outside the range of its vertices"),
+        ("a.stl", b"solid x\nfacet", "endsolid"),
+        ("a.stl", b"\x89PNG", "no STL"),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 9\nend_header\n", "9 lines, .* 0"),
+        ("a.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "range of its vertices"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 nan\nf 1 2 3\n", "not finite"),
         ("a.dae", b"<COLLADA>", "is cut: it ends in line 1, without </COLLADA>"),
         ("a.dae", b"<!DOCTYPE COLLADA [<!ENTITY a SYSTEM 'file:///etc/passwd'>]><COLLADA/>", "has a DOCTYPE"),
-        ("a.dae", "<COLLADA/>".encode("utf-16"), "no XML in UTF-8"),
-        ("a.dae", b"<?xml version='1.0' encoding='UTF-7'?><COLLADA/>", "no XML in UTF-8"),
-        ("a.3mf", b"PK\3\4", "is cut, or no 3MF"),
+        ("a.dae", "<COLLADA/>".encode("utf-16"), "UTF-8"),
+        ("a.dae", b"<?xml version='1.0' encoding='UTF-7'?><COLLADA/>", "UTF-8"),
+        ("a.3mf", b"PK\3\4", "no 3MF"),
         ("a.glb", b"glTF", "cut"),
         ("a.glb", b"", "is empty: 0 bytes"),
-        ("a.glb", b"\x89PNG", "no GLB: it begins with .* where b'glTF' is needed"),
+        ("a.glb", b"\x89PNG", "no GLB: .*b'glTF'"),
         ("a.gltf", b"[]", "no glTF"),
         ("a.gltf", b"{", "no glTF"),
         ("a.step", b"x", r"are not read\. These are: glb, .*, stl; urdf by add_urdf; mjb, mjcf, xml by Session"),
         ("a", b"x", "no ending"),
-        ("a.urdf", b"<robot/>", "a URDF is a robot: use add_urdf"),
+        ("a.urdf", b"<robot/>", "use add_urdf"),
         ("a.xml", b"<mujoco/>", r"are MuJoCo's: Session\('a\.xml'\) shares one"),
         ("a.urdf.xacro", b"<robot/>", r"xacro a\.urdf\.xacro > a\.urdf \(ROS has it; else pip install xacro\)"),
     ],
 )
-def test_what_is_no_such_file_is_refused(tmp_path: Path, name: str, data: bytes, text: str) -> None:
+def test_invalid_files_are_rejected(tmp_path: Path, name: str, data: bytes, text: str) -> None:
     (tmp_path / name).write_bytes(data)
     with pytest.raises(SceneBuildError, match=text):
         load_file(tmp_path / name)
 
 
-def test_a_mistake_of_ours_is_not_only_told_as_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A reader of ours that stops is named; what a library stops at says nothing to anybody."""
+def test_own_bug_is_not_only_reported_as_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An exception of our readers is named; one of a library is not."""
     monkeypatch.setattr("iris_session.scene.importers.trimesh_files.read_with_trimesh", wrong_reader)
     monkeypatch.setattr("iris_session.scene.importers.files._ROOM", Path(__file__).parent)
     (tmp_path / "a.stl").write_bytes(b"solid a")
-    with pytest.raises(SceneBuildError, match=r"^.{,500}please report: TypeError: .{,200}, test_files\.py:\d+\)$"):
+    with pytest.raises(SceneBuildError, match=r"^.{,500}report: TypeError: .{,200}, test_files\.py:\d+\)$"):
         load_file(tmp_path / "a.stl")
     monkeypatch.setattr("iris_session.scene.importers.files._ROOM", tmp_path)
-    with pytest.raises(SceneBuildError, match=r"export or download it again$"):
+    with pytest.raises(SceneBuildError, match=r"download it again$"):
         load_file(tmp_path / "a.stl")
 
 
@@ -246,11 +246,11 @@ def wrong_reader(*_: object) -> None:
     raise TypeError("'float' object\nis not iterable" + "!" * 1000)
 
 
-def test_missing_and_large_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_and_large_files_are_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(SceneBuildError, match="no such file"):
         load_file(tmp_path / "lost.stl")
     (tmp_path / "folder.stl").mkdir()
-    with pytest.raises(SceneBuildError, match=r"is a folder: name a file; none in it is of a kind .* \(3mf, "):
+    with pytest.raises(SceneBuildError, match=r"is a folder: .* \(3mf, "):
         load_file(tmp_path / "folder.stl")
     with (tmp_path / "large.stl").open("wb") as file:
         file.truncate(MAX_FILE_BYTES + 1)
@@ -259,16 +259,14 @@ def test_missing_and_large_files_are_refused(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr("iris_session.scene.importers.xml_files.MAX_FILE_BYTES", 4 << 20)
     with zipfile.ZipFile(tmp_path / "bomb.3mf", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("a", bytes(5 << 20))
-    with pytest.raises(SceneBuildError, match="unpacks to 5 MiB, at most 4 are read"):
+    with pytest.raises(SceneBuildError, match="5 MiB, at most 4"):
         load_file(tmp_path / "bomb.3mf")
 
 
 @pytest.mark.parametrize(
     ("package", "name"), [("trimesh", "a.stl"), ("collada", "a.dae"), ("yourdfpy", "a.urdf"), ("PIL", "a.png")]
 )
-def test_what_is_not_installed_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str, name: str
-) -> None:
+def test_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str, name: str) -> None:
     (tmp_path / name).write_bytes(b"<robot name='r'><link name='a'/></robot>")
     monkeypatch.setitem(sys.modules, package, None)
     scene = SceneBuilder()
@@ -296,7 +294,7 @@ def test_folders_that_belong_to_a_file(tmp_path: Path) -> None:
     assert references.find(f"file://{package}/meshes/a b.stl") == package / "meshes/a b.stl"
     assert references.find("package://package/meshes/a b.stl") == package / "meshes/a b.stl"
     for outside in ("../secret/a.stl", "../../other/a.stl", "meshes/a.stl", "/etc/passwd", "file:///etc/passwd"):
-        with pytest.raises(SceneBuildError, match="outside of its own folders"):
+        with pytest.raises(SceneBuildError, match="outside of"):
             references.find(outside)
     for wrong in ("package://package/../other/a.stl", "package://../other/a.stl", "package:///etc/passwd"):
         with pytest.raises(SceneBuildError, match="package"):
@@ -310,8 +308,23 @@ def test_folders_that_belong_to_a_file(tmp_path: Path) -> None:
         References(model, [tmp_path / "lost"])
 
 
-def test_a_folder_is_no_package_because_of_its_name(tmp_path: Path) -> None:
-    """A downloaded URDF must not show everybody what lies beside the folder of downloads."""
+def test_a_file_among_downloads_does_not_reach_the_users_images(tmp_path: Path) -> None:
+    home = tmp_path / "ann"
+    for folder in ("Downloads", "images", "franka/urdf", "franka/images"):
+        (home / folder).mkdir(parents=True)
+    for path in ("images/private.png", "Downloads/own.png", "franka/images/skin.png"):
+        (home / path).write_bytes(b"x")
+    references = References(home / "Downloads" / "robot.urdf")
+    assert references.find("own.png") == home / "Downloads/own.png"
+    with pytest.raises(SceneBuildError, match="outside of its own folders"):
+        references.find("../images/private.png")
+    assert References(home / "franka/urdf/robot.urdf").find("../images/skin.png") == home / "franka/images/skin.png"
+    given = References(home / "Downloads" / "robot.urdf", [home / "images"])
+    assert given.find("../images/private.png") == home / "images/private.png"
+
+
+def test_folder_needs_a_manifest_to_be_a_package(tmp_path: Path) -> None:
+    """A downloaded URDF must not expose files beside the downloads folder."""
     home = tmp_path / "ann"
     for folder in ("Downloads", "Pictures", ".ssh", "gripper"):
         (home / folder).mkdir(parents=True)
@@ -321,7 +334,7 @@ def test_a_folder_is_no_package_because_of_its_name(tmp_path: Path) -> None:
     model.write_text("")
     names = ("Pictures/private.png", ".ssh/key", "ann/Pictures/private.png", "gripper/a.stl")
     for name in names:
-        with pytest.raises(SceneBuildError, match=r"no package\.xml, so it is no package; name the package's folder"):
+        with pytest.raises(SceneBuildError, match=r"no package\.xml"):
             References(model).find(f"package://{name}")
     (home / "gripper" / "package.xml").write_text("<package><name>gripper</name></package>")
     assert References(model).find("package://gripper/a.stl") == home / "gripper" / "a.stl"

@@ -1,4 +1,4 @@
-"""Files that would cost everybody the scene: more than memory holds, and what cannot be sent."""
+"""Files that would cost more than memory holds, and content that cannot be sent."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.scene.importers.test_files import write_obj
 PIXELS = np.random.default_rng(3).integers(0, 255, (8, 16, 3), dtype=np.uint8)
 
 
-def test_many_large_images_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_large_images_are_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("iris_session.scene.images.MAX_FILE_PIXELS", 3 * 8 * 16)
     document = Document()
     for _ in range(4):
@@ -31,21 +31,21 @@ def test_many_large_images_are_refused(tmp_path: Path, monkeypatch: pytest.Monke
         document.square(material)
     SceneBuilder().add_file(document.write(tmp_path / "a.glb"))
     document.square(3)
-    with pytest.raises(SceneBuildError, match="more than 384 pixels together"):
+    with pytest.raises(SceneBuildError, match="more than 384 pixels"):
         SceneBuilder().add_file(document.write(tmp_path / "b.glb"))
 
 
-def test_a_large_picture_is_refused_whoever_opens_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_picture_is_rejected_in_every_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_obj(tmp_path)
     monkeypatch.setattr("iris_session.scene.images.MAX_PIXELS", 4 * 8 - 1)
-    with pytest.raises(SceneBuildError, match=r"a picture of parts\.obj has 8 x 4 pixels, at most 31"):
+    with pytest.raises(SceneBuildError, match=r"parts\.obj has 8 x 4 .*31"):
         SceneBuilder().add_file(path)
     with pytest.raises(SceneBuildError, match="has 8 x 4 pixels"):
         SceneBuilder().add_box(half_size=(1, 1, 1), texture=tmp_path / "picture.png")
 
 
-def test_names_that_cannot_be_sent_are_changed(tmp_path: Path) -> None:
-    """JSON may hold half of a character."""
+def test_names_that_cannot_be_sent_are_replaced(tmp_path: Path) -> None:
+    """JSON may contain lone surrogates."""
     document = Document()
     document.square()
     document.json["nodes"] = [{"mesh": 0, "name": "half \ud800"}, {"mesh": 0, "name": "table"}]
@@ -55,14 +55,14 @@ def test_names_that_cannot_be_sent_are_changed(tmp_path: Path) -> None:
     assert names[-2:] == ["half ?", "table"]
 
 
-def test_pictures_of_any_file_count_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_of_all_files_count_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where many materials name one picture: an OBJ file opens it for each."""
     path = write_obj(tmp_path)
     material = "newmtl {}\nKd 1 1 1\nmap_Kd picture.png\n"
     (tmp_path / "parts.mtl").write_text(material.format("red") + material.format("painted"))
     load_file(path)
     monkeypatch.setattr("iris_session.scene.images.MAX_FILE_PIXELS", 2 * 4 * 8 - 1)
-    with pytest.raises(SceneBuildError, match=r"the images of parts\.obj have more than 63 pixels together"):
+    with pytest.raises(SceneBuildError, match=r"parts\.obj .* 63 pixels"):
         load_file(path)
     textures = "".join(
         f'<link name="l{k}"><visual><geometry><box size="1 1 1"/></geometry><material name="m{k}">'
@@ -73,17 +73,17 @@ def test_pictures_of_any_file_count_together(tmp_path: Path, monkeypatch: pytest
     for k in range(2):
         (tmp_path / f"{k}.png").write_bytes((tmp_path / "picture.png").read_bytes())
     (tmp_path / "a.urdf").write_text(f'<robot name="a">{textures}</robot>')
-    with pytest.raises(SceneBuildError, match=r"the images of a\.urdf have more than 63"):
+    with pytest.raises(SceneBuildError, match=r"a\.urdf .* 63"):
         SceneBuilder().add_urdf(tmp_path / "a.urdf")
 
 
-def test_numbers_without_bytes_are_bounded(tmp_path: Path) -> None:
+def test_accessors_without_bytes_are_bounded(tmp_path: Path) -> None:
     """As doubles they would be eight times as large."""
     document = Document()
     document.square()
     document.json["accessors"].append({"componentType": 5121, "count": 100_000_000, "type": "VEC4", "normalized": True})
     document.json["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = len(document.json["accessors"]) - 1
-    with pytest.raises(SceneBuildError, match="has 100000000 entries without bytes"):
+    with pytest.raises(SceneBuildError, match="100000000 entries"):
         SceneBuilder().add_file(document.write(tmp_path / "a.glb"))
 
 
@@ -98,24 +98,24 @@ def test_copies_in_many_scales_are_bounded(tmp_path: Path, monkeypatch: pytest.M
         if alike:
             assert len(scene.build(store).spec.meshes) == 1
             continue
-        with pytest.raises(SceneBuildError, match="in so many scales that they have over 10 triangles"):
+        with pytest.raises(SceneBuildError, match="over 10 triangles"):
             scene.build(store)
 
 
-def test_a_file_is_added_whole_or_not_at_all(tmp_path: Path) -> None:
+def test_file_is_added_completely_or_not_at_all(tmp_path: Path) -> None:
     document = Document()
     document.square()
     far = {"mesh": 0, "scale": [1e200, 1e200, 1e200]}
     document.json["nodes"] = [{"mesh": 0}, {**far, "children": [2]}, far]
     path, scene = document.write(tmp_path / "a.glb"), SceneBuilder()
     before = scene.build(AssetStore(tmp_path / "store")).scene_hash
-    with pytest.raises(SceneBuildError, match="a place in the file is not finite"):
+    with pytest.raises(SceneBuildError, match="not finite"):
         scene.add_file(path, name="part", movable=True)
     assert scene.build(AssetStore(tmp_path / "store")).scene_hash == before
     assert scene.add_box("part", half_size=(1, 1, 1), movable=True) == "part", "the name is free"
 
 
-def test_cameras_that_see_nothing_are_told(tmp_path: Path) -> None:
+def test_degenerate_cameras_are_reported(tmp_path: Path) -> None:
     document = Document()
     document.square()
     lens = {"yfov": 0.0}
@@ -126,23 +126,23 @@ def test_cameras_that_see_nothing_are_told(tmp_path: Path) -> None:
         scene = SceneBuilder()
         scene.add_file(document.write(tmp_path / "a.glb"))
         made = scene.build(AssetStore(tmp_path / "store"))
-        assert any("camera 'eye': its angle of view" in line for line in made.skipped) == skipped
+        assert any("camera 'eye'" in line for line in made.skipped) == skipped
         assert len(made.spec.cameras) == (0 if skipped else 1)
 
 
-def test_pictures_that_other_programs_would_have_to_read_are_refused(tmp_path: Path) -> None:
-    """Pillow gives PostScript to Ghostscript, by its content and not by the name of the file."""
+def test_pictures_that_need_external_programs_are_rejected(tmp_path: Path) -> None:
+    """Pillow passes PostScript to Ghostscript, by content and not by file name."""
     path = write_obj(tmp_path)
     picture = tmp_path / "picture.png"
     Image.fromarray(PIXELS).save(tmp_path / "a.eps")
     picture.write_bytes((tmp_path / "a.eps").read_bytes())
-    with pytest.raises(SceneBuildError, match="in the form EPS; PNG, JPEG"):
+    with pytest.raises(SceneBuildError, match="EPS; PNG, JPEG"):
         load_file(path)
-    with pytest.raises(SceneBuildError, match="no image that can be read"):
+    with pytest.raises(SceneBuildError, match="no image"):
         SceneBuilder().add_box(half_size=(1, 1, 1), texture=picture)
 
 
-def test_lengths_beyond_all_reach_are_refused_without_a_warning(tmp_path: Path) -> None:
+def test_excessive_lengths_are_rejected_without_a_warning(tmp_path: Path) -> None:
     store = AssetStore(tmp_path)
     scene = SceneBuilder()
     scene.add_sphere(radius=1e200, quaternion=(0.5, 0.5, 0.5, 0.5))
@@ -153,11 +153,11 @@ def test_lengths_beyond_all_reach_are_refused_without_a_warning(tmp_path: Path) 
     document.json["nodes"] = [{"mesh": 0, "scale": [1e300, 1e300, 1e300]}]
     scene = SceneBuilder()
     scene.add_file(document.write(tmp_path / "a.glb"))
-    with pytest.raises(SceneBuildError, match="reaches farther than 1,000,000 m"):
+    with pytest.raises(SceneBuildError, match="farther than 1,000,000 m"):
         scene.build(store)
 
 
-def test_bounds_are_those_of_a_whole_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limits_apply_to_the_whole_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     document = Document()
     for _ in range(3):
         document.square()
@@ -182,5 +182,5 @@ def test_bounds_are_those_of_a_whole_file(tmp_path: Path, monkeypatch: pytest.Mo
         if fits:
             load_file(tmp_path / "b.gltf")
         else:
-            with pytest.raises(SceneBuildError, match="draws in more than"):
+            with pytest.raises(SceneBuildError, match="more than"):
                 load_file(tmp_path / "b.gltf")

@@ -1,4 +1,4 @@
-"""URDF: links where MuJoCo and yourdfpy have them, the same picture as MuJoCo's, and faults that are named."""
+"""URDF: links at the poses of MuJoCo and yourdfpy, the same picture as MuJoCo's, and named faults."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from iris_session.scene.composed import ComposedScene
 from iris_session.scene.elements import to_matrix
 from iris_session.scene.extent import compute_extent
 from tests.scene.arm import FREE, JOINTS, write_arm
-from tests.scene.pictures import Artist, cameras, graphics, silhouette_iou
+from tests.scene.pictures import ModelRenderer, cameras, graphics, silhouette_iou
 from tests.scene.rebuild import rebuild
 
 FOLLOWS = {"finger_right": ("finger_left", 0.5, 0.01)}
 
 
 def positions(seed: int) -> dict[str, float]:
-    """Random positions of the joints that can be set."""
+    """Return random positions of the joints that can be set."""
     rng = np.random.default_rng(seed)
     return {name: rng.uniform(-3 if low is None else low, 3 if high is None else high) for name, _, low, high in JOINTS}
 
@@ -44,7 +44,7 @@ def difference(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     return float(np.abs(a - b).max())
 
 
-def test_links_are_where_mujoco_and_yourdfpy_have_them(tmp_path: Path) -> None:
+def test_links_agree_with_mujoco_and_yourdfpy(tmp_path: Path) -> None:
     urdf = write_arm(tmp_path)
     arm = composed(urdf, tmp_path).articulations["arm"]
     model = mujoco.MjModel.from_xml_path(str(_beside_meshes(urdf)))
@@ -69,13 +69,13 @@ def test_links_are_where_mujoco_and_yourdfpy_have_them(tmp_path: Path) -> None:
 
 
 def _beside_meshes(urdf: Path) -> Path:
-    """The same file where MuJoCo finds its meshes: it strips paths, and searches below the model's own folder."""
+    """Write the same file where MuJoCo finds its meshes: it strips paths, and searches below the model's own folder."""
     copy = urdf.parents[1] / "arm.urdf"
     copy.write_text(urdf.read_text())
     return copy
 
 
-def test_joints_bodies_and_what_they_follow(tmp_path: Path) -> None:
+def test_joints_bodies_and_followers(tmp_path: Path) -> None:
     scene = composed(write_arm(tmp_path), tmp_path, position=(1, 2, 3))
     arm = scene.articulations["arm"]
     assert tuple(joint.name for joint in arm.joints) == FREE
@@ -83,7 +83,7 @@ def test_joints_bodies_and_what_they_follow(tmp_path: Path) -> None:
     by_name = {joint.name: joint for joint in arm.joints}
     assert (by_name["bend"].low, by_name["bend"].high, by_name["bend"].rest) == (0.3, 2.5, 0.3)
     assert by_name["twist"].high == float("inf")
-    # the sensor and the hand are fixed: they have no body of their own
+    # sensor and hand are fixed: they have no body of their own
     assert arm.bodies == scene.moving
     assert arm.bodies[0] == "arm/base"
     assert {"arm/sensor", "arm/hand"}.isdisjoint(arm.bodies)
@@ -93,11 +93,11 @@ def test_joints_bodies_and_what_they_follow(tmp_path: Path) -> None:
     colours = {visual.name: visual.rgba for visual in scene.spec.visuals}
     assert colours["link2"] == (0.9, 0.5, 0.1, 1.0)
     assert colours["finger_left"] == (0.5, 0.5, 0.5, 1.0)
-    assert len(scene.spec.meshes) == 2  # the six links wear one
+    assert len(scene.spec.meshes) == 2  # the six links use one
     assert scene.skipped == ()
 
 
-def test_a_joint_may_follow_one_that_follows_in_turn(tmp_path: Path) -> None:
+def test_joint_may_follow_a_follower(tmp_path: Path) -> None:
     links = "".join(f'<link name="l{k}"/>' for k in range(4))
     joints = "".join(
         f'<joint name="j{k}" type="prismatic"><parent link="l0"/><child link="l{k}"/><axis xyz="0 0 1"/>'
@@ -115,7 +115,7 @@ def test_a_joint_may_follow_one_that_follows_in_turn(tmp_path: Path) -> None:
     assert at == {"arm/l0": 0.0, "arm/l1": pytest.approx(6.31), "arm/l2": pytest.approx(2.1), "arm/l3": 1.0}
 
 
-def test_a_joint_without_end_has_no_limits_whatever_the_file_says(tmp_path: Path) -> None:
+def test_continuous_joint_has_no_limits(tmp_path: Path) -> None:
     (tmp_path / "a.urdf").write_text(
         '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="continuous"><parent link="a"/>'
         '<child link="b"/><axis xyz="0 0 1"/><limit lower="0" upper="0" effort="1" velocity="1"/></joint></robot>'
@@ -124,8 +124,8 @@ def test_a_joint_without_end_has_no_limits_whatever_the_file_says(tmp_path: Path
     assert (joint.low, joint.high) == (-float("inf"), float("inf"))
 
 
-def test_meshes_in_millimetres_are_that_small(tmp_path: Path) -> None:
-    trimesh.creation.box((1000, 2000, 3000)).export(tmp_path / "box.3mf")  # which counts in them
+def test_meshes_in_millimetres_are_scaled(tmp_path: Path) -> None:
+    trimesh.creation.box((1000, 2000, 3000)).export(tmp_path / "box.3mf")  # which uses them
     (tmp_path / "a.urdf").write_text(
         '<robot name="r"><link name="base"><visual><geometry><mesh filename="box.3mf" scale="2 2 2"/></geometry>'
         "</visual></link></robot>"
@@ -134,16 +134,16 @@ def test_meshes_in_millimetres_are_that_small(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.subtract(mesh.high, mesh.low), (2.0, 4.0, 6.0), atol=1e-5)
 
 
-def test_picture_is_mujocos(tmp_path: Path) -> None:
+def test_picture_agrees_with_mujoco(tmp_path: Path) -> None:
     urdf = write_arm(tmp_path)
     scene = SceneBuilder("arm")
     scene.add_urdf(urdf, name="arm")
     store = AssetStore(tmp_path / "store")
     ours = rebuild(store.get(scene.build(store).scene_hash), store)
     theirs = mujoco.MjModel.from_xml_path(str(_beside_meshes(urdf)))
-    rest = {"bend": 0.3, "finger_right": 0.01}  # ours stand as near to 0 as limits and what they follow allow
+    rest = {"bend": 0.3, "finger_right": 0.01}  # our joints are as close to 0 as limits and followers allow
     with graphics():
-        a, b = Artist(ours), Artist(theirs)
+        a, b = ModelRenderer(ours), ModelRenderer(theirs)
         for name, value in rest.items():
             b.data.qpos[theirs.joint(name).qposadr[0]] = value
         mujoco.mj_forward(theirs, b.data)
@@ -157,24 +157,24 @@ def test_picture_is_mujocos(tmp_path: Path) -> None:
     ("before", "after", "text"),
     [
         ('type="continuous"', 'type="magic"', "type 'magic'"),
-        ('<child link="link2"/>', '<child link="link9"/>', "'link9', which is not there"),
-        ('<child link="link2"/>', '<child link="link1"/>', "hangs on two joints, lift and twist: a URDF is a tree"),
-        ('<child link="link0"/>', '<child link="base"/>', "the joints turn make a loop: a URDF is a tree"),
-        ('<parent link="base"/>', '<parent link="link3"/>', "the joints lift, twist, bend, turn make a loop"),
-        ('<link name="base">', '<link name="stand"/><link name="base">', r"2 links hang on no joint \(stand, base\)"),
+        ('<child link="link2"/>', '<child link="link9"/>', "'link9'"),
+        ('<child link="link2"/>', '<child link="link1"/>', "two joints, lift and twist"),
+        ('<child link="link0"/>', '<child link="base"/>', "joints turn make a loop"),
+        ('<parent link="base"/>', '<parent link="link3"/>', "joints lift, twist, bend, turn make a loop"),
+        ('<link name="base">', '<link name="stand"/><link name="base">', r"2 links .*\(stand, base\)"),
         ('joint="finger_left" mult', 'joint="flange" mult', "which does not move"),
         ('joint="finger_left" mult', 'joint="finger_right" mult', "follows it in turn"),
         ("meshes/link.stl", "meshes/lost.stl", "lost.stl"),
         ("package://arm_description/", "package://other/", "package_dirs"),
-        ("package://arm_description/meshes/link.stl", "../../../../../../etc/passwd", "outside of its own folders"),
+        ("package://arm_description/meshes/link.stl", "../../../../../../etc/passwd", "outside of"),
         ("package://arm_description/meshes/link.stl", "package://arm_description/../../x.stl", "package_dirs"),
-        ("package://arm_description/meshes/link.stl", "https://host/link.stl", "files are read, not addresses"),
-        ('xyz="0.1 1.0 0.5"', 'xyz="0 0 0"', "the axis of joint turn"),
-        ('xyz="0.1 1.0 0.5"', 'xyz="a b c"', "3 finite numbers must stand"),
+        ("package://arm_description/meshes/link.stl", "https://host/link.stl", "not addresses"),
+        ('xyz="0.1 1.0 0.5"', 'xyz="0 0 0"', "axis of joint turn"),
+        ('xyz="0.1 1.0 0.5"', 'xyz="a b c"', "3 finite numbers"),
         ('radius="0.1"', 'radius="-1"', "positive lengths"),
-        ('rgba="0.9 0.5', 'rgba="nan 0.5', "4 finite numbers must stand"),
+        ('rgba="0.9 0.5', 'rgba="nan 0.5', "4 finite numbers"),
         ("<robot", "<!DOCTYPE r [<!ENTITY a 'b'>]><robot", "DOCTYPE"),
-        ("</robot>", "", "is cut: it ends in line"),
+        ("</robot>", "", "ends in line"),
         ("</robot>", "\0</robot>", "no XML .*allowed range"),
         ('<link name="base">', "<link>", r"arm\.urdf, line 1: <link> has no name"),
         ('<joint name="turn" type="revolute">', '<joint name="turn">', "<joint> turn has no type"),
@@ -196,7 +196,7 @@ def test_faults_are_named(tmp_path: Path, before: str, after: str, text: str) ->
     assert "\n" not in str(raised.value)
 
 
-def test_what_is_not_drawn_is_told(tmp_path: Path) -> None:
+def test_parts_that_are_not_drawn_are_reported(tmp_path: Path) -> None:
     urdf = write_arm(tmp_path)
     changed = urdf.read_text().replace('<sphere radius="0.02"/>', '<capsule radius="0.02" length="1"/>', 1)
     changed = changed.replace('name="orange"/>', 'name="lost"/>')
@@ -207,7 +207,7 @@ def test_what_is_not_drawn_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["floating", "planar"])
-def test_what_is_free_is_a_body_of_its_own(tmp_path: Path, kind: str) -> None:
+def test_floating_link_is_a_body_of_its_own(tmp_path: Path, kind: str) -> None:
     urdf = write_arm(tmp_path)
     before = composed(urdf, tmp_path)
     urdf.write_text(urdf.read_text().replace('type="continuous"', f'type="{kind}"'))
@@ -227,7 +227,7 @@ def test_what_is_free_is_a_body_of_its_own(tmp_path: Path, kind: str) -> None:
         ("</link>", "</lynk>", r"arm\.urdf, line \d+: this is no XML \(Opening and ending tag mismatch: link line \d+"),
     ],
 )
-def test_what_does_not_parse_is_told_with_one_line_number(tmp_path: Path, before: str, after: str, text: str) -> None:
+def test_xml_faults_are_reported_with_one_line_number(tmp_path: Path, before: str, after: str, text: str) -> None:
     urdf = write_arm(tmp_path)
     urdf.write_text(urdf.read_text().replace(before, after, 1))
     with pytest.raises(SceneBuildError, match=text) as raised:
@@ -235,7 +235,7 @@ def test_what_does_not_parse_is_told_with_one_line_number(tmp_path: Path, before
     assert "<string>" not in str(raised.value)
 
 
-def test_prefixes_that_nobody_declared_are_left_out(tmp_path: Path) -> None:
+def test_undeclared_prefixes_are_left_out(tmp_path: Path) -> None:
     urdf = write_arm(tmp_path)
     before = composed(urdf, tmp_path)
     text = urdf.read_text().replace('effort="1"', 'effort="1" drake:acceleration="15"')
@@ -254,8 +254,8 @@ def test_collision_shapes_on_request(tmp_path: Path) -> None:
     assert len(composed(urdf, tmp_path, collisions=True).spec.visuals) == 11
 
 
-def test_a_robot_in_another_size(tmp_path: Path) -> None:
-    """Every place scales, joints keep their positions, what is drawn is the same picture."""
+def test_scaled_robot(tmp_path: Path) -> None:
+    """Every position scales, joints keep their positions, the picture is the same."""
     urdf = write_arm(tmp_path)
     whole, half = composed(urdf, tmp_path), composed(urdf, tmp_path, scale=0.5, position=(1, 0, 0))
     one, other = whole.articulations["arm"], half.articulations["arm"]
@@ -275,8 +275,8 @@ def test_a_robot_in_another_size(tmp_path: Path) -> None:
             composed(urdf, tmp_path, scale=wrong)
 
 
-def test_what_exporters_leave_empty_and_nobody_draws_is_no_fault(tmp_path: Path) -> None:
-    """As SolidWorks' exporter does: a texture without a file, a centre of mass of what has none."""
+def test_empty_exporter_elements_are_ignored(tmp_path: Path) -> None:
+    """As SolidWorks' exporter writes: a texture without a file, a centre of mass without mass."""
     urdf = tmp_path / "part.urdf"
     urdf.write_text(
         '<robot name="part"><link name="base"><inertial><origin xyz="nan nan nan" rpy="0 0 0"/><mass value="0"/>'
@@ -287,25 +287,25 @@ def test_what_exporters_leave_empty_and_nobody_draws_is_no_fault(tmp_path: Path)
     assert shown.rgba == (1.0, 0.0, 0.0, 1.0)
 
 
-def test_a_robot_without_a_name_is_called_as_its_file(tmp_path: Path) -> None:
+def test_robot_without_a_name_is_named_after_its_file(tmp_path: Path) -> None:
     urdf = write_arm(tmp_path)
     urdf.write_text(urdf.read_text().replace('<robot name="arm">', "<robot>"))
     assert SceneBuilder().add_urdf(urdf) == "arm"
 
 
-def test_xacro_is_to_be_expanded(tmp_path: Path) -> None:
+def test_xacro_must_be_expanded(tmp_path: Path) -> None:
     path = tmp_path / "arm.urdf.xacro"
     path.write_text("<robot/>")
     with pytest.raises(SceneBuildError, match=r"xacro arm\.urdf\.xacro > arm\.urdf"):
         SceneBuilder().add_urdf(path)
-    with pytest.raises(SceneBuildError, match="is a folder: name a file"):
+    with pytest.raises(SceneBuildError, match="is a folder"):
         SceneBuilder().add_urdf(tmp_path)
     (tmp_path / "part.glb").write_bytes(b"glTF")
-    with pytest.raises(SceneBuildError, match=r"part\.glb is no URDF: files that end in \.glb go with add_file"):
+    with pytest.raises(SceneBuildError, match=r"part\.glb .* add_file"):
         SceneBuilder().add_urdf(tmp_path / "part.glb")
 
 
-def test_what_cannot_be_set_is_refused(tmp_path: Path) -> None:
+def test_invalid_arguments_are_rejected(tmp_path: Path) -> None:
     arm = composed(write_arm(tmp_path), tmp_path).articulations["arm"]
     with pytest.raises(SceneBuildError, match="follows 'finger_left'"):
         arm.compute_poses({"finger_right": 0.0})
@@ -317,14 +317,14 @@ def test_what_cannot_be_set_is_refused(tmp_path: Path) -> None:
         arm.compute_poses({"lift": "high"})  # type: ignore[dict-item]
 
 
-def test_a_file_that_a_package_does_not_have_is_told_with_those_it_has(tmp_path: Path) -> None:
+def test_missing_package_file_lists_the_existing_ones(tmp_path: Path) -> None:
     """A typo; a reference that only xacro can expand."""
     package = tmp_path / "mybot"
     for folder in ("meshes", "urdf"):
         (package / folder).mkdir(parents=True)
     (package / "package.xml").write_text("<package><name>mybot</name></package>")
     (package / "meshes" / "base.stl").write_bytes(b"x")
-    for reference, says in (
+    for reference, reason in (
         (
             "package://mybot/meshes/bsae.stl",
             "package mybot is there, and has no file .*bsae.stl; in .*meshes: base.stl$",
@@ -336,5 +336,5 @@ def test_a_file_that_a_package_does_not_have_is_told_with_those_it_has(tmp_path:
     ):
         text = f'<robot name="r"><link name="a"><visual><geometry><mesh filename="{reference}"/></geometry></visual>'
         (package / "urdf" / "r.urdf").write_text(f"{text}</link></robot>")
-        with pytest.raises(SceneBuildError, match=says):
+        with pytest.raises(SceneBuildError, match=reason):
             SceneBuilder().add_urdf(package / "urdf" / "r.urdf")

@@ -238,6 +238,7 @@ namespace IrisSession.Protocol
         public const string UserOwned = "user_owned";
         public const string Policy = "policy";
         public const string Invalid = "invalid";
+        public const string Withdrawn = "withdrawn";
         public const string TooFar = "too_far";
     }
 
@@ -963,7 +964,7 @@ namespace IrisSession.Protocol
         }
     }
 
-    /// <summary>One of 28 messages, told apart by the field "type".</summary>
+    /// <summary>One of 29 messages, distinguished by the field "type".</summary>
     public abstract class ClientMessage : WireValue
     {
         public abstract string Tag { get; }
@@ -982,6 +983,7 @@ namespace IrisSession.Protocol
                 case Samples.TagName: return Samples.Read(reader);
                 case Acquire.TagName: return Acquire.Read(reader);
                 case Release.TagName: return Release.Read(reader);
+                case Withdraw.TagName: return Withdraw.Read(reader);
                 case Consent.TagName: return Consent.Read(reader);
                 case Assign.TagName: return Assign.Read(reader);
                 case SetMode.TagName: return SetMode.Read(reader);
@@ -1006,7 +1008,7 @@ namespace IrisSession.Protocol
         }
     }
 
-    /// <summary>One of 11 messages, told apart by the field "type".</summary>
+    /// <summary>One of 11 messages, distinguished by the field "type".</summary>
     public abstract class ServerMessage : WireValue
     {
         public abstract string Tag { get; }
@@ -1032,7 +1034,7 @@ namespace IrisSession.Protocol
         }
     }
 
-    /// <summary>One of 24 messages, told apart by the field "event".</summary>
+    /// <summary>One of 25 messages, distinguished by the field "event".</summary>
     public abstract class EventKind : WireValue
     {
         public abstract string Tag { get; }
@@ -1046,6 +1048,7 @@ namespace IrisSession.Protocol
                 case ParticipantChanged.TagName: return ParticipantChanged.Read(reader);
                 case ParticipantLeft.TagName: return ParticipantLeft.Read(reader);
                 case LeaseChanged.TagName: return LeaseChanged.Read(reader);
+                case LeasesChanged.TagName: return LeasesChanged.Read(reader);
                 case ConsentRequested.TagName: return ConsentRequested.Read(reader);
                 case Intervention.TagName: return Intervention.Read(reader);
                 case EngagementChanged.TagName: return EngagementChanged.Read(reader);
@@ -1071,7 +1074,7 @@ namespace IrisSession.Protocol
         }
     }
 
-    /// <summary>One of 5 messages, told apart by the field "op".</summary>
+    /// <summary>One of 5 messages, distinguished by the field "op".</summary>
     public abstract class PatchOp : WireValue
     {
         public abstract string Tag { get; }
@@ -1859,6 +1862,55 @@ namespace IrisSession.Protocol
             writer.Write(T_world_anchor);
             writer.Write("size_m");
             writer.Write(SizeM);
+        }
+    }
+
+    /// <summary>
+    /// One e-stop that is in force: its number, and who stopped the session age_ns ago, for which reason.
+    ///
+    /// participant, name: empty for a connection that had not joined.
+    /// </summary>
+    public sealed class StopReport : WireValue
+    {
+        public long StopSeq = 0;
+        public string Participant = "";
+        public string Name = "";
+        public string Reason = "";
+        public long AgeNs = 0;
+
+        public static StopReport Read(WireReader reader)
+        {
+            StopReport value = new StopReport();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "stop_seq": value.StopSeq = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
+                    case "participant": value.Participant = reader.ReadString(64); seen |= 2u; break;
+                    case "name": value.Name = reader.ReadString(64); seen |= 4u; break;
+                    case "reason": value.Reason = reader.ReadString(512); seen |= 8u; break;
+                    case "age_ns": value.AgeNs = reader.ReadLong(long.MinValue, long.MaxValue); seen |= 16u; break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 31u) != 31u) throw new WireException("missing field of StopReport");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(5);
+            writer.Write("stop_seq");
+            writer.Write(StopSeq);
+            writer.Write("participant");
+            writer.Write(Participant);
+            writer.Write("name");
+            writer.Write(Name);
+            writer.Write("reason");
+            writer.Write(Reason);
+            writer.Write("age_ns");
+            writer.Write(AgeNs);
         }
     }
 
@@ -2663,6 +2715,46 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
+    /// Take back the acquire with this request id. It is denied (withdrawn, with its place in the queue and the
+    /// holder); if it was granted before, what it has granted is released.
+    /// </summary>
+    public sealed class Withdraw : ClientMessage
+    {
+        public const string TagName = "withdraw";
+        public override string Tag { get { return TagName; } }
+        public long RequestId = 0;
+        public long AcquireRequestId = 0;
+
+        public static Withdraw Read(WireReader reader)
+        {
+            Withdraw value = new Withdraw();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
+                    case "acquire_request_id": value.AcquireRequestId = reader.ReadLong(0, long.MaxValue); seen |= 2u; break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 3u) != 3u) throw new WireException("missing field of Withdraw");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(3);
+            writer.Write("type");
+            writer.Write(TagName);
+            writer.Write("request_id");
+            writer.Write(RequestId);
+            writer.Write("acquire_request_id");
+            writer.Write(AcquireRequestId);
+        }
+    }
+
+    /// <summary>
     /// Answer of a holder or director to a ConsentRequested event (mode request).
     /// </summary>
     public sealed class Consent : ClientMessage
@@ -3209,13 +3301,15 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// End the e-stop. Directors only.
+    /// End the e-stop. Directors only. stop_seq: the newest stop that the sender has seen (EStopChanged); denied
+    /// when there is a newer one.
     /// </summary>
     public sealed class ClearEStop : ClientMessage
     {
         public const string TagName = "clear_estop";
         public override string Tag { get { return TagName; } }
         public long RequestId = 0;
+        public long StopSeq = 0;
 
         public static ClearEStop Read(WireReader reader)
         {
@@ -3226,6 +3320,7 @@ namespace IrisSession.Protocol
                 switch (reader.ReadString())
                 {
                     case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
+                    case "stop_seq": value.StopSeq = reader.ReadLong(0, long.MaxValue); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -3235,17 +3330,19 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(2);
+            writer.WriteMapHeader(3);
             writer.Write("type");
             writer.Write(TagName);
             writer.Write("request_id");
             writer.Write(RequestId);
+            writer.Write("stop_seq");
+            writer.Write(StopSeq);
         }
     }
 
     /// <summary>
     /// Control the session, ControlAction: pause, resume, step (ticks physics ticks while paused), reset. Directors
-    /// only.
+    /// only. When physics has diverged, both reset and resume begin anew from the initial state.
     /// </summary>
     public sealed class Control : ClientMessage
     {
@@ -3909,8 +4006,9 @@ namespace IrisSession.Protocol
     /// Everything a late joiner needs; events with event_seq at or below its own are to be discarded.
     ///
     /// In the step of a reset tick and sim_time are still those before it. tick_period_ns: of this scene; 0: that of
-    /// Welcome. Bulk frame 1 (added by the front): float64 (n_bodies, 7) world poses x y z qw qx qy qz of bodies at
-    /// state_seq.
+    /// Welcome. stop_seq: of the newest stop (EStopChanged). consent_timeout_ns: time that a holder has to answer
+    /// ConsentRequested. Bulk frame 1 (added by the front): float64 (n_bodies, 7) world poses x y z qw qx qy qz of
+    /// bodies at state_seq.
     /// </summary>
     public sealed class Snapshot : ServerMessage
     {
@@ -3933,6 +4031,8 @@ namespace IrisSession.Protocol
         public EpisodeChanged Episode = null;
         public long StateSeq = 0;
         public long TickPeriodNs = 0;
+        public long StopSeq = 0;
+        public long ConsentTimeoutNs = 0;
 
         public static Snapshot Read(WireReader reader)
         {
@@ -3959,6 +4059,8 @@ namespace IrisSession.Protocol
                     case "episode": value.Episode = reader.TryReadNil() ? null : EpisodeChanged.Read(reader); break;
                     case "state_seq": value.StateSeq = reader.ReadLong(0, long.MaxValue); break;
                     case "tick_period_ns": value.TickPeriodNs = reader.ReadLong(long.MinValue, long.MaxValue); break;
+                    case "stop_seq": value.StopSeq = reader.ReadLong(0, long.MaxValue); break;
+                    case "consent_timeout_ns": value.ConsentTimeoutNs = reader.ReadLong(long.MinValue, long.MaxValue); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -3968,7 +4070,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(18);
+            writer.WriteMapHeader(20);
             writer.Write("type");
             writer.Write(TagName);
             writer.Write("request_id");
@@ -4005,6 +4107,10 @@ namespace IrisSession.Protocol
             writer.Write(StateSeq);
             writer.Write("tick_period_ns");
             writer.Write(TickPeriodNs);
+            writer.Write("stop_seq");
+            writer.Write(StopSeq);
+            writer.Write("consent_timeout_ns");
+            writer.Write(ConsentTimeoutNs);
         }
     }
 
@@ -4058,7 +4164,8 @@ namespace IrisSession.Protocol
     /// last five seconds; null below 25 states in them. drops: by reason, all messages dropped anywhere. restarts: of
     /// front and recorder. authority_silent_ns: since the authority's last message to the front; its part (ticks, roster,
     /// robots, recorder) is as old. -1: it has sent none yet. cpu_share: of one processor, by the authority's process;
-    /// load: of the machine, over a minute.
+    /// load: of the machine, over a minute. stops: the e-stops in force, newest first, the newest of each participant.
+    /// pause_reason: why physics stands still until a reset, empty otherwise.
     /// </summary>
     public sealed class StatusReport : ServerMessage
     {
@@ -4096,6 +4203,8 @@ namespace IrisSession.Protocol
         public AnchorReport[] Anchors = new AnchorReport[0];
         public CrossCheckReport[] CrossChecks = new CrossCheckReport[0];
         public AssetsReport Assets = null;
+        public StopReport[] Stops = new StopReport[0];
+        public string PauseReason = "";
 
         public static StatusReport Read(WireReader reader)
         {
@@ -4137,6 +4246,8 @@ namespace IrisSession.Protocol
                     case "anchors": value.Anchors = reader.ReadArray(Protocol.AnchorReport.Read, 0); break;
                     case "cross_checks": value.CrossChecks = reader.ReadArray(Protocol.CrossCheckReport.Read, 0); break;
                     case "assets": value.Assets = reader.TryReadNil() ? null : AssetsReport.Read(reader); break;
+                    case "stops": value.Stops = reader.ReadArray(Protocol.StopReport.Read, 0); break;
+                    case "pause_reason": value.PauseReason = reader.ReadString(512); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -4146,7 +4257,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(33);
+            writer.WriteMapHeader(35);
             writer.Write("type");
             writer.Write(TagName);
             writer.Write("request_id");
@@ -4213,6 +4324,10 @@ namespace IrisSession.Protocol
             writer.Write(CrossChecks);
             writer.Write("assets");
             writer.Write(Assets);
+            writer.Write("stops");
+            writer.Write(Stops);
+            writer.Write("pause_reason");
+            writer.Write(PauseReason);
         }
     }
 
@@ -4425,6 +4540,51 @@ namespace IrisSession.Protocol
             writer.Write(Cause);
             writer.Write("previous_holder");
             writer.Write(PreviousHolder);
+        }
+    }
+
+    /// <summary>
+    /// Several leases changed in one step for the same cause, as LeaseChanged for each, in this order.
+    ///
+    /// previous_holders has the length of leases.
+    /// </summary>
+    public sealed class LeasesChanged : EventKind
+    {
+        public const string TagName = "leases_changed";
+        public override string Tag { get { return TagName; } }
+        public Lease[] Leases = new Lease[0];
+        public string Cause = "";
+        public string[] PreviousHolders = new string[0];
+
+        public static LeasesChanged Read(WireReader reader)
+        {
+            LeasesChanged value = new LeasesChanged();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "leases": value.Leases = reader.ReadArray(Protocol.Lease.Read, 64); seen |= 1u; break;
+                    case "cause": value.Cause = reader.ReadString(64); seen |= 2u; break;
+                    case "previous_holders": value.PreviousHolders = reader.ReadStrings(64, 64); seen |= 4u; break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 7u) != 7u) throw new WireException("missing field of LeasesChanged");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(4);
+            writer.Write("event");
+            writer.Write(TagName);
+            writer.Write("leases");
+            writer.Write(Leases);
+            writer.Write("cause");
+            writer.Write(Cause);
+            writer.Write("previous_holders");
+            writer.Write(PreviousHolders);
         }
     }
 
@@ -4915,7 +5075,10 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// The e-stop was latched (active) or cleared by participant.
+    /// The session was stopped (active), also when it was stopped already, or the e-stop was cleared by participant.
+    ///
+    /// stop_seq counts the stops from 1; of a clear: the newest stop that it ended. participant: empty for a stop of a
+    /// connection that has not joined.
     /// </summary>
     public sealed class EStopChanged : EventKind
     {
@@ -4924,6 +5087,7 @@ namespace IrisSession.Protocol
         public bool Active = false;
         public string Participant = "";
         public string Reason = "";
+        public long StopSeq = 0;
 
         public static EStopChanged Read(WireReader reader)
         {
@@ -4936,6 +5100,7 @@ namespace IrisSession.Protocol
                     case "active": value.Active = reader.ReadBool(); seen |= 1u; break;
                     case "participant": value.Participant = reader.ReadString(64); seen |= 2u; break;
                     case "reason": value.Reason = reader.ReadString(512); break;
+                    case "stop_seq": value.StopSeq = reader.ReadLong(0, long.MaxValue); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -4945,7 +5110,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(4);
+            writer.WriteMapHeader(5);
             writer.Write("event");
             writer.Write(TagName);
             writer.Write("active");
@@ -4954,11 +5119,14 @@ namespace IrisSession.Protocol
             writer.Write(Participant);
             writer.Write("reason");
             writer.Write(Reason);
+            writer.Write("stop_seq");
+            writer.Write(StopSeq);
         }
     }
 
     /// <summary>
-    /// The session was paused or resumed by participant.
+    /// The session was paused or resumed by participant. reason: of a pause that only a reset ends (physics that
+    /// diverged).
     /// </summary>
     public sealed class PauseChanged : EventKind
     {
@@ -4966,6 +5134,7 @@ namespace IrisSession.Protocol
         public override string Tag { get { return TagName; } }
         public bool Paused = false;
         public string Participant = "";
+        public string Reason = "";
 
         public static PauseChanged Read(WireReader reader)
         {
@@ -4977,6 +5146,7 @@ namespace IrisSession.Protocol
                 {
                     case "paused": value.Paused = reader.ReadBool(); seen |= 1u; break;
                     case "participant": value.Participant = reader.ReadString(64); break;
+                    case "reason": value.Reason = reader.ReadString(512); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -4986,13 +5156,15 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(3);
+            writer.WriteMapHeader(4);
             writer.Write("event");
             writer.Write(TagName);
             writer.Write("paused");
             writer.Write(Paused);
             writer.Write("participant");
             writer.Write(Participant);
+            writer.Write("reason");
+            writer.Write(Reason);
         }
     }
 

@@ -204,6 +204,7 @@ export const DenialReason = {
   USER_OWNED: "user_owned",
   POLICY: "policy",
   INVALID: "invalid",
+  WITHDRAWN: "withdrawn",
   TOO_FAR: "too_far",
 } as const;
 export type DenialReason = (typeof DenialReason)[keyof typeof DenialReason] | (string & {});
@@ -609,6 +610,19 @@ export interface AnchorReport {
 }
 
 /**
+ * One e-stop that is in force: its number, and who stopped the session `age_ns` ago, for which reason.
+ *
+ * `participant`, `name`: empty for a connection that had not joined.
+ */
+export interface StopReport {
+  stop_seq: number;
+  participant: string;
+  name: string;
+  reason: string;
+  age_ns: number;
+}
+
+/**
  * One participant, as the session sees it. Times in `*_ns` are durations until now, -1 for never.
  *
  * `capture_to_receive`: device to front. `state_age`: end of tick to application, as its client reports it.
@@ -805,6 +819,16 @@ export interface Release {
   targets?: Target[];
 }
 
+/**
+ * Take back the `acquire` with this request id. It is denied (`withdrawn`, with its place in the queue and the
+ * holder); if it was granted before, what it has granted is released.
+ */
+export interface Withdraw {
+  type: "withdraw";
+  request_id: number;
+  acquire_request_id: number;
+}
+
 /** Answer of a holder or director to a `ConsentRequested` event (mode `request`). */
 export interface Consent {
   type: "consent";
@@ -928,15 +952,19 @@ export interface EStop {
   reason?: string;
 }
 
-/** End the e-stop. Directors only. */
+/**
+ * End the e-stop. Directors only. `stop_seq`: the newest stop that the sender has seen (`EStopChanged`); denied
+ * when there is a newer one.
+ */
 export interface ClearEStop {
   type: "clear_estop";
   request_id: number;
+  stop_seq?: number;
 }
 
 /**
  * Control the session, `ControlAction`: pause, resume, step (`ticks` physics ticks while paused), reset. Directors
- * only.
+ * only. When physics has diverged, both reset and resume begin anew from the initial state.
  */
 export interface Control {
   type: "control";
@@ -1093,8 +1121,9 @@ export interface Event {
  * Everything a late joiner needs; events with `event_seq` at or below its own are to be discarded.
  *
  * In the step of a reset `tick` and `sim_time` are still those before it. `tick_period_ns`: of this scene; 0: that of
- * `Welcome`. Bulk frame 1 (added by the front): float64 (n_bodies, 7) world poses `x y z qw qx qy qz` of `bodies` at
- * `state_seq`.
+ * `Welcome`. `stop_seq`: of the newest stop (`EStopChanged`). `consent_timeout_ns`: time that a holder has to answer
+ * `ConsentRequested`. Bulk frame 1 (added by the front): float64 (n_bodies, 7) world poses `x y z qw qx qy qz` of
+ * `bodies` at `state_seq`.
  */
 export interface Snapshot {
   type: "snapshot";
@@ -1115,6 +1144,8 @@ export interface Snapshot {
   episode?: EpisodeChanged | null;
   state_seq?: number;
   tick_period_ns?: number;
+  stop_seq?: number;
+  consent_timeout_ns?: number;
 }
 
 /**
@@ -1137,7 +1168,8 @@ export interface Paired {
  * last five seconds; null below 25 states in them. `drops`: by reason, all messages dropped anywhere. `restarts`: of
  * front and recorder. `authority_silent_ns`: since the authority's last message to the front; its part (ticks, roster,
  * robots, recorder) is as old. -1: it has sent none yet. `cpu_share`: of one processor, by the authority's process;
- * `load`: of the machine, over a minute.
+ * `load`: of the machine, over a minute. `stops`: the e-stops in force, newest first, the newest of each participant.
+ * `pause_reason`: why physics stands still until a reset, empty otherwise.
  */
 export interface StatusReport {
   type: "status_report";
@@ -1173,6 +1205,8 @@ export interface StatusReport {
   anchors?: AnchorReport[];
   cross_checks?: CrossCheckReport[];
   assets?: AssetsReport | null;
+  stops?: StopReport[];
+  pause_reason?: string;
 }
 
 /**
@@ -1220,6 +1254,18 @@ export interface LeaseChanged {
   lease: Lease;
   cause: string;
   previous_holder?: string;
+}
+
+/**
+ * Several leases changed in one step for the same `cause`, as `LeaseChanged` for each, in this order.
+ *
+ * `previous_holders` has the length of `leases`.
+ */
+export interface LeasesChanged {
+  event: "leases_changed";
+  leases: Lease[];
+  cause: string;
+  previous_holders: string[];
 }
 
 /** `requester` asks `holder` for a robot (mode `request`); answered by `Consent` with this `consent_id`. */
@@ -1330,19 +1376,29 @@ export interface SceneChanged {
   tick_period_ns?: number;
 }
 
-/** The e-stop was latched (`active`) or cleared by `participant`. */
+/**
+ * The session was stopped (`active`), also when it was stopped already, or the e-stop was cleared by `participant`.
+ *
+ * `stop_seq` counts the stops from 1; of a clear: the newest stop that it ended. `participant`: empty for a stop of a
+ * connection that has not joined.
+ */
 export interface EStopChanged {
   event: "estop_changed";
   active: boolean;
   participant: string;
   reason?: string;
+  stop_seq?: number;
 }
 
-/** The session was paused or resumed by `participant`. */
+/**
+ * The session was paused or resumed by `participant`. `reason`: of a pause that only a reset ends (physics that
+ * diverged).
+ */
 export interface PauseChanged {
   event: "pause_changed";
   paused: boolean;
   participant?: string;
+  reason?: string;
 }
 
 /** `state`: running, success, failure, discarded. `number` counts episodes from 1. */
@@ -1930,6 +1986,7 @@ export type ClientMessage =
   | Samples
   | Acquire
   | Release
+  | Withdraw
   | Consent
   | Assign
   | SetMode
@@ -1968,6 +2025,7 @@ export type EventKind =
   | ParticipantChanged
   | ParticipantLeft
   | LeaseChanged
+  | LeasesChanged
   | ConsentRequested
   | Intervention
   | EngagementChanged
@@ -2007,6 +2065,7 @@ export const DEFAULTS = {
   samples: {},
   acquire: { robots: [], objects: [], wait: false, weight: 1.0 },
   release: { request_id: 0, targets: [] },
+  withdraw: {},
   consent: {},
   assign: { participant: "" },
   set_mode: {},
@@ -2019,7 +2078,7 @@ export const DEFAULTS = {
   tracking_epoch: {},
   episode: { label: "" },
   estop: { reason: "" },
-  clear_estop: {},
+  clear_estop: { stop_seq: 0 },
   control: { ticks: 1 },
   marker: {},
   pair: { software: "" },
@@ -2033,14 +2092,15 @@ export const DEFAULTS = {
   reply: { denial: null, leases: [] },
   feedback: { hold_reason: "", contact_n: 0.0, limits: [], rejected: {} },
   event: {},
-  snapshot: { robots: [], bodies: [], paused: false, estop: false, episode: null, state_seq: 0, tick_period_ns: 0 },
+  snapshot: { robots: [], bodies: [], paused: false, estop: false, episode: null, state_seq: 0, tick_period_ns: 0, stop_seq: 0, consent_timeout_ns: 0 },
   paired: { roles: [] },
-  status_report: { tick: 0, tick_period_ns: 0, paused: false, estop: false, stalled: false, scheduling: "", late_share: 0.0, late_share_total: 0.0, lateness: null, late_causes: {}, step_to_publish: null, cpu_share: 0.0, load: 0.0, cpus: 0, memory_bytes: 0, participants: [], robots: [], recorder: null, drops: {}, restarts: {}, connections: 0, entries_per_s: 0.0, warnings: [], authority_silent_ns: -1, media: [], anchors: [], cross_checks: [], assets: null },
+  status_report: { tick: 0, tick_period_ns: 0, paused: false, estop: false, stalled: false, scheduling: "", late_share: 0.0, late_share_total: 0.0, lateness: null, late_causes: {}, step_to_publish: null, cpu_share: 0.0, load: 0.0, cpus: 0, memory_bytes: 0, participants: [], robots: [], recorder: null, drops: {}, restarts: {}, connections: 0, entries_per_s: 0.0, warnings: [], authority_silent_ns: -1, media: [], anchors: [], cross_checks: [], assets: null, stops: [], pause_reason: "" },
   delivery_budget: { mbit_per_s: 0.0, reason: "", streams: [] },
   participant_joined: { resumed: false },
   participant_changed: {},
   participant_left: { grace: false },
   lease_changed: { previous_holder: "" },
+  leases_changed: {},
   consent_requested: {},
   intervention: {},
   engagement_changed: { reason: "" },
@@ -2051,8 +2111,8 @@ export const DEFAULTS = {
   anchor_moved: { by: "" },
   headsets_compared: {},
   scene_changed: { scene_hash: "", tick_period_ns: 0 },
-  estop_changed: { reason: "" },
-  pause_changed: { participant: "" },
+  estop_changed: { reason: "", stop_seq: 0 },
+  pause_changed: { participant: "", reason: "" },
   episode_changed: { label: "", participant: "" },
   object_grasped: {},
   handover: {},

@@ -1,0 +1,317 @@
+"""Commands that control a running session: e-stop, pause, reset, leases, episodes, markers.
+
+Each joins for the time of the request, in the first role that its key may have of those that may ask for it, under a
+name that no assignment gives robots to, and leaves.
+"""
+
+from __future__ import annotations
+
+import argparse
+import getpass
+import re
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from iris_session.cli.common import (
+    CommandError,
+    add_address_options,
+    add_json_option,
+    check_session_reachable,
+    print_json,
+    to_printable,
+)
+from iris_session.protocol.names import ControlAction, DenialReason, EpisodeAction, LeaseMode, Role
+
+if TYPE_CHECKING:
+    from iris_session.client import Client
+
+#: Time to be admitted, and for the e-stop to be confirmed [s].
+TIMEOUT_S: Final = 5.0
+#: Roles that may ask for it, the least powerful first: a key may have few of them.
+DIRECTORS: Final = (Role.DIRECTOR,)
+DRIVERS: Final = (Role.AGENT, Role.OPERATOR, Role.LEADER, Role.DIRECTOR)
+ANYBODY: Final = (Role.OBSERVER, *DRIVERS)
+#: A reason of one word that is an address was meant as one.
+_ADDRESS: Final = re.compile(r"iris://.*|\d+\.\d+\.\d+\.\d+(:\d+)?|[\w.-]+:\d+|\[[0-9a-fA-F:]+\](:\d+)?")
+
+
+class Outcome(NamedTuple):
+    """Result of a command: one line for people, and fields for `--json`."""
+
+    text: str
+    fields: dict[str, Any]
+
+
+Action = Callable[["Client", argparse.Namespace], Outcome]
+
+
+def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the commands `estop`, `clear-estop`, `pause`, `resume`, `reset`, `assign`, `release`, `mode`, `episode` and
+    `marker`.
+    """
+    estop = _add_command(
+        commands,
+        "estop",
+        "stop every robot of a session; not a safety-rated stop",
+        stop_session,
+        'estop "hand in the way"',
+    )
+    estop.add_argument("reason", nargs="*", help="text for participants and the recording")
+    estop.set_defaults(roles=ANYBODY)
+    _add_command(
+        commands,
+        "clear-estop",
+        "allow motion again after an e-stop; says who had stopped",
+        clear_session,
+        "clear-estop",
+    )
+    for action, text in (
+        (ControlAction.PAUSE, "pause physics; robots hold"),
+        (ControlAction.RESUME, "continue paused physics"),
+        (ControlAction.RESET, "put the scene back to its initial state; leases stay"),
+    ):
+        _add_command(commands, action, text, control_physics, action).set_defaults(action=action)
+    assign = _add_command(
+        commands, "assign", "give robots to a participant", assign_robots, "assign left ann", "assign left,right p3"
+    )
+    assign.add_argument("robots", metavar="ROBOT[,ROBOT]", help="names of robots")
+    assign.add_argument("person", metavar="PERSON", help="name or id of a participant")
+    release = _add_command(commands, "release", "free robots, whoever holds them", release_robots, "release left right")
+    release.add_argument("robots", nargs="+", metavar="ROBOT", help="names of robots")
+    mode = _add_command(commands, "mode", "change the lease mode of robots", set_modes, "mode request left right")
+    mode.add_argument("mode", choices=sorted(LeaseMode.ALL), help="lease mode")
+    mode.add_argument("robots", nargs="*", metavar="ROBOT", help="names of robots (default: all)")
+    episode = _add_command(
+        commands,
+        "episode",
+        "start and end episodes of training data",
+        control_episode,
+        "episode start --label pour",
+        "episode success",
+    )
+    episode.add_argument("action", choices=sorted(EpisodeAction.ALL), help="what happens to the episode")
+    episode.set_defaults(roles=DRIVERS)
+    episode.add_argument("--label", default="", help="label of the episode")
+    marker = _add_command(
+        commands, "marker", "put a note into the recording", place_marker, 'marker "gripper was cleaned"'
+    )
+    marker.add_argument("text", nargs="+", help="the note")
+    marker.set_defaults(roles=ANYBODY)
+
+
+def _add_command(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, text: str, act: Action, *examples: str
+) -> argparse.ArgumentParser:
+    lines = [f"  iris-session {example}" for example in examples]
+    lines.append(f"  iris-session {examples[0]} --session lab-1")
+    parser = commands.add_parser(
+        name,
+        help=text,
+        description=f"{text[0].upper()}{text[1:]}. The session is the one on this machine, or that of --address or "
+        "--session.",
+        epilog="examples:\n" + "\n".join(lines),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_address_options(parser, option=True)
+    add_json_option(parser)
+    parser.set_defaults(run=run, act=act, roles=DIRECTORS)
+    return parser
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Join, act, leave. Exit status 1 if the session denies it or does not answer, 2 if there is nothing to ask."""
+    from iris_session.client import DeniedError, NotConnectedError, RefusedError, RequestTimeoutError
+
+    result: dict[str, Any] = {"ok": True, "command": arguments.command}
+    try:
+        with _join_session(arguments) as client:
+            result["session"] = client.address
+            outcome = arguments.act(client, arguments)
+    except (DeniedError, RefusedError, NotConnectedError, RequestTimeoutError, CommandError) as error:
+        text = str(error)
+        if isinstance(error, RefusedError) and error.code == DenialReason.ROLE and Role.DIRECTOR in arguments.roles:
+            text += "; on the server: `iris-session pair --role director`"
+        print(f"iris-session: {to_printable(text)}", file=sys.stderr)
+        if arguments.json:
+            denied = error.denial.reason if isinstance(error, DeniedError) else ""
+            reason = denied or (error.code if isinstance(error, RefusedError) else "no_answer")
+            print_json({**result, "ok": False, "reason": reason, "error": text})
+        return error.status if isinstance(error, CommandError) else 1
+    if arguments.json:
+        print_json({**result, **outcome.fields})
+    else:
+        print(to_printable(outcome.text))
+    return 0
+
+
+@contextmanager
+def _join_session(arguments: argparse.Namespace) -> Iterator[Client]:
+    from iris_session.client import RefusedError
+
+    check_session_reachable(arguments)
+    *others, last = arguments.roles
+    for role in others:
+        client = _make_client(arguments, role)
+        try:
+            client.connect()
+        except RefusedError as error:
+            client.close()
+            if error.code != DenialReason.ROLE:
+                raise
+        else:
+            with client:
+                yield client
+            return
+    with _make_client(arguments, last) as client:
+        yield client
+
+
+def _make_client(arguments: argparse.Namespace, role: str) -> Client:
+    from iris_session.client import Client
+
+    return Client(
+        arguments.address,
+        session=arguments.session,
+        join_code=arguments.code,
+        role=role,
+        name=f"{_get_user_name()} (terminal)",
+        alignment="not_needed",
+    )
+
+
+def _get_user_name() -> str:
+    try:
+        return getpass.getuser()[:32]
+    except (KeyError, OSError):  # a container may have no name for its user
+        return "user"
+
+
+def stop_session(client: Client, arguments: argparse.Namespace) -> Outcome:
+    """Send an e-stop, and wait until the session reports it."""
+    from iris_session.client import RequestTimeoutError
+
+    if len(arguments.reason) == 1 and _ADDRESS.fullmatch(arguments.reason[0]):
+        raise CommandError(f"{arguments.reason[0]} is an address, not a reason: give it with --address")
+    client.estop(" ".join(arguments.reason))
+    if not client.wait_for(lambda one: one.mirror.estop, TIMEOUT_S):
+        raise RequestTimeoutError(
+            f"the e-stop was sent, but the session has not confirmed it within {TIMEOUT_S:g} s: "
+            "use the emergency stop of the robot"
+        )
+    where = "".join(f" {name} {value}" for name, value in _get_place(arguments))
+    text = f"E-STOP at {client.address}: every robot holds; continue with `iris-session clear-estop{where}`"
+    return Outcome(text, {"estop": True})
+
+
+def _get_place(arguments: argparse.Namespace) -> list[tuple[str, str]]:
+    """Return the options that name the session."""
+    given = (("--address", arguments.address), ("--session", arguments.session))
+    return [(option, value) for option, value in given if value]
+
+
+def clear_session(client: Client, _: argparse.Namespace) -> Outcome:
+    """End the e-stop, and say who had stopped. A stop that came after the list was read stays."""
+    if not client.mirror.estop:
+        return Outcome("there is no e-stop", {"estop": False, "cleared": []})
+    stops = client.status().stops
+    until_s = time.monotonic() + TIMEOUT_S
+    while not stops and time.monotonic() < until_s:  # the status is a moment older than the event
+        client.sleep(0.1)
+        stops = client.status().stops
+    if not stops:
+        raise CommandError("the session is stopped, but its status does not say by whom: try again", 1)
+    client.clear_estop(max(one.stop_seq for one in stops))
+    who = "; ".join(f"{one.name or 'a connection without a name'}: {one.reason or 'no reason given'}" for one in stops)
+    cleared = [{"stop_seq": one.stop_seq, "name": one.name, "reason": one.reason} for one in stops]
+    text = f"e-stop cleared ({who}): robots move when they are clutched again"
+    return Outcome(text, {"estop": False, "cleared": cleared})
+
+
+def control_physics(client: Client, arguments: argparse.Namespace) -> Outcome:
+    """Pause, resume or reset."""
+    client.control(arguments.action)
+    text = {"pause": "paused", "resume": "running", "reset": "reset to the initial state"}[arguments.action]
+    if client.mirror.estop:
+        text += "; the e-stop is still active: clear-estop"
+    return Outcome(text, {"action": arguments.action})
+
+
+def assign_robots(client: Client, arguments: argparse.Namespace) -> Outcome:
+    """Give robots to a participant."""
+    person = find_participant(client, arguments.person)
+    robots = _split_names([arguments.robots])
+    leases = client.assign(robots, person)
+    return Outcome(
+        f"{', '.join(robots)} -> {client.mirror.participants[person].name} ({person})",
+        {"participant": person, "robots": [lease.target for lease in leases] or robots},
+    )
+
+
+def find_participant(client: Client, person: str) -> str:
+    """Return the id of the participant with that id or name.
+
+    Raises:
+        CommandError: There is none, or several have the name.
+    """
+    participants = client.mirror.participants
+    if person in participants:
+        return person
+    found = [one.id for one in participants.values() if one.name == person]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise CommandError(f"{len(found)} participants are named {person!r}: give one of the ids {', '.join(found)}")
+    others = [f"{one.name} ({one.id})" for one in participants.values() if one.id != client.participant_id]
+    raise CommandError(f"no participant {person!r} in the session; there are: {', '.join(others) or 'none'}")
+
+
+def release_robots(client: Client, arguments: argparse.Namespace) -> Outcome:
+    """Free robots."""
+    robots = _split_names(arguments.robots)
+    client.assign(robots)
+    return Outcome(f"{', '.join(robots)}: free", {"robots": robots})
+
+
+def _split_names(words: Sequence[str]) -> list[str]:
+    """Return the names of words that may hold several, separated by commas."""
+    return [name.strip() for word in words for name in word.split(",") if name.strip()]
+
+
+def set_modes(client: Client, arguments: argparse.Namespace) -> Outcome:
+    """Change the lease mode of robots."""
+    robots = _split_names(arguments.robots) or sorted(client.mirror.robots)
+    for robot in robots:
+        client.set_mode(robot, arguments.mode)
+    return Outcome(f"{', '.join(robots)}: mode {arguments.mode}", {"robots": robots, "mode": arguments.mode})
+
+
+def control_episode(client: Client, arguments: argparse.Namespace) -> Outcome:
+    """Start, end, discard or repeat an episode."""
+    before = client.mirror.episode
+    client.episode(arguments.action, arguments.label)
+    if arguments.action == EpisodeAction.RESET:
+        return Outcome("scene reset, no episode runs", {"action": arguments.action})
+
+    def is_over(one: Client) -> bool:  # the reply may come before the event; `rerecord` makes two events
+        now = one.mirror.episode
+        begins = arguments.action in (EpisodeAction.START, EpisodeAction.RERECORD)
+        return now is not None and now != before and (now.state == "running") == begins
+
+    client.wait_for(is_over, TIMEOUT_S)
+    episode = client.mirror.episode
+    if episode is None:
+        raise CommandError(f"the session accepted {arguments.action}, but announced no episode", 1)
+    return Outcome(
+        f"episode {episode.number}: {episode.state}",
+        {"action": arguments.action, "number": episode.number, "state": episode.state},
+    )
+
+
+def place_marker(client: Client, arguments: argparse.Namespace) -> Outcome:
+    """Put a note into the recording."""
+    text = " ".join(arguments.text)
+    client.marker(text)
+    return Outcome(f"noted: {text}", {"text": text})

@@ -1,0 +1,108 @@
+"""Keys of the terminal that runs `serve`: e-stop, clear, pause. Nothing is read without a terminal."""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+import termios
+import threading
+import tty
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from iris_session.session.owner import Owner
+
+#: Time until a terminal is looked at again while another program has it [s].
+BACKGROUND_S: Final = 0.5
+
+
+class KeyBinding:
+    """One key: what it does, and its name in the footer."""
+
+    def __init__(self, key: str, text: str, act: Callable[[], None]) -> None:
+        self.key = key
+        self.text = text
+        self.act = act
+
+
+def bind_session_keys(session: Owner) -> dict[str, KeyBinding]:
+    """Return the keys of a session: space for the e-stop, `c` to clear it, `p` to pause and resume where it can."""
+    from iris_session.session.session import Session
+
+    keys = [
+        KeyBinding(" ", "space e-stop", lambda: session.estop("key in the terminal of the session")),
+        KeyBinding("c", "c clear e-stop", session.clear_estop),
+    ]
+    if isinstance(session, Session):
+
+        def toggle_pause() -> None:
+            session.resume() if session.status().paused else session.pause()
+
+        keys.append(KeyBinding("p", "p pause/resume", toggle_pause))
+    return {one.key: one for one in keys}
+
+
+@contextmanager
+def read_keys(keys: Mapping[str, KeyBinding]) -> Iterator[bool]:
+    """Act on keys until the context ends, in a thread of its own: a key must not wait for the loop of the session.
+
+    Yields False when standard input is no terminal, or not ours: a command in the background leaves it alone.
+    """
+    fd = sys.stdin.fileno() if sys.stdin is not None and sys.stdin.isatty() else -1
+    if fd < 0 or not _owns_terminal(fd):
+        yield False
+        return
+    before = termios.tcgetattr(fd)
+    wake_read, wake_write = os.pipe()
+    thread = threading.Thread(target=_follow_keys, args=(fd, wake_read, keys), name="iris-keys", daemon=True)
+    tty.setcbreak(fd)  # keys without Enter; Ctrl-C stays a signal
+    thread.start()
+    try:
+        yield True
+    finally:
+        os.close(wake_write)
+        thread.join()
+        os.close(wake_read)
+        if _owns_terminal(fd):
+            termios.tcsetattr(fd, termios.TCSADRAIN, before)
+
+
+def _owns_terminal(fd: int) -> bool:
+    """Return whether this process is in the foreground of its terminal; reading it elsewhere would stop the process."""
+    with suppress(OSError):
+        return os.tcgetpgrp(fd) == os.getpgrp()
+    return False
+
+
+def _follow_keys(fd: int, wake: int, keys: Mapping[str, KeyBinding]) -> None:
+    ready = select.poll()
+    ready.register(wake)
+    while True:
+        ready.register(fd, select.POLLIN)
+        if any(one == wake for one, _ in ready.poll()):
+            return
+        if not _owns_terminal(fd):  # sent to the background (Ctrl-Z, bg)
+            ready.unregister(fd)
+            if ready.poll(int(BACKGROUND_S * 1e3)):
+                return
+            continue
+        with suppress(OSError):
+            typed = os.read(fd, 64)
+            if not typed:
+                return  # the terminal is closed
+            _act(typed.decode("ascii", "replace"), keys)
+
+
+def _act(typed: str, keys: Mapping[str, KeyBinding]) -> None:
+    """Run the bindings of the typed keys; an escape sequence (an arrow, a paste) is none of them."""
+    from iris_session.session.errors import SessionError
+
+    if typed.startswith("\x1b"):
+        return
+    for one in dict.fromkeys(typed):
+        if one in keys:
+            with suppress(SessionError):  # the session is closing
+                keys[one].act()

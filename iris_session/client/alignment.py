@@ -1,0 +1,244 @@
+"""`client.alignment`: the alignment of this client, observations of anchors, and measurements that a director runs."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+from numpy.typing import NDArray
+
+from anchors.pose import PoseTuple
+from iris_session.client.arguments import Numbers, PoseLike, to_numbers, to_pose
+from iris_session.client.core.connection import ClientConnection
+from iris_session.client.errors import InvalidMessageError
+from iris_session.client.sheet_observer import CAMERA_SIGMA, SheetObserver, to_observation
+from iris_session.protocol.client_messages import (
+    Align,
+    ClientMessage,
+    MoveAnchor,
+    Observation,
+    PlaceAlignment,
+    TrackingEpoch,
+)
+from iris_session.protocol.common import Alignment
+from iris_session.protocol.names import AlignAction, AnchorKind
+from iris_session.protocol.server_messages import Reply
+
+if TYPE_CHECKING:
+    from anchors.camera import CameraModel
+    from anchors.detection import SheetDetection
+    from anchors.sheet import Sheet
+
+
+class AlignmentClient(Protocol):
+    """The parts of a `Client` that its alignment uses."""
+
+    connection: ClientConnection
+
+    def send(self, message: ClientMessage) -> bool:
+        """See `Client.send`."""
+
+    def request(self, message: Any) -> Reply:
+        """See `Client.request`."""
+
+    def session_now_ns(self) -> int:
+        """See `Client.session_now_ns`."""
+
+
+class ClientAlignment:
+    """Alignment of one client: how its tracking frame lies in the world.
+
+    A client in role `director` also measures, places and moves those of others.
+    """
+
+    def __init__(self, client: AlignmentClient) -> None:
+        self._client = client
+        self._sheets = SheetObserver()
+        self._lock = threading.Lock()  # of the numbers of viewpoints
+
+    @property
+    def current(self) -> Alignment | None:
+        """Our own `T_world_tracking` as accepted by the session, `None` before."""
+        connection = self._client.connection
+        return connection.mirror.find_alignment(connection.participant_id)
+
+    @property
+    def tracking_epoch(self) -> int:
+        """Number of jumps of our tracking frame so far; `report_tracking_jump` counts one more."""
+        return self._client.connection.tracking_epoch
+
+    # --- our own ------------------------------------------------------------------------------------------------------
+
+    def report_tracking_jump(self) -> int:
+        """Report that the tracking frame jumped: our alignment is void.
+
+        Returns:
+            The new tracking epoch.
+        """
+        connection = self._client.connection
+        epoch = connection.tracking_epoch = connection.tracking_epoch + 1
+        if connection.is_joined:  # else it follows the next welcome
+            self._client.send(TrackingEpoch(epoch))
+        return epoch
+
+    def observe(
+        self,
+        anchor_id: str,
+        T_tracking_anchor: PoseLike,
+        *,
+        kind: str = AnchorKind.QR,
+        capture_ns: int | None = None,
+        viewpoint_id: int = 0,
+        size_m: float = 0.0,
+        quality: float = 1.0,
+        device: str = "head",
+        covariance: Numbers = (),
+        tracking_epoch: int | None = None,
+    ) -> None:
+        """Report the observation of an anchor, in the tracking frame.
+
+        Args:
+            anchor_id: Id of the anchor.
+            T_tracking_anchor: Its pose in the tracking frame, `((x, y, z) [m], (w, x, y, z))`.
+            kind: An `AnchorKind`.
+            capture_ns: Session time of the observation [ns], default now.
+            viewpoint_id: The same number for observations from one place.
+            size_m: Measured edge length [m], 0 when not measured.
+            quality: 0 to 1.
+            device: The device that observed it.
+            covariance: 36 values, 6x6 row-major, (x, y, z [m], rx, ry, rz [rad]), tracking axes; without it the
+                session assumes that of a headset's camera.
+            tracking_epoch: Epoch of the tracking frame, default the present one.
+
+        Raises:
+            InvalidMessageError: A value does not fit the protocol.
+            NotConnectedError: There is no connection.
+        """
+        values = to_numbers("covariance", covariance)
+        if len(values) not in (0, 36):
+            raise InvalidMessageError(f"covariance: expected 36 numbers, 6x6 row-major, or none, got {len(values)}")
+        self._client.send(
+            Observation(
+                anchor_id=anchor_id,
+                kind=kind,
+                T_tracking_anchor=to_pose("T_tracking_anchor", T_tracking_anchor),
+                capture_ns=self._client.session_now_ns() if capture_ns is None else capture_ns,
+                tracking_epoch=self.tracking_epoch if tracking_epoch is None else tracking_epoch,
+                viewpoint_id=viewpoint_id,
+                size_m=size_m,
+                quality=quality,
+                device=device,
+                covariance=values,
+            )
+        )
+
+    def observe_image(
+        self,
+        image: NDArray[Any],
+        camera: CameraModel,
+        sheets: Sequence[Sheet],
+        T_tracking_camera: PoseLike,
+        *,
+        capture_ns: int | None = None,
+        viewpoint_id: int | None = None,
+        device: str = "head",
+        camera_sigma: tuple[float, float] = CAMERA_SIGMA,
+        tracking_epoch: int | None = None,
+    ) -> list[SheetDetection]:
+        """Detect sheets in an image and report them as observations.
+
+        Sheets with an ambiguous pose (both poses of a plane fit) are left out. Takes tenths of a second: not for the
+        loop that sends samples.
+
+        Args:
+            image: (height, width[, 3]) uint8.
+            camera: Intrinsics of the camera.
+            sheets: Sheets to look for.
+            T_tracking_camera: Pose of the camera at `capture_ns` (x right, y down, z into the scene),
+                `((x, y, z) [m], (w, x, y, z))`.
+            capture_ns: Session time of the image [ns], default now.
+            viewpoint_id: By default counted by where the camera goes.
+            device: The device that observed it.
+            camera_sigma: Standard deviations ([m], [rad]) of `T_tracking_camera`.
+            tracking_epoch: Epoch of the tracking frame, default the present one at the call.
+
+        Returns:
+            The sightings that were reported.
+
+        Raises:
+            InvalidMessageError: Image, camera or pose cannot be.
+            NotConnectedError: There is no connection.
+            ClientError: OpenCV or SciPy is missing.
+        """
+        epoch = self.tracking_epoch if tracking_epoch is None else tracking_epoch  # before the detection
+        now_ns = self._client.session_now_ns() if capture_ns is None else capture_ns
+        pose = to_pose("T_tracking_camera", T_tracking_camera)
+        T: PoseTuple = (pose.p, pose.q)
+        found = self._sheets.detect(image, camera, sheets)
+        if viewpoint_id is None:
+            with self._lock:
+                viewpoint_id = self._sheets.viewpoints.number_at(epoch, T)
+        for sighting in found:
+            self._client.send(
+                to_observation(
+                    sighting,
+                    T,
+                    capture_ns=now_ns,
+                    tracking_epoch=epoch,
+                    viewpoint_id=viewpoint_id,
+                    device=device,
+                    camera_sigma=camera_sigma,
+                )
+            )
+        return found
+
+    # --- measurements, and those of others ----------------------------------------------------------------------------
+
+    def start_run(self, participant: str = "") -> None:
+        """Measure an alignment again from the beginning. The one in force stays until there is a better one.
+
+        Args:
+            participant: Id of another participant, as director; empty: ourselves.
+
+        Raises:
+            DeniedError: We may not.
+        """
+        self._client.request(Align(0, AlignAction.START, participant))
+
+    def stop_run(self, participant: str = "") -> None:
+        """Stop the measurement of an alignment, and keep the one in force.
+
+        Args:
+            participant: Id of another participant, as director; empty: ourselves.
+
+        Raises:
+            DeniedError: We may not.
+        """
+        self._client.request(Align(0, AlignAction.STOP, participant))
+
+    def place(self, participant: str, T_world_tracking: PoseLike, *, offset: bool = False) -> None:
+        """As director, align a participant by hand.
+
+        Args:
+            participant: Id of the participant.
+            T_world_tracking: Pose of its tracking frame in the world, `((x, y, z) [m], (w, x, y, z))`.
+            offset: The pose is an offset to the measured alignment.
+
+        Raises:
+            DeniedError: We are not a director, or there is no such participant.
+        """
+        self._client.request(PlaceAlignment(0, participant, to_pose("T_world_tracking", T_world_tracking), offset))
+
+    def move_anchor(self, anchor_id: str, T_world_anchor: PoseLike, *, force: bool = False) -> None:
+        """As director, set the pose of an anchor; the scene moves for every participant aligned to it.
+
+        Args:
+            anchor_id: Id of the anchor.
+            T_world_anchor: Its pose in the world, `((x, y, z) [m], (w, x, y, z))`.
+            force: Also further than 5 m from where it was.
+
+        Raises:
+            DeniedError: We are not a director, or it is too far (`too_far`).
+        """
+        self._client.request(MoveAnchor(0, anchor_id, to_pose("T_world_anchor", T_world_anchor), force))

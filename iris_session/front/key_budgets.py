@@ -1,0 +1,220 @@
+"""Budgets of keys: what one key may send and cause, over all its connections.
+
+The rates of `protocol.limits` bound each connection and message type. They alone would let one key multiply its share
+by opening more connections, and spend it on what costs everyone most. `KeyBudget` holds the token buckets of one key,
+`KeyBudgets` those of all keys. `intake` and `admission` take from them, and refuse what is above with a typed reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import msgspec
+
+from iris_session.link.config import FrontLimits
+from iris_session.protocol.entries import Entry
+from iris_session.protocol.limits import Drops, KeyLimits, TokenBucket
+from iris_session.security.zap import ZAP_CONTROL
+
+#: Drop reasons of messages above the budget of their key.
+KEY_MESSAGES: Final = "key_messages"
+KEY_BYTES: Final = "key_bytes"
+KEY_REQUESTS: Final = "key_requests"
+KEY_EVENTS: Final = "key_events"
+#: Connections refused: of a key that opens too many, or was disconnected for a flood a moment ago.
+KEY_CONNECTIONS: Final = "key_connections"
+KEY_BANNED: Final = "key_banned"
+#: E-stops above the budget of their key, merged into the next one.
+ESTOPS_MERGED: Final = "estops_merged"
+
+#: Keys whose budgets are remembered; those with connections are never forgotten.
+MAX_KEYS: Final = 256
+#: Budgets without use are full again after this, so they can be forgotten.
+FORGET_NS: Final = 60_000_000_000
+#: E-stops that wait are looked for this often.
+PERIOD_NS: Final = 50_000_000
+
+
+class KeyBudget:
+    """Token buckets of one key.
+
+    Attributes:
+        is_gateway: The key may be a gateway's.
+        parent: Budget of the gateway's key of a participant behind a gateway, which pays too.
+        rejections: Token bucket of rejected messages of all its connections.
+        late_estop: The newest e-stop above the budget; it is sent as soon as there is a token.
+        used_ns: Session time of its last use.
+        connections: Connections that use it.
+    """
+
+    __slots__ = (
+        "_bytes",
+        "_estops",
+        "_events",
+        "_messages",
+        "_requests",
+        "connections",
+        "is_gateway",
+        "late_estop",
+        "parent",
+        "rejections",
+        "used_ns",
+    )
+
+    def __init__(
+        self, limits: FrontLimits, now_ns: int = 0, *, is_gateway: bool = False, parent: KeyBudget | None = None
+    ) -> None:
+        key, factor = limits.key, limits.key.gateway_factor if is_gateway else 1
+        self.is_gateway = is_gateway
+        self.parent = parent
+        self._messages = TokenBucket(key.messages * factor, key.message_burst * factor, now_ns)
+        self._bytes = TokenBucket(key.bytes * factor, key.byte_burst * factor, now_ns)
+        self._requests = TokenBucket(key.requests * factor, key.request_burst * factor, now_ns)
+        self._events = TokenBucket(key.events * factor, key.event_burst * factor, now_ns)
+        self._estops = TokenBucket(key.estops * factor, key.estop_burst * factor, now_ns)
+        self.rejections = TokenBucket(limits.excess_per_s * factor, limits.excess_burst * factor, now_ns)
+        self.late_estop: Entry | None = None
+        self.used_ns = now_ns
+        self.connections = 0
+
+    def take_message(self, now_ns: int, n_messages: int, n_bytes: int) -> str:
+        """Take what a message takes. Return the drop reason when it is above the budget, else an empty string."""
+        self.used_ns = now_ns
+        if not self._bytes.take(now_ns, n_bytes):
+            return KEY_BYTES
+        if not self._messages.take(now_ns, n_messages):
+            return KEY_MESSAGES
+        return self.parent.take_message(now_ns, n_messages, n_bytes) if self.parent is not None else ""
+
+    def take_request(self, now_ns: int, units: int, events: int) -> str:
+        """Take what a request causes. Return the drop reason when it is above the budget, else an empty string."""
+        self.used_ns = now_ns
+        if units and not self._requests.take(now_ns, units):
+            return KEY_REQUESTS
+        if events and not self._events.take(now_ns, events):
+            return KEY_EVENTS
+        return self.parent.take_request(now_ns, units, events) if self.parent is not None else ""
+
+    def take_estop(self, now_ns: int) -> bool:
+        """Take an e-stop. Return whether it may go to the authority now."""
+        self.used_ns = now_ns
+        return self._estops.take(now_ns) and (self.parent is None or self.parent.take_estop(now_ns))
+
+
+class KeyBudgets:
+    """Budgets of all keys. A `Service`: `tick` offers e-stops that waited for a token.
+
+    Args:
+        limits: Limits of the front.
+        offer: Queues an entry for the authority.
+    """
+
+    def __init__(self, limits: FrontLimits, offer: Callable[[Entry], bool]) -> None:
+        self._limits = limits
+        self._offer = offer
+        self._budgets: dict[str, KeyBudget] = {}  # the most recently found comes last
+        self._late: dict[str, KeyBudget] = {}  # with an e-stop that waits
+        self._next_ns = 0
+
+    def __len__(self) -> int:
+        return len(self._budgets)
+
+    def find(self, key_id: str, now_ns: int, *, is_gateway: bool = False, parent: KeyBudget | None = None) -> KeyBudget:
+        """Return the budget of a key, a full one for a key that was not seen lately.
+
+        Args:
+            key_id: The key, or the hash of the secret that stands for it.
+            now_ns: Session time.
+            is_gateway: Whether the key may be a gateway's.
+            parent: Budget of the gateway that speaks for it.
+        """
+        budget = self._budgets.pop(key_id, None)
+        if budget is None or budget.is_gateway is not is_gateway:  # the roles of the key have changed
+            self._forget(now_ns)
+            budget = KeyBudget(self._limits, now_ns, is_gateway=is_gateway, parent=parent)
+        budget.parent = parent
+        self._budgets[key_id] = budget
+        return budget
+
+    def hold_estop(self, key_id: str, budget: KeyBudget, entry: Entry) -> None:
+        """Keep an e-stop above the budget, in place of an earlier one, until there is a token."""
+        budget.late_estop = entry
+        self._late[key_id] = budget
+
+    def tick(self, now_ns: int) -> None:
+        """Offer e-stops that waited for a token. A stop is delayed and merged, never lost."""
+        if not self._late or now_ns < self._next_ns:
+            return
+        self._next_ns = now_ns + PERIOD_NS
+        for key_id, budget in list(self._late.items()):
+            if budget.late_estop is not None and budget.take_estop(now_ns):
+                entry, budget.late_estop = budget.late_estop, None
+                self._offer(msgspec.structs.replace(entry, receive_ns=now_ns))
+            if budget.late_estop is None:
+                del self._late[key_id]
+
+    def close(self) -> None:
+        """Do nothing: nothing was opened."""
+
+    def _forget(self, now_ns: int) -> None:
+        """Forget budgets that are full again, and the least recently found ones of keys without connections."""
+        if len(self._budgets) < MAX_KEYS:
+            return
+        idle = [key_id for key_id, budget in self._budgets.items() if not budget.connections]
+        old = [key_id for key_id in idle if now_ns - self._budgets[key_id].used_ns > FORGET_NS]
+        for key_id in old or idle[: len(self._budgets) - MAX_KEYS + 1]:
+            del self._budgets[key_id]
+
+
+class HandshakeLimiter:
+    """Limit how often a key opens connections to each channel: each costs memory before its first message.
+
+    Args:
+        limits: Of keys.
+        drops: Drop counters.
+        is_gateway: Returns whether a key may be a gateway's.
+        is_banned: Returns whether a key was disconnected for a flood a moment ago; it may connect to control, where
+            its hello is refused with the reason.
+    """
+
+    def __init__(
+        self,
+        limits: KeyLimits,
+        drops: Drops,
+        is_gateway: Callable[[str], bool],
+        is_banned: Callable[[str, int], bool],
+    ) -> None:
+        self._limits = limits
+        self._drops = drops
+        self._is_gateway = is_gateway
+        self._is_banned = is_banned
+        self._buckets: dict[tuple[bytes, str], TokenBucket] = {}  # the most recently used comes last
+
+    def allow(self, domain: bytes, key_id: str, now_ns: int) -> bool:
+        """Return whether a key may open one more connection to a channel, and use its token."""
+        if domain != ZAP_CONTROL and self._is_banned(key_id, now_ns):
+            self._drops.count(KEY_BANNED)
+            return False
+        bucket = self._buckets.pop((domain, key_id), None)
+        if bucket is None:
+            while len(self._buckets) >= MAX_KEYS:
+                del self._buckets[next(iter(self._buckets))]
+            factor = self._limits.gateway_factor if self._is_gateway(key_id) else 1
+            bucket = TokenBucket(self._limits.handshakes * factor, self._limits.handshake_burst * factor, now_ns)
+        self._buckets[domain, key_id] = bucket
+        if not bucket.take(now_ns):
+            self._drops.count(KEY_CONNECTIONS)
+            return False
+        return True
+
+
+def describe_excess(reason: str, limits: KeyLimits) -> str:
+    """Return the text of a message that was rejected for `reason`, one of those above."""
+    amount = {
+        KEY_MESSAGES: f"{limits.messages:g} messages a second",
+        KEY_BYTES: f"{limits.bytes:g} bytes a second",
+        KEY_REQUESTS: f"requests worth {limits.requests:g} units a second",
+        KEY_EVENTS: f"{limits.events:g} events a second",
+    }[reason]
+    return f"this key is above {amount}, over all its connections"

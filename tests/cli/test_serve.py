@@ -1,0 +1,258 @@
+"""`serve`: files that MuJoCo does not simulate, rejected options, and `--anchors`."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+
+import pytest
+import trimesh
+
+from iris_session.cli import scene, serve
+from iris_session.cli.common import CommandError
+from iris_session.cli.main import build_parser, main
+from iris_session.cli.scene import find_scene_file
+from iris_session.scene import report
+from iris_session.session.config import SessionConfig
+
+TRIANGLE = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+ARM = '<robot name="arm"><link name="base"><visual><geometry><sphere radius="0.1"/></geometry></visual></link></robot>'
+QUIET = ("--no-record", "--no-beacon", "--control-port", "0", "--state-port", "0")
+
+
+@pytest.fixture
+def part(tmp_path: Path) -> Path:
+    path = tmp_path / "Part no. 1.off"
+    path.write_text(TRIANGLE)
+    return path
+
+
+def test_scene_argument_is_a_file_a_model_or_a_name(
+    tmp_path: Path, part: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("scene.xml", "scene.MJCF", "scene.mjb"):
+        (tmp_path / name).write_text("")
+        assert find_scene_file(str(tmp_path / name)) is None
+    assert find_scene_file(str(part)) == part
+    (tmp_path / "arms3").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert find_scene_file("arms3") is None, "a folder is not in the way of a scene's name"
+    assert find_scene_file("nowhere") is None, "the caller lists the scene names"
+    assert find_scene_file("missing.xml") is None
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert find_scene_file(f"~/{part.name}") == part
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("missing.glb", ": a.glb, Part no. 1.off, b.urdf, c.xml"),
+        ("lost/missing.glb", "no folder"),
+        (".", ": Part no. 1.off, a.glb, b.urdf, c.xml"),
+        ("folder.glb", "is a folder"),
+        (
+            "part.docx",
+            ".docx cannot be read; supported are 3mf, dae, glb, gltf, mjb, mjcf, obj,",
+        ),
+        ("part", "without a suffix"),
+        ("empty.glb", "is empty: 0 bytes"),
+        ("~nobody-is-called-so/a.glb", "home folder"),
+        ("arm.urdf.xacro", "xacro arm.urdf.xacro > arm.urdf"),
+    ],
+)
+def test_unusable_files_are_reported_with_candidates(tmp_path: Path, part: Path, name: str, expected: str) -> None:
+    for there in ("a.glb", "b.urdf", "c.xml", "part.docx", "part", "arm.urdf.xacro"):
+        (tmp_path / there).write_text("x")
+    (tmp_path / "folder.glb").mkdir()
+    if name == "empty.glb":
+        (tmp_path / name).write_text("")
+    with pytest.raises(CommandError) as raised:
+        find_scene_file(name if name.startswith("~") else str(tmp_path / name))
+    assert expected in str(raised.value)
+    assert raised.value.status == 2
+    assert part.is_file()
+
+
+@pytest.mark.parametrize("name", ["part.off", "arm.urdf"])
+def test_file_is_shown_until_the_end(name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / name
+    path.write_text(ARM if name.endswith("urdf") else TRIANGLE)
+    assert main(["serve", str(path), "--seconds", "0.1", "--json", *QUIET]) == 0
+    out, errors = capfd.readouterr()
+    assert json.loads(out)["ok"]
+    assert f"session '{path.stem}' on 127.0.0.1:" in errors
+    extent = "0.2 x 0.2 x 0.2 m" if name.endswith("urdf") else "1 x 1 x 0 m"
+    assert f"extent is {extent}" in errors
+    assert "metres are meant" not in errors
+
+
+def test_file_in_millimetres_is_reported_and_scaled(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "part.off"
+    path.write_text(TRIANGLE.replace("1 0 0", "120 0 0").replace("0 1 0", "0 40 0"))
+    assert main(["serve", str(path), "--seconds", "0.1", *QUIET]) == 0
+    assert "(--scale 0.001) makes it 0.12" in capfd.readouterr().out
+    assert main(["serve", str(path), "--scale", "0.001", "--seconds", "0.1", *QUIET]) == 0
+    out = capfd.readouterr().out
+    assert "0.12 x 0.04 x 0 m" in out
+    assert "metres are meant" not in out
+
+
+@pytest.mark.parametrize("given", ["0", "-1", "nan", "inf", "small"])
+def test_invalid_scale_is_rejected(given: str, part: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as raised:
+        main(["serve", str(part), f"--scale={given}", *QUIET])
+    assert raised.value.code == 2
+    assert f"{given!r} is" in capsys.readouterr().err
+
+
+def test_simulated_models_are_not_scaled(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in (("serve", "handover"), ("scene", "inspect", "scene.xml")):
+        assert main([*arguments, "--scale", "2"]) == 2
+        error = capsys.readouterr().err
+        assert f"with {arguments[-1]}" in error
+        assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "option",
+    [("--robots", "robots.toml"), ("--assign", "ann=left"), ("--mode", "request"), ("--assignment", "nearest")],
+)
+def test_robot_options_are_rejected_for_shown_files(
+    option: tuple[str, str], part: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["serve", str(part), *option, *QUIET]) == 2
+    error = capsys.readouterr().err
+    assert f"{option[0]}: {part.name} has no robots" in error
+    assert error.count("\n") == 1
+
+
+def test_package_dir_is_used(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    arm = tmp_path / "arm" / "arm.urdf"
+    for path in (arm.parent, tmp_path / "models" / "part"):
+        path.mkdir(parents=True)
+    (tmp_path / "models" / "part" / "a.off").write_text(TRIANGLE)
+    arm.write_text(ARM.replace('<sphere radius="0.1"/>', '<mesh filename="package://part/a.off"/>'))
+    assert main(["serve", str(arm), *QUIET]) == 2
+    assert "(here: --package-dir DIR)" in capfd.readouterr().err
+    named = ("--package-dir", str(tmp_path / "models"))
+    assert main(["serve", str(arm), *named, "--seconds", "0.1", "--json", *QUIET]) == 0
+    capfd.readouterr()
+    assert main(["serve", "handover", *named, *QUIET]) == 2
+    assert "--package-dir" in capfd.readouterr().err
+    assert main(["serve", str(arm), "--package-dir", str(tmp_path / "nodir"), *QUIET]) == 2
+    assert capfd.readouterr().err == f"iris-session: --package-dir {tmp_path / 'nodir'}: no such folder\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"), [("part.off", "damaged"), ("part.docx", "cannot be read"), ("arm.urdf", "arm")]
+)
+def test_unreadable_file_is_a_one_line_error(
+    name: str, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / name
+    path.write_text("nothing of the kind")
+    assert main(["serve", str(path), *QUIET]) == 2
+    error = capsys.readouterr().err
+    assert expected in error
+    assert error.count("\n") == 1
+
+
+def test_serve_and_inspect_print_the_same_extent(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """A ball on a rotated node keeps its size; the box around it does not."""
+    ball = trimesh.Scene()
+    turned = trimesh.transformations.rotation_matrix(math.radians(45), (1, 1, 0))
+    ball.add_geometry(trimesh.creation.icosphere(radius=0.5), transform=turned)
+    path = tmp_path / "ball.glb"
+    ball.export(path)
+    assert main(["serve", str(path), "--seconds", "0.1", *QUIET]) == 0
+    served = re.search(r"extent is (.+) m$", capfd.readouterr().out, re.MULTILINE)
+    assert main(["scene", "inspect", str(path)]) == 0
+    inspected = re.search(r"extent: (.+) m along", capfd.readouterr().out)
+    assert served
+    assert inspected
+    assert served[1] == inspected[1]
+    assert max(map(float, served[1].split(" x "))) < 1.05
+
+
+def test_progress_is_printed_for_large_files(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scene, "_LARGE_FILE_BYTES", 1000)
+    monkeypatch.setattr(scene, "_MANY_TRIANGLES", 1000)
+    monkeypatch.setattr(report, "LARGE_MESH", 1000)
+    path = tmp_path / "scan.stl"
+    trimesh.creation.icosphere(subdivisions=3).export(path)
+    assert main(["serve", str(path), "--seconds", "0.1", *QUIET]) == 0
+    out, errors = capfd.readouterr()
+    reading, preparing = errors.splitlines()[:2]
+    assert reading == "reading scan.stl (0.1 MB)"
+    assert "scan.stl (1,280 triangles" in preparing
+    advice = "mesh scan has 1,280 triangles: over 1,000, simplify it"
+    assert advice in out
+    assert main(["scene", "inspect", str(path)]) == 0
+    assert f"headset: {advice}" in capfd.readouterr().out
+    small = tmp_path / "small.off"
+    small.write_text(TRIANGLE)
+    assert main(["scene", "inspect", str(small)]) == 0
+    assert capfd.readouterr().err == ""
+
+
+DOOR = (
+    'format = 1\nreference = "door"\n[anchors.door]\nposition_m = [1.0, 2.0, 0.5]\n'
+    "quaternion_wxyz = [0.0, 0.0, 0.0, 1.0]\nsize_m = 0.12\n"
+)
+
+
+def test_file_replaces_the_anchors_of_the_scene(tmp_path: Path) -> None:
+    path = tmp_path / "anchors.toml"
+    path.write_text(DOOR)
+    arguments = build_parser().parse_args(["serve", "arm", "--no-record", "--anchors", str(path)])
+    config = serve.create_session(arguments).config
+    assert config.anchors == {"door": ((1.0, 2.0, 0.5), (0.0, 0.0, 0.0, 1.0))}
+    assert config.sheet_sizes() == {"door": 0.12}
+    plain = serve.create_session(build_parser().parse_args(["serve", "arm", "--no-record"])).config
+    assert set(plain.anchors) == {"table"}
+
+
+def test_example_file_is_valid(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for words in ([], ["arms4"]):
+        assert main(["anchors", "example", *words]) == 0
+        text = capsys.readouterr().out
+        path = tmp_path / "example.toml"
+        path.write_text(text)
+        arguments = build_parser().parse_args(["serve", "arms4", "--no-record", "--anchors", str(path)])
+        config = serve.create_session(arguments).config
+        assert set(config.anchors) == {"table"}
+        assert config.sheet_sizes() == {"table": 0.16}
+    own = serve.create_session(build_parser().parse_args(["serve", "arms4", "--no-record"])).config
+    assert config.anchors == own.anchors, "that of the scene"
+    assert main(["anchors", "example", "arms4", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"toml": text}
+
+
+@pytest.mark.parametrize("text", ["nonsense", DOOR.replace("position_m", "position_mm"), None])
+def test_invalid_file_is_a_one_line_error_that_names_the_example(
+    text: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "anchors.toml"
+    if text is not None:
+        path.write_text(text)
+    assert main(["serve", "arm", "--no-record", "--anchors", str(path)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert error.startswith("iris-session: ")
+    assert "`iris-session anchors example`" in error
+
+
+def test_resumed_session_gets_new_anchors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Effect in the session: tests/session/test_resume.py."""
+    path = tmp_path / "anchors.toml"
+    path.write_text(DOOR)
+    opened: list[SessionConfig] = []
+    monkeypatch.setattr("iris_session.session.session.Session", lambda model, config: opened.append(config))
+    for given in (["--anchors", str(path)], []):
+        serve.resume_session(build_parser().parse_args(["serve", "--resume", str(tmp_path), *given]))
+    assert [set(config.anchors) for config in opened] == [{"door"}, {"table"}]
+    assert opened[0].resume == tmp_path

@@ -1,0 +1,162 @@
+"""Clients of one session, driven by one loop: `Scenario` polls all of them until a condition holds."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import pytest
+
+from anchors.pose import PoseTuple
+from iris_session.client import Client
+from iris_session.protocol.server_messages import Event, ParticipantJoined
+from tests.e2e.session_process import DEADLINE_S, SessionProcess, read_output_tails
+
+
+class Hand:
+    """The hand of an operator at a screen, or a policy's: sends samples of one device that drives `robot`.
+
+    The pose is in the tracking frame, which is the world for clients that need no alignment.
+    """
+
+    def __init__(self, client: Client, robot: str, device: str = "desktop") -> None:
+        self.client = client
+        self.robot = robot
+        self.device = device
+        self.pose: PoseTuple = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
+        self.clutch = False
+        self.velocity = (0.0, 0.0, 0.0)
+        self.sending = True
+        self._next = 0.0
+
+    def send_if_due(self) -> None:
+        """Move by `velocity` and send a sample, 72 times a second."""
+        now = time.monotonic()
+        if not self.sending or now < self._next:
+            return
+        dt = 1.0 / 72.0
+        self._next = now + dt
+        p = self.pose[0]
+        v = self.velocity
+        self.pose = ((p[0] + v[0] * dt, p[1] + v[1] * dt, p[2] + v[2] * dt), self.pose[1])
+        self.client.send_sample(self.device, self.pose, robots=[self.robot], clutch=self.clutch)
+
+    @property
+    def tip(self) -> PoseTuple:
+        tip = self.client.scene.tip_pose(self.robot)
+        assert tip is not None
+        return tip
+
+
+class Scenario:
+    """The clients of one test at one session; `run_until` polls all of them until a condition holds."""
+
+    def __init__(self, server: SessionProcess) -> None:
+        self.server = server
+        self.clients: list[Client] = []
+        self.hands: list[Hand] = []
+        self.events: dict[str, list[Event]] = {}
+
+    def join(self, name: str, role: str = "operator", identity: str | None = None) -> Client:
+        """Join a client that needs no alignment (policy, desktop)."""
+        log = self.events[name] = []
+        client = Client(
+            self.server.address,
+            role=role,
+            name=name,
+            devices=("desktop", "head", "joints", "target"),
+            alignment="not_needed",
+            identity=identity,
+            on_event=log.append,
+        )
+        return self.add(client)
+
+    def add(self, client: Client) -> Client:
+        """Join a client while others are polled: on a busy machine a join may exceed the heartbeat timeout."""
+        self.clients.append(client)
+        client.open()
+        self.run_until(lambda: client.ready, f"{client.name} has joined")
+        return client
+
+    def add_hand(self, client: Client, robot: str) -> Hand:
+        """Give a client a hand for a robot, once its scene has the robot."""
+        self.run_until(lambda: client.scene.tip_pose(robot) is not None, f"{client.name} sees {robot}")
+        hand = Hand(client, robot)
+        self.hands.append(hand)
+        return hand
+
+    def drive(self, name: str, robot: str, velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Hand:
+        """Join an operator that acquires a robot, engages it and moves it at `velocity` [m/s]."""
+        client = self.join(name)
+        hand = self.add_hand(client, robot)
+        client.acquire([robot])
+        self.engage(hand)
+        hand.velocity = velocity
+        return hand
+
+    def engage(self, hand: Hand) -> None:
+        """Open and close the clutch until the robot follows: an operator tries again, too, when it does not."""
+        closed_at = 0.0
+
+        def has_engaged() -> bool:
+            nonlocal closed_at
+            if time.monotonic() > closed_at + 2.0:  # on a busy machine no sample may have counted while it was open
+                hand.clutch = False
+                self.run_for(0.1)
+                hand.clutch, closed_at = True, time.monotonic()
+            return self.is_following(hand)
+
+        self.run_until(has_engaged, f"{hand.robot} follows {hand.client.name}")
+
+    def is_following(self, hand: Hand) -> bool:
+        """Return whether samples of the hand's participant were applied to its robot within 100 ms."""
+        return is_driven(hand.client, hand.robot, hand.client.connection.participant_id)
+
+    def poll(self) -> None:
+        for hand in self.hands:
+            hand.send_if_due()
+        for client in self.clients:
+            client.poll(0.0)
+        time.sleep(0.002)
+
+    def run_until(self, condition: Callable[[], object], what: str, timeout_s: float = DEADLINE_S) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            if time.monotonic() > deadline:
+                pytest.fail(f"not within {timeout_s:g} s: {what}\n{read_output_tails(self.server.folder.parent)}")
+            self.poll()
+
+    def run_for(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.poll()
+
+    def get_height(self, name: str, body: str) -> float:
+        """Return the height at which client `name` sees a body [m]; 0 before its first state."""
+        client = next(client for client in self.clients if client.name == name)
+        state = client.scene.state
+        return 0.0 if state is None else float(state.poses[client.mirror.body_index[body]][2])
+
+    def list_event_kinds(self, name: str) -> list[str]:
+        """Return the names of the events that client `name` has received."""
+        return [type(event.body).__name__ for event in self.events[name]]
+
+    def has_seen_joining(self, name: str, joined: str) -> bool:
+        """Return whether client `name` has received the event that participant `joined` joined."""
+        bodies = [event.body for event in self.events[name]]
+        return any(isinstance(b, ParticipantJoined) and b.participant.name == joined for b in bodies)
+
+    def close(self) -> None:
+        for client in self.clients:
+            client.close()
+
+
+def is_driven(client: Client, robot: str, participant: str | None = None) -> bool:
+    """Return whether samples (of one participant) were applied to a robot in the last 100 ms of the client's state."""
+    state = client.scene.state
+    return state is not None and any(
+        a.robot == robot
+        and participant in (None, a.participant)
+        and state.header.session_time - a.step_ns < 100_000_000
+        for a in state.header.applied
+    )

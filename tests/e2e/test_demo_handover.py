@@ -1,0 +1,134 @@
+"""`iris-session demo handover`: the whole product in one command, over good and bad links, and interrupted."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.e2e.session_process import (
+    COMMAND,
+    DEMO_OPTIONS,
+    DEMO_S,
+    assert_all_end,
+    list_descendants,
+    run_command,
+    run_verify,
+    wait_until,
+)
+
+pytestmark = pytest.mark.e2e
+
+
+#: Processes of a demo: front, recorder, display and two emulated headsets.
+CHILDREN = 5
+
+
+def test_hammer_is_handed_over_and_the_recording_verifies(tmp_path: Path) -> None:
+    done = run_command("demo", "handover", *DEMO_OPTIONS, cwd=tmp_path, timeout_s=DEMO_S)
+    assert done.returncode == 0, (done.stdout, done.stderr[-3000:])
+    result = json.loads(done.stdout)  # exactly one object
+    assert result["ok"] is True
+    assert set(result) >= {
+        *("ok", "seconds", "participants", "handovers", "recording", "alignment_mm", "late_tick_share"),
+        *("verified", "problems"),
+    }
+    assert result["participants"] == ["ann", "bob"]
+    assert result["problems"] == []
+    assert result["verified"] is True
+    (handover,) = result["handovers"]
+    assert set(handover) == {"object", "giver", "receiver", "at_s", "duration_s"}
+    assert handover["object"] == "hammer"
+    assert handover["giver"] != handover["receiver"]
+    assert 0.0 < handover["at_s"] < result["seconds"]
+    assert handover["duration_s"] > 0.1
+    for error in result["alignment_mm"].values():
+        assert 0.0 < error["at_sheet"] < 2.0 * error["stated_p95"]
+    assert 0.0 <= result["late_tick_share"] <= 1.0
+    recording = Path(result["recording"])
+    assert recording.parts[0] == "sessions"
+    assert recording.name == "session.rrd"
+    assert "handover" in done.stderr  # of the display
+    report = run_verify(tmp_path / recording)
+    assert report["recording_class"] == "closed"
+    assert report["finished"]
+
+
+@pytest.fixture
+def demo(tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A running demo: every process has started and both operators have joined."""
+    out = tmp_path / "demo.out"
+    with out.open("wb") as file:
+        process = subprocess.Popen([*COMMAND, "demo", "handover"], stdout=file, stderr=file, cwd=tmp_path)
+    wait_until(lambda: out.read_text().count("participant_joined") == 2, "both operators join")
+    yield process
+    if process.poll() is None:
+        for child in list_descendants(process.pid):
+            child.kill()
+        process.kill()
+        process.wait()
+
+
+def test_timeout_fails_and_lists_the_problems(tmp_path: Path) -> None:
+    done = run_command("demo", "handover", "--json", "--timeout", "4", cwd=tmp_path)
+    assert done.returncode == 1, done.stderr
+    result = json.loads(done.stdout)
+    assert result["ok"] is False
+    assert result["handovers"] == []
+    text = " ".join(result["problems"])
+    assert "4 s" in text
+    assert "handover" in text
+    assert result["verified"] is True, "the recording of a failed demo verifies, too"
+
+
+def test_ctrl_c_leaves_no_process_and_a_finished_recording(demo: subprocess.Popen[bytes], tmp_path: Path) -> None:
+    children = list_descendants(demo.pid)
+    assert len(children) == CHILDREN
+    demo.send_signal(signal.SIGINT)
+    wait_until(lambda: demo.poll() is not None, "the demo ends")
+    assert demo.wait() == 130
+    assert_all_end(children)
+    assert "interrupted" in (tmp_path / "demo.out").read_text()
+    (recording,) = tmp_path.glob("sessions/*/session.rrd")
+    assert run_verify(recording)["finished"]
+
+
+def test_killed_demo_leaves_no_process_and_a_finished_recording(demo: subprocess.Popen[bytes], tmp_path: Path) -> None:
+    children = list_descendants(demo.pid)
+    assert len(children) == CHILDREN
+    demo.kill()
+    demo.wait()
+    assert_all_end(children)
+    assert not [p for p in psutil.process_iter() if p.pid in {c.pid for c in children} and p.is_running()]
+    (recording,) = tmp_path.glob("sessions/*/session.rrd")
+    assert run_verify(recording)["finished"]
+
+
+def test_handover_over_busy_wifi(tmp_path: Path) -> None:
+    recording = tmp_path / "session.rrd"
+    options = ("--profile", "busy-wifi", "--seed", "3", "--record", str(recording), *DEMO_OPTIONS)
+    done = run_command("demo", "handover", *options, cwd=tmp_path, timeout_s=DEMO_S)
+    result = json.loads(done.stdout)
+    assert result["ok"], (result["problems"], done.stderr[-2000:])
+    assert result["verified"]
+    assert [h["object"] for h in result["handovers"]] == ["hammer"]
+    assert all(age > 10.0 for age in result["state_age_ms_p99"].values()), "the delay of the link is in the ages"
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (["--latency=-3"], "'-3'"),
+        (["--latency", "3", "--profile", "lan"], "--profile"),
+        (["--profile", "wifi"], "'wifi'"),
+    ],
+)
+def test_invalid_links_are_rejected(tmp_path: Path, options: list[str], named: str) -> None:
+    done = run_command("demo", "handover", *options, cwd=tmp_path)
+    assert done.returncode == 2
+    assert named in done.stderr

@@ -1,0 +1,69 @@
+"""The demos beside the handover, each by its command: real robots' models and deformables, recorded and verified."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.e2e.session_process import DEMO_OPTIONS, DEMO_S, run_command
+from tests.models import robot_models
+
+__all__ = ["robot_models"]
+pytestmark = pytest.mark.e2e
+
+
+def run_demo(folder: Path, *arguments: str) -> dict[str, Any]:
+    """Run a demo, which must succeed. Return its result."""
+    done = run_command("demo", *arguments, *DEMO_OPTIONS, cwd=folder, timeout_s=DEMO_S)
+    assert done.returncode == 0, (done.stdout, done.stderr[-3000:])
+    result: dict[str, Any] = json.loads(done.stdout)
+    assert (result["ok"], result["problems"], result["verified"]) == (True, [], True), result
+    assert result["participants"] == ["ann", "bob"]
+    return result
+
+
+@pytest.mark.usefixtures("robot_models")
+def test_aloha_operators_exchange_boards(tmp_path: Path) -> None:
+    result = run_demo(tmp_path, "aloha")
+    found = {h["object"]: (h["giver"], h["receiver"]) for h in result["handovers"]}
+    assert found == {
+        "red_board": ("south/right", "north/left"),
+        "blue_board": ("north/right", "south/left"),
+    }
+    for error in result["alignment_mm"].values():
+        assert 0.0 < error["at_sheet"] < 2.0 * error["stated_p95"]
+
+
+@pytest.mark.usefixtures("robot_models")
+def test_iiwa_operators_hand_over_a_hammer(tmp_path: Path) -> None:
+    result = run_demo(tmp_path, "iiwa")
+    assert [(h["object"], h["giver"], h["receiver"]) for h in result["handovers"]] == [("object1", "left", "right")]
+
+
+def test_two_operators_stow_two_soft_bodies(tmp_path: Path) -> None:
+    goals = run_demo(tmp_path, "soft")["goals"]
+    assert sorted((goal["deformable"], goal["goal"]) for goal in goals) == [("mint", "stowed"), ("rose", "stowed")]
+
+
+def test_two_operators_fold_a_cloth(tmp_path: Path) -> None:
+    goals = run_demo(tmp_path, "cloth")["goals"]
+    assert [(goal["deformable"], goal["goal"]) for goal in goals] == [("cloth", "folded")]
+
+
+def test_invalid_number_of_operators_is_one_line(tmp_path: Path) -> None:
+    done = run_command("demo", "aloha", "--operators", "4", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("iris-session: demo aloha")
+    assert "2 operators" in done.stderr
+
+
+def test_missing_robot_models_name_the_variable_and_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("IRIS_DATA", raising=False)
+    done = run_command("demo", "iiwa", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "IRIS_DATA" in done.stderr
+    assert "models/kuka_iiwa_14/iiwa14.xml" in done.stderr
+    assert done.stderr.count("\n") == 1

@@ -1,0 +1,151 @@
+"""The end of a session: signals in any state end it in order, without a traceback, and no process stays."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.scenario import Hand, Scenario
+from tests.e2e.session_process import (
+    COMMAND,
+    FREE_PORTS,
+    SessionProcess,
+    assert_all_end,
+    list_descendants,
+    run_verify,
+    wait_until,
+)  # fmt: skip
+
+pytestmark = pytest.mark.e2e
+
+SERVE = [*COMMAND, "serve", "handover", "--no-beacon", *FREE_PORTS]
+#: A session ends within 2 s of Ctrl-C; on a busy machine it may take much longer.
+END_S = 30.0
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_signal_ends_the_session_in_order(serve: Callable[..., SessionProcess], number: signal.Signals) -> None:
+    server = serve("handover", "--json")
+    scenario = Scenario(server)
+    ann = scenario.join("ann", "observer")
+    children = list_descendants(server.process.pid)
+    server.process.send_signal(number)
+    wait_until(lambda: server.process.poll() is not None, "the session ends")
+    assert server.process.wait() == 0, server.output
+    assert_all_end(children)
+    scenario.run_until(lambda: not ann.connection.is_joined, "ann has disconnected")
+    scenario.close()
+    assert server.verify()["finished"]
+
+
+def interrupt(server: SessionProcess) -> None:
+    """Press Ctrl-C; the session must end soon, and no process may stay."""
+    children = list_descendants(server.process.pid)
+    began = time.monotonic()
+    server.process.send_signal(signal.SIGINT)
+    wait_until(lambda: server.process.poll() is not None, "the session ends", END_S)
+    print(f"ended after {time.monotonic() - began:.2f} s")
+    assert_all_end(children)
+
+
+def test_ctrl_c_while_one_client_joins_and_another_drives(
+    scenario: Scenario, driving: Hand, emulate: Callable[..., subprocess.Popen[bytes]]
+) -> None:
+    headset = emulate(scenario.server.address, "name=eve,behaviour=idle")
+    scenario.run_until(lambda: scenario.has_seen_joining("ann", "eve"), "eve has sent hello")
+    headset.send_signal(signal.SIGSTOP)
+    try:
+        interrupt(scenario.server)
+    finally:
+        headset.send_signal(signal.SIGCONT)
+    assert scenario.server.process.returncode == 0
+    assert scenario.server.verify()["finished"]
+
+
+def test_ctrl_c_while_paused(scenario: Scenario) -> None:
+    director = scenario.join("dora", "director")
+    director.control("pause")
+    scenario.run_until(lambda: director.mirror.paused, "the session is paused")
+    interrupt(scenario.server)
+    assert scenario.server.process.returncode == 0
+    assert scenario.server.verify()["finished"]
+
+
+def test_ctrl_c_while_the_recorder_hangs(scenario: Scenario, driving: Hand) -> None:
+    """Rows that the recorder did not receive are lost, which is reported; the rest verifies."""
+    scenario.run_for(0.5)
+    scenario.server.children()["recording.process"].suspend()
+    scenario.run_for(0.3)
+    interrupt(scenario.server)
+    assert scenario.server.process.returncode == 1
+    assert "recording is missing" in scenario.server.output
+    report = run_verify(scenario.server.recording)
+    assert not report["finished"]
+    assert report["problems"] == []
+
+
+def test_ctrl_c_while_the_front_hangs(scenario: Scenario, driving: Hand) -> None:
+    scenario.server.children()["front.main"].suspend()
+    interrupt(scenario.server)
+    assert scenario.server.process.returncode == 0
+    assert scenario.server.verify()["finished"]
+
+
+def test_second_interrupt_at_once_ends_without_traceback(tmp_path: Path) -> None:
+    process = subprocess.Popen(SERVE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+    assert process.stdout is not None
+    assert "session 'handover'" in process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=30)
+    assert "Traceback" not in errors
+    assert process.returncode in (0, 130)  # 0: both signals arrived as one
+
+
+def test_blocked_output_does_not_delay_the_end(tmp_path: Path) -> None:
+    """Standard output is a full pipe without a reader."""
+    read, write = os.pipe()
+    process = subprocess.Popen(
+        [*SERVE, "--seconds", "2"], stdout=write, stderr=subprocess.PIPE, text=True, cwd=tmp_path
+    )
+    assert select.select([read], [], [], 30.0)[0]
+    os.read(read, 20)
+    os.set_blocking(write, False)
+    try:
+        while True:
+            os.write(write, b"x" * 4096)
+    except BlockingIOError:
+        os.set_blocking(write, True)
+    try:
+        _, errors = process.communicate(timeout=20)
+    except subprocess.TimeoutExpired:
+        os.set_blocking(read, False)
+        os.read(read, 1 << 20)  # the last line, to standard output itself, blocks as in any program
+        _, errors = process.communicate(timeout=30)
+    os.close(read)
+    os.close(write)
+    assert "Traceback" not in errors
+    assert process.returncode == 0
+
+
+@pytest.mark.parametrize("after_s", [0.1, 3.0, 12.0])
+def test_interrupted_benchmark_ends_without_traceback(tmp_path: Path, after_s: float) -> None:
+    """Ctrl-C in a terminal reaches all processes of the group: those that import, wait, and measure."""
+    command = [*COMMAND, "bench", "state", "--clients", "2", "--bodies", "10"]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path, start_new_session=True
+    )
+    assert process.stderr is not None
+    assert "baseline" in process.stderr.readline()
+    time.sleep(after_s)
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert "Traceback" not in errors
+    assert process.returncode == 130

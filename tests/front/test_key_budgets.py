@@ -1,0 +1,221 @@
+"""Budgets of keys: what one key may send and cause over all its connections, on a clock of the test's own."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+
+import msgspec
+import pytest
+import zmq
+
+from iris_session.front.connections import Peer
+from iris_session.protocol.client_messages import (
+    Acquire,
+    EStop,
+    GetSnapshot,
+    Heartbeat,
+    Hello,
+    Marker,
+    Release,
+    Sample,
+)
+from iris_session.protocol.common import IDENTITY, Target
+from iris_session.protocol.entries import Entry
+from iris_session.protocol.names import DenialReason
+from iris_session.protocol.server_messages import ProtocolFault, Refused, Reply
+from tests.front.intake_rig import HELLO, IntakeRig
+
+MS = 1_000_000
+SECOND = 1_000_000_000
+SAMPLE = Sample("head", "pose", 1, 0, 1, 0, 1, pose=IDENTITY)
+
+
+@pytest.fixture
+def rig() -> Iterator[IntakeRig]:
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    yield IntakeRig(context)
+    context.destroy(linger=0)
+
+
+class KeyRig:
+    """Several connections of one key, each with a TCP connection of its own."""
+
+    def __init__(self, rig: IntakeRig, n: int, secret: bytes = b"s" * 16, first: int = 100) -> None:
+        self.rig = rig
+        self.epochs: list[int] = []
+        self.peers = [Peer(first + i, "") for i in range(n)]
+        self.routes = [b"%d" % (first + i) for i in range(n)]
+        for peer, route in zip(self.peers, self.routes, strict=True):
+            self.epochs.append(rig.join(peer, route=route, secret=secret).connection_epoch)
+            rig.now_ns += SECOND
+
+    def send(self, i: int, message: object) -> None:
+        self.rig.take(message, self.peers[i], self.epochs[i], route=self.routes[i])  # type: ignore[arg-type]
+
+
+def collect(rig: IntakeRig, counts: Counter[type]) -> list[Entry]:
+    entries = rig.entries()
+    counts.update(type(entry.message) for entry in entries)
+    return entries
+
+
+def test_the_messages_of_one_key_are_limited_over_all_its_connections(rig: IntakeRig) -> None:
+    hog, ann = KeyRig(rig, 8), KeyRig(rig, 1, b"a" * 16, 200)
+    kept: Counter[type] = Counter()
+    seconds, seq = 5, 0
+    for _ in range(seconds * 100):
+        rig.now_ns += 10 * MS
+        for i in range(8):
+            for _ in range(6):  # each connection within its own limit: 600 a second
+                seq += 1
+                hog.send(i, msgspec.structs.replace(SAMPLE, seq=seq, clutch=bool(seq % 2)))
+        ann.send(0, msgspec.structs.replace(SAMPLE, seq=seq))
+        kept.update(entry.connection for entry in rig.entries())
+    assert sum(kept[epoch] for epoch in hog.epochs) <= 2400 * (seconds + 1)
+    assert rig.drops.by_reason["key_messages"] > 5000
+    assert kept[ann.epochs[0]] == seconds * 100
+    assert any("this key" in m.message for _, m, _ in rig.sent if isinstance(m, ProtocolFault))
+
+
+def test_the_bytes_of_one_key_are_limited(rig: IntakeRig) -> None:
+    hog = KeyRig(rig, 8)
+    large = msgspec.structs.replace(SAMPLE, hand_joints=tuple(0.1 for _ in range(182)), q=(0.1,) * 64, qd=(0.1,) * 64)
+    for seq in range(8 * 2000):
+        hog.send(seq % 8, msgspec.structs.replace(large, seq=seq))
+        rig.now_ns += MS // 4
+    assert rig.drops.by_reason.get("key_bytes", 0) > 0
+
+
+def test_requests_for_many_targets_are_weighed_by_the_events_that_they_cause(rig: IntakeRig) -> None:
+    hog, kept = KeyRig(rig, 1), Counter[type]()
+    robots, objects = tuple(f"arm{i}" for i in range(32)), tuple(f"part{i}" for i in range(8))
+    for i in range(100):
+        rig.now_ns += 50 * MS
+        hog.send(0, Acquire(2 * i + 1, robots, objects))
+        hog.send(0, Release(2 * i + 2))
+        collect(rig, kept)
+    assert kept[Acquire] <= 4 + 5  # a burst of 80 events, then 20 a second, at 22 each
+    assert kept[Release] == 100  # what ends something is never denied
+    denied = [m.denial for _, m, _ in rig.sent if isinstance(m, Reply) and m.denial is not None]
+    assert {denial.reason for denial in denied} == {DenialReason.QUOTA}
+    assert "events a second" in denied[0].message
+    assert rig.drops.by_reason["key_events"] == 100 - kept[Acquire]
+
+
+def test_a_person_who_acquires_and_releases_notices_no_limit(rig: IntakeRig) -> None:
+    ann, kept = KeyRig(rig, 1), Counter[type]()
+    for i in range(120):
+        rig.now_ns += 250 * MS
+        ann.send(0, Acquire(2 * i + 1, ("left", "right")))
+        ann.send(0, Release(2 * i + 2))
+        ann.send(0, Marker(1000 + i, "done"))
+        ann.send(0, Heartbeat())
+        collect(rig, kept)
+    assert (kept[Acquire], kept[Release], kept[Marker]) == (120, 120, 120)
+    assert rig.drops.by_reason == {}
+
+
+def test_the_events_of_one_key_are_limited_over_all_its_connections(rig: IntakeRig) -> None:
+    hog, kept = KeyRig(rig, 8), Counter[type]()
+    for i in range(200):
+        rig.now_ns += 50 * MS
+        for c in range(8):
+            hog.send(c, Marker(i + 1, "x"))
+        collect(rig, kept)
+    assert 200 <= kept[Marker] <= 80 + 10 * 20 + 1
+
+
+def test_a_headset_that_is_put_on_and_off_all_the_time_is_no_flood_of_events(rig: IntakeRig) -> None:
+    hog = KeyRig(rig, 2)
+    changes, worn = 0, True
+    for i in range(1000):
+        rig.now_ns += 10 * MS
+        hog.send(
+            i % 2, Heartbeat(bool(i % 4 < 2)) if i % 10 == 0 else msgspec.structs.replace(SAMPLE, seq=i, worn=i % 3 > 0)
+        )
+        for entry in rig.entries():
+            if isinstance(entry.message, (Heartbeat, Sample)) and entry.connection == hog.epochs[0]:
+                changes += entry.message.worn is not worn
+                worn = entry.message.worn
+    assert 50 < changes <= 80 + 10 * 20 + 20
+    assert rig.drops.by_reason["key_events"] > 50
+
+
+def test_a_clutch_that_opens_always_passes(rig: IntakeRig) -> None:
+    hog, targets = KeyRig(rig, 1), (Target("left", 1),)
+    closed, closings = False, 0
+    for i in range(1000):
+        rig.now_ns += 10 * MS
+        hog.send(0, msgspec.structs.replace(SAMPLE, seq=i, targets=targets, clutch=i % 2 == 0))
+        for entry in rig.entries():
+            if not isinstance(entry.message, Sample):
+                continue  # the audit that names the flood
+            closings += entry.message.clutch and not closed
+            closed = entry.message.clutch
+        if i % 2:
+            assert not closed
+    assert 100 <= closings <= (80 + 10 * 20) // 2 + 1
+
+
+def test_snapshots_of_a_large_scene_cost_more(rig: IntakeRig) -> None:
+    hog, kept = KeyRig(rig, 8), Counter[type]()
+    for i in range(100):
+        rig.now_ns += 100 * MS
+        for c in range(8):
+            hog.send(c, GetSnapshot(i + 1))
+        collect(rig, kept)
+    assert kept[GetSnapshot] <= 800 / 20 + 10 * 200 / 20 + 1
+
+
+def test_one_key_joins_a_few_times_a_second(rig: IntakeRig) -> None:
+    joined = 0
+    for i in range(200):
+        rig.now_ns += 50 * MS
+        rig.take(HELLO, Peer(1000 + i, ""), route=b"x")
+        joined += len(rig.entries())
+    assert joined <= (80 + 10 * 20) / 4 + 1
+    refused = [m for _, m, _ in rig.sent if isinstance(m, Refused)]
+    assert "joins too often" in refused[-1].message
+    rig.take(Hello("operator", "Bob", secret=b"b" * 16), Peer(5000, ""), route=b"y")
+    assert len(rig.entries()) == 1
+
+
+def test_the_first_stop_counts_at_once_and_the_others_are_merged_into_one_within_half_a_second(rig: IntakeRig) -> None:
+    hog, ann = KeyRig(rig, 3), KeyRig(rig, 1, b"a" * 16, 200)
+    hog.send(0, EStop("first"))
+    assert [e.message for e in rig.entries()] == [EStop("first")]
+    stops = 0
+    for i in range(300):
+        hog.send(i % 3, EStop(f"again {i}"))
+        stops += len(rig.entries())
+    assert stops <= 4
+    assert rig.drops.by_reason["estops_merged"] >= 290
+    ann.send(0, EStop("really"))
+    assert [e.message for e in rig.entries()] == [EStop("really")]
+    rig.now_ns += 500 * MS
+    rig.budgets.tick(rig.now_ns)
+    assert [e.message for e in rig.entries()] == [EStop("again 299")]
+    rig.now_ns += 5 * SECOND
+    rig.budgets.tick(rig.now_ns)
+    assert rig.entries() == []
+
+
+def test_those_behind_a_gateway_have_budgets_of_their_own_and_the_gateways_together(rig: IntakeRig) -> None:
+    rig.join(role="gateway")
+    epochs = []
+    for name in ("ann", "mallory"):
+        rig.take(Hello("observer", name, secret=name.encode().ljust(16)), behalf=name)
+        (entry,) = rig.entries()
+        epochs.append(entry.connection)
+        connection = rig.clients.by_number[entry.connection]
+        connection.admitted = True
+    kept: Counter[int] = Counter()
+    for i in range(200):
+        rig.now_ns += 50 * MS
+        rig.take(Marker(i + 1, "x"), epoch=epochs[0], behalf="ann") if i % 10 == 0 else None
+        for _ in range(2):
+            rig.take(Marker(i + 1, "x"), epoch=epochs[1], behalf="mallory")
+        kept.update(entry.connection for entry in rig.entries())
+    assert kept[epochs[0]] == 20
+    assert kept[epochs[1]] <= 80 + 10 * 20 + 1

@@ -1,0 +1,205 @@
+"""Raw samples on their way to the recorder: batches, shares of keys and of all, what observers leave in a recording."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import zmq
+
+from iris_session.front import raw_feed
+from iris_session.front.connections import FrontConnection, Peer, Route
+from iris_session.front.raw_feed import (
+    BATCH_BYTES,
+    BURST_S,
+    KEY_BYTES_PER_S,
+    KEY_SHARE,
+    LOG_PERIOD_NS,
+    NOT_READ,
+    OBSERVER_BYTES_PER_S,
+    PRESENCE_BYTES_PER_S,
+    PRESENCE_DEVICES,
+    PRESENCE_HZ,
+    PRESENCE_SHARE,
+    REQUEST_BYTES_PER_S,
+    REQUEST_SHARE,
+    TOTAL_BYTES_PER_S,
+    TOTAL_SHARE,
+    PresenceLimiter,
+    RawFeed,
+)
+from iris_session.protocol.client_messages import Hello, Sample
+from iris_session.protocol.common import Pose, Target
+from iris_session.protocol.limits import Drops
+
+SECOND = 1_000_000_000
+POSE = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+#: The largest sample that a client can send: about 6 kB.
+LARGE = Sample("head", "pose", 1, 0, 1, 0, 1, pose=POSE, hand_joints=(0.1,) * 182, q=(0.1,) * 64, qd=(0.1,) * 64)
+LARGE_BYTES = len(msgspec.msgpack.encode(LARGE))
+
+
+def connection(number: int, key: str, role: str = "operator") -> FrontConnection:
+    hello = Hello(role, f"name of {key}", secret=b"s" * 16)
+    return FrontConnection(number, Route(bytes([number])), Peer(number, key), ("10.0.0.1", 5), key, hello, 0)
+
+
+class Rig:
+    """A feed with a socket that reads it, which may also not be read."""
+
+    def __init__(self, path: Path) -> None:
+        self.drops = Drops()
+        self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self.recorder = self.context.socket(zmq.PULL)
+        self.recorder.setsockopt(zmq.RCVHWM, 1)
+        self.recorder.bind(f"ipc://{path}/raw")
+        self.feed = RawFeed(self.context, f"ipc://{path}/raw", self.drops)
+
+    def receive(self) -> list[Any]:
+        batches = []
+        while self.recorder.poll(300):
+            batches.append(self.recorder.recv())
+        return [row for batch in batches for row in msgspec.msgpack.decode(batch)]
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    rig = Rig(tmp_path)
+    yield rig
+    rig.context.destroy(linger=0)
+
+
+def test_samples_go_in_batches(rig: Rig) -> None:
+    ann = connection(1, "ann")
+    for i in range(30):
+        rig.feed.send(ann, i, msgspec.structs.replace(LARGE, seq=i))
+    rig.feed.tick(SECOND)
+    rows = rig.receive()
+    assert [(number, at) for number, at, _ in rows] == [(1, i) for i in range(30)]
+    assert [msgspec.msgpack.decode(data, type=Sample).seq for *_, data in rows] == list(range(30))
+
+
+def test_one_key_has_its_share_over_all_its_connections(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+    """A key that sends all it can (600 samples a second, eight connections) leaves the others theirs."""
+    eves = [connection(10 + i, "eve") for i in range(8)]
+    ann = connection(1, "ann")
+    sent = 0
+    with caplog.at_level(logging.WARNING):
+        for tick in range(1000):  # ten seconds
+            now_ns = tick * SECOND // 100
+            for eve in eves:
+                for _ in range(6):
+                    rig.feed.send(eve, now_ns, LARGE)
+            rig.feed.send(ann, now_ns, LARGE)
+            rig.feed.tick(now_ns)
+            sent += 48
+            while rig.recorder.poll(0):
+                rig.recorder.recv()
+    left_out = rig.drops.by_reason[KEY_SHARE]
+    assert (sent - left_out) * LARGE_BYTES <= KEY_BYTES_PER_S * (10 + BURST_S)
+    assert (sent - left_out) * LARGE_BYTES >= KEY_BYTES_PER_S * 9
+    assert 1 not in rig.drops.by_connection
+    lines = [record.message for record in caplog.records]
+    assert 1 <= len(lines) <= 10 * SECOND // LOG_PERIOD_NS + 1
+    assert "name of eve" in lines[0]
+
+
+def test_all_keys_together_are_bounded(rig: Rig) -> None:
+    keys = [connection(i, f"key {i}") for i in range(60)]
+    sent = 0
+    for tick in range(300):
+        for one in keys:
+            rig.feed.send(one, tick * SECOND // 100, LARGE)
+            sent += 1
+        rig.feed.tick(tick * SECOND // 100)
+        while rig.recorder.poll(0):
+            rig.recorder.recv()
+    assert (sent - rig.drops.by_reason[TOTAL_SHARE]) * LARGE_BYTES <= TOTAL_BYTES_PER_S * (3 + BURST_S)
+
+
+def test_recorder_that_does_not_read_costs_bounded_memory(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(raw_feed, "BATCHES_IN_TRANSIT", 4)
+    feed = RawFeed(rig.context, "inproc://nobody-reads", rig.drops)
+    ann = connection(1, "ann")
+    n = 20 * BATCH_BYTES // LARGE_BYTES
+    for _ in range(n):
+        feed.send(ann, 0, LARGE)
+    feed.tick(0)
+    assert n - 5 * (BATCH_BYTES // LARGE_BYTES + 1) <= rig.drops.by_reason[NOT_READ] < n
+    feed.close()
+    feed._socket.close(linger=0)  # type: ignore[union-attr]
+
+
+def test_feed_without_recorder_counts_nothing() -> None:
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    drops = Drops()
+    feed = RawFeed(context, "", drops)
+    for _ in range(2000):
+        feed.send(connection(1, "ann"), 0, LARGE)
+    feed.tick(0)
+    feed.close()
+    assert drops.by_reason == {}
+    context.term()
+
+
+def test_of_observers_only_presence_at_display_rate_counts() -> None:
+    drops = Drops()
+    limiter, eve = PresenceLimiter(drops), connection(1, "eve", "observer")
+    kept = []
+    for i in range(1200):  # two seconds at the limit of a connection, every sample an edge
+        sample = msgspec.structs.replace(LARGE, seq=i, buttons=i % 2)
+        kept.append(limiter.limit(eve, sample, i * SECOND // 600))
+    passed = [one for one in kept if one is not None]
+    assert 2 * PRESENCE_HZ - 2 <= len(passed) <= 2 * PRESENCE_HZ + 2
+    assert all(len(msgspec.msgpack.encode(one)) < 300 for one in passed)
+    assert {(one.pose, one.buttons, one.hand_joints, one.q) for one in passed} == {(POSE, 0, (), ())}
+    assert drops.by_reason == {}, "a headset that samples faster than a display does nothing wrong"
+
+
+def test_headset_taken_off_is_said_at_once() -> None:
+    limiter, eve = PresenceLimiter(Drops()), connection(1, "eve", "observer")
+    on = Sample("head", "pose", 1, 0, 1, 0, 1, pose=POSE)
+    assert limiter.limit(eve, on, 0) is on
+    off = msgspec.structs.replace(on, worn=False)
+    assert limiter.limit(eve, off, 1) is off
+    assert limiter.limit(eve, off, 2) is None
+
+
+@pytest.mark.parametrize("devices", [1, 40])
+def test_observers_of_one_key_have_one_share(devices: int) -> None:
+    drops = Drops()
+    limiter = PresenceLimiter(drops)
+    eves = [connection(i, "eve", "observer") for i in range(8)]
+    targets = tuple(Target("t" * 64, i) for i in range(8))
+    written = 0
+    for i in range(6000):
+        for eve in eves:
+            sample = Sample(f"{i % devices}{'d' * 60}", "pose", i, 0, 1, 0, 1, targets, worn=bool(i % 2), pose=POSE)
+            passed = limiter.limit(eve, sample, i * SECOND // 600)
+            written += 0 if passed is None else len(msgspec.msgpack.encode(passed))
+    assert written <= PRESENCE_BYTES_PER_S * (10 + BURST_S)
+    assert drops.by_reason[PRESENCE_SHARE] > 0
+    assert all(len(eve.presence_due_ns) <= PRESENCE_DEVICES for eve in eves)
+
+
+def test_requests_of_observers_have_a_share() -> None:
+    limiter = PresenceLimiter(Drops())
+    eves = [connection(i, "eve", "observer") for i in range(8)]
+    taken = sum(20_000 for i in range(1000) for eve in eves if not limiter.take_request(eve, 20_000, i * SECOND // 100))
+    assert taken <= REQUEST_BYTES_PER_S * (10 + BURST_S)
+    assert limiter.take_request(connection(9, "ann", "observer"), 20_000, 10 * SECOND) == ""
+    assert limiter.take_request(eves[0], 60_000, 10 * SECOND) == REQUEST_SHARE
+
+
+def test_observers_record_less_than_others(rig: Rig) -> None:
+    eve = connection(1, "eve", "observer")
+    for i in range(6000):
+        rig.feed.send(eve, i * SECOND // 600, LARGE)
+        while rig.recorder.poll(0):
+            rig.recorder.recv()
+    kept = 6000 - rig.drops.by_reason[KEY_SHARE]
+    assert kept * LARGE_BYTES <= OBSERVER_BYTES_PER_S * (10 + BURST_S)

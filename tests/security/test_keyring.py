@@ -1,0 +1,90 @@
+"""The keyring follows its file: what a missing, replaced or empty list means."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from iris_session.protocol.limits import Drops
+from iris_session.security import KeyHome, KeyPair
+from iris_session.security.keyring import ABSENCE_NS, Keyring, open_keyring
+
+
+class List:
+    """An allow-list of two keys and the keyring of a session, with time by the test."""
+
+    def __init__(self, folder: Path) -> None:
+        self.home = KeyHome(folder)
+        self.home.load_server_key()
+        self.marks = [self.home.clients.allow_key(name, KeyPair.generate().public).fingerprint for name in "ab"]
+        self.file = folder / "clients.json"
+        self.drops = Drops()
+        self.keyring = open_keyring(str(folder), "", "", self.drops)
+        self.now_ns = 0
+
+    def pass_time(self, ns: int) -> None:
+        for _ in range(10):
+            self.now_ns += ns // 10
+            self.keyring.tick(self.now_ns)
+            self.keyring.reload_if_changed()
+
+
+@pytest.fixture
+def listed(tmp_path: Path) -> Iterator[List]:
+    listed = List(tmp_path / "home")
+    yield listed
+    listed.keyring.close()
+
+
+def test_list_that_is_missing_for_a_moment_revokes_nobody(listed: List, caplog: pytest.LogCaptureFixture) -> None:
+    away = listed.file.rename(listed.file.with_name("clients.json~"))
+    listed.pass_time(ABSENCE_NS - 100_000_000)
+    assert list(listed.keyring.fingerprints) == listed.marks
+    assert listed.keyring.is_missing
+    away.rename(listed.file)
+    listed.pass_time(10 * ABSENCE_NS)
+    assert list(listed.keyring.fingerprints) == listed.marks
+    assert not listed.keyring.removed
+    assert caplog.text.count("allow-list is missing") == 1
+    assert listed.drops.by_reason["allow_list_missing"] == 1
+
+
+def test_list_that_stays_missing_revokes_all(listed: List) -> None:
+    listed.file.unlink()
+    listed.pass_time(2 * ABSENCE_NS)
+    assert list(listed.keyring.fingerprints) == []
+    assert list(listed.keyring.removed) == listed.marks
+    assert not listed.keyring.is_missing
+
+
+def test_empty_list_revokes_all_at_once(listed: List) -> None:
+    listed.file.write_text("[]")
+    listed.keyring.reload_if_changed()
+    assert list(listed.keyring.fingerprints) == []
+    assert list(listed.keyring.removed) == listed.marks
+
+
+def test_list_that_disappears_while_it_is_read_revokes_nobody(listed: List, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = listed.home.clients.read
+
+    def vanish() -> dict[str, object]:
+        listed.file.rename(listed.file.with_name("clients.json~"))
+        return dict(read())
+
+    listed.file.write_bytes(listed.file.read_bytes() + b"\n")
+    with monkeypatch.context() as patch:
+        patch.setattr(listed.keyring, "_read", vanish)
+        listed.keyring.reload_if_changed()
+    assert list(listed.keyring.fingerprints) == listed.marks
+    listed.file.with_name("clients.json~").rename(listed.file)
+    listed.pass_time(2 * ABSENCE_NS)
+    assert list(listed.keyring.fingerprints) == listed.marks
+    assert not listed.keyring.removed
+
+
+def test_keyring_without_file_has_nothing_missing() -> None:
+    keyring = Keyring()
+    keyring.reload_if_changed()
+    assert not keyring.is_missing

@@ -1,0 +1,443 @@
+"""`Session.attach`: MuJoCo's step functions are wrapped for the data attached, and for nothing else. Real processes."""
+
+from __future__ import annotations
+
+import functools
+import os
+import subprocess
+import sys
+import textwrap
+import time
+import types
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from iris_session import ConfigError, OwnershipError, Session, SessionConfig
+from iris_session.demo.scenes import n_arms_scene, scene_path
+from iris_session.physics import load_model
+from iris_session.protocol.server_messages import SceneChanged
+from iris_session.session.attachment import STEP_FUNCTIONS, Attachment, EnvironmentStep, find_simulation
+from iris_session.session.verification import verify_recording
+from tests.session.loops import Agent, Rig, largest_step
+from tests.session.play import TICK_NS
+from tests.session.test_ctrl_sharing import SPEED_STEP, sideways
+from tests.session.test_session import QUIET
+
+ORIGINALS = {name: getattr(mujoco, name) for name in STEP_FUNCTIONS}
+
+
+@pytest.fixture
+def model() -> mujoco.MjModel:
+    return load_model(scene_path("handover"))
+
+
+@pytest.fixture(autouse=True)
+def _no_trace() -> Iterator[None]:
+    yield
+    assert mujoco.get_mjcb_control() is None
+    for name, function in ORIGINALS.items():
+        assert getattr(mujoco, name) is function, "the last session gives MuJoCo's functions back"
+
+
+class Attached:
+    """A loop without processes whose data is attached."""
+
+    def __init__(self, model: mujoco.MjModel | None = None) -> None:
+        self.rig = Rig(model)
+        self.model, self.data = self.rig.model, self.rig.data
+        self.attachment = Attachment(self.rig.loop, None, "step", lambda model, data: None)
+
+    @property
+    def counts(self) -> list[int]:
+        """Ticks of every round."""
+        return [row.n_ticks for row in self.rig.recorder.rows if row.n_ticks]
+
+    def changes(self) -> int:
+        """New epochs so far."""
+        events = [event.body for decision in self.rig.front.decisions for event in decision.events]
+        return len([body for body in events if isinstance(body, SceneChanged)])
+
+    def close(self) -> None:
+        self.attachment.close()
+        self.rig.loop.close()
+
+
+@pytest.fixture
+def attached() -> Iterator[Attached]:
+    attached = Attached()
+    yield attached
+    attached.close()
+
+
+def make_data(model: mujoco.MjModel) -> mujoco.MjData:
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    return data
+
+
+def count_rounds(session: Session) -> list[int]:
+    """Collects `n_ticks` of every step from here on."""
+    counts: list[int] = []
+    step = session.stepper.core.step
+
+    def counting(now_ns: int, entries: Any, n_ticks: int, *args: Any, **kwargs: Any) -> Any:
+        if n_ticks:
+            counts.append(n_ticks)
+        return step(now_ns, entries, n_ticks, *args, **kwargs)
+
+    session.stepper.core.step = counting  # type: ignore[method-assign]
+    return counts
+
+
+# --- what is wrapped --------------------------------------------------------------------------------------------------
+
+
+def test_models_can_be_compiled_and_forward_is_no_tick(attached: Attached) -> None:
+    model, data = attached.model, attached.data
+    assert mujoco.get_mjcb_control() is None
+    assert mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>").nbody == 1
+    mujoco.mj_forward(model, data)
+    assert attached.counts == []
+    mujoco.mj_step(model, data)
+    mujoco.mj_step(m=model, d=data, nstep=3)
+    assert attached.counts == [1] * 4
+    mujoco.mj_step1(model, data)
+    mujoco.mj_step2(model, data)
+    assert attached.counts == [1] * 5
+    assert data.time == pytest.approx(5 * 0.002)
+
+
+def test_the_integrator_may_be_rk4(model: mujoco.MjModel) -> None:
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    free = make_data(model)
+    attached = Attached(model)
+    try:
+        for _ in range(20):
+            mujoco.mj_step(model, attached.data)
+    finally:
+        attached.close()
+    for _ in range(20):
+        mujoco.mj_step(model, free)
+    assert attached.counts == [1] * 20
+    assert np.array_equal(attached.data.qpos, free.qpos)
+
+
+def test_names_bound_before_are_wrapped_in_every_module_and_restored() -> None:
+    script, late = types.ModuleType("a_script"), types.ModuleType("imported_later")
+    exec("from mujoco import mj_step\nfrom mujoco import mj_step as advance, mj_step2", script.__dict__)
+    sys.modules["a_script"] = script
+    attached = Attached()
+    model, data = attached.model, attached.data
+    try:
+        script.mj_step(model, data)
+        script.advance(model, data)
+        exec("from mujoco import mj_step", late.__dict__)
+        sys.modules["imported_later"] = late
+        late.mj_step(model, data)
+        assert attached.counts == [1, 1, 1]
+        attached.close()
+        assert script.mj_step is script.advance is late.mj_step is ORIGINALS["mj_step"]
+        assert script.mj_step2 is ORIGINALS["mj_step2"]
+    finally:
+        attached.close()
+        sys.modules.pop("a_script", None)
+        sys.modules.pop("imported_later", None)
+
+
+def test_other_data_pass_through_at_nearly_no_cost(attached: Attached) -> None:
+    mujoco.mj_step(attached.model, make_data(attached.model))
+    with pytest.raises(TypeError):
+        mujoco.mj_step(attached.model)
+    assert attached.counts == []
+    tiny = mujoco.MjModel.from_xml_string("<mujoco/>")
+    empty = mujoco.MjData(tiny)
+
+    def measure(step: Any) -> float:
+        best = np.inf
+        for _ in range(50):
+            began = time.perf_counter()
+            for _ in range(100):
+                step(tiny, empty)
+            best = min(best, (time.perf_counter() - began) / 100)
+        return float(best)
+
+    assert measure(mujoco.mj_step) < measure(ORIGINALS["mj_step"]) + 2e-6
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_two_sessions_in_one_process_close_in_any_order(first: int) -> None:
+    both = [Attached(), Attached()]
+    try:
+        with pytest.raises(OwnershipError, match="attached"):
+            Attachment(both[0].rig.loop, None, "step", lambda model, data: None)
+        for one in both:
+            mujoco.mj_step(one.model, one.data)
+        assert [one.counts for one in both] == [[1], [1]]
+        both[first].close()
+        for one in both:
+            mujoco.mj_step(one.model, one.data)
+        assert [len(one.counts) for one in both] == ([1, 2] if first == 0 else [2, 1])
+    finally:
+        for one in both:
+            one.close()
+
+
+def test_a_function_that_somebody_puts_around_ours_stays(attached: Attached) -> None:
+    inner, calls = mujoco.mj_step, []
+
+    def around(m: Any, d: Any, nstep: int = 1) -> None:
+        calls.append(nstep)
+        inner(m, d, nstep)
+
+    try:
+        mujoco.mj_step = around
+        mujoco.mj_step(attached.model, attached.data)
+        attached.close()
+        assert mujoco.mj_step is around
+        mujoco.mj_step(attached.model, attached.data)
+        assert calls == [1, 1]
+        assert attached.data.time == pytest.approx(0.004)
+    finally:
+        mujoco.mj_step = ORIGINALS["mj_step"]
+
+
+def test_a_child_that_is_forked_does_not_belong_to_the_session(attached: Attached) -> None:
+    child = os.fork()
+    if child == 0:
+        began = attached.data.time
+        mujoco.mj_step(attached.model, attached.data)
+        os._exit(0 if attached.data.time > began and not attached.counts else 1)
+    assert os.waitpid(child, 0)[1] == 0
+
+
+def test_a_control_callback_of_the_script_is_refused(model: mujoco.MjModel) -> None:
+    """MuJoCo calls it for the session's own data, too, and compiles no model while it is set."""
+    try:
+        mujoco.set_mjcb_control(lambda m, d: None)
+        with pytest.raises(OwnershipError, match="mjcb_control"):
+            Session.attach(model, make_data(model), QUIET)
+    finally:
+        mujoco.set_mjcb_control(None)
+
+
+# --- resets -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_reset_after_exactly_one_step_is_seen(attached: Attached) -> None:
+    model, data = attached.model, attached.data
+    mujoco.mj_step(model, data)
+    mujoco.mj_forward(model, data)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_step(model, data)
+    assert attached.changes() == 1
+    mujoco.mj_step(model, data)
+    mujoco.mj_resetData(model, data)
+    for _ in range(3):
+        mujoco.mj_step(model, data)
+    assert attached.changes() == 2
+
+
+def test_a_viewer_is_no_reset(attached: Attached) -> None:
+    """MuJoCo's passive viewer clears the timers of the data at every sync."""
+    for step in range(60):
+        mujoco.mj_step(attached.model, attached.data)
+        if step % 8 == 0:
+            attached.data.timer.number[:] = 0
+            mujoco.mj_forward(attached.model, attached.data)
+    assert attached.changes() == 0
+    assert attached.counts == [1] * 60
+
+
+@pytest.mark.parametrize("how", ["attach then reset", "reset, forward, pose, forward"])
+def test_resets_leave_robots_where_their_owner_put_them(attached: Attached, how: str) -> None:
+    model, data = attached.model, attached.data
+    if how != "attach then reset":
+        for _ in range(20):
+            mujoco.mj_step(model, data)
+        mujoco.mj_resetData(model, data)
+        mujoco.mj_forward(model, data)
+    data.qpos[:] = model.key_qpos[0]
+    joint = attached.rig.joints()[0]
+    data.qpos[joint] += 0.5
+    data.ctrl[:] = model.key_ctrl[0]
+    data.ctrl[attached.rig.actuators()[0]] = data.qpos[joint]
+    mujoco.mj_forward(model, data)
+    placed, ctrl = data.qpos[attached.rig.joints()].copy(), data.ctrl.copy()
+    for _ in range(300):
+        mujoco.mj_step(model, data)
+    assert np.array_equal(data.ctrl, ctrl)
+    assert np.abs(data.qpos[attached.rig.joints()] - placed).max() < 0.02
+
+
+# --- environments -----------------------------------------------------------------------------------------------------
+
+
+class Environment:
+    """As Gymnasium's and robosuite's: `ctrl` is written in `step`; a hard reset builds model and data anew."""
+
+    def __init__(self, arms: int = 2, advance: Any = None) -> None:
+        self.arms, self.advance = arms, advance
+        self.reset()
+
+    def reset(self) -> None:
+        self.model = n_arms_scene(self.arms, objects=1).compile()
+        self.data = mujoco.MjData(self.model)
+        mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
+
+    def step(self, frames: int = 5) -> str:
+        for _ in range(frames):
+            (self.advance or mujoco.mj_step)(self.model, self.data)
+        return "observation"
+
+
+def test_an_environment_is_followed_to_the_model_that_it_builds_at_a_reset(tmp_path: Path) -> None:
+    environment = Environment()
+    config = SessionConfig(control_port=0, state_port=0, record=tmp_path / "session.rrd", realtime=False)
+    session = Session.attach(environment=environment, config=config)
+    try:
+        counts = count_rounds(session)
+        assert environment.step() == "observation"
+        assert counts == [1] * 5
+        environment.reset()  # the same model, compiled again
+        environment.step()
+        assert [e.body.cause for e in session.recent_events() if isinstance(e.body, SceneChanged)] == ["external"]
+        environment.arms = 3
+        environment.reset()
+        environment.step()
+        assert [e.body.cause for e in session.recent_events() if isinstance(e.body, SceneChanged)][1:] == ["new_scene"]
+        assert len(session.robots) == 3
+        assert session.data is environment.data
+        for _ in range(10):
+            environment.step()
+        assert len(counts) == 65
+        other = mujoco.MjData(environment.model)
+        mujoco.mj_step(environment.model, other)
+        assert len(counts) == 65
+        assert session.status().sim_time == pytest.approx(environment.data.time, abs=0.05)
+    finally:
+        session.close()
+    assert "step" not in vars(environment)
+    report = verify_recording(tmp_path / "session.rrd")
+    assert report.ok, report.line()
+
+
+def test_the_step_of_an_environment_that_is_not_seen_through_is_the_tick() -> None:
+    environment = Environment(advance=functools.partial(ORIGINALS["mj_step"]))
+    session = Session.attach(environment.model, environment.data, QUIET, environment=environment)
+    try:
+        counts = count_rounds(session)
+        environment.step()  # here the session learns it
+        for _ in range(4):
+            environment.step()
+        assert counts == [1, 5, 5, 5]
+    finally:
+        session.close()
+    environment.step()
+    assert len(counts) == 4
+
+
+def test_wrapped_steps_of_one_environment_end_in_any_order() -> None:
+    environment = Environment()
+    first = EnvironmentStep(environment, "step", lambda original: original())
+    between = environment.step
+    second = EnvironmentStep(environment, "step", lambda original: (original(), "second"))
+    first.remove()
+    assert environment.step() == ("observation", "second")
+    second.remove()
+    assert environment.step is between
+    assert environment.step() == "observation"
+
+
+def test_shapes_of_known_environments_are_found(model: mujoco.MjModel) -> None:
+    data = make_data(model)
+    space = types.SimpleNamespace
+    plain = space(model=model, data=data)
+    for environment in (
+        plain,
+        space(unwrapped=plain),
+        space(sim=space(model=space(_model=model), data=space(_data=data))),
+        space(env=space(sim=plain)),
+        space(physics=space(model=space(ptr=model), data=space(ptr=data))),
+    ):
+        assert find_simulation(environment) == (model, data)
+    assert find_simulation(space(model=1, data=2)) is None
+    assert find_simulation(None) is None
+
+
+def test_what_cannot_be_attached_is_refused(model: mujoco.MjModel) -> None:
+    with pytest.raises(ConfigError, match="model and data"):
+        Session.attach(config=QUIET)
+    with pytest.raises(OwnershipError, match="'advance_it'"):
+        Session.attach(environment=Environment(), config=QUIET, step="advance_it")
+
+
+def test_steps_that_are_not_seen_are_a_warning(attached: Attached) -> None:
+    for _ in range(600):
+        ORIGINALS["mj_step"](attached.model, attached.data)
+    assert any("outside of the session's ticks" in text for text in attached.rig.loop.list_warnings())
+
+
+# --- driving through the wrapped step ---------------------------------------------------------------------------------
+
+
+def test_a_pause_of_seconds_while_a_hand_moves_on_is_no_leap() -> None:
+    rig = Rig()
+    agent = Agent(rig)
+    rig.round()
+    agent.acquire()
+    agent.engage()
+    rig.applied.clear()
+    attachment = Attachment(rig.loop, None, "step", lambda model, data: None)
+    try:
+
+        def tick() -> None:
+            rig.now_ns += TICK_NS
+            mujoco.mj_step(rig.model, rig.data)
+            rig.applied.append(rig.data.ctrl.copy())
+
+        goal = sideways(agent.tip(), 0.3)
+        for i in range(100):
+            if i % 7 == 0:
+                agent.sample(goal(i / 500), clutch=True)
+            tick()
+        assert rig.loop.driven == ("left",)
+        rig.now_ns += 5_000_000_000  # the script plots; the hand goes on
+        for i in range(200):
+            if i % 7 == 0:
+                agent.sample(goal(5.0 + i / 500), clutch=True)
+            tick()
+        assert largest_step(rig.applied, rig.actuators()) <= SPEED_STEP
+        assert np.abs(rig.applied[-1] - rig.applied[100])[rig.actuators()].max() < 0.05, "it holds until clutched again"
+    finally:
+        attachment.close()
+        rig.loop.close()
+
+
+def test_two_lines_of_a_script_and_a_model_compiled_meanwhile(tmp_path: Path) -> None:
+    """The whole of it in a process of its own, as a user has it, with `from mujoco import mj_step`."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        textwrap.dedent("""
+        import mujoco
+        from mujoco import mj_step
+        from iris_session import Session, SessionConfig, scene_path
+
+        model = mujoco.MjModel.from_xml_path(str(scene_path("handover")))
+        data = mujoco.MjData(model)
+        session = Session.attach(model, data, SessionConfig(control_port=0, state_port=0, record=False))
+        for _ in range(50):
+            mj_step(model, data)
+        mujoco.MjModel.from_xml_string("<mujoco/>")
+        print("ticks", session.status().tick)
+        """)
+    )
+    done = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, timeout=60.0, check=False, cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() in (["ticks", "49"], ["ticks", "50"])  # by whether the last state was due

@@ -1,0 +1,136 @@
+"""User loops under several versions of MuJoCo, each in an environment of its own with the base install alone.
+
+python tools/user_loop_versions.py 3.3.0 3.3.7 4.0.0    makes the environments, then checks each
+python tools/user_loop_versions.py --here               checks the MuJoCo of this environment
+
+Each check runs a loop with `begin_tick()/end_tick()` and one that is attached, with an observer, and compares both with
+the trajectory without a session, bit for bit. The last line is one JSON object; the exit status is 1 if a check fails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import tomllib
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+STEPS = 400
+#: Two arms and a ball that falls beside them. Written here, because the demo scenes need a newer MuJoCo than 3.3.0.
+ARM = """<body name="{n}" pos="0 {y} 0.5"><joint name="{n}1" axis="0 0 1" damping="2" armature="0.1"/>
+<geom size="0.05"/>
+<body name="{n}_upper" pos="0.3 0 0"><joint name="{n}2" axis="0 1 0" damping="2" armature="0.1"/><geom size="0.05"/>
+<body name="{n}_lower" pos="0.3 0 0"><joint name="{n}3" axis="0 1 0" damping="2" armature="0.1"/><geom size="0.05"/>
+<site name="{n}_tip"/></body></body></body>"""
+MOTOR = '<position name="{n}{i}" joint="{n}{i}" kp="50"/>'
+SCENE = f"""<mujoco><worldbody><geom type="plane" size="2 2 0.1"/>{ARM.format(n="left", y=0.4)}
+{ARM.format(n="right", y=-0.4)}<body name="ball" pos="0 0 1"><freejoint/><geom size="0.1"/></body></worldbody><actuator>
+{"".join(MOTOR.format(n=n, i=i) for n in ("left", "right") for i in (1, 2, 3))}</actuator></mujoco>"""
+
+
+def run_checks() -> dict[str, Any]:
+    """Return the results with the MuJoCo of this environment."""
+    import mujoco
+    import numpy as np
+
+    from iris_session import Client, ControlConfig, Session, SessionConfig
+
+    model = mujoco.MjModel.from_xml_string(SCENE)
+    config = SessionConfig(
+        control_port=0, state_port=0, record=False, realtime=False, control=ControlConfig(output="targets")
+    )
+
+    def simulate(data: Any, step: Any) -> Any:
+        states = []
+        for i in range(STEPS):
+            if i == STEPS // 2:
+                mujoco.mj_resetData(model, data)
+            data.ctrl[:] = 0.3 * np.sin(3.0 * data.time)
+            step(data)
+            states.append(np.concatenate(([data.time], data.qpos, data.qvel, data.ctrl)))
+        return np.array(states)
+
+    def advance(data: Any) -> None:
+        mujoco.mj_step(model, data)
+
+    def watch(session: Session) -> Client:
+        client = Client(session.address, role="observer", name="watcher")
+        client.start()
+        return client
+
+    results: dict[str, Any] = {"mujoco": mujoco.__version__}
+    expected = simulate(mujoco.MjData(model), advance)
+    data = mujoco.MjData(model)
+    with Session(model, data, config) as session:
+
+        def tick(data: Any) -> None:
+            session.begin_tick()
+            mujoco.mj_step(model, data)
+            session.end_tick()
+
+        session.begin_tick()  # participants can join from here on
+        session.end_tick()
+        with watch(session):
+            results["ticks_identical"] = bool(np.array_equal(simulate(data, tick), expected))
+            results["ticks_observed"] = len(session.status().participants) == 1
+    data = mujoco.MjData(model)
+    session = Session.attach(model, data, config)
+    with watch(session):
+        mujoco.MjModel.from_xml_string("<mujoco/>")
+        results["attach_identical"] = bool(np.array_equal(simulate(data, advance), expected))
+        results["attach_observed"] = len(session.status().participants) == 1
+        results["targets"] = len(session.targets()) == 2
+    session.close()
+    results["ok"] = all(value for name, value in results.items() if name != "mujoco")
+    return results
+
+
+def check_version(version: str, folder: Path) -> dict[str, Any]:
+    """Make an environment with `version` and the base install, and return its results."""
+    subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
+    python = folder / "bin" / "python"
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    base = [name for name in project["dependencies"] if not name.startswith("mujoco")]
+    install = [str(python), "-m", "pip", "install", "--quiet", f"mujoco=={version}", *base]
+    subprocess.run(install, check=True, stdout=subprocess.DEVNULL)
+    done = subprocess.run(
+        [str(python), __file__, "--here"],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        timeout=300.0,
+    )
+    lines = done.stdout.splitlines()
+    if not lines or not lines[-1].startswith("{"):
+        return {"mujoco": version, "ok": False, "error": done.stderr.strip().splitlines()[-1:]}
+    results: dict[str, Any] = json.loads(lines[-1])
+    return results
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("versions", nargs="*", help="versions of MuJoCo, for example 3.3.0 3.3.7 4.0.0")
+    parser.add_argument("--here", action="store_true", help="check the MuJoCo of this environment")
+    args = parser.parse_args()
+    if args.here:
+        results = run_checks()
+        print(json.dumps(results))
+        return 0 if results["ok"] else 1
+    cases = []
+    for version in args.versions:
+        with tempfile.TemporaryDirectory(prefix=f"mujoco-{version}-") as folder:
+            cases.append(check_version(version, Path(folder)))
+        print(json.dumps(cases[-1]), flush=True)
+    print(json.dumps({"cases": cases, "ok": bool(cases) and all(case["ok"] for case in cases)}))
+    return 0 if cases and all(case["ok"] for case in cases) else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
