@@ -252,7 +252,11 @@ class RecorderFeed:
         self.silence_ns = self._now[1] - self._last_status_ns if self._window else 0
 
     def close(
-        self, timeout_s: float = 5.0, alive: Callable[[], bool] = lambda: True, silence_s: float = math.inf
+        self,
+        timeout_s: float = 5.0,
+        alive: Callable[[], bool] = lambda: True,
+        silence_s: float = math.inf,
+        cpu_s: Callable[[], float] = lambda: 0.0,
     ) -> bool:
         """Send everything and wait until it is in the file.
 
@@ -261,7 +265,9 @@ class RecorderFeed:
         Args:
             timeout_s: Longest wait.
             alive: Returns whether the recorder process still runs.
-            silence_s: Longest time without a status (`SILENCE_S`, unless the recorder was just started).
+            silence_s: Longest time without a status and without work (`SILENCE_S`, unless the recorder was just
+                started).
+            cpu_s: Returns the CPU time of the recorder process [s]; while it grows the recorder is slow, not hanging.
 
         Returns:
             False if not everything is known to be in the file.
@@ -270,13 +276,14 @@ class RecorderFeed:
             return self._complete
         self.flush()
         waits = max(1, round(timeout_s / 0.02))
-        silent, said = 0, self.stats.recorder
+        silent, said = 0, (self.stats.recorder, cpu_s())
         while waits and silent < silence_s / 0.02 and alive() and self._header and (self._window or self._spill):
             self._socket.poll(20)
             self._transfer()
             waits -= 1
-            silent = 0 if self.stats.recorder is not said else silent + 1
-            said = self.stats.recorder
+            now = (self.stats.recorder, cpu_s())
+            silent = 0 if now != said else silent + 1
+            said = now
         self._complete = not self._window and not self._spill
         if self._spill:
             self._drop(self._spill.rows, self._spill.others, "the session ended before the recorder could take it all")

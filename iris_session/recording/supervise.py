@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 import msgspec
+import psutil
 
 from iris_session.recording.errors import RecorderError
 from iris_session.recording.messages import FAULT_PREFIX, RecorderConfig
@@ -63,6 +64,16 @@ class RecorderProcess:
         """False before the start and after the process has ended. May be read from another thread, like `pid`."""
         process = self._process
         return process is not None and process.is_running
+
+    @property
+    def cpu_s(self) -> float:
+        """CPU time of the process so far [s], 0 if it has ended: on a busy machine a slow recorder differs by this
+        from one that hangs."""
+        try:
+            times = psutil.Process(self.pid).cpu_times()
+        except psutil.Error:
+            return 0.0
+        return float(times.user + times.system)
 
     @property
     def failure(self) -> str:

@@ -385,7 +385,7 @@ class SessionProcesses:
         if feed is not None and recorder is not None:
             has_reported = feed.stats.recorders >= recorder.starts  # a new one is silent until it is up
             wait_s, silence_s = (ACCEPT_S, SILENCE_S) if has_reported else (STARTING_S, math.inf)
-            is_accepted = feed.close(wait_s, lambda: recorder.alive, silence_s)
+            is_accepted = feed.close(wait_s, lambda: recorder.alive, silence_s, lambda: recorder.cpu_s)
             if not is_accepted:
                 fault = recorder.failure or "the recorder did not write all of it in time"
                 fault = f"the end of the recording is missing: {fault}"

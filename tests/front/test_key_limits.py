@@ -47,7 +47,7 @@ def open_push(lab: Lab, pair: KeyPair) -> zmq.Socket[bytes]:
 
 
 def ingest_address(session: FrontSession) -> str:
-    return f"tcp://127.0.0.1:{session.ports.media_ingest}"
+    return f"tcp://{session.host}:{session.ports.media_ingest}"
 
 
 def null_greeting() -> bytes:
@@ -61,7 +61,7 @@ class Unfinished:
     """A source that sends frame after frame of one message and never the last, by plain TCP."""
 
     def __init__(self, session: FrontSession) -> None:
-        self.socket = socket.create_connection(("127.0.0.1", session.ports.media_ingest))
+        self.socket = socket.create_connection((session.host, session.ports.media_ingest))
         self.socket.sendall(null_greeting())
         self.socket.setblocking(False)
         self._frame = b"\x03" + struct.pack(">Q", MIB) + bytes(MIB)
@@ -241,7 +241,7 @@ def xsubs(session: FrontSession) -> Iterator[list[zmq.Socket[bytes]]]:
         sub = session.context.socket(zmq.XSUB)
         sub.linger = 0
         sub.sndhwm = 1000
-        sub.connect(f"tcp://127.0.0.1:{session.ports.state}")
+        sub.connect(f"tcp://{session.host}:{session.ports.state}")
         sockets.append(sub)
     yield sockets
     for sub in sockets:

@@ -187,6 +187,22 @@ def test_rows_not_received_before_the_end_are_counted(played) -> None:  # type: 
     assert not feed.close(0.0), "asked again"
 
 
+@pytest.mark.parametrize(("cpu_step_s", "waits"), [(0.01, 50), (0.0, 4)], ids=["slow", "hanging"])
+def test_close_waits_for_a_slow_recorder_but_not_for_one_that_hangs(
+    feed: RecorderFeed, played, cpu_step_s: float, waits: int
+) -> None:  # type: ignore[no-untyped-def]
+    played[0].say(feed, 1, -1, -1)
+    steps(feed, 0, 10)
+    asked: list[float] = []
+
+    def cpu_s() -> float:
+        asked.append(cpu_step_s * len(asked))
+        return asked[-1]
+
+    assert not feed.close(1.0, silence_s=0.06, cpu_s=cpu_s)
+    assert len(asked) == pytest.approx(waits, abs=1)
+
+
 def test_silence_of_a_busy_recorder_is_measured(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
     played[0].say(feed, 1, -1, -1)
     steps(feed, 0, 100)
