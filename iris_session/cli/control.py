@@ -33,7 +33,7 @@ TIMEOUT_S: Final = 5.0
 #: Roles that may ask for it, the least powerful first: a key may have few of them.
 DIRECTORS: Final = (Role.DIRECTOR,)
 DRIVERS: Final = (Role.AGENT, Role.OPERATOR, Role.LEADER, Role.DIRECTOR)
-ANYBODY: Final = (Role.OBSERVER, *DRIVERS)
+ALL_ROLES: Final = (Role.OBSERVER, *DRIVERS)
 #: A reason of one word that is an address was meant as one.
 _ADDRESS: Final = re.compile(r"iris://.*|\d+\.\d+\.\d+\.\d+(:\d+)?|[\w.-]+:\d+|\[[0-9a-fA-F:]+\](:\d+)?")
 
@@ -60,7 +60,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         'estop "hand in the way"',
     )
     estop.add_argument("reason", nargs="*", help="text for participants and the recording")
-    estop.set_defaults(roles=ANYBODY)
+    estop.set_defaults(roles=ALL_ROLES)
     _add_command(
         commands,
         "clear-estop",
@@ -79,7 +79,9 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     assign.add_argument("robots", metavar="ROBOT[,ROBOT]", help="names of robots")
     assign.add_argument("person", metavar="PERSON", help="name or id of a participant")
-    release = _add_command(commands, "release", "free robots, whoever holds them", release_robots, "release left right")
+    release = _add_command(
+        commands, "release", "free robots, whichever participant holds them", release_robots, "release left right"
+    )
     release.add_argument("robots", nargs="+", metavar="ROBOT", help="names of robots")
     mode = _add_command(commands, "mode", "change the lease mode of robots", set_modes, "mode request left right")
     mode.add_argument("mode", choices=sorted(LeaseMode.ALL), help="lease mode")
@@ -99,7 +101,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         commands, "marker", "put a note into the recording", place_marker, 'marker "gripper was cleaned"'
     )
     marker.add_argument("text", nargs="+", help="the note")
-    marker.set_defaults(roles=ANYBODY)
+    marker.set_defaults(roles=ALL_ROLES)
 
 
 def _add_command(
@@ -134,6 +136,8 @@ def run(arguments: argparse.Namespace) -> int:
         text = str(error)
         if isinstance(error, RefusedError) and error.code == DenialReason.ROLE and Role.DIRECTOR in arguments.roles:
             text += "; on the server: `iris-session pair --role director`"
+        if isinstance(error, RefusedError) and arguments.act is stop_session:
+            text += "; the e-stop was sent before, but not confirmed: look at the robots"
         print(f"iris-session: {to_printable(text)}", file=sys.stderr)
         if arguments.json:
             denied = error.denial.reason if isinstance(error, DeniedError) else ""
@@ -151,22 +155,42 @@ def run(arguments: argparse.Namespace) -> int:
 def _join_session(arguments: argparse.Namespace) -> Iterator[Client]:
     from iris_session.client import RefusedError
 
+    stops = arguments.act is stop_session
+    if stops and _ADDRESS.fullmatch(" ".join(arguments.reason)):
+        raise CommandError(f"{arguments.reason[0]} is an address, not a reason: give it with --address")
     check_session_reachable(arguments)
-    *others, last = arguments.roles
-    for role in others:
+    for role in arguments.roles:
         client = _make_client(arguments, role)
         try:
+            if stops:
+                _begin_stop(client, " ".join(arguments.reason))
             client.connect()
         except RefusedError as error:
             client.close()
-            if error.code != DenialReason.ROLE:
+            if error.code != DenialReason.ROLE or role == arguments.roles[-1]:
                 raise
+        except BaseException:
+            client.close()
+            raise
         else:
             with client:
                 yield client
             return
-    with _make_client(arguments, last) as client:
-        yield client
+
+
+def _begin_stop(client: Client, reason: str) -> None:
+    """Send the e-stop with the hello: a session that is slow to admit, or full, stops all the same."""
+    from iris_session.client import NotConnectedError
+
+    def try_stop(one: Client) -> bool:
+        try:
+            one.estop(reason)
+        except NotConnectedError:  # no socket yet
+            return False
+        return True
+
+    client.open()
+    client.wait_for(try_stop, TIMEOUT_S)
 
 
 def _make_client(arguments: argparse.Namespace, role: str) -> Client:
@@ -190,12 +214,9 @@ def _get_user_name() -> str:
 
 
 def stop_session(client: Client, arguments: argparse.Namespace) -> Outcome:
-    """Send an e-stop, and wait until the session reports it."""
+    """Wait until the session reports the e-stop that was sent with the hello."""
     from iris_session.client import RequestTimeoutError
 
-    if len(arguments.reason) == 1 and _ADDRESS.fullmatch(arguments.reason[0]):
-        raise CommandError(f"{arguments.reason[0]} is an address, not a reason: give it with --address")
-    client.estop(" ".join(arguments.reason))
     if not client.wait_for(lambda one: one.mirror.estop, TIMEOUT_S):
         raise RequestTimeoutError(
             f"the e-stop was sent, but the session has not confirmed it within {TIMEOUT_S:g} s: "

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 #: Time until a terminal is looked at again while another program has it [s].
 BACKGROUND_S: Final = 0.5
+ESTOP_KEY: Final = " "
 
 
 class KeyBinding:
@@ -33,7 +34,7 @@ def bind_session_keys(session: Owner) -> dict[str, KeyBinding]:
     from iris_session.session.session import Session
 
     keys = [
-        KeyBinding(" ", "space e-stop", lambda: session.estop("key in the terminal of the session")),
+        KeyBinding(ESTOP_KEY, "space e-stop", lambda: session.estop("key in the terminal of the session")),
         KeyBinding("c", "c clear e-stop", session.clear_estop),
     ]
     if isinstance(session, Session):
@@ -97,12 +98,14 @@ def _follow_keys(fd: int, wake: int, keys: Mapping[str, KeyBinding]) -> None:
 
 
 def _act(typed: str, keys: Mapping[str, KeyBinding]) -> None:
-    """Run the bindings of the typed keys; an escape sequence (an arrow, a paste) is none of them."""
+    """Run the binding of a typed key. Of several at once (a paste, a key held down) only the e-stop counts, and an
+    escape sequence (an arrow) is none.
+    """
     from iris_session.session.errors import SessionError
 
     if typed.startswith("\x1b"):
         return
-    for one in dict.fromkeys(typed):
-        if one in keys:
-            with suppress(SessionError):  # the session is closing
-                keys[one].act()
+    key = typed[0] if len(set(typed)) == 1 else ESTOP_KEY
+    if key in typed and key in keys:
+        with suppress(SessionError):  # the session is closing
+            keys[key].act()

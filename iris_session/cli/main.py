@@ -64,22 +64,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"iris-session {version('iris-session')}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (
-        demo,
-        serve,
-        pair,
-        keys,
-        sessions,
-        status,
-        control,
-        doctor,
-        verify,
-        emulate,
-        robots,
-        scene,
-        anchors,
-        bench,
-    ):
+    for module in _MODULES:
         module.register(commands)
     return parser
 

@@ -24,7 +24,7 @@ from iris_session.protocol.specs import ObjectSpec, RobotSpec
 FORMAT: Final = 4
 #: The newest iris-session that verifies and resumes recordings of an earlier format. Format 4 came with the control law
 #: that holds from measured joints.
-VERIFIERS: Final = {3: "iris-session 0.1.0 at commit 804ab72"}
+VERIFIERS: Final = {3: "iris-session 0.1.0 at commit 90b3e12"}
 CLOSED: Final = "closed"  # all code is part of iris-session: re-simulated bit for bit
 OPEN: Final = "open"  # a user loop or a real robot: the plant's state comes from the rows
 HASH_BYTES: Final = 16

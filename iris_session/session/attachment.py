@@ -239,7 +239,8 @@ class Attachment:
         """Return whether `data` is what the environment simulates; go on with it when it is new."""
         if data is self._loop.data:
             return True
-        if find_simulation(self._environment) is None or find_simulation(self._environment)[1] is not data:  # type: ignore[index]
+        found = find_simulation(self._environment)
+        if found is None or found[1] is not data:
             return False
         self._change_model(model, data)
         move_loop(self, data)

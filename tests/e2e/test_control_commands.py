@@ -8,14 +8,19 @@ import pty
 import signal
 import subprocess
 import termios
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from iris_session import AuthorityConfig, Session, SessionConfig
 from iris_session.client import Client
+from iris_session.demo.scenes import scene_path
 from tests.e2e.session_process import DEADLINE_S, SessionProcess, make_serve_command, run_in_process, wait_until
+from tests.loopback import make_loopback_address
 
 pytestmark = pytest.mark.e2e
 
@@ -94,6 +99,23 @@ def test_a_reason_needs_no_quotes_and_is_no_address(shared_session: SessionProce
     assert run_control(shared_session, "clear-estop")["cleared"][0]["reason"] == "hand in the way"
     for address in ("192.168.0.10", "lab-1:7721", "iris://lab-1"):
         assert run_control(shared_session, "estop", address, status=2)["ok"] is False
+
+
+def test_estop_reaches_a_session_that_is_full() -> None:
+    limits = AuthorityConfig(max_participants=1)
+    config = SessionConfig(host=make_loopback_address(), control_port=0, state_port=0, authority=limits)
+    with Session(scene_path("handover"), config=config) as session, ThreadPoolExecutor() as pool:
+        stop = threading.Event()
+        running = pool.submit(lambda: [session.run(seconds=0.05) for _ in iter(stop.is_set, True)])
+        try:
+            with Client(session.address, name="ann", role="observer").connect(DEADLINE_S).start() as ann:
+                code, _, errors = run_in_process("estop", "--address", session.address)
+                assert code == 1
+                assert "sent" in errors
+                assert ann.wait_for(lambda c: c.mirror.estop, DEADLINE_S)
+        finally:
+            stop.set()
+            running.result()
 
 
 def test_no_session_is_one_line() -> None:
