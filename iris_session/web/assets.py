@@ -1,8 +1,8 @@
 """Assets for browsers: fetched from the session once for all who want them, kept in a content store.
 
 An asset is given out only if the session serves it now: before the store is asked, the session is asked for its size.
-Order, window and repetition of requests are those of `client.core.asset_loader`; files are read, written and hashed by the
-threads of `client.asset_workers`.
+Order, window and repetition of requests are those of `client.core.asset_loader`; files are read, written and hashed by
+the threads of `client.asset_workers`.
 """
 
 from __future__ import annotations
@@ -198,7 +198,7 @@ class GatewayAssets:
     # --- the channel --------------------------------------------------------------------------------------------------
 
     def _find_reader(self) -> SocketReader | None:
-        """Return the connection to the assets channel, opened where needed; `None` while the gateway is not admitted."""
+        """Return the connection to the assets channel, opened where needed; `None` without admission."""
         epoch = self._find_epoch()
         if epoch != self._epoch:
             self.close_link()

@@ -166,7 +166,9 @@ class Hub:
     def close_browser(self, browser: Browser) -> bytes | None:
         """Remove a browser whose WebSocket is closed. Return the message for the session, if it has a connection."""
         self._browsers.pop(browser.name, None)
-        message = encode_client(wrap_message(Disconnected(), browser.epoch, browser.name)) if browser.said_hello else None
+        message = (
+            encode_client(wrap_message(Disconnected(), browser.epoch, browser.name)) if browser.said_hello else None
+        )
         self._leave(browser)
         browser.close(CLOSE_NOT_ALLOWED, "closed")
         return message
@@ -311,9 +313,7 @@ class Hub:
 
     def needs_ticket(self, browser: Browser, now_ns: int) -> bool:
         """Return whether a browser is to get a ticket: after its welcome, and before the last one expires."""
-        return browser.is_admitted and (
-            not browser.ticket or now_ns - browser.ticket_ns >= self.limits.ticket_ns // 2
-        )
+        return browser.is_admitted and (not browser.ticket or now_ns - browser.ticket_ns >= self.limits.ticket_ns // 2)
 
     def issue_ticket(self, browser: Browser, random: bytes, now_ns: int) -> None:
         """Make a ticket of `TICKET_BYTES` random bytes and queue it. The one before stays valid until it expires."""

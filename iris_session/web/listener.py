@@ -1,8 +1,8 @@
 """TCP connections of the gateway: accepted within limits, with TLS, and closed when they do nothing.
 
-aiohttp has no limit of connections, and none of the time in which a request must come. So connections are accepted here,
-counted per address, and given to aiohttp behind a protocol of our own (`WatchedProtocol`), which knows when each was last of
-use. A connection is a stranger until a request of it has a ticket or the session has welcomed its browser.
+aiohttp has no limit of connections, and none of the time in which a request must come. So connections are accepted
+here, counted per address, and given to aiohttp behind a protocol of our own (`WatchedProtocol`), which notes their end.
+A connection is a stranger until a request of it has a ticket, or the session has welcomed its browser.
 """
 
 from __future__ import annotations
@@ -15,11 +15,10 @@ import ssl
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from iris_session.link.config import is_loopback
 from iris_session.protocol.limits import Drops
 from iris_session.web.sockets import limit_unsent
 
-#: Connections in all, and strangers among them in all; of one address, the oldest strangers are evicted above its share.
+#: Connections in all, and strangers among them in all and of one address; above it the oldest are evicted.
 MAX_CONNECTIONS: Final = 512
 MAX_STRANGERS: Final = 256
 MAX_STRANGERS_PER_ADDRESS: Final = 128
@@ -97,7 +96,9 @@ class ConnectionLimiter:
 class WatchedProtocol(asyncio.Protocol):
     """Protocol of one connection that passes everything on to that of aiohttp, and notes the end."""
 
-    def __init__(self, inner: asyncio.Protocol, on_made: Callable[[asyncio.Transport], None], on_lost: Callable[[], None]) -> None:
+    def __init__(
+        self, inner: asyncio.Protocol, on_made: Callable[[asyncio.Transport], None], on_lost: Callable[[], None]
+    ) -> None:
         self._inner = inner
         self._on_made = on_made
         self._on_lost = on_lost
@@ -135,9 +136,7 @@ class Listener:
         drops: Counters.
     """
 
-    def __init__(
-        self, make_protocol: Callable[[], asyncio.Protocol], tls: ssl.SSLContext | None, drops: Drops
-    ) -> None:
+    def __init__(self, make_protocol: Callable[[], asyncio.Protocol], tls: ssl.SSLContext | None, drops: Drops) -> None:
         self._make_protocol = make_protocol
         self._tls = tls
         self._drops = drops
@@ -193,7 +192,7 @@ class Listener:
         """Make a connection of an accepted socket: count it, sniff TLS, shake hands."""
         task = asyncio.current_task()
         assert task is not None
-        connection = Connection(peer[0], self._loop.time(), task.cancel)
+        connection = Connection(peer[0], self._loop.time(), lambda: _cancel(task))
         self._by_peer[peer] = connection
         is_passed_on = False
         try:
@@ -245,11 +244,11 @@ class Listener:
                 return first[0] == _TLS_HANDSHAKE
 
     async def _wait_readable(self, sock: socket.socket) -> None:
-        ready = self._loop.create_future()
+        ready = asyncio.Event()
         descriptor = sock.fileno()
-        self._loop.add_reader(descriptor, lambda: ready.done() or ready.set_result(None))
+        self._loop.add_reader(descriptor, ready.set)
         try:
-            await ready
+            await ready.wait()
         finally:
             self._loop.remove_reader(descriptor)
 
@@ -272,12 +271,15 @@ class Listener:
             await self._loop.sock_sendall(sock, answer + b"Content-Length: 0\r\nConnection: close\r\n\r\n")
 
 
+def _cancel(task: asyncio.Task[None]) -> None:
+    task.cancel()
+
+
 def open_listening_sockets(hosts: Sequence[str], port: int) -> list[socket.socket]:
     """Return listening sockets on one port of each address; port 0 takes any free one. Raises `OSError`."""
     sockets: list[socket.socket] = []
     try:
-        for host in dict.fromkeys(hosts):
-            name = "127.0.0.1" if host == "localhost" else host
+        for name in dict.fromkeys("127.0.0.1" if host == "localhost" else host for host in hosts):
             family = socket.AF_INET6 if ":" in name else socket.AF_INET
             sock = socket.socket(family, socket.SOCK_STREAM)
             sockets.append(sock)
@@ -292,8 +294,3 @@ def open_listening_sockets(hosts: Sequence[str], port: int) -> list[socket.socke
             sock.close()
         raise
     return sockets
-
-
-def is_local(hosts: Sequence[str]) -> bool:
-    """Return whether only this machine reaches these addresses."""
-    return all(is_loopback(host) for host in hosts)

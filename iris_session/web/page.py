@@ -1,7 +1,7 @@
 """Files of the page, and the HTTP headers and host names of the gateway's answers. No sockets.
 
-The page is built by `make web` into `iris_session/web/page/`, and is part of the wheel. Without it a small page says how to
-build it. Paths of requests are looked up in a table and never become paths of files.
+The page is built by `make web` into `iris_session/web/page/`, and is part of the wheel. Without it a small page says
+how to build it. Paths of requests are looked up in a table and never become paths of files.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ MISSING_PAGE: Final = b"""<!doctype html>
 <html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>iris-session</title>
 <h1>iris-session: the page is not built</h1>
 <p>The session runs, and this gateway answers. Only the page is missing in this installation.</p>
-<p>In a checkout of the repository, run <code>make web</code> on the machine of the session, then load this address again.
-An installed package (<code>pip install 'iris-session[web]'</code>) contains the page.</p>
+<p>In a checkout of the repository, run <code>make web</code> on the machine of the session, then load this address
+again. An installed package (<code>pip install 'iris-session[web]'</code>) contains the page.</p>
 </html>
 """
 

@@ -1,8 +1,8 @@
 """HTTP and WebSockets of the gateway, by aiohttp. Nothing that a browser sends raises out of here.
 
-A WebSocket has two tasks: one reads, one writes what waits for it. State and media are written only while little of the
-connection is unacknowledged, so a slow reader gets the newest values and nothing queues; one that acknowledges nothing for
-seconds is closed.
+A WebSocket has two tasks: one reads, one writes what waits for it. State and media are written only while little of
+the connection is unacknowledged, so a slow reader gets the newest values and nothing queues; one that acknowledges
+nothing for seconds is closed.
 """
 
 from __future__ import annotations
@@ -33,12 +33,14 @@ from iris_session.web.wire import (
     CLOSE_TOO_SLOW,
     GATEWAY,
     MAX_CLIENT_MESSAGE,
+    MEDIA,
     MEDIA_WISHES,
     SUBPROTOCOL,
     Ticket,
     decode_frames,
     decode_gateway_message,
     decode_wishes,
+    encode_frames,
 )
 
 log = logging.getLogger(__name__)
@@ -53,8 +55,9 @@ SLOW_S: Final = 6.0
 _LOOK_S: Final = 0.05
 _CHECK_S: Final = 0.5
 _CLOSE_S: Final = 1.0
+_SMALL_MESSAGE: Final = 32_768
 TICKET_S: Final = 5.0
-#: Time for the gateway to be admitted by the session, before a WebSocket is told to come again.
+#: Time for the gateway to be admitted by the session, before a WebSocket is closed with "come again".
 READY_S: Final = 5.0
 #: Requests for assets at once: of one participant, and of all.
 ASSETS_PER_BROWSER: Final = 16
@@ -142,18 +145,21 @@ class SocketWriter:
 
     async def send(self, message: bytes) -> bool:
         """Send a message. False: the client has read nothing for `SLOW_S`, or has closed."""
-        sending = asyncio.ensure_future(self.socket.send_bytes(message))
         try:
-            while not sending.done():
-                if self.is_slow():
-                    return False
-                await asyncio.wait((sending,), timeout=_CHECK_S)
-            sending.result()
+            if len(message) < _SMALL_MESSAGE and not self._transport.get_write_buffer_size():
+                await self.socket.send_bytes(message)  # does not wait: there is room
+                return True
+            sending = asyncio.ensure_future(self.socket.send_bytes(message))
+            try:
+                while not sending.done():
+                    if self.is_slow():
+                        return False
+                    await asyncio.wait((sending,), timeout=_CHECK_S)
+                sending.result()
+            finally:
+                sending.cancel()
         except (ConnectionError, RuntimeError):  # closed meanwhile
             return False
-        finally:
-            if not sending.done():
-                sending.cancel()
         return True
 
     def is_slow(self) -> bool:
@@ -448,7 +454,8 @@ class WebServer:
             if writer.is_slow():
                 self._drops.count("web_too_slow")
                 browser.close(CLOSE_TOO_SLOW, "this client reads nothing")
-        await writer.close(browser.closing)
+        if browser.closing is not None:
+            await writer.close(browser.closing)
 
     async def _end_session(self, browser: Browser, writer: SocketWriter, writing: asyncio.Task[None]) -> None:
         notification = self._hub.close_browser(browser)
@@ -477,7 +484,7 @@ class WebServer:
         before, self._media[browser.name] = self._media.get(browser.name), writer
         if before is not None:
             await before.close(Closing(CLOSE_LIMIT, "another media socket of this participant was opened"))
-        stream = MediaWriter(browser, writer)
+        stream = MediaWriter(writer)
         feed = self._session.open_media(browser, stream.offer)
         writing = asyncio.create_task(self._write_media(browser, stream, feed))
         try:
@@ -523,12 +530,10 @@ class WebServer:
                 channel, frames = decode_frames(message.data)
                 if channel == GATEWAY:  # a fresh ticket: it is the same participant
                     continue
-                if channel != MEDIA_WISHES or len(frames) != 1:
-                    raise _UnexpectedChannelError
-                feed.set_wishes(decode_wishes(frames[0]))
-            except (ProtocolError, _UnexpectedChannelError) as error:
+                feed.set_wishes(decode_wishes(frames[0] if channel == MEDIA_WISHES and len(frames) == 1 else b""))
+            except ProtocolError as error:
                 self._drops.count("web_malformed")
-                await writer.close(Closing(CLOSE_NOT_ALLOWED, str(error) or "expected media wishes"))
+                await writer.close(Closing(CLOSE_NOT_ALLOWED, str(error)))
                 return
 
     async def _write_media(self, browser: Browser, stream: MediaWriter, feed: MediaFeedSide) -> None:
@@ -545,28 +550,22 @@ class WebServer:
                 feed.resume()
             if writer.is_slow():
                 break
-        slow = browser.is_admitted and writer.is_slow()
-        if slow:
+        if browser.is_admitted:
             self._drops.count("web_too_slow")
-        await writer.close(Closing(CLOSE_TOO_SLOW if slow else CLOSE_NOT_ALLOWED, "this client reads nothing"))
-
-
-class _UnexpectedChannelError(Exception):
-    """A message on a channel that its WebSocket does not have."""
+            await writer.close(Closing(CLOSE_TOO_SLOW, "this client reads nothing"))
+        else:
+            await writer.close(Closing(CLOSE_NOT_ALLOWED, "the session has no connection for this participant now"))
 
 
 class MediaWriter:
     """The frame that waits for one media socket."""
 
-    def __init__(self, browser: Browser, writer: SocketWriter) -> None:
-        self.browser = browser
+    def __init__(self, writer: SocketWriter) -> None:
         self.writer = writer
         self.frame: bytes | None = None
 
     def offer(self, frames: list[bytes]) -> None:
         """Set the frame to write next."""
-        from iris_session.web.wire import MEDIA, encode_frames
-
         self.frame = encode_frames(MEDIA, frames)
         self.writer.wake()
 

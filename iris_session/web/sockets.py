@@ -1,4 +1,4 @@
-"""ZeroMQ sockets in an asyncio loop, and the state of TCP connections: bytes that wait, bytes that were acknowledged."""
+"""ZeroMQ sockets in an asyncio loop, and counts of TCP connections: bytes that wait, bytes that were acknowledged."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class SocketReader:
         self._paused = False
         self._scheduled = False
         self._loop = asyncio.get_running_loop()
-        self._descriptor = int(sock.getsockopt(zmq.FD))  # type: ignore[arg-type]
+        self._descriptor = int(sock.getsockopt(zmq.FD))
         self._loop.add_reader(self._descriptor, self._read)
         self._schedule()
 

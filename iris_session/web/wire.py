@@ -106,7 +106,7 @@ class _ClientEnvelope(msgspec.Struct, array_like=True):
 
 _server: Final = msgspec.msgpack.Decoder(_ServerEnvelope)
 _client: Final = msgspec.msgpack.Decoder(_ClientEnvelope)
-_gateway: Final = msgspec.msgpack.Decoder(GatewayMessage)
+_gateway: Final[msgspec.msgpack.Decoder[GatewayMessage]] = msgspec.msgpack.Decoder(GatewayMessage)
 _wishes: Final = msgspec.msgpack.Decoder(Annotated[list[str], msgspec.Meta(max_length=MAX_WISHES)])
 _encoder: Final = msgspec.msgpack.Encoder()
 
