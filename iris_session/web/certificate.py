@@ -88,12 +88,17 @@ def find_certificate(home: KeyHome) -> Certificate | None:
     return load_certificate(home.path / CERTIFICATE_FILE, home.path / KEY_FILE)
 
 
-def load_certificate(certificate_path: str | os.PathLike[str], key_path: str | os.PathLike[str]) -> Certificate:
-    """Return a certificate in PEM files. Raises `KeysError` when they cannot be read or do not belong together."""
+def load_certificate(
+    certificate_path: str | os.PathLike[str], key_path: str | os.PathLike[str] | None = None
+) -> Certificate:
+    """Return a certificate in PEM files. Raises `KeysError` when they cannot be read or do not belong together.
+
+    `key_path` `None`: only the certificate is needed; its own path stands in place of the key's.
+    """
     require_package("cryptography", _PURPOSE)
     from cryptography import x509
 
-    path, key = Path(certificate_path), Path(key_path)
+    path, key = Path(certificate_path), Path(certificate_path if key_path is None else key_path)
     data = _read(path)
     try:
         found = x509.load_pem_x509_certificate(data)
@@ -101,9 +106,10 @@ def load_certificate(certificate_path: str | os.PathLike[str], key_path: str | o
         public = _encode_public(found.public_key())
     except Exception as error:  # of the parser, for any bytes: ValueError, UnsupportedAlgorithm, its own panics
         raise KeysError(f"{path} is not a certificate in PEM form: {_shorten(error)}") from None
-    _read(key)
     try:
-        make_tls_context(path, key)
+        if key_path is not None:
+            _read(key)
+            make_tls_context(path, key)
     except (ssl.SSLError, OSError, ValueError) as error:
         raise KeysError(f"{key} is not the key of {path}, or is encrypted: {_shorten(error)}") from None
     return Certificate(path, key, hashlib.sha256(public).digest(), _format_fingerprint(found), names)
