@@ -1,0 +1,1548 @@
+// Tables of the iris-session protocol. Written by `python -m iris_session.codegen typescript-schema`: do not edit.
+//
+// Types of fields; ["null", type] is that type or null.
+//   ["bool"], ["float"], ["int", lowest, highest] (null: no bound within int64), ["str", characters, pattern],
+//   ["bytes", bytes], ["array", item, length, longest], ["map", item], ["struct", name], ["union", name].
+// 0 or "" as a bound stands for none. `length` of an array: exactly so many items.
+
+export type FieldType =
+  | readonly ["bool" | "float"]
+  | readonly ["int", number | null, number | null]
+  | readonly ["str", number, string]
+  | readonly ["bytes", number]
+  | readonly ["array", FieldType, number, number]
+  | readonly ["map", FieldType]
+  | readonly ["struct", string]
+  | readonly ["union", string]
+  | readonly ["null", FieldType];
+
+/** One field: name, type, and the default in a list of its own; an empty list where the field is required. */
+export type FieldRow = readonly [name: string, type: FieldType, fallback: readonly unknown[]];
+
+/** One struct. `array`: a MessagePack array, else a map. `tag`: its tag field and tag, in a union. */
+export interface StructTable {
+  readonly array: boolean;
+  readonly tag: readonly [field: string, tag: string] | null;
+  readonly fields: readonly FieldRow[];
+}
+
+const EMPTY_BYTES = new Uint8Array();
+
+export const STRUCTS: Readonly<Record<string, StructTable>> = {
+  Pose: {
+    array: true,
+    tag: null,
+    fields: [
+      ["p", ["array", ["float"], 3, 0], []],
+      ["q", ["array", ["float"], 4, 0], []],
+    ],
+  },
+  Target: {
+    array: true,
+    tag: null,
+    fields: [
+      ["name", ["str", 64, ""], []],
+      ["lease_version", ["int", 0, null], []],
+      ["kind", ["str", 64, ""], ["robot"]],
+    ],
+  },
+  Lease: {
+    array: false,
+    tag: null,
+    fields: [
+      ["target", ["str", 64, ""], []],
+      ["kind", ["str", 64, ""], []],
+      ["mode", ["str", 64, ""], []],
+      ["holder", ["str", 64, ""], []],
+      ["lease_version", ["int", 0, null], []],
+      ["expires_ns", ["int", null, null], [0]],
+      ["queue", ["array", ["str", 64, ""], 0, 0], [[]]],
+      ["sub_holders", ["array", ["str", 64, ""], 0, 0], [[]]],
+      ["weights", ["array", ["float"], 0, 0], [[]]],
+      ["scale", ["float"], [1.0]],
+    ],
+  },
+  Denial: {
+    array: false,
+    tag: null,
+    fields: [
+      ["reason", ["str", 64, ""], []],
+      ["message", ["str", 512, ""], []],
+      ["advice", ["str", 512, ""], [""]],
+      ["target", ["str", 64, ""], [""]],
+      ["holder", ["str", 64, ""], [""]],
+      ["holder_name", ["str", 64, ""], [""]],
+    ],
+  },
+  Alignment: {
+    array: false,
+    tag: null,
+    fields: [
+      ["version", ["int", 0, null], []],
+      ["kind", ["str", 64, ""], []],
+      ["T_world_tracking", ["struct", "Pose"], []],
+      ["tracking_epoch", ["int", 0, null], [0]],
+      ["covariance", ["array", ["float"], 0, 0], [[]]],
+      ["error_at_anchor_m", ["float"], [0.0]],
+      ["error_at_robot_m", ["float"], [0.0]],
+      ["offset", ["bool"], [false]],
+    ],
+  },
+  Applied: {
+    array: true,
+    tag: null,
+    fields: [
+      ["robot", ["str", 64, ""], []],
+      ["participant", ["str", 64, ""], []],
+      ["device", ["str", 64, ""], []],
+      ["seq", ["int", 0, null], []],
+      ["capture_ns", ["int", null, null], []],
+      ["receive_ns", ["int", null, null], []],
+      ["step_ns", ["int", null, null], []],
+    ],
+  },
+  Endpoints: {
+    array: false,
+    tag: null,
+    fields: [
+      ["state", ["int", 0, null], [0]],
+      ["media", ["int", 0, null], [0]],
+      ["assets", ["int", 0, null], [0]],
+      ["web", ["int", 0, null], [0]],
+      ["media_ingest", ["int", 0, null], [0]],
+    ],
+  },
+  ParticipantInfo: {
+    array: false,
+    tag: null,
+    fields: [
+      ["id", ["str", 64, ""], []],
+      ["name", ["str", 64, ""], []],
+      ["role", ["str", 64, ""], []],
+      ["connected", ["bool"], []],
+      ["devices", ["array", ["str", 64, ""], 0, 0], [[]]],
+      ["worn", ["bool"], [true]],
+      ["tracking_epoch", ["int", 0, null], [0]],
+      ["alignment", ["null", ["struct", "Alignment"]], [null]],
+    ],
+  },
+  RobotInfo: {
+    array: false,
+    tag: null,
+    fields: [
+      ["name", ["str", 64, ""], []],
+      ["joints", ["array", ["str", 64, ""], 0, 0], []],
+      ["base_body", ["int", 0, null], []],
+      ["site_body", ["int", 0, null], []],
+      ["T_body_site", ["struct", "Pose"], []],
+      ["gripper", ["bool"], []],
+    ],
+  },
+  BodyInfo: {
+    array: true,
+    tag: null,
+    fields: [
+      ["id", ["int", 0, null], []],
+      ["name", ["str", 64, ""], []],
+      ["moving", ["bool"], []],
+      ["object", ["bool"], [false]],
+    ],
+  },
+  Quantiles: {
+    array: true,
+    tag: null,
+    fields: [
+      ["p50", ["float"], []],
+      ["p99", ["float"], []],
+    ],
+  },
+  StreamBudget: {
+    array: false,
+    tag: null,
+    fields: [
+      ["stream", ["str", 64, ""], []],
+      ["budget_class", ["str", 64, ""], ["full"]],
+      ["mbit_per_s", ["float"], [0.0]],
+    ],
+  },
+  AnchorSeen: {
+    array: false,
+    tag: null,
+    fields: [
+      ["anchor_id", ["str", 64, ""], []],
+      ["observations", ["int", 0, null], []],
+      ["age_ns", ["int", null, null], []],
+    ],
+  },
+  AlignmentReport: {
+    array: false,
+    tag: null,
+    fields: [
+      ["version", ["int", 0, null], [0]],
+      ["running", ["bool"], [true]],
+      ["offset", ["bool"], [false]],
+      ["error_at_anchor_m", ["float"], [0.0]],
+      ["error_at_robot_m", ["float"], [0.0]],
+      ["residual_tilt_rad", ["float"], [0.0]],
+      ["observations", ["int", 0, null], [0]],
+      ["viewpoints", ["int", 0, null], [0]],
+      ["unusable", ["int", 0, null], [0]],
+      ["pending_m", ["float"], [0.0]],
+      ["pending_rad", ["float"], [0.0]],
+      ["advice", ["str", 512, ""], [""]],
+      ["alarm", ["str", 64, ""], [""]],
+      ["alarm_size_m", ["float"], [0.0]],
+      ["alarm_ns", ["int", null, null], [-1]],
+      ["seen", ["array", ["struct", "AnchorSeen"], 0, 0], [[]]],
+    ],
+  },
+  CrossCheckReport: {
+    array: false,
+    tag: null,
+    fields: [
+      ["a", ["str", 64, ""], []],
+      ["b", ["str", 64, ""], []],
+      ["anchor_id", ["str", 64, ""], []],
+      ["error_m", ["float"], []],
+      ["error_rad", ["float"], []],
+      ["expected_p95_m", ["float"], []],
+      ["age_ns", ["int", null, null], []],
+      ["n", ["int", 0, null], [0]],
+    ],
+  },
+  AnchorReport: {
+    array: false,
+    tag: null,
+    fields: [
+      ["anchor_id", ["str", 64, ""], []],
+      ["T_world_anchor", ["struct", "Pose"], []],
+      ["size_m", ["float"], [0.0]],
+    ],
+  },
+  StopReport: {
+    array: false,
+    tag: null,
+    fields: [
+      ["stop_seq", ["int", 0, null], []],
+      ["participant", ["str", 64, ""], []],
+      ["name", ["str", 64, ""], []],
+      ["reason", ["str", 512, ""], []],
+      ["age_ns", ["int", null, null], []],
+    ],
+  },
+  ParticipantReport: {
+    array: false,
+    tag: null,
+    fields: [
+      ["id", ["str", 64, ""], []],
+      ["name", ["str", 64, ""], []],
+      ["role", ["str", 64, ""], []],
+      ["connected", ["bool"], []],
+      ["address", ["str", 64, ""], [""]],
+      ["software", ["str", 64, ""], [""]],
+      ["worn", ["bool"], [true]],
+      ["heard_ns", ["int", null, null], [-1]],
+      ["alignment", ["str", 64, ""], ["none"]],
+      ["alignment_age_ns", ["int", null, null], [-1]],
+      ["alignment_void_ns", ["int", null, null], [-1]],
+      ["alignment_error_m", ["float"], [0.0]],
+      ["tracking_epoch", ["int", 0, null], [0]],
+      ["holds", ["array", ["str", 64, ""], 0, 0], [[]]],
+      ["waits_for", ["array", ["str", 64, ""], 0, 0], [[]]],
+      ["samples_per_s", ["float"], [0.0]],
+      ["capture_to_receive", ["null", ["struct", "Quantiles"]], [null]],
+      ["state_age", ["null", ["struct", "Quantiles"]], [null]],
+      ["missed_share", ["float"], [0.0]],
+      ["rtt_ms", ["float"], [0.0]],
+      ["bytes_per_s", ["float"], [0.0]],
+      ["budget_class", ["str", 64, ""], [""]],
+      ["rejected", ["map", ["int", null, null]], [{}]],
+      ["drops", ["int", 0, null], [0]],
+      ["reported", ["bool"], [false]],
+      ["lost", ["str", 64, ""], [""]],
+      ["media", ["array", ["struct", "StreamBudget"], 0, 0], [[]]],
+      ["media_bytes_per_s", ["float"], [0.0]],
+      ["media_drops", ["int", 0, null], [0]],
+      ["alignment_report", ["null", ["struct", "AlignmentReport"]], [null]],
+    ],
+  },
+  RobotReport: {
+    array: false,
+    tag: null,
+    fields: [
+      ["name", ["str", 64, ""], []],
+      ["mode", ["str", 64, ""], []],
+      ["holder", ["str", 64, ""], [""]],
+      ["holder_name", ["str", 64, ""], [""]],
+      ["state", ["str", 64, ""], [""]],
+      ["hold_reason", ["str", 64, ""], [""]],
+      ["receive_to_step", ["null", ["struct", "Quantiles"]], [null]],
+      ["queue", ["array", ["str", 64, ""], 0, 0], [[]]],
+    ],
+  },
+  RecorderReport: {
+    array: false,
+    tag: null,
+    fields: [
+      ["state", ["str", 64, ""], ["off"]],
+      ["path", ["str", 512, ""], [""]],
+      ["bytes_written", ["int", 0, null], [0]],
+      ["disk_free_bytes", ["int", 0, null], [0]],
+      ["lost_rows", ["int", 0, null], [0]],
+      ["spilled_bytes", ["int", 0, null], [0]],
+      ["text", ["str", 512, ""], [""]],
+    ],
+  },
+  MediaStreamReport: {
+    array: false,
+    tag: null,
+    fields: [
+      ["stream", ["str", 64, ""], []],
+      ["hz", ["float"], [0.0]],
+      ["mbit_per_s", ["float"], [0.0]],
+      ["source", ["str", 64, ""], [""]],
+      ["subscribers", ["int", 0, null], [0]],
+    ],
+  },
+  AssetsReport: {
+    array: false,
+    tag: null,
+    fields: [
+      ["served", ["int", 0, null], [0]],
+      ["bytes_sent", ["int", 0, null], [0]],
+      ["requests", ["int", 0, null], [0]],
+      ["refusals", ["int", 0, null], [0]],
+      ["waiting", ["int", 0, null], [0]],
+    ],
+  },
+  Hello: {
+    array: false,
+    tag: ["type", "hello"],
+    fields: [
+      ["role", ["str", 64, ""], []],
+      ["name", ["str", 64, ""], []],
+      ["software", ["str", 64, ""], [""]],
+      ["devices", ["array", ["str", 64, ""], 0, 32], [[]]],
+      ["capabilities", ["array", ["str", 64, ""], 0, 32], [[]]],
+      ["alignment", ["str", 64, ""], ["measured"]],
+      ["secret", ["bytes", 64], [EMPTY_BYTES]],
+      ["resume_token", ["bytes", 64], [EMPTY_BYTES]],
+      ["join_code", ["str", 64, ""], [""]],
+    ],
+  },
+  Bye: {
+    array: false,
+    tag: ["type", "bye"],
+    fields: [
+      ["reason", ["str", 512, ""], [""]],
+    ],
+  },
+  Heartbeat: {
+    array: false,
+    tag: ["type", "heartbeat"],
+    fields: [
+      ["worn", ["bool"], [true]],
+    ],
+  },
+  ClockPing: {
+    array: false,
+    tag: ["type", "clock_ping"],
+    fields: [
+      ["t0_ns", ["int", null, null], []],
+    ],
+  },
+  GetSnapshot: {
+    array: false,
+    tag: ["type", "get_snapshot"],
+    fields: [
+      ["request_id", ["int", 0, null], [0]],
+    ],
+  },
+  Sample: {
+    array: false,
+    tag: ["type", "sample"],
+    fields: [
+      ["device", ["str", 64, ""], []],
+      ["kind", ["str", 64, ""], []],
+      ["seq", ["int", 0, null], []],
+      ["capture_ns", ["int", null, null], []],
+      ["scene_epoch", ["int", 0, null], []],
+      ["tracking_epoch", ["int", 0, null], []],
+      ["alignment_version", ["int", 0, null], []],
+      ["targets", ["array", ["struct", "Target"], 0, 8], [[]]],
+      ["tracked", ["bool"], [true]],
+      ["worn", ["bool"], [true]],
+      ["clutch", ["bool"], [false]],
+      ["gripper", ["null", ["float"]], [null]],
+      ["buttons", ["int", 0, null], [0]],
+      ["pose", ["null", ["struct", "Pose"]], [null]],
+      ["twist", ["null", ["array", ["float"], 6, 0]], [null]],
+      ["hand_joints", ["array", ["float"], 0, 182], [[]]],
+      ["q", ["array", ["float"], 0, 64], [[]]],
+      ["qd", ["array", ["float"], 0, 64], [[]]],
+    ],
+  },
+  Samples: {
+    array: false,
+    tag: ["type", "samples"],
+    fields: [
+      ["samples", ["array", ["struct", "Sample"], 0, 8], []],
+    ],
+  },
+  Acquire: {
+    array: false,
+    tag: ["type", "acquire"],
+    fields: [
+      ["request_id", ["int", 0, null], []],
+      ["robots", ["array", ["str", 64, ""], 0, 32], [[]]],
+      ["objects", ["array", ["str", 64, ""], 0, 32], [[]]],
+      ["wait", ["bool"], [false]],
+      ["weight", ["float"], [1.0]],
+    ],
+  },
+  Release: {
+    array: false,
+    tag: ["type", "release"],
+    fields: [
+      ["request_id", ["int", 0, null], [0]],
+      ["targets", ["array", ["struct", "Target"], 0, 8], [[]]],
+    ],
+  },
+  Withdraw: {
+    array: false,
+    tag: ["type", "withdraw"],
+    fields: [
+      ["request_id", ["int", 0, null], []],
+      ["acquire_request_id", ["int", 0, null], []],
+    ],
+  },
+  Consent: {
+    array: false,
+    tag: ["type", "consent"],
+    fields: [
+      ["request_id", ["int", 0, null], []],
+      ["consent_id", ["int", 0, null], []],
+      ["grant", ["bool"], []],
+    ],
+  },
+  Assign: {
+    array: false,
+    tag: ["type", "assign"],
+    fields: [
+      ["request_id", ["int", 0, null], []],
+      ["robots", ["array", ["str", 64, ""], 0, 32], []],
+      ["participant", ["str", 64, ""], [""]],
+    ],
+  },
+  SetMode: {
+    array: false,
+    tag: ["type", "set_mode"],
+    fields: [
+      ["request_id", ["int", 0, null], []],
+      ["robot", ["str", 64, ""], []],
+      ["mode", ["str", 64, ""], []],
+    ],
+  },
+  SetScale: {
+    array: false,
+    tag: ["type", "set_scale"],
+    fields: [
+      ["request_id", ["int", 0, null], []],
+      ["robots", ["array", ["str", 64, ""], 0, 32], [[]]],
+      ["scale", ["float"], [1.0]],
+    ],
+  },
+  Grasp: {
+    array: false,
+    tag: ["type", "grasp"],
+    fields: [
+      ["request_id", ["int", 0, null], []],
+      ["object", ["str", 64, ""], []],
+      ["device", ["str", 64, ""], []],
+    ],
+  },
+  Observation: {
+    array: false,
+    tag: ["type", "observation"],
+    fields: [
+      ["anchor_id", ["str", 64, ""], []],
+      ["kind", ["str", 64, ""], []],
+      ["T_tracking_anchor", ["struct", "Pose"], []],
+      ["capture_ns", ["int", null, null], []],
+      ["tracking_epoch", ["int", 0, null], []],
+      ["viewpoint_id", ["int", 0, null], [0]],
+      ["size_m", ["float"], [0.0]],
+      ["quality", ["float"], [1.0]],
+      ["device", ["str", 64, ""], ["head"]],
+      ["covariance", ["array", ["float"], 0, 36], [[]]],
+    ],
+  },
+  PlaceAlignment: {
+    array: false,
+    tag: ["type", "place_alignment"],
+    fields: [
+      ["request_id", ["int", 0, null], []],
+      ["participant", ["str", 64, ""], []],
+      ["T_world_tracking", ["struct", "Pose"], []],
+      ["offset", ["bool"], [false]],
+    ],
+  },
+  Align: {
+    array: false,
+    tag: ["type", "align"],
+    fields: [
+      ["request_id", ["int", 0, null], []],
+      ["action", ["str", 64, ""], []],
+      ["participant", ["str", 64, ""], [""]],
+    ],
+  },
+  MoveAnchor: {
+    array: false,
+    tag: ["type", "move_anchor"],
+    fields: [
+      ["request_id", ["int", 0, null], []],
+      ["anchor_id", ["str", 64, ""], []],
+      ["T_world_anchor", ["struct", "Pose"], []],
+      ["force", ["bool"], [false]],
+    ],
+  },
+  TrackingEpoch: {
+    array: false,
+    tag: ["type", "tracking_epoch"],
+    fields: [
+      ["tracking_epoch", ["int", 0, null], []],
+    ],
+  },
+  Episode: {
+    array: false,
+    tag: ["type", "episode"],
+    fields: [
+      ["request_id", ["int", 0, null], []],
+      ["action", ["str", 64, ""], []],
+      ["label", ["str", 512, ""], [""]],
+    ],
+  },
+  EStop: {
+    array: false,
+    tag: ["type", "estop"],
+    fields: [
+      ["reason", ["str", 512, ""], [""]],
+    ],
+  },
+  ClearEStop: {
+    array: false,
+    tag: ["type", "clear_estop"],
+    fields: [
+      ["request_id", ["int", 0, null], []],
+      ["stop_seq", ["int", 0, null], [0]],
+    ],
+  },
+  Control: {
+    array: false,
+    tag: ["type", "control"],
+    fields: [
+      ["request_id", ["int", 0, null], []],
+      ["action", ["str", 64, ""], []],
+      ["ticks", ["int", 0, null], [1]],
+    ],
+  },
+  Marker: {
+    array: false,
+    tag: ["type", "marker"],
+    fields: [
+      ["request_id", ["int", 0, null], []],
+      ["text", ["str", 512, ""], []],
+    ],
+  },
+  Pair: {
+    array: false,
+    tag: ["type", "pair"],
+    fields: [
+      ["name", ["str", 64, ""], []],
+      ["proof", ["bytes", 64], []],
+      ["software", ["str", 64, ""], [""]],
+    ],
+  },
+  RemoveParticipant: {
+    array: false,
+    tag: ["type", "remove_participant"],
+    fields: [
+      ["request_id", ["int", 0, null], []],
+      ["participant", ["str", 64, ""], []],
+      ["revoke", ["bool"], [false]],
+      ["reason", ["str", 512, ""], [""]],
+    ],
+  },
+  GetStatus: {
+    array: false,
+    tag: ["type", "get_status"],
+    fields: [
+      ["request_id", ["int", 0, null], [0]],
+    ],
+  },
+  ClientReport: {
+    array: false,
+    tag: ["type", "client_report"],
+    fields: [
+      ["age_ms_p50", ["float"], []],
+      ["age_ms_p99", ["float"], []],
+      ["delivered", ["int", 0, null], []],
+      ["missed", ["int", 0, null], [0]],
+      ["rtt_ms", ["float"], [0.0]],
+      ["bytes_per_s", ["float"], [0.0]],
+      ["media_bytes_per_s", ["float"], [0.0]],
+      ["media_age_ms", ["float"], [0.0]],
+      ["display_hz", ["float"], [0.0]],
+      ["media_limit_mbit_per_s", ["float"], [0.0]],
+    ],
+  },
+  Welcome: {
+    array: false,
+    tag: ["type", "welcome"],
+    fields: [
+      ["session_id", ["str", 64, ""], []],
+      ["session_name", ["str", 64, ""], []],
+      ["kind", ["str", 64, ""], []],
+      ["participant_id", ["str", 64, ""], []],
+      ["connection_epoch", ["int", 0, null], []],
+      ["role", ["str", 64, ""], []],
+      ["resume_token", ["bytes", 0], []],
+      ["resumed", ["bool"], []],
+      ["session_time", ["int", null, null], []],
+      ["heartbeat_ns", ["int", null, null], []],
+      ["tick_period_ns", ["int", null, null], []],
+      ["state_period_ns", ["int", null, null], []],
+      ["endpoints", ["struct", "Endpoints"], []],
+      ["key_fingerprint", ["str", 64, ""], [""]],
+    ],
+  },
+  Refused: {
+    array: false,
+    tag: ["type", "refused"],
+    fields: [
+      ["code", ["str", 64, ""], []],
+      ["message", ["str", 512, ""], []],
+      ["advice", ["str", 512, ""], [""]],
+      ["supported_versions", ["array", ["int", null, null], 0, 0], [[1]]],
+    ],
+  },
+  ProtocolFault: {
+    array: false,
+    tag: ["type", "protocol_fault"],
+    fields: [
+      ["code", ["str", 64, ""], []],
+      ["message", ["str", 512, ""], []],
+      ["reason", ["str", 64, ""], [""]],
+    ],
+  },
+  ClockPong: {
+    array: false,
+    tag: ["type", "clock_pong"],
+    fields: [
+      ["t0_ns", ["int", null, null], []],
+      ["t1_ns", ["int", null, null], []],
+      ["t2_ns", ["int", null, null], []],
+    ],
+  },
+  Reply: {
+    array: false,
+    tag: ["type", "reply"],
+    fields: [
+      ["request_id", ["int", 0, null], []],
+      ["ok", ["bool"], []],
+      ["denial", ["null", ["struct", "Denial"]], [null]],
+      ["leases", ["array", ["struct", "Lease"], 0, 0], [[]]],
+    ],
+  },
+  Feedback: {
+    array: false,
+    tag: ["type", "feedback"],
+    fields: [
+      ["robot", ["str", 64, ""], []],
+      ["state", ["str", 64, ""], []],
+      ["hold_reason", ["str", 64, ""], [""]],
+      ["contact_n", ["float"], [0.0]],
+      ["limits", ["array", ["str", 64, ""], 0, 0], [[]]],
+      ["rejected", ["map", ["int", null, null]], [{}]],
+    ],
+  },
+  Event: {
+    array: false,
+    tag: ["type", "event"],
+    fields: [
+      ["event_seq", ["int", 0, null], []],
+      ["step", ["int", 0, null], []],
+      ["session_time", ["int", null, null], []],
+      ["body", ["union", "EventKind"], []],
+    ],
+  },
+  Snapshot: {
+    array: false,
+    tag: ["type", "snapshot"],
+    fields: [
+      ["request_id", ["int", 0, null], []],
+      ["event_seq", ["int", 0, null], []],
+      ["scene_epoch", ["int", 0, null], []],
+      ["scene_revision", ["int", 0, null], []],
+      ["scene_hash", ["str", 64, ""], []],
+      ["tick", ["int", 0, null], []],
+      ["sim_time", ["float"], []],
+      ["session_time", ["int", null, null], []],
+      ["participants", ["array", ["struct", "ParticipantInfo"], 0, 0], []],
+      ["leases", ["array", ["struct", "Lease"], 0, 0], []],
+      ["robots", ["array", ["struct", "RobotInfo"], 0, 0], [[]]],
+      ["bodies", ["array", ["struct", "BodyInfo"], 0, 0], [[]]],
+      ["paused", ["bool"], [false]],
+      ["estop", ["bool"], [false]],
+      ["episode", ["null", ["struct", "EpisodeChanged"]], [null]],
+      ["state_seq", ["int", 0, null], [0]],
+      ["tick_period_ns", ["int", null, null], [0]],
+      ["stop_seq", ["int", 0, null], [0]],
+      ["consent_timeout_ns", ["int", null, null], [0]],
+    ],
+  },
+  Paired: {
+    array: false,
+    tag: ["type", "paired"],
+    fields: [
+      ["proof", ["bytes", 64], []],
+      ["roles", ["array", ["str", 64, ""], 0, 32], [[]]],
+    ],
+  },
+  StatusReport: {
+    array: false,
+    tag: ["type", "status_report"],
+    fields: [
+      ["request_id", ["int", 0, null], []],
+      ["session_id", ["str", 64, ""], []],
+      ["session_name", ["str", 64, ""], []],
+      ["session_time", ["int", null, null], []],
+      ["tick", ["int", 0, null], [0]],
+      ["tick_period_ns", ["int", null, null], [0]],
+      ["paused", ["bool"], [false]],
+      ["estop", ["bool"], [false]],
+      ["stalled", ["bool"], [false]],
+      ["scheduling", ["str", 64, ""], [""]],
+      ["late_share", ["float"], [0.0]],
+      ["late_share_total", ["float"], [0.0]],
+      ["lateness", ["null", ["struct", "Quantiles"]], [null]],
+      ["late_causes", ["map", ["int", null, null]], [{}]],
+      ["step_to_publish", ["null", ["struct", "Quantiles"]], [null]],
+      ["cpu_share", ["float"], [0.0]],
+      ["load", ["float"], [0.0]],
+      ["cpus", ["int", 0, null], [0]],
+      ["memory_bytes", ["int", 0, null], [0]],
+      ["participants", ["array", ["struct", "ParticipantReport"], 0, 0], [[]]],
+      ["robots", ["array", ["struct", "RobotReport"], 0, 0], [[]]],
+      ["recorder", ["null", ["struct", "RecorderReport"]], [null]],
+      ["drops", ["map", ["int", null, null]], [{}]],
+      ["restarts", ["map", ["int", null, null]], [{}]],
+      ["connections", ["int", 0, null], [0]],
+      ["entries_per_s", ["float"], [0.0]],
+      ["warnings", ["array", ["str", 512, ""], 0, 0], [[]]],
+      ["authority_silent_ns", ["int", null, null], [-1]],
+      ["media", ["array", ["struct", "MediaStreamReport"], 0, 0], [[]]],
+      ["anchors", ["array", ["struct", "AnchorReport"], 0, 0], [[]]],
+      ["cross_checks", ["array", ["struct", "CrossCheckReport"], 0, 0], [[]]],
+      ["assets", ["null", ["struct", "AssetsReport"]], [null]],
+      ["stops", ["array", ["struct", "StopReport"], 0, 0], [[]]],
+      ["pause_reason", ["str", 512, ""], [""]],
+    ],
+  },
+  DeliveryBudget: {
+    array: false,
+    tag: ["type", "delivery_budget"],
+    fields: [
+      ["budget_class", ["str", 64, ""], []],
+      ["mbit_per_s", ["float"], [0.0]],
+      ["reason", ["str", 512, ""], [""]],
+      ["streams", ["array", ["struct", "StreamBudget"], 0, 0], [[]]],
+    ],
+  },
+  ParticipantJoined: {
+    array: false,
+    tag: ["event", "participant_joined"],
+    fields: [
+      ["participant", ["struct", "ParticipantInfo"], []],
+      ["resumed", ["bool"], [false]],
+    ],
+  },
+  ParticipantChanged: {
+    array: false,
+    tag: ["event", "participant_changed"],
+    fields: [
+      ["participant", ["struct", "ParticipantInfo"], []],
+    ],
+  },
+  ParticipantLeft: {
+    array: false,
+    tag: ["event", "participant_left"],
+    fields: [
+      ["participant", ["str", 64, ""], []],
+      ["reason", ["str", 64, ""], []],
+      ["grace", ["bool"], [false]],
+    ],
+  },
+  LeaseChanged: {
+    array: false,
+    tag: ["event", "lease_changed"],
+    fields: [
+      ["lease", ["struct", "Lease"], []],
+      ["cause", ["str", 64, ""], []],
+      ["previous_holder", ["str", 64, ""], [""]],
+    ],
+  },
+  LeasesChanged: {
+    array: false,
+    tag: ["event", "leases_changed"],
+    fields: [
+      ["leases", ["array", ["struct", "Lease"], 0, 64], []],
+      ["cause", ["str", 64, ""], []],
+      ["previous_holders", ["array", ["str", 64, ""], 0, 64], []],
+    ],
+  },
+  ConsentRequested: {
+    array: false,
+    tag: ["event", "consent_requested"],
+    fields: [
+      ["consent_id", ["int", 0, null], []],
+      ["target", ["str", 64, ""], []],
+      ["requester", ["str", 64, ""], []],
+      ["holder", ["str", 64, ""], []],
+    ],
+  },
+  Intervention: {
+    array: false,
+    tag: ["event", "intervention"],
+    fields: [
+      ["robot", ["str", 64, ""], []],
+      ["human", ["str", 64, ""], []],
+      ["agent", ["str", 64, ""], []],
+      ["active", ["bool"], []],
+    ],
+  },
+  EngagementChanged: {
+    array: false,
+    tag: ["event", "engagement_changed"],
+    fields: [
+      ["robot", ["str", 64, ""], []],
+      ["participant", ["str", 64, ""], []],
+      ["engaged", ["bool"], []],
+      ["reason", ["str", 64, ""], [""]],
+    ],
+  },
+  ScaleChanged: {
+    array: false,
+    tag: ["event", "scale_changed"],
+    fields: [
+      ["robot", ["str", 64, ""], []],
+      ["scale", ["float"], []],
+      ["participant", ["str", 64, ""], []],
+    ],
+  },
+  AlignmentChanged: {
+    array: false,
+    tag: ["event", "alignment_changed"],
+    fields: [
+      ["participant", ["str", 64, ""], []],
+      ["alignment", ["struct", "Alignment"], []],
+    ],
+  },
+  AlignmentRun: {
+    array: false,
+    tag: ["event", "alignment_run"],
+    fields: [
+      ["participant", ["str", 64, ""], []],
+      ["running", ["bool"], []],
+      ["run", ["int", 0, null], []],
+      ["by", ["str", 64, ""], [""]],
+    ],
+  },
+  AlignmentAlarmed: {
+    array: false,
+    tag: ["event", "alignment_alarmed"],
+    fields: [
+      ["participant", ["str", 64, ""], []],
+      ["kind", ["str", 64, ""], []],
+      ["anchor_id", ["str", 64, ""], []],
+      ["size_m", ["float"], []],
+      ["beside", ["array", ["str", 64, ""], 0, 32], [[]]],
+    ],
+  },
+  AnchorMoved: {
+    array: false,
+    tag: ["event", "anchor_moved"],
+    fields: [
+      ["anchor_id", ["str", 64, ""], []],
+      ["T_world_anchor", ["struct", "Pose"], []],
+      ["by", ["str", 64, ""], [""]],
+    ],
+  },
+  HeadsetsCompared: {
+    array: false,
+    tag: ["event", "headsets_compared"],
+    fields: [
+      ["a", ["str", 64, ""], []],
+      ["b", ["str", 64, ""], []],
+      ["anchor_id", ["str", 64, ""], []],
+      ["error_m", ["float"], []],
+      ["error_rad", ["float"], []],
+      ["expected_p95_m", ["float"], []],
+      ["p_world", ["array", ["float"], 3, 0], []],
+      ["n", ["int", 0, null], []],
+    ],
+  },
+  SceneChanged: {
+    array: false,
+    tag: ["event", "scene_changed"],
+    fields: [
+      ["scene_epoch", ["int", 0, null], []],
+      ["scene_revision", ["int", 0, null], []],
+      ["cause", ["str", 64, ""], []],
+      ["scene_hash", ["str", 64, ""], [""]],
+      ["tick_period_ns", ["int", null, null], [0]],
+    ],
+  },
+  EStopChanged: {
+    array: false,
+    tag: ["event", "estop_changed"],
+    fields: [
+      ["active", ["bool"], []],
+      ["participant", ["str", 64, ""], []],
+      ["reason", ["str", 512, ""], [""]],
+      ["stop_seq", ["int", 0, null], [0]],
+    ],
+  },
+  PauseChanged: {
+    array: false,
+    tag: ["event", "pause_changed"],
+    fields: [
+      ["paused", ["bool"], []],
+      ["participant", ["str", 64, ""], [""]],
+      ["reason", ["str", 512, ""], [""]],
+    ],
+  },
+  EpisodeChanged: {
+    array: false,
+    tag: ["event", "episode_changed"],
+    fields: [
+      ["number", ["int", 0, null], []],
+      ["state", ["str", 64, ""], []],
+      ["label", ["str", 512, ""], [""]],
+      ["participant", ["str", 64, ""], [""]],
+    ],
+  },
+  ObjectGrasped: {
+    array: false,
+    tag: ["event", "object_grasped"],
+    fields: [
+      ["object", ["str", 64, ""], []],
+      ["participant", ["str", 64, ""], []],
+      ["device", ["str", 64, ""], []],
+      ["grasped", ["bool"], []],
+    ],
+  },
+  Handover: {
+    array: false,
+    tag: ["event", "handover"],
+    fields: [
+      ["object", ["str", 64, ""], []],
+      ["giver", ["str", 64, ""], []],
+      ["receiver", ["str", 64, ""], []],
+      ["giver_participant", ["str", 64, ""], []],
+      ["receiver_participant", ["str", 64, ""], []],
+      ["duration_ns", ["int", null, null], []],
+    ],
+  },
+  MarkerAdded: {
+    array: false,
+    tag: ["event", "marker_added"],
+    fields: [
+      ["participant", ["str", 64, ""], []],
+      ["text", ["str", 512, ""], []],
+    ],
+  },
+  SamplesRejected: {
+    array: false,
+    tag: ["event", "samples_rejected"],
+    fields: [
+      ["participant", ["str", 64, ""], []],
+      ["device", ["str", 64, ""], []],
+      ["reason", ["str", 64, ""], []],
+      ["count", ["int", 0, null], []],
+    ],
+  },
+  Gap: {
+    array: false,
+    tag: ["event", "gap"],
+    fields: [
+      ["kind", ["str", 64, ""], []],
+      ["duration_ns", ["int", null, null], []],
+      ["rows", ["int", 0, null], [0]],
+    ],
+  },
+  Notice: {
+    array: false,
+    tag: ["event", "notice"],
+    fields: [
+      ["level", ["str", 64, ""], []],
+      ["text", ["str", 512, ""], []],
+      ["participant", ["str", 64, ""], [""]],
+      ["reason", ["str", 64, ""], [""]],
+    ],
+  },
+  Audited: {
+    array: false,
+    tag: ["event", "audited"],
+    fields: [
+      ["kind", ["str", 64, ""], []],
+      ["subject", ["str", 64, ""], [""]],
+      ["name", ["str", 64, ""], [""]],
+      ["address", ["str", 64, ""], [""]],
+      ["detail", ["str", 512, ""], [""]],
+      ["count", ["int", 0, null], [1]],
+    ],
+  },
+  ClientEnvelope: {
+    array: true,
+    tag: null,
+    fields: [
+      ["version", ["int", null, null], []],
+      ["connection_epoch", ["int", 0, null], []],
+      ["on_behalf_of", ["str", 64, ""], []],
+      ["message", ["union", "ClientMessage"], []],
+    ],
+  },
+  ServerEnvelope: {
+    array: true,
+    tag: null,
+    fields: [
+      ["version", ["int", null, null], []],
+      ["connection_epoch", ["int", 0, null], []],
+      ["message", ["union", "ServerMessage"], []],
+    ],
+  },
+  StateHeader: {
+    array: true,
+    tag: null,
+    fields: [
+      ["scene_epoch", ["int", 0, null], []],
+      ["scene_revision", ["int", 0, null], []],
+      ["tick", ["int", 0, null], []],
+      ["sim_time", ["float"], []],
+      ["session_time", ["int", null, null], []],
+      ["published_ns", ["int", null, null], []],
+      ["state_seq", ["int", 0, null], []],
+      ["base_seq", ["int", 0, null], []],
+      ["applied", ["array", ["struct", "Applied"], 0, 0], [[]]],
+    ],
+  },
+  PresenceItem: {
+    array: true,
+    tag: null,
+    fields: [
+      ["participant", ["str", 64, ""], []],
+      ["device", ["str", 64, ""], []],
+      ["pose", ["struct", "Pose"], []],
+      ["capture_ns", ["int", null, null], [0]],
+    ],
+  },
+  Presence: {
+    array: true,
+    tag: null,
+    fields: [
+      ["session_time", ["int", null, null], []],
+      ["published_ns", ["int", null, null], []],
+      ["items", ["array", ["struct", "PresenceItem"], 0, 0], []],
+    ],
+  },
+  MediaHeader: {
+    array: true,
+    tag: null,
+    fields: [
+      ["stream", ["str", 64, ""], []],
+      ["budget_class", ["str", 64, ""], []],
+      ["scene_epoch", ["int", 0, null], []],
+      ["seq", ["int", 0, null], []],
+      ["capture_ns", ["int", null, null], []],
+      ["published_ns", ["int", null, null], []],
+      ["encoding", ["str", 64, ""], ["bytes"]],
+      ["dropped", ["int", 0, null], [0]],
+    ],
+  },
+  MediaPush: {
+    array: true,
+    tag: null,
+    fields: [
+      ["stream", ["str", 64, ""], []],
+      ["scene_epoch", ["int", 0, null], []],
+      ["capture_ns", ["int", null, null], []],
+      ["classes", ["array", ["str", 64, ""], 0, 0], [["full"]]],
+      ["encoding", ["str", 64, ""], ["bytes"]],
+    ],
+  },
+  AssetRequest: {
+    array: true,
+    tag: null,
+    fields: [
+      ["version", ["int", 0, null], []],
+      ["connection_epoch", ["int", 0, null], []],
+      ["request_id", ["int", 0, null], []],
+      ["address", ["str", 64, ""], []],
+      ["offset", ["int", 0, null], []],
+      ["length", ["int", 0, null], []],
+    ],
+  },
+  AssetChunk: {
+    array: true,
+    tag: null,
+    fields: [
+      ["version", ["int", 0, null], []],
+      ["request_id", ["int", 0, null], []],
+      ["address", ["str", 64, ""], []],
+      ["offset", ["int", 0, null], []],
+      ["total", ["int", 0, null], []],
+    ],
+  },
+  AssetRefused: {
+    array: true,
+    tag: null,
+    fields: [
+      ["version", ["int", 0, null], []],
+      ["request_id", ["int", 0, null], []],
+      ["address", ["str", 64, ""], []],
+      ["reason", ["str", 64, ""], []],
+      ["advice", ["str", 512, ""], [""]],
+    ],
+  },
+  Beacon: {
+    array: false,
+    tag: null,
+    fields: [
+      ["protocol", ["int", 0, null], []],
+      ["session_id", ["str", 64, ""], []],
+      ["session_name", ["str", 64, ""], []],
+      ["kind", ["str", 64, ""], []],
+      ["host", ["str", 64, ""], []],
+      ["control", ["int", 0, null], []],
+      ["state", ["int", 0, null], []],
+      ["media", ["int", 0, null], []],
+      ["assets", ["int", 0, null], []],
+      ["web", ["int", 0, null], []],
+      ["key_fingerprint", ["str", 64, ""], [""]],
+    ],
+  },
+  Introduction: {
+    array: false,
+    tag: null,
+    fields: [
+      ["beacon", ["struct", "Beacon"], []],
+      ["server_key", ["str", 64, ""], [""]],
+      ["pairing", ["bool"], [false]],
+      ["participants", ["int", 0, null], [0]],
+    ],
+  },
+  SceneSpec: {
+    array: false,
+    tag: null,
+    fields: [
+      ["version", ["int", 0, null], [1]],
+      ["name", ["str", 512, ""], [""]],
+      ["source", ["str", 512, ""], [""]],
+      ["bodies", ["array", ["struct", "Body"], 0, 131072], [[]]],
+      ["visuals", ["array", ["struct", "Visual"], 0, 0], [[]]],
+      ["materials", ["array", ["struct", "Material"], 0, 65536], [[]]],
+      ["textures", ["array", ["struct", "Texture"], 0, 65536], [[]]],
+      ["meshes", ["array", ["struct", "Mesh"], 0, 65536], [[]]],
+      ["hfields", ["array", ["struct", "HeightField"], 0, 65536], [[]]],
+      ["lights", ["array", ["struct", "Light"], 0, 65536], [[]]],
+      ["cameras", ["array", ["struct", "Camera"], 0, 65536], [[]]],
+      ["sites", ["array", ["struct", "Site"], 0, 65536], [[]]],
+      ["tendons", ["array", ["struct", "Tendon"], 0, 65536], [[]]],
+      ["deformables", ["array", ["struct", "Deformable"], 0, 65536], [[]]],
+      ["environment", ["struct", "Environment"], [{"headlight": {"active": true, "ambient": [0.1, 0.1, 0.1], "diffuse": [0.4, 0.4, 0.4], "specular": [0.5, 0.5, 0.5]}, "skybox": -1, "haze_rgba": [1.0, 1.0, 1.0, 1.0], "haze": 0.3, "fog_rgba": [0.0, 0.0, 0.0, 1.0], "fog_start": 0.0, "fog_end": 0.0, "znear": 0.01, "zfar": 50.0, "extent": 1.0, "center": [0.0, 0.0, 0.0]}]],
+      ["groups_shown", ["array", ["int", -2147483648, 2147483647], 0, 256], [[0, 1, 2]]],
+      ["totals", ["struct", "Totals"], [{"objects": 0, "triangles": 0, "mesh_bytes": 0, "texture_bytes": 0, "texture_memory": 0, "asset_bytes": 0}]],
+    ],
+  },
+  Body: {
+    array: false,
+    tag: null,
+    fields: [
+      ["id", ["int", 0, null], []],
+      ["name", ["str", 512, ""], []],
+      ["parent", ["int", -1, 2147483647], []],
+      ["T_parent_body", ["struct", "Pose"], []],
+      ["T_world_body", ["struct", "Pose"], []],
+      ["moving", ["bool"], []],
+    ],
+  },
+  Visual: {
+    array: false,
+    tag: null,
+    fields: [
+      ["id", ["int", 0, null], []],
+      ["body", ["int", 0, null], []],
+      ["name", ["str", 512, ""], []],
+      ["T_body_visual", ["struct", "Pose"], []],
+      ["group", ["int", -2147483648, 2147483647], []],
+      ["geometry", ["struct", "Geometry"], []],
+      ["material", ["int", -1, 2147483647], []],
+      ["rgba", ["array", ["float"], 4, 0], []],
+    ],
+  },
+  Geometry: {
+    array: false,
+    tag: null,
+    fields: [
+      ["kind", ["str", 64, ""], []],
+      ["size", ["array", ["float"], 3, 0], []],
+      ["mesh", ["int", -1, 2147483647], [-1]],
+      ["hfield", ["int", -1, 2147483647], [-1]],
+    ],
+  },
+  Material: {
+    array: false,
+    tag: null,
+    fields: [
+      ["name", ["str", 512, ""], []],
+      ["rgba", ["array", ["float"], 4, 0], []],
+      ["emission", ["float"], [0.0]],
+      ["specular", ["float"], [0.5]],
+      ["shininess", ["float"], [0.5]],
+      ["reflectance", ["float"], [0.0]],
+      ["metallic", ["float"], [-1.0]],
+      ["roughness", ["float"], [-1.0]],
+      ["textures", ["array", ["struct", "TextureUse"], 0, 16], [[]]],
+      ["repeat", ["array", ["float"], 2, 0], [[1.0, 1.0]]],
+      ["uniform", ["bool"], [false]],
+    ],
+  },
+  TextureUse: {
+    array: false,
+    tag: null,
+    fields: [
+      ["role", ["str", 64, ""], []],
+      ["texture", ["int", -1, 2147483647], []],
+    ],
+  },
+  Texture: {
+    array: false,
+    tag: null,
+    fields: [
+      ["name", ["str", 512, ""], []],
+      ["kind", ["str", 64, ""], []],
+      ["width", ["int", 0, null], []],
+      ["height", ["int", 0, null], []],
+      ["channels", ["int", 0, null], []],
+      ["colorspace", ["str", 64, ""], []],
+      ["levels", ["array", ["struct", "TextureLevel"], 0, 32], []],
+    ],
+  },
+  TextureLevel: {
+    array: false,
+    tag: null,
+    fields: [
+      ["address", ["str", 0, "^[0-9a-f]{64}$"], []],
+      ["bytes", ["int", 0, null], []],
+      ["encoding", ["str", 64, ""], []],
+      ["width", ["int", 0, null], []],
+      ["height", ["int", 0, null], []],
+      ["max_error", ["int", -2147483648, 2147483647], [0]],
+    ],
+  },
+  Mesh: {
+    array: false,
+    tag: null,
+    fields: [
+      ["name", ["str", 512, ""], []],
+      ["low", ["array", ["float"], 3, 0], []],
+      ["high", ["array", ["float"], 3, 0], []],
+      ["textured", ["bool"], []],
+      ["levels", ["array", ["struct", "MeshLevel"], 0, 32], []],
+    ],
+  },
+  MeshLevel: {
+    array: false,
+    tag: null,
+    fields: [
+      ["address", ["str", 0, "^[0-9a-f]{64}$"], []],
+      ["bytes", ["int", 0, null], []],
+      ["encoding", ["str", 64, ""], []],
+      ["vertices", ["int", 0, null], []],
+      ["triangles", ["int", 0, null], []],
+      ["max_error_m", ["float"], [0.0]],
+    ],
+  },
+  HeightField: {
+    array: false,
+    tag: null,
+    fields: [
+      ["name", ["str", 512, ""], []],
+      ["rows", ["int", 0, null], []],
+      ["columns", ["int", 0, null], []],
+      ["size", ["array", ["float"], 4, 0], []],
+      ["address", ["str", 0, "^[0-9a-f]{64}$"], []],
+      ["bytes", ["int", 0, null], []],
+      ["encoding", ["str", 64, ""], ["arrays"]],
+    ],
+  },
+  Light: {
+    array: false,
+    tag: null,
+    fields: [
+      ["name", ["str", 512, ""], []],
+      ["kind", ["str", 64, ""], []],
+      ["body", ["int", 0, null], []],
+      ["p_body", ["array", ["float"], 3, 0], []],
+      ["direction_body", ["array", ["float"], 3, 0], []],
+      ["ambient", ["array", ["float"], 3, 0], []],
+      ["diffuse", ["array", ["float"], 3, 0], []],
+      ["specular", ["array", ["float"], 3, 0], []],
+      ["attenuation", ["array", ["float"], 3, 0], [[1.0, 0.0, 0.0]]],
+      ["cutoff", ["float"], [45.0]],
+      ["exponent", ["float"], [10.0]],
+      ["range", ["float"], [0.0]],
+      ["intensity", ["float"], [0.0]],
+      ["bulb_radius", ["float"], [0.0]],
+      ["texture", ["int", -1, 2147483647], [-1]],
+      ["castshadow", ["bool"], [true]],
+      ["active", ["bool"], [true]],
+      ["follow", ["str", 64, ""], ["fixed"]],
+      ["target", ["int", -1, 2147483647], [-1]],
+    ],
+  },
+  Camera: {
+    array: false,
+    tag: null,
+    fields: [
+      ["name", ["str", 512, ""], []],
+      ["body", ["int", 0, null], []],
+      ["T_body_camera", ["struct", "Pose"], []],
+      ["fovy", ["float"], []],
+      ["orthographic", ["bool"], [false]],
+      ["focal", ["array", ["float"], 2, 0], [[0.0, 0.0]]],
+      ["principal", ["array", ["float"], 2, 0], [[0.0, 0.0]]],
+      ["resolution", ["array", ["int", -2147483648, 2147483647], 2, 0], [[1, 1]]],
+      ["follow", ["str", 64, ""], ["fixed"]],
+      ["target", ["int", -1, 2147483647], [-1]],
+    ],
+  },
+  Site: {
+    array: false,
+    tag: null,
+    fields: [
+      ["id", ["int", 0, null], []],
+      ["body", ["int", 0, null], []],
+      ["name", ["str", 512, ""], []],
+      ["T_body_site", ["struct", "Pose"], []],
+      ["group", ["int", -2147483648, 2147483647], []],
+      ["geometry", ["struct", "Geometry"], []],
+      ["material", ["int", -1, 2147483647], []],
+      ["rgba", ["array", ["float"], 4, 0], []],
+    ],
+  },
+  Tendon: {
+    array: false,
+    tag: null,
+    fields: [
+      ["name", ["str", 512, ""], []],
+      ["group", ["int", -2147483648, 2147483647], []],
+      ["width", ["float"], []],
+      ["sites", ["array", ["int", 0, null], 0, 4096], []],
+      ["material", ["int", -1, 2147483647], []],
+      ["rgba", ["array", ["float"], 4, 0], []],
+    ],
+  },
+  Deformable: {
+    array: false,
+    tag: null,
+    fields: [
+      ["name", ["str", 512, ""], []],
+      ["dim", ["int", 0, null], []],
+      ["group", ["int", -2147483648, 2147483647], []],
+      ["vertices", ["int", 0, null], []],
+      ["elements", ["int", 0, null], []],
+      ["radius", ["float"], []],
+      ["flat", ["bool"], []],
+      ["material", ["int", -1, 2147483647], []],
+      ["rgba", ["array", ["float"], 4, 0], []],
+      ["stream", ["str", 64, ""], []],
+      ["address", ["str", 0, "^[0-9a-f]{64}$"], []],
+      ["bytes", ["int", 0, null], []],
+      ["encoding", ["str", 64, ""], ["arrays"]],
+    ],
+  },
+  Environment: {
+    array: false,
+    tag: null,
+    fields: [
+      ["headlight", ["struct", "Headlight"], [{"active": true, "ambient": [0.1, 0.1, 0.1], "diffuse": [0.4, 0.4, 0.4], "specular": [0.5, 0.5, 0.5]}]],
+      ["skybox", ["int", -1, 2147483647], [-1]],
+      ["haze_rgba", ["array", ["float"], 4, 0], [[1.0, 1.0, 1.0, 1.0]]],
+      ["haze", ["float"], [0.3]],
+      ["fog_rgba", ["array", ["float"], 4, 0], [[0.0, 0.0, 0.0, 1.0]]],
+      ["fog_start", ["float"], [0.0]],
+      ["fog_end", ["float"], [0.0]],
+      ["znear", ["float"], [0.01]],
+      ["zfar", ["float"], [50.0]],
+      ["extent", ["float"], [1.0]],
+      ["center", ["array", ["float"], 3, 0], [[0.0, 0.0, 0.0]]],
+    ],
+  },
+  Headlight: {
+    array: false,
+    tag: null,
+    fields: [
+      ["active", ["bool"], [true]],
+      ["ambient", ["array", ["float"], 3, 0], [[0.1, 0.1, 0.1]]],
+      ["diffuse", ["array", ["float"], 3, 0], [[0.4, 0.4, 0.4]]],
+      ["specular", ["array", ["float"], 3, 0], [[0.5, 0.5, 0.5]]],
+    ],
+  },
+  Totals: {
+    array: false,
+    tag: null,
+    fields: [
+      ["objects", ["int", 0, null], [0]],
+      ["triangles", ["int", 0, null], [0]],
+      ["mesh_bytes", ["int", 0, null], [0]],
+      ["texture_bytes", ["int", 0, null], [0]],
+      ["texture_memory", ["int", 0, null], [0]],
+      ["asset_bytes", ["int", 0, null], [0]],
+    ],
+  },
+  ArrayHeader: {
+    array: false,
+    tag: null,
+    fields: [
+      ["kind", ["str", 64, ""], []],
+      ["arrays", ["array", ["struct", "ArrayInfo"], 0, 16], []],
+      ["max_error", ["float"], [0.0]],
+    ],
+  },
+  ArrayInfo: {
+    array: false,
+    tag: null,
+    fields: [
+      ["name", ["str", 64, ""], []],
+      ["dtype", ["str", 64, ""], []],
+      ["shape", ["array", ["int", 0, null], 0, 4], []],
+      ["bytes", ["int", 0, null], []],
+      ["filter", ["str", 64, ""], ["none"]],
+      ["codec", ["str", 64, ""], ["none"]],
+      ["scale", ["array", ["float"], 0, 4], [[]]],
+      ["offset", ["array", ["float"], 0, 4], [[]]],
+    ],
+  },
+  SetVisual: {
+    array: false,
+    tag: ["op", "set_visual"],
+    fields: [
+      ["visual", ["int", 0, null], []],
+      ["rgba", ["null", ["array", ["float"], 4, 0]], [null]],
+      ["group", ["null", ["int", -2147483648, 2147483647]], [null]],
+      ["material", ["null", ["int", -1, 2147483647]], [null]],
+      ["T_body_visual", ["null", ["struct", "Pose"]], [null]],
+    ],
+  },
+  AddVisual: {
+    array: false,
+    tag: ["op", "add_visual"],
+    fields: [
+      ["visual", ["struct", "Visual"], []],
+    ],
+  },
+  RemoveVisual: {
+    array: false,
+    tag: ["op", "remove_visual"],
+    fields: [
+      ["visual", ["int", 0, null], []],
+    ],
+  },
+  AddMesh: {
+    array: false,
+    tag: ["op", "add_mesh"],
+    fields: [
+      ["mesh", ["struct", "Mesh"], []],
+    ],
+  },
+  AddMaterial: {
+    array: false,
+    tag: ["op", "add_material"],
+    fields: [
+      ["material", ["struct", "Material"], []],
+    ],
+  },
+};
+
+/** Members of the closed unions, by the name of their struct. */
+export const UNIONS: Readonly<Record<string, readonly string[]>> = {
+  ClientMessage: ["Hello", "Bye", "Heartbeat", "ClockPing", "GetSnapshot", "Sample", "Samples", "Acquire", "Release", "Withdraw", "Consent", "Assign", "SetMode", "SetScale", "Grasp", "Observation", "PlaceAlignment", "Align", "MoveAnchor", "TrackingEpoch", "Episode", "EStop", "ClearEStop", "Control", "Marker", "Pair", "RemoveParticipant", "GetStatus", "ClientReport"],
+  ServerMessage: ["Welcome", "Refused", "ProtocolFault", "ClockPong", "Reply", "Feedback", "Event", "Snapshot", "Paired", "StatusReport", "DeliveryBudget"],
+  EventKind: ["ParticipantJoined", "ParticipantChanged", "ParticipantLeft", "LeaseChanged", "LeasesChanged", "ConsentRequested", "Intervention", "EngagementChanged", "ScaleChanged", "AlignmentChanged", "AlignmentRun", "AlignmentAlarmed", "AnchorMoved", "HeadsetsCompared", "SceneChanged", "EStopChanged", "PauseChanged", "EpisodeChanged", "ObjectGrasped", "Handover", "MarkerAdded", "SamplesRejected", "Gap", "Notice", "Audited"],
+  PatchOp: ["SetVisual", "AddVisual", "RemoveVisual", "AddMesh", "AddMaterial"],
+};
+
+/** Most bytes of a whole envelope to the session, by tag. */
+export const CLIENT_LIMITS: Readonly<Record<string, number>> = {
+  hello: 40000,
+  bye: 4000,
+  heartbeat: 512,
+  clock_ping: 512,
+  get_snapshot: 512,
+  sample: 8000,
+  samples: 48000,
+  acquire: 20000,
+  release: 20000,
+  withdraw: 512,
+  consent: 20000,
+  assign: 20000,
+  set_mode: 20000,
+  set_scale: 20000,
+  grasp: 20000,
+  observation: 2000,
+  place_alignment: 20000,
+  align: 20000,
+  move_anchor: 20000,
+  tracking_epoch: 512,
+  episode: 4000,
+  estop: 4000,
+  clear_estop: 512,
+  control: 1000,
+  marker: 4000,
+  pair: 1000,
+  remove_participant: 20000,
+  get_status: 512,
+  client_report: 1000,
+};
+
+/** Most bytes of a whole envelope to a client, by tag. */
+export const SERVER_LIMITS: Readonly<Record<string, number>> = {
+  welcome: 4000,
+  refused: 8000,
+  protocol_fault: 4000,
+  clock_pong: 512,
+  reply: 1000000,
+  feedback: 64000,
+  event: 64000,
+  snapshot: 32000000,
+  paired: 8000,
+  status_report: 4000000,
+  delivery_budget: 16000,
+};
+
+export const MAX_CLIENT_BYTES = 48000;
+export const MAX_SERVER_BYTES = 32000000;
+export const MAX_STATE_HEADER_BYTES = 128000;
+export const MAX_PRESENCE_BYTES = 256000;
+export const MAX_MEDIA_HEADER_BYTES = 2000;
+export const MAX_MEDIA_FRAME_BYTES = 8388608;
+export const MAX_ASSET_REQUEST_BYTES = 512;
+export const MAX_ASSET_HEADER_BYTES = 4000;
+export const MAX_BEACON_BYTES = 1400;
+export const MAX_ASSET_BYTES = 1074790400;
+export const MAX_ASSET_CHUNK_BYTES = 1048576;
+export const MAX_ASSET_REQUESTS = 64;
+export const MAX_ARRAY_HEADER_BYTES = 16384;
+export const MAX_ARRAY_BYTES = 1073741824;
