@@ -444,10 +444,15 @@ export function decodeUnionList(name: string, bytes: Uint8Array, exact = false):
   return items;
 }
 
+/** Write the value of any struct. Throws `MalformedError` for one that does not fit. */
+export function writeStruct(writer: Writer, name: string, value: unknown): void {
+  structEncoder(name)(writer, value);
+}
+
 /** Encode the value of any struct. Throws `MalformedError` for one that does not fit. */
 export function encodeStruct(name: string, value: unknown): Uint8Array<ArrayBuffer> {
   const writer = new Writer();
-  structEncoder(name)(writer, value);
+  writeStruct(writer, name, value);
   return writer.finish();
 }
 
