@@ -54,7 +54,8 @@ def render_schema() -> str:
     """Return the text of schema.g.ts."""
     structs = "\n".join(_render_struct(struct) for struct in list_all_structs())
     unions = "\n".join(
-        f"  {name}: [{', '.join(json.dumps(member.__name__) for member in members)}]," for name, members in UNIONS.items()
+        f"  {name}: [{', '.join(json.dumps(member.__name__) for member in members)}],"
+        for name, members in UNIONS.items()
     )
     return "\n".join(
         [

@@ -12,6 +12,7 @@ import { Writer } from "./msgpack.ts";
 export type Event = Filled<wire.Event>;
 export type Snapshot = Filled<wire.Snapshot>;
 export type Alignment = Filled<wire.Alignment>;
+export type AnchorInfo = Filled<wire.AnchorInfo>;
 
 /** Events `first` to `last` that will not be delivered: a snapshot has their effects, not the events. */
 export interface MissedEvents {
@@ -26,7 +27,7 @@ const MAX_HELD_EVENTS = 256;
 const SAME_BODIES = ["reset", "patch", "external"];
 
 /**
- * Roster, leases, alignments, robots and bodies of the session.
+ * Roster, leases, alignments, robots, anchors and bodies of the session.
  *
  * `bodyIndex` and `indexOfId` give the row of a body in state frames, by name and by id. `synced` is false before the
  * first snapshot and after a gap; the other attributes then show the last known state. `bodies` are those of the epochs
@@ -50,6 +51,7 @@ export class SessionMirror {
   participants = new Map<string, ParticipantInfo>();
   leases = new Map<string, Lease>();
   robots = new Map<string, RobotInfo>();
+  anchors = new Map<string, AnchorInfo>();
   bodies: BodyInfo[] = [];
   bodiesSince = 0;
   bodiesUntil = 0;
@@ -92,6 +94,7 @@ export class SessionMirror {
     this.participants = new Map(snapshot.participants.map((info) => [info.id, info]));
     this.leases = new Map(snapshot.leases.map((lease) => [lease.target, lease]));
     this.robots = new Map(snapshot.robots.map((robot) => [robot.name, robot]));
+    this.anchors = new Map(snapshot.anchors.map((anchor) => [anchor.id, anchor]));
     this.takeBodies(snapshot);
     this.synced = this.hasSnapshot = true;
     const seqs = [...held.keys()].sort((a, b) => a - b);
@@ -208,6 +211,11 @@ export class SessionMirror {
       case "alignment_changed": {
         const info = this.participants.get(body.participant);
         if (info !== undefined) this.participants.set(body.participant, { ...info, alignment: body.alignment });
+        break;
+      }
+      case "anchor_moved": {
+        const anchor = this.anchors.get(body.anchor_id) ?? { id: body.anchor_id, size_m: 0, error_m: 0 };
+        this.anchors.set(body.anchor_id, { ...anchor, T_world_anchor: body.T_world_anchor });
         break;
       }
       case "scene_changed":

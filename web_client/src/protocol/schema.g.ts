@@ -148,6 +148,16 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["object", ["bool"], [false]],
     ],
   },
+  AnchorInfo: {
+    array: false,
+    tag: null,
+    fields: [
+      ["id", ["str", 64, ""], []],
+      ["T_world_anchor", ["struct", "Pose"], []],
+      ["size_m", ["float"], [0.0]],
+      ["error_m", ["float"], [0.0]],
+    ],
+  },
   Quantiles: {
     array: true,
     tag: null,
@@ -328,6 +338,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["secret", ["bytes", 64], [EMPTY_BYTES]],
       ["resume_token", ["bytes", 64], [EMPTY_BYTES]],
       ["join_code", ["str", 64, ""], [""]],
+      ["certificate_hash", ["bytes", 64], [EMPTY_BYTES]],
     ],
   },
   Bye: {
@@ -335,6 +346,13 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
     tag: ["type", "bye"],
     fields: [
       ["reason", ["str", 512, ""], [""]],
+    ],
+  },
+  Disconnected: {
+    array: false,
+    tag: ["type", "disconnected"],
+    fields: [
+      ["reason", ["str", 64, ""], ["closed"]],
     ],
   },
   Heartbeat: {
@@ -561,6 +579,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["name", ["str", 64, ""], []],
       ["proof", ["bytes", 64], []],
       ["software", ["str", 64, ""], [""]],
+      ["identity", ["bytes", 64], [EMPTY_BYTES]],
     ],
   },
   RemoveParticipant: {
@@ -571,6 +590,24 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["participant", ["str", 64, ""], []],
       ["revoke", ["bool"], [false]],
       ["reason", ["str", 512, ""], [""]],
+    ],
+  },
+  Rename: {
+    array: false,
+    tag: ["type", "rename"],
+    fields: [
+      ["request_id", ["int", 0, null], []],
+      ["participant", ["str", 64, ""], []],
+      ["name", ["str", 64, ""], []],
+    ],
+  },
+  SetRole: {
+    array: false,
+    tag: ["type", "set_role"],
+    fields: [
+      ["request_id", ["int", 0, null], []],
+      ["participant", ["str", 64, ""], []],
+      ["role", ["str", 64, ""], []],
     ],
   },
   GetStatus: {
@@ -699,6 +736,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["tick_period_ns", ["int", null, null], [0]],
       ["stop_seq", ["int", 0, null], [0]],
       ["consent_timeout_ns", ["int", null, null], [0]],
+      ["anchors", ["array", ["struct", "AnchorInfo"], 0, 0], [[]]],
     ],
   },
   Paired: {
@@ -1478,7 +1516,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
 
 /** Members of the closed unions, by the name of their struct. */
 export const UNIONS: Readonly<Record<string, readonly string[]>> = {
-  ClientMessage: ["Hello", "Bye", "Heartbeat", "ClockPing", "GetSnapshot", "Sample", "Samples", "Acquire", "Release", "Withdraw", "Consent", "Assign", "SetMode", "SetScale", "Grasp", "Observation", "PlaceAlignment", "Align", "MoveAnchor", "TrackingEpoch", "Episode", "EStop", "ClearEStop", "Control", "Marker", "Pair", "RemoveParticipant", "GetStatus", "ClientReport"],
+  ClientMessage: ["Hello", "Bye", "Disconnected", "Heartbeat", "ClockPing", "GetSnapshot", "Sample", "Samples", "Acquire", "Release", "Withdraw", "Consent", "Assign", "SetMode", "SetScale", "Grasp", "Observation", "PlaceAlignment", "Align", "MoveAnchor", "TrackingEpoch", "Episode", "EStop", "ClearEStop", "Control", "Marker", "Pair", "RemoveParticipant", "Rename", "SetRole", "GetStatus", "ClientReport"],
   ServerMessage: ["Welcome", "Refused", "ProtocolFault", "ClockPong", "Reply", "Feedback", "Event", "Snapshot", "Paired", "StatusReport", "DeliveryBudget"],
   EventKind: ["ParticipantJoined", "ParticipantChanged", "ParticipantLeft", "LeaseChanged", "LeasesChanged", "ConsentRequested", "Intervention", "EngagementChanged", "ScaleChanged", "AlignmentChanged", "AlignmentRun", "AlignmentAlarmed", "AnchorMoved", "HeadsetsCompared", "SceneChanged", "EStopChanged", "PauseChanged", "EpisodeChanged", "ObjectGrasped", "Handover", "MarkerAdded", "SamplesRejected", "Gap", "Notice", "Audited"],
   PatchOp: ["SetVisual", "AddVisual", "RemoveVisual", "AddMesh", "AddMaterial"],
@@ -1488,6 +1526,7 @@ export const UNIONS: Readonly<Record<string, readonly string[]>> = {
 export const CLIENT_LIMITS: Readonly<Record<string, number>> = {
   hello: 40000,
   bye: 4000,
+  disconnected: 512,
   heartbeat: 512,
   clock_ping: 512,
   get_snapshot: 512,
@@ -1513,6 +1552,8 @@ export const CLIENT_LIMITS: Readonly<Record<string, number>> = {
   marker: 4000,
   pair: 1000,
   remove_participant: 20000,
+  rename: 20000,
+  set_role: 20000,
   get_status: 512,
   client_report: 1000,
 };
