@@ -53,10 +53,8 @@ _EXACT: Final = 2**53 - 1
 def render_schema() -> str:
     """Return the text of schema.g.ts."""
     structs = "\n".join(_render_struct(struct) for struct in list_all_structs())
-    unions = "\n".join(
-        f"  {name}: [{', '.join(json.dumps(member.__name__) for member in members)}],"
-        for name, members in UNIONS.items()
-    )
+    members = {name: ", ".join(json.dumps(kind.__name__) for kind in kinds) for name, kinds in UNIONS.items()}
+    unions = "\n".join(f"  {name}: [{names}]," for name, names in members.items())
     return "\n".join(
         [
             HEAD,
@@ -77,7 +75,8 @@ def _render_struct(struct: Struct) -> str:
     rows = "\n".join(f"      {_render_field(field)}," for field in struct.fields)
     tag = json.dumps([struct.tag_field, struct.tag]) if struct.tag else "null"
     fields = f"[\n{rows}\n    ]" if rows else "[]"
-    return f"  {struct.name}: {{\n    array: {json.dumps(struct.array_like)},\n    tag: {tag},\n    fields: {fields},\n  }},"
+    parts = {"array": json.dumps(struct.array_like), "tag": tag, "fields": fields}
+    return "\n".join([f"  {struct.name}: {{", *(f"    {key}: {value}," for key, value in parts.items()), "  },"])
 
 
 def _render_field(field: Field) -> str:
