@@ -23,9 +23,9 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     parser = commands.add_parser(
         "web",
         help="serve the page for browsers for a session on another machine",
-        description="Serve the page for browsers, and the gateway behind it, for a session on another machine. A session "
-        "of this machine does so by itself. At an encrypted session the key of this user must be allowed in role "
-        "gateway, and in the roles of those who join here: `iris-session pair --role any` there.",
+        description="Serve the page for browsers, and the gateway behind it, for a session on another machine. A "
+        "session of this machine does so by itself. At an encrypted session the key of this user must be allowed in "
+        "role gateway, and in the roles of those who join here: `iris-session pair --role any` there.",
         epilog="examples:\n"
         "  iris-session web 192.168.0.10\n"
         "  iris-session web 192.168.0.10:7721 --code 7KQ2-M4XD-9PTR    the first time\n"
