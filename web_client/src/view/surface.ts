@@ -46,8 +46,14 @@ void main() {
   #include <project_vertex>
   #include <worldpos_vertex>
   #include <shadowmap_vertex>
-  vPosition = (modelMatrix * vec4(transformed, 1.0)).xyz;
-  vNormal = mat3(modelMatrix) * objectNormal;
+  vec4 local = vec4(transformed, 1.0);
+  vec3 localNormal = objectNormal;
+  #ifdef USE_INSTANCING
+    local = instanceMatrix * local;
+    localNormal = mat3(instanceMatrix) * localNormal;
+  #endif
+  vPosition = (modelMatrix * local).xyz;
+  vNormal = mat3(modelMatrix) * localNormal;
   #ifdef HAS_MAP
     vMapUv = uv;
   #endif
@@ -116,12 +122,6 @@ vec3 shine(SceneLight light, vec3 normal, vec3 toEye, vec3 base, float shadow) {
 
 void main() {
   vec4 base = vec4(color, opacity);
-  #ifdef HAS_MAP
-    base *= texture2D(map, vMapUv);
-  #endif
-  #ifdef HAS_CUBE
-    base *= textureCube(cube, vCube);
-  #endif
   #ifdef HAS_VERTEX_COLORS
     base *= vVertexColor;
   #endif
@@ -141,7 +141,15 @@ const FRAGMENT_TAIL = /* glsl */ `
   #ifdef FADE_AT
     base.a *= 1.0 - smoothstep(0.35, 1.0, distance(cameraPosition, vPosition) / FADE_AT);
   #endif
-  gl_FragColor = vec4(min(lit, 1.0), base.a);
+  // As in the fixed pipeline, a texture multiplies what the lights gave, highlights too, after that was clamped.
+  vec4 seen = vec4(min(lit, 1.0), base.a);
+  #ifdef HAS_MAP
+    seen *= texture2D(map, vMapUv);
+  #endif
+  #ifdef HAS_CUBE
+    seen *= textureCube(cube, vCube);
+  #endif
+  gl_FragColor = seen;
   #include <colorspace_fragment>
 }`;
 
