@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import NamedTuple
@@ -130,6 +130,14 @@ class CrossCheck:
         """Discard the observations of a target that was moved."""
         for key in [key for key in self._observations if key[1] == thing]:
             del self._observations[key]
+
+    def copy_headsets(self, headsets: Collection[str]) -> CrossCheck:
+        """Return a copy with the observations of these headsets, to be compared while others are added here."""
+        observations = {key: looks.copy() for key, looks in self._observations.items() if key[0] in headsets}
+        epochs = {headset: epoch for headset, epoch in self._epochs.items() if headset in headsets}
+        return CrossCheck(
+            self.noise, self.config, self.unknown_viewpoint_sigma_m, _observations=observations, _epochs=epochs
+        )
 
     def compare(
         self, alignments: Mapping[str, AlignmentEstimate], now_ns: int, moving: frozenset[str] = frozenset()

@@ -1,6 +1,6 @@
 """Schedule the cross-check of headsets: which pair is compared when, and which disagreement is reported.
 
-One pair per call, each pair at most once a second; a pair is reported at most every five seconds, and only after new
+One pair at a time, each pair at most once a second; a pair is reported at most every five seconds, and only after new
 observations. The mathematics is in `anchors.cross_check`.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from itertools import combinations
 from typing import Final
 
@@ -16,6 +16,7 @@ from anchors.alignment import AlignmentEstimate
 from anchors.cross_check import CrossCheck, CrossCheckConfig, Disagreement
 from anchors.pose import PoseTuple, Vec3
 from iris_session.alignment.estimator import NUMERICAL_ERRORS
+from iris_session.alignment.worker import Job
 from iris_session.protocol.entries import CrossChecked, Entry
 
 REPORT_INTERVAL_NS: Final = 5_000_000_000
@@ -31,7 +32,7 @@ Pair = tuple[int, int]
 
 
 class CrossCheckScheduler:
-    """Observations of all connections; each `tick` compares one pair.
+    """Observations of all connections; each job of `begin_comparison` compares one pair.
 
     A target is what two headsets observe: an anchor, which stands still, or anything else, which may move.
     """
@@ -46,6 +47,7 @@ class CrossCheckScheduler:
         self._reported: dict[Pair, tuple[int, Pair]] = {}  # time, and number of observations of either then
         self._pending: deque[Pair] = deque()
         self._next_scan_ns = 0
+        self._discards = 0  # a comparison that began before the last one does not count
 
     def add_observation(
         self,
@@ -79,12 +81,14 @@ class CrossCheckScheduler:
 
     def discard_observations(self, connection: int) -> None:
         """Discard the observations of a connection whose tracking frame has changed."""
+        self._discards += 1
         self._check.discard_headset(str(connection))
         self._moving.pop(connection, None)
         self._epochs.pop(connection, None)
 
     def discard_target(self, target: str) -> None:
         """Discard all observations of a target that was moved."""
+        self._discards += 1
         self._check.discard_target(target)
 
     def remove_connection(self, connection: int) -> None:
@@ -94,10 +98,15 @@ class CrossCheckScheduler:
         for pair in [pair for pair in self._reported if connection in pair]:
             del self._reported[pair]
 
-    def tick(self, in_force: Mapping[int, AlignmentEstimate], now_ns: int) -> Entry | None:
-        """Compare the next pair; return the entry for the authority if a result is to be reported.
+    def begin_comparison(
+        self, in_force: Mapping[int, AlignmentEstimate], now_ns: int, offer: Callable[[Entry], object]
+    ) -> Job | None:
+        """Return the job that compares the next pair, if one is due.
 
-        `in_force`: alignment in force by connection.
+        Args:
+            in_force: Alignment in force by connection.
+            now_ns: Session time.
+            offer: Takes the entry for the authority, if a result is to be reported.
         """
         if not self._pending and now_ns >= self._next_scan_ns:
             self._next_scan_ns = now_ns + SCAN_INTERVAL_NS
@@ -107,11 +116,21 @@ class CrossCheckScheduler:
         a, b = self._pending.popleft()
         if a not in in_force or b not in in_force:
             return None
-        worst = self._find_worst(in_force[a], in_force[b], (a, b), now_ns)
-        if worst is None:
-            return None
-        self._reported[a, b] = (now_ns, self._count_observations((a, b)))
-        return Entry(a, a, now_ns, _to_message(worst, b))
+        check = self._check.copy_headsets((str(a), str(b)))
+        alignments = {str(a): in_force[a], str(b): in_force[b]}
+        moving = frozenset(self._moving.get(a, ())) & frozenset(self._moving.get(b, ()))
+        counts, discards = self._count_observations((a, b)), self._discards
+
+        def compare() -> Callable[[], None]:
+            worst = _find_worst(check, alignments, now_ns, moving)
+            return lambda: finish(worst)
+
+        def finish(worst: Disagreement | None) -> None:
+            if worst is not None and discards == self._discards:
+                self._reported[a, b] = (now_ns, counts)
+                offer(Entry(a, a, now_ns, _to_message(worst, b)))
+
+        return compare
 
     def _is_due(self, pair: Pair, now_ns: int) -> bool:
         counts = self._count_observations(pair)
@@ -121,18 +140,17 @@ class CrossCheckScheduler:
     def _count_observations(self, pair: Pair) -> Pair:
         return self._n_observations.get(pair[0], 0), self._n_observations.get(pair[1], 0)
 
-    def _find_worst(
-        self, alignment_a: AlignmentEstimate, alignment_b: AlignmentEstimate, pair: Pair, now_ns: int
-    ) -> Disagreement | None:
-        """Return the disagreement furthest beyond its expected error, of all targets that both observed."""
-        a, b = pair
-        moving = frozenset(self._moving.get(a, ())) & frozenset(self._moving.get(b, ()))
-        try:
-            found = self._check.compare({str(a): alignment_a, str(b): alignment_b}, now_ns, moving)
-        except NUMERICAL_ERRORS:
-            return None
-        found = [one for one in found if math.isfinite(one.error_m) and one.expected_p95_m > 0.0]
-        return max(found, key=lambda one: one.error_m / one.expected_p95_m, default=None)
+
+def _find_worst(
+    check: CrossCheck, alignments: Mapping[str, AlignmentEstimate], now_ns: int, moving: frozenset[str]
+) -> Disagreement | None:
+    """Return the disagreement furthest beyond its expected error, of all targets that both observed."""
+    try:
+        found = check.compare(alignments, now_ns, moving)
+    except NUMERICAL_ERRORS:
+        return None
+    found = [one for one in found if math.isfinite(one.error_m) and one.expected_p95_m > 0.0]
+    return max(found, key=lambda one: one.error_m / one.expected_p95_m, default=None)
 
 
 def _to_message(found: Disagreement, other: int) -> CrossChecked:

@@ -350,7 +350,7 @@ class AlignmentService:
     # --- periodic work -----------------------------------------------------------------------------------------------
 
     def tick(self, now_ns: int) -> None:
-        """Begin at most one estimate, or compute one cross-check: either takes up to milliseconds."""
+        """Begin at most one estimate or one cross-check: either takes up to milliseconds."""
         self._worker.poll()
         if self._worker.is_busy:
             return
@@ -360,9 +360,9 @@ class AlignmentService:
                 self._propose(number, state, now_ns)
                 return
         in_force = {n: s.monitor.in_force for n, s in self._states.items() if s.monitor.in_force is not None}
-        entry = self._cross_check.tick(in_force, now_ns)
-        if entry is not None:
-            self._offer(entry)
+        comparison = self._cross_check.begin_comparison(in_force, now_ns, self._offer)
+        if comparison is not None:
+            self._worker.submit(comparison)
 
     def _propose(self, number: int, state: _HeadsetState, now_ns: int) -> None:
         """Compute a proposal in the worker, and offer it when it is there."""

@@ -6,5 +6,6 @@ gate, handovers, feedback. It decides; `control` moves, `physics` simulates, the
 
 from iris_session.authority.authority import Authority
 from iris_session.authority.config import AuthorityConfig, SpeedLimit
+from iris_session.authority.state import is_same_snapshot
 
-__all__ = ["Authority", "AuthorityConfig", "SpeedLimit"]
+__all__ = ["Authority", "AuthorityConfig", "SpeedLimit", "is_same_snapshot"]

@@ -50,6 +50,8 @@ DIRECTOR_ONLY: Final = (
     cm.PlaceAlignment,
     cm.MoveAnchor,
     RemoveParticipant,
+    cm.Rename,
+    cm.SetRole,
 )
 #: Entries that only the process that owns the session may make.
 HOST_ONLY: Final = (
@@ -421,4 +423,6 @@ _HANDLERS: Final[dict[type, Callable[[Context, Participant, Any], None]]] = {
     cm.Control: session_control.control_session,
     cm.Marker: _process_marker,
     RemoveParticipant: roster.process_removal,
+    cm.Rename: roster.rename_participant,
+    cm.SetRole: roster.set_role,
 }

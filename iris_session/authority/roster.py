@@ -5,13 +5,20 @@ from __future__ import annotations
 from typing import Final
 
 from iris_session.authority import alignment, anchoring, assignment, engagement, leases
-from iris_session.authority.context import Context
+from iris_session.authority.context import HUMAN, Context
 from iris_session.authority.state import HOST_ID, NO_CONNECTION, Participant
-from iris_session.protocol.client_messages import RemoveParticipant
+from iris_session.protocol.client_messages import RemoveParticipant, Rename, SetRole
 from iris_session.protocol.common import IDENTITY, MAX_TEXT, Alignment, Denial
 from iris_session.protocol.entries import HOST, Join
 from iris_session.protocol.names import AlignmentKind, AuditKind, DenialReason, Device, HoldReason, RefusalCode, Role
-from iris_session.protocol.server_messages import AlignmentRun, Audited, ParticipantJoined, ParticipantLeft, Snapshot
+from iris_session.protocol.server_messages import (
+    AlignmentRun,
+    AnchorInfo,
+    Audited,
+    ParticipantJoined,
+    ParticipantLeft,
+    Snapshot,
+)
 from iris_session.protocol.steps import Admitted, Dropped
 
 NOT_NEEDED: Final = Alignment(0, AlignmentKind.NOT_NEEDED, IDENTITY)
@@ -21,6 +28,8 @@ HAND_DEVICES: Final = (Device.CONTROLLER_LEFT, Device.CONTROLLER_RIGHT, Device.H
 #: only the connection broke. A client that does not must be aligned again after a resume.
 RUN_PREFIX: Final = "run:"
 
+#: Characters of a name (`protocol.common.Name`).
+MAX_NAME: Final = 64
 #: A goodbye is free text, the reason of `participant_left` is as short as a name on the wire.
 MAX_REASON: Final = 64
 
@@ -44,10 +53,9 @@ def process_join(ctx: Context, connection: int, m: Join) -> None:
     if m.alignment not in (AlignmentKind.MEASURED, AlignmentKind.NOT_NEEDED):
         text, known = f"unknown alignment {m.alignment}", f"{AlignmentKind.MEASURED}, {AlignmentKind.NOT_NEEDED}"
         return ctx.refuse_hello(connection, DenialReason.UNKNOWN_VALUE, text, known)
-    worn = [d for d in m.devices if d in HAND_DEVICES]
-    if m.alignment == AlignmentKind.NOT_NEEDED and m.role in Role.DRIVING and worn and not _may_drive(ctx, m):
-        text = f"role {m.role} may not drive with {', '.join(worn)} without an alignment"
-        return ctx.refuse_hello(connection, DenialReason.UNALIGNED, text, alignment.UNALIGNED_ADVICE)
+    unaligned = m.alignment == AlignmentKind.NOT_NEEDED and _describe_unaligned(ctx, m.role, m.key_id, m.devices)
+    if unaligned:
+        return ctx.refuse_hello(connection, DenialReason.UNALIGNED, unaligned, alignment.UNALIGNED_ADVICE)
     if m.roles and m.role not in m.roles:
         ctx.emit(Audited(AuditKind.ROLE_REFUSED, m.key_id, m.name, "", m.role))
         text = f"this key may not join as {m.role}"
@@ -71,13 +79,20 @@ def process_join(ctx: Context, connection: int, m: Join) -> None:
     return _admit_participant(ctx, p, connection, m, resumed=False)
 
 
-def _may_drive(ctx: Context, m: Join) -> bool:
-    """Return true when one of the declared devices may drive without an alignment."""
-    return any(alignment.may_be_unaligned(ctx, m.role, m.key_id, device) for device in m.devices)
+def _describe_unaligned(ctx: Context, role: str, key_id: str, devices: tuple[str, ...]) -> str:
+    """Return why a participant without an alignment may not have this role with its declared devices, or an empty
+    string.
+    """
+    worn = [d for d in devices if d in HAND_DEVICES]
+    if role not in Role.DRIVING or not worn:
+        return ""
+    if any(alignment.may_be_unaligned(ctx, role, key_id, device) for device in devices):
+        return ""
+    return f"role {role} may not drive with {', '.join(worn)} without an alignment"
 
 
 def _resume_participant(ctx: Context, connection: int, m: Join, p: Participant) -> None:
-    if m.key_id != p.key_id or m.role != p.role:
+    if m.key_id != p.key_id or m.role not in (p.role, p.hello_role) or (m.roles and p.role not in m.roles):
         text = f"{p.id} has another key or role"
         return ctx.refuse_hello(connection, RefusalCode.RESUME_TOKEN, text, "join without the resume token")
     if p.connection != NO_CONNECTION:
@@ -90,7 +105,9 @@ def _resume_participant(ctx: Context, connection: int, m: Join, p: Participant) 
         if not p.aligning:
             p.aligning, p.alignment_run = True, p.alignment_run + 1
             ctx.emit(AlignmentRun(p.id, True, p.alignment_run))
-    p.name, p.needs_alignment = m.name, needs_alignment
+    if m.name != p.hello_name:  # else a director has renamed it
+        p.name, p.hello_name = m.name, ""
+    p.needs_alignment = needs_alignment
     p.seen.clear()
     return _admit_participant(ctx, p, connection, m, resumed=True)
 
@@ -101,7 +118,7 @@ def _list_runs(m: Join) -> list[str]:
 
 def _admit_participant(ctx: Context, p: Participant, connection: int, m: Join, resumed: bool) -> None:
     p.connection, p.gateway, p.heard_ns, p.expires_ns, p.worn = connection, m.gateway, ctx.now_ns, 0, True
-    p.devices, p.run, p.spared = m.devices, next(iter(_list_runs(m)), ""), False
+    p.devices, p.run, p.spared, p.roles = m.devices, next(iter(_list_runs(m)), ""), False, m.roles
     assignment.update_name_owners(ctx)
     for feedback in ctx.state.feedback.values():
         feedback.sent.pop(p.id, None)  # it may not have arrived over the old connection
@@ -177,6 +194,79 @@ def process_removal(ctx: Context, p: Participant, m: RemoveParticipant) -> None:
         ctx.dropped.append(Dropped(HOST, "revoked", gone.key_id))
     remove_participant(ctx, gone, "removed")
     return _disconnect_clients(ctx, connection, "gateway")
+
+
+def rename_participant(ctx: Context, p: Participant, m: Rename) -> None:
+    """Give a participant another name for a director; one that another participant has gets a number."""
+    person = _find_person(ctx, p, m)
+    name = m.name.strip()
+    if person is None:
+        return None
+    if not name or not name.isprintable():
+        text = f"{m.name!r} is not a name: expected 1 to {MAX_NAME} printable characters"
+        return ctx.deny(p, m.request_id, Denial(DenialReason.INVALID, text))
+    taken = {other.name for other in ctx.state.participants.values() if other is not person}
+    name = _make_unique(name, taken)
+    if name != person.name:
+        ctx.emit(Audited(AuditKind.RENAMED, person.id, name, "", f"{p.name}: was {person.name}"[:MAX_TEXT]))
+        person.hello_name, person.name = person.hello_name or person.name, name
+        assignment.update_name_owners(ctx)
+        ctx.publish_participant(person)
+    return ctx.accept(p, m.request_id)
+
+
+def _make_unique(name: str, taken: set[str]) -> str:
+    """Return `name`, with a number when it is taken: `ann-2`."""
+    if name not in taken:
+        return name
+    numbered = (f"{name[: MAX_NAME - 4]}-{n}" for n in range(2, len(taken) + 3))
+    return next(one for one in numbered if one not in taken)
+
+
+def set_role(ctx: Context, p: Participant, m: SetRole) -> None:
+    """Give a participant another role for a director, one that its key may join in.
+
+    It keeps its leases when it drives in both roles, as a person or as an agent: between these, lease modes treat it
+    differently.
+    """
+    person = _find_person(ctx, p, m)
+    if person is None:
+        return None
+    denial = _check_new_role(ctx, person, m.role)
+    if denial is not None:
+        return ctx.deny(p, m.request_id, denial)
+    if m.role != person.role:
+        detail = f"{p.name}: {person.role} to {m.role}"[:MAX_TEXT]
+        ctx.emit(Audited(AuditKind.ROLE_CHANGED, person.id, person.name, "", detail))
+        if m.role not in Role.DRIVING or (m.role in HUMAN) != (person.role in HUMAN):
+            leases.release_everything(ctx, person, "role")
+        person.hello_role, person.role = person.hello_role or person.role, m.role
+        ctx.publish_participant(person)
+    return ctx.accept(p, m.request_id)
+
+
+def _find_person(ctx: Context, p: Participant, m: Rename | SetRole) -> Participant | None:
+    """Return the participant that a director's request names; deny the request when there is none."""
+    person = ctx.find_participant(m.participant)
+    if person is None or person.id == HOST_ID:
+        text = f"no participant {m.participant}"
+        ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_PARTICIPANT, text, "use an id of the roster"))
+        return None
+    return person
+
+
+def _check_new_role(ctx: Context, person: Participant, role: str) -> Denial | None:
+    if role not in Role.ALL:
+        return Denial(DenialReason.UNKNOWN_VALUE, f"unknown role {role}", f"roles: {', '.join(sorted(Role.ALL))}")
+    if role != person.role and Role.GATEWAY in (role, person.role):
+        text = f"{person.name} is {person.role}: nobody becomes a gateway or another role from one while connected"
+        return Denial(DenialReason.ROLE, text, f"let it join anew as {role}")
+    if person.roles and role not in person.roles:
+        return Denial(
+            DenialReason.ROLE, f"the key of {person.name} may not be {role}", f"its roles: {', '.join(person.roles)}"
+        )
+    unaligned = "" if person.needs_alignment else _describe_unaligned(ctx, role, person.key_id, person.devices)
+    return Denial(DenialReason.UNALIGNED, unaligned, alignment.UNALIGNED_ADVICE) if unaligned else None
 
 
 def _disconnect_clients(ctx: Context, gateway: int, reason: str, *, keeps_place: bool = False) -> None:
@@ -262,4 +352,5 @@ def build_snapshot(ctx: Context, request_id: int) -> Snapshot:
         consent_timeout_ns=ctx.config.consent_timeout_ns,
         episode=state.episode,
         tick_period_ns=ctx.view.tick_period_ns,
+        anchors=tuple(AnchorInfo(name, T) for name, T in state.anchors.items()),
     )

@@ -20,6 +20,8 @@ from iris_session.protocol.steps import CommandSource
 HOST_ID: Final = "host"
 #: `Pending.request_id` of a place in the queue that outlived its connection: no reply is sent.
 NO_REPLY: Final = -1
+#: Fields of `Participant` that snapshots of the first recordings of this format do not have.
+ADDED_FIELDS: Final = frozenset({"roles", "hello_name", "hello_role"})
 #: `Participant.connection` while the connection is lost.
 NO_CONNECTION: Final = -1
 
@@ -103,8 +105,10 @@ class Participant(msgspec.Struct):
     active, `alignment_run` counts the starts. `placed`: a director's placement is in force, so measurements do not
     count. `in_use`: it has engaged in this run and tracking frame, first aligned in it at `aligned_ns`. Proposals that
     were made at `proposals_from_ns` or before do not count. `told_ns`: when a correction was last announced to its
-    wearer. `refusal`: of a measurement, reported as progress since `refusal_from_ns`; empty: none, or it was reported
-    as a warning. `devices` empty: none declared, all known ones are accepted.
+    wearer. `roles`: those that its key may join as; empty: any. `hello_name`, `hello_role`: what it said when it
+    joined, empty unless a director changed it since. `refusal`: of a measurement, reported as progress since
+    `refusal_from_ns`; empty: none, or it was reported as a warning. `devices` empty: none
+    declared, all known ones are accepted.
     """
 
     id: str
@@ -143,6 +147,9 @@ class Participant(msgspec.Struct):
     seen: dict[str, DeviceState] = {}
     rejected: dict[str, int] = {}
     rejections: dict[str, Rejections] = {}
+    roles: tuple[str, ...] = ()
+    hello_name: str = ""
+    hello_role: str = ""
 
 
 class LeaseGrant(msgspec.Struct):
@@ -302,3 +309,19 @@ class AuthorityState(msgspec.Struct):
     anchors: dict[str, Pose] = {}
     anchors_ns: int = -1
     cross_checks: dict[str, CrossCheckState] = {}
+
+
+def is_same_snapshot(recorded: bytes, snapshot: bytes) -> bool:
+    """Return whether two snapshots say the same. `recorded` may lack fields that participants got later."""
+    if recorded == snapshot:
+        return True
+    earlier, present = msgspec.msgpack.decode(recorded), msgspec.msgpack.decode(snapshot)
+    if not isinstance(earlier, dict) or not isinstance(present, dict):
+        return False
+    had = earlier.get("participants", {})
+    for name, fields in present.get("participants", {}).items():
+        if not isinstance(had, dict) or not isinstance(had.get(name), dict):
+            return False
+        for added in ADDED_FIELDS - had[name].keys():
+            del fields[added]
+    return bool(earlier == present)

@@ -10,15 +10,15 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 
 from iris_session.codegen import conversions, rigid_reference
-from iris_session.codegen.examples import iterate_examples
+from iris_session.codegen.examples import iterate_examples, make_full
 from iris_session.protocol import codec
 from iris_session.protocol.assets import AssetChunk, AssetRefused, AssetRequest
-from iris_session.protocol.client_messages import Bye, ClientEnvelope, Hello, Sample, wrap_message
+from iris_session.protocol.client_messages import Bye, ClientEnvelope, Hello, Pair, Sample, wrap_message
 from iris_session.protocol.discovery import Beacon
 from iris_session.protocol.media import MediaHeader, MediaPush
 from iris_session.protocol.names import PROTOCOL_VERSION
@@ -26,10 +26,17 @@ from iris_session.protocol.server_messages import (
     Event,
     Presence,
     ServerEnvelope,
+    Snapshot,
     StateHeader,
 )
 
 _pack = msgspec.msgpack.encode
+#: Fields that messages got after their first vectors were written: a message without them must decode, too.
+ADDED_FIELDS: Final[dict[type[msgspec.Struct], tuple[str, ...]]] = {
+    Hello: ("certificate_hash",),
+    Pair: ("identity",),
+    Snapshot: ("anchors",),
+}
 #: Structs that are a message of their own, without an envelope.
 VERSIONED = (AssetRequest, AssetChunk, AssetRefused)
 
@@ -49,6 +56,7 @@ def render_golden() -> str:
         "asset_refused": list(_iterate_values("asset_refused", AssetRefused)),
         "beacon": list(_iterate_values("beacon", Beacon)),
         "decode_only": list(_iterate_decode_only()),
+        "decode_only_server": list(_iterate_earlier("server", codec.SERVER_TYPES.values())),
         "malformed": list(_iterate_malformed()),
         "conversions": list(_iterate_conversions()),
         "rigid": list(_iterate_rigid()),
@@ -125,6 +133,21 @@ def _iterate_decode_only() -> Iterator[dict[str, Any]]:
     wide = bytes.fromhex("94 d3 0000000000000001 cf 0000000000000000 d9 00 de 0002 d9 04") + b"type"
     wide += b"\xda\x00\x03bye\xa6reason\xdb\x00\x00\x00\x01x"
     yield _describe_vector("numbers and strings in wider forms", wide, wrap_message(Bye("x")))
+    yield from _iterate_earlier("client", codec.CLIENT_TYPES.values())
+
+
+def _iterate_earlier(side: str, kinds: Any) -> Iterator[dict[str, Any]]:
+    """Yield messages as they were before they got `ADDED_FIELDS`: in journals, and of clients of that time."""
+    for kind in kinds:
+        if kind in ADDED_FIELDS:
+            full = make_full(kind)
+            fields = {field.name: field for field in msgspec.structs.fields(kind)}
+            before = {name: fields[name].default for name in ADDED_FIELDS[kind]}
+            later = msgspec.to_builtins(full, builtin_types=(bytes,))
+            bare = {name: value for name, value in later.items() if name not in before}
+            data = _pack(_put_in_envelope(side, bare))
+            value = _put_in_envelope(side, msgspec.structs.replace(full, **before))
+            yield _describe_vector(f"{codec.get_tag(kind)} of before", data, value)
 
 
 def _iterate_malformed() -> Iterator[dict[str, Any]]:

@@ -59,9 +59,9 @@ class DisconnectHandler:
                 self._admission.remove_peer(descriptor)
                 self._closed.append((descriptor, self._now_ns() + LAST_MESSAGES_NS))
 
-    def process_disconnects(self, replaced: Iterable[FrontConnection], drained: bool) -> None:
-        """Disconnect connections whose TCP connection was closed, that were replaced by another hello on their route,
-        or that do not read what is sent to them.
+    def process_disconnects(self, ended: Iterable[tuple[FrontConnection, str]], drained: bool) -> None:
+        """Disconnect connections whose TCP connection was closed, that `ended` on their route for the reason beside
+        them, or that do not read what is sent to them.
 
         A closed connection is handled after its last messages, because an e-stop may be pending in the socket.
         `drained`: no message is.
@@ -69,8 +69,8 @@ class DisconnectHandler:
         if self._closed:
             now_ns = self._now_ns()
             self._closed = [one for one in self._closed if self._is_close_pending(*one, drained, now_ns)]
-        for connection in replaced:
-            self.report_lost(connection, "replaced")
+        for connection, reason in ended:
+            self.report_lost(connection, reason)
         failed, self._outbox.failed = self._outbox.failed, {}
         for number, reason in failed.items():
             slow = self._connections.by_number.get(number)

@@ -18,6 +18,7 @@ from iris_session.protocol.client_messages import (
     ClientEnvelope,
     ClientMessage,
     ClockPing,
+    Disconnected,
     EStop,
     Heartbeat,
     Hello,
@@ -44,6 +45,9 @@ _UNKNOWN_PEER_FAULTS: Final = 20
 FLOOD_NS: Final = 2_000_000_000
 #: Events of an edge that makes something happen and will be undone: a headset put on, a clutch closed.
 _EDGE_EVENTS: Final = 2
+#: Why one behind a gateway was disconnected, as the gateway says; any other reason counts as the first.
+LOST: Final = "closed"
+_LOST_REASONS: Final = {reason: reason for reason in (LOST, "silent", "slow", "flood")}
 #: Devices of one connection whose clutch is remembered: as many as a client may name in `hello`.
 _MAX_DEVICES: Final = 32
 
@@ -52,7 +56,8 @@ class Intake:
     """Handle messages of the control socket and offer entries to the coalescer.
 
     Attributes:
-        replaced: Connections replaced by a new hello or another peer on their route. The loop disconnects them.
+        ended: Connections, by number, replaced by a new hello or another peer on their route, or whose gateway reports
+            that they are lost; each with the reason. The loop disconnects them.
     """
 
     def __init__(
@@ -81,7 +86,7 @@ class Intake:
         self._raw = raw
         self._presence = PresenceLimiter(context.drops)
         self._unknown_peer_faults = TokenBucket(_UNKNOWN_PEER_FAULTS, _UNKNOWN_PEER_FAULTS)
-        self.replaced: list[FrontConnection] = []
+        self.ended: dict[int, tuple[FrontConnection, str]] = {}
 
     def handle_message(self, routing_id: bytes, peer: Peer, data: memoryview, extra_frames: int) -> None:
         """Handle one message of the socket."""
@@ -116,8 +121,7 @@ class Intake:
             return
         connection = self._connections.by_route.get(route)
         if connection is not None and (connection.peer != peer or isinstance(message, Hello)):
-            self.replaced.append(connection)
-            self._connections.remove(connection)
+            self._end_connection(connection, "replaced")
             connection = None
         if connection is None and isinstance(message, EStop):
             self._forward_late_estop(route, peer, envelope, now_ns)
@@ -131,6 +135,8 @@ class Intake:
             self._admission.report_forged_gateway(route, peer, now_ns)
             self._count_rejection(peer, None, now_ns)
             self._send_fault(route, None, FaultCode.HELLO, "only a gateway speaks on behalf of others", now_ns)
+        elif isinstance(message, Disconnected):
+            self._handle_disconnected(route, peer, message, connection, now_ns)
         elif connection is None:
             # Behind a gateway, one that has not said hello must not use up what the gateway may send before hello.
             self._count_rejection(peer, self._admission.find_gateway(route.routing_id, peer), now_ns)
@@ -138,6 +144,21 @@ class Intake:
             self._send_fault(route, None, FaultCode.HELLO, text, now_ns)
         else:
             self._handle_from_connection(connection, envelope, size, now_ns)
+
+    def _end_connection(self, connection: FrontConnection, reason: str) -> None:
+        self.ended[connection.number] = (connection, reason)
+        self._connections.remove(connection)
+
+    def _handle_disconnected(
+        self, route: Route, peer: Peer, message: Disconnected, connection: FrontConnection | None, now_ns: int
+    ) -> None:
+        """Disconnect one behind a gateway that reports it as lost. A client with a socket of its own closes that."""
+        if not route.on_behalf_of:
+            text = "only a gateway reports that others are disconnected: close the socket, or send bye"
+            self._count_rejection(peer, connection, now_ns)
+            self._send_fault(route, connection, FaultCode.HELLO, text, now_ns)
+        elif connection is not None:
+            self._end_connection(connection, _LOST_REASONS.get(message.reason, LOST))
 
     def _forward_late_estop(self, route: Route, peer: Peer, envelope: ClientEnvelope, now_ns: int) -> None:
         """Forward the e-stop of a client that was disconnected and does not know it yet."""

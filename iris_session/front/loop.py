@@ -166,8 +166,8 @@ class Front:
             self._downlink.drain()
             if not more:
                 break
-        replaced, self._intake.replaced = self._intake.replaced, []
-        self._disconnects.process_disconnects(replaced, drained=not more)
+        ended, self._intake.ended = self._intake.ended, {}
+        self._disconnects.process_disconnects(ended.values(), drained=not more)
         self._run_services(idle=not more)
         self._uplink.flush()
         return more

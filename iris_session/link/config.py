@@ -127,6 +127,7 @@ class FrontConfig(msgspec.Struct, frozen=True):
         anchor_sizes: Edge of the printed code by anchor id [m].
         forward_observations: Send raw observations to the authority too.
         recorder_endpoint: Endpoint of a PULL socket for raw samples, empty when nothing is recorded.
+        gateway_key: Public key (Z85) of the session's own gateway, which is admitted without the list; empty for none.
     """
 
     host: str = "127.0.0.1"
@@ -160,6 +161,7 @@ class FrontConfig(msgspec.Struct, frozen=True):
     anchor_sizes: dict[str, float] = {}
     forward_observations: bool = False
     recorder_endpoint: str = ""
+    gateway_key: str = ""
 
     @property
     def hosts(self) -> tuple[str, ...]:

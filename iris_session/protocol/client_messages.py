@@ -22,8 +22,10 @@ Targets = Annotated[tuple[Target, ...], msgspec.Meta(max_length=8)]
 class Hello(Message, frozen=True, tag="hello"):
     """First message of a connection.
 
-    `secret`: client-made 128-bit secret that stands for the key on plain loopback. `resume_token`: from the last
-    `Welcome`, single use. `alignment`: `measured`, or `not_needed` for policies, leaders, desktop and remote VR.
+    `secret`: client-made 128-bit secret that stands for the key on plain loopback; behind a gateway the 32 bytes of a
+    web identity. `resume_token`: from the last `Welcome`, single use. `alignment`: `measured`, or `not_needed` for
+    policies, leaders, desktop and remote VR. `certificate_hash`: of a gateway, SHA-256 of the SubjectPublicKeyInfo of
+    the certificate that it shows to those behind it.
     """
 
     role: Name
@@ -35,12 +37,19 @@ class Hello(Message, frozen=True, tag="hello"):
     secret: Annotated[bytes, msgspec.Meta(max_length=64)] = b""
     resume_token: Annotated[bytes, msgspec.Meta(max_length=64)] = b""
     join_code: Name = ""
+    certificate_hash: Annotated[bytes, msgspec.Meta(max_length=64)] = b""
 
 
 class Bye(Message, frozen=True, tag="bye"):
     """Leave the session at once: leases are released without grace."""
 
     reason: Text = ""
+
+
+class Disconnected(Message, frozen=True, tag="disconnected"):
+    """Report of a gateway that one behind it lost its connection: the grace period begins at once."""
+
+    reason: Name = "closed"
 
 
 class Heartbeat(Message, frozen=True, tag="heartbeat"):
@@ -276,12 +285,13 @@ class Pair(Message, frozen=True, tag="pair"):
     """Request to put the key of this connection on the allow-list: the only message allowed from an unknown key.
 
     `proof`: shows that the sender knows a join code, without revealing it (`protocol.pairing`). `name`: under which the
-    key is listed.
+    key is listed. `identity`: behind a gateway, the 32 bytes of the web identity that is to be listed.
     """
 
     name: Name
     proof: Proof
     software: Name = ""
+    identity: Annotated[bytes, msgspec.Meta(max_length=64)] = b""
 
 
 class RemoveParticipant(Message, frozen=True, tag="remove_participant"):
@@ -293,9 +303,29 @@ class RemoveParticipant(Message, frozen=True, tag="remove_participant"):
     reason: Text = ""
 
 
+class Rename(Message, frozen=True, tag="rename"):
+    """Give a participant another name. Directors only. A name that another participant has gets a number."""
+
+    request_id: Count
+    participant: Name
+    name: Name
+
+
+class SetRole(Message, frozen=True, tag="set_role"):
+    """Give a participant another role, one that its key may join in. Directors only.
+
+    It keeps what it holds when it may drive in both roles as a person, or in both as an agent.
+    """
+
+    request_id: Count
+    participant: Name
+    role: Name
+
+
 ClientMessage = (
     Hello
     | Bye
+    | Disconnected
     | Heartbeat
     | ClockPing
     | GetSnapshot
@@ -321,6 +351,8 @@ ClientMessage = (
     | Marker
     | Pair
     | RemoveParticipant
+    | Rename
+    | SetRole
     | GetStatus
     | ClientReport
 )

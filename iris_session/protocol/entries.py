@@ -29,8 +29,10 @@ from iris_session.protocol.client_messages import (
     PlaceAlignment,
     Release,
     RemoveParticipant,
+    Rename,
     Sample,
     SetMode,
+    SetRole,
     SetScale,
     TrackingEpoch,
     Withdraw,
@@ -225,6 +227,8 @@ EntryMessage = (
     | FrontRestarted
     | RecordingGap
     | RemoveParticipant
+    | Rename
+    | SetRole
     | Audit
     | SessionResumed
     | SceneLoaded

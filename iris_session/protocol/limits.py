@@ -23,6 +23,7 @@ from iris_session.protocol.client_messages import (
     ClockPing,
     Consent,
     Control,
+    Disconnected,
     Episode,
     EStop,
     GetSnapshot,
@@ -36,9 +37,11 @@ from iris_session.protocol.client_messages import (
     PlaceAlignment,
     Release,
     RemoveParticipant,
+    Rename,
     Sample,
     Samples,
     SetMode,
+    SetRole,
     SetScale,
     TrackingEpoch,
     Withdraw,
@@ -77,6 +80,7 @@ LIMITS: Final[Mapping[type[Message], Limit]] = MappingProxyType(
     {
         Hello: Limit(40_000, 2, 10),
         Bye: Limit(4_000, 2, 4),
+        Disconnected: Limit(512, 2, 4),
         Heartbeat: Limit(512, 20, 40),
         ClockPing: Limit(512, 20, 40),
         GetSnapshot: Limit(512, 2, 10),
@@ -102,6 +106,8 @@ LIMITS: Final[Mapping[type[Message], Limit]] = MappingProxyType(
         Marker: Limit(4_000, 20, 40),
         Pair: Limit(1_000, 1, 5),
         RemoveParticipant: _REQUEST,
+        Rename: _REQUEST,
+        SetRole: _REQUEST,
         GetStatus: Limit(512, 4, 8),
         ClientReport: Limit(1_000, 4, 8),
     }
@@ -190,6 +196,7 @@ _EVENTS: Final[Mapping[type[Message], int]] = MappingProxyType(
 #: Messages that cause no further event. `Heartbeat` and samples do at the edges that `front.intake` looks for.
 _WITHOUT_EVENT: Final = (
     Bye,
+    Disconnected,
     Release,
     Heartbeat,
     ClockPing,

@@ -290,6 +290,8 @@ class AuditKind:
     KEY_REVOKED: Final = "key_revoked"
     ROLE_REFUSED: Final = "role_refused"
     REMOVED: Final = "removed"
+    RENAMED: Final = "renamed"  # by a director
+    ROLE_CHANGED: Final = "role_changed"  # by a director
     GATEWAY_REFUSED: Final = "gateway_refused"  # `on_behalf_of` from a participant that is no gateway
     TOKEN_REFUSED: Final = "token_refused"
     FLOOD: Final = "flood"  # a client sends more than its limits for seconds

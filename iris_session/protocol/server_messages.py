@@ -148,6 +148,15 @@ class BodyInfo(msgspec.Struct, frozen=True, array_like=True):
     object: bool = False
 
 
+class AnchorInfo(msgspec.Struct, frozen=True):
+    """An anchor of the session. `size_m`: edge of its sheet, `error_m`: stated p95 of its position; 0: unknown."""
+
+    id: Name
+    T_world_anchor: Pose
+    size_m: float = 0.0
+    error_m: float = 0.0
+
+
 # --- events: the shared history, numbered without gaps by `event_seq` -----------------------------------------------
 
 
@@ -173,8 +182,8 @@ class ParticipantLeft(EventBody, frozen=True, tag="participant_left"):
 
 
 class LeaseChanged(EventBody, frozen=True, tag="lease_changed"):
-    """`cause`: acquired, released, expired, takeover, assigned, resumed, consent, priority, left, mode, queue,
-    scene_changed (another scene was loaded that has no such robot or object)."""
+    """`cause`: acquired, released, expired, takeover, assigned, resumed, consent, priority, left, mode, queue, role (a
+    director gave the holder another one), scene_changed (another scene was loaded that has no such robot or object)."""
 
     lease: Lease
     cause: Name
@@ -449,8 +458,8 @@ class Snapshot(Message, frozen=True, tag="snapshot"):
 
     In the step of a reset `tick` and `sim_time` are still those before it. `tick_period_ns`: of this scene; 0: that of
     `Welcome`. `stop_seq`: of the newest stop (`EStopChanged`). `consent_timeout_ns`: time that a holder has to answer
-    `ConsentRequested`. Bulk frame 1 (added by the front): float64 (n_bodies, 7) world poses `x y z qw qx qy qz` of
-    `bodies` at `state_seq`.
+    `ConsentRequested`. `anchors`: as they are after its events. Bulk frame 1 (added by the front): float64 (n_bodies,
+    7) world poses `x y z qw qx qy qz` of `bodies` at `state_seq`.
     """
 
     request_id: Count
@@ -472,6 +481,7 @@ class Snapshot(Message, frozen=True, tag="snapshot"):
     tick_period_ns: Nanoseconds = 0
     stop_seq: Count = 0
     consent_timeout_ns: Nanoseconds = 0
+    anchors: tuple[AnchorInfo, ...] = ()
 
 
 class Paired(Message, frozen=True, tag="paired"):

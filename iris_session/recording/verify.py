@@ -22,7 +22,6 @@ from iris_session.recording import environment
 from iris_session.recording.errors import NotARecordingError
 from iris_session.recording.journal import (
     CRASHED,
-    SNAPSHOTS,
     Continues,
     JournalRow,
     Keyframe,
@@ -53,8 +52,8 @@ class Core(Protocol):
         """Set the state to that of `keyframe`."""
         ...
 
-    def keyframe(self, step: int) -> Keyframe:
-        """Return the present state as the keyframe after `step`."""
+    def find_differences(self, keyframe: Keyframe) -> list[str]:
+        """Return the names of the snapshots in `keyframe` that are not those of the present state."""
         ...
 
 
@@ -366,8 +365,7 @@ class _Run:
                 return
             self.simulating = True
         else:
-            mine = self._core.keyframe(keyframe.step)
-            other = [name for name in SNAPSHOTS if getattr(mine, name) != getattr(keyframe, name)]
+            other = self._core.find_differences(keyframe)
             if other:
                 text = f"keyframe: {', '.join(other)} is not what the simulation gives"
                 self.add_problem(Problem(keyframe.step, "divergence", other[0], text))

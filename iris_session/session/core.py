@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import msgspec
 import mujoco
@@ -21,8 +21,9 @@ from iris_session.physics import SimulationDivergedError, World
 from iris_session.physics.world import STATE
 from iris_session.protocol.entries import HOST, Entry, ExternalReset, SceneLoaded
 from iris_session.protocol.names import LateCause
+from iris_session.protocol.server_messages import Snapshot
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
-from iris_session.protocol.steps import ControlStatus, Decision
+from iris_session.protocol.steps import ControlStatus, Decision, OutgoingMessage
 from iris_session.session.config import SessionConfig
 from iris_session.session.ctrl_sharing import CtrlSharing
 from iris_session.session.errors import ConfigError
@@ -36,6 +37,9 @@ def ignore_lap(cause: str) -> None:
 #: participants at 72 Hz send so many in a third of the steps; a robot is still solved at 62 Hz if all steps have them.
 CROWDED_ENTRIES: Final = 6
 _encoder = msgspec.msgpack.Encoder()
+#: Fields of `Snapshot` in digests: those that it had when the recording format was made.
+_DIGESTED_FIELDS: Final = tuple(name for name in Snapshot.__struct_fields__ if name != "anchors")
+_DigestedSnapshot: Final = msgspec.defstruct("Snapshot", _DIGESTED_FIELDS, tag_field="type", tag="snapshot")
 _decode_status = msgspec.msgpack.Decoder(tuple[ControlStatus, ...]).decode
 _decode_shared = msgspec.msgpack.Decoder(tuple[bytes, bytes]).decode
 
@@ -234,7 +238,7 @@ class SessionCore:
 
     def _digest(self, decision: Decision) -> bytes:
         h = hashlib.blake2b(digest_size=16)
-        h.update(_encoder.encode(decision))
+        h.update(encode_for_digest(decision))
         h.update(_encoder.encode(self._status))
         h.update(self.world.save_state())
         return h.digest()
@@ -264,6 +268,24 @@ class SessionCore:
             self.sharing.restore(sharing)
         self.controller.restore(controller)
         self._status = _decode_status(state.status)
+
+
+def encode_for_digest(decision: Decision) -> bytes:
+    """Return the bytes of a decision that are part of the digest of its step.
+
+    A field that `Snapshot` got after the recording format is left out, so that earlier recordings of this format keep
+    their digests. The events, which are in, say the same.
+    """
+    if any(isinstance(one.message, Snapshot) for one in decision.outgoing):
+        outgoing = tuple(OutgoingMessage(one.connection, _to_digested(one.message)) for one in decision.outgoing)
+        decision = msgspec.structs.replace(decision, outgoing=outgoing)
+    return _encoder.encode(decision)
+
+
+def _to_digested(message: Any) -> Any:
+    if not isinstance(message, Snapshot):
+        return message
+    return _DigestedSnapshot(*(getattr(message, name) for name in _DIGESTED_FIELDS))
 
 
 def _limit_scales(config: CoreConfig) -> AuthorityConfig:

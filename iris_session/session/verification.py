@@ -7,10 +7,12 @@ from pathlib import Path
 
 import msgspec
 
+from iris_session.authority import is_same_snapshot
 from iris_session.physics import decode_model
 from iris_session.protocol.entries import Entry
 from iris_session.recording import Keyframe, SessionHeader, VerifyReport, unpack_model, verify
 from iris_session.recording.environment import use_one_blas_thread
+from iris_session.recording.journal import SNAPSHOTS
 from iris_session.recording.verify import Models
 from iris_session.session.core import CoreConfig, CoreState, SessionCore
 
@@ -32,10 +34,13 @@ class ReplayCore:
         """Restore the state after the step of a keyframe."""
         self.core.restore(CoreState(keyframe.plant, keyframe.authority, keyframe.controller, keyframe.status))
 
-    def keyframe(self, step: int) -> Keyframe:
-        """Return a keyframe of the present state, which is after `step`."""
+    def find_differences(self, keyframe: Keyframe) -> list[str]:
+        """Return the names of the snapshots in `keyframe` that are not those of the present state."""
         state = self.core.snapshot()
-        return Keyframe(step, state.plant, state.authority, state.controller, state.status)
+        other = [name for name in SNAPSHOTS if getattr(state, name) != getattr(keyframe, name)]
+        if "authority" in other and is_same_snapshot(keyframe.authority, state.authority):
+            other.remove("authority")
+        return other
 
 
 def verify_recording(path: Path, progress: Callable[[int, int], None] | None = None) -> VerifyReport:

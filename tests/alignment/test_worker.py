@@ -130,3 +130,27 @@ def test_estimates_in_a_thread_arrive_as_proposals() -> None:
         lab.poll()
         time.sleep(0.001)
     lab.service.close()
+
+
+@pytest.mark.parametrize("is_moved", [False, True])
+def test_cross_check_is_computed_beside_the_loop_and_void_when_its_sheet_was_moved(is_moved: bool) -> None:
+    lab, held = Lab(), HeldWorker()
+    ann, bob = lab.wearer(1), lab.wearer(2)
+    for one in (ann, bob):
+        one.survey()
+    views = ann.place(d=0.5), bob.place(d=0.5)
+    lab.service._worker = held
+    until_ns = lab.now_ns + 30 * 1_000_000_000
+    while not lab.cross_checks() and lab.now_ns < until_ns:
+        lab.now_ns += 20_000_000
+        for one, view in zip((ann, bob), views, strict=True):
+            one.report_observation(view)
+        lab.poll(1)
+        if held.job is not None:
+            assert lab.cross_checks() == [], "nothing is compared in the loop"
+            is_comparison = "begin_comparison" in held.job.__qualname__
+            finish, held.job = held.job(), None
+            if is_moved and is_comparison:
+                lab.service._cross_check.discard_target("sheet")
+            finish()
+    assert bool(lab.cross_checks()) is not is_moved

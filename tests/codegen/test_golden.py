@@ -64,6 +64,9 @@ def test_decode_only_vectors_decode_to_their_value() -> None:
         data = bytes.fromhex(vector["hex"])
         assert codec.decode_client(data) == expected, vector["name"]
         assert codec.encode_client(expected) != data, vector["name"]
+    for vector in GOLDEN["decode_only_server"]:
+        data = bytes.fromhex(vector["hex"])
+        assert codec.decode_server(data) == msgspec.convert(vector["value"], ServerEnvelope), vector["name"]
 
 
 def test_malformed_vectors_are_rejected_with_their_code() -> None:

@@ -108,6 +108,26 @@ class Scenario:
 
         self.run_until(has_engaged, f"{hand.robot} follows {hand.client.name}")
 
+    def keep_engaged(self, hand: Hand) -> None:
+        """Engage again unless the robot follows: on a busy machine a sample may have come too late."""
+        if not self.is_following(hand):
+            self.engage(hand)
+
+    def move_until(
+        self, hand: Hand, velocity: tuple[float, float, float], condition: Callable[[], object], what: str
+    ) -> None:
+        """Move a hand at `velocity` [m/s] until a condition holds, then stop it."""
+
+        def is_done() -> bool:
+            if not self.is_following(hand):
+                hand.velocity = (0.0, 0.0, 0.0)
+                self.engage(hand)
+            hand.velocity = velocity
+            return bool(condition())
+
+        self.run_until(is_done, what)
+        hand.velocity = (0.0, 0.0, 0.0)
+
     def is_following(self, hand: Hand) -> bool:
         """Return whether samples of the hand's participant were applied to its robot within 100 ms."""
         return is_driven(hand.client, hand.robot, hand.client.connection.participant_id)

@@ -240,8 +240,13 @@ def check_moving(table: AlignmentScenario, client: Client, robot: str) -> None:
     hand: Hand = table.scenario.add_hand(client, robot)
     table.scenario.engage(hand)
     before = hand.tip
-    hand.velocity = (0.0, 0.0, 0.1)
-    table.run_until(lambda: hand.tip[0][2] - before[0][2] > 0.03, f"{robot} follows {client.name}")
+
+    def has_moved() -> bool:
+        table.scenario.keep_engaged(hand)
+        hand.velocity = (0.0, 0.0, 0.1)
+        return hand.tip[0][2] - before[0][2] > 0.03
+
+    table.run_until(has_moved, f"{robot} follows {client.name}")
     table.scenario.hands.remove(hand)
     client.release(robot)
 

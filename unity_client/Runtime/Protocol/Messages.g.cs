@@ -312,6 +312,8 @@ namespace IrisSession.Protocol
         public const string KeyRevoked = "key_revoked";
         public const string RoleRefused = "role_refused";
         public const string Removed = "removed";
+        public const string Renamed = "renamed";
+        public const string RoleChanged = "role_changed";
         public const string GatewayRefused = "gateway_refused";
         public const string TokenRefused = "token_refused";
         public const string Flood = "flood";
@@ -964,7 +966,7 @@ namespace IrisSession.Protocol
         }
     }
 
-    /// <summary>One of 29 messages, distinguished by the field "type".</summary>
+    /// <summary>One of 32 messages, distinguished by the field "type".</summary>
     public abstract class ClientMessage : WireValue
     {
         public abstract string Tag { get; }
@@ -976,6 +978,7 @@ namespace IrisSession.Protocol
             {
                 case Hello.TagName: return Hello.Read(reader);
                 case Bye.TagName: return Bye.Read(reader);
+                case Disconnected.TagName: return Disconnected.Read(reader);
                 case Heartbeat.TagName: return Heartbeat.Read(reader);
                 case ClockPing.TagName: return ClockPing.Read(reader);
                 case GetSnapshot.TagName: return GetSnapshot.Read(reader);
@@ -1001,6 +1004,8 @@ namespace IrisSession.Protocol
                 case Marker.TagName: return Marker.Read(reader);
                 case Pair.TagName: return Pair.Read(reader);
                 case RemoveParticipant.TagName: return RemoveParticipant.Read(reader);
+                case Rename.TagName: return Rename.Read(reader);
+                case SetRole.TagName: return SetRole.Read(reader);
                 case GetStatus.TagName: return GetStatus.Read(reader);
                 case ClientReport.TagName: return ClientReport.Read(reader);
             }
@@ -1566,6 +1571,49 @@ namespace IrisSession.Protocol
             writer.Write(Name);
             writer.Write(Moving);
             writer.Write(Object);
+        }
+    }
+
+    /// <summary>
+    /// An anchor of the session. size_m: edge of its sheet, error_m: stated p95 of its position; 0: unknown.
+    /// </summary>
+    public sealed class AnchorInfo : WireValue
+    {
+        public string Id = "";
+        public Pose T_world_anchor = new Pose();
+        public double SizeM = 0.0;
+        public double ErrorM = 0.0;
+
+        public static AnchorInfo Read(WireReader reader)
+        {
+            AnchorInfo value = new AnchorInfo();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "id": value.Id = reader.ReadString(64); seen |= 1u; break;
+                    case "T_world_anchor": value.T_world_anchor = Pose.Read(reader); seen |= 2u; break;
+                    case "size_m": value.SizeM = reader.ReadDouble(); break;
+                    case "error_m": value.ErrorM = reader.ReadDouble(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 3u) != 3u) throw new WireException("missing field of AnchorInfo");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(4);
+            writer.Write("id");
+            writer.Write(Id);
+            writer.Write("T_world_anchor");
+            writer.Write(T_world_anchor);
+            writer.Write("size_m");
+            writer.Write(SizeM);
+            writer.Write("error_m");
+            writer.Write(ErrorM);
         }
     }
 
@@ -2278,8 +2326,10 @@ namespace IrisSession.Protocol
     /// <summary>
     /// First message of a connection.
     ///
-    /// secret: client-made 128-bit secret that stands for the key on plain loopback. resume_token: from the last
-    /// Welcome, single use. alignment: measured, or not_needed for policies, leaders, desktop and remote VR.
+    /// secret: client-made 128-bit secret that stands for the key on plain loopback; behind a gateway the 32 bytes of a
+    /// web identity. resume_token: from the last Welcome, single use. alignment: measured, or not_needed for
+    /// policies, leaders, desktop and remote VR. certificate_hash: of a gateway, SHA-256 of the SubjectPublicKeyInfo of
+    /// the certificate that it shows to those behind it.
     /// </summary>
     public sealed class Hello : ClientMessage
     {
@@ -2294,6 +2344,7 @@ namespace IrisSession.Protocol
         public byte[] Secret = new byte[0];
         public byte[] ResumeToken = new byte[0];
         public string JoinCode = "";
+        public byte[] CertificateHash = new byte[0];
 
         public static Hello Read(WireReader reader)
         {
@@ -2312,6 +2363,7 @@ namespace IrisSession.Protocol
                     case "secret": value.Secret = reader.ReadBytes(64); break;
                     case "resume_token": value.ResumeToken = reader.ReadBytes(64); break;
                     case "join_code": value.JoinCode = reader.ReadString(64); break;
+                    case "certificate_hash": value.CertificateHash = reader.ReadBytes(64); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -2321,7 +2373,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(10);
+            writer.WriteMapHeader(11);
             writer.Write("type");
             writer.Write(TagName);
             writer.Write("role");
@@ -2342,6 +2394,8 @@ namespace IrisSession.Protocol
             writer.Write(ResumeToken);
             writer.Write("join_code");
             writer.Write(JoinCode);
+            writer.Write("certificate_hash");
+            writer.Write(CertificateHash);
         }
     }
 
@@ -2362,6 +2416,39 @@ namespace IrisSession.Protocol
                 switch (reader.ReadString())
                 {
                     case "reason": value.Reason = reader.ReadString(512); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(2);
+            writer.Write("type");
+            writer.Write(TagName);
+            writer.Write("reason");
+            writer.Write(Reason);
+        }
+    }
+
+    /// <summary>
+    /// Report of a gateway that one behind it lost its connection: the grace period begins at once.
+    /// </summary>
+    public sealed class Disconnected : ClientMessage
+    {
+        public const string TagName = "disconnected";
+        public override string Tag { get { return TagName; } }
+        public string Reason = "closed";
+
+        public static Disconnected Read(WireReader reader)
+        {
+            Disconnected value = new Disconnected();
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "reason": value.Reason = reader.ReadString(64); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -3427,7 +3514,7 @@ namespace IrisSession.Protocol
     /// Request to put the key of this connection on the allow-list: the only message allowed from an unknown key.
     ///
     /// proof: shows that the sender knows a join code, without revealing it (protocol.pairing). name: under which the
-    /// key is listed.
+    /// key is listed. identity: behind a gateway, the 32 bytes of the web identity that is to be listed.
     /// </summary>
     public sealed class Pair : ClientMessage
     {
@@ -3436,6 +3523,7 @@ namespace IrisSession.Protocol
         public string Name = "";
         public byte[] Proof = new byte[0];
         public string Software = "";
+        public byte[] Identity = new byte[0];
 
         public static Pair Read(WireReader reader)
         {
@@ -3448,6 +3536,7 @@ namespace IrisSession.Protocol
                     case "name": value.Name = reader.ReadString(64); seen |= 1u; break;
                     case "proof": value.Proof = reader.ReadBytes(64); seen |= 2u; break;
                     case "software": value.Software = reader.ReadString(64); break;
+                    case "identity": value.Identity = reader.ReadBytes(64); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -3457,7 +3546,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(4);
+            writer.WriteMapHeader(5);
             writer.Write("type");
             writer.Write(TagName);
             writer.Write("name");
@@ -3466,6 +3555,8 @@ namespace IrisSession.Protocol
             writer.Write(Proof);
             writer.Write("software");
             writer.Write(Software);
+            writer.Write("identity");
+            writer.Write(Identity);
         }
     }
 
@@ -3513,6 +3604,94 @@ namespace IrisSession.Protocol
             writer.Write(Revoke);
             writer.Write("reason");
             writer.Write(Reason);
+        }
+    }
+
+    /// <summary>
+    /// Give a participant another name. Directors only. A name that another participant has gets a number.
+    /// </summary>
+    public sealed class Rename : ClientMessage
+    {
+        public const string TagName = "rename";
+        public override string Tag { get { return TagName; } }
+        public long RequestId = 0;
+        public string Participant = "";
+        public string Name = "";
+
+        public static Rename Read(WireReader reader)
+        {
+            Rename value = new Rename();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
+                    case "participant": value.Participant = reader.ReadString(64); seen |= 2u; break;
+                    case "name": value.Name = reader.ReadString(64); seen |= 4u; break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 7u) != 7u) throw new WireException("missing field of Rename");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(4);
+            writer.Write("type");
+            writer.Write(TagName);
+            writer.Write("request_id");
+            writer.Write(RequestId);
+            writer.Write("participant");
+            writer.Write(Participant);
+            writer.Write("name");
+            writer.Write(Name);
+        }
+    }
+
+    /// <summary>
+    /// Give a participant another role, one that its key may join in. Directors only.
+    ///
+    /// It keeps what it holds when it may drive in both roles as a person, or in both as an agent.
+    /// </summary>
+    public sealed class SetRole : ClientMessage
+    {
+        public const string TagName = "set_role";
+        public override string Tag { get { return TagName; } }
+        public long RequestId = 0;
+        public string Participant = "";
+        public string Role = "";
+
+        public static SetRole Read(WireReader reader)
+        {
+            SetRole value = new SetRole();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
+                    case "participant": value.Participant = reader.ReadString(64); seen |= 2u; break;
+                    case "role": value.Role = reader.ReadString(64); seen |= 4u; break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 7u) != 7u) throw new WireException("missing field of SetRole");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(4);
+            writer.Write("type");
+            writer.Write(TagName);
+            writer.Write("request_id");
+            writer.Write(RequestId);
+            writer.Write("participant");
+            writer.Write(Participant);
+            writer.Write("role");
+            writer.Write(Role);
         }
     }
 
@@ -4007,8 +4186,8 @@ namespace IrisSession.Protocol
     ///
     /// In the step of a reset tick and sim_time are still those before it. tick_period_ns: of this scene; 0: that of
     /// Welcome. stop_seq: of the newest stop (EStopChanged). consent_timeout_ns: time that a holder has to answer
-    /// ConsentRequested. Bulk frame 1 (added by the front): float64 (n_bodies, 7) world poses x y z qw qx qy qz of
-    /// bodies at state_seq.
+    /// ConsentRequested. anchors: as they are after its events. Bulk frame 1 (added by the front): float64 (n_bodies,
+    /// 7) world poses x y z qw qx qy qz of bodies at state_seq.
     /// </summary>
     public sealed class Snapshot : ServerMessage
     {
@@ -4033,6 +4212,7 @@ namespace IrisSession.Protocol
         public long TickPeriodNs = 0;
         public long StopSeq = 0;
         public long ConsentTimeoutNs = 0;
+        public AnchorInfo[] Anchors = new AnchorInfo[0];
 
         public static Snapshot Read(WireReader reader)
         {
@@ -4061,6 +4241,7 @@ namespace IrisSession.Protocol
                     case "tick_period_ns": value.TickPeriodNs = reader.ReadLong(long.MinValue, long.MaxValue); break;
                     case "stop_seq": value.StopSeq = reader.ReadLong(0, long.MaxValue); break;
                     case "consent_timeout_ns": value.ConsentTimeoutNs = reader.ReadLong(long.MinValue, long.MaxValue); break;
+                    case "anchors": value.Anchors = reader.ReadArray(Protocol.AnchorInfo.Read, 0); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -4070,7 +4251,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(20);
+            writer.WriteMapHeader(21);
             writer.Write("type");
             writer.Write(TagName);
             writer.Write("request_id");
@@ -4111,6 +4292,8 @@ namespace IrisSession.Protocol
             writer.Write(StopSeq);
             writer.Write("consent_timeout_ns");
             writer.Write(ConsentTimeoutNs);
+            writer.Write("anchors");
+            writer.Write(Anchors);
         }
     }
 
@@ -4500,8 +4683,8 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// cause: acquired, released, expired, takeover, assigned, resumed, consent, priority, left, mode, queue,
-    /// scene_changed (another scene was loaded that has no such robot or object).
+    /// cause: acquired, released, expired, takeover, assigned, resumed, consent, priority, left, mode, queue, role (a
+    /// director gave the holder another one), scene_changed (another scene was loaded that has no such robot or object).
     /// </summary>
     public sealed class LeaseChanged : EventKind
     {

@@ -268,6 +268,8 @@ export const AuditKind = {
   KEY_REVOKED: "key_revoked",
   ROLE_REFUSED: "role_refused",
   REMOVED: "removed",
+  RENAMED: "renamed",
+  ROLE_CHANGED: "role_changed",
   GATEWAY_REFUSED: "gateway_refused",
   TOKEN_REFUSED: "token_refused",
   FLOOD: "flood",
@@ -544,6 +546,14 @@ export type BodyInfo = [
   object?: boolean,
 ];
 
+/** An anchor of the session. `size_m`: edge of its sheet, `error_m`: stated p95 of its position; 0: unknown. */
+export interface AnchorInfo {
+  id: string;
+  T_world_anchor: Pose;
+  size_m?: number;
+  error_m?: number;
+}
+
 /** Median and 99th percentile [ms] over the last seconds; null where nothing was measured. */
 export type Quantiles = [
   p50: number,
@@ -718,8 +728,10 @@ export interface AssetsReport {
 /**
  * First message of a connection.
  *
- * `secret`: client-made 128-bit secret that stands for the key on plain loopback. `resume_token`: from the last
- * `Welcome`, single use. `alignment`: `measured`, or `not_needed` for policies, leaders, desktop and remote VR.
+ * `secret`: client-made 128-bit secret that stands for the key on plain loopback; behind a gateway the 32 bytes of a
+ * web identity. `resume_token`: from the last `Welcome`, single use. `alignment`: `measured`, or `not_needed` for
+ * policies, leaders, desktop and remote VR. `certificate_hash`: of a gateway, SHA-256 of the SubjectPublicKeyInfo of
+ * the certificate that it shows to those behind it.
  */
 export interface Hello {
   type: "hello";
@@ -732,11 +744,18 @@ export interface Hello {
   secret?: Uint8Array;
   resume_token?: Uint8Array;
   join_code?: string;
+  certificate_hash?: Uint8Array;
 }
 
 /** Leave the session at once: leases are released without grace. */
 export interface Bye {
   type: "bye";
+  reason?: string;
+}
+
+/** Report of a gateway that one behind it lost its connection: the grace period begins at once. */
+export interface Disconnected {
+  type: "disconnected";
   reason?: string;
 }
 
@@ -984,13 +1003,14 @@ export interface Marker {
  * Request to put the key of this connection on the allow-list: the only message allowed from an unknown key.
  *
  * `proof`: shows that the sender knows a join code, without revealing it (`protocol.pairing`). `name`: under which the
- * key is listed.
+ * key is listed. `identity`: behind a gateway, the 32 bytes of the web identity that is to be listed.
  */
 export interface Pair {
   type: "pair";
   name: string;
   proof: Uint8Array;
   software?: string;
+  identity?: Uint8Array;
 }
 
 /** End the participation of a participant. Directors only. `revoke`: its key is taken off the allow-list too. */
@@ -1000,6 +1020,26 @@ export interface RemoveParticipant {
   participant: string;
   revoke?: boolean;
   reason?: string;
+}
+
+/** Give a participant another name. Directors only. A name that another participant has gets a number. */
+export interface Rename {
+  type: "rename";
+  request_id: number;
+  participant: string;
+  name: string;
+}
+
+/**
+ * Give a participant another role, one that its key may join in. Directors only.
+ *
+ * It keeps what it holds when it may drive in both roles as a person, or in both as an agent.
+ */
+export interface SetRole {
+  type: "set_role";
+  request_id: number;
+  participant: string;
+  role: Role;
 }
 
 /** Request for a `StatusReport`. */
@@ -1122,8 +1162,8 @@ export interface Event {
  *
  * In the step of a reset `tick` and `sim_time` are still those before it. `tick_period_ns`: of this scene; 0: that of
  * `Welcome`. `stop_seq`: of the newest stop (`EStopChanged`). `consent_timeout_ns`: time that a holder has to answer
- * `ConsentRequested`. Bulk frame 1 (added by the front): float64 (n_bodies, 7) world poses `x y z qw qx qy qz` of
- * `bodies` at `state_seq`.
+ * `ConsentRequested`. `anchors`: as they are after its events. Bulk frame 1 (added by the front): float64 (n_bodies,
+ * 7) world poses `x y z qw qx qy qz` of `bodies` at `state_seq`.
  */
 export interface Snapshot {
   type: "snapshot";
@@ -1146,6 +1186,7 @@ export interface Snapshot {
   tick_period_ns?: number;
   stop_seq?: number;
   consent_timeout_ns?: number;
+  anchors?: AnchorInfo[];
 }
 
 /**
@@ -1246,8 +1287,8 @@ export interface ParticipantLeft {
 }
 
 /**
- * `cause`: acquired, released, expired, takeover, assigned, resumed, consent, priority, left, mode, queue,
- * scene_changed (another scene was loaded that has no such robot or object).
+ * `cause`: acquired, released, expired, takeover, assigned, resumed, consent, priority, left, mode, queue, role (a
+ * director gave the holder another one), scene_changed (another scene was loaded that has no such robot or object).
  */
 export interface LeaseChanged {
   event: "lease_changed";
@@ -1979,6 +2020,7 @@ export interface AddMaterial {
 export type ClientMessage =
   | Hello
   | Bye
+  | Disconnected
   | Heartbeat
   | ClockPing
   | GetSnapshot
@@ -2004,6 +2046,8 @@ export type ClientMessage =
   | Marker
   | Pair
   | RemoveParticipant
+  | Rename
+  | SetRole
   | GetStatus
   | ClientReport;
 
@@ -2056,8 +2100,9 @@ export type PatchOp =
 
 /** Values of the fields that a message, event or operation may leave out, by its tag. */
 export const DEFAULTS = {
-  hello: { software: "", devices: [], capabilities: [], alignment: "measured", secret: new Uint8Array(), resume_token: new Uint8Array(), join_code: "" },
+  hello: { software: "", devices: [], capabilities: [], alignment: "measured", secret: new Uint8Array(), resume_token: new Uint8Array(), join_code: "", certificate_hash: new Uint8Array() },
   bye: { reason: "" },
+  disconnected: { reason: "closed" },
   heartbeat: { worn: true },
   clock_ping: {},
   get_snapshot: { request_id: 0 },
@@ -2081,8 +2126,10 @@ export const DEFAULTS = {
   clear_estop: { stop_seq: 0 },
   control: { ticks: 1 },
   marker: {},
-  pair: { software: "" },
+  pair: { software: "", identity: new Uint8Array() },
   remove_participant: { revoke: false, reason: "" },
+  rename: {},
+  set_role: {},
   get_status: { request_id: 0 },
   client_report: { missed: 0, rtt_ms: 0.0, bytes_per_s: 0.0, media_bytes_per_s: 0.0, media_age_ms: 0.0, display_hz: 0.0, media_limit_mbit_per_s: 0.0 },
   welcome: { key_fingerprint: "" },
@@ -2092,7 +2139,7 @@ export const DEFAULTS = {
   reply: { denial: null, leases: [] },
   feedback: { hold_reason: "", contact_n: 0.0, limits: [], rejected: {} },
   event: {},
-  snapshot: { robots: [], bodies: [], paused: false, estop: false, episode: null, state_seq: 0, tick_period_ns: 0, stop_seq: 0, consent_timeout_ns: 0 },
+  snapshot: { robots: [], bodies: [], paused: false, estop: false, episode: null, state_seq: 0, tick_period_ns: 0, stop_seq: 0, consent_timeout_ns: 0, anchors: [] },
   paired: { roles: [] },
   status_report: { tick: 0, tick_period_ns: 0, paused: false, estop: false, stalled: false, scheduling: "", late_share: 0.0, late_share_total: 0.0, lateness: null, late_causes: {}, step_to_publish: null, cpu_share: 0.0, load: 0.0, cpus: 0, memory_bytes: 0, participants: [], robots: [], recorder: null, drops: {}, restarts: {}, connections: 0, entries_per_s: 0.0, warnings: [], authority_silent_ns: -1, media: [], anchors: [], cross_checks: [], assets: null, stops: [], pause_reason: "" },
   delivery_budget: { mbit_per_s: 0.0, reason: "", streams: [] },
@@ -2162,6 +2209,10 @@ export const VALUE_DEFAULTS = {
     worn: true,
     tracking_epoch: 0,
     alignment: null,
+  },
+  AnchorInfo: {
+    size_m: 0.0,
+    error_m: 0.0,
   },
   StreamBudget: {
     budget_class: "full",
