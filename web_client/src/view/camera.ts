@@ -31,7 +31,7 @@ export class Viewpoint {
   private chosen = -1;
   private readonly lastMatrix = new Matrix4();
 
-  constructor(private readonly canvas: HTMLCanvasElement) {
+  constructor(canvas: HTMLCanvasElement) {
     this.controls = new OrbitControls(this.free, canvas);
     this.controls.enableDamping = false;
     this.controls.zoomSpeed = 0.8;
@@ -56,7 +56,9 @@ export class Viewpoint {
   frame(view: SceneView): void {
     const { center, extent, zfar } = view.spec.environment;
     this.free.far = Math.max(200, zfar * extent);
-    this.setFree({ lookat: center, azimuth: 145, elevation: -28, distance: 1.35 * Math.max(extent, 0.2) });
+    // Narrow pictures, as on phones, are seen from farther away.
+    const distance = (2 * Math.max(extent, 0.2)) / Math.min(1, this.aspect);
+    this.setFree({ lookat: center, azimuth: 145, elevation: -22, distance });
   }
 
   /** Choose a camera of the scene by its index, or the free one (-1). */
