@@ -19,6 +19,8 @@ from iris_session.link.sockets import readable
 from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import (
     Event,
+    ParticipantChanged,
+    ParticipantInfo,
     ParticipantLeft,
     ProtocolFault,
     Refused,
@@ -118,6 +120,8 @@ class Downlink:
             self._alignment.process_event(event.body)
             if isinstance(event.body, ParticipantLeft) and not event.body.grace:
                 self._admission.expire_tokens(event.body.participant)
+            elif isinstance(event.body, ParticipantChanged):
+                self._update_role(event.body.participant)
         for outgoing in snapshots:
             self._send_outgoing(outgoing)
         heard_ns = self._authority.heard_ns
@@ -133,6 +137,13 @@ class Downlink:
                 self._disconnects.remove(connection, dropped.reason)
             if dropped.key_id:
                 self._revocation.revoke(dropped.key_id, heard_ns)
+
+    def _update_role(self, info: ParticipantInfo) -> None:
+        """Take over the role that a director gave to a participant."""
+        for connection in tuple(self._connections.by_number.values()):
+            if connection.participant_id == info.id and connection.role != info.role:
+                connection.role = info.role
+                self._revocation.check_role(connection, self._authority.heard_ns)
 
     def _send_outgoing(self, outgoing: OutgoingMessage) -> None:
         message: ServerMessage = outgoing.message
