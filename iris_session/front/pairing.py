@@ -68,7 +68,7 @@ TOO_MANY_WRONG: Final = "too many wrong codes from this address"
 
 
 class _Source(NamedTuple):
-    """Who is limited: a network, or a gateway, which counts as `factor` networks. `address`: for the audit."""
+    """Origin of attempts that is limited: a network, or a gateway, which counts as `factor` networks."""
 
     name: str
     address: str
