@@ -18,6 +18,7 @@ from iris_session.link import messages as link
 from iris_session.link.sockets import readable
 from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import (
+    AnchorInfo,
     Event,
     ParticipantChanged,
     ParticipantInfo,
@@ -48,6 +49,7 @@ class Downlink:
         assets: AssetService,
     ) -> None:
         self._socket = socket
+        self._config = context.config
         self._authority = context.authority
         self._connections = context.connections
         self._outbox = context.outbox
@@ -151,18 +153,28 @@ class Downlink:
         if connection is None:
             return
         if isinstance(message, Snapshot):
-            # The front adds what only it knows: the scene, and the poses of the newest state frame.
+            # The front adds what only it knows: the scene, the poses of the newest state frame, the sizes of anchors.
             self._alignment.process_snapshot(message.participants)
             state_seq, poses = self._publisher.read_keyframe()
             scene = self._publisher.scene
             filled = msgspec.structs.replace(
-                message, scene_hash=scene.scene_hash, robots=scene.robots, bodies=scene.bodies, state_seq=state_seq
+                message,
+                scene_hash=scene.scene_hash,
+                robots=scene.robots,
+                bodies=scene.bodies,
+                state_seq=state_seq,
+                anchors=tuple(self._describe_anchor(anchor) for anchor in message.anchors),
             )
             self._outbox.send(connection, filled, poses)
             return
         self._outbox.send(connection, message)
         if isinstance(message, Refused):
             self._disconnects.remove(connection, "refused")
+
+    def _describe_anchor(self, anchor: AnchorInfo) -> AnchorInfo:
+        """Return an anchor with its size and stated error, where they are known."""
+        size, error = self._config.anchor_sizes.get(anchor.id, 0.0), self._config.anchor_errors.get(anchor.id, 0.0)
+        return msgspec.structs.replace(anchor, size_m=size, error_m=error)
 
     def broadcast(self, message: Event | ProtocolFault) -> None:
         """Send a message to every admitted connection, encoded once."""
