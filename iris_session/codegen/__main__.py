@@ -21,6 +21,7 @@ from iris_session.codegen import (
     scene_golden,
     tables,
     typescript,
+    typescript_schema,
 )
 
 _DOCUMENT: Final = "docs/protocol.md"
@@ -41,6 +42,7 @@ def update_document(text: str) -> str:
 TARGETS: Final[dict[str, tuple[str, Callable[[str], str]]]] = {
     "csharp": ("unity_client/Runtime/Protocol/Messages.g.cs", lambda _: csharp.render_csharp()),
     "typescript": ("web_client/src/protocol/messages.g.ts", lambda _: typescript.render_typescript()),
+    "typescript-schema": ("web_client/src/protocol/schema.g.ts", lambda _: typescript_schema.render_schema()),
     "golden": ("docs/protocol/golden.json", lambda _: golden.render_golden()),
     "scene": ("docs/protocol/scene.json", lambda _: scene_golden.render_scene_golden()),
     "conversations": ("docs/protocol/conversations.json", lambda _: conversations.render_conversations()),

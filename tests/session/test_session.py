@@ -232,8 +232,7 @@ def test_loaded_scene_begins_with_its_given_data(session: Session) -> None:
     data.qpos[0] = 0.9  # whose it is goes on with it
     session.run(until=change.done)
     change.result()
-    before = session.stepper.core.current_config().initial_state
-    session.run(until=lambda: session.stepper.core.current_config().initial_state != before, seconds=30.0)
+    session.run(until=lambda: session.stepper.core.current_config().initial_state == begun, seconds=30.0)
     assert session.stepper.core.current_config().initial_state == begun
     other = session.load_scene(path, mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>")))
     with pytest.raises(ConfigError, match="data"):
