@@ -113,8 +113,7 @@ class Intake:
         message = envelope.message
         if isinstance(message, Pair):
             self._guard.touch(peer.descriptor, now_ns)
-            self._count_rejection(peer, None, now_ns)
-            self._pairing.handle_pair(route, peer, message, now_ns)
+            self._handle_pair(route, peer, message, now_ns)
             return
         if parse_pairing_key(peer.user_id):
             self._reject_unpaired(route, peer, message, now_ns)
@@ -144,6 +143,15 @@ class Intake:
             self._send_fault(route, None, FaultCode.HELLO, text, now_ns)
         else:
             self._handle_from_connection(connection, envelope, size, now_ns)
+
+    def _handle_pair(self, route: Route, peer: Peer, pair: Pair, now_ns: int) -> None:
+        gateway = self._admission.find_gateway(route.routing_id, peer) if route.on_behalf_of else None
+        self._count_rejection(peer, gateway, now_ns)
+        if route.on_behalf_of and gateway is None:
+            self._admission.report_forged_gateway(route, peer, now_ns)
+            self._send_fault(route, None, FaultCode.HELLO, "only a gateway speaks on behalf of others", now_ns)
+        else:
+            self._pairing.handle_pair(route, peer, pair, now_ns, gateway)
 
     def _end_connection(self, connection: FrontConnection, reason: str) -> None:
         self.ended[connection.number] = (connection, reason)
@@ -266,7 +274,7 @@ class Intake:
             scene = self._publisher.scene
             units, events = weigh_request(message, len(scene.bodies)), count_events(message, len(scene.robots))
             reason = connection.budget.take_request(now_ns, units, events)
-            if not reason and connection.hello.role == Role.OBSERVER and not isinstance(message, Observation):
+            if not reason and connection.role == Role.OBSERVER and not isinstance(message, Observation):
                 reason = self._presence.take_request(connection, size, now_ns)
         if not reason:
             return ""
@@ -340,7 +348,7 @@ class Intake:
         self._alignment.process_sample(connection, sample, now_ns)
         if not self._take_edges(connection, sample, now_ns):
             return
-        if connection.hello.role == Role.OBSERVER:
+        if connection.role == Role.OBSERVER:
             presence = self._presence.limit(connection, sample, now_ns)
             if presence is None:
                 return
