@@ -14,10 +14,11 @@ from typing import Final
 import msgspec
 
 from iris_session.protocol.client_messages import Disconnected, wrap_message
-from iris_session.protocol.codec import Bytes, encode_client
-from iris_session.protocol.errors import ProtocolError, ProtocolVersionError
+from iris_session.protocol.codec import Bytes, encode_client, encode_server
+from iris_session.protocol.errors import MalformedError, ProtocolError, ProtocolVersionError
 from iris_session.protocol.limits import Drops, TokenBucket
-from iris_session.protocol.names import FaultCode
+from iris_session.protocol.names import PROTOCOL_VERSION, FaultCode
+from iris_session.protocol.server_messages import ProtocolFault, ServerEnvelope
 from iris_session.web.wire import (
     CLOSE_LIMIT,
     CLOSE_NOT_ALLOWED,
@@ -46,6 +47,8 @@ _SMALL: Final = 256
 #: Faults after which a connection is over for the session.
 _ENDING_FAULTS: Final = frozenset({FaultCode.DROPPED, FaultCode.REVOKED, FaultCode.HELLO, FaultCode.SESSION_ENDED})
 _BYE: Final = "bye"
+#: Answers to malformed messages of one browser.
+_FAULTS_PER_S, _FAULT_BURST = 2.0, 5
 _WELCOME, _FAULT, _REFUSED, _BUDGET = "welcome", "protocol_fault", "refused", "delivery_budget"
 
 
@@ -56,6 +59,7 @@ class HubLimits(msgspec.Struct, frozen=True):
         browsers: WebSockets for control at once; a session has 64 connections.
         messages_per_s, message_burst: Messages of one browser.
         bytes_per_s, byte_burst: Their bytes.
+        early_per_s, early_burst: Messages without a `welcome`: the session counts those against the gateway.
         queued_messages, queued_bytes: Control messages that wait for one browser; a snapshot has at most 32 MB.
         total_bytes: Control messages that wait for all browsers together.
         join_ns: Time until the session has welcomed a browser.
@@ -68,6 +72,8 @@ class HubLimits(msgspec.Struct, frozen=True):
     message_burst: int = 3000
     bytes_per_s: float = 4.0 * (1 << 20)
     byte_burst: int = 8 << 20
+    early_per_s: float = 10.0
+    early_burst: int = 200
     queued_messages: int = 1024
     queued_bytes: int = 48 << 20
     total_bytes: int = 128 << 20
@@ -117,6 +123,8 @@ class Browser:
         self.ticket_ns = 0
         self.messages = TokenBucket(limits.messages_per_s, limits.message_burst, now_ns)
         self.bytes = TokenBucket(limits.bytes_per_s, limits.byte_burst, now_ns)
+        self.early = TokenBucket(limits.early_per_s, limits.early_burst, now_ns)
+        self.faults = TokenBucket(_FAULTS_PER_S, _FAULT_BURST, now_ns)
 
     @property
     def is_admitted(self) -> bool:
@@ -207,7 +215,11 @@ class Hub:
         if browser.closing is not None:
             return None
         browser.heard_ns = now_ns
-        if not browser.messages.take(now_ns) or not browser.bytes.take(now_ns, len(data)):
+        if (
+            not browser.messages.take(now_ns)
+            or not browser.bytes.take(now_ns, len(data))
+            or (not browser.epoch and not browser.early.take(now_ns))
+        ):
             self._reject(browser, CLOSE_LIMIT, "web_flood", "more messages than a client may send: send less")
             return None
         try:
@@ -223,15 +235,26 @@ class Hub:
         except ProtocolError as error:
             self._reject(browser, CLOSE_NOT_ALLOWED, f"web_{error.code}", str(error))
             return None
-        self._note_client_message(browser, frames[0])
-        return envelope
+        return envelope if self._check_message(browser, frames[0], now_ns) else None
 
-    def _note_client_message(self, browser: Browser, envelope: memoryview) -> None:
-        """Note a hello, after which the session has a connection to lose, and a bye, after which it has none."""
-        if not browser.said_hello:
-            browser.said_hello = True
-        elif len(envelope) < _SMALL and peek_client_type(envelope) == _BYE:
+    def _check_message(self, browser: Browser, envelope: memoryview, now_ns: int) -> bool:
+        """Return whether a message is MessagePack; if not, answer it as the session would.
+
+        Note a hello, after which the session has a connection to lose, and a bye, after which it has none.
+        """
+        try:
+            kind = peek_client_type(envelope)
+        except MalformedError as error:
+            self.drops.count("web_malformed")
+            if browser.faults.take(now_ns):
+                fault = ServerEnvelope(PROTOCOL_VERSION, browser.epoch, ProtocolFault(error.code, str(error)))
+                self._queue(browser, encode_frames(CONTROL, (encode_server(fault),)))
+            return False
+        if kind == _BYE and browser.said_hello:
             self._leave(browser)
+        elif kind != _BYE:
+            browser.said_hello = True
+        return True
 
     # --- from the session to browsers ---------------------------------------------------------------------------------
 

@@ -197,11 +197,14 @@ def splice_name(envelope: Bytes, name: str) -> bytes:
 
 
 def peek_client_type(envelope: Bytes) -> str:
-    """Return the type of a client message, empty for what is not one."""
+    """Return the type of a client message, empty for one without. Raises `MalformedError` for what is not MessagePack.
+
+    The session checks the rest: it may know types that a gateway does not.
+    """
     try:
         return _client.decode(envelope).message.type
-    except BAD_BYTES:
-        return ""
+    except BAD_BYTES as error:
+        raise MalformedError(f"no envelope: {error}") from None
 
 
 def peek_server_message(envelope: Bytes) -> ServerHead:

@@ -94,6 +94,31 @@ def test_floods_close_their_sender() -> None:
     assert large.receive(browser, HEARTBEAT, 0) is None
 
 
+def test_a_browser_without_a_welcome_may_say_little() -> None:
+    hub = Hub(HubLimits(early_per_s=1.0, early_burst=3))
+    browser, joined = open_browser(hub, 1), open_browser(hub, 2)
+    assert [hub.receive(browser, HELLO, 0) is not None for _ in range(4)] == [True] * 3 + [False]
+    assert browser.closing is not None
+    welcome(hub, joined)
+    assert all(hub.receive(joined, HEARTBEAT, 0) for _ in range(100))
+
+
+def test_what_is_not_messagepack_is_answered_by_the_gateway() -> None:
+    hub = Hub()
+    browser = open_browser(hub)
+    welcome(hub, browser)
+    take(hub, browser)
+    for _ in range(20):
+        assert hub.receive(browser, wire.encode_frames(wire.CONTROL, [b"\x94\x01\x05\xa0\xc1"]), 0) is None
+    answers = [decode_server(frames[0]) for _, frames in take(hub, browser)]
+    assert 0 < len(answers) < 20, "at a bounded rate"
+    assert answers[0].connection_epoch == 5
+    assert isinstance(answers[0].message, ProtocolFault)
+    assert answers[0].message.code == "malformed"
+    assert hub.drops.by_reason == {"web_malformed": 20}
+    assert browser.closing is None
+
+
 def test_answers_reach_the_browser_that_they_name() -> None:
     hub = Hub()
     ann, bob = open_browser(hub, 1), open_browser(hub, 2)
