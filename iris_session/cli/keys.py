@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from iris_session.cli.common import CommandError, add_json_option, print_json
 from iris_session.cli.pair import add_role_option, parse_roles
 from iris_session.protocol.names import Role
+from iris_session.security.allow_list import CURVE
 
 if TYPE_CHECKING:
     from iris_session.security import KeyHome, KeyPair
@@ -100,6 +101,7 @@ def run_list(arguments: argparse.Namespace) -> int:
                 "fingerprint": mark,
                 "key": one.key,
                 "roles": list(one.roles),
+                "kind": one.kind,
                 "added": one.added,
                 "last_seen": one.last_seen,
             }
@@ -112,7 +114,8 @@ def run_list(arguments: argparse.Namespace) -> int:
     width = max((len(one.name) for one in keys.values()), default=0)
     for mark, one in keys.items():
         roles, seen = ", ".join(one.roles) or "any role", one.last_seen or "never"
-        print(f"{one.name:{width}}  {mark}  {roles}  added {one.added or 'manually'}  last seen {seen}")
+        kind = "" if one.kind == CURVE else f"{one.kind}  "
+        print(f"{one.name:{width}}  {mark}  {kind}{roles}  added {one.added or 'manually'}  last seen {seen}")
     return 0
 
 

@@ -206,7 +206,7 @@ def apply_anchors_file(config: SessionConfig, path: Path | None) -> SessionConfi
     if path is None:
         return config
     given = load_anchors(path)
-    return dataclasses.replace(config, anchors=given.anchors, anchor_sizes=given.sizes)
+    return dataclasses.replace(config, anchors=given.anchors, anchor_sizes=given.sizes, anchor_errors=given.error_m)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -52,6 +52,7 @@ class SessionConfig:
             False records nothing.
         anchors: `T_world_anchor` by anchor id, as `((x, y, z), (w, x, y, z))` [m].
         anchor_sizes: Edge of the printed sheets [m] that are to be checked for a misprint. The default sheet has 0.16.
+        anchor_errors: Stated p95 of the position error of anchors [m], which clients show.
         curve: Encrypt on loopback too.
         curve_key: ZeroMQ certificate of the server, instead of the key in the user's home of keys.
         curve_clients: Folder of public certificates, instead of the user's allow-list.
@@ -85,6 +86,7 @@ class SessionConfig:
     record: bool | str | Path = True
     anchors: Mapping[str, PoseTuple] = field(default_factory=lambda: DEFAULT_ANCHORS)
     anchor_sizes: Mapping[str, float] = field(default_factory=dict)
+    anchor_errors: Mapping[str, float] = field(default_factory=dict)
     curve: bool = False
     curve_key: str = ""
     curve_clients: str = ""

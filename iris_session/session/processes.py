@@ -227,6 +227,7 @@ class SessionProcesses:
             curve_clients_dir=config.curve_clients,
             anchors=config.anchor_poses(),
             anchor_sizes=config.sheet_sizes(),
+            anchor_errors={name: float(error_m) for name, error_m in config.anchor_errors.items()},
             recorder_endpoint="" if self.recorder is None else self.recorder.samples_endpoint,
         )
 
