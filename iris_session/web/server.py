@@ -259,6 +259,9 @@ class WebServer:
         """Check where a request comes from, and turn every error into an answer."""
         connection = self._find_connection(request)
         if connection is not None:
+            if self._listener is not None and not self._listener.allow_request(connection):
+                connection.close()
+                raise ConnectionResetError
             connection.requests += 1
         try:
             return await self._answer(request, handler)
