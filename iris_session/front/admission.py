@@ -5,8 +5,9 @@ Keys, secrets and tokens do not go beyond this module: the authority sees key id
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Final, Protocol
 
 from iris_session.front.connection_guard import HelloRateLimiter, max_connections_per_key
 from iris_session.front.connections import FrontConnection, Peer, Route
@@ -16,13 +17,16 @@ from iris_session.link.sockets import peer_of
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.entries import Entry, Join
 from iris_session.protocol.limits import RateLimiter, count_events, weigh_request
-from iris_session.protocol.names import AuditKind, RefusalCode, Role
+from iris_session.protocol.names import AuditKind, DenialReason, RefusalCode, Role
 from iris_session.protocol.server_messages import Endpoints, Refused, Welcome
 from iris_session.protocol.steps import Admitted
 from iris_session.security import compute_fingerprint
-from iris_session.security.keyring import select_gateway_roles
 
 SECRET_BYTES = 16  # 128 bits, made by the client
+#: Secret of a person behind a gateway: its SHA-256 is the web identity.
+WEB_SECRET_BYTES: Final = 32
+#: SHA-256 of the public key in a gateway's certificate.
+CERTIFICATE_HASH_BYTES: Final = 32
 
 
 class ClientChannel(Protocol):
@@ -76,11 +80,17 @@ class Admission:
             raise _RefusedError(RefusalCode.RATE, "too many hellos at once", "try again in a second")
         gateway = self._require_gateway(route, peer, now_ns)
         key_id = self._make_key_id(peer, hello, gateway)
+        web = gateway is not None and len(hello.secret) == WEB_SECRET_BYTES
         if self._guard.is_banned(key_id, now_ns):
             raise _RefusedError(
                 RefusalCode.RATE, "this client was disconnected for flooding", "send less; try again soon"
             )
-        roles = self._find_roles(key_id, gateway)
+        roles = self._find_roles(key_id, gateway, web=web)
+        if roles is None:
+            self._audit_unpaired(key_id, peer, hello, now_ns, web=web)
+            raise _RefusedError(
+                RefusalCode.UNPAIRED, "this key is not on the session's list (any more)", "pair anew with a join code"
+            )
         budget = self._take_budget(key_id, hello, gateway, now_ns)
         address = peer_of(peer.descriptor)
         resume_of = self._find_resumed(hello, key_id, address[0], now_ns)
@@ -89,10 +99,13 @@ class Admission:
         if len(self._connections) >= (2 * limit if resume_of else limit):
             raise _RefusedError(RefusalCode.FULL, f"all {limit} connections are in use", "try again later")
         self._check_share(gateway.key_id if gateway else key_id, resumes=bool(resume_of))
+        if web:
+            self._check_share(key_id, resumes=bool(resume_of))
         number = self._tokens.allocate_connection()
         connection = FrontConnection(
             number, route, peer, address, key_id, hello, gateway.number if gateway else 0, budget
         )
+        connection.web = web
         join = Join(
             key_id,
             hello.role,
@@ -197,17 +210,43 @@ class Admission:
                 f"hello has a secret of {len(hello.secret)} bytes, at least {SECRET_BYTES} are needed",
                 "make 16 random bytes once, keep them, and send them in every hello",
             )
+        if gateway is not None and len(hello.secret) == WEB_SECRET_BYTES:
+            return compute_fingerprint(hashlib.sha256(hello.secret).digest())
+        if gateway is not None and self._serves_people(gateway):
+            raise _RefusedError(
+                RefusalCode.IDENTITY,
+                f"hello has a secret of {len(hello.secret)} bytes, behind this gateway it is {WEB_SECRET_BYTES}",
+                f"make {WEB_SECRET_BYTES} random bytes once, keep them, and send them in every hello",
+            )
         return compute_fingerprint((gateway.key_id.encode() if gateway else b"") + hello.secret, b"iris-secret")
 
-    def _find_roles(self, key_id: str, gateway: FrontConnection | None) -> tuple[str, ...]:
-        """Return the roles that the key may join with, empty for any role. Raises `_RefusedError`."""
-        entry = self._keyring.find_key(gateway.key_id if gateway else key_id)
-        if self._tokens.is_revoked(key_id) or (entry is None and self._keyring.key is not None):
-            raise _RefusedError(
-                RefusalCode.UNPAIRED, "this key is not on the session's list (any more)", "pair anew with a join code"
+    def _serves_people(self, gateway: FrontConnection) -> bool:
+        """Return whether those behind a gateway need identities of their own: it is that of the session, or shows them
+        a certificate to pair with."""
+        if self._keyring.key is None:
+            return False
+        return bool(gateway.hello.certificate_hash) or gateway.key_id == self._keyring.own_gateway
+
+    def _find_roles(self, key_id: str, gateway: FrontConnection | None, *, web: bool) -> tuple[str, ...] | None:
+        """Return the roles that the key may join with, empty for any role, `None` if it is not listed (any more).
+        Raises `_RefusedError`."""
+        if self._tokens.is_revoked(key_id):
+            return None
+        if web:
+            self._keyring.reload_if_changed()  # as at the handshake of a CURVE key
+        roles = self._keyring.find_roles(key_id, gateway.key_id if gateway else "", web=web)
+        if web and roles == ():
+            text = "no role of this key may be taken behind this gateway"
+            raise _RefusedError(DenialReason.ROLE, text, "ask the person who runs the session for another role")
+        return roles
+
+    def _audit_unpaired(self, key_id: str, peer: Peer, hello: Hello, now_ns: int, *, web: bool) -> None:
+        """Record that an unknown web identity said hello. An unknown CURVE key does not get that far."""
+        if web:
+            address = peer_of(peer.descriptor)[0]
+            self._audit.record(
+                AuditKind.KEY_REFUSED, now_ns, subject=key_id, name=hello.name, address=address, detail="web"
             )
-        roles = () if entry is None else entry.roles
-        return roles if gateway is None else select_gateway_roles(roles)
 
     def _find_resumed(self, hello: Hello, key_id: str, address: str, now_ns: int) -> str:
         """Return the participant that a resume token names, empty without a token. Raises `_RefusedError`."""
@@ -235,7 +274,7 @@ class Admission:
         token = self._tokens.issue(connection.key_id, admitted.participant_id, connection.hello.resume_token, behind)
         connection.admitted = True
         self._keyring.record_join(connection.key_id)
-        connection.participant_id = admitted.participant_id
+        connection.participant_id, connection.role = admitted.participant_id, admitted.role
         for channel in self._channels:
             channel.sync_clients()
         self._outbox.send(

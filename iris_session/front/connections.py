@@ -57,6 +57,8 @@ class FrontConnection:
         number: Connection number, which the protocol calls connection epoch.
         budget: What its key may send and cause, shared by all connections of the key.
         gateway: Number of the gateway that speaks for this connection, 0 for none.
+        web: Its key is the web identity of a person behind the gateway.
+        role: As said in `hello`, or as a director has set it since.
         participant_id: Assigned by the authority, empty before.
         confirmed: A message with this connection epoch has come, so the client has its `Welcome`.
         flood_last_ns, flood_since_ns: When a rate limit was last exceeded, and since when without a pause.
@@ -94,7 +96,9 @@ class FrontConnection:
         "rates",
         "report",
         "reported_ns",
+        "role",
         "route",
+        "web",
         "worn",
     )
 
@@ -109,6 +113,8 @@ class FrontConnection:
         gateway: int,
         budget: KeyBudget | None = None,
     ) -> None:
+        self.web = False
+        self.role = hello.role
         self.number = number
         self.route = route
         self.peer = peer

@@ -139,7 +139,9 @@ class FrontSockets:
         if config.loopback and not (config.curve or config.curve_secret_file):
             return Keyring(drops=self._drops)
         try:
-            return open_keyring(config.key_home, config.curve_secret_file, config.curve_clients_dir, self._drops)
+            return open_keyring(
+                config.key_home, config.curve_secret_file, config.curve_clients_dir, self._drops, config.gateway_key
+            )
         except KeysError as error:
             raise FrontError(str(error)) from error
 

@@ -18,7 +18,10 @@ from iris_session.link import messages as link
 from iris_session.link.sockets import readable
 from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import (
+    AnchorInfo,
     Event,
+    ParticipantChanged,
+    ParticipantInfo,
     ParticipantLeft,
     ProtocolFault,
     Refused,
@@ -46,6 +49,7 @@ class Downlink:
         assets: AssetService,
     ) -> None:
         self._socket = socket
+        self._config = context.config
         self._authority = context.authority
         self._connections = context.connections
         self._outbox = context.outbox
@@ -118,6 +122,8 @@ class Downlink:
             self._alignment.process_event(event.body)
             if isinstance(event.body, ParticipantLeft) and not event.body.grace:
                 self._admission.expire_tokens(event.body.participant)
+            elif isinstance(event.body, ParticipantChanged):
+                self._update_role(event.body.participant)
         for outgoing in snapshots:
             self._send_outgoing(outgoing)
         heard_ns = self._authority.heard_ns
@@ -134,24 +140,41 @@ class Downlink:
             if dropped.key_id:
                 self._revocation.revoke(dropped.key_id, heard_ns)
 
+    def _update_role(self, info: ParticipantInfo) -> None:
+        """Take over the role that a director gave to a participant."""
+        for connection in tuple(self._connections.by_number.values()):
+            if connection.participant_id == info.id and connection.role != info.role:
+                connection.role = info.role
+                self._revocation.check_role(connection, self._authority.heard_ns)
+
     def _send_outgoing(self, outgoing: OutgoingMessage) -> None:
         message: ServerMessage = outgoing.message
         connection = self._connections.by_number.get(outgoing.connection)
         if connection is None:
             return
         if isinstance(message, Snapshot):
-            # The front adds what only it knows: the scene, and the poses of the newest state frame.
+            # The front adds what only it knows: the scene, the poses of the newest state frame, the sizes of anchors.
             self._alignment.process_snapshot(message.participants)
             state_seq, poses = self._publisher.read_keyframe()
             scene = self._publisher.scene
             filled = msgspec.structs.replace(
-                message, scene_hash=scene.scene_hash, robots=scene.robots, bodies=scene.bodies, state_seq=state_seq
+                message,
+                scene_hash=scene.scene_hash,
+                robots=scene.robots,
+                bodies=scene.bodies,
+                state_seq=state_seq,
+                anchors=tuple(self._describe_anchor(anchor) for anchor in message.anchors),
             )
             self._outbox.send(connection, filled, poses)
             return
         self._outbox.send(connection, message)
         if isinstance(message, Refused):
             self._disconnects.remove(connection, "refused")
+
+    def _describe_anchor(self, anchor: AnchorInfo) -> AnchorInfo:
+        """Return an anchor with its size and stated error, where they are known."""
+        size, error = self._config.anchor_sizes.get(anchor.id, 0.0), self._config.anchor_errors.get(anchor.id, 0.0)
+        return msgspec.structs.replace(anchor, size_m=size, error_m=error)
 
     def broadcast(self, message: Event | ProtocolFault) -> None:
         """Send a message to every admitted connection, encoded once."""

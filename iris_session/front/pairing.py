@@ -1,5 +1,8 @@
 """Pairing: a client with an unknown key proves that it knows a join code, and its key is put on the allow-list.
 
+A client with a socket of its own pairs the CURVE key of this socket. A person behind a gateway pairs a web identity,
+and the proofs are over the key of the gateway's certificate in place of the session's.
+
 A code has few attempts, and so has an address. One attempt after the other goes to `FileWorker`, which changes the
 files of the home of keys; the answer is sent when that is done, and nothing else waits for it.
 """
@@ -13,7 +16,8 @@ from collections import deque
 from functools import partial
 from typing import Final, NamedTuple
 
-from iris_session.front.connections import Peer, Route
+from iris_session.front.admission import CERTIFICATE_HASH_BYTES
+from iris_session.front.connections import FrontConnection, Peer, Route
 from iris_session.front.context import FrontContext
 from iris_session.link.config import SECOND
 from iris_session.link.sockets import peer_of
@@ -22,7 +26,18 @@ from iris_session.protocol.client_messages import Pair
 from iris_session.protocol.limits import TokenBucket
 from iris_session.protocol.names import AuditKind, RefusalCode
 from iris_session.protocol.server_messages import Paired, Refused
-from iris_session.security import JoinCode, KeyHome, KeyPair, KeysBusyError, KeysError, compute_fingerprint, decode_key
+from iris_session.security import (
+    CURVE,
+    WEB,
+    JoinCode,
+    KeyHome,
+    KeyPair,
+    KeysBusyError,
+    KeysError,
+    compute_fingerprint,
+    decode_key,
+    encode_key,
+)
 from iris_session.security.join_codes import RedeemResult
 from iris_session.security.keyring import parse_pairing_key
 from iris_session.system.file_worker import LOCK_TIMEOUT_S
@@ -41,20 +56,34 @@ MAX_PENDING: Final = 32
 #: Wrong codes of one address within `WINDOW_NS`: as many as two codes have.
 ADDRESS_ATTEMPTS: Final = 10
 WINDOW_NS: Final = 600 * SECOND
+#: How many addresses a gateway counts as: it limits those of the people behind it.
+GATEWAY_FACTOR: Final = 8
 MAX_ADDRESSES: Final = 1024
 #: Codes that could not be read (no descriptor left, a network drive) are read again after so long.
 RETRY_S: Final = 1.0
+NO_WEB_CODE: Final = "no join code can be used behind this gateway now"
 REVOKED: Final = "this key was revoked just now"
 BUSY: Final = "the list of keys is busy"
 TOO_MANY_WRONG: Final = "too many wrong codes from this address"
 
 
-class _PendingAttempt(NamedTuple):
-    route: Route
+class _Source(NamedTuple):
+    """Origin of attempts that is limited: a network, or a gateway, which counts as `factor` networks."""
+
+    name: str
     address: str
+    factor: int = 1
+
+
+class _PendingAttempt(NamedTuple):
+    """`web_key`: of the certificate of the gateway, empty for a CURVE key."""
+
+    route: Route
+    source: _Source
     key: str
     pair: Pair
     since_ns: int
+    web_key: bytes = b""
 
 
 class PairingService:
@@ -103,15 +132,17 @@ class PairingService:
                 log.warning("pairing does not work: %s", error)
         self._read_error = read_error
 
-    def handle_pair(self, route: Route, peer: Peer, pair: Pair, now_ns: int) -> None:
-        """Handle a `Pair`, of a key that is on the list or is not."""
+    def handle_pair(
+        self, route: Route, peer: Peer, pair: Pair, now_ns: int, gateway: FrontConnection | None = None
+    ) -> None:
+        """Handle a `Pair`, of a key that is on the list or is not. `gateway`: that of a person behind one."""
         address = peer_of(peer.descriptor)[0]
-        key = parse_pairing_key(peer.user_id)
-        known = self._keyring.find_key(peer.user_id)
-        if known is not None:
-            key = known.key
-        allowed = self._allow_address(address, now_ns)
-        if self._has_exhausted_attempts(address, now_ns):  # before the limits that clients share
+        if gateway is None:
+            source = _Source(_network_prefix(address), address)
+        else:
+            source = _Source(f"gateway {gateway.key_id}", address, GATEWAY_FACTOR)
+        allowed = self._allow_source(source, now_ns)
+        if self._has_exhausted_attempts(source, now_ns):  # before the limits that clients share
             self._audit.record(AuditKind.CODE_REFUSED, now_ns, address=address, detail="too many wrong codes")
             self._drops.count("pair_shut_out")
             if allowed:
@@ -123,33 +154,65 @@ class PairingService:
                 self._outbox.send_to_route(route, Refused(RefusalCode.RATE, "too many pairing attempts", advice))
         elif self._keyring.key is None:
             self._refuse(route, "this session is not encrypted: it has no keys to pair", "say hello")
-        elif not key:
-            self._refuse(route, "this key was revoked while it was connected", "connect anew")
-        elif route.on_behalf_of:
-            self._refuse(route, "a key pairs for itself", "leave on_behalf_of empty")
         elif self._keyring.home is None:
             self._refuse(route, "this session takes its keys from a folder", "ask for your public key to be put there")
-        elif compute_fingerprint(decode_key(key)) in self._keyring.pending_revocations:
-            self._refuse(route, REVOKED, "ask for another join code")
-        elif (earlier := self._find_earlier_answer(key, pair)) is not None:
-            self._outbox.send_to_route(route, earlier)
-        elif not self.has_open_code:
-            mark = compute_fingerprint(decode_key(key))
-            self._audit.record(AuditKind.CODE_REFUSED, now_ns, subject=mark, name=pair.name, address=address)
-            self._refuse(route, "no join code can be used now", "run `iris-session pair` where the session runs")
+        elif gateway is not None:
+            self._handle_web_pair(route, source, pair, now_ns, gateway)
         else:
-            self._pending.append(_PendingAttempt(route, address, key, pair, now_ns))
+            known = self._keyring.find_key(peer.user_id)
+            key = parse_pairing_key(peer.user_id) if known is None else known.key
+            if key:
+                self._handle_known_key(_PendingAttempt(route, source, key, pair, now_ns), now_ns)
+            else:
+                self._refuse(route, "this key was revoked while it was connected", "connect anew")
 
-    def _find_earlier_answer(self, key: str, pair: Pair) -> Paired | None:
+    def _handle_web_pair(
+        self, route: Route, source: _Source, pair: Pair, now_ns: int, gateway: FrontConnection
+    ) -> None:
+        """Handle a `Pair` of a person behind a gateway."""
+        web_key = gateway.hello.certificate_hash
+        if len(web_key) != CERTIFICATE_HASH_BYTES:
+            self._refuse(route, "this gateway has no certificate to pair with", "pair at the session's own address")
+        elif len(pair.identity) != pairing.KEY_BYTES:
+            text = f"pair has an identity of {len(pair.identity)} bytes, behind a gateway it is {pairing.KEY_BYTES}"
+            self._refuse(route, text, "send the SHA-256 of the secret of your hello")
+        else:
+            key = encode_key(pair.identity)
+            self._handle_known_key(_PendingAttempt(route, source, key, pair, now_ns, web_key), now_ns)
+
+    def _handle_known_key(self, attempt: _PendingAttempt, now_ns: int) -> None:
+        """Answer an attempt whose key is known, or put it in the queue."""
+        route, mark = attempt.route, compute_fingerprint(decode_key(attempt.key))
+        entry = self._keyring.find_entry(mark)
+        if mark in self._keyring.pending_revocations:
+            self._refuse(route, REVOKED, "ask for another join code")
+        elif entry is not None and entry.kind != (WEB if attempt.web_key else CURVE):
+            self._refuse(route, f"this key is on the list as one of kind {entry.kind}", "make a new one")
+        elif (earlier := self._find_earlier_answer(attempt)) is not None:
+            self._outbox.send_to_route(route, earlier)
+        elif not self._has_open_code_for(attempt.web_key):
+            self._audit.record(
+                AuditKind.CODE_REFUSED, now_ns, subject=mark, name=attempt.pair.name, address=attempt.source.address
+            )
+            text = NO_WEB_CODE if attempt.web_key and self.has_open_code else "no join code can be used now"
+            self._refuse(route, text, "run `iris-session pair` where the session runs")
+        else:
+            self._pending.append(attempt)
+
+    def _has_open_code_for(self, web_key: bytes) -> bool:
+        now_s = time.time()
+        return any(code.is_open(now_s) and code.find_secret(web_key) for code in self._list_codes())
+
+    def _find_earlier_answer(self, attempt: _PendingAttempt) -> Paired | None:
         """Return the answer to an attempt that succeeded and is repeated, because the first answer was lost or late.
 
         The file of codes keeps it, so a front that was restarted since gives the same answer. `None` for another
         attempt, and for a key that has been taken off the list since.
         """
-        entry = self._keyring.find_key(compute_fingerprint(decode_key(key)))
+        entry = self._keyring.find_entry(compute_fingerprint(decode_key(attempt.key)))
         for code in self._list_codes() if entry is not None else ():
-            paired = code.paired is not None and code.paired.key == key
-            if entry is not None and paired and pairing.is_same_proof(code.proof, pair.proof):
+            paired = code.paired is not None and code.paired.key == attempt.key
+            if entry is not None and paired and pairing.is_same_proof(code.proof, attempt.pair.proof):
                 return Paired(code.answer, entry.roles)
         return None
 
@@ -176,9 +239,9 @@ class PairingService:
             self._refuse_busy(one.route)
         elif compute_fingerprint(decode_key(one.key)) in self._keyring.pending_revocations:
             self._refuse(one.route, REVOKED, "ask for another join code")
-        elif self._has_exhausted_attempts(one.address, now_ns):
+        elif self._has_exhausted_attempts(one.source, now_ns):
             self._refuse(one.route, TOO_MANY_WRONG, "wait ten minutes")
-        elif (earlier := self._find_earlier_answer(one.key, one.pair)) is not None:
+        elif (earlier := self._find_earlier_answer(one)) is not None:
             self._outbox.send_to_route(one.route, earlier)  # another process of this user has paired meanwhile
         else:
             self._pending.append(one)
@@ -201,20 +264,20 @@ class PairingService:
         mark = compute_fingerprint(decode_key(pending.key))
         entry = attempt.entry
         if entry is not None:
-            self._wrong.pop(_network_prefix(pending.address), None)
+            self._wrong.pop(pending.source.name, None)
             revoked = mark in self._keyring.pending_revocations  # since it asked: the later word counts
             if revoked or not self._keyring.confirm_pairing(mark):
                 self._refuse(pending.route, REVOKED, "ask for another join code")
                 return
             roles = ", ".join(entry.roles) or "any role"
             self._audit.record(
-                AuditKind.PAIRED, now_ns, subject=mark, name=entry.name, address=pending.address, detail=roles
+                AuditKind.PAIRED, now_ns, subject=mark, name=entry.name, address=pending.source.address, detail=roles
             )
             self._outbox.send_to_route(pending.route, Paired(attempt.answer, entry.roles))
             return
-        self._count_wrong(pending.address, now_ns)
+        self._count_wrong(pending.source, now_ns)
         kind = AuditKind.CODE_EXHAUSTED if attempt.exhausted else AuditKind.CODE_REFUSED
-        self._audit.record(kind, now_ns, subject=mark, name=pending.pair.name, address=pending.address)
+        self._audit.record(kind, now_ns, subject=mark, name=pending.pair.name, address=pending.source.address)
         advice = "run `iris-session pair` again" if not attempt.open_codes else "check the code"
         self._refuse(pending.route, "this join code is wrong, used or expired", advice)
 
@@ -227,33 +290,35 @@ class PairingService:
         self._drops.count("pair_refused")
         self._outbox.send_to_route(route, Refused(RefusalCode.CODE, message, advice))
 
-    def _allow_address(self, address: str, now_ns: int) -> bool:
-        """Return whether this address is within its rate limit, and use a token."""
-        network = _network_prefix(address)
-        bucket = self._rates.pop(network, None) or TokenBucket(ADDRESS_PER_SECOND, ADDRESS_BURST, now_ns)
+    def _allow_source(self, source: _Source, now_ns: int) -> bool:
+        """Return whether an address or gateway is within its rate limit, and use a token."""
+        bucket = self._rates.pop(source.name, None)
+        if bucket is None:
+            bucket = TokenBucket(min(ADDRESS_PER_SECOND * source.factor, PER_SECOND / 2), ADDRESS_BURST, now_ns)
         while len(self._rates) >= MAX_ADDRESSES:
             del self._rates[next(iter(self._rates))]
-        self._rates[network] = bucket
+        self._rates[source.name] = bucket
         return bucket.take(now_ns)
 
-    def _has_exhausted_attempts(self, address: str, now_ns: int) -> bool:
-        wrong, since_ns = self._wrong.get(_network_prefix(address), (0, now_ns))
-        return wrong >= ADDRESS_ATTEMPTS and now_ns - since_ns < WINDOW_NS
+    def _has_exhausted_attempts(self, source: _Source, now_ns: int) -> bool:
+        wrong, since_ns = self._wrong.get(source.name, (0, now_ns))
+        return wrong >= ADDRESS_ATTEMPTS * source.factor and now_ns - since_ns < WINDOW_NS
 
-    def _count_wrong(self, address: str, now_ns: int) -> None:
-        network = _network_prefix(address)
-        wrong, since_ns = self._wrong.pop(network, (0, now_ns))
+    def _count_wrong(self, source: _Source, now_ns: int) -> None:
+        wrong, since_ns = self._wrong.pop(source.name, (0, now_ns))
         if now_ns - since_ns >= WINDOW_NS:
             wrong, since_ns = 0, now_ns
         while len(self._wrong) >= MAX_ADDRESSES:
             del self._wrong[next(iter(self._wrong))]
-        self._wrong[network] = (wrong + 1, since_ns)
+        self._wrong[source.name] = (wrong + 1, since_ns)
 
 
 def _run_attempt(home: KeyHome, key: KeyPair, pending: _PendingAttempt) -> RedeemResult:
     pair = pending.pair
     name = "".join(c for c in pair.name if c.isprintable()).strip() or "unnamed"
-    return home.join_codes.redeem(key.raw_public, pending.key, pair.proof, name, home.clients, LOCK_TIMEOUT_S)
+    return home.join_codes.redeem(
+        key.raw_public, pending.key, pair.proof, name, home.clients, LOCK_TIMEOUT_S, pending.web_key
+    )
 
 
 def _network_prefix(address: str) -> str:

@@ -99,7 +99,7 @@ class RawFeed:
         if self._socket is None:
             return
         data = _encode(message)
-        shares = self._observer_shares if connection.hello.role == Role.OBSERVER else self._shares
+        shares = self._observer_shares if connection.role == Role.OBSERVER else self._shares
         if not shares.take(connection.key_id, len(data), receive_ns):
             self._leave_out(KEY_SHARE, connection, 1)
         elif not self._total.take(receive_ns, len(data)):

@@ -86,7 +86,9 @@ class RevocationService:
         if self._keyring.removed:
             gone_keys, self._keyring.removed = self._keyring.removed, {}
             for mark, old in gone_keys.items():
-                now = self._keyring.find_key(mark)
+                now = self._keyring.find_entry(mark)
+                if now is not None and now.kind != old.kind:
+                    now = None  # as that kind of key it is not listed any more
                 if now is None and self._tokens.is_revoked(mark):
                     continue  # a director revoked it: all is done
                 if now is None:
@@ -122,18 +124,28 @@ class RevocationService:
         refused when they join again."""
         for connection in self._list_connections(key_id):
             behind = self._connections.list_behind(connection)
-            if roles and connection.hello.role not in roles:
+            if roles and connection.role not in roles:
                 lost = [*behind, connection]
             else:
                 left = select_gateway_roles(roles)
-                lost = [one for one in behind if left and one.hello.role not in left]
+                lost = [one for one in behind if left and one.role not in left]
             for one in lost:
                 self._disconnect_role(one, now_ns)
 
+    def check_role(self, connection: FrontConnection, now_ns: int) -> None:
+        """Remove a connection if its key may not have its role (any more): the authority knows the roles of a key as
+        they were when it joined."""
+        gateway = self._connections.by_number.get(connection.gateway)
+        behind = gateway.key_id if gateway is not None else ""
+        roles = self._keyring.find_roles(connection.key_id, behind, web=connection.web)
+        if roles is not None and (roles or connection.web) and connection.role not in roles:
+            self._disconnect_role(connection, now_ns)
+
     def _disconnect_role(self, connection: FrontConnection, now_ns: int) -> None:
-        participant, role = connection.participant_id, connection.hello.role
+        participant, role = connection.participant_id, connection.role
         if connection.gateway:
-            text = f"the session closed this connection: its gateway may speak for no {role} any more"
+            whose = "its key" if connection.web else "its gateway"
+            text = f"the session closed this connection: {whose} may not be {role} any more"
             self._outbox.send(connection, ProtocolFault(FaultCode.DROPPED, text, "role"))
         self._disconnects.report_lost(connection, "role")
         if not connection.gateway:

@@ -125,6 +125,7 @@ class FrontConfig(msgspec.Struct, frozen=True):
         curve_clients_dir: Folder of public certificates (`*.key`), instead of the allow-list.
         anchors: `T_world_anchor` by anchor id.
         anchor_sizes: Edge of the printed code by anchor id [m].
+        anchor_errors: Stated p95 of the position error by anchor id [m], where it is known.
         forward_observations: Send raw observations to the authority too.
         recorder_endpoint: Endpoint of a PULL socket for raw samples, empty when nothing is recorded.
         gateway_key: Public key (Z85) of the session's own gateway, which is admitted without the list; empty for none.
@@ -162,6 +163,7 @@ class FrontConfig(msgspec.Struct, frozen=True):
     forward_observations: bool = False
     recorder_endpoint: str = ""
     gateway_key: str = ""
+    anchor_errors: dict[str, float] = {}
 
     @property
     def hosts(self) -> tuple[str, ...]:

@@ -15,6 +15,8 @@ import msgspec
 from iris_session.protocol.common import Alignment, Lease, Pose
 from iris_session.protocol.server_messages import (
     AlignmentChanged,
+    AnchorInfo,
+    AnchorMoved,
     BodyInfo,
     EpisodeChanged,
     EStopChanged,
@@ -46,7 +48,7 @@ class MissedEvents(NamedTuple):
 
 
 class SessionMirror:
-    """Roster, leases, alignments, robots and bodies of the session.
+    """Roster, leases, alignments, robots, bodies and anchors of the session.
 
     `body_index` and `index_of_id` give the row of a body in state frames, by name and by `BodyInfo.id`. `synced` is
     false before the first snapshot and after a gap; the other attributes then show the last known state. `bodies` are
@@ -78,6 +80,7 @@ class SessionMirror:
         self.participants: dict[str, ParticipantInfo] = {}
         self.leases: dict[str, Lease] = {}
         self.robots: dict[str, RobotInfo] = {}
+        self.anchors: dict[str, AnchorInfo] = {}
         self.bodies: tuple[BodyInfo, ...] = ()
         self.bodies_since = self.bodies_until = 0
         self.body_index: dict[str, int] = {}
@@ -110,6 +113,7 @@ class SessionMirror:
         self.participants = {p.id: p for p in snapshot.participants}
         self.leases = {lease.target: lease for lease in snapshot.leases}
         self.robots = {robot.name: robot for robot in snapshot.robots}
+        self.anchors = {anchor.id: anchor for anchor in snapshot.anchors}
         if snapshot.bodies != self.bodies:
             self.bodies_since = snapshot.scene_epoch
         self.bodies, self.bodies_until = snapshot.bodies, snapshot.scene_epoch
@@ -180,9 +184,9 @@ class SessionMirror:
 
     def mirror_hash(self) -> str:
         """Return the digest (32 hex digits) of everything shared, independent of when and how this mirror received
-        it.
+        it. Poses of anchors are part of it when there are any.
         """
-        state = (
+        state: tuple[object, ...] = (
             self.event_seq,
             self.scene_epoch,
             self.scene_revision,
@@ -197,6 +201,8 @@ class SessionMirror:
             [self.robots[key] for key in sorted(self.robots)],
             self.bodies,
         )
+        if self.anchors:
+            state = (*state, [(key, self.anchors[key].T_world_anchor) for key in sorted(self.anchors)])
         return hashlib.blake2b(_encoder.encode(state), digest_size=16).hexdigest()
 
     def _hold_event(self, event: Event) -> None:
@@ -221,6 +227,9 @@ class SessionMirror:
                 info_or_none = self.participants.get(name)
                 if info_or_none is not None:
                     self.participants[name] = msgspec.structs.replace(info_or_none, alignment=alignment)
+            case AnchorMoved(anchor_id=name, T_world_anchor=pose):
+                known = self.anchors.get(name) or AnchorInfo(name, pose)
+                self.anchors[name] = msgspec.structs.replace(known, T_world_anchor=pose)
             case SceneChanged(epoch, revision, cause, scene_hash, period_ns):
                 self.scene_epoch = epoch
                 self.scene_revision = revision

@@ -7,8 +7,15 @@ Not here: the pairing exchange on the wire (`protocol.pairing`, `front.pairing`)
 (`front.revocation`), the sockets themselves (`link.sockets`).
 """
 
-from iris_session.security.allow_list import DEFAULT_ROLES, AllowedKey, AllowList
-from iris_session.security.curve import KeyPair, compute_fingerprint, decode_key, load_public, load_secret
+from iris_session.security.allow_list import CURVE, DEFAULT_ROLES, WEB, AllowedKey, AllowList
+from iris_session.security.curve import (
+    KeyPair,
+    compute_fingerprint,
+    decode_key,
+    encode_key,
+    load_public,
+    load_secret,
+)
 from iris_session.security.join_codes import JoinCode, JoinCodes
 from iris_session.security.key_home import KeyHome, KeysBusyError, KeysError
 from iris_session.security.known_servers import KnownServer, KnownServers
@@ -21,10 +28,13 @@ __all__ = [
     "KeyPair",
     "compute_fingerprint",
     "decode_key",
+    "encode_key",
     "load_public",
     "load_secret",
     "AllowList",
     "AllowedKey",
+    "CURVE",
+    "WEB",
     "DEFAULT_ROLES",
     "JoinCodes",
     "JoinCode",

@@ -1,4 +1,8 @@
-"""`clients.json`: the keys that may join, under which names and in which roles."""
+"""`clients.json`: the keys that may join, under which names and in which roles.
+
+An entry has a kind: `curve`, the public key of a client, or `web`, the SHA-256 of the secret of a browser or app behind
+a gateway. Neither counts as the other.
+"""
 
 from __future__ import annotations
 
@@ -21,21 +25,33 @@ FILE: Final = "clients.json"
 MAX_KEYS: Final = 1024
 #: Default roles of a new key: everything except commanding other participants or speaking for them.
 DEFAULT_ROLES: Final = (Role.OPERATOR, Role.OBSERVER, Role.AGENT, Role.LEADER)
+#: Kinds of keys.
+CURVE: Final = "curve"
+WEB: Final = "web"
+KINDS: Final = (CURVE, WEB)
 MAX_NAME: Final = 64  # as `protocol.common.Name`
 
 
 class AllowedKey(msgspec.Struct, frozen=True):
-    """One allowed key. `key`: public, Z85. `roles`: roles it may join in, empty for any. Times: UTC, ISO 8601."""
+    """One allowed key. `key`: public, Z85. `roles`: roles it may join in, empty for any. Times: UTC, ISO 8601.
+
+    `kind`: of `KINDS`; absent in files of earlier versions.
+    """
 
     name: str
     key: str
     roles: tuple[str, ...] = ()
     added: str = ""
     last_seen: str = ""
+    kind: str = CURVE
 
     @property
     def fingerprint(self) -> str:
         return compute_fingerprint(decode_key(self.key))
+
+    def allows(self, role: str) -> bool:
+        """Return whether the key may join in a role."""
+        return not self.roles or role in self.roles
 
 
 def format_utc_now() -> str:
@@ -77,25 +93,27 @@ class AllowList:
             keys[entry.fingerprint] = entry
         return keys
 
-    def allow_key(self, name: str, key: str, roles: tuple[str, ...] = ()) -> AllowedKey:
-        """Add `key` (Z85) to the list, or rename it and set its roles. Raises `KeysError` for a taken name."""
-        with self._folder.lock():
-            return self.put_locked(name, key, roles, rename=False)
+    def allow_key(self, name: str, key: str, roles: tuple[str, ...] = (), kind: str = "") -> AllowedKey:
+        """Add `key` (Z85) to the list, or rename it and set its roles. Raises `KeysError` for a taken name.
 
-    def put_locked(self, name: str, key: str, roles: tuple[str, ...], *, rename: bool) -> AllowedKey:
-        """Do `allow_key` while the lock is held. `rename`: a taken name gets a number, `ann-2`."""
-        entry, entries = self.plan_entry(name, key, roles, rename=rename)
-        self.replace_all(entries)
-        return entry
+        `kind`: of `KINDS`; empty: as it is listed, `curve` for a new key.
+        """
+        with self._folder.lock():
+            entry, entries = self.plan_entry(name, key, roles, rename=False, kind=kind)
+            self.replace_all(entries)
+            return entry
 
     def replace_all(self, entries: list[AllowedKey]) -> None:
         """Write the whole list. The lock must be held."""
         self._folder.write_json(FILE, entries)
 
     def plan_entry(
-        self, name: str, key: str, roles: tuple[str, ...], *, rename: bool
+        self, name: str, key: str, roles: tuple[str, ...], *, rename: bool, kind: str = ""
     ) -> tuple[AllowedKey, list[AllowedKey]]:
-        """Return the entry that `put_locked` would add, and the list with it. Nothing is written."""
+        """Return the entry that `allow_key` would add, and the list with it. Nothing is written.
+
+        `rename`: a taken name gets a number, `ann-2`.
+        """
         if not _is_name(name):
             raise KeysError(f"{name!r} is not a valid key name: expected 1 to {MAX_NAME} printable characters")
         entries = self.read()
@@ -108,9 +126,13 @@ class AllowList:
         if mark not in entries and len(entries) >= MAX_KEYS:
             raise KeysError(f"the allow-list is full ({MAX_KEYS} keys): revoke some")
         old = entries.get(mark)
-        entry = AllowedKey(
-            name, key, validate_roles(roles), old.added if old else format_utc_now(), old.last_seen if old else ""
-        )
+        kind = kind or (old.kind if old else CURVE)
+        if old is not None and old.kind != kind:
+            raise KeysError(
+                f"this key is listed as {old.name!r}, of kind {old.kind}: revoke it before it becomes {kind}"
+            )
+        added, last_seen = (old.added, old.last_seen) if old else (format_utc_now(), "")
+        entry = AllowedKey(name, key, validate_roles(roles), added, last_seen, kind)
         entries[mark] = entry
         return entry, list(entries.values())
 
@@ -147,6 +169,8 @@ def _find_fault(entry: AllowedKey, others: dict[str, AllowedKey]) -> str:
         validate_roles(entry.roles)
     except KeysError as error:
         return str(error)
+    if entry.kind not in KINDS:
+        return f"{entry.kind[:MAX_NAME]!r} is not a kind of key: expected {' or '.join(KINDS)}"
     if not _is_name(entry.name):
         return f"{entry.name[:MAX_NAME]!r} is not a valid key name: expected 1 to {MAX_NAME} printable characters"
     return f"this key is listed as {others[mark].name!r} already" if mark in others else ""

@@ -48,6 +48,11 @@ def decode_key(text: str) -> bytes:
     raise KeysError(f"{text[:50]!r} is not a CURVE key: expected {Z85_CHARACTERS} Z85 characters, as in a *.key file")
 
 
+def encode_key(raw: bytes) -> str:
+    """Return 32 raw bytes in Z85, as keys are written in files."""
+    return z85.encode(raw).decode()
+
+
 @dataclass(frozen=True, slots=True)
 class KeyPair:
     """A CURVE key pair, both halves Z85 text of 40 characters."""

@@ -11,7 +11,9 @@ from typing import Final
 from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import Role
 from iris_session.security import (
+    CURVE,
     DEFAULT_ROLES,
+    WEB,
     AllowedKey,
     KeyHome,
     KeyPair,
@@ -34,6 +36,12 @@ PAIRING_PREFIX: Final = "pair:"
 _log = logging.getLogger(__name__)
 
 
+#: Name of the session's own gateway.
+GATEWAY_NAME: Final = "web gateway"
+#: Roles in which people behind a gateway may join.
+_PERSONAL_ROLES: Final = tuple(sorted(Role.ALL - {Role.GATEWAY}))
+
+
 def parse_pairing_key(user_id: str) -> str:
     """Return the key (Z85) of a connection that may only pair, empty for any other."""
     return user_id.removeprefix(PAIRING_PREFIX) if user_id.startswith(PAIRING_PREFIX) else ""
@@ -51,7 +59,8 @@ class Keyring:
     """The keys of a session and their changes, all by fingerprint. A `Service` of the front.
 
     `key`: key pair of the server, `None` on plain loopback. `home`: the key home where unknown keys may pair, else
-    `None`. `files`: the worker that makes every change of its files.
+    `None`. `files`: the worker that makes every change of its files. `own_gateway`: fingerprint of the session's own
+    gateway, which may join in any role without being listed; empty for none.
 
     Collected until the front takes them: `removed`, keys that were removed from the list or got other roles; `added`,
     new keys; `last_seen`, UTC at which keys joined. `pending_revocations`: keys that a director revoked and that are
@@ -65,7 +74,10 @@ class Keyring:
         read: Callable[[], dict[str, AllowedKey]] = dict,
         signature: Callable[[], object] = lambda: None,
         drops: Drops | None = None,
+        gateway_key: str = "",
     ) -> None:
+        self._gateway = AllowedKey(GATEWAY_NAME, gateway_key) if gateway_key and key is not None else None
+        self.own_gateway = "" if self._gateway is None else self._gateway.fingerprint
         self.key = key
         self.home = home
         self._read = read
@@ -99,21 +111,49 @@ class Keyring:
 
     @property
     def fingerprints(self) -> Collection[str]:
-        """Fingerprints of all allowed keys."""
-        return self._keys.keys()
+        """Fingerprints of all allowed CURVE keys."""
+        own = [self.own_gateway] if self.own_gateway else []
+        return [*own, *(mark for mark, entry in self._keys.items() if entry.kind == CURVE)]
+
+    def find_entry(self, mark: str) -> AllowedKey | None:
+        """Return the entry of the list with that fingerprint, of any kind."""
+        return self._keys.get(mark)
 
     def find_key(self, mark: str) -> AllowedKey | None:
-        """Return the allowed key with that fingerprint."""
-        return self._keys.get(mark)
+        """Return the allowed CURVE key with that fingerprint."""
+        if self._gateway is not None and mark == self.own_gateway:
+            return self._gateway
+        entry = self._keys.get(mark)
+        return entry if entry is not None and entry.kind == CURVE else None
+
+    def find_roles(self, key_id: str, gateway: str = "", *, web: bool = False) -> tuple[str, ...] | None:
+        """Return the roles that a key may join in, empty for any; `None` if it is not on the list.
+
+        Args:
+            key_id: The key, or the hash of the secret that stands for it.
+            gateway: Key of the gateway in front of it, empty for none.
+            web: Whether `key_id` is a web identity: then the roles are never `gateway`, and empty for none.
+        """
+        entry, person = self.find_key(gateway or key_id), self._keys.get(key_id)
+        if self.key is None:
+            return _PERSONAL_ROLES if web else ()
+        if entry is None:
+            return None
+        roles = select_gateway_roles(entry.roles) if gateway else entry.roles
+        if not web:
+            return roles
+        if person is None or person.kind != WEB:
+            return None
+        return tuple(role for role in _PERSONAL_ROLES if role in (roles or _PERSONAL_ROLES) and person.allows(role))
 
     def may_be_gateway(self, mark: str) -> bool:
         """Return whether a key is allowed in the role `gateway`: by name, or because it may join in any role."""
-        entry = self._keys.get(mark)
-        return entry is not None and (not entry.roles or Role.GATEWAY in entry.roles)
+        entry = self.find_key(mark)
+        return entry is not None and entry.allows(Role.GATEWAY)
 
     def may_hand_in_media(self, mark: str) -> bool:
         """Return whether a key is allowed in a role whose frames the session takes: `camera`, `source`, or any."""
-        entry = self._keys.get(mark)
+        entry = self.find_key(mark)
         return entry is not None and (not entry.roles or not MEDIA_ROLES.isdisjoint(entry.roles))
 
     def record_join(self, mark: str) -> None:
@@ -160,7 +200,7 @@ class Keyring:
         self._read_signature, self._reported = signature, None
         for mark, old in self._keys.items():
             new = keys.get(mark)
-            if new is None or new.roles != old.roles:
+            if new is None or (new.roles, new.kind) != (old.roles, old.kind):
                 self.removed[mark] = old
         self.added.update((mark, new) for mark, new in keys.items() if mark not in self._keys)
         self._keys = keys
@@ -179,7 +219,7 @@ class Keyring:
         return self._now_ns - self._missing_ns >= ABSENCE_NS
 
 
-def open_keyring(key_home: str, secret_file: str, clients_dir: str, drops: Drops) -> Keyring:
+def open_keyring(key_home: str, secret_file: str, clients_dir: str, drops: Drops, gateway_key: str = "") -> Keyring:
     """Return the keyring of an encrypted session.
 
     Args:
@@ -187,6 +227,7 @@ def open_keyring(key_home: str, secret_file: str, clients_dir: str, drops: Drops
         secret_file: Certificate of the server (`*.key_secret`) instead of the one in the key home, or empty.
         clients_dir: Folder of public certificates (`*.key`) instead of the allow-list, or empty.
         drops: Counts files that cannot be read.
+        gateway_key: Public key (Z85) of the session's own gateway, or empty.
 
     Raises:
         KeysError: A key or the allow-list cannot be used.
@@ -194,12 +235,12 @@ def open_keyring(key_home: str, secret_file: str, clients_dir: str, drops: Drops
     home = KeyHome(key_home)
     key = load_secret(secret_file) if secret_file else home.load_server_key()
     if not clients_dir:
-        return Keyring(key, home, home.clients.read, lambda: home.clients.signature, drops)
+        return Keyring(key, home, home.clients.read, lambda: home.clients.signature, drops, gateway_key)
     folder = Path(clients_dir)
     if not folder.is_dir():
         raise KeysError(f"{folder} is not a folder: it has to hold the public keys (*.key) of the allowed clients")
     certificates = _CertificateFolder(folder, drops)
-    return Keyring(key, None, certificates.read, certificates.signature, drops)
+    return Keyring(key, None, certificates.read, certificates.signature, drops, gateway_key)
 
 
 class _CertificateFolder:

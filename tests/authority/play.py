@@ -289,6 +289,8 @@ class Play:
                 cm.PlaceAlignment(1, person, pose, rng.random() < 0.5),
                 cm.Align(1, rng.choice(["start", "stop", "dance"]), person),
                 cm.MoveAnchor(1, rng.choice(["table", "moon"]), pose),
+                cm.Rename(1, person, rng.choice(["anna", "bert", " "])),
+                cm.SetRole(1, person, rng.choice(["operator", "observer", "director", "agent", "gateway", "cook"])),
                 FrontRestarted() if rng.random() < 0.2 else cm.ClearEStop(1, seen),
             ]
         )

@@ -6,9 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iris_session.client import SessionMirror
-from iris_session.protocol.common import IDENTITY, Alignment, Lease
+from iris_session.protocol.common import IDENTITY, Alignment, Lease, Pose
 from iris_session.protocol.server_messages import (
     AlignmentChanged,
+    AnchorInfo,
+    AnchorMoved,
     BodyInfo,
     EpisodeChanged,
     EStopChanged,
@@ -28,11 +30,13 @@ from iris_session.protocol.server_messages import (
 )
 from iris_session.protocol.session_mirror import MissedEvents
 
+ANCHORS = (AnchorInfo("a", IDENTITY, 0.16, 0.002), AnchorInfo("b", IDENTITY))
 BODIES = (BodyInfo(0, "world", False), BodyInfo(3, "hammer", True, True))
 
 names = st.sampled_from(["p1", "p2", "p3", "p4"])
 flags = st.booleans()
 counts = st.integers(1, 9)
+floats = st.sampled_from([0.5, 2.0])
 bodies = st.one_of(
     st.builds(lambda p, w: ParticipantJoined(ParticipantInfo(p, "ann", "operator", True, worn=w)), names, flags),
     st.builds(lambda p: ParticipantChanged(ParticipantInfo(p, "bob", "observer", True)), names),
@@ -52,6 +56,9 @@ bodies = st.one_of(
     st.builds(EStopChanged, flags, names, st.just(""), counts),
     st.builds(PauseChanged, flags),
     st.builds(EpisodeChanged, counts, st.sampled_from(["running", "success"])),
+    st.builds(
+        lambda name, x: AnchorMoved(name, Pose((x, 0.0, 0.0), IDENTITY.q)), st.sampled_from(["a", "gone"]), floats
+    ),
     st.just(Notice("info", "hello")),
 )
 
@@ -63,12 +70,12 @@ def event(seq: int, body: EventKind) -> Event:
 def snapshot(mirror: SessionMirror | None = None) -> Snapshot:
     """Return the snapshot of a session whose state is `mirror`."""
     if mirror is None:
-        return Snapshot(0, 0, 1, 0, "hash", 0, 0.0, 0, (), (), bodies=BODIES)
+        return Snapshot(0, 0, 1, 0, "hash", 0, 0.0, 0, (), (), bodies=BODIES, anchors=ANCHORS)
     return Snapshot(
         0, mirror.event_seq, mirror.scene_epoch, mirror.scene_revision, mirror.scene_hash, 0, 0.0, 0,
         tuple(mirror.participants.values()), tuple(mirror.leases.values()), tuple(mirror.robots.values()),
         mirror.bodies, mirror.paused, mirror.estop, mirror.episode, tick_period_ns=mirror.tick_period_ns,
-        stop_seq=mirror.stop_seq,
+        stop_seq=mirror.stop_seq, anchors=tuple(mirror.anchors.values()),
     )  # fmt: skip
 
 
@@ -90,6 +97,21 @@ def test_scale_of_a_robot_is_kept_until_its_lease_changes() -> None:
         mirror.apply_event(event(seq, body))
         assert mirror.leases["left"].scale == scale
         assert list(mirror.leases) == ["left"]
+
+
+def test_anchors_are_where_they_were_moved() -> None:
+    mirror = synced()
+    before, there = mirror.mirror_hash(), Pose((1.0, 2.0, 3.0), IDENTITY.q)
+    mirror.apply_event(event(1, AnchorMoved("a", there)))
+    assert mirror.anchors == {"a": AnchorInfo("a", there, 0.16, 0.002), "b": ANCHORS[1]}
+    assert mirror.mirror_hash() != before
+
+
+def test_hash_of_a_session_without_anchors_is_as_it_always_was() -> None:
+    """Conversations of other implementations hold such hashes."""
+    mirror = SessionMirror()
+    mirror.apply_snapshot(Snapshot(0, 0, 1, 0, "hash", 0, 0.0, 0, (), (), bodies=BODIES))
+    assert mirror.mirror_hash() == "d8a8a047954124722d9537495fc44c92"
 
 
 @given(st.lists(bodies, max_size=30), st.data())

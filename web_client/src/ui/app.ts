@@ -1,0 +1,213 @@
+// The page as a whole: composes header, picture and dashboard, joins the session, and keeps them up to date.
+
+import type { WorkerClient } from "../core/page_client.ts";
+import { type AvatarInfo, participantColor } from "../view/avatars.ts";
+import { View } from "../view/view.ts";
+import { Actions } from "./actions.ts";
+import { makeAlignmentPanel, makeAnchorsPanel } from "./alignment.ts";
+import { h, setText } from "./dom.ts";
+import { makeBadge, makeEstop, makeSelf } from "./header.ts";
+import {
+  makeAdvicePanel,
+  makeEpisodesPanel,
+  makeEventsPanel,
+  makeLoopPanel,
+  makeRecordingPanel,
+  makeStreamsPanel,
+} from "./operation.ts";
+import { makePairing } from "./pairing.ts";
+import { makeParticipantsPanel } from "./participants.ts";
+import { makeRobotsPanel } from "./robots.ts";
+import { makeStage } from "./stage.ts";
+import { PageState } from "./state.ts";
+import { type EventLevel, formatMillimetres } from "./words.ts";
+
+/** Roles in the order in which they are tried when the person has not chosen one. */
+const ROLES = ["director", "operator", "observer"] as const;
+const STATUS_PERIOD_MS = 1000;
+const NOTICE_MS = 8000;
+const SOFTWARE = "iris-session web client";
+/** What is remembered of this browser: choices of the person, no secrets. */
+const STORAGE_KEY = "iris-session.page";
+
+interface Remembered {
+  name: string;
+  role: string;
+  roles: string[];
+}
+
+/** What tests and the console may look at. */
+export interface PageHandle {
+  state: PageState;
+  view: View | null;
+}
+
+/** Build the page into `root` and join the session. */
+export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
+  const state = new PageState(client);
+  const baseUrl = location.origin;
+  const remembered = recall();
+  const notices = h("div", { class: "notices", role: "status", aria: { live: "polite" } });
+  const show = (text: string, level: EventLevel): void => {
+    const notice = h("div", { class: `notice ${level}` }, text);
+    notices.append(notice);
+    while (notices.childElementCount > 4) notices.firstElementChild?.remove();
+    setTimeout(() => notice.remove(), NOTICE_MS);
+  };
+  const actions = new Actions(client, show);
+  const untried: string[] = remembered.role ? [] : [...ROLES];
+
+  const join = (name: string, role: string): void => {
+    if (name) remembered.name = name;
+    client.post({
+      type: "connect",
+      base_url: baseUrl,
+      role,
+      name: remembered.name,
+      devices: ["desktop"],
+      alignment: "not_needed",
+      software: SOFTWARE,
+    });
+  };
+  const joinByChoice = (): void => {
+    const allowed = remembered.roles.length > 0 ? ROLES.filter((role) => remembered.roles.includes(role)) : ROLES;
+    if (!remembered.role) untried.splice(0, untried.length, ...allowed);
+    join(remembered.name, remembered.role || (untried.shift() ?? "observer"));
+  };
+  const pairing = makePairing(client, baseUrl, () => remembered.name, (name, roles) => {
+    remembered.name = name;
+    remembered.roles = roles;
+    remembered.role = "";
+    remember(remembered);
+    joinByChoice();
+  });
+  const joinAs = (name: string, role: string): void => {
+    remembered.role = role;
+    if (name) remembered.name = name;
+    remember(remembered);
+    client.post({ type: "disconnect" });
+    join(name, role);
+  };
+
+  const stage = makeStage(state, { pair: () => pairing.open("", ""), retry: joinByChoice });
+  const handle: PageHandle = { state, view: null };
+  try {
+    handle.view = new View(stage.canvas, client, {
+      onScene: (spec) => {
+        state.spec = spec;
+        state.touch();
+      },
+      onProblem: (text) => state.note(text, "warning"),
+    });
+    stage.setView(handle.view, "");
+  } catch (error) {
+    client.on("scene", ({ spec }) => {
+      state.spec = spec;
+    });
+    stage.setView(null, (error as Error).message);
+  }
+  const { view } = handle;
+
+  const badge = makeBadge(state, () => view?.delay_ms ?? 0);
+  const estop = makeEstop(state, actions);
+  const self = makeSelf(state, joinAs);
+  const title = h("h1", {}, "iris-session");
+  const header = h("header", { class: "bar" }, title, badge.element, self.element, estop.stop);
+  const neededStreams = (): string[] => (view ? (state.spec?.deformables.map((part) => part.stream) ?? []) : []);
+  const panels = [
+    makeAdvicePanel(state),
+    makeRobotsPanel(state, actions),
+    makeParticipantsPanel(state, actions),
+    makeEpisodesPanel(state, actions),
+    makeAlignmentPanel(state, actions),
+    makeEventsPanel(state),
+    makeRecordingPanel(state, actions),
+    makeLoopPanel(state, actions),
+    makeStreamsPanel(state, client, neededStreams),
+    makeAnchorsPanel(state),
+  ];
+  const dashboard = h(
+    "section",
+    { class: "dashboard", id: "dashboard", tabindex: -1, aria: { label: "Dashboard" } },
+    ...panels.map((panel) => panel.element),
+  );
+  root.replaceChildren(
+    h("a", { class: "skip", attributes: { href: "#dashboard" } }, "Skip to the dashboard"),
+    header,
+    estop.banner,
+    h("main", {}, stage.element, dashboard),
+    notices,
+    pairing.dialog,
+  );
+
+  state.onChange(() => {
+    const name = state.welcome?.session_name || state.info?.session_name || "";
+    setText(title, name || "iris-session");
+    document.title = `${state.session?.estop ? "STOPPED, " : ""}${name ? `${name}, ` : ""}iris-session`;
+    document.body.classList.toggle("is-stopped", state.session?.estop ?? false);
+    estop.update();
+    badge.update(state);
+    self.update(state);
+    stage.update();
+    for (const panel of panels) panel.update(state);
+    if (view) updateOverlay(view, state);
+  });
+  client.on("notice", ({ text, level }) => show(text, level));
+  client.on("phase", (phase) => {
+    if (phase.phase !== "refused") return;
+    const next = phase.refusal === "role" ? untried.shift() : undefined;
+    if (next !== undefined) join(remembered.name, next);
+    else if (phase.refusal === "unpaired") pairing.open("", phase.text);
+  });
+  setInterval(() => {
+    if (state.isReady && !document.hidden) client.post({ type: "get_status" });
+  }, STATUS_PERIOD_MS);
+
+  const code = new URLSearchParams(location.hash.slice(1)).get("c");
+  if (code) {
+    history.replaceState(null, "", location.pathname); // a code must not stay in the address
+    pairing.open(code, "");
+  } else {
+    joinByChoice();
+  }
+  window.addEventListener("pagehide", () => client.post({ type: "disconnect" }));
+  state.touch();
+  return handle;
+}
+
+function updateOverlay(view: View, state: PageState): void {
+  const participants = state.session?.participants ?? [];
+  const people = new Map<string, AvatarInfo>();
+  for (const participant of participants) {
+    const held = state.heldBy(participant.id);
+    const error = participant.alignment?.error_at_robot_m ?? 0;
+    const detail = [held.join(", "), error > 0 ? `± ${formatMillimetres(error)}` : ""].filter((part) => part !== "");
+    people.set(participant.id, {
+      name: participant.name,
+      color: participantColor(participants, participant.id),
+      detail: detail.join(" · "),
+      isSelf: participant.id === state.selfId,
+    });
+  }
+  view.avatars.setPeople(people);
+  if (view.anchors.setAnchors(state.session?.anchors ?? [])) view.touch();
+}
+
+function recall(): Remembered {
+  const fallback: Remembered = { name: "Web", role: "", roles: [] };
+  try {
+    const found: unknown = JSON.parse(localStorage.getItem(STORAGE_KEY) ?? "{}");
+    const { name, role, roles } = { ...fallback, ...(found as Partial<Remembered>) };
+    return { name: String(name), role: String(role), roles: Array.isArray(roles) ? roles.map(String) : [] };
+  } catch {
+    return fallback;
+  }
+}
+
+function remember(remembered: Remembered): void {
+  try {
+    localStorage.setItem(STORAGE_KEY, JSON.stringify(remembered));
+  } catch {
+    // Storage is switched off: the choice counts for this visit.
+  }
+}

@@ -1,0 +1,129 @@
+// The bar above everything: which session, how fresh the picture is, who you are, and the e-stop.
+
+import type { Actions } from "./actions.ts";
+import { button, h, setOptions, setText, setValue } from "./dom.ts";
+import type { Panel } from "./panel.ts";
+import type { PageState } from "./state.ts";
+import { formatMilliseconds, roleWords } from "./words.ts";
+
+/** Ages above which the badge warns [ms]: of the picture that is shown. */
+const GOOD_AGE_MS = 120;
+const BAD_AGE_MS = 400;
+
+/** Age of what is shown, rate and round trip. `getDelay`: delay of the interpolation [ms]. */
+export function makeBadge(state: PageState, getDelay: () => number): Panel {
+  const dot = h("span", { class: "signal", aria: { hidden: "true" } });
+  const age = h("span");
+  const rate = h("span");
+  const trip = h("span");
+  const element = h(
+    "div",
+    { class: "badge", role: "group", aria: { label: "Connection" }, title: "Age of the picture, states per second, round trip" },
+    dot,
+    h("span", { class: "item" }, h("small", {}, "age"), age),
+    h("span", { class: "item" }, h("small", {}, "rate"), rate),
+    h("span", { class: "item" }, h("small", {}, "round trip"), trip),
+  );
+  return {
+    element,
+    update: () => {
+      const { stats } = state;
+      const isFresh = state.isReady && stats !== null;
+      const shown = isFresh ? Math.max(stats.age_ms_p50, getDelay()) : Number.NaN;
+      setText(age, formatMilliseconds(shown));
+      setText(rate, isFresh ? `${stats.state_hz.toFixed(0)} Hz` : "–");
+      setText(trip, isFresh ? formatMilliseconds(stats.rtt_ms > 0 ? stats.rtt_ms : state.rtt_ms) : "–");
+      const quality = !isFresh || stats.state_hz < 1 || shown > BAD_AGE_MS ? "bad" : shown > GOOD_AGE_MS ? "fair" : "good";
+      dot.className = `signal ${quality}`;
+    },
+  };
+}
+
+/** The e-stop: a large button and a key. Stopping needs one press, clearing is for directors. */
+export function makeEstop(state: PageState, actions: Actions): { stop: HTMLElement; banner: HTMLElement; update: () => void } {
+  const word = h("span", { class: "word" }, "E-STOP");
+  const key = h("small", {}, "Space");
+  const stop = h("button", { type: "button", class: "estop", id: "estop", aria: { keyshortcuts: "Space" } }, word, key);
+  const press = (reason: string): void => {
+    actions.estop(reason);
+    stop.classList.add("pressed");
+    setTimeout(() => stop.classList.remove("pressed"), 300);
+  };
+  stop.addEventListener("click", () => press("button of the dashboard"));
+  document.addEventListener(
+    "keydown",
+    (event) => {
+      if (event.key !== " " || event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
+      if (!event.shiftKey && takesSpace(event.target)) return;
+      event.preventDefault();
+      press("key in the dashboard");
+    },
+    { capture: true },
+  );
+  const text = h("strong");
+  const clear = button(
+    "Clear",
+    () => void actions.request({ type: "clear_estop", stop_seq: state.session?.stop_seq ?? 0 }, "The e-stop is cleared."),
+    { class: "clear", id: "clear-estop" },
+  );
+  const note = h("span", { class: "note" });
+  const banner = h("div", { class: "stopped", role: "alert", hidden: true }, text, note, clear);
+  return {
+    stop,
+    banner,
+    update: () => {
+      const isStopped = state.session?.estop ?? false;
+      stop.classList.toggle("active", isStopped);
+      stop.setAttribute("aria-label", isStopped ? "E-stop, in force. Stop again" : "E-stop: stop all robots");
+      setText(word, isStopped ? "STOPPED" : "E-STOP");
+      if (banner.hidden === isStopped) banner.hidden = !isStopped;
+      if (!isStopped) return;
+      const newest = state.status?.stops[0];
+      const who = newest?.name ? ` by ${newest.name}` : "";
+      setText(text, `Stopped${who}${newest?.reason ? `: ${newest.reason}` : ""}`);
+      setText(note, state.isDirector ? "All robots hold." : "All robots hold. A director can clear it.");
+      clear.hidden = !state.isDirector;
+    },
+  };
+}
+
+/** Return whether a key press of Space means something else to what has the focus. */
+function takesSpace(target: EventTarget | null): boolean {
+  return target instanceof HTMLElement && target.closest("button, input, select, textarea, summary, a, dialog") !== null;
+}
+
+/** Who this page is: name and role, to join again with others. */
+export function makeSelf(state: PageState, join: (name: string, role: string) => void): Panel {
+  const summary = h("summary", {});
+  const name = h("input", { type: "text", id: "self-name", attributes: { maxlength: "64", spellcheck: "false", autocomplete: "nickname" } });
+  const role = h("select", { id: "self-role" });
+  setOptions(role, ["director", "operator", "observer"].map((one) => [one, roleWords(one)] as const));
+  const identity = h("p", { class: "note" });
+  const form = h(
+    "form",
+    { class: "popover" },
+    h("label", { class: "field" }, h("span", {}, "Your name"), name),
+    h("label", { class: "field" }, h("span", {}, "Join as"), role),
+    h("button", { class: "primary" }, "Join with these"),
+    identity,
+  );
+  const element = h("details", { class: "self" }, summary, form);
+  form.addEventListener("submit", (event) => {
+    event.preventDefault();
+    element.open = false;
+    join(name.value.trim(), role.value);
+  });
+  return {
+    element,
+    update: () => {
+      const { self } = state;
+      setText(summary, self ? `${self.name}, ${roleWords(self.role)}` : "Not joined");
+      if (!element.open && self) {
+        setValue(name, self.name);
+        setValue(role, self.role);
+      }
+      const fingerprint = state.identity?.fingerprint ?? "";
+      setText(identity, fingerprint ? `Fingerprint of this browser: ${fingerprint}` : "");
+    },
+  };
+}

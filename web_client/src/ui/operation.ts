@@ -1,0 +1,202 @@
+// The session itself: its loop, episodes, recording, streams, and the advice of its own checks.
+
+import type { WorkerClient } from "../core/page_client.ts";
+import type { Actions } from "./actions.ts";
+import { button, h, KeyedList, setText } from "./dom.ts";
+import { makeFacts, makeSection, type Panel } from "./panel.ts";
+import type { PageState } from "./state.ts";
+import { episodeStateWords, formatBytes, formatMilliseconds, formatShare, formatSessionTime } from "./words.ts";
+
+/** Roles that may start and end episodes. */
+const EPISODE_ROLES = ["operator", "director", "agent", "leader"];
+
+export function makeEpisodesPanel(state: PageState, actions: Actions): Panel {
+  const now = h("p", { class: "big", aria: { live: "polite" } });
+  const label = h("input", { type: "text", id: "episode-label", attributes: { maxlength: "512", placeholder: "Label (optional)" } });
+  const act = (text: string, action: string, className = "small"): HTMLButtonElement =>
+    button(text, () => void actions.request({ type: "episode", action, label: label.value.trim() }), { class: className });
+  const start = act("Start", "start", "small primary");
+  const endings = [act("Success", "success", "small good"), act("Failure", "failure"), act("Discard", "discard"), act("Record again", "rerecord")];
+  const reset = act("Reset scene", "reset");
+  const controls = h("div", { class: "controls" }, start, ...endings, reset);
+  const field = h("div", { class: "controls" }, h("label", { for: "episode-label", class: "hidden-text" }, "Label of the episode"), label);
+  const section = makeSection("episodes", "Episodes", h("div", {}, now, field, controls));
+  return {
+    element: section.element,
+    update: () => {
+      const episode = state.session?.episode ?? null;
+      const isRunning = episode?.state === "running";
+      const name = episode ? `Episode ${episode.number}: ${episodeStateWords(episode.state)}` : "No episode yet";
+      setText(now, episode?.label ? `${name} (${episode.label})` : name);
+      now.classList.toggle("running", isRunning);
+      const mayAct = state.isReady && EPISODE_ROLES.includes(state.role);
+      field.hidden = controls.hidden = !mayAct;
+      start.hidden = isRunning;
+      for (const ending of endings) ending.hidden = !isRunning;
+    },
+  };
+}
+
+export function makeLoopPanel(state: PageState, actions: Actions): Panel {
+  const facts = makeFacts(["Time", "Rate", "Late ticks", "Processor", "Memory", "State after"]);
+  const control = (text: string, action: string): HTMLButtonElement =>
+    button(text, () => void actions.request({ type: "control", action }), { class: "small" });
+  const [pause, resume, step, reset] = [control("Pause", "pause"), control("Resume", "resume"), control("One step", "step"), control("Reset", "reset")];
+  const controls = h("div", { class: "controls" }, pause, resume, step, reset);
+  const section = makeSection("loop", "Loop", h("div", {}, facts.element, controls));
+  return {
+    element: section.element,
+    update: () => {
+      const { status, session } = state;
+      const period = session?.tick_period_ns || state.welcome?.tick_period_ns || 0;
+      facts.set("Time", status ? formatSessionTime(status.session_time) : "–");
+      facts.set("Rate", period > 0 ? `${(1e9 / period).toFixed(0)} Hz${session?.paused ? ", paused" : ""}` : "–");
+      facts.set("Late ticks", status ? formatShare(status.late_share) : "–");
+      facts.set("Processor", status ? `${formatShare(status.cpu_share)} of one, load ${status.load.toFixed(1)} of ${status.cpus}` : "–");
+      facts.set("Memory", status ? formatBytes(status.memory_bytes) : "–");
+      facts.set("State after", status?.step_to_publish ? formatMilliseconds(status.step_to_publish[0]) : "–");
+      section.setCount(session?.paused ? "paused" : state.phase.stalled ? "stalled" : "");
+      controls.hidden = !state.isDirector;
+      pause.hidden = session?.paused ?? false;
+      resume.hidden = step.hidden = !(session?.paused ?? false);
+    },
+  };
+}
+
+export function makeRecordingPanel(state: PageState, actions: Actions): Panel {
+  const facts = makeFacts(["State", "File", "Written", "Disk free", "Lost"]);
+  const words = h("p", { class: "advice", hidden: true });
+  const note = h("input", { type: "text", id: "marker-text", attributes: { maxlength: "512", placeholder: "Note for the recording" } });
+  const form = h("form", { class: "controls" }, h("label", { for: "marker-text", class: "hidden-text" }, "Note for the recording"), note, h("button", { class: "small" }, "Add note"));
+  form.addEventListener("submit", (event) => {
+    event.preventDefault();
+    const text = note.value.trim();
+    if (!text) return;
+    void actions.request({ type: "marker", text }, "Note added.").then((granted) => {
+      if (granted) note.value = "";
+    });
+  });
+  const section = makeSection("recording", "Recording", h("div", {}, facts.element, words, form));
+  return {
+    element: section.element,
+    update: () => {
+      const recorder = state.status?.recorder ?? null;
+      const names: Record<string, string> = {
+        off: "off: nothing is recorded",
+        running: "running",
+        hangs: "hangs",
+        dead: "is being replaced",
+        failed: "failed: the file cannot be written",
+      };
+      facts.set("State", recorder ? (names[recorder.state] ?? recorder.state) : "–");
+      facts.set("File", recorder?.path || "–");
+      facts.set("Written", recorder ? formatBytes(recorder.bytes_written) : "–");
+      facts.set("Disk free", recorder && recorder.disk_free_bytes > 0 ? formatBytes(recorder.disk_free_bytes) : "–");
+      facts.set("Lost", recorder ? `${recorder.lost_rows} steps` : "–");
+      const text = recorder && recorder.state !== "running" ? recorder.text : "";
+      setText(words, text);
+      words.hidden = text === "";
+      section.setCount(recorder?.state === "running" ? "running" : (recorder?.state ?? ""));
+      form.hidden = !state.isReady;
+    },
+  };
+}
+
+export function makeStreamsPanel(state: PageState, client: WorkerClient, getNeeded: () => readonly string[]): Panel {
+  const list = h("ul", { class: "rows" });
+  const empty = h("p", { class: "empty" }, "This session has no streams.");
+  const reason = h("p", { class: "note" });
+  const section = makeSection("streams", "Streams", h("div", {}, list, empty, reason), { open: false });
+  const switchedOff = new Set<string>();
+  let sent = "";
+  const send = (): void => {
+    const streams = (state.budget?.streams ?? []).map((one) => one.stream).filter((name) => !switchedOff.has(name));
+    const wanted = [...new Set([...streams.filter((name) => getNeeded().includes(name))])].sort();
+    const key = `${state.welcome?.connection_epoch ?? 0} ${JSON.stringify(wanted)}`;
+    if (key === sent || !state.isReady) return;
+    sent = key;
+    client.post({ type: "want_streams", streams: wanted });
+  };
+  const rows = new KeyedList<{ stream: string }>(
+    list,
+    ({ stream }) => {
+      const box = h("input", { type: "checkbox" });
+      box.checked = true;
+      box.addEventListener("change", () => {
+        if (box.checked) switchedOff.delete(stream);
+        else switchedOff.add(stream);
+        send();
+      });
+      const facts = h("span", { class: "note" });
+      const label = h("label", { class: "line" }, box, h("strong", { class: "name" }, stream), facts);
+      return {
+        element: h("li", { class: "row" }, label),
+        update: () => {
+          const mine = state.budget?.streams.find((one) => one.stream === stream);
+          const report = state.status?.media.find((one) => one.stream === stream);
+          const isDrawn = getNeeded().includes(stream);
+          box.disabled = !isDrawn;
+          const parts = [
+            isDrawn ? (mine?.budget_class ?? "") : "not drawn by this page",
+            report ? `${report.hz.toFixed(0)} Hz` : "",
+            report ? `${report.mbit_per_s.toFixed(1)} Mbit/s` : "",
+            report?.source ? `from ${report.source}` : "",
+          ];
+          setText(facts, parts.filter((part) => part !== "").join(" · "));
+        },
+      };
+    },
+    empty,
+  );
+  return {
+    element: section.element,
+    update: () => {
+      const streams = state.budget?.streams ?? [];
+      rows.update(streams, (one) => one.stream);
+      section.setCount(streams.length > 0 ? String(streams.length) : "");
+      setText(reason, state.budget?.reason ?? "");
+      send();
+    },
+  };
+}
+
+export function makeAdvicePanel(state: PageState): Panel {
+  const list = h("ul", { class: "notes" });
+  const rows = new KeyedList<string>(list, (text) => ({ element: h("li", {}, text), update: () => undefined }));
+  const section = makeSection("advice", "Advice", list);
+  return {
+    element: section.element,
+    update: () => {
+      const { status } = state;
+      const found = [...(status?.warnings ?? [])];
+      if (status?.pause_reason) found.unshift(status.pause_reason);
+      if (state.progress?.refusal) found.push(`Loading the scene waits: ${state.progress.refusal}`);
+      rows.update(found, (text) => text);
+      section.element.hidden = found.length === 0;
+      section.setCount(String(found.length));
+    },
+  };
+}
+
+export function makeEventsPanel(state: PageState): Panel {
+  const list = h("ol", { class: "log", role: "log", tabindex: 0, aria: { live: "off", label: "Events, newest first" } });
+  const empty = h("p", { class: "empty" }, "Nothing has happened yet.");
+  const section = makeSection("events", "Events", h("div", {}, list, empty));
+  const rows = new KeyedList<PageState["log"][number]>(
+    list,
+    (entry) => ({
+      element: h(
+        "li",
+        { class: entry.level },
+        h("span", { class: "time" }, formatSessionTime(entry.session_time)),
+        h("span", {}, entry.text),
+      ),
+      update: () => undefined,
+    }),
+    empty,
+  );
+  return {
+    element: section.element,
+    update: () => rows.update(state.log.slice(0, 100), (entry) => String(entry.seq)),
+  };
+}

@@ -1,0 +1,158 @@
+// Robots and their leases: who drives, why a robot holds; take, release, assign, hand over, mode, scale, consent.
+
+import type { RobotInfo } from "../core/api.ts";
+import { participantColor } from "../view/avatars.ts";
+import type { Actions } from "./actions.ts";
+import { button, h, KeyedList, type Row, setOptions, setText, setValue } from "./dom.ts";
+import { makeSection, type Panel } from "./panel.ts";
+import type { ConsentAsked, PageState } from "./state.ts";
+import { holdReasonWords, leaseModeWords } from "./words.ts";
+
+const MODES = ["exclusive", "request", "takeover", "priority", "shared"] as const;
+const SCALES = [0.1, 0.25, 0.5, 1, 2] as const;
+const FREE = "";
+/** Roles that drive robots. */
+const DRIVERS = ["operator", "agent", "leader", "director"];
+
+export function makeRobotsPanel(state: PageState, actions: Actions): Panel {
+  const list = h("ul", { class: "rows" });
+  const asked = h("ul", { class: "rows asked" });
+  const empty = h("p", { class: "empty" }, "This scene has no robots.");
+  const section = makeSection("robots", "Robots", h("div", {}, asked, list, empty));
+  const rows = new KeyedList<RobotInfo>(list, (item) => makeRow(item, state, actions), empty);
+  const consents = new KeyedList<ConsentAsked>(asked, (item) => makeConsentRow(item, state, actions));
+  return {
+    element: section.element,
+    update: () => {
+      const robots = state.session?.robots ?? [];
+      section.setCount(robots.length > 0 ? String(robots.length) : "");
+      rows.update(robots, (robot) => robot.name);
+      state.consents = state.consents.filter((consent) => consent.until_ms > performance.now());
+      consents.update(state.consents, (consent) => String(consent.consent_id));
+    },
+  };
+}
+
+function makeRow({ name }: RobotInfo, state: PageState, actions: Actions): Row<RobotInfo> {
+  const dot = h("span", { class: "dot", aria: { hidden: "true" } });
+  const title = h("strong", { class: "name" }, name);
+  const holder = h("span", { class: "holder" });
+  const why = h("div", { class: "note" });
+  const take = button("Take", () => void actions.request({ type: "acquire", robots: [name] }, `You have ${name}.`), {
+    class: "small primary",
+  });
+  const wait = button(
+    "Wait for it",
+    () => void actions.request({ type: "acquire", robots: [name], wait: true }, `You have ${name}.`),
+    { class: "small" },
+  );
+  const release = button(
+    "Release",
+    () => {
+      const lease = state.lease(name);
+      if (lease) actions.release([[name, lease.lease_version, "robot"]]);
+    },
+    { class: "small" },
+  );
+  const assign = h("select", { class: "small", aria: { label: `Assign ${name} to` } });
+  assign.addEventListener("change", () => {
+    const participant = assign.value;
+    const done = participant === FREE ? `${name} is free.` : `${state.nameOf(participant)} has ${name}.`;
+    void actions.request({ type: "assign", robots: [name], participant }, done).then((granted) => {
+      if (!granted) assign.value = state.lease(name)?.holder ?? FREE;
+    });
+  });
+  const mode = h("select", { class: "small", aria: { label: `Lease mode of ${name}` } });
+  setOptions(mode, MODES.map((one) => [one, leaseModeWords(one)] as const));
+  mode.addEventListener("change", () => {
+    void actions.request({ type: "set_mode", robot: name, mode: mode.value }).then((granted) => {
+      if (!granted) mode.value = state.lease(name)?.mode ?? "exclusive";
+    });
+  });
+  const scale = h("select", { class: "small", aria: { label: `Motion scale of ${name}` } });
+  scale.addEventListener("change", () => {
+    void actions.request({ type: "set_scale", robots: [name], scale: Number(scale.value) }).then((granted) => {
+      if (!granted) scale.value = String(state.lease(name)?.scale ?? 1);
+    });
+  });
+  const assignLabel = h("label", { class: "field" }, h("span", {}, "Assign"), assign);
+  const modeLabel = h("label", { class: "field" }, h("span", {}, "Mode"), mode);
+  const scaleLabel = h("label", { class: "field" }, h("span", {}, "Scale"), scale);
+  const fields = h("div", { class: "fields" }, assignLabel, modeLabel, scaleLabel);
+  const element = h(
+    "li",
+    { class: "row", data: { robot: name } },
+    h("div", { class: "line" }, dot, title, holder),
+    why,
+    h("div", { class: "controls" }, take, wait, release),
+    fields,
+  );
+  return {
+    element,
+    update: () => {
+      const lease = state.lease(name);
+      const report = state.status?.robots.find((robot) => robot.name === name);
+      const participants = state.session?.participants ?? [];
+      const isMine = lease !== undefined && (lease.holder === state.selfId || lease.sub_holders.includes(state.selfId));
+      const isFree = !lease || lease.holder === "";
+      dot.style.background = isFree ? "transparent" : participantColor(participants, lease.holder);
+      dot.classList.toggle("hollow", isFree);
+      setText(holder, isFree ? "free" : isMine ? "you" : state.nameOf(lease.holder));
+      holder.classList.toggle("free", isFree);
+      setText(why, describe(state, name, lease, report));
+      const canTake = state.isReady && DRIVERS.includes(state.role) && !isMine;
+      take.hidden = !canTake;
+      setText(take, isFree ? "Take" : lease.mode === "takeover" ? "Take over" : lease.mode === "request" ? "Ask for it" : "Take");
+      take.setAttribute("aria-label", `${take.textContent ?? ""} ${name}`);
+      wait.hidden = !canTake || isFree || lease.queue.includes(state.selfId) || lease.mode === "takeover";
+      wait.setAttribute("aria-label", `Wait for ${name}`);
+      release.hidden = !isMine;
+      release.setAttribute("aria-label", `Release ${name}`);
+      assignLabel.hidden = modeLabel.hidden = !state.isDirector;
+      scaleLabel.hidden = !(state.isDirector || isMine) || isFree;
+      fields.hidden = assignLabel.hidden && scaleLabel.hidden;
+      const drivers = participants.filter((one) => DRIVERS.includes(one.role) || one.id === lease?.holder);
+      setOptions(assign, [[FREE, "nobody"], ...drivers.map((one) => [one.id, one.name] as const)]);
+      setValue(assign, lease?.holder ?? FREE);
+      setValue(mode, lease?.mode ?? "exclusive");
+      const scales = [...new Set([...SCALES, lease?.scale ?? 1])].sort((a, b) => a - b);
+      setOptions(scale, scales.map((one) => [String(one), `${one} ×`] as const));
+      setValue(scale, String(lease?.scale ?? 1));
+    },
+  };
+}
+
+function describe(
+  state: PageState,
+  robot: string,
+  lease: ReturnType<PageState["lease"]>,
+  report: NonNullable<PageState["status"]>["robots"][number] | undefined,
+): string {
+  const feedback = state.feedback.get(robot);
+  const reason = feedback?.hold_reason || report?.hold_reason || "";
+  const parts: string[] = [];
+  if (state.session?.estop) parts.push("stopped");
+  else if (reason && lease?.holder) parts.push(`holds: ${holdReasonWords(reason)}`);
+  else if (report?.state && report.state !== "hold") parts.push("driven");
+  if (lease && lease.expires_ns > 0) parts.push("its holder is disconnected, the lease is kept for a while");
+  if (lease && lease.sub_holders.length > 1) parts.push(`shared by ${lease.sub_holders.map((id) => state.nameOf(id)).join(", ")}`);
+  if (lease && lease.queue.length > 0) parts.push(`waiting: ${lease.queue.map((id) => state.nameOf(id)).join(", ")}`);
+  if (feedback && feedback.limits.length > 0) parts.push(`at its limit: ${feedback.limits.join(", ")}`);
+  return parts.join(" · ");
+}
+
+function makeConsentRow(asked: ConsentAsked, state: PageState, actions: Actions): Row<ConsentAsked> {
+  const answer = (grant: boolean): void => {
+    void actions.request({ type: "consent", consent_id: asked.consent_id, grant });
+    state.consents = state.consents.filter((one) => one.consent_id !== asked.consent_id);
+    state.touch();
+  };
+  const text = h("div", { class: "line" }, `${state.nameOf(asked.requester)} asks you for ${asked.target}.`);
+  const controls = h(
+    "div",
+    { class: "controls" },
+    button("Give it", () => answer(true), { class: "small primary" }),
+    button("Keep it", () => answer(false), { class: "small" }),
+  );
+  return { element: h("li", { class: "row", role: "alert" }, text, controls), update: () => undefined };
+}

@@ -1,0 +1,206 @@
+// What the page knows: the newest update of each kind, the roster by id, the history of events. Panels read it.
+
+import type {
+  AssetProgress,
+  BudgetUpdate,
+  Filled,
+  IdentityUpdate,
+  InboxMessage,
+  InfoUpdate,
+  Lease,
+  ParticipantInfo,
+  PhaseUpdate,
+  SceneSpec,
+  SessionUpdate,
+  StatsUpdate,
+  StatusReport,
+  WelcomeUpdate,
+} from "../core/api.ts";
+import type { WorkerClient } from "../core/page_client.ts";
+import type * as wire from "../protocol/messages.g.ts";
+import { type EventLevel, eventWords } from "./words.ts";
+
+const MAX_EVENTS = 300;
+
+export interface LogEntry {
+  seq: number;
+  session_time: number;
+  text: string;
+  level: EventLevel;
+}
+
+export interface ConsentAsked {
+  consent_id: number;
+  target: string;
+  requester: string;
+  holder: string;
+  until_ms: number;
+}
+
+const NO_PHASE: PhaseUpdate = {
+  type: "phase",
+  phase: "idle",
+  text: "",
+  refusal: "",
+  advice: "",
+  close_code: 0,
+  stalled: false,
+};
+
+/** State of the page. `onChange` is called at most once per display frame. */
+export class PageState {
+  phase: PhaseUpdate = NO_PHASE;
+  info: InfoUpdate | null = null;
+  identity: IdentityUpdate | null = null;
+  welcome: WelcomeUpdate["welcome"] | null = null;
+  session: SessionUpdate | null = null;
+  status: StatusReport | null = null;
+  stats: StatsUpdate | null = null;
+  budget: BudgetUpdate["budget"] | null = null;
+  progress: AssetProgress | null = null;
+  spec: SceneSpec | null = null;
+  /** Newest feedback by robot: of those that this page holds. */
+  readonly feedback = new Map<string, Filled<wire.Feedback>>();
+  readonly log: LogEntry[] = [];
+  consents: ConsentAsked[] = [];
+  rtt_ms = Number.NaN;
+  /** Names of participants that left, for events about them. */
+  private readonly formerNames = new Map<string, string>();
+  private readonly listeners: ((state: PageState) => void)[] = [];
+  private isQueued = false;
+  private nextSeq = 1;
+
+  constructor(client: WorkerClient) {
+    const keep = <K extends "phase" | "info" | "identity" | "session" | "stats">(type: K): void => {
+      client.on(type, (update) => {
+        (this as Record<K, unknown>)[type] = update;
+        this.touch();
+      });
+    };
+    keep("phase");
+    keep("info");
+    keep("identity");
+    keep("stats");
+    client.on("session", (update) => {
+      for (const { id, name } of update.participants) this.formerNames.set(id, name);
+      this.session = update;
+      this.touch();
+    });
+    client.on("welcome", ({ welcome }) => {
+      this.welcome = welcome;
+      this.feedback.clear();
+      this.consents = [];
+      this.touch();
+    });
+    client.on("status", ({ status }) => {
+      this.status = status;
+      this.touch();
+    });
+    client.on("budget", ({ budget }) => {
+      this.budget = budget;
+      this.touch();
+    });
+    client.on("asset_progress", (progress) => {
+      this.progress = progress;
+      this.touch();
+    });
+    client.on("clock", ({ rtt_ms }) => {
+      this.rtt_ms = rtt_ms;
+      this.touch();
+    });
+    client.on("inbox", ({ messages }) => {
+      for (const message of messages) this.take(message);
+      this.touch();
+    });
+  }
+
+  onChange(listener: (state: PageState) => void): void {
+    this.listeners.push(listener);
+  }
+
+  /** Call the listeners soon. In a background tab, where no frames come, after a moment. */
+  touch(): void {
+    if (this.isQueued) return;
+    this.isQueued = true;
+    const run = (): void => {
+      if (!this.isQueued) return;
+      this.isQueued = false;
+      for (const listener of this.listeners) listener(this);
+    };
+    if (document.hidden) setTimeout(run, 200);
+    else requestAnimationFrame(run);
+  }
+
+  get selfId(): string {
+    return this.session?.participant_id ?? "";
+  }
+
+  get self(): ParticipantInfo | undefined {
+    return this.participant(this.selfId);
+  }
+
+  /** Role of this page in the session, empty before it has joined. */
+  get role(): string {
+    return this.self?.role ?? this.welcome?.role ?? "";
+  }
+
+  get isDirector(): boolean {
+    return this.role === "director";
+  }
+
+  get isReady(): boolean {
+    return this.phase.phase === "ready";
+  }
+
+  participant(id: string): ParticipantInfo | undefined {
+    return this.session?.participants.find((participant) => participant.id === id);
+  }
+
+  nameOf(id: string): string {
+    return this.participant(id)?.name ?? this.formerNames.get(id) ?? id;
+  }
+
+  lease(robot: string): Lease | undefined {
+    return this.session?.leases.find((lease) => lease.target === robot && lease.kind === "robot");
+  }
+
+  /** Names of robots that a participant holds. */
+  heldBy(id: string): string[] {
+    const leases = this.session?.leases ?? [];
+    return leases.filter((l) => l.holder === id || l.sub_holders.includes(id)).map((l) => l.target);
+  }
+
+  /** Add a line of the page's own to the history. */
+  note(text: string, level: EventLevel = "info"): void {
+    this.addLog(this.newestTime(), text, level);
+    this.touch();
+  }
+
+  private take(message: InboxMessage): void {
+    if (message.type === "feedback") this.feedback.set(message.robot, message);
+    else if (message.type === "event") this.takeEvent(message);
+    else if (message.type === "protocol_fault") this.addLog(this.newestTime(), message.message, "warning");
+  }
+
+  private takeEvent({ session_time, body }: Filled<wire.Event>): void {
+    if (body.event === "participant_joined") this.formerNames.set(body.participant.id, body.participant.name);
+    if (body.event === "consent_requested" && body.holder === this.selfId) {
+      const timeout_ms = (this.session?.consent_timeout_ns ?? 0) / 1e6 || 15_000;
+      this.consents.push({ ...body, until_ms: performance.now() + timeout_ms });
+    }
+    if (body.event === "lease_changed") {
+      this.consents = this.consents.filter((asked) => asked.target !== body.lease.target || body.cause === "queue");
+    }
+    const words = eventWords(body, (id) => this.nameOf(id));
+    if (words) this.addLog(session_time, words.text, words.level);
+  }
+
+  private newestTime(): number {
+    return this.log[0]?.session_time ?? this.status?.session_time ?? 0;
+  }
+
+  private addLog(session_time: number, text: string, level: EventLevel): void {
+    this.log.unshift({ seq: this.nextSeq++, session_time, text, level });
+    this.log.length = Math.min(this.log.length, MAX_EVENTS);
+  }
+}

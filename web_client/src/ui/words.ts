@@ -1,0 +1,233 @@
+// Words for what the session reports: names of enumerations, numbers with units, sentences about events. Pure.
+
+import type { Filled } from "../core/api.ts";
+import type * as wire from "../protocol/messages.g.ts";
+
+const HOLD_REASONS: Record<string, string> = {
+  no_lease: "nobody has its lease",
+  no_sample: "its holder sends nothing yet",
+  clutch_open: "clutch open",
+  stale: "samples come too late or not at all",
+  not_worn: "headset taken off",
+  untracked: "tracking lost",
+  unaligned: "its holder is not aligned",
+  rejected: "a sample was rejected: open and close the clutch",
+  estop: "e-stop",
+  disconnected: "its holder is disconnected",
+  gap: "the session stood still: open and close the clutch",
+  scene_changed: "the scene changed: open and close the clutch",
+  intervention: "a person took over",
+  rearm: "open and close the clutch",
+};
+
+const LEASE_MODES: Record<string, string> = {
+  exclusive: "exclusive",
+  request: "on request",
+  takeover: "take over",
+  priority: "people first",
+  shared: "shared",
+};
+
+const ROLES: Record<string, string> = {
+  operator: "operator",
+  observer: "observer",
+  director: "director",
+  agent: "agent",
+  leader: "leader robot",
+  gateway: "gateway",
+  recorder: "recorder",
+  camera: "camera",
+  source: "source",
+};
+
+const ALIGNMENTS: Record<string, string> = {
+  none: "not aligned",
+  measured: "measured",
+  placed: "placed by hand",
+  not_needed: "not needed",
+};
+
+const LEASE_CAUSES: Record<string, string> = {
+  acquired: "took",
+  takeover: "took over",
+  assigned: "was assigned",
+  resumed: "has again",
+  consent: "was given",
+  priority: "took over",
+};
+
+const EPISODE_STATES: Record<string, string> = {
+  running: "running",
+  success: "success",
+  failure: "failure",
+  discarded: "discarded",
+};
+
+/** Return the words of a value, or the value itself for one that this page does not know. */
+const look = (table: Record<string, string>, value: string): string => table[value] ?? value.replaceAll("_", " ");
+
+export const holdReasonWords = (reason: string): string => look(HOLD_REASONS, reason);
+export const leaseModeWords = (mode: string): string => look(LEASE_MODES, mode);
+export const roleWords = (role: string): string => look(ROLES, role);
+export const alignmentWords = (kind: string): string => look(ALIGNMENTS, kind);
+export const episodeStateWords = (state: string): string => look(EPISODE_STATES, state);
+
+export function formatMillimetres(metres: number): string {
+  const mm = 1000 * metres;
+  return mm >= 100 ? `${(metres * 100).toFixed(0)} cm` : `${mm.toFixed(mm < 10 ? 1 : 0)} mm`;
+}
+
+export function formatMilliseconds(ms: number): string {
+  return !Number.isFinite(ms) ? "–" : ms >= 1000 ? `${(ms / 1000).toFixed(1)} s` : `${ms.toFixed(ms < 10 ? 1 : 0)} ms`;
+}
+
+export function formatBytes(bytes: number): string {
+  const units = ["B", "kB", "MB", "GB", "TB"];
+  let [value, unit] = [bytes, 0];
+  while (value >= 1000 && unit + 1 < units.length) [value, unit] = [value / 1000, unit + 1];
+  return `${value.toFixed(value < 10 && unit > 0 ? 1 : 0)} ${units[unit]}`;
+}
+
+/** Return a duration such as `3 s`, `4 min`, `2 h`. */
+export function formatAge(ns: number): string {
+  const s = Math.max(0, ns / 1e9);
+  if (s < 90) return `${s.toFixed(0)} s`;
+  return s < 5400 ? `${(s / 60).toFixed(0)} min` : `${(s / 3600).toFixed(1)} h`;
+}
+
+/** Return a session time as minutes and seconds, `12:05.3`. */
+export function formatSessionTime(ns: number): string {
+  const s = Math.max(0, ns / 1e9);
+  const minutes = Math.floor(s / 60);
+  return `${minutes}:${(s % 60).toFixed(1).padStart(4, "0")}`;
+}
+
+export const formatShare = (share: number): string => `${(100 * share).toFixed(share < 0.1 ? 1 : 0)} %`;
+
+/** Return a denial as one sentence: what, who holds it, what to do. */
+export function denialWords(denial: Filled<wire.Denial>): string {
+  const holder = denial.holder_name && !denial.message.includes(denial.holder_name) ? ` Held by ${denial.holder_name}.` : "";
+  const advice = denial.advice ? ` ${capitalize(denial.advice)}` : "";
+  return `${capitalize(denial.message || denial.reason.replaceAll("_", " "))}${endSentence(denial.message)}${holder}${advice}`;
+}
+
+function endSentence(text: string): string {
+  return /[.!?:]$/.test(text) ? "" : ".";
+}
+
+export function capitalize(text: string): string {
+  return text.slice(0, 1).toUpperCase() + text.slice(1);
+}
+
+export type EventLevel = "info" | "warning" | "error";
+
+/** An event as a sentence. `nameOf`: the name of a participant id. Null: nothing that people need to read. */
+export function eventWords(
+  body: Filled<wire.EventKind>,
+  nameOf: (participant: string) => string,
+): { text: string; level: EventLevel } | null {
+  const info = (text: string): { text: string; level: EventLevel } => ({ text, level: "info" });
+  const warning = (text: string): { text: string; level: EventLevel } => ({ text, level: "warning" });
+  switch (body.event) {
+    case "participant_joined":
+      return info(`${body.participant.name} ${body.resumed ? "is back" : `joined as ${roleWords(body.participant.role)}`}`);
+    case "participant_left":
+      return body.grace
+        ? warning(`${nameOf(body.participant)} lost the connection (${body.reason.replaceAll("_", " ")}); its leases are kept for a while`)
+        : info(`${nameOf(body.participant)} left${body.reason ? ` (${body.reason.replaceAll("_", " ")})` : ""}`);
+    case "lease_changed":
+      return info(leaseSentence(body.lease, body.cause, body.previous_holder, nameOf));
+    case "leases_changed":
+      return info(
+        body.leases
+          .map((lease, i) => leaseSentence(lease, body.cause, body.previous_holders[i] ?? "", nameOf))
+          .join("; "),
+      );
+    case "consent_requested":
+      return info(`${nameOf(body.requester)} asks ${nameOf(body.holder)} for ${body.target}`);
+    case "intervention":
+      return body.active
+        ? warning(`${nameOf(body.human)} overrides ${nameOf(body.agent)} on ${body.robot}`)
+        : info(`${nameOf(body.agent)} has ${body.robot} again`);
+    case "engagement_changed":
+      return body.engaged
+        ? info(`${nameOf(body.participant)} drives ${body.robot}`)
+        : info(`${body.robot} holds${body.reason ? `: ${holdReasonWords(body.reason)}` : ""}`);
+    case "scale_changed":
+      return info(`motion of ${body.robot} is scaled by ${body.scale}`);
+    case "alignment_changed": {
+      const { kind, error_at_robot_m } = body.alignment;
+      const error = error_at_robot_m > 0 ? `, within ${formatMillimetres(error_at_robot_m)} at the robot` : "";
+      return info(`alignment of ${nameOf(body.participant)}: ${alignmentWords(kind)}${error}`);
+    }
+    case "alignment_run":
+      return info(`${nameOf(body.participant)} ${body.running ? "measures its alignment" : "keeps its alignment"}`);
+    case "alignment_alarmed":
+      return warning(
+        body.kind === "jump"
+          ? `the tracking of ${nameOf(body.participant)} jumped by ${formatMillimetres(body.size_m)}: look at the sheet again`
+          : `${nameOf(body.participant)} sees ${body.anchor_id} ${formatMillimetres(body.size_m)} from where it was`,
+      );
+    case "anchor_moved":
+      return info(`${body.by ? nameOf(body.by) : "a director"} moved the anchor ${body.anchor_id}`);
+    case "headsets_compared":
+      return body.error_m > body.expected_p95_m
+        ? warning(
+            `${nameOf(body.a)} and ${nameOf(body.b)} see ${body.anchor_id} ${formatMillimetres(body.error_m)} apart, ` +
+              `expected at most ${formatMillimetres(body.expected_p95_m)}`,
+          )
+        : null;
+    case "scene_changed":
+      return info({ reset: "scene reset", new_scene: "another scene", patch: "scene changed" }[body.cause] ?? "time of the scene went back");
+    case "estop_changed":
+      return body.active
+        ? { level: "error", text: `e-stop by ${nameOf(body.participant) || "a connection that has not joined"}${body.reason ? `: ${body.reason}` : ""}` }
+        : info(`${nameOf(body.participant)} cleared the e-stop`);
+    case "pause_changed":
+      return info(`${body.participant ? nameOf(body.participant) : "the session"} ${body.paused ? "paused" : "resumed"}${body.reason ? `: ${body.reason}` : ""}`);
+    case "episode_changed":
+      return info(`episode ${body.number}: ${episodeStateWords(body.state)}${body.label ? ` (${body.label})` : ""}`);
+    case "object_grasped":
+      return info(`${nameOf(body.participant)} ${body.grasped ? "took" : "released"} ${body.object} by hand`);
+    case "handover":
+      return info(`${body.object} was handed over from ${body.giver} to ${body.receiver}`);
+    case "marker_added":
+      return info(`${nameOf(body.participant)} notes: ${body.text}`);
+    case "samples_rejected":
+      return warning(`${body.count} samples of ${nameOf(body.participant)} (${body.device}) rejected: ${body.reason.replaceAll("_", " ")}`);
+    case "gap":
+      return warning(
+        body.kind === "recording"
+          ? `the recording lacks ${body.rows} steps`
+          : body.kind === "resumed"
+            ? "the session goes on from an earlier recording"
+            : `the session stood still for ${formatAge(body.duration_ns)}`,
+      );
+    case "notice":
+      return { level: body.level === "error" || body.level === "warning" ? body.level : "info", text: body.text };
+    case "audited":
+      return warning(
+        [body.kind.replaceAll("_", " "), body.name, body.address, body.detail, body.count > 1 ? `${body.count} times` : ""]
+          .filter((part) => part !== "")
+          .join(", "),
+      );
+    default:
+      return null;
+  }
+}
+
+function leaseSentence(
+  lease: Filled<wire.Lease>,
+  cause: string,
+  previous: string,
+  nameOf: (participant: string) => string,
+): string {
+  if (cause === "mode") return `${lease.target} is now ${leaseModeWords(lease.mode)}`;
+  if (cause === "queue") {
+    return lease.queue.length > 0 ? `${lease.queue.map(nameOf).join(", ")} wait for ${lease.target}` : `nobody waits for ${lease.target}`;
+  }
+  if (lease.holder === "") return `${lease.target} is free${previous ? ` (was held by ${nameOf(previous)})` : ""}`;
+  const verb = LEASE_CAUSES[cause];
+  const from = previous && previous !== lease.holder ? ` from ${nameOf(previous)}` : "";
+  return verb ? `${nameOf(lease.holder)} ${verb} ${lease.target}${from}` : `${nameOf(lease.holder)} has ${lease.target}${from}`;
+}

@@ -1,0 +1,173 @@
+// From where the scene is seen: a free camera that mouse, fingers and keys move, or a camera of the scene.
+
+import { Matrix4, OrthographicCamera, PerspectiveCamera, Quaternion, Vector3 } from "three";
+import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
+
+import { T_THREE_WORLD } from "./axes.ts";
+import { directFollower, placeFollower, tracks, watches, restRotation } from "./lighting.ts";
+import type { SceneView } from "./scene_view.ts";
+import type { Camera } from "./spec.ts";
+
+/** A free camera in MuJoCo's terms [deg, m], in the session's world. */
+export interface FreeCamera {
+  lookat: [number, number, number];
+  azimuth: number;
+  elevation: number;
+  distance: number;
+  fovy?: number;
+}
+
+const DEFAULT_FOVY = 45;
+const KEY_STEP_RAD = 0.08;
+const KEY_ZOOM = 1.1;
+
+/** The camera of the page, and its controls. */
+export class Viewpoint {
+  readonly free = new PerspectiveCamera(DEFAULT_FOVY, 1, 0.01, 200);
+  private readonly orthographic = new OrthographicCamera();
+  private readonly controls: OrbitControls;
+  private aspect = 1;
+  /** Index of the scene's camera that is looked through, -1 for the free one. */
+  private chosen = -1;
+  private readonly lastMatrix = new Matrix4();
+
+  constructor(canvas: HTMLCanvasElement) {
+    this.controls = new OrbitControls(this.free, canvas);
+    this.controls.enableDamping = false;
+    this.controls.zoomSpeed = 0.8;
+    this.controls.minDistance = 0.05;
+    this.controls.maxDistance = 100;
+    canvas.addEventListener("keydown", (event) => {
+      if (this.chosen < 0 && this.moveByKey(event)) event.preventDefault();
+    });
+  }
+
+  get index(): number {
+    return this.chosen;
+  }
+
+  get camera(): PerspectiveCamera | OrthographicCamera {
+    return this.isOrthographic ? this.orthographic : this.free;
+  }
+
+  private isOrthographic = false;
+
+  /** Look at a scene as a whole. */
+  frame(view: SceneView): void {
+    const { center, extent, zfar } = view.spec.environment;
+    this.free.far = Math.max(200, zfar * extent);
+    // Narrow pictures, as on phones, are seen from farther away.
+    const distance = (2 * Math.max(extent, 0.2)) / Math.min(1, this.aspect);
+    this.setFree({ lookat: center, azimuth: 145, elevation: -22, distance });
+  }
+
+  /** Choose a camera of the scene by its index, or the free one (-1). */
+  choose(index: number): void {
+    if (index < 0 && this.chosen >= 0) {
+      this.free.fov = DEFAULT_FOVY;
+      // The free camera goes on where the other one was, looking at a point before it.
+      const forward = new Vector3(0, 0, -1).applyQuaternion(this.free.quaternion);
+      this.controls.target.copy(this.free.position).addScaledVector(forward, 1);
+    }
+    this.chosen = index;
+    this.isOrthographic = false;
+    this.controls.enabled = index < 0;
+  }
+
+  setFree({ lookat, azimuth, elevation, distance, fovy }: FreeCamera): void {
+    const [az, el] = [(azimuth * Math.PI) / 180, (elevation * Math.PI) / 180];
+    const forward = new Vector3(Math.cos(el) * Math.cos(az), Math.cos(el) * Math.sin(az), Math.sin(el));
+    const target = new Vector3(...lookat);
+    const position = target.clone().addScaledVector(forward, -distance);
+    this.choose(-1);
+    this.free.fov = fovy ?? DEFAULT_FOVY;
+    this.controls.target.copy(target.applyMatrix4(T_THREE_WORLD));
+    this.free.position.copy(position.applyMatrix4(T_THREE_WORLD));
+    this.free.updateProjectionMatrix();
+    this.controls.update();
+  }
+
+  setAspect(aspect: number): void {
+    this.aspect = aspect;
+    this.free.aspect = aspect;
+    this.free.updateProjectionMatrix();
+  }
+
+  /** Move to where the scene has the camera. Returns whether what is seen has changed. */
+  update(view: SceneView | null): boolean {
+    const spec = view?.spec.cameras[this.chosen];
+    if (view && spec) this.follow(view, spec);
+    else this.controls.update();
+    const { camera } = this;
+    camera.updateMatrixWorld();
+    const now = new Matrix4().multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse);
+    if (now.equals(this.lastMatrix)) return false;
+    this.lastMatrix.copy(now);
+    return true;
+  }
+
+  private follow(view: SceneView, spec: Camera): void {
+    const [p_body, q] = spec.T_body_camera;
+    const at = { body: spec.body, p_body, follow: spec.follow, target: spec.target };
+    const p_world = placeFollower(at, view.bodies, view.rest, new Vector3());
+    const turn = new Quaternion(q[1], q[2], q[3], q[0]);
+    const body = view.bodies.get(spec.body);
+    if (tracks(at)) turn.premultiply(restRotation(spec.body, view.rest));
+    else if (body) turn.premultiply(body.quaternion);
+    if (watches(at) && view.bodies.has(spec.target)) {
+      const forward = new Vector3();
+      directFollower(at, [0, 0, -1], p_world, view.bodies, view.rest, forward);
+      turn.setFromRotationMatrix(new Matrix4().lookAt(new Vector3(), forward, new Vector3(0, 0, 1)));
+    }
+    this.isOrthographic = spec.orthographic;
+    const { camera } = this;
+    if (camera instanceof OrthographicCamera) {
+      [camera.top, camera.bottom] = [spec.fovy / 2, -spec.fovy / 2];
+      [camera.right, camera.left] = [camera.top * this.aspect, -camera.top * this.aspect];
+      [camera.near, camera.far] = [0.01, 200];
+    } else {
+      camera.fov = spec.fovy;
+    }
+    camera.updateProjectionMatrix();
+    camera.position.copy(p_world).applyMatrix4(T_THREE_WORLD);
+    camera.quaternion.setFromRotationMatrix(T_THREE_WORLD).multiply(turn);
+  }
+
+  /** Arrow keys turn, with Shift they move, + and - go nearer and farther. */
+  private moveByKey(event: KeyboardEvent): boolean {
+    const { target } = this.controls;
+    const offset = this.free.position.clone().sub(target);
+    if (event.ctrlKey || event.metaKey || event.altKey) return false;
+    const sideways = new Vector3(1, 0, 0).applyQuaternion(this.free.quaternion);
+    const upward = new Vector3(0, 1, 0).applyQuaternion(this.free.quaternion);
+    const arrows: Record<string, [number, number]> = {
+      ArrowLeft: [-1, 0],
+      ArrowRight: [1, 0],
+      ArrowUp: [0, 1],
+      ArrowDown: [0, -1],
+    };
+    const arrow = arrows[event.key];
+    if (arrow && event.shiftKey) {
+      const step = 0.05 * offset.length();
+      const move = sideways.multiplyScalar(arrow[0] * step).addScaledVector(upward, arrow[1] * step);
+      target.add(move);
+      this.free.position.add(move);
+    } else if (arrow) {
+      offset.applyAxisAngle(new Vector3(0, 1, 0), arrow[0] * KEY_STEP_RAD);
+      const polar = offset.angleTo(new Vector3(0, 1, 0)) - arrow[1] * KEY_STEP_RAD;
+      if (polar > 0.05 && polar < Math.PI - 0.05) offset.applyAxisAngle(sideways, -arrow[1] * KEY_STEP_RAD);
+      this.free.position.copy(target).add(offset);
+    } else if (event.key === "+" || event.key === "=" || event.key === "-") {
+      offset.multiplyScalar(event.key === "-" ? KEY_ZOOM : 1 / KEY_ZOOM);
+      this.free.position.copy(target).add(offset);
+    } else {
+      return false;
+    }
+    this.controls.update();
+    return true;
+  }
+
+  dispose(): void {
+    this.controls.dispose();
+  }
+}

@@ -1,0 +1,175 @@
+// Cloths, soft bodies and ropes: vertices that come with every frame of a stream, interpolated like bodies.
+
+import {
+  BufferAttribute,
+  BufferGeometry,
+  DynamicDrawUsage,
+  InstancedMesh,
+  Matrix4,
+  Mesh,
+  type Object3D,
+  type ShaderMaterial,
+  Vector3,
+} from "three";
+
+import type { DeformableArrays } from "./arrays.ts";
+import { pieceBetween } from "./scene_view.ts";
+import { buildPrimitive } from "./shapes.ts";
+import type { Deformable } from "./spec.ts";
+
+/** One deformable. `setVertices` takes the vertices of the whole, in the session's world. */
+export class DeformableView {
+  readonly object: Object3D;
+  readonly stream: string;
+  readonly vertices: number;
+  private readonly geometry: BufferGeometry;
+  private readonly write: (vertices: Float32Array) => void;
+
+  constructor(part: Deformable, arrays: DeformableArrays, material: ShaderMaterial) {
+    this.stream = part.stream;
+    this.vertices = part.vertices;
+    if (part.dim === 1) {
+      [this.object, this.geometry, this.write] = makeRope(part, arrays, material);
+    } else {
+      [this.object, this.geometry, this.write] = makeSheet(part, arrays, material);
+    }
+    this.object.name = part.name;
+    this.object.frustumCulled = false;
+    this.object.castShadow = true;
+    this.object.receiveShadow = true;
+    this.write(arrays.position);
+  }
+
+  /** Move the vertices. Frames of another topology are ignored. */
+  setVertices(vertices: Float32Array): void {
+    if (vertices.length === 3 * this.vertices) this.write(vertices);
+  }
+
+  dispose(): void {
+    this.geometry.dispose();
+  }
+}
+
+type Made = [Object3D, BufferGeometry, (vertices: Float32Array) => void];
+
+function makeRope(part: Deformable, arrays: DeformableArrays, material: ShaderMaterial): Made {
+  const shape = buildPrimitive({ kind: "cylinder", size: [1, 1, 0.5], mesh: -1, hfield: -1 });
+  const geometry = new BufferGeometry();
+  geometry.setAttribute("position", new BufferAttribute(shape.position, 3));
+  geometry.setAttribute("normal", new BufferAttribute(shape.normal, 3));
+  geometry.setIndex(new BufferAttribute(shape.index, 1));
+  const { elements } = arrays;
+  const pieces = new InstancedMesh(geometry, material, elements.length / 2);
+  const [a, b, matrix] = [new Vector3(), new Vector3(), new Matrix4()];
+  const write = (vertices: Float32Array): void => {
+    for (let i = 0; i < elements.length / 2; i++) {
+      a.fromArray(vertices, 3 * elements[2 * i]!);
+      b.fromArray(vertices, 3 * elements[2 * i + 1]!);
+      pieces.setMatrixAt(i, pieceBetween(a, b, Math.max(part.radius, 0.001), matrix));
+    }
+    pieces.instanceMatrix.needsUpdate = true;
+  };
+  return [pieces, geometry, write];
+}
+
+/**
+ * Triangles with normals computed here: per vertex, or per triangle where `flat`. A cloth has its thickness as MuJoCo
+ * draws it: both sides are `radius` away from the vertices, with a rim between them.
+ */
+function makeSheet(part: Deformable, arrays: DeformableArrays, material: ShaderMaterial): Made {
+  const { elements, uv } = arrays;
+  const n = part.vertices;
+  const corners = elements.length;
+  const isThick = part.dim === 2 && part.radius > 0;
+  const rim = isThick ? findRim(elements) : [];
+  // Corners of the drawn triangles: the vertex and its side (+1, -1; 0 without thickness).
+  const vertex: number[] = [];
+  const side: number[] = [];
+  const coordinate: number[] = [];
+  const add = (v: number, s: number, corner: number): void => {
+    vertex.push(v);
+    side.push(s);
+    if (uv) coordinate.push(uv[2 * corner]!, uv[2 * corner + 1]!);
+  };
+  for (let c = 0; c < corners; c += 3) {
+    for (const k of [0, 1, 2]) add(elements[c + k]!, isThick ? 1 : 0, c + k);
+    if (isThick) for (const k of [0, 2, 1]) add(elements[c + k]!, -1, c + k);
+  }
+  for (const [a, b, ca, cb] of rim) {
+    for (const [v, s, c] of [[a, 1, ca], [a, -1, ca], [b, -1, cb], [a, 1, ca], [b, -1, cb], [b, 1, cb]] as const) {
+      add(v, s, c);
+    }
+  }
+  const count = vertex.length;
+  const position = new Float32Array(3 * count);
+  const normal = new Float32Array(3 * count);
+  const smooth = new Float32Array(3 * n);
+  const geometry = new BufferGeometry();
+  const positions = new BufferAttribute(position, 3).setUsage(DynamicDrawUsage);
+  const normals = new BufferAttribute(normal, 3).setUsage(DynamicDrawUsage);
+  geometry.setAttribute("position", positions);
+  geometry.setAttribute("normal", normals);
+  if (uv) geometry.setAttribute("uv", new BufferAttribute(new Float32Array(coordinate), 2));
+  const rimStart = count - 6 * rim.length;
+  const write = (p: Float32Array): void => {
+    addUpNormals(p, elements, smooth);
+    for (let i = 0; i < count; i++) {
+      const [v, s] = [3 * vertex[i]!, side[i]!];
+      for (let d = 0; d < 3; d++) {
+        position[3 * i + d] = p[v + d]! + s * part.radius * smooth[v + d]!;
+        normal[3 * i + d] = (s < 0 ? -1 : 1) * smooth[v + d]!;
+      }
+    }
+    for (let i = part.flat ? 0 : rimStart; i < count; i += 3) setFlatNormal(position, normal, i);
+    positions.needsUpdate = normals.needsUpdate = true;
+  };
+  return [new Mesh(geometry, material), geometry, write];
+}
+
+/** Return the edges of one triangle only, as (vertex, vertex, corner, corner), in its winding. */
+function findRim(elements: Uint16Array | Uint32Array): [number, number, number, number][] {
+  const edges = new Map<string, [number, number, number, number] | null>();
+  for (let c = 0; c < elements.length; c += 3) {
+    for (const [i, j] of [[0, 1], [1, 2], [2, 0]] as const) {
+      const [a, b] = [elements[c + i]!, elements[c + j]!];
+      const key = a < b ? `${a} ${b}` : `${b} ${a}`;
+      edges.set(key, edges.has(key) ? null : [a, b, c + i, c + j]);
+    }
+  }
+  return [...edges.values()].filter((edge) => edge !== null);
+}
+
+/** Write the unit normals of vertices to `out`: the sum over their triangles, weighed by area. */
+function addUpNormals(p: Float32Array, elements: Uint16Array | Uint32Array, out: Float32Array): void {
+  out.fill(0);
+  for (let c = 0; c < elements.length; c += 3) {
+    const [a, b, d] = [3 * elements[c]!, 3 * elements[c + 1]!, 3 * elements[c + 2]!];
+    const [ux, uy, uz] = [p[b]! - p[a]!, p[b + 1]! - p[a + 1]!, p[b + 2]! - p[a + 2]!];
+    const [vx, vy, vz] = [p[d]! - p[a]!, p[d + 1]! - p[a + 1]!, p[d + 2]! - p[a + 2]!];
+    const [x, y, z] = [uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx];
+    for (const at of [a, b, d]) {
+      out[at]! += x;
+      out[at + 1]! += y;
+      out[at + 2]! += z;
+    }
+  }
+  for (let i = 0; i < out.length; i += 3) {
+    const length = Math.hypot(out[i]!, out[i + 1]!, out[i + 2]!) || 1;
+    out[i]! /= length;
+    out[i + 1]! /= length;
+    out[i + 2]! /= length;
+  }
+}
+
+function setFlatNormal(p: Float32Array, normal: Float32Array, corner: number): void {
+  const [a, b, d] = [3 * corner, 3 * corner + 3, 3 * corner + 6];
+  const [ux, uy, uz] = [p[b]! - p[a]!, p[b + 1]! - p[a + 1]!, p[b + 2]! - p[a + 2]!];
+  const [vx, vy, vz] = [p[d]! - p[a]!, p[d + 1]! - p[a + 1]!, p[d + 2]! - p[a + 2]!];
+  const [x, y, z] = [uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx];
+  const length = Math.hypot(x, y, z) || 1;
+  for (const at of [a, b, d]) {
+    normal[at] = x / length;
+    normal[at + 1] = y / length;
+    normal[at + 2] = z / length;
+  }
+}

@@ -1,0 +1,317 @@
+// The picture of the page: takes what the worker posts, draws it on the shared clock.
+
+import {
+  Color,
+  ColorManagement,
+  LinearSRGBColorSpace,
+  type Mesh,
+  MeshBasicMaterial,
+  PCFShadowMap,
+  Scene,
+  WebGLRenderer,
+} from "three";
+
+import { type FrameUpdate, nowMs, type SceneSpec } from "../core/api.ts";
+import type { WorkerClient } from "../core/page_client.ts";
+import { AnchorOverlay } from "./anchors.ts";
+import { WorkerAssets } from "./assets.ts";
+import { Avatars } from "./avatars.ts";
+import { makeWorldRoot } from "./axes.ts";
+import { type Budget, DESKTOP, HEADSET, SOFTWARE } from "./budget.ts";
+import { Viewpoint } from "./camera.ts";
+import { DelayEstimator, FrameBuffer, interpolatePoses, interpolateValues, POSE_FLOATS } from "./interpolation.ts";
+import { SceneView } from "./scene_view.ts";
+
+// Colours are blended as they are (docs/scene.md).
+ColorManagement.enabled = false;
+
+const BACKGROUND = 0x1b1f27;
+/** Background without a sky is brighter than the page, so that dark robots are seen. */
+const NO_SKY = 0x2a303b;
+/** Frames that are drawn after the last change, because textures arrive between frames. */
+const FRAMES_AFTER_CHANGE = 3;
+/** Longest time without a drawn frame [ms]: what changes silently is seen then. */
+const IDLE_MS = 1000;
+
+/** What this device can draw. */
+export interface Device {
+  budget: Budget;
+  shadows: boolean;
+  pixelRatio: number;
+  renderer: string;
+}
+
+export interface ViewEvents {
+  /** The scene was replaced: its cameras may be others. */
+  onScene: (spec: SceneSpec) => void;
+  onProblem: (text: string) => void;
+}
+
+interface Stream {
+  buffer: FrameBuffer;
+  values: Float32Array;
+}
+
+/** Draws the session on a canvas. Throws `Error` with advice when the browser has no WebGL. */
+export class View {
+  readonly avatars = new Avatars();
+  readonly anchors = new AnchorOverlay();
+  readonly viewpoint: Viewpoint;
+  readonly device: Device;
+  scene: SceneView | null = null;
+  /** Frames drawn since the page began. */
+  drawn = 0;
+  /** Age of what is drawn: delay of the interpolation behind session time [ms]. */
+  get delay_ms(): number {
+    return this.delay.delay_ms;
+  }
+
+  private readonly renderer: WebGLRenderer;
+  private readonly root = new Scene();
+  private readonly overlay = makeWorldRoot();
+  private readonly assets: WorkerAssets;
+  private readonly delay = new DelayEstimator();
+  private readonly frames: FrameBuffer;
+  private readonly streams = new Map<string, Stream>();
+  private poses = new Float32Array(0);
+  private bodyIds: number[] = [];
+  private bodiesVersion = -1;
+  private sessionOffset_ms = Number.NaN;
+  private framesToDraw = FRAMES_AFTER_CHANGE;
+  private lastDrawn_ms = 0;
+  private lastFrame_ms = 0;
+  private drawnSinceReport = 0;
+  private sceneCount = 0;
+
+  constructor(
+    private readonly canvas: HTMLCanvasElement,
+    private readonly client: WorkerClient,
+    private readonly events: ViewEvents,
+  ) {
+    this.renderer = makeRenderer(canvas);
+    this.device = inspectDevice(this.renderer);
+    this.renderer.setPixelRatio(this.device.pixelRatio);
+    this.renderer.shadowMap.enabled = this.device.shadows;
+    this.renderer.shadowMap.type = PCFShadowMap;
+    this.renderer.outputColorSpace = LinearSRGBColorSpace;
+    this.root.background = new Color(BACKGROUND);
+    this.overlay.add(this.avatars.group, this.anchors.group);
+    this.root.add(this.overlay);
+    this.assets = new WorkerAssets(client);
+    this.viewpoint = new Viewpoint(canvas);
+    this.frames = new FrameBuffer((values) => client.recycle(values));
+    new ResizeObserver(() => this.resize()).observe(canvas);
+    this.resize();
+    this.listen();
+    this.renderer.setAnimationLoop(() => this.draw());
+    setInterval(() => this.reportDrawn(), 1000);
+  }
+
+  /** Draw again: something changed that the view does not see by itself. */
+  touch(): void {
+    this.framesToDraw = FRAMES_AFTER_CHANGE;
+  }
+
+  /** Poses that are drawn now, 7 numbers per body, in the order of `drawnBodies`. */
+  get drawnPoses(): Float32Array {
+    return this.poses;
+  }
+
+  get drawnBodies(): readonly number[] {
+    return this.bodyIds;
+  }
+
+  /**
+   * Draw everything but planes and sky in white on black, once, and return the picture as a data URL. For tests and
+   * for masks.
+   */
+  drawSilhouette(): string {
+    const { scene } = this;
+    const white = new MeshBasicMaterial({ color: 0xffffff, side: 2 });
+    const hidden: { visible: boolean }[] = [this.overlay, ...(scene?.sky ? [scene.sky] : [])];
+    scene?.world.traverse((object) => {
+      if (object.userData.isPlane) hidden.push(object);
+    });
+    const shown = hidden.filter((object) => object.visible);
+    for (const object of shown) object.visible = false;
+    const { background } = this.root;
+    this.root.background = new Color(0);
+    this.root.overrideMaterial = white;
+    this.renderer.render(this.root, this.viewpoint.camera);
+    const picture = this.canvas.toDataURL("image/png");
+    this.root.overrideMaterial = null;
+    this.root.background = background;
+    for (const object of shown) object.visible = true;
+    white.dispose();
+    this.touch();
+    return picture;
+  }
+
+  private listen(): void {
+    const { client } = this;
+    client.on("clock", ({ session_offset_ms }) => (this.sessionOffset_ms = session_offset_ms));
+    client.on("bodies", ({ version, bodies }) => {
+      this.bodiesVersion = version;
+      this.bodyIds = bodies.map(([id]) => id);
+      this.frames.clear();
+      this.poses = new Float32Array(0);
+    });
+    client.on("scene", ({ spec }) => this.setScene(spec));
+    client.on("frame", (frame) => this.takeFrame(frame));
+    client.on("presence", ({ items }) => this.avatars.setPresence(items, this.sessionTime()));
+    client.on("deformable", ({ stream, vertices, session_ms }) => {
+      const known = this.streams.get(stream);
+      const target = known ?? { buffer: new FrameBuffer(), values: new Float32Array(0) };
+      this.streams.set(stream, target);
+      target.buffer.push({ session_ms, values: vertices });
+    });
+  }
+
+  private setScene(spec: SceneSpec): void {
+    const before = this.scene;
+    const scene = new SceneView(spec, this.assets, {
+      budget: this.device.budget,
+      shadows: this.device.shadows,
+      anisotropy: Math.min(8, this.renderer.capabilities.getMaxAnisotropy()),
+      onProblem: this.events.onProblem,
+    });
+    this.scene = scene;
+    this.sceneCount += 1;
+    this.assets.keepOnly(listAddresses(spec));
+    const isSameRoom = before !== null && before.spec.name === spec.name && before.spec.bodies.length === spec.bodies.length;
+    if (!isSameRoom) this.viewpoint.frame(scene);
+    const swap = (): void => {
+      before?.dispose();
+      if (this.scene !== scene) return;
+      this.root.add(scene.world);
+      this.touch();
+    };
+    // A changed scene appears when it is complete; the first one as it comes.
+    if (isSameRoom) void scene.complete.then(swap);
+    else swap();
+    void scene.complete.then(() => {
+      if (this.scene !== scene) return;
+      if (scene.sky) this.root.add(scene.sky);
+      this.root.background = new Color(scene.sky ? BACKGROUND : NO_SKY);
+      this.touch();
+    });
+    this.events.onScene(spec);
+  }
+
+  private takeFrame(frame: FrameUpdate): void {
+    if (frame.bodies_version !== this.bodiesVersion || frame.poses.length !== POSE_FLOATS * this.bodyIds.length) {
+      this.client.recycle(frame.poses);
+      return;
+    }
+    const period = frame.session_ms - this.lastFrame_ms;
+    this.lastFrame_ms = frame.session_ms;
+    if (period > 0 && period < 500) this.delay.add(frame.age_ms, period, nowMs());
+    this.frames.push({ session_ms: frame.session_ms, values: frame.poses });
+  }
+
+  private sessionTime(): number {
+    return nowMs() + (Number.isNaN(this.sessionOffset_ms) ? 0 : this.sessionOffset_ms);
+  }
+
+  private draw(): void {
+    const session_ms = this.sessionTime() - this.delay.delay_ms;
+    const isChanged = [
+      this.moveBodies(session_ms),
+      this.moveDeformables(session_ms),
+      this.avatars.update(session_ms),
+      this.viewpoint.update(this.scene),
+    ].some(Boolean);
+    const now = nowMs();
+    if (isChanged) this.framesToDraw = FRAMES_AFTER_CHANGE;
+    const isLoading = this.scene !== null && this.sceneCount > 0 && now - this.lastDrawn_ms > IDLE_MS;
+    if (this.framesToDraw <= 0 && !isLoading && !this.renderer.xr.isPresenting) return;
+    this.framesToDraw -= 1;
+    this.lastDrawn_ms = now;
+    this.scene?.lighting.update(this.scene.rest);
+    this.renderer.render(this.root, this.viewpoint.camera);
+    this.drawn += 1;
+    this.drawnSinceReport += 1;
+  }
+
+  private moveBodies(session_ms: number): boolean {
+    const found = this.frames.around(session_ms);
+    if (!found || !this.scene) return false;
+    const { length } = found.before.values;
+    const isNew = this.poses.length !== length;
+    if (isNew) this.poses = new Float32Array(length);
+    const last = isNew ? null : this.poses.slice();
+    interpolatePoses(found.before.values, found.after.values, found.share, this.poses);
+    if (last?.every((value, i) => value === this.poses[i]!)) return false;
+    for (let row = 0; row < this.bodyIds.length; row++) {
+      const group = this.scene.bodies.get(this.bodyIds[row]!);
+      if (!group) continue;
+      const at = POSE_FLOATS * row;
+      const [x, y, z] = [this.poses[at]!, this.poses[at + 1]!, this.poses[at + 2]!];
+      group.visible = Number.isFinite(x + y + z + this.poses[at + 3]!); // a body that diverged is not drawn
+      if (!group.visible) continue;
+      group.position.set(x, y, z);
+      group.quaternion.set(this.poses[at + 4]!, this.poses[at + 5]!, this.poses[at + 6]!, this.poses[at + 3]!);
+    }
+    return true;
+  }
+
+  private moveDeformables(session_ms: number): boolean {
+    let isMoved = false;
+    for (const part of this.scene?.deformables ?? []) {
+      const stream = this.streams.get(part.stream);
+      const found = stream?.buffer.around(session_ms);
+      if (!stream || !found) continue;
+      const { length } = found.before.values;
+      const last = stream.values.length === length ? stream.values.slice() : null;
+      if (!last) stream.values = new Float32Array(length);
+      interpolateValues(found.before.values, found.after.values, found.share, stream.values);
+      if (last?.every((value, i) => value === stream.values[i]!)) continue;
+      part.setVertices(stream.values);
+      isMoved = true;
+    }
+    return isMoved;
+  }
+
+  private resize(): void {
+    const { clientWidth, clientHeight } = this.canvas;
+    if (clientWidth === 0 || clientHeight === 0) return;
+    this.renderer.setSize(clientWidth, clientHeight, false);
+    this.viewpoint.setAspect(clientWidth / clientHeight);
+    this.touch();
+  }
+
+  private reportDrawn(): void {
+    this.client.post({ type: "drawn", frames: this.drawnSinceReport });
+    this.drawnSinceReport = 0;
+  }
+}
+
+function makeRenderer(canvas: HTMLCanvasElement): WebGLRenderer {
+  try {
+    return new WebGLRenderer({ canvas, antialias: true, powerPreference: "high-performance" });
+  } catch {
+    throw new Error("This browser cannot draw in 3D: switch on WebGL 2, or use another browser. The dashboard works.");
+  }
+}
+
+/** Choose what to draw by what draws it. */
+function inspectDevice(renderer: WebGLRenderer): Device {
+  const gl = renderer.getContext();
+  const extension = gl.getExtension("WEBGL_debug_renderer_info");
+  const name = String(gl.getParameter(extension ? extension.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
+  const isSoftware = /swiftshader|llvmpipe|software|basic render/i.test(name);
+  const isMobile = matchMedia("(pointer: coarse)").matches || /quest|oculus/i.test(navigator.userAgent);
+  return {
+    budget: isSoftware ? SOFTWARE : isMobile ? HEADSET : DESKTOP,
+    shadows: !isSoftware && !isMobile,
+    pixelRatio: isSoftware ? 1 : Math.min(devicePixelRatio, 2),
+    renderer: name,
+  };
+}
+
+function listAddresses(spec: SceneSpec): Set<string> {
+  const levels = [...spec.meshes, ...spec.textures].flatMap((item) => item.levels.map((level) => level.address));
+  return new Set([...levels, ...spec.hfields.map((f) => f.address), ...spec.deformables.map((d) => d.address)]);
+}
+
+export type { Mesh };

@@ -1,0 +1,34 @@
+import { expect, test } from "vitest";
+
+import { denialWords, eventWords, formatBytes, formatMillimetres, formatSessionTime } from "../../src/ui/words.ts";
+
+const nameOf = (id: string): string => ({ p1: "ann", p2: "ben" })[id] ?? "";
+type Body = Parameters<typeof eventWords>[0];
+
+test("an e-stop says who and why", () => {
+  const body = { event: "estop_changed", active: true, participant: "p1", reason: "too close", stop_seq: 1 } as Body;
+  expect(eventWords(body, nameOf)).toEqual({ level: "error", text: "e-stop by ann: too close" });
+});
+
+test("a lease that changes hands names both", () => {
+  const lease = { target: "left", kind: "robot", mode: "takeover", holder: "p2", lease_version: 2, expires_ns: 0 };
+  const filled = { ...lease, queue: [], sub_holders: [], weights: [], scale: 1 };
+  const body = { event: "lease_changed", lease: filled, cause: "takeover", previous_holder: "p1" } as Body;
+  expect(eventWords(body, nameOf)!.text).toBe("ben took over left from ann");
+});
+
+test("an event of another version is left out, not an error", () => {
+  expect(eventWords({ event: "from_the_future" } as unknown as Body, nameOf)).toBeNull();
+});
+
+test("a denial names the holder once, and the advice", () => {
+  const denial = { reason: "held", message: "left is held", advice: "wait for it", target: "left", holder: "p1" };
+  expect(denialWords({ ...denial, holder_name: "ann" })).toBe("Left is held. Held by ann. Wait for it");
+  expect(denialWords({ ...denial, message: "ann holds left.", holder_name: "ann" })).toBe("Ann holds left. Wait for it");
+});
+
+test("numbers have units that fit", () => {
+  expect([formatMillimetres(0.0043), formatMillimetres(0.021), formatMillimetres(1.5)]).toEqual(["4.3 mm", "21 mm", "150 cm"]);
+  expect([formatBytes(512), formatBytes(48_200_000)]).toEqual(["512 B", "48 MB"]);
+  expect(formatSessionTime(754.3e9)).toBe("12:34.3");
+});
