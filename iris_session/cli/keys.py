@@ -13,7 +13,8 @@ from iris_session.protocol.names import Role
 from iris_session.security.allow_list import CURVE
 
 if TYPE_CHECKING:
-    from iris_session.security import KeyPair
+    from iris_session.security import KeyHome, KeyPair
+    from iris_session.web.certificate import Certificate
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -156,14 +157,31 @@ def run_show(arguments: argparse.Namespace) -> int:
     from iris_session.security import KeyHome
 
     home = KeyHome()
-    server, own = home.find_server_key(), home.find_identity()
+    server, own, page = home.find_server_key(), home.find_identity(), _find_page_certificate(home)
     if arguments.json:
-        print_json({"home": str(home.path), "server": _key_to_dict(server), "identity": _key_to_dict(own)})
+        certificate = None if page is None else {"fingerprint": page.fingerprint, "key": page.key}
+        keys = {"server": _key_to_dict(server), "identity": _key_to_dict(own), "certificate": certificate}
+        print_json({"home": str(home.path), **keys})
         return 0
     print(f"folder of keys    {home.path}")
     print(f"your sessions     {_format_key(server, 'created when you serve an encrypted session')}")
     print(f"you as a client   {_format_key(own, 'created when you join an encrypted session')}")
+    text = "no certificate yet, created when you serve an encrypted session"
+    if page is not None:
+        text = f"certificate {page.fingerprint}    for {', '.join(page.names)}"
+    print(f"page for browsers {text}")
     return 0
+
+
+def _find_page_certificate(home: KeyHome) -> Certificate | None:
+    """Return the certificate of the page, `None` where there is none, or nothing to read it with."""
+    from iris_session.system.extras import MissingExtraError
+    from iris_session.web.certificate import find_certificate
+
+    try:
+        return find_certificate(home)
+    except MissingExtraError:
+        return None
 
 
 def _key_to_dict(pair: KeyPair | None) -> dict[str, str] | None:
