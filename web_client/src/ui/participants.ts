@@ -79,7 +79,7 @@ function makeRow({ id }: ParticipantInfo, state: PageState, actions: Actions): R
       setValue(role, item.role);
       role.setAttribute("aria-label", `Role of ${item.name}`);
       nameField.setAttribute("aria-label", `New name of ${item.name}`);
-      remove.setAttribute("aria-label", `Remove ${item.name}`);
+      remove.setAttribute("aria-label", `Remove: ${item.name}`);
       setValue(nameField, nameField.value || item.name);
       remove.hidden = id === state.selfId;
     },

@@ -3,8 +3,8 @@
 import {
   Color,
   ColorManagement,
+  DoubleSide,
   LinearSRGBColorSpace,
-  type Mesh,
   MeshBasicMaterial,
   PCFShadowMap,
   Scene,
@@ -112,38 +112,48 @@ export class View {
     this.framesToDraw = FRAMES_AFTER_CHANGE;
   }
 
-  /** Poses that are drawn now, 7 numbers per body, in the order of `drawnBodies`. */
-  get drawnPoses(): Float32Array {
-    return this.poses;
-  }
-
-  get drawnBodies(): readonly number[] {
-    return this.bodyIds;
+  /** What is drawn now: poses, 7 numbers per body of `bodies`, and vertices of deformables by stream. */
+  get shown(): { bodies: number[]; poses: Float32Array; vertices: Map<string, Float32Array> } {
+    const vertices = new Map([...this.streams].map(([name, stream]) => [name, stream.values] as const));
+    return { bodies: this.bodyIds, poses: this.poses, vertices };
   }
 
   /**
-   * Draw everything but planes and sky in white on black, once, and return the picture as a data URL. For tests and
-   * for masks.
+   * Draw the scene once in another size, without people, anchors and shadows, and return the picture as a data URL.
+   * `silhouette`: white on black, without planes and sky. For tests and for masks.
    */
-  drawSilhouette(): string {
-    const { scene } = this;
-    const white = new MeshBasicMaterial({ color: 0xffffff, side: 2 });
-    const hidden: { visible: boolean }[] = [this.overlay, ...(scene?.sky ? [scene.sky] : [])];
-    scene?.world.traverse((object) => {
-      if (object.userData.isPlane) hidden.push(object);
-    });
-    const shown = hidden.filter((object) => object.visible);
-    for (const object of shown) object.visible = false;
-    const { background } = this.root;
-    this.root.background = new Color(0);
-    this.root.overrideMaterial = white;
-    this.renderer.render(this.root, this.viewpoint.camera);
+  capture(width: number, height: number, silhouette: boolean): string {
+    const { scene, root } = this;
+    const hidden: { visible: boolean }[] = [this.overlay];
+    if (silhouette) {
+      if (scene?.sky) hidden.push(scene.sky);
+      scene?.world.traverse((object) => {
+        if (object.userData.isPlane) hidden.push(object);
+      });
+    }
+    const changed = hidden.filter((object) => object.visible);
+    const { background } = root;
+    const white = new MeshBasicMaterial({ color: 0xffffff, side: DoubleSide });
+    for (const object of changed) object.visible = false;
+    if (silhouette) {
+      root.background = new Color(0);
+      root.overrideMaterial = white;
+    }
+    this.renderer.shadowMap.enabled = false;
+    this.renderer.setPixelRatio(1);
+    this.renderer.setSize(width, height, false);
+    this.viewpoint.setAspect(width / height);
+    this.viewpoint.update(scene);
+    scene?.lighting.update(scene.rest);
+    this.renderer.render(root, this.viewpoint.camera);
     const picture = this.canvas.toDataURL("image/png");
-    this.root.overrideMaterial = null;
-    this.root.background = background;
-    for (const object of shown) object.visible = true;
+    root.overrideMaterial = null;
+    root.background = background;
+    for (const object of changed) object.visible = true;
     white.dispose();
-    this.touch();
+    this.renderer.shadowMap.enabled = this.device.shadows;
+    this.renderer.setPixelRatio(this.device.pixelRatio);
+    this.resize();
     return picture;
   }
 
@@ -313,5 +323,3 @@ function listAddresses(spec: SceneSpec): Set<string> {
   const levels = [...spec.meshes, ...spec.textures].flatMap((item) => item.levels.map((level) => level.address));
   return new Set([...levels, ...spec.hfields.map((f) => f.address), ...spec.deformables.map((d) => d.address)]);
 }
-
-export type { Mesh };
