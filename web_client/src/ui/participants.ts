@@ -18,7 +18,7 @@ export function makeParticipantsPanel(state: PageState, actions: Actions): Panel
   return {
     element: section.element,
     update: () => {
-      const participants = state.session?.participants ?? [];
+      const participants = (state.session?.participants ?? []).filter((one) => one.role !== "gateway");
       section.setCount(participants.length > 0 ? String(participants.length) : "");
       rows.update(participants, (participant) => participant.id);
     },

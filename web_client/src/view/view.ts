@@ -30,6 +30,8 @@ const BACKGROUND = 0x1b1f27;
 const NO_SKY = 0x2a303b;
 /** Frames that are drawn after the last change, because textures arrive between frames. */
 const FRAMES_AFTER_CHANGE = 3;
+/** Differences of poses that cannot be seen: two steps of the lattice of positions [m], and of quaternions. */
+const SAME = 1.3e-4;
 /** Longest time without a drawn frame [ms]: what changes silently is seen then. */
 const IDLE_MS = 1000;
 
@@ -38,6 +40,8 @@ export interface Device {
   budget: Budget;
   shadows: boolean;
   pixelRatio: number;
+  /** Shortest time between two frames [ms]: the processor that draws has other work, too. */
+  framePeriod_ms: number;
   renderer: string;
 }
 
@@ -74,11 +78,13 @@ export class View {
   private readonly frames: FrameBuffer;
   private readonly streams = new Map<string, Stream>();
   private poses = new Float32Array(0);
+  private drawnPoses = new Float32Array(0);
   private bodyIds: number[] = [];
   private bodiesVersion = -1;
   private sessionOffset_ms = Number.NaN;
   private framesToDraw = FRAMES_AFTER_CHANGE;
   private lastDrawn_ms = 0;
+  private lastTried_ms = 0;
   private lastFrame_ms = 0;
   private drawnSinceReport = 0;
   private sceneCount = 0;
@@ -115,7 +121,7 @@ export class View {
   /** What is drawn now: poses, 7 numbers per body of `bodies`, and vertices of deformables by stream. */
   get shown(): { bodies: number[]; poses: Float32Array; vertices: Map<string, Float32Array> } {
     const vertices = new Map([...this.streams].map(([name, stream]) => [name, stream.values] as const));
-    return { bodies: this.bodyIds, poses: this.poses, vertices };
+    return { bodies: this.bodyIds, poses: this.drawnPoses, vertices };
   }
 
   /**
@@ -224,6 +230,8 @@ export class View {
   }
 
   private draw(): void {
+    if (nowMs() - this.lastTried_ms < this.device.framePeriod_ms) return;
+    this.lastTried_ms = nowMs();
     const session_ms = this.sessionTime() - this.delay.delay_ms;
     const isChanged = [
       this.moveBodies(session_ms),
@@ -249,9 +257,9 @@ export class View {
     const { length } = found.before.values;
     const isNew = this.poses.length !== length;
     if (isNew) this.poses = new Float32Array(length);
-    const last = isNew ? null : this.poses.slice();
     interpolatePoses(found.before.values, found.after.values, found.share, this.poses);
-    if (last?.every((value, i) => value === this.poses[i]!)) return false;
+    if (!isNew && !isVisiblyDifferent(this.poses, this.drawnPoses)) return false;
+    this.drawnPoses = this.poses.slice();
     for (let row = 0; row < this.bodyIds.length; row++) {
       const group = this.scene.bodies.get(this.bodyIds[row]!);
       if (!group) continue;
@@ -296,6 +304,13 @@ export class View {
   }
 }
 
+/** Return whether two arrays of poses differ by more than the bound of the stream. */
+function isVisiblyDifferent(a: Float32Array, b: Float32Array): boolean {
+  if (a.length !== b.length) return true;
+  for (let i = 0; i < a.length; i++) if (!(Math.abs(a[i]! - b[i]!) <= SAME)) return true;
+  return false;
+}
+
 function makeRenderer(canvas: HTMLCanvasElement): WebGLRenderer {
   try {
     return new WebGLRenderer({ canvas, antialias: true, powerPreference: "high-performance" });
@@ -314,6 +329,7 @@ function inspectDevice(renderer: WebGLRenderer): Device {
   return {
     budget: isSoftware ? SOFTWARE : isMobile ? HEADSET : DESKTOP,
     shadows: !isSoftware && !isMobile,
+    framePeriod_ms: isSoftware ? 30 : 0,
     pixelRatio: isSoftware ? 1 : Math.min(devicePixelRatio, 2),
     renderer: name,
   };
