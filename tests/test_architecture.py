@@ -60,6 +60,7 @@ FORBIDDEN = {
     "front": {"mujoco", "rerun"},
     "recording": set(),
     "client": {"mujoco", "rerun"},
+    "web": {"mujoco", "rerun"},
     "netsim": {"zmq", "mujoco", "rerun"},
     "emulator": {"mujoco", "rerun"},
     "doctor": {"zmq", "mujoco", "rerun"},

@@ -192,13 +192,26 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--curve-clients", default="", metavar="DIR", help="public certificates to admit, instead of the allow-list"
     )
+    add_page_options(group)
     group.add_argument("--no-record", action="store_true", help="record nothing")
+    group.add_argument("--no-web", action="store_true", help="serve no page for browsers")
     group.add_argument("--sites", action="store_true", help="send the model's sites to clients")
     group.add_argument("--tendons", action="store_true", help="send the model's spatial tendons to clients")
     group.add_argument(
         "--assignment", choices=sorted(AssignmentPolicy.ALL), default=None, help="how robots are assigned"
     )
     group.add_argument("--mode", choices=sorted(LeaseMode.ALL), default=None, help="lease mode of every robot")
+
+
+def add_page_options(group: argparse._ActionsContainer) -> None:
+    """Add the options of the page for browsers, for `serve`, `demo` and `web`."""
+    group.add_argument(
+        "--web-port", type=int, default=None, metavar="PORT", help="port of the page for browsers (default: 7725)"
+    )
+    group.add_argument(
+        "--web-cert", default="", metavar="FILE", help="certificate for HTTPS, PEM (default: one of this user's own)"
+    )
+    group.add_argument("--web-key", default="", metavar="FILE", help="key of that certificate, PEM")
 
 
 def open_scene(scene: str) -> NamedScene:

@@ -1,4 +1,4 @@
-"""Commands that control a running session: e-stop, pause, reset, leases, episodes, markers.
+"""Commands that control a running session: e-stop, pause, reset, leases, names and roles, episodes, markers.
 
 Each joins for the time of the request, in the first role that its key may have of those that may ask for it, under a
 name that no assignment gives robots to, and leaves.
@@ -23,6 +23,7 @@ from iris_session.cli.common import (
     print_json,
     to_printable,
 )
+from iris_session.protocol.client_messages import Rename, SetRole
 from iris_session.protocol.names import ControlAction, DenialReason, EpisodeAction, LeaseMode, Role
 
 if TYPE_CHECKING:
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 #: Time to be admitted, and for the e-stop to be confirmed [s].
 TIMEOUT_S: Final = 5.0
+#: Time for the event of a change that was granted [s]: it comes just before the reply, if anything changed.
+NEWS_S: Final = 0.5
 #: Roles that may ask for it, the least powerful first: a key may have few of them.
 DIRECTORS: Final = (Role.DIRECTOR,)
 DRIVERS: Final = (Role.AGENT, Role.OPERATOR, Role.LEADER, Role.DIRECTOR)
@@ -49,8 +52,8 @@ Action = Callable[["Client", argparse.Namespace], Outcome]
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the commands `estop`, `clear-estop`, `pause`, `resume`, `reset`, `assign`, `release`, `mode`, `episode` and
-    `marker`.
+    """Add the commands `estop`, `clear-estop`, `pause`, `resume`, `reset`, `assign`, `release`, `mode`, `rename`,
+    `role`, `episode` and `marker`.
     """
     estop = _add_command(
         commands,
@@ -86,6 +89,16 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     mode = _add_command(commands, "mode", "change the lease mode of robots", set_modes, "mode request left right")
     mode.add_argument("mode", choices=sorted(LeaseMode.ALL), help="lease mode")
     mode.add_argument("robots", nargs="*", metavar="ROBOT", help="names of robots (default: all)")
+    rename = _add_command(
+        commands, "rename", "give a participant another name", rename_participant, "rename p3 ann", "rename quest ann"
+    )
+    rename.add_argument("person", metavar="PERSON", help="name or id of a participant")
+    rename.add_argument("name", metavar="NAME", help="its new name; one that is taken gets a number")
+    role = _add_command(
+        commands, "role", "give a participant another role, one of those of its key", set_role, "role ann director"
+    )
+    role.add_argument("person", metavar="PERSON", help="name or id of a participant")
+    role.add_argument("role", choices=sorted(Role.ALL - {Role.GATEWAY}), metavar="ROLE", help="its new role")
     episode = _add_command(
         commands,
         "episode",
@@ -269,6 +282,29 @@ def assign_robots(client: Client, arguments: argparse.Namespace) -> Outcome:
         f"{', '.join(robots)} -> {client.mirror.participants[person].name} ({person})",
         {"participant": person, "robots": [lease.target for lease in leases] or robots},
     )
+
+
+def rename_participant(client: Client, arguments: argparse.Namespace) -> Outcome:
+    """Give a participant another name."""
+    person = find_participant(client, arguments.person)
+    before = client.mirror.participants[person].name
+    client.request(Rename(0, person, arguments.name))
+    client.wait_for(lambda one: _find_name(one, person) != before, NEWS_S)
+    name = _find_name(client, person)
+    return Outcome(f"{person}: {before} is now {name}", {"participant": person, "name": name})
+
+
+def _find_name(client: Client, person: str) -> str:
+    info = client.mirror.participants.get(person)
+    return "" if info is None else info.name
+
+
+def set_role(client: Client, arguments: argparse.Namespace) -> Outcome:
+    """Give a participant another role."""
+    person = find_participant(client, arguments.person)
+    client.request(SetRole(0, person, arguments.role))
+    name = _find_name(client, person)
+    return Outcome(f"{name} ({person}) is now {arguments.role}", {"participant": person, "role": arguments.role})
 
 
 def find_participant(client: Client, person: str) -> str:

@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING
 from iris_session.cli.common import CommandError, add_json_option, print_json
 from iris_session.cli.pair import add_role_option, parse_roles
 from iris_session.protocol.names import Role
+from iris_session.security.allow_list import CURVE
 
 if TYPE_CHECKING:
-    from iris_session.security import KeyPair
+    from iris_session.security import KeyHome, KeyPair
+    from iris_session.web.certificate import Certificate
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -99,6 +101,7 @@ def run_list(arguments: argparse.Namespace) -> int:
                 "fingerprint": mark,
                 "key": one.key,
                 "roles": list(one.roles),
+                "kind": one.kind,
                 "added": one.added,
                 "last_seen": one.last_seen,
             }
@@ -111,7 +114,8 @@ def run_list(arguments: argparse.Namespace) -> int:
     width = max((len(one.name) for one in keys.values()), default=0)
     for mark, one in keys.items():
         roles, seen = ", ".join(one.roles) or "any role", one.last_seen or "never"
-        print(f"{one.name:{width}}  {mark}  {roles}  added {one.added or 'manually'}  last seen {seen}")
+        kind = "" if one.kind == CURVE else f"{one.kind}  "
+        print(f"{one.name:{width}}  {mark}  {kind}{roles}  added {one.added or 'manually'}  last seen {seen}")
     return 0
 
 
@@ -153,14 +157,31 @@ def run_show(arguments: argparse.Namespace) -> int:
     from iris_session.security import KeyHome
 
     home = KeyHome()
-    server, own = home.find_server_key(), home.find_identity()
+    server, own, page = home.find_server_key(), home.find_identity(), _find_page_certificate(home)
     if arguments.json:
-        print_json({"home": str(home.path), "server": _key_to_dict(server), "identity": _key_to_dict(own)})
+        certificate = None if page is None else {"fingerprint": page.fingerprint, "key": page.key}
+        keys = {"server": _key_to_dict(server), "identity": _key_to_dict(own), "certificate": certificate}
+        print_json({"home": str(home.path), **keys})
         return 0
     print(f"folder of keys    {home.path}")
     print(f"your sessions     {_format_key(server, 'created when you serve an encrypted session')}")
     print(f"you as a client   {_format_key(own, 'created when you join an encrypted session')}")
+    text = "no certificate yet, created when you serve an encrypted session"
+    if page is not None:
+        text = f"certificate {page.fingerprint}    for {', '.join(page.names)}"
+    print(f"page for browsers {text}")
     return 0
+
+
+def _find_page_certificate(home: KeyHome) -> Certificate | None:
+    """Return the certificate of the page, `None` where there is none, or nothing to read it with."""
+    from iris_session.system.extras import MissingExtraError
+    from iris_session.web.certificate import find_certificate
+
+    try:
+        return find_certificate(home)
+    except MissingExtraError:
+        return None
 
 
 def _key_to_dict(pair: KeyPair | None) -> dict[str, str] | None:

@@ -25,6 +25,7 @@ from iris_session.cli import (
     sessions,
     status,
     verify,
+    web,
 )
 from iris_session.cli.common import CommandError, join_negative_poses, list_expected_errors
 from iris_session.system.extras import describe_import_error
@@ -34,6 +35,8 @@ _EPILOG = """examples:
   iris-session demo handover                 two emulated operators hand over a hammer
   iris-session serve scene.xml               share a MuJoCo scene on this machine
   iris-session pair                          a join code and a QR code for one new device
+  iris-session pair --web                    a link and a QR code for one browser
+  iris-session web 192.168.0.10              a page here for a session on another machine
   iris-session keys list                     the keys that may join
   iris-session sessions                      the sessions on this network
   iris-session robots scene.xml              the robots found in a model, as TOML to edit
@@ -50,7 +53,7 @@ _EPILOG = """examples:
 
 #: In the order of `--help`.
 _MODULES = (
-    demo, serve, pair, keys, sessions, status, control, doctor, verify, emulate, robots, scene, anchors, bench,
+    demo, serve, pair, web, keys, sessions, status, control, doctor, verify, emulate, robots, scene, anchors, bench,
 )  # fmt: skip
 
 

@@ -15,10 +15,13 @@ from iris_session.security.private_folder import KeysBusyError
 
 if TYPE_CHECKING:
     from iris_session.security import JoinCode, KeyHome, KeyPair, RegisteredSession
+    from iris_session.web.certificate import Certificate
 
 ANY_ROLE: Final = "any"
 POLL_S: Final = 0.2
 MAX_MINUTES: Final = 24 * 60.0
+#: Port of the page, from the port of control, where the session is not on this machine.
+WEB_OFFSET: Final = 4
 #: Text by reason why no device has paired.
 FAILURE_TEXTS: Final = {
     "void": "void after five wrong attempts: create another code",
@@ -38,6 +41,8 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         epilog="examples:\n"
         "  iris-session pair                               scan the code, or type it\n"
         "  iris-session pair --role director --name ann    a key that may direct\n"
+        "  iris-session pair --web                         a link for a browser, as a QR code\n"
+        "  iris-session pair --web --role observer         a browser that may look only\n"
         "  iris-session pair --png code.png --no-wait      to show on another screen\n"
         "  iris-session pair --address 10.0.0.5:7721       address at which others reach this machine",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -54,7 +59,11 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     parser.add_argument(
         "--curve-key", default="", metavar="FILE", help="secret key of the session (default: the user's)"
     )
+    parser.add_argument("--web", action="store_true", help="show a link to the page for browsers as the QR code")
     parser.add_argument("--png", type=Path, metavar="FILE", help="also write the QR code as an image")
+    parser.add_argument(
+        "--web-cert", default="", metavar="FILE", help="certificate of the page (default: this user's own)"
+    )
     parser.add_argument("--no-wait", action="store_true", help="do not wait until the code is used")
     add_json_option(parser)
     parser.set_defaults(run=run)
@@ -83,11 +92,19 @@ def run(arguments: argparse.Namespace) -> int:
 
     home = KeyHome()
     key = load_secret(arguments.curve_key) if arguments.curve_key else home.load_server_key()
-    session, places = _find_addresses(arguments, home, key)
+    session, places, web = _find_addresses(arguments, home, key)
     roles = parse_roles(arguments.role)
-    code, made = home.join_codes.create(key, minutes=arguments.minutes, roles=roles, name=arguments.name)
+    certificate = _find_certificate(arguments, home, [host for host, _ in places])
+    code, made = home.join_codes.create(
+        key,
+        minutes=arguments.minutes,
+        roles=roles,
+        name=arguments.name,
+        web_key=b"" if certificate is None else certificate.spki_hash,
+    )
     try:
         uri = pairing_uri(*places[0], key.public, code, session)
+        page = "" if certificate is None else _make_page_link(places[0][0], web, code)
         invitation = {
             "code": code,
             "uri": uri,
@@ -96,6 +113,8 @@ def run(arguments: argparse.Namespace) -> int:
             "fingerprint": key.fingerprint,
             "roles": list(roles),
             "expires": made.expires,
+            "page": page,
+            "certificate": "" if certificate is None else certificate.fingerprint,
         }
         _print_invitation(arguments, invitation)
         return 0 if arguments.no_wait else _wait_until_used(home, made, arguments)
@@ -116,18 +135,47 @@ def _parse_minutes(text: str) -> float:
     return minutes
 
 
-def _find_addresses(arguments: argparse.Namespace, home: KeyHome, key: KeyPair) -> tuple[str, list[tuple[str, int]]]:
-    """Return the name of the session, and hosts and ports at which others reach it, best first."""
+def _find_certificate(arguments: argparse.Namespace, home: KeyHome, hosts: list[str]) -> Certificate | None:
+    """Return the certificate of the page, so that the code works there too. With `--web` it is made where needed."""
+    from iris_session.system.extras import MissingExtraError
+    from iris_session.web.certificate import find_certificate, load_certificate, load_or_make_certificate
+
+    if arguments.web_cert:
+        return load_certificate(arguments.web_cert)
+    try:
+        return load_or_make_certificate(home, hosts) if arguments.web else find_certificate(home)
+    except MissingExtraError:
+        if arguments.web:
+            raise
+        return None  # no page, no certificate
+
+
+def _make_page_link(host: str, port: int, code: str) -> str:
+    """Return the link that opens the page and joins. What follows the `#` is not sent to the server."""
+    from iris_session.web.process import WEB_PORT, format_page_address
+
+    return f"{format_page_address(host, port or WEB_PORT, secure=True)}#c={code}"
+
+
+def _find_addresses(
+    arguments: argparse.Namespace, home: KeyHome, key: KeyPair
+) -> tuple[str, list[tuple[str, int]], int]:
+    """Return the name of the session, hosts and ports at which others reach it, best first, and the page's port."""
     from iris_session.client.address import Address
 
     if arguments.address:
         address = Address.parse(arguments.address)
-        return arguments.session, [(address.host, address.port)]
+        web = address.port + WEB_OFFSET if arguments.web else 0
+        return arguments.session, [(address.host, address.port)], web
     here = [note for note in home.sessions.read() if note.server == key.fingerprint]
     found = [note for note in here if arguments.session in ("", note.name)]
     if len(found) != 1:
         raise CommandError(_format_session_choice(arguments.session, here, found))
-    return found[0].name, [(host, found[0].control) for host in found[0].hosts]
+    if arguments.web and not found[0].web:
+        raise CommandError(
+            f"session {found[0].name!r} serves no page: pip install 'iris-session[web]' there, or leave out --no-web"
+        )
+    return found[0].name, [(host, found[0].control) for host in found[0].hosts], found[0].web
 
 
 def _format_session_choice(name: str, here: list[RegisteredSession], found: list[RegisteredSession]) -> str:
@@ -151,7 +199,7 @@ def _format_address(host: str, port: int) -> str:
 def _print_invitation(arguments: argparse.Namespace, invitation: dict[str, Any]) -> None:
     import segno
 
-    qr = segno.make(invitation["uri"], micro=False, error="m")
+    qr = segno.make(invitation["page"] if arguments.web else invitation["uri"], micro=False, error="m")
     if arguments.png is not None:
         try:
             qr.save(str(arguments.png), kind="png", scale=10, border=4)
@@ -165,6 +213,9 @@ def _print_invitation(arguments: argparse.Namespace, invitation: dict[str, Any])
     print(f"address      {'  or  '.join(invitation['addresses'])}")
     print(f"fingerprint  {invitation['fingerprint']}")
     print(f"roles        {', '.join(invitation['roles']) or 'any'}")
+    if invitation["page"]:
+        print(f"in a browser {invitation['page']}")
+        print(f"certificate  {invitation['certificate']}    compare it when the browser warns")
     print(f"from Python  Client({invitation['addresses'][0]!r}, join_code={invitation['code']!r})")
     print(f"or           {invitation['uri']}", flush=True)
 

@@ -119,6 +119,10 @@ def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConf
         curve=arguments.curve,
         curve_key=arguments.curve_key,
         curve_clients=arguments.curve_clients,
+        web=not arguments.no_web,
+        web_port=arguments.web_port,
+        web_cert=arguments.web_cert,
+        web_key=arguments.web_key,
         sites=arguments.sites,
         tendons=arguments.tendons,
         authority=authority,
@@ -202,7 +206,7 @@ def apply_anchors_file(config: SessionConfig, path: Path | None) -> SessionConfi
     if path is None:
         return config
     given = load_anchors(path)
-    return dataclasses.replace(config, anchors=given.anchors, anchor_sizes=given.sizes)
+    return dataclasses.replace(config, anchors=given.anchors, anchor_sizes=given.sizes, anchor_errors=given.error_m)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -22,6 +22,7 @@ from iris_session.codegen import (
     tables,
     typescript,
     typescript_schema,
+    web_golden,
 )
 
 _DOCUMENT: Final = "docs/protocol.md"
@@ -48,6 +49,7 @@ TARGETS: Final[dict[str, tuple[str, Callable[[str], str]]]] = {
     "conversations": ("docs/protocol/conversations.json", lambda _: conversations.render_conversations()),
     "arrays": ("docs/protocol/arrays.json", lambda _: arrays_golden.render_golden()),
     "deformable": ("docs/protocol/deformable.json", lambda _: deformable_golden.render_golden()),
+    "web": ("docs/protocol/web.json", lambda _: web_golden.render_golden()),
     "docs": (_DOCUMENT, update_document),
     "reference": ("docs/reference.md", lambda _: reference.render_reference()),
 }

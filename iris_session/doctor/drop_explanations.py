@@ -13,7 +13,38 @@ _KEY: Final = "one key sends or causes more than the session accepts, over all i
 _DISK: Final = "not recorded: the recorder did not keep up"
 _PAIRING: Final = "pairing refused, see the session's terminal"
 _ODD: Final = "protocol violation"
+_WEB_FULL: Final = "web gateway: connections closed because there were too many"
+#: Counted by the web gateway.
+WEB_EXPLANATIONS: Final[Mapping[str, str]] = {
+    "web_accept": "web gateway: the system gave no connection (ulimit -n)",
+    "web_asset_hash": "web gateway: assets that came with other bytes, twice",
+    "web_asset_malformed": "web gateway: answers about assets that fit no request",
+    "web_asset_slow": "web gateway: downloads of assets that were not read",
+    "web_asset_unknown": "web gateway: requests for assets that the session does not serve",
+    "web_assets_at_once": "web gateway: requests for more assets at once than one client may have",
+    "web_connections": _WEB_FULL,
+    "web_connections_per_address": _WEB_FULL,
+    "web_fault": "web gateway: a fault of its own, see its log",
+    "web_flood": "web gateway: clients that sent far too much",
+    "web_full": "web gateway: clients above the number that it takes",
+    "web_gateway_only": "web gateway: clients that spoke in another name",
+    "web_handshake": "web gateway: connections without a handshake of TLS: a certificate that is not trusted",
+    "web_host": "web gateway: requests under a name that is not this machine's: use its address",
+    "web_idle": "web gateway: connections that sent no request",
+    "web_malformed": "web gateway: messages that are none",
+    "web_no_hello": "web gateway: clients that did not join in time",
+    "web_origin": "web gateway: requests by pages of other sites",
+    "web_plain": "web gateway: http:// where https:// is needed; the browser was sent there",
+    "web_session_full": "web gateway: clients closed because the session did not read",
+    "web_silent": "web gateway: clients that sent no heartbeats",
+    "web_subprotocol": "web gateway: WebSockets of another version, or of other programs",
+    "web_ticket": "web gateway: requests without a valid ticket",
+    "web_too_slow": "web gateway: clients closed because they read nothing for seconds",
+    "web_unknown_name": "web gateway: messages for clients that had closed",
+    "web_version": "web gateway: clients of another protocol version",
+}
 EXPLANATIONS: Final[Mapping[str, str]] = {
+    **WEB_EXPLANATIONS,
     "send_queue_full": f"answers and events: {_SLOW}",
     "media_superseded": f"media frames replaced by newer ones: {_SLOW}",
     "state_superseded": "states replaced by newer ones: the front was late",

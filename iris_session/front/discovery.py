@@ -255,7 +255,13 @@ class SessionRegistration:
         self._notes = home.sessions
         self._files = files
         self._note = RegisteredSession(
-            config.session_id, config.session_name, os.getpid(), ports.reachable, ports.control, ports.key_fingerprint
+            config.session_id,
+            config.session_name,
+            os.getpid(),
+            ports.reachable,
+            ports.control,
+            ports.key_fingerprint,
+            config.web_port,
         )
         self._submitted = False
 

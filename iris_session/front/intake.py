@@ -28,7 +28,7 @@ from iris_session.protocol.client_messages import (
     Samples,
     TrackingEpoch,
 )
-from iris_session.protocol.codec import decode_client, get_tag
+from iris_session.protocol.codec import decode_client, get_tag, peek_on_behalf_of
 from iris_session.protocol.common import Denial
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.errors import MalformedError, ProtocolError, ProtocolVersionError, RateError
@@ -97,12 +97,18 @@ class Intake:
                 raise MalformedError(f"a client message is one frame, got {1 + extra_frames}")
             envelope = decode_client(data)
         except ProtocolError as error:
-            self._reject_unreadable(route, peer, error, now_ns)
+            self._reject_unreadable(self._find_route(routing_id, peer, data), peer, error, now_ns)
             return
         if envelope.on_behalf_of:
             route = Route(routing_id, envelope.on_behalf_of)
             self._touch_gateway(Route(routing_id), peer, now_ns)
         self._dispatch(route, peer, envelope, len(data), now_ns)
+
+    def _find_route(self, routing_id: bytes, peer: Peer, data: memoryview) -> Route:
+        """Return the route of a message that cannot be decoded: behind a gateway that of the client that it names."""
+        name = peek_on_behalf_of(data)
+        is_behind = bool(name) and self._admission.find_gateway(routing_id, peer) is not None
+        return Route(routing_id, name) if is_behind else Route(routing_id)
 
     def _touch_gateway(self, route: Route, peer: Peer, now_ns: int) -> None:
         gateway = self._connections.find(route, peer)
@@ -375,7 +381,8 @@ class Intake:
     def _reject_unreadable(self, route: Route, peer: Peer, error: ProtocolError, now_ns: int) -> None:
         """Reject a message that cannot be decoded; before `hello` with a refusal, as the answer to it."""
         connection = self._connections.find(route, peer)
-        self._count_rejection(peer, connection, now_ns, error.code if connection is not None else BEFORE_HELLO)
+        counted = connection or (self._admission.find_gateway(route.routing_id, peer) if route.on_behalf_of else None)
+        self._count_rejection(peer, counted, now_ns, error.code if connection is not None else BEFORE_HELLO)
         if connection is not None:
             self._send_fault(route, connection, error.code, str(error), now_ns)
             return

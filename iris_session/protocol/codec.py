@@ -15,7 +15,7 @@ import msgspec
 
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, AssetChunk, AssetRefused, AssetRequest
 from iris_session.protocol.client_messages import ClientEnvelope, ClientMessage
-from iris_session.protocol.common import EventBody, Message
+from iris_session.protocol.common import EventBody, Message, Name
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.errors import MalformedError, ProtocolError, ProtocolVersionError, TooLargeError
 from iris_session.protocol.limits import (
@@ -110,6 +110,12 @@ class _ClientTags(msgspec.Struct, array_like=True):
     message: _Tags
 
 
+class _ClientName(msgspec.Struct, array_like=True):
+    version: int
+    connection_epoch: int
+    on_behalf_of: Name
+
+
 class _ServerTags(msgspec.Struct, array_like=True):
     version: int
     connection_epoch: msgspec.Raw
@@ -123,6 +129,7 @@ _version: Final = msgspec.msgpack.Decoder(_Version)
 _beacon_version: Final = msgspec.msgpack.Decoder(_BeaconVersion)
 _introduction_version: Final = msgspec.msgpack.Decoder(_IntroductionVersion)
 _client_tags: Final = msgspec.msgpack.Decoder(_ClientTags)
+_client_name: Final = msgspec.msgpack.Decoder(_ClientName)
 _server_tags: Final = msgspec.msgpack.Decoder(_ServerTags)
 _state_header: Final = msgspec.msgpack.Decoder(StateHeader)
 _presence: Final = msgspec.msgpack.Decoder(Presence)
@@ -184,6 +191,14 @@ def peek_version(data: Bytes) -> int:
         raise MalformedError(
             f"no envelope: {error}; expected a MessagePack array that starts with the version"
         ) from None
+
+
+def peek_on_behalf_of(data: Bytes) -> str:
+    """Return `on_behalf_of` of an envelope whose message does not fit the schema; empty for what is no envelope."""
+    try:
+        return _client_name.decode(data).on_behalf_of
+    except BAD_BYTES:
+        return ""
 
 
 def encode_state_header(header: StateHeader) -> bytes:

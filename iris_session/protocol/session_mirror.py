@@ -228,8 +228,8 @@ class SessionMirror:
                 if info_or_none is not None:
                     self.participants[name] = msgspec.structs.replace(info_or_none, alignment=alignment)
             case AnchorMoved(anchor_id=name, T_world_anchor=pose):
-                if name in self.anchors:
-                    self.anchors[name] = msgspec.structs.replace(self.anchors[name], T_world_anchor=pose)
+                known = self.anchors.get(name) or AnchorInfo(name, pose)
+                self.anchors[name] = msgspec.structs.replace(known, T_world_anchor=pose)
             case SceneChanged(epoch, revision, cause, scene_hash, period_ns):
                 self.scene_epoch = epoch
                 self.scene_revision = revision

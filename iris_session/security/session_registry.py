@@ -14,7 +14,7 @@ FILE: Final = "sessions.json"
 
 class RegisteredSession(msgspec.Struct, frozen=True):
     """One running session. `hosts`: addresses at which it can be reached, best first. `server`: fingerprint of its key.
-    `pid`: of the process that holds the sockets."""
+    `pid`: of the process that holds the sockets. `web`: port of the page, 0 for none."""
 
     session_id: str
     name: str
@@ -22,6 +22,7 @@ class RegisteredSession(msgspec.Struct, frozen=True):
     hosts: tuple[str, ...]
     control: int
     server: str
+    web: int = 0
 
 
 class SessionRegistry:

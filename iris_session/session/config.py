@@ -52,10 +52,15 @@ class SessionConfig:
             False records nothing.
         anchors: `T_world_anchor` by anchor id, as `((x, y, z), (w, x, y, z))` [m].
         anchor_sizes: Edge of the printed sheets [m] that are to be checked for a misprint. The default sheet has 0.16.
+        anchor_errors: Stated p95 of the position error of anchors [m], which clients show.
         curve: Encrypt on loopback too.
         curve_key: ZeroMQ certificate of the server, instead of the key in the user's home of keys.
         curve_clients: Folder of public certificates, instead of the user's allow-list.
         keyframe_s: Distance of keyframes in the recording, 0.5 to 60 [s].
+        web: Serve the page for browsers, where the extra `web` is installed.
+        web_port: TCP port of the page; `None`: that of the state plus 3, or any free one.
+        web_cert: Certificate (PEM) for HTTPS, instead of the one in the user's home of keys.
+        web_key: Its key (PEM).
         assets: Offer meshes and textures to clients: True keeps them in the user's cache, a path in that folder.
         sites: Include the sites of a MuJoCo model in what clients draw.
         tendons: Include its tendons, with the sites they run through.
@@ -81,10 +86,15 @@ class SessionConfig:
     record: bool | str | Path = True
     anchors: Mapping[str, PoseTuple] = field(default_factory=lambda: DEFAULT_ANCHORS)
     anchor_sizes: Mapping[str, float] = field(default_factory=dict)
+    anchor_errors: Mapping[str, float] = field(default_factory=dict)
     curve: bool = False
     curve_key: str = ""
     curve_clients: str = ""
     keyframe_s: float = 5.0
+    web: bool = True
+    web_port: int | None = None
+    web_cert: str = ""
+    web_key: str = ""
     assets: bool | str | Path = True
     sites: bool = False
     tendons: bool = False
@@ -108,6 +118,10 @@ class SessionConfig:
             port = getattr(self, label)
             if not 0 <= port <= 65535:
                 raise ConfigError(f"{label} {port} is not a port: 0 (any free one) to 65535")
+        if self.web_port is not None and not 0 <= self.web_port <= 65535:
+            raise ConfigError(f"web_port {self.web_port} is not a port: 0 (any free one) to 65535")
+        if bool(self.web_cert) != bool(self.web_key):
+            raise ConfigError("web_cert and web_key belong together: give both, or none")
         if not 1.0 <= self.state_hz <= 240.0:
             raise ConfigError(f"state_hz {self.state_hz} is out of range: 1 to 240")
         if not 0.5 <= self.keyframe_s <= 60.0:
@@ -146,6 +160,7 @@ _OBJECTS: Final = (
 _KINDS: Final[dict[str, tuple[type, ...]]] = {
     "str": (str,),
     "int": (int,),
+    "int | None": (int, NoneType),
     "float": (float, int),
     "bool": (bool,),
     "bool | str | Path": (bool, str, Path),

@@ -1,8 +1,9 @@
-"""The processes of a session besides the authority, front and recorder: start, supervise, restart, end.
+"""The processes of a session besides the authority, front, recorder and web gateway: start, supervise, restart, end.
 
 A front that dies is replaced on the same ports (clients reconnect and resume); a recorder that dies is replaced and
-continues in a new part of the recording. Both are announced and logged, neither stops a step. A process that dies again
-and again is restarted after growing delays.
+continues in a new part of the recording; the web gateway is started with the first connection of a browser, and again
+when it dies. All of it is announced and logged, and stops no step. A process that dies again and again is restarted
+after growing delays.
 """
 
 from __future__ import annotations
@@ -53,6 +54,7 @@ from iris_session.session.status import ProcessStatus, StatusReporter
 from iris_session.session.stepper import NextPatch, NextScene, ResumedFrom, Stepper
 from iris_session.session.supervision import RecorderSupervisor, RestartTimer, make_recorder_report, try_restart
 from iris_session.session.unique_name import NameFinder
+from iris_session.session.web_page import WebPage, open_web_page
 
 #: Ports of media and assets, from the port of state: 7723, 7726 and 7724 by default.
 MEDIA_OFFSET: Final = 1
@@ -78,7 +80,7 @@ class PublishedScene(NamedTuple):
 
 
 class SessionProcesses:
-    """Front and recorder of one session.
+    """Front, recorder and web gateway of one session.
 
     Args:
         config: Settings of the session.
@@ -118,6 +120,7 @@ class SessionProcesses:
         self.recorder: RecorderProcess | None = None
         self.feed: RecorderFeed | None = None
         self.front: FrontProcess | None = None
+        self.web: WebPage | None = None
         self._deformables: DeformableStreams | None = None
         self._front_timer = RestartTimer()
         self.supervisor: RecorderSupervisor | None = None
@@ -152,6 +155,7 @@ class SessionProcesses:
                     self._note_writer = ResumeNoteWriter(find_note_path(self.recording))
             self.name = others.find_free_name(self._config.name, self.session_id)
             self.notes += others.notes
+            self.web = open_web_page(self._config, self.name)
             self.front = FrontProcess(
                 self._make_front_config(),
                 self.scenes.show(
@@ -171,6 +175,7 @@ class SessionProcesses:
                 self.notes.append(f"encrypted, key {ports.key_fingerprint}; {how}")
             if reachable != [self._address]:
                 self.notes.append(f"others reach it at {', '.join(reachable)}")
+            self.notes += self.web.start(ports, self.scenes.asset_root)
         except (FrontError, RecordingError) as error:
             self.close()
             raise StartError(str(error)) from None  # the text says it all
@@ -199,7 +204,7 @@ class SessionProcesses:
         self._note_writer.offer(ResumeNote(self.session_id, listening, self.front.link.handback))
 
     def _make_front_config(self) -> FrontConfig:
-        config = self._config
+        config, web = self._config, self.web
         return FrontConfig(
             host=config.host,
             listen=addresses_of(config.interfaces) if config.interfaces else (),
@@ -210,6 +215,8 @@ class SessionProcesses:
             media_port=config.state_port + MEDIA_OFFSET if config.state_port else 0,
             media_ingest_port=config.state_port + INGEST_OFFSET if config.state_port else 0,
             assets_port=config.state_port + ASSETS_OFFSET if config.state_port else 0,
+            web_port=0 if web is None else web.port,
+            gateway_key="" if web is None else web.public_key,
             adapt_media=config.adapt_media,
             session_id=self.session_id,
             session_name=self.name,
@@ -220,6 +227,7 @@ class SessionProcesses:
             curve_clients_dir=config.curve_clients,
             anchors=config.anchor_poses(),
             anchor_sizes=config.sheet_sizes(),
+            anchor_errors={name: float(error_m) for name, error_m in config.anchor_errors.items()},
             recorder_endpoint="" if self.recorder is None else self.recorder.samples_endpoint,
         )
 
@@ -308,6 +316,9 @@ class SessionProcesses:
         if self.supervisor is not None and self.feed is not None:
             for text in self.supervisor.poll(now_ns, self.feed.silence_ns):
                 self._announce(stepper, text)
+        if self.web is not None:
+            for text in self.web.poll(now_ns):
+                self._announce(stepper, text)
         self._report_overflows(stepper)
         if self.front is not None and self.reporter.is_due(now_ns):
             self.front.link.send_report(self.reporter.make_report(stepper, self.make_status()))
@@ -357,13 +368,16 @@ class SessionProcesses:
             refused = 0 if last is None else last.vertices_refused
             drops["recorded_vertices"] = self.feed.stats.dropped_vertices + refused
             drops["recorded_samples"] = 0 if last is None else last.samples_left_out
+        if self.web is not None:
+            drops |= self.web.drops
         drops |= self._overflows
         return {reason: count for reason, count in drops.items() if count}
 
     def count_restarts(self) -> dict[str, int]:
-        """Return how often front and recorder were restarted."""
+        """Return how often front, recorder and, once it was started, the web gateway were restarted."""
         recorder = 0 if self.supervisor is None else self.supervisor.restarts
-        return {"front": self._front_timer.restarts, "recorder": recorder}
+        web = {} if self.web is None or not self.web.restarts else {"web": self.web.restarts}
+        return {"front": self._front_timer.restarts, "recorder": recorder, **web}
 
     def close(self) -> str:
         """End the front, which notifies its clients, then finish the recording. May be called twice.
@@ -376,6 +390,9 @@ class SessionProcesses:
             self._save_resume_note()
             self.front.close(NOTIFY_S)
             self.front = None
+        if self.web is not None:
+            self.web.close()
+            self.web = None
         self.scenes.close()
         if self.supervisor is not None:
             self.supervisor.close()

@@ -95,6 +95,11 @@ class SharedScenes:
                 self._add_note(f"{NO_SPECIFICATION}: {error.filename or where}: {error.strerror or error}")
 
     @property
+    def asset_root(self) -> str:
+        """Folder of the asset store, empty without one."""
+        return "" if self._store is None else str(self._store.root)
+
+    @property
     def notes(self) -> list[str]:
         """Messages for people about the newest scene and about the store, one line each."""
         newest = self.newest

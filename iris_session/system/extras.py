@@ -25,6 +25,8 @@ EXTRAS: Final[Mapping[str, str]] = {
     "PIL": "files",
     "lxml": "files",
     "open3d": "cloud",
+    "aiohttp": "web",
+    "cryptography": "web",
 }
 
 

@@ -90,7 +90,12 @@ class ChildProcess:
         child.close(exit_s=2.0, terminate_s=0.2)
 
     `pid`, `is_running` and `exit_status` may be used from any thread, the rest from one at a time.
+
+    Attributes:
+        inherited: Descriptors of the parent that the child keeps, under the same numbers; set by subclasses.
     """
+
+    inherited: Sequence[int] = ()
 
     def __init__(
         self,
@@ -133,6 +138,7 @@ class ChildProcess:
                 env=child_environment(**(environment or {})),
                 start_new_session=own_session,
                 process_group=0 if own_group else None,
+                pass_fds=tuple(self.inherited),
                 bufsize=0,
             )
         self._rest = b""

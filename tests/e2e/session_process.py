@@ -143,7 +143,7 @@ class SessionProcess:
         found = {}
         for child in psutil.Process(self.process.pid).children():
             line = " ".join(child.cmdline())
-            for name in ("front.main", "recording.process"):
+            for name in ("front.main", "recording.process", "web.gateway"):
                 if name in line:
                     found[name] = child
         return found

@@ -86,6 +86,20 @@ def test_unknown_participant_or_robot_is_named(shared_session: SessionProcess, a
     assert run_control(shared_session, "release", "elbow", status=1)["reason"] == "unknown_target"
 
 
+def test_participants_get_names_and_roles(shared_session: SessionProcess, ann: Client) -> None:
+    assert run_control(shared_session, "rename", "ann", "eva")["name"] == "eva"
+    assert ann.wait_for(lambda c: c.mirror.participants[c.participant_id].name == "eva", DEADLINE_S)
+    with Client(shared_session.address, name="bob", role="observer").connect(DEADLINE_S) as bob:
+        bob.start()
+        assert run_control(shared_session, "rename", bob.participant_id, "eva")["name"] == "eva-2"
+    assert run_control(shared_session, "role", "eva", "director")["role"] == "director"
+    assert ann.wait_for(lambda c: c.mirror.participants[c.participant_id].role == "director", DEADLINE_S)
+    ann.assign("left", ann.participant_id)
+    run_control(shared_session, "role", ann.participant_id, "observer")
+    assert ann.wait_for(lambda c: not c.mirror.leases["left"].holder, DEADLINE_S)
+    assert run_control(shared_session, "role", "nobody", "observer", status=2)["ok"] is False
+
+
 def test_ambiguous_participant_name_lists_the_ids(shared_session: SessionProcess, ann: Client) -> None:
     with Client(shared_session.address, name="ann", role="agent").connect(DEADLINE_S) as second:
         code, _, errors = run_in_process("assign", "left", "ann", "--address", shared_session.address)

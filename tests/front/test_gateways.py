@@ -11,7 +11,7 @@ import zmq
 from iris_session.protocol.client_messages import Hello, Marker, RemoveParticipant
 from iris_session.protocol.entries import Join, Lost
 from iris_session.protocol.names import FaultCode
-from iris_session.protocol.server_messages import ProtocolFault, Welcome
+from iris_session.protocol.server_messages import ProtocolFault, Refused, Welcome
 from iris_session.protocol.steps import Decision, Dropped
 from iris_session.security import KeyPair
 from tests.front.harness import RawClient
@@ -172,3 +172,16 @@ def test_subscribers_reconnect_only_when_a_subscribed_key_is_revoked(lab: Lab, w
     watcher.frame()
     assert watcher.disconnected == (who == "with state")
     watcher.close()
+
+
+def test_what_a_client_behind_a_gateway_sends_counts_as_its_own(lab: Lab) -> None:
+    gateway = Gateway(lab, "gateway", "operator")
+    gateway.enter("tab1", "operator")
+    before = len(gateway.client.got(ProtocolFault))
+    unknown = b"\x94\x01\x00\xa4tab1\x81\xa4type\xa7unknown"
+    gateway.client.socket.send(unknown)
+    gateway.client.wait_for(ProtocolFault, before + 1)
+    assert gateway.faults()["tab1"].code == FaultCode.MALFORMED
+    gateway.client.socket.send(unknown.replace(b"tab1", b"tab2"))
+    gateway.client.wait_for(Refused)
+    assert "" not in gateway.faults(), "the gateway itself has done nothing wrong"

@@ -1,0 +1,117 @@
+"""`iris-session web ADDRESS`: a page for browsers on this machine, for a session on this one or another."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import sys
+from typing import TYPE_CHECKING
+
+from iris_session.cli.common import CommandError, add_address_options, add_page_options, check_session_reachable
+from iris_session.system.extras import require_package
+
+if TYPE_CHECKING:
+    from iris_session.client.endpoint_resolver import Endpoint
+    from iris_session.web.certificate import Certificate
+    from iris_session.web.config import GatewayConfig
+
+CONNECT_S = 15.0
+
+
+def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command `web`."""
+    parser = commands.add_parser(
+        "web",
+        help="serve the page for browsers for a session on another machine",
+        description="Serve the page for browsers, and the gateway behind it, for a session on another machine. A "
+        "session of this machine does so by itself. At an encrypted session the key of this user must be allowed in "
+        "role gateway, and in the roles of those who join here: `iris-session pair --role any` there.",
+        epilog="examples:\n"
+        "  iris-session web 192.168.0.10\n"
+        "  iris-session web 192.168.0.10:7721 --code 7KQ2-M4XD-9PTR    the first time\n"
+        "  iris-session web 192.168.0.10 --host 127.0.0.1              for this machine only, without HTTPS",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_address_options(parser)
+    parser.add_argument(
+        "--host", default="0.0.0.0", metavar="ADDR", help="address to listen on (default: %(default)s, all)"
+    )
+    add_page_options(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Serve until Ctrl-C. Exit status 1 if the session does not admit the gateway."""
+    for package in ("aiohttp", "cryptography"):
+        require_package(package, "the page for browsers")
+    from iris_session.client.endpoint_resolver import parse_connect_request, resolve_blocking
+    from iris_session.link.config import is_loopback
+    from iris_session.web.config import GatewayStart
+    from iris_session.web.gateway import serve
+
+    if bool(arguments.web_cert) != bool(arguments.web_key):
+        raise CommandError("--web-cert and --web-key belong together: give both, or none")
+    if arguments.web_port is not None and not 0 < arguments.web_port < 65536:
+        raise CommandError(f"--web-port {arguments.web_port} is not a port: give 1 to 65535")
+    check_session_reachable(arguments)
+    request = parse_connect_request(arguments.address, arguments.session, None, arguments.code)
+    endpoint = resolve_blocking(request, CONNECT_S)
+    secure = endpoint.curve is not None or not is_loopback(arguments.host)
+    hosts = _list_own_addresses(arguments.host)
+    certificate = _find_certificate(arguments, hosts) if secure else None
+    config = _make_config(arguments, endpoint, certificate, hosts)
+    _print_addresses(hosts, config.port, certificate)
+    endpoint.store_key()
+    fault = asyncio.run(serve(GatewayStart(config)))
+    if fault:
+        print(f"iris-session: {fault}", file=sys.stderr)
+    return 1 if fault else 0
+
+
+def _make_config(
+    arguments: argparse.Namespace, endpoint: Endpoint, certificate: Certificate | None, hosts: tuple[str, ...]
+) -> GatewayConfig:
+    from iris_session.web.config import GatewayConfig
+    from iris_session.web.process import WEB_PORT
+
+    curve = endpoint.curve
+    return GatewayConfig(
+        host=endpoint.address.host,
+        control_port=endpoint.address.port,
+        server_key="" if curve is None else curve.server_public.decode(),
+        public_key="" if curve is None else curve.public.decode(),
+        secret_key="" if curve is None else curve.secret.decode(),
+        hosts=(arguments.host,),
+        port=WEB_PORT if arguments.web_port is None else arguments.web_port,
+        certificate_path="" if certificate is None else str(certificate.certificate_path),
+        key_path="" if certificate is None else str(certificate.key_path),
+        certificate_hash=b"" if certificate is None else certificate.spki_hash,
+        names=(*hosts, *(() if certificate is None else certificate.names)),
+        session_name=endpoint.session,
+    )
+
+
+def _list_own_addresses(host: str) -> tuple[str, ...]:
+    """Return the addresses by which browsers reach a page that listens on `host`, best first."""
+    from iris_session.link.interfaces import interfaces, reachable
+
+    found = [one.address for one in reachable((host,), interfaces()) if not one.loopback]
+    return tuple(dict.fromkeys(found)) or (host,)
+
+
+def _find_certificate(arguments: argparse.Namespace, hosts: tuple[str, ...]) -> Certificate:
+    from iris_session.security import KeyHome
+    from iris_session.web.certificate import load_certificate, load_or_make_certificate
+
+    if arguments.web_cert:
+        return load_certificate(arguments.web_cert, arguments.web_key)
+    return load_or_make_certificate(KeyHome(), hosts)
+
+
+def _print_addresses(hosts: tuple[str, ...], port: int, certificate: Certificate | None) -> None:
+    from iris_session.web.process import format_page_address
+
+    pages = [format_page_address(host, port, secure=certificate is not None) for host in hosts]
+    print(f"in a browser: {'  or  '.join(pages)}", flush=True)
+    if certificate is not None:
+        print(f"certificate {certificate.fingerprint}", flush=True)

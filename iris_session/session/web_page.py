@@ -1,0 +1,169 @@
+"""The page of a session: its port, its certificate, and the gateway process that serves it.
+
+Addresses, keys and certificate are put together here; the process and its supervision are in `web.process`. Without the
+extra `web`, or where the port is in use, the session runs without a page and says so in a note.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Sequence
+from typing import Final
+
+import msgspec
+
+from iris_session.link import Ports, addresses_of
+from iris_session.link.config import is_loopback
+from iris_session.security import KeyHome, KeyPair, KeysError, load_secret
+from iris_session.session.config import SessionConfig
+from iris_session.session.errors import StartError
+from iris_session.system.extras import MissingExtraError
+from iris_session.web.certificate import Certificate, load_certificate, load_or_make_certificate
+from iris_session.web.config import GatewayConfig
+from iris_session.web.listener import open_listening_sockets
+from iris_session.web.process import GatewayProcess, format_page_address, has_packages
+
+#: Port of the page, from the port of state: 7725 by default.
+WEB_OFFSET: Final = 3
+
+
+class WebPage:
+    """The page of one session; without a port when it has none.
+
+    Attributes:
+        port: TCP port, 0 for no page.
+        public_key: Public key (Z85) of the gateway, which the front admits; empty without encryption.
+        address: Address of the page, empty before `start` and without a page.
+        certificate: Of HTTPS, `None` without encryption.
+    """
+
+    def __init__(self, config: SessionConfig, name: str, sockets: Sequence[socket.socket] = (), note: str = "") -> None:
+        self._config = config
+        self._name = name
+        self._process = GatewayProcess(sockets, lambda: self._gateway) if sockets else None
+        self._note = note
+        self._gateway = GatewayConfig()
+        self._keys = KeyPair.generate() if sockets and needs_encryption(config) else None
+        self.port = 0 if self._process is None else self._process.port
+        self.public_key = "" if self._keys is None else self._keys.public
+        self.address = ""
+        self.certificate: Certificate | None = None
+
+    def start(self, ports: Ports, asset_root: str) -> list[str]:
+        """Let the process start with the first connection. Return notes for people about where the page is.
+
+        Args:
+            ports: Of the front, which listens.
+            asset_root: Folder of the session's asset store.
+
+        Raises:
+            StartError: The certificate that was given cannot be used.
+        """
+        if self._process is None:
+            return [self._note] if self._note else []
+        config = self._config
+        names = tuple(filter(None, (*ports.reachable, config.advertise)))
+        note = ""
+        if self._keys is not None:
+            try:
+                self.certificate = find_certificate(config, names)
+            except (KeysError, MissingExtraError) as error:
+                if config.web_cert:
+                    raise StartError(str(error)) from None
+                self.close()
+                return [f"no page for browsers: {error}"]
+            note = f" (certificate {self.certificate.fingerprint})"
+        self.address = format_page_address(ports.reachable[0], self.port, secure=self._keys is not None)
+        host = ports.host.strip("[]")
+        made = GatewayConfig(
+            host="127.0.0.1" if host == "localhost" else host,
+            control_port=ports.control,
+            names=names,
+            session_name=self._name,
+            asset_root=asset_root,
+        )
+        if self._keys is not None and self.certificate is not None:
+            made = msgspec.structs.replace(
+                made,
+                server_key=self._load_server_key(),
+                public_key=self._keys.public,
+                secret_key=self._keys.secret,
+                certificate_path=str(self.certificate.certificate_path),
+                key_path=str(self.certificate.key_path),
+                certificate_hash=self.certificate.spki_hash,
+                names=(*names, *self.certificate.names),
+            )
+        self._gateway = made
+        return [f"in a browser: {self.address}{note}"]
+
+    def _load_server_key(self) -> str:
+        """Return the public key (Z85) of the session. The front has read it before."""
+        given = self._config.curve_key
+        return (load_secret(given) if given else KeyHome().load_server_key()).public
+
+    @property
+    def pid(self) -> int:
+        """Process id of the gateway, 0 while it does not run."""
+        return 0 if self._process is None else self._process.pid
+
+    @property
+    def restarts(self) -> int:
+        """Restarts of the gateway."""
+        return 0 if self._process is None else self._process.restarts
+
+    @property
+    def drops(self) -> dict[str, int]:
+        """Counters of what the gateway has refused or dropped, by reason."""
+        return {} if self._process is None else self._process.drops
+
+    def poll(self, now_ns: int) -> list[str]:
+        """Start the process when a browser comes, restart it when it has ended; return what is to be announced."""
+        return [] if self._process is None else self._process.poll(now_ns)
+
+    def close(self) -> None:
+        """End the process and free the port."""
+        if self._process is not None:
+            self._process.close()
+            self._process = None
+            self.port = 0
+            self.address = ""
+
+
+def open_web_page(config: SessionConfig, name: str) -> WebPage:
+    """Open the port of a session's page, before its front starts, which tells clients the port.
+
+    Raises:
+        StartError: A port that was asked for by number is not free.
+    """
+    if not config.web:
+        return WebPage(config, name)
+    if not has_packages():
+        return WebPage(config, name, note="no page for browsers: pip install 'iris-session[web]'")
+    port = config.web_port
+    if port is None:
+        port = config.state_port + WEB_OFFSET if config.state_port else 0
+    try:
+        sockets = open_listening_sockets(find_hosts(config), port)
+    except OSError as error:
+        text = f"port {port} (web) cannot be used: {error.strerror}"
+        if config.web_port is not None:
+            raise StartError(f"{text}; give another web_port, 0 for any free one") from None
+        return WebPage(config, name, note=f"no page for browsers: {text}")
+    return WebPage(config, name, sockets)
+
+
+def find_hosts(config: SessionConfig) -> tuple[str, ...]:
+    """Return the addresses on which a session listens."""
+    return addresses_of(config.interfaces) if config.interfaces else (config.host,)
+
+
+def needs_encryption(config: SessionConfig) -> bool:
+    """Return whether a session is encrypted: always off loopback."""
+    return bool(config.curve or config.curve_key) or not all(is_loopback(host) for host in find_hosts(config))
+
+
+def find_certificate(config: SessionConfig, names: Sequence[str]) -> Certificate:
+    """Return the certificate for HTTPS: the one that was given, else that of the key home. Raises `KeysError`."""
+    if config.web_cert:
+        return load_certificate(config.web_cert, config.web_key)
+    return load_or_make_certificate(KeyHome(), names)

@@ -1,0 +1,153 @@
+"""ZeroMQ sockets in an asyncio loop, and counts of TCP connections: bytes that wait, bytes that were acknowledged."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import struct
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import zmq
+
+from iris_session.link.sockets import readable, tcp_counts
+
+if sys.platform == "linux":
+    import fcntl
+    import termios
+
+#: Messages handled before other tasks of the loop run.
+ROUND: Final = 64
+_NOBLOCK: Final = int(zmq.NOBLOCK)
+#: Unsent bytes that the system takes of one connection; more stays with us, where the newest value replaces the last.
+NOT_SENT_BYTES: Final = 16_384
+_TCP_NOTSENT_LOWAT: Final = 25  # linux/tcp.h
+
+
+@dataclass(frozen=True, slots=True)
+class SessionKeys:
+    """CURVE keys of a gateway's sockets, as Z85 text in bytes; `server` is that of the session."""
+
+    server: bytes
+    public: bytes
+    secret: bytes
+
+
+class SocketReader:
+    """Read a ZeroMQ socket in the running asyncio loop, and write to it without waiting.
+
+    Args:
+        sock: The socket; closed by `close`.
+        on_message: Called with the frames of each message, in order.
+        on_drained: Called after a round of messages.
+        batch: Messages at a time; with 1, `pause` in `on_message` leaves the next one unread.
+    """
+
+    def __init__(
+        self,
+        sock: zmq.Socket[bytes],
+        on_message: Callable[[list[zmq.Frame]], None],
+        on_drained: Callable[[], None] | None = None,
+        batch: int = ROUND,
+    ) -> None:
+        self.socket = sock
+        self._on_message = on_message
+        self._on_drained = on_drained
+        self._batch = batch
+        self._paused = False
+        self._scheduled = False
+        self._loop = asyncio.get_running_loop()
+        self._descriptor = int(sock.getsockopt(zmq.FD))
+        self._loop.add_reader(self._descriptor, self._read)
+        self._schedule()
+
+    def send(self, frames: Sequence[bytes]) -> bool:
+        """Send a message. False: there is no room."""
+        try:
+            self.socket.send_multipart(frames, _NOBLOCK, copy=True)
+        except zmq.ZMQError:
+            return False
+        finally:
+            self._schedule()  # sending may use up the signal that a message has come
+        return True
+
+    def pause(self) -> None:
+        """Leave messages in the socket."""
+        self._paused = True
+
+    def resume(self) -> None:
+        """Read on."""
+        self._paused = False
+        self._schedule()
+
+    def close(self) -> None:
+        """Close the socket. May be called twice."""
+        if not self.socket.closed:
+            self._loop.remove_reader(self._descriptor)
+            self.socket.close(linger=0)
+
+    def _schedule(self) -> None:
+        if not self._scheduled:
+            self._scheduled = True
+            self._loop.call_soon(self._read_scheduled)
+
+    def _read_scheduled(self) -> None:
+        self._scheduled = False
+        self._read()
+
+    def _read(self) -> None:
+        n = 0
+        while not self._paused and not self.socket.closed and readable(self.socket):
+            if n >= self._batch:
+                self._schedule()
+                break
+            n += 1
+            self._on_message(self.socket.recv_multipart(_NOBLOCK, copy=False))
+        if n and self._on_drained is not None and not self.socket.closed:
+            self._on_drained()
+
+
+def open_socket(
+    context: zmq.Context[zmq.Socket[bytes]], kind: int, host: str, keys: SessionKeys | None
+) -> zmq.Socket[bytes]:
+    """Return a socket with the settings of all sockets to the session. It is not connected yet."""
+    sock: zmq.Socket[bytes] = context.socket(kind)
+    sock.setsockopt(zmq.TCP_KEEPALIVE, 1)  # a peer that vanished is noticed in 11 s
+    sock.setsockopt(zmq.TCP_KEEPALIVE_IDLE, 5)
+    sock.setsockopt(zmq.TCP_KEEPALIVE_INTVL, 2)
+    sock.setsockopt(zmq.TCP_KEEPALIVE_CNT, 3)
+    sock.setsockopt(zmq.RECONNECT_IVL, 50)
+    sock.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
+    sock.setsockopt(zmq.IPV6, int(":" in host))
+    if keys is not None:
+        sock.curve_serverkey = keys.server
+        sock.curve_publickey = keys.public
+        sock.curve_secretkey = keys.secret
+    return sock
+
+
+def limit_unsent(sock: socket.socket) -> None:
+    """Let the system take few unsent bytes of a connection, so that newer values replace what is not sent yet."""
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError):
+            sock.setsockopt(socket.IPPROTO_TCP, _TCP_NOTSENT_LOWAT, NOT_SENT_BYTES)
+
+
+def count_unacknowledged(descriptor: int) -> int:
+    """Return the bytes of a connection that the peer has not acknowledged; 0 where the system does not report them."""
+    if sys.platform != "linux" or descriptor < 0:
+        return 0
+    try:
+        answer = fcntl.ioctl(descriptor, termios.TIOCOUTQ, b"\0\0\0\0")
+    except OSError:
+        return 0
+    return int(struct.unpack("i", answer)[0])
+
+
+def count_acknowledged(descriptor: int) -> int:
+    """Return the bytes that the peer has acknowledged so far; -1 where the system does not count them."""
+    counts = tcp_counts(descriptor) if descriptor >= 0 else None
+    return -1 if counts is None else counts.acknowledged

@@ -1,0 +1,264 @@
+"""Bytes of the web channel: several frames in one WebSocket message. Pure, and never raises but a `ProtocolError`.
+
+A binary message is channel (u8), count (u8), `count` lengths (u32, little-endian), then the frames, which are those of
+ZeroMQ. A gateway does not decode what people say: it puts their name into the envelope (`splice_name`), and reads the
+type of what the session answers (`peek_server_message`).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from typing import Annotated, Final, NamedTuple
+
+import msgspec
+
+from iris_session.protocol.codec import BAD_BYTES, Bytes
+from iris_session.protocol.errors import MalformedError, ProtocolError, ProtocolVersionError, TooLargeError
+from iris_session.protocol.media import is_stream_name
+from iris_session.protocol.names import PROTOCOL_VERSION, RefusalCode
+
+#: WebSocket subprotocol of this version.
+SUBPROTOCOL: Final = "iris-session.1"
+CONTROL: Final = 1
+STATE: Final = 2
+MEDIA: Final = 3
+MEDIA_WISHES: Final = 4
+GATEWAY: Final = 5
+#: WebSocket message of a client at most [bytes].
+MAX_CLIENT_MESSAGE: Final = 65_536
+#: Streams that a client may wish for, as many as a session has.
+MAX_WISHES: Final = 16
+#: Server messages that are larger are none of those that a gateway acts on.
+MAX_PEEKED: Final = 65_536
+
+# Codes with which a gateway closes a WebSocket.
+CLOSE_ENDED: Final = 4000
+CLOSE_VERSION: Final = 4001
+CLOSE_NOT_ALLOWED: Final = 4003
+CLOSE_TOO_SLOW: Final = 4008
+CLOSE_LIMIT: Final = 4009
+CLOSE_RESTART: Final = 1012
+
+_HEAD: Final = 2
+_LENGTH: Final = 4
+_MAX_FRAMES: Final = 255
+_ENVELOPE_ELEMENTS: Final = 4
+
+
+class ForgedNameError(ProtocolError):
+    """A client behind a gateway has set `on_behalf_of` itself."""
+
+    code = RefusalCode.GATEWAY_ONLY
+
+    def __init__(self) -> None:
+        super().__init__("on_behalf_of must be empty: the gateway sets it")
+
+
+class Ticket(msgspec.Struct, frozen=True, tag="ticket"):
+    """Ticket of a participant, by which its media socket and its requests for assets are known as its own.
+
+    From the gateway with `expires_s`, seconds until it expires; from a client on its media socket without.
+    """
+
+    ticket: Annotated[str, msgspec.Meta(max_length=128)]
+    expires_s: Annotated[int, msgspec.Meta(ge=0, le=86_400)] = 0
+
+
+class GatewayNotice(msgspec.Struct, frozen=True, tag="notice"):
+    """Words of the gateway for the person."""
+
+    text: Annotated[str, msgspec.Meta(max_length=512)]
+
+
+GatewayMessage = Ticket | GatewayNotice
+
+
+class ServerHead(NamedTuple):
+    """Beginning of a server message: connection epoch, `type`, and `code` of a fault."""
+
+    connection_epoch: int
+    type: str
+    code: str
+
+
+class _Type(msgspec.Struct):
+    type: str = ""
+    code: str = ""
+
+
+class _ServerEnvelope(msgspec.Struct, array_like=True):
+    version: int
+    connection_epoch: int
+    message: _Type
+
+
+class _ClientType(msgspec.Struct):
+    type: str = ""
+
+
+class _ClientEnvelope(msgspec.Struct, array_like=True):
+    version: int
+    connection_epoch: int
+    on_behalf_of: str
+    message: _ClientType
+
+
+_server: Final = msgspec.msgpack.Decoder(_ServerEnvelope)
+_client: Final = msgspec.msgpack.Decoder(_ClientEnvelope)
+_gateway: Final[msgspec.msgpack.Decoder[GatewayMessage]] = msgspec.msgpack.Decoder(GatewayMessage)
+_wishes: Final = msgspec.msgpack.Decoder(Annotated[list[str], msgspec.Meta(max_length=MAX_WISHES)])
+_encoder: Final = msgspec.msgpack.Encoder()
+
+
+def encode_frames(channel: int, frames: Sequence[Bytes]) -> bytes:
+    """Return the binary WebSocket message that holds `frames`."""
+    if not 0 < len(frames) <= _MAX_FRAMES:
+        raise ValueError(f"a message has 1 to {_MAX_FRAMES} frames, not {len(frames)}")
+    lengths = [len(frame) for frame in frames]
+    return b"".join((struct.pack(f"<BB{len(frames)}I", channel, len(frames), *lengths), *frames))
+
+
+def decode_frames(data: Bytes) -> tuple[int, list[memoryview]]:
+    """Return channel and frames of a binary WebSocket message. Raises `MalformedError`."""
+    view = memoryview(data)
+    if len(view) < _HEAD:
+        raise MalformedError(f"no web message: {len(view)} bytes, at least {_HEAD} are needed")
+    channel, count = view[0], view[1]
+    begin = _HEAD + _LENGTH * count
+    if not count or begin > len(view):
+        raise MalformedError(f"no web message: {count} frames in {len(view)} bytes")
+    lengths = struct.unpack_from(f"<{count}I", view, _HEAD)
+    if begin + sum(lengths) != len(view):
+        raise MalformedError(f"no web message: frames of {sum(lengths)} bytes, but {len(view) - begin} follow")
+    frames = []
+    for length in lengths:
+        frames.append(view[begin : begin + length])
+        begin += length
+    return channel, frames
+
+
+def encode_gateway_message(message: GatewayMessage) -> bytes:
+    """Return the WebSocket message of channel 5."""
+    return encode_frames(GATEWAY, (_encoder.encode(message),))
+
+
+def decode_gateway_message(frame: Bytes) -> GatewayMessage:
+    """Decode the frame of channel 5. Raises `MalformedError`."""
+    try:
+        return _gateway.decode(frame)
+    except BAD_BYTES as error:
+        raise MalformedError(f"no message of a gateway: {error}") from None
+
+
+def encode_wishes(streams: Sequence[str]) -> bytes:
+    """Return the WebSocket message that names all media streams that are wanted."""
+    return encode_frames(MEDIA_WISHES, (_encoder.encode(list(streams)),))
+
+
+def decode_wishes(frame: Bytes) -> frozenset[str]:
+    """Decode the frame of channel 4. Raises `MalformedError`."""
+    try:
+        names = _wishes.decode(frame)
+    except BAD_BYTES as error:
+        raise MalformedError(f"no media wishes: {error}") from None
+    for name in names:
+        if not is_stream_name(name):
+            raise MalformedError(f"no media wishes: {name[:64]!r} cannot be the name of a stream")
+    return frozenset(names)
+
+
+def splice_name(envelope: Bytes, name: str) -> bytes:
+    """Return an encoded `ClientEnvelope` with `name` in place of its empty `on_behalf_of`.
+
+    What follows the name is copied unread: the session checks it.
+
+    Raises:
+        ProtocolVersionError: The envelope is of another version.
+        ForgedNameError: `on_behalf_of` is not empty.
+        MalformedError: It is no envelope.
+        TooLargeError: `name` has more than 31 bytes.
+    """
+    data = memoryview(envelope)
+    encoded = name.encode()
+    if len(encoded) > 31:
+        raise TooLargeError("name", len(encoded), 31)
+    elements, at = _read_array(data)
+    version, at = _read_integer(data, at)
+    if version != PROTOCOL_VERSION:
+        raise ProtocolVersionError(version)
+    if elements < _ENVELOPE_ELEMENTS:
+        raise MalformedError(f"no envelope: {elements} elements, {_ENVELOPE_ELEMENTS} are needed")
+    _, at = _read_integer(data, at)
+    length, after = _read_string(data, at)
+    if length:
+        raise ForgedNameError
+    return b"".join((data[:at], bytes((0xA0 | len(encoded),)), encoded, data[after:]))
+
+
+def peek_client_type(envelope: Bytes) -> str:
+    """Return the type of a client message, empty for one without. Raises `MalformedError` for what is not MessagePack.
+
+    The session checks the rest: it may know types that a gateway does not.
+    """
+    try:
+        return _client.decode(envelope).message.type
+    except BAD_BYTES as error:
+        raise MalformedError(f"no envelope: {error}") from None
+
+
+def peek_server_message(envelope: Bytes) -> ServerHead:
+    """Return the head of a `ServerEnvelope`; its type is empty for what is not one, and for large ones."""
+    if len(envelope) > MAX_PEEKED:
+        return ServerHead(0, "", "")
+    try:
+        found = _server.decode(envelope)
+    except BAD_BYTES:
+        return ServerHead(0, "", "")
+    return ServerHead(found.connection_epoch, found.message.type, found.message.code)
+
+
+def _read_array(data: memoryview) -> tuple[int, int]:
+    """Return the number of elements of the array at the beginning, and where they begin."""
+    first = data[0] if len(data) else 0
+    if first & 0xF0 == 0x90:
+        return first & 0x0F, 1
+    width = {0xDC: 2, 0xDD: 4}.get(first, 0)
+    if not width or len(data) < 1 + width:
+        raise MalformedError("no envelope: expected a MessagePack array that starts with the version")
+    return int.from_bytes(data[1 : 1 + width], "big"), 1 + width
+
+
+#: Bytes after the first one, by it: unsigned, then signed integers.
+_INTEGERS: Final = {0xCC: 1, 0xCD: 2, 0xCE: 4, 0xCF: 8, 0xD0: 1, 0xD1: 2, 0xD2: 4, 0xD3: 8}
+_FIRST_SIGNED: Final = 0xD0
+_STRINGS: Final = {0xD9: 1, 0xDA: 2, 0xDB: 4}
+
+
+def _read_integer(data: memoryview, at: int) -> tuple[int, int]:
+    """Return the integer at `at`, and where the next element begins."""
+    first = data[at] if at < len(data) else 0xC1
+    if first < 0x80:
+        return first, at + 1
+    if first >= 0xE0:
+        return first - 0x100, at + 1
+    width = _INTEGERS.get(first, 0)
+    if not width or len(data) < at + 1 + width:
+        raise MalformedError("no envelope: version and connection_epoch must be integers")
+    value = int.from_bytes(data[at + 1 : at + 1 + width], "big", signed=first >= _FIRST_SIGNED)
+    return value, at + 1 + width
+
+
+def _read_string(data: memoryview, at: int) -> tuple[int, int]:
+    """Return the length of the string at `at`, and where the next element begins."""
+    first = data[at] if at < len(data) else 0xC1
+    if first & 0xE0 == 0xA0:
+        length, begin = first & 0x1F, at + 1
+    else:
+        width = _STRINGS.get(first, 0)
+        if not width or len(data) < at + 1 + width:
+            raise MalformedError("no envelope: on_behalf_of must be a string")
+        length, begin = int.from_bytes(data[at + 1 : at + 1 + width], "big"), at + 1 + width
+    if len(data) < begin + length:
+        raise MalformedError("no envelope: it ends within on_behalf_of")
+    return length, begin + length

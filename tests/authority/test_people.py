@@ -1,0 +1,244 @@
+"""A director renames participants and gives them other roles."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from iris_session.authority import AuthorityConfig, is_same_snapshot
+from iris_session.protocol.client_messages import Acquire, Control, GetSnapshot, Grasp, MoveAnchor, Rename, SetRole
+from iris_session.protocol.common import IDENTITY, Pose
+from iris_session.protocol.entries import Lost
+from iris_session.protocol.server_messages import (
+    AnchorInfo,
+    Audited,
+    LeaseChanged,
+    ParticipantChanged,
+    ParticipantJoined,
+    Snapshot,
+)
+from tests.authority.table import Person, Table, robot
+from tests.authority.test_roster import refused, rejoin
+
+
+def snapshot(t: Table) -> Snapshot:
+    t.step(t.host(GetSnapshot(1)))
+    (message,) = [o.message for o in t.decision.outgoing if isinstance(o.message, Snapshot)]
+    return message
+
+
+def meet(**fields: object) -> tuple[Table, Person, Person]:
+    """A director and an operator."""
+    t = Table()
+    return t, t.join("director", name="dora"), t.operator(name="ann", **fields)
+
+
+class TestRename:
+    def test_everyone_learns_the_name(self) -> None:
+        t, dora, ann = meet()
+        assert dora.asks(Rename(1, ann.id, " eva ")).ok
+        (event,) = t.since(ParticipantChanged)
+        assert (event.participant.id, event.participant.name) == (ann.id, "eva")
+        (audit,) = t.since(Audited)
+        assert (audit.kind, audit.subject, audit.name, audit.detail) == ("renamed", ann.id, "eva", "dora: was ann")
+        assert [p.name for p in snapshot(t).participants] == ["dora", "eva"]
+
+    def test_by_its_name_and_by_the_host(self) -> None:
+        t, _, ann = meet()
+        t.step(t.host(Rename(1, "ann", "eva")))
+        assert t.since(ParticipantChanged)[0].participant.id == ann.id
+
+    def test_taken_name_gets_a_number(self) -> None:
+        t, dora, ann = meet()
+        t.join(name="dora-2")
+        assert dora.asks(Rename(1, ann.id, "dora")).ok
+        assert t.since(ParticipantChanged)[0].participant.name == "dora-3"
+        long = "x" * 64
+        t.join(name=long)
+        assert dora.asks(Rename(2, ann.id, long)).ok
+        assert t.since(ParticipantChanged)[0].participant.name == "x" * 60 + "-2"
+
+    def test_same_name_is_no_event(self) -> None:
+        t, dora, ann = meet()
+        assert dora.asks(Rename(1, ann.id, "ann")).ok
+        assert t.decision.events == ()
+
+    @pytest.mark.parametrize("name", ["", "  ", "a\nb", "\x1b[2J"])
+    def test_no_name(self, name: str) -> None:
+        _, dora, ann = meet()
+        assert dora.denied(Rename(1, ann.id, name)) == "invalid"
+
+    @pytest.mark.parametrize("who", ["host", "nobody", ""])
+    def test_no_participant(self, who: str) -> None:
+        _, dora, _ = meet()
+        assert dora.denied(Rename(1, who, "eva")) == "unknown_participant"
+
+    def test_directors_only(self) -> None:
+        _, dora, ann = meet()
+        assert ann.denied(Rename(1, dora.id, "eva")) == "role"
+
+    def test_name_outlives_the_connection(self) -> None:
+        t, dora, ann = meet()
+        dora.does(Rename(1, ann.id, "eva"))
+        t.step(ann.says(Lost()))
+        back = rejoin(t, ann)
+        assert t.last(ParticipantJoined).participant.name == "eva"
+        t.step(back.says(Lost()))
+        back.connection = ann.connection  # for its key
+        back.name = "anna"
+        rejoin(t, back)
+        assert t.last(ParticipantJoined).participant.name == "anna", "it names itself anew"
+
+    def test_assigned_name_is_given_with_its_robots(self) -> None:
+        t = Table(AuthorityConfig(policy="config", assignments={"left-hand": ("left",)}))
+        dora, ann = t.join("director", name="dora"), t.operator(name="ann")
+        assert ann.denied(Acquire(1, ("left",))) == "policy"
+        dora.does(Rename(1, ann.id, "left-hand"))
+        assert ann.acquire("left").ok
+
+
+class TestSetRole:
+    def test_operator_becomes_director_and_keeps_its_robot(self) -> None:
+        t, dora, ann = meet()
+        ann.acquire("left")
+        assert ann.denied(Control(1, "pause")) == "role"
+        assert dora.asks(SetRole(1, ann.id, "director")).ok
+        (event,) = t.since(ParticipantChanged)
+        assert (event.participant.id, event.participant.role) == (ann.id, "director")
+        (audit,) = t.since(Audited)
+        assert (audit.kind, audit.subject, audit.detail) == ("role_changed", ann.id, "dora: operator to director")
+        assert t.since(LeaseChanged) == []
+        ann.engage("left")
+        assert t.hold() == ""
+        assert ann.asks(Control(2, "pause")).ok
+
+    def test_observer_holds_nothing(self) -> None:
+        t, dora, ann = meet()
+        ann.acquire("left")
+        ann.asks(Grasp(2, "hammer", "hand/right"))
+        ann.engage("left")
+        assert dora.asks(SetRole(1, ann.id, "observer")).ok
+        changes = t.since(LeaseChanged)
+        assert {(c.lease.target, c.lease.holder, c.cause, c.previous_holder) for c in changes} == {
+            ("left", "", "role", ann.id),
+            ("hammer", "", "role", ann.id),
+        }
+        assert t.hold()
+        ann.sends("left", clutch=True)
+        assert t.hold()
+        assert dora.asks(SetRole(2, ann.id, "operator")).ok
+        assert ann.acquire("left").ok
+
+    def test_place_in_the_queue_is_given_up(self) -> None:
+        t, dora, ann = meet()
+        bob = t.operator("left", name="bob")
+        ann.does(Acquire(7, ("left",), wait=True))
+        assert t.last(LeaseChanged).lease.queue == (ann.id,)
+        dora.does(SetRole(1, ann.id, "observer"))
+        assert t.last(LeaseChanged).lease.queue == ()
+        assert t.last(LeaseChanged).lease.holder == bob.id
+
+    def test_person_who_becomes_an_agent_lets_go(self) -> None:
+        """Modes `priority` and `takeover` treat agents otherwise than people."""
+        t = Table(robots=(robot("left", "priority"), robot("right")))
+        dora, ann = t.join("director", name="dora"), t.operator("left", name="ann")
+        assert dora.asks(SetRole(1, ann.id, "agent")).ok
+        assert t.last(LeaseChanged).lease.holder == ""
+        bob = t.operator(name="bob")
+        assert ann.acquire("left").ok
+        assert bob.acquire("left").ok, "a person preempts it"
+
+    @pytest.mark.parametrize(
+        ("roles", "role", "reason"),
+        [
+            (("operator", "observer"), "director", "role"),
+            ((), "gateway", "role"),
+            (("operator", "gateway"), "gateway", "role"),
+            ((), "king", "unknown_value"),
+        ],
+    )
+    def test_denied(self, roles: tuple[str, ...], role: str, reason: str) -> None:
+        t, dora, ann = meet(roles=roles)
+        assert dora.denied(SetRole(1, ann.id, role)) == reason
+        assert t.decision.events == ()
+
+    def test_role_of_the_key(self) -> None:
+        _, dora, ann = meet(roles=("operator", "director"))
+        assert dora.asks(SetRole(1, ann.id, "director")).ok
+
+    def test_gateway_stays_one(self) -> None:
+        t, dora, _ = meet()
+        gate = t.join("gateway", name="web")
+        assert dora.denied(SetRole(1, gate.id, "director")) == "role"
+        assert dora.asks(SetRole(2, gate.id, "gateway")).ok
+
+    def test_directors_only_and_people_only(self) -> None:
+        _, dora, ann = meet()
+        assert ann.denied(SetRole(1, ann.id, "director")) == "role"
+        assert dora.denied(SetRole(1, "host", "observer")) == "unknown_participant"
+        assert dora.asks(SetRole(2, dora.id, "operator")).ok
+        assert dora.denied(SetRole(3, dora.id, "director")) == "role", "it has given its rights away"
+
+    def test_wearer_who_is_not_aligned_by_measurement_may_not_drive(self) -> None:
+        """As at joining: an observer in remote VR shows its hands, but does not drive with them."""
+        t = Table()
+        dora = t.join("director", name="dora")
+        far = t.join("observer", alignment="not_needed", devices=("head", "controller/right"))
+        assert dora.denied(SetRole(1, far.id, "operator")) == "unaligned"
+        assert dora.asks(SetRole(2, far.id, "agent")).ok, "agents may, by default"
+
+    def test_role_outlives_the_connection(self) -> None:
+        t, dora, ann = meet()
+        ann.acquire("left")
+        dora.does(SetRole(1, ann.id, "director"))
+        t.step(ann.says(Lost()))
+        rejoin(t, ann, role="operator")
+        (admitted,) = t.decision.admitted
+        assert (admitted.role, admitted.resumed) == ("director", True)
+        assert t.last(LeaseChanged).lease.holder == ann.id
+
+    def test_role_that_the_key_has_lost_is_not_resumed(self) -> None:
+        t, dora, ann = meet()
+        dora.does(SetRole(1, ann.id, "director"))
+        t.step(ann.says(Lost()))
+        rejoin(t, ann, role="operator", roles=("operator",))
+        assert refused(t) == "resume_token"
+
+
+class TestAnchors:
+    def test_snapshot_has_them_where_they_are(self) -> None:
+        there = Pose((1.0, 0.0, 0.5), IDENTITY.q)
+        t = Table(AuthorityConfig(anchors={"table": IDENTITY, "wall": there}))
+        assert snapshot(t).anchors == (AnchorInfo("table", IDENTITY), AnchorInfo("wall", there))
+        t.step(t.host(MoveAnchor(1, "table", there)))
+        assert snapshot(t).anchors == (AnchorInfo("table", there), AnchorInfo("wall", there))
+
+
+class TestEarlierSnapshots:
+    """Keyframes of recordings that were made before participants had `roles` and the like."""
+
+    def test_without_the_fields_they_say_the_same(self) -> None:
+        t, _, ann = meet(roles=("operator",))
+        now = t.authority.snapshot()
+        earlier = msgspec.msgpack.decode(now)
+        for fields in earlier["participants"].values():
+            for name in ("roles", "hello_name", "hello_role"):
+                del fields[name]
+        data = msgspec.msgpack.encode(earlier)
+        assert data != now
+        assert is_same_snapshot(data, now)
+        assert is_same_snapshot(now, now)
+        Table().authority.restore(data)
+        earlier["participants"][ann.id]["name"] = "eva"
+        assert not is_same_snapshot(msgspec.msgpack.encode(earlier), now)
+
+    def test_other_fields_and_participants_are_compared(self) -> None:
+        t, dora, ann = meet()
+        before = t.authority.snapshot()
+        dora.does(SetRole(1, ann.id, "director"))
+        assert not is_same_snapshot(before, t.authority.snapshot())
+        some = msgspec.msgpack.decode(before)
+        del some["participants"][ann.id]
+        assert not is_same_snapshot(msgspec.msgpack.encode(some), before)
+        assert not is_same_snapshot(before, msgspec.msgpack.encode(some))
+        assert not is_same_snapshot(msgspec.msgpack.encode([1]), before)

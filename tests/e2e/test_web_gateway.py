@@ -1,0 +1,405 @@
+"""The web gateway of a served session: browsers join, watch, fetch, come back; hostile ones disturb no one."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import re
+import socket
+import time
+from collections.abc import AsyncIterator, Callable, Coroutine
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import pytest
+
+from iris_session.client import Client
+from iris_session.protocol.client_messages import Acquire, Bye, EStop, Hello
+from iris_session.protocol.scene import decode_scene
+from iris_session.protocol.server_messages import EStopChanged, Event, ProtocolFault, Refused, Reply
+from iris_session.web import wire
+from tests.e2e.session_process import DEADLINE_S, SessionProcess, wait_until
+from tests.web.browser import WebBrowser, open_http
+
+pytestmark = pytest.mark.e2e
+Serve = Callable[..., SessionProcess]
+
+
+def page_of(server: SessionProcess) -> str:
+    wait_until(lambda: "in a browser: " in server.output, "the page's address")
+    found = re.search(r"in a browser: (\S+)", server.output)
+    assert found, server.output
+    return found[1]
+
+
+def run(work: Coroutine[Any, Any, None]) -> None:
+    asyncio.run(asyncio.wait_for(work, 2 * DEADLINE_S))
+
+
+@contextlib.asynccontextmanager
+async def browsers(page: str, *names: str) -> AsyncIterator[list[WebBrowser]]:
+    """Browsers that have joined as observers."""
+    async with open_http() as http:
+        made = [WebBrowser(http, page, name) for name in names]
+        try:
+            for one in made:
+                await one.join()
+            yield made
+        finally:
+            for one in made:
+                await one.close()
+
+
+@pytest.fixture(scope="module")
+def page(shared_session: SessionProcess) -> str:
+    return page_of(shared_session)
+
+
+def test_page_and_information_without_a_ticket(page: str) -> None:
+    async def work() -> None:
+        async with open_http() as http:
+            async with http.get(page) as answer:
+                assert answer.status == 200
+                assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
+                assert answer.headers["X-Content-Type-Options"] == "nosniff"
+                assert b"<html" in await answer.read()
+            async with http.get(f"{page}v1/info") as answer:
+                info = await answer.json()
+            assert info["versions"] == [1]
+            assert info["session_name"].startswith("handover")
+            assert (info["pairing"], info["key"]) == (False, "")
+            for path, status in (("v1/nothing", 404), ("../etc/passwd", 404), ("v1/asset/xyz", 401)):
+                async with http.get(page + path) as answer:
+                    assert answer.status == status, path
+            async with http.post(f"{page}v1/info", data=b"x" * 100_000) as answer:
+                assert answer.status == 405
+
+    run(work())
+
+
+def test_browsers_join_and_get_state_like_zeromq_clients(page: str, shared_session: SessionProcess) -> None:
+    async def work() -> None:
+        async with browsers(page, "ann", "bob") as (ann, bob):
+            snapshot = await ann.snapshot()
+            assert {p.name for p in snapshot.participants if p.connected} >= {"ann", "bob", "web"}
+            assert len(ann.bulk[-1]) == 56 * len(snapshot.bodies)
+            begin = time.monotonic()
+            before = len(ann.states), len(bob.states)
+            await asyncio.sleep(2.0)
+            took = time.monotonic() - begin
+            rates = [(len(one.states) - n) / took for one, n in zip((ann, bob), before, strict=True)]
+            assert min(rates) > 20.0, rates  # 60 on an idle machine
+            seqs = [header.state_seq for header, _ in ann.states]
+            assert seqs == sorted(seqs)
+        with Client(shared_session.address, role="observer", name="eve").connect(DEADLINE_S) as eve:
+            assert eve.wait_for(
+                lambda c: not {"ann", "bob"} & {p.name for p in c.mirror.participants.values() if p.connected}, 20.0
+            ), "closed sockets are lost connections"
+
+    run(work())
+
+
+def test_an_operator_behind_the_gateway_drives_and_stops(page: str) -> None:
+    async def work() -> None:
+        async with open_http() as http:
+            ann = await WebBrowser(http, page, "ann").join("director", devices=("desktop",))
+            bob = await WebBrowser(http, page, "bob").join("operator", devices=("desktop",))
+            await ann.send(Acquire(1, ("left",)))
+            reply = await ann.wait_for(Reply)
+            assert reply.denial is None
+            await bob.send(Acquire(1, ("left",)))
+            denied = await bob.wait_for(Reply)
+            assert denied.denial is not None
+            assert "ann" in str(denied.denial)
+            await bob.send(EStop("hand in the way"))
+            await ann.wait(
+                lambda: any(isinstance(e.body, EStopChanged) and e.body.active for e in ann.got(Event)), "a stop"
+            )
+            await ann.send(Bye())
+            await bob.send(Bye())
+            await ann.close()
+            await bob.close()
+
+    run(work())
+
+
+def test_assets_are_fetched_with_ranges_and_a_ticket(page: str) -> None:
+    async def work() -> None:
+        async with browsers(page, "ann", "bob") as (ann, bob):
+            address = (await ann.snapshot()).scene_hash
+            answers = await asyncio.gather(*(one.fetch(address) for one in (ann, bob, ann, bob)))
+            for status, body, headers in answers:
+                assert status == 200
+                assert hashlib.sha256(body).hexdigest() == address
+                assert headers["Cache-Control"] == "private, immutable, max-age=31536000"
+            body, total = answers[0][1], len(answers[0][1])
+            for given, begin, end in (("0-0", 0, 1), ("5-9", 5, 10), ("10-", 10, total), ("-7", total - 7, total)):
+                status, part, headers = await ann.fetch(address, Range=f"bytes={given}")
+                assert (status, part) == (206, body[begin:end])
+                assert headers["Content-Range"] == f"bytes {begin}-{end - 1}/{total}"
+            status, _, headers = await ann.fetch(address, Range=f"bytes={total}-")
+            assert (status, headers["Content-Range"]) == (416, f"bytes */{total}")
+            for address_given, ticket, expected in (
+                (address, "", 401),
+                (address, "x" * 4000, 401),
+                ("0" * 64, None, 404),
+                (address.upper(), None, 404),
+                ("%2e%2e", None, 404),
+            ):
+                assert (await ann.fetch(address_given, ticket))[0] == expected
+            ticket = bob.ticket
+            await bob.close()
+            await asyncio.sleep(0.3)
+            assert (await ann.fetch(address, ticket))[0] == 401, "the ticket of a browser that has closed"
+
+    run(work())
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({"Origin": "https://evil.example"}, 403),
+        ({"Origin": "null"}, 403),
+        ({"Host": "evil.example"}, 421),
+        ({"Sec-Fetch-Site": "cross-site"}, 403),
+    ],
+)
+def test_other_sites_are_refused(page: str, headers: dict[str, str], status: int) -> None:
+    async def work() -> None:
+        async with open_http() as http:
+            for path in ("v1/session", "v1/media"):
+                with pytest.raises(aiohttp.WSServerHandshakeError) as error:
+                    await http.ws_connect(page + path, protocols=[wire.SUBPROTOCOL], headers=headers)
+                assert error.value.status == status
+            async with http.get(f"{page}v1/info", headers=headers) as answer:
+                assert answer.status == status
+
+    run(work())
+
+
+def test_another_version_is_refused_in_words(page: str) -> None:
+    async def work() -> None:
+        async with open_http() as http:
+            for protocols in ([], ["iris-session.2"]):
+                with pytest.raises(aiohttp.WSServerHandshakeError) as error:
+                    await http.ws_connect(f"{page}v1/session", protocols=protocols)
+                assert error.value.status == 400
+            async with http.get(f"{page}v1/session") as answer:
+                assert answer.status == 400
+                assert b"iris-session.1" in await answer.read()
+            ann = await WebBrowser(http, page).open()
+            await ann.socket.send_bytes(wire.encode_frames(wire.CONTROL, [b"\x94\x02\x00\xa0\x80"]))
+            assert await ann.wait_closed() == wire.CLOSE_VERSION
+            await ann.close()
+
+    run(work())
+
+
+def test_hostile_messages_close_their_sender_only(page: str) -> None:
+    forged = b"\x94\x01\x00\xa3bob\x81\xa4type\xa9heartbeat"
+    hostile: list[tuple[bytes | str, int]] = [
+        (b"", wire.CLOSE_NOT_ALLOWED),
+        (b"\xff" * 100, wire.CLOSE_NOT_ALLOWED),
+        (wire.encode_frames(wire.CONTROL, [forged]), wire.CLOSE_NOT_ALLOWED),
+        (wire.encode_frames(wire.STATE, [b"rigid"]), wire.CLOSE_NOT_ALLOWED),
+        (b"\x01\x01\xff\xff\xff\xff" + b"a" * 50, wire.CLOSE_NOT_ALLOWED),
+        ("text", wire.CLOSE_NOT_ALLOWED),
+        (b"\x01" * (wire.MAX_CLIENT_MESSAGE + 1), 1009),
+    ]
+
+    async def work() -> None:
+        async with browsers(page, "ann") as (ann,):
+            for data, code in hostile:
+                bad = await WebBrowser(ann.http, page, "bad").open()
+                if isinstance(data, str):
+                    await bad.socket.send_str(data)
+                else:
+                    await bad.socket.send_bytes(data)
+                assert await bad.wait_closed() == code, data[:20]
+                await bad.close()
+            bad = await WebBrowser(ann.http, page, "bad").join()
+            for envelope in (b"\x94\x01\x00\xa0\xc1", b"\x94\x01\x00\xa0\x81\xa4type\xa7unknown"):
+                n = sum(fault.code == "malformed" for fault in bad.got(ProtocolFault))
+                await bad.socket.send_bytes(wire.encode_frames(wire.CONTROL, [envelope]))
+                await bad.wait(
+                    lambda n=n: sum(f.code == "malformed" for f in bad.got(ProtocolFault)) > n, "an answer of its own"
+                )
+            with contextlib.suppress(ConnectionError):
+                for _ in range(6000):
+                    await bad.send(Bye(), 99)
+            assert await bad.wait_closed() == wire.CLOSE_LIMIT
+            await bad.close()
+            assert ann.close_code is None
+            n = len(ann.states)
+            await ann.wait(lambda: len(ann.states) > n, "state goes on")
+
+    run(work())
+
+
+def test_media_need_a_ticket(page: str) -> None:
+    async def work() -> None:
+        async with browsers(page, "ann") as (ann,):
+            for first in (b"", b"\x05\x01\x01\x00\x00\x00\x80", wire.encode_wishes(["cloud"])):
+                media = await ann.http.ws_connect(f"{page}v1/media", protocols=[wire.SUBPROTOCOL])
+                await media.send_bytes(first)
+                message = await media.receive(10.0)
+                assert (message.type, message.data) == (aiohttp.WSMsgType.CLOSE, wire.CLOSE_NOT_ALLOWED)
+            media = await ann.open_media(ticket="wrong")
+            await ann.wait(lambda: media.close_code is not None, "closed")
+            assert media.close_code == wire.CLOSE_NOT_ALLOWED
+            first_socket = await ann.open_media()
+            await ann.open_media()
+            await ann.wait(lambda: first_socket.close_code is not None, "replaced by the second one")
+
+    run(work())
+
+
+def test_media_reach_the_browser_that_wishes_for_them(serve: Serve) -> None:
+    page = page_of(serve("cloth"))
+
+    async def work() -> None:
+        async with browsers(page, "ann", "bob") as (ann, bob):
+            snapshot = await ann.snapshot()
+            status, body, _ = await ann.fetch(snapshot.scene_hash)
+            assert status == 200
+            stream = decode_scene(body).deformables[0].stream
+            await ann.open_media(stream)
+            await ann.wait(lambda: len(ann.media) > 20, "frames")
+            assert {header.stream for header in ann.media} == {stream}
+            assert bob.media == []
+
+    run(work())
+
+
+def test_a_thousand_silent_sockets_harm_no_one(page: str) -> None:
+    host, port = re.findall(r"//([\d.]+):(\d+)/", page)[0]
+
+    async def work() -> None:
+        async with browsers(page, "ann") as (ann,):
+            loris: list[socket.socket] = []
+            try:
+                for n in range(1000):
+                    one = socket.create_connection((host, int(port)), timeout=5.0)
+                    with contextlib.suppress(OSError):
+                        one.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Slow: " if n % 2 else b"")
+                    loris.append(one)
+                    if n % 50 == 0:
+                        await asyncio.sleep(0)
+                n_states = len(ann.states)
+                await ann.wait(lambda: len(ann.states) > n_states + 20, "state goes on", 10.0)
+                bob = await WebBrowser(ann.http, page, "bob").join()
+                await bob.close()
+            finally:
+                for one in loris:
+                    one.close()
+            assert ann.close_code is None
+
+    run(work())
+
+
+def test_a_reader_that_stops_gets_the_newest_and_is_closed_in_the_end(page: str) -> None:
+    async def work() -> None:
+        async with browsers(page, "ann", "slow") as (ann, slow):
+            transport = slow.socket._conn.transport if hasattr(slow.socket, "_conn") else None
+            assert transport is not None
+            transport.pause_reading()
+            await asyncio.sleep(2.5)
+            begin = time.monotonic_ns()
+            transport.resume_reading()
+            n = len(slow.states)
+            await slow.wait(lambda: len(slow.states) > n + 1, "state comes")
+            await asyncio.sleep(0.2)
+            newest = [header for header, at in slow.states if at > begin][-1]
+            assert newest.state_seq >= ann.states[-20][0].state_seq, "fresh again at once"
+            assert slow.close_code is None, "a pause of seconds is no reason to close"
+            slow.heartbeats = True
+            n = len(ann.states)
+            await ann.wait(lambda: len(ann.states) > n, "state goes on")
+
+    run(work())
+
+
+def test_killed_gateway_comes_back_and_leases_stay(serve: Serve) -> None:
+    server = serve()
+    page = page_of(server)
+
+    async def work() -> None:
+        async with open_http() as http:
+            ann = await WebBrowser(http, page, "ann").join("operator")
+            await ann.send(Acquire(1, ("left",)))
+            assert (await ann.wait_for(Reply)).denial is None
+            token, participant = ann.welcome.resume_token, ann.welcome.participant_id  # type: ignore[union-attr]
+            for name in ("web.gateway", "front.main"):
+                if name == "front.main":
+                    await asyncio.sleep(1.5)
+                server.children()[name].kill()
+                await ann.wait(lambda: ann.socket.closed, f"{name} is noticed")
+                begin = time.monotonic()
+                while True:
+                    await ann.close()
+                    try:
+                        await ann.open()
+                        welcome = await asyncio.wait_for(ann.say_hello("operator", resume_token=token), 10.0)
+                        break
+                    except (aiohttp.ClientError, TimeoutError, AssertionError, ConnectionError):
+                        assert time.monotonic() - begin < DEADLINE_S
+                        await asyncio.sleep(0.2)
+                assert welcome.resumed, name
+                assert welcome.participant_id == participant
+                token = welcome.resume_token
+                snapshot = await ann.snapshot()
+                assert {lease.target: lease.holder for lease in snapshot.leases}["left"] == participant
+                print(f"{name}: back after {time.monotonic() - begin:.2f} s")
+            await ann.close()
+
+    run(work())
+    assert "web gateway ended" in server.output
+
+
+def test_session_end_is_said(serve: Serve) -> None:
+    server = serve()
+    page = page_of(server)
+
+    async def work() -> None:
+        async with browsers(page, "ann") as (ann,):
+            server.process.terminate()
+            assert await ann.wait_closed() == wire.CLOSE_ENDED
+
+    run(work())
+    assert server.process.wait(DEADLINE_S) == 0
+
+
+def test_unpaired_browsers_of_an_encrypted_session(
+    serve: Serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "keys"))
+    server = serve("handover", "--curve")
+    page = page_of(server)
+    assert page.startswith("https://")
+
+    async def work() -> None:
+        async with open_http() as http:
+            async with http.get(f"{page}v1/info") as answer:
+                info = await answer.json()
+            assert info["pairing"] is True
+            assert len(info["key"]) == 43
+            plain = page.replace("https://", "http://")
+            async with http.get(plain, allow_redirects=False) as answer:
+                assert (answer.status, answer.headers["Location"]) == (307, page)
+            ann = await WebBrowser(http, page).open()
+            await ann.send(Hello("observer", "ann", secret=ann.secret), 0)
+            assert (await ann.wait_for(Refused)).code == "unpaired"
+            await ann.close()
+
+    run(work())
+
+
+def test_without_a_page_there_is_no_port(serve: Serve) -> None:
+    server = serve("handover", "--no-web")
+    assert "in a browser" not in server.output
+    with Client(server.address, role="observer", name="eve").connect(DEADLINE_S) as eve:
+        welcome = eve._connection.welcome
+        assert welcome is not None
+        assert welcome.endpoints.web == 0

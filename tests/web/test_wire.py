@@ -1,0 +1,133 @@
+"""Bytes of the web channel: vectors both ways, refusals, and arbitrary bytes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from iris_session.codegen.web_golden import build_golden, render_golden
+from iris_session.protocol.client_messages import Bye, Heartbeat, wrap_message
+from iris_session.protocol.codec import decode_client, encode_client, encode_server
+from iris_session.protocol.errors import MalformedError, ProtocolError, ProtocolVersionError, TooLargeError
+from iris_session.protocol.server_messages import ClockPong, ProtocolFault, ServerEnvelope
+from iris_session.web import wire
+
+FILE = Path(__file__).parents[2] / "docs" / "protocol" / "web.json"
+GOLDEN: dict[str, Any] = json.loads(FILE.read_text())
+
+
+def cases(section: str) -> pytest.MarkDecorator:
+    rows = GOLDEN[section]
+    return pytest.mark.parametrize("row", rows, ids=[row["name"] for row in rows])
+
+
+def test_vectors_are_current() -> None:
+    assert FILE.read_text() == render_golden()
+    assert json.loads(json.dumps(build_golden())) == GOLDEN
+    assert GOLDEN["subprotocol"] == wire.SUBPROTOCOL
+
+
+@cases("messages")
+def test_messages_both_ways(row: dict[str, Any]) -> None:
+    data, frames = bytes.fromhex(row["hex"]), [bytes.fromhex(frame) for frame in row["frames"]]
+    channel, decoded = wire.decode_frames(data)
+    assert (channel, [bytes(frame) for frame in decoded]) == (row["channel"], frames)
+    assert wire.encode_frames(channel, frames) == data
+
+
+@cases("refused")
+def test_containers_that_must_be_refused(row: dict[str, Any]) -> None:
+    with pytest.raises(MalformedError):
+        wire.decode_frames(bytes.fromhex(row["hex"]))
+
+
+@cases("gateway")
+def test_gateway_messages(row: dict[str, Any]) -> None:
+    data, value = bytes.fromhex(row["hex"]), row["value"]
+    if isinstance(value, list):
+        assert wire.decode_wishes(data) == frozenset(value)
+        assert wire.decode_frames(wire.encode_wishes(value))[1][0] == data
+        return
+    message = wire.decode_gateway_message(data)
+    assert {**msgspec.to_builtins(message), **value} == msgspec.to_builtins(message)
+
+
+@cases("envelopes")
+def test_a_gateway_fills_in_the_name(row: dict[str, Any]) -> None:
+    data, name = bytes.fromhex(row["hex"]), row["on_behalf_of"]
+    spliced = wire.splice_name(data, name)
+    assert spliced == bytes.fromhex(row["spliced"])
+    before, after = decode_client(data), decode_client(spliced)
+    assert after.on_behalf_of == name
+    assert msgspec.structs.replace(after, on_behalf_of="") == before
+
+
+@cases("bad_envelopes")
+def test_envelopes_that_close_the_socket(row: dict[str, Any]) -> None:
+    expected = ProtocolVersionError if row["close"] == wire.CLOSE_VERSION else (MalformedError, wire.ForgedNameError)
+    with pytest.raises(expected):
+        wire.splice_name(bytes.fromhex(row["hex"]), "web-00112233aabb")
+
+
+@given(st.binary(max_size=300))
+def test_arbitrary_bytes_raise_protocol_errors_only(data: bytes) -> None:
+    for decode in (
+        wire.decode_frames,
+        wire.decode_gateway_message,
+        wire.decode_wishes,
+        lambda data: wire.splice_name(data, "web-00112233aabb"),
+        wire.peek_client_type,
+        wire.peek_server_message,
+    ):
+        try:
+            decode(data)
+        except ProtocolError:
+            continue
+
+
+@given(st.integers(0, 255), st.lists(st.binary(max_size=40), min_size=1, max_size=255))
+def test_any_frames_come_back(channel: int, frames: list[bytes]) -> None:
+    decoded_channel, decoded = wire.decode_frames(wire.encode_frames(channel, frames))
+    assert (decoded_channel, [bytes(frame) for frame in decoded]) == (channel, frames)
+
+
+@given(st.binary(max_size=64))
+def test_what_follows_the_name_cannot_change_it(rest: bytes) -> None:
+    envelope = wire.splice_name(b"\x94\x01\x07\xa0" + rest, "web-00112233aabb")
+    assert envelope.startswith(b"\x94\x01\x07\xb0web-00112233aabb")
+    try:
+        assert decode_client(envelope).on_behalf_of == "web-00112233aabb"
+    except ProtocolError:
+        return
+
+
+def test_names_have_one_byte_of_length() -> None:
+    with pytest.raises(TooLargeError):
+        wire.splice_name(encode_client(wrap_message(Heartbeat())), "n" * 32)
+
+
+def test_wishes_are_bounded_names() -> None:
+    for names in (["a"] * 17, ["-x"], [""], ["a/b"]):
+        with pytest.raises(MalformedError):
+            wire.decode_wishes(msgspec.msgpack.encode(names))
+
+
+def test_frames_are_counted_in_a_byte() -> None:
+    for frames in ([], [b""] * 256):
+        with pytest.raises(ValueError, match="1 to 255 frames"):
+            wire.encode_frames(wire.CONTROL, frames)
+
+
+def test_types_are_read_without_the_message() -> None:
+    assert wire.peek_client_type(encode_client(wrap_message(Bye(), 3, "x"))) == "bye"
+    pong = encode_server(ServerEnvelope(1, 9, ClockPong(1, 2, 3)))
+    assert wire.peek_server_message(pong) == (9, "clock_pong", "")
+    fault = encode_server(ServerEnvelope(1, 9, ProtocolFault("revoked", "text")))
+    assert wire.peek_server_message(fault) == (9, "protocol_fault", "revoked")
+    assert wire.peek_server_message(bytes(wire.MAX_PEEKED + 1)).type == ""
