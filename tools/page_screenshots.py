@@ -21,7 +21,7 @@ from tests.e2e.session_process import COMMAND
 
 START_S: Final = 90.0
 #: After both robots are held: until hands are at work [s].
-SETTLE_S: Final = 12.0
+SETTLE_S: Final = 8.0
 BOTH_HELD: Final = "[...document.querySelectorAll('[data-robot] .holder')].every((one) => one.textContent !== 'free')"
 
 
@@ -29,9 +29,9 @@ def wait_for_address(output: Path, process: subprocess.Popen[bytes]) -> str:
     """Return the address of the page that the demo prints. Raises `SystemExit`."""
     deadline = time.monotonic() + START_S
     while time.monotonic() < deadline and process.poll() is None:
-        match = re.search(r"https?://[^\s,]+", output.read_text(errors="replace"))
+        match = re.search(r"in a browser: (https?://\S+)", output.read_text(errors="replace"))
         if match:
-            return match.group(0)
+            return match.group(1)
         time.sleep(0.1)
     raise SystemExit(f"the demo printed no address of a page:\n{output.read_text(errors='replace')[-2000:]}")
 
