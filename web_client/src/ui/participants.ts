@@ -58,7 +58,7 @@ function makeRow({ id }: ParticipantInfo, state: PageState, actions: Actions): R
   return {
     element,
     update: (item) => {
-      dot.style.background = participantColor(state.session?.participants ?? [], id);
+      dot.style.background = participantColor(id);
       setText(name, item.name);
       you.hidden = id !== state.selfId;
       const report = state.status?.participants.find((one) => one.id === id);

@@ -95,7 +95,7 @@ function makeRow({ name }: RobotInfo, state: PageState, actions: Actions): Row<R
       const participants = state.session?.participants ?? [];
       const isMine = lease !== undefined && (lease.holder === state.selfId || lease.sub_holders.includes(state.selfId));
       const isFree = !lease || lease.holder === "";
-      dot.style.background = isFree ? "transparent" : participantColor(participants, lease.holder);
+      dot.style.background = isFree ? "transparent" : participantColor(lease.holder);
       dot.classList.toggle("hollow", isFree);
       setText(holder, isFree ? "free" : isMine ? "you" : state.nameOf(lease.holder));
       holder.classList.toggle("free", isFree);
