@@ -470,3 +470,10 @@ def test_no_secret_reaches_the_journal(lab: Lab) -> None:
     assert texts
     for hidden in (ada.secret, ada.identity):
         assert not any(hidden.hex() in text or repr(hidden) in text for text in texts)
+
+
+def test_vector_of_the_document() -> None:
+    identity = hashlib.sha256(bytes(range(32))).digest()
+    text = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text()
+    assert f"`{identity.hex()}`" in text
+    assert f"`{compute_fingerprint(identity)}`" in text

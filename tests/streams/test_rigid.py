@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iris_session.streams.errors import StreamError
-from iris_session.streams.quantise import Floats
+from iris_session.streams.quantise import POSITION_QUANTUM_ERROR_M, ROTATION_QUANTUM_ERROR_RAD, Floats
 from iris_session.streams.rigid import (
     DRIFT_ALLOWANCE_M,
     DRIFT_ALLOWANCE_RAD,
@@ -36,6 +37,17 @@ def assert_within_bound(decoded: Floats, truth: Floats) -> None:
 def test_allowance_leaves_room_for_drift() -> None:
     assert DRIFT_ALLOWANCE_M > 4e-5
     assert math.degrees(DRIFT_ALLOWANCE_RAD) > 0.02
+
+
+def test_document_states_these_bounds() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text()
+    drift_um, drift_deg = DRIFT_ALLOWANCE_M * 1e6, math.degrees(DRIFT_ALLOWANCE_RAD)
+    code_mm, code_deg = POSITION_QUANTUM_ERROR_M * 1e3, math.degrees(ROTATION_QUANTUM_ERROR_RAD)
+    assert f"when it has left it by {drift_um:.1f} um or {drift_deg:.4f} deg" in text
+    assert f"an anchor is within {code_mm:.4f} mm and {code_deg:.4f} deg of it" in text
+    assert f"the sums are {code_mm + drift_um * 1e-3:.4f} mm and {code_deg + drift_deg:.4f} deg" in text
+    assert f"B is at most {WINDOW} frames behind" in text
+    assert f"bodies are repeated every {REFRESH_FRAMES} frames" in text
 
 
 def test_three_hundred_moving_bodies_are_small_and_within_the_bound() -> None:

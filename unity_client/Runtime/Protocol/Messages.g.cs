@@ -2573,8 +2573,8 @@ namespace IrisSession.Protocol
     /// capture_ns: when it was sampled (session time by the client's clock estimate), not when it will be displayed.
     /// pose: T_tracking_device. twist: (vx, vy, vz [m/s], wx, wy, wz [rad/s]) in the tracking frame.
     /// clutch: true while the person wants the target to follow. gripper: 0 open to 1 closed.
-    /// buttons: bit mask. hand_joints: up to 26 poses flattened (x, y, z, qw, qx, qy, qz). q, qd: a leader's
-    /// joint positions [rad or m] and velocities.
+    /// buttons: bit mask (section 6). hand_joints: up to 26 poses flattened (x, y, z, qw, qx, qy, qz). q, qd: a
+    /// leader's joint positions [rad or m] and velocities.
     /// </summary>
     public sealed class Sample : ClientMessage
     {
