@@ -413,7 +413,7 @@ class Gateway:
     def _report(self, assets: GatewayAssets, listener: Listener, *, force: bool = False) -> None:
         """Write a report if something has changed. A parent that does not read it is not waited for."""
         now = time.monotonic()
-        if now < self._report_at and not force:
+        if not self._parent_pid or (now < self._report_at and not force):
             return
         self._report_at = now + REPORT_S
         report = GatewayReport(

@@ -8,7 +8,9 @@ import contextlib
 import hashlib
 import json
 import re
+import signal
 import socket
+import subprocess
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from pathlib import Path
@@ -23,8 +25,9 @@ from iris_session.protocol import pairing
 from iris_session.protocol.client_messages import Acquire, Bye, EStop, GetSnapshot, Hello, Pair
 from iris_session.protocol.scene import decode_scene
 from iris_session.protocol.server_messages import EStopChanged, Event, Paired, ProtocolFault, Refused, Reply
+from iris_session.protocol.status import GetStatus, StatusReport
 from iris_session.web import wire
-from tests.e2e.session_process import DEADLINE_S, SessionProcess, run_command, wait_until
+from tests.e2e.session_process import COMMAND, DEADLINE_S, END_WITH_PARENT, SessionProcess, run_command, wait_until
 from tests.web.browser import WebBrowser, open_http
 
 pytestmark = pytest.mark.e2e
@@ -457,6 +460,49 @@ def test_a_browser_pairs_by_the_printed_link_and_is_revoked(
             await ann.close()
 
     run(work())
+
+
+def test_a_gateway_by_hand_fetches_an_asset_once_for_all(
+    serve: Serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server = serve("handover", "--no-web")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    out = (tmp_path / "web.out").open("w+b")
+    command = [*COMMAND, "web", server.address, "--host", "127.0.0.1", "--web-port", str(port)]
+    gateway = subprocess.Popen([*END_WITH_PARENT, *command], stdout=out, stderr=subprocess.STDOUT)
+    page = f"http://127.0.0.1:{port}/"
+
+    def can_connect() -> bool:
+        with contextlib.suppress(OSError):
+            socket.create_connection(("127.0.0.1", port), 1.0).close()
+            return True
+        return False
+
+    async def work() -> None:
+        async with browsers(page, "ann", "bob") as (ann, bob):
+            address = (await ann.snapshot()).scene_hash
+            answers = await asyncio.gather(*(one.fetch(address) for one in (ann, bob) * 8))
+            assert {status for status, _, _ in answers} == {200}
+            assert {hashlib.sha256(body).hexdigest() for _, body, _ in answers} == {address}
+            await ann.send(GetStatus())
+            report = await ann.wait_for(StatusReport)
+            size = len(answers[0][1])
+            assert size <= report.assets.bytes_sent <= size + 10, "its bytes once, and one byte to ask for its size"
+
+    try:
+        wait_until(can_connect, "the gateway listens")
+        run(work())
+        gateway.send_signal(signal.SIGINT)
+        assert gateway.wait(DEADLINE_S) == 0
+        out.seek(0)
+        assert out.read().decode().splitlines() == [f"in a browser: {page}"]
+    finally:
+        gateway.kill()
+        gateway.wait()
+        out.close()
 
 
 def test_without_a_page_there_is_no_port(serve: Serve) -> None:
