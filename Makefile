@@ -19,7 +19,7 @@ help:
 	@echo "  make coverage   the bounds of coverage, after test-unit"
 	@echo "make test-random  the unit tests with other random examples than the usual ones"
 	@echo "make bench    the benchmarks of docs/benchmarks.md"
-	@echo "make screenshots  records the demo anew and makes the moving picture of the README"
+	@echo "make screenshots  records the demo anew and makes the pictures of README and docs"
 	@echo "make install  only makes $(VENV) and installs"
 
 $(VENV)/.installed: pyproject.toml
@@ -56,14 +56,15 @@ web: $(PAGE)
 install: $(VENV)/.installed
 install-dev: $(VENV)/.installed-dev
 
-demo: install
+demo: install $(PAGE)
 	@$(BIN)/iris-session demo handover
 
-# OpenGL without a display (Debian: libegl1 libgl1-mesa-dri).
-screenshots: install
+# OpenGL without a display (Debian: libegl1 libgl1-mesa-dri), and a browser (Debian: chromium).
+screenshots: install-dev $(PAGE)
 	@folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && \
 	$(BIN)/iris-session demo handover --record "$$folder/session.rrd" && \
 	MUJOCO_GL=egl $(BIN)/python tools/render_recording.py "$$folder/session.rrd" docs/img/handover.gif --size 720 430
+	@PYTHONPATH=. $(BIN)/python tools/page_screenshots.py docs/img
 
 check: install-dev
 	$(BIN)/ruff check .
@@ -90,7 +91,7 @@ test: check
 test-unit: install-dev
 	$(UNIT) $(T)
 
-test-e2e: install-dev
+test-e2e: install-dev $(PAGE)
 	$(E2E) $(T)
 
 test-web: web_client/node_modules/.installed

@@ -44,6 +44,7 @@ from iris_session.security.private_folder import PrivateFolder
 from iris_session.security.session_registry import RegisteredSession, SessionRegistry
 from iris_session.streams.errors import StreamError
 from iris_session.streams.rigid import RigidDecoder, RigidEncoder
+from iris_session.web import wire
 
 # --- inputs -----------------------------------------------------------------------------------------------------------
 
@@ -482,11 +483,38 @@ def _encode_versioned(rng: Random, kind: type[msgspec.Struct]) -> bytes:
     return data[:1] + b"\x01" + data[2:] if rng.random() < 0.7 else data
 
 
+WEB_NAME: Final = "web-00112233aabb"
+
+
+def _web_messages(rng: Random) -> bytes:
+    """Return a WebSocket message: mostly an envelope for the control channel, else any frames on any channel."""
+    if rng.random() < 0.8:
+        return wire.encode_frames(wire.CONTROL, [rng.choice(client_messages())(rng)])
+    frames = [rng.randbytes(rng.choice((0, 1, 20, 300))) for _ in range(rng.choice((1, 1, 2, 3, 255)))]
+    return wire.encode_frames(rng.randrange(8), frames)
+
+
+def check_web(data: bytes) -> None:
+    """Do with a WebSocket message what a gateway does, on every channel. Raises `ProtocolError`."""
+    channel, frames = wire.decode_frames(data)
+    assert sum(map(len, frames)) < len(data)
+    if channel == wire.MEDIA_WISHES:
+        wire.decode_wishes(frames[0])
+    elif channel == wire.GATEWAY:
+        wire.decode_gateway_message(frames[0])
+    else:
+        wire.peek_server_message(frames[0])
+        spliced = wire.splice_name(frames[0], WEB_NAME)
+        wire.peek_client_type(frames[0])
+        assert codec.decode_client(spliced).on_behalf_of == WEB_NAME
+
+
 _OURS: Final[Errors] = (ProtocolError,)
 _ENTRIES: Final[Errors] = (msgspec.DecodeError,)
 DECODERS: Final[dict[str, Callable[[Random], Any]]] = {
     "client": lambda rng: Decoder(rng, client_messages(), codec.decode_client, _OURS),
     "server": lambda rng: Decoder(rng, server_messages(), codec.decode_server, _OURS),
+    "web": lambda rng: Decoder(rng, [_web_messages], check_web, _OURS),
     "version": lambda rng: Decoder(rng, client_messages(), codec.peek_version, _OURS),
     "state-header": decode_plain(StateHeader, codec.decode_state_header, _OURS),
     "presence": decode_plain(Presence, codec.decode_presence, _OURS),

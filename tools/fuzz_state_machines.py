@@ -42,7 +42,14 @@ from iris_session.link import FrontLimits
 from iris_session.protocol import codec
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, AssetChunk, AssetRefused, AssetRequest
 from iris_session.protocol.client_messages import ClientEnvelope, ClockPing, EStop, Hello, Marker, Sample, wrap_message
-from iris_session.protocol.codec import CLIENT_TYPES, decode_client, decode_server, encode_client, encode_server
+from iris_session.protocol.codec import (
+    CLIENT_TYPES,
+    decode_client,
+    decode_server,
+    encode_client,
+    encode_server,
+    peek_on_behalf_of,
+)
 from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.limits import KeyLimits
@@ -58,6 +65,8 @@ from iris_session.protocol.server_messages import (
     StateHeader,
     Welcome,
 )
+from iris_session.web import wire
+from iris_session.web.hub import Hub, HubLimits
 
 # --- client, front and core -------------------------------------------------------------------------------------------
 
@@ -642,9 +651,59 @@ class FrontAssets(FrontControl):
         self._store.cleanup()
 
 
+class WebHub:
+    """Hub of a gateway between hostile browsers and a session that answers anything."""
+
+    BROWSERS: Final = 5
+
+    def __init__(self, rng: Random) -> None:
+        self._rng = rng
+        self._clients = Corpus(rng, client_messages())
+        self._servers = Corpus(rng, server_messages())
+        self._now_ns = 0
+        self.hub = Hub(HubLimits(browsers=self.BROWSERS, queued_messages=50, total_bytes=1 << 20))
+
+    def make(self) -> bytes:
+        return bytes((self._rng.randrange(10),)) + self._clients.damaged()
+
+    def feed(self, data: bytes) -> bool:
+        rng, hub = self._rng, self.hub
+        self._now_ns += rng.choice((0, 1, 20, 500)) * MS
+        browser = hub.open_browser(rng.randbytes(6), "a", self._now_ns) if len(hub) < self.BROWSERS else None
+        browser = browser or rng.choice(list(hub))
+        envelope = None
+        if data[0] < 6:
+            framed = wire.encode_frames(wire.CONTROL, [data[1:]]) if data[0] else data[1:]
+            envelope = hub.receive(browser, framed, self._now_ns)
+            if envelope is not None:
+                assert peek_on_behalf_of(envelope) == browser.name
+        elif data[0] < 9:
+            frames = [self._servers.damaged(), *([b"\0" * 56] if data[0] == 8 else []), browser.name.encode()]
+            assert hub.deliver(frames, self._now_ns)
+        else:
+            hub.publish([rng.choice((b"rigid", b"presence")), data[1:]])
+        if hub.needs_ticket(browser, self._now_ns):
+            hub.issue_ticket(browser, rng.randbytes(32), self._now_ns)
+            assert hub.find_ticket(browser.ticket.decode(), self._now_ns) in (browser, None)
+        hub.tick(self._now_ns)
+        while rng.random() < 0.7 and (hub.take_message(browser) or hub.take_latest(browser)):
+            pass
+        assert sum(one.queued_bytes for one in hub) <= hub.limits.total_bytes + 1000
+        assert all(len(one.latest) <= 2 and (one.epoch or not one.latest) for one in hub)
+        for one in hub:
+            assert one.queued_bytes == sum(map(len, one.outgoing))
+            if one.closing is not None and rng.random() < 0.5:
+                hub.close_browser(one)
+        return envelope is not None
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
 MACHINES: Final[dict[str, Callable[[Random], Any]]] = {
     "connection": HostileSession,
     "state-stream": ClientState,
+    "web-hub": WebHub,
     "front": FrontControl,
     "front-tcp": FrontTcp,
     "core": Core,

@@ -90,6 +90,8 @@ def run(arguments: argparse.Namespace) -> int:
     out = sys.stderr if arguments.json else sys.stdout
 
     def show(session: Session) -> AbstractContextManager[Callable[[], None]]:
+        for note in session.notes:  # the address of the page among them
+            print(note, file=out, flush=True)
         return TerminalView(session, out, f"demo {arguments.demo} on {session.address}").open()
 
     result = run_demo(play, config, arguments.timeout, show, profile, arguments.seed)

@@ -163,13 +163,28 @@ class Hub:
     # --- life of a browser --------------------------------------------------------------------------------------------
 
     def open_browser(self, random: bytes, address: str, now_ns: int) -> Browser | None:
-        """Return a new browser, `None` when there are too many. `random`: `NAME_BYTES` bytes."""
+        """Return a new browser, `None` when there are too many. `random`: `NAME_BYTES` bytes.
+
+        Browsers without a welcome make room: the oldest of the address that has the most of them.
+        """
         name = f"{_NAME_PREFIX}{random[:NAME_BYTES].hex()}"
+        if len(self._browsers) >= self.limits.browsers:
+            self._evict_waiting()
         if len(self._browsers) >= self.limits.browsers or name in self._browsers:
             self.drops.count("web_full")
             return None
         browser = self._browsers[name] = Browser(name, address, self.limits, now_ns)
         return browser
+
+    def _evict_waiting(self) -> None:
+        by_address: dict[str, list[Browser]] = {}
+        for browser in self._browsers.values():
+            if not browser.epoch:
+                by_address.setdefault(browser.address, []).append(browser)
+        if by_address:
+            oldest = max(by_address.values(), key=len)[0]
+            del self._browsers[oldest.name]
+            self._reject(oldest, CLOSE_LIMIT, "web_evicted", "too many clients that have not joined: come again")
 
     def close_browser(self, browser: Browser) -> bytes | None:
         """Remove a browser whose WebSocket is closed. Return the message for the session, if it has a connection."""

@@ -12,16 +12,21 @@ import contextlib
 import re
 import socket
 import ssl
+import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from iris_session.protocol.limits import Drops
+from iris_session.protocol.limits import Drops, TokenBucket
 from iris_session.web.sockets import limit_unsent
 
 #: Connections in all, and strangers among them in all and of one address; above it the oldest are evicted.
 MAX_CONNECTIONS: Final = 512
 MAX_STRANGERS: Final = 256
 MAX_STRANGERS_PER_ADDRESS: Final = 128
+#: Of one address: handshakes of TLS, which cost a millisecond each, and requests. The page has some ten files.
+HANDSHAKES_PER_S, HANDSHAKE_BURST = 20.0, 120
+REQUESTS_PER_S, REQUEST_BURST = 200.0, 1000
+MAX_ADDRESSES: Final = 1024
 #: Time for the first byte, for the handshake of TLS, and for a request.
 FIRST_BYTE_S: Final = 5.0
 HANDSHAKE_S: Final = 8.0
@@ -93,6 +98,29 @@ class ConnectionLimiter:
         return list(self._connections)
 
 
+class AddressRates:
+    """Limits of how often an address may do something. Pure: times [ns] are arguments.
+
+    Args:
+        per_s, burst: Of one address.
+    """
+
+    def __init__(self, per_s: float, burst: int) -> None:
+        self._per_s = per_s
+        self._burst = burst
+        self._buckets: dict[str, TokenBucket] = {}  # the most recently used comes last
+
+    def allow(self, address: str, now_ns: int) -> bool:
+        """Return whether an address may do it once more now, and use its token."""
+        bucket = self._buckets.pop(address, None)
+        if bucket is None:
+            while len(self._buckets) >= MAX_ADDRESSES:
+                del self._buckets[next(iter(self._buckets))]
+            bucket = TokenBucket(self._per_s, self._burst, now_ns)
+        self._buckets[address] = bucket
+        return bucket.take(now_ns)
+
+
 class WatchedProtocol(asyncio.Protocol):
     """Protocol of one connection that passes everything on to that of aiohttp, and notes the end."""
 
@@ -141,6 +169,8 @@ class Listener:
         self._tls = tls
         self._drops = drops
         self._limiter = ConnectionLimiter(drops)
+        self._handshakes = AddressRates(HANDSHAKES_PER_S, HANDSHAKE_BURST)
+        self._requests = AddressRates(REQUESTS_PER_S, REQUEST_BURST)
         self._by_peer: dict[tuple[str, int], Connection] = {}
         self._loop = asyncio.get_running_loop()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -158,6 +188,13 @@ class Listener:
     def find(self, peer: object) -> Connection | None:
         """Return the connection of a peer, as `peername` of its transport is."""
         return self._by_peer.get(peer[:2]) if isinstance(peer, tuple) else None
+
+    def allow_request(self, connection: Connection) -> bool:
+        """Return whether the address of a connection may make one more request now."""
+        if self._requests.allow(connection.address, time.monotonic_ns()):
+            return True
+        self._drops.count("web_request_rate")
+        return False
 
     async def close(self) -> None:
         """Stop accepting, and close all connections."""
@@ -179,6 +216,10 @@ class Listener:
             except OSError:
                 self._drops.count("web_accept")
                 await asyncio.sleep(_ACCEPT_PAUSE_S)
+                continue
+            if self._tls is not None and not self._handshakes.allow(str(peer[0]), time.monotonic_ns()):
+                self._drops.count("web_handshake_rate")
+                sock.close()
                 continue
             self._start(self._serve(sock, (str(peer[0]), int(peer[1]))))
 

@@ -126,6 +126,7 @@ class SocketWriter:
         self._acknowledged = 0
         self._progress_at = asyncio.get_running_loop().time()
         self._checked_at = 0.0
+        self._slow = False
         transport.set_write_buffer_limits(high=MEDIA_WINDOW)
 
     def wake(self) -> None:
@@ -166,13 +167,14 @@ class SocketWriter:
         """Return whether bytes wait, and the client has acknowledged none for `SLOW_S`."""
         now = asyncio.get_running_loop().time()
         if now - self._checked_at < _CHECK_S / 2:
-            return False
+            return self._slow
         self._checked_at = now
         acknowledged = count_acknowledged(self._descriptor)
         waits = self._transport.get_write_buffer_size() or count_unacknowledged(self._descriptor)
         if acknowledged != self._acknowledged or not waits:
             self._acknowledged, self._progress_at = acknowledged, now
-        return now - self._progress_at > SLOW_S
+        self._slow = now - self._progress_at > SLOW_S
+        return self._slow
 
     async def close(self, closing: Closing) -> None:
         """Close the WebSocket with a code and a reason; a client that does not answer is cut off."""
@@ -257,6 +259,9 @@ class WebServer:
         """Check where a request comes from, and turn every error into an answer."""
         connection = self._find_connection(request)
         if connection is not None:
+            if self._listener is not None and not self._listener.allow_request(connection):
+                connection.close()
+                raise ConnectionResetError
             connection.requests += 1
         try:
             return await self._answer(request, handler)

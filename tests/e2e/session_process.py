@@ -142,7 +142,10 @@ class SessionProcess:
         """Return front and recorder by the name of their module."""
         found = {}
         for child in psutil.Process(self.process.pid).children():
-            line = " ".join(child.cmdline())
+            try:
+                line = " ".join(child.cmdline())
+            except psutil.Error:  # it has just ended
+                continue
             for name in ("front.main", "recording.process", "web.gateway"):
                 if name in line:
                     found[name] = child

@@ -15,11 +15,13 @@ Image = NDArray[np.uint8]
 
 
 class ModelRenderer:
-    """Draws one model at its default state: colour, and which geom each pixel shows (-1: none)."""
+    """Draws one model, at first in its default state: colour, and which geom each pixel shows (-1: none)."""
 
-    def __init__(self, model: mujoco.MjModel) -> None:
+    def __init__(self, model: mujoco.MjModel, width: int = WIDTH, height: int = HEIGHT) -> None:
         model.vis.quality.offsamples = 0
         model.vis.quality.shadowsize = 0
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        self._width, self._height = width, height
         self.model = model
         self.data = mujoco.MjData(model)
         mujoco.mj_forward(model, self.data)
@@ -30,10 +32,11 @@ class ModelRenderer:
     def colour(self, camera: mujoco.MjvCamera) -> Image:
         return self._draw(camera, segments=False)
 
-    def segments(self, camera: mujoco.MjvCamera) -> NDArray[np.int64]:
+    def segments(self, camera: mujoco.MjvCamera, attribute: str = "objid") -> NDArray[np.int64]:
+        """Return an attribute of the geom that each pixel shows, such as `objtype`, -1 where there is none."""
         raw = self._draw(camera, segments=True).astype(np.int64)
         number = raw[..., 0] + (raw[..., 1] << 8) + (raw[..., 2] << 16) - 1
-        owner = {geom.segid: geom.objid for geom in self._scene.geoms[: self._scene.ngeom]}
+        owner = {geom.segid: int(getattr(geom, attribute)) for geom in self._scene.geoms[: self._scene.ngeom]}
         table = np.array([owner.get(i, -1) for i in range(int(number.max()) + 1)] + [-1])
         return table[number]
 
@@ -46,8 +49,8 @@ class ModelRenderer:
         )
         for flag, on in (("SEGMENT", segments), ("IDCOLOR", segments), ("SHADOW", False), ("REFLECTION", False)):
             self._scene.flags[int(getattr(mujoco.mjtRndFlag, f"mjRND_{flag}"))] = on
-        image = np.empty((HEIGHT, WIDTH, 3), np.uint8)
-        view = mujoco.MjrRect(0, 0, WIDTH, HEIGHT)
+        image = np.empty((self._height, self._width, 3), np.uint8)
+        view = mujoco.MjrRect(0, 0, self._width, self._height)
         mujoco.mjr_setBuffer(int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN), self._context)
         mujoco.mjr_render(view, self._scene, self._context)
         mujoco.mjr_readPixels(image, None, view, self._context)

@@ -28,7 +28,8 @@ def test_decoders_raise_only_documented_errors(target: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("target", "inputs"), [("connection", 10_000), ("state-stream", 3000), ("core", 3000), ("asset-loader", 5000)]
+    ("target", "inputs"),
+    [("connection", 10_000), ("state-stream", 3000), ("core", 3000), ("asset-loader", 5000), ("web-hub", 5000)],
 )
 def test_random_conversations_keep_state_machines_consistent(target: str, inputs: int) -> None:
     result = fuzz.fuzz(target, inputs, seed=11)

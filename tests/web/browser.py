@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import socket
 import time
 from collections.abc import AsyncIterator, Callable
 from typing import TypeVar
@@ -15,7 +16,7 @@ from iris_session.protocol.client_messages import ClientMessage, GetSnapshot, He
 from iris_session.protocol.codec import decode_media_header, decode_server, decode_state_header, encode_client
 from iris_session.protocol.common import Message
 from iris_session.protocol.media import MediaHeader
-from iris_session.protocol.server_messages import Snapshot, StateHeader, Welcome
+from iris_session.protocol.server_messages import ClockPong, Snapshot, StateHeader, Welcome
 from iris_session.web import wire
 
 T = TypeVar("T", bound=Message)
@@ -35,6 +36,7 @@ class WebBrowser:
         self.bulk: list[bytes] = []
         self.states: list[tuple[StateHeader, int]] = []
         self.presences = 0
+        self.pongs: list[tuple[int, int, int]] = []
         self.media: list[MediaHeader] = []
         self.ticket = ""
         self.welcome: Welcome | None = None
@@ -82,6 +84,13 @@ class WebBrowser:
     async def send(self, message: ClientMessage, epoch: int | None = None) -> None:
         data = encode_client(wrap_message(message, self.epoch if epoch is None else epoch))
         await self.socket.send_bytes(wire.encode_frames(wire.CONTROL, [data]))
+
+    def stop_reading(self) -> Callable[[], None]:
+        """Leave what comes in the system. Return a function that reads on."""
+        connection = self.socket._conn  # type: ignore[attr-defined]
+        transport = connection.transport
+        transport.pause_reading()
+        return transport.resume_reading  # type: ignore[no-any-return]
 
     async def snapshot(self) -> Snapshot:
         before = len(self.got(Snapshot))
@@ -134,6 +143,8 @@ class WebBrowser:
                 self.bulk += [bytes(frame) for frame in frames[1:]]
                 if isinstance(answer, Welcome):
                     self.welcome = answer
+                elif isinstance(answer, ClockPong):
+                    self.pongs.append((answer.t0_ns, answer.t1_ns, now_ns))
             elif channel == wire.STATE and bytes(frames[0]) == b"rigid":
                 self.states.append((decode_state_header(frames[1]), now_ns))
             elif channel == wire.STATE:
@@ -162,15 +173,25 @@ class WebBrowser:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         self._tasks.clear()
-        for socket in (self._socket, self._media_socket):
-            if socket is not None and not socket.closed:
-                await socket.close()
+        for one in (self._socket, self._media_socket):
+            if one is not None and not one.closed:
+                await one.close()
 
 
 @contextlib.asynccontextmanager
-async def open_http() -> AsyncIterator[aiohttp.ClientSession]:
-    """A client that takes the gateway's certificate as it is, with any number of connections."""
-    connector = aiohttp.TCPConnector(ssl=False, limit=0)
+async def open_http(receive_bytes: int = 0) -> AsyncIterator[aiohttp.ClientSession]:
+    """A client that takes the gateway's certificate as it is, with any number of connections.
+
+    `receive_bytes`: what the system receives of each connection without being read, 0 for its default.
+    """
+
+    def make_socket(info: aiohttp.AddrInfoType) -> socket.socket:
+        made = socket.socket(*info[:3])
+        if receive_bytes:
+            made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_bytes)
+        return made
+
+    connector = aiohttp.TCPConnector(ssl=False, limit=0, socket_factory=make_socket)
     async with aiohttp.ClientSession(connector=connector, auto_decompress=False) as http:
         yield http
         await asyncio.sleep(0.05)  # TLS connections close

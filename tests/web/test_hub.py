@@ -262,13 +262,23 @@ def test_browsers_that_do_not_join_or_are_silent_are_closed() -> None:
     assert hub.drops.by_reason == {"web_no_hello": 1, "web_silent": 1}
 
 
-def test_a_hub_has_room_for_so_many() -> None:
-    hub = Hub(HubLimits(browsers=2))
-    first = open_browser(hub, 1)
-    open_browser(hub, 2)
-    assert hub.open_browser(b"\0\0\0\0\0\3", "", 0) is None
-    hub.close_browser(first)
-    open_browser(hub, 4)
+def test_a_full_hub_makes_room_only_by_those_that_have_not_joined() -> None:
+    hub = Hub(HubLimits(browsers=4))
+    joined, lone = open_browser(hub, 1), hub.open_browser((2).to_bytes(6, "big"), "10.0.0.2", 0)
+    welcome(hub, joined)
+    flood = [open_browser(hub, n) for n in (3, 4, 5, 6)]
+    assert lone is not None
+    assert [one.closing is None for one in (joined, lone, *flood)] == [True, True, False, False, True, True]
+    assert flood[0].closing is not None
+    assert flood[0].closing.code == wire.CLOSE_LIMIT
+    hub.receive(flood[2], HELLO, 0)
+    assert hub.close_browser(flood[2]) is not None
+    for n in (7, 8):
+        open_browser(hub, n)
+    for browser in hub:
+        welcome(hub, browser)
+    assert hub.open_browser(b"\0\0\0\0\0\x09", "", 0) is None
+    assert hub.drops.by_reason == {"web_evicted": 3, "web_full": 1}
 
 
 def test_media_wait_for_the_budget() -> None:

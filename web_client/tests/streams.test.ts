@@ -1,6 +1,6 @@
 // State, deformables, arrays, scenes and axes against docs/protocol.
 
-import { zstdCompressSync } from "node:zlib";
+import { constants, zstdCompressSync } from "node:zlib";
 import { describe, expect, test } from "vitest";
 import { decodeArrays, requireArray } from "../src/core/arrays.ts";
 import { fromThree, toThree } from "../src/core/axes.ts";
@@ -214,11 +214,44 @@ describe("Zstandard", () => {
 
   test("one frame that states its size is read", () => expect(toHex(decompressFrame(frame, text.length))).toBe(toHex(text)));
 
+  /** Content of many kinds: what compresses well, badly, not at all, and in many blocks. */
+  const makeContent = (kind: number, length: number): Uint8Array => {
+    let state = kind + 1;
+    return Uint8Array.from({ length }, (_, i) => {
+      state = (Math.imul(state, 1103515245) + 12345) >>> 0;
+      const noise = state >>> 16;
+      return [i >> 4, noise & 255, noise & 3, noise % 11 === 0 ? noise & 255 : i % 7, ((i * i) >> 6) & 255, Math.clz32(noise) * 7, (i % 1000 < 500 ? i : noise) & 63][kind] ?? 0;
+    });
+  };
+
+  test.each([0, 1, 2, 3, 4, 5, 6, 7])("content of kind %i, at every level", (kind) => {
+    for (const length of [0, 1, 5, 100, 300, 5_000, 70_000, 131_073, 400_000]) {
+      const content = makeContent(kind, length);
+      for (const level of [1, 3, 9, 19]) {
+        const options = { pledgedSrcSize: length, params: { [constants.ZSTD_c_compressionLevel]: level, [constants.ZSTD_c_checksumFlag]: level & 1 } };
+        const packed = new Uint8Array(zstdCompressSync(content, options as object));
+        expect(Buffer.compare(decompressFrame(packed, length), content), `${length} bytes, level ${level}`).toBe(0);
+      }
+    }
+  });
+
+  test("every frame with a bit changed is refused, or has the stated size", () => {
+    for (let i = 0; i < 8 * frame.length; i++) {
+      const changed = withByte(frame, i >> 3, (frame[i >> 3] as number) ^ (1 << (i & 7)));
+      try {
+        expect(decompressFrame(changed, text.length)).toHaveLength(text.length);
+      } catch (error) {
+        expect(error).toBeInstanceOf(MalformedError);
+      }
+    }
+  });
+
   test.each<[string, Uint8Array, number]>([
     ["nothing", new Uint8Array(), 0],
     ["another size", frame, text.length - 1],
     ["a byte less", frame.subarray(0, -1), text.length],
     ["a byte more", new Uint8Array([...frame, 0]), text.length],
+    ["a block that holds less than is stated", fromHex("28b52ffd" + "20" + "05" + "210000" + "01020304"), 5],
     ["two frames", new Uint8Array([...frame, ...frame]), text.length],
     ["no stated size", new Uint8Array(zstdCompressSync(text)).map((byte, i) => (i === 4 ? byte & 0x1f : byte)), text.length],
     ["a size that no block holds", fromHex("28b52ffd" + "a0" + "00000040" + "0100" + "00"), 2 ** 30],

@@ -27,6 +27,8 @@ const HELLO_TIMEOUT_NS = 1_000_000_000;
 const HELLO_TIMEOUT_MAX_NS = 4_000_000_000;
 const BACKOFF_MIN_NS = 100_000_000;
 const BACKOFF_MAX_NS = 2_000_000_000;
+/** Longest pause while no gateway answers: it is back within seconds when it was restarted. */
+const UNREACHABLE_NS = 500_000_000;
 const STEADY_NS = 1_000_000_000;
 const SNAPSHOT_RETRY_NS = 500_000_000;
 /** Heartbeat periods that a session may ask for: with others a client would never rest, or never notice its end. */
@@ -120,6 +122,14 @@ export class ClientConnection {
       this.backoffNs = BACKOFF_MIN_NS;
       this.sendHello(nowNs);
     }
+  }
+
+  /** Wait a little and join again: the socket could not be opened, or was closed before the session answered. */
+  handleUnreachable(nowNs: number): void {
+    if (this.phase !== "joining") return;
+    this.helloWaitNs = HELLO_TIMEOUT_NS;
+    this.startBackoff(nowNs);
+    this.retryAt = Math.min(this.retryAt, nowNs + UNREACHABLE_NS);
   }
 
   /** True while the session has accepted us and the connection stands as far as we know. */

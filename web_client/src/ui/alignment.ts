@@ -78,8 +78,8 @@ function makeRow({ id }: ParticipantInfo, state: PageState, actions: Actions): R
       const mayChange = state.isDirector || id === state.selfId;
       start.hidden = stop.hidden = !mayChange;
       stop.hidden ||= !(report?.running ?? false);
-      start.setAttribute("aria-label", `Measure the alignment of ${item.name} again`);
-      stop.setAttribute("aria-label", `Keep the alignment of ${item.name} as it is`);
+      start.setAttribute("aria-label", `Measure again: ${item.name}`);
+      stop.setAttribute("aria-label", `Keep: ${item.name}`);
     },
   };
 }

@@ -184,7 +184,7 @@ function updateOverlay(view: View, state: PageState): void {
     const detail = [held.join(", "), error > 0 ? `± ${formatMillimetres(error)}` : ""].filter((part) => part !== "");
     people.set(participant.id, {
       name: participant.name,
-      color: participantColor(participants, participant.id),
+      color: participantColor(participant.id),
       detail: detail.join(" · "),
       isSelf: participant.id === state.selfId,
     });

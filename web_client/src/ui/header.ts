@@ -74,7 +74,7 @@ export function makeEstop(state: PageState, actions: Actions): { stop: HTMLEleme
     update: () => {
       const isStopped = state.session?.estop ?? false;
       stop.classList.toggle("active", isStopped);
-      stop.setAttribute("aria-label", isStopped ? "E-stop, in force. Stop again" : "E-stop: stop all robots");
+      stop.title = isStopped ? "The e-stop is in force. Press to stop again" : "Stop all robots";
       setText(word, isStopped ? "STOPPED" : "E-STOP");
       if (banner.hidden === isStopped) banner.hidden = !isStopped;
       if (!isStopped) return;

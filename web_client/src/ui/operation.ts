@@ -179,9 +179,10 @@ export function makeAdvicePanel(state: PageState): Panel {
 }
 
 export function makeEventsPanel(state: PageState): Panel {
-  const list = h("ol", { class: "log", role: "log", tabindex: 0, aria: { live: "off", label: "Events, newest first" } });
+  const list = h("ol");
   const empty = h("p", { class: "empty" }, "Nothing has happened yet.");
-  const section = makeSection("events", "Events", h("div", {}, list, empty));
+  const log = h("div", { class: "log", role: "log", tabindex: 0, aria: { live: "off", label: "Events, newest first" } }, list);
+  const section = makeSection("events", "Events", h("div", {}, log, empty));
   const rows = new KeyedList<PageState["log"][number]>(
     list,
     (entry) => ({

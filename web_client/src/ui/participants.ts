@@ -18,7 +18,7 @@ export function makeParticipantsPanel(state: PageState, actions: Actions): Panel
   return {
     element: section.element,
     update: () => {
-      const participants = state.session?.participants ?? [];
+      const participants = (state.session?.participants ?? []).filter((one) => one.role !== "gateway");
       section.setCount(participants.length > 0 ? String(participants.length) : "");
       rows.update(participants, (participant) => participant.id);
     },
@@ -58,7 +58,7 @@ function makeRow({ id }: ParticipantInfo, state: PageState, actions: Actions): R
   return {
     element,
     update: (item) => {
-      dot.style.background = participantColor(state.session?.participants ?? [], id);
+      dot.style.background = participantColor(id);
       setText(name, item.name);
       you.hidden = id !== state.selfId;
       const report = state.status?.participants.find((one) => one.id === id);
@@ -79,7 +79,7 @@ function makeRow({ id }: ParticipantInfo, state: PageState, actions: Actions): R
       setValue(role, item.role);
       role.setAttribute("aria-label", `Role of ${item.name}`);
       nameField.setAttribute("aria-label", `New name of ${item.name}`);
-      remove.setAttribute("aria-label", `Remove ${item.name}`);
+      remove.setAttribute("aria-label", `Remove: ${item.name}`);
       setValue(nameField, nameField.value || item.name);
       remove.hidden = id === state.selfId;
     },

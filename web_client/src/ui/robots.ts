@@ -95,7 +95,7 @@ function makeRow({ name }: RobotInfo, state: PageState, actions: Actions): Row<R
       const participants = state.session?.participants ?? [];
       const isMine = lease !== undefined && (lease.holder === state.selfId || lease.sub_holders.includes(state.selfId));
       const isFree = !lease || lease.holder === "";
-      dot.style.background = isFree ? "transparent" : participantColor(participants, lease.holder);
+      dot.style.background = isFree ? "transparent" : participantColor(lease.holder);
       dot.classList.toggle("hollow", isFree);
       setText(holder, isFree ? "free" : isMine ? "you" : state.nameOf(lease.holder));
       holder.classList.toggle("free", isFree);
@@ -103,11 +103,11 @@ function makeRow({ name }: RobotInfo, state: PageState, actions: Actions): Row<R
       const canTake = state.isReady && DRIVERS.includes(state.role) && !isMine;
       take.hidden = !canTake;
       setText(take, isFree ? "Take" : lease.mode === "takeover" ? "Take over" : lease.mode === "request" ? "Ask for it" : "Take");
-      take.setAttribute("aria-label", `${take.textContent ?? ""} ${name}`);
+      take.setAttribute("aria-label", `${take.textContent ?? ""}: ${name}`);
       wait.hidden = !canTake || isFree || lease.queue.includes(state.selfId) || lease.mode === "takeover";
-      wait.setAttribute("aria-label", `Wait for ${name}`);
+      wait.setAttribute("aria-label", `Wait for it: ${name}`);
       release.hidden = !isMine;
-      release.setAttribute("aria-label", `Release ${name}`);
+      release.setAttribute("aria-label", `Release: ${name}`);
       assignLabel.hidden = modeLabel.hidden = !state.isDirector;
       scaleLabel.hidden = !(state.isDirector || isMine) || isFree;
       fields.hidden = assignLabel.hidden && scaleLabel.hidden;

@@ -16,7 +16,7 @@ import {
   Vector3,
 } from "three";
 
-import type { ParticipantInfo, PresenceItem } from "../core/api.ts";
+import type { PresenceItem } from "../core/api.ts";
 import { FrameBuffer, interpolatePoses, POSE_FLOATS } from "./interpolation.ts";
 import { Label } from "./labels.ts";
 
@@ -44,10 +44,11 @@ interface DeviceAvatar {
   newest_ms: number;
 }
 
-/** Return the colour of a participant: by its place in the roster, so that all clients show the same. */
-export function participantColor(participants: readonly ParticipantInfo[], id: string): string {
-  const index = participants.findIndex((participant) => participant.id === id);
-  return index < 0 ? UNKNOWN_COLOR : PARTICIPANT_COLORS[index % PARTICIPANT_COLORS.length]!;
+/** Return the colour of a participant: by the number in its id, so that it never changes and all clients show the same. */
+export function participantColor(id: string): string {
+  const number = /(\d+)$/.exec(id)?.[1];
+  if (number === undefined) return UNKNOWN_COLOR;
+  return PARTICIPANT_COLORS[(Number(number) + PARTICIPANT_COLORS.length - 1) % PARTICIPANT_COLORS.length]!;
 }
 
 /** All avatars. Add `group` to the session's world. */

@@ -3,8 +3,8 @@
 import {
   Color,
   ColorManagement,
+  DoubleSide,
   LinearSRGBColorSpace,
-  type Mesh,
   MeshBasicMaterial,
   PCFShadowMap,
   Scene,
@@ -30,6 +30,8 @@ const BACKGROUND = 0x1b1f27;
 const NO_SKY = 0x2a303b;
 /** Frames that are drawn after the last change, because textures arrive between frames. */
 const FRAMES_AFTER_CHANGE = 3;
+/** Differences of poses that cannot be seen: two steps of the lattice of positions [m], and of quaternions. */
+const SAME = 1.3e-4;
 /** Longest time without a drawn frame [ms]: what changes silently is seen then. */
 const IDLE_MS = 1000;
 
@@ -38,6 +40,8 @@ export interface Device {
   budget: Budget;
   shadows: boolean;
   pixelRatio: number;
+  /** Shortest time between two frames [ms]: the processor that draws has other work, too. */
+  framePeriod_ms: number;
   renderer: string;
 }
 
@@ -74,11 +78,13 @@ export class View {
   private readonly frames: FrameBuffer;
   private readonly streams = new Map<string, Stream>();
   private poses = new Float32Array(0);
+  private drawnPoses = new Float32Array(0);
   private bodyIds: number[] = [];
   private bodiesVersion = -1;
   private sessionOffset_ms = Number.NaN;
   private framesToDraw = FRAMES_AFTER_CHANGE;
   private lastDrawn_ms = 0;
+  private lastTried_ms = 0;
   private lastFrame_ms = 0;
   private drawnSinceReport = 0;
   private sceneCount = 0;
@@ -112,38 +118,48 @@ export class View {
     this.framesToDraw = FRAMES_AFTER_CHANGE;
   }
 
-  /** Poses that are drawn now, 7 numbers per body, in the order of `drawnBodies`. */
-  get drawnPoses(): Float32Array {
-    return this.poses;
-  }
-
-  get drawnBodies(): readonly number[] {
-    return this.bodyIds;
+  /** What is drawn now: poses, 7 numbers per body of `bodies`, and vertices of deformables by stream. */
+  get shown(): { bodies: number[]; poses: Float32Array; vertices: Map<string, Float32Array> } {
+    const vertices = new Map([...this.streams].map(([name, stream]) => [name, stream.values] as const));
+    return { bodies: this.bodyIds, poses: this.drawnPoses, vertices };
   }
 
   /**
-   * Draw everything but planes and sky in white on black, once, and return the picture as a data URL. For tests and
-   * for masks.
+   * Draw the scene once in another size, without people, anchors and shadows, and return the picture as a data URL.
+   * `silhouette`: white on black, without planes and sky. For tests and for masks.
    */
-  drawSilhouette(): string {
-    const { scene } = this;
-    const white = new MeshBasicMaterial({ color: 0xffffff, side: 2 });
-    const hidden: { visible: boolean }[] = [this.overlay, ...(scene?.sky ? [scene.sky] : [])];
-    scene?.world.traverse((object) => {
-      if (object.userData.isPlane) hidden.push(object);
-    });
-    const shown = hidden.filter((object) => object.visible);
-    for (const object of shown) object.visible = false;
-    const { background } = this.root;
-    this.root.background = new Color(0);
-    this.root.overrideMaterial = white;
-    this.renderer.render(this.root, this.viewpoint.camera);
+  capture(width: number, height: number, silhouette: boolean): string {
+    const { scene, root } = this;
+    const hidden: { visible: boolean }[] = [this.overlay];
+    if (silhouette) {
+      if (scene?.sky) hidden.push(scene.sky);
+      scene?.world.traverse((object) => {
+        if (object.userData.isPlane) hidden.push(object);
+      });
+    }
+    const changed = hidden.filter((object) => object.visible);
+    const { background } = root;
+    const white = new MeshBasicMaterial({ color: 0xffffff, side: DoubleSide });
+    for (const object of changed) object.visible = false;
+    if (silhouette) {
+      root.background = new Color(0);
+      root.overrideMaterial = white;
+    }
+    this.renderer.shadowMap.enabled = false;
+    this.renderer.setPixelRatio(1);
+    this.renderer.setSize(width, height, false);
+    this.viewpoint.setAspect(width / height);
+    this.viewpoint.update(scene);
+    scene?.lighting.update(scene.rest);
+    this.renderer.render(root, this.viewpoint.camera);
     const picture = this.canvas.toDataURL("image/png");
-    this.root.overrideMaterial = null;
-    this.root.background = background;
-    for (const object of shown) object.visible = true;
+    root.overrideMaterial = null;
+    root.background = background;
+    for (const object of changed) object.visible = true;
     white.dispose();
-    this.touch();
+    this.renderer.shadowMap.enabled = this.device.shadows;
+    this.renderer.setPixelRatio(this.device.pixelRatio);
+    this.resize();
     return picture;
   }
 
@@ -214,6 +230,8 @@ export class View {
   }
 
   private draw(): void {
+    if (nowMs() - this.lastTried_ms < this.device.framePeriod_ms) return;
+    this.lastTried_ms = nowMs();
     const session_ms = this.sessionTime() - this.delay.delay_ms;
     const isChanged = [
       this.moveBodies(session_ms),
@@ -239,9 +257,9 @@ export class View {
     const { length } = found.before.values;
     const isNew = this.poses.length !== length;
     if (isNew) this.poses = new Float32Array(length);
-    const last = isNew ? null : this.poses.slice();
     interpolatePoses(found.before.values, found.after.values, found.share, this.poses);
-    if (last?.every((value, i) => value === this.poses[i]!)) return false;
+    if (!isNew && !isVisiblyDifferent(this.poses, this.drawnPoses)) return false;
+    this.drawnPoses = this.poses.slice();
     for (let row = 0; row < this.bodyIds.length; row++) {
       const group = this.scene.bodies.get(this.bodyIds[row]!);
       if (!group) continue;
@@ -286,6 +304,13 @@ export class View {
   }
 }
 
+/** Return whether two arrays of poses differ by more than the bound of the stream. */
+function isVisiblyDifferent(a: Float32Array, b: Float32Array): boolean {
+  if (a.length !== b.length) return true;
+  for (let i = 0; i < a.length; i++) if (!(Math.abs(a[i]! - b[i]!) <= SAME)) return true;
+  return false;
+}
+
 function makeRenderer(canvas: HTMLCanvasElement): WebGLRenderer {
   try {
     return new WebGLRenderer({ canvas, antialias: true, powerPreference: "high-performance" });
@@ -304,6 +329,7 @@ function inspectDevice(renderer: WebGLRenderer): Device {
   return {
     budget: isSoftware ? SOFTWARE : isMobile ? HEADSET : DESKTOP,
     shadows: !isSoftware && !isMobile,
+    framePeriod_ms: isSoftware ? 30 : 0,
     pixelRatio: isSoftware ? 1 : Math.min(devicePixelRatio, 2),
     renderer: name,
   };
@@ -313,5 +339,3 @@ function listAddresses(spec: SceneSpec): Set<string> {
   const levels = [...spec.meshes, ...spec.textures].flatMap((item) => item.levels.map((level) => level.address));
   return new Set([...levels, ...spec.hfields.map((f) => f.address), ...spec.deformables.map((d) => d.address)]);
 }
-
-export type { Mesh };

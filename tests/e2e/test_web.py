@@ -1,0 +1,258 @@
+"""The page in a real Chromium, against a real session and its gateway."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from iris_session.demo.named_scenes import scene_by_name
+from tests.e2e.browser import WEB_CLIENT, Browser, Page, require_browser
+from tests.e2e.scenario import Scenario
+from tests.e2e.session_process import SessionProcess, wait_until
+from tests.scene.pictures import ModelRenderer, graphics, silhouette_iou
+
+pytestmark = pytest.mark.e2e
+
+WIDTH, HEIGHT = 640, 360
+#: Silhouettes, and mean difference of colours where both draw something [of 255]: without a graphics card large meshes
+#: are drawn in a coarser level; exact ones differ by 0.5.
+MIN_IOU, MAX_COLOUR_DIFFERENCE = 0.97, 8.0
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    require_browser()
+    made = Browser()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
+    """Open the page of a session by the address that the session printed."""
+    pages: list[Page] = []
+
+    def open_one(server: SessionProcess, name: str, **options: Any) -> Page:
+        page = browser.open(f"{name}-{time.monotonic_ns()}", printed_address(server), **options)
+        pages.append(page)
+        page.wait_until_ready()
+        return page
+
+    yield open_one
+    for page in pages:
+        page.close()
+
+
+def printed_address(server: SessionProcess) -> str:
+    """Return the address of the page that `serve` prints."""
+    wait_until(lambda: "in a browser:" in server.output or server.process.poll() is not None, "the address is printed")
+    match = re.search(r"in a browser: (https?://\S+)", server.output)
+    assert match, server.output
+    return match.group(1)
+
+
+def join_as(page: Page, name: str, role: str) -> None:
+    """Join again with another name and role, by the form of the page."""
+    page.evaluate("document.querySelector('.self').open = true")
+    page.fill("Your name", name)
+    page.select("Join as", role)
+    page.click("button", "Join with these")
+    page.wait(f"irisSession.state.self?.name === {json.dumps(name)} && irisSession.state.role === {json.dumps(role)}")
+    page.wait("irisSession.state.phase.phase === 'ready'")
+
+
+def holder(page: Page, robot: str) -> str:
+    """Return the name of the holder of a robot, as the dashboard shows it."""
+    text: str = page.evaluate(f"document.querySelector('[data-robot={robot}] .holder').textContent")
+    return text
+
+
+# --- the picture ------------------------------------------------------------------------------------------------------
+
+
+class Reference:
+    """MuJoCo's own picture of a model, at the poses that the page drew."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self._renderer = ModelRenderer(model, WIDTH, HEIGHT)
+        self.model, self.data = model, self._renderer.data
+        self.camera = mujoco.MjvCamera()
+        mujoco.mjv_defaultFreeCamera(model, self.camera)
+
+    def look_from(self, azimuth: float, elevation: float, distances: float) -> dict[str, Any]:
+        """Place the camera. `distances`: in extents of the scene. Return it as the page takes it."""
+        self.camera.azimuth, self.camera.elevation = azimuth, elevation
+        self.camera.distance = distances * self.model.stat.extent
+        return {
+            "lookat": [float(x) for x in self.camera.lookat],
+            "azimuth": azimuth,
+            "elevation": elevation,
+            "distance": float(self.camera.distance),
+            "fovy": float(self.model.vis.global_.fovy),
+        }
+
+    def place(self, drawn: dict[str, Any]) -> None:
+        """Move bodies and deformables to where the page drew them."""
+        for body, pose in zip(drawn["bodies"], np.array(drawn["poses"]).reshape(-1, 7), strict=True):
+            self.data.xpos[body], self.data.xquat[body] = pose[:3], pose[3:] / np.linalg.norm(pose[3:])
+            mujoco.mju_quat2Mat(self.data.xmat[body], self.data.xquat[body])
+        for geom in range(self.model.ngeom):
+            body = self.model.geom_bodyid[geom]
+            rotation, turn = self.data.xmat[body].reshape(3, 3), np.empty(9)
+            mujoco.mju_quat2Mat(turn, self.model.geom_quat[geom])
+            self.data.geom_xpos[geom] = self.data.xpos[body] + rotation @ self.model.geom_pos[geom]
+            self.data.geom_xmat[geom] = (rotation @ turn.reshape(3, 3)).ravel()
+        for k, vertices in enumerate(drawn["vertices"].values()):
+            begin = self.model.flex_vertadr[k]
+            count = self.model.flex_vertnum[k]
+            self.data.flexvert_xpos[begin : begin + count] = np.array(vertices).reshape(-1, 3)
+
+    def draw(self) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """Return the picture without shadows and reflections, and where something other than a plane is."""
+        picture = self._renderer.colour(self.camera)
+        number = self._renderer.segments(self.camera)
+        is_geom = self._renderer.segments(self.camera, "objtype") == int(mujoco.mjtObj.mjOBJ_GEOM)
+        kinds = self.model.geom_type[np.where(is_geom, number, 0)]
+        is_plane = is_geom & (kinds == int(mujoco.mjtGeom.mjGEOM_PLANE))
+        return picture, (number >= 0) & ~is_plane
+
+
+@pytest.mark.parametrize(("scene", "distances"), [("handover", 1.35), ("cloth", 1.35), ("aloha", 0.9)])
+def test_the_page_draws_what_mujoco_draws(
+    serve: Callable[..., SessionProcess], open_page: Callable[..., Page], scene: str, distances: float
+) -> None:
+    page = open_page(serve(scene), "viewer")
+    with graphics():
+        reference = Reference(scene_by_name(scene).model)
+        for azimuth, elevation in ((145.0, -28.0), (30.0, -20.0), (260.0, -50.0)):
+            camera = reference.look_from(azimuth, elevation, distances)
+            page.evaluate(f"irisSession.view.viewpoint.setFree({json.dumps(camera)})")
+            drawn = page.read_picture(WIDTH, HEIGHT, silhouette=True)
+            reference.place(drawn)
+            picture, mask = reference.draw()
+            silhouette = drawn["image"][..., 0] > 127
+            assert mask.mean() > 0.02
+            assert silhouette_iou(mask, silhouette) >= MIN_IOU
+            colours = page.read_picture(WIDTH, HEIGHT, silhouette=False)["image"]
+            difference = np.abs(colours.astype(int) - picture)[mask & silhouette]
+            assert difference.mean() <= MAX_COLOUR_DIFFERENCE
+    assert page.errors == []
+
+
+# --- people and leases ------------------------------------------------------------------------------------------------
+
+
+def test_two_browsers_share_robots(scenario: Scenario, open_page: Callable[..., Page]) -> None:
+    """The second is seen as a participant, is denied with the holder's name, and takes over when that is allowed."""
+    first = open_page(scenario.server, "first")
+    join_as(first, "ann", "director")
+    second = open_page(scenario.server, "second")
+    join_as(second, "ben", "operator")
+    first.wait("[...document.querySelectorAll('#panel-participants .name')].some((one) => one.textContent === 'ben')")
+    first.click("button", "Take: left")
+    second.wait("document.querySelector('[data-robot=left] .holder').textContent === 'ann'")
+    second.click("button", "Take: left")
+    second.wait("/ann/.test(document.querySelector('.notice.warning')?.textContent)")
+    assert holder(second, "left") == "ann"
+    first.select("Lease mode of left", "take over")
+    second.click("button", "Take over: left")
+    first.wait("document.querySelector('[data-robot=left] .holder').textContent === 'ben'")
+    second.wait("document.querySelector('[data-robot=left] .holder').textContent === 'you'")
+    first.select("Assign left to", "nobody")
+    second.wait("document.querySelector('[data-robot=left] .holder').textContent === 'free'")
+    assert first.errors == []
+    assert second.errors == []
+
+
+def test_markup_in_names_is_text(scenario: Scenario, open_page: Callable[..., Page]) -> None:
+    page = open_page(scenario.server, "reader")
+    scenario.join("<img src=x onerror=alert(1)>")
+    page.wait("document.querySelector('#panel-participants').textContent.includes('<img src=x')")
+    assert page.evaluate("document.querySelectorAll('img').length") == 0
+    assert page.errors == []
+
+
+def test_estop_holds_all_robots(scenario: Scenario, open_page: Callable[..., Page]) -> None:
+    page = open_page(scenario.server, "stopper")
+    hand = scenario.drive("cat", "left", (0.0, 0.05, 0.0))
+    page.evaluate("document.activeElement.blur()")
+    page.press("Space")
+    scenario.run_until(lambda: hand.client.mirror.estop, "the e-stop is in force")
+    stopped = hand.tip
+    until = time.monotonic() + 1.0
+    scenario.run_until(lambda: time.monotonic() > until, "a second")
+    assert np.linalg.norm(np.subtract(hand.tip[0], stopped[0])) < 0.01
+    page.wait("!document.querySelector('.stopped').hidden && document.title.startsWith('STOPPED')")
+    page.click("button", "Clear")
+    scenario.run_until(lambda: not hand.client.mirror.estop, "the e-stop is cleared")
+
+
+# --- everyone ---------------------------------------------------------------------------------------------------------
+
+
+def focus_by_tab(page: Page, name: str) -> None:
+    """Press Tab until the control with this name has the focus."""
+    for _ in range(80):
+        page.press("Tab")
+        if page.evaluate("(document.activeElement.ariaLabel ?? document.activeElement.textContent).trim()") == name:
+            return
+    raise AssertionError(f"{name} is not reached by Tab")
+
+
+def test_the_keyboard_alone_is_enough(scenario: Scenario, open_page: Callable[..., Page]) -> None:
+    page = open_page(scenario.server, "keys")
+    focus_by_tab(page, "Take: left")
+    page.press("Enter")
+    page.wait("document.querySelector('[data-robot=left] .holder').textContent === 'you'")
+    focus_by_tab(page, "Release: left")
+    page.press("Enter")
+    page.wait("document.querySelector('[data-robot=left] .holder').textContent === 'free'")
+    page.press("Shift+Space")  # whatever has the focus
+    page.wait("irisSession.state.session.estop")
+    focus_by_tab(page, "Clear")
+    page.press("Enter")
+    page.wait("!irisSession.state.session.estop")
+    page.evaluate("document.querySelector('#scene').focus()")
+    before = page.evaluate("irisSession.view.viewpoint.camera.position.toArray()")
+    page.press("ArrowLeft")
+    assert page.evaluate("irisSession.view.viewpoint.camera.position.toArray()") != before
+
+
+@pytest.mark.parametrize("phone", [False, True])
+def test_axe_finds_nothing_serious(scenario: Scenario, open_page: Callable[..., Page], phone: bool) -> None:
+    width, height = (390, 844) if phone else (1280, 800)
+    page = open_page(scenario.server, "axe", width=width, height=height, phone=phone)
+    page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+    page.inject(WEB_CLIENT / "node_modules" / "axe-core" / "axe.min.js")
+    violations = page.evaluate("axe.run().then((report) => report.violations)")
+    assert [(one["id"], one["nodes"][0]["html"]) for one in violations] == []
+    assert page.evaluate("document.documentElement.scrollWidth") <= width  # nothing is cut off
+
+
+# --- connections ------------------------------------------------------------------------------------------------------
+
+
+def test_a_reload_resumes(scenario: Scenario, open_page: Callable[..., Page]) -> None:
+    page = open_page(scenario.server, "reload")
+    join_as(page, "dan", "operator")
+    page.reload()
+    page.wait_until_ready()
+    assert page.evaluate("[irisSession.state.self.name, irisSession.state.role]") == ["dan", "operator"]
+
+
+def test_the_end_of_the_session_is_shown(own_scenario: Scenario, browser: Browser) -> None:
+    page = browser.open("ending", printed_address(own_scenario.server))
+    page.wait_until_ready()
+    own_scenario.server.process.terminate()
+    page.wait("!document.querySelector('.message').hidden")
+    words: str = page.evaluate("document.querySelector('.message').innerText")
+    assert words.strip()
+    page.close()

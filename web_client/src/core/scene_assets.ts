@@ -1,0 +1,189 @@
+// Assets for the page, and those that the worker needs itself: the scene's specification, and the topologies of its
+// deformables.
+
+import type { AssetWish, FromWorker, SceneSpec } from "./api.ts";
+import { decodeArrays, requireArray } from "./arrays.ts";
+import { AssetFetcher, type FetchEnvironment } from "./asset_fetcher.ts";
+import { DeformableDecoder, decodeTopology } from "./deformable.ts";
+import { WireError } from "./errors.ts";
+import type { SessionMirror } from "./mirror.ts";
+import { decodeScene } from "./scene.ts";
+import type { Store } from "./storage.ts";
+
+/** What of the environment is needed. */
+export interface AssetEnvironment extends FetchEnvironment {
+  post(update: FromWorker, transfer: Transferable[]): void;
+  store: Store;
+}
+
+type Use = (bytes: Uint8Array<ArrayBuffer>) => void;
+
+const ADDRESS = /^[0-9a-f]{64}$/;
+/** Decoded arrays of one asset at most [bytes]. */
+const MAX_DECODED_BYTES = 512 << 20;
+/** Time until a specification that could not be fetched is requested again. */
+const RETRY_MS = 1_000;
+
+/** Fetches, decodes and posts assets. */
+export class SceneAssets {
+  private readonly fetcher: AssetFetcher;
+  private readonly wishes = new Map<string, AssetWish>();
+  private readonly uses = new Map<string, Use[]>();
+  private readonly decoders = new Map<string, DeformableDecoder>();
+  private sceneHash = "";
+  private shown = "";
+  private progress = { wanted: 0, done: 0, bytes: 0, bytes_done: 0 };
+
+  constructor(private readonly environment: AssetEnvironment) {
+    this.fetcher = new AssetFetcher(environment, environment.store, {
+      complete: (address, bytes) => this.onComplete(address, bytes),
+      failed: (address, text) => this.onFailed(address, text),
+      progress: () => this.postProgress(),
+    });
+  }
+
+  /** Set where assets come from. An empty ticket: nowhere. */
+  setLink(baseUrl: string, ticket: string): void {
+    if (ticket === "") {
+      this.fetcher.reset();
+      this.wishes.clear();
+      this.uses.clear();
+      this.decoders.clear();
+      this.sceneHash = this.shown = "";
+      this.progress = { wanted: 0, done: 0, bytes: 0, bytes_done: 0 };
+    } else this.fetcher.setLink(baseUrl, ticket);
+  }
+
+  /** Fetch an asset for the page. */
+  want(wish: AssetWish): void {
+    if (!ADDRESS.test(wish.address)) {
+      this.environment.post({ type: "asset_failed", address: wish.address, text: "this is no address of an asset" }, []);
+      return;
+    }
+    if (this.wishes.has(wish.address)) return;
+    this.wishes.set(wish.address, wish);
+    this.count(wish.bytes);
+    this.fetcher.want(wish.address, wish.bytes);
+  }
+
+  /** The page wants an asset no more. */
+  cancel(address: string): void {
+    const wish = this.wishes.get(address);
+    if (wish === undefined) return;
+    this.wishes.delete(address);
+    this.progress.wanted -= 1;
+    this.progress.bytes -= wish.bytes;
+    if (!this.uses.has(address)) this.fetcher.cancel(address);
+  }
+
+  /** Fetch the scene that the session has now. */
+  followScene({ synced, sceneHash, sceneEpoch, sceneRevision }: SessionMirror): void {
+    if (!synced || !ADDRESS.test(sceneHash) || sceneHash === this.sceneHash) return;
+    this.sceneHash = sceneHash;
+    this.fetchScene(sceneHash, sceneEpoch, sceneRevision);
+  }
+
+  /** Return the decoder of a stream, undefined while its topology is not there. */
+  findDecoder(stream: string): DeformableDecoder | undefined {
+    return this.decoders.get(stream);
+  }
+
+  private fetchScene(address: string, sceneEpoch: number, sceneRevision: number): void {
+    this.use(address, -1, (bytes) => {
+      if (address !== this.sceneHash) return;
+      try {
+        const spec = decodeScene(bytes);
+        this.shown = address;
+        this.environment.post({ type: "scene", address, scene_epoch: sceneEpoch, scene_revision: sceneRevision, spec }, []);
+        this.fetchTopologies(spec);
+      } catch (error) {
+        this.notify(`the scene cannot be shown: ${describeWireError(error)}`);
+      }
+    });
+  }
+
+  private fetchTopologies(spec: SceneSpec): void {
+    this.decoders.clear();
+    for (const { stream, address, bytes, name } of spec.deformables) {
+      this.use(address, bytes, (asset) => {
+        try {
+          const { arrays } = decodeArrays(asset, MAX_DECODED_BYTES);
+          const plan = requireArray(arrays, "plan", [Uint8Array], [null]);
+          this.decoders.set(stream, new DeformableDecoder(decodeTopology(plan.data)));
+        } catch (error) {
+          this.notify(`the deformable ${name} cannot be shown: ${describeWireError(error)}`);
+        }
+      });
+    }
+  }
+
+  private use(address: string, bytes: number, use: Use): void {
+    const uses = this.uses.get(address) ?? [];
+    this.uses.set(address, [...uses, use]);
+    this.fetcher.want(address, bytes);
+  }
+
+  private onComplete(address: string, bytes: Uint8Array<ArrayBuffer>): void {
+    const uses = this.uses.get(address) ?? [];
+    this.uses.delete(address);
+    for (const use of uses) use(bytes);
+    const wish = this.wishes.get(address);
+    if (wish === undefined) return;
+    this.wishes.delete(address);
+    this.postAsset(wish, bytes);
+    this.progress.done += 1;
+    this.progress.bytes_done += wish.bytes;
+    this.postProgress();
+  }
+
+  private postAsset({ address, encoding }: AssetWish, bytes: Uint8Array<ArrayBuffer>): void {
+    if (encoding !== "arrays") {
+      this.environment.post({ type: "asset", address, encoding, kind: "", max_error: 0, arrays: null, bytes }, [bytes.buffer]);
+      return;
+    }
+    try {
+      const { kind, maxError, arrays } = decodeArrays(bytes, MAX_DECODED_BYTES);
+      const buffers = Object.values(arrays).map((array) => array.data.buffer as ArrayBuffer);
+      this.environment.post({ type: "asset", address, encoding, kind, max_error: maxError, arrays, bytes: null }, buffers);
+    } catch (error) {
+      this.environment.post({ type: "asset_failed", address, text: describeWireError(error) }, []);
+    }
+  }
+
+  private onFailed(address: string, text: string): void {
+    this.uses.delete(address);
+    const wish = this.wishes.get(address);
+    if (wish !== undefined) {
+      this.wishes.delete(address);
+      this.progress.done += 1;
+      this.progress.bytes_done += wish.bytes;
+      this.environment.post({ type: "asset_failed", address, text }, []);
+    }
+    if (address !== this.sceneHash || this.shown === address) return;
+    this.sceneHash = ""; // a newer one may be announced meanwhile
+    this.environment.setTimer(RETRY_MS, () => {
+      if (this.sceneHash !== "") return;
+      this.sceneHash = address;
+      this.fetchScene(address, 0, 0);
+    });
+  }
+
+  private count(bytes: number): void {
+    if (this.progress.wanted === this.progress.done) this.progress = { wanted: 0, done: 0, bytes: 0, bytes_done: 0 };
+    this.progress.wanted += 1;
+    this.progress.bytes += bytes;
+  }
+
+  private postProgress(): void {
+    this.environment.post({ type: "asset_progress", ...this.progress, refusal: this.fetcher.refusal }, []);
+  }
+
+  private notify(text: string): void {
+    this.environment.post({ type: "notice", level: "error", text }, []);
+  }
+}
+
+function describeWireError(error: unknown): string {
+  if (!(error instanceof WireError)) throw error;
+  return error.message;
+}

@@ -1,0 +1,64 @@
+// Drives Chromium for tests in another language: one JSON command per line on standard input, one JSON answer per line
+// on standard output. Commands name a page; `open` makes it, in a browser context (storage, identity) of its own unless
+// `like` names the page whose context it shares. Answers: {"id", "value"} or {"id", "error"}.
+
+import { createInterface } from "node:readline";
+import { chromium } from "playwright-core";
+
+const [executablePath] = process.argv.slice(2);
+const browser = await chromium.launch({
+  executablePath,
+  args: ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
+});
+const pages = new Map();
+
+/** The messages of a page that tests look at: errors of the page itself, and refused requests. */
+const logs = new Map();
+
+const commands = {
+  async open({ page, url, width = 1280, height = 800, like = "", phone = false }) {
+    const context =
+      pages.get(like)?.context() ??
+      (await browser.newContext({ viewport: { width, height }, ignoreHTTPSErrors: true, hasTouch: phone, isMobile: phone }));
+    const made = await context.newPage();
+    const log = [];
+    made.on("pageerror", (error) => log.push(`page: ${error.message}`));
+    made.on("console", (message) => message.type() === "error" && log.push(`console: ${message.text()}`));
+    made.on("requestfailed", (request) => log.push(`request: ${request.url()} ${request.failure()?.errorText}`));
+    logs.set(page, log);
+    pages.set(page, made);
+    await made.goto(url);
+  },
+  log: ({ page }) => logs.get(page),
+  close: ({ page }) => pages.get(page).close(),
+  reload: ({ page }) => pages.get(page).reload(),
+  evaluate: ({ page, script }) => pages.get(page).evaluate(script),
+  // Not waitForFunction: it evaluates strings within the page, which the page's security policy forbids.
+  async wait({ page, script, timeout_ms }) {
+    const deadline = Date.now() + timeout_ms;
+    while (!(await pages.get(page).evaluate(script).catch(() => false))) {
+      if (Date.now() > deadline) throw new Error(`not within ${timeout_ms} ms: ${script}`);
+      await new Promise((resolve) => setTimeout(resolve, 50));
+    }
+    return true;
+  },
+  click: ({ page, role, name, timeout_ms }) => pages.get(page).getByRole(role, { name, exact: true }).click({ timeout: timeout_ms }),
+  fill: ({ page, label, text, timeout_ms }) => pages.get(page).getByRole("textbox", { name: label, exact: true }).fill(text, { timeout: timeout_ms }),
+  select: ({ page, label, text, timeout_ms }) =>
+    pages.get(page).getByRole("combobox", { name: label, exact: true }).selectOption({ label: text }, { timeout: timeout_ms }),
+  press: ({ page, key }) => pages.get(page).keyboard.press(key),
+  type: ({ page, text }) => pages.get(page).keyboard.type(text),
+  screenshot: ({ page, path, full = false }) => pages.get(page).screenshot({ path, fullPage: full }).then(() => path),
+  inject: ({ page, path }) => pages.get(page).addScriptTag({ path }).then(() => true),
+};
+
+const answer = (id, body) => process.stdout.write(`${JSON.stringify({ id, ...body })}\n`);
+for await (const line of createInterface({ input: process.stdin })) {
+  const { id, command, ...rest } = JSON.parse(line);
+  try {
+    answer(id, { value: (await commands[command](rest)) ?? null });
+  } catch (error) {
+    answer(id, { error: String(error.message ?? error) });
+  }
+}
+await browser.close();
