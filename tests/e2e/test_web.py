@@ -290,12 +290,15 @@ def test_a_browser_pairs_by_the_printed_link(
 # --- connections ------------------------------------------------------------------------------------------------------
 
 
-def test_a_reload_resumes(scenario: Scenario, open_page: Callable[..., Page]) -> None:
+def test_a_reload_resumes_with_the_lease(scenario: Scenario, open_page: Callable[..., Page]) -> None:
     page = open_page(scenario.server, "reload")
     join_as(page, "dan", "operator")
+    page.click("button", "Take: left")
+    page.wait("document.querySelector('[data-robot=left] .holder').textContent === 'you'")
     page.reload()
     page.wait_until_ready()
     assert page.evaluate("[irisSession.state.self.name, irisSession.state.role]") == ["dan", "operator"]
+    page.wait("document.querySelector('[data-robot=left] .holder').textContent === 'you'")
 
 
 def test_the_end_of_the_session_is_shown(own_scenario: Scenario, browser: Browser) -> None:
