@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 from iris_session.demo.named_scenes import scene_by_name
 from tests.e2e.browser import WEB_CLIENT, Browser, Page, require_browser
 from tests.e2e.scenario import Scenario
-from tests.e2e.session_process import SessionProcess, wait_until
+from tests.e2e.session_process import COMMAND, END_WITH_PARENT, SessionProcess, wait_until
 from tests.scene.pictures import ModelRenderer, graphics, silhouette_iou
 
 pytestmark = pytest.mark.e2e
@@ -237,15 +239,66 @@ def test_axe_finds_nothing_serious(scenario: Scenario, open_page: Callable[..., 
     assert page.evaluate("document.documentElement.scrollWidth") <= width  # nothing is cut off
 
 
+# --- pairing ----------------------------------------------------------------------------------------------------------
+
+
+def make_link(role: str) -> tuple[subprocess.Popen[str], str]:
+    """Start `iris-session pair --web` for the session of this home and return it with the link that it prints."""
+    command = [*COMMAND, "pair", "--web", "--role", role]
+    process = subprocess.Popen([*END_WITH_PARENT, *command], stdout=subprocess.PIPE, text=True)
+    assert process.stdout
+    for line in process.stdout:
+        if match := re.search(r"in a browser (https://\S+#c=\S+)", line):
+            return process, match.group(1)
+    raise AssertionError("pair has printed no link")
+
+
+def test_a_browser_pairs_by_the_printed_link(
+    serve: Callable[..., SessionProcess], browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a code the form opens by itself; the link for observers lets in, and lets do nothing."""
+    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "keys"))
+    server = serve("handover", "--curve")
+    stranger = browser.open("stranger", printed_address(server))
+    stranger.wait("document.querySelector('dialog').open")
+    stranger.fill("Join code", "0000-0000-0000")
+    stranger.fill("Name of this browser", "stranger")
+    stranger.click("button", "Pair this browser")
+    stranger.wait("document.querySelector('dialog .advice').textContent !== ''")
+    stranger.close()
+    pairing, link = make_link("observer")
+    try:
+        guest = browser.open("guest", link)
+        guest.wait("document.querySelector('dialog').open")
+        assert "c=" not in guest.evaluate("location.href")  # a code must not stay in the address
+        guest.press("Enter")
+        guest.wait_until_ready()
+        assert guest.evaluate("irisSession.state.role") == "observer"
+        assert guest.evaluate("[...document.querySelectorAll('[data-robot] button')].every((one) => one.hidden)")
+        assert pairing.wait(30) == 0
+        guest.reload()
+        guest.wait_until_ready()  # paired once, for good
+        assert guest.errors == []
+        guest.close()
+    finally:
+        pairing.kill()
+        pairing.wait()
+        if pairing.stdout:
+            pairing.stdout.close()
+
+
 # --- connections ------------------------------------------------------------------------------------------------------
 
 
-def test_a_reload_resumes(scenario: Scenario, open_page: Callable[..., Page]) -> None:
+def test_a_reload_resumes_with_the_lease(scenario: Scenario, open_page: Callable[..., Page]) -> None:
     page = open_page(scenario.server, "reload")
     join_as(page, "dan", "operator")
+    page.click("button", "Take: left")
+    page.wait("document.querySelector('[data-robot=left] .holder').textContent === 'you'")
     page.reload()
     page.wait_until_ready()
     assert page.evaluate("[irisSession.state.self.name, irisSession.state.role]") == ["dan", "operator"]
+    page.wait("document.querySelector('[data-robot=left] .holder').textContent === 'you'")
 
 
 def test_the_end_of_the_session_is_shown(own_scenario: Scenario, browser: Browser) -> None:

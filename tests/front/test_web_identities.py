@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import os
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from iris_session.front.revocation import CHECK_PERIOD_NS
 from iris_session.protocol import pairing
 from iris_session.protocol.client_messages import Disconnected, Hello, Marker, Pair
 from iris_session.protocol.common import Message
@@ -228,6 +230,8 @@ class TestRoles:
         allow(lab, ada, "operator", "observer", "director")
         welcome, _ = gateway.enter(ada)
         allow(lab, ada, "operator", "observer")
+        applied_s = time.monotonic() + 5e-9 * CHECK_PERIOD_NS
+        lab.session.pump(lambda: time.monotonic() > applied_s, "the list is read, and its change applied")
         ids = welcome.participant_id
         lab.session.once(Decision((), events=(changed(lab, ids, "observer"),)))
         gateway.client.send(Marker(1, "still here"), on_behalf_of="ada", epoch=welcome.connection_epoch)

@@ -3,10 +3,10 @@
 import { describe, expect, test } from "vitest";
 import { blake2b } from "../src/core/blake2b.ts";
 import { MalformedError, PairingError, TooLargeError } from "../src/core/errors.ts";
-import { decodeValue, encodeValue } from "../src/core/msgpack.ts";
+import { decodeValue, encodeValue, type Value } from "../src/core/msgpack.ts";
 import { computeFingerprint, decodeKey, hashSecret, isSameProof, makeProof, normaliseCode, stretchCode } from "../src/core/pairing.ts";
 import { decodeGatewayMessage, encodeTicket, encodeWishes, packMessage, unpackMessage } from "../src/core/wire.ts";
-import { fromHex, toHex } from "./golden.ts";
+import { fromHex, readGolden, toHex } from "./golden.ts";
 
 const S = Uint8Array.from({ length: 32 }, (_, i) => i);
 const C = Uint8Array.from({ length: 32 }, (_, i) => 32 + i);
@@ -74,10 +74,30 @@ describe("web wire", () => {
     const { channel, frames: read } = unpackMessage(bytes);
     expect(channel).toBe(2);
     expect(read.map(toHex)).toEqual(frames.map(toHex));
-    expect(unpackMessage(fromHex("0500"))).toEqual({ channel: 5, frames: [] });
   });
 
-  test.each(["", "01", "0101", "010101000000", "01010100000000ff", "0101ffffffff00", "01ff00000000"])("refuses %s", (hex) => {
+  interface WebGolden {
+    messages: { name: string; channel: number; frames: string[]; hex: string }[];
+    refused: { name: string; hex: string }[];
+    gateway: { name: string; hex: string; value: unknown }[];
+  }
+  const golden = readGolden<WebGolden>("web");
+
+  test.each(golden.messages)("golden: $name", ({ channel, frames, hex }) => {
+    expect(unpackMessage(fromHex(hex))).toEqual({ channel, frames: frames.map(fromHex) });
+    expect(toHex(packMessage(channel, frames.map(fromHex)))).toBe(hex);
+  });
+
+  test.each(golden.refused)("golden, refused: $name", ({ hex }) => expect(() => unpackMessage(fromHex(hex))).toThrow(MalformedError));
+
+  test.each(golden.gateway)("golden: $name", ({ hex, value }) => {
+    expect(decodeValue(fromHex(hex))).toEqual(value);
+    expect(toHex(encodeValue(value as Value))).toBe(hex);
+    if (Array.isArray(value)) expect(toHex(unpackMessage(encodeWishes(value)).frames[0] as Uint8Array)).toBe(hex);
+    else if ((value as { type: string }).type === "notice") expect(decodeGatewayMessage(fromHex(hex))).toEqual(value);
+  });
+
+  test.each(["", "01", "0500", "0101", "010101000000", "01010100000000ff", "0101ffffffff00", "01ff00000000"])("refuses %s", (hex) => {
     expect(() => unpackMessage(fromHex(hex))).toThrow(MalformedError);
   });
 

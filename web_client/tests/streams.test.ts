@@ -8,7 +8,7 @@ import { decodeStruct, decodeUnionList, encodeStruct } from "../src/core/codec.t
 import { crc32, DeformableDecoder, decodeTopology } from "../src/core/deformable.ts";
 import { MalformedError, WireError } from "../src/core/errors.ts";
 import { RigidDecoder } from "../src/core/rigid.ts";
-import { decodeScene, listAssets } from "../src/core/scene.ts";
+import { decodeScene } from "../src/core/scene.ts";
 import { decompressFrame } from "../src/core/zstd.ts";
 import { fromHex, readGolden, toHex, toJson, type Vector } from "./golden.ts";
 
@@ -289,14 +289,6 @@ describe("scenes", () => {
 
   test.each(golden.malformed)("refuses $name", ({ hex }) => {
     expect(() => decodeScene(fromHex(hex))).toThrow(WireError);
-  });
-
-  test("assets are listed in the order in which they show something", () => {
-    const spec = decodeScene(fromHex((golden.scenes[0] as Vector).hex));
-    const listed = listAssets(spec);
-    const levels = [...spec.meshes.flatMap((mesh) => mesh.levels), ...spec.textures.flatMap((texture) => texture.levels)];
-    expect([...listed.keys()].slice(0, spec.deformables.length)).toEqual(spec.deformables.map((entry) => entry.address));
-    for (const { address, bytes } of [...levels, ...spec.hfields]) expect(listed.get(address)).toBe(bytes);
   });
 });
 

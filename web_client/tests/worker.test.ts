@@ -284,6 +284,8 @@ describe("joining", () => {
     bench.say({ type: "refused", code: "unpaired", message: "not on the list", advice: "pair first" }, 0);
     expect(bench.last("phase")).toMatchObject({ phase: "refused", refusal: "unpaired", advice: "pair first" });
     expect(bench.socket.readyState).toBe(3);
+    bench.post({ type: "disconnect" });
+    expect(bench.last("phase")).toMatchObject({ phase: "closed", refusal: "" });
   });
 
   test.each([[4001, "version"], [4003, "identity"]])("close code %i is final", async (code, refusal) => {
@@ -335,6 +337,17 @@ describe("joined", () => {
     expect(bench.last("welcome").welcome).toMatchObject({ resumed: true, connection_epoch: 2 });
     expect(bench.of("bodies")).toHaveLength(1);
     expect(bench.last("phase").phase).toBe("ready");
+  });
+
+  test("a client that did too much joins again later", async () => {
+    await bench.join();
+    bench.pass(1500);
+    bench.socket.end(4009);
+    expect(bench.last("phase").phase).toBe("waiting");
+    bench.pass(1900);
+    expect(bench.sockets).toHaveLength(1);
+    bench.pass(200);
+    expect(bench.sockets).toHaveLength(2);
   });
 
   test("an e-stop is sent, also with the next hello", async () => {
@@ -526,6 +539,11 @@ describe("assets and media", () => {
     media.end(1006);
     bench.pass(300);
     expect(bench.sockets).toHaveLength(3);
+    bench.socket.end(4003);
+    bench.pass(6000);
+    expect(bench.sockets).toHaveLength(3);
+    (bench.sockets[0] as FakeSocket).deliver(5, ticket("t2"));
+    expect(bench.sockets).toHaveLength(4);
     bench.post({ type: "want_streams", streams: [] });
     expect(bench.socket.readyState).toBe(3);
   });

@@ -331,8 +331,10 @@ export class ClientWorker {
       this.postFailure(code === CloseCode.VERSION ? "version" : "identity", code === CloseCode.VERSION ? RELOAD : reason || "the session does not allow this page");
       return;
     }
-    if (connection.isJoined) connection.handleDisconnect(this.environment.nowNs());
-    else connection.handleUnreachable(this.environment.nowNs());
+    const nowNs = this.environment.nowNs();
+    if (code === CloseCode.FLOOD) connection.handleUnreachable(nowNs, true);
+    else if (connection.isJoined) connection.handleDisconnect(nowNs);
+    else connection.handleUnreachable(nowNs);
     this.pump();
   }
 
@@ -454,8 +456,10 @@ export class ClientWorker {
     if (key === posted.phase) return;
     posted.phase = key;
     const { phase, failure, stalled } = connection;
-    const advice = failure?.advice ?? connection.retryableRefusal?.advice ?? "";
-    const refusal = failure?.code ?? connection.retryableRefusal?.code ?? "";
+    const reason = phase === "closed" ? null : (failure ?? connection.retryableRefusal);
+    const advice = reason?.advice ?? "";
+    const refusal = reason?.code ?? "";
+    if (connection.isJoined) this.closeCode = 0;
     this.environment.post({ type: "phase", phase, text, refusal, advice, close_code: this.closeCode, stalled }, []);
   }
 

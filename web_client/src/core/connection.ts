@@ -124,12 +124,16 @@ export class ClientConnection {
     }
   }
 
-  /** Wait a little and join again: the socket could not be opened, or was closed before the session answered. */
-  handleUnreachable(nowNs: number): void {
-    if (this.phase !== "joining") return;
+  /**
+   * Wait and join again: the socket could not be opened, was closed before the session answered, or was closed because this
+   * client did too much (`later`).
+   */
+  handleUnreachable(nowNs: number, later = false): void {
+    if (this.phase !== "joining" && !this.isJoined) return;
+    if (this.isJoined) this.counters.reconnects += 1;
     this.helloWaitNs = HELLO_TIMEOUT_NS;
     this.startBackoff(nowNs);
-    this.retryAt = Math.min(this.retryAt, nowNs + UNREACHABLE_NS);
+    this.retryAt = later ? nowNs + BACKOFF_MAX_NS : Math.min(this.retryAt, nowNs + UNREACHABLE_NS);
   }
 
   /** True while the session has accepted us and the connection stands as far as we know. */

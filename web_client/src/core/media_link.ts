@@ -6,7 +6,7 @@ import { decodeMediaHeader } from "./codec.ts";
 import { MalformedError, WireError } from "./errors.ts";
 import type { SocketLike } from "./pairing_client.ts";
 import type { SceneAssets } from "./scene_assets.ts";
-import { Channel, encodeTicket, encodeWishes, SUBPROTOCOL, unpackMessage } from "./wire.ts";
+import { Channel, CloseCode, encodeTicket, encodeWishes, SUBPROTOCOL, unpackMessage } from "./wire.ts";
 
 /** What of the environment is needed. */
 export interface MediaEnvironment {
@@ -84,8 +84,12 @@ export class MediaLink {
       socket.send(encodeWishes(this.wishes));
     };
     socket.onmessage = (event) => this.onMessage(event.data);
-    socket.onclose = () => {
+    socket.onclose = ({ code }) => {
       this.closeSocket();
+      if (code === CloseCode.NOT_ALLOWED) {
+        this.ticket = ""; // the next one comes with the next welcome, or before this one expires
+        return;
+      }
       this.cancelTimer = this.environment.setTimer(this.pauseMs, () => {
         this.cancelTimer = null;
         this.update();

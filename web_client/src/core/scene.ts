@@ -16,25 +16,6 @@ export function decodeScene(bytes: Uint8Array): SceneSpec {
   return spec;
 }
 
-/**
- * Return every asset of a scene with its size in bytes, each once: those that show something early come first.
- *
- * Order: deformables, height fields and coarsest levels of meshes, of textures, then the finer levels.
- */
-export function listAssets(spec: SceneSpec): Map<string, number> {
-  const found = new Map<string, number>();
-  for (const { address, bytes } of [...spec.deformables, ...spec.hfields]) found.set(address, bytes);
-  const ladders = [...spec.meshes.map((mesh) => mesh.levels), ...spec.textures.map((texture) => texture.levels)];
-  const deepest = ladders.reduce((most, levels) => Math.max(most, levels.length), 0);
-  for (let depth = 1; depth <= deepest; depth++) {
-    for (const levels of ladders) {
-      const level = levels.at(-depth);
-      if (depth <= levels.length && level !== undefined && !found.has(level.address)) found.set(level.address, level.bytes);
-    }
-  }
-  return found;
-}
-
 /** Throw `MalformedError` unless every reference has its target and every id is unique. */
 export function checkScene(spec: SceneSpec): void {
   const bodies = checkIds("bodies", spec.bodies);

@@ -34,7 +34,7 @@ export function unpackMessage(bytes: Uint8Array): WebMessage {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   const count = view.getUint8(1);
   let at = 2 + 4 * count;
-  if (at > bytes.length) throw new MalformedError(`a message of ${bytes.length} bytes with ${count} frames`);
+  if (count === 0 || at > bytes.length) throw new MalformedError(`a message of ${bytes.length} bytes with ${count} frames`);
   const frames: Uint8Array[] = [];
   for (let i = 0; i < count; i++) {
     const length = view.getUint32(2 + 4 * i, true);

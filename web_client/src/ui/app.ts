@@ -170,7 +170,6 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   } else {
     joinByChoice();
   }
-  window.addEventListener("pagehide", () => client.post({ type: "disconnect" }));
   state.touch();
   return handle;
 }

@@ -50,7 +50,7 @@ export function makeStage(state: PageState, actions: { pair: () => void; retry: 
   const title = h("h2");
   const words = h("p");
   const advice = h("p", { class: "note" });
-  const pair = button("Pair this browser", () => actions.pair(), { class: "primary" });
+  const pair = button("Enter a join code", () => actions.pair(), { class: "primary" });
   const retry = button("Join again", () => actions.retry());
   const message = h(
     "div",
