@@ -22,6 +22,7 @@ from iris_session.doctor.runner import LOCAL, find_default_address
 from iris_session.protocol import pairing
 from iris_session.security import KeyHome, KeyPair, KeysBusyError, KeysError, RegisteredSession
 from iris_session.security.private_folder import PrivateFolder
+from iris_session.web.certificate import find_certificate, load_or_make_certificate
 
 Capture = pytest.CaptureFixture[str]
 
@@ -122,9 +123,11 @@ def test_expected_errors_are_one_line_each(home: KeyHome, arguments: list[str], 
 
 def test_show_creates_nothing(home: KeyHome, capsys: Capture) -> None:
     assert main(["keys", "show", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"home": str(home.path), "server": None, "identity": None}
+    shown = json.loads(capsys.readouterr().out)
+    assert shown == {"home": str(home.path), "server": None, "identity": None, "certificate": None}
     assert main(["keys", "show"]) == 0
-    assert capsys.readouterr().out.count("no key yet") == 2
+    text = capsys.readouterr().out
+    assert (text.count("no key yet"), text.count("no certificate yet")) == (2, 1)
     assert not home.path.exists()
 
 
@@ -140,6 +143,31 @@ def test_show_prints_both_public_keys_and_no_secret(home: KeyHome, capsys: Captu
     text += capsys.readouterr().out
     assert home.load_server_key().secret not in text
     assert home.load_identity().secret not in text
+
+
+def test_show_prints_the_certificate_of_the_page(home: KeyHome, capsys: Capture) -> None:
+    made = load_or_make_certificate(home, ["192.168.0.10"])
+    assert main(["keys", "show", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["certificate"] == {"fingerprint": made.fingerprint, "key": made.key}
+    assert main(["keys", "show"]) == 0
+    text = capsys.readouterr().out
+    assert made.fingerprint in text
+    assert "192.168.0.10" in text
+
+
+def test_pair_web_shows_a_link_that_works_behind_the_gateway(home: KeyHome, capsys: Capture) -> None:
+    command = ["pair", "--web", "--no-wait", "--address", "192.168.0.10:7731"]
+    assert main([*command, "--json"]) == 0
+    invitation = json.loads(capsys.readouterr().out)
+    made = find_certificate(home)
+    assert made is not None
+    assert "192.168.0.10" in made.names
+    assert invitation["page"] == f"https://192.168.0.10:7735/#c={invitation['code']}"
+    assert invitation["certificate"] == made.fingerprint
+    (code,) = home.join_codes.read()
+    assert code.web_key == made.spki_hash
+    assert main(command) == 0
+    assert "in a browser https://192.168.0.10:7735/#c=" in capsys.readouterr().out
 
 
 def test_forget_removes_stored_key(home: KeyHome) -> None:
