@@ -166,7 +166,7 @@ export class AssetFetcher {
     if (matches) {
       loader.remove(address);
       this.parts.delete(address);
-      await this.store.putAsset(address, whole);
+      void this.store.putAsset(address, whole); // it copies before it returns
       this.listener.complete(address, whole);
     } else if (loader.restartAsset(address)) this.parts.set(address, []);
     else this.fail(address, `the bytes of asset ${address} have another hash, twice`);

@@ -382,14 +382,13 @@ export class ClientWorker {
 
   private onState(connection: ClientConnection, frames: readonly Uint8Array[], nowNs: number): void {
     const { stream, clock } = connection;
-    const presence = stream.counters.presence;
     const state = stream.drain([frames], clock.sessionNs(nowNs), nowNs);
     if (state !== null) {
       this.meter.recordState(state);
       this.postFrame(connection, state);
     }
-    const items = stream.listPresence();
-    if (stream.counters.presence !== presence) this.environment.post({ type: "presence", items }, []);
+    const items = stream.takePresence();
+    if (items !== null) this.environment.post({ type: "presence", items }, []);
   }
 
   private postFrame(connection: ClientConnection, state: SceneState): void {

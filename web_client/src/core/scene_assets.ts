@@ -29,7 +29,8 @@ export class SceneAssets {
   private readonly fetcher: AssetFetcher;
   private readonly wishes = new Map<string, AssetWish>();
   private readonly uses = new Map<string, Use[]>();
-  private readonly decoders = new Map<string, DeformableDecoder>();
+  /** Decoders by stream, with the address of their topology. */
+  private readonly decoders = new Map<string, { address: string; decoder: DeformableDecoder }>();
   private sceneHash = "";
   private shown = "";
   private progress = { wanted: 0, done: 0, bytes: 0, bytes_done: 0 };
@@ -85,7 +86,7 @@ export class SceneAssets {
 
   /** Return the decoder of a stream, undefined while its topology is not there. */
   findDecoder(stream: string): DeformableDecoder | undefined {
-    return this.decoders.get(stream);
+    return this.decoders.get(stream)?.decoder;
   }
 
   private fetchScene(address: string, sceneEpoch: number, sceneRevision: number): void {
@@ -103,13 +104,15 @@ export class SceneAssets {
   }
 
   private fetchTopologies(spec: SceneSpec): void {
-    this.decoders.clear();
+    const addresses = new Map(spec.deformables.map(({ stream, address }) => [stream, address]));
+    for (const [stream, { address }] of this.decoders) if (addresses.get(stream) !== address) this.decoders.delete(stream);
     for (const { stream, address, bytes, name } of spec.deformables) {
+      if (this.decoders.has(stream)) continue;
       this.use(address, bytes, (asset) => {
         try {
           const { arrays } = decodeArrays(asset, MAX_DECODED_BYTES);
           const plan = requireArray(arrays, "plan", [Uint8Array], [null]);
-          this.decoders.set(stream, new DeformableDecoder(decodeTopology(plan.data)));
+          this.decoders.set(stream, { address, decoder: new DeformableDecoder(decodeTopology(plan.data)) });
         } catch (error) {
           this.notify(`the deformable ${name} cannot be shown: ${describeWireError(error)}`);
         }

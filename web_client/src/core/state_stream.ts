@@ -91,6 +91,7 @@ export class StateStream {
   private present = new Map<string, Map<string, PresenceItem>>();
   private presenceNs = 0;
   private presenceWaiting: Uint8Array[] = [];
+  private presenceTaken = 0;
   private cameNs = -1;
   private flushUntil = 0;
   private usualAge = 0;
@@ -143,6 +144,14 @@ export class StateStream {
   listPresence(): PresenceItem[] {
     this.decodeWaiting();
     return [...this.present.values()].flatMap((devices) => [...devices.values()]);
+  }
+
+  /** Return `listPresence()` if presence has come since the last call, else null. */
+  takePresence(): PresenceItem[] | null {
+    const before = this.presenceTaken;
+    this.decodeWaiting();
+    this.presenceTaken = this.counters.presence;
+    return this.presenceTaken === before ? null : this.listPresence();
   }
 
   /** Remove all participants but these: presence that they sent before leaving may arrive late. */

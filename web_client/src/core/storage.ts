@@ -1,6 +1,6 @@
 // What a browser keeps: its secret, resume tokens, and assets by their hash. IndexedDB; memory where there is none.
 
-/** Values by key, and assets by address. Nothing throws: what cannot be kept is not kept. */
+/** Values by key, and assets by address. Nothing throws: what cannot be kept is not kept. Bytes to keep are copied at once. */
 export interface Store {
   getValue(key: string): Promise<Uint8Array<ArrayBuffer> | null>;
   putValue(key: string, bytes: Uint8Array): Promise<void>;

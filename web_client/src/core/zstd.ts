@@ -10,6 +10,8 @@ const MAGIC = 0xfd2fb528;
 /** Most bytes of one block after decompression. */
 const MAX_BLOCK = 128 << 10;
 const MAX_HUFFMAN_BITS = 11;
+/** Bytes that are copied one by one: a call costs more. */
+const SHORT = 48;
 
 /** Decoding table of finite state entropy: symbol, bits to read and base of the next state, by state. */
 interface FseTable {
@@ -126,7 +128,8 @@ class BackwardBits {
   private read(low: number): number {
     const at = this.start + (low >> 3);
     const { bytes } = this;
-    const word = (bytes[at] as number) | ((bytes[at + 1] ?? 0) << 8) | ((bytes[at + 2] ?? 0) << 16) | ((bytes[at + 3] ?? 0) << 24);
+    // Beyond the end of the frame bytes are undefined, which counts as 0; none of these bits is used.
+    const word = (bytes[at] as number) | ((bytes[at + 1] as number) << 8) | ((bytes[at + 2] as number) << 16) | ((bytes[at + 3] as number) << 24);
     return word >>> (low & 7);
   }
 }
@@ -137,7 +140,10 @@ class FrameDecoder {
   private huffman: HuffmanTable | null = null;
   /** Tables of the block before: literal lengths, offsets, match lengths. */
   private readonly tables: (FseTable | null)[] = [null, null, null];
-  private readonly offsets = [1, 4, 8];
+  /** The last three distances of matches. */
+  private first = 1;
+  private second = 4;
+  private third = 8;
   private readonly literals: Uint8Array;
 
   constructor(
@@ -240,23 +246,27 @@ class FrameDecoder {
 
   /** Return the distance of a match: a new one, or one of the last three. */
   private resolveOffset(value: number, literalLength: number): number {
-    const { offsets } = this;
+    const { first, second, third } = this;
     if (value > 3) {
-      offsets.unshift(value - 3);
-      offsets.pop();
-      return value - 3;
+      this.third = second;
+      this.second = first;
+      this.first = value - 3;
+      return this.first;
     }
     const i = value - 1 + (literalLength === 0 ? 1 : 0);
-    const offset = i === 3 ? (offsets[0] as number) - 1 : (offsets[i] as number);
-    if (offset === 0) throw damaged("a match at no distance");
-    offsets.splice(Math.min(i, 2), 1);
-    offsets.unshift(offset);
-    return offset;
+    if (i === 0) return first;
+    this.first = i === 1 ? second : i === 2 ? third : first - 1;
+    this.second = first;
+    if (i > 1) this.third = second;
+    if (this.first === 0) throw damaged("a match at no distance");
+    return this.first;
   }
 
   private copyLiterals(from: number, to: number, begin: number): void {
+    const { content, literals } = this;
     this.checkRoom(to - from, begin);
-    this.content.set(this.literals.subarray(from, to), this.at);
+    if (to - from > SHORT) content.set(literals.subarray(from, to), this.at);
+    else for (let i = from, at = this.at; i < to; i++, at++) content[at] = literals[i] as number;
     this.at += to - from;
   }
 
@@ -265,7 +275,7 @@ class FrameDecoder {
     if (offset > this.at) throw damaged("a match before the beginning");
     const { content } = this;
     const from = this.at - offset;
-    if (offset >= length) content.copyWithin(this.at, from, from + length);
+    if (offset >= length && length > SHORT) content.copyWithin(this.at, from, from + length);
     else for (let i = 0; i < length; i++) content[this.at + i] = content[from + i] as number;
     this.at += length;
   }
@@ -334,7 +344,19 @@ class FrameDecoder {
 
 function readHuffmanStream({ log, symbols, lengths }: HuffmanTable, frame: Uint8Array, start: number, end: number, out: Uint8Array): void {
   const bits = new BackwardBits(frame, start, end);
-  for (let i = 0; i < out.length; i++) {
+  const mask = (1 << log) - 1;
+  const first = 8 * start;
+  let i = 0;
+  let { left } = bits;
+  for (; i < out.length && left >= log; i++) {
+    const low = left - log;
+    const at = (first + low) >> 3;
+    const code = (((frame[at] as number) | ((frame[at + 1] as number) << 8) | ((frame[at + 2] as number) << 16)) >>> (low & 7)) & mask;
+    out[i] = symbols[code] as number;
+    left -= lengths[code] as number;
+  }
+  bits.left = left;
+  for (; i < out.length; i++) {
     const code = bits.peek(log);
     out[i] = symbols[code] as number;
     bits.left -= lengths[code] as number;
