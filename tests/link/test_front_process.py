@@ -26,6 +26,7 @@ from iris_session.protocol.server_messages import ProtocolFault, Snapshot
 from iris_session.protocol.status import DeliveryBudget
 from iris_session.security import KeyHome
 from tests.front.harness import FrontSession, scene
+from tests.loopback import make_loopback_address
 
 pytestmark = pytest.mark.e2e
 OpenSession = Callable[..., FrontSession]
@@ -47,10 +48,11 @@ def wait(condition: Callable[[], bool], what: str) -> None:
 
 
 def test_port_in_use_error_names_the_port() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
+    host = make_loopback_address()  # the port before it, for the introduction, is free there
+    with socket.create_server((host, 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(FrontError) as error:
-            FrontProcess(FrontConfig(control_port=port, state_port=0), scene()).start()
+            FrontProcess(FrontConfig(host=host, control_port=port, state_port=0), scene()).start()
     assert f"port {port} (control)" in str(error.value)
 
 
