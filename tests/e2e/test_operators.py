@@ -86,6 +86,7 @@ def test_killed_client_resumes_its_lease(
     assert distance(resting[0], now[0]) < 5e-4
     emulate(scenario.server.address, headset)
     scenario.run_until(lambda: watcher.mirror.participants[lease.holder].connected, "ann has reconnected")
+    scenario.run_until(lambda: watcher.mirror.leases["left"].expires_ns == 0, "the lease is resumed, the next event")
     resumed = watcher.mirror.leases["left"]
     assert resumed.holder == lease.holder
     assert resumed.lease_version > lease.lease_version
