@@ -152,6 +152,7 @@ def test_person_behind_gateways(lab: Lab) -> None:
     version = lab.dora.mirror.leases["left"].lease_version
     first.lose("ada")
     lab.wait(lambda c: not c.mirror.participants[ada].connected, "ada is disconnected")
+    lab.wait(lambda c: c.mirror.leases["left"].expires_ns > 0, "the grace period of the lease begins")
     lease = lab.dora.mirror.leases["left"]
     assert lease.holder == ada, "the lease is kept for the grace period"
     assert lease.expires_ns > 0
@@ -160,6 +161,7 @@ def test_person_behind_gateways(lab: Lab) -> None:
     resumed = second.ask("tab", again, Welcome)
     assert (resumed.participant_id, resumed.resumed) == (ada, True)
     lab.wait(lambda c: c.mirror.participants[ada].connected, "ada is back")
+    lab.wait(lambda c: c.mirror.leases["left"].expires_ns == 0, "the lease is resumed")
     lease = lab.dora.mirror.leases["left"]
     assert (lease.holder, lease.expires_ns, lease.lease_version > version) == (ada, 0, True)
 
