@@ -14,7 +14,7 @@ import msgspec
 
 from iris_session.link.config import FrontLimits
 from iris_session.protocol.entries import Entry
-from iris_session.protocol.limits import Drops, KeyLimits, TokenBucket
+from iris_session.protocol.limits import Drops, KeyedBuckets, KeyLimits, TokenBucket
 from iris_session.security.zap import ZAP_CONTROL
 
 #: Drop reasons of messages above the budget of their key.
@@ -189,21 +189,15 @@ class HandshakeLimiter:
         self._drops = drops
         self._is_gateway = is_gateway
         self._is_banned = is_banned
-        self._buckets: dict[tuple[bytes, str], TokenBucket] = {}  # the most recently used comes last
+        self._buckets = KeyedBuckets(limits.handshakes, limits.handshake_burst, MAX_KEYS)
 
     def allow(self, domain: bytes, key_id: str, now_ns: int) -> bool:
         """Return whether a key may open one more connection to a channel, and use its token."""
         if domain != ZAP_CONTROL and self._is_banned(key_id, now_ns):
             self._drops.count(KEY_BANNED)
             return False
-        bucket = self._buckets.pop((domain, key_id), None)
-        if bucket is None:
-            while len(self._buckets) >= MAX_KEYS:
-                del self._buckets[next(iter(self._buckets))]
-            factor = self._limits.gateway_factor if self._is_gateway(key_id) else 1
-            bucket = TokenBucket(self._limits.handshakes * factor, self._limits.handshake_burst * factor, now_ns)
-        self._buckets[domain, key_id] = bucket
-        if not bucket.take(now_ns):
+        factor = self._limits.gateway_factor if self._is_gateway(key_id) else 1
+        if not self._buckets.take((domain, key_id), now_ns, factor=factor):
             self._drops.count(KEY_CONNECTIONS)
             return False
         return True

@@ -23,7 +23,7 @@ from iris_session.link.config import SECOND
 from iris_session.link.sockets import peer_of
 from iris_session.protocol import pairing
 from iris_session.protocol.client_messages import Pair
-from iris_session.protocol.limits import TokenBucket
+from iris_session.protocol.limits import KeyedBuckets, TokenBucket
 from iris_session.protocol.names import AuditKind, RefusalCode
 from iris_session.protocol.server_messages import Paired, Refused
 from iris_session.security import (
@@ -98,7 +98,8 @@ class PairingService:
         self._refusals = TokenBucket(PER_SECOND, BURST)
         self._pending: deque[_PendingAttempt] = deque()
         self._trying = False
-        self._rates: dict[str, TokenBucket] = {}
+        self._address_rates = KeyedBuckets(ADDRESS_PER_SECOND, ADDRESS_BURST, MAX_ADDRESSES)
+        self._gateway_rates = KeyedBuckets(PER_SECOND / 2, ADDRESS_BURST, MAX_ADDRESSES)
         self._wrong: dict[str, tuple[int, int]] = {}  # network -> wrong attempts, since when [ns]
         self._signature: object = None
         self._read_error, self._retry_s = "", 0.0  # why the codes could not be read, and when they are read again
@@ -292,13 +293,8 @@ class PairingService:
 
     def _allow_source(self, source: _Source, now_ns: int) -> bool:
         """Return whether an address or gateway is within its rate limit, and use a token."""
-        bucket = self._rates.pop(source.name, None)
-        if bucket is None:
-            bucket = TokenBucket(min(ADDRESS_PER_SECOND * source.factor, PER_SECOND / 2), ADDRESS_BURST, now_ns)
-        while len(self._rates) >= MAX_ADDRESSES:
-            del self._rates[next(iter(self._rates))]
-        self._rates[source.name] = bucket
-        return bucket.take(now_ns)
+        rates = self._address_rates if source.factor == 1 else self._gateway_rates
+        return rates.take(source.name, now_ns)
 
     def _has_exhausted_attempts(self, source: _Source, now_ns: int) -> bool:
         wrong, since_ns = self._wrong.get(source.name, (0, now_ns))

@@ -15,7 +15,7 @@ import zmq
 
 from iris_session.front.connections import FrontConnection
 from iris_session.protocol.client_messages import Observation, Sample
-from iris_session.protocol.limits import Drops, TokenBucket
+from iris_session.protocol.limits import Drops, KeyedBuckets, TokenBucket
 from iris_session.protocol.names import Role, SampleKind
 
 log = logging.getLogger(__name__)
@@ -55,22 +55,6 @@ REQUEST_SHARE: Final = "observer_request_share"
 _encode = msgspec.msgpack.Encoder().encode
 
 
-class KeyShares:
-    """Byte budgets by key: `rate` bytes per second each, `BURST_S` of it at once. Bounded."""
-
-    def __init__(self, rate: int) -> None:
-        self._rate = rate
-        self._buckets: dict[str, TokenBucket] = {}  # the most recently used comes last
-
-    def take(self, key_id: str, n: int, now_ns: int) -> bool:
-        """Return whether `n` bytes of a key are within its share, and count them."""
-        bucket = self._buckets.pop(key_id, None) or TokenBucket(self._rate, BURST_S * self._rate, now_ns)
-        while len(self._buckets) >= MAX_KEYS:
-            del self._buckets[next(iter(self._buckets))]
-        self._buckets[key_id] = bucket
-        return bucket.take(now_ns, n)
-
-
 class RawFeed:
     """Forward samples and observations to the recorder: batches of `[connection, receive_ns, message bytes]`.
 
@@ -80,8 +64,8 @@ class RawFeed:
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, drops: Drops) -> None:
         self._drops = drops
-        self._shares = KeyShares(KEY_BYTES_PER_S)
-        self._observer_shares = KeyShares(OBSERVER_BYTES_PER_S)
+        self._shares = KeyedBuckets(KEY_BYTES_PER_S, BURST_S * KEY_BYTES_PER_S, MAX_KEYS)
+        self._observer_shares = KeyedBuckets(OBSERVER_BYTES_PER_S, BURST_S * OBSERVER_BYTES_PER_S, MAX_KEYS)
         self._total = TokenBucket(TOTAL_BYTES_PER_S, BURST_S * TOTAL_BYTES_PER_S)
         self._batch: list[tuple[int, int, bytes]] = []
         self._batch_bytes = 0
@@ -100,7 +84,7 @@ class RawFeed:
             return
         data = _encode(message)
         shares = self._observer_shares if connection.role == Role.OBSERVER else self._shares
-        if not shares.take(connection.key_id, len(data), receive_ns):
+        if not shares.take(connection.key_id, receive_ns, len(data)):
             self._leave_out(KEY_SHARE, connection, 1)
         elif not self._total.take(receive_ns, len(data)):
             self._leave_out(TOTAL_SHARE, connection, 1)
@@ -145,12 +129,12 @@ class PresenceLimiter:
 
     def __init__(self, drops: Drops) -> None:
         self._drops = drops
-        self._shares = KeyShares(PRESENCE_BYTES_PER_S)
-        self._request_shares = KeyShares(REQUEST_BYTES_PER_S)
+        self._shares = KeyedBuckets(PRESENCE_BYTES_PER_S, BURST_S * PRESENCE_BYTES_PER_S, MAX_KEYS)
+        self._request_shares = KeyedBuckets(REQUEST_BYTES_PER_S, BURST_S * REQUEST_BYTES_PER_S, MAX_KEYS)
 
     def take_request(self, connection: FrontConnection, n_bytes: int, now_ns: int) -> str:
         """Take the bytes of a request of an observer. Return the drop reason above the share, else an empty string."""
-        return "" if self._request_shares.take(connection.key_id, n_bytes, now_ns) else REQUEST_SHARE
+        return "" if self._request_shares.take(connection.key_id, now_ns, n_bytes) else REQUEST_SHARE
 
     def limit(self, connection: FrontConnection, sample: Sample, now_ns: int) -> Sample | None:
         """Return the sample without what only a driver needs, or `None` when it is too early for another one.
@@ -164,7 +148,7 @@ class PresenceLimiter:
         n = _POSE_BYTES + 4 * (len(sample.device) + len(sample.kind))
         n += sum(8 * len(target.name) for target in sample.targets)
         full = sample.device not in due and len(due) >= PRESENCE_DEVICES
-        if full or not self._shares.take(connection.key_id, n, now_ns):
+        if full or not self._shares.take(connection.key_id, now_ns, n):
             self._drops.count(PRESENCE_SHARE, connection.number)
             return None
         # A sample that is a little late does not delay those after it.

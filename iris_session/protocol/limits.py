@@ -8,7 +8,7 @@ memory and work, not use. Pure: time is an argument, in nanoseconds.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from types import MappingProxyType
 from typing import Final
 
@@ -260,6 +260,34 @@ class TokenBucket:
             return False
         self._tokens -= n * _TOKEN
         return True
+
+
+class KeyedBuckets:
+    """Token buckets by key: of an address, a client's key. Bounded: the key that was not used for longest is forgotten.
+
+    Args:
+        rate, burst: Of one key.
+        max_keys: Most keys that are remembered.
+    """
+
+    def __init__(self, rate: float, burst: int, max_keys: int) -> None:
+        self._rate = rate
+        self._burst = burst
+        self._max_keys = max_keys
+        self._buckets: dict[Hashable, TokenBucket] = {}  # the most recently used comes last
+
+    def take(self, key: Hashable, now_ns: int, n: int = 1, *, factor: int = 1) -> bool:
+        """Use `n` tokens of a key; return false, and use none, when there are fewer.
+
+        `factor`: how many times the rate and burst a key has that is not remembered.
+        """
+        bucket = self._buckets.pop(key, None)
+        if bucket is None:
+            while len(self._buckets) >= self._max_keys:
+                del self._buckets[next(iter(self._buckets))]
+            bucket = TokenBucket(self._rate * factor, self._burst * factor, now_ns)
+        self._buckets[key] = bucket
+        return bucket.take(now_ns, n)
 
 
 class RateLimiter:

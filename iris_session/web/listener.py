@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from iris_session.protocol.limits import Drops, TokenBucket
+from iris_session.protocol.limits import Drops, KeyedBuckets
 from iris_session.web.sockets import limit_unsent
 
 #: Connections in all, and strangers among them in all and of one address; above it the oldest are evicted.
@@ -98,29 +98,6 @@ class ConnectionLimiter:
         return list(self._connections)
 
 
-class AddressRates:
-    """Limits of how often an address may do something. Pure: times [ns] are arguments.
-
-    Args:
-        per_s, burst: Of one address.
-    """
-
-    def __init__(self, per_s: float, burst: int) -> None:
-        self._per_s = per_s
-        self._burst = burst
-        self._buckets: dict[str, TokenBucket] = {}  # the most recently used comes last
-
-    def allow(self, address: str, now_ns: int) -> bool:
-        """Return whether an address may do it once more now, and use its token."""
-        bucket = self._buckets.pop(address, None)
-        if bucket is None:
-            while len(self._buckets) >= MAX_ADDRESSES:
-                del self._buckets[next(iter(self._buckets))]
-            bucket = TokenBucket(self._per_s, self._burst, now_ns)
-        self._buckets[address] = bucket
-        return bucket.take(now_ns)
-
-
 class WatchedProtocol(asyncio.Protocol):
     """Protocol of one connection that passes everything on to that of aiohttp, and notes the end."""
 
@@ -169,8 +146,8 @@ class Listener:
         self._tls = tls
         self._drops = drops
         self._limiter = ConnectionLimiter(drops)
-        self._handshakes = AddressRates(HANDSHAKES_PER_S, HANDSHAKE_BURST)
-        self._requests = AddressRates(REQUESTS_PER_S, REQUEST_BURST)
+        self._handshakes = KeyedBuckets(HANDSHAKES_PER_S, HANDSHAKE_BURST, MAX_ADDRESSES)
+        self._requests = KeyedBuckets(REQUESTS_PER_S, REQUEST_BURST, MAX_ADDRESSES)
         self._by_peer: dict[tuple[str, int], Connection] = {}
         self._loop = asyncio.get_running_loop()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -191,7 +168,7 @@ class Listener:
 
     def allow_request(self, connection: Connection) -> bool:
         """Return whether the address of a connection may make one more request now."""
-        if self._requests.allow(connection.address, time.monotonic_ns()):
+        if self._requests.take(connection.address, time.monotonic_ns()):
             return True
         self._drops.count("web_request_rate")
         return False
@@ -217,7 +194,7 @@ class Listener:
                 self._drops.count("web_accept")
                 await asyncio.sleep(_ACCEPT_PAUSE_S)
                 continue
-            if self._tls is not None and not self._handshakes.allow(str(peer[0]), time.monotonic_ns()):
+            if self._tls is not None and not self._handshakes.take(str(peer[0]), time.monotonic_ns()):
                 self._drops.count("web_handshake_rate")
                 sock.close()
                 continue

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from iris_session.protocol import codec
 from iris_session.protocol.client_messages import EStop, Hello, Sample
 from iris_session.protocol.errors import RateError
-from iris_session.protocol.limits import LIMITS, SERVER_LIMITS, Drops, Limit, RateLimiter, TokenBucket
+from iris_session.protocol.limits import LIMITS, SERVER_LIMITS, Drops, KeyedBuckets, Limit, RateLimiter, TokenBucket
 from iris_session.protocol.server_messages import Snapshot
 
 SECOND = 1_000_000_000
@@ -48,6 +48,29 @@ def test_backward_time_adds_no_tokens() -> None:
 def test_zero_burst_means_no_limit() -> None:
     limiter = RateLimiter(SERVER_LIMITS)
     assert all(limiter.allow(Snapshot, 0) for _ in range(1000))
+
+
+def test_buckets_are_of_one_key() -> None:
+    buckets = KeyedBuckets(10.0, 3, max_keys=2)
+    assert [buckets.take("a", 0) for _ in range(4)] == [True, True, True, False]
+    assert buckets.take("b", 0, 3)
+    assert not buckets.take("b", 0)
+    assert buckets.take("a", SECOND // 10)
+    assert not buckets.take("a", SECOND // 10)
+
+
+def test_factor_is_of_rate_and_burst() -> None:
+    buckets = KeyedBuckets(10.0, 3, max_keys=2)
+    assert buckets.take("a", 0, 6, factor=2)
+    assert buckets.take("a", SECOND // 10, 2, factor=2)
+    assert not buckets.take("a", SECOND // 10, factor=2)
+
+
+def test_key_that_was_not_used_for_longest_is_forgotten() -> None:
+    buckets = KeyedBuckets(10.0, 1, max_keys=2)
+    assert [buckets.take(key, 0) for key in "abac"] == [True, True, False, True]
+    assert not buckets.take("a", 0)
+    assert buckets.take("b", 0)
 
 
 def test_unknown_type_raises() -> None:

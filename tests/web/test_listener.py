@@ -8,7 +8,7 @@ import pytest
 
 from iris_session.protocol.limits import Drops
 from iris_session.web import listener
-from iris_session.web.listener import AddressRates, Connection, ConnectionLimiter, open_listening_sockets
+from iris_session.web.listener import Connection, ConnectionLimiter, open_listening_sockets
 
 
 def connect(limiter: ConnectionLimiter, address: str, now: float = 0.0) -> Connection:
@@ -57,16 +57,6 @@ def test_a_thousand_sockets_leave_those_that_were_let_in() -> None:
     assert set(people) <= set(left)
     assert late in left, "and a new one is accepted"
     assert len(left) <= len(people) + listener.MAX_STRANGERS_PER_ADDRESS
-
-
-def test_rates_are_of_one_address() -> None:
-    rates = AddressRates(10.0, 3)
-    assert [rates.allow("a", 0) for _ in range(4)] == [True, True, True, False]
-    assert rates.allow("b", 0)
-    assert rates.allow("a", 100_000_000)
-    for n in range(listener.MAX_ADDRESSES):
-        rates.allow(str(n), 0)
-    assert rates.allow("a", 100_000_000), "the table is bounded: the address is forgotten"
 
 
 def test_connections_without_a_request_are_idle() -> None:
