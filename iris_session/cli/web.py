@@ -71,8 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _make_config(
     arguments: argparse.Namespace, endpoint: Endpoint, certificate: Certificate | None, hosts: tuple[str, ...]
 ) -> GatewayConfig:
-    from iris_session.web.config import GatewayConfig
-    from iris_session.web.process import WEB_PORT
+    from iris_session.web.config import WEB_PORT, GatewayConfig
 
     curve = endpoint.curve
     return GatewayConfig(
