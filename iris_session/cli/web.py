@@ -29,12 +29,14 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         epilog="examples:\n"
         "  iris-session web 192.168.0.10\n"
         "  iris-session web 192.168.0.10:7721 --code 7KQ2-M4XD-9PTR    the first time\n"
-        "  iris-session web 192.168.0.10 --host 127.0.0.1              for this machine only, without HTTPS",
+        "  iris-session web 192.168.0.10 --host 127.0.0.1              for browsers of this machine only",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_address_options(parser)
     parser.add_argument(
-        "--host", default="0.0.0.0", metavar="ADDR", help="address to listen on (default: %(default)s, all)"
+        "--host",
+        metavar="ADDR",
+        help="address to listen on (default: all addresses; 127.0.0.1 if the session is not encrypted)",
     )
     add_page_options(parser)
     parser.set_defaults(run=run)
@@ -45,7 +47,6 @@ def run(arguments: argparse.Namespace) -> int:
     for package in ("aiohttp", "cryptography"):
         require_package(package, "the page for browsers")
     from iris_session.client.endpoint_resolver import parse_connect_request, resolve_blocking
-    from iris_session.link.config import is_loopback
     from iris_session.web.config import GatewayStart
     from iris_session.web.gateway import serve
 
@@ -56,10 +57,11 @@ def run(arguments: argparse.Namespace) -> int:
     check_session_reachable(arguments)
     request = parse_connect_request(arguments.address, arguments.session, None, arguments.code)
     endpoint = resolve_blocking(request, CONNECT_S)
-    secure = endpoint.curve is not None or not is_loopback(arguments.host)
-    hosts = _list_own_addresses(arguments.host)
+    host = _choose_host(arguments.host, encrypted=endpoint.curve is not None)
+    hosts = _list_own_addresses(host)
+    secure = endpoint.curve is not None or bool(arguments.web_cert)
     certificate = _find_certificate(arguments, hosts) if secure else None
-    config = _make_config(arguments, endpoint, certificate, hosts)
+    config = _make_config(arguments, endpoint, certificate, host, hosts)
     _print_addresses(hosts, config.port, certificate)
     endpoint.store_key()
     fault = asyncio.run(serve(GatewayStart(config)))
@@ -68,8 +70,26 @@ def run(arguments: argparse.Namespace) -> int:
     return 1 if fault else 0
 
 
+def _choose_host(host: str | None, *, encrypted: bool) -> str:
+    """Return the address to listen on. A session without keys admits everybody, so its page stays on this machine."""
+    from iris_session.link.config import is_loopback
+
+    if host is None:
+        return "0.0.0.0" if encrypted else "127.0.0.1"
+    if not encrypted and not is_loopback(host):
+        raise CommandError(
+            f"--host {host}: the session is not encrypted and admits everybody who reaches the page: "
+            "start it with `iris-session serve --curve`, or leave --host out"
+        )
+    return host
+
+
 def _make_config(
-    arguments: argparse.Namespace, endpoint: Endpoint, certificate: Certificate | None, hosts: tuple[str, ...]
+    arguments: argparse.Namespace,
+    endpoint: Endpoint,
+    certificate: Certificate | None,
+    host: str,
+    hosts: tuple[str, ...],
 ) -> GatewayConfig:
     from iris_session.web.config import WEB_PORT, GatewayConfig
 
@@ -80,7 +100,7 @@ def _make_config(
         server_key="" if curve is None else curve.server_public.decode(),
         public_key="" if curve is None else curve.public.decode(),
         secret_key="" if curve is None else curve.secret.decode(),
-        hosts=(arguments.host,),
+        hosts=(host,),
         port=WEB_PORT if arguments.web_port is None else arguments.web_port,
         certificate_path="" if certificate is None else str(certificate.certificate_path),
         key_path="" if certificate is None else str(certificate.key_path),

@@ -471,7 +471,10 @@ def test_a_gateway_by_hand_fetches_an_asset_once_for_all(
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     out = (tmp_path / "web.out").open("w+b")
-    command = [*COMMAND, "web", server.address, "--host", "127.0.0.1", "--web-port", str(port)]
+    command = [*COMMAND, "web", server.address, "--web-port", str(port)]
+    refused = run_command(*command[len(COMMAND) :], "--host", "0.0.0.0", cwd=tmp_path)
+    assert refused.returncode == 2, "a session without keys admits everybody"
+    assert "--curve" in refused.stderr
     gateway = subprocess.Popen([*END_WITH_PARENT, *command], stdout=out, stderr=subprocess.STDOUT)
     page = f"http://127.0.0.1:{port}/"
 
