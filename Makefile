@@ -114,7 +114,7 @@ coverage: install-dev
 
 # Every benchmark runs, whatever the one before says; the status is that of the worst.
 bench: install
-	@status=0; for bench in "state" "state --curve" "input" "slow-client" "alignment" "join" "deformable" "stop"; do \
+	@status=0; for bench in "state" "state --curve" "input" "slow-client" "alignment" "join" "deformable" "stop" "web"; do \
 	  $(BIN)/iris-session bench $$bench --check || status=1; \
 	done; exit $$status
 

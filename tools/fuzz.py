@@ -7,7 +7,7 @@ Inputs are generated from the schemas of the messages, valid and invalid, and th
 exception that a target does not promise, a broken invariant, or memory that grows. Its input is saved, and the same
 seed reproduces it. Prints a table row per target, or one JSON object; exit status 1 if there is a finding.
 
-Decoders are in `fuzz_decoders`, conversations in `fuzz_state_machines`.
+Decoders are in `fuzz_decoders`, conversations in `fuzz_state_machines`, the live web gateway in `fuzz_web`.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ from typing import Any, Final
 import psutil
 from fuzz_decoders import DECODERS
 from fuzz_state_machines import ALL_TYPES, MACHINES
+from fuzz_web import WebGateway
 
-TARGETS: Final = {**DECODERS, **MACHINES}
+TARGETS: Final = {**DECODERS, **MACHINES, "web-gateway": WebGateway}
 #: Allowed growth of memory above that after the first inputs.
 MAX_GROWTH_MIB: Final = 64
 WARM_UP: Final = 5000

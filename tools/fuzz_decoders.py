@@ -486,7 +486,7 @@ def _encode_versioned(rng: Random, kind: type[msgspec.Struct]) -> bytes:
 WEB_NAME: Final = "web-00112233aabb"
 
 
-def _web_messages(rng: Random) -> bytes:
+def make_web_message(rng: Random) -> bytes:
     """Return a WebSocket message: mostly an envelope for the control channel, else any frames on any channel."""
     if rng.random() < 0.8:
         return wire.encode_frames(wire.CONTROL, [rng.choice(client_messages())(rng)])
@@ -514,7 +514,7 @@ _ENTRIES: Final[Errors] = (msgspec.DecodeError,)
 DECODERS: Final[dict[str, Callable[[Random], Any]]] = {
     "client": lambda rng: Decoder(rng, client_messages(), codec.decode_client, _OURS),
     "server": lambda rng: Decoder(rng, server_messages(), codec.decode_server, _OURS),
-    "web": lambda rng: Decoder(rng, [_web_messages], check_web, _OURS),
+    "web": lambda rng: Decoder(rng, [make_web_message], check_web, _OURS),
     "version": lambda rng: Decoder(rng, client_messages(), codec.peek_version, _OURS),
     "state-header": decode_plain(StateHeader, codec.decode_state_header, _OURS),
     "presence": decode_plain(Presence, codec.decode_presence, _OURS),

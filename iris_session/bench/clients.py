@@ -46,7 +46,8 @@ class ClientJob(msgspec.Struct, frozen=True):
 
 
 class Job(msgspec.Struct, frozen=True):
-    """Job of one process. `keep_poses`: log every decoded pose of every frame. Keys: Z85 text; empty: plain."""
+    """Job of one process. `keep_poses`: log every decoded pose of every frame. Keys: Z85 text; empty: plain. `page`:
+    address of the session's page, for browsers."""
 
     address: str
     origin_ns: int
@@ -56,6 +57,7 @@ class Job(msgspec.Struct, frozen=True):
     server_public: str = ""
     public: str = ""
     secret: str = ""
+    page: str = ""
 
 
 class BenchClient:

@@ -6,6 +6,7 @@ Clients join directly, or over an impaired link: then the impairment proxy of `n
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -39,6 +40,7 @@ WARM_UP_S: Final = 3.0
 #: Time in which client processes have to end after the measurement [s].
 EXIT_S: Final = 60.0
 CLIENTS: Final = "iris_session.bench.clients"
+BROWSERS: Final = "iris_session.bench.web_clients"
 Log = dict[str, NDArray[Any]]
 
 
@@ -153,6 +155,7 @@ def measure(
     groups: Sequence[Group],
     seconds: float,
     *,
+    browsers: Sequence[Group] = (),
     links: Mapping[str, str] = MappingProxyType({}),
     seed: int = 0,
     actions: Sequence[Action] = (),
@@ -170,6 +173,7 @@ def measure(
         model: Model of the session.
         groups: Clients by process.
         seconds: Length of the measured window.
+        browsers: Browsers at the session's page by process, on plain loopback.
         links: Link profile by address.
         seed: Random seed of the links.
         actions: Functions to call during the window, in order of their times.
@@ -201,8 +205,13 @@ def measure(
             ports = session.processes.front_ports
             proxy = stack.enter_context(ImpairmentProcess(links, ports.for_clients, target=ports.host, seed=seed))
         arena = BenchRun(session, [], {}, proxy)
-        for i, group in enumerate(groups):
-            job = make_job(
+        page = "" if session.processes.web is None else session.processes.web.address
+        if browsers and not page:
+            raise BenchError("the session has no page for browsers")
+        kinds = [(module, make_job, group) for group in groups]
+        kinds += [(BROWSERS, functools.partial(Job, page=page), group) for group in browsers]
+        for i, (kind, make, group) in enumerate(kinds):
+            job = make(
                 session.address,
                 session.origin_ns,
                 str(folder / f"log{i}.npz"),
@@ -210,7 +219,7 @@ def measure(
                 keep_poses,
                 **({} if keys is None else {k: keys[k] for k in ("server_public", "public", "secret")}),
             )
-            process = ClientProcess(job, module)
+            process = ClientProcess(job, kind)
             stack.callback(process.kill)
             arena.processes.append(process)
             arena.by_client.update((spec.name, process) for spec in group)

@@ -28,17 +28,20 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iris-session bench alignment --pairs 2000 --seed 1 --check\n"
         "  iris-session bench deformable --check\n"
         "  iris-session bench join --check\n"
-        "  iris-session bench stop --check",
+        "  iris-session bench stop --check\n"
+        "  iris-session bench web --clients 8 --check",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("bench", choices=("state", "input", "slow-client", "alignment", "deformable", "join", "stop"))
+    parser.add_argument(
+        "bench", choices=("state", "input", "slow-client", "alignment", "deformable", "join", "stop", "web")
+    )
     parser.add_argument(
         "--clients",
         type=int,
-        help="state, slow-client, deformable, join: number of clients (default: 16; the last two: 4)",
+        help="state, slow-client, deformable, join, web: number of clients (default: 16; deformable, join: 4; web: 8)",
     )
     parser.add_argument(
-        "--bodies", type=int, default=300, help="state, slow-client: moving bodies (default: %(default)s)"
+        "--bodies", type=int, default=300, help="state, slow-client, web: moving bodies (default: %(default)s)"
     )
     parser.add_argument("--operators", type=int, default=8, help="input: operators (default: %(default)s)")
     parser.add_argument("--robots", type=int, default=8, help="input: seven-joint arms (default: %(default)s)")
@@ -81,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
     from iris_session.bench.report import BenchError
 
     if arguments.clients is None:
-        arguments.clients = 4 if arguments.bench in ("deformable", "join") else 16
+        arguments.clients = {"deformable": 4, "join": 4, "web": 8}.get(arguments.bench, 16)
     _check_sizes(arguments)
     if arguments.bench == "slow-client" and arguments.clients < 3:
         raise CommandError(f"--clients {arguments.clients}: bench slow-client needs 3 or more, two of which are slow")
@@ -111,6 +114,12 @@ def _check_sizes(arguments: argparse.Namespace) -> None:
         limits = {}
         if arguments.curve or arguments.profile:
             raise CommandError("bench stop cannot be combined with --curve or --profile: it uses no network")
+    elif arguments.bench == "web":
+        limits = {"clients": (1, 48), "bodies": (1, 2000)}  # a gateway has three quarters of all connections
+        if arguments.curve or arguments.profile:
+            raise CommandError(
+                "bench web cannot be combined with --curve or --profile: its bars are for plain loopback"
+            )
     elif arguments.bench == "join":
         limits = {"clients": (1, 64), "objects": (1, 2000), "assets_mb": (1, 2000)}
         if arguments.curve or arguments.profile:
@@ -139,6 +148,10 @@ def _run_benchmark(arguments: argparse.Namespace, progress: Callable[[str], None
 
         sizes = (arguments.objects, arguments.assets_mb, arguments.clients)
         return run_join(*sizes, arguments.seconds or 20.0, arguments.seed, progress)
+    if arguments.bench == "web":
+        from iris_session.bench.web import run_web
+
+        return run_web(arguments.clients, arguments.bodies, arguments.seconds or 20.0, arguments.seed, progress)
     common = {"curve": arguments.curve, "profile": arguments.profile, "seed": arguments.seed, "progress": progress}
     if arguments.bench == "state":
         from iris_session.bench.state import run_state

@@ -19,6 +19,8 @@ from iris_session.cli.main import main
         (["slow-client", "--clients", "2"], "slow-client needs"),
         (["join", "--assets-mb", "0.5"], "--assets-mb 0.5: "),
         (["join", "--curve"], "--curve"),
+        (["web", "--clients", "49"], "--clients 49: "),
+        (["web", "--curve"], "--curve"),
     ],
 )
 def test_invalid_numbers_are_one_line_error(options: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+import http.server
 import json
 import re
 import subprocess
+import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +20,7 @@ import pytest
 from numpy.typing import NDArray
 
 from iris_session.demo.named_scenes import scene_by_name
-from tests.e2e.browser import WEB_CLIENT, Browser, Page, require_browser
+from tests.e2e.browser import BUILT_PAGE, WEB_CLIENT, Browser, Page, require_browser
 from tests.e2e.scenario import Scenario
 from tests.e2e.session_process import COMMAND, END_WITH_PARENT, SessionProcess, wait_until
 from tests.scene.pictures import ModelRenderer, graphics, silhouette_iou
@@ -197,6 +201,39 @@ def test_estop_holds_all_robots(scenario: Scenario, open_page: Callable[..., Pag
     scenario.run_until(lambda: not hand.client.mirror.estop, "the e-stop is cleared")
 
 
+def test_the_estop_button_stops_robots(scenario: Scenario, open_page: Callable[..., Page]) -> None:
+    """From the click to the event and to the pose at another client: measured and printed, with a generous bound."""
+    page = open_page(scenario.server, "stopper")
+    hand = scenario.drive("cat", "left", (0.0, 0.05, 0.0))
+    begin = hand.tip
+    scenario.run_until(lambda: np.linalg.norm(np.subtract(hand.tip[0], begin[0])) > 0.01, "the robot moves")
+    page.evaluate(
+        "void document.querySelector('#estop').addEventListener('click',"
+        " () => { window.clicked = performance.timeOrigin + performance.now(); }, { capture: true })"
+    )
+    stopped_at: list[float] = []
+
+    def note_stop() -> bool:
+        if hand.client.mirror.estop and not stopped_at:
+            stopped_at.append(time.time())
+        return bool(stopped_at)
+
+    with ThreadPoolExecutor(1) as thread:  # the client is polled while the browser clicks
+        click = thread.submit(page.click, "button", "E-STOP Space")
+        scenario.run_until(lambda: note_stop() and click.done(), "the e-stop is in force")
+        click.result()
+    stopped = hand.tip
+    until = time.monotonic() + 0.5
+    scenario.run_until(lambda: time.monotonic() > until, "half a second")
+    drift = float(np.linalg.norm(np.subtract(hand.tip[0], stopped[0])))
+    delay_ms = 1e3 * stopped_at[0] - page.evaluate("window.clicked")
+    print(f"e-stop by the button: at another client after {delay_ms:.0f} ms, then {1e3 * drift:.1f} mm of motion")
+    assert 0.0 < delay_ms < 5_000.0
+    assert drift < 0.01
+    page.wait("!document.querySelector('.stopped').hidden")
+    assert page.errors == []
+
+
 # --- everyone ---------------------------------------------------------------------------------------------------------
 
 
@@ -288,6 +325,36 @@ def test_a_browser_pairs_by_the_printed_link(
 
 
 # --- connections ------------------------------------------------------------------------------------------------------
+
+
+class NewerGateway(http.server.SimpleHTTPRequestHandler):
+    """This page, served by a gateway of a later version of the protocol."""
+
+    def do_GET(self) -> None:
+        if self.path != "/v1/info":
+            super().do_GET()
+            return
+        body = json.dumps({"versions": [2, 3], "session_name": "later", "session_id": "s", "key": "", "pairing": False})
+        self.send_response(200)
+        self.send_header("Content-Type", "application/json")
+        self.end_headers()
+        self.wfile.write(body.encode())
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Log nothing."""
+
+
+def test_a_page_of_an_older_version_says_to_reload(browser: Browser) -> None:
+    handler = functools.partial(NewerGateway, directory=str(BUILT_PAGE.parent))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        try:
+            page = browser.open("older", f"http://127.0.0.1:{server.server_port}/")
+            page.wait("!document.querySelector('.message').hidden && irisSession.state.phase.refusal === 'version'")
+            page.wait("/different versions.*reload/.test(document.querySelector('.message').innerText)")
+            page.close()
+        finally:
+            server.shutdown()
 
 
 def test_a_reload_resumes_with_the_lease(scenario: Scenario, open_page: Callable[..., Page]) -> None:

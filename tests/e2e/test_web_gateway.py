@@ -24,7 +24,7 @@ from iris_session.client import Client
 from iris_session.protocol import pairing
 from iris_session.protocol.client_messages import Acquire, Bye, EStop, GetSnapshot, Hello, Pair
 from iris_session.protocol.scene import decode_scene
-from iris_session.protocol.server_messages import EStopChanged, Event, Paired, ProtocolFault, Refused, Reply
+from iris_session.protocol.server_messages import EStopChanged, Event, Paired, ProtocolFault, Refused, Reply, Welcome
 from iris_session.protocol.status import GetStatus, StatusReport
 from iris_session.web import wire
 from tests.e2e.session_process import COMMAND, DEADLINE_S, END_WITH_PARENT, SessionProcess, run_command, wait_until
@@ -378,6 +378,60 @@ def test_killed_gateway_comes_back_and_leases_stay(serve: Serve) -> None:
 
     run(work())
     assert "web gateway ended" in server.output
+
+
+async def come_back(browser: WebBrowser, token: bytes) -> Welcome:
+    """Join again with a resume token, as often as it takes."""
+    until = time.monotonic() + DEADLINE_S
+    while True:
+        await browser.close()
+        try:
+            await browser.open()
+            return await asyncio.wait_for(browser.say_hello(resume_token=token), 10.0)
+        except (aiohttp.ClientError, TimeoutError, AssertionError, ConnectionError):
+            assert time.monotonic() < until, f"{browser.name} does not come back"
+            await asyncio.sleep(0.1)
+
+
+def test_all_browsers_of_a_killed_gateway_resume_and_nothing_leaks(serve: Serve) -> None:
+    server = serve()
+    page = page_of(server)
+    names = [f"tab{i}" for i in range(8)]
+
+    def count_open() -> tuple[int, int]:
+        """Return the open descriptors of session and front."""
+        return psutil.Process(server.process.pid).num_fds(), server.children()["front.main"].num_fds()
+
+    async def work() -> None:
+        async with browsers(page, "warm"):  # the gateway runs
+            pass
+        before = count_open()
+        async with browsers(page, *names) as tabs:
+            welcomes = [tab.welcome for tab in tabs]
+            killed = server.children()["web.gateway"]
+            killed.kill()
+            for tab in tabs:
+                await tab.wait(lambda tab=tab: tab.socket.closed, "the end is noticed")
+            begin = time.monotonic()
+            again = await asyncio.gather(
+                *(come_back(tab, old.resume_token) for tab, old in zip(tabs, welcomes, strict=True) if old)
+            )
+            took_s = time.monotonic() - begin
+            print(f"eight browsers are back after {took_s:.2f} s")
+            assert all(welcome.resumed for welcome in again)
+            assert [w.participant_id for w in again] == [w.participant_id for w in welcomes if w]
+            assert took_s < 10.0
+            people = [p for p in (await tabs[0].snapshot()).participants if p.connected]
+            assert sorted(p.name for p in people) == sorted([*names, "web"]), "no one is there twice"
+            for tab in tabs:
+                n = len(tab.states)
+                await tab.wait(lambda tab=tab, n=n: len(tab.states) > n + 5, "state goes on")
+            assert not killed.is_running()
+            assert server.children()["web.gateway"].pid != killed.pid
+        wait_until(lambda: count_open() <= before, f"descriptors as before: {before}", 30.0)
+
+    run(work())
+    server.finish()
 
 
 def test_session_end_is_said(serve: Serve) -> None:

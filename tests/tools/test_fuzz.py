@@ -48,6 +48,14 @@ def test_hostile_peers_do_not_stop_the_front(target: str, inputs: int) -> None:
     assert result.inputs == inputs
 
 
+@pytest.mark.e2e
+def test_hostile_browsers_do_not_stop_the_gateway() -> None:
+    """WebSocket messages, bytes of WebSockets and requests at a real gateway of a real session."""
+    result = fuzz.fuzz("web-gateway", 500, seed=11)
+    assert result.findings == []
+    assert result.inputs == 500
+
+
 def test_seed_reproduces_inputs() -> None:
     first, second, other = (DECODERS["client"](Random(seed)) for seed in ("1", "1", "2"))
     made = [first.make() for _ in range(500)]
