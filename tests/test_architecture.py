@@ -34,6 +34,8 @@ DENIED_WORDS = re.compile(
     r"|visitors?|neighbou?rs|departures|knock|what bends)\b",
     re.IGNORECASE,
 )
+#: Words that no text for people has: messages, pages, documentation.
+DENIED_IN_TEXTS = re.compile(r"\b(somebody|nobody|whoever)\b", re.IGNORECASE)
 #: Questions instead of statements at the beginning of a docstring.
 QUESTION = re.compile(r"(What|Who|Whether|Where|When|How|Which|Why)\b")
 
@@ -286,6 +288,22 @@ def test_standard_words() -> None:
         if (found := DENIED_WORDS.search(text))
     ]
     assert not offenders, "docs/glossary.md has standard words:\n" + "\n".join(offenders)
+
+
+def test_texts_for_people_have_standard_words() -> None:
+    offenders = [
+        f"{path.relative_to(ROOT)}:{node.lineno}: {found[0]}"
+        for path in modules()
+        for node in ast.walk(tree(path))
+        if isinstance(node, ast.Constant)
+        and isinstance(node.value, str)
+        and (found := DENIED_IN_TEXTS.search(node.value))
+    ]
+    for path in sorted([*(ROOT / "docs").glob("*.md"), *(ROOT / "web_client/src").rglob("*.ts")]):
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+            if found := DENIED_IN_TEXTS.search(line):
+                offenders.append(f"{path.relative_to(ROOT)}:{number}: {found[0]}")
+    assert not offenders, "\n".join(offenders)
 
 
 def test_docstrings_are_statements() -> None:

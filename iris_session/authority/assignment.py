@@ -55,7 +55,7 @@ def _check_name_owner(ctx: Context, p: Participant) -> Denial | None:
     """
     if ctx.state.name_owners.get(p.name, p.key_id) == p.key_id:
         return None
-    text = f"somebody else has joined as {p.name} before, and has the robots of that name"
+    text = f"another participant has joined as {p.name} before, and has the robots of that name"
     advice = f"join under a name of your own, or have robots assigned to {KEY_PREFIX}{p.key_id}"
     return Denial(DenialReason.POLICY, text, advice)
 

@@ -285,7 +285,7 @@ def _ask_consent(ctx: Context, p: Participant, pending: Pending, robots: list[Le
             )
             return ctx.deny(p, pending.request_id, denial)
     if any(other.participant == p.id for other in ctx.state.consents):
-        text = "you asked already, and nobody has answered yet"
+        text = "you asked already, and there is no answer yet"
         denial = Denial(DenialReason.CONSENT_PENDING, text, "wait for the answer, or release to take it back")
         return ctx.deny(p, pending.request_id, denial)
     if len(ctx.state.consents) >= ctx.config.max_consents:
@@ -446,10 +446,10 @@ def _check_scale_targets(ctx: Context, p: Participant, names: Sequence[str]) -> 
             return build_unknown_denial("robot", name, ctx.robots)
         if not _list_scaled_grants(ctx, p, lease):
             holder = ctx.get_holder(lease)
-            held_by = ctx.state.participants[holder].name if holder else "nobody"
+            held_by = ctx.state.participants[holder].name if holder else ""
             advice = "acquire it first, or ask its holder" if holder else "acquire it first"
-            text = f"{name} is held by {held_by}"
-            return Denial(DenialReason.NOT_HOLDER, text, advice, name, holder, held_by if holder else "")
+            text = f"{name} is held by {held_by}" if holder else f"{name} is free"
+            return Denial(DenialReason.NOT_HOLDER, text, advice, name, holder, held_by)
     return None
 
 

@@ -70,7 +70,7 @@ def process_join(ctx: Context, connection: int, m: Join) -> None:
         return _resume_participant(ctx, connection, m, old)
     if len(state.participants) > ctx.config.max_participants and not _evict_disconnected(ctx):
         text = f"the session is full: {ctx.config.max_participants} participants"
-        return ctx.refuse_hello(connection, DenialReason.SESSION_FULL, text, "wait until somebody leaves")
+        return ctx.refuse_hello(connection, DenialReason.SESSION_FULL, text, "wait until a participant leaves")
     p = Participant(
         f"p{state.next_participant}", m.name, m.role, m.key_id, connection, m.alignment == AlignmentKind.MEASURED, 0
     )
@@ -259,7 +259,7 @@ def _check_new_role(ctx: Context, person: Participant, role: str) -> Denial | No
     if role not in Role.ALL:
         return Denial(DenialReason.UNKNOWN_VALUE, f"unknown role {role}", f"roles: {', '.join(sorted(Role.ALL))}")
     if role != person.role and Role.GATEWAY in (role, person.role):
-        text = f"{person.name} is {person.role}: nobody becomes a gateway or another role from one while connected"
+        text = f"{person.name} is {person.role}: a role cannot be changed to or from gateway while connected"
         return Denial(DenialReason.ROLE, text, f"let it join anew as {role}")
     if person.roles and role not in person.roles:
         return Denial(

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 ANY_ROLE: Final = "any"
 POLL_S: Final = 0.2
 MAX_MINUTES: Final = 24 * 60.0
-#: Port of the page, from the port of control, where the session is not on this machine.
-WEB_OFFSET: Final = 4
 #: Text by reason why no device has paired.
 FAILURE_TEXTS: Final = {
     "void": "void after five wrong attempts: create another code",
@@ -60,6 +58,12 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "--curve-key", default="", metavar="FILE", help="secret key of the session (default: the user's)"
     )
     parser.add_argument("--web", action="store_true", help="show a link to the page for browsers as the QR code")
+    parser.add_argument(
+        "--web-port",
+        type=int,
+        metavar="PORT",
+        help="port of the page (default: as the session has said, or by --address)",
+    )
     parser.add_argument("--png", type=Path, metavar="FILE", help="also write the QR code as an image")
     parser.add_argument(
         "--web-cert", default="", metavar="FILE", help="certificate of the page (default: this user's own)"
@@ -90,6 +94,8 @@ def run(arguments: argparse.Namespace) -> int:
     from iris_session.client.address import pairing_uri
     from iris_session.security import KeyHome, load_secret
 
+    if arguments.web_port is not None and not 0 < arguments.web_port < 65536:
+        raise CommandError(f"--web-port {arguments.web_port} is not a port: give 1 to 65535")
     home = KeyHome()
     key = load_secret(arguments.curve_key) if arguments.curve_key else home.load_server_key()
     session, places, web = _find_addresses(arguments, home, key)
@@ -104,7 +110,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     try:
         uri = pairing_uri(*places[0], key.public, code, session)
-        page = "" if certificate is None else _make_page_link(places[0][0], web, code)
+        page = "" if certificate is None or not web else _make_page_link(places[0][0], web, code)
         invitation = {
             "code": code,
             "uri": uri,
@@ -152,30 +158,56 @@ def _find_certificate(arguments: argparse.Namespace, home: KeyHome, hosts: list[
 
 def _make_page_link(host: str, port: int, code: str) -> str:
     """Return the link that opens the page and joins. What follows the `#` is not sent to the server."""
-    from iris_session.web.process import WEB_PORT, format_page_address
+    from iris_session.web.process import format_page_address
 
-    return f"{format_page_address(host, port or WEB_PORT, secure=True)}#c={code}"
+    return f"{format_page_address(host, port, secure=True)}#c={code}"
 
 
 def _find_addresses(
     arguments: argparse.Namespace, home: KeyHome, key: KeyPair
 ) -> tuple[str, list[tuple[str, int]], int]:
-    """Return the name of the session, hosts and ports at which others reach it, best first, and the page's port."""
+    """Return the name of the session, hosts and ports at which others reach it, best first, and the page's port.
+
+    The port is 0 for a session without a page.
+    """
     from iris_session.client.address import Address
 
-    if arguments.address:
-        address = Address.parse(arguments.address)
-        web = address.port + WEB_OFFSET if arguments.web else 0
-        return arguments.session, [(address.host, address.port)], web
     here = [note for note in home.sessions.read() if note.server == key.fingerprint]
     found = [note for note in here if arguments.session in ("", note.name)]
+    if arguments.address:
+        address = Address.parse(arguments.address)
+        same = [note for note in found if note.control == address.port]
+        web = _find_web_port(arguments, same[0]) if same else _guess_web_port(arguments, address.port)
+        return arguments.session, [(address.host, address.port)], web
     if len(found) != 1:
         raise CommandError(_format_session_choice(arguments.session, here, found))
-    if arguments.web and not found[0].web:
+    return found[0].name, [(host, found[0].control) for host in found[0].hosts], _find_web_port(arguments, found[0])
+
+
+def _find_web_port(arguments: argparse.Namespace, note: RegisteredSession) -> int:
+    """Return the port of the page of a session on this machine, 0 for none."""
+    port = int(arguments.web_port or note.web)
+    if arguments.web and not port:
         raise CommandError(
-            f"session {found[0].name!r} serves no page: pip install 'iris-session[web]' there, or leave out --no-web"
+            f"session {note.name!r} serves no page: pip install 'iris-session[web]' there, or leave out --no-web"
         )
-    return found[0].name, [(host, found[0].control) for host in found[0].hosts], found[0].web
+    return port
+
+
+def _guess_web_port(arguments: argparse.Namespace, control_port: int) -> int:
+    """Return the port of the page of a session that does not run here: the usual one, unless it was given."""
+    from iris_session.web.config import WEB_FROM_CONTROL
+
+    if arguments.web_port is not None:
+        return int(arguments.web_port)
+    port = control_port + WEB_FROM_CONTROL
+    if arguments.web:
+        print(
+            f"iris-session: no session with control port {control_port} runs here, so the page is assumed at port "
+            f"{port}: give --web-port if it has another one",
+            file=sys.stderr,
+        )
+    return port
 
 
 def _format_session_choice(name: str, here: list[RegisteredSession], found: list[RegisteredSession]) -> str:

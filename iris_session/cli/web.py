@@ -91,8 +91,7 @@ def _make_config(
     host: str,
     hosts: tuple[str, ...],
 ) -> GatewayConfig:
-    from iris_session.web.config import GatewayConfig
-    from iris_session.web.process import WEB_PORT
+    from iris_session.web.config import WEB_PORT, GatewayConfig
 
     curve = endpoint.curve
     return GatewayConfig(

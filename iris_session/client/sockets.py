@@ -16,6 +16,7 @@ from typing import Final, TypeGuard
 import zmq
 
 from iris_session.client.errors import IdentityError
+from iris_session.link.discovery import host_port
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES
 from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID
 from iris_session.security import KeysError, load_public, load_secret
@@ -76,6 +77,26 @@ class CurveKeys:
         return cls(server_public.encode(), own.public.encode(), own.secret.encode())
 
 
+def open_socket(
+    context: zmq.Context[zmq.Socket[bytes]], kind: int, host: str, curve: CurveKeys | None
+) -> zmq.Socket[bytes]:
+    """Return a socket with the settings of all sockets to a session. It is not connected yet."""
+    sock: zmq.Socket[bytes] = context.socket(kind)
+    sock.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
+    sock.setsockopt(zmq.TCP_KEEPALIVE, 1)  # as the session's sockets: a peer that vanished is noticed in 11 s
+    sock.setsockopt(zmq.TCP_KEEPALIVE_IDLE, 5)
+    sock.setsockopt(zmq.TCP_KEEPALIVE_INTVL, 2)
+    sock.setsockopt(zmq.TCP_KEEPALIVE_CNT, 3)
+    sock.setsockopt(zmq.RECONNECT_IVL, 50)
+    sock.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
+    sock.setsockopt(zmq.IPV6, int(":" in host))
+    if curve is not None:
+        sock.curve_serverkey = curve.server_public
+        sock.curve_publickey = curve.public
+        sock.curve_secretkey = curve.secret
+    return sock
+
+
 def to_milliseconds(nanoseconds: int) -> int:
     """Convert to milliseconds, rounded up: rounded down, the last millisecond of a wait would be a busy loop."""
     return max(0, -(-nanoseconds // 1_000_000))
@@ -106,7 +127,7 @@ class ClientSockets:
 
     def set_target(self, host: str, control_port: int, curve: CurveKeys | None) -> None:
         """Set address and keys of the sockets that are opened from now on."""
-        self._host = f"[{host}]" if ":" in host else host
+        self._host = host
         self._control_port = control_port
         self._curve = curve
         self.close_media()
@@ -123,10 +144,8 @@ class ClientSockets:
         control.setsockopt(zmq.IMMEDIATE, 1)  # nothing waits for a peer that is not there
         control.setsockopt(zmq.SNDHWM, CONTROL_HWM)
         control.setsockopt(zmq.RCVHWM, 1024)  # events; a slow reader is disconnected by the front, never silently cut
-        control.setsockopt(zmq.RECONNECT_IVL, 50)
-        control.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
         self._monitor = control.get_monitor_socket(zmq.EVENT_DISCONNECTED)
-        control.connect(f"tcp://{self._host}:{self._control_port}")
+        control.connect(f"tcp://{host_port(self._host, self._control_port)}")
         self._control = control
         self.version += 1
 
@@ -143,11 +162,9 @@ class ClientSockets:
         state = self._new_socket(zmq.SUB)
         state.setsockopt(zmq.RCVHWM, STATE_HWM)
         state.setsockopt(zmq.RCVBUF, STATE_RCVBUF)
-        state.setsockopt(zmq.RECONNECT_IVL, 50)
-        state.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
         state.setsockopt(zmq.SUBSCRIBE, TOPIC_RIGID)
         state.setsockopt(zmq.SUBSCRIBE, TOPIC_PRESENCE)
-        state.connect(f"tcp://{self._host}:{port}")
+        state.connect(f"tcp://{host_port(self._host, port)}")
         self._state, self._state_of = state, (port, generation)
         self.version += 1
 
@@ -162,9 +179,7 @@ class ClientSockets:
             media = self._media = self._new_socket(zmq.SUB)
             media.setsockopt(zmq.RCVHWM, MEDIA_HWM)
             media.setsockopt(zmq.RCVBUF, MEDIA_RCVBUF)
-            media.setsockopt(zmq.RECONNECT_IVL, 50)
-            media.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
-            media.connect(f"tcp://{self._host}:{port}")
+            media.connect(f"tcp://{host_port(self._host, port)}")
             self.version += 1
         for topic in topics:
             if self._media is not None:
@@ -188,7 +203,7 @@ class ClientSockets:
             self._ingest = self._new_socket(zmq.PUSH)
             self._ingest.setsockopt(zmq.SNDHWM, MEDIA_HWM)
             self._ingest.setsockopt(zmq.IMMEDIATE, 1)
-            self._ingest.connect(f"tcp://{self._host}:{port}")
+            self._ingest.connect(f"tcp://{host_port(self._host, port)}")
         try:
             self._ingest.send_multipart(frames, zmq.NOBLOCK)
         except zmq.Again:
@@ -207,10 +222,8 @@ class ClientSockets:
             assets.setsockopt(zmq.MAXMSGSIZE, MAX_ASSET_CHUNK_BYTES)
             assets.setsockopt(zmq.SNDHWM, ASSETS_SEND_HWM)
             assets.setsockopt(zmq.RCVHWM, ASSETS_HWM)
-            assets.setsockopt(zmq.RECONNECT_IVL, 50)
-            assets.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
             self._assets_monitor = assets.get_monitor_socket(zmq.EVENT_DISCONNECTED)
-            assets.connect(f"tcp://{self._host}:{port}")
+            assets.connect(f"tcp://{host_port(self._host, port)}")
             self.version += 1
 
     def send_assets(self, data: bytes) -> bool:
@@ -339,18 +352,7 @@ class ClientSockets:
             self._control = self._monitor = None
 
     def _new_socket(self, kind: int, context: zmq.Context[zmq.Socket[bytes]] | None = None) -> zmq.Socket[bytes]:
-        sock: zmq.Socket[bytes] = (context or self._context).socket(kind)
-        sock.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
-        sock.setsockopt(zmq.TCP_KEEPALIVE, 1)  # as the session's sockets: a peer that vanished is noticed in 11 s
-        sock.setsockopt(zmq.TCP_KEEPALIVE_IDLE, 5)
-        sock.setsockopt(zmq.TCP_KEEPALIVE_INTVL, 2)
-        sock.setsockopt(zmq.TCP_KEEPALIVE_CNT, 3)
-        sock.setsockopt(zmq.IPV6, int(self._host.startswith("[")))
-        if self._curve is not None:
-            sock.curve_serverkey = self._curve.server_public
-            sock.curve_publickey = self._curve.public
-            sock.curve_secretkey = self._curve.secret
-        return sock
+        return open_socket(context or self._context, kind, self._host, self._curve)
 
 
 def _readable(sock: zmq.Socket[bytes] | None) -> TypeGuard[zmq.Socket[bytes]]:

@@ -33,6 +33,8 @@ from iris_session.protocol.common import Alignment, Denial, Lease, Pose
 from iris_session.protocol.names import PROTOCOL_VERSION, DenialReason, LeaseMode, RefusalCode, Role
 from iris_session.protocol.server_messages import (
     TOPIC_RIGID,
+    AnchorInfo,
+    AnchorMoved,
     BodyInfo,
     ClockPong,
     Endpoints,
@@ -292,11 +294,12 @@ def _make_snapshot(
     lease: Lease | None = None,
     epoch: int = 1,
     state_seq: int = 10,
+    anchors: Sequence[AnchorInfo] = (),
 ) -> Step:
     leases = (_make_lease("", 1) if lease is None else lease,)
     snapshot = Snapshot(
         0, event_seq, scene_epoch, 0, scene_hash, 100, 0.2, at_ns + OFFSET_NS, tuple(participants), leases, (ROBOT,),
-        tuple(bodies), state_seq=state_seq,
+        tuple(bodies), state_seq=state_seq, anchors=tuple(anchors),
     )  # fmt: skip
     return _make_receive(at_ns, snapshot, _make_poses(bodies, 0.0).astype("<f8").tobytes(), epoch=epoch)
 
@@ -487,6 +490,19 @@ def _estop() -> list[Step]:
     ]
 
 
+def _anchors() -> list[Step]:
+    moved = Pose((0.5, -0.25, 0.0), (0.0, 0.0, 0.0, 1.0))
+    anchors = (AnchorInfo("wall", ROBOT.T_body_site), AnchorInfo("table", ALIGNMENT.T_world_tracking, 0.2, 0.004))
+    return [
+        *_make_join(),
+        _make_event(40 * MS, 4, AnchorMoved("table", moved, "p1")),
+        _make_event(50 * MS, 6, Notice("info", "six", "")),
+        _make_step(540 * MS, "tick"),
+        _make_snapshot(560 * MS, 6, anchors=anchors),
+        _make_event(570 * MS, 7, AnchorMoved("wall", moved, "p1")),
+    ]
+
+
 #: Name of a conversation -> its purpose, and its steps.
 CONVERSATIONS: Final[dict[str, tuple[str, Callable[[], list[Step]]]]] = {
     "join": ("hello, welcome, clock, snapshot, state, events, heartbeat, bye", _joining),
@@ -503,6 +519,7 @@ CONVERSATIONS: Final[dict[str, tuple[str, Callable[[], list[Step]]]]] = {
     "malformed": ("bytes that do not fit the protocol are counted, and change nothing", _malformed),
     "scene change": ("a patch, another scene whose state comes first, a reset", _scene_change),
     "estop": ("an e-stop is sent again after a reconnect until the session has it", _estop),
+    "anchors": ("an anchor is moved, a snapshot has two of them, not in the order of their ids", _anchors),
 }
 
 

@@ -37,6 +37,7 @@ WEB_EXPLANATIONS: Final[Mapping[str, str]] = {
     "web_malformed": "web gateway: messages that are none",
     "web_no_hello": "web gateway: clients that did not join in time",
     "web_origin": "web gateway: requests by pages of other sites",
+    "web_pair_rate": "web gateway: clients closed because their address tried to pair too often",
     "web_plain": "web gateway: http:// where https:// is needed; the browser was sent there",
     "web_session_full": "web gateway: clients closed because the session did not read",
     "web_silent": "web gateway: clients that sent no heartbeats",

@@ -9,7 +9,6 @@ files of the home of keys; the answer is sent when that is done, and nothing els
 
 from __future__ import annotations
 
-import ipaddress
 import logging
 import time
 from collections import deque
@@ -23,7 +22,7 @@ from iris_session.link.config import SECOND
 from iris_session.link.sockets import peer_of
 from iris_session.protocol import pairing
 from iris_session.protocol.client_messages import Pair
-from iris_session.protocol.limits import KeyedBuckets, TokenBucket
+from iris_session.protocol.limits import KeyedBuckets, TokenBucket, find_network
 from iris_session.protocol.names import AuditKind, RefusalCode
 from iris_session.protocol.server_messages import Paired, Refused
 from iris_session.security import (
@@ -139,7 +138,7 @@ class PairingService:
         """Handle a `Pair`, of a key that is on the list or is not. `gateway`: that of a person behind one."""
         address = peer_of(peer.descriptor)[0]
         if gateway is None:
-            source = _Source(_network_prefix(address), address)
+            source = _Source(find_network(address), address)
         else:
             source = _Source(f"gateway {gateway.key_id}", address, GATEWAY_FACTOR)
         allowed = self._allow_source(source, now_ns)
@@ -315,15 +314,3 @@ def _run_attempt(home: KeyHome, key: KeyPair, pending: _PendingAttempt) -> Redee
     return home.join_codes.redeem(
         key.raw_public, pending.key, pair.proof, name, home.clients, LOCK_TIMEOUT_S, pending.web_key
     )
-
-
-def _network_prefix(address: str) -> str:
-    """Return the network that counts as one address: with IPv6, a household or lab has 2**64 addresses."""
-    try:
-        ip = ipaddress.ip_address(address.partition("%")[0])
-    except ValueError:
-        return address
-    if isinstance(ip, ipaddress.IPv6Address):
-        mapped = ip.ipv4_mapped
-        return str(mapped) if mapped else str(ipaddress.ip_network((ip, 64), strict=False))
-    return address

@@ -8,6 +8,7 @@ memory and work, not use. Pure: time is an argument, in nanoseconds.
 
 from __future__ import annotations
 
+import ipaddress
 from collections.abc import Hashable, Mapping
 from types import MappingProxyType
 from typing import Final
@@ -288,6 +289,18 @@ class KeyedBuckets:
             bucket = TokenBucket(self._rate * factor, self._burst * factor, now_ns)
         self._buckets[key] = bucket
         return bucket.take(now_ns, n)
+
+
+def find_network(address: str) -> str:
+    """Return the network that counts as one address: with IPv6, a household or lab has 2**64 addresses."""
+    try:
+        ip = ipaddress.ip_address(address.partition("%")[0])
+    except ValueError:
+        return address
+    if isinstance(ip, ipaddress.IPv6Address):
+        mapped = ip.ipv4_mapped
+        return str(mapped) if mapped else str(ipaddress.ip_network((ip, 64), strict=False))
+    return address
 
 
 class RateLimiter:

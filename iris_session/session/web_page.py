@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Sequence
-from typing import Final
 
 import msgspec
 
@@ -19,12 +18,9 @@ from iris_session.session.config import SessionConfig
 from iris_session.session.errors import StartError
 from iris_session.system.extras import MissingExtraError
 from iris_session.web.certificate import Certificate, load_certificate, load_or_make_certificate
-from iris_session.web.config import GatewayConfig
+from iris_session.web.config import WEB_FROM_STATE, GatewayConfig
 from iris_session.web.listener import open_listening_sockets
 from iris_session.web.process import GatewayProcess, format_page_address, has_packages
-
-#: Port of the page, from the port of state: 7725 by default.
-WEB_OFFSET: Final = 3
 
 
 class WebPage:
@@ -141,7 +137,7 @@ def open_web_page(config: SessionConfig, name: str) -> WebPage:
         return WebPage(config, name, note="no page for browsers: pip install 'iris-session[web]'")
     port = config.web_port
     if port is None:
-        port = config.state_port + WEB_OFFSET if config.state_port else 0
+        port = config.state_port + WEB_FROM_STATE if config.state_port else 0
     try:
         sockets = open_listening_sockets(find_hosts(config), port)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Start configuration of the gateway process, and the report that it writes. Plain data, no behaviour.
+"""Start configuration of the gateway process, the report that it writes, and ports. Plain data, no behaviour.
 
 The gateway reads `GatewayStart` as MessagePack from its standard input, never from its arguments, and writes
 `GatewayReport`s to its standard output, a line of JSON each.
@@ -6,9 +6,17 @@ The gateway reads `GatewayStart` as MessagePack from its standard input, never f
 
 from __future__ import annotations
 
+from typing import Final
+
 import msgspec
 
 from iris_session.web.hub import HubLimits
+
+#: Port of the page by default.
+WEB_PORT: Final = 7725
+#: Port of the page, from those of control and state, in every block of ports.
+WEB_FROM_CONTROL: Final = 4
+WEB_FROM_STATE: Final = 3
 
 
 class GatewayConfig(msgspec.Struct, frozen=True):
@@ -34,7 +42,7 @@ class GatewayConfig(msgspec.Struct, frozen=True):
     public_key: str = ""
     secret_key: str = ""
     hosts: tuple[str, ...] = ("127.0.0.1",)
-    port: int = 7725
+    port: int = WEB_PORT
     descriptors: tuple[int, ...] = ()
     certificate_path: str = ""
     key_path: str = ""

@@ -31,6 +31,15 @@ from iris_session.assets.store import AssetStore, default_root
 from iris_session.client.core.connection import ClientConnection
 from iris_session.client.core.status import ConnectionPhase
 from iris_session.client.identity import Identity
+from iris_session.client.sockets import (
+    MEDIA_HWM,
+    MEDIA_RCVBUF,
+    STATE_HWM,
+    STATE_RCVBUF,
+    CurveKeys,
+    open_socket,
+)
+from iris_session.link.discovery import host_port
 from iris_session.link.sockets import raise_descriptor_limit, readable
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.limits import Drops
@@ -46,7 +55,7 @@ from iris_session.web.hub import TICKET_BYTES, Browser, Hub
 from iris_session.web.listener import Listener, open_listening_sockets
 from iris_session.web.page import HostCheck, PageFiles
 from iris_session.web.server import READY_S, WebServer
-from iris_session.web.sockets import SessionKeys, SocketReader, open_socket
+from iris_session.web.sockets import SocketReader
 from iris_session.web.wire import CLOSE_ENDED, CLOSE_RESTART
 
 log = logging.getLogger(__name__)
@@ -61,10 +70,7 @@ STATE_LINGER_S: Final = 5.0
 FAREWELL_S: Final = 0.5
 #: Longest time for which another thread (files of assets) keeps the loop from running.
 SWITCH_S: Final = 0.0005
-STATE_HWM, STATE_RCVBUF = 2, 16_384
-MEDIA_HWM, MEDIA_RCVBUF = 2, 131_072
 CONTROL_HWM: Final = 2048
-MAX_MESSAGE_BYTES: Final = 64 << 20
 
 
 class SessionLink:
@@ -78,7 +84,7 @@ class SessionLink:
         self._config = config
         self._hub = hub
         keys = (config.server_key, config.public_key, config.secret_key)
-        self._keys = SessionKeys(*(one.encode() for one in keys)) if config.server_key else None
+        self._keys = CurveKeys(*(one.encode() for one in keys)) if config.server_key else None
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(1)
         hello = Hello(
             Role.GATEWAY,
@@ -161,9 +167,8 @@ class SessionLink:
         control.setsockopt(zmq.IMMEDIATE, 1)
         control.setsockopt(zmq.SNDHWM, CONTROL_HWM)
         control.setsockopt(zmq.RCVHWM, CONTROL_HWM)
-        control.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
         self._monitor = control.get_monitor_socket(zmq.EVENT_DISCONNECTED)
-        control.connect(_make_endpoint(config.host, config.control_port))
+        control.connect(f"tcp://{host_port(config.host, config.control_port)}")
         self._control = SocketReader(control, self._receive_control, self._update)
 
     def _close_control(self) -> None:
@@ -212,10 +217,9 @@ class SessionLink:
         state = open_socket(self._context, zmq.SUB, self._config.host, self._keys)
         state.setsockopt(zmq.RCVHWM, STATE_HWM)
         state.setsockopt(zmq.RCVBUF, STATE_RCVBUF)
-        state.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
         state.setsockopt(zmq.SUBSCRIBE, TOPIC_RIGID)
         state.setsockopt(zmq.SUBSCRIBE, TOPIC_PRESENCE)
-        state.connect(_make_endpoint(self._config.host, welcome.endpoints.state))
+        state.connect(f"tcp://{host_port(self._config.host, welcome.endpoints.state)}")
         self._state = SocketReader(state, self._receive_state, self._publish_state)
 
     def _close_state(self) -> None:
@@ -239,9 +243,8 @@ class SessionLink:
         media = open_socket(self._context, zmq.SUB, self._config.host, self._keys)
         media.setsockopt(zmq.RCVHWM, MEDIA_HWM)
         media.setsockopt(zmq.RCVBUF, MEDIA_RCVBUF)
-        media.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
         if port:
-            media.connect(_make_endpoint(self._config.host, port))
+            media.connect(f"tcp://{host_port(self._config.host, port)}")
         return MediaFeedSocket(media, browser, on_frames)
 
     def open_assets(self) -> zmq.Socket[bytes] | None:
@@ -253,7 +256,7 @@ class SessionLink:
         assets.setsockopt(zmq.IMMEDIATE, 0)
         assets.setsockopt(zmq.SNDHWM, 1024)
         assets.setsockopt(zmq.RCVHWM, 16)
-        assets.connect(_make_endpoint(self._config.host, welcome.endpoints.assets))
+        assets.connect(f"tcp://{host_port(self._config.host, welcome.endpoints.assets)}")
         return assets
 
     def find_epoch(self) -> int:
@@ -430,10 +433,6 @@ class Gateway:
             self._written = report
             with contextlib.suppress(OSError):
                 os.write(sys.stdout.fileno(), msgspec.json.encode(report) + b"\n")
-
-
-def _make_endpoint(host: str, port: int) -> str:
-    return f"tcp://[{host}]:{port}" if ":" in host else f"tcp://{host}:{port}"
 
 
 def _describe_software() -> str:

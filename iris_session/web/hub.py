@@ -16,7 +16,7 @@ import msgspec
 from iris_session.protocol.client_messages import Disconnected, wrap_message
 from iris_session.protocol.codec import Bytes, encode_client, encode_server
 from iris_session.protocol.errors import MalformedError, ProtocolError, ProtocolVersionError
-from iris_session.protocol.limits import Drops, TokenBucket
+from iris_session.protocol.limits import Drops, KeyedBuckets, TokenBucket, find_network
 from iris_session.protocol.names import PROTOCOL_VERSION, FaultCode
 from iris_session.protocol.server_messages import ProtocolFault, ServerEnvelope
 from iris_session.web.wire import (
@@ -47,6 +47,9 @@ _SMALL: Final = 256
 #: Faults after which a connection is over for the session.
 _ENDING_FAULTS: Final = frozenset({FaultCode.DROPPED, FaultCode.REVOKED, FaultCode.HELLO, FaultCode.SESSION_ENDED})
 _BYE: Final = "bye"
+_PAIR: Final = "pair"
+#: Networks whose pairing attempts are counted.
+MAX_NETWORKS: Final = 1024
 #: Answers to malformed messages of one browser.
 _FAULTS_PER_S, _FAULT_BURST = 2.0, 5
 _WELCOME, _FAULT, _REFUSED, _BUDGET = "welcome", "protocol_fault", "refused", "delivery_budget"
@@ -59,6 +62,7 @@ class HubLimits(msgspec.Struct, frozen=True):
         browsers: WebSockets for control at once; a session has 64 connections.
         messages_per_s, message_burst: Messages of one browser.
         bytes_per_s, byte_burst: Their bytes.
+        pair_per_s, pair_burst: Pairing attempts of one network; the session counts wrong ones against the gateway.
         early_per_s, early_burst: Messages without a `welcome`: the session counts those against the gateway.
         queued_messages, queued_bytes: Control messages that wait for one browser; a snapshot has at most 32 MB.
         total_bytes: Control messages that wait for all browsers together.
@@ -72,6 +76,8 @@ class HubLimits(msgspec.Struct, frozen=True):
     message_burst: int = 3000
     bytes_per_s: float = 4.0 * (1 << 20)
     byte_burst: int = 8 << 20
+    pair_per_s: float = 20 / 600
+    pair_burst: int = 20
     early_per_s: float = 10.0
     early_burst: int = 200
     queued_messages: int = 1024
@@ -152,6 +158,7 @@ class Hub:
         self.limits = HubLimits() if limits is None else limits
         self.drops = Drops() if drops is None else drops
         self._browsers: dict[str, Browser] = {}
+        self._pairs = KeyedBuckets(self.limits.pair_per_s, self.limits.pair_burst, MAX_NETWORKS)
         self._tickets: dict[bytes, tuple[Browser, int]] = {}  # with the time at which each expires
 
     def __len__(self) -> int:
@@ -253,7 +260,7 @@ class Hub:
         return envelope if self._check_message(browser, frames[0], now_ns) else None
 
     def _check_message(self, browser: Browser, envelope: memoryview, now_ns: int) -> bool:
-        """Return whether a message is MessagePack; if not, answer it as the session would.
+        """Return whether a message is for the session. What is not MessagePack is answered as the session would.
 
         Note a hello, after which the session has a connection to lose, and a bye, after which it has none.
         """
@@ -264,6 +271,10 @@ class Hub:
             if browser.faults.take(now_ns):
                 fault = ServerEnvelope(PROTOCOL_VERSION, browser.epoch, ProtocolFault(error.code, str(error)))
                 self._queue(browser, encode_frames(CONTROL, (encode_server(fault),)))
+            return False
+        if kind == _PAIR and not self._pairs.take(find_network(browser.address), now_ns):
+            text = "too many pairing attempts from this address: wait a minute"
+            self._reject(browser, CLOSE_LIMIT, "web_pair_rate", text)
             return False
         if kind == _BYE and browser.said_hello:
             self._leave(browser)

@@ -23,8 +23,6 @@ from iris_session.system.backoff import Backoff
 from iris_session.system.process import PIPE, ChildProcess
 from iris_session.web.config import GatewayConfig, GatewayReport, GatewayStart
 
-#: Port of the page by default.
-WEB_PORT: Final = 7725
 PACKAGES: Final = ("aiohttp", "cryptography")
 RESTART_DELAYS_NS: Final = (0, 500_000_000, 1_000_000_000, 2_000_000_000, 5_000_000_000)
 #: A gateway that lived this long counts as healthy again.

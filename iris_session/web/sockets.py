@@ -8,7 +8,6 @@ import socket
 import struct
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import zmq
@@ -25,15 +24,6 @@ _NOBLOCK: Final = int(zmq.NOBLOCK)
 #: Unsent bytes that the system takes of one connection; more stays with us, where the newest value replaces the last.
 NOT_SENT_BYTES: Final = 16_384
 _TCP_NOTSENT_LOWAT: Final = 25  # linux/tcp.h
-
-
-@dataclass(frozen=True, slots=True)
-class SessionKeys:
-    """CURVE keys of a gateway's sockets, as Z85 text in bytes; `server` is that of the session."""
-
-    server: bytes
-    public: bytes
-    secret: bytes
 
 
 class SocketReader:
@@ -108,25 +98,6 @@ class SocketReader:
             self._on_message(self.socket.recv_multipart(_NOBLOCK, copy=False))
         if n and self._on_drained is not None and not self.socket.closed:
             self._on_drained()
-
-
-def open_socket(
-    context: zmq.Context[zmq.Socket[bytes]], kind: int, host: str, keys: SessionKeys | None
-) -> zmq.Socket[bytes]:
-    """Return a socket with the settings of all sockets to the session. It is not connected yet."""
-    sock: zmq.Socket[bytes] = context.socket(kind)
-    sock.setsockopt(zmq.TCP_KEEPALIVE, 1)  # a peer that vanished is noticed in 11 s
-    sock.setsockopt(zmq.TCP_KEEPALIVE_IDLE, 5)
-    sock.setsockopt(zmq.TCP_KEEPALIVE_INTVL, 2)
-    sock.setsockopt(zmq.TCP_KEEPALIVE_CNT, 3)
-    sock.setsockopt(zmq.RECONNECT_IVL, 50)
-    sock.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
-    sock.setsockopt(zmq.IPV6, int(":" in host))
-    if keys is not None:
-        sock.curve_serverkey = keys.server
-        sock.curve_publickey = keys.public
-        sock.curve_secretkey = keys.secret
-    return sock
 
 
 def limit_unsent(sock: socket.socket) -> None:

@@ -10,6 +10,7 @@ import threading
 import time
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import cv2
 import pytest
@@ -22,7 +23,9 @@ from iris_session.doctor.runner import LOCAL, find_default_address
 from iris_session.protocol import pairing
 from iris_session.security import KeyHome, KeyPair, KeysBusyError, KeysError, RegisteredSession
 from iris_session.security.private_folder import PrivateFolder
+from iris_session.session.config import SessionConfig
 from iris_session.web.certificate import find_certificate, load_or_make_certificate
+from iris_session.web.config import WEB_FROM_CONTROL, WEB_FROM_STATE, WEB_PORT, GatewayConfig
 
 Capture = pytest.CaptureFixture[str]
 
@@ -167,7 +170,38 @@ def test_pair_web_shows_a_link_that_works_behind_the_gateway(home: KeyHome, caps
     (code,) = home.join_codes.read()
     assert code.web_key == made.spki_hash
     assert main(command) == 0
-    assert "in a browser https://192.168.0.10:7735/#c=" in capsys.readouterr().out
+    shown = capsys.readouterr()
+    assert "in a browser https://192.168.0.10:7735/#c=" in shown.out
+    assert "assumed at port 7735: give --web-port" in shown.err
+
+
+def find_page_port(capsys: Capture, *options: str) -> int | None:
+    assert main(["pair", "--web", "--no-wait", "--json", "--address", "192.168.0.10:7731", *options]) == 0
+    shown = capsys.readouterr()
+    assert "assumed" not in shown.err
+    return urlsplit(json.loads(shown.out)["page"]).port
+
+
+def test_pair_web_has_the_port_of_a_session_that_runs_here(home: KeyHome, capsys: Capture) -> None:
+    mark = home.load_server_key().fingerprint
+    home.sessions.add(RegisteredSession("s0", "lab-0", os.getpid(), ("10.0.0.5",), 7721, mark, 7725))
+    assert find_page_port(capsys, "--web-port", "9001") == 9001
+    home.sessions.add(RegisteredSession("s1", "lab-1", os.getpid(), ("10.0.0.5",), 7731, mark, 8443))
+    assert find_page_port(capsys) == 8443
+    assert find_page_port(capsys, "--web-port", "9001") == 9001
+    home.sessions.add(RegisteredSession("s1", "lab-1", os.getpid(), ("10.0.0.5",), 7731, mark, 0))
+    assert main(["pair", "--web", "--no-wait", "--address", "192.168.0.10:7731"]) != 0
+    assert "serves no page" in capsys.readouterr().err
+    assert main(["pair", "--no-wait", "--json"]) != 0, "two sessions"
+    assert main(["pair", "--no-wait", "--json", "--session", "lab-1"]) == 0
+    assert json.loads(capsys.readouterr().out)["page"] == "", "no link to a page that is not served"
+    assert main(["pair", "--web", "--no-wait", "--web-port", "70000"]) != 0
+
+
+def test_ports_of_a_block_are_those_by_default() -> None:
+    config = SessionConfig()
+    assert (config.control_port + WEB_FROM_CONTROL, config.state_port + WEB_FROM_STATE) == (WEB_PORT, WEB_PORT)
+    assert GatewayConfig().port == WEB_PORT
 
 
 def test_forget_removes_stored_key(home: KeyHome) -> None:

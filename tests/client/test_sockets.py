@@ -6,6 +6,11 @@ import subprocess
 import sys
 
 import pytest
+import zmq
+
+from iris_session.client import sockets
+from iris_session.security import KeyPair
+from iris_session.web import gateway
 
 #: Threads of libzmq with a lower priority (proc_pid_stat(5), field 19); they set their names a moment after starting.
 CODE = """
@@ -38,3 +43,18 @@ assert os.waitpid(child, 0)[1] == 0
 @pytest.mark.skipif(sys.platform != "linux", reason="threads have a priority on Linux only")
 def test_asset_thread_has_a_lower_priority_in_every_process() -> None:
     subprocess.run([sys.executable, "-c", CODE], check=True, timeout=90)
+
+
+@pytest.mark.parametrize(("host", "ipv6"), [("10.0.0.1", 0), ("::1", 1), ("fe80::1%eth0", 1)])
+def test_sockets_of_clients_and_gateways_have_the_same_settings(host: str, ipv6: int) -> None:
+    session, own = KeyPair.generate(), KeyPair.generate()
+    curve = sockets.CurveKeys(session.public.encode(), own.public.encode(), own.secret.encode())
+    assert vars(gateway)["open_socket"] is sockets.open_socket, "one definition"
+    assert vars(gateway)["CurveKeys"] is sockets.CurveKeys
+    with zmq.Context() as context, sockets.open_socket(context, zmq.DEALER, host, curve) as sock:
+        assert sock.getsockopt(zmq.IPV6) == ipv6
+        assert sock.getsockopt(zmq.MAXMSGSIZE) == sockets.MAX_MESSAGE_BYTES
+        assert (sock.getsockopt(zmq.TCP_KEEPALIVE), sock.getsockopt(zmq.RECONNECT_IVL_MAX)) == (1, 500)
+        assert sock.getsockopt(zmq.MECHANISM) == zmq.CURVE
+    with zmq.Context() as context, sockets.open_socket(context, zmq.SUB, host, None) as sock:
+        assert sock.getsockopt(zmq.MECHANISM) == zmq.NULL

@@ -172,7 +172,7 @@ def test_two_browsers_share_robots(scenario: Scenario, open_page: Callable[..., 
     second.click("button", "Take over: left")
     first.wait("document.querySelector('[data-robot=left] .holder').textContent === 'ben'")
     second.wait("document.querySelector('[data-robot=left] .holder').textContent === 'you'")
-    first.select("Assign left to", "nobody")
+    first.select("Assign left to", "free")
     second.wait("document.querySelector('[data-robot=left] .holder').textContent === 'free'")
     assert first.errors == []
     assert second.errors == []

@@ -9,7 +9,16 @@ from hypothesis import strategies as st
 from iris_session.protocol import codec
 from iris_session.protocol.client_messages import EStop, Hello, Sample
 from iris_session.protocol.errors import RateError
-from iris_session.protocol.limits import LIMITS, SERVER_LIMITS, Drops, KeyedBuckets, Limit, RateLimiter, TokenBucket
+from iris_session.protocol.limits import (
+    LIMITS,
+    SERVER_LIMITS,
+    Drops,
+    KeyedBuckets,
+    Limit,
+    RateLimiter,
+    TokenBucket,
+    find_network,
+)
 from iris_session.protocol.server_messages import Snapshot
 
 SECOND = 1_000_000_000
@@ -57,6 +66,20 @@ def test_buckets_are_of_one_key() -> None:
     assert not buckets.take("b", 0)
     assert buckets.take("a", SECOND // 10)
     assert not buckets.take("a", SECOND // 10)
+
+
+@pytest.mark.parametrize(
+    ("address", "network"),
+    [
+        ("10.0.0.1", "10.0.0.1"),
+        ("::ffff:10.0.0.1", "10.0.0.1"),
+        ("2001:db8:0:1:2::3", "2001:db8:0:1::/64"),
+        ("fe80::1%eth0", "fe80::/64"),
+        ("", ""),
+    ],
+)
+def test_ipv6_addresses_of_one_network_count_as_one(address: str, network: str) -> None:
+    assert find_network(address) == network
 
 
 def test_factor_is_of_rate_and_burst() -> None:

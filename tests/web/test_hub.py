@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from iris_session.protocol.client_messages import Bye, Disconnected, Heartbeat, Hello, wrap_message
+from iris_session.protocol.client_messages import Bye, Disconnected, Heartbeat, Hello, Pair, wrap_message
 from iris_session.protocol.codec import decode_client, decode_server, encode_client, encode_server
 from iris_session.protocol.common import Message
 from iris_session.protocol.server_messages import Endpoints, ProtocolFault, ServerEnvelope, Welcome
@@ -13,6 +13,7 @@ from iris_session.web import wire
 from iris_session.web.hub import SECOND, TICKET_BYTES, Browser, Hub, HubLimits
 
 HELLO = wire.encode_frames(wire.CONTROL, [encode_client(wrap_message(Hello("observer", "ann", secret=bytes(32))))])
+PAIR = wire.encode_frames(wire.CONTROL, [encode_client(wrap_message(Pair("ann", bytes(32), identity=bytes(32))))])
 HEARTBEAT = wire.encode_frames(wire.CONTROL, [encode_client(wrap_message(Heartbeat(), 5))])
 
 
@@ -101,6 +102,28 @@ def test_a_browser_without_a_welcome_may_say_little() -> None:
     assert browser.closing is not None
     welcome(hub, joined)
     assert all(hub.receive(joined, HEARTBEAT, 0) for _ in range(100))
+
+
+def test_pairing_attempts_of_one_network_are_limited() -> None:
+    hub = Hub()
+
+    def open_from(n: int, address: str) -> Browser:
+        browser = hub.open_browser(n.to_bytes(6, "big"), address, 0)
+        assert browser is not None
+        return browser
+
+    first, typing = [open_from(n, f"2001:db8::{n}") for n in range(2)], open_from(2, "10.0.0.1")
+    assert all(hub.receive(first[n % 2], PAIR, 0) for n in range(20))
+    assert all(hub.receive(typing, PAIR, n) for n in range(6)), "a person who mistypes a code"
+    third = open_from(3, "2001:db8::3")
+    assert hub.receive(third, HELLO, 0) is not None
+    assert hub.receive(third, PAIR, 0) is None
+    assert third.closing is not None
+    assert third.closing.code == wire.CLOSE_LIMIT
+    assert hub.drops.by_reason == {"web_pair_rate": 1}
+    assert [browser.closing for browser in (*first, typing)] == [None] * 3
+    assert hub.receive(first[0], PAIR, 31 * SECOND) is not None
+    assert hub.receive(first[0], PAIR, 31 * SECOND) is None
 
 
 def test_what_is_not_messagepack_is_answered_by_the_gateway() -> None:

@@ -140,10 +140,14 @@ export class SessionMirror {
     return lease !== undefined && isHeldBy(lease, participant) ? lease.lease_version : null;
   }
 
-  /** Return the digest (32 hex digits) of everything shared, independent of when and how this mirror received it. */
+  /**
+   * Return the digest (32 hex digits) of everything shared, independent of when and how this mirror received it. Poses of
+   * anchors are part of it when there are any.
+   */
   hash(): string {
     const writer = new Writer();
-    writer.writeArrayHead(13);
+    const hasAnchors = this.anchors.size > 0;
+    writer.writeArrayHead(hasAnchors ? 14 : 13);
     for (const number of [this.eventSeq, this.sceneEpoch, this.sceneRevision]) writer.writeInt(number);
     writer.writeString(this.sceneHash);
     writer.writeInt(this.tickPeriodNs);
@@ -156,6 +160,7 @@ export class SessionMirror {
     writeList(writer, "Lease", sortedValues(this.leases));
     writeList(writer, "RobotInfo", sortedValues(this.robots));
     writeList(writer, "BodyInfo", this.bodies);
+    if (hasAnchors) writeAnchorPoses(writer, sortedValues(this.anchors));
     return [...blake2b(writer.finish(), 16)].map((byte) => byte.toString(16).padStart(2, "0")).join("");
   }
 
@@ -274,4 +279,13 @@ function compareCodePoints(a: string, b: string): number {
 function writeList(writer: Writer, struct: string, items: readonly unknown[]): void {
   writer.writeArrayHead(items.length);
   for (const item of items) writeStruct(writer, struct, item);
+}
+
+function writeAnchorPoses(writer: Writer, anchors: readonly AnchorInfo[]): void {
+  writer.writeArrayHead(anchors.length);
+  for (const anchor of anchors) {
+    writer.writeArrayHead(2);
+    writer.writeString(anchor.id);
+    writeStruct(writer, "Pose", anchor.T_world_anchor);
+  }
 }

@@ -12,7 +12,7 @@ const ROLES = ["operator", "observer", "director"] as const;
 
 export function makeParticipantsPanel(state: PageState, actions: Actions): Panel {
   const list = h("ul", { class: "rows" });
-  const empty = h("p", { class: "empty" }, "Nobody has joined.");
+  const empty = h("p", { class: "empty" }, "No participants.");
   const section = makeSection("participants", "Participants", h("div", {}, list, empty));
   const rows = new KeyedList<ParticipantInfo>(list, (item) => makeRow(item, state, actions), empty);
   return {

@@ -112,7 +112,7 @@ function makeRow({ name }: RobotInfo, state: PageState, actions: Actions): Row<R
       scaleLabel.hidden = !(state.isDirector || isMine) || isFree;
       fields.hidden = assignLabel.hidden && scaleLabel.hidden;
       const drivers = participants.filter((one) => DRIVERS.includes(one.role) || one.id === lease?.holder);
-      setOptions(assign, [[FREE, "nobody"], ...drivers.map((one) => [one.id, one.name] as const)]);
+      setOptions(assign, [[FREE, "free"], ...drivers.map((one) => [one.id, one.name] as const)]);
       setValue(assign, lease?.holder ?? FREE);
       setValue(mode, lease?.mode ?? "exclusive");
       const scales = [...new Set([...SCALES, lease?.scale ?? 1])].sort((a, b) => a - b);

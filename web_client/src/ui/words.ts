@@ -4,7 +4,7 @@ import type { Filled } from "../core/api.ts";
 import type * as wire from "../protocol/messages.g.ts";
 
 const HOLD_REASONS: Record<string, string> = {
-  no_lease: "nobody has its lease",
+  no_lease: "no participant has its lease",
   no_sample: "its holder sends nothing yet",
   clutch_open: "clutch open",
   stale: "samples come too late or not at all",
@@ -224,7 +224,7 @@ function leaseSentence(
 ): string {
   if (cause === "mode") return `${lease.target} is now ${leaseModeWords(lease.mode)}`;
   if (cause === "queue") {
-    return lease.queue.length > 0 ? `${lease.queue.map(nameOf).join(", ")} wait for ${lease.target}` : `nobody waits for ${lease.target}`;
+    return lease.queue.length > 0 ? `${lease.queue.map(nameOf).join(", ")} wait for ${lease.target}` : `the queue for ${lease.target} is empty`;
   }
   if (lease.holder === "") return `${lease.target} is free${previous ? ` (was held by ${nameOf(previous)})` : ""}`;
   const verb = LEASE_CAUSES[cause];

@@ -139,7 +139,7 @@ export class Avatars {
   }
 }
 
-/** Devices of other kinds than heads, hands and controllers have no place in the room. Nobody sees their own head. */
+/** Devices of other kinds than heads, hands and controllers have no place in the room, nor has one's own head. */
 function isDrawn(info: AvatarInfo, device: string): boolean {
   if (device === "head") return !info.isSelf;
   return device.startsWith("hand/") || device.startsWith("controller/");
