@@ -40,6 +40,19 @@ def test_two_people_stow_soft_bodies_and_recover_dropped_ones() -> None:
     assert left.attempts == 2  # type: ignore[attr-defined]
 
 
+@pytest.mark.usefixtures("untraced")
+def test_soft_body_beside_the_box_is_picked_up_again() -> None:
+    rig = soft_demo(make_demo("soft"), seed=2)
+    left = rig.behaviours["left"]
+    assert isinstance(left, Stower)
+    rig.run(20.0, until=lambda rig: left.phase == "lift")
+    place, left._place = left._place, left._grip[0][:2]
+    rig.run(20.0, until=lambda rig: left.attempts == 2)
+    left._place = place
+    rig.run(40.0, until=SoftRig.over)
+    assert (rig.verdict(), left.attempts) == ("", 2)
+
+
 @pytest.mark.parametrize("name", ["folder", "stower"])
 def test_deformable_that_is_not_visible_is_named(name: str) -> None:
     thing = {"folder": "cloth", "stower": "rose"}[name]

@@ -113,8 +113,10 @@ class Stower(DeformableTask):
     def _finish_carry(self, then: str, within_m: float) -> None:
         if self._check_slip(f"the {self.soft} slipped out of the gripper of {self.robot}"):
             return
-        if self.hand.has_arrived(within_m, 0.06) or self._has_lasted(5.0):
+        if self.hand.has_arrived(within_m, 0.06):
             self._enter(then)
+        elif self._has_lasted(8.0):
+            self._retry(f"{self.robot} cannot move the {self.soft}")
 
     def _open(self) -> None:
         if self._entering_now:
@@ -136,7 +138,7 @@ class Stower(DeformableTask):
         if all(self._is_inside_box(corner) for corner in self.perception.corners.values()):
             self._enter("return")
         else:
-            self._fail(f"the {self.soft} does not lie in the box")
+            self._retry(f"the {self.soft} does not lie in the box")
 
     def _back_off(self) -> None:
         if self._entering_now:
