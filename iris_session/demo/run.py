@@ -7,8 +7,10 @@ themselves are in `demos`.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
+import os
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
@@ -35,6 +37,8 @@ READ_PERIOD_NS: Final = 100_000_000
 JOIN_TIMEOUT_S: Final = 60.0
 #: Time for a deformable to come to rest after all operators are done [s].
 SETTLE_S: Final = 3.0
+#: Nice value of emulated headsets where it is permitted: a headset has processors of its own.
+HEADSET_NICE: Final = -5
 #: Operators per process, when there are more than two; observers per process.
 WORKERS_PER_PROCESS: Final = 2
 OBSERVERS_PER_PROCESS: Final = 4
@@ -52,6 +56,8 @@ class EmulatorProcess:
             stdout=PIPE,
             own_session=True,
         )
+        with contextlib.suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, self._process.pid, HEADSET_NICE)
         self._awaited = [spec.name for spec in specs if not spec.endless]
         self.reports: dict[str, HeadsetReport] = {}
 

@@ -146,6 +146,13 @@ class Scenario:
                 pytest.fail(f"not within {timeout_s:g} s: {what}\n{read_output_tails(self.server.folder.parent)}")
             self.poll()
 
+    def wait_for(self, condition: Callable[[], object], timeout_s: float) -> bool:
+        """Poll until a condition holds; return false if it does not within `timeout_s`."""
+        deadline = time.monotonic() + timeout_s
+        while not (holds := bool(condition())) and time.monotonic() < deadline:
+            self.poll()
+        return holds
+
     def run_for(self, seconds: float) -> None:
         end = time.monotonic() + seconds
         while time.monotonic() < end:

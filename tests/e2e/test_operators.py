@@ -174,6 +174,15 @@ INVALID_POSES: tuple[tuple[PoseTuple, str], ...] = (
 )
 
 
+def send_invalid_pose(scenario: Scenario, hand: Hand, pose: PoseTuple) -> PoseTuple:
+    """Engage a hand, and send one sample with this pose. Return the pose of the tip before."""
+    hand.sending = True
+    scenario.engage(hand)
+    before, hand.sending = hand.tip, False
+    hand.client.send_sample(hand.device, pose, robots=[hand.robot], clutch=True)
+    return before
+
+
 def test_invalid_pose_ends_the_engagement_and_moves_nothing(scenario: Scenario) -> None:
     """Each pose is sent by another client."""
     watcher = scenario.join("watcher", "observer")
@@ -181,16 +190,16 @@ def test_invalid_pose_ends_the_engagement_and_moves_nothing(scenario: Scenario) 
         hand = scenario.add_hand(scenario.join("ann"), "left")
         ann = hand.client
         ann.acquire(["left"])
-        scenario.engage(hand)
-        before = hand.tip
-        hand.sending = False
-        ann.send_sample(hand.device, pose, robots=["left"], clutch=True)
 
         def is_reported(me: str = ann.participant_id, reason: str = reason) -> bool:
             bodies = [event.body for event in scenario.events["watcher"]]
             return any(isinstance(b, SamplesRejected) and (b.participant, b.reason) == (me, reason) for b in bodies)
 
-        scenario.run_until(is_reported, f"a rejection for {reason}")
+        for _ in range(5):  # on a busy machine the sample may come too late, which is the reason then
+            before = send_invalid_pose(scenario, hand, pose)
+            if scenario.wait_for(is_reported, 3.0):
+                break
+        assert is_reported(), reason
         scenario.run_for(0.4)
         assert distance(before[0], hand.tip[0]) < 1e-3
         assert quat_angle(before[1], hand.tip[1]) < 1e-2

@@ -309,6 +309,7 @@ def test_a_thousand_silent_sockets_harm_no_one(page: str) -> None:
 def test_a_reader_that_stops_gets_the_newest_afterwards(page: str) -> None:
     async def work() -> None:
         async with browsers(page, "ann", "slow") as (ann, slow):
+            await slow.wait(lambda: slow.states, "the first state comes")
             resume = slow.stop_reading()
             await asyncio.sleep(2.5)
             begin_ns = time.monotonic_ns()

@@ -39,7 +39,7 @@ CAREFUL_SPEED: float = 0.12
 CARRY_SPEED: float = 0.22
 #: Corners closer to each other than this are folded [m]; when laid down they must be closer, because a cloth settles
 #: for a while.
-FOLDED: float = 0.049
+FOLDED: float = 0.047
 LAID: float = 0.044
 #: Distance of the finger pads below which a gripper is closed on cloth [m].
 SHUT: float = 0.02
@@ -50,14 +50,14 @@ SHAKES: int = 3
 HOME_ABOVE: float = 0.22
 SETTLED_S: float = 1.5
 #: Time to wait for a partner [s], and time to wait before the release, which also succeeds alone [s].
-PATIENCE_S: float = 60.0
+PATIENCE_S: float = 150.0
 TOGETHER_S: float = 6.0
 
 
 class Folder(DeformableTask):
     """Folds `cloth` with `robot`, together with the operator of `partner`."""
 
-    most_attempts = 6  # later attempts are short: corners that lie apart are only brought together
+    max_attempts = 10  # later attempts are short: corners that lie apart are only brought together
 
     def __init__(
         self, robot: str, cloth: str, partner: str, device: str = Device.CONTROLLER_RIGHT, arm: ArmKind = ARM

@@ -185,7 +185,7 @@ class Giver(HandoverTask):
         partner: str,
         device: str = Device.CONTROLLER_RIGHT,
         arm: ArmKind = ARM,
-        patience_s: float = 60.0,
+        patience_s: float = 150.0,
     ) -> None:
         super().__init__(robot, object, partner, device, arm)
         self._after_close = "lift"
@@ -306,7 +306,7 @@ class Receiver(HandoverTask):
         device: str = Device.CONTROLLER_RIGHT,
         arm: ArmKind = ARM,
         place: tuple[float, float] | None = None,
-        patience_s: float = 120.0,
+        patience_s: float = 150.0,
     ) -> None:
         super().__init__(robot, object, partner, device, arm)
         self._after_close = "secure"

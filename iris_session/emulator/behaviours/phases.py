@@ -34,7 +34,7 @@ class PhasedTask:
     """
 
     back_off = "back_off"
-    max_attempts = 4
+    max_attempts = 8
 
     def __init__(self, robot: str, device: str, eyes: ScenePerception, arm: ArmKind = ARM) -> None:
         self.phase = "wait"
