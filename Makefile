@@ -74,13 +74,15 @@ check: install-dev
 # What decides; the rest talks to sockets, disks and people.
 CORE := iris_session/authority/*,iris_session/protocol/*,iris_session/control/*
 
-# Tests at once, and which. Two leave a third of two cores unused: tests wait for processes, and for sessions in real time.
+# Tests at once, and which. Two leave a third of two cores unused, since tests wait for processes; sessions in real time
+# need that third.
 JOBS ?= 3
+JOBS_E2E ?= 2
 T ?= tests
 
 UNIT = $(BIN)/python -m pytest -q -m "not e2e" -n $(JOBS) --dist worksteal --cov --cov-report=
 # A file stays on one worker, because its tests share sessions; the longest begin first (tests/e2e/conftest.py).
-E2E = $(BIN)/python -m pytest -q -m e2e -n $(JOBS) --dist loadfile --no-loadscope-reorder
+E2E = $(BIN)/python -m pytest -q -m e2e -n $(JOBS_E2E) --dist loadfile --no-loadscope-reorder
 
 test: check
 	$(MAKE) --no-print-directory test-unit
@@ -97,7 +99,7 @@ DEMOS := tests/e2e/test_demo_scenes.py tests/e2e/test_demo_handover.py
 BROWSER := tests/e2e/test_web.py
 test-e2e: install-dev $(PAGE)
 ifeq ($(T),tests)
-	$(E2E) -n 2 --dist load $(DEMOS)
+	$(E2E) --dist load $(DEMOS)
 	$(E2E) $(addprefix --ignore=,$(DEMOS) $(BROWSER)) $(T)
 	$(E2E) -n 1 $(BROWSER)
 else
