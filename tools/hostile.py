@@ -304,9 +304,20 @@ class Lab:
         scene.write_text(make_scene())
         anchors = self.folder / "anchors.toml"
         anchors.write_text(ANCHORS)
-        ports = ["--control-port", "0", "--state-port", "0", "--curve", "--no-beacon"]
+        ports = ["--control-port", "0", "--state-port", "0", "--curve", "--no-beacon", "--no-web"]
+        operators = ["--unaligned", "operator"]  # the honest ones: nothing here is about alignment
         self.server = subprocess.Popen(
-            [*COMMAND, "serve", str(scene), "--anchors", str(anchors), *ports, "--record", str(self.recording)],
+            [
+                *COMMAND,
+                "serve",
+                str(scene),
+                "--anchors",
+                str(anchors),
+                *ports,
+                *operators,
+                "--record",
+                str(self.recording),
+            ],
             stdout=self._open_log("serve.json"),
             stderr=subprocess.STDOUT,
             env={**os.environ, "IRIS_HOME": str(self.home.path)},

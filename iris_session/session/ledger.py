@@ -51,7 +51,7 @@ class SessionLedger:
 
     Attributes:
         mirror: Participants and leases, as a client keeps them.
-        handovers: All handovers since the session began.
+        handovers: The newest handovers, at most `MAX_HANDOVERS`.
         recent: The newest events, at most `RECENT_EVENTS`.
         applied: By robot, the newest sample that moved it.
         connections: Participant id by connection number.

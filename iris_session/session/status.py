@@ -77,7 +77,7 @@ class SessionStatus(msgspec.Struct, frozen=True):
         estop: The e-stop is latched.
         participants: One row each, as in a `StatusReport`; fields that only the front knows have their defaults.
             `alignment_error_m` [m, 95 %] means something only where `alignment` is `measured`.
-        handovers: All handovers since the session began.
+        handovers: The newest handovers, at most 1000; the recording has all.
         lateness: Of the ticks of `run()`: `ticks`, `late`, `late_share`, `p50_ms`, `p99_ms`, `max_ms`. Empty in a loop
             of the owner's.
         input_to_ctrl_ms: By robot, from the capture of the newest applied sample to the step that applied it [ms].

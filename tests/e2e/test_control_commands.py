@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pty
+import re
 import signal
 import subprocess
 import termios
@@ -41,6 +42,14 @@ def ann(shared_session: SessionProcess) -> Iterator[Client]:
         .start() as client
     ):
         yield client
+
+
+def test_a_session_is_found_by_its_name(shared_session: SessionProcess) -> None:
+    name = re.search(r"session '([^']+)' on", shared_session.output)
+    assert name, shared_session.output
+    code, _, errors = run_in_process("marker", "found by name", "--session", name[1])
+    assert code == 0, errors
+    assert run_in_process("marker", "not found", "--session", "no-such-session")[0] != 0
 
 
 def test_estop_is_set_and_cleared(shared_session: SessionProcess, ann: Client) -> None:

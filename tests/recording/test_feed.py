@@ -14,7 +14,7 @@ from iris_session.protocol.common import Denial, Pose
 from iris_session.protocol.server_messages import BodyInfo, PresenceItem, Reply
 from iris_session.protocol.steps import Decision, OutgoingMessage
 from iris_session.recording import Keyframe, RecorderFeed, make_row
-from iris_session.recording.feed import BATCH_ITEMS, BATCH_ROWS, VERTEX_FRAMES
+from iris_session.recording.feed import BATCH_ITEMS, BATCH_ROWS, JOURNAL_SHARE, VERTEX_FRAMES
 from iris_session.recording.journal import check_keyframe
 from iris_session.recording.messages import (
     BATCH,
@@ -173,6 +173,22 @@ def test_full_spill_drops_rows_counts_and_reports_them(played) -> None:  # type:
     assert batch.dropped_rows == lost
     assert batch.keyframes[0].step == 499
     assert not feed.close(0.0)
+
+
+def test_the_rest_of_a_nearly_full_spill_is_for_the_journal(played) -> None:  # type: ignore[no-untyped-def]
+    _, endpoint, folder = played
+    limit = 60_000
+    feed = RecorderFeed(endpoint, folder, window_bytes=2000, spill_bytes=limit)
+    feed.send_header(make_header())
+    for step in range(1000):
+        feed.add_state(step, step, 0.1, 70, np.arange(21.0).reshape(3, 7))
+        steps(feed, step, 1)
+        if feed.stats.dropped_items:
+            break
+    assert feed.stats.dropped_items > 0
+    assert feed.stats.dropped_rows == 0
+    assert JOURNAL_SHARE * limit < feed._spill.pending_bytes < limit
+    feed.close(0.0)
 
 
 def test_rows_not_received_before_the_end_are_counted(played) -> None:  # type: ignore[no-untyped-def]

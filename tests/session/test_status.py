@@ -12,10 +12,13 @@ from iris_session.protocol.client_messages import MoveAnchor, PlaceAlignment, Tr
 from iris_session.protocol.common import IDENTITY, MAX_TEXT, Pose
 from iris_session.protocol.entries import Bye, Entry, Join
 from iris_session.protocol.names import Role
+from iris_session.protocol.server_messages import Event, Handover
 from iris_session.protocol.status import AnchorReport, ParticipantReport, RecorderReport
+from iris_session.protocol.steps import Decision
 from iris_session.recording.feed import FeedStats
 from iris_session.recording.messages import RecorderStatus
 from iris_session.session.config import SessionConfig
+from iris_session.session.ledger import MAX_HANDOVERS, SessionLedger
 from iris_session.session.processes import SessionProcesses
 from iris_session.session.status import (
     PATIENCE_NS,
@@ -57,6 +60,15 @@ def session() -> Session:
 
 def bob(now_ns: int) -> Entry:
     return Entry(BOB, BOB, now_ns, Join("key2", Role.OPERATOR, "bob", devices=("head",), alignment="measured"))
+
+
+def test_handovers_of_the_status_are_bounded() -> None:
+    ledger = SessionLedger()
+    for n in range(MAX_HANDOVERS + 5):
+        handed = Handover(f"object{n}", "left", "right", "p1", "p2", 1)
+        ledger.apply_step(Decision(commands=(), events=(Event(n + 1, n, n, handed),)), ())
+    assert len(ledger.handovers) == MAX_HANDOVERS
+    assert ledger.handovers[-1].object == f"object{MAX_HANDOVERS + 4}"
 
 
 def test_alignment_has_an_age_and_can_be_void(session: Session) -> None:
