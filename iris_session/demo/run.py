@@ -1,8 +1,9 @@
 """Run a demo: a session in this process, emulated operators in others, and a result with a verdict.
 
 A run succeeds only if the session's own detector saw every handover by contact alone, if every goal with a deformable
-was reached (`goals`; recorded as the verdict of an episode), and if the recording verifies bit for bit. The demos
-themselves are in `demos`.
+was reached (`goals`; recorded as the verdict of an episode), and if the recording verifies bit for bit. When an
+operator fails, such as after dropping an object where it cannot be grasped, the scene is reset and all begin again, as
+people do who record demonstrations. The demos themselves are in `demos`.
 """
 
 from __future__ import annotations
@@ -27,7 +28,6 @@ from iris_session.protocol.names import EpisodeAction
 from iris_session.session.config import SessionConfig
 from iris_session.session.ledger import HandoverStatus
 from iris_session.session.session import Session
-from iris_session.session.status import SessionStatus
 from iris_session.session.verification import verify_recording
 from iris_session.system.process import PIPE, ChildProcess
 
@@ -39,6 +39,9 @@ JOIN_TIMEOUT_S: Final = 60.0
 SETTLE_S: Final = 3.0
 #: Nice value of emulated headsets where it is permitted: a headset has processors of its own.
 HEADSET_NICE: Final = -5
+#: Attempts at the whole demo, each after a reset, and time that must be left for another one [s].
+MAX_TAKES: Final = 3
+TAKE_S: Final = 30.0
 #: Operators per process, when there are more than two; observers per process.
 WORKERS_PER_PROCESS: Final = 2
 OBSERVERS_PER_PROCESS: Final = 4
@@ -106,6 +109,7 @@ class DemoResult(msgspec.Struct, frozen=True):
     """Result of a demo, as printed by `demo NAME --json`.
 
     `alignment_mm`: stated p95 and true error at the sheet [mm], by name of the headset, of the aligned ones only.
+    `takes`: attempts, each from a reset scene; `handovers` and `goals` are those of the last one.
     """
 
     ok: bool
@@ -125,6 +129,7 @@ class DemoResult(msgspec.Struct, frozen=True):
     notes: tuple[str, ...] = ()
     interrupted: bool = False
     goals: tuple[GoalStatus, ...] = ()
+    takes: int = 1
 
 
 def run_demo(
@@ -156,10 +161,11 @@ def run_demo(
             groups
         )
         people = stack.enter_context(_EmulatorGroup(addresses, groups, timeout_s))
-        next_read_ns = began_ns = 0
+        next_read_ns = began_ns = take_ns = 0
+        failed_takes: list[str] = []
 
         def finished() -> bool:
-            nonlocal next_read_ns, began_ns
+            nonlocal next_read_ns, began_ns, take_ns
             update()
             now_ns = session.clock()
             began_ns = began_ns or now_ns  # preparing the loop is not part of its pace
@@ -167,19 +173,30 @@ def run_demo(
             if now_ns < next_read_ns:
                 return False
             next_read_ns = now_ns + READ_PERIOD_NS
-            return people.is_finished() and judge.is_settled()
+            is_over = people.is_finished() and judge.is_settled()
+            failures = people.list_failures() or (judge.list_problems() if is_over else [])
+            left_s = timeout_s - (now_ns - began_ns) * 1e-9
+            if failures and len(failed_takes) < MAX_TAKES - 1 and left_s > TAKE_S:
+                failed_takes.append(f"begun again at {now_ns * 1e-9:.0f} s: {'; '.join(failures)}")
+                judge.restart()
+                session.reset()
+                people.restart(left_s)
+                take_ns = now_ns
+                return False
+            return is_over
 
         session.run(seconds=timeout_s + 5.0, until=finished)
-        run_s = max(session.clock() - began_ns, 1) * 1e-9
+        run_s = max(session.clock() - max(began_ns, take_ns), 1) * 1e-9
         people.close()
         interrupted = session.stopping
         status = session.status()
         seconds = session.clock() * 1e-9
         recording = session.recording
     reports = people.reports
+    handovers = tuple(one for one in status.handovers if one.at_s * 1e9 >= take_ns)
     # Ctrl-C requests an immediate end; `iris-session verify` has all the time it needs.
     verified, verification = (None, "not verified: interrupted") if interrupted else _verify_recording(recording)
-    problems = ["interrupted before its end"] if interrupted else _list_problems(demo, reports, status, timeout_s)
+    problems = ["interrupted before its end"] if interrupted else _list_problems(demo, reports, handovers, timeout_s)
     if not interrupted:
         problems += judge.list_problems()
     if verified is False:
@@ -189,7 +206,7 @@ def run_demo(
         demo=demo.name,
         seconds=round(seconds, 3),
         participants=tuple(sorted(reports)),
-        handovers=status.handovers,
+        handovers=handovers,
         recording=None if recording is None else str(recording),
         verified=verified,
         verification=verification,
@@ -203,9 +220,10 @@ def run_demo(
         real_time_factor=round(status.sim_time / run_s, 3),
         state_age_ms_p99={name: round(r.age_ms_p99, 2) for name, r in reports.items() if math.isfinite(r.age_ms_p99)},
         problems=tuple(problems),
-        notes=demo.notes,
+        notes=(*demo.notes, *failed_takes),
         interrupted=interrupted,
         goals=judge.get_status(),
+        takes=1 + len(failed_takes),
     )
 
 
@@ -218,6 +236,13 @@ class _GoalTracker:
         self._monitors = tuple(GoalMonitor(goal) for goal in play.goals)
         self._began = False
         self._finished_s: float | None = None
+
+    def restart(self) -> None:
+        """Forget what was reached; the episode is discarded."""
+        if self._began:
+            self._session.post(Episode(0, EpisodeAction.DISCARD, self._name))
+        self._monitors = tuple(GoalMonitor(one.goal) for one in self._monitors)
+        self._began, self._finished_s = False, None
 
     def update(self) -> None:
         """Process one tick."""
@@ -268,10 +293,17 @@ class _EmulatorGroup:
     """The emulated headsets of a demo, in their own processes."""
 
     def __init__(self, addresses: Sequence[str], groups: Sequence[Sequence[HeadsetSpec]], timeout_s: float) -> None:
+        self._addresses, self._groups = addresses, groups
         self._workers: list[EmulatorProcess] = []
         self._observers: list[EmulatorProcess] = []
+        self.restart(timeout_s)
+
+    def restart(self, timeout_s: float) -> None:
+        """End all processes, and start them anew."""
+        self.close()
+        self._workers, self._observers = [], []
         try:
-            for address, group in zip(addresses, groups, strict=True):
+            for address, group in zip(self._addresses, self._groups, strict=True):
                 if group[0].observer:
                     self._observers.append(EmulatorProcess(address, group, timeout_s + 5.0))
                 else:
@@ -297,25 +329,35 @@ class _EmulatorGroup:
             process.poll()
         return not any(process.is_running and process.is_busy for process in self._workers)
 
+    def list_failures(self) -> list[str]:
+        """Return one line per operator that has failed."""
+        return _list_failures(self.reports)
+
     def close(self) -> None:
         for process in (*self._workers, *self._observers):
             process.close()
 
 
-def _list_problems(play: Demo, reports: dict[str, HeadsetReport], status: SessionStatus, timeout_s: float) -> list[str]:
+def _list_problems(
+    play: Demo, reports: dict[str, HeadsetReport], handovers: Sequence[HandoverStatus], timeout_s: float
+) -> list[str]:
     """Return the reasons why the demo failed, empty after a success."""
     tasks = {spec.name: spec for spec in play.headsets}
-    problems = [f"{name}: {report.failed}" for name, report in reports.items() if report.failed]
+    problems = _list_failures(reports)
     problems += [
         f"{name}: not done within {timeout_s:g} s, at '{r.phase}'"
         for name, r in reports.items()
         if not (r.done or r.failed or tasks[name].endless)
     ]
-    given = {handover.object for handover in status.handovers}
+    given = {handover.object for handover in handovers}
     problems += [
         f"the detector saw no handover of the {thing} by contact alone" for thing in play.objects if thing not in given
     ]
     return problems
+
+
+def _list_failures(reports: dict[str, HeadsetReport]) -> list[str]:
+    return [f"{name}: {report.failed}" for name, report in reports.items() if report.failed]
 
 
 def _verify_recording(recording: Path | None) -> tuple[bool | None, str]:

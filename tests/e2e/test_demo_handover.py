@@ -11,6 +11,9 @@ from pathlib import Path
 import psutil
 import pytest
 
+from iris_session.demo import run
+from iris_session.demo.demos import make_demo
+from iris_session.session.config import SessionConfig
 from tests.e2e.session_process import (
     COMMAND,
     DEMO_OPTIONS,
@@ -57,6 +60,24 @@ def test_hammer_is_handed_over_and_the_recording_verifies(tmp_path: Path) -> Non
     report = run_verify(tmp_path / recording)
     assert report["recording_class"] == "closed"
     assert report["finished"]
+
+
+def test_failed_operators_begin_again_from_a_reset_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    listed = run._EmulatorGroup.list_failures
+    failed: list[str] = []
+
+    def fail_once_at_work(people: run._EmulatorGroup) -> list[str]:
+        if not failed and any("close" in phase for one in people.reports.values() for phase in one.phases):
+            failed.append("ann: dropped it")
+            return failed
+        return listed(people)
+
+    monkeypatch.setattr(run._EmulatorGroup, "list_failures", fail_once_at_work)
+    config = SessionConfig(control_port=0, state_port=0, record=tmp_path / "session.rrd")
+    result = run.run_demo(make_demo("handover"), config, timeout_s=270.0)
+    assert (result.ok, result.verified, result.takes) == (True, True, 2), result.problems
+    assert "dropped it" in result.notes[-1]
+    assert [one.object for one in result.handovers] == ["hammer"]
 
 
 @pytest.fixture
