@@ -344,6 +344,19 @@ def test_a_reader_that_never_reads_is_closed(page: str) -> None:
     run(work())
 
 
+async def come_back(browser: WebBrowser, token: bytes, role: str = "observer") -> Welcome:
+    """Join again with a resume token, as often as it takes."""
+    until = time.monotonic() + DEADLINE_S
+    while True:
+        await browser.close()
+        try:
+            await browser.open()
+            return await asyncio.wait_for(browser.say_hello(role, resume_token=token), 10.0)
+        except (aiohttp.ClientError, TimeoutError, AssertionError, ConnectionError):
+            assert time.monotonic() < until, f"{browser.name} does not come back"
+            await asyncio.sleep(0.1)
+
+
 def test_killed_gateway_comes_back_and_leases_stay(serve: Serve) -> None:
     server = serve()
     page = page_of(server)
@@ -360,15 +373,7 @@ def test_killed_gateway_comes_back_and_leases_stay(serve: Serve) -> None:
                 server.children()[name].kill()
                 await ann.wait(lambda: ann.socket.closed, f"{name} is noticed")
                 begin = time.monotonic()
-                while True:
-                    await ann.close()
-                    try:
-                        await ann.open()
-                        welcome = await asyncio.wait_for(ann.say_hello("operator", resume_token=token), 10.0)
-                        break
-                    except (aiohttp.ClientError, TimeoutError, AssertionError, ConnectionError):
-                        assert time.monotonic() - begin < DEADLINE_S
-                        await asyncio.sleep(0.2)
+                welcome = await come_back(ann, token, "operator")
                 assert welcome.resumed, name
                 assert welcome.participant_id == participant
                 token = welcome.resume_token
@@ -379,19 +384,6 @@ def test_killed_gateway_comes_back_and_leases_stay(serve: Serve) -> None:
 
     run(work())
     assert "web gateway ended" in server.output
-
-
-async def come_back(browser: WebBrowser, token: bytes) -> Welcome:
-    """Join again with a resume token, as often as it takes."""
-    until = time.monotonic() + DEADLINE_S
-    while True:
-        await browser.close()
-        try:
-            await browser.open()
-            return await asyncio.wait_for(browser.say_hello(resume_token=token), 10.0)
-        except (aiohttp.ClientError, TimeoutError, AssertionError, ConnectionError):
-            assert time.monotonic() < until, f"{browser.name} does not come back"
-            await asyncio.sleep(0.1)
 
 
 def test_all_browsers_of_a_killed_gateway_resume_and_nothing_leaks(serve: Serve) -> None:
