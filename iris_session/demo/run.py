@@ -180,7 +180,7 @@ def run_demo(
                 failed_takes.append(f"begun again at {now_ns * 1e-9:.0f} s: {'; '.join(failures)}")
                 judge.restart()
                 session.reset()
-                people.restart(left_s)
+                people.restart(left_s)  # ticks wait until the old processes have ended; nothing is driven meanwhile
                 take_ns = now_ns
                 return False
             return is_over

@@ -43,7 +43,7 @@ def test_hammer_is_handed_over_and_the_recording_verifies(tmp_path: Path) -> Non
     }
     assert result["participants"] == ["ann", "bob"]
     assert result["problems"] == []
-    assert result["verified"] is True
+    assert (result["verified"], result["takes"]) == (True, 1)
     (handover,) = result["handovers"]
     assert set(handover) == {"object", "giver", "receiver", "at_s", "duration_s"}
     assert handover["object"] == "hammer"

@@ -15,20 +15,21 @@ __all__ = ["robot_models"]
 pytestmark = pytest.mark.e2e
 
 
-def run_demo(folder: Path, *arguments: str) -> dict[str, Any]:
-    """Run a demo, which must succeed. Return its result."""
+def run_demo(folder: Path, *arguments: str, max_takes: int = 1) -> dict[str, Any]:
+    """Run a demo, which must succeed within so many attempts. Return its result."""
     done = run_command("demo", *arguments, *DEMO_OPTIONS, cwd=folder, timeout_s=DEMO_S)
     assert done.stdout, done.stderr[-3000:]
     result: dict[str, Any] = json.loads(done.stdout)
     problems = "\n".join([*result["problems"], done.stderr[-6000:], done.stdout])
     assert (done.returncode, result["ok"], result["verified"]) == (0, True, True), problems
+    assert result["takes"] <= max_takes, problems
     assert result["participants"] == ["ann", "bob"]
     return result
 
 
 @pytest.mark.usefixtures("robot_models")
 def test_aloha_operators_exchange_boards(tmp_path: Path) -> None:
-    result = run_demo(tmp_path, "aloha")
+    result = run_demo(tmp_path, "aloha", max_takes=2)  # a board slips or leans in about one of twenty, by physics alone
     found = {h["object"]: (h["giver"], h["receiver"]) for h in result["handovers"]}
     assert found == {
         "red_board": ("south/right", "north/left"),
