@@ -35,8 +35,10 @@ from iris_session.system.process import PIPE, ChildProcess
 READ_PERIOD_NS: Final = 100_000_000
 #: Time to join the session that the demo itself started: a busy machine may be slow.
 JOIN_TIMEOUT_S: Final = 60.0
-#: Time for a deformable to come to rest after all operators are done [s].
+#: Time for a deformable to come to rest after all operators are done [s], and time for operators to leave by themselves
+#: after all goals are reached: one who is not content with the result would begin anew.
 SETTLE_S: Final = 3.0
+LEAVE_S: Final = 4.0
 #: Nice value of emulated headsets where it is permitted: a headset has processors of its own.
 HEADSET_NICE: Final = -5
 #: Attempts at the whole demo, each after a reset, and time that must be left for another one [s].
@@ -173,7 +175,7 @@ def run_demo(
             if now_ns < next_read_ns:
                 return False
             next_read_ns = now_ns + READ_PERIOD_NS
-            is_over = people.is_finished() and judge.is_settled()
+            is_over = (people.is_finished() and judge.is_settled()) or judge.is_reached_for(LEAVE_S)
             failures = people.list_failures() or (judge.list_problems() if is_over else [])
             left_s = timeout_s - (now_ns - began_ns) * 1e-9
             if failures and len(failed_takes) < MAX_TAKES - 1 and left_s > TAKE_S:
@@ -196,9 +198,11 @@ def run_demo(
     handovers = tuple(one for one in status.handovers if one.at_s * 1e9 >= take_ns)
     # Ctrl-C requests an immediate end; `iris-session verify` has all the time it needs.
     verified, verification = (None, "not verified: interrupted") if interrupted else _verify_recording(recording)
-    problems = ["interrupted before its end"] if interrupted else _list_problems(demo, reports, handovers, timeout_s)
-    if not interrupted:
-        problems += judge.list_problems()
+    problems = judge.list_problems()
+    if interrupted:
+        problems = ["interrupted before its end"]
+    elif problems or not demo.goals:  # goals that are reached decide, whatever operators still meant to do
+        problems = _list_problems(demo, reports, handovers, timeout_s) + problems
     if verified is False:
         problems.append(verification)
     return DemoResult(
@@ -258,6 +262,12 @@ class _GoalTracker:
             reached |= watch.update(now_s, world.flexes.read_vertices(name), world.flexes.find_touching_robots(name))
         if reached and all(watch.at_s is not None for watch in self._monitors):
             self._session.post(Episode(0, EpisodeAction.SUCCESS, self._name))
+
+    def is_reached_for(self, seconds: float) -> bool:
+        """Return True if there are goals, and all were reached at least so long ago."""
+        reached = [watch.at_s for watch in self._monitors if watch.at_s is not None]
+        now_s = self._session.stepper.core.world.view().sim_time
+        return 0 < len(reached) == len(self._monitors) and now_s - max(reached) > seconds
 
     def is_settled(self) -> bool:
         """Return True, once all tasks are done, when the goals are reached or evidently will not be."""

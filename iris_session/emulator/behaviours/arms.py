@@ -18,8 +18,9 @@ class ArmKind:
     `above_table`: height of the base above the table [m]. `exchange_height`: of the hands above the bases when a thing
     changes hands [m]; `exchange_inward`: from the line between the bases towards where both arms face [m]. `lean`: how
     far the gripper leans away from its arm when it takes things from above [rad]. `reach`: how far in front of its base
-    it lays things down [m]. `speed`: of free movements [m/s]. `near_m`, `near_rad`: how near the tip can be brought to
-    where it should be.
+    it lays things down [m]. `grasp_above`: how far above its middle an object that lies on the table is grasped [m], so
+    that the fingertips do not stand on the table. `speed`: of free movements [m/s]. `near_m`, `near_rad`: how near the
+    tip can be brought to where it should be.
     """
 
     base: str = "base"
@@ -30,6 +31,7 @@ class ArmKind:
     exchange_inward: float = 0.2
     lean: float = 0.0
     reach: float = 0.43
+    grasp_above: float = 0.0
     speed: float = 0.40
     near_m: float = 0.0025
     near_rad: float = 0.025
@@ -50,6 +52,7 @@ VIPERX: Final = ArmKind(
     exchange_height=0.22,
     exchange_inward=0.15,
     lean=math.radians(20.0),
+    grasp_above=0.006,
     speed=0.25,
     near_m=0.004,
     near_rad=0.04,

@@ -219,6 +219,9 @@ class Giver(HandoverTask):
         self._take_x = min(ends, key=self._compute_effort)
         self._enter("approach")
 
+    def _compute_grasp(self) -> PoseTuple:
+        return raise_pose(super()._compute_grasp(), self.arm.grasp_above)
+
     def _compute_effort(self, take_x: float) -> float:
         """Return the turn of the wrist [rad] to grasp the object at this end and to offer the other."""
         self._take_x = take_x
