@@ -1,10 +1,12 @@
 // The page as a whole: composes header, picture and dashboard, joins the session, and keeps them up to date.
 
 import type { WorkerClient } from "../core/page_client.ts";
+import { makeDrive } from "../desktop/drive.ts";
 import { type AvatarInfo, participantColor } from "../view/avatars.ts";
 import { View } from "../view/view.ts";
 import { Actions } from "./actions.ts";
 import { makeAlignmentPanel, makeAnchorsPanel } from "./alignment.ts";
+import { makeCameras } from "./cameras.ts";
 import { h, setText } from "./dom.ts";
 import { makeBadge, makeEstop, makeSelf } from "./header.ts";
 import {
@@ -20,6 +22,7 @@ import { makeParticipantsPanel } from "./participants.ts";
 import { makeRobotsPanel } from "./robots.ts";
 import { makeStage } from "./stage.ts";
 import { PageState } from "./state.ts";
+import { recall, remember } from "./storage.ts";
 import { type EventLevel, formatMillimetres } from "./words.ts";
 
 /** Roles in the order in which they are tried when the person has not chosen one. */
@@ -46,7 +49,7 @@ export interface PageHandle {
 export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   const state = new PageState(client);
   const baseUrl = location.origin;
-  const remembered = recall();
+  const remembered = recall<Remembered>(STORAGE_KEY, { name: "Web", role: "", roles: [] });
   const notices = h("div", { class: "notices", role: "status", aria: { live: "polite" } });
   const show = (text: string, level: EventLevel): void => {
     const notice = h("div", { class: `notice ${level}` }, text);
@@ -78,13 +81,13 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
     remembered.name = name;
     remembered.roles = roles;
     remembered.role = "";
-    remember(remembered);
+    remember(STORAGE_KEY, remembered);
     joinByChoice();
   });
   const joinAs = (name: string, role: string): void => {
     remembered.role = role;
     if (name) remembered.name = name;
-    remember(remembered);
+    remember(STORAGE_KEY, remembered);
     client.post({ type: "disconnect" });
     join(name, role);
   };
@@ -108,6 +111,10 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   }
   const { view } = handle;
 
+  const drive = makeDrive(state, client, () => view?.viewpoint.axes ?? null);
+  const cameras = makeCameras(state, view);
+  stage.tools.append(cameras.menu);
+  stage.element.append(cameras.element, drive.element);
   const badge = makeBadge(state, () => view?.delay_ms ?? 0);
   const estop = makeEstop(state, actions);
   const self = makeSelf(state, joinAs);
@@ -116,7 +123,7 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   const neededStreams = (): string[] => (view ? (state.spec?.deformables.map((part) => part.stream) ?? []) : []);
   const panels = [
     makeAdvicePanel(state),
-    makeRobotsPanel(state, actions),
+    makeRobotsPanel(state, actions, drive),
     makeParticipantsPanel(state, actions),
     makeEpisodesPanel(state, actions),
     makeAlignmentPanel(state, actions),
@@ -149,6 +156,8 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
     badge.update(state);
     self.update(state);
     stage.update();
+    drive.update();
+    cameras.update();
     for (const panel of panels) panel.update(state);
     if (view) updateOverlay(view, state);
   });
@@ -190,23 +199,4 @@ function updateOverlay(view: View, state: PageState): void {
   }
   view.avatars.setPeople(people);
   if (view.anchors.setAnchors(state.session?.anchors ?? [])) view.touch();
-}
-
-function recall(): Remembered {
-  const fallback: Remembered = { name: "Web", role: "", roles: [] };
-  try {
-    const found: unknown = JSON.parse(localStorage.getItem(STORAGE_KEY) ?? "{}");
-    const { name, role, roles } = { ...fallback, ...(found as Partial<Remembered>) };
-    return { name: String(name), role: String(role), roles: Array.isArray(roles) ? roles.map(String) : [] };
-  } catch {
-    return fallback;
-  }
-}
-
-function remember(remembered: Remembered): void {
-  try {
-    localStorage.setItem(STORAGE_KEY, JSON.stringify(remembered));
-  } catch {
-    // Storage is switched off: the choice counts for this visit.
-  }
 }

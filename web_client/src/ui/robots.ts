@@ -2,6 +2,7 @@
 
 import type { RobotInfo } from "../core/api.ts";
 import { participantColor } from "../view/avatars.ts";
+import type { Drive } from "../desktop/drive.ts";
 import type { Actions } from "./actions.ts";
 import { button, h, KeyedList, type Row, setOptions, setText, setValue } from "./dom.ts";
 import { makeSection, type Panel } from "./panel.ts";
@@ -14,12 +15,12 @@ const FREE = "";
 /** Roles that drive robots. */
 const DRIVERS = ["operator", "agent", "leader", "director"];
 
-export function makeRobotsPanel(state: PageState, actions: Actions): Panel {
+export function makeRobotsPanel(state: PageState, actions: Actions, drive: Drive): Panel {
   const list = h("ul", { class: "rows" });
   const asked = h("ul", { class: "rows asked" });
   const empty = h("p", { class: "empty" }, "This scene has no robots.");
   const section = makeSection("robots", "Robots", h("div", {}, asked, list, empty));
-  const rows = new KeyedList<RobotInfo>(list, (item) => makeRow(item, state, actions), empty);
+  const rows = new KeyedList<RobotInfo>(list, (item) => makeRow(item, state, actions, drive), empty);
   const consents = new KeyedList<ConsentAsked>(asked, (item) => makeConsentRow(item, state, actions));
   return {
     element: section.element,
@@ -33,7 +34,7 @@ export function makeRobotsPanel(state: PageState, actions: Actions): Panel {
   };
 }
 
-function makeRow({ name }: RobotInfo, state: PageState, actions: Actions): Row<RobotInfo> {
+function makeRow({ name }: RobotInfo, state: PageState, actions: Actions, drive: Drive): Row<RobotInfo> {
   const dot = h("span", { class: "dot", aria: { hidden: "true" } });
   const title = h("strong", { class: "name" }, name);
   const holder = h("span", { class: "holder" });
@@ -54,6 +55,7 @@ function makeRow({ name }: RobotInfo, state: PageState, actions: Actions): Row<R
     },
     { class: "small" },
   );
+  const steer = button("Drive", () => drive.toggle(name), { class: "small primary" });
   const assign = h("select", { class: "small", aria: { label: `Assign ${name} to` } });
   assign.addEventListener("change", () => {
     const participant = assign.value;
@@ -84,7 +86,7 @@ function makeRow({ name }: RobotInfo, state: PageState, actions: Actions): Row<R
     { class: "row", data: { robot: name } },
     h("div", { class: "line" }, dot, title, holder),
     why,
-    h("div", { class: "controls" }, take, wait, release),
+    h("div", { class: "controls" }, take, wait, steer, release),
     fields,
   );
   return {
@@ -106,6 +108,9 @@ function makeRow({ name }: RobotInfo, state: PageState, actions: Actions): Row<R
       take.setAttribute("aria-label", `${take.textContent ?? ""}: ${name}`);
       wait.hidden = !canTake || isFree || lease.queue.includes(state.selfId) || lease.mode === "takeover";
       wait.setAttribute("aria-label", `Wait for it: ${name}`);
+      steer.hidden = !isMine;
+      setText(steer, drive.robot === name ? "Stop driving" : "Drive");
+      steer.setAttribute("aria-label", `${steer.textContent ?? ""}: ${name}`);
       release.hidden = !isMine;
       release.setAttribute("aria-label", `Release: ${name}`);
       assignLabel.hidden = modeLabel.hidden = !state.isDirector;

@@ -17,6 +17,7 @@ export interface FreeCamera {
   fovy?: number;
 }
 
+const T_WORLD_THREE = T_THREE_WORLD.clone().invert();
 const DEFAULT_FOVY = 45;
 const KEY_STEP_RAD = 0.08;
 const KEY_ZOOM = 1.1;
@@ -48,6 +49,16 @@ export class Viewpoint {
 
   get camera(): PerspectiveCamera | OrthographicCamera {
     return this.isOrthographic ? this.orthographic : this.free;
+  }
+
+  /** Where the camera looks, and what is up in its picture: unit vectors in the session's world. */
+  get axes(): { forward: [number, number, number]; up: [number, number, number] } {
+    const { quaternion } = this.camera;
+    const toWorld = (axis: Vector3): [number, number, number] => {
+      const { x, y, z } = axis.applyQuaternion(quaternion).applyMatrix4(T_WORLD_THREE);
+      return [x, y, z];
+    };
+    return { forward: toWorld(new Vector3(0, 0, -1)), up: toWorld(new Vector3(0, 1, 0)) };
   }
 
   private isOrthographic = false;
@@ -96,41 +107,18 @@ export class Viewpoint {
   /** Move to where the scene has the camera. Returns whether what is seen has changed. */
   update(view: SceneView | null): boolean {
     const spec = view?.spec.cameras[this.chosen];
-    if (view && spec) this.follow(view, spec);
-    else this.controls.update();
+    if (view && spec) {
+      this.isOrthographic = spec.orthographic;
+      placeSceneCamera(view, spec, this.free, this.orthographic, this.aspect);
+    } else {
+      this.controls.update();
+    }
     const { camera } = this;
     camera.updateMatrixWorld();
     const now = new Matrix4().multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse);
     if (now.equals(this.lastMatrix)) return false;
     this.lastMatrix.copy(now);
     return true;
-  }
-
-  private follow(view: SceneView, spec: Camera): void {
-    const [p_body, q] = spec.T_body_camera;
-    const at = { body: spec.body, p_body, follow: spec.follow, target: spec.target };
-    const p_world = placeFollower(at, view.bodies, view.rest, new Vector3());
-    const turn = new Quaternion(q[1], q[2], q[3], q[0]);
-    const body = view.bodies.get(spec.body);
-    if (tracks(at)) turn.premultiply(restRotation(spec.body, view.rest));
-    else if (body) turn.premultiply(body.quaternion);
-    if (watches(at) && view.bodies.has(spec.target)) {
-      const forward = new Vector3();
-      directFollower(at, [0, 0, -1], p_world, view.bodies, view.rest, forward);
-      turn.setFromRotationMatrix(new Matrix4().lookAt(new Vector3(), forward, new Vector3(0, 0, 1)));
-    }
-    this.isOrthographic = spec.orthographic;
-    const { camera } = this;
-    if (camera instanceof OrthographicCamera) {
-      [camera.top, camera.bottom] = [spec.fovy / 2, -spec.fovy / 2];
-      [camera.right, camera.left] = [camera.top * this.aspect, -camera.top * this.aspect];
-      [camera.near, camera.far] = [0.01, 200];
-    } else {
-      camera.fov = spec.fovy;
-    }
-    camera.updateProjectionMatrix();
-    camera.position.copy(p_world).applyMatrix4(T_THREE_WORLD);
-    camera.quaternion.setFromRotationMatrix(T_THREE_WORLD).multiply(turn);
   }
 
   /** Arrow keys turn, with Shift they move, + and - go nearer and farther. */
@@ -170,4 +158,39 @@ export class Viewpoint {
   dispose(): void {
     this.controls.dispose();
   }
+}
+
+/** Move the camera of three.js that is of the kind of `spec`, one of the scene's cameras, to where that is, and return it. */
+export function placeSceneCamera(
+  view: SceneView,
+  spec: Camera,
+  perspective: PerspectiveCamera,
+  orthographic: OrthographicCamera,
+  aspect: number,
+): PerspectiveCamera | OrthographicCamera {
+  const [p_body, q] = spec.T_body_camera;
+  const at = { body: spec.body, p_body, follow: spec.follow, target: spec.target };
+  const p_world = placeFollower(at, view.bodies, view.rest, new Vector3());
+  const turn = new Quaternion(q[1], q[2], q[3], q[0]);
+  const body = view.bodies.get(spec.body);
+  if (tracks(at)) turn.premultiply(restRotation(spec.body, view.rest));
+  else if (body) turn.premultiply(body.quaternion);
+  if (watches(at) && view.bodies.has(spec.target)) {
+    const forward = new Vector3();
+    directFollower(at, [0, 0, -1], p_world, view.bodies, view.rest, forward);
+    turn.setFromRotationMatrix(new Matrix4().lookAt(new Vector3(), forward, new Vector3(0, 0, 1)));
+  }
+  const camera = spec.orthographic ? orthographic : perspective;
+  if (camera instanceof OrthographicCamera) {
+    [camera.top, camera.bottom] = [spec.fovy / 2, -spec.fovy / 2];
+    [camera.right, camera.left] = [camera.top * aspect, -camera.top * aspect];
+    [camera.near, camera.far] = [0.01, 200];
+  } else {
+    camera.fov = spec.fovy;
+    camera.aspect = aspect;
+  }
+  camera.updateProjectionMatrix();
+  camera.position.copy(p_world).applyMatrix4(T_THREE_WORLD);
+  camera.quaternion.setFromRotationMatrix(T_THREE_WORLD).multiply(turn);
+  return camera;
 }

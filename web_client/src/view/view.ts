@@ -19,6 +19,7 @@ import { Avatars } from "./avatars.ts";
 import { makeWorldRoot } from "./axes.ts";
 import { type Budget, DESKTOP, HEADSET, SOFTWARE } from "./budget.ts";
 import { Viewpoint } from "./camera.ts";
+import { CameraPictures } from "./pictures.ts";
 import { DelayEstimator, FrameBuffer, interpolatePoses, interpolateValues, POSE_FLOATS } from "./interpolation.ts";
 import { SceneView } from "./scene_view.ts";
 
@@ -62,6 +63,7 @@ export class View {
   readonly anchors = new AnchorOverlay();
   readonly viewpoint: Viewpoint;
   readonly device: Device;
+  readonly pictures: CameraPictures;
   scene: SceneView | null = null;
   /** Frames drawn since the page began. */
   drawn = 0;
@@ -101,6 +103,7 @@ export class View {
     this.renderer.shadowMap.type = PCFShadowMap;
     this.renderer.outputColorSpace = LinearSRGBColorSpace;
     this.root.background = new Color(BACKGROUND);
+    this.pictures = new CameraPictures(this.renderer, this.device.budget === SOFTWARE);
     this.overlay.add(this.avatars.group, this.anchors.group);
     this.root.add(this.overlay);
     this.assets = new WorkerAssets(client);
@@ -116,6 +119,7 @@ export class View {
   /** Draw again: something changed that the view does not see by itself. */
   touch(): void {
     this.framesToDraw = FRAMES_AFTER_CHANGE;
+    this.pictures.markOutdated();
   }
 
   /** What is drawn now: poses, 7 numbers per body of `bodies`, and vertices of deformables by stream. */
@@ -240,13 +244,16 @@ export class View {
       this.viewpoint.update(this.scene),
     ].some(Boolean);
     const now = nowMs();
-    if (isChanged) this.framesToDraw = FRAMES_AFTER_CHANGE;
+    if (isChanged) this.touch();
+    const isPresenting = this.renderer.xr.isPresenting;
+    if (!isPresenting && this.pictures.drawDue(this.root, this.overlay, this.scene, now)) this.framesToDraw = Math.max(1, this.framesToDraw);
     const isLoading = this.scene !== null && this.sceneCount > 0 && now - this.lastDrawn_ms > IDLE_MS;
-    if (this.framesToDraw <= 0 && !isLoading && !this.renderer.xr.isPresenting) return;
+    if (this.framesToDraw <= 0 && !isLoading && !isPresenting) return;
     this.framesToDraw -= 1;
     this.lastDrawn_ms = now;
     this.scene?.lighting.update(this.scene.rest);
     this.renderer.render(this.root, this.viewpoint.camera);
+    if (!isPresenting) this.pictures.show();
     this.drawn += 1;
     this.drawnSinceReport += 1;
   }

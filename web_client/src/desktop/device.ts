@@ -1,0 +1,144 @@
+// The device `desktop`: from intents to samples of kind `twist` in the world. Pure: time, inputs and the session come
+// in as arguments.
+//
+// It drives while a dead-man key or button is held. Whatever ends that from outside (the window lost the focus, an
+// e-stop, ...) opens the clutch at once, and the dead-man has to be let go and pressed again.
+
+import type { SampleInput } from "../core/api.ts";
+import type { Intent, Vec3 } from "./intent.ts";
+
+/** Least and greatest speed of the tip [m/s]. */
+export const SPEED_RANGE = [0.01, 0.3] as const;
+/** Angular speed that goes with a speed [rad/m]: 10 cm/s and 0.5 rad/s. */
+const TURN_PER_METRE = 5;
+
+export type Twist = [number, number, number, number, number, number];
+/** Horizontal direction of "forward" in the world: a unit vector (x, y). */
+export type Heading = readonly [number, number];
+
+/** What the session says about the robot that is driven. */
+export interface Situation {
+  /** The connection is there, with everything known. */
+  isReady: boolean;
+  isStopped: boolean;
+  isHolder: boolean;
+}
+
+/** Turns intents into samples that drive one robot. */
+export class DesktopDevice {
+  /** The robot that is driven, empty for none. */
+  robot = "";
+  isEngaged = false;
+  /** Why the clutch was opened from outside, until the dead-man is pressed anew; else empty. */
+  released = "";
+  private mustLetGo = false;
+  private gripper: number | null = null;
+  private lastGripper = 0;
+  private wasToggled = false;
+
+  constructor(private readonly send: (sample: SampleInput) => void) {}
+
+  /** Drive a robot from now on. Its first sample has the clutch open, as every engagement needs. */
+  arm(robot: string, now_ms: number): void {
+    if (this.robot !== "") this.disarm(now_ms);
+    this.robot = robot;
+    this.released = "";
+    this.mustLetGo = true;
+    this.sendHold(now_ms);
+  }
+
+  /** Drive no robot. */
+  disarm(now_ms: number): void {
+    if (this.robot === "") return;
+    this.sendHold(now_ms);
+    this.robot = "";
+    this.released = "";
+  }
+
+  /** Open the clutch now, for a reason in words; the dead-man has to be let go and pressed again. */
+  release(reason: string, now_ms: number): void {
+    if (this.robot === "") return;
+    this.mustLetGo = true;
+    if (!this.isEngaged) return;
+    this.released = reason;
+    this.sendHold(now_ms);
+  }
+
+  /**
+   * Send the sample of this moment. Returns false when the robot is not held any more, and the device is disarmed.
+   *
+   * `speed`: of the tip [m/s], within `SPEED_RANGE`. `heading`: where "forward" is.
+   */
+  tick(intent: Intent, heading: Heading, speed: number, situation: Situation, now_ms: number): boolean {
+    if (this.robot === "") return false;
+    if (situation.isReady && !situation.isHolder) {
+      this.disarm(now_ms);
+      return false;
+    }
+    if (!situation.isReady) this.release("the connection is lost", now_ms);
+    else if (situation.isStopped) this.release("e-stop", now_ms);
+    const isBlocked = !situation.isReady || situation.isStopped;
+    if (!intent.clutch) this.mustLetGo = isBlocked;
+    const isEngaged = intent.clutch && !this.mustLetGo && !isBlocked;
+    if (!isEngaged) {
+      this.sendHold(now_ms);
+      return true;
+    }
+    if (!this.isEngaged) this.gripper = null;
+    this.isEngaged = true;
+    this.released = "";
+    this.readGripper(intent);
+    this.send({ ...this.makeSample(now_ms), clutch: true, gripper: this.gripper, twist: toTwist(intent, heading, speed) });
+    return true;
+  }
+
+  private readGripper({ close, open, toggle }: Intent): void {
+    const isFlipped = toggle && !this.wasToggled;
+    this.wasToggled = toggle;
+    if (close !== open) this.gripper = close ? 1 : 0;
+    else if (isFlipped) this.gripper = 1 - this.lastGripper;
+    this.lastGripper = this.gripper ?? this.lastGripper;
+  }
+
+  private sendHold(now_ms: number): void {
+    this.isEngaged = false;
+    this.send(this.makeSample(now_ms));
+  }
+
+  /** A sample with the clutch open that stands still. */
+  private makeSample(now_ms: number): SampleInput {
+    const { robot } = this;
+    return { device: "desktop", kind: "twist", pose: null, capture_ms: now_ms, robots: [robot], clutch: false, twist: [0, 0, 0, 0, 0, 0] };
+  }
+}
+
+/** Return the twist of an intent in the world [m/s, rad/s]: no faster than `speed`, whatever the direction. */
+export function toTwist(intent: Intent, heading: Heading, speed: number): Twist {
+  const bounded = Math.min(SPEED_RANGE[1], Math.max(SPEED_RANGE[0], speed));
+  const v = toWorld(limitLength(intent.move), heading, bounded);
+  const w = toWorld(limitLength(intent.turn), heading, bounded * TURN_PER_METRE);
+  return [...v, ...w];
+}
+
+/**
+ * Return the horizontal direction in which a camera looks, in the world. `forward`, `up`: its axes in the world.
+ *
+ * One that looks straight down or up has the top of its picture, or the bottom, there.
+ */
+export function toHeading(forward: Readonly<Vec3>, up: Readonly<Vec3>): Heading {
+  const isSteep = Math.hypot(forward[0], forward[1]) < 0.2;
+  const sign = isSteep && forward[2] > 0 ? -1 : 1;
+  const [x, y] = isSteep ? [sign * up[0], sign * up[1]] : [forward[0], forward[1]];
+  const length = Math.hypot(x, y);
+  return length > 0 ? [x / length, y / length] : [1, 0];
+}
+
+/** Return a vector (right, forward, up) of a view in the world, times `scale`. */
+function toWorld([right, forward, up]: Vec3, [x, y]: Heading, scale: number): Vec3 {
+  return [scale * (right * y + forward * x), scale * (forward * y - right * x), scale * up];
+}
+
+function limitLength(vector: Vec3): Vec3 {
+  const length = Math.hypot(...vector);
+  return length > 1 ? (vector.map((part) => part / length) as Vec3) : vector;
+}

@@ -1,0 +1,171 @@
+// Driving a robot from the desk: the panel over the picture, the clock of the samples, and what connects inputs, device
+// and session.
+
+import { nowMs } from "../core/api.ts";
+import type { WorkerClient } from "../core/page_client.ts";
+import { button, h, setOptions, setText } from "../ui/dom.ts";
+import type { PageState } from "../ui/state.ts";
+import { recall, remember } from "../ui/storage.ts";
+import { holdReasonWords } from "../ui/words.ts";
+import { DesktopDevice, type Heading, SPEED_RANGE, toHeading } from "./device.ts";
+import { DesktopInputs } from "./inputs.ts";
+import { KEY_WORDS, type Vec3 } from "./intent.ts";
+
+/** Time between samples [ms]: 59 a second. */
+const PERIOD_MS = 17;
+/** Longest time that one sample stands for [s]: after a pause of the page a drag does not catch up. */
+const MAX_DT_S = 0.1;
+/** The session's answer to an engagement takes this long at most [ms]; before, its hold reason is the one before. */
+const ANSWER_MS = 400;
+const STORAGE_KEY = "iris-session.desktop";
+const DEFAULTS = { speed_cm_s: 10, relativeTo: "view" };
+
+/** Axes of the camera in the session's world. */
+export interface CameraAxes {
+  forward: Vec3;
+  up: Vec3;
+}
+
+export interface Drive {
+  element: HTMLElement;
+  /** The robot that is driven, empty for none. */
+  readonly robot: string;
+  /** Drive a robot, or stop when it is the one that is driven. */
+  toggle(robot: string): void;
+  update(): void;
+}
+
+/** Make the panel. `getCamera`: from where the person looks, null without a picture. */
+export function makeDrive(state: PageState, client: WorkerClient, getCamera: () => CameraAxes | null): Drive {
+  const device = new DesktopDevice((sample) => client.post({ type: "samples", samples: [sample] }));
+  const chosen = recall(STORAGE_KEY, DEFAULTS);
+  let timer = 0;
+  let ticked_ms = 0;
+  let engaged_ms = Number.NEGATIVE_INFINITY;
+
+  const robot = h("strong");
+  const mark = h("span", { class: "tag" });
+  const why = h("p", { class: "why", role: "status" });
+  const handle = h("div", { class: "handle", role: "img", aria: { label: "Handle: press and drag with the mouse or a finger" } }, "Press and drag: along the table. Wheel: height");
+  const speedText = h("output");
+  const speed = h("input", {
+    type: "range",
+    attributes: { min: String(100 * SPEED_RANGE[0]), max: String(100 * SPEED_RANGE[1]), step: "1" },
+    on: { input: () => setSpeed(Number(speed.value)) },
+  });
+  const relativeTo = h("select", { class: "small", on: { change: () => keep({ relativeTo: relativeTo.value }) } });
+  setOptions(relativeTo, [["view", "the view"], ["world", "the world"]]);
+  const inputs = new DesktopInputs(handle, {
+    onRelease: (reason) => {
+      device.release(reason, nowMs());
+      show();
+    },
+    onQuit: () => stop(),
+  });
+  const connect = button("Connect a SpaceMouse", () => void inputs.spaceMouse.choose().then(show, show), { class: "small" });
+  connect.hidden = !inputs.spaceMouse.isSupported;
+  const connected = h("p", { class: "note" });
+  const keys = h("dl", { class: "facts keys" }, ...KEY_WORDS.map(([key, action]) => h("div", {}, h("dt", {}, key), h("dd", {}, action))));
+  const pads = h("p", { class: "note" }, "Gamepad: hold the right shoulder button; sticks, cross, A closes, B opens.");
+  const element = h(
+    "section",
+    { class: "drive card", hidden: true, aria: { label: "Driving from the desk" } },
+    h("div", { class: "line" }, robot, mark, button("Stop driving", () => stop(), { class: "small" })),
+    why,
+    handle,
+    h("label", { class: "field" }, h("span", {}, "Speed"), speed, speedText),
+    h("label", { class: "field" }, h("span", {}, "Relative to"), relativeTo),
+    h("details", { class: "more", attributes: { open: "" } }, h("summary", {}, "Keys and other devices"), keys, pads, connected, connect),
+  );
+
+  function keep(changed: Partial<typeof DEFAULTS>): void {
+    Object.assign(chosen, changed);
+    remember(STORAGE_KEY, chosen);
+  }
+
+  function setSpeed(cm_s: number): void {
+    const inRange = Math.min(100 * SPEED_RANGE[1], Math.max(100 * SPEED_RANGE[0], Number(cm_s) || DEFAULTS.speed_cm_s));
+    keep({ speed_cm_s: inRange });
+    speed.value = String(inRange);
+    setText(speedText, `${inRange.toFixed(0)} cm/s`);
+  }
+
+  function findHeading(): Heading {
+    const camera = relativeTo.value === "view" ? getCamera() : null;
+    return camera ? toHeading(camera.forward, camera.up) : [1, 0];
+  }
+
+  function tick(): void {
+    const now = nowMs();
+    const metresPerSecond = chosen.speed_cm_s / 100;
+    const intent = inputs.read(metresPerSecond, Math.min(MAX_DT_S, (now - ticked_ms) / 1000));
+    ticked_ms = now;
+    const { session } = state;
+    const situation = {
+      isReady: state.isReady && (session?.synced ?? false),
+      isStopped: session?.estop ?? false,
+      isHolder: state.heldBy(state.selfId).includes(device.robot),
+    };
+    const wasEngaged = device.isEngaged;
+    if (!device.tick(intent, findHeading(), metresPerSecond, situation, now)) {
+      state.note("Driving ended: you do not hold the robot any more", "warning");
+      stop();
+    } else if (device.isEngaged !== wasEngaged) {
+      engaged_ms = device.isEngaged ? now : Number.POSITIVE_INFINITY;
+      show();
+    }
+  }
+
+  function start(name: string): void {
+    device.arm(name, nowMs());
+    inputs.start();
+    ticked_ms = nowMs();
+    clearInterval(timer);
+    timer = window.setInterval(tick, PERIOD_MS);
+    state.touch();
+  }
+
+  function stop(): void {
+    clearInterval(timer);
+    device.disarm(nowMs());
+    inputs.stop();
+    state.touch();
+  }
+
+  function show(): void {
+    element.hidden = device.robot === "";
+    if (device.robot === "") return;
+    setText(robot, `Driving ${device.robot}`);
+    const reason = state.feedback.get(device.robot)?.hold_reason ?? "";
+    const isHeld = !device.isEngaged || (reason !== "" && nowMs() - engaged_ms > ANSWER_MS);
+    setText(mark, isHeld ? "held" : "engaged");
+    mark.classList.toggle("good", !isHeld);
+    element.classList.toggle("engaged", !isHeld);
+    setText(why, describe(device, state.session?.estop ?? false, reason, isHeld));
+    setText(connected, inputs.listConnected().join(", "));
+    connect.hidden = !inputs.spaceMouse.isSupported || inputs.spaceMouse.name !== "";
+  }
+
+  setSpeed(chosen.speed_cm_s);
+  relativeTo.value = chosen.relativeTo === "world" ? "world" : "view";
+  return {
+    element,
+    get robot() {
+      return device.robot;
+    },
+    toggle: (name) => {
+      if (device.robot === name) stop();
+      else start(name);
+    },
+    update: show,
+  };
+}
+
+/** Return in words why the robot holds, or that it follows. */
+function describe(device: DesktopDevice, isStopped: boolean, reason: string, isHeld: boolean): string {
+  if (isStopped) return "Held: e-stop. A director clears it.";
+  if (!isHeld) return "The robot follows you.";
+  if (device.isEngaged) return `Held by the session: ${holdReasonWords(reason)}.`;
+  const how = "Hold left Shift, the right shoulder button or the handle to move it.";
+  return device.released ? `Held: ${device.released}. ${how}` : `Held: clutch open. ${how}`;
+}

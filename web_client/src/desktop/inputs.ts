@@ -1,0 +1,161 @@
+// Reads keyboard, mouse, fingers, gamepads and SpaceMouse of this browser while a robot is driven. What ends a hold of the
+// dead-man from outside is reported at once; what the inputs mean is in `intent.ts`.
+
+import { CLUTCH_KEY, DRIVE_KEYS, DragPath, type Intent, makeIdle, merge, readKeys, readPad, readSpaceMouse } from "./intent.ts";
+import { SpaceMouse } from "./spacemouse.ts";
+
+/** Way of the tip for a pixel of the mouse at 1 m/s [m]: at 10 cm/s half a millimetre. */
+const METRES_PER_PIXEL = 0.005;
+/** Pixels of a step of a wheel that reports lines or pages. */
+const WHEEL_PIXELS = [1, 30, 300] as const;
+
+export interface InputEvents {
+  /** The dead-man is void: `reason` in words for people. */
+  onRelease: (reason: string) => void;
+  /** The person wants to stop driving. */
+  onQuit: () => void;
+}
+
+/** The inputs of one page. `handle`: what mouse and fingers drag. */
+export class DesktopInputs {
+  readonly spaceMouse: SpaceMouse;
+  private readonly pressed = new Set<string>();
+  private readonly drag = new DragPath();
+  private dragging: number | null = null;
+  private last = { x: 0, y: 0 };
+  private speed = 0;
+  private listening: AbortController | null = null;
+
+  constructor(
+    private readonly handle: HTMLElement,
+    private readonly events: InputEvents,
+  ) {
+    this.spaceMouse = new SpaceMouse(() => this.release("the SpaceMouse was disconnected"));
+  }
+
+  /** Names of what is connected besides keyboard and mouse, gamepads without the standard order with a note. */
+  listConnected(): string[] {
+    const pads = listPads().map((pad) => (pad.mapping === "standard" ? pad.id : `${pad.id} (its buttons have no known order: not used)`));
+    return this.spaceMouse.name ? [...pads, this.spaceMouse.name] : pads;
+  }
+
+  /** Listen until `stop`. Keys that are already pressed do not count. */
+  start(): void {
+    this.stop();
+    this.listening = new AbortController();
+    const options = { signal: this.listening.signal, capture: true };
+    window.addEventListener("keydown", (event) => this.onKey(event), options);
+    window.addEventListener("keyup", (event) => this.onKey(event), options);
+    window.addEventListener("blur", () => this.release("the window lost the focus"), options);
+    window.addEventListener("pagehide", () => this.release("the page was left"), options);
+    window.addEventListener("gamepaddisconnected", () => this.release("the gamepad was disconnected"), options);
+    document.addEventListener("visibilitychange", () => document.hidden && this.release("the page is hidden"), options);
+    document.addEventListener("pointerlockchange", () => this.onLockChange(), options);
+    const { handle } = this;
+    handle.addEventListener("pointerdown", (event) => this.beginDrag(event), options);
+    handle.addEventListener("pointermove", (event) => this.moveDrag(event), options);
+    handle.addEventListener("pointerup", (event) => this.endDrag(event), options);
+    handle.addEventListener("pointercancel", (event) => this.endDrag(event), options);
+    handle.addEventListener("wheel", (event) => this.turnWheel(event), { ...options, passive: false });
+    void this.spaceMouse.reopen().catch(() => undefined); // taken away meanwhile, or in use by another program
+  }
+
+  stop(): void {
+    this.listening?.abort();
+    this.listening = null;
+    this.forget();
+  }
+
+  /** Return what is asked for now. `speed`: of the tip [m/s]; `dt`: since the last call [s]. */
+  read(speed: number, dt: number): Intent {
+    this.speed = speed;
+    const dragged = { ...makeIdle(), clutch: this.dragging !== null, move: this.drag.take(speed, dt) };
+    return merge([readKeys(this.pressed), ...listPads().map(readPad), readSpaceMouse(this.spaceMouse.state), dragged]);
+  }
+
+  private release(reason: string): void {
+    this.forget();
+    this.events.onRelease(reason);
+  }
+
+  private forget(): void {
+    this.pressed.clear();
+    this.spaceMouse.state.clear();
+    this.drag.clear();
+    this.dragging = null;
+    this.handle.classList.remove("held");
+    if (document.pointerLockElement === this.handle) document.exitPointerLock();
+  }
+
+  private onKey(event: KeyboardEvent): void {
+    // The end of a press is not reported beside some modifiers and while both Shift keys are held.
+    if (event.ctrlKey || event.metaKey || event.altKey) this.pressed.clear();
+    if (!event.shiftKey) this.pressed.delete(CLUTCH_KEY);
+    if (event.type === "keyup") {
+      this.pressed.delete(event.code);
+      return;
+    }
+    if (event.ctrlKey || event.metaKey || event.altKey || takesText(event.target)) return;
+    if (event.code === "Escape") this.events.onQuit();
+    if (!DRIVE_KEYS.has(event.code)) return;
+    if (!event.repeat) this.pressed.add(event.code);
+    const isDriving = this.pressed.has(CLUTCH_KEY) || this.dragging !== null;
+    if (!isDriving || event.code === CLUTCH_KEY) return;
+    event.preventDefault(); // the view, lists and scroll bars have these keys otherwise
+    event.stopPropagation();
+  }
+
+  private beginDrag(event: PointerEvent): void {
+    if (event.button !== 0 || this.dragging !== null) return;
+    event.preventDefault();
+    this.dragging = event.pointerId;
+    this.last = { x: event.clientX, y: event.clientY };
+    this.handle.classList.add("held");
+    this.handle.setPointerCapture(event.pointerId);
+    // With a lock the mouse does not end at the edge of the screen. Without one it works, too.
+    if (event.pointerType === "mouse") void Promise.resolve(this.handle.requestPointerLock()).catch(() => undefined);
+  }
+
+  private moveDrag(event: PointerEvent): void {
+    if (event.pointerId !== this.dragging) return;
+    if ((event.buttons & 1) === 0) {
+      this.endDrag(event);
+      return;
+    }
+    const isLocked = document.pointerLockElement === this.handle;
+    const dx = isLocked ? event.movementX : event.clientX - this.last.x;
+    const dy = isLocked ? event.movementY : event.clientY - this.last.y;
+    this.last = { x: event.clientX, y: event.clientY };
+    const scale = METRES_PER_PIXEL * this.speed;
+    this.drag.add([scale * dx, -scale * dy, 0]);
+  }
+
+  private endDrag(event: PointerEvent): void {
+    if (event.pointerId !== this.dragging) return;
+    this.dragging = null;
+    this.drag.clear();
+    this.handle.classList.remove("held");
+    if (document.pointerLockElement === this.handle) document.exitPointerLock();
+  }
+
+  private turnWheel(event: WheelEvent): void {
+    event.preventDefault();
+    if (this.dragging === null) return;
+    this.drag.add([0, 0, -event.deltaY * (WHEEL_PIXELS[event.deltaMode] ?? 1) * METRES_PER_PIXEL * this.speed]);
+  }
+
+  private onLockChange(): void {
+    const isLocked = document.pointerLockElement === this.handle;
+    if (isLocked && this.dragging === null) document.exitPointerLock(); // it came after the button was let go
+    else if (!isLocked && this.dragging !== null) this.release("the mouse was taken away");
+  }
+}
+
+function listPads(): Gamepad[] {
+  return [...(navigator.getGamepads?.() ?? [])].filter((pad): pad is Gamepad => pad !== null && pad.connected);
+}
+
+/** Return whether keys mean text or a choice to what has the focus. */
+function takesText(target: EventTarget | null): boolean {
+  return target instanceof HTMLElement && target.closest("input[type=text], textarea, [contenteditable], dialog") !== null;
+}
