@@ -7,6 +7,7 @@ import contextlib
 import io
 import json
 import os
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from tests.e2e.session_process import DEADLINE_S, END_WITH_PARENT, skip_unless_ci
+from tests.e2e.session_process import DEADLINE_S, END_WITH_PARENT, SessionProcess, skip_unless_ci, wait_until
 
 ROOT: Final = Path(__file__).parents[2]
 WEB_CLIENT: Final = ROOT / "web_client"
@@ -129,9 +130,27 @@ class Page:
         """Choose an option by its text."""
         self._browser.call("select", self.name, label=label, text=text, timeout_ms=1000 * DEADLINE_S)
 
+    def check(self, name: str) -> None:
+        """Check a box."""
+        self._browser.call("check", self.name, name=name, timeout_ms=1000 * DEADLINE_S)
+
     def press(self, key: str) -> None:
         """Press a key, such as `Tab` or `Shift+Space`, wherever the focus is."""
         self._browser.call("press", self.name, key=key)
+
+    def hold(self, key: str) -> None:
+        """Press a key and keep it pressed."""
+        self._browser.call("hold", self.name, key=key)
+
+    def let_go(self, key: str) -> None:
+        """End the press of a key."""
+        self._browser.call("let_go", self.name, key=key)
+
+    def drag(self, selector: str, x: float, y: float, *, seconds: float) -> None:
+        """Press the mouse on an element, move it by (x, y) [pixels] within `seconds`, and let it go."""
+        steps = max(1, round(20 * seconds))
+        step_ms = 1e3 * seconds / steps
+        self._browser.call("drag", self.name, selector=selector, x=x, y=y, steps=steps, step_ms=step_ms)
 
     def type(self, text: str) -> None:
         """Type a text where the focus is."""
@@ -197,3 +216,21 @@ def decode_picture(url: str) -> NDArray[np.uint8]:
     """Return the RGB pixels of a PNG data URL."""
     data = base64.b64decode(url.partition(",")[2])
     return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+
+
+def printed_address(server: SessionProcess) -> str:
+    """Return the address of the page that `serve` prints."""
+    wait_until(lambda: "in a browser:" in server.output or server.process.poll() is not None, "the address is printed")
+    match = re.search(r"in a browser: (https?://\S+)", server.output)
+    assert match, server.output
+    return match.group(1)
+
+
+def join_as(page: Page, name: str, role: str) -> None:
+    """Join again with another name and role, by the form of the page."""
+    page.evaluate("document.querySelector('.self').open = true")
+    page.fill("Your name", name)
+    page.select("Join as", role)
+    page.click("button", "Join with these")
+    page.wait(f"irisSession.state.self?.name === {json.dumps(name)} && irisSession.state.role === {json.dumps(role)}")
+    page.wait("irisSession.state.phase.phase === 'ready'")

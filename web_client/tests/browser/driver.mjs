@@ -46,7 +46,23 @@ const commands = {
   fill: ({ page, label, text, timeout_ms }) => pages.get(page).getByRole("textbox", { name: label, exact: true }).fill(text, { timeout: timeout_ms }),
   select: ({ page, label, text, timeout_ms }) =>
     pages.get(page).getByRole("combobox", { name: label, exact: true }).selectOption({ label: text }, { timeout: timeout_ms }),
+  check: ({ page, name, timeout_ms }) => pages.get(page).getByRole("checkbox", { name, exact: true }).check({ timeout: timeout_ms }),
   press: ({ page, key }) => pages.get(page).keyboard.press(key),
+  hold: ({ page, key }) => pages.get(page).keyboard.down(key),
+  let_go: ({ page, key }) => pages.get(page).keyboard.up(key),
+  // Presses the mouse in the middle of an element, moves it by (x, y) pixels, and lets it go.
+  async drag({ page, selector, x, y, steps, step_ms }) {
+    const { mouse } = pages.get(page);
+    const box = await pages.get(page).locator(selector).boundingBox();
+    const at = { x: box.x + box.width / 2, y: box.y + box.height / 2 };
+    await mouse.move(at.x, at.y);
+    await mouse.down();
+    for (let i = 1; i <= steps; i++) {
+      await mouse.move(at.x + (x * i) / steps, at.y + (y * i) / steps);
+      await new Promise((resolve) => setTimeout(resolve, step_ms));
+    }
+    await mouse.up();
+  },
   type: ({ page, text }) => pages.get(page).keyboard.type(text),
   screenshot: ({ page, path, full = false }) => pages.get(page).screenshot({ path, fullPage: full }).then(() => path),
   inject: ({ page, path }) => pages.get(page).addScriptTag({ path }).then(() => true),

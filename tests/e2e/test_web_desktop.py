@@ -1,0 +1,300 @@
+"""Driving a robot from the page with keys and mouse, and the panels of recording cameras, in a real Chromium."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from iris_session.demo.scenes import scene_path
+from tests.e2e.browser import Page, decode_picture, join_as
+from tests.e2e.scenario import Scenario
+from tests.e2e.session_process import SessionProcess
+
+pytestmark = pytest.mark.e2e
+
+#: The view looks along +Y of the world: W moves there, D along +X.
+VIEW = {"lookat": [0, 0, 0.2], "azimuth": 90, "elevation": -25, "distance": 2.0}
+SPEED = 0.1  # of the tip by default [m/s]
+#: A robot that stops has this long [s]; its tip is at rest within this of where it stays [m].
+STOP_S, REST_M = 0.2, 0.001
+#: Another camera: half a metre before the tip of the left robot, whose picture is 17 cm high there.
+CLOSE = '<camera name="close" pos="-0.2 -0.5 0.28" xyaxes="1 0 0 0 0 1" fovy="20"/>'
+
+#: Notes in `window.at` when keys change and the focus is lost, in session time [ms].
+NOTE_KEYS = """void (window.at = {}, ["keydown", "keyup", "blur"].forEach((type) => {
+  const note = (event) => { window.at[`${type} ${event.code ?? ""}`.trim()] = irisSession.view.sessionTime(); };
+  window.addEventListener(type, (event) => { if (!event.repeat) note(event); }, { capture: true });
+}))"""
+#: A gamepad whose left stick is pushed away; `window.shoulder`: its right shoulder button is held.
+PAD = """void (window.shoulder = false, navigator.getGamepads = () => [{
+  connected: true, id: "pad", index: 0, mapping: "standard", axes: [0, -1, 0, 0],
+  buttons: Array.from({ length: 17 }, (_, i) => ({ pressed: i === 5 && window.shoulder })),
+}])"""
+UNPLUG = 'void (navigator.getGamepads = () => [], window.dispatchEvent(new Event("gamepaddisconnected")))'
+
+
+class Tip:
+    """The end effector of the left robot as another client sees it, with times of the session."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        self.client = scenario.join("watcher", "director")
+        scenario.run_until(lambda: self.client.scene.tip_pose("left") is not None, "the watcher sees the robot")
+        self.times: list[float] = []
+        self.places: list[NDArray[np.float64]] = []
+
+    @property
+    def place(self) -> NDArray[np.float64]:
+        tip = self.client.scene.tip_pose("left")
+        assert tip is not None
+        return np.array(tip[0])
+
+    def note(self) -> None:
+        state = self.client.scene.state
+        if state is not None and (not self.times or state.header.session_time * 1e-6 > self.times[-1]):
+            self.times.append(state.header.session_time * 1e-6)
+            self.places.append(self.place)
+
+    def watch(self, condition: Callable[[], object], what: str) -> None:
+        """Note where the tip is until a condition holds."""
+
+        def is_done() -> bool:
+            self.note()
+            return bool(condition())
+
+        self.scenario.run_until(is_done, what)
+
+    def watch_for(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        self.watch(lambda: time.monotonic() > end, f"{seconds} s")
+
+    def measure_stop(self, since_ms: float) -> float:
+        """Watch a second; return how long after a moment of the session the tip was at rest [s]."""
+        self.watch_for(1.0)
+        distances = np.linalg.norm(np.array(self.places) - self.places[-1], axis=1)
+        moving = np.array(self.times)[distances > REST_M]
+        return float((moving[-1] - since_ms) * 1e-3) if len(moving) else 0.0
+
+
+@pytest.fixture
+def scenario(shared_scenario: Scenario) -> Scenario:
+    return shared_scenario
+
+
+@pytest.fixture
+def driver(scenario: Scenario, open_page: Callable[..., Page]) -> Page:
+    """A page that drives the left robot, which it holds. It notes when keys change, in session time [ms]."""
+    page = open_page(scenario.server, "driver")
+    join_as(page, "dora", "operator")
+    start_driving(page)
+    return page
+
+
+def start_driving(page: Page) -> None:
+    page.click("button", "Take: left")
+    page.click("button", "Drive: left")
+    page.wait("!document.querySelector('.drive').hidden")
+    page.evaluate(f"irisSession.view.viewpoint.setFree({json.dumps(VIEW)})")
+    page.evaluate(NOTE_KEYS)
+
+
+def words(page: Page) -> str:
+    text: str = page.evaluate("document.querySelector('.drive .why').textContent")
+    return text
+
+
+def drive_forward(page: Page, tip: Tip, distance: float) -> NDArray[np.float64]:
+    """Hold left Shift and W until the tip has moved by `distance` [m]; return where it began."""
+    begin = tip.place
+    page.hold("Shift")
+    page.hold("w")
+    tip.watch(lambda: np.linalg.norm(tip.place - begin) > distance, f"the tip moves {distance} m")
+    return begin
+
+
+def test_keys_move_the_end_effector(scenario: Scenario, driver: Page) -> None:
+    tip = Tip(scenario)
+    begin = tip.place
+    driver.hold("w")  # without the dead-man nothing moves
+    tip.watch_for(0.5)
+    assert np.linalg.norm(tip.place - begin) < REST_M
+    assert words(driver).startswith("Held: clutch open.")
+    driver.let_go("w")
+    begin = drive_forward(driver, tip, 0.095)
+    driver.wait("document.querySelector('.drive.engaged')")
+    assert words(driver) == "The robot follows you."
+    driver.let_go("w")
+    at = driver.evaluate("window.at")
+    stopped_s = tip.measure_stop(at["keyup KeyW"])
+    moved = tip.place - begin
+    expected = SPEED * (at["keyup KeyW"] - at["keydown KeyW"]) * 1e-3
+    print(f"moved {1e3 * moved} mm, {1e3 * expected:.1f} mm by time; at rest after {1e3 * stopped_s:.0f} ms")
+    assert abs(moved[1] - expected) < 0.015
+    assert 0.09 < moved[1] < 0.13
+    assert np.linalg.norm(moved[[0, 2]]) < 0.005
+    assert stopped_s < STOP_S
+    driver.let_go("Shift")
+    driver.wait("document.querySelector('.drive .why').textContent.startsWith('Held: clutch open.')")
+    assert driver.errors == []
+
+
+def test_a_window_without_focus_stops_the_robot(scenario: Scenario, driver: Page) -> None:
+    """It stops although the keys are still pressed, and goes on when the dead-man is pressed anew."""
+    tip = Tip(scenario)
+    drive_forward(driver, tip, 0.03)
+    driver.evaluate("void window.dispatchEvent(new Event('blur'))")
+    stopped_s = tip.measure_stop(driver.evaluate("window.at.blur"))
+    print(f"at rest {1e3 * stopped_s:.0f} ms after the focus was lost")
+    assert stopped_s < STOP_S
+    assert words(driver).startswith("Held: the window lost the focus.")
+    driver.let_go("w")
+    driver.let_go("Shift")
+    drive_forward(driver, tip, 0.01)
+    driver.let_go("Shift")
+
+
+def test_a_lost_lease_ends_driving(scenario: Scenario, driver: Page) -> None:
+    tip = Tip(scenario)
+    drive_forward(driver, tip, 0.03)
+    freed_ms = tip.times[-1]
+    tip.client.assign(["left"])
+    stopped_s = tip.measure_stop(freed_ms)
+    print(f"at rest {1e3 * stopped_s:.0f} ms after the lease was lost")
+    assert stopped_s < STOP_S
+    driver.wait("document.querySelector('.drive').hidden")
+    driver.let_go("w")
+    driver.let_go("Shift")
+
+
+def test_the_estop_key_is_the_same_while_driving(scenario: Scenario, driver: Page) -> None:
+    tip = Tip(scenario)
+    drive_forward(driver, tip, 0.02)
+    driver.press("Space")
+    driver.wait("irisSession.state.session.estop")
+    tip.watch_for(0.5)
+    stopped = tip.place
+    tip.watch_for(0.5)
+    assert np.linalg.norm(tip.place - stopped) < REST_M
+    assert words(driver).startswith("Held: e-stop.")
+    tip.client.clear_estop()
+    driver.wait("!irisSession.state.session.estop")
+    tip.watch_for(0.5)
+    assert np.linalg.norm(tip.place - stopped) < REST_M  # the keys are still pressed
+    driver.let_go("w")
+    driver.let_go("Shift")
+    drive_forward(driver, tip, 0.01)
+    driver.let_go("Shift")
+
+
+def test_the_mouse_drags_the_end_effector(scenario: Scenario, driver: Page) -> None:
+    """Half a millimetre for a pixel: to the right along +X, and no farther when the button is let go."""
+    tip = Tip(scenario)
+    begin = tip.place
+    driver.drag(".drive .handle", 100, 0, seconds=1.0)
+    tip.watch_for(0.7)
+    moved = tip.place - begin
+    print(f"moved {1e3 * moved} mm")
+    assert 0.03 < moved[0] < 0.06
+    assert np.linalg.norm(moved[1:]) < 0.005
+    assert words(driver).startswith("Held: clutch open.")
+
+
+def test_a_gamepad_drives_until_it_is_unplugged(scenario: Scenario, driver: Page) -> None:
+    """The pad is one that the test makes: the page was never tried with a real one."""
+    tip = Tip(scenario)
+    begin = tip.place
+    driver.evaluate(PAD)
+    tip.watch_for(0.3)
+    assert np.linalg.norm(tip.place - begin) < REST_M  # the shoulder button is not held
+    driver.evaluate("void (window.shoulder = true)")
+    tip.watch(lambda: tip.place[1] - begin[1] > 0.03, "the gamepad moves the tip")
+    unplugged_ms = driver.evaluate("irisSession.view.sessionTime()")
+    driver.evaluate(UNPLUG)
+    stopped_s = tip.measure_stop(unplugged_ms)
+    print(f"at rest {1e3 * stopped_s:.0f} ms after the gamepad was unplugged")
+    assert stopped_s < STOP_S
+    assert words(driver).startswith("Held: the gamepad was disconnected.")
+
+
+# --- recording cameras ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def close_scenario(serve: Callable[..., SessionProcess], tmp_path: Path) -> Iterator[Scenario]:
+    """A session of the handover scene with one more camera."""
+    scene = tmp_path / "scene.xml"
+    text = scene_path("handover").read_text()
+    scene.write_text(text.replace("<camera", f"{CLOSE}\n    <camera", 1))
+    shutil.copy(scene_path("handover").with_name("arm.xml"), tmp_path)
+    made = Scenario(serve(str(scene)))
+    yield made
+    made.close()
+
+
+def read_panel(page: Page, camera: str, path: Path) -> NDArray[np.uint8]:
+    """Return the pixels of a camera's panel, as they are on the screen."""
+    page.screenshot(path)
+    box: dict[str, Any] = page.evaluate(
+        f"(({{x, y, width, height}}) => ({{x, y, width, height}}))(document.querySelector("
+        f"'[data-camera={camera}] .place').getBoundingClientRect())"
+    )
+    with Image.open(path) as picture:
+        cut = picture.convert("RGB").crop((box["x"], box["y"], box["x"] + box["width"], box["y"] + box["height"]))
+    return np.asarray(cut.resize((160, 120)))
+
+
+def test_a_panel_shows_what_its_camera_sees(
+    close_scenario: Scenario, open_page: Callable[..., Page], tmp_path: Path
+) -> None:
+    page = open_page(close_scenario.server, "cameras")
+    join_as(page, "dora", "operator")
+    page.evaluate("document.querySelector('.menu').open = true")
+    page.check("close")
+    page.evaluate("document.querySelector('.menu').open = false")
+    page.wait("irisSession.view.pictures.pictures.some((one) => !one.isOutdated)")
+    time.sleep(0.5)  # two more frames
+    shown = read_panel(page, "close", tmp_path / "page.png")
+    page.evaluate("irisSession.view.viewpoint.choose(0)")
+    picture = decode_picture(page.evaluate("irisSession.view.capture(160, 120, false)"))
+    page.evaluate("irisSession.view.viewpoint.choose(-1)")
+    difference = np.abs(shown.astype(int) - picture).mean()
+    print(f"mean difference of the panel to the picture of its camera: {difference:.1f} of 255")
+    assert picture.std() > 20.0
+    assert difference < 8.0
+    assert page.errors == []
+
+
+def test_a_gripper_that_leaves_a_picture_is_warned_of(close_scenario: Scenario, open_page: Callable[..., Page]) -> None:
+    outside = "document.querySelector('[data-camera=close] .outside').textContent"
+    page = open_page(close_scenario.server, "cameras")
+    join_as(page, "dora", "operator")
+    page.evaluate("document.querySelector('.menu').open = true")
+    page.check("close")
+    page.evaluate("document.querySelector('.menu').open = false")
+    start_driving(page)
+    tip = Tip(close_scenario)
+    assert page.evaluate(outside) == ""
+    page.hold("Shift")
+    page.hold("r")
+    page.wait(f"{outside} === 'Outside this picture: the gripper of left'")
+    page.let_go("r")
+    tip.watch_for(0.5)
+    left_at = float(tip.place[2])
+    assert 0.07 < left_at - 0.28 < 0.11  # the edge is 88 mm above the middle
+    page.hold("f")
+    page.wait(f"{outside} === ''")
+    page.let_go("f")
+    page.let_go("Shift")
+    page.reload()
+    page.wait_until_ready()
+    page.wait("document.querySelector('[data-camera=close]')")  # remembered
+    assert page.errors == []
