@@ -35,8 +35,13 @@ export interface Drive {
   update(): void;
 }
 
-/** Make the panel. `getCamera`: from where the person looks, null without a picture. */
-export function makeDrive(state: PageState, client: WorkerClient, getCamera: () => CameraAxes | null): Drive {
+/** Make the panel. `getCamera`: from where the person looks, null without a picture. `warn`: shows a line for a while. */
+export function makeDrive(
+  state: PageState,
+  client: WorkerClient,
+  getCamera: () => CameraAxes | null,
+  warn: (text: string) => void,
+): Drive {
   const device = new DesktopDevice((sample) => client.post({ type: "samples", samples: [sample] }));
   const chosen = recall(STORAGE_KEY, DEFAULTS);
   let timer = 0;
@@ -108,7 +113,7 @@ export function makeDrive(state: PageState, client: WorkerClient, getCamera: () 
     };
     const wasEngaged = device.isEngaged;
     if (!device.tick(intent, findHeading(), metresPerSecond, situation, now)) {
-      state.note("Driving ended: you do not hold the robot any more", "warning");
+      warn("Driving has ended: you do not hold the robot any more.");
       stop();
     } else if (device.isEngaged !== wasEngaged) {
       engaged_ms = device.isEngaged ? now : Number.POSITIVE_INFINITY;

@@ -139,8 +139,8 @@ export class DesktopInputs {
   }
 
   private turnWheel(event: WheelEvent): void {
-    event.preventDefault();
     if (this.dragging === null) return;
+    event.preventDefault();
     this.drag.add([0, 0, -event.deltaY * (WHEEL_PIXELS[event.deltaMode] ?? 1) * METRES_PER_PIXEL * this.speed]);
   }
 

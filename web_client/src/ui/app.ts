@@ -111,7 +111,7 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   }
   const { view } = handle;
 
-  const drive = makeDrive(state, client, () => view?.viewpoint.axes ?? null);
+  const drive = makeDrive(state, client, () => view?.viewpoint.axes ?? null, (text) => show(text, "warning"));
   const cameras = makeCameras(state, view);
   stage.tools.append(cameras.menu);
   stage.element.append(cameras.element, drive.element);
