@@ -78,7 +78,7 @@ export class DesktopDevice {
     if (!situation.isReady) this.release("the connection is lost", now_ms);
     else if (situation.isStopped) this.release("e-stop", now_ms);
     const isBlocked = !situation.isReady || situation.isStopped;
-    if (!intent.clutch) this.mustLetGo = isBlocked;
+    if (!intent.clutch) this.mustLetGo = false;
     const isEngaged = intent.clutch && !this.mustLetGo && !isBlocked;
     if (!isEngaged) {
       this.sendHold(now_ms);
