@@ -61,7 +61,7 @@ export const DRIVE_KEYS: ReadonlySet<string> = new Set([
 /** The keys for people. */
 export const KEY_WORDS: readonly (readonly [keys: string, action: string])[] = [
   ["left Shift", "hold to let the robot follow"],
-  ["W S, A D", "away and near, left and right"],
+  ["W S, A D", "away, near; left, right"],
   ["R F", "up and down"],
   ["← →, ↑ ↓, Q E", "turn, tilt, roll"],
   ["C, V", "close, open the gripper"],
