@@ -144,7 +144,7 @@ def test_keys_move_the_end_effector(scenario: Scenario, driver: Page) -> None:
     expected = SPEED * (at["keyup KeyW"] - at["keydown KeyW"]) * 1e-3
     print(f"moved {1e3 * moved} mm, {1e3 * expected:.1f} mm by time; at rest after {1e3 * stopped_s:.0f} ms")
     assert abs(moved[1] - expected) < 0.015
-    assert 0.09 < moved[1] < 0.13
+    assert 0.09 < moved[1] < 0.16
     assert np.linalg.norm(moved[[0, 2]]) < 0.005
     assert stopped_s < STOP_S
     driver.let_go("Shift")
