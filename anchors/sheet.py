@@ -62,7 +62,7 @@ class Rect:
 
 @dataclass(frozen=True)
 class Sheet:
-    """One printed anchor. `edge_m`: edge of the QR code, its quiet zone not included. `has_marks`: with four crosses."""
+    """One printed anchor. `edge_m`: edge of the QR code, without its quiet zone. `has_marks`: with four crosses."""
 
     anchor_id: str
     edge_m: float
@@ -128,8 +128,8 @@ class Sheet:
 
 
 def compute_marks(edge_m: float) -> dict[str, Vec3]:
-    """Return the positions of the marks of a sheet by id, in the sheet frame [m]."""
-    return {name: (x * edge_m, y * edge_m, 0.0) for name, (x, y) in MARKS.items()}
+    """Return the positions of the marks of a sheet by id, in the sheet frame [m], to the micrometre."""
+    return {name: (round(x * edge_m, 6), round(y * edge_m, 6), 0.0) for name, (x, y) in MARKS.items()}
 
 
 def compute_marker_ids(anchor_id: str) -> tuple[int, ...]:

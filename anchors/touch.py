@@ -17,7 +17,7 @@ import numpy as np
 
 from anchors.alignment import AlignmentConfig, AlignmentEstimate
 from anchors.lie import Array, quat_exp, quat_multiply, quat_to_matrix, skew, swing
-from anchors.pose import IDENTITY_POSE, PoseTuple, Quat, Vec3, distance
+from anchors.pose import IDENTITY_POSE, Quat, Vec3, distance
 from anchors.solver import to_inverse_pose, to_world_covariance
 from anchors.uncertainty import Z99, chi2_quantile, position_error_p95
 
@@ -78,7 +78,7 @@ class TouchNoise:
     @property
     def sigma(self) -> Array:
         """Standard deviation of each point (n,) [m], the mean of its axes."""
-        return np.sqrt(np.diagonal(self.covariance).reshape(-1, 3).mean(axis=1))
+        return np.asarray(np.sqrt(np.diagonal(self.covariance).reshape(-1, 3).mean(axis=1)))
 
     def select(self, points: Sequence[int]) -> TouchNoise:
         """Return the noise of some of the points."""
