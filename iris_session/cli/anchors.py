@@ -75,8 +75,8 @@ def _register_print(actions: argparse._SubParsersAction[argparse.ArgumentParser]
         "print",
         help="write a sheet as PDF or SVG",
         description="Write a sheet of exact size: a QR code with the anchor's id between four markers that cameras "
-        "detect from a distance, and a ruler to check the printed size. With --marks also four crosses, to be pricked and "
-        "touched with a controller by devices that cannot read the code.",
+        "detect from a distance, and a ruler to check the printed size. With --marks also four crosses, to be "
+        "pricked and touched with a controller by devices that cannot read the code.",
         epilog="examples:\n"
         "  iris-session anchors print --size 160mm --id table --out table.pdf\n"
         "  iris-session anchors print --id shelf --paper a3 --size 200mm\n"
