@@ -249,7 +249,7 @@ def _check_marks(name: str, positions: object, anchors: Mapping[str, Any]) -> No
         except (TypeError, ValueError):
             p = ()
         right = isinstance(mark, str) and 0 < len(mark) <= MAX_ID and len(p) == 3
-        if not right or not max(map(abs, p)) <= LARGEST_SHEET_M:
+        if not right or not all(abs(v) <= LARGEST_SHEET_M for v in p):
             raise ConfigError(
                 f"{where}: mark {mark!r:.60} at {at!r:.60} must be (x, y, z) in metres in the frame of the anchor, at "
                 f"most {LARGEST_SHEET_M:g} m from it"

@@ -227,7 +227,7 @@ def test_tip_is_remembered_over_a_reconnect_until_its_participant_leaves() -> No
         _touch(ann, mark)
     assert ann.proposals()[-1].kind == "measured"
     lab.service.remove_connection(1)
-    lab.service.process_event(ParticipantLeft(ann.connection.participant_id, False, ""))
+    lab.service.process_event(ParticipantLeft(ann.connection.participant_id, "left", False))
     for mark in "123":
         _touch(ann, mark)
     assert ann.proposals()[-1].kind == "fingertip"
