@@ -137,7 +137,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// How an anchor was observed, or what else an observation says.
+    /// Kind of an observation: the form of the anchor, or the way in which it was found.
     ///
     /// touch: a tip or a fingertip on a mark. tip: a controller turned while its tip stayed in a hole. persistent: a
     /// place that the device kept since an earlier alignment.
