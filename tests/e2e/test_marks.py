@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from anchors.lie import Array, quat_exp, quat_to_matrix
-from anchors.pose import PoseTuple, Vec3, apply, distance, inverse, quat_from_yaw
+from anchors.pose import PoseTuple, Vec3, apply, compose, distance, inverse, quat_from_yaw
 from iris_session.client import Client
 from iris_session.protocol.common import Alignment
 from iris_session.protocol.names import AlignmentKind, DenialReason, HoldReason, RejectReason
@@ -25,6 +25,7 @@ pytestmark = pytest.mark.e2e
 RIGHT = "controller/right"
 FINGER = "hand/right"
 T_WORLD_TRACKING: PoseTuple = ((1.2, -0.7, 0.3), quat_from_yaw(2.0))
+T_TRACKING_P: PoseTuple = ((0.3, 0.2, -0.1), quat_from_yaw(0.7))
 TIP: Vec3 = (0.01, -0.02, -0.12)
 TOUCH_SIGMA_M = 0.0015
 
@@ -48,6 +49,7 @@ class Toucher:
         log = scenario.events[name] = []
         self.scenario = scenario
         self.device = device
+        self.T_world_tracking = T_WORLD_TRACKING
         self.rng = np.random.default_rng(len(name))
         self.client = scenario.add(
             Client(
@@ -82,7 +84,7 @@ class Toucher:
         place = (anchor.T_world_anchor.p, anchor.T_world_anchor.q)
         for name in names:
             q = quat_exp(self.rng.uniform(-0.4, 0.4, 3))
-            mark = np.array(apply(inverse(T_WORLD_TRACKING), apply(place, marks[name])))
+            mark = np.array(apply(inverse(self.T_world_tracking), apply(place, marks[name])))
             grip = mark - quat_to_matrix(q) @ np.array(TIP)
             p = grip + quat_to_matrix(q) @ np.array(p_grip_tip) + self.rng.normal(0.0, sigma_m, 3)
             self.client.alignment.observe(
@@ -102,7 +104,7 @@ class Toucher:
 
     def error_at(self, point: Vec3, alignment: Alignment) -> float:
         T = (alignment.T_world_tracking.p, alignment.T_world_tracking.q)
-        return distance(apply(T, apply(inverse(T_WORLD_TRACKING), point)), point)
+        return distance(apply(T, apply(inverse(self.T_world_tracking), point)), point)
 
     def hold_robot(self, robot: str) -> Hand:
         self.scenario.run_until(lambda: self.client.scene.tip_pose(robot) is not None, "the scene is there")
@@ -156,6 +158,37 @@ def test_fingertip_may_look_and_is_denied_to_drive_until_a_tip_is_calibrated(mar
     found = bob.turn_in_a_hole()
     bob.touch_marks(found.p_grip_tip, "1234")
     bob.wait_for_alignment(AlignmentKind.MEASURED)
+    marked.engage(hand)
+    marked.server.finish()
+
+
+def test_kept_place_comes_back_for_looking_and_a_touch_confirms_it(marked: Scenario) -> None:
+    dan = Toucher(marked, "dan", RIGHT)
+    found = dan.turn_in_a_hole()
+    dan.touch_marks(found.p_grip_tip, "1234")
+    aligned = dan.wait_for_alignment(AlignmentKind.MEASURED)
+    world = dan.client.mirror.anchors["table"].T_world_anchor
+    T_tracking_anchor = compose(inverse((aligned.T_world_tracking.p, aligned.T_world_tracking.q)), (world.p, world.q))
+    T_P_anchor = compose(inverse(T_TRACKING_P), T_tracking_anchor)
+    R = np.kron(np.eye(2), quat_to_matrix(np.array(inverse(T_WORLD_TRACKING)[1])))
+    covariance = (R @ np.reshape(aligned.covariance, (6, 6)) @ R.T).ravel().tolist()
+
+    # The page is loaded again: another tracking frame, in which the place P is found 5 mm off.
+    dan.T_world_tracking = ((0.4, 0.9, -0.2), quat_from_yaw(-1.0))
+    dan.client.alignment.report_tracking_jump()
+    marked.run_until(lambda: dan.current_kind == "", "the old alignment is void")
+    (x, y, z), q = compose(compose(inverse(dan.T_world_tracking), T_WORLD_TRACKING), T_TRACKING_P)
+    seen = compose(((x + 0.005, y, z), q), T_P_anchor)
+    dan.client.alignment.observe("table", seen, kind="persistent", covariance=covariance)
+    kept = dan.wait_for_alignment(AlignmentKind.PERSISTENT)
+    assert kept.error_at_anchor_m > 0.01
+    hand = dan.hold_robot("left")
+    marked.run_for(0.3)
+    assert not marked.is_following(hand)
+    dan.touch_marks(found.p_grip_tip, "1")
+    confirmed = dan.wait_for_alignment(AlignmentKind.MEASURED)
+    assert confirmed.error_at_anchor_m < kept.error_at_anchor_m
+    assert dan.error_at(world.p, confirmed) < 2.0 * confirmed.error_at_anchor_m
     marked.engage(hand)
     marked.server.finish()
 
