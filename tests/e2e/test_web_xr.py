@@ -39,6 +39,9 @@ IWER: Final = WEB_CLIENT / "node_modules" / "iwer" / "build" / "iwer.min.js"
 INSTALL: Final = """
 window.quest = new IWER.XRDevice(IWER.metaQuest3);
 quest.installRuntime({ forceInstall: true });
+// The emulator says of every pose that it is a guess; headsets say so of devices that they have lost.
+window.isGuess = false;
+Object.defineProperty(XRPose.prototype, "emulatedPosition", { get: () => window.isGuess });
 window.place = (input, [x, y, z, qx, qy, qz, qw]) => {
   input.position.set(x, y, z);
   input.quaternion.set(qx, qy, qz, qw);
@@ -242,6 +245,10 @@ def test_a_lease_goes_into_vr_and_back(quest: EmulatedQuest) -> None:
     quest.wait("irisSession.state.feedback.get('left').hold_reason === 'untracked'")
     quest.evaluate("quest.updateVisibilityState('visible')")
     quest.press("squeeze", 0.0)
+    quest.wait("irisSession.state.feedback.get('left').hold_reason === 'clutch_open'")
+    quest.evaluate("window.isGuess = true")
+    quest.wait("irisSession.state.feedback.get('left').hold_reason === 'untracked'")
+    quest.evaluate("window.isGuess = false")
 
     alignment = quest.person.alignment
     assert alignment
