@@ -351,7 +351,7 @@ export class View {
   }
 
   private resize(): void {
-    if (this.renderer.xr.isPresenting) return;
+    if (this.headset) return;
     const { clientWidth, clientHeight } = this.canvas;
     if (clientWidth === 0 || clientHeight === 0) return;
     this.renderer.setSize(clientWidth, clientHeight, false);

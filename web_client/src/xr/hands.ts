@@ -45,6 +45,7 @@ export class Hands {
   private readonly hands = new Map<Side, Hand>();
   /** Robots that were asked for, until they are held. */
   private readonly wanted = new Map<Side, string>();
+  private isSuspended = false;
 
   /** Take a frame. Returns what it asks of the session. */
   update(reading: FrameReading, context: Context): Intent[] {
@@ -58,7 +59,13 @@ export class Hands {
     const seen = new Set(reading.inputs.map(({ side }) => side));
     for (const side of this.hands.keys()) if (!seen.has(side)) this.hands.delete(side);
     for (const input of reading.inputs) if (input.tracked) this.updateHand(input, reading.capture_ms, context, intents);
+    this.isSuspended = false;
     return intents;
+  }
+
+  /** Input does not reach the scene now: what is pressed when it does again counts from its next press. */
+  suspend(): void {
+    this.isSuspended = true;
   }
 
   /** Return whether a hand holds its squeeze. */
@@ -97,7 +104,7 @@ export class Hands {
   private updateHand(input: InputReading, now_ms: number, context: Context, intents: Intent[]): void {
     const { side, kind, buttons } = input;
     const before = this.hands.get(side);
-    const isNew = before?.kind !== kind;
+    const isNew = this.isSuspended || before?.kind !== kind;
     const hand: Hand = {
       kind,
       trigger: isPressed(input.trigger, before?.trigger ?? false),

@@ -89,14 +89,17 @@ export class Headset {
 
   /** Take a frame: before the scene is drawn. */
   onFrame(frame: XRFrame, space: XRReferenceSpace): void {
-    const reading = this.reader.read(frame, space);
-    this.reading = reading;
     const isVisible = this.session.visibilityState === "visible";
+    const read = this.reader.read(frame, space);
+    // What is covered has no input; its devices are reported where they were, as not tracked.
+    const reading = isVisible ? read : { ...read, inputs: this.reading?.inputs ?? [] };
+    this.reading = reading;
     const T_world_tracking = this.findPlace();
     this.showsScene = T_world_tracking !== null;
     if (T_world_tracking !== null) this.props.place(T_world_tracking);
     const hits = this.point(reading, T_world_tracking);
     if (isVisible) this.ask(this.hands.update(reading, this.makeContext()));
+    else this.hands.suspend();
     const samples = this.hands.makeSamples(reading, isVisible);
     if (samples.length > 0) this.client.post({ type: "samples", samples });
     this.props.move(reading, hits);

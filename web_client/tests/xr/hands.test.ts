@@ -52,6 +52,16 @@ describe("leases", () => {
     expect(step({ pointed: { right: "left" } }, input({ trigger: 1, buttons: BUTTON.thumbstick }))).toEqual([]);
   });
 
+  test("what is pressed while a menu covers the scene is not pressed afterwards", () => {
+    step({}, input());
+    hands.suspend();
+    const context = { pointed: { right: "left" } };
+    expect(step(context, input({ trigger: 1, buttons: BUTTON.lower }))).toEqual([]);
+    expect(step(context, input({ trigger: 1, buttons: BUTTON.lower }))).toEqual([]);
+    step(context, input());
+    expect(step(context, input({ trigger: 1 }))).toEqual([{ type: "acquire", robot: "left" }]);
+  });
+
   test("held at one's own robot it releases, unless the hand squeezes, lets go or turns away", () => {
     take("left");
     const context = { held: ["left"], pointed: { right: "left" } };
