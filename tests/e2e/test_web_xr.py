@@ -27,7 +27,7 @@ from anchors.pose import (
 from iris_session.client import Client
 from iris_session.codegen.conversions import to_three
 from iris_session.protocol.names import AlignmentKind
-from iris_session.protocol.server_messages import ParticipantInfo
+from iris_session.protocol.server_messages import EngagementChanged, ParticipantInfo
 from tests.e2e.browser import WEB_CLIENT, Page, join_as
 from tests.e2e.scenario import Scenario, is_driven
 from tests.e2e.session_process import DEADLINE_S
@@ -37,6 +37,9 @@ pytestmark = pytest.mark.e2e
 IWER: Final = WEB_CLIENT / "node_modules" / "iwer" / "build" / "iwer.min.js"
 #: Makes the emulated headset `quest`, and `glide`, which moves its right controller in page frames.
 INSTALL: Final = """
+// A headset with 30 frames a second: without a graphics card more leave nothing for the session on the same machine.
+const request = window.requestAnimationFrame.bind(window);
+window.requestAnimationFrame = (callback) => setTimeout(() => request(callback), 25);
 window.quest = new IWER.XRDevice(IWER.metaQuest3);
 quest.installRuntime({ forceInstall: true });
 // The emulator says of every pose that it is a guess; headsets say so of devices that they have lost.
@@ -66,6 +69,7 @@ HEAD: Final[PoseTuple] = ((0.0, 0.0, 1.6), (1.0, 0.0, 0.0, 0.0))
 #: Motion of the hand in the world, 10 cm long.
 MOTION_M: Final = (0.0, 0.06, 0.08)
 FOLLOWS_M: Final = 0.005
+ATTEMPTS: Final = 8
 
 
 class EmulatedQuest:
@@ -115,6 +119,39 @@ class EmulatedQuest:
         row = to_three((*apply(inverse(T_WORLD_TRACKING), p_world), 1.0, 0.0, 0.0, 0.0))
         self.evaluate(f"glide({json.dumps(row[:3])}, {seconds})")
 
+    def engage(self, robot: str) -> None:
+        """Squeeze until the robot follows: a person lets go and tries again, too, when it does not."""
+        for _ in range(ATTEMPTS):
+            self.press("squeeze", 0.0)
+            self.scenario.run_for(0.3)
+            self.press("squeeze", 1.0)
+            if self.scenario.wait_for(lambda: is_driven(self.host, robot, self.person.id), 5.0):
+                return
+        raise AssertionError(f"{robot} does not follow\n{self.page.describe()}")
+
+    def move_robot(self, robot: str, begin: PoseTuple, motion: Vec3) -> float:
+        """Squeeze, move the right controller, and return how far the end effector is from where that takes it [m].
+
+        An attempt during which the robot held counts for nothing: the machine that draws for the headset runs the
+        session too, so samples come too late now and then.
+        """
+        for _ in range(ATTEMPTS):
+            self.press("squeeze", 0.0)
+            self.place("quest.controllers.right", begin)
+            self.engage(robot)
+            seen = len(self.scenario.events["host"])
+            tip = self.host.scene.tip_pose(robot)
+            assert tip
+            target = add(tip[0], motion)
+            self.glide(add(begin[0], motion), 2.0)
+            self.scenario.run_for(1.0)
+            bodies = [event.body for event in self.scenario.events["host"][seen:]]
+            if not any(isinstance(b, EngagementChanged) and b.robot == robot and not b.engaged for b in bodies):
+                tip = self.host.scene.tip_pose(robot)
+                assert tip
+                return math.dist(tip[0], target)
+        raise AssertionError(f"{robot} held in each of {ATTEMPTS} attempts\n{self.page.describe()}")
+
     @property
     def person(self) -> ParticipantInfo:
         """The participant of the page, as the director sees it."""
@@ -135,7 +172,7 @@ class EmulatedQuest:
 @pytest.fixture
 def quest(scenario: Scenario, open_page: Callable[..., Page]) -> Iterator[EmulatedQuest]:
     before = [IWER.read_text(), INSTALL]
-    page = open_page(scenario.server, "quest", width=640, height=360, before=before)
+    page = open_page(scenario.server, "quest", width=480, height=320, before=before)
     join_as(page, "eve", "operator")
     made = EmulatedQuest(scenario, page)
     made.run_until(lambda: made.host.scene.tip_pose("left") is not None, "the director sees the robots")
@@ -190,24 +227,9 @@ def test_a_robot_is_driven_in_ar(quest: EmulatedQuest) -> None:
     quest.press("trigger", 0.0)
     quest.wait(f"{HEADSET}.hands.driven.get('right') === 'left'")
 
-    quest.press("squeeze", 1.0)
-    quest.run_until(lambda: is_driven(host, "left", person), "the robot follows the squeeze")
-    begin = host.scene.tip_pose("left")
-    assert begin
-    target = add(begin[0], MOTION_M)
-    quest.glide(add(pose[0], MOTION_M), 2.0)
-
-    def compute_error() -> float:
-        now = host.scene.tip_pose("left")
-        assert now
-        return math.dist(now[0], target)
-
-    quest.run_until(lambda: compute_error() < FOLLOWS_M, "the end effector follows 10 cm")
-    quest.scenario.run_for(0.5)
-    error = compute_error()
+    error = quest.move_robot("left", pose, MOTION_M)
     print(f"the hand moved {100 * math.hypot(*MOTION_M):.0f} cm, the end effector is {1e3 * error:.1f} mm from there")
     assert error <= FOLLOWS_M
-    assert is_driven(host, "left", person)
 
     quest.press("squeeze", 0.0)
     quest.run_until(lambda: not is_driven(host, "left", person), "the robot holds")
@@ -238,8 +260,7 @@ def test_a_lease_goes_into_vr_and_back(quest: EmulatedQuest) -> None:
     assert (quest.person.id, holder(host, "left")) == (person, person)
     assert quest.evaluate(f"{HEADSET}.showsScene") is True
 
-    quest.press("squeeze", 1.0)
-    quest.run_until(lambda: is_driven(host, "left", person), "the robot that was leased before follows")
+    quest.engage("left")  # the robot that was leased before
     quest.evaluate("quest.updateVisibilityState('visible-blurred')")
     quest.run_until(lambda: not is_driven(host, "left", person), "it holds while a menu covers the scene")
     quest.wait("irisSession.state.feedback.get('left').hold_reason === 'untracked'")
