@@ -7,6 +7,7 @@ import contextlib
 import io
 import json
 import os
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from tests.e2e.session_process import DEADLINE_S, END_WITH_PARENT, skip_unless_ci
+from tests.e2e.session_process import DEADLINE_S, END_WITH_PARENT, SessionProcess, skip_unless_ci, wait_until
 
 ROOT: Final = Path(__file__).parents[2]
 WEB_CLIENT: Final = ROOT / "web_client"
@@ -191,6 +192,24 @@ class Page:
         except BrowserError as error:
             return str(error)
         return f"{json.dumps(state, indent=1)}\n{self.errors}"
+
+
+def printed_address(server: SessionProcess) -> str:
+    """Return the address of the page that `serve` prints."""
+    wait_until(lambda: "in a browser:" in server.output or server.process.poll() is not None, "the address is printed")
+    match = re.search(r"in a browser: (https?://\S+)", server.output)
+    assert match, server.output
+    return match.group(1)
+
+
+def join_as(page: Page, name: str, role: str) -> None:
+    """Join again with another name and role, by the form of the page."""
+    page.evaluate("document.querySelector('.self').open = true")
+    page.fill("Your name", name)
+    page.select("Join as", role)
+    page.click("button", "Join with these")
+    page.wait(f"irisSession.state.self?.name === {json.dumps(name)} && irisSession.state.role === {json.dumps(role)}")
+    page.wait("irisSession.state.phase.phase === 'ready'")
 
 
 def decode_picture(url: str) -> NDArray[np.uint8]:

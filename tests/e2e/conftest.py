@@ -5,13 +5,15 @@ from __future__ import annotations
 import contextlib
 import signal
 import subprocess
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pytest
 
 from iris_session.client import Client
+from tests.e2e.browser import Browser, Page, printed_address, require_browser
 from tests.e2e.scenario import Hand, Scenario
 from tests.e2e.session_process import COMMAND, DEADLINE_S, END_WITH_PARENT, SessionProcess, kill_all, make_serve_command
 
@@ -101,6 +103,30 @@ def shared_scenario(shared_session: SessionProcess) -> Iterator[Scenario]:
     scenario = Scenario(shared_session)
     yield scenario
     scenario.close()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    require_browser()
+    made = Browser()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
+    """Open the page of a session by the address that the session printed."""
+    pages: list[Page] = []
+
+    def open_one(server: SessionProcess, name: str, **options: Any) -> Page:
+        page = browser.open(f"{name}-{time.monotonic_ns()}", printed_address(server), **options)
+        pages.append(page)
+        page.wait_until_ready()
+        return page
+
+    yield open_one
+    for page in pages:
+        page.close()
 
 
 @pytest.fixture

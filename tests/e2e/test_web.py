@@ -9,7 +9,7 @@ import re
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,9 @@ import pytest
 from numpy.typing import NDArray
 
 from iris_session.demo.named_scenes import scene_by_name
-from tests.e2e.browser import BUILT_PAGE, WEB_CLIENT, Browser, Page, require_browser
+from tests.e2e.browser import BUILT_PAGE, WEB_CLIENT, Browser, Page, join_as, printed_address
 from tests.e2e.scenario import Scenario
-from tests.e2e.session_process import COMMAND, END_WITH_PARENT, SessionProcess, wait_until
+from tests.e2e.session_process import COMMAND, END_WITH_PARENT, SessionProcess
 from tests.scene.pictures import ModelRenderer, graphics, silhouette_iou
 
 pytestmark = pytest.mark.e2e
@@ -31,48 +31,6 @@ WIDTH, HEIGHT = 640, 360
 #: Silhouettes, and mean difference of colours where both draw something [of 255]: without a graphics card large meshes
 #: are drawn in a coarser level; exact ones differ by 0.5.
 MIN_IOU, MAX_COLOUR_DIFFERENCE = 0.97, 8.0
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    require_browser()
-    made = Browser()
-    yield made
-    made.close()
-
-
-@pytest.fixture
-def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
-    """Open the page of a session by the address that the session printed."""
-    pages: list[Page] = []
-
-    def open_one(server: SessionProcess, name: str, **options: Any) -> Page:
-        page = browser.open(f"{name}-{time.monotonic_ns()}", printed_address(server), **options)
-        pages.append(page)
-        page.wait_until_ready()
-        return page
-
-    yield open_one
-    for page in pages:
-        page.close()
-
-
-def printed_address(server: SessionProcess) -> str:
-    """Return the address of the page that `serve` prints."""
-    wait_until(lambda: "in a browser:" in server.output or server.process.poll() is not None, "the address is printed")
-    match = re.search(r"in a browser: (https?://\S+)", server.output)
-    assert match, server.output
-    return match.group(1)
-
-
-def join_as(page: Page, name: str, role: str) -> None:
-    """Join again with another name and role, by the form of the page."""
-    page.evaluate("document.querySelector('.self').open = true")
-    page.fill("Your name", name)
-    page.select("Join as", role)
-    page.click("button", "Join with these")
-    page.wait(f"irisSession.state.self?.name === {json.dumps(name)} && irisSession.state.role === {json.dumps(role)}")
-    page.wait("irisSession.state.phase.phase === 'ready'")
 
 
 def holder(page: Page, robot: str) -> str:

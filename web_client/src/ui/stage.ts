@@ -17,6 +17,8 @@ const PHASE_WORDS: Record<string, string> = {
 export interface Stage {
   element: HTMLElement;
   canvas: HTMLCanvasElement;
+  /** The bar over the picture. */
+  tools: HTMLElement;
   /** Set the view, or the reason why there is none. */
   setView(view: View | null, problem: string): void;
   update(): void;
@@ -65,6 +67,7 @@ export function makeStage(state: PageState, actions: { pair: () => void; retry: 
   return {
     element,
     canvas,
+    tools,
     setView: (made, problem) => {
       view = made;
       setText(trouble, problem);

@@ -17,6 +17,7 @@ export interface FreeCamera {
   fovy?: number;
 }
 
+const T_WORLD_THREE = T_THREE_WORLD.clone().invert();
 const DEFAULT_FOVY = 45;
 const KEY_STEP_RAD = 0.08;
 const KEY_ZOOM = 1.1;
@@ -48,6 +49,16 @@ export class Viewpoint {
 
   get camera(): PerspectiveCamera | OrthographicCamera {
     return this.isOrthographic ? this.orthographic : this.free;
+  }
+
+  /** Where the camera looks, and what is up in its picture: unit vectors in the session's world. */
+  get axes(): { forward: [number, number, number]; up: [number, number, number] } {
+    const { quaternion } = this.camera;
+    const toWorld = (axis: Vector3): [number, number, number] => {
+      const { x, y, z } = axis.applyQuaternion(quaternion).applyMatrix4(T_WORLD_THREE);
+      return [x, y, z];
+    };
+    return { forward: toWorld(new Vector3(0, 0, -1)), up: toWorld(new Vector3(0, 1, 0)) };
   }
 
   private isOrthographic = false;
