@@ -12,7 +12,7 @@ import json
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final
 
@@ -46,12 +46,13 @@ class SheetObservation:
 @dataclass(frozen=True)
 class Constellation:
     """`T_world_anchor` of each sheet. `error_m`: p95 of its position relative to the reference; sizes [m] where
-    known."""
+    known; `marks`: positions of its marks by id, in the frame of the sheet [m], where it has any."""
 
     reference: str
     anchors: dict[str, PoseTuple]
     error_m: dict[str, float]
     sizes: dict[str, float]
+    marks: dict[str, dict[str, Vec3]] = field(default_factory=dict)
 
     def to_toml(self) -> str:
         """Return the TOML text of an anchors file, for people to read and edit."""
@@ -64,6 +65,12 @@ class Constellation:
             lines.append(f"error_m = {float(self.error_m.get(name, 0.0))!r}")
             if name in self.sizes:
                 lines.append(f"size_m = {float(self.sizes[name])!r}")
+            if self.marks.get(name):
+                lines.append(f"[anchors.{_quote(name)}.marks_m]")
+                lines += [
+                    f"{_quote(mark)} = [{', '.join(repr(float(c)) for c in at)}]"
+                    for mark, at in self.marks[name].items()
+                ]
             lines.append("")
         return "\n".join(lines)
 
@@ -89,6 +96,7 @@ class Constellation:
             {name: pose for name, (pose, _, _) in read.items()},
             {name: error for name, (_, error, _) in read.items()},
             {name: size for name, (_, _, size) in read.items() if size > 0.0},
+            {name: _read_marks(name, table["marks_m"]) for name, table in tables.items() if "marks_m" in table},
         )
 
 
@@ -97,7 +105,7 @@ def _quote(name: str) -> str:
     return json.dumps(name, ensure_ascii=False)
 
 
-_KEYS: Final = ("position_m", "quaternion_wxyz", "error_m", "size_m")
+_KEYS: Final = ("position_m", "quaternion_wxyz", "error_m", "size_m", "marks_m")
 
 
 def _read_anchor(name: str, table: Any) -> tuple[PoseTuple, float, float]:
@@ -115,6 +123,16 @@ def _read_anchor(name: str, table: Any) -> tuple[PoseTuple, float, float]:
             raise ConstellationError(f"anchors.{name}.{key} must be a length in metres")
         extra.append(float(value))
     return pose, extra[0], extra[1]
+
+
+def _read_marks(name: str, table: Any) -> dict[str, Vec3]:
+    if not isinstance(table, dict):
+        raise ConstellationError(f"anchors.{name}.marks_m must be a table of positions by id of the mark")
+    marks = {}
+    for mark in table:
+        x, y, z = _read_numbers(f"{name}.marks_m", table, mark, 3)
+        marks[mark] = (x, y, z)
+    return marks
 
 
 def _read_numbers(name: str, table: Any, key: str, n: int) -> list[float]:

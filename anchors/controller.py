@@ -15,7 +15,7 @@ import numpy as np
 
 from anchors.lie import Array, quat_conjugate, quat_log, quat_multiply, quat_to_matrix
 from anchors.pose import PoseTuple, Vec3, compose, is_rigid, quat_normalize
-from anchors.uncertainty import isotropic_covariance
+from anchors.uncertainty import isotropic_covariance, length_p95
 
 _ZERO: Final[Vec3] = (0.0, 0.0, 0.0)
 _TRIM: Final = 4.0  # residuals beyond this many sigmas are wrong readings
@@ -39,7 +39,8 @@ class TipCalibration:
     """Position of the tip of a controller (`p_controller_tip`), or why it is unknown (`refused`, `advice`).
 
     `sigma_m`: standard deviation of the tip along its least certain direction; `residual_m`: how far the readings
-    scatter about the pivot (root mean square, 3D).
+    scatter about the pivot (root mean square, 3D). `covariance`: of the tip, 3x3 row-major in the controller's frame
+    [m^2], empty when refused.
     """
 
     p_controller_tip: Vec3
@@ -49,6 +50,12 @@ class TipCalibration:
     n_used: int
     refused: bool
     advice: str
+    covariance: tuple[float, ...] = ()
+
+    @property
+    def error_m(self) -> float:
+        """Stated p95 [m] of the position of the tip, infinite when refused."""
+        return math.inf if self.refused else length_p95(np.reshape(self.covariance, (3, 3)))
 
 
 def calibrate_tip(
@@ -97,7 +104,8 @@ def calibrate_tip(
         advice = f"the readings scatter by {residual * 1e3:.1f} mm: the tip slipped; rest it in a dent and turn slowly"
     elif tip_sigma > max_sigma_m:
         advice = f"the tip is known to {tip_sigma * 1e3:.1f} mm only: turn further, in every direction"
-    return TipCalibration(_to_vec3(x[:3]), _to_vec3(x[3:]), tip_sigma, residual, n, bool(advice), advice)
+    stated = () if advice else tuple(covariance[:3, :3].ravel().tolist())
+    return TipCalibration(_to_vec3(x[:3]), _to_vec3(x[3:]), tip_sigma, residual, n, bool(advice), advice, stated)
 
 
 def tip_position(T_tracking_controller: PoseTuple, p_controller_tip: Vec3) -> Vec3:

@@ -3,7 +3,8 @@
 Headsets track the code natively and report its edge and centre. Cameras find the markers from much further away, and
 measure the pose over the whole page. Every length is a fixed share of the edge of the code, so id and edge determine
 the sheet, independent of the paper. Which markers it has follows from a hash of the id: sheets are distinguished
-even where the code cannot be read.
+even where the code cannot be read. A sheet with marks has four crosses around the frame, to be pricked and touched with
+the tip of a controller, by devices that cannot read the code.
 
 Sheet frame: origin in the centre of the code, x right, y up, z out of the paper towards the viewer [m].
 PDF and SVG output: `anchors.sheet_print`.
@@ -14,10 +15,13 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+
+from anchors.pose import Vec3
 
 Array = NDArray[np.float64]
 
@@ -25,6 +29,12 @@ Array = NDArray[np.float64]
 MARKER_EDGE: Final = 0.29
 HALF_WIDTH: Final = 0.60  # from the centre to the outer edges of the markers
 HALF_HEIGHT: Final = 0.89
+#: Crosses by id, from the centre of the code: outside the frame, three in the corners. The third stands apart, so that
+#: the four look the same in no other order.
+MARKS: Final = MappingProxyType({"1": (-0.66, 0.94), "2": (0.66, 0.94), "3": (0.66, -0.40), "4": (-0.66, -0.94)})
+MARK_ARM: Final = 0.025  # from the crossing to the end of a line
+MARKED_HALF_WIDTH: Final = 0.69  # to the outer ends of the crosses
+MARKED_HALF_HEIGHT: Final = 0.97
 #: ArUco, 4 x 4 bits inside a border of one: the largest modules for a given edge, so the longest range. The code has
 #: no error correction to speak of; a sheet is known by several markers in the right places instead.
 DICTIONARY: Final = "DICT_4X4_1000"
@@ -52,10 +62,11 @@ class Rect:
 
 @dataclass(frozen=True)
 class Sheet:
-    """One printed anchor. `edge_m`: edge of the QR code, its quiet zone not included."""
+    """One printed anchor. `edge_m`: edge of the QR code, without its quiet zone. `has_marks`: with four crosses."""
 
     anchor_id: str
     edge_m: float
+    has_marks: bool = False
 
     def __post_init__(self) -> None:
         if not (0 < len(self.anchor_id) <= MAX_ID and self.anchor_id.isascii() and self.anchor_id.isprintable()):
@@ -80,7 +91,13 @@ class Sheet:
     @property
     def size_m(self) -> tuple[float, float]:
         """Width and height of everything black."""
-        return 2.0 * HALF_WIDTH * self.edge_m, 2.0 * HALF_HEIGHT * self.edge_m
+        half = (MARKED_HALF_WIDTH, MARKED_HALF_HEIGHT) if self.has_marks else (HALF_WIDTH, HALF_HEIGHT)
+        return 2.0 * half[0] * self.edge_m, 2.0 * half[1] * self.edge_m
+
+    @property
+    def marks(self) -> dict[str, Vec3]:
+        """Positions of the crossings by id [m]; none on a sheet without marks."""
+        return compute_marks(self.edge_m) if self.has_marks else {}
 
     @cached_property
     def marker_corners(self) -> Array:
@@ -108,6 +125,11 @@ class Sheet:
             corner = self.marker_corners[number][0]
             shapes[f"marker {number}"] = _merge_runs(encode_marker(marker_id), corner, self.marker_edge_m)
         return shapes
+
+
+def compute_marks(edge_m: float) -> dict[str, Vec3]:
+    """Return the positions of the marks of a sheet by id, in the sheet frame [m], to the micrometre."""
+    return {name: (round(x * edge_m, 6), round(y * edge_m, 6), 0.0) for name, (x, y) in MARKS.items()}
 
 
 def compute_marker_ids(anchor_id: str) -> tuple[int, ...]:

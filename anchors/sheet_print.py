@@ -10,7 +10,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from anchors.sheet import HALF_HEIGHT, HALF_WIDTH, MARKER_EDGE, Rect, Sheet, SheetError
+from anchors.sheet import (
+    HALF_HEIGHT,
+    HALF_WIDTH,
+    MARK_ARM,
+    MARKED_HALF_HEIGHT,
+    MARKED_HALF_WIDTH,
+    MARKER_EDGE,
+    Rect,
+    Sheet,
+    SheetError,
+)
 
 #: Width and height [mm], upright. ISO 216, and ANSI A for `letter`, ANSI B for `tabloid`.
 PAPERS: Final = {
@@ -46,10 +56,11 @@ class _Page:
     texts: list[_Text]
 
 
-def largest_edge_mm(paper: str) -> int:
+def largest_edge_mm(paper: str, has_marks: bool = False) -> int:
     """Return the edge [mm] of the largest code, in whole millimetres, whose sheet fits on the paper."""
     width, height = _find_paper(paper)
-    return int(min((width / 2 - MARGIN_MM) / HALF_WIDTH, (height / 2 - MARGIN_MM) / HALF_HEIGHT))
+    half = (MARKED_HALF_WIDTH, MARKED_HALF_HEIGHT) if has_marks else (HALF_WIDTH, HALF_HEIGHT)
+    return int(min((width / 2 - MARGIN_MM) / half[0], (height / 2 - MARGIN_MM) / half[1]))
 
 
 def to_svg(sheet: Sheet, paper: str = "a4") -> str:
@@ -130,10 +141,11 @@ def _find_paper(name: str) -> tuple[float, float]:
 def _lay_out(sheet: Sheet, paper: str) -> _Page:
     width, height = _find_paper(paper)
     edge = 1e3 * sheet.edge_m
-    largest = largest_edge_mm(paper)
+    largest = largest_edge_mm(paper, sheet.has_marks)
     if edge > largest + 1e-9:
         raise SheetError(
-            f"a code of {edge:g} mm with its frame does not fit on {paper}: at most {largest} mm there, or larger paper"
+            f"a code of {edge:g} mm with its frame {'and marks ' * sheet.has_marks}does not fit on {paper}: at most "
+            f"{largest} mm there, or larger paper"
         )
     x0, y0 = 0.5 * width, 0.5 * height
     shapes = [
@@ -148,7 +160,24 @@ def _lay_out(sheet: Sheet, paper: str) -> _Page:
         _Text(x0, y0 + 0.73 * edge, 0.8 * unit, "print at 100 %, then measure:"),
         *figures,
     ]
-    return _Page(width, height, [*shapes, ruler], texts)
+    crosses = []
+    for name, (x, y, _) in sheet.marks.items():
+        cross, label = _place_cross(x0 + 1e3 * x, y0 - 1e3 * y, MARK_ARM * edge, 1.0 if x < 0.0 else -1.0, name)
+        crosses.append(cross)
+        texts.append(label)
+    return _Page(width, height, [*shapes, ruler, *crosses], texts)
+
+
+def _place_cross(x: float, y: float, arm: float, inwards: float, name: str) -> tuple[list[Rect], _Text]:
+    """Return a cross of two thin lines around (x, y), and its id above it towards the middle of the sheet."""
+    half = 0.5 * _LINE_MM
+    rects = [
+        Rect(x - arm, y - half, 2.0 * arm, _LINE_MM),
+        # Beside the first line: viewers differ in how they fill a path that overlaps itself.
+        Rect(x - half, y - arm, _LINE_MM, arm - half),
+        Rect(x - half, y + half, _LINE_MM, arm - half),
+    ]
+    return rects, _Text(x + 0.6 * inwards * arm, y - 0.3 * arm, 0.9 * arm, name)
 
 
 def _place_title(x: float, y: float, edge: float, unit: float, text: str) -> list[_Text]:

@@ -1,14 +1,12 @@
 """Turn the observations of one connection into alignment proposals at a bounded rate.
 
-By sheets and tracked controllers (`ConnectionEstimator`), and by touched marks (`TouchEstimator`), which take part in
-the same proposals. The mathematics is in `anchors.alignment` and `anchors.touch`.
+By sheets and tracked controllers, whose mathematics is in `anchors.alignment`. Touched marks and kept anchors
+(`alignment.touches`) take part in the same proposals.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping
-from dataclasses import replace
 from types import MappingProxyType
 from typing import Final
 
@@ -17,12 +15,12 @@ import numpy as np
 
 from anchors.alignment import AlignmentEstimate, AlignmentEstimator
 from anchors.controller import controller_covariance
-from anchors.pose import IDENTITY_POSE, PoseTuple, Vec3, is_valid_point
-from anchors.touch import Touch, TouchRegistration, register_touches
+from anchors.pose import IDENTITY_POSE, PoseTuple, Vec3
+from iris_session.alignment.touches import MAX_TIPS, TouchEstimator
 from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.common import MAX_TEXT, Pose
 from iris_session.protocol.entries import AlignmentProposal
-from iris_session.protocol.names import AnchorKind
+from iris_session.protocol.names import AlignmentKind, AnchorKind
 from iris_session.protocol.status import AlignmentReport, AnchorSeen
 
 #: Errors that linear algebra raises for extreme input of a client.
@@ -35,21 +33,21 @@ _CLOSE_NS: Final = 1_500_000_000
 #: How fast a tracking frame may drift (docs/anchors.md).
 _DRIFT_M_PER_S: Final = 0.003 / 60.0
 _CONTROLLER: Final = controller_covariance()
-#: Newest touches kept per point, and points kept. Eight points that do not fit take 15 ms to analyse.
-MAX_TOUCHES_PER_POINT: Final = 5
-MAX_POINTS: Final = 8
-_MIN_POINTS: Final = 3
 
 
 class ConnectionEstimator:
     """Estimator of one connection: a proposal when something new was observed, at most one per period.
 
     `running`: false while the participant's run is stopped; observations are then ignored. `newest`: the last estimate
-    that was not refused, `None` after a reset.
+    that was not refused and that may be driven with, `None` after a reset.
     """
 
     def __init__(
-        self, anchors: Mapping[str, PoseTuple], period_ns: int, sizes: Mapping[str, float] = MappingProxyType({})
+        self,
+        anchors: Mapping[str, PoseTuple],
+        period_ns: int,
+        sizes: Mapping[str, float] = MappingProxyType({}),
+        marks: Mapping[str, Mapping[str, Vec3]] = MappingProxyType({}),
     ) -> None:
         """Create an estimator.
 
@@ -57,22 +55,25 @@ class ConnectionEstimator:
             anchors: Present `T_world_anchor`, updated by the owner.
             period_ns: Least time between two proposals.
             sizes: Edge length [m] of printed sheets, where known.
+            marks: Positions of marks by anchor and id of the mark, in the anchor frame [m].
         """
         self._anchors = anchors
         self._period_ns = period_ns
         self._sizes = sizes
+        self._marks = marks
+        self._tips: dict[str, tuple[float, ...]] = {}
         self.start_run()
 
     def start_run(self) -> None:
         """Begin a new run: earlier observations no longer count."""
         self.running = True
         self._estimator = AlignmentEstimator(self._anchors, sizes=self._sizes)
-        self._touches = TouchEstimator(self._anchors)
+        self._touches = TouchEstimator(self._anchors, self._marks, self._tips)
         self._observed: dict[str, tuple[int, int]] = {}  # anchor -> number of observations, time of the last [ns]
         self._used = self._unusable = 0
         self._next_ns = 0
-        self._unknown: tuple[str, int] | None = None  # unknown anchor and tracking epoch, not yet reported
-        self._reported_unknown: tuple[str, int] | None = None
+        self._unknown: tuple[str, str, int] | None = None  # unknown anchor or mark, tracking epoch; not yet reported
+        self._reported_unknown: tuple[str, str, int] | None = None
         self._refused_ns = -_CLOSE_NS
         self._repeat_refusal = False  # the last refusal came too soon after another: send it once more
         self.reset()
@@ -86,6 +87,17 @@ class ConnectionEstimator:
         self._touched: tuple[int, float, int] | None = None  # alignment by touch: epoch, stated error [m], time [ns]
         self._last: AlignmentEstimate | None = None  # also when it was refused
         self.newest: AlignmentEstimate | None = None
+
+    def set_tip(self, device: str, covariance: tuple[float, ...]) -> None:
+        """Set the covariance of the tip of a device (3x3 row-major, grip frame [m^2]); its earlier touches no longer
+        count."""
+        self._tips.pop(device, None)
+        self._tips[device] = covariance
+        self._touches.discard_touches(device)
+        if len(self._tips) > MAX_TIPS:
+            oldest = next(iter(self._tips))
+            self._touches.discard_touches(oldest)
+            del self._tips[oldest]
 
     def on_anchors_moved(self) -> None:
         """Discard estimates, but keep observations: they stay valid when an anchor is given a new pose."""
@@ -103,11 +115,11 @@ class ConnectionEstimator:
         anchor_id = observation.anchor_id
         if not self.running:
             return True  # not judged
-        if anchor_id in self._anchors:
+        if anchor_id in self._anchors and self._touches.has_mark(anchor_id, observation.mark):
             used = self._use_observation(observation, p_tracking_head)
         else:
             used = False
-            unknown = (anchor_id, observation.tracking_epoch)
+            unknown = (anchor_id, observation.mark, observation.tracking_epoch)
             if unknown != self._reported_unknown:
                 self._unknown = unknown
         if used:
@@ -120,7 +132,9 @@ class ConnectionEstimator:
     def _use_observation(self, observation: Observation, p_tracking_head: Vec3 | None) -> bool:
         pose, covariance = observation.T_tracking_anchor, observation.covariance
         if observation.kind == AnchorKind.TOUCH:
-            return self._touches.add_touch(observation.anchor_id, pose.p, observation.tracking_epoch)
+            return self._touches.add_touch(observation)
+        if observation.kind == AnchorKind.PERSISTENT:
+            return self._touches.add_persistent(observation)
         if observation.kind == AnchorKind.CONTROLLER:  # tracked: neither distance nor mirrored poses matter
             covariance, p_tracking_head = covariance or _CONTROLLER, None
         misprints = self._estimator.wrong_size
@@ -158,7 +172,7 @@ class ConnectionEstimator:
             self._reported_unknown, self._unknown, self._refused_ns = self._unknown, None, now_ns
             return self._refuse_unknown_anchor(*self._reported_unknown)
         try:
-            estimate = self._estimate(now_ns)
+            estimate, kind = self._estimate(now_ns)
         except NUMERICAL_ERRORS:
             text = "the observations of the anchor cannot be solved: look at it from elsewhere"
             return self._filter_refusal(_to_refusal(self._estimator.tracking_epoch, text), now_ns)
@@ -166,26 +180,28 @@ class ConnectionEstimator:
             return None
         self._last = estimate
         if estimate.refused:
-            return self._filter_refusal(_to_proposal(estimate), now_ns)
-        self._refused, self.newest = None, estimate
-        return _to_proposal(estimate)
+            return self._filter_refusal(_to_proposal(estimate, kind), now_ns)
+        self._refused = None
+        if kind == AlignmentKind.MEASURED:
+            self.newest = estimate
+        return _to_proposal(estimate, kind)
 
-    def _estimate(self, now_ns: int) -> AlignmentEstimate | None:
-        """Return an estimate by touched marks if any are new, else by observations; `None` if the latter is worse than
-        a former one by touch."""
+    def _estimate(self, now_ns: int) -> tuple[AlignmentEstimate | None, str]:
+        """Return an estimate by touched marks or a kept anchor if any are new, else by observations, and its
+        `AlignmentKind`; `None` if the latter is worse than a former one by touch."""
         if self._touches.pending:
-            estimate = self._touches.estimate()
-            if not estimate.refused:
+            estimate, kind = self._touches.estimate()
+            if not estimate.refused and kind == AlignmentKind.MEASURED:
                 self._touched = (estimate.tracking_epoch, estimate.error_at_anchor_m, now_ns)
-            return estimate
+            return estimate, kind
         self._pending = False
         estimate = self._estimator.estimate()
         if self._touched is not None and self._touched[0] == estimate.tracking_epoch:
             _, error_m, touched_ns = self._touched
             if not estimate.error_at_anchor_m < error_m + _DRIFT_M_PER_S * (now_ns - touched_ns) * 1e-9:
-                return None
+                return None, AlignmentKind.MEASURED
         self._touched = None
-        return estimate
+        return estimate, AlignmentKind.MEASURED
 
     def _filter_refusal(self, proposal: AlignmentProposal, now_ns: int) -> AlignmentProposal | None:
         """Return the refusal if it differs from the last one, or if the last one may not have reached the wearer."""
@@ -196,7 +212,11 @@ class ConnectionEstimator:
         self._repeat_refusal, self._refused_ns, self._refused = close, now_ns, refused
         return proposal
 
-    def _refuse_unknown_anchor(self, anchor_id: str, tracking_epoch: int) -> AlignmentProposal:
+    def _refuse_unknown_anchor(self, anchor_id: str, mark: str, tracking_epoch: int) -> AlignmentProposal:
+        if anchor_id in self._anchors:
+            marks = ", ".join(sorted(self._marks.get(anchor_id, ()))) or "none"
+            text = f"anchor '{anchor_id}' has no mark '{mark}'; known: {marks} (marks_m in the anchors file)"
+            return _to_refusal(tracking_epoch, text)
         known = ", ".join(sorted(self._anchors)) or "none"
         return _to_refusal(tracking_epoch, f"anchor '{anchor_id}' is not of this session; known: {known}")
 
@@ -225,76 +245,12 @@ class ConnectionEstimator:
         return "; ".join(filter(None, [*parts, f"not used: {unusable}" if unusable else ""]))
 
 
-class TouchEstimator:
-    """Touched marks of one connection: a bounded number of touches, registered together.
-
-    `pending`: enough points were touched, and something is new since the last estimate.
-    """
-
-    def __init__(self, anchors: Mapping[str, PoseTuple]) -> None:
-        """Create an estimator; `anchors`: present `T_world_anchor`, of which only the position is used."""
-        self._anchors = anchors
-        self._touches: dict[str, deque[Vec3]] = {}
-        self._suspects: frozenset[str] = frozenset()
-        self._tracking_epoch = 0
-        self.pending = False
-
-    def add_touch(self, point: str, p_tracking_tip: Vec3, tracking_epoch: int) -> bool:
-        """Add one touch; return false if it is of an older tracking frame or not a finite point."""
-        if tracking_epoch < self._tracking_epoch or not is_valid_point(p_tracking_tip):
-            return False
-        if tracking_epoch > self._tracking_epoch:
-            self.reset()
-            self._tracking_epoch = tracking_epoch
-        kept = self._touches.pop(point, None) or deque(maxlen=MAX_TOUCHES_PER_POINT)
-        if point in self._suspects:  # touched again after a refusal: the earlier touches were wrong
-            kept.clear()
-            self._suspects -= {point}
-        kept.append(p_tracking_tip)
-        self._touches[point] = kept
-        while len(self._touches) > MAX_POINTS:
-            del self._touches[next(iter(self._touches))]
-        self.pending = len(self._touches) >= _MIN_POINTS
-        return True
-
-    @property
-    def advice(self) -> str:
-        """The number of points still needed for an estimate, as text; empty if none are missing."""
-        if not 0 < len(self._touches) < _MIN_POINTS:
-            return ""
-        return f"{len(self._touches)} points touched, {_MIN_POINTS} are needed"
-
-    def on_anchors_moved(self) -> None:
-        """Estimate again with the new positions of the marks."""
-        self.pending = len(self._touches) >= _MIN_POINTS
-
-    def reset(self) -> None:
-        """Discard all touches."""
-        self._touches.clear()
-        self._suspects = frozenset()
-        self.pending = False
-
-    def estimate(self) -> AlignmentEstimate:
-        """Return the alignment by all touches kept. Raises one of `NUMERICAL_ERRORS` where they cannot be solved."""
-        self.pending = False
-        touches = [Touch(point, p) for point, kept in self._touches.items() for p in kept]
-        marks = {point: self._anchors[point][0] for point in self._touches}
-        registration = register_touches(marks, touches, self._tracking_epoch)
-        self._suspects = frozenset(registration.suspects)
-        return replace(registration.estimate, advice=registration.estimate.advice or _residuals_text(registration))
-
-
-def _residuals_text(registration: TouchRegistration) -> str:
-    residuals = ", ".join(f"'{point}' {r * 1e3:.1f} mm" for point, r in sorted(registration.residuals_m.items()))
-    return f"touched points miss their marks by: {residuals}" if residuals else ""
-
-
 def _to_refusal(tracking_epoch: int, advice: str) -> AlignmentProposal:
     p, q = IDENTITY_POSE
     return AlignmentProposal(Pose(p, q), tracking_epoch, (), p, 0.0, refused=True, advice=advice[:MAX_TEXT])
 
 
-def _to_proposal(estimate: AlignmentEstimate) -> AlignmentProposal:
+def _to_proposal(estimate: AlignmentEstimate, kind: str) -> AlignmentProposal:
     p, q = estimate.T_world_tracking
     return AlignmentProposal(
         Pose(p, q),
@@ -307,4 +263,5 @@ def _to_proposal(estimate: AlignmentEstimate) -> AlignmentProposal:
         n_viewpoints=estimate.n_viewpoints,
         refused=estimate.refused,
         advice=estimate.advice[:MAX_TEXT],  # it may list many sheets
+        kind=kind,
     )

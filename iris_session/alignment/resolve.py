@@ -153,7 +153,7 @@ def find_outliers(
     """Return viewpoints that contradict the solution of their time, the worst first."""
     groups: dict[tuple[str, int], list[RecordedObservation]] = {}
     for look in looks:
-        if look.observation.kind != AnchorKind.TOUCH:
+        if look.observation.kind not in AnchorKind.NOT_SEEN:
             groups.setdefault((look.observation.anchor_id, look.observation.viewpoint_id), []).append(look)
     found = []
     for (anchor_id, viewpoint_id), group in groups.items():

@@ -11,18 +11,19 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from types import MappingProxyType
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 from anchors.alignment import AlignmentEstimate
 from anchors.drift import Alarm
 from anchors.pose import PoseTuple, Vec3, is_rigid
 from iris_session.alignment.cross_check import CrossCheckScheduler
-from iris_session.alignment.estimator import ConnectionEstimator
+from iris_session.alignment.estimator import NUMERICAL_ERRORS, ConnectionEstimator
 from iris_session.alignment.monitor import AlignmentMonitor
+from iris_session.alignment.touches import MAX_TIPS, solve_tip
 from iris_session.alignment.worker import InlineWorker, Worker
 from iris_session.protocol.client_messages import Observation, Sample
 from iris_session.protocol.common import Alignment, Pose
-from iris_session.protocol.entries import AlignmentProposal, Entry
+from iris_session.protocol.entries import AlignmentProposal, Entry, TipSolved
 from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import AlarmKind, AlignmentKind, AnchorKind, SampleKind
 from iris_session.protocol.server_messages import (
@@ -35,6 +36,7 @@ from iris_session.protocol.server_messages import (
     ParticipantInfo,
     ParticipantJoined,
     ParticipantLeft,
+    TipCalibrated,
 )
 from iris_session.protocol.status import AlignmentReport
 
@@ -42,6 +44,7 @@ _HEAD: Final = "head"
 _COVARIANCE_VALUES: Final = 36
 _NO_ANCHORS: Final[Mapping[str, Pose]] = MappingProxyType({})
 _NO_SIZES: Final[Mapping[str, float]] = MappingProxyType({})
+_NO_MARKS: Final[Mapping[str, Mapping[str, Vec3]]] = MappingProxyType({})
 #: Disconnected participants whose alignment is remembered, per possible connection.
 _REMEMBERED_PER_CONNECTION: Final = 4
 #: Proposals whose pivot is remembered: 13 s at five per second, so that corrections that are announced first or slide
@@ -49,6 +52,10 @@ _REMEMBERED_PER_CONNECTION: Final = 4
 _MAX_PIVOTS: Final = 64
 #: Observations that wait while the estimate of their connection is computed: a second of them at the rate limit.
 _MAX_WAITING: Final = 64
+#: Least time between two calibrations of tips of one connection, each of which takes milliseconds.
+TIP_PERIOD_NS: Final = 500_000_000
+#: Devices of one connection whose tips wait for their calibration.
+MAX_WAITING_TIPS: Final = 4
 
 
 class HeadsetConnection(Protocol):
@@ -71,7 +78,8 @@ class _HeadsetState:
     is in the old tracking frame, though it may arrive later (sheets are detected in pictures that are tenths of a
     second old). `pivots`: pivot of each of the last proposals by its covariance, oldest first. While an estimate is
     computed (`busy`), the estimator belongs to the worker: `waiting` holds what is to be done with it afterwards, and
-    `is_outdated` is set when the result will not count.
+    `is_outdated` is set when the result will not count. `tips`: the newest observation of kind `tip` of each device,
+    calibrated from `next_tip_ns` on.
     """
 
     __slots__ = (
@@ -82,8 +90,10 @@ class _HeadsetState:
         "is_outdated",
         "last_jump",
         "monitor",
+        "next_tip_ns",
         "pivots",
         "proposal_ns",
+        "tips",
         "waiting",
     )
 
@@ -98,6 +108,8 @@ class _HeadsetState:
         self.last_jump: tuple[int, int] | None = None
         self.busy = self.is_outdated = False
         self.waiting: deque[Callable[[], object]] = deque()
+        self.tips: dict[str, Observation] = {}
+        self.next_tip_ns = 0
 
     def change_estimator(self, change: Callable[[], object]) -> None:
         """Do what invalidates earlier estimates; after the one that is being computed, which does not count then."""
@@ -138,6 +150,7 @@ class AlignmentService:
         *,
         anchors: Mapping[str, Pose] = _NO_ANCHORS,
         anchor_sizes: Mapping[str, float] = _NO_SIZES,
+        anchor_marks: Mapping[str, Mapping[str, Vec3]] = _NO_MARKS,
         proposal_period_ns: int = 200_000_000,
         max_connections: int = 64,
         worker: Worker | None = None,
@@ -149,6 +162,7 @@ class AlignmentService:
             drops: Counters of what is not used, by reason.
             anchors: `T_world_anchor` at the start of the session.
             anchor_sizes: Edge length [m] of printed sheets, where known.
+            anchor_marks: Positions of marks by anchor and id of the mark, in the anchor frame [m].
             proposal_period_ns: Least time between two proposals of one connection.
             max_connections: Most connections of the session; bounds the memory for disconnected participants.
             worker: Computes estimates; by default at once.
@@ -157,6 +171,7 @@ class AlignmentService:
         self._drops = drops
         self._worker = InlineWorker() if worker is None else worker
         self._sizes = anchor_sizes
+        self._marks = anchor_marks
         self._proposal_period_ns = proposal_period_ns
         self._max_remembered = _REMEMBERED_PER_CONNECTION * max_connections
         #: `T_world_anchor`, as it is now.
@@ -165,6 +180,7 @@ class AlignmentService:
         self._cross_check = CrossCheckScheduler(self.anchors)
         self._in_force: dict[str, Alignment] = {}  # by participant, also of those who may reconnect
         self._stopped: dict[str, None] = {}  # participants whose run was stopped
+        self._tips: dict[str, dict[str, tuple[float, ...]]] = {}  # covariance by participant and device
 
     def __len__(self) -> int:
         return len(self._states)
@@ -184,12 +200,23 @@ class AlignmentService:
     def process_observation(self, connection: HeadsetConnection, observation: Observation, now_ns: int) -> None:
         """Check an observation against the present alignment, then add it to the estimate and the cross-check."""
         state = self._states.get(connection.number) or self._add_connection(connection)
-        if not state.busy:
+        if observation.kind == AnchorKind.TIP:
+            self._keep_tip(connection.number, state, observation)
+        elif not state.busy:
             self._add_observation(connection.number, state, observation, now_ns)
         elif len(state.waiting) < _MAX_WAITING:
             state.waiting.append(partial(self._add_observation, connection.number, state, observation, now_ns))
         else:
             self._drops.count("observation_waiting", connection.number)
+
+    def _keep_tip(self, number: int, state: _HeadsetState, observation: Observation) -> None:
+        """Keep the newest poses of the tip of each device until they are calibrated."""
+        if state.tips.pop(observation.device, None) is not None:
+            self._drops.count("tip_superseded", number)
+        state.tips[observation.device] = observation
+        if len(state.tips) > MAX_WAITING_TIPS:
+            del state.tips[next(iter(state.tips))]
+            self._drops.count("tip_waiting", number)
 
     def _add_observation(self, number: int, state: _HeadsetState, observation: Observation, now_ns: int) -> None:
         if state.is_before_jump(observation):
@@ -197,15 +224,15 @@ class AlignmentService:
             return
         p_tracking_head = self._find_head_position(state, observation)
         known = observation.anchor_id in self.anchors
-        touch, tracked = observation.kind == AnchorKind.TOUCH, observation.kind == AnchorKind.CONTROLLER
-        if known and not touch:
+        seen, tracked = observation.kind not in AnchorKind.NOT_SEEN, observation.kind == AnchorKind.CONTROLLER
+        if known and seen:
             alarm = state.monitor.check_observation(observation, p_tracking_head)
             if alarm is not None:
                 self._process_alarm(number, state, alarm, observation.tracking_epoch, now_ns)
         used = True
         if known or not tracked:
             used = state.estimator.add_observation(observation, p_tracking_head, now_ns)
-        if (known and not touch and used) or (tracked and not known):
+        if (known and seen and used) or (tracked and not known):
             kept = self._add_to_cross_check(number, observation, p_tracking_head, now_ns)
             used = kept if not known else used
         if not used:
@@ -233,7 +260,9 @@ class AlignmentService:
         )
 
     def _add_connection(self, connection: HeadsetConnection) -> _HeadsetState:
-        estimator = ConnectionEstimator(self.anchors, self._proposal_period_ns, self._sizes)
+        estimator = ConnectionEstimator(self.anchors, self._proposal_period_ns, self._sizes, self._marks)
+        for device, covariance in self._tips.get(connection.participant_id, {}).items():
+            estimator.set_tip(device, covariance)
         state = _HeadsetState(connection, estimator, AlignmentMonitor(self.anchors))
         self._states[connection.number] = state
         estimator.running = connection.participant_id not in self._stopped
@@ -277,11 +306,15 @@ class AlignmentService:
                 self._set_alignment(event.participant.id, None)
         elif isinstance(event, AlignmentRun):
             self._process_run(event)
+        elif isinstance(event, TipCalibrated):
+            if not event.refused:
+                self._set_tip(event.participant, event.device, event.covariance)
         elif isinstance(event, AnchorMoved):
             self._move_anchor(event.anchor_id, event.T_world_anchor)
         elif isinstance(event, ParticipantLeft) and not event.grace:
             self._in_force.pop(event.participant, None)
             self._stopped.pop(event.participant, None)
+            self._tips.pop(event.participant, None)
 
     def process_snapshot(self, participants: Iterable[ParticipantInfo]) -> None:
         """Apply the participants of a snapshot: a restarted front has received no events."""
@@ -296,6 +329,17 @@ class AlignmentService:
             _limit_size(self._in_force, self._max_remembered)
         for state in self._find_states(participant):
             self._apply_alignment(state, alignment)
+
+    def _set_tip(self, participant: str, device: str, covariance: tuple[float, ...]) -> None:
+        tips = self._tips.pop(participant, {})
+        tips.pop(device, None)
+        tips[device] = covariance
+        if len(tips) > MAX_TIPS:
+            del tips[next(iter(tips))]
+        self._tips[participant] = tips
+        _limit_size(self._tips, self._max_remembered)
+        for state in self._find_states(participant):
+            state.change_estimator(partial(state.estimator.set_tip, device, covariance))
 
     def _apply_alignment(self, state: _HeadsetState, alignment: Alignment | None) -> None:
         measured = alignment is not None and alignment.kind == AlignmentKind.MEASURED and not alignment.offset
@@ -350,11 +394,15 @@ class AlignmentService:
     # --- periodic work -----------------------------------------------------------------------------------------------
 
     def tick(self, now_ns: int) -> None:
-        """Begin at most one estimate or one cross-check: either takes up to milliseconds."""
+        """Begin at most one estimate, calibration or cross-check: each takes up to milliseconds."""
         self._worker.poll()
         if self._worker.is_busy:
             return
         for number, state in self._states.items():
+            if state.tips and now_ns >= state.next_tip_ns:
+                self._states[number] = self._states.pop(number)  # round robin
+                self._calibrate_tip(number, state, now_ns)
+                return
             if state.estimator.is_due(now_ns):
                 self._states[number] = self._states.pop(number)  # round robin
                 self._propose(number, state, now_ns)
@@ -374,6 +422,25 @@ class AlignmentService:
 
         self._worker.submit(compute)
 
+    def _calibrate_tip(self, number: int, state: _HeadsetState, now_ns: int) -> None:
+        """Calibrate a tip in the worker, and offer the result when it is there."""
+        observation = state.tips.pop(next(iter(state.tips)))
+        state.next_tip_ns = now_ns + TIP_PERIOD_NS
+
+        def compute() -> Callable[[], None]:
+            try:
+                solved = solve_tip(observation)
+            except NUMERICAL_ERRORS:
+                text = "these poses cannot be solved: turn the controller again, in every direction"
+                solved = TipSolved(observation.device, refused=True, advice=text)
+            return lambda: finish(solved)
+
+        def finish(solved: TipSolved) -> None:
+            if self._states.get(number) is state:
+                self._offer(Entry(number, number, now_ns, solved))
+
+        self._worker.submit(compute)
+
     def _finish_proposal(
         self, number: int, state: _HeadsetState, proposal: AlignmentProposal | None, now_ns: int
     ) -> None:
@@ -386,9 +453,10 @@ class AlignmentService:
             state.waiting.popleft()()
 
     def _offer_proposal(self, number: int, state: _HeadsetState, proposal: AlignmentProposal, now_ns: int) -> None:
-        if state.estimator.newest is not None and not proposal.refused:
-            state.monitor.set_estimate(state.estimator.newest)
+        if not proposal.refused:
             state.remember_pivot(proposal)
+        if state.estimator.newest is not None and not proposal.refused and proposal.kind == AlignmentKind.MEASURED:
+            state.monitor.set_estimate(state.estimator.newest)
         state.proposal_ns = max(now_ns, state.alarm_ns + 1)
         self._offer(Entry(number, number, state.proposal_ns, proposal))
 
@@ -402,7 +470,7 @@ class AlignmentService:
         return report if state is None else state.estimator.complete_report(report, now_ns)
 
 
-def _limit_size(memory: dict[str, Alignment] | dict[str, None], max_size: int) -> None:
+def _limit_size(memory: dict[str, Any], max_size: int) -> None:
     """Remove the oldest items until at most `max_size` are left."""
     while len(memory) > max_size:
         del memory[next(iter(memory))]

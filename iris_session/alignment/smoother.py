@@ -110,8 +110,8 @@ class AlignmentSmoother:
         e = AlignmentEstimator(self._anchors.last_poses, AlignmentConfig(), self._sizes)
         touched = 0
         for look in self._looks:
-            if look.observation.kind == AnchorKind.TOUCH:
-                touched += 1
+            if look.observation.kind in AnchorKind.NOT_SEEN:
+                touched += look.observation.kind == AnchorKind.TOUCH
             else:
                 add_observation(e, look, look.observation.capture_ns)
         counts = {
@@ -151,7 +151,7 @@ class AlignmentSmoother:
             key = (seen.anchor_id, seen.viewpoint_id)
             if away[i] > AROUND_NS or (key not in groups and len(groups) >= MAX_GROUPS):
                 break
-            if seen.kind != AnchorKind.TOUCH and len(groups.setdefault(key, [])) < MAX_IN_GROUP:
+            if seen.kind not in AnchorKind.NOT_SEEN and len(groups.setdefault(key, [])) < MAX_IN_GROUP:
                 groups[key].append(self._looks[i])
         sides: tuple[list[RecordedObservation], list[RecordedObservation]] = ([], [])
         for group in groups.values():

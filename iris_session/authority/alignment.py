@@ -12,6 +12,9 @@ alignment is in use every better one applies at once. Afterwards small correctio
 and come in one go, and while a clutch is engaged nothing changes: the displayed scene moves no robot, and the pose that
 moves a robot (`LeaseGrant.T_world_tracking`) is frozen for the engagement anyway.
 
+An alignment by fingertips, or by an anchor that a device kept (`AlignmentKind.VIEW_ONLY`), may be less exact. It moves
+nothing, and never replaces one that does.
+
 Alignment runs, alarms and moved anchors are in `anchoring`.
 """
 
@@ -64,6 +67,7 @@ def process_proposal(ctx: Context, p: Participant, m: AlignmentProposal) -> None
         return None
     if ctx.entry_ns <= max(p.proposals_from_ns, ctx.state.anchors_ns):
         return None  # made before the front knew of a jump, a new run, or where the anchors are now
+    drives = m.kind not in AlignmentKind.VIEW_ONLY
     if m.refused or not _is_valid_proposal(ctx, m):
         text = "the anchor measurement is not good enough" if m.refused else "the measurement is not a valid pose"
         if m.refused and _report_progress(ctx, p, m, text):
@@ -72,9 +76,12 @@ def process_proposal(ctx: Context, p: Participant, m: AlignmentProposal) -> None
     if m.tracking_epoch > p.tracking_epoch:
         # The announcement of the frame can arrive after the first observation in it.
         set_tracking_epoch(ctx, p, TrackingEpoch(m.tracking_epoch))
+    if not drives and p.alignment is not None and p.alignment.kind not in AlignmentKind.VIEW_ONLY:
+        return None
     error = compute_error_at_robots(ctx, p, m.covariance, m.pivot_world, m.error_at_anchor_m)
-    if error > ctx.config.max_error_at_robot_m:
-        text = _describe_large_error(ctx, "the robot", error)
+    bound = ctx.config.max_error_at_robot_m if drives else ctx.config.max_error_to_view_m
+    if error > bound:
+        text = _describe_large_error("the robot", error, bound)
         return None if _report_progress(ctx, p, m, text) else _notify_refusal(ctx, p, text, m.advice or ADVICE)
     tilted = m.residual_tilt_rad > ctx.config.max_residual_tilt_rad
     degrees = math.degrees(m.residual_tilt_rad)
@@ -88,6 +95,8 @@ def process_proposal(ctx: Context, p: Participant, m: AlignmentProposal) -> None
 
 
 def _is_valid_proposal(ctx: Context, m: AlignmentProposal) -> bool:
+    if m.kind not in (AlignmentKind.MEASURED, *AlignmentKind.VIEW_ONLY):
+        return False
     if len(m.covariance) != 36 or not math.isfinite(sum(m.covariance) + sum(m.pivot_world) + m.residual_tilt_rad):
         return False
     variances = m.covariance[::7]
@@ -105,7 +114,8 @@ def _is_news(ctx: Context, p: Participant, m: AlignmentProposal, error: float) -
     stated error.
     """
     now, coming = p.alignment, p.correction
-    if now is None or now.kind == AlignmentKind.PLACED or (p.alarm is not None and not p.alarm.beside):
+    replaced = now is None or now.kind == AlignmentKind.PLACED or now.kind in AlignmentKind.VIEW_ONLY - {m.kind}
+    if now is None or replaced or (p.alarm is not None and not p.alarm.beside):
         return True
     if coming is not None:
         old: Pose | None = coming.T_world_tracking
@@ -123,11 +133,10 @@ def _is_news(ctx: Context, p: Participant, m: AlignmentProposal, error: float) -
 
 def refuse_large_error(ctx: Context, p: Participant, robot: str, error: float, advice: str = "") -> None:
     """Refuse an alignment whose stated error at the robot is too large."""
-    _notify_refusal(ctx, p, _describe_large_error(ctx, robot, error), advice or ADVICE)
+    _notify_refusal(ctx, p, _describe_large_error(robot, error, ctx.config.max_error_at_robot_m), advice or ADVICE)
 
 
-def _describe_large_error(ctx: Context, robot: str, error: float) -> str:
-    bound = ctx.config.max_error_at_robot_m
+def _describe_large_error(robot: str, error: float, bound: float) -> str:
     return f"predicted error {error * 1000:.0f} mm at {robot}, at most {bound * 1000:.0f} mm is allowed"
 
 
@@ -219,7 +228,9 @@ def offer_measurement(ctx: Context, p: Participant, m: AlignmentProposal) -> Non
         float(m.error_at_anchor_m),
         ctx.now_ns + ctx.config.slide_ns,
     )
-    if p.alignment is None or not (is_in_use(ctx, p) or is_engaged(ctx, p)):
+    if p.alignment is None or p.alignment.kind in AlignmentKind.VIEW_ONLY:
+        return _complete_correction(ctx, p, goal, m.kind)
+    if not (is_in_use(ctx, p) or is_engaged(ctx, p)):
         return _complete_correction(ctx, p, goal)
     if p.correction is not None:
         before = p.correction
@@ -234,10 +245,10 @@ def apply_placement(ctx: Context, p: Participant, word: Placement) -> None:
         p.placing = word
         return inform_wearer(ctx, p, f"a director has placed {p.name}: it comes into force when you let go")
     p.placing = None
-    if word.offset and p.T_world_tracking_measured is not None:
+    if word.offset and p.T_world_tracking_measured is not None and p.alignment is not None:
         p.offset = word.T_world_tracking
         T = compose_poses(p.offset, p.T_world_tracking_measured)
-        return _set_alignment(ctx, p, AlignmentKind.MEASURED, T, offset=True)
+        return _set_alignment(ctx, p, p.alignment.kind, T, offset=True)
     p.offset = p.T_world_tracking_measured = p.correction = None
     p.placed = True
     _set_alignment(ctx, p, AlignmentKind.PLACED, word.T_world_tracking)
@@ -364,10 +375,10 @@ def _slide_correction(ctx: Context, p: Participant, c: Correction, away_m: float
     return _apply_measured(ctx, p, T, c.pivot_world, widen_covariance(c.covariance, tuple(left)), error_at_anchor_m)
 
 
-def _complete_correction(ctx: Context, p: Participant, c: Correction) -> None:
+def _complete_correction(ctx: Context, p: Participant, c: Correction, kind: str = AlignmentKind.MEASURED) -> None:
     """Apply all of a correction."""
     p.correction = None
-    _apply_measured(ctx, p, c.T_world_tracking, c.pivot_world, c.covariance, c.error_at_anchor_m)
+    _apply_measured(ctx, p, c.T_world_tracking, c.pivot_world, c.covariance, c.error_at_anchor_m, kind)
     _clear_answered_alarm(ctx, p)
 
 
@@ -378,13 +389,14 @@ def _apply_measured(
     pivot_world: Vec3,
     covariance: tuple[float, ...],
     error_at_anchor_m: float,
+    kind: str = AlignmentKind.MEASURED,
 ) -> None:
     """Put a measured alignment in force; a director's offset on top of it voids the stated error."""
     p.T_world_tracking_measured, p.pivot_world = T, pivot_world
     if p.offset is not None:
-        return _set_alignment(ctx, p, AlignmentKind.MEASURED, compose_poses(p.offset, T), offset=True)
+        return _set_alignment(ctx, p, kind, compose_poses(p.offset, T), offset=True)
     error_at_robot_m = compute_error_at_robots(ctx, p, covariance, pivot_world, error_at_anchor_m)
-    return _set_alignment(ctx, p, AlignmentKind.MEASURED, T, covariance, error_at_anchor_m, error_at_robot_m)
+    return _set_alignment(ctx, p, kind, T, covariance, error_at_anchor_m, error_at_robot_m)
 
 
 def _set_alignment(
@@ -483,11 +495,21 @@ def widen_covariance(covariance: tuple[float, ...], away: tuple[float, ...]) -> 
 # --- notices to the wearer ---
 
 
-def warn_wearer(ctx: Context, p: Participant, kind: str, text: str, *, same: str) -> None:
+def advise_view_only(p: Participant) -> tuple[str, str]:
+    """Return why `p` may look but not drive, and what to do about it."""
+    if p.alignment is not None and p.alignment.kind == AlignmentKind.PERSISTENT:
+        return "its alignment comes from a kept anchor and is not confirmed", "touch one mark with a calibrated tip"
+    return (
+        "its marks were touched with a fingertip, or with a tip that is not calibrated",
+        "calibrate the tip of a controller in a pricked hole, and touch three marks with it",
+    )
+
+
+def warn_wearer(ctx: Context, p: Participant, kind: str, text: str, *, same: str, reason: str = "") -> None:
     """Warn the wearer, at most once per `warning_ns` and kind; the next warning counts those left out meanwhile.
 
     `text` empty: the condition has ended. `same`: the part of a warning that stays equal in repetitions, which are not
-    sent again.
+    sent again. `reason`: the `DenialReason` that the warning explains.
     """
     w = p.warnings.get(kind)
     if w is None:
@@ -502,7 +524,7 @@ def warn_wearer(ctx: Context, p: Participant, kind: str, text: str, *, same: str
         w.left_out += changed
     elif now != w.said:
         more = f" ({w.left_out} more of these meanwhile)" if w.left_out else ""
-        ctx.emit(Notice("warning", text[: MAX_TEXT - len(more)] + more, p.id))
+        ctx.emit(Notice("warning", text[: MAX_TEXT - len(more)] + more, p.id, reason))
         w.said, w.said_ns, w.left_out = now, ctx.now_ns, 0
 
 

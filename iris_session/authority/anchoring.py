@@ -10,13 +10,14 @@ from iris_session.authority.context import Context, build_unknown_denial, join_n
 from iris_session.authority.state import HOST_ID, AlarmState, CrossCheckState, Participant
 from iris_session.protocol.client_messages import Align, MoveAnchor, TrackingEpoch
 from iris_session.protocol.common import Denial, Pose
-from iris_session.protocol.entries import AlignmentAlarm, CrossChecked
+from iris_session.protocol.entries import AlignmentAlarm, CrossChecked, TipSolved
 from iris_session.protocol.names import AlarmKind, AlignAction, AlignmentKind, DenialReason, Role
 from iris_session.protocol.server_messages import (
     AlignmentAlarmed,
     AlignmentRun,
     AnchorMoved,
     HeadsetsCompared,
+    TipCalibrated,
 )
 from iris_session.protocol.status import AlignmentReport, CrossCheckReport
 
@@ -143,6 +144,18 @@ def _describe_alarm(p: Participant, m: AlignmentAlarm, size_m: float) -> str:
 def _clear_alarm(ctx: Context, p: Participant) -> None:
     p.alarm = None
     alignment.warn_wearer(ctx, p, "alarm", "", same="")
+
+
+def publish_tip(ctx: Context, p: Participant, m: TipSolved) -> None:
+    """Publish the tip of a controller, or why it could not be calibrated. Ignored for invalid numbers."""
+    numbers = (*m.p_grip_tip, *m.covariance, m.error_m, m.residual_m)
+    if not all(map(math.isfinite, numbers)) or len(m.covariance) != (0 if m.refused else 9):
+        return
+    x, y, z = m.p_grip_tip
+    covariance = tuple(map(float, m.covariance))
+    sizes = (float(m.error_m), float(m.residual_m))
+    tip = (float(x), float(y), float(z))
+    ctx.emit(TipCalibrated(p.id, m.device, tip, covariance, *sizes, m.n_poses, m.refused, m.advice))
 
 
 def record_cross_check(ctx: Context, p: Participant, m: CrossChecked) -> None:

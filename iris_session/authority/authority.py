@@ -67,7 +67,7 @@ HOST_ONLY: Final = (
     em.OwnerListens,
 )
 #: Entries that the front itself makes for the participant of a connection: no envelope, quota or sign of life.
-FRONT_MADE: Final = (em.AlignmentProposal, em.AlignmentAlarm, em.CrossChecked)
+FRONT_MADE: Final = (em.AlignmentProposal, em.AlignmentAlarm, em.TipSolved, em.CrossChecked)
 
 NOT_JOINED: Final = Denial(DenialReason.NOT_JOINED, "this connection is no participant", "say hello first")
 
@@ -413,6 +413,7 @@ _HANDLERS: Final[dict[type, Callable[[Context, Participant, Any], None]]] = {
     cm.Observation: _ignore_observation,
     em.AlignmentProposal: alignment.process_proposal,
     em.AlignmentAlarm: anchoring.raise_alarm,
+    em.TipSolved: anchoring.publish_tip,
     em.CrossChecked: anchoring.record_cross_check,
     cm.PlaceAlignment: alignment.place_alignment,
     cm.Align: anchoring.control_alignment_run,

@@ -56,6 +56,7 @@ POSITIVE: Final = (
     "max_step_ticks",
     "contact_step_n",
     "max_anchor_move_m",
+    "max_error_to_view_m",
     "slide_ns",
     "slide_m_per_s",
     "slide_rad_per_s",
@@ -102,6 +103,7 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # alignment
     unaligned: tuple[Name, ...] = UNALIGNED
     max_error_at_robot_m: float = 0.05  # stated p95; above it the alignment is refused with advice
+    max_error_to_view_m: float = 0.2  # the same for alignments that do not drive
     max_residual_tilt_rad: float = 0.01745  # 1 degree: a warning
     patience_ns: int = 2 * SECOND  # of the first refusals of a participant: progress, then a warning
     min_change_m: float = 0.002  # smaller corrections of an accepted alignment are not worth a new version

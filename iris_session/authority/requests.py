@@ -20,7 +20,7 @@ from iris_session.authority.leases import build_held_denial
 from iris_session.authority.state import NO_CONNECTION, NO_REPLY, LeaseGrant, LeaseState, Participant, Pending
 from iris_session.protocol.client_messages import Acquire, Assign, Consent, Grasp, SetMode, SetScale, Withdraw
 from iris_session.protocol.common import Denial
-from iris_session.protocol.names import DenialReason, Device, HoldReason, LeaseMode, Role
+from iris_session.protocol.names import AlignmentKind, DenialReason, Device, HoldReason, LeaseMode, Role
 from iris_session.protocol.server_messages import ConsentRequested, ScaleChanged
 
 #: Weights of sharers differ by at most a factor of a million, so that normalising them is exact enough.
@@ -349,6 +349,9 @@ def grasp_object(ctx: Context, p: Participant, m: Grasp) -> None:
         denial = Denial(DenialReason.UNKNOWN_VALUE, f"unknown device {m.device}", known)
     if denial is None and p.alignment is None:
         denial = Denial(DenialReason.UNALIGNED, "your headset is not aligned", "look at an anchor sheet", m.object)
+    if denial is None and p.alignment is not None and p.alignment.kind in AlignmentKind.VIEW_ONLY:
+        why, advice = alignment.advise_view_only(p)
+        denial = Denial(DenialReason.VIEW_ONLY, f"{p.name} can look, not drive: {why}", advice, m.object)
     if denial is None and not (p.needs_alignment or alignment.may_be_unaligned(ctx, p.role, p.key_id, m.device)):
         text = f"you may not use {m.device} without an alignment"
         denial = Denial(DenialReason.UNALIGNED, text, alignment.UNALIGNED_ADVICE, m.object)

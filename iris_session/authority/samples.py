@@ -14,11 +14,23 @@ from iris_session.authority.context import Context, find_grant
 from iris_session.authority.state import DeviceState, JointReading, LeaseGrant, LeaseState, Participant, Rejections
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.entries import Entry
-from iris_session.protocol.names import Device, HoldReason, LeaseMode, RejectReason, Role, SampleKind, TargetKind
+from iris_session.protocol.names import (
+    AlignmentKind,
+    DenialReason,
+    Device,
+    HoldReason,
+    LeaseMode,
+    RejectReason,
+    Role,
+    SampleKind,
+    TargetKind,
+)
 from iris_session.protocol.server_messages import SamplesRejected
 
 Drive = tuple[LeaseState, LeaseGrant]
 UNSEEN = DeviceState()
+#: Reasons of a hold that are said also to one whose clutch is open: nothing moves before they are mended.
+_HOLDS = {RejectReason.UNALIGNED: HoldReason.UNALIGNED, RejectReason.VIEW_ONLY: HoldReason.VIEW_ONLY}
 
 
 def check_sample(ctx: Context, p: Participant, entry: Entry, s: Sample, drives: list[Drive]) -> str:
@@ -89,6 +101,8 @@ def _check_alignment(ctx: Context, p: Participant, s: Sample, drives: list[Drive
         return "" if allowed else RejectReason.UNALIGNED
     if p.alignment is None:
         return RejectReason.UNALIGNED if drives else ""
+    if drives and p.alignment.kind in AlignmentKind.VIEW_ONLY:
+        return RejectReason.VIEW_ONLY
     if s.alignment_version == p.alignment.version:
         return ""
     frozen = drives and all(
@@ -187,13 +201,17 @@ def reject_sample(ctx: Context, p: Participant, s: Sample, reason: str) -> None:
     count_rejection(ctx, p, s.device, reason)
     if reason == RejectReason.SEQ:
         return
-    hold = HoldReason.UNALIGNED if reason == RejectReason.UNALIGNED else HoldReason.REJECTED
+    hold = _HOLDS.get(reason, HoldReason.REJECTED)
     if reason == RejectReason.UNALIGNED and p.alignment is None:
         advice = "look at an anchor sheet" if p.aligning else "start its alignment run"
         alignment.warn_wearer(ctx, p, "unaligned", f"{p.name} is not aligned and moves nothing: {advice}", same=advice)
     if reason == RejectReason.UNALIGNED and not p.needs_alignment:
         text = f"{p.name} may not drive with {s.device} without an alignment: {alignment.UNALIGNED_ADVICE}"
         alignment.warn_wearer(ctx, p, "unaligned", text, same=s.device)
+    if reason == RejectReason.VIEW_ONLY:
+        why, advice = alignment.advise_view_only(p)
+        text = f"{p.name} can look, not drive: {why}; {advice}"
+        alignment.warn_wearer(ctx, p, "unaligned", text, same=why, reason=DenialReason.VIEW_ONLY)
     for t in s.targets:
         lease = ctx.find_lease(t.kind, t.name)
         g = find_grant(lease, p.id, s.device) if lease is not None else None
@@ -204,7 +222,7 @@ def reject_sample(ctx: Context, p: Participant, s: Sample, reason: str) -> None:
         if not g.engagement:
             # The cause of an earlier stop (e-stop, reset) stays visible until the clutch opens, and another device that
             # is ready to engage stays ready.
-            shown = hold == HoldReason.UNALIGNED or g.hold in (HoldReason.NO_SAMPLE, HoldReason.CLUTCH_OPEN)
+            shown = reason in _HOLDS or g.hold in (HoldReason.NO_SAMPLE, HoldReason.CLUTCH_OPEN)
             if shown and not g.armed:
                 g.hold = hold
         elif g.device == s.device:

@@ -287,10 +287,10 @@ def _simulate_touching_headset(rng: np.random.Generator) -> tuple[HeadsetError]:
     touches = []
     for name, p in MARKS.items():
         (tip,) = headset.touch_mark(np.array(p), TIP_SIGMA_M)
-        touches.append(Touch(name, tip))
+        touches.append(Touch(name, tip, TIP_SIGMA_M))
         at = headset.now_s
         headset.walk()
-    estimate = register_touches(MARKS, touches, sigma_m=TIP_SIGMA_M).estimate
+    estimate = register_touches(MARKS, touches).estimate
     return (_compute_error(_to_arrays(estimate.T_world_tracking), headset.T_world_tracking(at), estimate),)
 
 

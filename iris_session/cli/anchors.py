@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import json
 import math
 import re
 from dataclasses import dataclass
@@ -33,8 +34,12 @@ from iris_session.cli.common import (
 if TYPE_CHECKING:
     from anchors.camera import CameraModel
     from anchors.detection import SheetDetection
-    from anchors.pose import PoseTuple
+    from anchors.pose import PoseTuple, Vec3
     from anchors.sheet import Sheet
+
+#: Edges of the code where none is given: with its marks it must be smaller to fit on A4.
+PLAIN_SHEET_M: Final = 0.160
+MARKED_SHEET_M: Final = 0.140
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -70,13 +75,18 @@ def _register_print(actions: argparse._SubParsersAction[argparse.ArgumentParser]
         "print",
         help="write a sheet as PDF or SVG",
         description="Write a sheet of exact size: a QR code with the anchor's id between four markers that cameras "
-        "detect from a distance, and a ruler to check the printed size.",
+        "detect from a distance, and a ruler to check the printed size. With --marks also four crosses, to be "
+        "pricked and touched with a controller by devices that cannot read the code.",
         epilog="examples:\n"
         "  iris-session anchors print --size 160mm --id table --out table.pdf\n"
-        "  iris-session anchors print --id shelf --paper a3 --size 200mm",
+        "  iris-session anchors print --id shelf --paper a3 --size 200mm\n"
+        "  iris-session anchors print --marks --out table.pdf",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    one.add_argument("--size", type=parse_length, default=0.160, metavar="LENGTH", help="edge of the QR code (160mm)")
+    one.add_argument(
+        "--size", type=parse_length, metavar="LENGTH", help="edge of the QR code (160mm; with --marks 140mm)"
+    )
+    one.add_argument("--marks", action="store_true", help="four crosses around the frame; a4 holds sizes up to 143mm")
     one.add_argument("--id", default="table", metavar="NAME", help="id of the anchor (%(default)s)")
     one.add_argument("--paper", default="a4", metavar="PAPER", help="a5, a4, a3, a2, letter or tabloid (%(default)s)")
     one.add_argument("--out", type=Path, metavar="FILE", help="*.pdf or *.svg (default: NAME.pdf)")
@@ -90,7 +100,8 @@ def _register_example(actions: argparse._SubParsersAction[argparse.ArgumentParse
         "example",
         help="an anchors file to edit, for `serve --anchors`",
         description="Print the anchors of a scene as a file to edit. Pass it as `serve --anchors FILE`.",
-        epilog="examples:\n  iris-session anchors example > anchors.toml\n  iris-session anchors example handover",
+        epilog="examples:\n  iris-session anchors example > anchors.toml\n  iris-session anchors example handover\n"
+        "  iris-session anchors example --marks > anchors.toml",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     one.add_argument(
@@ -99,6 +110,7 @@ def _register_example(actions: argparse._SubParsersAction[argparse.ArgumentParse
         default="",
         help="name of a scene (see `iris-session serve --help`); default: one sheet, `table`",
     )
+    one.add_argument("--marks", action="store_true", help="of sheets with marks, as `print --marks` writes them")
     add_json_option(one)
     one.set_defaults(run=run_example)
 
@@ -112,7 +124,8 @@ def run_print(arguments: argparse.Namespace) -> int:
     if out.suffix.lower() not in (".pdf", ".svg"):
         raise CommandError(f"{out}: the file must end in .pdf or .svg")
     try:
-        sheet = Sheet(arguments.id, arguments.size)
+        size_m = arguments.size or (MARKED_SHEET_M if arguments.marks else PLAIN_SHEET_M)
+        sheet = Sheet(arguments.id, size_m, arguments.marks)
         drawn = to_pdf(sheet, arguments.paper) if out.suffix.lower() == ".pdf" else to_svg(sheet, arguments.paper)
     except SheetError as error:
         raise CommandError(str(error)) from error
@@ -129,16 +142,23 @@ def run_print(arguments: argparse.Namespace) -> int:
                 "paper": arguments.paper,
                 "markers": list(sheet.marker_ids),
                 "marker_edge_m": sheet.marker_edge_m,
+                "marks_m": {name: list(p) for name, p in sheet.marks.items()},
             }
         )
         return 0
     print(f"{out}: anchor {sheet.anchor_id!r}, code {1e3 * sheet.edge_m:g} mm, for {arguments.paper}")
     print(f"print at 100 % (not 'fit to page'), then measure the code: {1e3 * sheet.edge_m:g} mm from edge to edge")
+    if sheet.has_marks:
+        print("prick the crosses with a needle; the session must know them: lines for the anchors file")
+        print(f"\nsize_m = {sheet.edge_m!r}\n[anchors.{json.dumps(sheet.anchor_id)}.marks_m]")
+        for name, p in sheet.marks.items():
+            print(f'"{name}" = [{", ".join(f"{c:.6g}" for c in p)}]')
     return 0
 
 
 def run_example(arguments: argparse.Namespace) -> int:
     """Print the anchors of a scene in the format of `serve --anchors`."""
+    from anchors.sheet import compute_marks
     from iris_session.session.config import SessionConfig, dump_anchors
 
     config = SessionConfig()
@@ -146,7 +166,11 @@ def run_example(arguments: argparse.Namespace) -> int:
     if arguments.scene:
         scene = open_scene(arguments.scene)
         anchors, sizes = scene.anchors, scene.anchor_sizes
-    text = dump_anchors(anchors, sizes)
+    marks: dict[str, dict[str, Vec3]] = {}
+    if arguments.marks:
+        sizes = dict.fromkeys(anchors, MARKED_SHEET_M)
+        marks = {name: compute_marks(MARKED_SHEET_M) for name in anchors}
+    text = dump_anchors(anchors, sizes, marks)
     if arguments.json:
         print_json({"toml": text})
     else:

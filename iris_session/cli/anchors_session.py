@@ -328,8 +328,8 @@ def _format_headset(p: ParticipantReport) -> Iterator[str]:
         yield f"{name:20.20s} {p.alignment:16.16s}"
         return
     kind = p.alignment + (" + offset" if r.offset else "") + ("" if r.running else " STOPPED")
-    aligned = p.alignment in (AlignmentKind.MEASURED, AlignmentKind.PLACED)
-    stated = aligned and p.alignment == AlignmentKind.MEASURED and not r.offset
+    aligned = p.alignment in (AlignmentKind.MEASURED, AlignmentKind.PLACED, *AlignmentKind.VIEW_ONLY)
+    stated = aligned and p.alignment != AlignmentKind.PLACED and not r.offset
     at = [f"{m * 1e3:.1f} mm" if stated else "-" for m in (r.error_at_anchor_m, r.error_at_robot_m)]
     yield (
         f"{name:20.20s} {kind:16.16s} {r.version:7d} {format_duration(p.alignment_age_ns) if aligned else '-':>6s} "
@@ -463,13 +463,14 @@ def _load_reference_anchors(recording: Recording, given: Constellation | None) -
     header = recording.header
     places: dict[str, PoseTuple] = {name: (pose.p, pose.q) for name, pose in header.anchors.items()}
     sizes = {} if header.settings is None else dict(header.settings.anchor_sizes)
-    return Constellation(next(iter(places), ""), places, {}, sizes)
+    marks = {} if header.settings is None else dict(header.settings.anchor_marks)
+    return Constellation(next(iter(places), ""), places, {}, sizes, marks)
 
 
 def _replace_anchors(saved: Constellation, anchors: dict[str, PoseTuple]) -> Constellation:
     from anchors.constellation import Constellation
 
-    return Constellation(saved.reference, anchors, saved.error_m, saved.sizes)
+    return Constellation(saved.reference, anchors, saved.error_m, saved.sizes, saved.marks)
 
 
 def _resolve_frames(looks: AlignmentHistory, anchors: Any, sizes: dict[str, float]) -> list[FrameResult]:

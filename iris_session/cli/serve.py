@@ -206,7 +206,13 @@ def apply_anchors_file(config: SessionConfig, path: Path | None) -> SessionConfi
     if path is None:
         return config
     given = load_anchors(path)
-    return dataclasses.replace(config, anchors=given.anchors, anchor_sizes=given.sizes, anchor_errors=given.error_m)
+    return dataclasses.replace(
+        config,
+        anchors=given.anchors,
+        anchor_sizes=given.sizes,
+        anchor_errors=given.error_m,
+        anchor_marks=given.marks,
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:

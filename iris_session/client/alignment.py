@@ -14,6 +14,7 @@ from iris_session.client.core.connection import ClientConnection
 from iris_session.client.errors import InvalidMessageError
 from iris_session.client.sheet_observer import CAMERA_SIGMA, SheetObserver, to_observation
 from iris_session.protocol.client_messages import (
+    MAX_TIP_POSES,
     Align,
     ClientMessage,
     MoveAnchor,
@@ -21,7 +22,7 @@ from iris_session.protocol.client_messages import (
     PlaceAlignment,
     TrackingEpoch,
 )
-from iris_session.protocol.common import Alignment
+from iris_session.protocol.common import IDENTITY, Alignment
 from iris_session.protocol.names import AlignAction, AnchorKind
 from iris_session.protocol.server_messages import Reply
 
@@ -94,6 +95,7 @@ class ClientAlignment:
         quality: float = 1.0,
         device: str = "head",
         covariance: Numbers = (),
+        mark: str = "",
         tracking_epoch: int | None = None,
     ) -> None:
         """Report the observation of an anchor, in the tracking frame.
@@ -108,7 +110,8 @@ class ClientAlignment:
             quality: 0 to 1.
             device: The device that observed it.
             covariance: 36 values, 6x6 row-major, (x, y, z [m], rx, ry, rz [rad]), tracking axes; without it the
-                session assumes that of a headset's camera.
+                session assumes that of a headset's camera, or of a touch with `device`.
+            mark: Of kind `touch`, the touched mark; the position is that of the tip, the rotation that of the grip.
             tracking_epoch: Epoch of the tracking frame, default the present one.
 
         Raises:
@@ -130,6 +133,34 @@ class ClientAlignment:
                 quality=quality,
                 device=device,
                 covariance=values,
+                mark=mark,
+            )
+        )
+
+    def report_tip_poses(self, device: str, T_tracking_grip: Sequence[PoseLike]) -> None:
+        """Report poses of a controller that was turned while its tip stayed in a hole.
+
+        The session calibrates the tip, and answers with the event `tip_calibrated`.
+
+        Args:
+            device: The controller, such as `controller/right`.
+            T_tracking_grip: 20 to 100 poses, `((x, y, z) [m], (w, x, y, z))`; of more, 100 are sent.
+
+        Raises:
+            InvalidMessageError: A value does not fit the protocol.
+            NotConnectedError: There is no connection.
+        """
+        n = len(T_tracking_grip)
+        kept = min(n, MAX_TIP_POSES)
+        self._client.send(
+            Observation(
+                anchor_id="",
+                kind=AnchorKind.TIP,
+                T_tracking_anchor=IDENTITY,
+                capture_ns=self._client.session_now_ns(),
+                tracking_epoch=self.tracking_epoch,
+                device=device,
+                grip_poses=tuple(to_pose("T_tracking_grip", T_tracking_grip[k * n // kept]) for k in range(kept)),
             )
         )
 

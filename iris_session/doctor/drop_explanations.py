@@ -90,6 +90,8 @@ EXPLANATIONS: Final[Mapping[str, str]] = {
     "observation_before_jump": "observations from before a jump of the tracking frame",
     "observation_unusable": "observations of anchors that are too far away or unknown to the session",
     "observation_waiting": f"observations of anchors: {_FAST}",
+    "tip_superseded": "poses of a tip, before those that came earlier were solved",
+    "tip_waiting": "poses of the tips of more devices than are solved at a time",
     "alarms_repeated": "repeated alarms of headsets",
     "beacon_unsent": "the network does not send broadcasts",
     "allow_list_unreadable": "the list of keys cannot be read; the previous list is used",

@@ -50,6 +50,7 @@ HOLD_ADVICE: Final = {
     HoldReason.STALE: "no accepted sample for 150 ms: the network is slow, or the app stopped sending",
     HoldReason.UNTRACKED: "the device is not tracked: bring it into view",
     HoldReason.UNALIGNED: "no alignment, or its error here is too large: bring the sheet into view",
+    HoldReason.VIEW_ONLY: "aligned by a fingertip or a kept anchor: touch marks with a calibrated tip",
     HoldReason.REJECTED: "a sample was rejected: see `rejected`; open and close the clutch",
     HoldReason.DISCONNECTED: "its holder is disconnected; the lease is kept for a grace period",
 }

@@ -24,6 +24,7 @@ from iris_session.protocol.entries import (
     EntryMessage,
     Join,
     Lost,
+    TipSolved,
 )
 from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import AlarmKind
@@ -54,7 +55,7 @@ def _has_edge(old: Entry, new: Entry, a: Sample, b: Sample) -> bool:
 def _replacement_key(message: EntryMessage) -> Hashable:
     """Return the key under which a pending entry replaces the one before, `None` if it replaces none.
 
-    Anchor names are the session's own, so the keys are few.
+    Anchor names are the session's own, and a tip is solved once a second, so the keys are few.
     """
     if isinstance(message, Heartbeat | TrackingEpoch):
         return type(message)
@@ -62,6 +63,8 @@ def _replacement_key(message: EntryMessage) -> Hashable:
         return AlignmentProposal, message.refused
     if isinstance(message, AlignmentAlarm):
         return AlignmentAlarm, message.kind, message.anchor_id
+    if isinstance(message, TipSolved):
+        return TipSolved, message.device
     if isinstance(message, CrossChecked):
         return CrossChecked, message.other
     return None

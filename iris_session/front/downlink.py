@@ -19,6 +19,7 @@ from iris_session.link.sockets import readable
 from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import (
     AnchorInfo,
+    AnchorMark,
     Event,
     ParticipantChanged,
     ParticipantInfo,
@@ -172,9 +173,10 @@ class Downlink:
             self._disconnects.remove(connection, "refused")
 
     def _describe_anchor(self, anchor: AnchorInfo) -> AnchorInfo:
-        """Return an anchor with its size and stated error, where they are known."""
+        """Return an anchor with its size, stated error and marks, where they are known."""
         size, error = self._config.anchor_sizes.get(anchor.id, 0.0), self._config.anchor_errors.get(anchor.id, 0.0)
-        return msgspec.structs.replace(anchor, size_m=size, error_m=error)
+        marks = tuple(AnchorMark(*mark) for mark in self._config.anchor_marks.get(anchor.id, {}).items())
+        return msgspec.structs.replace(anchor, size_m=size, error_m=error, marks=marks)
 
     def broadcast(self, message: Event | ProtocolFault) -> None:
         """Send a message to every admitted connection, encoded once."""

@@ -247,6 +247,7 @@ def _make_alignment_service(context: FrontContext) -> AlignmentService:
         context.drops,
         anchors=config.anchors,
         anchor_sizes=config.anchor_sizes,
+        anchor_marks=config.anchor_marks,
         proposal_period_ns=config.proposal_period_ns,
         max_connections=config.limits.connections,
         worker=ThreadWorker(),

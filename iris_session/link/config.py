@@ -10,7 +10,7 @@ from typing import Final
 
 import msgspec
 
-from iris_session.protocol.common import Pose
+from iris_session.protocol.common import Name, Pose, Vec3
 from iris_session.protocol.limits import KeyLimits
 from iris_session.protocol.server_messages import BodyInfo, RobotInfo
 
@@ -126,6 +126,7 @@ class FrontConfig(msgspec.Struct, frozen=True):
         anchors: `T_world_anchor` by anchor id.
         anchor_sizes: Edge of the printed code by anchor id [m].
         anchor_errors: Stated p95 of the position error by anchor id [m], where it is known.
+        anchor_marks: Positions of marks by anchor id and id of the mark, in the anchor frame [m].
         forward_observations: Send raw observations to the authority too.
         recorder_endpoint: Endpoint of a PULL socket for raw samples, empty when nothing is recorded.
         gateway_key: Public key (Z85) of the session's own gateway, which is admitted without the list; empty for none.
@@ -164,6 +165,7 @@ class FrontConfig(msgspec.Struct, frozen=True):
     recorder_endpoint: str = ""
     gateway_key: str = ""
     anchor_errors: dict[str, float] = {}
+    anchor_marks: dict[str, dict[Name, Vec3]] = {}
 
     @property
     def hosts(self) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ in integer nanoseconds unless a field says otherwise.
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Final
 
 import msgspec
 
@@ -17,6 +17,9 @@ from iris_session.protocol.status import ClientReport, GetStatus
 
 Joints = Annotated[tuple[float, ...], msgspec.Meta(max_length=64)]
 Targets = Annotated[tuple[Target, ...], msgspec.Meta(max_length=8)]
+#: Poses of an observation `tip`: some seconds of turning, thinned out.
+MAX_TIP_POSES: Final = 100
+TipPoses = Annotated[tuple[Pose, ...], msgspec.Meta(max_length=MAX_TIP_POSES)]
 
 
 class Hello(Message, frozen=True, tag="hello"):
@@ -187,6 +190,8 @@ class Observation(Message, frozen=True, tag="observation"):
 
     `kind`: `AnchorKind`. `size_m`: edge of the sheet as detected. `viewpoint_id`: observations with the same number
     share their systematic error. `covariance`: 6x6 row-major (position, rotation) or empty. `quality`: 0 to 1.
+    `mark`: touched mark of the anchor (`AnchorInfo.marks`), empty for the origin of the anchor. `grip_poses`: of kind
+    `tip`, `T_tracking_grip` of `device` (section 5).
     """
 
     anchor_id: Name
@@ -199,6 +204,8 @@ class Observation(Message, frozen=True, tag="observation"):
     quality: float = 1.0
     device: Name = "head"
     covariance: Annotated[tuple[float, ...], msgspec.Meta(max_length=36)] = ()
+    mark: Name = ""
+    grip_poses: TipPoses = ()
 
 
 class PlaceAlignment(Message, frozen=True, tag="place_alignment"):

@@ -76,7 +76,7 @@ class AlignmentProposal(Message, frozen=True, tag="alignment_proposal"):
 
     Covariance: 6x6 row-major at the anchor, order (x, y, z, rx, ry, rz), world frame. `advice` is set when the
     estimator refuses (`refused` true): "step closer", "add a sheet near the robot".
-    `pivot_world`: the point that the covariance is stated at (the anchor).
+    `pivot_world`: the point that the covariance is stated at (the anchor). `kind`: the `AlignmentKind` that it makes.
     """
 
     T_world_tracking: Pose
@@ -87,6 +87,22 @@ class AlignmentProposal(Message, frozen=True, tag="alignment_proposal"):
     residual_tilt_rad: float = 0.0
     n_observations: Count = 0
     n_viewpoints: Count = 0
+    refused: bool = False
+    advice: Text = ""
+    kind: Name = "measured"
+
+
+class TipSolved(Message, frozen=True, tag="tip_solved"):
+    """Result of the calibration of a tip in the front, for the participant of this entry's connection. Fields as in
+    `TipCalibrated`.
+    """
+
+    device: Name
+    p_grip_tip: Vec3 = (0.0, 0.0, 0.0)
+    covariance: tuple[float, ...] = ()
+    error_m: float = 0.0
+    residual_m: float = 0.0
+    n_poses: Count = 0
     refused: bool = False
     advice: Text = ""
 
@@ -214,6 +230,7 @@ EntryMessage = (
     | Align
     | MoveAnchor
     | AlignmentAlarm
+    | TipSolved
     | CrossChecked
     | TrackingEpoch
     | Episode

@@ -95,7 +95,7 @@ LIMITS: Final[Mapping[type[Message], Limit]] = MappingProxyType(
         SetMode: _REQUEST,
         SetScale: _REQUEST,
         Grasp: _REQUEST,
-        Observation: Limit(2_000, 60, 120),
+        Observation: Limit(10_000, 60, 120),
         PlaceAlignment: _REQUEST,
         Align: _REQUEST,
         MoveAnchor: _REQUEST,

@@ -97,12 +97,19 @@ class AssignmentPolicy:
 
 
 class AlignmentKind:
-    """Origin of `T_world_tracking` of a participant."""
+    """Origin of `T_world_tracking` of a participant.
+
+    `fingertip`: marks touched with a fingertip, or with a tip that is not calibrated; `persistent`: an anchor that the
+    device kept, confirmed by no touch yet. Both are good enough to look, not to drive.
+    """
 
     NONE: Final = "none"
     MEASURED: Final = "measured"
     PLACED: Final = "placed"
     NOT_NEEDED: Final = "not_needed"
+    FINGERTIP: Final = "fingertip"
+    PERSISTENT: Final = "persistent"
+    VIEW_ONLY: Final = frozenset({"fingertip", "persistent"})
 
 
 class AlignAction:
@@ -129,13 +136,20 @@ class AlarmKind:
 
 
 class AnchorKind:
-    """Physical form of an anchor."""
+    """Kind of an observation: the form of the anchor, or the way in which it was found.
+
+    `touch`: a tip or a fingertip on a mark. `tip`: a controller turned while its tip stayed in a hole. `persistent`: a
+    place that the device kept since an earlier alignment.
+    """
 
     QR: Final = "qr"
     BOARD: Final = "board"
     CONTROLLER: Final = "controller"
     TOUCH: Final = "touch"
-    ALL: Final = frozenset({"qr", "board", "controller", "touch"})
+    TIP: Final = "tip"
+    PERSISTENT: Final = "persistent"
+    NOT_SEEN: Final = frozenset({"touch", "tip", "persistent"})
+    ALL: Final = frozenset({"qr", "board", "controller", "touch", "tip", "persistent"})
 
 
 class SessionKind:
@@ -171,6 +185,7 @@ class HoldReason:
     SCENE_CHANGED: Final = "scene_changed"  # reset or new epoch; clutch again
     INTERVENTION: Final = "intervention"  # mode `priority`, sent to the agent: a human has the robot
     REARM: Final = "rearm"  # engagement ended (release, takeover, new tracking epoch); clutch again
+    VIEW_ONLY: Final = "view_only"  # the alignment is good enough to look, not to drive
 
 
 class RejectReason:
@@ -197,6 +212,7 @@ class RejectReason:
     DEVICE: Final = "device"  # device not declared in hello, or does not fit the kind
     LEADER_APART: Final = "leader_apart"
     KIND_MISMATCH: Final = "kind"  # others drive this shared robot by samples of another kind
+    VIEW_ONLY: Final = "view_only"  # the alignment is good enough to look, not to drive
 
 
 class DenialReason:
@@ -226,6 +242,7 @@ class DenialReason:
     INVALID: Final = "invalid"  # values out of range (non-finite pose, n_ticks < 1, ...)
     WITHDRAWN: Final = "withdrawn"  # the sender took the request back
     TOO_FAR: Final = "too_far"  # more often a wrong number than intended: confirm with `force`
+    VIEW_ONLY: Final = "view_only"  # the alignment is good enough to look, not to drive
 
 
 class RefusalCode:

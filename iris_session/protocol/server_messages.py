@@ -6,7 +6,7 @@ and `Presence`, of which only the latest counts. World frame: right-handed, Z up
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Final
 
 import msgspec
 
@@ -28,6 +28,9 @@ from iris_session.protocol.common import (
 )
 from iris_session.protocol.names import PROTOCOL_VERSION
 from iris_session.protocol.status import DeliveryBudget, StatusReport
+
+#: Marks of one anchor.
+MAX_MARKS: Final = 16
 
 
 class Endpoints(msgspec.Struct, frozen=True):
@@ -148,13 +151,25 @@ class BodyInfo(msgspec.Struct, frozen=True, array_like=True):
     object: bool = False
 
 
+class AnchorMark(msgspec.Struct, frozen=True):
+    """A mark of an anchor that can be touched, such as a printed cross. `p_anchor`: its position in the anchor frame
+    [m].
+    """
+
+    id: Name
+    p_anchor: Vec3
+
+
 class AnchorInfo(msgspec.Struct, frozen=True):
-    """An anchor of the session. `size_m`: edge of its sheet, `error_m`: stated p95 of its position; 0: unknown."""
+    """An anchor of the session. `size_m`: edge of its sheet, `error_m`: stated p95 of its position; 0: unknown.
+    `marks`: in the order in which they are best touched.
+    """
 
     id: Name
     T_world_anchor: Pose
     size_m: float = 0.0
     error_m: float = 0.0
+    marks: Annotated[tuple[AnchorMark, ...], msgspec.Meta(max_length=MAX_MARKS)] = ()
 
 
 # --- events: the shared history, numbered without gaps by `event_seq` -----------------------------------------------
@@ -281,6 +296,25 @@ class AnchorMoved(EventBody, frozen=True, tag="anchor_moved"):
     anchor_id: Name
     T_world_anchor: Pose
     by: Name = ""
+
+
+class TipCalibrated(EventBody, frozen=True, tag="tip_calibrated"):
+    """Answer to an observation of kind `tip`: the tip of a controller of a participant, or why it is unknown
+    (`refused`, `advice`).
+
+    `p_grip_tip`: position of the tip in the grip frame of `device` [m]. `covariance`: of it, 3x3 row-major [m^2].
+    `error_m`: its stated p95. `residual_m`: scatter of the poses about the hole. `n_poses`: those that were used.
+    """
+
+    participant: Name
+    device: Name
+    p_grip_tip: Vec3 = (0.0, 0.0, 0.0)
+    covariance: Annotated[tuple[float, ...], msgspec.Meta(max_length=9)] = ()
+    error_m: float = 0.0
+    residual_m: float = 0.0
+    n_poses: Count = 0
+    refused: bool = False
+    advice: Text = ""
 
 
 class HeadsetsCompared(EventBody, frozen=True, tag="headsets_compared"):
@@ -429,6 +463,7 @@ EventKind = (
     | AlignmentRun
     | AlignmentAlarmed
     | AnchorMoved
+    | TipCalibrated
     | HeadsetsCompared
     | SceneChanged
     | EStopChanged

@@ -57,6 +57,7 @@ class Settings(msgspec.Struct, frozen=True):
 
     `state_hz`: rate of state frames [Hz]. `keyframe_s`: interval of keyframes [s]. `realtime`: a real-time priority was
     requested. `adapt_media`: slow links receive fewer media frames. `anchor_sizes`: edge of the printed sheets [m].
+    `anchor_marks`: positions of their marks in the anchor frame [m].
     """
 
     state_hz: float
@@ -64,6 +65,7 @@ class Settings(msgspec.Struct, frozen=True):
     realtime: bool
     adapt_media: bool = True
     anchor_sizes: dict[str, float] = {}
+    anchor_marks: dict[str, dict[str, tuple[float, float, float]]] = {}
 
 
 class SessionHeader(msgspec.Struct, frozen=True):

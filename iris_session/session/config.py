@@ -20,11 +20,12 @@ import mujoco
 import numpy as np
 
 from anchors.constellation import Constellation, ConstellationError
-from anchors.pose import IDENTITY_QUAT, PoseTuple, quat_normalize
+from anchors.pose import IDENTITY_QUAT, PoseTuple, Vec3, quat_normalize
 from iris_session.authority import AuthorityConfig
 from iris_session.control import ControlConfig
 from iris_session.protocol.common import Pose
 from iris_session.protocol.discovery import DISCOVERY_PORT
+from iris_session.protocol.server_messages import MAX_MARKS
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.session.errors import ConfigError, short_repr
 
@@ -53,6 +54,8 @@ class SessionConfig:
         anchors: `T_world_anchor` by anchor id, as `((x, y, z), (w, x, y, z))` [m].
         anchor_sizes: Edge of the printed sheets [m] that are to be checked for a misprint. The default sheet has 0.16.
         anchor_errors: Stated p95 of the position error of anchors [m], which clients show.
+        anchor_marks: Positions `(x, y, z)` of marks that can be touched, by anchor id and id of the mark, in the frame
+            of the anchor [m].
         curve: Encrypt on loopback too.
         curve_key: ZeroMQ certificate of the server, instead of the key in the user's home of keys.
         curve_clients: Folder of public certificates, instead of the user's allow-list.
@@ -87,6 +90,7 @@ class SessionConfig:
     anchors: Mapping[str, PoseTuple] = field(default_factory=lambda: DEFAULT_ANCHORS)
     anchor_sizes: Mapping[str, float] = field(default_factory=dict)
     anchor_errors: Mapping[str, float] = field(default_factory=dict)
+    anchor_marks: Mapping[str, Mapping[str, Vec3]] = field(default_factory=dict)
     curve: bool = False
     curve_key: str = ""
     curve_clients: str = ""
@@ -106,7 +110,7 @@ class SessionConfig:
 
     def __post_init__(self) -> None:
         check_types(self)
-        check_anchors(self.anchors, self.anchor_sizes)
+        check_anchors(self.anchors, self.anchor_sizes, self.anchor_marks)
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,47}", self.name):
             raise ConfigError(
                 f"session name {self.name!r} cannot be used: 1 to 48 letters, digits, '.', '_' or '-', "
@@ -135,6 +139,13 @@ class SessionConfig:
         """Return the edge of each printed sheet whose size is known [m], including the default one."""
         known = dict.fromkeys(DEFAULT_ANCHORS, DEFAULT_SHEET_M) if self.anchors == DEFAULT_ANCHORS else {}
         return {**known, **{name: float(size) for name, size in self.anchor_sizes.items()}}
+
+    def mark_positions(self) -> dict[str, dict[str, Vec3]]:
+        """Return the positions of the marks of each anchor in its frame [m]."""
+        return {
+            name: {mark: (float(x), float(y), float(z)) for mark, (x, y, z) in marks.items()}
+            for name, marks in self.anchor_marks.items()
+        }
 
     def recording_path(self) -> Path | None:
         """Return the path of the recording, `None` for none. A default folder gets its name at each call."""
@@ -168,6 +179,7 @@ _KINDS: Final[dict[str, tuple[type, ...]]] = {
     "tuple[str, ...]": (tuple,),
     "Mapping[str, PoseTuple]": (Mapping,),
     "Mapping[str, float]": (Mapping,),
+    "Mapping[str, Mapping[str, Vec3]]": (Mapping,),
     "AuthorityConfig": (msgspec.Struct,),
     "ControlConfig": (msgspec.Struct,),
 }
@@ -195,8 +207,10 @@ def check_types(config: Any) -> None:
             raise ConfigError(f"{item.name} must be {annotation}, not {type(value).__name__} {value!r:.60}")
 
 
-def check_anchors(anchors: Mapping[str, Any], sizes: Mapping[str, Any]) -> None:
-    """Check poses `((x, y, z), (w, x, y, z))` and sizes [m] of anchors. Raises `ConfigError`."""
+def check_anchors(anchors: Mapping[str, Any], sizes: Mapping[str, Any], marks: Mapping[str, Any]) -> None:
+    """Check poses `((x, y, z), (w, x, y, z))`, sizes [m] and marks of anchors. Raises `ConfigError`."""
+    for name, positions in marks.items():
+        _check_marks(name, positions, anchors)
     for name, size in sizes.items():
         if name not in anchors:
             raise ConfigError(f"anchor_sizes: there is no anchor {name!r}: {', '.join(map(repr, anchors)) or 'none'}")
@@ -220,6 +234,26 @@ def check_anchors(anchors: Mapping[str, Any], sizes: Mapping[str, Any]) -> None:
             raise ConfigError(f"{where} holds a number that is not finite")
         if abs(math.hypot(*q) - 1.0) > UNIT_TOLERANCE:
             raise ConfigError(f"{where}: the quaternion (w, x, y, z) has length {math.hypot(*q):.3g}, it must be 1")
+
+
+def _check_marks(name: str, positions: object, anchors: Mapping[str, Any]) -> None:
+    """Check the marks of one anchor. Raises `ConfigError`."""
+    where = f"anchor_marks: {name!r}"
+    if name not in anchors:
+        raise ConfigError(f"{where}: there is no such anchor: {', '.join(map(repr, anchors)) or 'none'}")
+    if not isinstance(positions, Mapping) or len(positions) > MAX_MARKS:
+        raise ConfigError(f"{where}: {positions!r:.60} must be at most {MAX_MARKS} positions by id of the mark")
+    for mark, at in positions.items():
+        try:
+            p = tuple(float(v) for v in at)
+        except (TypeError, ValueError):
+            p = ()
+        right = isinstance(mark, str) and 0 < len(mark) <= MAX_ID and len(p) == 3
+        if not right or not all(abs(v) <= LARGEST_SHEET_M for v in p):
+            raise ConfigError(
+                f"{where}: mark {mark!r:.60} at {at!r:.60} must be (x, y, z) in metres in the frame of the anchor, at "
+                f"most {LARGEST_SHEET_M:g} m from it"
+            )
 
 
 def check_timestep(model: mujoco.MjModel) -> None:
@@ -305,20 +339,25 @@ def load_anchors(path: Path) -> Constellation:
                 f"{path.name}: anchors.{name}.position_m is {max(map(abs, p)):g} m away: are these metres?"
             )
     try:
-        check_anchors(found.anchors, found.sizes)
+        check_anchors(found.anchors, found.sizes, found.marks)
     except ConfigError as error:
         raise ConfigError(f"{path.name}: {error}") from error
     return found
 
 
-def dump_anchors(anchors: Mapping[str, PoseTuple], sizes: Mapping[str, float]) -> str:
+def dump_anchors(
+    anchors: Mapping[str, PoseTuple],
+    sizes: Mapping[str, float],
+    marks: Mapping[str, Mapping[str, Vec3]] = MappingProxyType({}),
+) -> str:
     """Return the text of an anchors file, to be edited; `load_anchors` reads it back."""
     reference = next(iter(anchors))
     head = (
         "# Where anchors are: T_world_anchor, metres and a unit quaternion, w first. The origin of a sheet is the\n"
         "# centre of its code, x right, y up along the upright sheet, z out of the paper. `size_m`: edge of the code\n"
         "# as measured; leave it out where not known. `error_m`: 95 % of how well the place is known relative to\n"
-        "# the reference.\n"
+        "# the reference. `marks_m`: crosses to be touched (`anchors print --marks`), by id, in the sheet frame.\n"
     )
     errors = dict.fromkeys(anchors, 0.0)
-    return head + Constellation(reference, dict(anchors), errors, dict(sizes)).to_toml()
+    touched = {name: dict(positions) for name, positions in marks.items()}
+    return head + Constellation(reference, dict(anchors), errors, dict(sizes), touched).to_toml()

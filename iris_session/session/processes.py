@@ -228,6 +228,7 @@ class SessionProcesses:
             anchors=config.anchor_poses(),
             anchor_sizes=config.sheet_sizes(),
             anchor_errors={name: float(error_m) for name, error_m in config.anchor_errors.items()},
+            anchor_marks=config.mark_positions(),
             recorder_endpoint="" if self.recorder is None else self.recorder.samples_endpoint,
         )
 
@@ -424,5 +425,10 @@ class SessionProcesses:
 def make_settings(config: SessionConfig) -> Settings:
     """Return the settings that a resumed session takes over, for the header of the recording."""
     return Settings(
-        config.state_hz, config.keyframe_s, config.realtime, config.adapt_media, anchor_sizes=config.sheet_sizes()
+        config.state_hz,
+        config.keyframe_s,
+        config.realtime,
+        config.adapt_media,
+        anchor_sizes=config.sheet_sizes(),
+        anchor_marks=config.mark_positions(),
     )

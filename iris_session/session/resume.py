@@ -169,6 +169,8 @@ class PastSession:
         if "anchor_sizes" in changes:  # sheets that were given anew may be others
             anchors = changes.get("anchors", given.anchors)
             changes["anchor_sizes"] = {name: m for name, m in changes["anchor_sizes"].items() if name in anchors}
+        if "anchor_marks" in changes and given.anchors != plain.anchors:
+            changes["anchor_marks"] = {}
         return dataclasses.replace(given, control=core.control, **changes)
 
     def _check_model(self, model: mujoco.MjModel) -> None:

@@ -103,13 +103,20 @@ class Wearer:
 class Lab:
     """An `AlignmentService` and the true poses of the anchors (`world`)."""
 
-    def __init__(self, anchors: dict[str, PoseTuple] = ANCHORS, sizes: dict[str, float] | None = None) -> None:
+    def __init__(
+        self,
+        anchors: dict[str, PoseTuple] = ANCHORS,
+        sizes: dict[str, float] | None = None,
+        marks: dict[str, dict[str, Vec3]] | None = None,
+    ) -> None:
         self.now_ns = SECOND
         self.entries: list[Entry] = []
         self.drops = Drops()
         self.world = dict(anchors)
         poses = {name: Pose(*T) for name, T in anchors.items()}
-        self.service = AlignmentService(self._offer, self.drops, anchors=poses, anchor_sizes=sizes or {})
+        self.service = AlignmentService(
+            self._offer, self.drops, anchors=poses, anchor_sizes=sizes or {}, anchor_marks=marks or {}
+        )
 
     def _offer(self, entry: Entry) -> bool:
         self.entries.append(entry)

@@ -523,11 +523,12 @@ def test_invalid_input_never_raises_and_entries_can_be_encoded(bad: float) -> No
                 for one in (ann, bob):
                     sample = Sample("head", "pose", 1, ns, 1, epoch, 0, pose=pose)
                     lab.service.process_sample(one.connection, sample, lab.now_ns)
-                    for kind in ("qr", "board", "controller", "touch", "nonsense"):
+                    for kind in ("qr", "board", "controller", "touch", "persistent", "nonsense"):
                         for anchor in ("sheet", "other", "nothing"):
                             seen = Observation(anchor, kind, pose, ns, epoch, covariance=(bad,) * 36, quality=bad)
                             one.observe(seen)
                             one.observe(msgspec.structs.replace(seen, T_tracking_anchor=IDENTITY, size_m=bad))
+                    one.observe(Observation("", "tip", pose, ns, epoch, device="hand/left", grip_poses=(pose,) * 30))
                 lab.now_ns += 300 * MS
                 lab.poll(50)
     for one in (ann, bob):

@@ -12,7 +12,7 @@ import pypdfium2
 import pytest
 from numpy.typing import NDArray
 
-from anchors.sheet import Sheet, SheetError, compute_marker_ids
+from anchors.sheet import MARK_ARM, Sheet, SheetError, compute_marker_ids, compute_marks, load_dictionary
 from anchors.sheet_print import MARGIN_MM, PAPERS, largest_edge_mm, to_pdf, to_svg
 
 TABLE = Sheet("table", 0.160)
@@ -115,6 +115,50 @@ def test_svg_agrees_with_the_pdf() -> None:
     texts = [element.text for element in root if element.tag.endswith("text")]
     assert "<a&b>" in texts
     assert "80 mm between the long marks" in texts
+
+
+@pytest.mark.parametrize(("paper", "edge"), [("a4", 0.140), ("a3", 0.200)])
+def test_marks_are_printed_where_the_sheet_says(paper: str, edge: float) -> None:
+    """The crossings of the rasterised page are within a tenth of a millimetre of the marks of the sheet."""
+    sheet = Sheet("table", edge, has_marks=True)
+    page = _raster(to_pdf(sheet, paper))
+    ink = 1.0 - page.astype(np.float64) / 255.0
+    width, height = PAPERS[paper]
+    mm, mm_down = width / page.shape[1], height / page.shape[0]
+    plain = 1.0 - _raster(to_pdf(Sheet("table", edge), paper)).astype(np.float64) / 255.0
+    assert set(sheet.marks) == set("1234")
+    for name, (x, y, z) in sheet.marks.items():
+        assert z == 0.0
+        column, row = (0.5 * width + 1e3 * x) / mm, (0.5 * height - 1e3 * y) / mm_down
+        near = round(3.0 / mm)
+        part = ink[round(row) - near : round(row) + near, round(column) - near : round(column) + near]
+        assert plain[round(row) - near : round(row) + near, round(column) - near : round(column) + near].max() < 0.1
+        # The arm towards the outer edge of the page: the other has the id beside it.
+        outer = part[:, : near // 2] if x < 0.0 else part[:, -near // 2 :]
+        across = float(np.average(np.arange(len(part)) + 0.5, weights=outer.sum(axis=1)))
+        lower = part[-near // 2 :]
+        along = float(np.average(np.arange(len(part)) + 0.5, weights=lower.sum(axis=0)))
+        assert (across + round(row) - near - row) * mm_down == pytest.approx(0.0, abs=0.1), name
+        assert (along + round(column) - near - column) * mm == pytest.approx(0.0, abs=0.1), name
+        for axis in (0, 1):
+            outside = (column, row)[axis] * mm
+            assert (
+                MARGIN_MM + 1e3 * MARK_ARM * edge
+                <= outside
+                <= (width, height)[axis] - MARGIN_MM - 1e3 * MARK_ARM * edge
+            )
+
+
+def test_sheets_with_marks_are_smaller_and_still_read() -> None:
+    assert (largest_edge_mm("a4", has_marks=True), largest_edge_mm("a3", has_marks=True)) == (143, 206)
+    with pytest.raises(SheetError, match="frame and marks does not fit on a4: at most 143 mm"):
+        to_pdf(Sheet("table", 0.144, has_marks=True))
+    assert compute_marks(0.14)["3"] == (0.0924, -0.056, 0.0), "this would invalidate every printed sheet"
+    page = _raster(to_pdf(Sheet("table", 0.140, has_marks=True)))
+    page = cv2.resize(page, None, fx=0.3, fy=0.3, interpolation=cv2.INTER_AREA)
+    assert cv2.QRCodeDetector().detectAndDecode(page)[0] == "table"
+    found = cv2.aruco.ArucoDetector(load_dictionary()).detectMarkers(page)[1]
+    assert set(TABLE.marker_ids) <= {int(n) for n in found.ravel()}
 
 
 @pytest.mark.parametrize(

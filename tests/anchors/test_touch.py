@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from anchors.alignment import AlignmentConfig
-from anchors.pose import PoseTuple, Vec3, apply, distance, inverse, quat_angle, quat_from_rotvec, quat_from_yaw
-from anchors.touch import Touch, register_touches
+from anchors.controller import TipCalibration, calibrate_tip
+from anchors.lie import Array, quat_exp, quat_to_matrix
+from anchors.pose import PoseTuple, Quat, Vec3, apply, distance, inverse, quat_angle, quat_from_rotvec, quat_from_yaw
+from anchors.sheet import compute_marks
+from anchors.touch import TOUCH_SIGMA_M, Touch, register_touches, suggest_point
 
 MARKS: dict[str, Vec3] = {
     "a": (0.0, 0.0, 0.0),
@@ -168,3 +173,99 @@ def test_permutations_excluded_by_distances_are_not_fitted(n: int, monkeypatch: 
 
 def _pose_at(p: np.ndarray) -> Vec3:
     return (float(p[0]), float(p[1]), float(p[2]))
+
+
+# --- tips, printed marks ---
+
+TIP = np.array([0.01, -0.02, -0.12])
+PRINTED = compute_marks(0.14)
+
+
+def _calibrate(rng: np.random.Generator, sigma_m: float) -> TipCalibration:
+    """Turn a controller in a hole: 40 poses, by up to 34 degrees to each side."""
+    turns = quat_exp(rng.uniform(-0.6, 0.6, (40, 3)))
+    p = np.array([0.2, 0.1, 0.0]) - quat_to_matrix(turns) @ TIP + rng.normal(0.0, sigma_m, (40, 3))
+    return calibrate_tip([(_vec3(at), _quat(q)) for at, q in zip(p, turns, strict=True)])
+
+
+def _vec3(p: Array) -> Vec3:
+    x, y, z = p.tolist()
+    return (x, y, z)
+
+
+def _quat(q: Array) -> Quat:
+    w, x, y, z = q.tolist()
+    return (w, x, y, z)
+
+
+@pytest.mark.parametrize("turning", [0.0, 0.8])
+@pytest.mark.parametrize("names", ["123", "1234"])
+def test_stated_error_includes_that_of_the_tip(names: str, turning: float) -> None:
+    """Monte Carlo: a tip calibrated with noise, then marks touched with it, held alike or turned every time."""
+    rng = np.random.default_rng(3)
+    far: Vec3 = (0.3, 0.4, 0.2)
+    inside = {"sheet": 0, "robot": 0}
+    errors = []
+    n = 400
+    for _ in range(n):
+        tip = _calibrate(rng, 0.0015)
+        held = rng.uniform(-1.0, 1.0, 3)
+        touches = []
+        for name in names:
+            q = quat_exp(held + turning * rng.uniform(-1.0, 1.0, 3))
+            grip = np.array(apply(inverse(T_WORLD_TRACKING), PRINTED[name])) - quat_to_matrix(q) @ TIP
+            at = grip + quat_to_matrix(q) @ np.array(tip.p_controller_tip) + rng.normal(0.0, TOUCH_SIGMA_M, 3)
+            touches.append(Touch(name, _vec3(at), TOUCH_SIGMA_M, "right", _quat(q)))
+        got = register_touches(PRINTED, touches, tips={"right": tip.covariance}).estimate
+        for where, point in (("sheet", got.pivot_world), ("robot", far)):
+            at_world = apply(got.T_world_tracking, apply(inverse(T_WORLD_TRACKING), point))
+            errors.append(distance(at_world, point))
+            inside[where] += errors[-1] <= got.error_at(point)
+    assert all(0.92 <= count / n <= 0.985 for count in inside.values()), inside
+
+
+def test_common_error_of_a_tip_does_not_average_out() -> None:
+    """With 3 mm that all touches share, four touches are not twice as exact as one."""
+    shared = tuple((0.003**2 * np.eye(3)).ravel().tolist())
+    touches = [replace(t, tip="right") for t in _touches("abcd")]
+    with_tip = register_touches(MARKS, touches, tips={"right": shared}).estimate
+    alone = register_touches(MARKS, touches).estimate
+    assert with_tip.error_at_anchor_m > 0.003 * 2.7 > 3.0 * alone.error_at_anchor_m
+
+
+def test_fingertips_state_their_larger_error() -> None:
+    inside = 0
+    for seed in range(200):
+        touches = [replace(t, sigma_m=0.01) for t in _touches("1234", 0.01, seed, PRINTED)]
+        got = register_touches(PRINTED, touches).estimate
+        at = apply(got.T_world_tracking, apply(inverse(T_WORLD_TRACKING), PRINTED["2"]))
+        inside += distance(at, PRINTED["2"]) <= got.error_at(PRINTED["2"])
+        assert 0.008 < got.error_at_anchor_m < 0.03
+    assert 0.92 <= inside / 200 <= 0.99
+
+
+def test_printed_marks_look_the_same_in_no_other_order() -> None:
+    touches = _touches("1234", 0.0005, marks=PRINTED)
+    assert register_touches(PRINTED, touches).estimate.advice == ""
+    for order in itertools.permutations("1234"):
+        if order != tuple("1234"):
+            mixed = [replace(t, point=name) for t, name in zip(touches, order, strict=True)]
+            assert register_touches(PRINTED, mixed).estimate.refused, order
+
+
+@pytest.mark.parametrize(
+    ("touched", "named"), [("", "1"), ("1", "3"), ("14", "3"), ("12", "4"), ("234", "1"), ("1234", "")]
+)
+def test_next_mark_spreads_the_set(touched: str, named: str) -> None:
+    assert suggest_point(PRINTED, touched) == named
+
+
+def test_degenerate_sets_name_the_mark_to_touch_next() -> None:
+    line = {"a": (0.0, 0.0, 0.0), "b": (0.3, 0.0, 0.0), "c": (0.6, 0.0, 0.0), "d": (0.3, 0.2, 0.0)}
+    got = register_touches(line, _touches("abc", marks=line)).estimate
+    assert got.refused
+    assert "touch 'd' next" in got.advice
+    close = {"a": (0.0, 0.0, 0.0), "b": (0.06, 0.0, 0.0), "c": (0.0, 0.06, 0.0), "d": (0.4, 0.3, 0.0)}
+    got = register_touches(close, _touches("abc", marks=close)).estimate
+    assert got.refused
+    assert got.advice == "points a, b, c lie within 85 mm, too close to tell a rotation: touch 'd' next"

@@ -110,6 +110,23 @@ def test_print_writes_pdf_and_svg(tmp_path: Path, capsys: pytest.CaptureFixture[
         assert out.read_bytes().startswith(begin)
 
 
+def test_printed_marks_are_those_of_the_anchors_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = str(tmp_path / "table.pdf")
+    assert main(["anchors", "print", "--marks", "--out", out, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert (result["size_m"], set(result["marks_m"])) == (0.14, set("1234"))
+    assert main(["anchors", "print", "--marks", "--out", out]) == 0
+    lines = capsys.readouterr().out
+    printed = tomllib.loads(lines[lines.index("[anchors") :])["anchors"]["table"]["marks_m"]
+    assert main(["anchors", "example", "--marks"]) == 0
+    anchors = tomllib.loads(capsys.readouterr().out)["anchors"]["table"]
+    assert anchors["marks_m"] == printed == result["marks_m"]
+    assert anchors["size_m"] == 0.14
+    assert main(["anchors", "print", "--marks", "--size", "150mm", "--out", out]) == 2
+    assert "at most 143 mm" in capsys.readouterr().err
+    assert main(["anchors", "print", "--marks", "--size", "200mm", "--paper", "a3", "--out", out]) == 0
+
+
 def test_print_names_the_file_after_the_anchor(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

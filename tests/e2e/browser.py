@@ -212,12 +212,6 @@ class Page:
         return f"{json.dumps(state, indent=1)}\n{self.errors}"
 
 
-def decode_picture(url: str) -> NDArray[np.uint8]:
-    """Return the RGB pixels of a PNG data URL."""
-    data = base64.b64decode(url.partition(",")[2])
-    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
-
-
 def printed_address(server: SessionProcess) -> str:
     """Return the address of the page that `serve` prints."""
     wait_until(lambda: "in a browser:" in server.output or server.process.poll() is not None, "the address is printed")
@@ -234,3 +228,9 @@ def join_as(page: Page, name: str, role: str) -> None:
     page.click("button", "Join with these")
     page.wait(f"irisSession.state.self?.name === {json.dumps(name)} && irisSession.state.role === {json.dumps(role)}")
     page.wait("irisSession.state.phase.phase === 'ready'")
+
+
+def decode_picture(url: str) -> NDArray[np.uint8]:
+    """Return the RGB pixels of a PNG data URL."""
+    data = base64.b64decode(url.partition(",")[2])
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))

@@ -71,6 +71,7 @@ def test_every_internal_message_is_covered() -> None:
         "Audit",
         "SessionResumed",
         "AlignmentAlarm",
+        "TipSolved",
         "CrossChecked",
         "SceneLoaded",
         "ScenePatched",

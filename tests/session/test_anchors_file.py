@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -22,8 +23,36 @@ def test_anchors_file_roundtrip(tmp_path: Path) -> None:
     path.write_text(dump_anchors(PLACES, {"table": 0.16}))
     found = load_anchors(path)
     assert (found.anchors, found.sizes, found.reference) == (PLACES, {"table": 0.16}, "table")
+    assert found.marks == {}
     config = SessionConfig(anchors=found.anchors, anchor_sizes=found.sizes)
     assert config.sheet_sizes() == {"table": 0.16}
+
+
+def test_marks_are_part_of_their_sheet(tmp_path: Path) -> None:
+    marks = {'door "2"': {"1": (0.1, 0.2, 0.0), "left up": (-0.1, 0.2, 0.0)}}
+    path = tmp_path / "anchors.toml"
+    path.write_text(dump_anchors(PLACES, {"table": 0.16}, marks))
+    found = load_anchors(path)
+    assert (found.anchors, found.sizes, found.marks) == (PLACES, {"table": 0.16}, marks)
+    assert SessionConfig(anchors=found.anchors, anchor_marks=found.marks).mark_positions() == marks
+
+
+@pytest.mark.parametrize(
+    ("marks", "value"),
+    [
+        ({"shelf": {}}, "'shelf': there is no such anchor"),
+        ({"table": {"1": (0.1, 0.2)}}, "mark '1'"),
+        ({"table": {"1": (0.1, 0.2, "z")}}, "mark '1'"),
+        ({"table": {"1": (0.1, 0.2, float("nan"))}}, "mark '1'"),
+        ({"table": {"1": (92.4, 131.6, 0.0)}}, "in metres"),
+        ({"table": {"": (0.1, 0.2, 0.0)}}, "mark ''"),
+        ({"table": {str(n): (0.0, 0.0, 0.0) for n in range(17)}}, "at most 16"),
+        ({"table": [(0.1, 0.2, 0.0)]}, "positions by id"),
+    ],
+)
+def test_marks_that_cannot_be_used_are_named(marks: dict[str, Any], value: str) -> None:
+    with pytest.raises(ConfigError, match=value):
+        SessionConfig(anchors=PLACES, anchor_marks=marks)
 
 
 @pytest.mark.parametrize(
@@ -36,6 +65,8 @@ def test_anchors_file_roundtrip(tmp_path: Path) -> None:
         (GOOD.replace("[1, 0, 0, 0]", "[1, 1, 0, 0]"), "quaternion"),
         (GOOD.replace("[0, 0, 0]", "[0, -450, 0]"), "450 m"),
         (GOOD + "size_m = 160\n", "160.0"),
+        (GOOD + "marks_m = 4\n", "anchors.a.marks_m must be a table"),
+        (GOOD + "marks_m = {1 = [0, 0]}\n", "anchors.a.marks_m.1"),
         (GOOD.replace('"a"', f'"{"x" * 65}"').replace(".a]", f".{'x' * 65}]"), "1 to 64 characters"),
         (GOOD.replace('"a"', '""').replace(".a]", '.""]'), "1 to 64 characters"),
     ],

@@ -323,6 +323,27 @@ describe("joined", () => {
     expect(bench.last("reply").error).toMatch(/lost/);
   });
 
+  test("going into a headset and out of it resumes the participant, each time with another run", async () => {
+    await bench.join();
+    bench.post({ type: "rejoin", devices: ["head", "controller/left"], alignment: "measured" });
+    expect(bench.sockets.filter(({ url }) => url.endsWith("session"))).toHaveLength(2);
+    bench.socket.open();
+    const [hello] = bench.socket.find("hello");
+    expect(hello).toMatchObject({ name: "ann", devices: ["head", "controller/left"], alignment: "measured", capabilities: ["run:0011223344556677-1"] });
+    expect(hello?.["resume_token"]).toEqual(new Uint8Array([1]));
+    expect(bench.sockets[0]?.find("bye")).toEqual([]); // which would release its leases
+    bench.welcome(2, true);
+    bench.snapshot("none", 2);
+    bench.pass(1500);
+    expect(bench.last("phase")).toMatchObject({ phase: "ready" });
+    bench.socket.end(1006);
+    bench.socket.open();
+    expect(bench.socket.find("hello")[0]).toMatchObject({ alignment: "measured", capabilities: ["run:0011223344556677-1"] }); // the same frame
+    bench.post({ type: "rejoin", devices: ["desktop"], alignment: "not_needed" });
+    bench.socket.open();
+    expect(bench.socket.find("hello")[0]).toMatchObject({ alignment: "not_needed", capabilities: ["run:0011223344556677-2"] });
+  });
+
   test("a lost socket is replaced at once, with the token, and resumes", async () => {
     await bench.join();
     bench.pass(1500);

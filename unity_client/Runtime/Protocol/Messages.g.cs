@@ -99,6 +99,9 @@ namespace IrisSession.Protocol
 
     /// <summary>
     /// Origin of T_world_tracking of a participant.
+    ///
+    /// fingertip: marks touched with a fingertip, or with a tip that is not calibrated; persistent: an anchor that the
+    /// device kept, confirmed by no touch yet. Both are good enough to look, not to drive.
     /// </summary>
     public static class AlignmentKind
     {
@@ -106,6 +109,8 @@ namespace IrisSession.Protocol
         public const string Measured = "measured";
         public const string Placed = "placed";
         public const string NotNeeded = "not_needed";
+        public const string Fingertip = "fingertip";
+        public const string Persistent = "persistent";
     }
 
     /// <summary>
@@ -132,7 +137,10 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Physical form of an anchor.
+    /// Kind of an observation: the form of the anchor, or the way in which it was found.
+    ///
+    /// touch: a tip or a fingertip on a mark. tip: a controller turned while its tip stayed in a hole. persistent: a
+    /// place that the device kept since an earlier alignment.
     /// </summary>
     public static class AnchorKind
     {
@@ -140,6 +148,8 @@ namespace IrisSession.Protocol
         public const string Board = "board";
         public const string Controller = "controller";
         public const string Touch = "touch";
+        public const string Tip = "tip";
+        public const string Persistent = "persistent";
     }
 
     /// <summary>
@@ -181,6 +191,7 @@ namespace IrisSession.Protocol
         public const string SceneChanged = "scene_changed";
         public const string Intervention = "intervention";
         public const string Rearm = "rearm";
+        public const string ViewOnly = "view_only";
     }
 
     /// <summary>
@@ -209,6 +220,7 @@ namespace IrisSession.Protocol
         public const string Device = "device";
         public const string LeaderApart = "leader_apart";
         public const string KindMismatch = "kind";
+        public const string ViewOnly = "view_only";
     }
 
     /// <summary>
@@ -240,6 +252,7 @@ namespace IrisSession.Protocol
         public const string Invalid = "invalid";
         public const string Withdrawn = "withdrawn";
         public const string TooFar = "too_far";
+        public const string ViewOnly = "view_only";
     }
 
     /// <summary>
@@ -1039,7 +1052,7 @@ namespace IrisSession.Protocol
         }
     }
 
-    /// <summary>One of 25 messages, distinguished by the field "event".</summary>
+    /// <summary>One of 26 messages, distinguished by the field "event".</summary>
     public abstract class EventKind : WireValue
     {
         public abstract string Tag { get; }
@@ -1062,6 +1075,7 @@ namespace IrisSession.Protocol
                 case AlignmentRun.TagName: return AlignmentRun.Read(reader);
                 case AlignmentAlarmed.TagName: return AlignmentAlarmed.Read(reader);
                 case AnchorMoved.TagName: return AnchorMoved.Read(reader);
+                case TipCalibrated.TagName: return TipCalibrated.Read(reader);
                 case HeadsetsCompared.TagName: return HeadsetsCompared.Read(reader);
                 case SceneChanged.TagName: return SceneChanged.Read(reader);
                 case EStopChanged.TagName: return EStopChanged.Read(reader);
@@ -1575,7 +1589,44 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
+    /// A mark of an anchor that can be touched, such as a printed cross. p_anchor: its position in the anchor frame
+    /// [m].
+    /// </summary>
+    public sealed class AnchorMark : WireValue
+    {
+        public string Id = "";
+        public double[] PAnchor = new double[3];
+
+        public static AnchorMark Read(WireReader reader)
+        {
+            AnchorMark value = new AnchorMark();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "id": value.Id = reader.ReadString(64); seen |= 1u; break;
+                    case "p_anchor": value.PAnchor = reader.ReadDoubles(3, 0); seen |= 2u; break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 3u) != 3u) throw new WireException("missing field of AnchorMark");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(2);
+            writer.Write("id");
+            writer.Write(Id);
+            writer.Write("p_anchor");
+            writer.Write(PAnchor);
+        }
+    }
+
+    /// <summary>
     /// An anchor of the session. size_m: edge of its sheet, error_m: stated p95 of its position; 0: unknown.
+    /// marks: in the order in which they are best touched.
     /// </summary>
     public sealed class AnchorInfo : WireValue
     {
@@ -1583,6 +1634,7 @@ namespace IrisSession.Protocol
         public Pose T_world_anchor = new Pose();
         public double SizeM = 0.0;
         public double ErrorM = 0.0;
+        public AnchorMark[] Marks = new AnchorMark[0];
 
         public static AnchorInfo Read(WireReader reader)
         {
@@ -1596,6 +1648,7 @@ namespace IrisSession.Protocol
                     case "T_world_anchor": value.T_world_anchor = Pose.Read(reader); seen |= 2u; break;
                     case "size_m": value.SizeM = reader.ReadDouble(); break;
                     case "error_m": value.ErrorM = reader.ReadDouble(); break;
+                    case "marks": value.Marks = reader.ReadArray(Protocol.AnchorMark.Read, 16); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -1605,7 +1658,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(4);
+            writer.WriteMapHeader(5);
             writer.Write("id");
             writer.Write(Id);
             writer.Write("T_world_anchor");
@@ -1614,6 +1667,8 @@ namespace IrisSession.Protocol
             writer.Write(SizeM);
             writer.Write("error_m");
             writer.Write(ErrorM);
+            writer.Write("marks");
+            writer.Write(Marks);
         }
     }
 
@@ -3065,6 +3120,8 @@ namespace IrisSession.Protocol
     ///
     /// kind: AnchorKind. size_m: edge of the sheet as detected. viewpoint_id: observations with the same number
     /// share their systematic error. covariance: 6x6 row-major (position, rotation) or empty. quality: 0 to 1.
+    /// mark: touched mark of the anchor (AnchorInfo.marks), empty for the origin of the anchor. grip_poses: of kind
+    /// tip, T_tracking_grip of device (section 5).
     /// </summary>
     public sealed class Observation : ClientMessage
     {
@@ -3080,6 +3137,8 @@ namespace IrisSession.Protocol
         public double Quality = 1.0;
         public string Device = "head";
         public double[] Covariance = new double[0];
+        public string Mark = "";
+        public Pose[] GripPoses = new Pose[0];
 
         public static Observation Read(WireReader reader)
         {
@@ -3099,6 +3158,8 @@ namespace IrisSession.Protocol
                     case "quality": value.Quality = reader.ReadDouble(); break;
                     case "device": value.Device = reader.ReadString(64); break;
                     case "covariance": value.Covariance = reader.ReadDoubles(0, 36); break;
+                    case "mark": value.Mark = reader.ReadString(64); break;
+                    case "grip_poses": value.GripPoses = reader.ReadArray(Protocol.Pose.Read, 100); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -3108,7 +3169,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(11);
+            writer.WriteMapHeader(13);
             writer.Write("type");
             writer.Write(TagName);
             writer.Write("anchor_id");
@@ -3131,6 +3192,10 @@ namespace IrisSession.Protocol
             writer.Write(Device);
             writer.Write("covariance");
             writer.Write(Covariance);
+            writer.Write("mark");
+            writer.Write(Mark);
+            writer.Write("grip_poses");
+            writer.Write(GripPoses);
         }
     }
 
@@ -5134,6 +5199,77 @@ namespace IrisSession.Protocol
             writer.Write(T_world_anchor);
             writer.Write("by");
             writer.Write(By);
+        }
+    }
+
+    /// <summary>
+    /// Answer to an observation of kind tip: the tip of a controller of a participant, or why it is unknown
+    /// (refused, advice).
+    ///
+    /// p_grip_tip: position of the tip in the grip frame of device [m]. covariance: of it, 3x3 row-major [m^2].
+    /// error_m: its stated p95. residual_m: scatter of the poses about the hole. n_poses: those that were used.
+    /// </summary>
+    public sealed class TipCalibrated : EventKind
+    {
+        public const string TagName = "tip_calibrated";
+        public override string Tag { get { return TagName; } }
+        public string Participant = "";
+        public string Device = "";
+        public double[] PGripTip = new double[] { 0.0, 0.0, 0.0 };
+        public double[] Covariance = new double[0];
+        public double ErrorM = 0.0;
+        public double ResidualM = 0.0;
+        public long NPoses = 0;
+        public bool Refused = false;
+        public string Advice = "";
+
+        public static TipCalibrated Read(WireReader reader)
+        {
+            TipCalibrated value = new TipCalibrated();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "participant": value.Participant = reader.ReadString(64); seen |= 1u; break;
+                    case "device": value.Device = reader.ReadString(64); seen |= 2u; break;
+                    case "p_grip_tip": value.PGripTip = reader.ReadDoubles(3, 0); break;
+                    case "covariance": value.Covariance = reader.ReadDoubles(0, 9); break;
+                    case "error_m": value.ErrorM = reader.ReadDouble(); break;
+                    case "residual_m": value.ResidualM = reader.ReadDouble(); break;
+                    case "n_poses": value.NPoses = reader.ReadLong(0, long.MaxValue); break;
+                    case "refused": value.Refused = reader.ReadBool(); break;
+                    case "advice": value.Advice = reader.ReadString(512); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 3u) != 3u) throw new WireException("missing field of TipCalibrated");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(10);
+            writer.Write("event");
+            writer.Write(TagName);
+            writer.Write("participant");
+            writer.Write(Participant);
+            writer.Write("device");
+            writer.Write(Device);
+            writer.Write("p_grip_tip");
+            writer.Write(PGripTip);
+            writer.Write("covariance");
+            writer.Write(Covariance);
+            writer.Write("error_m");
+            writer.Write(ErrorM);
+            writer.Write("residual_m");
+            writer.Write(ResidualM);
+            writer.Write("n_poses");
+            writer.Write(NPoses);
+            writer.Write("refused");
+            writer.Write(Refused);
+            writer.Write("advice");
+            writer.Write(Advice);
         }
     }
 

@@ -71,6 +71,11 @@ export type ToWorker =
   | ({ type: "connect" } & ConnectOptions)
   /** Leave: leases are released at once. */
   | { type: "disconnect" }
+  /**
+   * Become a participant with other devices, without leaving: leases stay. What it tracks begins anew, so its alignment is
+   * void.
+   */
+  | { type: "rejoin"; devices: wire.Device[]; alignment: wire.AlignmentKind }
   /** Put this browser on the allow-list with a join code. Answered by `paired`. */
   | { type: "pair"; base_url: string; code: string; name: string; software?: string }
   /** A request of the wire. Answered by one `reply` with the same `id`. */

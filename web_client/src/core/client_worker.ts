@@ -57,6 +57,8 @@ export class ClientWorker {
   private closeCode = 0;
   private cancelTimer: (() => void) | null = null;
   private attempt = 0;
+  /** Tracking frames before this one. */
+  private runs = 0;
   /** Requests of the page that wait for a reply: number on the wire -> number of the page. */
   private waiting = new Map<number, number>();
   private readonly meter = new ArrivalMeter();
@@ -94,6 +96,9 @@ export class ClientWorker {
         break;
       case "disconnect":
         this.disconnect();
+        break;
+      case "rejoin":
+        this.rejoin(command.devices, command.alignment);
         break;
       case "pair":
         void this.pair(command);
@@ -152,16 +157,7 @@ export class ClientWorker {
       this.postFailure("version", info.text);
       return;
     }
-    const hello: wire.Hello = {
-      type: "hello",
-      role: options.role,
-      name: options.name,
-      software: options.software ?? SOFTWARE,
-      devices: options.devices ?? [],
-      capabilities: [...(options.capabilities ?? []), `run:${environment.run}`],
-      alignment: options.alignment ?? "measured",
-    };
-    this.connection = new ClientConnection(hello, identity);
+    this.connection = new ClientConnection(this.makeHello(options), identity);
     this.samples = new SampleBuilder(this.connection);
     try {
       this.connection.open(environment.nowNs());
@@ -171,6 +167,26 @@ export class ClientWorker {
       return;
     }
     this.pump();
+  }
+
+  private makeHello(options: ConnectOptions): wire.Hello {
+    return {
+      type: "hello",
+      role: options.role,
+      name: options.name,
+      software: options.software ?? SOFTWARE,
+      devices: options.devices ?? [],
+      capabilities: [...(options.capabilities ?? []), `run:${this.environment.run}${this.runs > 0 ? `-${this.runs}` : ""}`],
+      alignment: options.alignment ?? "measured",
+    };
+  }
+
+  /** Say hello with other devices. The tracking frame is another one from now on. */
+  private rejoin(devices: wire.Device[], alignment: wire.AlignmentKind): void {
+    if (this.options === null) return;
+    this.runs += 1;
+    this.options = { ...this.options, devices, alignment };
+    this.connection?.rejoin(this.makeHello(this.options), this.environment.nowNs());
   }
 
   private disconnect(): void {

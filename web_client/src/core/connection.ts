@@ -89,7 +89,7 @@ export class ClientConnection {
   private tickedAt = 0;
 
   constructor(
-    readonly hello: wire.Hello,
+    private hello: wire.Hello,
     readonly identity: IdentityStore,
   ) {}
 
@@ -101,6 +101,15 @@ export class ClientConnection {
     this.backoffNs = BACKOFF_MIN_NS;
     this.helloWaitNs = HELLO_TIMEOUT_NS;
     this.sendHello(nowNs);
+  }
+
+  /**
+   * Become a participant with another hello, such as one with other devices: the same one, which keeps its leases. A
+   * connection is replaced by a fresh one; without one the next hello is this one.
+   */
+  rejoin(hello: wire.Hello, nowNs: number): void {
+    this.hello = hello;
+    if (this.isJoined || this.phase === "joining") this.sendHello(nowNs);
   }
 
   /** Queue a bye, which releases leases at once. Send what `peekOutgoing` still shows. */

@@ -78,12 +78,19 @@ export const AssignmentPolicy = {
 } as const;
 export type AssignmentPolicy = (typeof AssignmentPolicy)[keyof typeof AssignmentPolicy] | (string & {});
 
-/** Origin of `T_world_tracking` of a participant. */
+/**
+ * Origin of `T_world_tracking` of a participant.
+ *
+ * `fingertip`: marks touched with a fingertip, or with a tip that is not calibrated; `persistent`: an anchor that the
+ * device kept, confirmed by no touch yet. Both are good enough to look, not to drive.
+ */
 export const AlignmentKind = {
   NONE: "none",
   MEASURED: "measured",
   PLACED: "placed",
   NOT_NEEDED: "not_needed",
+  FINGERTIP: "fingertip",
+  PERSISTENT: "persistent",
 } as const;
 export type AlignmentKind = (typeof AlignmentKind)[keyof typeof AlignmentKind] | (string & {});
 
@@ -110,12 +117,19 @@ export const AlarmKind = {
 } as const;
 export type AlarmKind = (typeof AlarmKind)[keyof typeof AlarmKind] | (string & {});
 
-/** Physical form of an anchor. */
+/**
+ * Kind of an observation: the form of the anchor, or the way in which it was found.
+ *
+ * `touch`: a tip or a fingertip on a mark. `tip`: a controller turned while its tip stayed in a hole. `persistent`: a
+ * place that the device kept since an earlier alignment.
+ */
 export const AnchorKind = {
   QR: "qr",
   BOARD: "board",
   CONTROLLER: "controller",
   TOUCH: "touch",
+  TIP: "tip",
+  PERSISTENT: "persistent",
 } as const;
 export type AnchorKind = (typeof AnchorKind)[keyof typeof AnchorKind] | (string & {});
 
@@ -151,6 +165,7 @@ export const HoldReason = {
   SCENE_CHANGED: "scene_changed",
   INTERVENTION: "intervention",
   REARM: "rearm",
+  VIEW_ONLY: "view_only",
 } as const;
 export type HoldReason = (typeof HoldReason)[keyof typeof HoldReason] | (string & {});
 
@@ -177,6 +192,7 @@ export const RejectReason = {
   DEVICE: "device",
   LEADER_APART: "leader_apart",
   KIND_MISMATCH: "kind",
+  VIEW_ONLY: "view_only",
 } as const;
 export type RejectReason = (typeof RejectReason)[keyof typeof RejectReason] | (string & {});
 
@@ -206,6 +222,7 @@ export const DenialReason = {
   INVALID: "invalid",
   WITHDRAWN: "withdrawn",
   TOO_FAR: "too_far",
+  VIEW_ONLY: "view_only",
 } as const;
 export type DenialReason = (typeof DenialReason)[keyof typeof DenialReason] | (string & {});
 
@@ -546,12 +563,25 @@ export type BodyInfo = [
   object?: boolean,
 ];
 
-/** An anchor of the session. `size_m`: edge of its sheet, `error_m`: stated p95 of its position; 0: unknown. */
+/**
+ * A mark of an anchor that can be touched, such as a printed cross. `p_anchor`: its position in the anchor frame
+ * [m].
+ */
+export interface AnchorMark {
+  id: string;
+  p_anchor: [number, number, number];
+}
+
+/**
+ * An anchor of the session. `size_m`: edge of its sheet, `error_m`: stated p95 of its position; 0: unknown.
+ * `marks`: in the order in which they are best touched.
+ */
 export interface AnchorInfo {
   id: string;
   T_world_anchor: Pose;
   size_m?: number;
   error_m?: number;
+  marks?: AnchorMark[];
 }
 
 /** Median and 99th percentile [ms] over the last seconds; null where nothing was measured. */
@@ -899,6 +929,8 @@ export interface Grasp {
  *
  * `kind`: `AnchorKind`. `size_m`: edge of the sheet as detected. `viewpoint_id`: observations with the same number
  * share their systematic error. `covariance`: 6x6 row-major (position, rotation) or empty. `quality`: 0 to 1.
+ * `mark`: touched mark of the anchor (`AnchorInfo.marks`), empty for the origin of the anchor. `grip_poses`: of kind
+ * `tip`, `T_tracking_grip` of `device` (section 5).
  */
 export interface Observation {
   type: "observation";
@@ -912,6 +944,8 @@ export interface Observation {
   quality?: number;
   device?: Device;
   covariance?: number[];
+  mark?: string;
+  grip_poses?: Pose[];
 }
 
 /** Align a participant by hand, or add an offset to a measured alignment (`offset` true). Directors only. */
@@ -1382,6 +1416,26 @@ export interface AnchorMoved {
   anchor_id: string;
   T_world_anchor: Pose;
   by?: string;
+}
+
+/**
+ * Answer to an observation of kind `tip`: the tip of a controller of a participant, or why it is unknown
+ * (`refused`, `advice`).
+ *
+ * `p_grip_tip`: position of the tip in the grip frame of `device` [m]. `covariance`: of it, 3x3 row-major [m^2].
+ * `error_m`: its stated p95. `residual_m`: scatter of the poses about the hole. `n_poses`: those that were used.
+ */
+export interface TipCalibrated {
+  event: "tip_calibrated";
+  participant: string;
+  device: Device;
+  p_grip_tip?: [number, number, number];
+  covariance?: number[];
+  error_m?: number;
+  residual_m?: number;
+  n_poses?: number;
+  refused?: boolean;
+  advice?: string;
 }
 
 /**
@@ -2078,6 +2132,7 @@ export type EventKind =
   | AlignmentRun
   | AlignmentAlarmed
   | AnchorMoved
+  | TipCalibrated
   | HeadsetsCompared
   | SceneChanged
   | EStopChanged
@@ -2116,7 +2171,7 @@ export const DEFAULTS = {
   set_mode: {},
   set_scale: { robots: [], scale: 1.0 },
   grasp: {},
-  observation: { viewpoint_id: 0, size_m: 0.0, quality: 1.0, device: "head", covariance: [] },
+  observation: { viewpoint_id: 0, size_m: 0.0, quality: 1.0, device: "head", covariance: [], mark: "", grip_poses: [] },
   place_alignment: { offset: false },
   align: { participant: "" },
   move_anchor: { force: false },
@@ -2156,6 +2211,7 @@ export const DEFAULTS = {
   alignment_run: { by: "" },
   alignment_alarmed: { beside: [] },
   anchor_moved: { by: "" },
+  tip_calibrated: { p_grip_tip: [0.0, 0.0, 0.0], covariance: [], error_m: 0.0, residual_m: 0.0, n_poses: 0, refused: false, advice: "" },
   headsets_compared: {},
   scene_changed: { scene_hash: "", tick_period_ns: 0 },
   estop_changed: { reason: "", stop_seq: 0 },
@@ -2213,6 +2269,7 @@ export const VALUE_DEFAULTS = {
   AnchorInfo: {
     size_m: 0.0,
     error_m: 0.0,
+    marks: [],
   },
   StreamBudget: {
     budget_class: "full",

@@ -148,6 +148,14 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["object", ["bool"], [false]],
     ],
   },
+  AnchorMark: {
+    array: false,
+    tag: null,
+    fields: [
+      ["id", ["str", 64, ""], []],
+      ["p_anchor", ["array", ["float"], 3, 0], []],
+    ],
+  },
   AnchorInfo: {
     array: false,
     tag: null,
@@ -156,6 +164,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["T_world_anchor", ["struct", "Pose"], []],
       ["size_m", ["float"], [0.0]],
       ["error_m", ["float"], [0.0]],
+      ["marks", ["array", ["struct", "AnchorMark"], 0, 16], [[]]],
     ],
   },
   Quantiles: {
@@ -493,6 +502,8 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["quality", ["float"], [1.0]],
       ["device", ["str", 64, ""], ["head"]],
       ["covariance", ["array", ["float"], 0, 36], [[]]],
+      ["mark", ["str", 64, ""], [""]],
+      ["grip_poses", ["array", ["struct", "Pose"], 0, 100], [[]]],
     ],
   },
   PlaceAlignment: {
@@ -914,6 +925,21 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["anchor_id", ["str", 64, ""], []],
       ["T_world_anchor", ["struct", "Pose"], []],
       ["by", ["str", 64, ""], [""]],
+    ],
+  },
+  TipCalibrated: {
+    array: false,
+    tag: ["event", "tip_calibrated"],
+    fields: [
+      ["participant", ["str", 64, ""], []],
+      ["device", ["str", 64, ""], []],
+      ["p_grip_tip", ["array", ["float"], 3, 0], [[0.0, 0.0, 0.0]]],
+      ["covariance", ["array", ["float"], 0, 9], [[]]],
+      ["error_m", ["float"], [0.0]],
+      ["residual_m", ["float"], [0.0]],
+      ["n_poses", ["int", 0, null], [0]],
+      ["refused", ["bool"], [false]],
+      ["advice", ["str", 512, ""], [""]],
     ],
   },
   HeadsetsCompared: {
@@ -1518,7 +1544,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
 export const UNIONS: Readonly<Record<string, readonly string[]>> = {
   ClientMessage: ["Hello", "Bye", "Disconnected", "Heartbeat", "ClockPing", "GetSnapshot", "Sample", "Samples", "Acquire", "Release", "Withdraw", "Consent", "Assign", "SetMode", "SetScale", "Grasp", "Observation", "PlaceAlignment", "Align", "MoveAnchor", "TrackingEpoch", "Episode", "EStop", "ClearEStop", "Control", "Marker", "Pair", "RemoveParticipant", "Rename", "SetRole", "GetStatus", "ClientReport"],
   ServerMessage: ["Welcome", "Refused", "ProtocolFault", "ClockPong", "Reply", "Feedback", "Event", "Snapshot", "Paired", "StatusReport", "DeliveryBudget"],
-  EventKind: ["ParticipantJoined", "ParticipantChanged", "ParticipantLeft", "LeaseChanged", "LeasesChanged", "ConsentRequested", "Intervention", "EngagementChanged", "ScaleChanged", "AlignmentChanged", "AlignmentRun", "AlignmentAlarmed", "AnchorMoved", "HeadsetsCompared", "SceneChanged", "EStopChanged", "PauseChanged", "EpisodeChanged", "ObjectGrasped", "Handover", "MarkerAdded", "SamplesRejected", "Gap", "Notice", "Audited"],
+  EventKind: ["ParticipantJoined", "ParticipantChanged", "ParticipantLeft", "LeaseChanged", "LeasesChanged", "ConsentRequested", "Intervention", "EngagementChanged", "ScaleChanged", "AlignmentChanged", "AlignmentRun", "AlignmentAlarmed", "AnchorMoved", "TipCalibrated", "HeadsetsCompared", "SceneChanged", "EStopChanged", "PauseChanged", "EpisodeChanged", "ObjectGrasped", "Handover", "MarkerAdded", "SamplesRejected", "Gap", "Notice", "Audited"],
   PatchOp: ["SetVisual", "AddVisual", "RemoveVisual", "AddMesh", "AddMaterial"],
 };
 
@@ -1540,7 +1566,7 @@ export const CLIENT_LIMITS: Readonly<Record<string, number>> = {
   set_mode: 20000,
   set_scale: 20000,
   grasp: 20000,
-  observation: 2000,
+  observation: 10000,
   place_alignment: 20000,
   align: 20000,
   move_anchor: 20000,

@@ -24,6 +24,7 @@ import { makeStage } from "./stage.ts";
 import { PageState } from "./state.ts";
 import { recall, remember } from "./storage.ts";
 import { type EventLevel, formatMillimetres } from "./words.ts";
+import { type HeadsetControls, makeHeadsetControls } from "../xr/controls.ts";
 
 /** Roles in the order in which they are tried when the person has not chosen one. */
 const ROLES = ["director", "operator", "observer"] as const;
@@ -43,6 +44,7 @@ interface Remembered {
 export interface PageHandle {
   state: PageState;
   view: View | null;
+  headset: HeadsetControls | null;
 }
 
 /** Build the page into `root` and join the session. */
@@ -93,7 +95,7 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   };
 
   const stage = makeStage(state, { pair: () => pairing.open("", ""), retry: joinByChoice });
-  const handle: PageHandle = { state, view: null };
+  const handle: PageHandle = { state, view: null, headset: null };
   try {
     handle.view = new View(stage.canvas, client, {
       onScene: (spec) => {
@@ -115,6 +117,11 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   const cameras = makeCameras(state, view);
   stage.tools.append(cameras.menu);
   stage.element.append(cameras.element, drive.element);
+  handle.headset = makeHeadsetControls(view, state, client, (showInside) => new Actions(client, (text, level) => {
+    show(text, level);
+    showInside(text);
+  }));
+  stage.tools.append(handle.headset.element);
   const badge = makeBadge(state, () => view?.delay_ms ?? 0);
   const estop = makeEstop(state, actions);
   const self = makeSelf(state, joinAs);

@@ -47,7 +47,7 @@ const NO_PHASE: PhaseUpdate = {
   stalled: false,
 };
 
-/** State of the page. `onChange` is called at most once per display frame. */
+/** State of the page. */
 export class PageState {
   phase: PhaseUpdate = NO_PHASE;
   info: InfoUpdate | null = null;
@@ -118,7 +118,7 @@ export class PageState {
     this.listeners.push(listener);
   }
 
-  /** Call the listeners soon. In a background tab, where no frames come, after a moment. */
+  /** Call the listeners soon: at the next frame, or after a moment in background tabs and headsets, where none comes. */
   touch(): void {
     if (this.isQueued) return;
     this.isQueued = true;
@@ -127,8 +127,8 @@ export class PageState {
       this.isQueued = false;
       for (const listener of this.listeners) listener(this);
     };
-    if (document.hidden) setTimeout(run, 200);
-    else requestAnimationFrame(run);
+    requestAnimationFrame(run);
+    setTimeout(run, 200);
   }
 
   get selfId(): string {

@@ -11,6 +11,7 @@ const HOLD_REASONS: Record<string, string> = {
   not_worn: "headset taken off",
   untracked: "tracking lost",
   unaligned: "its holder is not aligned",
+  view_only: "its holder is aligned well enough to look, not to drive",
   rejected: "a sample was rejected: open and close the clutch",
   estop: "e-stop",
   disconnected: "its holder is disconnected",

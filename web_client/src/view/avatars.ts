@@ -139,10 +139,9 @@ export class Avatars {
   }
 }
 
-/** Devices of other kinds than heads, hands and controllers have no place in the room, nor has one's own head. */
+/** Devices of other kinds than heads, hands and controllers have no place in the room. One's own are where they are. */
 function isDrawn(info: AvatarInfo, device: string): boolean {
-  if (device === "head") return !info.isSelf;
-  return device.startsWith("hand/") || device.startsWith("controller/");
+  return !info.isSelf && (device === "head" || device.startsWith("hand/") || device.startsWith("controller/"));
 }
 
 function labelLines(info: AvatarInfo): string[] {

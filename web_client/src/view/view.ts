@@ -6,7 +6,9 @@ import {
   DoubleSide,
   LinearSRGBColorSpace,
   MeshBasicMaterial,
+  type Object3D,
   PCFShadowMap,
+  type PerspectiveCamera,
   Scene,
   WebGLRenderer,
 } from "three";
@@ -52,6 +54,22 @@ export interface ViewEvents {
   onProblem: (text: string) => void;
 }
 
+/** What a headset adds to the scene, and what it does at each of its frames. */
+export interface HeadsetStage {
+  /** The tracking frame, in the axes of three.js. Holds the camera. */
+  readonly rig: Object3D;
+  readonly camera: PerspectiveCamera;
+  /** Objects in the session's world. */
+  readonly panels: Object3D;
+  /** The room is seen through: no sky, no floor. */
+  readonly isTransparent: boolean;
+  /** False: the scene has no place yet. */
+  readonly showsScene: boolean;
+  onFrame(frame: XRFrame, space: XRReferenceSpace): void;
+  /** The tracking frame jumped. */
+  onReset(): void;
+}
+
 interface Stream {
   buffer: FrameBuffer;
   values: Float32Array;
@@ -90,6 +108,7 @@ export class View {
   private lastFrame_ms = 0;
   private drawnSinceReport = 0;
   private sceneCount = 0;
+  private headset: HeadsetStage | null = null;
 
   constructor(
     private readonly canvas: HTMLCanvasElement,
@@ -112,7 +131,7 @@ export class View {
     new ResizeObserver(() => this.resize()).observe(canvas);
     this.resize();
     this.listen();
-    this.renderer.setAnimationLoop(() => this.draw());
+    this.renderer.setAnimationLoop((_time, frame?: XRFrame) => this.draw(frame));
     setInterval(() => this.reportDrawn(), 1000);
   }
 
@@ -120,6 +139,23 @@ export class View {
   touch(): void {
     this.framesToDraw = FRAMES_AFTER_CHANGE;
     this.pictures.markOutdated();
+  }
+
+  /** Draw in a headset until its session ends. Rejects when the session cannot be drawn. */
+  async present(session: XRSession, stage: HeadsetStage): Promise<void> {
+    const { xr } = this.renderer;
+    const leave = (): void => {
+      xr.removeEventListener("sessionend", leave);
+      this.leaveHeadset();
+    };
+    xr.addEventListener("sessionend", leave);
+    this.headset = stage;
+    this.root.add(stage.rig);
+    this.overlay.add(stage.panels);
+    xr.enabled = true;
+    xr.setReferenceSpaceType("local-floor");
+    await xr.setSession(session);
+    xr.getReferenceSpace()?.addEventListener("reset", () => stage.onReset());
   }
 
   /** What is drawn now: poses, 7 numbers per body of `bodies`, and vertices of deformables by stream. */
@@ -233,8 +269,12 @@ export class View {
     return nowMs() + (Number.isNaN(this.sessionOffset_ms) ? 0 : this.sessionOffset_ms);
   }
 
-  private draw(): void {
-    if (nowMs() - this.lastTried_ms < this.device.framePeriod_ms) return;
+  private draw(frame?: XRFrame): void {
+    const { headset } = this;
+    const space = this.renderer.xr.getReferenceSpace();
+    const isPresenting = headset !== null && frame !== undefined && space !== null;
+    if (isPresenting) headset.onFrame(frame, space);
+    else if (nowMs() - this.lastTried_ms < this.device.framePeriod_ms) return;
     this.lastTried_ms = nowMs();
     const session_ms = this.sessionTime() - this.delay.delay_ms;
     const isChanged = [
@@ -252,7 +292,8 @@ export class View {
     this.framesToDraw -= 1;
     this.lastDrawn_ms = now;
     this.scene?.lighting.update(this.scene.rest);
-    this.renderer.render(this.root, this.viewpoint.camera);
+    if (isPresenting) this.showFor(headset.showsScene, headset.isTransparent);
+    this.renderer.render(this.root, isPresenting ? headset.camera : this.viewpoint.camera);
     if (!isPresenting) this.pictures.show();
     this.drawn += 1;
     this.drawnSinceReport += 1;
@@ -297,7 +338,27 @@ export class View {
     return isMoved;
   }
 
+  /** Show or hide the scene, and what would cover the room: sky and planes. */
+  private showFor(showsScene: boolean, isTransparent: boolean): void {
+    const { scene } = this;
+    this.overlay.visible = showsScene;
+    if (!scene) return;
+    scene.world.visible = showsScene;
+    if (scene.sky) scene.sky.visible = !isTransparent;
+    scene.world.traverse((object) => {
+      if (object.userData.isPlane) object.visible = !isTransparent;
+    });
+  }
+
+  private leaveHeadset(): void {
+    this.headset = null;
+    this.showFor(true, false);
+    this.renderer.xr.enabled = false;
+    this.resize();
+  }
+
   private resize(): void {
+    if (this.headset) return;
     const { clientWidth, clientHeight } = this.canvas;
     if (clientWidth === 0 || clientHeight === 0) return;
     this.renderer.setSize(clientWidth, clientHeight, false);

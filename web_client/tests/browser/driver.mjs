@@ -16,11 +16,12 @@ const pages = new Map();
 const logs = new Map();
 
 const commands = {
-  async open({ page, url, width = 1280, height = 800, like = "", phone = false }) {
+  async open({ page, url, width = 1280, height = 800, like = "", phone = false, before = [] }) {
     const context =
       pages.get(like)?.context() ??
       (await browser.newContext({ viewport: { width, height }, ignoreHTTPSErrors: true, hasTouch: phone, isMobile: phone }));
     const made = await context.newPage();
+    for (const content of before) await made.addInitScript({ content }); // runs before the page's own scripts
     const log = [];
     made.on("pageerror", (error) => log.push(`page: ${error.message}`));
     made.on("console", (message) => message.type() === "error" && log.push(`console: ${message.text()}`));

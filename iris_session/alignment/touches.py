@@ -1,0 +1,244 @@
+"""Alignment of one connection by touched marks, and by an anchor that its device kept.
+
+A bounded number of touches is kept and registered together. How well a touch counts depends on the tip: one that was
+calibrated in this session, one of which the client states the covariance, or a fingertip. Touches that are too coarse
+to drive with make an alignment to look with. The mathematics is in `anchors.touch` and `anchors.persistent`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from anchors.alignment import AlignmentConfig, AlignmentEstimate
+from anchors.controller import calibrate_tip
+from anchors.persistent import align_persistent, confirm_alignment
+from anchors.pose import PoseTuple, Vec3, apply, is_rigid, is_valid_point, quat_normalize
+from anchors.touch import TOUCH_SIGMA_M, Touch, TouchRegistration, register_touches, suggest_point
+from anchors.uncertainty import validate_covariance
+from iris_session.protocol.client_messages import Observation
+from iris_session.protocol.common import MAX_TEXT
+from iris_session.protocol.entries import TipSolved
+from iris_session.protocol.names import AlignmentKind
+
+#: Newest touches kept per point, and points kept. Eight points that do not fit take 15 ms to analyse.
+MAX_TOUCHES_PER_POINT: Final = 5
+MAX_POINTS: Final = 8
+#: Devices of one participant whose tips are remembered.
+MAX_TIPS: Final = 8
+#: Noise of a touch per axis: of a fingertip, and of a controller whose tip is not calibrated.
+FINGERTIP_SIGMA_M: Final = 0.010
+#: Coarser touches do not make an alignment to drive with.
+MAX_DRIVING_SIGMA_M: Final = 0.004
+#: No client can state that its touches are better.
+MIN_SIGMA_M: Final = 0.0005
+_MIN_POINTS: Final = 3
+#: Fingertips are less exact than tips at the sheet too.
+_FINGERTIP_CONFIG: Final = AlignmentConfig(max_error_m=0.05)
+
+#: Covariance of the tip of each device (3x3 row-major, grip frame [m^2]).
+Tips = Mapping[str, tuple[float, ...]]
+
+
+class _Point(NamedTuple):
+    """A touched point: a mark of an anchor, or (`mark` empty) its origin."""
+
+    anchor_id: str
+    mark: str
+
+    @property
+    def name(self) -> str:
+        return f"{self.anchor_id}/{self.mark}" if self.mark else self.anchor_id
+
+
+class _Kept(NamedTuple):
+    """Pose of an anchor by a place that the device kept."""
+
+    anchor_id: str
+    T_tracking_anchor: PoseTuple
+    covariance: tuple[float, ...]
+
+
+class TouchEstimator:
+    """Touches of one connection and its kept anchor, in one tracking frame.
+
+    `pending`: they suffice for an estimate, and something is new since the last one.
+    """
+
+    def __init__(
+        self,
+        anchors: Mapping[str, PoseTuple],
+        marks: Mapping[str, Mapping[str, Vec3]],
+        tips: dict[str, tuple[float, ...]],
+    ) -> None:
+        """Create an estimator.
+
+        Args:
+            anchors: Present `T_world_anchor`, updated by the owner.
+            marks: Positions of marks by anchor and id of the mark, in the anchor frame.
+            tips: Calibrated tips of this participant, updated by the owner.
+        """
+        self._anchors = anchors
+        self._marks = marks
+        self._tips = tips
+        self._touches: dict[_Point, deque[Touch]] = {}
+        self._suspects: frozenset[str] = frozenset()
+        self._kept: _Kept | None = None
+        self._tracking_epoch = 0
+        self.pending = False
+
+    def has_mark(self, anchor_id: str, mark: str) -> bool:
+        """Return whether a known anchor has this mark; every anchor has its origin."""
+        return not mark or mark in self._marks.get(anchor_id, {})
+
+    def add_touch(self, observation: Observation) -> bool:
+        """Add one touch of a known anchor; return false if it is of an older tracking frame, no mark of it, or not a
+        finite point."""
+        pose = observation.T_tracking_anchor
+        point = _Point(observation.anchor_id, observation.mark)
+        if not self.has_mark(*point) or not is_valid_point(pose.p) or not self._begin_epoch(observation.tracking_epoch):
+            return False
+        kept = self._touches.pop(point, None) or deque(maxlen=MAX_TOUCHES_PER_POINT)
+        if point.name in self._suspects:  # touched again after a refusal: the earlier touches were wrong
+            kept.clear()
+            self._suspects -= {point.name}
+        kept.append(self._to_touch(point.name, observation))
+        self._touches[point] = kept
+        while len(self._touches) > MAX_POINTS:
+            del self._touches[next(iter(self._touches))]
+        self.pending = self._suffice()
+        return True
+
+    def _to_touch(self, name: str, observation: Observation) -> Touch:
+        pose, device = observation.T_tracking_anchor, observation.device
+        stated = validate_covariance(observation.covariance)
+        sigma = TOUCH_SIGMA_M
+        if stated:
+            largest = float(np.linalg.eigvalsh(np.reshape(stated, (6, 6))[:3, :3])[-1])
+            sigma = max(math.sqrt(largest), MIN_SIGMA_M)
+        elif device.startswith("controller/") and device not in self._tips:
+            sigma = FINGERTIP_SIGMA_M
+        if device.startswith("hand/"):
+            sigma = max(sigma, FINGERTIP_SIGMA_M)
+        if device not in self._tips:
+            return Touch(name, pose.p, sigma)
+        turned = quat_normalize(pose.q) if is_rigid((pose.p, pose.q)) else (1.0, 0.0, 0.0, 0.0)
+        return Touch(name, pose.p, sigma, device, turned)
+
+    def add_persistent(self, observation: Observation) -> bool:
+        """Set where a known anchor lies by a kept place; return false if that is of an older tracking frame, not a
+        pose, or contradicts gravity."""
+        pose = observation.T_tracking_anchor
+        kept = _Kept(observation.anchor_id, (pose.p, pose.q), observation.covariance)
+        if not is_rigid(kept.T_tracking_anchor) or not self._begin_epoch(observation.tracking_epoch):
+            return False
+        if self._align_kept(kept) is None:
+            return False
+        self._kept = kept
+        self.pending = True
+        return True
+
+    def _align_kept(self, kept: _Kept) -> AlignmentEstimate | None:
+        p, q = kept.T_tracking_anchor
+        pose = (p, quat_normalize(q))
+        return align_persistent(self._anchors[kept.anchor_id], pose, kept.covariance, self._tracking_epoch)
+
+    def _begin_epoch(self, tracking_epoch: int) -> bool:
+        """Discard everything of an older tracking frame; return false if `tracking_epoch` itself is older."""
+        if tracking_epoch < self._tracking_epoch:
+            return False
+        if tracking_epoch > self._tracking_epoch:
+            self.reset()
+            self._tracking_epoch = tracking_epoch
+        return True
+
+    def _suffice(self) -> bool:
+        return len(self._touches) >= _MIN_POINTS or (self._kept is not None and bool(self._list_precise()))
+
+    def _list_precise(self) -> list[Touch]:
+        return [t for kept in self._touches.values() for t in kept if t.sigma_m <= MAX_DRIVING_SIGMA_M]
+
+    @property
+    def advice(self) -> str:
+        """The marks still to be touched for an estimate, as text; empty if nothing is missing."""
+        if not 0 < len(self._touches) < _MIN_POINTS or self._suffice():
+            return ""
+        counted = f"{len(self._touches)} points touched, {_MIN_POINTS} are needed"
+        named = suggest_point(self._list_points(), [point.name for point in self._touches])
+        return f"{counted}: touch '{named}' next" if named else counted
+
+    def _list_points(self) -> dict[str, Vec3]:
+        """Return the world positions of what was touched, and of all other marks of those anchors."""
+        points = {point: (0.0, 0.0, 0.0) for point in self._touches if not point.mark}
+        for anchor_id in dict.fromkeys(point.anchor_id for point in self._touches):
+            points |= {_Point(anchor_id, mark): p for mark, p in self._marks.get(anchor_id, {}).items()}
+        return {point.name: apply(self._anchors[point.anchor_id], p) for point, p in points.items()}
+
+    def on_anchors_moved(self) -> None:
+        """Estimate again with the new positions of the marks."""
+        self.pending = self._suffice() or self._kept is not None
+
+    def discard_touches(self, device: str) -> None:
+        """Discard the touches of a device: they were made with another tip."""
+        for point, kept in list(self._touches.items()):
+            left = [t for t in kept if t.tip != device and t.sigma_m < FINGERTIP_SIGMA_M]
+            if left:
+                self._touches[point] = deque(left, maxlen=MAX_TOUCHES_PER_POINT)
+            else:
+                del self._touches[point]
+        self.pending = self._suffice() or self._kept is not None
+
+    def reset(self) -> None:
+        """Discard all touches and the kept anchor."""
+        self._touches.clear()
+        self._suspects = frozenset()
+        self._kept = None
+        self.pending = False
+
+    def estimate(self) -> tuple[AlignmentEstimate, str]:
+        """Return the alignment by what is kept, and its `AlignmentKind`. Raises one of `NUMERICAL_ERRORS` where it
+        cannot be solved."""
+        self.pending = False
+        estimate, kind = self._estimate()
+        # More of the same would mend no refusal: the wearer is to hear of it at once (0), not to go on looking.
+        return replace(estimate, n_viewpoints=0, n_observations=0), kind
+
+    def _estimate(self) -> tuple[AlignmentEstimate, str]:
+        precise, points = self._list_precise(), self._list_points()
+        kept = None if self._kept is None else self._align_kept(self._kept)
+        if len({t.point for t in precise}) >= _MIN_POINTS:
+            return self._register(points, precise, AlignmentConfig()), AlignmentKind.MEASURED
+        if kept is not None and precise:
+            confirmed = confirm_alignment(kept, points, precise, self._tips)
+            self._suspects = frozenset(t.point for t in precise) if confirmed.refused else frozenset()
+            return confirmed, AlignmentKind.MEASURED
+        if kept is not None:
+            return kept, AlignmentKind.PERSISTENT
+        everything = [t for same in self._touches.values() for t in same]
+        return self._register(points, everything, _FINGERTIP_CONFIG), AlignmentKind.FINGERTIP
+
+    def _register(self, points: Mapping[str, Vec3], touches: list[Touch], config: AlignmentConfig) -> AlignmentEstimate:
+        registration = register_touches(points, touches, self._tracking_epoch, self._tips, config)
+        self._suspects = frozenset(registration.suspects)
+        return replace(registration.estimate, advice=registration.estimate.advice or _describe_residuals(registration))
+
+
+def _describe_residuals(registration: TouchRegistration) -> str:
+    residuals = ", ".join(f"'{point}' {r * 1e3:.1f} mm" for point, r in sorted(registration.residuals_m.items()))
+    return f"touched points miss their marks by: {residuals}" if residuals else ""
+
+
+def solve_tip(observation: Observation) -> TipSolved:
+    """Calibrate the tip of the device of an observation of kind `tip`. Raises one of the numerical errors of linear
+    algebra where it cannot be solved."""
+    found = calibrate_tip([(pose.p, pose.q) for pose in observation.grip_poses])
+    if found.refused:
+        return TipSolved(observation.device, refused=True, advice=found.advice[:MAX_TEXT])
+    return TipSolved(
+        observation.device, found.p_controller_tip, found.covariance, found.error_m, found.residual_m, found.n_used
+    )

@@ -1,0 +1,74 @@
+// The buttons that enter a headset, on the stage; or one line that says why there are none.
+
+import type { WorkerClient } from "../core/page_client.ts";
+import type { Actions } from "../ui/actions.ts";
+import { button, h, setText } from "../ui/dom.ts";
+import type { PageState } from "../ui/state.ts";
+import type { View } from "../view/view.ts";
+import { Headset, type Mode } from "./headset.ts";
+
+const MODES: readonly (readonly [Mode, string])[] = [
+  ["immersive-ar", "Enter AR"],
+  ["immersive-vr", "Enter VR"],
+];
+
+export interface HeadsetControls {
+  element: HTMLElement;
+  /** The immersive session, null without one. */
+  headset: Headset | null;
+}
+
+/** Return why this page cannot enter a headset, empty: it can try. */
+export function describeMissing(isSecure: boolean, hasWebXr: boolean): string {
+  if (!isSecure) return "No AR and VR: this address is neither HTTPS nor of this machine.";
+  return hasWebXr ? "" : "No AR and VR: this browser has no WebXR.";
+}
+
+export function makeHeadsetControls(view: View | null, state: PageState, client: WorkerClient, makeActions: (show: (text: string) => void) => Actions): HeadsetControls {
+  const words = h("span", { class: "check note" });
+  const element = h("span", { class: "headset" }, words);
+  const controls: HeadsetControls = { element, headset: null };
+  if (!view) return controls;
+  const missing = describeMissing(isSecureContext, "xr" in navigator && navigator.xr !== undefined);
+  setText(words, missing);
+  if (missing !== "") return controls;
+  const buttons = MODES.map(([mode, text]) => {
+    const enter = async (): Promise<void> => {
+      for (const one of buttons) one.disabled = true;
+      try {
+        controls.headset = await begin(mode, view, state, client, makeActions);
+        controls.headset.session.addEventListener("end", () => {
+          controls.headset = null;
+          for (const one of buttons) one.disabled = false;
+        });
+        setText(words, "");
+      } catch (error) {
+        for (const one of buttons) one.disabled = false;
+        setText(words, `${text}: ${(error as Error).message}`);
+      }
+    };
+    return button(text, () => void enter(), { class: "small primary", hidden: true });
+  });
+  element.prepend(...buttons);
+  const update = async (): Promise<void> => {
+    const supported = await Promise.all(MODES.map(([mode]) => navigator.xr?.isSessionSupported(mode).catch(() => false) ?? false));
+    buttons.forEach((one, i) => (one.hidden = !supported[i]));
+    setText(words, supported.some(Boolean) ? "" : "No headset at this browser.");
+  };
+  navigator.xr?.addEventListener("devicechange", () => void update());
+  void update();
+  return controls;
+}
+
+async function begin(mode: Mode, view: View, state: PageState, client: WorkerClient, makeActions: (show: (text: string) => void) => Actions): Promise<Headset> {
+  const session = await navigator.xr!.requestSession(mode, { requiredFeatures: ["local-floor"], optionalFeatures: ["hand-tracking"] });
+  const headset: Headset = new Headset(session, mode, view, state, client, makeActions((text) => headset.show(text)));
+  session.addEventListener("end", () => headset.dispose());
+  try {
+    await view.present(session, headset);
+  } catch (error) {
+    await session.end();
+    throw error;
+  }
+  return headset;
+}

@@ -1,0 +1,119 @@
+// What a headset shows of its own: controllers, hands, rays, and panels. All in the tracking frame, in the axes of
+// three.js, below one group that is placed in the world by the alignment.
+
+import { BufferGeometry, CapsuleGeometry, Float32BufferAttribute, Group, Line, LineBasicMaterial, Mesh, MeshBasicMaterial, PerspectiveCamera, SphereGeometry, Vector3 } from "three";
+
+import type * as wire from "../protocol/messages.g.ts";
+import { Label } from "../view/labels.ts";
+import { type FrameReading, type InputReading, type Ray, type Side, toRow } from "./reading.ts";
+
+const COLOR = 0x8fa3bf;
+const RAY_COLOR = 0xc9d2e0;
+const HIT_COLOR = 0x35d0ba;
+/** Length of a ray that meets nothing [m]. */
+const RAY_M = 2;
+const NEAR_M = 0.03;
+const FAR_M = 200;
+/** Place of the urgent panel before the eyes, and of the other one above a hand [m]. */
+const URGENT_AT = new Vector3(0, -0.22, -0.9);
+const ABOVE_HAND_M = 0.13;
+
+interface Prop {
+  object: Group;
+  controller: Mesh;
+  hand: Mesh;
+  ray: Line;
+}
+
+/** The props of one headset. `rig` is the tracking frame. */
+export class Props {
+  readonly rig = new Group();
+  readonly camera = new PerspectiveCamera(70, 1, NEAR_M, FAR_M);
+  /** Before the eyes: what cannot wait. */
+  readonly urgent = new Label(0.03);
+  /** Above a hand: who one is, alignment, what the buttons do. */
+  readonly status = new Label(0.012);
+  private readonly props = new Map<Side, Prop>();
+
+  constructor() {
+    this.rig.name = "headset";
+    for (const { sprite } of [this.urgent, this.status]) {
+      sprite.material.depthTest = false;
+      sprite.renderOrder = 20;
+    }
+    this.rig.add(this.camera, this.urgent.sprite, this.status.sprite);
+  }
+
+  /** Place the tracking frame: everything of this headset moves with it. */
+  place(T_world_tracking: wire.Pose): void {
+    const [x, y, z, qx, qy, qz, qw] = toRow(T_world_tracking) as [number, number, number, number, number, number, number];
+    this.rig.position.set(x, y, z);
+    this.rig.quaternion.set(qx, qy, qz, qw);
+    this.rig.updateMatrixWorld();
+  }
+
+  /** Move everything to where a frame has it. `hits`: how far the ray of a hand goes until it meets a robot [m]. */
+  move(reading: FrameReading, hits: Partial<Record<Side, number>>): void {
+    for (const prop of this.props.values()) prop.object.visible = prop.ray.visible = false;
+    for (const input of reading.inputs) this.moveInput(input, hits[input.side]);
+    if (reading.head) {
+      const [x, y, z, qx, qy, qz, qw] = toRow(reading.head) as [number, number, number, number, number, number, number];
+      const { position } = this.urgent.sprite;
+      position.copy(URGENT_AT).applyQuaternion({ x: qx, y: qy, z: qz, w: qw });
+      position.set(position.x + x, position.y + y, position.z + z);
+    }
+    const hand = this.props.get("left")?.object.visible ? this.props.get("left") : this.props.get("right");
+    this.status.sprite.visible = hand?.object.visible ?? false;
+    if (hand) this.status.sprite.position.copy(hand.object.position).y += ABOVE_HAND_M;
+  }
+
+  dispose(): void {
+    this.urgent.dispose();
+    this.status.dispose();
+    this.rig.removeFromParent();
+    for (const { controller, hand, ray } of this.props.values()) {
+      for (const { geometry } of [controller, hand, ray]) geometry.dispose();
+      (ray.material as LineBasicMaterial).dispose();
+    }
+  }
+
+  private moveInput({ side, kind, pose, tracked, ray }: InputReading, hit: number | undefined): void {
+    const prop = this.props.get(side) ?? this.addProp(side);
+    if (pose) {
+      const [x, y, z, qx, qy, qz, qw] = toRow(pose) as [number, number, number, number, number, number, number];
+      prop.object.position.set(x, y, z);
+      prop.object.quaternion.set(qx, qy, qz, qw);
+    }
+    prop.object.visible = pose !== null && tracked;
+    prop.controller.visible = kind === "controller";
+    prop.hand.visible = kind === "hand";
+    prop.ray.visible = ray !== null && tracked;
+    if (ray) layRay(prop.ray, ray, hit);
+  }
+
+  private addProp(side: Side): Prop {
+    const material = new MeshBasicMaterial({ color: COLOR });
+    const controller = new Mesh(new CapsuleGeometry(0.018, 0.09, 4, 12).rotateX(Math.PI / 2), material);
+    const hand = new Mesh(new SphereGeometry(0.025, 16, 12), material);
+    const geometry = new BufferGeometry();
+    geometry.setAttribute("position", new Float32BufferAttribute([0, 0, 0, 0, 0, -1], 3));
+    const ray = new Line(geometry, new LineBasicMaterial({ color: RAY_COLOR, transparent: true, opacity: 0.7 }));
+    ray.frustumCulled = false;
+    const object = new Group();
+    object.add(controller, hand);
+    this.rig.add(object, ray);
+    const prop = { object, controller, hand, ray };
+    this.props.set(side, prop);
+    return prop;
+  }
+}
+
+function layRay(line: Line, { origin, direction }: Ray, hit: number | undefined): void {
+  const length = hit ?? RAY_M;
+  const end = [0, 1, 2].map((i) => origin[i]! + length * direction[i]!) as [number, number, number];
+  const rows = [origin, end].map((point) => toRow([[...point], [1, 0, 0, 0]]));
+  const places = line.geometry.getAttribute("position");
+  rows.forEach((row, i) => places.setXYZ(i, row[0]!, row[1]!, row[2]!));
+  places.needsUpdate = true;
+  (line.material as LineBasicMaterial).color.set(hit === undefined ? RAY_COLOR : HIT_COLOR);
+}

@@ -1,0 +1,101 @@
+// Lines of the panels in the scene, and what is felt in the hand. Pure.
+
+import type { Filled, Lease, ParticipantInfo } from "../core/api.ts";
+import type * as wire from "../protocol/messages.g.ts";
+import { formatMillimetres, holdReasonWords } from "../ui/words.ts";
+
+/** Characters of a line. */
+const LINE = 44;
+
+export interface RobotFacts {
+  name: string;
+  lease: Lease | undefined;
+  /** Why it holds, empty: it does not, or it is not known. */
+  holdReason: string;
+  selfId: string;
+  isStopped: boolean;
+  nameOf: (participant: string) => string;
+  isPointedAt: boolean;
+  isOwn: boolean;
+}
+
+/** Return the lines of the panel at a robot: who holds it, why it stands still, what the trigger does. */
+export function describeRobot({ name, lease, holdReason, selfId, isStopped, nameOf, isPointedAt, isOwn }: RobotFacts): string[] {
+  const holder = lease?.holder ?? "";
+  const who = isOwn ? "you" : holder === "" ? "free" : nameOf(holder);
+  const lines = [`${name}: ${who}`];
+  if (isStopped) lines.push("stopped by the e-stop");
+  else if (holder !== "" && holdReason !== "") lines.push(...wrap(`holds: ${holdReasonWords(holdReason)}`));
+  if (lease && lease.queue.includes(selfId)) lines.push("you wait for it");
+  if (isPointedAt) lines.push(isOwn ? "hold the trigger to release it" : "press the trigger to take it");
+  return lines;
+}
+
+/** Return the line about one's own alignment. */
+export function describeAlignment(alignment: ParticipantInfo["alignment"] | undefined): string {
+  if (!alignment || alignment.kind === "none" || alignment.kind === "not_needed") return "not aligned";
+  if (alignment.kind === "placed") return "placed by a director, error not measured";
+  const error = alignment.error_at_robot_m > 0 ? ` ± ${formatMillimetres(alignment.error_at_robot_m)} at the robot` : "";
+  return alignment.offset ? "aligned, with an offset by hand" : `aligned${error}`;
+}
+
+/** What a person has to know before anything else. */
+export interface Urgent {
+  isStopped: boolean;
+  /** Empty while the connection stands, else why it does not. */
+  connection: string;
+  isAligned: boolean;
+  isTransparent: boolean;
+  /** Advice of the session about the alignment. */
+  advice: string;
+  notice: string;
+}
+
+/** Return the lines before the eyes, none when all is well. */
+export function describeUrgent({ isStopped, connection, isAligned, isTransparent, advice, notice }: Urgent): string[] {
+  const lines: string[] = [];
+  if (isStopped) lines.push("STOPPED: all robots hold");
+  if (connection !== "") lines.push(...wrap(connection));
+  else if (!isAligned) {
+    lines.push("This headset is not aligned");
+    lines.push(
+      ...wrap(
+        isTransparent
+          ? "The scene appears when the headset is aligned to the room, or when a director places it."
+          : "The scene is at a place of this headset's own. Robots follow when a director places it.",
+      ),
+    );
+    if (advice !== "") lines.push(...wrap(advice));
+  }
+  if (notice !== "") lines.push(...wrap(notice));
+  return lines;
+}
+
+export interface Pulse {
+  /** 0 to 1. */
+  intensity: number;
+  duration_ms: number;
+}
+
+/** Contact force that is felt fully [N]. */
+const FULL_N = 20;
+
+/** Return what the hand feels when the feedback of its robot changes, null for nothing. */
+export function findPulse(before: Filled<wire.Feedback> | undefined, now: Filled<wire.Feedback>): Pulse | null {
+  if (now.contact_n > (before?.contact_n ?? 0)) return { intensity: Math.min(1, 0.2 + now.contact_n / FULL_N), duration_ms: 40 };
+  const isRefused = now.hold_reason !== "" && now.hold_reason !== "clutch_open" && now.hold_reason !== before?.hold_reason;
+  if (isRefused && before !== undefined) return { intensity: 0.8, duration_ms: 150 };
+  if (now.limits.some((limit) => !before?.limits.includes(limit))) return { intensity: 0.4, duration_ms: 60 };
+  return null;
+}
+
+/** Return a text in lines. */
+export function wrap(text: string): string[] {
+  const lines: string[] = [];
+  for (const word of text.split(/\s+/)) {
+    const last = lines.at(-1);
+    if (last !== undefined && last.length + 1 + word.length <= LINE) lines[lines.length - 1] = `${last} ${word}`;
+    else lines.push(word);
+  }
+  return lines;
+}

@@ -1,0 +1,64 @@
+// Panels in the scene and what a hand feels.
+
+import { describe, expect, test } from "vitest";
+
+import type { Lease, ParticipantInfo } from "../../src/core/api.ts";
+import { describeMissing } from "../../src/xr/controls.ts";
+import { describeAlignment, describeRobot, describeUrgent, findPulse, wrap } from "../../src/xr/words.ts";
+
+const facts = { name: "left", lease: undefined, holdReason: "", selfId: "p1", isStopped: false, nameOf: () => "ben", isPointedAt: false, isOwn: false };
+const lease = { target: "left", holder: "p2", queue: [] as string[] } as unknown as Lease;
+
+describe("panels", () => {
+  test("at a robot: holder, why it holds, what the trigger does", () => {
+    expect(describeRobot(facts)).toEqual(["left: free"]);
+    expect(describeRobot({ ...facts, isPointedAt: true })).toEqual(["left: free", "press the trigger to take it"]);
+    expect(describeRobot({ ...facts, lease, holdReason: "clutch_open" })).toEqual(["left: ben", "holds: clutch open"]);
+    const own = { ...facts, lease, isOwn: true, isPointedAt: true, holdReason: "untracked" };
+    expect(describeRobot(own)).toEqual(["left: you", "holds: tracking lost", "hold the trigger to release it"]);
+    expect(describeRobot({ ...own, isStopped: true })[1]).toBe("stopped by the e-stop");
+  });
+
+  test("one's own alignment, with its stated error", () => {
+    const alignment = { kind: "measured", error_at_robot_m: 0.0042, offset: false } as NonNullable<ParticipantInfo["alignment"]>;
+    expect(describeAlignment(alignment)).toBe("aligned ± 4.2 mm at the robot");
+    expect(describeAlignment({ ...alignment, offset: true })).toBe("aligned, with an offset by hand");
+    expect(describeAlignment({ ...alignment, kind: "placed" })).toMatch(/director/);
+    expect(describeAlignment({ ...alignment, kind: "not_needed" })).toBe("not aligned");
+    expect(describeAlignment(null)).toBe("not aligned");
+  });
+
+  test("before the eyes: nothing while all is well, else what matters most first", () => {
+    const well = { isStopped: false, connection: "", isAligned: true, isTransparent: true, advice: "", notice: "" };
+    expect(describeUrgent(well)).toEqual([]);
+    expect(describeUrgent({ ...well, isAligned: false }).join(" ")).toMatch(/not aligned The scene appears when/);
+    expect(describeUrgent({ ...well, isAligned: false, isTransparent: false }).join(" ")).toMatch(/a place of this headset's own/);
+    expect(describeUrgent({ ...well, isStopped: true, connection: "lost", isAligned: false })).toEqual(["STOPPED: all robots hold", "lost"]);
+  });
+
+  test("long texts are wrapped between words", () => {
+    const text = "a robot that is held by another participant is not moved by this headset";
+    expect(wrap(text).join(" ")).toBe(text);
+    expect(Math.max(...wrap(text).map((line) => line.length))).toBeLessThanOrEqual(44);
+  });
+
+  test("why there is no headset", () => {
+    expect(describeMissing(false, true)).toMatch(/HTTPS/);
+    expect(describeMissing(true, false)).toMatch(/no WebXR/);
+    expect(describeMissing(true, true)).toBe("");
+  });
+});
+
+describe("haptics", () => {
+  const quiet = { type: "feedback" as const, robot: "left", state: "pose", hold_reason: "", contact_n: 0, limits: [], rejected: {} };
+
+  test("contact, a refused motion and a limit are felt; an open clutch is not", () => {
+    expect(findPulse(quiet, quiet)).toBeNull();
+    expect(findPulse(quiet, { ...quiet, contact_n: 5 })?.intensity).toBeCloseTo(0.45);
+    expect(findPulse({ ...quiet, contact_n: 5 }, { ...quiet, contact_n: 4 })).toBeNull();
+    expect(findPulse(quiet, { ...quiet, hold_reason: "untracked" })?.duration_ms).toBe(150);
+    expect(findPulse(quiet, { ...quiet, hold_reason: "clutch_open" })).toBeNull();
+    expect(findPulse(quiet, { ...quiet, limits: ["elbow"] })).not.toBeNull();
+    expect(findPulse({ ...quiet, limits: ["elbow"] }, { ...quiet, limits: ["elbow"] })).toBeNull();
+  });
+});
