@@ -285,8 +285,8 @@ export class View {
     ].some(Boolean);
     const now = nowMs();
     if (isChanged) this.touch();
-    const isPresenting = this.renderer.xr.isPresenting;
-    if (!isPresenting && this.pictures.drawDue(this.root, this.overlay, this.scene, now)) this.framesToDraw = Math.max(1, this.framesToDraw);
+    const isOnScreen = !this.renderer.xr.isPresenting;
+    if (isOnScreen && this.pictures.drawDue(this.root, this.overlay, this.scene, now)) this.framesToDraw = Math.max(1, this.framesToDraw);
     const isLoading = this.scene !== null && this.sceneCount > 0 && now - this.lastDrawn_ms > IDLE_MS;
     if (this.framesToDraw <= 0 && !isLoading && !isPresenting) return;
     this.framesToDraw -= 1;
@@ -294,7 +294,7 @@ export class View {
     this.scene?.lighting.update(this.scene.rest);
     if (isPresenting) this.showFor(headset.showsScene, headset.isTransparent);
     this.renderer.render(this.root, isPresenting ? headset.camera : this.viewpoint.camera);
-    if (!isPresenting) this.pictures.show();
+    if (isOnScreen) this.pictures.show();
     this.drawn += 1;
     this.drawnSinceReport += 1;
   }
