@@ -219,7 +219,7 @@ export class SessionMirror {
         break;
       }
       case "anchor_moved": {
-        const anchor = this.anchors.get(body.anchor_id) ?? { id: body.anchor_id, size_m: 0, error_m: 0 };
+        const anchor = this.anchors.get(body.anchor_id) ?? { id: body.anchor_id, size_m: 0, error_m: 0, marks: [] };
         this.anchors.set(body.anchor_id, { ...anchor, T_world_anchor: body.T_world_anchor });
         break;
       }
