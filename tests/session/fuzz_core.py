@@ -165,13 +165,15 @@ class Fuzz:
             return tuple(SetVisual(rng.randrange(50), group=rng.randrange(6)) for _ in range(rng.randrange(4)))
         if name in ("T_world_tracking", "T_tracking_anchor", "T_world_anchor", "pose"):
             return self.pose()
+        if name == "grip_poses":
+            return tuple(self.pose() for _ in range(rng.randrange(4)))
         if name == "anchors":
             return {"table": self.pose()} if rng.random() < 0.5 else {}
         if name == "anchor_id":
             return rng.choice(("table", *WORDS))
         if name in ("covariance", "q", "qd", "hand_joints"):
-            return (number,) * rng.choice([0, 1, 6, 7, 36])
-        if name in ("pivot_world", "p_world"):
+            return (number,) * rng.choice([0, 1, 6, 7, 9, 36])
+        if name in ("pivot_world", "p_world", "p_grip_tip"):
             return (number, 0.0, rng.choice(FLOATS))
         if "float" in kind:
             return number
