@@ -22,7 +22,7 @@ from iris_session.protocol.server_messages import ProtocolFault
 LAST_MESSAGES_NS: Final = 100 * MILLISECOND
 #: Reasons after which the TCP connection stays open: an e-stop by it counts until it is closed, after a minute at the
 #: latest.
-TCP_STAYS_OPEN: Final = ("silent", "gateway", "heartbeat", "replaced")
+TCP_STAYS_OPEN: Final = ("silent", "gateway", "heartbeat", "replaced", "refused")
 
 
 class DisconnectHandler:

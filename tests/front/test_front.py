@@ -195,6 +195,8 @@ def test_dropped_and_refused_connections_end(session: FrontSession) -> None:
     assert client.wait_for(Refused).code == "unknown_value"
     client.send(Heartbeat(), epoch=2)
     session.pump(lambda: any(f.code == "hello" for f in client.got(ProtocolFault)), "fault")
+    client.send(EStop("sent before the refusal had arrived"), epoch=2)
+    assert session.wait_entries(EStop)[0].connection == join.connection
 
 
 def test_snapshot_is_filled_and_comes_after_the_events_of_its_step(session: FrontSession) -> None:
