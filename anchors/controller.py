@@ -19,6 +19,10 @@ from anchors.uncertainty import isotropic_covariance, length_p95
 
 _ZERO: Final[Vec3] = (0.0, 0.0, 0.0)
 _TRIM: Final = 4.0  # residuals beyond this many sigmas are wrong readings
+# Rotation [rad] over which the errors of readings are alike: a tracker's error changes with the view of the controller
+# and over tenths of a second. 15 degrees covers errors that last 0.5 s while it is turned (tests/anchors).
+_ALIKE_RAD: Final = math.radians(15.0)
+_MIN_DISTINCT: Final = 4.0
 
 
 def holder_anchor(T_world_holder: PoseTuple, T_holder_controller: PoseTuple) -> PoseTuple:
@@ -62,14 +66,16 @@ def calibrate_tip(
     poses: Sequence[PoseTuple],
     min_poses: int = 20,
     min_turn_rad: float = math.radians(20.0),
-    max_sigma_m: float = 0.001,
+    max_sigma_m: float = 0.002,
     max_residual_m: float = 0.006,
 ) -> TipCalibration:
     """Calibrate a tip by pivoting: it rests in a dent while the controller is turned about it (Yaniv 2015, algebraic
     one-step method).
 
     Each pose `T_tracking_controller` = (R, t) says R p_tip + t = p_pivot: linear in both unknown points. Outliers
-    and invalid poses are left out. Refused if the rotations do not determine all three coordinates, or the tip slipped.
+    and invalid poses are left out. The errors of readings are correlated by exp(-angle between them / 15 deg), so more
+    readings of the same motion do not reduce the stated error. Refused if the rotations do not determine all three
+    coordinates, or the tip slipped.
     """
     poses = [T for T in poses if is_rigid(T)]
     if len(poses) < min_poses:
@@ -96,12 +102,13 @@ def calibrate_tip(
         keep = now
     n = int(np.count_nonzero(keep))
     residual = math.sqrt(float(np.mean(errors[keep] ** 2)))
-    information = np.einsum("nij,nik->jk", A[keep], A[keep])
-    covariance = np.linalg.inv(information) * (residual**2 / 3.0 * n / max(1.0, n - 2.0))
+    covariance, distinct = _correlated_covariance(A[keep], q[keep], float(np.sum(errors[keep] ** 2)))
     tip_sigma = math.sqrt(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
     advice = ""
     if residual > max_residual_m or 2 * n < len(poses):
         advice = f"the readings scatter by {residual * 1e3:.1f} mm: the tip slipped; rest it in a dent and turn slowly"
+    elif distinct < _MIN_DISTINCT:
+        advice = f"the readings are of about {distinct:.0f} different rotations only: go on turning, in every direction"
     elif tip_sigma > max_sigma_m:
         advice = f"the tip is known to {tip_sigma * 1e3:.1f} mm only: turn further, in every direction"
     stated = () if advice else tuple(covariance[:3, :3].ravel().tolist())
@@ -113,13 +120,29 @@ def tip_position(T_tracking_controller: PoseTuple, p_controller_tip: Vec3) -> Ve
     return compose(T_tracking_controller, (p_controller_tip, (1.0, 0.0, 0.0, 0.0)))[0]
 
 
+def _correlated_covariance(A: Array, q: Array, squares: float) -> tuple[Array, float]:
+    """Return the covariance (6, 6) of the least squares with design `A` (n, 3, 6) and correlated errors, and how many
+    independent readings the mean of the readings is worth. `squares`: sum of the squared residuals [m^2]."""
+    turns = _relative_rotations(q)
+    alike = np.exp(-np.linalg.norm(turns[:, None] - turns, axis=2) / _ALIKE_RAD)
+    inverse = np.linalg.inv(np.einsum("nij,nik->jk", A, A))
+    middle = np.einsum("nij,nik->jk", A, np.tensordot(alike, A, axes=1))
+    # Expected sum of squared residuals per variance of a coordinate: tr((1 - P) S), P projection, S correlation.
+    freedom = max(3.0, 3.0 * len(A) - float(np.trace(inverse @ middle)))
+    return inverse @ middle @ inverse * (squares / freedom), len(A) ** 2 / float(np.sum(alike))
+
+
+def _relative_rotations(q: Array) -> Array:
+    """Return rotation vectors (n, 3) [rad] from the reading in the middle."""
+    return quat_log(quat_multiply(q, quat_conjugate(q[len(q) // 2])))
+
+
 def _second_axis_rotation(q: Array) -> float:
     """Return the rotation [rad] about the second principal axis: rotations about one axis leave the tip free along it.
 
     It is twice the standard deviation, which for even rotations from end to end is 0.58 of the range.
     """
-    turns = quat_log(quat_multiply(q, quat_conjugate(q[len(q) // 2])))
-    spread = np.linalg.eigvalsh(np.cov(turns.T))
+    spread = np.linalg.eigvalsh(np.cov(_relative_rotations(q).T))
     return 2.0 * math.sqrt(max(0.0, float(spread[1])))
 
 

@@ -35,6 +35,28 @@ class PersistentConfig:
     max_tilt_rad: float = math.radians(15.0)
 
 
+def covariance_at_anchor(
+    covariance: Sequence[float], pivot_world: Vec3, T_world_anchor: PoseTuple
+) -> tuple[float, ...]:
+    """Return the covariance of an alignment at an anchor, in its axes, to be kept with a persistent anchor.
+
+    The axes of the anchor stay where they are in the room, whatever world and tracking frame are later.
+
+    Args:
+        covariance: 36 values, 6x6 row-major, (x, y, z [m], rx, ry, rz [rad]), world axes, at `pivot_world`.
+        pivot_world: The point of the world at which it is stated.
+        T_world_anchor: Pose of the anchor.
+
+    Returns:
+        36 values in the same order.
+    """
+    p, q = T_world_anchor
+    X = np.eye(6)
+    X[:3, 3:] = -skew(np.array(p) - np.array(pivot_world))
+    X = np.kron(np.eye(2), quat_to_matrix(np.array(q)).T) @ X
+    return tuple((X @ np.reshape(covariance, (6, 6)) @ X.T).ravel().tolist())
+
+
 def inflate_covariance(covariance: Sequence[float], config: PersistentConfig | None = None) -> Array:
     """Return the covariance (6, 6) of a persistent anchor whose earlier alignment had `covariance` (36 values)."""
     c = config or PersistentConfig()
@@ -55,7 +77,8 @@ def align_persistent(
     Args:
         T_world_anchor: Pose of the anchor.
         T_tracking_anchor: The same in the present tracking frame.
-        covariance: Of the earlier alignment at the anchor, 36 values, tracking axes; empty or invalid: not known.
+        covariance: Of the earlier alignment at the anchor, 36 values, in its axes (`covariance_at_anchor`); empty or
+            invalid: not known.
         tracking_epoch: The present tracking frame.
         config: Assumed errors.
 
@@ -67,7 +90,7 @@ def align_persistent(
     tilt = float(np.linalg.norm(swing(np.array(q))))
     if not tilt <= config.max_tilt_rad:
         return None
-    R = np.kron(np.eye(2), quat_to_matrix(np.array(q)))
+    R = np.kron(np.eye(2), quat_to_matrix(np.array(T_world_anchor[1])))
     C = R @ inflate_covariance(covariance, config) @ R.T
     raw = AlignmentEstimate((p, q), tracking_epoch, (), T_world_anchor[0], 0.0, tilt, 1, 1, False, "")
     sigma = AlignmentConfig().tilt_sigma_rad

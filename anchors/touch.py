@@ -2,7 +2,8 @@
 
 Collinear points do not determine the alignment, and points touched in the wrong order do not fit; the advice names
 the points, and the one to touch next. The order that was touched is found by trying the others. What is wrong in the
-calibration of a tip is wrong in all of its touches, turned with the controller; the noise of each touch is its own.
+calibration of a tip is wrong in all of its touches, turned with the controller; the noise of each mark is its own, and
+touching it again does not reduce it.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ _NO_TIP: Final = (0.0,) * 9
 class Touch:
     """The tip rested on a marked point: `p_tracking_tip` averaged over that time.
 
-    `sigma_m`: noise of this touch per axis. `tip`: whose calibration it depends on, empty: on none;
-    `q_tracking_tip`: the rotation of that controller.
+    `sigma_m`: noise of this touch per axis. `tip`: the device that touched; if the covariance of its tip is known, that
+    counts too, turned by `q_tracking_tip`, the rotation of that controller.
     """
 
     point: str
@@ -63,9 +64,13 @@ class TouchNoise:
 
     @staticmethod
     def of_touches(touches: Sequence[Sequence[Touch]], tips: Mapping[str, Sequence[float]]) -> TouchNoise:
-        """Return the noise of the mean of the touches of each point; `tips`: covariances of tips, 3x3 row-major."""
+        """Return the noise of the mean of the touches of each point; `tips`: covariances of tips, 3x3 row-major.
+
+        Touches of one point share their error: it may be one contact that was reported in several frames, and a tracker
+        is wrong by the same at the same place.
+        """
         n = len(touches)
-        C = np.diag(np.repeat([sum(t.sigma_m**2 for t in same) / len(same) ** 2 for same in touches], 3))
+        C = np.diag(np.repeat([sum(t.sigma_m**2 for t in same) / len(same) for same in touches], 3))
         for tip, stated in tips.items():
             turn = np.zeros((n, 3, 3))
             for i, same in enumerate(touches):

@@ -125,9 +125,19 @@ def isotropic_covariance(position_sigma_m: float, rotation_sigma_rad: float) -> 
 def validate_covariance(covariance: Sequence[float]) -> tuple[float, ...]:
     """Return a client's covariance (36 values) made symmetric; empty if it is not finite, symmetric and positive
     definite."""
-    if len(covariance) != 36 or not all(map(math.isfinite, covariance)) or max(map(abs, covariance)) > 1e3:
+    return _validate(covariance, 6)
+
+
+def validate_position_covariance(covariance: Sequence[float]) -> tuple[float, ...]:
+    """Return the covariance of the position (9 values) in that of a pose (36 values), of which the rest does not count;
+    empty if it is not finite, symmetric and positive definite."""
+    return _validate([covariance[6 * i + k] for i in range(3) for k in range(3)], 3) if len(covariance) == 36 else ()
+
+
+def _validate(covariance: Sequence[float], n: int) -> tuple[float, ...]:
+    if len(covariance) != n * n or not all(map(math.isfinite, covariance)) or max(map(abs, covariance)) > 1e3:
         return ()
-    C = np.array(covariance, dtype=np.float64).reshape(6, 6)
+    C = np.array(covariance, dtype=np.float64).reshape(n, n)
     if not float(np.abs(C - C.T).max()) <= 1e-3 * float(np.abs(C).max()):
         return ()
     C = 0.5 * (C + C.T)

@@ -72,8 +72,8 @@ class ConnectionEstimator:
         self._observed: dict[str, tuple[int, int]] = {}  # anchor -> number of observations, time of the last [ns]
         self._used = self._unusable = 0
         self._next_ns = 0
-        self._unknown: tuple[str, str, int] | None = None  # unknown anchor or mark, tracking epoch; not yet reported
-        self._reported_unknown: tuple[str, str, int] | None = None
+        self._wrong: tuple[int, str] | None = None  # tracking epoch, why an observation was refused; not yet reported
+        self._reported_wrong: tuple[int, str] | None = None
         self._refused_ns = -_CLOSE_NS
         self._repeat_refusal = False  # the last refusal came too soon after another: send it once more
         self.reset()
@@ -82,6 +82,7 @@ class ConnectionEstimator:
         """Discard the observations of this run: the tracking frame has changed."""
         self._estimator.reset()
         self._touches.reset()
+        self._touches_last = False  # the last estimate was by touched marks or a kept anchor
         self._pending = False  # an observation since the last proposal changes the estimate or its advice
         self._refused: tuple[int, str] | None = None  # tracking epoch and advice of the last refusal
         self._touched: tuple[int, float, int] | None = None  # alignment by touch: epoch, stated error [m], time [ns]
@@ -115,13 +116,13 @@ class ConnectionEstimator:
         anchor_id = observation.anchor_id
         if not self.running:
             return True  # not judged
-        if anchor_id in self._anchors and self._touches.has_mark(anchor_id, observation.mark):
-            used = self._use_observation(observation, p_tracking_head)
-        else:
+        wrong = self._describe_wrong(observation)
+        if wrong:
             used = False
-            unknown = (anchor_id, observation.mark, observation.tracking_epoch)
-            if unknown != self._reported_unknown:
-                self._unknown = unknown
+            if (observation.tracking_epoch, wrong) != self._reported_wrong:
+                self._wrong = (observation.tracking_epoch, wrong)
+        else:
+            used = self._use_observation(observation, p_tracking_head)
         if used:
             self._used += 1
             self._observed[anchor_id] = (self._observed.get(anchor_id, (0, 0))[0] + 1, now_ns)
@@ -158,19 +159,19 @@ class ConnectionEstimator:
 
     def is_due(self, now_ns: int) -> bool:
         """Return whether `propose` has something to do."""
-        unknown = self._unknown is not None and now_ns - self._refused_ns >= _CLOSE_NS
-        return self.running and now_ns >= self._next_ns and (self._pending or self._touches.pending or unknown)
+        wrong = self._wrong is not None and now_ns - self._refused_ns >= _CLOSE_NS
+        return self.running and now_ns >= self._next_ns and (self._pending or self._touches.pending or wrong)
 
     def propose(self, now_ns: int) -> AlignmentProposal | None:
         """Return a proposal from all observations.
 
         `None`: the same refusal as before for the same reason, or no improvement on marks that were touched. When
-        nothing usable is new, an unknown anchor is reported once: it may hang beside a known one.
+        nothing usable is new, an unknown anchor or an invalid touch is reported once: it may hang beside a known one.
         """
         self._next_ns = now_ns + self._period_ns
-        if not self._pending and not self._touches.pending and self._unknown is not None:
-            self._reported_unknown, self._unknown, self._refused_ns = self._unknown, None, now_ns
-            return self._refuse_unknown_anchor(*self._reported_unknown)
+        if not self._pending and not self._touches.pending and self._wrong is not None:
+            self._reported_wrong, self._wrong, self._refused_ns = self._wrong, None, now_ns
+            return _to_refusal(*self._reported_wrong)
         try:
             estimate, kind = self._estimate(now_ns)
         except NUMERICAL_ERRORS:
@@ -188,13 +189,15 @@ class ConnectionEstimator:
 
     def _estimate(self, now_ns: int) -> tuple[AlignmentEstimate | None, str]:
         """Return an estimate by touched marks or a kept anchor if any are new, else by observations, and its
-        `AlignmentKind`; `None` if the latter is worse than a former one by touch."""
-        if self._touches.pending:
+        `AlignmentKind`; `None` if the latter is worse than a former one by touch. They take turns where both are new:
+        a kept anchor may be reported in every frame."""
+        if self._touches.pending and not (self._pending and self._touches_last):
+            self._touches_last = True
             estimate, kind = self._touches.estimate()
             if not estimate.refused and kind == AlignmentKind.MEASURED:
                 self._touched = (estimate.tracking_epoch, estimate.error_at_anchor_m, now_ns)
             return estimate, kind
-        self._pending = False
+        self._pending = self._touches_last = False
         estimate = self._estimator.estimate()
         if self._touched is not None and self._touched[0] == estimate.tracking_epoch:
             _, error_m, touched_ns = self._touched
@@ -212,13 +215,21 @@ class ConnectionEstimator:
         self._repeat_refusal, self._refused_ns, self._refused = close, now_ns, refused
         return proposal
 
-    def _refuse_unknown_anchor(self, anchor_id: str, mark: str, tracking_epoch: int) -> AlignmentProposal:
-        if anchor_id in self._anchors:
+    def _describe_wrong(self, observation: Observation) -> str:
+        """Return why an observation is of no anchor or mark, or states an invalid covariance; empty if it does not."""
+        anchor_id, mark = observation.anchor_id, observation.mark
+        if anchor_id not in self._anchors:
+            return f"anchor '{anchor_id}' is not of this session; known: {', '.join(sorted(self._anchors)) or 'none'}"
+        if not self._touches.has_mark(anchor_id, mark):
             marks = ", ".join(sorted(self._marks.get(anchor_id, ()))) or "none"
-            text = f"anchor '{anchor_id}' has no mark '{mark}'; known: {marks} (marks_m in the anchors file)"
-            return _to_refusal(tracking_epoch, text)
-        known = ", ".join(sorted(self._anchors)) or "none"
-        return _to_refusal(tracking_epoch, f"anchor '{anchor_id}' is not of this session; known: {known}")
+            return f"anchor '{anchor_id}' has no mark '{mark}'; known: {marks} (marks_m in the anchors file)"
+        if observation.kind == AnchorKind.TOUCH and not self._touches.is_covariance_valid(observation):
+            touched = f"'{anchor_id}/{mark}'" if mark else f"'{anchor_id}'"
+            return (
+                f"the covariance of the touch of {touched} is not 36 values with a finite, symmetric and positive "
+                "definite position (rows and columns 0 to 2): send that, or none"
+            )
+        return ""
 
     def complete_report(self, report: AlignmentReport | None, now_ns: int) -> AlignmentReport | None:
         """Return the authority's report (`None`: nothing to report) with the counts and advice of this estimator."""

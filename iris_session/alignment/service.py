@@ -47,9 +47,6 @@ _NO_SIZES: Final[Mapping[str, float]] = MappingProxyType({})
 _NO_MARKS: Final[Mapping[str, Mapping[str, Vec3]]] = MappingProxyType({})
 #: Disconnected participants whose alignment is remembered, per possible connection.
 _REMEMBERED_PER_CONNECTION: Final = 4
-#: Proposals whose pivot is remembered: 13 s at five per second, so that corrections that are announced first or slide
-#: in still find theirs.
-_MAX_PIVOTS: Final = 64
 #: Observations that wait while the estimate of their connection is computed: a second of them at the rate limit.
 _MAX_WAITING: Final = 64
 #: Least time between two calibrations of tips of one connection, each of which takes milliseconds.
@@ -76,10 +73,9 @@ class _HeadsetState:
     `alarm_ns`, `proposal_ns`: session times of the last alarm and proposal; entries are stamped so that these times
     show their order. `last_jump`: tracking epoch and capture time of the last jump. An observation captured before it
     is in the old tracking frame, though it may arrive later (sheets are detected in pictures that are tenths of a
-    second old). `pivots`: pivot of each of the last proposals by its covariance, oldest first. While an estimate is
-    computed (`busy`), the estimator belongs to the worker: `waiting` holds what is to be done with it afterwards, and
-    `is_outdated` is set when the result will not count. `tips`: the newest observation of kind `tip` of each device,
-    calibrated from `next_tip_ns` on.
+    second old). While an estimate is computed (`busy`), the estimator belongs to the worker: `waiting` holds what is to
+    be done with it afterwards, and `is_outdated` is set when the result will not count. `tips`: the newest observation
+    of kind `tip` of each device, calibrated from `next_tip_ns` on.
     """
 
     __slots__ = (
@@ -91,7 +87,6 @@ class _HeadsetState:
         "last_jump",
         "monitor",
         "next_tip_ns",
-        "pivots",
         "proposal_ns",
         "tips",
         "waiting",
@@ -104,7 +99,6 @@ class _HeadsetState:
         self.estimator = estimator
         self.monitor = monitor
         self.alarm_ns = self.proposal_ns = -1
-        self.pivots: dict[tuple[float, ...], Vec3] = {}
         self.last_jump: tuple[int, int] | None = None
         self.busy = self.is_outdated = False
         self.waiting: deque[Callable[[], object]] = deque()
@@ -118,20 +112,6 @@ class _HeadsetState:
             self.waiting.append(change)
         else:
             change()
-
-    def remember_pivot(self, proposal: AlignmentProposal) -> None:
-        self.pivots.pop(proposal.covariance, None)
-        self.pivots[proposal.covariance] = proposal.pivot_world
-        if len(self.pivots) > _MAX_PIVOTS:
-            del self.pivots[next(iter(self.pivots))]
-
-    def find_pivot(self, covariance: tuple[float, ...]) -> Vec3 | None:
-        """Return the point of the world at which this covariance is stated, `None` without any proposal.
-
-        An `Alignment` does not carry its pivot. The covariance of a correction that slides in is wider than the
-        proposed one; it is stated at the pivot of the newest proposal.
-        """
-        return self.pivots.get(covariance) or next(reversed(self.pivots.values()), None)
 
     def is_before_jump(self, observation: Observation) -> bool:
         """Return whether the observation was captured in the tracking frame before the last jump."""
@@ -343,28 +323,7 @@ class AlignmentService:
 
     def _apply_alignment(self, state: _HeadsetState, alignment: Alignment | None) -> None:
         measured = alignment is not None and alignment.kind == AlignmentKind.MEASURED and not alignment.offset
-        state.monitor.set_alignment(self._to_estimate(state, alignment), measured, state.estimator.running)
-
-    def _to_estimate(self, state: _HeadsetState, alignment: Alignment | None) -> AlignmentEstimate | None:
-        """Return an alignment in the form of an estimate, `None` if there is none or its error is unknown."""
-        if alignment is None or len(alignment.covariance) != _COVARIANCE_VALUES or not self.anchors:
-            return None
-        pivot_world = state.find_pivot(alignment.covariance)
-        if pivot_world is None:  # the front was restarted
-            pivot_world = next(iter(self.anchors.values()))[0]
-        pose = alignment.T_world_tracking
-        return AlignmentEstimate(
-            (pose.p, pose.q),
-            alignment.tracking_epoch,
-            alignment.covariance,
-            pivot_world,
-            alignment.error_at_anchor_m,
-            residual_tilt_rad=0.0,
-            n_observations=0,
-            n_viewpoints=0,
-            refused=False,
-            advice="",
-        )
+        state.monitor.set_alignment(_to_estimate(alignment), measured, state.estimator.running)
 
     def _process_run(self, run: AlignmentRun) -> None:
         self._stopped.pop(run.participant, None)
@@ -453,8 +412,6 @@ class AlignmentService:
             state.waiting.popleft()()
 
     def _offer_proposal(self, number: int, state: _HeadsetState, proposal: AlignmentProposal, now_ns: int) -> None:
-        if not proposal.refused:
-            state.remember_pivot(proposal)
         if state.estimator.newest is not None and not proposal.refused and proposal.kind == AlignmentKind.MEASURED:
             state.monitor.set_estimate(state.estimator.newest)
         state.proposal_ns = max(now_ns, state.alarm_ns + 1)
@@ -468,6 +425,25 @@ class AlignmentService:
         """Return the authority's report on a participant, completed by the state of the estimator."""
         state = self._states.get(number)
         return report if state is None else state.estimator.complete_report(report, now_ns)
+
+
+def _to_estimate(alignment: Alignment | None) -> AlignmentEstimate | None:
+    """Return an alignment in the form of an estimate, `None` if there is none or its error is unknown."""
+    if alignment is None or len(alignment.covariance) != _COVARIANCE_VALUES:
+        return None
+    pose = alignment.T_world_tracking
+    return AlignmentEstimate(
+        (pose.p, pose.q),
+        alignment.tracking_epoch,
+        alignment.covariance,
+        alignment.pivot_world,
+        alignment.error_at_anchor_m,
+        residual_tilt_rad=0.0,
+        n_observations=0,
+        n_viewpoints=0,
+        refused=False,
+        advice="",
+    )
 
 
 def _limit_size(memory: dict[str, Any], max_size: int) -> None:

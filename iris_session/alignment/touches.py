@@ -18,9 +18,19 @@ import numpy as np
 from anchors.alignment import AlignmentConfig, AlignmentEstimate
 from anchors.controller import calibrate_tip
 from anchors.persistent import align_persistent, confirm_alignment
-from anchors.pose import PoseTuple, Vec3, apply, is_rigid, is_valid_point, quat_normalize
+from anchors.pose import (
+    IDENTITY_POSE,
+    PoseTuple,
+    Vec3,
+    apply,
+    distance,
+    is_rigid,
+    is_valid_point,
+    quat_angle,
+    quat_normalize,
+)
 from anchors.touch import TOUCH_SIGMA_M, Touch, TouchRegistration, register_touches, suggest_point
-from anchors.uncertainty import validate_covariance
+from anchors.uncertainty import validate_covariance, validate_position_covariance
 from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.entries import TipSolved
@@ -31,13 +41,17 @@ MAX_TOUCHES_PER_POINT: Final = 5
 MAX_POINTS: Final = 8
 #: Devices of one participant whose tips are remembered.
 MAX_TIPS: Final = 8
-#: Noise of a touch per axis: of a fingertip, and of a controller whose tip is not calibrated.
+#: Noise of a touch per axis: of a fingertip, and of everything that is no calibrated tip and states no covariance.
 FINGERTIP_SIGMA_M: Final = 0.010
 #: Coarser touches do not make an alignment to drive with.
 MAX_DRIVING_SIGMA_M: Final = 0.004
 #: No client can state that its touches are better.
 MIN_SIGMA_M: Final = 0.0005
+#: A kept anchor that has moved by less is where it was.
+_MOVED_M: Final = 0.002
+_MOVED_RAD: Final = math.radians(0.2)
 _MIN_POINTS: Final = 3
+_NOT_USED: Final = "the touched marks contradict the kept anchor: it is not used"
 #: Fingertips are less exact than tips at the sheet too.
 _FINGERTIP_CONFIG: Final = AlignmentConfig(max_error_m=0.05)
 
@@ -57,11 +71,17 @@ class _Point(NamedTuple):
 
 
 class _Kept(NamedTuple):
-    """Pose of an anchor by a place that the device kept."""
+    """Pose of an anchor by a place that the device kept; its covariance in the axes of the anchor."""
 
     anchor_id: str
     T_tracking_anchor: PoseTuple
     covariance: tuple[float, ...]
+
+    def is_like(self, other: _Kept) -> bool:
+        """Return whether the other says nothing else."""
+        (p, q), (p_other, q_other) = self.T_tracking_anchor, other.T_tracking_anchor
+        alike = (self.anchor_id, self.covariance) == (other.anchor_id, other.covariance)
+        return alike and distance(p, p_other) < _MOVED_M and quat_angle(q, q_other) < _MOVED_RAD
 
 
 class TouchEstimator:
@@ -96,47 +116,53 @@ class TouchEstimator:
         """Return whether a known anchor has this mark; every anchor has its origin."""
         return not mark or mark in self._marks.get(anchor_id, {})
 
+    def is_covariance_valid(self, observation: Observation) -> bool:
+        """Return whether a touch states no covariance, or one whose position is usable."""
+        return self._find_sigma(observation) is not None
+
     def add_touch(self, observation: Observation) -> bool:
         """Add one touch of a known anchor; return false if it is of an older tracking frame, no mark of it, or not a
-        finite point."""
+        finite point, or its covariance is invalid."""
         pose = observation.T_tracking_anchor
         point = _Point(observation.anchor_id, observation.mark)
-        if not self.has_mark(*point) or not is_valid_point(pose.p) or not self._begin_epoch(observation.tracking_epoch):
+        sigma = self._find_sigma(observation)
+        if not self.has_mark(*point) or not is_valid_point(pose.p) or sigma is None:
+            return False
+        if not self._begin_epoch(observation.tracking_epoch):
             return False
         kept = self._touches.pop(point, None) or deque(maxlen=MAX_TOUCHES_PER_POINT)
         if point.name in self._suspects:  # touched again after a refusal: the earlier touches were wrong
             kept.clear()
             self._suspects -= {point.name}
-        kept.append(self._to_touch(point.name, observation))
+        turned = quat_normalize(pose.q) if is_rigid((pose.p, pose.q)) else IDENTITY_POSE[1]
+        kept.append(Touch(point.name, pose.p, sigma, observation.device, turned))
         self._touches[point] = kept
         while len(self._touches) > MAX_POINTS:
             del self._touches[next(iter(self._touches))]
         self.pending = self._suffice()
         return True
 
-    def _to_touch(self, name: str, observation: Observation) -> Touch:
-        pose, device = observation.T_tracking_anchor, observation.device
-        stated = validate_covariance(observation.covariance)
-        sigma = TOUCH_SIGMA_M
-        if stated:
-            largest = float(np.linalg.eigvalsh(np.reshape(stated, (6, 6))[:3, :3])[-1])
-            sigma = max(math.sqrt(largest), MIN_SIGMA_M)
-        elif device.startswith("controller/") and device not in self._tips:
-            sigma = FINGERTIP_SIGMA_M
-        if device.startswith("hand/"):
-            sigma = max(sigma, FINGERTIP_SIGMA_M)
-        if device not in self._tips:
-            return Touch(name, pose.p, sigma)
-        turned = quat_normalize(pose.q) if is_rigid((pose.p, pose.q)) else (1.0, 0.0, 0.0, 0.0)
-        return Touch(name, pose.p, sigma, device, turned)
+    def _find_sigma(self, observation: Observation) -> float | None:
+        """Return the noise of a touch per axis, `None` if its covariance is invalid."""
+        is_finger = observation.device.startswith("hand/")
+        if not observation.covariance:
+            return TOUCH_SIGMA_M if observation.device in self._tips and not is_finger else FINGERTIP_SIGMA_M
+        stated = validate_position_covariance(observation.covariance)
+        if not stated:
+            return None
+        largest = float(np.linalg.eigvalsh(np.reshape(stated, (3, 3)))[-1])
+        return max(math.sqrt(largest), FINGERTIP_SIGMA_M if is_finger else MIN_SIGMA_M)
 
     def add_persistent(self, observation: Observation) -> bool:
         """Set where a known anchor lies by a kept place; return false if that is of an older tracking frame, not a
         pose, or contradicts gravity."""
         pose = observation.T_tracking_anchor
-        kept = _Kept(observation.anchor_id, (pose.p, pose.q), observation.covariance)
-        if not is_rigid(kept.T_tracking_anchor) or not self._begin_epoch(observation.tracking_epoch):
+        if not is_rigid((pose.p, pose.q)) or not self._begin_epoch(observation.tracking_epoch):
             return False
+        covariance = validate_covariance(observation.covariance)
+        kept = _Kept(observation.anchor_id, (pose.p, quat_normalize(pose.q)), covariance)
+        if self._kept is not None and kept.is_like(self._kept):
+            return True
         if self._align_kept(kept) is None:
             return False
         self._kept = kept
@@ -144,9 +170,8 @@ class TouchEstimator:
         return True
 
     def _align_kept(self, kept: _Kept) -> AlignmentEstimate | None:
-        p, q = kept.T_tracking_anchor
-        pose = (p, quat_normalize(q))
-        return align_persistent(self._anchors[kept.anchor_id], pose, kept.covariance, self._tracking_epoch)
+        T_world_anchor = self._anchors[kept.anchor_id]
+        return align_persistent(T_world_anchor, kept.T_tracking_anchor, kept.covariance, self._tracking_epoch)
 
     def _begin_epoch(self, tracking_epoch: int) -> bool:
         """Discard everything of an older tracking frame; return false if `tracking_epoch` itself is older."""
@@ -158,7 +183,7 @@ class TouchEstimator:
         return True
 
     def _suffice(self) -> bool:
-        return len(self._touches) >= _MIN_POINTS or (self._kept is not None and bool(self._list_precise()))
+        return len(self._touches) >= _MIN_POINTS or (self._kept is not None and bool(self._touches))
 
     def _list_precise(self) -> list[Touch]:
         return [t for kept in self._touches.values() for t in kept if t.sigma_m <= MAX_DRIVING_SIGMA_M]
@@ -166,7 +191,7 @@ class TouchEstimator:
     @property
     def advice(self) -> str:
         """The marks still to be touched for an estimate, as text; empty if nothing is missing."""
-        if not 0 < len(self._touches) < _MIN_POINTS or self._suffice():
+        if not 0 < len(self._touches) < _MIN_POINTS or (self._kept is not None and self._list_precise()):
             return ""
         counted = f"{len(self._touches)} points touched, {_MIN_POINTS} are needed"
         named = suggest_point(self._list_points(), [point.name for point in self._touches])
@@ -186,7 +211,7 @@ class TouchEstimator:
     def discard_touches(self, device: str) -> None:
         """Discard the touches of a device: they were made with another tip."""
         for point, kept in list(self._touches.items()):
-            left = [t for t in kept if t.tip != device and t.sigma_m < FINGERTIP_SIGMA_M]
+            left = [t for t in kept if t.tip != device]
             if left:
                 self._touches[point] = deque(left, maxlen=MAX_TOUCHES_PER_POINT)
             else:
@@ -210,17 +235,23 @@ class TouchEstimator:
 
     def _estimate(self) -> tuple[AlignmentEstimate, str]:
         precise, points = self._list_precise(), self._list_points()
-        kept = None if self._kept is None else self._align_kept(self._kept)
         if len({t.point for t in precise}) >= _MIN_POINTS:
             return self._register(points, precise, AlignmentConfig()), AlignmentKind.MEASURED
-        if kept is not None and precise:
-            confirmed = confirm_alignment(kept, points, precise, self._tips)
-            self._suspects = frozenset(t.point for t in precise) if confirmed.refused else frozenset()
-            return confirmed, AlignmentKind.MEASURED
-        if kept is not None:
-            return kept, AlignmentKind.PERSISTENT
         everything = [t for same in self._touches.values() for t in same]
-        return self._register(points, everything, _FINGERTIP_CONFIG), AlignmentKind.FINGERTIP
+        kept = None if self._kept is None else self._align_kept(self._kept)
+        if kept is None:
+            return self._register(points, everything, _FINGERTIP_CONFIG), AlignmentKind.FINGERTIP
+        if not everything:
+            return kept, AlignmentKind.PERSISTENT
+        confirmed = confirm_alignment(kept, points, precise or everything, self._tips)
+        self._suspects = frozenset()
+        if not confirmed.refused:
+            return (confirmed, AlignmentKind.MEASURED) if precise else (kept, AlignmentKind.PERSISTENT)
+        if len(self._touches) >= _MIN_POINTS:
+            found = self._register(points, everything, _FINGERTIP_CONFIG)
+            return replace(found, advice=f"{_NOT_USED}; {found.advice}".rstrip("; ")), AlignmentKind.FINGERTIP
+        self._suspects = frozenset(t.point for t in precise or everything)
+        return confirmed, AlignmentKind.PERSISTENT
 
     def _register(self, points: Mapping[str, Vec3], touches: list[Touch], config: AlignmentConfig) -> AlignmentEstimate:
         registration = register_touches(points, touches, self._tracking_epoch, self._tips, config)

@@ -424,7 +424,7 @@ def _set_alignment(
         offset,
     )
     warn_wearer(ctx, p, "unaligned", "", same="")
-    ctx.emit(AlignmentChanged(p.id, p.alignment))
+    ctx.emit(AlignmentChanged(p.id, p.published_alignment or p.alignment))
 
 
 def _clear_answered_alarm(ctx: Context, p: Participant) -> None:

@@ -172,7 +172,9 @@ class Context:
     def to_participant_info(self, p: Participant) -> ParticipantInfo:
         """Return one row of the roster."""
         connected = p.connection != NO_CONNECTION
-        return ParticipantInfo(p.id, p.name, p.role, connected, p.devices, p.worn, p.tracking_epoch, p.alignment)
+        return ParticipantInfo(
+            p.id, p.name, p.role, connected, p.devices, p.worn, p.tracking_epoch, p.published_alignment
+        )
 
     def publish_participant(self, p: Participant) -> None:
         """Publish the present state of a participant as an event. The host is not in the roster."""

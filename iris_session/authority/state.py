@@ -151,6 +151,13 @@ class Participant(msgspec.Struct):
     hello_name: str = ""
     hello_role: str = ""
 
+    @property
+    def published_alignment(self) -> Alignment | None:
+        """The alignment as clients receive it: with the pivot of its covariance, which the state has beside it."""
+        if self.alignment is None or not self.alignment.covariance:
+            return self.alignment
+        return msgspec.structs.replace(self.alignment, pivot_world=self.pivot_world)
+
 
 class LeaseGrant(msgspec.Struct):
     """The right of one participant on one target, its clutch latches and its engagement.

@@ -197,7 +197,8 @@ def run_move(arguments: argparse.Namespace) -> int:
         was = next((one.T_world_anchor.p for one in report.anchors if one.anchor_id == arguments.anchor), None)
         moved_m = 0.0 if was is None else distance(was, arguments.pose[0])  # the session denies an unknown anchor
         client.alignment.move_anchor(arguments.anchor, arguments.pose, force=arguments.force)
-    aligned = [p for p in list_headsets(report) if p.alignment in (AlignmentKind.MEASURED, AlignmentKind.PLACED)]
+    kinds = {AlignmentKind.MEASURED, AlignmentKind.PLACED, *AlignmentKind.VIEW_ONLY}
+    aligned = [p for p in list_headsets(report) if p.alignment in kinds]
     stay = {
         p.id: f"{p.name} ({p.id}): {why}" for p in aligned if (why := explain_unaffected_alignment(p, arguments.anchor))
     }

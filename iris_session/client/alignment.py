@@ -108,9 +108,12 @@ class ClientAlignment:
             viewpoint_id: The same number for observations from one place.
             size_m: Measured edge length [m], 0 when not measured.
             quality: 0 to 1.
-            device: The device that observed it.
+            device: The device that observed it; of kind `touch`, what touched. Without a covariance, all but a
+                controller whose tip was calibrated counts as a fingertip.
             covariance: 36 values, 6x6 row-major, (x, y, z [m], rx, ry, rz [rad]), tracking axes; without it the
-                session assumes that of a headset's camera, or of a touch with `device`.
+                session assumes that of a headset's camera, or of a touch with `device`. Of kind `touch` only the
+                position counts; of kind `persistent` the axes are those of the anchor
+                (`anchors.persistent.covariance_at_anchor`).
             mark: Of kind `touch`, the touched mark; the position is that of the tip, the rotation that of the grip.
             tracking_epoch: Epoch of the tracking frame, default the present one.
 
@@ -144,7 +147,8 @@ class ClientAlignment:
 
         Args:
             device: The controller, such as `controller/right`.
-            T_tracking_grip: 20 to 100 poses, `((x, y, z) [m], (w, x, y, z))`; of more, 100 are sent.
+            T_tracking_grip: 20 to 100 poses, `((x, y, z) [m], (w, x, y, z))`; of more, 100 are sent. Poses within 15
+                degrees of one another share their error: spread them over the whole motion.
 
         Raises:
             InvalidMessageError: A value does not fit the protocol.

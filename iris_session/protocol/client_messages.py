@@ -81,8 +81,9 @@ class Sample(Message, frozen=True, tag="sample"):
     `capture_ns`: when it was sampled (session time by the client's clock estimate), not when it will be displayed.
     `pose`: `T_tracking_device`. `twist`: (vx, vy, vz [m/s], wx, wy, wz [rad/s]) in the tracking frame.
     `clutch`: true while the person wants the target to follow. `gripper`: 0 open to 1 closed.
-    `buttons`: bit mask (section 6). `hand_joints`: up to 26 poses flattened (x, y, z, qw, qx, qy, qz). `q`, `qd`: a
-    leader's joint positions [rad or m] and velocities.
+    `buttons`: bit mask (section 6). `hand_joints`: up to 26 poses `T_tracking_joint` flattened (x, y, z, qw, qx, qy,
+    qz): 25 in the order of WebXR (the wrist first), 26 in that of OpenXR (the palm first); not in every sample. `q`,
+    `qd`: a leader's joint positions [rad or m] and velocities.
     """
 
     device: Name
@@ -189,7 +190,8 @@ class Observation(Message, frozen=True, tag="observation"):
     """Observation of an anchor by a headset or camera: `T_tracking_anchor`.
 
     `kind`: `AnchorKind`. `size_m`: edge of the sheet as detected. `viewpoint_id`: observations with the same number
-    share their systematic error. `covariance`: 6x6 row-major (position, rotation) or empty. `quality`: 0 to 1.
+    share their systematic error. `covariance`: 6x6 row-major (position, rotation), tracking axes, of kind `persistent`
+    those of the anchor, or empty. `quality`: 0 to 1.
     `mark`: touched mark of the anchor (`AnchorInfo.marks`), empty for the origin of the anchor. `grip_poses`: of kind
     `tip`, `T_tracking_grip` of `device` (section 5).
     """

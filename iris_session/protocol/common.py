@@ -97,7 +97,8 @@ class Denial(msgspec.Struct, frozen=True):
 class Alignment(msgspec.Struct, frozen=True):
     """`T_world_tracking` of one participant, as accepted by the authority.
 
-    `covariance`: 6x6 row-major, order (x, y, z [m], rx, ry, rz [rad]), world frame, empty when unknown.
+    `covariance`: 6x6 row-major, order (x, y, z [m], rx, ry, rz [rad]), world frame, empty when unknown; that of the
+    position is stated at `pivot_world`.
     `error_at_anchor_m`, `error_at_robot_m`: stated p95 of the position error at the anchor and at the robot.
     """
 
@@ -109,6 +110,7 @@ class Alignment(msgspec.Struct, frozen=True):
     error_at_anchor_m: float = 0.0
     error_at_robot_m: float = 0.0
     offset: bool = False
+    pivot_world: Vec3 = (0.0, 0.0, 0.0)
 
 
 class Applied(msgspec.Struct, frozen=True, array_like=True):

@@ -273,13 +273,22 @@ class SessionCore:
 def encode_for_digest(decision: Decision) -> bytes:
     """Return the bytes of a decision that are part of the digest of its step.
 
-    A field that `Snapshot` got after the recording format is left out, so that earlier recordings of this format keep
-    their digests. The events, which are in, say the same.
+    Fields that `Snapshot` and `Alignment` got after the recording format are left out, so that earlier recordings of
+    this format keep their digests. The events, which are in, and the journal say the same.
     """
     if any(isinstance(one.message, Snapshot) for one in decision.outgoing):
         outgoing = tuple(OutgoingMessage(one.connection, _to_digested(one.message)) for one in decision.outgoing)
         decision = msgspec.structs.replace(decision, outgoing=outgoing)
-    return _encoder.encode(decision)
+    data = _encoder.encode(decision)
+    return _encoder.encode(_remove_pivots(msgspec.msgpack.decode(data))) if b"pivot_world" in data else data
+
+
+def _remove_pivots(value: Any) -> Any:
+    """Return decoded messages without the field that `Alignment` got after the recording format."""
+    if isinstance(value, dict):
+        is_alignment = "error_at_robot_m" in value
+        return {k: _remove_pivots(v) for k, v in value.items() if k != "pivot_world" or not is_alignment}
+    return [_remove_pivots(v) for v in value] if isinstance(value, list) else value
 
 
 def _to_digested(message: Any) -> Any:

@@ -133,7 +133,13 @@ class Lab:
 
     def confirm(self, wearer: Wearer, got: AlignmentProposal, **fields: object) -> None:
         alignment = Alignment(
-            1, "measured", got.T_world_tracking, got.tracking_epoch, got.covariance, got.error_at_anchor_m
+            1,
+            "measured",
+            got.T_world_tracking,
+            got.tracking_epoch,
+            got.covariance,
+            got.error_at_anchor_m,
+            pivot_world=got.pivot_world,
         )
         alignment = msgspec.structs.replace(alignment, **fields)
         self.service.process_event(AlignmentChanged(wearer.connection.participant_id, alignment))

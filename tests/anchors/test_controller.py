@@ -35,7 +35,7 @@ def test_tip_is_accurate() -> None:
     got = calibrate_tip(_poses(_cone_rotations()))
     assert not got.refused
     assert got.advice == ""
-    assert _tip_error(got) < 4.0 * got.sigma_m < 0.002
+    assert _tip_error(got) < got.error_m < 0.003
     assert math.dist(got.p_tracking_pivot, PIVOT) < 0.001
     assert got.residual_m == pytest.approx(0.001 * math.sqrt(3.0), rel=0.2)
     pose = _poses(_cone_rotations(), sigma_m=0.0)[7]
@@ -59,7 +59,7 @@ def test_wrong_readings_are_excluded() -> None:
         (_poses(_cone_rotations() * 0.1), "least used direction"),
         (_poses(_cone_rotations() * np.array([1.0, 0.0, 0.0])), "to the front"),
         (_poses(_cone_rotations(), sigma_m=0.01), "the tip slipped"),
-        (_poses(_cone_rotations(25), sigma_m=0.0034), "known to 1."),
+        (_poses(_cone_rotations(25), sigma_m=0.0034), "the tip is known to"),
     ],
 )
 def test_insufficient_motion_fails_with_advice(poses: list[PoseTuple], word: str) -> None:
@@ -81,3 +81,42 @@ def test_invalid_poses_are_excluded() -> None:
     lost: list[PoseTuple] = [((math.nan, 0.0, 0.0), poses[0][1]), (poses[0][0], (0.0, 0.0, 0.0, 0.0))]
     assert calibrate_tip([*lost, *poses]) == calibrate_tip(poses)
     assert calibrate_tip(lost * 20).refused
+
+
+def _smooth_rotations(rng: np.random.Generator) -> Array:
+    """Return 100 rotations of ten seconds of turning back and forth about three axes."""
+    angle = np.linspace(0.0, 10.0, 100)[:, None] * np.array([1.4, 1.1, 0.6]) + rng.uniform(0.0, 6.28, 3)
+    return np.array([0.6, 0.6, 0.3]) * np.sin(angle)
+
+
+def _smooth_noise(rng: np.random.Generator, seconds: float) -> Array:
+    """Return noise (100, 3) of unit variance, at 10 Hz, which is forgotten in `seconds`."""
+    kept = math.exp(-0.1 / seconds)
+    noise = rng.normal(0.0, 1.0, (100, 3))
+    for i in range(1, 100):
+        noise[i] = kept * noise[i - 1] + math.sqrt(1.0 - kept**2) * noise[i]
+    return noise
+
+
+@pytest.mark.parametrize("noise", ["repeated", 0.2, 0.5])
+def test_stated_error_of_the_tip_holds_for_readings_that_share_their_errors(noise: str | float) -> None:
+    rng = np.random.default_rng(2)
+    inside = n = 0
+    for _ in range(150):
+        if isinstance(noise, str):
+            turns = np.tile(rng.uniform(-0.6, 0.6, (20, 3)), (5, 1))
+            off = np.tile(rng.normal(0.0, 0.0005, (20, 3)), (5, 1))
+        else:
+            turns, off = _smooth_rotations(rng), 0.0005 * _smooth_noise(rng, noise)
+        exact = np.array([p for p, _ in _poses(turns, 0.0)])
+        got = calibrate_tip([(tuple(p), q) for p, (_, q) in zip((exact + off).tolist(), _poses(turns), strict=True)])
+        n += not got.refused
+        inside += _tip_error(got) <= got.error_m < 0.003
+    assert n >= 120
+    assert inside / n >= 0.93
+
+
+def test_readings_in_a_few_places_are_refused_however_many() -> None:
+    got = calibrate_tip(_poses(np.tile(0.6 * np.eye(3), (30, 1)), 0.0))
+    assert got.refused
+    assert "about 3 different" in got.advice

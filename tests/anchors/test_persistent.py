@@ -7,9 +7,15 @@ import math
 import numpy as np
 import pytest
 
-from anchors.lie import Array, quat_exp, quat_multiply
-from anchors.persistent import PersistentConfig, align_persistent, confirm_alignment, inflate_covariance
-from anchors.pose import PoseTuple, Vec3, apply, compose, distance, inverse, quat_from_rotvec, quat_from_yaw
+from anchors.lie import Array, quat_exp, quat_multiply, quat_to_matrix
+from anchors.persistent import (
+    PersistentConfig,
+    align_persistent,
+    confirm_alignment,
+    covariance_at_anchor,
+    inflate_covariance,
+)
+from anchors.pose import PoseTuple, Quat, Vec3, apply, compose, distance, inverse, quat_from_rotvec, quat_from_yaw
 from anchors.sheet import compute_marks
 from anchors.touch import Touch
 from anchors.uncertainty import isotropic_covariance
@@ -28,12 +34,16 @@ def _to_vec3(p: Array) -> Vec3:
     return (x, y, z)
 
 
+def _to_quat(q: Array) -> Quat:
+    w, x, y, z = q.tolist()
+    return (w, x, y, z)
+
+
 def _found_again(rng: np.random.Generator, T_world_tracking: PoseTuple) -> PoseTuple:
     """Return where a device sees the anchor, wrong as the inflated covariance says."""
     p, q = compose(inverse(T_world_tracking), T_WORLD_ANCHOR)
     d = rng.multivariate_normal(np.zeros(6), inflate_covariance(EARLIER))
-    w, x, y, z = quat_multiply(quat_exp(d[3:]), np.array(q)).tolist()
-    return _to_vec3(np.array(p) + d[:3]), (w, x, y, z)
+    return _to_vec3(np.array(p) + d[:3]), _to_quat(quat_multiply(quat_exp(d[3:]), np.array(q)))
 
 
 def _touch(name: str, rng: np.random.Generator | None = None, T: PoseTuple = T_WORLD_TRACKING) -> Touch:
@@ -67,6 +77,39 @@ def test_stated_error_is_honest(marks: str) -> None:
             at = apply(got.T_world_tracking, apply(inverse(T), point))
             inside[where] += not got.refused and distance(at, point) <= got.error_at(point)
     assert all(0.925 <= count / n <= 0.98 for count in inside.values()), inside
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.5])
+def test_covariance_is_stored_in_the_axes_of_the_anchor(yaw: float) -> None:
+    """Monte Carlo: an alignment that is uncertain along one axis, about a pivot beside the anchor; afterwards the
+    world lies otherwise, and one mark is touched."""
+    rng = np.random.default_rng(5)
+    sigma = np.array([0.012, 0.002, 0.002, *np.radians([0.2, 0.2, 0.8])])
+    pivot = (0.6, -0.2, 0.1)
+    stored = covariance_at_anchor(tuple(np.diag(sigma**2).ravel().tolist()), pivot, T_WORLD_ANCHOR)
+    T_NOW_WORLD: PoseTuple = ((0.2, 0.1, 0.0), quat_from_yaw(yaw))
+    anchor = compose(T_NOW_WORLD, T_WORLD_ANCHOR)
+    marks = {name: apply(T_NOW_WORLD, p) for name, p in MARKS.items()}
+    far, T_tracking_now = apply(T_NOW_WORLD, ROBOT), inverse(compose(T_NOW_WORLD, T_WORLD_TRACKING))
+    config = PersistentConfig(inflation=1.0, position_sigma_m=1e-4, rotation_sigma_rad=1e-4)
+    inside = refused = 0
+    n = 300
+    for _ in range(n):
+        d = rng.multivariate_normal(np.zeros(6), np.diag(sigma**2))
+        turn = quat_exp(d[3:])
+        p = np.array(T_WORLD_ANCHOR[0])
+        place = np.array(pivot) + quat_to_matrix(turn) @ (p - np.array(pivot)) + d[:3]
+        found = (_to_vec3(place), _to_quat(quat_multiply(turn, np.array(T_WORLD_ANCHOR[1]))))
+        seen = compose(inverse(T_WORLD_TRACKING), found)
+        kept = align_persistent(anchor, seen, stored, 0, config)
+        assert kept is not None
+        at = np.array(apply(T_tracking_now, marks["1"])) + rng.normal(0.0, SIGMA_M, 3)
+        got = confirm_alignment(kept, marks, [Touch("1", _to_vec3(at), SIGMA_M)])
+        refused += got.refused
+        off = [distance(apply(one.T_world_tracking, apply(T_tracking_now, far)), far) for one in (kept, got)]
+        inside += off[0] <= kept.error_at(far)
+    assert 0.92 <= inside / n <= 0.98
+    assert refused <= 0.01 * n
 
 
 def test_a_touch_reduces_the_error_there_and_leaves_the_rotation_open() -> None:

@@ -58,6 +58,16 @@ def test_stated_error_is_honest() -> None:
     assert 0.90 <= inside / 100 <= 0.99
 
 
+def test_stated_error_holds_for_touches_that_are_repeated() -> None:
+    """A client that reports a resting tip in five frames has touched once."""
+    inside = 0
+    for seed in range(100):
+        estimate = register_touches(MARKS, 5 * _touches("abc", 0.0015, seed)).estimate
+        at = apply(estimate.T_world_tracking, apply(inverse(T_WORLD_TRACKING), MARKS["c"]))
+        inside += distance(at, MARKS["c"]) <= estimate.error_at(MARKS["c"])
+    assert inside >= 93
+
+
 def test_gravity_determines_the_tilt() -> None:
     """From points within half a metre alone, the tilt would be wrong by several tenths of a degree."""
     far: Vec3 = (0.3, 0.2, 3.0)
@@ -205,7 +215,7 @@ def test_stated_error_includes_that_of_the_tip(names: str, turning: float) -> No
     rng = np.random.default_rng(3)
     far: Vec3 = (0.3, 0.4, 0.2)
     inside = {"sheet": 0, "robot": 0}
-    errors = []
+    errors, stated = [], []
     n = 400
     for _ in range(n):
         tip = _calibrate(rng, 0.0015)
@@ -220,8 +230,11 @@ def test_stated_error_includes_that_of_the_tip(names: str, turning: float) -> No
         for where, point in (("sheet", got.pivot_world), ("robot", far)):
             at_world = apply(got.T_world_tracking, apply(inverse(T_WORLD_TRACKING), point))
             errors.append(distance(at_world, point))
-            inside[where] += errors[-1] <= got.error_at(point)
-    assert all(0.92 <= count / n <= 0.985 for count in inside.values()), inside
+            stated.append(got.error_at(point))
+            inside[where] += errors[-1] <= stated[-1]
+    # The readings are independent, more than the calibration assumes: the stated error may be too large.
+    assert all(count / n >= 0.93 for count in inside.values()), inside
+    assert float(np.median(errors)) > 0.25 * float(np.median(stated))
 
 
 def test_common_error_of_a_tip_does_not_average_out() -> None:

@@ -58,6 +58,7 @@ def test_a_good_measurement_is_accepted_with_its_error() -> None:
     anna = t.operator()
     a = t.last(AlignmentChanged).alignment
     assert (a.version, a.kind, a.T_world_tracking.p, a.offset) == (1, "measured", (1.0, 0.0, 0.0), False)
+    assert a.pivot_world == (0.0, -0.5, 0.0)
     assert 0.0 < a.error_at_robot_m < 0.001
     assert a.error_at_anchor_m == 0.002
     t.step(anna.says(proposal()))
@@ -482,6 +483,7 @@ def test_a_correction_of_somebody_with_an_offset_slides_below_the_offset() -> No
     came = [a for _, a in rest(t, anna, seconds=2.0)]
     assert [a.T_world_tracking.p for a in came] == [pytest.approx((0.0, y, 1.0), abs=1e-12) for y in (1.002, 1.003)]
     assert all(a.offset and not a.covariance and a.error_at_anchor_m == 0.0 for a in came)
+    assert {a.pivot_world for a in came} == {(0.0, 0.0, 0.0)}
 
 
 def test_a_directors_word_waits_for_the_clutch() -> None:

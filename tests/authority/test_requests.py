@@ -608,6 +608,20 @@ def test_an_intervention_outlasts_a_standstill_and_a_pause() -> None:
     assert t.last(Intervention).active, "who looks and thinks keeps the robot"
 
 
+@pytest.mark.parametrize("stop", ["pause", "estop"])
+def test_an_open_clutch_during_a_pause_or_an_estop_gives_nothing_back(stop: str) -> None:
+    t, agent, human = intervened()
+    boss = t.join("director")
+    boss.does(Control(1, "pause") if stop == "pause" else EStop())
+    stand_by(t, human, 250, agent, boss)
+    assert t.last(Intervention).active, "five seconds in which it could not drive"
+    assert boss.asks(Control(2, "resume") if stop == "pause" else ClearEStop(2, 1)).ok
+    stand_by(t, human, 95, agent, boss)
+    assert t.last(Intervention).active, "the time counts from the end of the stop"
+    stand_by(t, human, 15, agent, boss)
+    assert not t.last(Intervention).active
+
+
 @pytest.mark.parametrize("policy", ["join-order", "nearest"])
 def test_a_human_without_a_wish_gets_the_robot_of_an_agent(policy: str) -> None:
     t = Table(AuthorityConfig(policy=policy), robots=(robot("left", "priority"),))

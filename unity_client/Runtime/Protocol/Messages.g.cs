@@ -1299,7 +1299,8 @@ namespace IrisSession.Protocol
     /// <summary>
     /// T_world_tracking of one participant, as accepted by the authority.
     ///
-    /// covariance: 6x6 row-major, order (x, y, z [m], rx, ry, rz [rad]), world frame, empty when unknown.
+    /// covariance: 6x6 row-major, order (x, y, z [m], rx, ry, rz [rad]), world frame, empty when unknown; that of the
+    /// position is stated at pivot_world.
     /// error_at_anchor_m, error_at_robot_m: stated p95 of the position error at the anchor and at the robot.
     /// </summary>
     public sealed class Alignment : WireValue
@@ -1312,6 +1313,7 @@ namespace IrisSession.Protocol
         public double ErrorAtAnchorM = 0.0;
         public double ErrorAtRobotM = 0.0;
         public bool Offset = false;
+        public double[] PivotWorld = new double[] { 0.0, 0.0, 0.0 };
 
         public static Alignment Read(WireReader reader)
         {
@@ -1329,6 +1331,7 @@ namespace IrisSession.Protocol
                     case "error_at_anchor_m": value.ErrorAtAnchorM = reader.ReadDouble(); break;
                     case "error_at_robot_m": value.ErrorAtRobotM = reader.ReadDouble(); break;
                     case "offset": value.Offset = reader.ReadBool(); break;
+                    case "pivot_world": value.PivotWorld = reader.ReadDoubles(3, 0); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -1338,7 +1341,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(8);
+            writer.WriteMapHeader(9);
             writer.Write("version");
             writer.Write(Version);
             writer.Write("kind");
@@ -1355,6 +1358,8 @@ namespace IrisSession.Protocol
             writer.Write(ErrorAtRobotM);
             writer.Write("offset");
             writer.Write(Offset);
+            writer.Write("pivot_world");
+            writer.Write(PivotWorld);
         }
     }
 
@@ -2628,8 +2633,9 @@ namespace IrisSession.Protocol
     /// capture_ns: when it was sampled (session time by the client's clock estimate), not when it will be displayed.
     /// pose: T_tracking_device. twist: (vx, vy, vz [m/s], wx, wy, wz [rad/s]) in the tracking frame.
     /// clutch: true while the person wants the target to follow. gripper: 0 open to 1 closed.
-    /// buttons: bit mask (section 6). hand_joints: up to 26 poses flattened (x, y, z, qw, qx, qy, qz). q, qd: a
-    /// leader's joint positions [rad or m] and velocities.
+    /// buttons: bit mask (section 6). hand_joints: up to 26 poses T_tracking_joint flattened (x, y, z, qw, qx, qy,
+    /// qz): 25 in the order of WebXR (the wrist first), 26 in that of OpenXR (the palm first); not in every sample. q,
+    /// qd: a leader's joint positions [rad or m] and velocities.
     /// </summary>
     public sealed class Sample : ClientMessage
     {
@@ -3119,7 +3125,8 @@ namespace IrisSession.Protocol
     /// Observation of an anchor by a headset or camera: T_tracking_anchor.
     ///
     /// kind: AnchorKind. size_m: edge of the sheet as detected. viewpoint_id: observations with the same number
-    /// share their systematic error. covariance: 6x6 row-major (position, rotation) or empty. quality: 0 to 1.
+    /// share their systematic error. covariance: 6x6 row-major (position, rotation), tracking axes, of kind persistent
+    /// those of the anchor, or empty. quality: 0 to 1.
     /// mark: touched mark of the anchor (AnchorInfo.marks), empty for the origin of the anchor. grip_poses: of kind
     /// tip, T_tracking_grip of device (section 5).
     /// </summary>

@@ -499,7 +499,8 @@ export interface Denial {
 /**
  * `T_world_tracking` of one participant, as accepted by the authority.
  *
- * `covariance`: 6x6 row-major, order (x, y, z [m], rx, ry, rz [rad]), world frame, empty when unknown.
+ * `covariance`: 6x6 row-major, order (x, y, z [m], rx, ry, rz [rad]), world frame, empty when unknown; that of the
+ * position is stated at `pivot_world`.
  * `error_at_anchor_m`, `error_at_robot_m`: stated p95 of the position error at the anchor and at the robot.
  */
 export interface Alignment {
@@ -511,6 +512,7 @@ export interface Alignment {
   error_at_anchor_m?: number;
   error_at_robot_m?: number;
   offset?: boolean;
+  pivot_world?: [number, number, number];
 }
 
 /** The newest sample that entered the IK target behind the `ctrl` in use, for one robot. All times session time. */
@@ -816,8 +818,9 @@ export interface GetSnapshot {
  * `capture_ns`: when it was sampled (session time by the client's clock estimate), not when it will be displayed.
  * `pose`: `T_tracking_device`. `twist`: (vx, vy, vz [m/s], wx, wy, wz [rad/s]) in the tracking frame.
  * `clutch`: true while the person wants the target to follow. `gripper`: 0 open to 1 closed.
- * `buttons`: bit mask (section 6). `hand_joints`: up to 26 poses flattened (x, y, z, qw, qx, qy, qz). `q`, `qd`: a
- * leader's joint positions [rad or m] and velocities.
+ * `buttons`: bit mask (section 6). `hand_joints`: up to 26 poses `T_tracking_joint` flattened (x, y, z, qw, qx, qy,
+ * qz): 25 in the order of WebXR (the wrist first), 26 in that of OpenXR (the palm first); not in every sample. `q`,
+ * `qd`: a leader's joint positions [rad or m] and velocities.
  */
 export interface Sample {
   type: "sample";
@@ -928,7 +931,8 @@ export interface Grasp {
  * Observation of an anchor by a headset or camera: `T_tracking_anchor`.
  *
  * `kind`: `AnchorKind`. `size_m`: edge of the sheet as detected. `viewpoint_id`: observations with the same number
- * share their systematic error. `covariance`: 6x6 row-major (position, rotation) or empty. `quality`: 0 to 1.
+ * share their systematic error. `covariance`: 6x6 row-major (position, rotation), tracking axes, of kind `persistent`
+ * those of the anchor, or empty. `quality`: 0 to 1.
  * `mark`: touched mark of the anchor (`AnchorInfo.marks`), empty for the origin of the anchor. `grip_poses`: of kind
  * `tip`, `T_tracking_grip` of `device` (section 5).
  */
@@ -2252,6 +2256,7 @@ export const VALUE_DEFAULTS = {
     error_at_anchor_m: 0.0,
     error_at_robot_m: 0.0,
     offset: false,
+    pivot_world: [0.0, 0.0, 0.0],
   },
   Endpoints: {
     state: 0,

@@ -86,6 +86,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["error_at_anchor_m", ["float"], [0.0]],
       ["error_at_robot_m", ["float"], [0.0]],
       ["offset", ["bool"], [false]],
+      ["pivot_world", ["array", ["float"], 3, 0], [[0.0, 0.0, 0.0]]],
     ],
   },
   Applied: {
