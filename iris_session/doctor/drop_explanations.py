@@ -73,6 +73,7 @@ EXPLANATIONS: Final[Mapping[str, str]] = {
     "subscribers_too_many": "connections to the state closed because their key had too many",
     "media_source_refused": "media of keys without the role camera or source",
     "media_flood": "connections to media closed because they sent more than was read",
+    "media_backoff": "connections to media refused of keys that sent more than was read before",
     "media_too_many": "connections to media closed because their key had too many",
     "audit_lost": "audit records of admissions and refusals",
     "malformed": _ODD,

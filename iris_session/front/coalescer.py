@@ -55,7 +55,7 @@ def _has_edge(old: Entry, new: Entry, a: Sample, b: Sample) -> bool:
 def _replacement_key(message: EntryMessage) -> Hashable:
     """Return the key under which a pending entry replaces the one before, `None` if it replaces none.
 
-    Anchor names are the session's own, and a tip is solved once a second, so the keys are few.
+    Anchor names are the session's own, and a tip is solved twice a second at most, so the keys are few.
     """
     if isinstance(message, Heartbeat | TrackingEpoch):
         return type(message)

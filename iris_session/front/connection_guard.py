@@ -23,6 +23,7 @@ import zmq
 
 from iris_session.front.audit import AuditTrail
 from iris_session.front.connections import ConnectionTable, FrontConnection, Peer, TrafficCounter
+from iris_session.front.key_budgets import remember
 from iris_session.front.memory_guard import PendingConnection
 from iris_session.link.config import MEBIBYTE, MILLISECOND, SECOND, FrontLimits
 from iris_session.link.sockets import close_tcp, next_tcp_event, peer_of, readable, tcp_counts
@@ -434,12 +435,25 @@ class ChannelBounds(NamedTuple):
     find_share: Callable[[str], int] | None = None
 
 
+class ChannelFlood(NamedTuple):
+    """A connection that was closed because more was received than read.
+
+    Attributes:
+        address, key_id: Host of the peer, and its key: empty before its first whole message and without encryption.
+        opened_ns: Session time at which it was accepted.
+    """
+
+    address: str
+    key_id: str
+    opened_ns: int
+
+
 class ChannelGuard:
     """Limit TCP connections of one socket of media or assets. Belongs to the thread of that channel.
 
     Closes connections that stay silent, that are too many, and that send more than is read: libzmq collects all frames
-    of a message, however many, before it delivers the first. Drop reasons begin with `name`. `list_pending` is for
-    other threads.
+    of a message, however many, before it delivers the first. Drop reasons begin with `name`. `list_pending` and
+    `pop_floods` are for other threads.
 
     Args:
         monitor: Monitor of the socket.
@@ -465,6 +479,7 @@ class ChannelGuard:
         self._pending: tuple[tuple[int, TcpConnection, int], ...] = ()
         self._traffic = TrafficCounter(curve=curve)
         self._tcp = TcpConnections()
+        self._floods: deque[ChannelFlood] = deque(maxlen=MAX_REMEMBERED)
         self._next_ns = self._next_bytes_ns = 0
 
     @property
@@ -557,7 +572,16 @@ class ChannelGuard:
 
     def evict(self, descriptor: int, reason: str) -> str:
         """Close a connection. Return the drop reason, empty if it has ended already."""
-        return self._tcp.evict(descriptor, reason)
+        connection = self._tcp.find(descriptor)
+        counted = self._tcp.evict(descriptor, reason)
+        if connection is not None and counted == f"{self._name}_flood":
+            address, owner = connection.address[0], connection.owner
+            self._floods.append(ChannelFlood(address, "" if owner == address else owner, connection.opened_ns))
+        return counted
+
+    def pop_floods(self) -> list[ChannelFlood]:
+        """Return and forget the connections that were closed for a flood since the last call."""
+        return [self._floods.popleft() for _ in range(len(self._floods))]
 
     def close(self) -> None:
         self._monitor.close(linger=0)
@@ -644,15 +668,15 @@ class ConnectionGuard:
         self.report_flood(tcp.address[0], detail, now_ns, connection)
         if connection is not None and connection.gateway:
             self._drops.count("flood_cut")
-            _remember(self._banned, connection.key_id, now_ns + BAN_NS)
+            remember(self._banned, connection.key_id, now_ns + BAN_NS)
             return True
         if not close_tcp(peer.descriptor, tcp.address):
             return False
         tcp.is_closed = True
         self._drops.count("flood_cut")
-        _remember(self._flooded, tcp.address[0], now_ns + BAN_NS)
+        remember(self._flooded, tcp.address[0], now_ns + BAN_NS)
         if connection is not None:
-            _remember(self._banned, connection.key_id, now_ns + BAN_NS)
+            remember(self._banned, connection.key_id, now_ns + BAN_NS)
         return True
 
     def report_flood(
@@ -676,7 +700,7 @@ class ConnectionGuard:
     def _report_subscriber_flood(self, address: str, detail: str, now_ns: int, key: str) -> None:
         self.report_flood(address, detail, now_ns)
         if key:
-            _remember(self._banned, key, now_ns + BAN_NS)
+            remember(self._banned, key, now_ns + BAN_NS)
 
     def is_banned(self, key_id: str, now_ns: int) -> bool:
         """Return whether this key was disconnected for a flood a moment ago."""
@@ -725,7 +749,7 @@ class ConnectionGuard:
     def _close_for_memory(self, connection: FrontConnection) -> int:
         if not close_tcp(connection.peer.descriptor, connection.address):
             return 0
-        _remember(self._banned, connection.key_id, connection.last_heard_ns + BAN_NS)
+        remember(self._banned, connection.key_id, connection.last_heard_ns + BAN_NS)
         return 1
 
     def _close_silent_for_memory(self, silent: Mapping[int, int]) -> int:
@@ -774,10 +798,3 @@ class ConnectionGuard:
             self._accepted[address] = self._accepted.get(address, 0) + 1
             if self._accepted[address] > FLOOD_CONNECTIONS_PER_S:
                 self.report_flood(address, "connections", now_ns)
-
-
-def _remember(table: dict[str, int], key: str, until_ns: int) -> None:
-    table.pop(key, None)
-    while len(table) >= MAX_REMEMBERED:
-        del table[next(iter(table))]
-    table[key] = until_ns

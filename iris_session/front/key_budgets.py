@@ -8,14 +8,17 @@ by opening more connections, and spend it on what costs everyone most. `KeyBudge
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final
+from typing import Final, TypeVar
 
 import msgspec
 
-from iris_session.link.config import FrontLimits
+from iris_session.link.config import SECOND, FrontLimits
 from iris_session.protocol.entries import Entry
-from iris_session.protocol.limits import Drops, KeyedBuckets, KeyLimits, TokenBucket
-from iris_session.security.zap import ZAP_CONTROL
+from iris_session.protocol.limits import Drops, KeyedBuckets, KeyLimits, TokenBucket, find_network
+from iris_session.security.zap import ZAP_CONTROL, ZAP_INGEST
+
+K = TypeVar("K")
+V = TypeVar("V")
 
 #: Drop reasons of messages above the budget of their key.
 KEY_MESSAGES: Final = "key_messages"
@@ -25,6 +28,8 @@ KEY_EVENTS: Final = "key_events"
 #: Connections refused: of a key that opens too many, or was disconnected for a flood a moment ago.
 KEY_CONNECTIONS: Final = "key_connections"
 KEY_BANNED: Final = "key_banned"
+#: Connections to media ingest refused: of a key that flooded it before.
+MEDIA_BACKOFF: Final = "media_backoff"
 #: E-stops above the budget of their key, merged into the next one.
 ESTOPS_MERGED: Final = "estops_merged"
 
@@ -34,6 +39,12 @@ MAX_KEYS: Final = 256
 FORGET_NS: Final = 60_000_000_000
 #: E-stops that wait are looked for this often.
 PERIOD_NS: Final = 50_000_000
+
+#: A key that flooded media ingest is refused there for so long: twice as long each time, up to the last.
+FIRST_BACKOFF_NS: Final = SECOND
+MAX_BACKOFF_NS: Final = 60 * SECOND
+#: A connection is noted later than it was accepted, by up to this on a busy machine.
+ACCEPT_SLACK_NS: Final = SECOND
 
 
 class KeyBudget:
@@ -167,6 +178,52 @@ class KeyBudgets:
             del self._budgets[key_id]
 
 
+class IngestBackoff:
+    """Refuse new connections to media ingest of keys that flooded it: 1 s, then 2, 4 ... 60 s.
+
+    libzmq names the key of a connection with its first whole message. So when a connection is closed before that, all
+    keys are refused that have connected from its address since it was opened: its own is among them. Connections that
+    are open stay. A key that floods no more for as long as it was last refused for, and a minute, begins anew.
+    """
+
+    def __init__(self) -> None:
+        self._handshakes: dict[tuple[str, str], int] = {}  # by network and key; the newest last
+        self._refused: dict[str, tuple[int, int]] = {}  # key -> until when, and for how long
+
+    def record_handshake(self, address: str, key_id: str, now_ns: int) -> None:
+        """Record that a key connects to media ingest."""
+        remember(self._handshakes, (find_network(address), key_id), now_ns)
+
+    def refuse(self, address: str, key_id: str, opened_ns: int, now_ns: int) -> dict[str, int]:
+        """Refuse the key of a connection that was closed for a flood, or those that it may have had.
+
+        Args:
+            address: Of the connection.
+            key_id: Its key, empty where it is not known.
+            opened_ns: Session time at which it was opened.
+            now_ns: Session time.
+
+        Returns:
+            For how long each key is refused [ns], without those that are refused already.
+        """
+        network, since_ns = find_network(address), opened_ns - ACCEPT_SLACK_NS
+        seen = [key for (where, key), at_ns in self._handshakes.items() if where == network and at_ns >= since_ns]
+        refused: dict[str, int] = {}
+        for key in [key_id] if key_id else seen:
+            until_ns, last_ns = self._refused.get(key, (-FORGET_NS, 0))
+            if now_ns < until_ns:
+                continue  # the flood for which it is refused
+            if now_ns - until_ns > FORGET_NS:
+                last_ns = 0
+            refused[key] = min(max(2 * last_ns, FIRST_BACKOFF_NS), MAX_BACKOFF_NS)
+            remember(self._refused, key, (now_ns + refused[key], refused[key]))
+        return refused
+
+    def is_refused(self, key_id: str, now_ns: int) -> bool:
+        """Return whether a key is refused at media ingest now."""
+        return now_ns < self._refused.get(key_id, (0, 0))[0]
+
+
 class HandshakeLimiter:
     """Limit how often a key opens connections to each channel: each costs memory before its first message.
 
@@ -176,6 +233,7 @@ class HandshakeLimiter:
         is_gateway: Returns whether a key may be a gateway's.
         is_banned: Returns whether a key was disconnected for a flood a moment ago; it may connect to control, where
             its hello is refused with the reason.
+        backoff: Of keys that flooded media ingest.
     """
 
     def __init__(
@@ -184,15 +242,20 @@ class HandshakeLimiter:
         drops: Drops,
         is_gateway: Callable[[str], bool],
         is_banned: Callable[[str, int], bool],
+        backoff: IngestBackoff,
     ) -> None:
         self._limits = limits
         self._drops = drops
         self._is_gateway = is_gateway
         self._is_banned = is_banned
+        self._backoff = backoff
         self._buckets = KeyedBuckets(limits.handshakes, limits.handshake_burst, MAX_KEYS)
 
-    def allow(self, domain: bytes, key_id: str, now_ns: int) -> bool:
+    def allow(self, domain: bytes, key_id: str, address: str, now_ns: int) -> bool:
         """Return whether a key may open one more connection to a channel, and use its token."""
+        if domain == ZAP_INGEST and self._backoff.is_refused(key_id, now_ns):
+            self._drops.count(MEDIA_BACKOFF)
+            return False
         if domain != ZAP_CONTROL and self._is_banned(key_id, now_ns):
             self._drops.count(KEY_BANNED)
             return False
@@ -200,7 +263,17 @@ class HandshakeLimiter:
         if not self._buckets.take((domain, key_id), now_ns, factor=factor):
             self._drops.count(KEY_CONNECTIONS)
             return False
+        if domain == ZAP_INGEST:
+            self._backoff.record_handshake(address, key_id, now_ns)
         return True
+
+
+def remember(table: dict[K, V], key: K, value: V) -> None:
+    """Put a value into a bounded table; the one that was put there first is forgotten."""
+    table.pop(key, None)
+    while len(table) >= MAX_KEYS:
+        del table[next(iter(table))]
+    table[key] = value
 
 
 def describe_excess(reason: str, limits: KeyLimits) -> str:

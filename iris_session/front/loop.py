@@ -25,7 +25,7 @@ from iris_session.front.disconnects import DisconnectHandler
 from iris_session.front.discovery import SessionFacts, SessionRegistration, make_discovery_services
 from iris_session.front.downlink import Downlink
 from iris_session.front.intake import Intake
-from iris_session.front.key_budgets import HandshakeLimiter
+from iris_session.front.key_budgets import HandshakeLimiter, IngestBackoff
 from iris_session.front.media.proxy import MediaProxy
 from iris_session.front.media.service import MediaService
 from iris_session.front.memory_guard import MemoryGuard
@@ -36,9 +36,10 @@ from iris_session.front.status import StatusService
 from iris_session.front.uplink import Uplink
 from iris_session.link import messages as link
 from iris_session.link.config import MILLISECOND, FrontStart
-from iris_session.link.sockets import readable
+from iris_session.link.sockets import MEDIA_THREAD_NAME, readable
 from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
+from iris_session.system.priority import lower_named_thread_priority
 from iris_session.system.process import is_parent
 
 #: Messages of clients handled before the link is drained again: about 0.2 ms.
@@ -74,8 +75,11 @@ class Front:
         self.cut_off = False
         context, sockets = self._context, self._sockets = open_front(start)
         self._link, self._control = sockets.link, sockets.control.socket
+        # What a source sends is decrypted as fast as it comes: on a busy machine state, control and clients go first.
+        lower_named_thread_priority(MEDIA_THREAD_NAME)
         proxy = _make_media_proxy(context, sockets)
-        media = MediaService(context, proxy)
+        backoff = IngestBackoff()
+        media = MediaService(context, proxy, backoff)
         asset_server = _make_asset_server(context, sockets)
         assets = AssetService(context, asset_server)
         alignment = _make_alignment_service(context)
@@ -92,10 +96,14 @@ class Front:
         if self._authenticator is not None:
             self._authenticator.is_revoked = context.tokens.is_revoked
             handshakes = HandshakeLimiter(
-                context.config.limits.key, context.drops, context.keyring.may_be_gateway, context.guard.is_banned
+                context.config.limits.key,
+                context.drops,
+                context.keyring.may_be_gateway,
+                context.guard.is_banned,
+                backoff,
             )
-            self._authenticator.is_rate_limited = lambda domain, mark: (
-                not handshakes.allow(domain, mark, context.now_ns())
+            self._authenticator.is_rate_limited = lambda domain, mark, address: (
+                not handshakes.allow(domain, mark, address, context.now_ns())
             )
         memory = MemoryGuard(
             context.config.limits.memory_bytes,

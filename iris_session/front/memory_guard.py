@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from typing import Final, NamedTuple
 
 import psutil
@@ -145,11 +146,14 @@ class MemoryGuard:
 def _make_resident_reader() -> Callable[[], int]:
     """Return a function that reads resident bytes without mapped files: assets are mapped, and the system takes those
     pages back when it needs them."""
-    process = psutil.Process()
+    process, resident = psutil.Process(), 0
 
     def read_resident() -> int:
-        info = process.memory_info()
-        return int(info.rss - getattr(info, "shared", 0))
+        nonlocal resident
+        with suppress(OSError):  # no descriptor is free now, until connections are closed
+            info = process.memory_info()
+            resident = int(info.rss - getattr(info, "shared", 0))
+        return resident
 
     return read_resident
 

@@ -190,14 +190,18 @@ class PairingService:
             self._refuse(route, f"this key is on the list as one of kind {entry.kind}", "make a new one")
         elif (earlier := self._find_earlier_answer(attempt)) is not None:
             self._outbox.send_to_route(route, earlier)
-        elif not self._has_open_code_for(attempt.web_key):
-            self._audit.record(
-                AuditKind.CODE_REFUSED, now_ns, subject=mark, name=attempt.pair.name, address=attempt.source.address
-            )
-            text = NO_WEB_CODE if attempt.web_key and self.has_open_code else "no join code can be used now"
-            self._refuse(route, text, "run `iris-session pair` where the session runs")
+        elif self._trying or self._has_open_code_for(attempt.web_key):
+            self._pending.append(attempt)  # the attempt that runs may be of the same key, and has used its code
         else:
-            self._pending.append(attempt)
+            self._refuse_without_code(attempt, now_ns)
+
+    def _refuse_without_code(self, attempt: _PendingAttempt, now_ns: int) -> None:
+        mark = compute_fingerprint(decode_key(attempt.key))
+        self._audit.record(
+            AuditKind.CODE_REFUSED, now_ns, subject=mark, name=attempt.pair.name, address=attempt.source.address
+        )
+        text = NO_WEB_CODE if attempt.web_key and self.has_open_code else "no join code can be used now"
+        self._refuse(attempt.route, text, "run `iris-session pair` where the session runs")
 
     def _has_open_code_for(self, web_key: bytes) -> bool:
         now_s = time.time()
@@ -227,6 +231,10 @@ class PairingService:
         assert home is not None
         assert key is not None
         first = self._pending[0]
+        if not self._has_open_code_for(first.web_key):
+            self._pending.popleft()
+            self._refuse_without_code(first, now_ns)
+            return
         self._trying = self._keyring.files.submit(
             partial(_run_attempt, home, key, first), partial(self._on_attempt_done, first)
         )

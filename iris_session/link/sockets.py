@@ -43,6 +43,8 @@ ASSET_MESSAGE_BYTES = 1024
 IO_THREADS = 2
 MAIN_THREAD = 1
 MEDIA_THREAD = 2
+#: The name that libzmq gives to the second.
+MEDIA_THREAD_NAME: Final = "ZMQbg/IO/1"
 #: As plain integers: operations on the enumerations take longer than the query of the socket.
 _EVENTS = int(zmq.EVENTS)
 _POLLIN = int(zmq.POLLIN)

@@ -35,18 +35,28 @@ def is_curve_request(request: list[bytes]) -> bool:
     return len(request) == _REQUEST_FRAMES and request[5] == b"CURVE"
 
 
+class TryLaterError(Exception):
+    """A key is refused for a time only."""
+
+
 def answer_zap_requests(socket: zmq.Socket[bytes], authenticate: Callable[[list[bytes]], str]) -> None:
-    """Answer every pending ZAP request. `authenticate(request)` returns the User-Id, empty to refuse."""
+    """Answer every pending ZAP request. `authenticate(request)` returns the User-Id, empty to refuse for good.
+
+    It raises `TryLaterError` to refuse for a time. libzmq then reads nothing more from the connection and closes it
+    after `ZMQ_HANDSHAKE_IVL`, and its client connects again, which it never does after a refusal for good.
+    """
     while _has_message(socket):
         frames = socket.recv_multipart()
         split = frames.index(b"") + 1
         route, request = frames[:split], frames[split:]
         request_id = request[1] if len(request) > 1 else b""
-        user_id = authenticate(request)
-        if user_id:
-            reply = [b"1.0", request_id, b"200", b"OK", user_id.encode(), b""]
+        try:
+            user_id = authenticate(request)
+        except TryLaterError:
+            reply = [b"1.0", request_id, b"300", b"try again later", b"", b""]
         else:
-            reply = [b"1.0", request_id, b"400", b"key not on the list", b"", b""]
+            status = (b"200", b"OK") if user_id else (b"400", b"key not on the list")
+            reply = [b"1.0", request_id, *status, user_id.encode(), b""]
         socket.send_multipart(route + reply)
 
 
@@ -61,7 +71,8 @@ class Authenticator:
         socket: The socket of the requests.
         on_refused: Called with the fingerprint, the address and the channel of every key that was refused.
         is_revoked: Returns True for a key that was revoked in this session, also where the list could not be changed.
-        is_rate_limited: Returns True for a listed key that connects to a channel (its ZAP domain) too often.
+        is_rate_limited: Returns True for a listed key that may not connect to a channel (its ZAP domain) from an
+            address now; it may try again later.
     """
 
     def __init__(
@@ -78,7 +89,7 @@ class Authenticator:
         self._drops = drops
         self.on_refused = refused
         self.is_revoked: Callable[[str], bool] = lambda _mark: False
-        self.is_rate_limited: Callable[[bytes, str], bool] = lambda _domain, _mark: False
+        self.is_rate_limited: Callable[[bytes, str, str], bool] = lambda _domain, _mark, _address: False
 
     def answer_requests(self) -> None:
         """Answer every pending request."""
@@ -87,14 +98,14 @@ class Authenticator:
             answer_zap_requests(self.socket, self._authenticate)
 
     def _authenticate(self, request: list[bytes]) -> str:
-        """Return the User-Id, empty to refuse."""
+        """Return the User-Id, empty to refuse. Raises `TryLaterError`."""
         if not is_curve_request(request):
             self._drops.count("unknown_key")
             return ""
         mark = compute_fingerprint(request[6])
         address = request[3].decode(errors="replace")
-        if self._keyring.find_key(mark) is not None and self.is_rate_limited(request[2], mark):
-            return ""
+        if self._keyring.find_key(mark) is not None and self.is_rate_limited(request[2], mark, address):
+            raise TryLaterError
         if request[2] == ZAP_INGEST and self._keyring.find_key(mark) is not None:
             if self._keyring.may_hand_in_media(mark) and not self.is_revoked(mark):
                 return mark

@@ -13,6 +13,7 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Final, TypeVar
 
 #: Any real-time priority runs before all ordinary threads; a low one stays below the kernel's own threads.
@@ -30,6 +31,16 @@ def lower_thread_priority() -> None:
     with contextlib.suppress(OSError, AttributeError):
         nice = min(_LAST_NICE, os.getpriority(os.PRIO_PROCESS, 0) + LOW_PRIORITY_NICE)
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), nice)
+
+
+def lower_named_thread_priority(name: str) -> None:
+    """Lower the priority of a thread of this process, by the name that it has in the system (Linux): of one that a
+    library has started. Where there is none, nothing changes."""
+    for task in Path("/proc/self/task").glob("*"):
+        with contextlib.suppress(OSError):
+            if (task / "comm").read_text().strip() == name:
+                nice = min(_LAST_NICE, os.getpriority(os.PRIO_PROCESS, int(task.name)) + LOW_PRIORITY_NICE)
+                os.setpriority(os.PRIO_PROCESS, int(task.name), nice)
 
 
 def run_at_low_priority(function: Callable[[], T]) -> T:

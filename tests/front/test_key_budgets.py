@@ -10,6 +10,7 @@ import pytest
 import zmq
 
 from iris_session.front.connections import Peer
+from iris_session.front.key_budgets import FORGET_NS, HandshakeLimiter, IngestBackoff
 from iris_session.protocol.client_messages import (
     Acquire,
     EStop,
@@ -22,8 +23,10 @@ from iris_session.protocol.client_messages import (
 )
 from iris_session.protocol.common import IDENTITY, Target
 from iris_session.protocol.entries import Entry
+from iris_session.protocol.limits import Drops, KeyLimits
 from iris_session.protocol.names import DenialReason
 from iris_session.protocol.server_messages import ProtocolFault, Refused, Reply
+from iris_session.security.zap import ZAP_CONTROL, ZAP_INGEST, ZAP_MEDIA, ZAP_STATE
 from tests.front.intake_rig import HELLO, IntakeRig
 
 MS = 1_000_000
@@ -101,6 +104,16 @@ def test_requests_for_many_targets_are_weighed_by_the_events_that_they_cause(rig
     assert {denial.reason for denial in denied} == {DenialReason.QUOTA}
     assert "events a second" in denied[0].message
     assert rig.drops.by_reason["key_events"] == 100 - kept[Acquire]
+
+
+def test_a_release_passes_when_the_events_of_its_key_are_used_up(rig: IntakeRig) -> None:
+    hog, kept = KeyRig(rig, 8), Counter[type]()
+    for i in range(96):
+        hog.send(i % 8, Marker(i + 1, "x"))
+    hog.send(0, Release(200))
+    collect(rig, kept)
+    assert kept[Marker] == 80
+    assert kept[Release] == 1
 
 
 def test_a_person_who_acquires_and_releases_notices_no_limit(rig: IntakeRig) -> None:
@@ -219,3 +232,81 @@ def test_those_behind_a_gateway_have_budgets_of_their_own_and_the_gateways_toget
         kept.update(entry.connection for entry in rig.entries())
     assert kept[epochs[0]] == 20
     assert kept[epochs[1]] <= 80 + 10 * 20 + 1
+
+
+def test_each_of_many_behind_a_gateway_is_limited_and_all_together(rig: IntakeRig) -> None:
+    rig.join(role="gateway")
+    names, epochs = [f"p{i}" for i in range(12)], []
+    for name in names:
+        rig.now_ns += SECOND
+        rig.take(Hello("observer", name, secret=name.encode().ljust(16)), behalf=name)
+        (entry,) = rig.entries()
+        rig.clients.by_number[entry.connection].admitted = True
+        epochs.append(entry.connection)
+    put_on, worn = Counter[int](), dict.fromkeys(epochs, True)
+    for i in range(1000):  # ten seconds
+        rig.now_ns += 10 * MS
+        for name, epoch in zip(names, epochs, strict=True):
+            rig.take(msgspec.structs.replace(SAMPLE, seq=i, worn=i % 2 > 0), epoch=epoch, behalf=name)
+        for entry in rig.entries():
+            if isinstance(entry.message, Sample):
+                put_on[entry.connection] += entry.message.worn and not worn[entry.connection]
+                worn[entry.connection] = entry.message.worn
+    budget = (80 + 10 * 20) // 2 + 1  # each time is two events
+    assert max(put_on.values()) <= budget
+    assert sum(put_on.values()) <= 8 * budget
+
+
+def test_handshakes_of_a_key_are_limited_for_each_channel() -> None:
+    drops, limits = Drops(), KeyLimits()
+    limiter = HandshakeLimiter(
+        limits, drops, lambda key: key == "gate", lambda key, _now_ns: key == "flooder", IngestBackoff()
+    )
+
+    def count_allowed(domain: bytes, key: str, now_ns: int = 0) -> int:
+        return sum(limiter.allow(domain, key, "10.0.0.1", now_ns) for _ in range(1000))
+
+    assert count_allowed(ZAP_STATE, "hog") == limits.handshake_burst
+    assert count_allowed(ZAP_STATE, "hog", SECOND) == limits.handshakes
+    assert count_allowed(ZAP_CONTROL, "hog") == limits.handshake_burst, "each channel has its own"
+    assert count_allowed(ZAP_STATE, "gate") == limits.gateway_factor * limits.handshake_burst
+    assert limiter.allow(ZAP_STATE, "ann", "10.0.0.1", 0)
+    assert "key_banned" not in drops.by_reason
+    assert count_allowed(ZAP_STATE, "flooder") == 0
+    assert limiter.allow(ZAP_CONTROL, "flooder", "10.0.0.1", 0), "its hello is refused with the reason"
+    assert drops.by_reason["key_banned"] == 1000
+
+
+# --- media ingest after a flood ---
+
+
+def test_a_key_that_floods_media_ingest_is_refused_for_longer_each_time_and_forgiven() -> None:
+    backoff, now_ns, seconds = IngestBackoff(), 10 * SECOND, []
+    for _ in range(8):
+        refused = backoff.refuse("10.0.0.1", "cam", now_ns, now_ns)
+        assert backoff.refuse("10.0.0.1", "cam", now_ns, now_ns + MS) == {}, "the same flood"
+        seconds.append(refused["cam"] // SECOND)
+        assert backoff.is_refused("cam", now_ns + refused["cam"] - 1)
+        now_ns += refused["cam"]
+        assert not backoff.is_refused("cam", now_ns)
+    assert seconds == [1, 2, 4, 8, 16, 32, 60, 60]
+    assert backoff.refuse("10.0.0.1", "cam", now_ns, now_ns + FORGET_NS + 1) == {"cam": SECOND}
+
+
+def test_a_flood_without_a_key_is_of_those_that_connected_from_its_address_meanwhile() -> None:
+    drops = Drops()
+    backoff = IngestBackoff()
+    limiter = HandshakeLimiter(KeyLimits(), drops, lambda _key: False, lambda _key, _now_ns: False, backoff)
+    for key, address, at_s in (
+        ("honest", "10.0.0.1", 1),
+        ("other", "10.0.0.2", 9),
+        ("mallory", "::ffff:10.0.0.1", 9),
+        ("mallory2", "10.0.0.1", 12),
+    ):
+        assert limiter.allow(ZAP_INGEST, key, address, at_s * SECOND)
+    now_ns = 14 * SECOND
+    assert backoff.refuse("10.0.0.1", "", 9 * SECOND, now_ns) == {"mallory": SECOND, "mallory2": SECOND}
+    assert [limiter.allow(ZAP_INGEST, key, "10.0.0.1", now_ns) for key in ("honest", "mallory")] == [True, False]
+    assert limiter.allow(ZAP_MEDIA, "mallory", "10.0.0.1", now_ns)
+    assert drops.by_reason == {"media_backoff": 1}
+    assert limiter.allow(ZAP_INGEST, "mallory", "10.0.0.1", now_ns + SECOND)

@@ -9,6 +9,7 @@ import socket
 import struct
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import psutil
 import pytest
@@ -16,12 +17,13 @@ import zmq
 
 from iris_session.link import FrontLimits
 from iris_session.protocol.client_messages import EStop, Hello, Marker, wrap_message
-from iris_session.protocol.codec import encode_client
+from iris_session.protocol.codec import encode_client, encode_media_frames
 from iris_session.protocol.entries import Lost
 from iris_session.protocol.names import AuditKind
 from iris_session.protocol.server_messages import Refused, Welcome
 from iris_session.protocol.steps import Decision, OutgoingMessage
 from iris_session.security import KeyPair
+from iris_session.system.priority import LOW_PRIORITY_NICE
 from tests.front.harness import FrontSession, RawClient
 from tests.front.lab import Lab
 
@@ -113,6 +115,7 @@ def test_one_key_leaves_subscribers_to_others(lab: Lab) -> None:
     for one in subscribers:
         one.setsockopt(zmq.RECONNECT_IVL, -1)
     assert lab.session.wait_drops("subscribers_too_many") > 0
+    assert lab.session.wait_drops("key_connections") > 0, "some were refused before they could subscribe"
     lab.session.pump(lambda: sum(bool(m.poll(0)) for m in monitors) >= 24, "the excess is closed")
     for one, monitor in zip(subscribers, monitors, strict=True):
         one.disable_monitor()
@@ -213,6 +216,53 @@ def test_the_sum_of_unfinished_messages_is_bounded(open_session: OpenSession) ->
         one.socket.close()
 
 
+def test_a_source_that_floods_waits_before_it_may_connect_again_and_others_do_not(lab: Lab) -> None:
+    """Behind one address, as of a gateway or NAT: the honest camera hands in all the time."""
+    keys = {name: lab.allowed(name, "camera", "observer")[0] for name in ("honest", "mallory")}
+    honest = open_push(lab, keys["honest"])
+    honest.setsockopt(zmq.IMMEDIATE, 1)  # a send fails while it is not connected
+    monitor = honest.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+    honest.connect(ingest_address(lab.session))
+
+    def hand_in() -> bool:
+        try:
+            honest.send_multipart(encode_media_frames("depth", b"x", 0, 1, "bytes"), zmq.DONTWAIT)
+        except zmq.Again:
+            return False
+        return True
+
+    lab.session.pump(hand_in, "the camera is connected")
+    began = time.monotonic()
+    lab.session.pump(lambda: hand_in() and time.monotonic() > began + 1.5, "connected long before the flood")
+    push = open_push(lab, keys["mallory"])
+    push.setsockopt(zmq.RECONNECT_IVL, 20)
+    push.setsockopt(zmq.SNDTIMEO, 20_000)
+    push.connect(ingest_address(lab.session))
+    push.send_multipart([bytes(MIB)] * 200, copy=False)  # never whole: it is cut after 64 MiB
+    lab.session.pump(
+        lambda: bool(hand_in() and "media_backoff" in lab.session.process.link.status.drops), "a refused handshake"
+    )
+    (flood,) = lab.audits(AuditKind.FLOOD)
+    assert flood.detail == "media ingest, mallory refused for 1 s"
+    assert not monitor.poll(0), "the honest camera was disconnected"
+    assert lab.session.wait_drops("media_flood") == 1
+    push.send_multipart([bytes(MIB)] * 200, copy=False)
+    lab.session.pump(
+        lambda: bool(hand_in() and lab.session.process.link.status.drops["media_flood"] > 1), "mallory is let in again"
+    )
+    honest.disable_monitor()
+    monitor.close(linger=0)
+    honest.close()
+    push.close()
+
+
+def test_decrypting_media_runs_after_other_work(session: FrontSession) -> None:
+    tasks = Path(f"/proc/{session.process.pid}/task").iterdir()
+    names = {(task / "comm").read_text().strip(): int(task.name) for task in tasks}
+    loop, media = (os.getpriority(os.PRIO_PROCESS, one) for one in (session.process.pid, names["ZMQbg/IO/1"]))
+    assert media == min(19, loop + LOW_PRIORITY_NICE)
+
+
 def test_memory_is_taken_from_the_largest_connection_of_any_socket(open_session: OpenSession) -> None:
     """An honest client on a slow link has some messages pending; a source holds most of the memory."""
     limits = FrontLimits(send_queue=100_000, slow_drops=10**9, memory_bytes=24 * MIB)
@@ -248,6 +298,14 @@ def xsubs(session: FrontSession) -> Iterator[list[zmq.Socket[bytes]]]:
         sub.close()
 
 
+def test_a_message_larger_than_a_subscription_ends_its_connection_before_the_front_sees_it(
+    session: FrontSession, xsubs: list[zmq.Socket[bytes]]
+) -> None:
+    xsubs[0].send(b"\x01" + bytes(200))
+    assert session.wait_drops("state_closed_early") > 0
+    assert "state_topic_unknown" not in session.process.link.status.drops  # type: ignore[union-attr]
+
+
 def test_topics_that_do_not_exist_do_not_grow_the_front(session: FrontSession, xsubs: list[zmq.Socket[bytes]]) -> None:
     front = psutil.Process(session.process.pid)
     session.pump(lambda: session.process.link.status is not None, "a start")
@@ -262,3 +320,12 @@ def test_topics_that_do_not_exist_do_not_grow_the_front(session: FrontSession, x
     for sub in xsubs:
         sub.close()
     session.pump(lambda: front.memory_info().rss - base < 24 * MIB, "the memory is given back", 20.0)
+
+
+def test_a_key_that_was_cut_off_for_its_topics_is_refused_for_a_moment(lab: Lab) -> None:
+    pair, _ = lab.allowed("hog", "observer")
+    sub = lab.session.subscriber(curve=lab.curve(pair))
+    for i in range(40):
+        sub.subscribe(b"topic %d" % i)
+    assert lab.session.wait_drops("flood_cut") > 0
+    assert lab.session.wait_drops("key_banned") > 0, "the socket connects again by itself"

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable, Iterator
 
+import psutil
 import pytest
 
 from iris_session.front.connection_guard import SILENT_CONNECTION_BYTES
@@ -13,6 +15,7 @@ from iris_session.front.memory_guard import (
     MIN_EVICT_BYTES,
     MemoryGuard,
     PendingConnection,
+    _make_resident_reader,
     select_largest,
 )
 from iris_session.protocol.limits import Drops
@@ -187,3 +190,15 @@ def test_memory_that_is_free_but_kept_costs_nobody() -> None:
     memory.look()
     assert memory.shed == []
     assert memory.free == 0
+
+
+def test_memory_that_cannot_be_read_now_is_that_of_the_last_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The system has no descriptor left for the file that tells it."""
+    read_resident = _make_resident_reader()
+    before = read_resident()
+
+    def fail(_process: psutil.Process) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(psutil.Process, "memory_info", fail)
+    assert read_resident() == before > 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.server_messages import Paired
 from iris_session.security import AllowedKey, JoinCode, KeyHome, KeyPair, KeysError
+from iris_session.security.allow_list import AllowList
 from iris_session.security.keyring import PAIRING_PREFIX, Keyring, open_keyring
 from tests.front.fakes import make_context
 from tests.front.slow_disk import slow_disk, turns
@@ -280,6 +282,29 @@ def test_attempts_of_one_key_with_one_code_are_answered_alike(rig: PairingRig) -
     first, *others = rig.answers(own)
     assert isinstance(first, Paired)
     assert others == [first, first]
+
+
+def test_attempt_of_a_key_waits_for_another_of_it_that_has_used_the_code(
+    rig: PairingRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own, eve = KeyPair.generate(), KeyPair.generate()
+    code, _ = rig.home.join_codes.create(rig.server)
+    is_used, goes_on, replace = threading.Event(), threading.Event(), AllowList.replace_all
+
+    def replace_later(*arguments: Any) -> None:
+        is_used.set()
+        assert goes_on.wait(30.0)
+        replace(*arguments)
+
+    monkeypatch.setattr(AllowList, "replace_all", replace_later)
+    rig.asks(own, rig.proof(code, own))
+    turns(rig.turn, is_used.is_set)
+    rig.asks(own, rig.proof(code, own))
+    rig.asks(eve, b"x" * 32, descriptor=2)
+    goes_on.set()
+    turns(rig.turn, lambda: len(rig.answers(own)) == 2)
+    assert [type(one) for one in rig.answers(own)] == [Paired, Paired]
+    assert rig.answer(eve).code == RefusalCode.CODE
 
 
 def test_certificates_are_read_again_with_any_modification_time(

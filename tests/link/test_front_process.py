@@ -14,17 +14,20 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import zmq
 import zmq.auth
 
-from iris_session.link import FrontConfig, FrontError, FrontProcess
+from iris_session.link import FrontConfig, FrontError, FrontLimits, FrontProcess
+from iris_session.link.sockets import RESERVED_DESCRIPTORS
 from iris_session.protocol.client_messages import GetSnapshot, Heartbeat, Hello, wrap_message
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.entries import FrontRestarted, Join
 from iris_session.protocol.server_messages import ProtocolFault, Snapshot
 from iris_session.protocol.status import DeliveryBudget
 from iris_session.security import KeyHome
+from tests.front.altered_front import DESCRIPTORS, FEW_DESCRIPTORS, run_altered
 from tests.front.harness import FrontSession, scene
 from tests.loopback import make_loopback_address
 
@@ -408,3 +411,18 @@ def _certificate(folder: Path, name: str) -> tuple[bytes, bytes]:
     public, secret = zmq.auth.load_certificate(folder / f"{name}.key_secret")
     assert secret is not None
     return public, secret
+
+
+def test_few_descriptors_are_kept_for_clients(open_session: OpenSession, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many connections that say nothing as the system gives descriptors: most are closed, and a client joins."""
+    run_altered(monkeypatch, FEW_DESCRIPTORS)
+    session = open_session()
+    silent = [socket.create_connection((session.host, session.ports.state)) for _ in range(DESCRIPTORS)]
+    began = time.monotonic()
+    session.wait_drops("strangers_too_many")
+    session.client().join()
+    assert time.monotonic() - began < 0.8e-9 * FrontLimits().hello_timeout_ns, "they were closed for being too many"
+    front = psutil.Process(session.process.pid)
+    session.pump(lambda: front.num_fds() < DESCRIPTORS - RESERVED_DESCRIPTORS, "descriptors that are free")
+    for one in silent:
+        one.close()

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import zmq
 
-from iris_session.front.connection_guard import ChannelGuard
+from iris_session.front.connection_guard import ChannelFlood, ChannelGuard
 from iris_session.front.media.scheduler import MediaScheduler
 from iris_session.front.memory_guard import PendingConnection
 from iris_session.protocol.codec import decode_media_push
@@ -102,6 +102,10 @@ class MediaProxy:
     def list_pending(self) -> list[PendingConnection]:
         """Return the connections of subscribers and sources and what is unread of them."""
         return [*self._subscriber_guard.list_pending(), *self._source_guard.list_pending()]
+
+    def pop_floods(self) -> list[ChannelFlood]:
+        """Return the connections of sources that were closed for a flood since the last call."""
+        return self._source_guard.pop_floods()
 
     def close(self) -> None:
         """Wait for the end of the thread, then close the sockets."""

@@ -7,10 +7,13 @@ from __future__ import annotations
 
 from typing import Any, Final
 
+from iris_session.front.connection_guard import ChannelFlood
 from iris_session.front.context import FrontContext
+from iris_session.front.key_budgets import IngestBackoff
 from iris_session.front.media.budget import (
     MILLISECOND,
     NONE_LEVEL,
+    SECOND,
     BudgetController,
     BudgetGrant,
     LinkMeasure,
@@ -47,7 +50,7 @@ class _ClientState:
 class MediaService:
     """Decide who gets which media, and who may hand in frames. A `Service`. With `adapt_media`, slow links get less."""
 
-    def __init__(self, context: FrontContext, proxy: MediaProxy) -> None:
+    def __init__(self, context: FrontContext, proxy: MediaProxy, backoff: IngestBackoff) -> None:
         self._context = context
         self._connections = context.connections
         self._outbox = context.outbox
@@ -56,6 +59,7 @@ class MediaService:
         self._tokens = context.tokens
         self._publisher = context.publisher
         self._proxy = proxy
+        self._backoff = backoff
         self._controller = BudgetController() if context.config.adapt_media else None
         self._states: dict[int, _ClientState] = {}
         self._stats: dict[str, StreamStats] = {}
@@ -68,6 +72,8 @@ class MediaService:
         """Take over which clients are admitted, and update the budgets when they are due."""
         if self._proxy.undecided:
             self._decide_sources()
+        for flood in self._proxy.pop_floods():
+            self._refuse_flooder(flood, now_ns)
         self.sync_clients()
         if now_ns >= self._next_ns:
             self._next_ns = now_ns + PERIOD_NS
@@ -171,6 +177,19 @@ class MediaService:
             subscribers[number] = MediaSubscriber(key, state.grant.levels, _initial_level(state.grant))
         with self._proxy.lock:
             self._proxy.scheduler.set_subscribers(subscribers)
+
+    def _refuse_flooder(self, flood: ChannelFlood, now_ns: int) -> None:
+        """Refuse new connections of a source that flooded, and report it by the names of the keys that it may have."""
+        refused = self._backoff.refuse(flood.address, flood.key_id, flood.opened_ns, now_ns)
+        names = sorted(name for key in refused if (name := self._find_source_name(key)) is not None)
+        if names:
+            seconds = max(refused.values()) // SECOND
+            detail = f"media ingest, {', '.join(names)} refused for {seconds} s"
+        elif self._keyring.key is None:
+            detail = "media ingest"
+        else:  # reported already, or no source's key any more
+            return
+        self._context.guard.report_flood(flood.address, detail, now_ns)
 
     def _decide_sources(self, *, again: bool = False) -> None:
         """Decide which keys may hand in frames, by the present allow-list: new keys; `again`: all keys."""
