@@ -16,7 +16,7 @@ from PIL import Image
 
 from iris_session.demo.scenes import scene_path
 from tests.e2e.browser import Page, decode_picture, join_as
-from tests.e2e.scenario import Scenario
+from tests.e2e.scenario import Scenario, assert_only_late
 from tests.e2e.session_process import SessionProcess
 
 pytestmark = pytest.mark.e2e
@@ -29,6 +29,8 @@ STOP_S, REST_M = 0.2, 0.001
 #: Another camera: half a metre before the tip of the left robot, whose picture is 17 cm high there.
 CLOSE = '<camera name="close" pos="-0.2 -0.5 0.28" xyaxes="1 0 0 0 0 1" fovy="20"/>'
 
+#: What the session says of the left robot to its holder.
+FEEDBACK = "irisSession.state.feedback.get('left') ?? { hold_reason: '', rejected: {} }"
 #: Notes in `window.at` when keys change and the focus is lost, in session time [ms].
 NOTE_KEYS = """void (window.at = {}, ["keydown", "keyup", "blur"].forEach((type) => {
   const note = (event) => { window.at[`${type} ${event.code ?? ""}`.trim()] = irisSession.view.sessionTime(); };
@@ -110,16 +112,19 @@ def words(page: Page) -> str:
 def drive_forward(page: Page, tip: Tip, distance: float) -> NDArray[np.float64]:
     """Hold left Shift and W until the tip has moved by `distance` [m]; return where it began.
 
-    On a busy machine a sample may come too late and be rejected: then the keys are pressed anew, as the page says.
+    On a busy machine a sample may come too late and be rejected: then, and only then, the keys are pressed anew.
     """
     for _ in range(10):
         begin, until = tip.place, time.monotonic() + 5.0
+        rejected = page.evaluate(FEEDBACK)["rejected"]
         page.hold("Shift")
         page.hold("w")
         while np.linalg.norm(tip.place - begin) <= distance and time.monotonic() < until:
             tip.watch_for(0.002)
         if np.linalg.norm(tip.place - begin) > distance:
             return begin
+        feedback = page.evaluate(FEEDBACK)
+        assert_only_late(rejected, feedback["rejected"], [feedback["hold_reason"]])
         page.let_go("w")
         page.let_go("Shift")
         tip.watch_for(0.3)  # a sample must have seen the key let go
@@ -163,6 +168,7 @@ def test_a_window_without_focus_stops_the_robot(scenario: Scenario, driver: Page
     assert words(driver).startswith("Held: the window lost the focus.")
     driver.let_go("w")
     driver.let_go("Shift")
+    tip.watch_for(0.3)  # nothing counts for 0.2 s after the focus came back
     drive_forward(driver, tip, 0.01)
     driver.let_go("Shift")
 
@@ -214,7 +220,7 @@ def test_the_mouse_drags_the_end_effector(scenario: Scenario, driver: Page) -> N
     assert words(driver).startswith("Held: clutch open.")
 
 
-def test_a_gamepad_drives_until_it_is_unplugged(scenario: Scenario, driver: Page) -> None:
+def test_a_gamepad_drives_until_it_is_unplugged_and_again_once_let_go(scenario: Scenario, driver: Page) -> None:
     """The pad is one that the test makes: the page was never tried with a real one."""
     tip = Tip(scenario)
     begin = tip.place
@@ -229,6 +235,15 @@ def test_a_gamepad_drives_until_it_is_unplugged(scenario: Scenario, driver: Page
     print(f"at rest {1e3 * stopped_s:.0f} ms after the gamepad was unplugged")
     assert stopped_s < STOP_S
     assert words(driver).startswith("Held: the gamepad was disconnected.")
+    driver.evaluate(PAD)
+    driver.evaluate('void (window.shoulder = true, window.dispatchEvent(new Event("gamepadconnected")))')
+    begin = tip.place
+    tip.watch_for(1.0)
+    assert np.linalg.norm(tip.place - begin) < REST_M  # the shoulder button was held when the gamepad came
+    driver.evaluate("void (window.shoulder = false)")
+    tip.watch_for(0.3)
+    driver.evaluate("void (window.shoulder = true)")
+    tip.watch(lambda: tip.place[1] - begin[1] > 0.02, "the gamepad moves the tip again")
 
 
 # --- recording cameras ------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Final
+from typing import Any, Final
 
 import pytest
 
@@ -24,18 +24,20 @@ from anchors.pose import (
     quat_mul,
     quat_rotate,
 )
+from iris_session.bench.chromium import WEB_CLIENT
 from iris_session.client import Client
 from iris_session.codegen.conversions import to_three
-from iris_session.protocol.names import AlignmentKind
-from iris_session.protocol.server_messages import EngagementChanged, ParticipantInfo
-from tests.e2e.browser import WEB_CLIENT, Page, join_as
-from tests.e2e.scenario import Scenario, is_driven
+from iris_session.protocol.client_messages import Acquire
+from iris_session.protocol.names import AlignmentKind, DenialReason
+from iris_session.protocol.server_messages import ConsentRequested, EngagementChanged, ParticipantInfo, Reply
+from tests.e2e.browser import Page, join_as
+from tests.e2e.scenario import Scenario, assert_only_late, is_driven
 from tests.e2e.session_process import DEADLINE_S
 
 pytestmark = pytest.mark.e2e
 
 IWER: Final = WEB_CLIENT / "node_modules" / "iwer" / "build" / "iwer.min.js"
-#: Makes the emulated headset `quest`, and `glide`, which moves its right controller in page frames.
+#: Makes the emulated headset `quest`; `glide` moves its right controller in page frames, `tap` presses its trigger.
 INSTALL: Final = """
 // A headset with 30 frames a second: without a graphics card more leave nothing for the session on the same machine.
 const request = window.requestAnimationFrame.bind(window);
@@ -49,6 +51,18 @@ window.place = (input, [x, y, z, qx, qy, qz, qw]) => {
   input.position.set(x, y, z);
   input.quaternion.set(qx, qy, qz, qw);
 };
+// A press of one frame, in the page itself: calls from outside take longer.
+window.tap = () => new Promise((resolve) => {
+  const set = (value) => quest.controllers.right.updateButtonValue("trigger", value);
+  const wait = () => {
+    const isSeen = irisSession.headset.headset.reading.inputs.some(({ trigger }) => trigger === 1);
+    if (!isSeen) return setTimeout(wait, 5);
+    set(0);
+    resolve(null);
+  };
+  set(1);
+  wait();
+});
 window.glide = (to, seconds) => new Promise((resolve) => {
   const { position } = quest.controllers.right;
   const from = [position.x, position.y, position.z];
@@ -63,6 +77,8 @@ window.glide = (to, seconds) => new Promise((resolve) => {
 });
 """
 HEADSET: Final = "irisSession.headset.headset"
+#: What the session says of a robot to its holder.
+FEEDBACK: Final = "(irisSession.state.feedback.get('{}') ?? {{ hold_reason: '', rejected: {{}} }})"
 #: Where the headset's tracking frame is: nothing about it is special.
 T_WORLD_TRACKING: Final[PoseTuple] = ((-0.4, 0.3, -0.75), quat_from_yaw(math.radians(35.0)))
 HEAD: Final[PoseTuple] = ((0.0, 0.0, 1.6), (1.0, 0.0, 0.0, 0.0))
@@ -109,6 +125,13 @@ class EmulatedQuest:
         """Press a button of the right controller."""
         self.evaluate(f"quest.controllers.right.updateButtonValue({json.dumps(button)}, {value})")
 
+    def tap_at_nothing(self) -> None:
+        """Press the trigger of the right controller for a moment, while it points at the sky."""
+        self.evaluate("quest.controllers.right.quaternion.set(Math.SQRT1_2, 0, 0, Math.SQRT1_2)")
+        let_go = f"{HEADSET}.reading.inputs.every((one) => one.trigger === 0)"
+        self.wait(f"{HEADSET}.pointed.right === undefined && {let_go}")
+        self.evaluate("tap()")
+
     def place(self, input_name: str, T_world_device: PoseTuple) -> None:
         """Place the headset or a controller, by its pose in the aligned world."""
         p, q = compose(inverse(T_WORLD_TRACKING), T_world_device)
@@ -120,36 +143,50 @@ class EmulatedQuest:
         self.evaluate(f"glide({json.dumps(row[:3])}, {seconds})")
 
     def engage(self, robot: str) -> None:
-        """Squeeze until the robot follows: a person lets go and tries again, too, when it does not."""
+        """Squeeze until the robot follows: a person lets go and tries again, too, when a sample came too late."""
         for _ in range(ATTEMPTS):
             self.press("squeeze", 0.0)
-            self.scenario.run_for(0.3)
+            # A squeeze that begins while marks are touched counts from the next one on.
+            self.wait(f"!{HEADSET}.marks.isActive && {HEADSET}.reading.inputs.every((one) => one.squeeze === 0)")
+            opened = f"{FEEDBACK.format(robot)}.hold_reason === 'clutch_open'"
+            self.wait(f"{opened} || !{HEADSET}.hands.driven.has('right')")
+            rejected = self.read_feedback(robot)["rejected"]
             self.press("squeeze", 1.0)
             if self.scenario.wait_for(lambda: is_driven(self.host, robot, self.person.id), 5.0):
                 return
+            feedback = self.read_feedback(robot)
+            assert_only_late(rejected, feedback["rejected"], [feedback["hold_reason"]])
         raise AssertionError(f"{robot} does not follow\n{self.page.describe()}")
+
+    def read_feedback(self, robot: str) -> dict[str, Any]:
+        """Return what the session says of a robot to its holder."""
+        found: Any = self.evaluate(FEEDBACK.format(robot))
+        return {**found}
 
     def move_robot(self, robot: str, begin: PoseTuple, motion: Vec3) -> float:
         """Squeeze, move the right controller, and return how far the end effector is from where that takes it [m].
 
-        An attempt during which the robot held counts for nothing: the machine that draws for the headset runs the
-        session too, so samples come too late now and then.
+        An attempt during which the robot held for a late sample counts for nothing: the machine that draws for the
+        headset runs the session too.
         """
         for _ in range(ATTEMPTS):
             self.press("squeeze", 0.0)
             self.place("quest.controllers.right", begin)
             self.engage(robot)
             seen = len(self.scenario.events["host"])
+            rejected = self.read_feedback(robot)["rejected"]
             tip = self.host.scene.tip_pose(robot)
             assert tip
             target = add(tip[0], motion)
             self.glide(add(begin[0], motion), 2.0)
             self.scenario.run_for(1.0)
             bodies = [event.body for event in self.scenario.events["host"][seen:]]
-            if not any(isinstance(b, EngagementChanged) and b.robot == robot and not b.engaged for b in bodies):
+            held = [b for b in bodies if isinstance(b, EngagementChanged) and b.robot == robot and not b.engaged]
+            if not held and is_driven(self.host, robot, self.person.id):  # it may have ended before `seen`
                 tip = self.host.scene.tip_pose(robot)
                 assert tip
                 return math.dist(tip[0], target)
+            assert_only_late(rejected, self.read_feedback(robot)["rejected"], [b.reason for b in held])
         raise AssertionError(f"{robot} held in each of {ATTEMPTS} attempts\n{self.page.describe()}")
 
     @property
@@ -248,7 +285,7 @@ def test_a_robot_is_driven_in_ar(quest: EmulatedQuest) -> None:
 
 
 def test_a_lease_goes_into_vr_and_back(quest: EmulatedQuest) -> None:
-    """The connection is resumed, not replaced; hiding and recentring hold; a director in VR is placed at once."""
+    """The connection is resumed, not replaced; hiding and recentring hold; a director in VR is placed when it asks."""
     host = quest.host
     quest.in_page(lambda: join_as(quest.page, "eve", "director"), "eve joins as director")
     quest.run_until(lambda: quest.person.role == "director", "eve directs")
@@ -256,9 +293,11 @@ def test_a_lease_goes_into_vr_and_back(quest: EmulatedQuest) -> None:
     quest.click("Take: left")
     quest.run_until(lambda: holder(host, "left") == person, "eve has the robot")
     quest.enter("Enter VR")
+    quest.wait(f"{HEADSET}.showsScene && {HEADSET}.props.urgent.shown.includes('To stay here')")
+    assert quest.person.alignment is None  # a measurement may still align it
+    quest.tap_at_nothing()
     quest.run_until(lambda: quest.is_aligned(AlignmentKind.PLACED), "a director is placed by its own word")
     assert (quest.person.id, holder(host, "left")) == (person, person)
-    assert quest.evaluate(f"{HEADSET}.showsScene") is True
 
     quest.engage("left")  # the robot that was leased before
     quest.evaluate("quest.updateVisibilityState('visible-blurred')")
@@ -274,19 +313,98 @@ def test_a_lease_goes_into_vr_and_back(quest: EmulatedQuest) -> None:
     alignment = quest.person.alignment
     assert alignment
     quest.evaluate("quest.recenter()")
+    quest.run_until(lambda: quest.person.alignment is None, "another tracking frame is not aligned")
+    quest.wait(f"{HEADSET}.props.urgent.shown.includes('To stay here')")
+    quest.tap_at_nothing()
     quest.run_until(
         lambda: (
             quest.is_aligned(AlignmentKind.PLACED)
             and quest.person.alignment is not None
             and quest.person.alignment.tracking_epoch > alignment.tracking_epoch
         ),
-        "another tracking frame is placed anew",
+        "it is placed anew",
     )
 
     quest.evaluate(f"{HEADSET}.session.end()")
     quest.run_until(lambda: quest.is_aligned(AlignmentKind.NOT_NEEDED), "the page is one with a screen again")
     quest.wait("irisSession.state.isReady && irisSession.headset.headset === null")
     assert (quest.person.id, holder(host, "left")) == (person, person)
+    assert quest.page.errors == []
+
+
+def test_a_request_for_the_robot_is_answered_in_the_headset(quest: EmulatedQuest) -> None:
+    """Ben asks and is refused, asks again and gets it; then the headset asks, and waits for Ben's consent."""
+    host, ben, person = quest.host, quest.scenario.join("ben"), quest.person.id
+    host.set_mode("left", "request")
+    host.assign(["left"], person)
+    quest.enter("Enter AR")
+    host.alignment.place(person, T_WORLD_TRACKING)
+    quest.place("quest", compose(T_WORLD_TRACKING, HEAD))
+    quest.wait(f"{HEADSET}.showsScene")
+
+    def ask(answer: str) -> Reply:
+        """Let Ben ask, and answer from the headset: point and press the trigger."""
+        request = ben.submit(Acquire(0, ("left",)))
+        quest.wait(f"{HEADSET}.consent.question.shown.includes('ben asks you for left')")
+        quest.wait(f"{HEADSET}.consent.answers !== null")
+        found: Any = quest.evaluate(f"{HEADSET}.consent.answers.{answer}")
+        quest.place("quest.controllers.right", aim_at(apply(T_WORLD_TRACKING, tuple(found)), 0.4))
+        quest.wait(f"{HEADSET}.aimed.right === '{answer}'")
+        quest.press("trigger", 1.0)
+        replies: list[Reply] = []
+
+        def has_reply() -> bool:
+            replies.extend(filter(None, [ben.answer(request)]))
+            return bool(replies)
+
+        quest.run_until(has_reply, f"Ben's request is answered: {answer}")
+        quest.press("trigger", 0.0)
+        quest.wait(f"{HEADSET}.consent.answers === null")
+        return replies[0]
+
+    refused = ask("refuse")
+    assert refused.denial is not None
+    assert refused.denial.reason == DenialReason.CONSENT_REFUSED
+    assert holder(host, "left") == person
+    assert ask("grant").denial is None
+    quest.run_until(lambda: holder(host, "left") == ben.participant_id, "Ben has the robot")
+
+    tip = host.scene.tip_pose("left")
+    assert tip
+    quest.place("quest.controllers.right", aim_at(tip[0], 0.6))
+    quest.wait(f"{HEADSET}.pointed.right === 'left'")
+    quest.press("trigger", 1.0)
+    quest.wait(f'{HEADSET}.consent.question.shown.includes("waiting for ben\'s consent to left")')
+    quest.press("trigger", 0.0)
+    asked = [e.body for e in quest.scenario.events["ben"] if isinstance(e.body, ConsentRequested)][-1]
+    ben.consent(asked.consent_id, grant=True)
+    quest.run_until(lambda: holder(host, "left") == person, "Ben has given it")
+    quest.wait(f"{HEADSET}.consent.question.shown === '[[],\"#e0a33a\"]'")
+    assert quest.page.errors == []
+
+
+#: Moves the right hand so that its index finger is in the ball at the left wrist, or next to it.
+TOUCH: Final = """(({ reading, wristStop }, away) => {
+  const tip = reading.inputs.find(({ side }) => side === "right").tip;
+  const [x, y, z] = wristStop.center.map((value, i) => value - tip[i]); // forward, left, up
+  const { position } = quest.hands.right;
+  position.set(position.x - y + away, position.y + z, position.z - x);
+})"""
+
+
+def test_bare_hands_stop_at_the_wrist(quest: EmulatedQuest) -> None:
+    host, person = quest.host, quest.person.id
+    quest.evaluate("quest.primaryInputMode = 'hand'")
+    quest.enter("Enter AR")
+    host.alignment.place(person, T_WORLD_TRACKING)
+    quest.run_until(lambda: (person, "hand/left") in host.scene.presence, "hands are seen by others")
+    quest.wait(f"{HEADSET}.wristStop.center !== null && {HEADSET}.reading.inputs.every(({{ tip }}) => tip !== null)")
+    quest.evaluate(f"{TOUCH}({HEADSET}, 0.1)")
+    quest.scenario.run_for(0.5)
+    assert not host.mirror.estop
+    quest.evaluate(f"{TOUCH}({HEADSET}, 0)")
+    quest.run_until(lambda: host.mirror.estop, "a fingertip at the wrist stops")
+    quest.wait(f"{HEADSET}.props.urgent.shown.includes('STOPPED')")
     assert quest.page.errors == []
 
 

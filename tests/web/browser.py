@@ -81,6 +81,19 @@ class WebBrowser:
         await self.send(Hello(role, self.name, secret=self.secret, **fields), 0)  # type: ignore[arg-type]
         return await self.wait_for(Welcome, before + 1)
 
+    async def come_back(self, role: str = "observer") -> Welcome:
+        """Join again with the resume token of the last welcome, as often as it takes."""
+        assert self.welcome is not None
+        token, until = self.welcome.resume_token, time.monotonic() + DEADLINE_S
+        while True:
+            await self.close()
+            try:
+                await self.open()
+                return await asyncio.wait_for(self.say_hello(role, resume_token=token), 10.0)
+            except (aiohttp.ClientError, TimeoutError, AssertionError, ConnectionError):
+                assert time.monotonic() < until, f"{self.name} does not come back"
+                await asyncio.sleep(0.1)
+
     async def send(self, message: ClientMessage, epoch: int | None = None) -> None:
         data = encode_client(wrap_message(message, self.epoch if epoch is None else epoch))
         await self.socket.send_bytes(wire.encode_frames(wire.CONTROL, [data]))

@@ -344,6 +344,14 @@ describe("joined", () => {
     expect(bench.socket.find("hello")[0]).toMatchObject({ alignment: "not_needed", capabilities: ["run:0011223344556677-2"] });
   });
 
+  test("going into a headset before the first socket is there counts", async () => {
+    bench.post({ type: "connect", base_url: BASE, role: "operator", name: "ann", devices: ["desktop"], alignment: "not_needed" });
+    bench.post({ type: "rejoin", devices: ["head", "controller/left"], alignment: "measured" });
+    await bench.until(() => bench.sockets.length > 0);
+    bench.socket.open();
+    expect(bench.socket.find("hello")[0]).toMatchObject({ devices: ["head", "controller/left"], alignment: "measured" });
+  });
+
   test("a lost socket is replaced at once, with the token, and resumes", async () => {
     await bench.join();
     bench.pass(1500);
@@ -392,6 +400,15 @@ describe("joined", () => {
     expect(bench.last("notice").text).toMatch(/no robot "nobody"/);
     bench.post({ type: "tracking_jump" });
     expect(bench.socket.find("tracking_epoch")[0]).toMatchObject({ tracking_epoch: 1 });
+  });
+
+  test("observations carry the tracking frame and session time", async () => {
+    await bench.join();
+    bench.post({ type: "tracking_jump" });
+    bench.post({ type: "observation", observation: { anchor_id: "desk", kind: "touch", mark: "1", T_tracking_anchor: [[0, 0, 1], [1, 0, 0, 0]], capture_ms: 1000 + bench.now / MS } });
+    const [found] = bench.socket.find("observation");
+    expect(found).toMatchObject({ anchor_id: "desk", kind: "touch", mark: "1", tracking_epoch: 1 });
+    expect(Math.abs((found?.["capture_ns"] as number) - bench.now - OFFSET_NS)).toBeLessThan(2 * MS);
   });
 
   test("a full socket drops samples and keeps requests", async () => {

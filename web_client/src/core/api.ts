@@ -33,7 +33,13 @@ export type RequestMessage = {
 }[wire.ClientMessage["type"]];
 
 /** Messages without a reply that the page may send by itself. */
-export type PlainMessage = wire.Observation | wire.Release | wire.Bye;
+export type PlainMessage = wire.Release | wire.Bye;
+
+/** An observation of an anchor, a mark, or a tip. The worker adds the tracking frame and session time. */
+export type ObservationInput = Omit<wire.Observation, "type" | "capture_ns" | "tracking_epoch"> & {
+  /** When it was observed, on the shared clock. */
+  capture_ms: number;
+};
 
 /** One tracked device at one moment. The worker adds epochs, versions, fencing tokens, `seq` and session time. */
 export interface SampleInput {
@@ -83,6 +89,7 @@ export type ToWorker =
   | { type: "send"; message: PlainMessage }
   | { type: "estop"; reason: string }
   | { type: "samples"; samples: SampleInput[] }
+  | { type: "observation"; observation: ObservationInput }
   | { type: "worn"; worn: boolean }
   /** The tracking frame jumped: all alignments are void. */
   | { type: "tracking_jump" }
@@ -183,12 +190,13 @@ export interface SessionUpdate {
   anchors: AnchorPlace[];
 }
 
-/** An anchor of the session in the world. `size_m` 0: not known. `error_m`: stated error, 0 for none. */
+/** An anchor of the session in the world. `size_m` 0: not known. `error_m`: stated error, 0 for none. `marks`: `AnchorInfo`. */
 export interface AnchorPlace {
   anchor_id: string;
   T_world_anchor: wire.Pose;
   size_m: number;
   error_m: number;
+  marks: Filled<wire.AnchorMark>[];
 }
 
 /** Row i of a frame is the pose of `bodies[i]`. `version` grows with every change. */

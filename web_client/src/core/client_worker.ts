@@ -3,7 +3,7 @@
 
 import type * as wire from "../protocol/messages.g.ts";
 import { PROTOCOL_VERSION } from "../protocol/messages.g.ts";
-import type { BodyInfo, ConnectOptions, FromWorker, RequestMessage, SampleInput, ToWorker } from "./api.ts";
+import type { BodyInfo, ConnectOptions, FromWorker, ObservationInput, RequestMessage, SampleInput, ToWorker } from "./api.ts";
 import { ArrivalMeter, makeReport } from "./arrival_meter.ts";
 import { SceneAssets } from "./scene_assets.ts";
 import { ClientConnection } from "./connection.ts";
@@ -115,6 +115,9 @@ export class ClientWorker {
       case "samples":
         this.sendSamples(command.samples);
         break;
+      case "observation":
+        this.sendObservation(command.observation);
+        break;
       case "worn":
         if (connection !== null) connection.worn = command.worn;
         break;
@@ -157,7 +160,7 @@ export class ClientWorker {
       this.postFailure("version", info.text);
       return;
     }
-    this.connection = new ClientConnection(this.makeHello(options), identity);
+    this.connection = new ClientConnection(this.makeHello(this.options), identity); // a rejoin may have changed them
     this.samples = new SampleBuilder(this.connection);
     try {
       this.connection.open(environment.nowNs());
@@ -369,11 +372,18 @@ export class ClientWorker {
   private sendSamples(inputs: readonly SampleInput[]): void {
     const { connection, samples } = this;
     if (connection === null || samples === null || inputs.length === 0) return;
-    const built = inputs.map(({ capture_ms, ...input }) => {
-      const localNs = Math.round((capture_ms - this.environment.sharedOriginMs) * MS_NS);
-      return samples.makeSample(input, Math.round(connection.clock.sessionNs(localNs)));
-    });
+    const built = inputs.map(({ capture_ms, ...input }) => samples.makeSample(input, this.toSessionNs(connection, capture_ms)));
     connection.send(built.length === 1 ? (built[0] as wire.Sample) : { type: "samples", samples: built });
+  }
+
+  private sendObservation({ capture_ms, ...observation }: ObservationInput): void {
+    const { connection } = this;
+    if (connection === null) return;
+    connection.send({ type: "observation", ...observation, capture_ns: this.toSessionNs(connection, capture_ms), tracking_epoch: connection.trackingEpoch });
+  }
+
+  private toSessionNs({ clock }: ClientConnection, shared_ms: number): number {
+    return Math.round(clock.sessionNs(Math.round((shared_ms - this.environment.sharedOriginMs) * MS_NS)));
   }
 
   private onTrackingJump(): void {

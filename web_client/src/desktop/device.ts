@@ -2,10 +2,11 @@
 // in as arguments.
 //
 // It drives while a dead-man key or button is held. Whatever ends that from outside (the window lost the focus, an
-// e-stop, ...) opens the clutch at once, and the dead-man has to be let go and pressed again.
+// e-stop, ...) opens the clutch at once, and the dead-man has to be let go and pressed again. A dead-man counts only
+// after it was seen let go on the same source, so that one that comes back pressed moves nothing.
 
 import type { SampleInput } from "../core/api.ts";
-import type { Intent, Vec3 } from "./intent.ts";
+import { type Intent, merge, type Motion, type Vec3 } from "./intent.ts";
 
 /** Least and greatest speed of the tip [m/s]. */
 export const SPEED_RANGE = [0.01, 0.3] as const;
@@ -31,7 +32,10 @@ export class DesktopDevice {
   isEngaged = false;
   /** Why the clutch was opened from outside, until the dead-man is pressed anew; else empty. */
   released = "";
-  private mustLetGo = false;
+  /** A dead-man is held that does not count before it is let go. */
+  mustLetGo = false;
+  /** Sources whose dead-man was seen let go since dead-men were void. */
+  private readonly ready = new Set<string>();
   private gripper: number | null = null;
   private lastGripper = 0;
   private wasToggled = false;
@@ -43,7 +47,8 @@ export class DesktopDevice {
     if (this.robot !== "") this.disarm(now_ms);
     this.robot = robot;
     this.released = "";
-    this.mustLetGo = true;
+    this.ready.clear();
+    this.lastGripper = 0;
     this.sendHold(now_ms);
   }
 
@@ -58,7 +63,7 @@ export class DesktopDevice {
   /** Open the clutch now, for a reason in words; the dead-man has to be let go and pressed again. */
   release(reason: string, now_ms: number): void {
     if (this.robot === "") return;
-    this.mustLetGo = true;
+    this.ready.clear();
     if (!this.isEngaged) return;
     this.released = reason;
     this.sendHold(now_ms);
@@ -67,9 +72,9 @@ export class DesktopDevice {
   /**
    * Send the sample of this moment. Returns false when the robot is not held any more, and the device is disarmed.
    *
-   * `speed`: of the tip [m/s], within `SPEED_RANGE`. `heading`: where "forward" is.
+   * `inputs`: what each source asks for. `speed`: of the tip [m/s], within `SPEED_RANGE`. `heading`: where "forward" is.
    */
-  tick(intent: Intent, heading: Heading, speed: number, situation: Situation, now_ms: number): boolean {
+  tick(inputs: ReadonlyMap<string, Intent>, heading: Heading, speed: number, situation: Situation, now_ms: number): boolean {
     if (this.robot === "") return false;
     if (situation.isReady && !situation.isHolder) {
       this.disarm(now_ms);
@@ -78,23 +83,36 @@ export class DesktopDevice {
     if (!situation.isReady) this.release("the connection is lost", now_ms);
     else if (situation.isStopped) this.release("e-stop", now_ms);
     const isBlocked = !situation.isReady || situation.isStopped;
-    if (!intent.clutch) this.mustLetGo = false;
-    const isEngaged = intent.clutch && !this.mustLetGo && !isBlocked;
-    if (!isEngaged) {
+    const isHeld = this.readDeadMen(inputs);
+    const motion = merge(inputs.values());
+    const isFlipped = motion.toggle && !this.wasToggled;
+    this.wasToggled = motion.toggle;
+    if (!isHeld || isBlocked) {
       this.sendHold(now_ms);
       return true;
     }
     if (!this.isEngaged) this.gripper = null;
     this.isEngaged = true;
     this.released = "";
-    this.readGripper(intent);
-    this.send({ ...this.makeSample(now_ms), clutch: true, gripper: this.gripper, twist: toTwist(intent, heading, speed) });
+    this.readGripper(motion, isFlipped);
+    this.send({ ...this.makeSample(now_ms), clutch: true, gripper: this.gripper, twist: toTwist(motion, heading, speed) });
     return true;
   }
 
-  private readGripper({ close, open, toggle }: Intent): void {
-    const isFlipped = toggle && !this.wasToggled;
-    this.wasToggled = toggle;
+  /** Note which dead-men are let go. Return whether one is held that counts. */
+  private readDeadMen(inputs: ReadonlyMap<string, Intent>): boolean {
+    for (const source of this.ready) if (!inputs.has(source)) this.ready.delete(source);
+    for (const [source, { clutch }] of inputs) {
+      if (clutch === false) this.ready.add(source);
+      else if (clutch === null) this.ready.delete(source);
+    }
+    const held = [...inputs].filter(([, { clutch }]) => clutch).map(([source]) => source);
+    const isHeld = held.some((source) => this.ready.has(source));
+    this.mustLetGo = held.length > 0 && !isHeld;
+    return isHeld;
+  }
+
+  private readGripper({ close, open }: Motion, isFlipped: boolean): void {
     if (close !== open) this.gripper = close ? 1 : 0;
     else if (isFlipped) this.gripper = 1 - this.lastGripper;
     this.lastGripper = this.gripper ?? this.lastGripper;
@@ -112,11 +130,11 @@ export class DesktopDevice {
   }
 }
 
-/** Return the twist of an intent in the world [m/s, rad/s]: no faster than `speed`, whatever the direction. */
-export function toTwist(intent: Intent, heading: Heading, speed: number): Twist {
+/** Return the twist of a motion in the world [m/s, rad/s]: no faster than `speed`, whatever the direction. */
+export function toTwist(motion: Motion, heading: Heading, speed: number): Twist {
   const bounded = Math.min(SPEED_RANGE[1], Math.max(SPEED_RANGE[0], speed));
-  const v = toWorld(limitLength(intent.move), heading, bounded);
-  const w = toWorld(limitLength(intent.turn), heading, bounded * TURN_PER_METRE);
+  const v = toWorld(limitLength(motion.move), heading, bounded);
+  const w = toWorld(limitLength(motion.turn), heading, bounded * TURN_PER_METRE);
   return [...v, ...w];
 }
 

@@ -103,7 +103,7 @@ export function makeDrive(
   function tick(): void {
     const now = nowMs();
     const metresPerSecond = chosen.speed_cm_s / 100;
-    const intent = inputs.read(metresPerSecond, Math.min(MAX_DT_S, (now - ticked_ms) / 1000));
+    const intents = inputs.read(metresPerSecond, Math.min(MAX_DT_S, (now - ticked_ms) / 1000), now);
     ticked_ms = now;
     const { session } = state;
     const situation = {
@@ -111,12 +111,14 @@ export function makeDrive(
       isStopped: session?.estop ?? false,
       isHolder: state.heldBy(state.selfId).includes(device.robot),
     };
-    const wasEngaged = device.isEngaged;
-    if (!device.tick(intent, findHeading(), metresPerSecond, situation, now)) {
+    const { isEngaged: wasEngaged, mustLetGo } = device;
+    if (!device.tick(intents, findHeading(), metresPerSecond, situation, now)) {
       warn("Driving has ended: you do not hold the robot any more.");
       stop();
     } else if (device.isEngaged !== wasEngaged) {
       engaged_ms = device.isEngaged ? now : Number.POSITIVE_INFINITY;
+      show();
+    } else if (device.mustLetGo !== mustLetGo) {
       show();
     }
   }
@@ -138,6 +140,11 @@ export function makeDrive(
   }
 
   function show(): void {
+    const isHeadset = state.isReady && state.self?.devices.includes("desktop") === false;
+    if (device.robot !== "" && isHeadset) {
+      warn("Driving has ended: this browser is a headset now.");
+      stop();
+    }
     element.hidden = device.robot === "";
     if (device.robot === "") return;
     setText(robot, `Driving ${device.robot}`);
@@ -171,6 +178,6 @@ function describe(device: DesktopDevice, isStopped: boolean, reason: string, isH
   if (isStopped) return "Held: e-stop. A director clears it.";
   if (!isHeld) return "The robot follows you.";
   if (device.isEngaged) return `Held by the session: ${holdReasonWords(reason)}.`;
-  const how = "Hold left Shift, the right shoulder button or the handle to move it.";
+  const how = device.mustLetGo ? "Let go of it, then hold it again." : "Hold left Shift, the right shoulder button or the handle to move it.";
   return device.released ? `Held: ${device.released}. ${how}` : `Held: clutch open. ${how}`;
 }

@@ -1,13 +1,16 @@
 // Reads keyboard, mouse, fingers, gamepads and SpaceMouse of this browser while a robot is driven. What ends a hold of the
 // dead-man from outside is reported at once; what the inputs mean is in `intent.ts`.
 
-import { CLUTCH_KEY, DRIVE_KEYS, DragPath, type Intent, makeIdle, merge, readKeys, readPad, readSpaceMouse } from "./intent.ts";
+import { nowMs } from "../core/api.ts";
+import { ClutchKey, DRIVE_KEYS, DragPath, type Intent, makeIdle, readKeys, readPad, readSpaceMouse } from "./intent.ts";
 import { SpaceMouse } from "./spacemouse.ts";
 
 /** Way of the tip for a pixel of the mouse at 1 m/s [m]: at 10 cm/s half a millimetre. */
 const METRES_PER_PIXEL = 0.005;
 /** Pixels of a step of a wheel that reports lines or pages. */
 const WHEEL_PIXELS = [1, 30, 300] as const;
+/** After the focus came back, or a gamepad, the browser may tell an old state of it for this long [ms]. */
+const SETTLE_MS = 200;
 
 export interface InputEvents {
   /** The dead-man is void: `reason` in words for people. */
@@ -19,7 +22,11 @@ export interface InputEvents {
 /** The inputs of one page. `handle`: what mouse and fingers drag. */
 export class DesktopInputs {
   readonly spaceMouse: SpaceMouse;
+  private readonly clutchKey = new ClutchKey();
   private readonly pressed = new Set<string>();
+  /** The window lost the focus: what is pressed meanwhile is meant for others, and not known of all inputs. */
+  private isAway = false;
+  private back_ms = Number.NEGATIVE_INFINITY;
   private readonly drag = new DragPath();
   private dragging: number | null = null;
   private last = { x: 0, y: 0 };
@@ -31,6 +38,12 @@ export class DesktopInputs {
     private readonly events: InputEvents,
   ) {
     this.spaceMouse = new SpaceMouse(() => this.release("the SpaceMouse was disconnected"));
+    // Also while nothing is driven: the click that begins it tells that no Shift key is held.
+    for (const type of ["keydown", "keyup", "pointerdown", "pointermove"] as const) {
+      window.addEventListener(type, (event) => this.trackClutchKey(event), { capture: true });
+    }
+    window.addEventListener("focus", () => this.setAway(false));
+    window.addEventListener("blur", () => this.setAway(true));
   }
 
   /** Names of what is connected besides keyboard and mouse, gamepads without the standard order with a note. */
@@ -46,8 +59,9 @@ export class DesktopInputs {
     const options = { signal: this.listening.signal, capture: true };
     window.addEventListener("keydown", (event) => this.onKey(event), options);
     window.addEventListener("keyup", (event) => this.onKey(event), options);
-    window.addEventListener("blur", () => this.release("the window lost the focus"), options);
+    window.addEventListener("blur", (event) => event.target === window && this.release("the window lost the focus"), options);
     window.addEventListener("pagehide", () => this.release("the page was left"), options);
+    window.addEventListener("gamepadconnected", () => this.onPad(), options);
     window.addEventListener("gamepaddisconnected", () => this.release("the gamepad was disconnected"), options);
     document.addEventListener("visibilitychange", () => document.hidden && this.release("the page is hidden"), options);
     document.addEventListener("pointerlockchange", () => this.onLockChange(), options);
@@ -66,11 +80,18 @@ export class DesktopInputs {
     this.forget();
   }
 
-  /** Return what is asked for now. `speed`: of the tip [m/s]; `dt`: since the last call [s]. */
-  read(speed: number, dt: number): Intent {
+  /** Return what each source asks for at a time. `speed`: of the tip [m/s]; `dt`: since the last call [s]. */
+  read(speed: number, dt: number, now_ms: number): ReadonlyMap<string, Intent> {
     this.speed = speed;
     const dragged = { ...makeIdle(), clutch: this.dragging !== null, move: this.drag.take(speed, dt) };
-    return merge([readKeys(this.pressed), ...listPads().map(readPad), readSpaceMouse(this.spaceMouse.state), dragged]);
+    const inputs = new Map<string, Intent>([
+      ["keyboard", readKeys(this.pressed, this.clutchKey.isHeld)],
+      ["SpaceMouse", readSpaceMouse(this.spaceMouse.state, now_ms)],
+      ["handle", dragged],
+    ]);
+    for (const pad of listPads()) inputs.set(`gamepad ${pad.index} ${pad.id}`, readPad(pad));
+    const isKnown = !this.isAway && !document.hidden && now_ms - this.back_ms > SETTLE_MS;
+    return isKnown ? inputs : new Map();
   }
 
   private release(reason: string): void {
@@ -80,17 +101,31 @@ export class DesktopInputs {
 
   private forget(): void {
     this.pressed.clear();
-    this.spaceMouse.state.clear();
     this.drag.clear();
     this.dragging = null;
     this.handle.classList.remove("held");
     if (document.pointerLockElement === this.handle) document.exitPointerLock();
   }
 
+  private setAway(isAway: boolean): void {
+    if (this.isAway && !isAway) this.back_ms = nowMs();
+    this.isAway = isAway;
+    if (isAway) this.clutchKey.forget();
+  }
+
+  private onPad(): void {
+    this.back_ms = nowMs();
+    this.release("a gamepad was connected");
+  }
+
+  private trackClutchKey(event: KeyboardEvent | PointerEvent): void {
+    if (event.type !== "pointermove") this.setAway(false); // a window without the focus has only these
+    if (!this.isAway) this.clutchKey.take(event);
+    if (event.type === "keydown" && takesText(event.target)) this.clutchKey.forget();
+  }
+
   private onKey(event: KeyboardEvent): void {
-    // The end of a press is not reported beside some modifiers and while both Shift keys are held.
-    if (event.ctrlKey || event.metaKey || event.altKey) this.pressed.clear();
-    if (!event.shiftKey) this.pressed.delete(CLUTCH_KEY);
+    if (event.ctrlKey || event.metaKey || event.altKey) this.pressed.clear(); // the end of a press may not be reported
     if (event.type === "keyup") {
       this.pressed.delete(event.code);
       return;
@@ -99,8 +134,7 @@ export class DesktopInputs {
     if (event.code === "Escape") this.events.onQuit();
     if (!DRIVE_KEYS.has(event.code)) return;
     if (!event.repeat) this.pressed.add(event.code);
-    const isDriving = this.pressed.has(CLUTCH_KEY) || this.dragging !== null;
-    if (!isDriving || event.code === CLUTCH_KEY) return;
+    if (!this.clutchKey.isHeld && this.dragging === null) return;
     event.preventDefault(); // the view, lists and scroll bars have these keys otherwise
     event.stopPropagation();
   }

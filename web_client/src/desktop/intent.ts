@@ -5,10 +5,8 @@ import type { SpaceMouseState } from "./spacemouse.ts";
 
 export type Vec3 = [number, number, number];
 
-/** What is asked for at one moment. Axes: right, forward (horizontal), up, as seen from the view. */
-export interface Intent {
-  /** A dead-man key or button is held: the robot may follow. */
-  clutch: boolean;
+/** The motion that is asked for at one moment. Axes: right, forward (horizontal), up, as seen from the view. */
+export interface Motion {
   /** Shares of the full speed along the axes, each -1 to 1. */
   move: Vec3;
   /** Shares of the full angular speed about the axes, right-handed. */
@@ -17,6 +15,12 @@ export interface Intent {
   open: boolean;
   /** Closes a gripper that was opened last, and the other way round; counts when it begins. */
   toggle: boolean;
+}
+
+/** What one source (the keyboard, a gamepad, ...) asks for. */
+export interface Intent extends Motion {
+  /** Its dead-man is held. Null: not known, which neither lets the robot follow nor counts as let go. */
+  clutch: boolean | null;
 }
 
 /** What is needed of a `Gamepad`. */
@@ -51,7 +55,6 @@ const OPEN_KEY = "KeyV";
 
 /** Keys that mean something while the dead-man key is held. */
 export const DRIVE_KEYS: ReadonlySet<string> = new Set([
-  CLUTCH_KEY,
   ...Object.keys(MOVE_KEYS),
   ...Object.keys(TURN_KEYS),
   CLOSE_KEY,
@@ -74,22 +77,23 @@ const PAD = { a: 0, b: 1, rightShoulder: 5, up: 12, down: 13, left: 14, right: 1
 const STICK_REST = 0.15;
 /** Share of its range within which the cap of a SpaceMouse rests. */
 const CAP_REST = 0.05;
+/** A deflected cap reports about 100 times a second. After this long without a report its link is lost [ms]. */
+const CAP_SILENT_MS = 200;
 
 /** Return the intent of nothing pressed. */
 export function makeIdle(): Intent {
   return { clutch: false, move: [0, 0, 0], turn: [0, 0, 0], close: false, open: false, toggle: false };
 }
 
-/** Return what the pressed keys ask for. `pressed`: values of `KeyboardEvent.code`. */
-export function readKeys(pressed: ReadonlySet<string>): Intent {
-  const intent = makeIdle();
+/** Return what the pressed keys ask for. `pressed`: values of `KeyboardEvent.code`. `clutch`: of the dead-man key. */
+export function readKeys(pressed: ReadonlySet<string>, clutch: boolean | null): Intent {
+  const intent = { ...makeIdle(), clutch };
   for (const code of pressed) {
     const move = MOVE_KEYS[code];
     if (move) intent.move[move[0]] += move[1];
     const turn = TURN_KEYS[code];
     if (turn) intent.turn[turn[0]] += turn[1];
   }
-  intent.clutch = pressed.has(CLUTCH_KEY);
   intent.close = pressed.has(CLOSE_KEY);
   intent.open = pressed.has(OPEN_KEY);
   return intent;
@@ -110,22 +114,25 @@ export function readPad(pad: PadReading): Intent {
   return intent;
 }
 
-/** Return what a SpaceMouse asks for. Its axes point right, to the person, and down. */
-export function readSpaceMouse(state: SpaceMouseState): Intent {
+/** Return what a SpaceMouse asks for at a time. Its axes point right, to the person, and down. */
+export function readSpaceMouse(state: SpaceMouseState, now_ms: number): Intent {
   const [x, y, z, rx, ry, rz] = state.axes.map((value) => cutRest(value, CAP_REST)) as [number, number, number, number, number, number];
-  const isPressed = (button: number): boolean => (state.buttons & (1 << button)) !== 0;
-  return { ...makeIdle(), clutch: isPressed(0), move: [x, -y, -z], turn: [rx, -ry, -rz], toggle: isPressed(1) };
+  const isDeflected = [x, y, z, rx, ry, rz].some((value) => value !== 0);
+  const { buttons } = state;
+  if (isDeflected && now_ms - state.moved_ms > CAP_SILENT_MS) return { ...makeIdle(), clutch: null };
+  const isPressed = (button: number): boolean => buttons !== null && (buttons & (1 << button)) !== 0;
+  const clutch = buttons === null ? null : isPressed(0);
+  return { ...makeIdle(), clutch, move: [x, -y, -z], turn: [rx, -ry, -rz], toggle: isPressed(1) };
 }
 
-/** Return all intents together: motions add up, at most full speed on each axis. */
-export function merge(intents: readonly Intent[]): Intent {
-  const merged = makeIdle();
+/** Return all motions together: they add up, at most full speed on each axis. */
+export function merge(intents: Iterable<Motion>): Motion {
+  const merged: Motion = makeIdle();
   for (const intent of intents) {
     for (const axis of [0, 1, 2] as const) {
       merged.move[axis] += intent.move[axis];
       merged.turn[axis] += intent.turn[axis];
     }
-    merged.clutch ||= intent.clutch;
     merged.close ||= intent.close;
     merged.open ||= intent.open;
     merged.toggle ||= intent.toggle;
@@ -133,6 +140,36 @@ export function merge(intents: readonly Intent[]): Intent {
   merged.move = merged.move.map(clipShare) as Vec3;
   merged.turn = merged.turn.map(clipShare) as Vec3;
   return merged;
+}
+
+/** What is needed of a `KeyboardEvent` or a `PointerEvent`. */
+export interface ModifierReading {
+  type: string;
+  code?: string;
+  repeat?: boolean;
+  shiftKey: boolean;
+  ctrlKey: boolean;
+  metaKey: boolean;
+  altKey: boolean;
+}
+
+/** The dead-man key, as far as events tell. */
+export class ClutchKey {
+  /** Null: not known. Its end is not reported while the right Shift key is held, nor to a window without the focus. */
+  isHeld: boolean | null = null;
+
+  take(event: ModifierReading): void {
+    const isBegin = event.type === "keydown" && !event.repeat;
+    if (event.shiftKey === false) this.isHeld = false; // the only evidence that it is let go
+    if (isBegin && event.code === CLUTCH_KEY && this.isHeld === false) this.isHeld = true;
+    const isEnd = event.type === "keyup" && event.code === CLUTCH_KEY && event.shiftKey;
+    const isBeside = event.ctrlKey || event.metaKey || event.altKey || (isBegin && event.code === "ShiftRight");
+    if (isEnd || isBeside) this.forget();
+  }
+
+  forget(): void {
+    this.isHeld = null;
+  }
 }
 
 /** The way of a mouse that has not been sent yet [m], along the axes of an intent. */

@@ -1,6 +1,8 @@
 // 3Dconnexion SpaceMouse by WebHID. Reports as publicly documented for the SpaceNavigator and its successors: 1 is the
 // translation (with the rotation behind it in newer ones), 2 the rotation, 3 the buttons. Never run on hardware.
 
+import { nowMs } from "../core/api.ts";
+
 /** Multi-axis controllers (HID usage tables, page 1, usage 8) of 3Dconnexion, and of Logitech from before 2013. */
 const FILTERS = [0x256f, 0x046d].map((vendorId) => ({ vendorId, usagePage: 1, usage: 8 }));
 /** Logical maximum of every axis. */
@@ -10,16 +12,20 @@ const REPORT = { translation: 1, rotation: 2, buttons: 3 } as const;
 /** What a SpaceMouse reported last. `axes`: shares of their range, x y z and about x y z; right, to the person, down. */
 export class SpaceMouseState {
   readonly axes = [0, 0, 0, 0, 0, 0];
-  buttons = 0;
+  /** Bits of the pressed ones. Null until reported: they are reported when they change. */
+  buttons: number | null = null;
+  /** When the axes were reported. */
+  moved_ms = 0;
 
   /** Take an input report, without its id. Reports of other kinds, or too short ones, change nothing. */
-  take(report: number, data: DataView): void {
+  take(report: number, data: DataView, now_ms: number): void {
     if (report === REPORT.buttons && data.byteLength >= 1) {
       this.buttons = data.getUint8(0);
     } else if (report === REPORT.translation || report === REPORT.rotation) {
       const begin = report === REPORT.rotation ? 3 : 0;
       const count = Math.min(6 - begin, Math.floor(data.byteLength / 2));
       if (count < 3) return;
+      this.moved_ms = now_ms;
       for (let i = 0; i < count; i++) {
         this.axes[begin + i] = Math.min(1, Math.max(-1, data.getInt16(2 * i, true) / FULL));
       }
@@ -28,7 +34,7 @@ export class SpaceMouseState {
 
   clear(): void {
     this.axes.fill(0);
-    this.buttons = 0;
+    this.buttons = null;
   }
 }
 
@@ -91,9 +97,10 @@ export class SpaceMouse {
     if (!device.opened) await device.open();
     this.device = device;
     this.name = device.productName;
+    this.state.clear();
     device.addEventListener("inputreport", (event) => {
       const { reportId, data } = event as unknown as HidReportEvent;
-      if (this.device === device) this.state.take(reportId, data);
+      if (this.device === device) this.state.take(reportId, data, nowMs());
     });
   }
 }

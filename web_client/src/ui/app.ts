@@ -69,8 +69,7 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
       base_url: baseUrl,
       role,
       name: remembered.name,
-      devices: ["desktop"],
-      alignment: "not_needed",
+      ...state.entry,
       software: SOFTWARE,
     });
   };

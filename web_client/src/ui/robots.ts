@@ -146,18 +146,20 @@ function describe(
   return parts.join(" · ");
 }
 
+/** Answer a participant who asks for a robot that one holds. */
+export function answerConsent(asked: ConsentAsked, grant: boolean, state: PageState, actions: Actions): void {
+  void actions.request({ type: "consent", consent_id: asked.consent_id, grant });
+  state.consents = state.consents.filter((one) => one.consent_id !== asked.consent_id);
+  state.touch();
+}
+
 function makeConsentRow(asked: ConsentAsked, state: PageState, actions: Actions): Row<ConsentAsked> {
-  const answer = (grant: boolean): void => {
-    void actions.request({ type: "consent", consent_id: asked.consent_id, grant });
-    state.consents = state.consents.filter((one) => one.consent_id !== asked.consent_id);
-    state.touch();
-  };
   const text = h("div", { class: "line" }, `${state.nameOf(asked.requester)} asks you for ${asked.target}.`);
   const controls = h(
     "div",
     { class: "controls" },
-    button("Give it", () => answer(true), { class: "small primary" }),
-    button("Keep it", () => answer(false), { class: "small" }),
+    button("Give it", () => answerConsent(asked, true, state, actions), { class: "small primary" }),
+    button("Keep it", () => answerConsent(asked, false, state, actions), { class: "small" }),
   );
   return { element: h("li", { class: "row", role: "alert" }, text, controls), update: () => undefined };
 }

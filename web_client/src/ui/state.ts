@@ -37,6 +37,14 @@ export interface ConsentAsked {
   until_ms: number;
 }
 
+/** What a page says it is when it joins. */
+export interface Entry {
+  devices: wire.Device[];
+  alignment: wire.AlignmentKind;
+}
+
+export const DESKTOP: Entry = { devices: ["desktop"], alignment: "not_needed" };
+
 const NO_PHASE: PhaseUpdate = {
   type: "phase",
   phase: "idle",
@@ -49,6 +57,8 @@ const NO_PHASE: PhaseUpdate = {
 
 /** State of the page. */
 export class PageState {
+  /** What this page is now: one with a screen, or a headset. */
+  entry = DESKTOP;
   phase: PhaseUpdate = NO_PHASE;
   info: InfoUpdate | null = null;
   identity: IdentityUpdate | null = null;

@@ -45,6 +45,8 @@ const ALIGNMENTS: Record<string, string> = {
   none: "not aligned",
   measured: "measured",
   placed: "placed by hand",
+  fingertip: "by fingertip, to look",
+  persistent: "by a kept anchor, to look",
   not_needed: "not needed",
 };
 

@@ -78,47 +78,61 @@ function makeRope(part: Deformable, arrays: DeformableArrays, material: ShaderMa
  */
 function makeSheet(part: Deformable, arrays: DeformableArrays, material: ShaderMaterial): Made {
   const { elements, uv } = arrays;
-  const n = part.vertices;
-  const corners = elements.length;
   const isThick = part.dim === 2 && part.radius > 0;
   const rim = isThick ? findRim(elements) : [];
-  // Corners of the drawn triangles: the vertex and its side (+1, -1; 0 without thickness).
+  // Drawn points: the vertex and its side (+1, -1; 0 without thickness). Triangles share them unless they are flat.
   const vertex: number[] = [];
   const side: number[] = [];
   const coordinate: number[] = [];
-  const add = (v: number, s: number, corner: number): void => {
+  const index: number[] = [];
+  const known = new Map<string, number>();
+  const add = (v: number, s: number, corner: number, isFlat: boolean): void => {
+    const at = uv ? [uv[2 * corner]!, uv[2 * corner + 1]!] : [];
+    const key = `${v} ${s} ${at.join(" ")}`;
+    const before = isFlat ? undefined : known.get(key);
+    index.push(before ?? vertex.length);
+    if (before !== undefined) return;
+    known.set(key, vertex.length);
     vertex.push(v);
     side.push(s);
-    if (uv) coordinate.push(uv[2 * corner]!, uv[2 * corner + 1]!);
+    coordinate.push(...at);
   };
-  for (let c = 0; c < corners; c += 3) {
-    for (const k of [0, 1, 2]) add(elements[c + k]!, isThick ? 1 : 0, c + k);
-    if (isThick) for (const k of [0, 2, 1]) add(elements[c + k]!, -1, c + k);
+  for (let c = 0; c < elements.length; c += 3) {
+    for (const k of [0, 1, 2]) add(elements[c + k]!, isThick ? 1 : 0, c + k, part.flat);
+    if (isThick) for (const k of [0, 2, 1]) add(elements[c + k]!, -1, c + k, part.flat);
   }
+  const rimStart = vertex.length;
   for (const [a, b, ca, cb] of rim) {
     for (const [v, s, c] of [[a, 1, ca], [a, -1, ca], [b, -1, cb], [a, 1, ca], [b, -1, cb], [b, 1, cb]] as const) {
-      add(v, s, c);
+      add(v, s, c, true);
     }
   }
   const count = vertex.length;
   const position = new Float32Array(3 * count);
   const normal = new Float32Array(3 * count);
-  const smooth = new Float32Array(3 * n);
+  const smooth = new Float32Array(3 * part.vertices);
   const geometry = new BufferGeometry();
   const positions = new BufferAttribute(position, 3).setUsage(DynamicDrawUsage);
   const normals = new BufferAttribute(normal, 3).setUsage(DynamicDrawUsage);
   geometry.setAttribute("position", positions);
   geometry.setAttribute("normal", normals);
   if (uv) geometry.setAttribute("uv", new BufferAttribute(new Float32Array(coordinate), 2));
-  const rimStart = count - 6 * rim.length;
+  geometry.setIndex(new BufferAttribute(new Uint32Array(index), 1));
+  const from = Uint32Array.from(vertex, (v) => 3 * v);
+  const offset = Float32Array.from(side, (s) => s * part.radius);
   const write = (p: Float32Array): void => {
     addUpNormals(p, elements, smooth);
-    for (let i = 0; i < count; i++) {
-      const [v, s] = [3 * vertex[i]!, side[i]!];
-      for (let d = 0; d < 3; d++) {
-        position[3 * i + d] = p[v + d]! + s * part.radius * smooth[v + d]!;
-        normal[3 * i + d] = (s < 0 ? -1 : 1) * smooth[v + d]!;
-      }
+    for (let i = 0, at = 0; i < count; i++, at += 3) {
+      const v = from[i]!;
+      const distance = offset[i]!;
+      const sign = distance < 0 ? -1 : 1;
+      const [nx, ny, nz] = [smooth[v]!, smooth[v + 1]!, smooth[v + 2]!];
+      position[at] = p[v]! + distance * nx;
+      position[at + 1] = p[v + 1]! + distance * ny;
+      position[at + 2] = p[v + 2]! + distance * nz;
+      normal[at] = sign * nx;
+      normal[at + 1] = sign * ny;
+      normal[at + 2] = sign * nz;
     }
     for (let i = part.flat ? 0 : rimStart; i < count; i += 3) setFlatNormal(position, normal, i);
     positions.needsUpdate = normals.needsUpdate = true;
@@ -147,18 +161,27 @@ function addUpNormals(p: Float32Array, elements: Uint16Array | Uint32Array, out:
     const [ux, uy, uz] = [p[b]! - p[a]!, p[b + 1]! - p[a + 1]!, p[b + 2]! - p[a + 2]!];
     const [vx, vy, vz] = [p[d]! - p[a]!, p[d + 1]! - p[a + 1]!, p[d + 2]! - p[a + 2]!];
     const [x, y, z] = [uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx];
-    for (const at of [a, b, d]) {
-      out[at]! += x;
-      out[at + 1]! += y;
-      out[at + 2]! += z;
-    }
+    addTo(out, a, x, y, z);
+    addTo(out, b, x, y, z);
+    addTo(out, d, x, y, z);
   }
   for (let i = 0; i < out.length; i += 3) {
-    const length = Math.hypot(out[i]!, out[i + 1]!, out[i + 2]!) || 1;
+    const length = measure(out[i]!, out[i + 1]!, out[i + 2]!);
     out[i]! /= length;
     out[i + 1]! /= length;
     out[i + 2]! /= length;
   }
+}
+
+function addTo(out: Float32Array, at: number, x: number, y: number, z: number): void {
+  out[at]! += x;
+  out[at + 1]! += y;
+  out[at + 2]! += z;
+}
+
+/** Return the length of a vector, 1 of none. `Math.hypot` takes ten times as long. */
+function measure(x: number, y: number, z: number): number {
+  return Math.sqrt(x * x + y * y + z * z) || 1;
 }
 
 function setFlatNormal(p: Float32Array, normal: Float32Array, corner: number): void {
@@ -166,7 +189,7 @@ function setFlatNormal(p: Float32Array, normal: Float32Array, corner: number): v
   const [ux, uy, uz] = [p[b]! - p[a]!, p[b + 1]! - p[a + 1]!, p[b + 2]! - p[a + 2]!];
   const [vx, vy, vz] = [p[d]! - p[a]!, p[d + 1]! - p[a + 1]!, p[d + 2]! - p[a + 2]!];
   const [x, y, z] = [uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx];
-  const length = Math.hypot(x, y, z) || 1;
+  const length = measure(x, y, z);
   for (const at of [a, b, d]) {
     normal[at] = x / length;
     normal[at + 1] = y / length;

@@ -75,9 +75,16 @@ export function interpolatePoses(a: Float32Array, b: Float32Array, share: number
   }
 }
 
-/** Write values between `a` and `b` to `out`. */
-export function interpolateValues(a: Float32Array, b: Float32Array, share: number, out: Float32Array): void {
-  for (let i = 0; i < out.length; i++) out[i] = a[i]! + share * (b[i]! - a[i]!);
+/** Write values between `a` and `b` to `out`. Returns whether one has changed. */
+export function interpolateValues(a: Float32Array, b: Float32Array, share: number, out: Float32Array): boolean {
+  let isChanged = false;
+  for (let i = 0; i < out.length; i++) {
+    const value = Math.fround(a[i]! + share * (b[i]! - a[i]!));
+    if (value === out[i]) continue;
+    out[i] = value;
+    isChanged = true;
+  }
+  return isChanged;
 }
 
 /** The delay behind session time at which frames are shown: so long that the next frame is usually there. */

@@ -22,6 +22,7 @@ import { makeWorldRoot } from "./axes.ts";
 import { type Budget, DESKTOP, HEADSET, SOFTWARE } from "./budget.ts";
 import { Viewpoint } from "./camera.ts";
 import { CameraPictures } from "./pictures.ts";
+import type { DeformableView } from "./deformables.ts";
 import { DelayEstimator, FrameBuffer, interpolatePoses, interpolateValues, POSE_FLOATS } from "./interpolation.ts";
 import { SceneView } from "./scene_view.ts";
 
@@ -73,6 +74,8 @@ export interface HeadsetStage {
 interface Stream {
   buffer: FrameBuffer;
   values: Float32Array;
+  /** What shows the values. */
+  part: DeformableView | null;
 }
 
 /** Draws the session on a canvas. Throws `Error` with advice when the browser has no WebGL. */
@@ -217,7 +220,7 @@ export class View {
     client.on("presence", ({ items }) => this.avatars.setPresence(items, this.sessionTime()));
     client.on("deformable", ({ stream, vertices, session_ms }) => {
       const known = this.streams.get(stream);
-      const target = known ?? { buffer: new FrameBuffer(), values: new Float32Array(0) };
+      const target = known ?? { buffer: new FrameBuffer(), values: new Float32Array(0), part: null };
       this.streams.set(stream, target);
       target.buffer.push({ session_ms, values: vertices });
     });
@@ -328,10 +331,11 @@ export class View {
       const found = stream?.buffer.around(session_ms);
       if (!stream || !found) continue;
       const { length } = found.before.values;
-      const last = stream.values.length === length ? stream.values.slice() : null;
-      if (!last) stream.values = new Float32Array(length);
-      interpolateValues(found.before.values, found.after.values, found.share, stream.values);
-      if (last?.every((value, i) => value === stream.values[i]!)) continue;
+      const isNew = stream.part !== part; // also where a changed scene replaced it: it would lie as it did at first
+      stream.part = part;
+      if (stream.values.length !== length) stream.values = new Float32Array(length);
+      const isChanged = interpolateValues(found.before.values, found.after.values, found.share, stream.values);
+      if (!isChanged && !isNew) continue;
       part.setVertices(stream.values);
       isMoved = true;
     }

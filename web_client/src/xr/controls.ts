@@ -61,7 +61,7 @@ export function makeHeadsetControls(view: View | null, state: PageState, client:
 }
 
 async function begin(mode: Mode, view: View, state: PageState, client: WorkerClient, makeActions: (show: (text: string) => void) => Actions): Promise<Headset> {
-  const session = await navigator.xr!.requestSession(mode, { requiredFeatures: ["local-floor"], optionalFeatures: ["hand-tracking"] });
+  const session = await navigator.xr!.requestSession(mode, { requiredFeatures: ["local-floor"], optionalFeatures: ["hand-tracking", "anchors"] });
   const headset: Headset = new Headset(session, mode, view, state, client, makeActions((text) => headset.show(text)));
   session.addEventListener("end", () => headset.dispose());
   try {

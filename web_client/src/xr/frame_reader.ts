@@ -6,12 +6,16 @@
 
 import { nowMs } from "../core/api.ts";
 import type * as wire from "../protocol/messages.g.ts";
-import { type FrameReading, type InputReading, packButtons, readGesture, type Side, toPose, toRay, type Vec3 } from "./reading.ts";
+import { type FrameReading, type InputReading, packButtons, readGesture, type Side, STOP_BUTTONS, toPose, toRay } from "./reading.ts";
+
+/** Least time between two readings of all joints of the hands [ms]: 50 poses are 3 kB. */
+const JOINTS_PERIOD_MS = 33;
 
 /** Reads frames of one session. Keeps the last known poses: a lost device is reported where it was, as not tracked. */
 export class FrameReader {
   private head: wire.Pose | null = null;
   private readonly poses = new Map<string, wire.Pose>();
+  private joints_ms = Number.NEGATIVE_INFINITY;
 
   constructor(private readonly session: XRSession) {}
 
@@ -21,23 +25,29 @@ export class FrameReader {
     const viewer = frame.getViewerPose(space);
     if (viewer) this.head = toPose(viewer.transform.position, viewer.transform.orientation);
     const inputs: InputReading[] = [];
+    const wantsJoints = capture_ms - this.joints_ms >= JOINTS_PERIOD_MS;
+    if (wantsJoints) this.joints_ms = capture_ms;
     for (const source of this.session.inputSources) {
       const { handedness: side } = source;
       if (side === "none" || inputs.some((input) => input.side === side)) continue;
-      inputs.push(this.readInput(frame, space, source, side));
+      inputs.push(this.readInput(frame, space, source, side, wantsJoints));
     }
-    return { capture_ms, head: this.head, headTracked: isTracked(viewer), inputs };
+    const stops = [...this.session.inputSources].filter(isStopPressed).length;
+    return { capture_ms, head: this.head, headTracked: isTracked(viewer), inputs, stops };
   }
 
-  private readInput(frame: XRFrame, space: XRReferenceSpace, source: XRInputSource, side: Side): InputReading {
+  private readInput(frame: XRFrame, space: XRReferenceSpace, source: XRInputSource, side: Side, wantsJoints: boolean): InputReading {
     const kind = source.hand ? "hand" : "controller";
     const aim = frame.getPose(source.targetRaySpace, space);
     const ray = aim ? toRay(toPose(aim.transform.position, aim.transform.orientation)) : null;
     const key = `${kind}/${side}`;
-    if (source.hand) return { side, kind, ray, buttons: 0, ...this.readHand(frame, space, source.hand, key) };
+    if (source.hand) {
+      const joints = wantsJoints ? readJoints(frame, space, source.hand) : [];
+      return { side, kind, ray, buttons: 0, joints, ...this.readHand(frame, space, source.hand, key) };
+    }
     // Where it is held, looking to where it points: one rigid frame of the controller, whose x axis others see as a ray.
-    const held = source.gripSpace ? (frame.getPose(source.gripSpace, space) ?? null) : null;
-    const at = held ?? aim;
+    // One that is lost is nowhere: the origin of its ray is 6 cm from the grip, and a robot would follow that jump.
+    const at = source.gripSpace ? frame.getPose(source.gripSpace, space) : aim;
     if (at && aim) this.poses.set(key, toPose(at.transform.position, aim.transform.orientation));
     const buttons = source.gamepad?.buttons ?? [];
     return {
@@ -49,11 +59,13 @@ export class FrameReader {
       trigger: buttons[0]?.value ?? 0,
       squeeze: buttons[1]?.value ?? 0,
       buttons: packButtons(buttons.map(({ pressed }) => pressed)),
+      tip: null,
+      joints: [],
     };
   }
 
   /** Read a hand: its pose is that of the wrist. */
-  private readHand(frame: XRFrame, space: XRReferenceSpace, hand: XRHand, key: string): Pick<InputReading, "pose" | "tracked" | "trigger" | "squeeze"> {
+  private readHand(frame: XRFrame, space: XRReferenceSpace, hand: XRHand, key: string): Pick<InputReading, "pose" | "tracked" | "trigger" | "squeeze" | "tip"> {
     const find = (name: XRHandJoint): XRJointPose | undefined => {
       const joint = hand.get(name);
       return joint && frame.getJointPose?.(joint, space);
@@ -61,11 +73,17 @@ export class FrameReader {
     const wrist = find("wrist");
     if (wrist) this.poses.set(key, toPose(wrist.transform.position, wrist.transform.orientation));
     const tips = [find("thumb-tip"), find("index-finger-tip"), find("middle-finger-tip"), find("middle-finger-phalanx-proximal"), wrist];
-    const [thumb, index, middle, knuckle, at] = tips.map((joint) => joint && toVec3(joint.transform.position));
+    const [thumb, index, middle, knuckle, at] = tips.map((joint) => joint && toPose(joint.transform.position, joint.transform.orientation)[0]);
     const isWhole = thumb && index && middle && knuckle && at;
     const gesture = isWhole ? readGesture({ thumb, index, middle, knuckle, wrist: at }) : { trigger: 0, squeeze: 0 };
-    return { pose: this.poses.get(key) ?? null, tracked: Boolean(isWhole) && isTracked(wrist), ...gesture };
+    const tracked = Boolean(isWhole) && isTracked(wrist);
+    return { pose: this.poses.get(key) ?? null, tracked, tip: (tracked && index) || null, ...gesture };
   }
+}
+
+/** Return whether a button of the e-stop is pressed: of any device, tracked or not. */
+function isStopPressed({ gamepad }: XRInputSource): boolean {
+  return (packButtons((gamepad?.buttons ?? []).map(({ pressed }) => pressed)) & STOP_BUTTONS) !== 0;
 }
 
 /** Return whether a pose was measured: there is one, and its position is not a guess. */
@@ -73,6 +91,9 @@ function isTracked(pose: XRPose | XRViewerPose | null | undefined): boolean {
   return pose !== null && pose !== undefined && !pose.emulatedPosition;
 }
 
-function toVec3({ x, y, z }: DOMPointReadOnly): Vec3 {
-  return [x, y, z];
+/** Return the poses of a hand's joints, as in `Sample.hand_joints`; none unless all are known. */
+function readJoints(frame: XRFrame, space: XRReferenceSpace, hand: XRHand): number[] {
+  const poses = [...hand.values()].map((joint) => frame.getJointPose?.(joint, space));
+  if (!poses.every((pose) => pose !== undefined && pose !== null)) return [];
+  return poses.flatMap(({ transform }) => toPose(transform.position, transform.orientation).flat());
 }

@@ -1,10 +1,13 @@
 // What a person's hands mean, frame by frame: which hand drives which robot, what is asked of the session, and the samples
 // that are sent. Pure.
 //
-// A trigger pressed at a robot acquires it; held at one's own robot it releases it. A squeeze moves the robot of that hand,
-// and the trigger is its gripper meanwhile. Buttons that are held when a hand appears count from their next press.
+// A trigger pressed at a robot acquires it; held at one's own robot it releases it; pressed at an answer it gives it. A
+// squeeze moves the robot of that hand, and the trigger is its gripper meanwhile. Buttons that are held when a hand appears
+// count from their next press; only the e-stop counts always.
 
 import type { SampleInput } from "../core/api.ts";
+import { Grips } from "./grips.ts";
+import type { Answer } from "./question.ts";
 import { BUTTON, type FrameReading, type InputReading, type Side } from "./reading.ts";
 
 /** A value is pressed from the first on, and until it falls below the second. */
@@ -12,30 +15,51 @@ const PRESS = 0.6;
 const LET_GO = 0.4;
 /** A trigger held this long at one's own robot releases it [ms]. */
 export const RELEASE_MS = 800;
+/** A trigger pressed at nothing for no longer than this asks to be placed [ms]: a longer press is no tap. */
+const TAP_MS = 800;
+/** After so long without a frame hands are new ones [ms]: what they did meanwhile is not known. */
+const GAP_MS = 500;
+/** A lease that was granted is seen within this time [ms]. */
+const GRANTED_MS = 2000;
+/** The clutch of a hand that has got a robot stays open this long [ms]: a session engages after it has seen it open. */
+const OPEN_MS = 100;
 
 export type Intent =
   | { type: "acquire"; robot: string }
   | { type: "release"; robot: string }
+  | { type: "answer"; answer: Answer }
   | { type: "episode"; action: "start" | "success" | "discard" }
+  /** Stay where the scene is shown. */
+  | { type: "place" }
   | { type: "estop" };
 
 /** What the session and the picture say at a frame. */
 export interface Context {
   /** Robots that this participant holds. */
   held: readonly string[];
+  /** Robots that the session moves for this participant. */
+  following: readonly string[];
   /** The robot that each hand points at. */
   pointed: Partial<Record<Side, string>>;
+  /** The answer to a question that each hand points at; it is nearer than robots. */
+  aimed: Partial<Record<Side, Answer>>;
   isEpisodeRunning: boolean;
+  /** This participant may place itself, and is not aligned. */
+  canPlace: boolean;
 }
 
 interface Hand {
   kind: InputReading["kind"];
   trigger: boolean;
   squeeze: boolean;
+  /** The squeeze was held when the hand appeared, and has not been let go since. */
+  mustLetGo: boolean;
   buttons: number;
   /** When the trigger was pressed at one's own robot [ms], null: it was not. */
   pressed_ms: number | null;
   pressedAt: string;
+  /** When the trigger was pressed at nothing [ms], null: it was not. */
+  tapped_ms: number | null;
 }
 
 /** State of both hands. */
@@ -43,29 +67,45 @@ export class Hands {
   /** The robot that each hand drives. */
   readonly driven = new Map<Side, string>();
   private readonly hands = new Map<Side, Hand>();
-  /** Robots that were asked for, until they are held. */
-  private readonly wanted = new Map<Side, string>();
-  private isSuspended = false;
+  /** Robots that were asked for, until they are held or denied, and until when they are waited for [ms]. */
+  private readonly wanted = new Map<Side, { robot: string; until_ms: number }>();
+  /** When each hand got its robot [ms]. */
+  private readonly bound_ms = new Map<Side, number>();
+  private readonly grips = new Grips();
+  /** What is asked of the gripper of each hand in this frame. */
+  private readonly grasps = new Map<Side, number | null>();
+  private stops = 0;
+  private frame_ms = Number.NEGATIVE_INFINITY;
 
   /** Take a frame. Returns what it asks of the session. */
   update(reading: FrameReading, context: Context): Intent[] {
+    const { capture_ms, stops } = reading;
+    const dt_ms = capture_ms - this.frame_ms;
+    if (dt_ms > GAP_MS) this.suspend();
+    this.frame_ms = capture_ms;
     for (const [side, robot] of this.driven) if (!context.held.includes(robot)) this.driven.delete(side);
-    for (const [side, robot] of this.wanted) {
-      if (!context.held.includes(robot)) continue;
-      this.wanted.delete(side);
-      this.bind(side, robot);
-    }
-    const intents: Intent[] = [];
-    const seen = new Set(reading.inputs.map(({ side }) => side));
-    for (const side of this.hands.keys()) if (!seen.has(side)) this.hands.delete(side);
-    for (const input of reading.inputs) if (input.tracked) this.updateHand(input, reading.capture_ms, context, intents);
-    this.isSuspended = false;
+    const intents: Intent[] = stops > this.stops ? [{ type: "estop" }] : [];
+    this.stops = stops;
+    const inputs = reading.inputs.filter(({ tracked }) => tracked);
+    for (const side of this.hands.keys()) if (!inputs.some((input) => input.side === side)) this.hands.delete(side);
+    for (const input of inputs) this.updateHand(input, capture_ms, context, intents);
+    this.bindWanted(context.held, capture_ms);
+    this.updateGrips(inputs, context, dt_ms / 1000);
     return intents;
   }
 
   /** Input does not reach the scene now: what is pressed when it does again counts from its next press. */
   suspend(): void {
-    this.isSuspended = true;
+    this.hands.clear();
+  }
+
+  /** The session has answered a request for a robot. */
+  settle(robot: string, isGranted: boolean, now_ms: number): void {
+    for (const [side, wish] of this.wanted) {
+      if (wish.robot !== robot) continue;
+      if (isGranted) wish.until_ms = now_ms + GRANTED_MS;
+      else this.wanted.delete(side);
+    }
   }
 
   /** Return whether a hand holds its squeeze. */
@@ -86,16 +126,19 @@ export class Hands {
     if (reading.head) samples.push({ device: "head", pose: reading.head, capture_ms, tracked: isVisible && reading.headTracked });
     for (const input of reading.inputs) {
       if (!input.pose) continue;
-      const robot = this.driven.get(input.side);
+      const { side } = input;
+      const robot = this.driven.get(side);
+      const clutch = this.isSqueezing(side) && capture_ms - (this.bound_ms.get(side) ?? 0) >= OPEN_MS;
       samples.push({
-        device: `${input.kind}/${input.side}`,
+        device: `${input.kind}/${side}`,
         pose: input.pose,
         capture_ms,
         tracked: isVisible && input.tracked,
         robots: robot === undefined ? [] : [robot],
-        clutch: this.isSqueezing(input.side),
-        gripper: input.trigger,
+        clutch,
+        gripper: clutch ? (this.grasps.get(side) ?? null) : null,
         buttons: input.buttons,
+        ...(isVisible && input.joints.length > 0 && { hand_joints: [...input.joints] }),
       });
     }
     return samples;
@@ -104,48 +147,92 @@ export class Hands {
   private updateHand(input: InputReading, now_ms: number, context: Context, intents: Intent[]): void {
     const { side, kind, buttons } = input;
     const before = this.hands.get(side);
-    const isNew = this.isSuspended || before?.kind !== kind;
+    const isNew = before?.kind !== kind;
+    const isSqueezed = isPressed(input.squeeze, isNew || before.squeeze || before.mustLetGo);
+    const mustLetGo = isSqueezed && (isNew || before.mustLetGo);
     const hand: Hand = {
       kind,
-      trigger: isPressed(input.trigger, before?.trigger ?? false),
-      squeeze: isPressed(input.squeeze, before?.squeeze ?? false),
+      trigger: isPressed(input.trigger, isNew || before.trigger),
+      squeeze: isSqueezed && !mustLetGo,
+      mustLetGo,
       buttons,
       pressed_ms: isNew ? null : before.pressed_ms,
       pressedAt: isNew ? "" : before.pressedAt,
+      tapped_ms: isNew ? null : before.tapped_ms,
     };
     this.hands.set(side, hand);
     if (isNew) return;
+    if (hand.squeeze && !before.squeeze) this.beginSqueeze(side, context.held);
+    this.readTrigger(side, hand, before.trigger, now_ms, context, intents);
+    const pressed = buttons & ~before.buttons;
+    if (pressed & BUTTON.lower) intents.push({ type: "episode", action: context.isEpisodeRunning ? "success" : "start" });
+    if (pressed & BUTTON.upper && context.isEpisodeRunning) intents.push({ type: "episode", action: "discard" });
+  }
+
+  private readTrigger(side: Side, hand: Hand, wasPressed: boolean, now_ms: number, context: Context, intents: Intent[]): void {
     const robot = context.pointed[side];
-    if (hand.squeeze && !before.squeeze && !this.driven.has(side)) this.bindFree(side, context.held);
+    const answer = context.aimed[side];
+    const isPress = hand.trigger && !wasPressed && !hand.squeeze;
     if (!hand.trigger || hand.squeeze || robot !== hand.pressedAt) hand.pressed_ms = null;
-    if (hand.trigger && !before.trigger && !hand.squeeze && robot !== undefined) {
-      if (!context.held.includes(robot)) {
-        this.wanted.set(side, robot);
-        intents.push({ type: "acquire", robot });
-      } else if (this.driven.get(side) !== robot) {
-        this.bind(side, robot);
-      } else {
-        [hand.pressed_ms, hand.pressedAt] = [now_ms, robot];
-      }
-    }
+    if (hand.squeeze || robot !== undefined || answer !== undefined) hand.tapped_ms = null;
+    if (isPress && answer !== undefined) intents.push({ type: "answer", answer });
+    else if (isPress && robot !== undefined) this.pressAt(robot, side, hand, now_ms, context, intents);
+    else if (isPress) hand.tapped_ms = now_ms;
     if (hand.pressed_ms !== null && now_ms - hand.pressed_ms >= RELEASE_MS) {
       hand.pressed_ms = null;
       intents.push({ type: "release", robot: hand.pressedAt });
     }
-    const pressed = buttons & ~before.buttons;
-    if (pressed & BUTTON.thumbstick) intents.push({ type: "estop" });
-    if (pressed & BUTTON.lower) intents.push({ type: "episode", action: context.isEpisodeRunning ? "success" : "start" });
-    if (pressed & BUTTON.upper && context.isEpisodeRunning) intents.push({ type: "episode", action: "discard" });
+    if (hand.trigger || hand.tapped_ms === null) return;
+    if (now_ms - hand.tapped_ms <= TAP_MS && context.canPlace) intents.push({ type: "place" });
+    hand.tapped_ms = null;
+  }
+
+  private pressAt(robot: string, side: Side, hand: Hand, now_ms: number, { held }: Context, intents: Intent[]): void {
+    const isMoved = [...this.driven].some(([other, driven]) => driven === robot && this.isSqueezing(other));
+    if (!held.includes(robot)) {
+      this.wanted.set(side, { robot, until_ms: Number.POSITIVE_INFINITY });
+      intents.push({ type: "acquire", robot });
+    } else if (this.driven.get(side) === robot) {
+      [hand.pressed_ms, hand.pressedAt] = [now_ms, robot];
+    } else if (!isMoved) {
+      this.bind(side, robot);
+    }
+  }
+
+  /** Give hands the robots that they asked for. */
+  private bindWanted(held: readonly string[], now_ms: number): void {
+    for (const [side, { robot, until_ms }] of this.wanted) {
+      if (held.includes(robot)) this.bind(side, robot);
+      else if (now_ms > until_ms) this.wanted.delete(side);
+    }
+  }
+
+  private updateGrips(inputs: readonly InputReading[], { held, following }: Context, dt_s: number): void {
+    this.grips.keepOnly(held);
+    this.grasps.clear();
+    for (const [side, robot] of this.driven) {
+      const trigger = inputs.find((input) => input.side === side)?.trigger;
+      if (trigger === undefined || !this.isSqueezing(side)) this.grips.letGo(robot);
+      else this.grasps.set(side, this.grips.follow(robot, trigger, following.includes(robot), dt_s));
+    }
   }
 
   /** Let a hand drive a robot, and no other hand. */
   private bind(side: Side, robot: string): void {
     for (const [other, driven] of this.driven) if (driven === robot) this.driven.delete(other);
+    for (const [other, wish] of this.wanted) if (other === side || wish.robot === robot) this.wanted.delete(other);
     this.driven.set(side, robot);
+    this.bound_ms.set(side, this.frame_ms);
   }
 
-  /** Let a hand drive a robot that is held and that no hand drives: the one named after its side, or the first. */
-  private bindFree(side: Side, held: readonly string[]): void {
+  /**
+   * A hand without a robot drives one that is held and that no hand drives: the one named after its side, or the first.
+   *
+   * What it asked for before is not given to it any more: a hand that works must not find itself at another robot.
+   */
+  private beginSqueeze(side: Side, held: readonly string[]): void {
+    this.wanted.delete(side);
+    if (this.driven.has(side)) return;
     const driven = new Set(this.driven.values());
     const free = held.filter((robot) => !driven.has(robot));
     const robot = free.find((name) => name.toLowerCase().includes(side)) ?? free[0];

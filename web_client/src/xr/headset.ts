@@ -3,30 +3,32 @@
 
 import { Group } from "three";
 
-import type { FromWorker, RobotInfo, SceneSpec } from "../core/api.ts";
+import { type FromWorker, nowMs, type RobotInfo, type SceneSpec } from "../core/api.ts";
 import type { WorkerClient } from "../core/page_client.ts";
 import type * as wire from "../protocol/messages.g.ts";
 import type { Actions } from "../ui/actions.ts";
-import type { PageState } from "../ui/state.ts";
+import { DESKTOP, type Entry, type PageState } from "../ui/state.ts";
 import { participantColor } from "../view/avatars.ts";
 import { Label } from "../view/labels.ts";
 import type { View } from "../view/view.ts";
+import { ConsentPanel } from "./consents.ts";
 import { FrameReader } from "./frame_reader.ts";
 import { type Context, Hands, type Intent } from "./hands.ts";
+import { Marks } from "./marks.ts";
 import { placeBeforeScene } from "./placement.ts";
 import { type Chain, findPointed, listChains } from "./pointing.ts";
 import { Props } from "./props.ts";
 import { type FrameReading, type Side, toWorldRay, type Vec3 } from "./reading.ts";
-import { describeAlignment, describeRobot, describeUrgent, findPulse, wrap } from "./words.ts";
+import { WristStop } from "./stop.ts";
+import { awaitsConsent, describeAlignment, describeRobot, describeUrgent, drawBar, findPulse, isPlaced, wrap } from "./words.ts";
 
 export type Mode = "immersive-ar" | "immersive-vr";
 
-const DEVICES = ["head", "controller/left", "controller/right", "hand/left", "hand/right"];
+const ENTRY: Entry = { devices: ["head", "controller/left", "controller/right", "hand/left", "hand/right"], alignment: "measured" };
 /** Height of a robot's panel above its highest link [m]. */
 const PANEL_ABOVE_M = 0.18;
-/** Time that a denial is shown [ms], between two attempts to be placed, and between two updates of the panels. */
+/** Time that a denial is shown [ms], and between two updates of the panels. */
 const NOTICE_MS = 5000;
-const PLACE_PERIOD_MS = 1000;
 const PANEL_PERIOD_MS = 100;
 const URGENT_COLOR = "#e0a33a";
 const FREE_COLOR = "#8a93a3";
@@ -39,18 +41,23 @@ export class Headset {
   /** The newest reading; for tests. */
   reading: FrameReading | null = null;
   private readonly hands = new Hands();
+  private readonly wristStop = new WristStop();
   private readonly props = new Props();
+  private readonly marks: Marks;
+  private readonly consent: ConsentPanel;
   private readonly reader: FrameReader;
   /** Panels at robots, in the session's world. */
   readonly panels = new Group();
   private readonly labels = new Map<string, Label>();
   private readonly feedback = new Map<string, wire.Feedback>();
   private pointed: Context["pointed"] = {};
+  private aimed: Context["aimed"] = {};
+  /** Robots that were asked for, until there is a reply. */
+  private readonly requested = new Set<string>();
   private chains: ReadonlyMap<string, Chain> = new Map();
   private chainsOf: readonly [readonly RobotInfo[], SceneSpec] | null = null;
   private defaultPlace: wire.Pose | null = null;
   private notice = { text: "", until_ms: 0 };
-  private placed_ms = Number.NEGATIVE_INFINITY;
   private panels_ms = Number.NEGATIVE_INFINITY;
   private readonly endListening: () => void;
 
@@ -64,9 +71,13 @@ export class Headset {
   ) {
     this.isTransparent = mode === "immersive-ar";
     this.reader = new FrameReader(session);
+    this.marks = new Marks(session, this.isTransparent, state, client, actions);
+    this.rig.add(this.marks.group);
+    this.consent = new ConsentPanel(state, actions);
+    this.rig.add(this.consent.group);
     this.endListening = client.on("inbox", (update) => this.takeInbox(update));
     session.addEventListener("visibilitychange", () => this.onVisibility());
-    client.post({ type: "rejoin", devices: DEVICES, alignment: "measured" });
+    this.rejoin(ENTRY);
   }
 
   get rig(): Group {
@@ -85,6 +96,7 @@ export class Headset {
   /** The tracking frame jumps: what was aligned to it is void. */
   onReset(): void {
     this.client.post({ type: "tracking_jump" });
+    this.marks.touching.reset();
   }
 
   /** Take a frame: before the scene is drawn. */
@@ -98,11 +110,11 @@ export class Headset {
     this.showsScene = T_world_tracking !== null;
     if (T_world_tracking !== null) this.props.place(T_world_tracking);
     const hits = this.point(reading, T_world_tracking);
-    if (isVisible) this.ask(this.hands.update(reading, this.makeContext()));
-    else this.hands.suspend();
+    if (isVisible) this.takeHands(reading, frame, space);
+    else this.suspend();
     const samples = this.hands.makeSamples(reading, isVisible);
     if (samples.length > 0) this.client.post({ type: "samples", samples });
-    this.props.move(reading, hits);
+    this.props.move(reading, hits, this.wristStop.center);
     const now = performance.now();
     if (now - this.panels_ms < PANEL_PERIOD_MS) return;
     this.panels_ms = now;
@@ -112,11 +124,19 @@ export class Headset {
   /** End: the page is one with a screen again. */
   dispose(): void {
     this.endListening();
+    this.marks.dispose();
+    this.consent.dispose();
     this.props.dispose();
     for (const label of this.labels.values()) label.dispose();
     this.panels.removeFromParent();
     this.client.post({ type: "worn", worn: true });
-    this.client.post({ type: "rejoin", devices: ["desktop"], alignment: "not_needed" });
+    this.rejoin(DESKTOP);
+  }
+
+  /** Say what this page is from now on, and whenever it joins again. */
+  private rejoin(entry: Entry): void {
+    this.state.entry = entry;
+    this.client.post({ type: "rejoin", ...entry });
   }
 
   /** No frames come while the session is hidden: what was held is not tracked any more, at once. */
@@ -124,7 +144,13 @@ export class Headset {
     const { visibilityState } = this.session;
     this.client.post({ type: "worn", worn: visibilityState !== "hidden" });
     if (visibilityState === "visible" || this.reading === null) return;
+    this.suspend();
     this.client.post({ type: "samples", samples: this.hands.makeSamples(this.reading, false) });
+  }
+
+  private suspend(): void {
+    this.hands.suspend();
+    this.wristStop.suspend();
   }
 
   // --- place ----------------------------------------------------------------------------------------------------------
@@ -134,7 +160,7 @@ export class Headset {
   }
 
   private get isAligned(): boolean {
-    return this.alignment?.kind === "measured" || this.alignment?.kind === "placed";
+    return isPlaced(this.alignment);
   }
 
   /** Return `T_world_tracking`, null: the scene has no place. */
@@ -143,18 +169,14 @@ export class Headset {
     if (alignment && this.isAligned) return alignment.T_world_tracking;
     if (this.isTransparent || !state.spec) return null;
     this.defaultPlace ??= placeBeforeScene(state.spec.environment, this.view.viewpoint.axes.forward);
-    this.placeSelf(this.defaultPlace);
     return this.defaultPlace;
   }
 
-  /** In VR nothing of the room is seen, so a director who enters it is aligned by its own word. */
-  private placeSelf(T_world_tracking: wire.Pose): void {
+  /** In VR nothing of the room is seen, so a director may be aligned by its own word: at the place that is shown. */
+  private get canPlace(): boolean {
     const { state } = this;
-    const now = performance.now();
-    const isJoined = state.isReady && state.self?.devices.includes("head");
-    if (!isJoined || !state.isDirector || now - this.placed_ms < PLACE_PERIOD_MS) return;
-    this.placed_ms = now;
-    void this.actions.request({ type: "place_alignment", participant: state.selfId, T_world_tracking });
+    const isJoined = state.isReady && (state.self?.devices.includes("head") ?? false);
+    return isJoined && state.isDirector && !this.isTransparent && !this.isAligned;
   }
 
   // --- hands ----------------------------------------------------------------------------------------------------------
@@ -164,23 +186,32 @@ export class Headset {
     const robots = new Set(state.session?.robots.map(({ name }) => name));
     return {
       held: state.heldBy(state.selfId).filter((name) => robots.has(name)),
+      following: [...robots].filter((name) => state.feedback.get(name)?.hold_reason === ""),
       pointed: this.pointed,
+      aimed: this.aimed,
       isEpisodeRunning: state.session?.episode?.state === "running",
+      canPlace: this.canPlace,
     };
   }
 
-  /** Find the robots that hands point at. Returns how far away they are [m]. */
+  /** Find the answers and robots that hands point at. Returns how far away they are [m]. */
   private point(reading: FrameReading, T_world_tracking: wire.Pose | null): Partial<Record<Side, number>> {
     this.pointed = {};
+    this.aimed = {};
     const hits: Partial<Record<Side, number>> = {};
+    for (const { side, answer, distance } of this.consent.update(reading, this.describeWaiting())) {
+      if (this.hands.isSqueezing(side)) continue;
+      this.aimed[side] = answer;
+      hits[side] = distance;
+    }
     const { session, spec } = this.state;
-    if (T_world_tracking === null || !session || !spec) return hits;
+    if (T_world_tracking === null || !session || !spec || this.marks.isActive) return hits;
     if (this.chainsOf?.[0] !== session.robots || this.chainsOf[1] !== spec) {
       this.chains = listChains(session.robots, spec.bodies);
       this.chainsOf = [session.robots, spec];
     }
     for (const { side, ray, tracked } of reading.inputs) {
-      if (!ray || !tracked || this.hands.isSqueezing(side)) continue;
+      if (!ray || !tracked || this.hands.isSqueezing(side) || this.aimed[side]) continue;
       const hit = findPointed(toWorldRay(T_world_tracking, ray), this.chains, (body) => this.positionOf(body));
       if (!hit) continue;
       this.pointed[side] = hit.robot;
@@ -193,11 +224,23 @@ export class Headset {
     return this.view.scene?.bodies.get(body)?.position.toArray() ?? null;
   }
 
+  /** Hands move no robot while they touch marks, and what they hold then counts afterwards from its next press. */
+  private takeHands(reading: FrameReading, frame: XRFrame, space: XRReferenceSpace): void {
+    const busy = Object.keys({ ...this.pointed, ...this.aimed }) as Side[];
+    const wasActive = this.marks.isActive;
+    this.marks.onFrame(frame, space, reading, busy);
+    if (wasActive !== this.marks.isActive) this.hands.suspend();
+    this.ask(this.hands.update(this.marks.mask(reading, busy), this.makeContext()));
+    if (this.wristStop.update(reading)) this.actions.estop("fingertip at the wrist");
+  }
+
   private ask(intents: readonly Intent[]): void {
     for (const intent of intents) {
-      if (intent.type === "estop") this.actions.estop("thumbstick of a controller");
+      if (intent.type === "estop") this.actions.estop("button of a controller");
       else if (intent.type === "episode") void this.actions.request({ type: "episode", action: intent.action });
-      else if (intent.type === "acquire") void this.actions.request({ type: "acquire", robots: [intent.robot] });
+      else if (intent.type === "answer") this.consent.answer(intent.answer);
+      else if (intent.type === "acquire") void this.acquire(intent.robot);
+      else if (intent.type === "place") this.placeSelf();
       else {
         const lease = this.state.lease(intent.robot);
         if (lease) this.actions.release([[intent.robot, lease.lease_version, "robot"]]);
@@ -205,8 +248,27 @@ export class Headset {
     }
   }
 
-  private takeInbox({ messages }: Extract<FromWorker, { type: "inbox" }>): void {
-    for (const message of messages) {
+  private placeSelf(): void {
+    const T_world_tracking = this.findPlace();
+    if (T_world_tracking) void this.actions.request({ type: "place_alignment", participant: this.state.selfId, T_world_tracking });
+  }
+
+  private async acquire(robot: string): Promise<void> {
+    this.requested.add(robot);
+    const isGranted = await this.actions.request({ type: "acquire", robots: [robot] });
+    this.requested.delete(robot);
+    this.hands.settle(robot, isGranted, nowMs());
+  }
+
+  /** Return whose consent this person waits for, as a line; empty: none. */
+  private describeWaiting(): string {
+    const lease = [...this.requested].map((robot) => this.state.lease(robot)).find(awaitsConsent);
+    return lease ? `waiting for ${this.state.nameOf(lease.holder)}'s consent to ${lease.target}` : "";
+  }
+
+  private takeInbox(update: Extract<FromWorker, { type: "inbox" }>): void {
+    this.marks.takeInbox(update);
+    for (const message of update.messages) {
       if (message.type !== "feedback") continue;
       const pulse = findPulse(this.feedback.get(message.robot) as typeof message | undefined, message);
       this.feedback.set(message.robot, message);
@@ -224,15 +286,19 @@ export class Headset {
     const { state, alignment } = this;
     const { session, phase } = state;
     const report = state.status?.participants.find(({ id }) => id === state.selfId)?.alignment_report;
+    this.props.isRaised = this.marks.isActive;
+    const steps = this.marks.describe(reading.capture_ms);
     const urgent = describeUrgent({
       isStopped: session?.estop ?? false,
       connection: state.isReady ? "" : phase.text || "joining the session again",
-      isAligned: this.isAligned,
+      isAligned: this.isAligned || steps.length > 0,
+      hasMarks: this.marks.hasMarks,
       isTransparent: this.isTransparent,
+      canPlace: this.canPlace,
       advice: report?.advice ?? "",
       notice: performance.now() < this.notice.until_ms ? this.notice.text : "",
     });
-    this.props.urgent.setText(urgent, URGENT_COLOR);
+    this.props.urgent.setText([...urgent, ...steps], URGENT_COLOR);
     const driven = [...this.hands.driven].map(([side, robot]) => `${side} hand: ${robot}`);
     const color = participantColor(state.selfId);
     this.props.status.setText([state.self?.name ?? "", ...wrap(describeAlignment(alignment)), ...driven], color);
@@ -256,9 +322,10 @@ export class Headset {
       nameOf: (id) => state.nameOf(id),
       isPointedAt: sides.length > 0,
       isOwn,
+      isRequested: this.requested.has(name),
     });
     const share = Math.max(0, ...sides.map((side) => this.hands.releaseShare(side, reading.capture_ms)));
-    if (share > 0) lines.push("▮".repeat(Math.ceil(10 * share)).padEnd(10, "▯"));
+    if (share > 0) lines.push(drawBar(share));
     const label = this.labels.get(name) ?? this.addPanel(name);
     label.setText(lines, lease?.holder ? participantColor(lease.holder) : FREE_COLOR);
     const points = (this.chains.get(name) ?? []).map((body) => this.positionOf(body)).filter((point) => point !== null);

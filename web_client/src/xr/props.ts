@@ -1,21 +1,25 @@
 // What a headset shows of its own: controllers, hands, rays, and panels. All in the tracking frame, in the axes of
 // three.js, below one group that is placed in the world by the alignment.
 
-import { BufferGeometry, CapsuleGeometry, Float32BufferAttribute, Group, Line, LineBasicMaterial, Mesh, MeshBasicMaterial, PerspectiveCamera, SphereGeometry, Vector3 } from "three";
+import { BufferGeometry, CapsuleGeometry, Float32BufferAttribute, Group, Line, LineBasicMaterial, Mesh, MeshBasicMaterial, type Object3D, PerspectiveCamera, SphereGeometry, Vector3 } from "three";
 
 import type * as wire from "../protocol/messages.g.ts";
 import { Label } from "../view/labels.ts";
-import { type FrameReading, type InputReading, type Ray, type Side, toRow } from "./reading.ts";
+import { type FrameReading, type InputReading, type Ray, type Side, toRow, type Vec3 } from "./reading.ts";
+import { STOP_RADIUS_M } from "./stop.ts";
 
 const COLOR = 0x8fa3bf;
 const RAY_COLOR = 0xc9d2e0;
 const HIT_COLOR = 0x35d0ba;
+const STOP_COLOR = "#d9363e";
 /** Length of a ray that meets nothing [m]. */
 const RAY_M = 2;
 const NEAR_M = 0.03;
 const FAR_M = 200;
 /** Place of the urgent panel before the eyes, and of the other one above a hand [m]. */
 const URGENT_AT = new Vector3(0, -0.22, -0.9);
+/** The same while the eyes look at what the hands do. */
+const RAISED_AT = new Vector3(0, 0.27, -0.9);
 const ABOVE_HAND_M = 0.13;
 
 interface Prop {
@@ -33,15 +37,22 @@ export class Props {
   readonly urgent = new Label(0.03);
   /** Above a hand: who one is, alignment, what the buttons do. */
   readonly status = new Label(0.012);
+  /** The urgent panel is above what the eyes look at. */
+  isRaised = false;
+  /** The ball at the wrist that stops. */
+  readonly stop = new Mesh(new SphereGeometry(STOP_RADIUS_M, 24, 16), new MeshBasicMaterial({ color: STOP_COLOR, transparent: true, opacity: 0.8 }));
+  private readonly stopLabel = new Label(0.018);
   private readonly props = new Map<Side, Prop>();
 
   constructor() {
     this.rig.name = "headset";
-    for (const { sprite } of [this.urgent, this.status]) {
+    this.stopLabel.setText(["STOP"], STOP_COLOR);
+    this.stop.add(this.stopLabel.sprite);
+    for (const { sprite } of [this.urgent, this.status, this.stopLabel]) {
       sprite.material.depthTest = false;
       sprite.renderOrder = 20;
     }
-    this.rig.add(this.camera, this.urgent.sprite, this.status.sprite);
+    this.rig.add(this.camera, this.urgent.sprite, this.status.sprite, this.stop);
   }
 
   /** Place the tracking frame: everything of this headset moves with it. */
@@ -52,14 +63,16 @@ export class Props {
     this.rig.updateMatrixWorld();
   }
 
-  /** Move everything to where a frame has it. `hits`: how far the ray of a hand goes until it meets a robot [m]. */
-  move(reading: FrameReading, hits: Partial<Record<Side, number>>): void {
+  /** Move everything to where a frame has it. `hits`: how far the ray of a hand goes until it meets something [m]. `stop`: centre of the ball. */
+  move(reading: FrameReading, hits: Partial<Record<Side, number>>, stop: Vec3 | null): void {
+    this.stop.visible = stop !== null;
+    if (stop) moveTo(this.stop, stop);
     for (const prop of this.props.values()) prop.object.visible = prop.ray.visible = false;
     for (const input of reading.inputs) this.moveInput(input, hits[input.side]);
     if (reading.head) {
       const [x, y, z, qx, qy, qz, qw] = toRow(reading.head) as [number, number, number, number, number, number, number];
       const { position } = this.urgent.sprite;
-      position.copy(URGENT_AT).applyQuaternion({ x: qx, y: qy, z: qz, w: qw });
+      position.copy(this.isRaised ? RAISED_AT : URGENT_AT).applyQuaternion({ x: qx, y: qy, z: qz, w: qw });
       position.set(position.x + x, position.y + y, position.z + z);
     }
     const hand = this.props.get("left")?.object.visible ? this.props.get("left") : this.props.get("right");
@@ -70,6 +83,9 @@ export class Props {
   dispose(): void {
     this.urgent.dispose();
     this.status.dispose();
+    this.stopLabel.dispose();
+    this.stop.geometry.dispose();
+    this.stop.material.dispose();
     this.rig.removeFromParent();
     for (const { controller, hand, ray } of this.props.values()) {
       for (const { geometry } of [controller, hand, ray]) geometry.dispose();
@@ -106,6 +122,12 @@ export class Props {
     this.props.set(side, prop);
     return prop;
   }
+}
+
+/** Place an object at a point of the wire's axes. */
+export function moveTo(object: Object3D, at: Vec3): void {
+  const [x, y, z] = toRow([[...at], [1, 0, 0, 0]]) as [number, number, number];
+  object.position.set(x, y, z);
 }
 
 function layRay(line: Line, { origin, direction }: Ray, hit: number | undefined): void {

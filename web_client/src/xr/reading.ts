@@ -27,6 +27,10 @@ export interface InputReading {
   squeeze: number;
   /** Bits of `Sample.buttons`. */
   buttons: number;
+  /** Tip of the index finger of a bare hand that is tracked, else null. */
+  tip: Vec3 | null;
+  /** Poses of a bare hand's joints, as in `Sample.hand_joints`; none at most frames. */
+  joints: readonly number[];
 }
 
 /** A headset at one frame. */
@@ -37,11 +41,15 @@ export interface FrameReading {
   head: wire.Pose | null;
   headTracked: boolean;
   inputs: InputReading[];
+  /** How many devices have a button of the e-stop pressed. */
+  stops: number;
 }
 
 /** Bits of `Sample.buttons` by their place in the WebXR gamepad mapping `xr-standard`. */
 export const BUTTON = { trigger: 1, squeeze: 2, touchpad: 4, thumbstick: 8, lower: 16, upper: 32, rest: 64, menu: 128 } as const;
 const BUTTON_COUNT = 8;
+/** Buttons of the e-stop: controllers without a thumbstick have a pad. */
+export const STOP_BUTTONS = BUTTON.thumbstick | BUTTON.touchpad;
 
 /** Distances between the tips of thumb and index finger of a closed and of an open pinch [m]. */
 const PINCH_M = [0.015, 0.045] as const;

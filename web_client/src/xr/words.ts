@@ -17,26 +17,59 @@ export interface RobotFacts {
   nameOf: (participant: string) => string;
   isPointedAt: boolean;
   isOwn: boolean;
+  /** One's own request for it has no reply yet. */
+  isRequested: boolean;
 }
 
 /** Return the lines of the panel at a robot: who holds it, why it stands still, what the trigger does. */
-export function describeRobot({ name, lease, holdReason, selfId, isStopped, nameOf, isPointedAt, isOwn }: RobotFacts): string[] {
+export function describeRobot({ name, lease, holdReason, selfId, isStopped, nameOf, isPointedAt, isOwn, isRequested }: RobotFacts): string[] {
   const holder = lease?.holder ?? "";
   const who = isOwn ? "you" : holder === "" ? "free" : nameOf(holder);
   const lines = [`${name}: ${who}`];
   if (isStopped) lines.push("stopped by the e-stop");
   else if (holder !== "" && holdReason !== "") lines.push(...wrap(`holds: ${holdReasonWords(holdReason)}`));
-  if (lease && lease.queue.includes(selfId)) lines.push("you wait for it");
-  if (isPointedAt) lines.push(isOwn ? "hold the trigger to release it" : "press the trigger to take it");
+  const place = lease?.queue.indexOf(selfId) ?? -1;
+  if (lease && place >= 0) lines.push(`you wait for it, place ${place + 1} of ${lease.queue.length}`);
+  if (isRequested && awaitsConsent(lease)) lines.push(`waiting for ${who}'s consent`);
+  else if (isPointedAt) {
+    const verb = awaitsConsent(lease) ? "ask for" : "take";
+    lines.push(isOwn ? "hold the trigger to release it" : `press the trigger to ${verb} it`);
+  }
   return lines;
 }
 
+/** Return whether a request for a robot waits for the consent of its holder. */
+export function awaitsConsent(lease: Lease | undefined): lease is Lease {
+  return lease !== undefined && lease.mode === "request" && lease.holder !== "";
+}
+
+/** Return the lines of the question of a participant who asks for one's robot. `left_ms`: time that is left to answer. */
+export function describeConsent(requester: string, robot: string, left_ms: number): string[] {
+  return [...wrap(`${requester} asks you for ${robot}`), `point at an answer, press the trigger: ${Math.ceil(left_ms / 1000)} s`];
+}
+
+type OwnAlignment = ParticipantInfo["alignment"] | undefined;
+
+/** Kinds of alignments that are good enough to look, not to drive. */
+const VIEW_ONLY = ["fingertip", "persistent"];
+
+/** Return whether an alignment says where the scene is in the room. */
+export function isPlaced(alignment: OwnAlignment): boolean {
+  return alignment != null && ["measured", "placed", ...VIEW_ONLY].includes(alignment.kind);
+}
+
+/** Return whether an alignment is good enough to look, not to drive. */
+export function isViewOnly(alignment: OwnAlignment): boolean {
+  return alignment != null && VIEW_ONLY.includes(alignment.kind);
+}
+
 /** Return the line about one's own alignment. */
-export function describeAlignment(alignment: ParticipantInfo["alignment"] | undefined): string {
-  if (!alignment || alignment.kind === "none" || alignment.kind === "not_needed") return "not aligned";
+export function describeAlignment(alignment: OwnAlignment): string {
+  if (!alignment || !isPlaced(alignment)) return "not aligned";
   if (alignment.kind === "placed") return "placed by a director, error not measured";
   const error = alignment.error_at_robot_m > 0 ? ` ± ${formatMillimetres(alignment.error_at_robot_m)} at the robot` : "";
-  return alignment.offset ? "aligned, with an offset by hand" : `aligned${error}`;
+  if (alignment.offset) return "aligned, with an offset by hand";
+  return `${isViewOnly(alignment) ? "to look, not to drive" : "aligned"}${error}`;
 }
 
 /** What a person has to know before anything else. */
@@ -46,13 +79,17 @@ export interface Urgent {
   connection: string;
   isAligned: boolean;
   isTransparent: boolean;
+  /** One may be placed by one's own word. */
+  canPlace: boolean;
+  /** The session has a sheet with marks to touch. */
+  hasMarks: boolean;
   /** Advice of the session about the alignment. */
   advice: string;
   notice: string;
 }
 
 /** Return the lines before the eyes, none when all is well. */
-export function describeUrgent({ isStopped, connection, isAligned, isTransparent, advice, notice }: Urgent): string[] {
+export function describeUrgent({ isStopped, connection, isAligned, isTransparent, canPlace, hasMarks, advice, notice }: Urgent): string[] {
   const lines: string[] = [];
   if (isStopped) lines.push("STOPPED: all robots hold");
   if (connection !== "") lines.push(...wrap(connection));
@@ -65,6 +102,8 @@ export function describeUrgent({ isStopped, connection, isAligned, isTransparent
           : "The scene is at a place of this headset's own. Robots follow when a director places it.",
       ),
     );
+    if (canPlace) lines.push(...wrap("To stay here: point at no robot, and press the trigger for a moment."));
+    if (hasMarks) lines.push(...wrap("To touch the marks of a sheet, hold a trigger for two seconds, pointing at no robot."));
     if (advice !== "") lines.push(...wrap(advice));
   }
   if (notice !== "") lines.push(...wrap(notice));
@@ -87,6 +126,11 @@ export function findPulse(before: Filled<wire.Feedback> | undefined, now: Filled
   if (isRefused && before !== undefined) return { intensity: 0.8, duration_ms: 150 };
   if (now.limits.some((limit) => !before?.limits.includes(limit))) return { intensity: 0.4, duration_ms: 60 };
   return null;
+}
+
+/** Return how much of something is done, 0 to 1, as a bar. */
+export function drawBar(share: number): string {
+  return "▮".repeat(Math.ceil(10 * Math.min(1, share))).padEnd(10, "▯");
 }
 
 /** Return a text in lines. */

@@ -66,6 +66,25 @@ const commands = {
   },
   type: ({ page, text }) => pages.get(page).keyboard.type(text),
   screenshot: ({ page, path, full = false }) => pages.get(page).screenshot({ path, fullPage: full }).then(() => path),
+  /** Lets nothing run on the page's main thread for a while. Its worker runs on, as that of a tab in the background does. */
+  async stand_still({ page, ms }) {
+    const session = await pages.get(page).context().newCDPSession(pages.get(page));
+    await session.send("Debugger.enable");
+    const paused = new Promise((resolve) => session.once("Debugger.paused", resolve));
+    await session.send("Debugger.pause");
+    await paused;
+    await new Promise((resolve) => setTimeout(resolve, ms));
+    await session.send("Debugger.resume");
+    await session.detach();
+  },
+  /** Bytes of the page's heap on its main thread, after a garbage collection. */
+  async heap({ page }) {
+    const session = await pages.get(page).context().newCDPSession(pages.get(page));
+    await session.send("HeapProfiler.collectGarbage");
+    const { usedSize } = await session.send("Runtime.getHeapUsage");
+    await session.detach();
+    return usedSize;
+  },
   inject: ({ page, path }) => pages.get(page).addScriptTag({ path }).then(() => true),
 };
 

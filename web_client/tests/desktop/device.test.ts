@@ -9,7 +9,7 @@ const STILL = [0, 0, 0, 0, 0, 0];
 /** Looking along +Y of the world: right is +X. */
 const NORTH = [0, 1] as const;
 
-const keys = (...codes: string[]): Intent => readKeys(new Set(codes));
+const keys = (...codes: string[]): Intent => readKeys(new Set(codes), codes.includes("ShiftLeft"));
 const FORWARD = keys("ShiftLeft", "KeyW");
 
 let sent: SampleInput[] = [];
@@ -17,8 +17,12 @@ let device: DesktopDevice;
 let now_ms = 0;
 
 function tick(intent: Intent, situation = HOLDER): SampleInput {
+  return tickAll({ keyboard: intent }, situation);
+}
+
+function tickAll(inputs: Record<string, Intent>, situation = HOLDER): SampleInput {
   now_ms += 17;
-  device.tick(intent, NORTH, 0.1, situation, now_ms);
+  device.tick(new Map(Object.entries(inputs)), NORTH, 0.1, situation, now_ms);
   return sent.at(-1)!;
 }
 
@@ -30,7 +34,7 @@ beforeEach(() => {
 
 describe("a device that is not armed", () => {
   it("sends nothing", () => {
-    device.tick(FORWARD, NORTH, 0.1, HOLDER, 1);
+    tick(FORWARD);
     device.release("blur", 2);
     device.disarm(3);
     expect(sent).toEqual([]);
@@ -95,7 +99,7 @@ describe("an armed device", () => {
 
   it("is disarmed when the lease is lost", () => {
     tick(FORWARD);
-    expect(device.tick(FORWARD, NORTH, 0.1, { ...HOLDER, isHolder: false }, 50)).toBe(false);
+    expect(device.tick(new Map([["keyboard", FORWARD]]), NORTH, 0.1, { ...HOLDER, isHolder: false }, 50)).toBe(false);
     expect(sent.at(-1)).toMatchObject({ clutch: false, twist: STILL });
     expect(device.robot).toBe("");
     const count = sent.length;
@@ -121,10 +125,63 @@ describe("an armed device", () => {
     expect(tick(toggle).gripper).toBe(0);
   });
 
+  it("does not toggle the gripper for a press that began before the dead-man", () => {
+    tick({ ...makeIdle(), toggle: true });
+    expect(tick({ ...FORWARD, toggle: true })).toMatchObject({ clutch: true, gripper: null });
+  });
+
+  it("toggles the gripper of another robot as if it were open", () => {
+    expect(tick({ ...FORWARD, toggle: true }).gripper).toBe(1);
+    device.arm("right", 100);
+    tick(makeIdle());
+    expect(tick({ ...FORWARD, toggle: true })).toMatchObject({ robots: ["right"], gripper: 1 });
+  });
+
   it("ends with an open clutch", () => {
     tick(FORWARD);
     device.disarm(60);
     expect(sent.at(-1)).toMatchObject({ robots: ["left"], clutch: false, capture_ms: 60 });
+  });
+});
+
+describe("the dead-man of a source", () => {
+  const idle = makeIdle();
+  const held: Intent = { ...idle, clutch: true, move: [0, 1, 0] };
+  const unknown: Intent = { ...idle, clutch: null };
+
+  beforeEach(() => device.arm("left", 0));
+
+  it("does not count when it comes back pressed, until it is let go", () => {
+    tickAll({ keyboard: idle, pad: idle });
+    expect(tickAll({ keyboard: idle, pad: held }).clutch).toBe(true);
+    expect(tickAll({ keyboard: idle }).clutch).toBe(false); // unplugged
+    expect(tickAll({ keyboard: idle, pad: held })).toMatchObject({ clutch: false, twist: STILL });
+    expect(device.mustLetGo).toBe(true);
+    tickAll({ keyboard: idle, pad: idle });
+    expect(device.mustLetGo).toBe(false);
+    expect(tickAll({ keyboard: idle, pad: held }).clutch).toBe(true);
+  });
+
+  it("does not count when it was not known in between", () => {
+    tickAll({ mouse: idle });
+    expect(tickAll({ mouse: held }).clutch).toBe(true);
+    expect(tickAll({ mouse: unknown }).clutch).toBe(false);
+    expect(tickAll({ mouse: held }).clutch).toBe(false);
+  });
+
+  it("is not let go by another source", () => {
+    tickAll({ keyboard: idle, pad: held });
+    expect(tickAll({ keyboard: idle, pad: held }).clutch).toBe(false);
+    expect(tickAll({ keyboard: held, pad: held }).clutch).toBe(true);
+    device.release("the window lost the focus", 60);
+    tickAll({ keyboard: idle, pad: held });
+    expect(tickAll({ keyboard: idle, pad: held }).clutch).toBe(false);
+  });
+
+  it("goes on while another one that counts is held", () => {
+    tickAll({ keyboard: idle, pad: idle });
+    tickAll({ keyboard: held, pad: held });
+    expect(tickAll({ keyboard: held }).clutch).toBe(true);
   });
 });
 

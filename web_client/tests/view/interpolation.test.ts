@@ -1,6 +1,6 @@
 import { expect, test } from "vitest";
 
-import { DelayEstimator, FrameBuffer, interpolatePoses } from "../../src/view/interpolation.ts";
+import { DelayEstimator, FrameBuffer, interpolatePoses, interpolateValues } from "../../src/view/interpolation.ts";
 
 const pose = (x: number, q: [number, number, number, number] = [1, 0, 0, 0]): Float32Array =>
   new Float32Array([x, 0, 0, ...q]);
@@ -49,6 +49,14 @@ test("rotations take the short way and stay of unit length", () => {
   expect(out[0]).toBeCloseTo(0.5);
   expect(Math.hypot(...out.subarray(3))).toBeCloseTo(1, 6);
   expect(out[3]!).toBeGreaterThan(0.9); // 45 degrees, not 135
+});
+
+test("values that are written again have not changed", () => {
+  const [a, b, out] = [Float32Array.of(0.1, 2), Float32Array.of(0.3, 2), new Float32Array(2)];
+  expect(interpolateValues(a, b, 0.25, out)).toBe(true);
+  expect(out[0]).toBeCloseTo(0.15);
+  expect(interpolateValues(a, b, 0.25, out)).toBe(false);
+  expect(interpolateValues(a, b, 0.5, out)).toBe(true);
 });
 
 test("the delay covers the age of late frames at once and shrinks slowly", () => {

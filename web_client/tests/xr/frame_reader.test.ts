@@ -1,7 +1,7 @@
 // Frames of an emulated headset (iwer) as readings. Nothing is drawn.
 
 import { XRDevice, metaQuest3 } from "iwer";
-import { beforeAll, expect, test, vi } from "vitest";
+import { beforeAll, describe, expect, test, vi } from "vitest";
 
 import { nowMs } from "../../src/core/api.ts";
 import { FrameReader } from "../../src/xr/frame_reader.ts";
@@ -81,4 +81,50 @@ test("bare hands: a wrist, and a pinch for the trigger", async () => {
   await read();
   const pinched = (await read()).inputs.find(({ side }) => side === "left")!;
   expect(pinched.trigger).toBeGreaterThan(open.trigger);
+  expect(open.tip).not.toBeNull();
+});
+
+test("bare hands: 25 joints in the tracking frame, the wrist first, at most 30 times a second", async () => {
+  quest.primaryInputMode = "hand";
+  await read();
+  const frames: FrameReading[] = [];
+  const begin = performance.now();
+  while (performance.now() - begin < 200) frames.push(await read());
+  const told = frames.flatMap(({ inputs }) => inputs.filter(({ joints }) => joints.length > 0));
+  expect(told.length).toBeGreaterThanOrEqual(4);
+  expect(told.length).toBeLessThanOrEqual(2 * 7);
+  for (const { pose, joints, tip } of told) {
+    expect(joints.length).toBe(25 * 7);
+    expect(joints.slice(0, 7)).toEqual(pose!.flat());
+    expect(joints.slice(9 * 7, 9 * 7 + 3)).toEqual(tip); // index-finger-tip is the tenth
+    for (let i = 0; i < 25; i++) expect(Math.hypot(...joints.slice(7 * i + 3, 7 * i + 7))).toBeCloseTo(1, 4);
+  }
+});
+
+describe("devices that the emulator does not have", () => {
+  const pose = (x: number): XRPose => ({ transform: { position: { x, y: 0, z: 0 }, orientation: { x: 0, y: 0, z: 0, w: 1 } }, emulatedPosition: false }) as unknown as XRPose;
+  const poses = { aim: pose(0.06), grip: pose(0) as XRPose | null };
+  const frame = { getViewerPose: () => pose(0), getPose: (name: keyof typeof poses) => poses[name] } as unknown as XRFrame;
+  const readSources = (...inputSources: object[]): FrameReading => new FrameReader({ inputSources } as unknown as XRSession).read(frame, {} as XRReferenceSpace);
+  const controller = (pressed: readonly number[] = [], handedness = "right"): object => {
+    const buttons = [0, 1, 2, 3].map((i) => ({ value: 0, pressed: pressed.includes(i) }));
+    return { handedness, targetRaySpace: "aim", gripSpace: "grip", gamepad: { buttons } };
+  };
+
+  test("a controller whose grip is lost stays where it was, not tracked: it is nowhere else", () => {
+    const reader = new FrameReader({ inputSources: [controller()] } as unknown as XRSession);
+    const [before] = reader.read(frame, {} as XRReferenceSpace).inputs;
+    poses.grip = null;
+    const [lost] = reader.read(frame, {} as XRReferenceSpace).inputs;
+    poses.grip = pose(0);
+    expect([before!.tracked, lost!.tracked]).toEqual([true, false]);
+    expect(lost!.pose).toEqual(before!.pose);
+    const handheld = { handedness: "right", targetRaySpace: "aim" };
+    expect(readSources(handheld).inputs[0]).toMatchObject({ tracked: true }); // has no grip at all
+  });
+
+  test("buttons of the e-stop count on every device: of no side, and the second one of a hand", () => {
+    expect(readSources(controller(), controller([2], "none"), controller([3])).stops).toBe(2);
+    expect(readSources(controller([0, 1]), { handedness: "left", targetRaySpace: "aim" }).stops).toBe(0);
+  });
 });

@@ -5,6 +5,7 @@ import { describe, expect, test } from "vitest";
 import type { RobotInfo, SceneSpec } from "../../src/core/api.ts";
 import { placeBeforeScene } from "../../src/xr/placement.ts";
 import { findPointed, listChains } from "../../src/xr/pointing.ts";
+import { findAnswer, isBeforeEyes, placeQuestion } from "../../src/xr/question.ts";
 import { packButtons, readGesture, toPose, toRay, toRow, toWorldRay, type Vec3 } from "../../src/xr/reading.ts";
 import { readGolden } from "../golden.ts";
 
@@ -68,6 +69,42 @@ describe("pointing", () => {
   test("along a link, and with bodies that are nowhere", () => {
     expect(point([1, 0.5, 2], [0, 0, -1])?.robot).toBe("left");
     expect(findPointed({ origin: [0, 0, 0], direction: [1, 0, 0] }, chains, () => null)).toBeNull();
+  });
+});
+
+describe("a question", () => {
+  const head: [Vec3, readonly [number, number, number, number]] = [[1, 2, 1.6], [Math.SQRT1_2, 0, 0, Math.SQRT1_2]]; // looks along y
+  const place = placeQuestion(head as never);
+
+  test("it is before the eyes and above the middle of the view, the answers below it, left and right", () => {
+    expect(place.at[0]).toBeCloseTo(1);
+    expect(place.at[1]).toBeGreaterThan(2.6);
+    expect(place.at[2]).toBeGreaterThan(1.75);
+    expect(place.answers.grant[0]).toBeLessThan(0.95); // left of a head that looks along y is -x
+    expect(place.answers.refuse[0]).toBeGreaterThan(1.05);
+    expect(place.answers.grant[2]).toBeLessThan(place.at[2] - 0.05);
+  });
+
+  test("it stays where it is while it is in view", () => {
+    const turned = (angle: number) => [head[0], [Math.cos((Math.PI / 2 + angle) / 2), 0, 0, Math.sin((Math.PI / 2 + angle) / 2)]];
+    expect(isBeforeEyes(turned(0.3) as never, place)).toBe(true);
+    expect(isBeforeEyes(turned(1.2) as never, place)).toBe(false);
+    expect(isBeforeEyes(turned(Math.PI) as never, place)).toBe(false);
+  });
+
+  test("a ray points at one answer, or at none", () => {
+    const origin: Vec3 = [1.2, 2.1, 1.2];
+    const toward = (target: Vec3, sign = 1) => {
+      const offset = target.map((value, i) => sign * (value - origin[i]!));
+      return { origin, direction: offset.map((value) => value / Math.hypot(...offset)) as unknown as Vec3 };
+    };
+    for (const answer of ["grant", "refuse"] as const) {
+      const found = findAnswer(toward(place.answers[answer]), place.answers);
+      expect(found?.answer).toBe(answer);
+      expect(found?.distance).toBeCloseTo(Math.hypot(...place.answers[answer].map((value, i) => value - origin[i]!)));
+      expect(findAnswer(toward(place.answers[answer], -1), place.answers)).toBeNull(); // behind
+    }
+    expect(findAnswer(toward(place.at), place.answers)).toBeNull();
   });
 });
 

@@ -4,9 +4,9 @@ import { describe, expect, test } from "vitest";
 
 import type { Lease, ParticipantInfo } from "../../src/core/api.ts";
 import { describeMissing } from "../../src/xr/controls.ts";
-import { describeAlignment, describeRobot, describeUrgent, findPulse, wrap } from "../../src/xr/words.ts";
+import { describeAlignment, describeConsent, describeRobot, describeUrgent, findPulse, isPlaced, wrap } from "../../src/xr/words.ts";
 
-const facts = { name: "left", lease: undefined, holdReason: "", selfId: "p1", isStopped: false, nameOf: () => "ben", isPointedAt: false, isOwn: false };
+const facts = { name: "left", lease: undefined, holdReason: "", selfId: "p1", isStopped: false, nameOf: () => "ben", isPointedAt: false, isOwn: false, isRequested: false };
 const lease = { target: "left", holder: "p2", queue: [] as string[] } as unknown as Lease;
 
 describe("panels", () => {
@@ -19,20 +19,34 @@ describe("panels", () => {
     expect(describeRobot({ ...own, isStopped: true })[1]).toBe("stopped by the e-stop");
   });
 
+  test("a robot whose holder has to consent, and one that one waits for", () => {
+    const asked = { ...lease, mode: "request" } as Lease;
+    expect(describeRobot({ ...facts, lease: asked, isPointedAt: true })).toEqual(["left: ben", "press the trigger to ask for it"]);
+    expect(describeRobot({ ...facts, lease: asked, isPointedAt: true, isRequested: true })).toEqual(["left: ben", "waiting for ben's consent"]);
+    expect(describeRobot({ ...facts, lease, isRequested: true })).toEqual(["left: ben"]); // a reply comes at once
+    expect(describeRobot({ ...facts, lease: { ...lease, queue: ["p3", "p1"] } })).toEqual(["left: ben", "you wait for it, place 2 of 2"]);
+    expect(describeConsent("ben", "left", 14_200)).toEqual(["ben asks you for left", "point at an answer, press the trigger: 15 s"]);
+  });
+
   test("one's own alignment, with its stated error", () => {
     const alignment = { kind: "measured", error_at_robot_m: 0.0042, offset: false } as NonNullable<ParticipantInfo["alignment"]>;
     expect(describeAlignment(alignment)).toBe("aligned ± 4.2 mm at the robot");
     expect(describeAlignment({ ...alignment, offset: true })).toBe("aligned, with an offset by hand");
     expect(describeAlignment({ ...alignment, kind: "placed" })).toMatch(/director/);
+    expect(describeAlignment({ ...alignment, kind: "fingertip" })).toBe("to look, not to drive ± 4.2 mm at the robot");
+    expect(isPlaced({ ...alignment, kind: "persistent" })).toBe(true);
+    expect(isPlaced({ ...alignment, kind: "none" })).toBe(false);
     expect(describeAlignment({ ...alignment, kind: "not_needed" })).toBe("not aligned");
     expect(describeAlignment(null)).toBe("not aligned");
   });
 
   test("before the eyes: nothing while all is well, else what matters most first", () => {
-    const well = { isStopped: false, connection: "", isAligned: true, isTransparent: true, advice: "", notice: "" };
+    const well = { isStopped: false, connection: "", isAligned: true, isTransparent: true, canPlace: false, hasMarks: false, advice: "", notice: "" };
     expect(describeUrgent(well)).toEqual([]);
     expect(describeUrgent({ ...well, isAligned: false }).join(" ")).toMatch(/not aligned The scene appears when/);
+    expect(describeUrgent({ ...well, isAligned: false, hasMarks: true }).join(" ")).toMatch(/hold a trigger for two seconds/);
     expect(describeUrgent({ ...well, isAligned: false, isTransparent: false }).join(" ")).toMatch(/a place of this headset's own/);
+    expect(describeUrgent({ ...well, isAligned: false, isTransparent: false, canPlace: true }).join(" ")).toMatch(/To stay here: point at no robot/);
     expect(describeUrgent({ ...well, isStopped: true, connection: "lost", isAligned: false })).toEqual(["STOPPED: all robots hold", "lost"]);
   });
 

@@ -1,0 +1,148 @@
+// An immersive session whose headset, picture and session are those of the test: what is asked of the session, and when.
+
+import { Group } from "three";
+import { afterEach, beforeEach, expect, test, vi } from "vitest";
+
+import type { ToWorker } from "../../src/core/api.ts";
+import type { WorkerClient } from "../../src/core/page_client.ts";
+import type { Actions } from "../../src/ui/actions.ts";
+import { DESKTOP, PageState } from "../../src/ui/state.ts";
+import type { View } from "../../src/view/view.ts";
+import type { Hands } from "../../src/xr/hands.ts";
+import { Headset } from "../../src/xr/headset.ts";
+import { STOP_BUTTONS } from "../../src/xr/reading.ts";
+
+const POSE = { transform: { position: { x: 0, y: 1, z: 0 }, orientation: { x: 0, y: 0, z: 0, w: 1 } }, emulatedPosition: false };
+const LEASE = { target: "arm", kind: "robot", holder: "p1", sub_holders: [], mode: "exclusive", queue: [], lease_version: 1 };
+
+/** A WebXR session with one controller. */
+class Session extends EventTarget {
+  visibilityState = "visible";
+  buttons = [0, 1, 2, 3].map(() => ({ value: 0, pressed: false }));
+  inputSources = [{ handedness: "right", targetRaySpace: "aim", gripSpace: "grip", gamepad: { buttons: this.buttons } }];
+
+  show(state: string): void {
+    this.visibilityState = state;
+    this.dispatchEvent(new Event("visibilitychange"));
+  }
+}
+
+let session: Session;
+let state: PageState;
+let posted: ToWorker[];
+let requests: { type: string }[];
+let stops: number;
+let isGranted: boolean;
+let headset: Headset;
+afterEach(() => void vi.useRealTimers());
+beforeEach(() => {
+  vi.useFakeTimers({ toFake: ["performance"] });
+  vi.stubGlobal("document", { createElement: () => ({ getContext: () => null }) });
+  [session, posted, requests, stops, isGranted] = [new Session(), [], [], 0, true];
+  const client = { on: () => () => undefined, post: (message: ToWorker) => posted.push(message) } as unknown as WorkerClient;
+  state = new PageState(client);
+  state.phase = { ...state.phase, phase: "ready" };
+  state.spec = { environment: { center: [0, 0, 0], extent: 1 }, bodies: [] } as unknown as PageState["spec"];
+  setSession({ role: "director" });
+  const actions = {
+    request: async (message: { type: string }) => {
+      requests.push(message);
+      return isGranted;
+    },
+    estop: () => (stops += 1),
+  } as unknown as Actions;
+  const view = { viewpoint: { axes: { forward: [1, 0, 0] } }, scene: { bodies: new Map([[1, new Group()]]) } } as unknown as View;
+  headset = new Headset(session as unknown as XRSession, "immersive-vr", view, state, client, actions);
+});
+
+function setSession(self: object, robots: readonly string[] = [], holder = "p1"): void {
+  const participant = { id: "p1", name: "ann", role: "director", devices: ["head"], alignment: null, ...self };
+  const leases = robots.map((target) => ({ ...LEASE, target, holder }));
+  const listed = robots.map((name) => ({ name, site_body: 1, base_body: 1 }));
+  state.session = { participant_id: "p1", participants: [participant], leases, robots: listed, anchors: [], estop: false } as unknown as PageState["session"];
+}
+
+const frame = { getViewerPose: () => POSE, getPose: () => POSE } as unknown as XRFrame;
+
+/** After 100 ms, show a frame with buttons of the controller, and return its sample. */
+function show(trigger = 0, squeeze = 0): { clutch?: boolean; tracked?: boolean } {
+  vi.advanceTimersByTime(100);
+  session.buttons[0]!.value = trigger;
+  session.buttons[1]!.value = squeeze;
+  headset.onFrame(frame, {} as XRReferenceSpace);
+  return lastSample();
+}
+
+function lastSample(): { clutch?: boolean; tracked?: boolean } {
+  const last = posted.findLast((message) => message.type === "samples");
+  return last!.samples.find(({ device }) => device === "controller/right")!;
+}
+
+test("a page that joins again while it is a headset says so, and one that has left it says that it has a screen", () => {
+  expect(state.entry.devices).toContain("head");
+  expect(posted.at(-1)).toEqual({ type: "rejoin", ...state.entry });
+  headset.dispose();
+  expect(state.entry).toEqual(DESKTOP);
+});
+
+test("a squeeze that is held while a menu comes and goes, without a frame meanwhile, counts from its next press", () => {
+  setSession({}, ["arm"]);
+  const clutch = (squeeze: number): boolean | undefined => show(0, squeeze).clutch;
+  expect([0, 1, 1].map(clutch)).toEqual([false, false, true]);
+  session.show("hidden");
+  expect(lastSample()).toMatchObject({ clutch: false, tracked: false });
+  session.show("visible");
+  expect([1, 1, 0, 1].map(clutch)).toEqual([false, false, false, true]);
+});
+
+test("a director in VR is placed when it asks for that, as often as it is not aligned, and an operator is not", () => {
+  const tap = (): void => {
+    for (const trigger of [0, 1, 0]) show(trigger);
+  };
+  show();
+  expect(headset.showsScene).toBe(true);
+  expect(requests).toEqual([]);
+  tap();
+  expect(requests).toMatchObject([{ type: "place_alignment", participant: "p1" }]);
+  setSession({ alignment: { kind: "placed", T_world_tracking: [[0, 0, 0], [1, 0, 0, 0]] } });
+  tap();
+  expect(requests.length).toBe(1);
+  setSession({ alignment: null }); // the headset has recentred
+  show();
+  expect(requests.length).toBe(1);
+  tap();
+  expect(requests.length).toBe(2);
+  setSession({ role: "operator" });
+  tap();
+  expect(requests.length).toBe(2);
+});
+
+test("a button of the e-stop stops, whatever the controller's pose is", () => {
+  show();
+  session.buttons.forEach((button, i) => (button.pressed = ((STOP_BUTTONS >> i) & 1) === 1));
+  headset.onFrame({ ...frame, getPose: () => null } as unknown as XRFrame, {} as XRReferenceSpace);
+  expect(stops).toBe(1);
+});
+
+test("a robot that was denied does not come to the hand when it is assigned later", async () => {
+  const { hands } = headset as unknown as { hands: Hands };
+  const press = async (): Promise<void> => {
+    show();
+    setSession({}, ["arm"], "p2");
+    show();
+    show(1);
+    await Promise.resolve(); // the reply
+    show();
+  };
+  isGranted = false;
+  await press();
+  expect(requests).toMatchObject([{ type: "acquire", robots: ["arm"] }]);
+  setSession({}, ["arm"]);
+  show();
+  expect(hands.driven.size).toBe(0);
+  isGranted = true;
+  await press();
+  setSession({}, ["arm"]);
+  show();
+  expect(hands.driven.get("right")).toBe("arm");
+});
