@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import hashlib
 import math
 import selectors
 import sys
@@ -58,6 +59,11 @@ class Job(msgspec.Struct, frozen=True):
     public: str = ""
     secret: str = ""
     page: str = ""
+
+
+def make_web_secret(secret: str, name: str) -> bytes:
+    """Return the secret of a browser at an encrypted session, made from the secret of its job."""
+    return hashlib.sha256(f"{secret} {name}".encode()).digest()
 
 
 class BenchClient:

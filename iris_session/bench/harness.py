@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import hashlib
 import os
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -22,7 +23,7 @@ import psutil
 from numpy.typing import NDArray
 
 from iris_session.authority.config import UNALIGNED, AuthorityConfig
-from iris_session.bench.clients import ClientJob, Job
+from iris_session.bench.clients import ClientJob, Job, make_web_secret
 from iris_session.bench.report import BenchError
 from iris_session.netsim.process import ImpairmentProcess, make_link_address
 from iris_session.physics import PacerStats
@@ -30,6 +31,7 @@ from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.names import Role
 from iris_session.protocol.server_messages import StateHeader
+from iris_session.security import WEB, KeyHome, KeyPair, encode_key
 from iris_session.session.config import SessionConfig
 from iris_session.session.session import Session
 from iris_session.system.process import PIPE, ChildProcess
@@ -41,6 +43,7 @@ WARM_UP_S: Final = 3.0
 EXIT_S: Final = 60.0
 CLIENTS: Final = "iris_session.bench.clients"
 BROWSERS: Final = "iris_session.bench.web_clients"
+TABS: Final = "iris_session.bench.web_tab"
 Log = dict[str, NDArray[Any]]
 
 
@@ -132,6 +135,10 @@ class ClientProcess:
         """Send a signal to the process, for example to stop or continue it."""
         self._process.send_signal(number)
 
+    def send_line(self, text: str) -> None:
+        """Write a line to the process's standard input."""
+        self._process.write(f"{text}\n".encode())
+
     def kill(self) -> None:
         self._process.close()
 
@@ -156,6 +163,7 @@ def measure(
     seconds: float,
     *,
     browsers: Sequence[Group] = (),
+    tabs: Sequence[Group] = (),
     links: Mapping[str, str] = MappingProxyType({}),
     seed: int = 0,
     actions: Sequence[Action] = (),
@@ -173,7 +181,8 @@ def measure(
         model: Model of the session.
         groups: Clients by process.
         seconds: Length of the measured window.
-        browsers: Browsers at the session's page by process, on plain loopback.
+        browsers: Browsers at the session's page by process, without a picture.
+        tabs: The same in a real Chromium.
         links: Link profile by address.
         seed: Random seed of the links.
         actions: Functions to call during the window, in order of their times.
@@ -187,7 +196,8 @@ def measure(
     """
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iris-bench-")))
-        keys = _create_keys(folder) if curve else None
+        people = [spec.name for group in browsers for spec in group]
+        keys = stack.enter_context(_open_key_home(folder / "keys", people)) if curve else None
         config = SessionConfig(
             name="bench",
             control_port=0,
@@ -196,8 +206,7 @@ def measure(
             assets=assets,
             # The tracking frames of the emulated operators are the world.
             authority=AuthorityConfig(unaligned=(*UNALIGNED, Role.OPERATOR)),
-            curve_key="" if keys is None else keys["server_file"],
-            curve_clients="" if keys is None else str(folder / "clients"),
+            curve=curve,
         )
         session = stack.enter_context(Session(model, config=config))
         proxy = None
@@ -206,10 +215,11 @@ def measure(
             proxy = stack.enter_context(ImpairmentProcess(links, ports.for_clients, target=ports.host, seed=seed))
         arena = BenchRun(session, [], {}, proxy)
         page = "" if session.processes.web is None else session.processes.web.address
-        if browsers and not page:
+        if (browsers or tabs) and not page:
             raise BenchError("the session has no page for browsers")
         kinds = [(module, make_job, group) for group in groups]
         kinds += [(BROWSERS, functools.partial(Job, page=page), group) for group in browsers]
+        kinds += [(TABS, functools.partial(Job, page=page + _make_code(session)), group) for group in tabs]
         for i, (kind, make, group) in enumerate(kinds):
             job = make(
                 session.address,
@@ -217,7 +227,7 @@ def measure(
                 str(folder / f"log{i}.npz"),
                 group,
                 keep_poses,
-                **({} if keys is None else {k: keys[k] for k in ("server_public", "public", "secret")}),
+                **({} if keys is None else keys),
             )
             process = ClientProcess(job, kind)
             stack.callback(process.kill)
@@ -374,21 +384,35 @@ def _store_receipts(received: dict[tuple[int, str], list[tuple[int, int]]], entr
             received.setdefault(key, []).append((entry.message.seq, entry.receive_ns))
 
 
-def _create_keys(folder: Path) -> dict[str, str]:
-    """Create a server and a client certificate in `folder`, as in an installation."""
-    import zmq.auth
+@contextlib.contextmanager
+def _open_key_home(folder: Path, people: Sequence[str]) -> Iterator[dict[str, str]]:
+    """Use a key home in `folder`, which admits one key for all clients, and browsers by their names.
 
-    (folder / "clients").mkdir()
-    _, server_secret = zmq.auth.create_certificates(folder, "server")
-    client_public, client_secret = zmq.auth.create_certificates(folder, "client")
-    Path(client_public).rename(folder / "clients" / "client.key")
-    os.chmod(server_secret, 0o600)
-    server_public, _ = zmq.auth.load_certificate(server_secret)
-    public, secret = zmq.auth.load_certificate(client_secret)
-    assert secret is not None
-    return {
-        "server_file": server_secret,
-        "server_public": server_public.decode(),
-        "public": public.decode(),
-        "secret": secret.decode(),
-    }
+    Yields:
+        The keys of a job.
+    """
+    home, pair = KeyHome(folder), KeyPair.generate()
+    server = home.load_server_key()
+    home.clients.allow_key("clients", pair.public)
+    for name in people:
+        identity = hashlib.sha256(make_web_secret(pair.secret, name)).digest()
+        home.clients.allow_key(name, encode_key(identity), kind=WEB)
+    before = os.environ.get("IRIS_HOME")
+    os.environ["IRIS_HOME"] = str(folder)  # of the session and its processes
+    try:
+        yield {"server_public": server.public, "public": pair.public, "secret": pair.secret}
+    finally:
+        if before is None:
+            del os.environ["IRIS_HOME"]
+        else:
+            os.environ["IRIS_HOME"] = before
+
+
+def _make_code(session: Session) -> str:
+    """Return what follows the address of the page so that a browser pairs; empty without encryption."""
+    page = session.processes.web
+    if page is None or page.certificate is None:
+        return ""
+    home = KeyHome()
+    code, _ = home.join_codes.create(home.load_server_key(), name="tab", web_key=page.certificate.spki_hash)
+    return f"#c={code}"

