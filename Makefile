@@ -96,7 +96,8 @@ test-unit: install-dev
 # Emulated people need their share of the cores in time, or they drop what they hold: not beside all the others.
 DEMOS := tests/e2e/test_demo_scenes.py tests/e2e/test_demo_handover.py
 # A browser that draws in software takes both cores: its tests run after those with real time.
-BROWSER := tests/e2e/test_web.py tests/e2e/test_web_xr.py tests/e2e/test_web_desktop.py
+BROWSER := tests/e2e/test_web.py tests/e2e/test_web_xr.py tests/e2e/test_web_marks.py tests/e2e/test_web_desktop.py \
+  tests/bench/test_web.py
 test-e2e: install-dev $(PAGE)
 ifeq ($(T),tests)
 	$(E2E) --dist load $(DEMOS)
@@ -119,7 +120,7 @@ coverage: install-dev
 
 # Every benchmark runs, whatever the one before says; the status is that of the worst.
 bench: install
-	@status=0; for bench in "state" "state --curve" "input" "slow-client" "alignment" "join" "deformable" "stop" "web"; do \
+	@status=0; for bench in "state" "state --curve" "input" "slow-client" "alignment" "join" "deformable" "stop" "web --curve"; do \
 	  $(BIN)/iris-session bench $$bench --check || status=1; \
 	done; exit $$status
 

@@ -15,6 +15,7 @@ from iris_session.emulator.runner import DisturbanceReader
 from iris_session.netsim.process import ImpairmentProcess
 from iris_session.protocol.server_messages import Event, MarkerAdded
 from iris_session.recording import RecorderProcess
+from tests.loopback import make_loopback_address
 
 ROOT = Path(__file__).parents[1]
 BEYOND = 1024
@@ -71,7 +72,7 @@ def test_processes_are_read(tmp_path: Path) -> None:
     recorder.start()
     assert recorder.alive
     assert recorder.close()
-    with ImpairmentProcess({"127.0.0.2": "none"}, []) as proxy:
+    with ImpairmentProcess({make_loopback_address(): "none"}, []) as proxy:
         assert proxy.execute("stats")["ok"]
     with (tmp_path / "shown").open("w+") as out:
         with TerminalView(_Session(), out, "title").open() as update:  # type: ignore[arg-type]

@@ -176,7 +176,7 @@ def run_demo(
                 return False
             next_read_ns = now_ns + READ_PERIOD_NS
             is_over = (people.is_finished() and judge.is_settled()) or judge.is_reached_for(LEAVE_S)
-            failures = people.list_failures() or (judge.list_problems() if is_over else [])
+            failures = judge.list_failures(people.list_failures(), is_over)
             left_s = timeout_s - (now_ns - began_ns) * 1e-9
             if failures and len(failed_takes) < MAX_TAKES - 1 and left_s > TAKE_S:
                 failed_takes.append(f"begun again at {now_ns * 1e-9:.0f} s: {'; '.join(failures)}")
@@ -201,7 +201,7 @@ def run_demo(
     problems = judge.list_problems()
     if interrupted:
         problems = ["interrupted before its end"]
-    elif problems or not demo.goals:  # goals that are reached decide, whatever operators still meant to do
+    elif problems or not demo.goals:
         problems = _list_problems(demo, reports, handovers, timeout_s) + problems
     if verified is False:
         problems.append(verification)
@@ -267,7 +267,13 @@ class _GoalTracker:
         """Return True if there are goals, and all were reached at least so long ago."""
         reached = [watch.at_s for watch in self._monitors if watch.at_s is not None]
         now_s = self._session.stepper.core.world.view().sim_time
-        return 0 < len(reached) == len(self._monitors) and now_s - max(reached) > seconds
+        return 0 < len(reached) == len(self._monitors) and now_s - max(reached) >= seconds
+
+    def list_failures(self, of_operators: list[str], is_over: bool) -> list[str]:
+        """Return why the take has failed: none once the goals are reached, whatever operators still meant to do."""
+        if self.is_reached_for(0.0):
+            return []
+        return of_operators or (self.list_problems() if is_over else [])
 
     def is_settled(self) -> bool:
         """Return True, once all tasks are done, when the goals are reached or evidently will not be."""

@@ -135,6 +135,8 @@ def open_web_page(config: SessionConfig, name: str) -> WebPage:
         return WebPage(config, name)
     if not has_packages():
         return WebPage(config, name, note="no page for browsers: pip install 'iris-session[web]'")
+    if config.curve_clients and needs_encryption(config):  # such a folder holds no identities of browsers
+        return WebPage(config, name, note="no page for browsers: --curve-clients admits certificates only")
     port = config.web_port
     if port is None:
         port = config.state_port + WEB_FROM_STATE if config.state_port else 0

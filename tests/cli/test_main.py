@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from iris_session.authority.config import UNALIGNED
 from iris_session.cli.main import build_parser, main
 from iris_session.cli.serve import make_session_config
 
@@ -173,6 +174,14 @@ def test_assigned_robots_reach_the_configuration() -> None:
     assert config.authority.assignments == {"ann": ("left", "right"), "bob": ("right", "third")}
     plain = make_session_config(build_parser().parse_args(["serve", "scene.xml"]), "scene")
     assert (plain.authority.policy, plain.authority.assignments) == ("join-order", {})
+
+
+def test_whoever_may_be_unaligned_reaches_the_configuration() -> None:
+    options = ["--unaligned", "operator", "--unaligned", "key:abc"]
+    config = make_session_config(build_parser().parse_args(["serve", "scene.xml", *options]), "scene")
+    assert config.authority.unaligned == (*UNALIGNED, "operator", "key:abc")
+    plain = make_session_config(build_parser().parse_args(["serve", "scene.xml"]), "scene")
+    assert plain.authority.unaligned == UNALIGNED
 
 
 def test_sites_and_tendons_are_optional() -> None:

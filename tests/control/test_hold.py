@@ -75,12 +75,12 @@ def test_a_commanded_joint_does_not_wind_up_against_an_obstacle(kind: str) -> No
     assert rig.controller.get_status()[0].limits[-1] == "tracking"
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_activation_of_a_blocked_integrator_does_not_wind_up_either(kind: str) -> None:
-    rig = wall(kind)
-    first = press(rig)
+def test_the_activation_of_a_blocked_integrator_does_not_wind_up_either() -> None:
+    """The force limit hides it: an activation that leads by radians pushes no harder, but comes back later."""
+    rig = wall("integrated_velocity")
+    press(rig)
     drive(rig, 0.6, 1000, begin=0.6)
-    assert np.abs(measure_push(rig.data)).max() <= first * 1.05
+    assert np.abs(rig.data.act - rig.data.qpos[:3]).max() <= 0.15 + 0.08
 
 
 @pytest.mark.parametrize("reason", REASONS)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import pytest
 
 from anchors.pose import PoseTuple
 from iris_session.client import Client
+from iris_session.protocol.names import HoldReason, RejectReason
 from iris_session.protocol.server_messages import Event, ParticipantJoined
 from tests.e2e.session_process import DEADLINE_S, SessionProcess, read_output_tails
 
@@ -186,4 +188,22 @@ def is_driven(client: Client, robot: str, participant: str | None = None) -> boo
         and participant in (None, a.participant)
         and state.header.session_time - a.step_ns < 100_000_000
         for a in state.header.applied
+    )
+
+
+def assert_only_late(before: Mapping[str, Any], now: Mapping[str, Any], reasons: Iterable[str]) -> None:
+    """Assert that a robot held for nothing but what a busy machine does now and then: samples that came too late, and a
+    session that stood still.
+
+    Args:
+        before: Counts of the participant's rejected samples (`Feedback.rejected`) when it engaged.
+        now: The same counts now.
+        reasons: Why the robot held (`HoldReason`).
+    """
+    rejected = {reason for reason, count in now.items() if count > before.get(reason, 0)}
+    is_late = set(reasons) <= {HoldReason.STALE, HoldReason.REJECTED, HoldReason.GAP} and rejected <= {
+        RejectReason.STALE
+    }
+    assert is_late, (
+        f"held: {sorted(set(reasons))}, rejected samples: {sorted(rejected)}; only late samples and a gap are excused"
     )

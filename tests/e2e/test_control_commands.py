@@ -20,6 +20,7 @@ import pytest
 from iris_session import AuthorityConfig, Session, SessionConfig
 from iris_session.client import Client
 from iris_session.demo.scenes import scene_path
+from iris_session.protocol.server_messages import Event, MarkerAdded
 from tests.e2e.session_process import DEADLINE_S, SessionProcess, make_serve_command, run_in_process, wait_until
 from tests.loopback import make_loopback_address
 
@@ -76,13 +77,23 @@ def test_robots_are_assigned_and_released(shared_session: SessionProcess, ann: C
     run_control(shared_session, "release", "left", "right")
     assert ann.wait_for(lambda c: not c.mirror.leases["left"].holder, DEADLINE_S)
     assert run_control(shared_session, "mode", "takeover", "left")["robots"] == ["left"]
+    assert ann.wait_for(lambda c: c.mirror.leases["left"].mode == "takeover", DEADLINE_S)
     run_control(shared_session, "mode", "exclusive")
+    assert ann.wait_for(lambda c: c.mirror.leases["left"].mode == "exclusive", DEADLINE_S)
 
 
-def test_episodes_and_markers_are_recorded(shared_session: SessionProcess) -> None:
+def test_episodes_and_markers_are_recorded(shared_session: SessionProcess, ann: Client) -> None:
+    notes: list[str] = []
+
+    def note_marker(event: Event) -> None:
+        if isinstance(event.body, MarkerAdded):
+            notes.append(event.body.text)
+
+    ann.on_event = note_marker
     assert run_control(shared_session, "episode", "start", "--label", "pour")["state"] == "running"
     assert run_control(shared_session, "episode", "success")["state"] == "success"
     run_control(shared_session, "marker", "gripper was cleaned")
+    assert ann.wait_for(lambda _: "gripper was cleaned" in notes, DEADLINE_S)
     denied = run_control(shared_session, "episode", "success", status=1)
     assert (denied["ok"], denied["reason"]) == (False, "episode_state")
 

@@ -25,7 +25,7 @@ from tests.e2e.session_process import (
     wait_until,
 )
 
-pytestmark = pytest.mark.e2e
+pytestmark = [pytest.mark.e2e, pytest.mark.timeout(DEMO_S + 60.0)]
 
 
 #: Processes of a demo: front, recorder, display and two emulated headsets.

@@ -17,10 +17,11 @@ from iris_session.client import Client
 from iris_session.netsim.process import ImpairmentProcess
 from iris_session.protocol.server_messages import EngagementChanged, SamplesRejected
 from tests.e2e.scenario import Hand, Scenario
+from tests.loopback import make_loopback_address
 
 pytestmark = pytest.mark.e2e
 
-LINK = "127.0.0.2"
+LINK = make_loopback_address()  # of no other test
 MS = 1_000_000
 
 

@@ -23,7 +23,7 @@ from tests.loopback import make_loopback_address
 pytestmark = pytest.mark.e2e
 
 
-LINK = "127.0.0.2"
+LINK = make_loopback_address()  # of no other test
 MIB = 1 << 20
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import functools
 import http.server
 import json
+import os
 import re
 import subprocess
 import threading
@@ -12,18 +14,22 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import mujoco
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from iris_session.bench.chromium import BUILT_PAGE, WEB_CLIENT
 from iris_session.demo.named_scenes import scene_by_name
-from tests.e2e.browser import BUILT_PAGE, WEB_CLIENT, Browser, Page, join_as, printed_address
+from iris_session.protocol.client_messages import Acquire
+from iris_session.protocol.server_messages import Reply
+from tests.e2e.browser import Browser, Page, join_as, printed_address
 from tests.e2e.scenario import Scenario
-from tests.e2e.session_process import COMMAND, END_WITH_PARENT, SessionProcess
+from tests.e2e.session_process import COMMAND, DEADLINE_S, END_WITH_PARENT, SessionProcess
 from tests.scene.pictures import ModelRenderer, graphics, silhouette_iou
+from tests.web.browser import WebBrowser, open_http
 
 pytestmark = pytest.mark.e2e
 
@@ -96,6 +102,8 @@ def test_the_page_draws_what_mujoco_draws(
     page = open_page(serve(scene), "viewer")
     with graphics():
         reference = Reference(scene_by_name(scene).model)
+        arrived = "[...irisSession.view.shown.vertices.values()].filter((one) => one.length > 0).length"
+        page.wait(f"{arrived} === {reference.model.nflex}")
         for azimuth, elevation in ((145.0, -28.0), (30.0, -20.0), (260.0, -50.0)):
             camera = reference.look_from(azimuth, elevation, distances)
             page.evaluate(f"irisSession.view.viewpoint.setFree({json.dumps(camera)})")
@@ -108,6 +116,25 @@ def test_the_page_draws_what_mujoco_draws(
             colours = page.read_picture(WIDTH, HEIGHT, silhouette=False)["image"]
             difference = np.abs(colours.astype(int) - picture)[mask & silhouette]
             assert difference.mean() <= MAX_COLOUR_DIFFERENCE
+    assert page.errors == []
+
+
+def test_a_cloth_that_is_folded_moves_in_the_page(
+    serve: Callable[..., SessionProcess], open_page: Callable[..., Page], emulate: Callable[..., object]
+) -> None:
+    """By itself it lies still on its table, also after a reset; two operators lift its edge."""
+    server = serve("cloth")
+    page = open_page(server, "viewer")
+    page.wait("irisSession.view.shown.vertices.size > 0")
+    highest = (
+        "Math.max(...irisSession.view.scene.deformables[0].object.geometry.attributes.position.array"
+        ".filter((_, i) => i % 3 === 2))"
+    )
+    assert page.evaluate(highest) < 0.02
+    emulate(server.address, *(f"name={side},behaviour=folder,object=cloth,robot={side}" for side in ("left", "right")))
+    page.wait(f"{highest} > 0.05", 2 * DEADLINE_S)
+    drawn = page.evaluate("[...irisSession.view.shown.vertices.values()][0].filter((_, i) => i % 3 === 2)")
+    assert max(drawn if isinstance(drawn, list) else drawn.values()) > 0.03
     assert page.errors == []
 
 
@@ -324,6 +351,79 @@ def test_a_reload_resumes_with_the_lease(scenario: Scenario, open_page: Callable
     page.wait_until_ready()
     assert page.evaluate("[irisSession.state.self.name, irisSession.state.role]") == ["dan", "operator"]
     page.wait("document.querySelector('[data-robot=left] .holder').textContent === 'you'")
+
+
+#: A tab in the background is tested for so long [s]: a minute with IRIS_BACKGROUND_S=60.
+BACKGROUND_S: Final = float(os.environ.get("IRIS_BACKGROUND_S", "6"))
+
+
+def test_a_tab_in_the_background_keeps_its_robot(scenario: Scenario, open_page: Callable[..., Page]) -> None:
+    """Browsers run timers and frames of such a tab rarely or not at all. Its worker keeps the connection."""
+    page = open_page(scenario.server, "background")
+    join_as(page, "dan", "operator")
+    page.click("button", "Take: left")
+    page.wait("document.querySelector('[data-robot=left] .holder').textContent === 'you'")
+    drawn = page.evaluate("irisSession.view.drawn")
+    watcher = scenario.join("watcher")
+    scenario.run_for(0.5)
+    known = len(scenario.events["watcher"])
+    dan = page.evaluate("irisSession.state.self.id")
+    with ThreadPoolExecutor(1) as thread:
+        still = thread.submit(page.stand_still, BACKGROUND_S)
+        scenario.run_until(still.done, "the tab is in front again", BACKGROUND_S + DEADLINE_S)
+        still.result()
+    assert [type(event.body).__name__ for event in scenario.events["watcher"][known:]] == []
+    assert watcher.mirror.leases["left"].holder == dan
+    page.wait(f"irisSession.view.drawn > {drawn} && irisSession.state.phase.phase === 'ready'")
+    assert page.evaluate("irisSession.state.self.id") == dan
+    assert page.errors == []
+
+
+READY_WITH_ARM: Final = (
+    "irisSession.state.phase.phase === 'ready' && irisSession.state.session?.synced"
+    " && document.querySelector('[data-robot=arm8] .holder').textContent === 'you'"
+)
+
+
+async def list_holders(browser: WebBrowser) -> dict[str, str]:
+    """Return the participants that hold robots, by robot."""
+    return {lease.target: lease.holder for lease in (await browser.snapshot()).leases if lease.holder}
+
+
+def test_all_come_back_with_their_robots(serve: Callable[..., SessionProcess], open_page: Callable[..., Page]) -> None:
+    """A tab and seven browsers without a picture hold a robot each; the gateway is killed, and then the front."""
+    server = serve("arms")
+    page = open_page(server, "dan", width=840, height=480)
+    join_as(page, "dan", "operator")
+    page.click("button", "Take: arm8")
+    page.wait("document.querySelector('[data-robot=arm8] .holder').textContent === 'you'")
+
+    async def work() -> None:
+        async with open_http() as http:
+            tabs = [await WebBrowser(http, printed_address(server), f"tab{i}").join("operator") for i in range(1, 8)]
+            for i, tab in enumerate(tabs, 1):
+                await tab.send(Acquire(1, (f"arm{i}",)))
+                assert (await tab.wait_for(Reply)).denial is None
+            before = await list_holders(tabs[0])
+            assert len(before) == 8
+            for name in ("web.gateway", "front.main"):
+                begin = time.monotonic()
+                server.children()[name].kill()
+                for tab in tabs:
+                    await tab.wait(lambda tab=tab: tab.socket.closed, f"{name} is noticed")
+                assert all(
+                    welcome.resumed for welcome in await asyncio.gather(*(t.come_back("operator") for t in tabs))
+                )
+                seven_s = time.monotonic() - begin
+                await asyncio.to_thread(page.wait, READY_WITH_ARM)
+                print(
+                    f"{name} killed: seven browsers back after {seven_s:.2f} s, the tab {time.monotonic() - begin:.2f}"
+                )
+                assert await list_holders(tabs[0]) == before
+            for tab in tabs:
+                await tab.close()
+
+    asyncio.run(asyncio.wait_for(work(), 3 * DEADLINE_S))
 
 
 def test_the_end_of_the_session_is_shown(own_scenario: Scenario, browser: Browser) -> None:

@@ -24,7 +24,7 @@ from iris_session.client import Client
 from iris_session.protocol import pairing
 from iris_session.protocol.client_messages import Acquire, Bye, EStop, GetSnapshot, Hello, Pair
 from iris_session.protocol.scene import decode_scene
-from iris_session.protocol.server_messages import EStopChanged, Event, Paired, ProtocolFault, Refused, Reply, Welcome
+from iris_session.protocol.server_messages import EStopChanged, Event, Paired, ProtocolFault, Refused, Reply
 from iris_session.protocol.status import GetStatus, StatusReport
 from iris_session.web import wire
 from tests.e2e.session_process import COMMAND, DEADLINE_S, END_WITH_PARENT, SessionProcess, run_command, wait_until
@@ -344,19 +344,6 @@ def test_a_reader_that_never_reads_is_closed(page: str) -> None:
     run(work())
 
 
-async def come_back(browser: WebBrowser, token: bytes, role: str = "observer") -> Welcome:
-    """Join again with a resume token, as often as it takes."""
-    until = time.monotonic() + DEADLINE_S
-    while True:
-        await browser.close()
-        try:
-            await browser.open()
-            return await asyncio.wait_for(browser.say_hello(role, resume_token=token), 10.0)
-        except (aiohttp.ClientError, TimeoutError, AssertionError, ConnectionError):
-            assert time.monotonic() < until, f"{browser.name} does not come back"
-            await asyncio.sleep(0.1)
-
-
 def test_killed_gateway_comes_back_and_leases_stay(serve: Serve) -> None:
     server = serve()
     page = page_of(server)
@@ -366,17 +353,16 @@ def test_killed_gateway_comes_back_and_leases_stay(serve: Serve) -> None:
             ann = await WebBrowser(http, page, "ann").join("operator")
             await ann.send(Acquire(1, ("left",)))
             assert (await ann.wait_for(Reply)).denial is None
-            token, participant = ann.welcome.resume_token, ann.welcome.participant_id  # type: ignore[union-attr]
+            participant = ann.welcome.participant_id  # type: ignore[union-attr]
             for name in ("web.gateway", "front.main"):
                 if name == "front.main":
                     await asyncio.sleep(1.5)
                 server.children()[name].kill()
                 await ann.wait(lambda: ann.socket.closed, f"{name} is noticed")
                 begin = time.monotonic()
-                welcome = await come_back(ann, token, "operator")
+                welcome = await ann.come_back("operator")
                 assert welcome.resumed, name
                 assert welcome.participant_id == participant
-                token = welcome.resume_token
                 snapshot = await ann.snapshot()
                 assert {lease.target: lease.holder for lease in snapshot.leases}["left"] == participant
                 print(f"{name}: back after {time.monotonic() - begin:.2f} s")
@@ -406,9 +392,7 @@ def test_all_browsers_of_a_killed_gateway_resume_and_nothing_leaks(serve: Serve)
             for tab in tabs:
                 await tab.wait(lambda tab=tab: tab.socket.closed, "the end is noticed")
             begin = time.monotonic()
-            again = await asyncio.gather(
-                *(come_back(tab, old.resume_token) for tab, old in zip(tabs, welcomes, strict=True) if old)
-            )
+            again = await asyncio.gather(*(tab.come_back() for tab in tabs))
             took_s = time.monotonic() - begin
             print(f"eight browsers are back after {took_s:.2f} s")
             assert all(welcome.resumed for welcome in again)

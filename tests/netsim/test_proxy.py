@@ -29,10 +29,13 @@ from iris_session.netsim.profiles import (
     load_profile,
     make_latency_profile,
 )
+from tests.loopback import make_loopback_address
 
 SECOND = 1_000_000_000
 MS = 1_000_000
 DEADLINE_S = 20.0
+#: Addresses of links that no other test uses, and of a roaming client.
+LINK, OTHER_LINK, ROAMED = (make_loopback_address() for _ in range(3))
 
 
 # --- conditions ---
@@ -215,9 +218,9 @@ def test_bytes_arrive_complete_in_order_and_not_early(echo: Echo, tmp_path: Path
     profile = _write_profile(tmp_path, delay_ms=15.0, jitter_ms=10.0, stall_every_s=0.2, stall_s=0.03)
     constant = _write_profile(tmp_path, delay_ms=30.0)
     with (
-        ImpairmentProcess({"127.0.0.2": profile, "127.0.0.3": constant}, [echo.port]) as proxy,
-        _connect("127.0.0.2", echo.port) as wild,
-        _connect("127.0.0.3", echo.port) as even,
+        ImpairmentProcess({LINK: profile, OTHER_LINK: constant}, [echo.port]) as proxy,
+        _connect(LINK, echo.port) as wild,
+        _connect(OTHER_LINK, echo.port) as even,
     ):
         payload = b"".join(struct.pack("<I", i) for i in range(100_000))
         sender = threading.Thread(target=wild.sendall, args=(payload,))
@@ -230,8 +233,8 @@ def test_bytes_arrive_complete_in_order_and_not_early(echo: Echo, tmp_path: Path
             assert _receive(even, 4) == b"ping"
             assert time.monotonic() - begin >= 0.060  # both ways
         stats = {link["link"]: link for link in proxy.execute("stats")["links"]}
-        assert stats["127.0.0.2"]["bytes_up"] == stats["127.0.0.2"]["bytes_down"] == len(payload)
-        assert stats["127.0.0.3"]["bytes_up"] == 20
+        assert stats[LINK]["bytes_up"] == stats[LINK]["bytes_down"] == len(payload)
+        assert stats[OTHER_LINK]["bytes_up"] == 20
         wild.shutdown(socket.SHUT_WR)
         assert wild.recv(1) == b""  # the end arrives last, in both directions
         _wait_until(lambda: echo.ends == ["closed"], "the server sees an orderly end")
@@ -239,8 +242,8 @@ def test_bytes_arrive_complete_in_order_and_not_early(echo: Echo, tmp_path: Path
 
 def test_stall_holds_the_sender_back_and_loses_nothing(echo: Echo) -> None:
     with (
-        ImpairmentProcess({"127.0.0.2": "none"}, [echo.port]) as proxy,
-        _connect("127.0.0.2", echo.port) as connection,
+        ImpairmentProcess({LINK: "none"}, [echo.port]) as proxy,
+        _connect(LINK, echo.port) as connection,
     ):
         connection.sendall(b"before")
         assert _receive(connection, 6) == b"before"
@@ -250,7 +253,7 @@ def test_stall_holds_the_sender_back_and_loses_nothing(echo: Echo) -> None:
         with contextlib.suppress(BlockingIOError):
             while True:
                 sent += connection.send(b"z" * 65536)
-        held = proxy.execute("stats @127.0.0.2")["links"][0]["held_bytes"]
+        held = proxy.execute(f"stats @{LINK}")["links"][0]["held_bytes"]
         assert 0 < held <= PROFILES["none"].window_kib * 1024
         assert sent < 32 * 2**20, "a stalled link must not swallow everything"
         with pytest.raises(BlockingIOError):
@@ -264,9 +267,9 @@ def test_rate_is_limited(echo: Echo, tmp_path: Path) -> None:
     """2 Mbit/s up: 125 kB take half a second over any number of connections."""
     profile = _write_profile(tmp_path, up={"rate_mbit": 2.0})
     with (
-        ImpairmentProcess({"127.0.0.2": profile}, [echo.port]),
-        _connect("127.0.0.2", echo.port) as one,
-        _connect("127.0.0.2", echo.port) as two,
+        ImpairmentProcess({LINK: profile}, [echo.port]),
+        _connect(LINK, echo.port) as one,
+        _connect(LINK, echo.port) as two,
     ):
         begin = time.monotonic()
         senders = [threading.Thread(target=c.sendall, args=(b"r" * 62_500,)) for c in (one, two)]
@@ -281,13 +284,13 @@ def test_rate_is_limited(echo: Echo, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("command", "end"), [("cut", "closed"), ("reset", "reset")])
 def test_cut_and_reset_end_connections(echo: Echo, command: str, end: str) -> None:
-    with ImpairmentProcess({"127.0.0.2": "none", "127.0.0.3": "none"}, [echo.port]) as proxy:
-        hit, spared = _connect("127.0.0.2", echo.port), _connect("127.0.0.3", echo.port)
+    with ImpairmentProcess({LINK: "none", OTHER_LINK: "none"}, [echo.port]) as proxy:
+        hit, spared = _connect(LINK, echo.port), _connect(OTHER_LINK, echo.port)
         with hit, spared:
             for connection in (hit, spared):
                 connection.sendall(b"x")
                 _receive(connection, 1)
-            proxy.execute(f"{command} @127.0.0.2")
+            proxy.execute(f"{command} @{LINK}")
             if command == "reset":
                 with pytest.raises(ConnectionResetError):
                     hit.recv(1)
@@ -296,25 +299,25 @@ def test_cut_and_reset_end_connections(echo: Echo, command: str, end: str) -> No
             _wait_until(lambda: echo.ends == [end], f"the server's end is {end}")
             spared.sendall(b"y")
             assert _receive(spared, 1) == b"y"
-            with _connect("127.0.0.2", echo.port) as again:  # the link accepts the next connection
+            with _connect(LINK, echo.port) as again:  # the link accepts the next connection
                 again.sendall(b"z")
                 assert _receive(again, 1) == b"z"
 
 
 def test_roaming_leaves_the_old_connection_open_at_the_server(echo: Echo) -> None:
     with (
-        ImpairmentProcess({"127.0.0.2": "none"}, [echo.port]) as proxy,
-        _connect("127.0.0.2", echo.port) as connection,
+        ImpairmentProcess({LINK: "none"}, [echo.port]) as proxy,
+        _connect(LINK, echo.port) as connection,
     ):
         connection.sendall(b"x")
         _receive(connection, 1)
-        proxy.execute("roam 127.0.0.9")
+        proxy.execute(f"roam {ROAMED}")
         with pytest.raises(ConnectionResetError):
             connection.recv(1)
-        with _connect("127.0.0.2", echo.port) as again:
+        with _connect(LINK, echo.port) as again:
             again.sendall(b"z")
             assert _receive(again, 1) == b"z"
-            assert echo.peers == ["127.0.0.1", "127.0.0.9"]
+            assert echo.peers == ["127.0.0.1", ROAMED]
             assert echo.ends == []
 
 
@@ -322,9 +325,9 @@ def test_connection_without_a_server_is_closed() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:
         port = listening.getsockname()[1]
     with (
-        ImpairmentProcess({"127.0.0.2": "none"}, [port]),
+        ImpairmentProcess({LINK: "none"}, [port]),
         pytest.raises(ConnectionResetError),  # at once, or at first use
-        _connect("127.0.0.2", port) as connection,
+        _connect(LINK, port) as connection,
     ):
         connection.recv(1)
 
@@ -340,10 +343,10 @@ def test_datagrams_are_lost_duplicated_and_reordered(tmp_path: Path) -> None:
             server.bind(("127.0.0.1", 0))
             port = server.getsockname()[1]
             with (
-                ImpairmentProcess({"127.0.0.2": profile}, [], udp=[port], seed=seed),
+                ImpairmentProcess({LINK: profile}, [], udp=[port], seed=seed),
                 socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client,
             ):
-                client.connect(("127.0.0.2", port))
+                client.connect((LINK, port))
                 for i in range(DATAGRAMS):
                     client.send(struct.pack("<I", i))
                     time.sleep(0.0005)  # one by one, as from a sender with a rate
@@ -369,30 +372,30 @@ def test_datagrams_are_lost_duplicated_and_reordered(tmp_path: Path) -> None:
 
 
 def test_commands_and_errors(echo: Echo, tmp_path: Path) -> None:
-    with ImpairmentProcess({"127.0.0.2": "none"}, [echo.port]) as proxy:
+    with ImpairmentProcess({LINK: "none"}, [echo.port]) as proxy:
         with pytest.raises(ImpairmentError, match="command: stall, resume"):
             proxy.execute("explode")
-        with pytest.raises(ImpairmentError, match=r"127\.0\.0\.9: .*127\.0\.0\.2"):
-            proxy.execute("stall @127.0.0.9")
+        with pytest.raises(ImpairmentError, match=f"{ROAMED}: .*{LINK}"):
+            proxy.execute(f"stall @{ROAMED}")
         with pytest.raises(ImpairmentError, match="no profile"):
             proxy.execute("profile nice-wifi")
         proxy.execute(f"profile {_write_profile(tmp_path, delay_ms=20.0)}")
-        with _connect("127.0.0.2", echo.port) as connection:
+        with _connect(LINK, echo.port) as connection:
             begin = time.monotonic()
             connection.sendall(b"x")
             _receive(connection, 1)
             assert time.monotonic() - begin >= 0.040
     with pytest.raises(ImpairmentError, match="no profile 'nice-wifi'"):
-        ImpairmentProcess({"127.0.0.2": "nice-wifi"}, [echo.port])
+        ImpairmentProcess({LINK: "nice-wifi"}, [echo.port])
     with pytest.raises(ImpairmentError, match=r"on 127\.0\.0\.1: .*127\.0\.0\.1 only"):
         ImpairmentProcess({"127.0.0.1": "none"}, [echo.port])
 
 
 def test_proxy_ends_with_its_parent(echo: Echo) -> None:
-    command = [sys.executable, "-m", "iris_session.netsim.process", "--ports", str(echo.port)]
+    command = [sys.executable, "-m", "iris_session.netsim.process", "--ports", str(echo.port), "--link", LINK]
     with subprocess.Popen([*command, "--until-eof"], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stdin is not None
-        assert json.loads(process.stdout.readline())["ready"] == ["127.0.0.2"]
+        assert json.loads(process.stdout.readline())["ready"] == [LINK]
         process.stdin.close()
         assert process.wait(DEADLINE_S) == 0

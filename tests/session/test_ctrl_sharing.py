@@ -73,14 +73,15 @@ def test_without_anybody_the_trajectory_is_the_owners_to_the_bit(rig: Rig) -> No
 def test_observers_and_a_holder_that_has_not_engaged_change_nothing(rig: Rig) -> None:
     rig.policy = swing(rig)
     expected = run_without(rig, 300)
-    Agent(rig, connection=2, role=Role.OBSERVER)
     agent = Agent(rig)
+    Agent(rig, connection=2, role=Role.OBSERVER)
     states = list(run_with(rig, 100))
     rig.applied.clear()
     begun = rig.data.time
     agent.acquire()  # three rounds
     agent.sample(agent.tip(), clutch=False)
     rig.rounds(1)
+    assert rig.stepper.core.authority.list_holders()["left"] == ("p1",)
     states_after = run_with(rig, 196)
     assert begun > 0.0
     assert np.array_equal(np.array(states), expected[:100])

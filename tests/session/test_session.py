@@ -23,6 +23,7 @@ from iris_session.physics import AmbiguousModelError, load_model
 from iris_session.protocol.client_messages import Control
 from iris_session.protocol.scene import AddVisual, RemoveVisual, SetVisual, encode_scene
 from iris_session.protocol.server_messages import EStopChanged, Gap, MarkerAdded, PauseChanged, SceneChanged
+from iris_session.protocol.status import StatusReport
 from iris_session.scene import AssetStore
 from iris_session.session import owner
 from iris_session.session.core import read_plant_state
@@ -40,6 +41,12 @@ def session() -> Iterator[Session]:
 
 def _bodies(session: Session) -> list[object]:
     return [event.body for event in session.recent_events()]
+
+
+def _make_report(session: Session) -> StatusReport:
+    """The authority's half of what the commands `status` and `clear-estop` read."""
+    assert session._processes is not None
+    return session._processes.reporter.make_report(session.stepper, session._processes.make_status())
 
 
 def test_messages_posted_before_the_first_step_are_in_it(session: Session) -> None:
@@ -83,6 +90,7 @@ def test_the_owner_clears_only_stops_that_it_can_have_seen(session: Session) -> 
     session.run(seconds=0.05)
     assert session.status().estop
     assert [(s.stop_seq, s.participant, s.reason) for s in session.status().stops] == [(2, "host", "two")]
+    assert [stop.stop_seq for stop in _make_report(session).stops] == [2]
     session.clear_estop()
     session.run(until=lambda: not session.status().estop, seconds=30.0)
     assert session.status().stops == ()
@@ -329,6 +337,7 @@ def test_one_command_mends_a_diverged_session(session: Session, command: str) ->
     session.data.qpos[0] = float("nan")
     session.run(until=lambda: session.status().paused, seconds=30.0)
     assert "NaN" in session.status().pause_reason
+    assert "NaN" in _make_report(session).pause_reason
     getattr(session, command)()
     session.run(until=lambda: not session.status().paused and session.status().tick > 5, seconds=30.0)
     assert (session.status().paused, session.status().pause_reason) == (False, "")

@@ -284,3 +284,25 @@ def test_polling_requests_is_known_to_the_authority_from_then_on() -> None:
         data.qvel[0] = np.nan
         session.begin_tick()
         assert session.status().data_fault == DataFault(("qvel",), pytest.approx(session.clock() * 1e-9, abs=60.0))
+
+
+def test_no_state_is_passed_read_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """MuJoCo 3.3 raises `TypeError` for such arrays."""
+    original = mujoco.mj_setState
+
+    def set_state(model: mujoco.MjModel, data: mujoco.MjData, state: np.ndarray, spec: int) -> None:
+        assert state.flags.writeable
+        original(model, data, state, spec)
+
+    monkeypatch.setattr(mujoco, "mj_setState", set_state)
+    model = load_model(scene_path("handover"))
+    data = mujoco.MjData(model)
+    data.qpos[0] += 0.1
+    with Session(model, data, QUIET) as session:
+        for _ in range(5):
+            session.begin_tick()
+            mujoco.mj_step(model, data)
+            session.end_tick()
+        mujoco.mj_resetData(model, data)
+        session.begin_tick()
+        session.end_tick()

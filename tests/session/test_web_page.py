@@ -1,0 +1,20 @@
+"""The page of a session: when there is none, and what is said then."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from iris_session.session.config import SessionConfig
+from iris_session.session.web_page import open_web_page
+
+
+def test_a_folder_of_certificates_admits_no_browser_so_there_is_no_page(tmp_path: Path) -> None:
+    given = {"curve": True, "web_port": 0}
+    page = open_web_page(SessionConfig(**given, curve_clients=str(tmp_path)), "lab")  # type: ignore[arg-type]
+    assert page.port == 0
+    page = open_web_page(SessionConfig(**given), "lab")  # type: ignore[arg-type]
+    assert page.port > 0
+    page.close()
+    page = open_web_page(SessionConfig(curve_clients=str(tmp_path), web_port=0), "lab")  # plain: everybody joins
+    assert page.port > 0
+    page.close()
