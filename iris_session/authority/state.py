@@ -319,7 +319,9 @@ class AuthorityState(msgspec.Struct):
 
 
 def is_same_snapshot(recorded: bytes, snapshot: bytes) -> bool:
-    """Return whether two snapshots say the same. `recorded` may lack fields that participants got later."""
+    """Return whether two snapshots say the same. `recorded` may lack fields that participants got later, and their
+    alignments.
+    """
     if recorded == snapshot:
         return True
     earlier, present = msgspec.msgpack.decode(recorded), msgspec.msgpack.decode(snapshot)
@@ -331,4 +333,7 @@ def is_same_snapshot(recorded: bytes, snapshot: bytes) -> bool:
             return False
         for added in ADDED_FIELDS - had[name].keys():
             del fields[added]
+        alignment = had[name].get("alignment")
+        if isinstance(alignment, dict) and "pivot_world" not in alignment and fields["alignment"] is not None:
+            del fields["alignment"]["pivot_world"]
     return bool(earlier == present)

@@ -29,8 +29,7 @@ T = TypeVar("T")
 def lower_thread_priority() -> None:
     """Lower the priority of the calling thread, where threads have one (Linux). It cannot be raised again."""
     with contextlib.suppress(OSError, AttributeError):
-        nice = min(_LAST_NICE, os.getpriority(os.PRIO_PROCESS, 0) + LOW_PRIORITY_NICE)
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), nice)
+        _lower_priority(threading.get_native_id())
 
 
 def lower_named_thread_priority(name: str) -> None:
@@ -39,8 +38,12 @@ def lower_named_thread_priority(name: str) -> None:
     for task in Path("/proc/self/task").glob("*"):
         with contextlib.suppress(OSError):
             if (task / "comm").read_text().strip() == name:
-                nice = min(_LAST_NICE, os.getpriority(os.PRIO_PROCESS, int(task.name)) + LOW_PRIORITY_NICE)
-                os.setpriority(os.PRIO_PROCESS, int(task.name), nice)
+                _lower_priority(int(task.name))
+
+
+def _lower_priority(native_id: int) -> None:
+    nice = min(_LAST_NICE, os.getpriority(os.PRIO_PROCESS, native_id) + LOW_PRIORITY_NICE)
+    os.setpriority(os.PRIO_PROCESS, native_id, nice)
 
 
 def run_at_low_priority(function: Callable[[], T]) -> T:

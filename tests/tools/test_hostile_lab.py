@@ -1,4 +1,4 @@
-"""What `tools/hostile.py` takes for usual: ages from before anything was attacked."""
+"""The state ages that `tools/hostile.py` compares with: those of a window before the attack."""
 
 from __future__ import annotations
 

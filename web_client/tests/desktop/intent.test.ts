@@ -73,7 +73,7 @@ describe("the dead-man key", () => {
     }
   });
 
-  it("does not begin with a press that repeats, or that nobody saw begin", () => {
+  it("does not begin with a repeated key event, or with one whose first press came elsewhere", () => {
     expect(take("keydown", "ShiftLeft", true, { repeat: true })).toBe(false);
     key.forget();
     expect(take("keydown", "ShiftLeft", true)).toBe(null);
