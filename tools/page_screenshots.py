@@ -1,14 +1,17 @@
-"""Pictures of the page for the documentation: the dashboard while a demo runs, on a desktop and on a phone.
+"""Pictures of the page for the documentation: the dashboard on a desktop and on a phone, and AR.
 
     python tools/page_screenshots.py docs/img
 
 Starts `iris-session demo handover`, opens its page in Chromium, waits until the operators hold their robots, and writes
-`dashboard.png` and `dashboard-phone.png`. Needs the built page (`make web`) and Chromium (Debian: `chromium`).
+`dashboard.png` and `dashboard-phone.png`. Then a session in which a person with an emulated Quest 3 and one at a desk
+hold a robot each: `ar.png` is what the headset shows; a real one shows the room behind it. Needs the built page
+(`make web`) and Chromium (Debian: `chromium`).
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import re
 import subprocess
 import tempfile
@@ -16,8 +19,11 @@ import time
 from pathlib import Path
 from typing import Final
 
-from tests.e2e.browser import Browser
-from tests.e2e.session_process import COMMAND
+from anchors.pose import PoseTuple, Vec3, quat_from_rotvec, quat_from_yaw, quat_mul
+from tests.e2e.browser import Browser, join_as, printed_address
+from tests.e2e.emulated_quest import HEADSET, INSTALL, IWER, T_WORLD_TRACKING, EmulatedQuest, aim_at
+from tests.e2e.scenario import Scenario
+from tests.e2e.session_process import COMMAND, SessionProcess, kill_all, make_serve_command
 
 START_S: Final = 90.0
 #: After both robots are held: until hands are at work [s].
@@ -34,6 +40,50 @@ def wait_for_address(output: Path, process: subprocess.Popen[bytes]) -> str:
             return match.group(1)
         time.sleep(0.1)
     raise SystemExit(f"the demo printed no address of a page:\n{output.read_text(errors='replace')[-2000:]}")
+
+
+#: Where the person with the headset stands, and where she looks.
+HEAD_WORLD: Final[Vec3] = (-0.55, 0.55, 1.1)
+LOOKED_AT_WORLD: Final[Vec3] = (0.4, -0.05, 0.25)
+
+
+def look_at(p_world: Vec3, target_world: Vec3) -> PoseTuple:
+    """Return the pose of a head at `p_world` that looks at a point: x is forward, z up."""
+    x, y, z = (b - a for a, b in zip(p_world, target_world, strict=True))
+    pitch = quat_from_rotvec((0.0, math.atan2(-z, math.hypot(x, y)), 0.0))
+    return p_world, quat_mul(quat_from_yaw(math.atan2(y, x)), pitch)
+
+
+def shoot_ar(browser: Browser, scratch: Path, picture: Path) -> None:
+    """Write a picture of what an operator in AR sees: her robot, and another person at work."""
+    session = SessionProcess(scratch, scratch / "ar.rrd", make_serve_command("handover", scratch / "ar.rrd"))
+    scenario = Scenario(session)
+    try:
+        page = browser.open(
+            "quest", printed_address(session), width=1280, height=720, before=[IWER.read_text(), INSTALL]
+        )
+        page.wait_until_ready()
+        join_as(page, "eve", "operator")
+        quest = EmulatedQuest(scenario, page)
+        ben = scenario.drive("ben", "right")
+        eve = quest.person.id
+        quest.host.assign(["left"], eve)
+        quest.enter("Enter AR")
+        quest.host.alignment.place(eve, T_WORLD_TRACKING)
+        quest.place("quest", look_at(HEAD_WORLD, LOOKED_AT_WORLD))
+        tip = quest.host.scene.tip_pose("left")
+        assert tip
+        quest.place("quest.controllers.right", aim_at(tip[0], 0.45))
+        quest.wait(f"{HEADSET}.showsScene")
+        quest.engage("left")
+        ben.velocity = (0.0, 0.02, 0.0)
+        scenario.run_for(SETTLE_S)
+        quest.in_page(lambda: page.screenshot(picture), "the picture is made")
+        quest.close()
+        page.close()
+    finally:
+        scenario.close()
+        kill_all([session])
 
 
 def main() -> None:
@@ -59,6 +109,10 @@ def main() -> None:
             phone.wait_until_ready()
             time.sleep(3.0)
             phone.screenshot(folder / "dashboard-phone.png")
+            phone.close()
+            process.terminate()
+            process.wait()
+            shoot_ar(browser, Path(scratch), folder / "ar.png")
         finally:
             browser.close()
             process.terminate()

@@ -21,9 +21,9 @@ from iris_session.codegen.conversions import to_three
 from iris_session.protocol.common import Alignment
 from iris_session.protocol.names import AlignmentKind
 from tests.e2e.browser import Page, join_as
+from tests.e2e.emulated_quest import HEADSET, INSTALL, IWER, EmulatedQuest, holder
 from tests.e2e.scenario import Scenario, is_driven
 from tests.e2e.session_process import SessionProcess, run_in_process
-from tests.e2e.test_web_xr import HEADSET, INSTALL, IWER, EmulatedQuest, holder
 
 pytestmark = pytest.mark.e2e
 
