@@ -73,6 +73,7 @@ class ConnectionEstimator:
         self._used = self._unusable = 0
         self._next_ns = 0
         self._wrong: tuple[int, str] | None = None  # tracking epoch, why an observation was refused; not yet reported
+        self._is_wrong_touch = False  # it was a touch: its person waits for the answer
         self._reported_wrong: tuple[int, str] | None = None
         self._refused_ns = -_CLOSE_NS
         self._repeat_refusal = False  # the last refusal came too soon after another: send it once more
@@ -119,16 +120,23 @@ class ConnectionEstimator:
         wrong = self._describe_wrong(observation)
         if wrong:
             used = False
-            if (observation.tracking_epoch, wrong) != self._reported_wrong:
-                self._wrong = (observation.tracking_epoch, wrong)
+            self._note_wrong((observation.tracking_epoch, wrong), observation.kind == AnchorKind.TOUCH)
         else:
             used = self._use_observation(observation, p_tracking_head)
+            if used and observation.kind == AnchorKind.TOUCH and self._is_wrong_touch:
+                self._wrong = None
         if used:
             self._used += 1
             self._observed[anchor_id] = (self._observed.get(anchor_id, (0, 0))[0] + 1, now_ns)
         else:
             self._unusable += 1
         return used
+
+    def _note_wrong(self, wrong: tuple[int, str], is_touch: bool) -> None:
+        """Note an observation to be reported as refused; unknown sheets do not displace a touch."""
+        if wrong == self._reported_wrong or (self._wrong is not None and self._is_wrong_touch and not is_touch):
+            return
+        self._wrong, self._is_wrong_touch = wrong, is_touch
 
     def _use_observation(self, observation: Observation, p_tracking_head: Vec3 | None) -> bool:
         pose, covariance = observation.T_tracking_anchor, observation.covariance
@@ -165,11 +173,12 @@ class ConnectionEstimator:
     def propose(self, now_ns: int) -> AlignmentProposal | None:
         """Return a proposal from all observations.
 
-        `None`: the same refusal as before for the same reason, or no improvement on marks that were touched. When
-        nothing usable is new, an unknown anchor or an invalid touch is reported once: it may hang beside a known one.
+        `None`: the same refusal as before for the same reason, or no improvement on marks that were touched. An invalid
+        touch is reported first, an unknown anchor when nothing usable is new (it may hang beside a known one); once.
         """
         self._next_ns = now_ns + self._period_ns
-        if not self._pending and not self._touches.pending and self._wrong is not None:
+        is_first = self._is_wrong_touch and now_ns - self._refused_ns >= _CLOSE_NS
+        if self._wrong is not None and (is_first or not (self._pending or self._touches.pending)):
             self._reported_wrong, self._wrong, self._refused_ns = self._wrong, None, now_ns
             return _to_refusal(*self._reported_wrong)
         try:

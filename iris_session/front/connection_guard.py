@@ -27,7 +27,8 @@ from iris_session.front.key_budgets import remember
 from iris_session.front.memory_guard import PendingConnection
 from iris_session.link.config import MEBIBYTE, MILLISECOND, SECOND, FrontLimits
 from iris_session.link.sockets import close_tcp, next_tcp_event, peer_of, readable, tcp_counts
-from iris_session.protocol.limits import Drops, TokenBucket
+from iris_session.protocol.common import MAX_TEXT
+from iris_session.protocol.limits import MAX_MEDIA_FRAME_BYTES, Drops, TokenBucket
 from iris_session.protocol.names import AuditKind
 from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID
 
@@ -53,6 +54,8 @@ MAX_REMEMBERED: Final = 256
 MAX_WARNINGS: Final = 8
 #: Buffers and queues of libzmq for a connection that has said nothing.
 SILENT_CONNECTION_BYTES: Final = 16 * 1024
+#: More than this is unread only of a peer whose key was accepted: before, libzmq takes one command of a frame's size.
+STRANGER_BYTES: Final = 2 * MAX_MEDIA_FRAME_BYTES
 BEFORE_HELLO: Final = "before hello"
 
 #: A subscriber sends its handshake and a few topics, no more.
@@ -441,11 +444,13 @@ class ChannelFlood(NamedTuple):
     Attributes:
         address, key_id: Host of the peer, and its key: empty before its first whole message and without encryption.
         opened_ns: Session time at which it was accepted.
+        has_key: It has a key, known or not: more was unread than libzmq takes before the handshake.
     """
 
     address: str
     key_id: str
     opened_ns: int
+    has_key: bool
 
 
 class ChannelGuard:
@@ -553,7 +558,7 @@ class ChannelGuard:
         bounds = self._bounds
         pending = {fd: self._traffic.pending_bytes(fd) for fd in self._tcp}
         chosen = [fd for fd, n_bytes in pending.items() if n_bytes > bounds.pending_bytes]
-        reasons = [self.evict(fd, f"{self._name}_flood") for fd in chosen]
+        reasons = [self.evict(fd, f"{self._name}_flood", pending[fd]) for fd in chosen]
         left = {fd: (one, pending[fd]) for fd, one in self._tcp.items() if fd not in chosen}
         while left and (bounds.owner_bytes or bounds.total_bytes):
             sums: dict[str, int] = {}
@@ -565,18 +570,20 @@ class ChannelGuard:
             ):
                 break
             largest = max((fd for fd, (one, _) in left.items() if one.owner == owner), key=lambda fd: left[fd][1])
-            reasons.append(self.evict(largest, f"{self._name}_flood"))
+            reasons.append(self.evict(largest, f"{self._name}_flood", pending[largest]))
             del left[largest]
         self._pending = tuple((fd, connection, n_bytes) for fd, (connection, n_bytes) in left.items() if n_bytes)
         return reasons
 
-    def evict(self, descriptor: int, reason: str) -> str:
-        """Close a connection. Return the drop reason, empty if it has ended already."""
+    def evict(self, descriptor: int, reason: str, unread: int = 0) -> str:
+        """Close a connection with `unread` bytes. Return the drop reason, empty if it has ended already."""
         connection = self._tcp.find(descriptor)
         counted = self._tcp.evict(descriptor, reason)
         if connection is not None and counted == f"{self._name}_flood":
             address, owner = connection.address[0], connection.owner
-            self._floods.append(ChannelFlood(address, "" if owner == address else owner, connection.opened_ns))
+            key_id = "" if owner == address else owner
+            has_key = bool(key_id) or unread > STRANGER_BYTES
+            self._floods.append(ChannelFlood(address, key_id, connection.opened_ns, has_key))
         return counted
 
     def pop_floods(self) -> list[ChannelFlood]:
@@ -688,7 +695,7 @@ class ConnectionGuard:
             name, subject = connection.hello.name, connection.participant_id
         self._drops.count("flood")
         peer = " ".join(part for part in (address, f"({name})" if name else "") if part) or "an unknown address"
-        text = warning or f"flood from {peer}: {detail}"
+        text = (warning or f"flood from {peer}: {detail}")[:MAX_TEXT]
         if now_ns - self._warnings.get((address, detail), (-LOG_NS, ""))[0] >= LOG_NS:
             log.warning("%s", text)
         self._audit.record(AuditKind.FLOOD, now_ns, subject=subject, name=name, address=address, detail=detail)

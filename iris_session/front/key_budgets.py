@@ -182,8 +182,9 @@ class IngestBackoff:
     """Refuse new connections to media ingest of keys that flooded it: 1 s, then 2, 4 ... 60 s.
 
     libzmq names the key of a connection with its first whole message. So when a connection is closed before that, all
-    keys are refused that have connected from its address since it was opened: its own is among them. Connections that
-    are open stay. A key that floods no more for as long as it was last refused for, and a minute, begins anew.
+    keys are refused that have connected from its address since it was opened: its own is among them, if it has one.
+    Connections that are open stay. A key that floods no more for as long as it was last refused for, and a minute,
+    begins anew.
     """
 
     def __init__(self) -> None:
@@ -195,7 +196,7 @@ class IngestBackoff:
         remember(self._handshakes, (find_network(address), key_id), now_ns)
 
     def refuse(self, address: str, key_id: str, opened_ns: int, now_ns: int) -> dict[str, int]:
-        """Refuse the key of a connection that was closed for a flood, or those that it may have had.
+        """Refuse the key of a connection that was closed for a flood, or those of which it had one.
 
         Args:
             address: Of the connection.

@@ -75,7 +75,7 @@ class Front:
         self.cut_off = False
         context, sockets = self._context, self._sockets = open_front(start)
         self._link, self._control = sockets.link, sockets.control.socket
-        # What a source sends is decrypted as fast as it comes: on a busy machine state, control and clients go first.
+        # Media are encrypted and decrypted as fast as they come: on a busy machine state, control and clients go first.
         lower_named_thread_priority(MEDIA_THREAD_NAME)
         proxy = _make_media_proxy(context, sockets)
         backoff = IngestBackoff()

@@ -107,6 +107,8 @@ class MemoryGuard:
         self._next_ns = now_ns + MEMORY_PERIOD_NS
         if self._base < 0:
             self._base = self._read_resident()
+        if self._base < 0:  # it could not be read yet
+            return
         held = self._read_resident() - self._base
         if held > min(self._max_bytes, TRIM_BYTES) and now_ns >= self._next_trim_ns:
             self._next_trim_ns = now_ns + TRIM_PERIOD_NS
@@ -145,12 +147,12 @@ class MemoryGuard:
 
 def _make_resident_reader() -> Callable[[], int]:
     """Return a function that reads resident bytes without mapped files: assets are mapped, and the system takes those
-    pages back when it needs them."""
-    process, resident = psutil.Process(), 0
+    pages back when it needs them. Where they cannot be read now, it returns what it read before, at first -1."""
+    process, resident = psutil.Process(), -1
 
     def read_resident() -> int:
         nonlocal resident
-        with suppress(OSError):  # no descriptor is free now, until connections are closed
+        with suppress(OSError, psutil.Error):  # no descriptor is free now, until connections are closed
             info = process.memory_info()
             resident = int(info.rss - getattr(info, "shared", 0))
         return resident

@@ -19,9 +19,16 @@ from iris_session.authority import Authority, AuthorityConfig
 from iris_session.control import ControlConfig, ControlError, Controller
 from iris_session.physics import SimulationDivergedError, World
 from iris_session.physics.world import STATE
+from iris_session.protocol.common import Alignment
 from iris_session.protocol.entries import HOST, Entry, ExternalReset, SceneLoaded
 from iris_session.protocol.names import LateCause
-from iris_session.protocol.server_messages import Snapshot
+from iris_session.protocol.server_messages import (
+    AlignmentChanged,
+    Event,
+    ParticipantChanged,
+    ParticipantJoined,
+    Snapshot,
+)
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import ControlStatus, Decision, OutgoingMessage
 from iris_session.session.config import SessionConfig
@@ -37,9 +44,11 @@ def ignore_lap(cause: str) -> None:
 #: participants at 72 Hz send so many in a third of the steps; a robot is still solved at 62 Hz if all steps have them.
 CROWDED_ENTRIES: Final = 6
 _encoder = msgspec.msgpack.Encoder()
-#: Fields of `Snapshot` in digests: those that it had when the recording format was made.
+#: Fields of `Snapshot` and `Alignment` in digests: those that they had when the recording format was made.
 _DIGESTED_FIELDS: Final = tuple(name for name in Snapshot.__struct_fields__ if name != "anchors")
 _DigestedSnapshot: Final = msgspec.defstruct("Snapshot", _DIGESTED_FIELDS, tag_field="type", tag="snapshot")
+_ALIGNMENT_FIELDS: Final = tuple(name for name in Alignment.__struct_fields__ if name != "pivot_world")
+_DigestedAlignment: Final = msgspec.defstruct("Alignment", _ALIGNMENT_FIELDS)
 _decode_status = msgspec.msgpack.Decoder(tuple[ControlStatus, ...]).decode
 _decode_shared = msgspec.msgpack.Decoder(tuple[bytes, bytes]).decode
 
@@ -274,27 +283,37 @@ def encode_for_digest(decision: Decision) -> bytes:
     """Return the bytes of a decision that are part of the digest of its step.
 
     Fields that `Snapshot` and `Alignment` got after the recording format are left out, so that earlier recordings of
-    this format keep their digests. The events, which are in, and the journal say the same.
+    this format keep their digests. The events say the same as the snapshot, and keyframes hold every pivot.
     """
-    if any(isinstance(one.message, Snapshot) for one in decision.outgoing):
+    if decision.outgoing or decision.events:
         outgoing = tuple(OutgoingMessage(one.connection, _to_digested(one.message)) for one in decision.outgoing)
-        decision = msgspec.structs.replace(decision, outgoing=outgoing)
-    data = _encoder.encode(decision)
-    return _encoder.encode(_remove_pivots(msgspec.msgpack.decode(data))) if b"pivot_world" in data else data
-
-
-def _remove_pivots(value: Any) -> Any:
-    """Return decoded messages without the field that `Alignment` got after the recording format."""
-    if isinstance(value, dict):
-        is_alignment = "error_at_robot_m" in value
-        return {k: _remove_pivots(v) for k, v in value.items() if k != "pivot_world" or not is_alignment}
-    return [_remove_pivots(v) for v in value] if isinstance(value, list) else value
+        events = tuple(_to_digested(event) for event in decision.events)
+        decision = msgspec.structs.replace(decision, outgoing=outgoing, events=events)
+    return _encoder.encode(decision)
 
 
 def _to_digested(message: Any) -> Any:
-    if not isinstance(message, Snapshot):
+    """Return a message without the fields that are not in digests."""
+    if isinstance(message, Snapshot):
+        values = {name: getattr(message, name) for name in _DIGESTED_FIELDS}
+        values["participants"] = tuple(_without_pivot(one) for one in message.participants)
+        return _DigestedSnapshot(**values)
+    if not isinstance(message, Event):
         return message
-    return _DigestedSnapshot(*(getattr(message, name) for name in _DIGESTED_FIELDS))
+    body: Any = message.body
+    if isinstance(body, AlignmentChanged):
+        body = _without_pivot(body)
+    elif isinstance(body, ParticipantJoined | ParticipantChanged):
+        body = msgspec.structs.replace(body, participant=_without_pivot(body.participant))
+    return msgspec.structs.replace(message, body=body)
+
+
+def _without_pivot(holder: Any) -> Any:
+    """Return what has an `alignment`, with that as digests have it."""
+    if holder.alignment is None:
+        return holder
+    alignment = _DigestedAlignment(*(getattr(holder.alignment, name) for name in _ALIGNMENT_FIELDS))
+    return msgspec.structs.replace(holder, alignment=alignment)
 
 
 def _limit_scales(config: CoreConfig) -> AuthorityConfig:

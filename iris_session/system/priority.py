@@ -12,6 +12,7 @@ import gc
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final, TypeVar
@@ -22,6 +23,8 @@ TICK_PRIORITY: Final = 5
 #: lock for moments, and every other thread then waits for them.
 LOW_PRIORITY_NICE: Final = 10
 _LAST_NICE: Final = 19
+#: A thread that was started has its name within this time, on a busy machine, too [s].
+NAMED_WITHIN_S: Final = 1.0
 
 T = TypeVar("T")
 
@@ -34,11 +37,15 @@ def lower_thread_priority() -> None:
 
 def lower_named_thread_priority(name: str) -> None:
     """Lower the priority of a thread of this process, by the name that it has in the system (Linux): of one that a
-    library has started. Where there is none, nothing changes."""
-    for task in Path("/proc/self/task").glob("*"):
-        with contextlib.suppress(OSError):
-            if (task / "comm").read_text().strip() == name:
-                _lower_priority(int(task.name))
+    library has started. It is waited for, because threads name themselves; where there is none, nothing changes."""
+    deadline = time.monotonic() + NAMED_WITHIN_S
+    while sys.platform == "linux" and time.monotonic() < deadline:
+        for task in Path("/proc/self/task").glob("*"):
+            with contextlib.suppress(OSError):
+                if (task / "comm").read_text().strip() == name:
+                    _lower_priority(int(task.name))
+                    return
+        time.sleep(0.001)
 
 
 def _lower_priority(native_id: int) -> None:

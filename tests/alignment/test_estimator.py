@@ -154,6 +154,29 @@ def test_unknown_sheet_is_reported_once_and_keeps_the_estimate() -> None:
     assert estimator.is_due(9 * PERIOD), "in a new tracking frame it is reported again"
 
 
+def test_invalid_touch_is_reported_beside_sheets_in_view() -> None:
+    def touch(covariance: tuple[float, ...] = (), mark: str = "") -> Observation:
+        return Observation("table", "touch", IDENTITY, 1, 1, covariance=covariance, mark=mark, device="hand/left")
+
+    estimator = ConnectionEstimator(ANCHORS, PERIOD)
+    for i in range(8):
+        estimator.add_observation(observation(i, pose=Pose((0.0, 0.0, -0.2), IDENTITY.q)))
+        assert not estimator.add_observation(touch((0.0,) * 36))
+        assert not estimator.add_observation(observation(i, anchor="poster"))
+    proposal = estimator.propose(0)
+    assert proposal is not None
+    assert proposal.advice.startswith("the covariance of the touch of 'table'")
+    proposal = estimator.propose(PERIOD)
+    assert proposal is not None
+    assert not proposal.refused
+    assert not estimator.add_observation(touch(mark="9"))
+    assert estimator.is_due(9 * PERIOD)
+    assert estimator.add_observation(touch())
+    proposal = estimator.propose(9 * PERIOD)
+    assert proposal is not None
+    assert "no mark" not in proposal.advice, "a valid touch came after it"
+
+
 def test_advice_about_many_sheets_fits_into_a_proposal() -> None:
     names = [f"sheet on the far side of the laboratory, number {k:02}" for k in range(12)]
     estimator = ConnectionEstimator(

@@ -33,6 +33,7 @@ from iris_session.front.connection_guard import (
 )
 from iris_session.link.config import SECOND, FrontConfig, FrontLimits
 from iris_session.link.sockets import bound_port, close_tcp, open_state, peer_of, tcp_counts, watch_tcp
+from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.limits import Drops
 from tests.front.control_rig import LIMITS, ControlSocketRig, is_closed
 
@@ -147,6 +148,8 @@ def test_memory_of_floods_is_bounded(rig: ControlSocketRig) -> None:
     for i in range(1000):
         rig.guard.report_flood(f"10.0.{i // 250}.{i % 250}", "sample", rig.now_ns)
     assert len(rig.guard.list_warnings(rig.now_ns)) == MAX_WARNINGS
+    rig.guard.report_flood("10.0.0.9", "x" * 600, rig.now_ns)
+    assert max(map(len, rig.guard.list_warnings(rig.now_ns))) == MAX_TEXT
     rig.guard.report_flood("", "memory: closed Ann", rig.now_ns, warning="memory ran short: closed Ann")
     assert rig.guard.list_warnings(rig.now_ns)[-1].endswith("closed Ann")
 
@@ -484,16 +487,21 @@ class IngestRig:
 
 
 @pytest.mark.parametrize("key", ["camera", ""])
-def test_unread_bytes_of_ingest_count_by_key_over_all_connections(key: str) -> None:
-    """By address where the key is not known yet."""
+def test_unread_bytes_of_ingest_count_by_key_over_all_connections(key: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By address where the key is not known yet: there is one if more is unread than a stranger can send."""
+    monkeypatch.setattr(connection_guard, "STRANGER_BYTES", 3999 if key else 4000)
     rig = IngestRig(ChannelBounds(8, pending_bytes=8192, owner_bytes=8192))
     mine = [rig.open(key, n) for n in (3000, 4000, 3500)]
     other = rig.open("other", 7000)
     assert rig.guard.tick(SECOND) == ["media_flood"]
     assert [is_closed(one) for one in (*mine, other)] == [False, True, False, False]
     assert sum(one.bytes for one in rig.guard.list_pending() if one.owner == (key or "127.0.0.1")) == 6500
-    assert rig.guard.pop_floods() == [ChannelFlood("127.0.0.1", key, SECOND)]
+    assert rig.guard.pop_floods() == [ChannelFlood("127.0.0.1", key, SECOND, bool(key))]
     assert rig.guard.tick(2 * SECOND) == [], "each is within the bound, and so is their sum"
+    monkeypatch.setattr(connection_guard, "STRANGER_BYTES", 3999)
+    rig.open(key, 4000)
+    rig.guard.tick(3 * SECOND)
+    assert [flood.has_key for flood in rig.guard.pop_floods()] == [True]
     rig.close()
 
 

@@ -202,3 +202,4 @@ def test_memory_that_cannot_be_read_now_is_that_of_the_last_time(monkeypatch: py
 
     monkeypatch.setattr(psutil.Process, "memory_info", fail)
     assert read_resident() == before > 0
+    assert _make_resident_reader()() == -1, "not known yet"

@@ -16,10 +16,9 @@ from iris_session.codegen.examples import make_full
 from iris_session.demo.scenes import scene_path
 from iris_session.physics import ModelUnsupportedError, SimulationDivergedError, load_model
 from iris_session.protocol.client_messages import Control
-from iris_session.protocol.common import IDENTITY, Alignment
 from iris_session.protocol.entries import ExternalReset
 from iris_session.protocol.names import CommandKind
-from iris_session.protocol.server_messages import AlignmentChanged, Event, Notice, SceneChanged, Snapshot
+from iris_session.protocol.server_messages import Event, EventBody, Notice, SceneChanged, Snapshot
 from iris_session.protocol.steps import Decision, OutgoingMessage
 from iris_session.session.core import CROWDED_ENTRIES, SessionCore, encode_for_digest, read_plant_state
 from tests.session.play import TICK_NS, entries, host, make_core, play
@@ -96,13 +95,17 @@ def test_digest_has_the_snapshot_that_the_recording_format_began_with() -> None:
     assert encode_for_digest(plain) == msgspec.msgpack.encode(plain)
 
 
-def test_digest_has_alignments_without_the_pivot_that_they_got_later() -> None:
-    event = Event(1, 2, 3, AlignmentChanged("p1", Alignment(1, "measured", IDENTITY, pivot_world=(1.0, 2.0, 3.0))))
-    digested = encode_for_digest(Decision((), outgoing=(OutgoingMessage(5, event),)))
-    expected = msgspec.to_builtins(Decision((), outgoing=(OutgoingMessage(5, event),)))
-    body = expected["outgoing"][0][1]["body"]
-    del body["alignment"]["pivot_world"]
-    assert digested == msgspec.msgpack.encode(expected)
+@pytest.mark.parametrize("cls", EventBody.__subclasses__(), ids=lambda cls: cls.__name__)
+def test_digest_has_events_without_the_pivot_that_alignments_got_later(cls: type[EventBody]) -> None:
+    event = Event(1, 2, 3, make_full(cls))
+    decision = Decision((), outgoing=(OutgoingMessage(5, event),), events=(event,))
+    expected = msgspec.to_builtins(decision)
+    for body in (expected["outgoing"][0][1]["body"], expected["events"][0]["body"]):
+        for holder in (body, body.get("participant")):
+            if isinstance(holder, dict) and "alignment" in holder:
+                del holder["alignment"]["pivot_world"]
+    assert encode_for_digest(decision) == msgspec.msgpack.encode(expected)
+    assert b"pivot_world" not in encode_for_digest(decision)
 
 
 def test_reset_restores_the_initial_state_in_a_new_epoch() -> None:

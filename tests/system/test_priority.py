@@ -6,10 +6,17 @@ import os
 import subprocess
 import sys
 import threading
+import time
+from pathlib import Path
 
 import pytest
 
-from iris_session.system.priority import LOW_PRIORITY_NICE, run_at_low_priority, tick_priority
+from iris_session.system.priority import (
+    LOW_PRIORITY_NICE,
+    lower_named_thread_priority,
+    run_at_low_priority,
+    tick_priority,
+)
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="threads have a priority on Linux only")
 
@@ -19,6 +26,25 @@ def test_low_priority_call_returns_and_raises() -> None:
     with pytest.raises(ZeroDivisionError):
         run_at_low_priority(lambda: 1 // 0)
     assert run_at_low_priority(lambda: None) is None
+
+
+def test_named_thread_is_waited_for() -> None:
+    """It has its name a moment after it was started."""
+    seen: list[int] = []
+    is_lowered = threading.Event()
+
+    def take_name() -> None:
+        time.sleep(0.05)
+        Path(f"/proc/self/task/{threading.get_native_id()}/comm").write_text("named late")
+        is_lowered.wait(10.0)
+        seen.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
+
+    thread = threading.Thread(target=take_name)
+    thread.start()
+    lower_named_thread_priority("named late")
+    is_lowered.set()
+    thread.join()
+    assert seen == [min(19, os.getpriority(os.PRIO_PROCESS, 0) + LOW_PRIORITY_NICE)]
 
 
 def test_threads_started_at_low_priority_inherit_it() -> None:

@@ -31,6 +31,8 @@ MBIT: Final = 125_000.0
 MIN_EXPECTED_FRAMES: Final = 20
 #: Refused keys that are remembered.
 MAX_REFUSED: Final = 256
+#: Sources that a warning names.
+MAX_NAMES: Final = 5
 
 
 class _ClientState:
@@ -180,16 +182,17 @@ class MediaService:
 
     def _refuse_flooder(self, flood: ChannelFlood, now_ns: int) -> None:
         """Refuse new connections of a source that flooded, and report it by the names of the keys that it may have."""
+        if not flood.has_key or self._keyring.key is None:
+            self._context.guard.report_flood(flood.address, "media ingest", now_ns)
+            return
         refused = self._backoff.refuse(flood.address, flood.key_id, flood.opened_ns, now_ns)
         names = sorted(name for key in refused if (name := self._find_source_name(key)) is not None)
-        if names:
-            seconds = max(refused.values()) // SECOND
-            detail = f"media ingest, {', '.join(names)} refused for {seconds} s"
-        elif self._keyring.key is None:
-            detail = "media ingest"
-        else:  # reported already, or no source's key any more
+        if not names:  # reported already, or no source's key any more
             return
-        self._context.guard.report_flood(flood.address, detail, now_ns)
+        shown = ", ".join(names[:MAX_NAMES]) + (f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else "")
+        seconds = max(refused.values()) // SECOND
+        text = f"flood from {flood.address}: media ingest, {shown} refused for {seconds} s"
+        self._context.guard.report_flood(flood.address, f"media ingest, {shown}", now_ns, warning=text)
 
     def _decide_sources(self, *, again: bool = False) -> None:
         """Decide which keys may hand in frames, by the present allow-list: new keys; `again`: all keys."""
