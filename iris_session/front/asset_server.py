@@ -18,7 +18,7 @@ import zmq
 
 from iris_session.assets.chunk_scheduler import ADVICE, ChunkReader, ChunkScheduler
 from iris_session.assets.store import ServedAssets
-from iris_session.front.connection_guard import ChannelGuard
+from iris_session.front.channel_guard import ChannelGuard
 from iris_session.front.memory_guard import PendingConnection
 from iris_session.link.config import MILLISECOND, FrontConfig
 from iris_session.link.sockets import open_assets, readable, watch_tcp

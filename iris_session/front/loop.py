@@ -18,7 +18,7 @@ from iris_session.alignment.worker import ThreadWorker
 from iris_session.front.admission import Admission
 from iris_session.front.asset_server import REQUEST_BYTES, AssetServer
 from iris_session.front.asset_service import AssetService
-from iris_session.front.connection_guard import ChannelBounds, ChannelGuard
+from iris_session.front.channel_guard import ChannelBounds, ChannelGuard
 from iris_session.front.connections import Peer
 from iris_session.front.context import FrontContext, FrontSockets, Service, find_channel_share, open_front
 from iris_session.front.disconnects import DisconnectHandler

@@ -17,7 +17,7 @@ import zmq
 
 from iris_session.assets.store import ServedAssets
 from iris_session.front.asset_server import AssetAccess, AssetServer, AssetSockets, open_asset_sockets
-from iris_session.front.connection_guard import ChannelBounds, ChannelGuard
+from iris_session.front.channel_guard import ChannelBounds, ChannelGuard
 from iris_session.link import FrontConfig, FrontLimits
 from iris_session.link.sockets import bound_port
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, MAX_ASSET_REQUESTS, AssetRequest

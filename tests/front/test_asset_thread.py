@@ -9,7 +9,7 @@ import pytest
 import zmq
 
 from iris_session.front.asset_server import CHUNKS, YIELD_MS, AssetAccess, AssetServer, open_asset_sockets
-from iris_session.front.connection_guard import MAX_COUNTED_MESSAGES, ChannelBounds, ChannelGuard
+from iris_session.front.channel_guard import MAX_COUNTED_MESSAGES, ChannelBounds, ChannelGuard
 from iris_session.link import FrontConfig, FrontLimits
 from iris_session.link.sockets import bound_port
 from iris_session.protocol.assets import AssetRequest

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import zmq
 
-from iris_session.front.connection_guard import ChannelBounds, ChannelGuard
+from iris_session.front.channel_guard import ChannelBounds, ChannelGuard
 from iris_session.front.media import proxy as media_module
 from iris_session.front.media.proxy import MediaProxy
 from iris_session.front.media.scheduler import MediaSubscriber

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import zmq
 
-from iris_session.front.connection_guard import ChannelFlood, ChannelGuard
+from iris_session.front.channel_guard import ChannelFlood, ChannelGuard
 from iris_session.front.media.scheduler import MediaScheduler
 from iris_session.front.memory_guard import PendingConnection
 from iris_session.protocol.codec import decode_media_push

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from iris_session.front.connection_guard import ChannelFlood
+from iris_session.front.channel_guard import ChannelFlood
 from iris_session.front.context import FrontContext
 from iris_session.front.key_budgets import IngestBackoff
 from iris_session.front.media.budget import (
