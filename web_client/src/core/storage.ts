@@ -3,7 +3,8 @@
 /** Values by key, and assets by address. Nothing throws: what cannot be kept is not kept. Bytes to keep are copied at once. */
 export interface Store {
   getValue(key: string): Promise<Uint8Array<ArrayBuffer> | null>;
-  putValue(key: string, bytes: Uint8Array): Promise<void>;
+  /** Returns whether it is kept after the page has ended. */
+  putValue(key: string, bytes: Uint8Array): Promise<boolean>;
   getAsset(address: string): Promise<Uint8Array<ArrayBuffer> | null>;
   putAsset(address: string, bytes: Uint8Array): Promise<void>;
 }
@@ -21,8 +22,9 @@ export class MemoryStore implements Store {
     return this.values.get(key)?.slice() ?? null;
   }
 
-  async putValue(key: string, bytes: Uint8Array): Promise<void> {
+  async putValue(key: string, bytes: Uint8Array): Promise<boolean> {
     this.values.set(key, bytes.slice());
+    return false;
   }
 
   async getAsset(): Promise<null> {
@@ -54,8 +56,8 @@ export class DatabaseStore implements Store {
     return this.get("values", key);
   }
 
-  async putValue(key: string, bytes: Uint8Array): Promise<void> {
-    await this.put("values", key, bytes);
+  putValue(key: string, bytes: Uint8Array): Promise<boolean> {
+    return this.put("values", key, bytes);
   }
 
   getAsset(address: string): Promise<Uint8Array<ArrayBuffer> | null> {

@@ -32,7 +32,7 @@ export class FrameReader {
       if (side === "none" || inputs.some((input) => input.side === side)) continue;
       inputs.push(this.readInput(frame, space, source, side, wantsJoints));
     }
-    const stops = [...this.session.inputSources].filter(isStopPressed).length;
+    const stops = [...this.session.inputSources].filter(isStopPressed);
     return { capture_ms, head: this.head, headTracked: isTracked(viewer), inputs, stops };
   }
 

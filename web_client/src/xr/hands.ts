@@ -2,8 +2,8 @@
 // that are sent. Pure.
 //
 // A trigger pressed at a robot acquires it; held at one's own robot it releases it; pressed at an answer it gives it. A
-// squeeze moves the robot of that hand, and the trigger is its gripper meanwhile. Buttons that are held when a hand appears
-// count from their next press; only the e-stop counts always.
+// squeeze moves the robot of that hand, and the trigger is its gripper meanwhile. While marks are touched, only answers are
+// given. Buttons that are held when a hand appears count from their next press; only the e-stop counts always.
 
 import type { SampleInput } from "../core/api.ts";
 import { Grips } from "./grips.ts";
@@ -30,13 +30,14 @@ export type Intent =
   | { type: "answer"; answer: Answer }
   | { type: "episode"; action: "start" | "success" | "discard" }
   /** Stay where the scene is shown. */
-  | { type: "place" }
-  | { type: "estop" };
+  | { type: "place" };
 
 /** What the session and the picture say at a frame. */
 export interface Context {
   /** Robots that this participant holds. */
   held: readonly string[];
+  /** Of each robot that no other participant holds, too: what changes when another may have moved its gripper. */
+  tenures: ReadonlyMap<string, string>;
   /** Robots that the session moves for this participant. */
   following: readonly string[];
   /** The robot that each hand points at. */
@@ -46,6 +47,8 @@ export interface Context {
   isEpisodeRunning: boolean;
   /** This participant may place itself, and is not aligned. */
   canPlace: boolean;
+  /** The person touches marks: a trigger that is not pressed at an answer is meant for them. */
+  isTouching: boolean;
 }
 
 interface Hand {
@@ -74,18 +77,25 @@ export class Hands {
   private readonly grips = new Grips();
   /** What is asked of the gripper of each hand in this frame. */
   private readonly grasps = new Map<Side, number | null>();
-  private stops = 0;
+  /** Devices whose button of the e-stop was pressed in the last frame. */
+  private stops: readonly object[] = [];
   private frame_ms = Number.NEGATIVE_INFINITY;
+
+  /** Take the devices whose button of the e-stop is pressed. Returns whether one is that was not in the frame before. */
+  takeStops(stops: readonly object[]): boolean {
+    const isPress = stops.some((device) => !this.stops.includes(device));
+    this.stops = stops;
+    return isPress;
+  }
 
   /** Take a frame. Returns what it asks of the session. */
   update(reading: FrameReading, context: Context): Intent[] {
-    const { capture_ms, stops } = reading;
+    const { capture_ms } = reading;
     const dt_ms = capture_ms - this.frame_ms;
     if (dt_ms > GAP_MS) this.suspend();
     this.frame_ms = capture_ms;
     for (const [side, robot] of this.driven) if (!context.held.includes(robot)) this.driven.delete(side);
-    const intents: Intent[] = stops > this.stops ? [{ type: "estop" }] : [];
-    this.stops = stops;
+    const intents: Intent[] = [];
     const inputs = reading.inputs.filter(({ tracked }) => tracked);
     for (const side of this.hands.keys()) if (!inputs.some((input) => input.side === side)) this.hands.delete(side);
     for (const input of inputs) this.updateHand(input, capture_ms, context, intents);
@@ -176,6 +186,7 @@ export class Hands {
     if (!hand.trigger || hand.squeeze || robot !== hand.pressedAt) hand.pressed_ms = null;
     if (hand.squeeze || robot !== undefined || answer !== undefined) hand.tapped_ms = null;
     if (isPress && answer !== undefined) intents.push({ type: "answer", answer });
+    else if (context.isTouching) [hand.pressed_ms, hand.tapped_ms] = [null, null];
     else if (isPress && robot !== undefined) this.pressAt(robot, side, hand, now_ms, context, intents);
     else if (isPress) hand.tapped_ms = now_ms;
     if (hand.pressed_ms !== null && now_ms - hand.pressed_ms >= RELEASE_MS) {
@@ -207,13 +218,13 @@ export class Hands {
     }
   }
 
-  private updateGrips(inputs: readonly InputReading[], { held, following }: Context, dt_s: number): void {
+  private updateGrips(inputs: readonly InputReading[], { held, following, tenures }: Context, dt_s: number): void {
     this.grips.keepOnly(held);
     this.grasps.clear();
     for (const [side, robot] of this.driven) {
       const trigger = inputs.find((input) => input.side === side)?.trigger;
       if (trigger === undefined || !this.isSqueezing(side)) this.grips.letGo(robot);
-      else this.grasps.set(side, this.grips.follow(robot, trigger, following.includes(robot), dt_s));
+      else this.grasps.set(side, this.grips.follow(robot, tenures.get(robot), trigger, following.includes(robot), dt_s));
     }
   }
 

@@ -106,6 +106,7 @@ export class Headset {
     // What is covered has no input; its devices are reported where they were, as not tracked.
     const reading = isVisible ? read : { ...read, inputs: this.reading?.inputs ?? [] };
     this.reading = reading;
+    if (isVisible) this.takeStops(reading);
     const T_world_tracking = this.findPlace();
     this.showsScene = T_world_tracking !== null;
     if (T_world_tracking !== null) this.props.place(T_world_tracking);
@@ -150,6 +151,7 @@ export class Headset {
 
   private suspend(): void {
     this.hands.suspend();
+    this.hands.takeStops([]); // one that is held when input comes back counts
     this.wristStop.suspend();
   }
 
@@ -184,13 +186,17 @@ export class Headset {
   private makeContext(): Context {
     const { state } = this;
     const robots = new Set(state.session?.robots.map(({ name }) => name));
+    const held = state.heldBy(state.selfId).filter((name) => robots.has(name));
+    const own = held.map((name) => state.lease(name)).filter((lease) => lease?.sub_holders.length === 0);
     return {
-      held: state.heldBy(state.selfId).filter((name) => robots.has(name)),
+      held,
+      tenures: new Map(own.map((lease) => [lease!.target, `${lease!.lease_version} ${state.session?.scene_epoch}`])),
       following: [...robots].filter((name) => state.feedback.get(name)?.hold_reason === ""),
       pointed: this.pointed,
       aimed: this.aimed,
       isEpisodeRunning: state.session?.episode?.state === "running",
       canPlace: this.canPlace,
+      isTouching: this.marks.isActive,
     };
   }
 
@@ -224,20 +230,23 @@ export class Headset {
     return this.view.scene?.bodies.get(body)?.position.toArray() ?? null;
   }
 
+  private takeStops(reading: FrameReading): void {
+    if (this.hands.takeStops(reading.stops)) this.actions.estop("button of a controller");
+    if (this.wristStop.update(reading)) this.actions.estop("fingertip at the wrist");
+  }
+
   /** Hands move no robot while they touch marks, and what they hold then counts afterwards from its next press. */
   private takeHands(reading: FrameReading, frame: XRFrame, space: XRReferenceSpace): void {
     const busy = Object.keys({ ...this.pointed, ...this.aimed }) as Side[];
     const wasActive = this.marks.isActive;
     this.marks.onFrame(frame, space, reading, busy);
     if (wasActive !== this.marks.isActive) this.hands.suspend();
-    this.ask(this.hands.update(this.marks.mask(reading, busy), this.makeContext()));
-    if (this.wristStop.update(reading)) this.actions.estop("fingertip at the wrist");
+    this.ask(this.hands.update(this.marks.mask(reading), this.makeContext()));
   }
 
   private ask(intents: readonly Intent[]): void {
     for (const intent of intents) {
-      if (intent.type === "estop") this.actions.estop("button of a controller");
-      else if (intent.type === "episode") void this.actions.request({ type: "episode", action: intent.action });
+      if (intent.type === "episode") void this.actions.request({ type: "episode", action: intent.action });
       else if (intent.type === "answer") this.consent.answer(intent.answer);
       else if (intent.type === "acquire") void this.acquire(intent.robot);
       else if (intent.type === "place") this.placeSelf();

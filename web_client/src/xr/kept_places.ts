@@ -4,7 +4,6 @@
 import type { ObservationInput } from "../core/api.ts";
 import type { Store } from "../core/storage.ts";
 import type * as wire from "../protocol/messages.g.ts";
-import { rotateCovariance } from "./poses.ts";
 import { toPose, toRow } from "./reading.ts";
 import type { Tip } from "./touching.ts";
 
@@ -25,7 +24,8 @@ export function keepTips(store: Store, owner: string, tips: ReadonlyMap<string, 
 /** Return the tips that were kept for this owner. */
 export async function recallTips(store: Store, owner: string): Promise<[string, Tip][]> {
   const kept = decode<{ owner: string; tips: [string, Tip][] }>(await store.getValue(TIPS_KEY));
-  return kept?.owner === owner ? kept.tips : [];
+  if (kept?.owner !== owner || !Array.isArray(kept.tips)) return [];
+  return kept.tips.filter(([device, tip]) => typeof device === "string" && isNumbers(tip?.p, 3) && isNumbers(tip.covariance, 9));
 }
 
 /** The place that this browser keeps for sessions of one name. */
@@ -44,8 +44,9 @@ export class PlaceKeeper {
 
   /** Ask the headset for the place that was kept. Nothing happens where there is none. */
   async restore(): Promise<void> {
-    this.kept = decode<KeptPlace>(await this.store.getValue(this.key));
-    if (!this.kept) return;
+    const kept = decode<KeptPlace>(await this.store.getValue(this.key));
+    if (!kept || !isNumbers(kept.covariance, 36)) return;
+    this.kept = kept;
     try {
       this.anchor = (await this.session.restorePersistentAnchor?.(this.kept.handle)) ?? null;
     } catch {
@@ -60,34 +61,40 @@ export class PlaceKeeper {
     const found = frame.getPose(anchor.anchorSpace, space);
     if (!found) return null;
     const pose = toPose(found.transform.position, found.transform.orientation);
-    return { anchor_id: kept.anchor_id, kind: "persistent", T_tracking_anchor: pose, covariance: rotateCovariance(pose[1], kept.covariance), capture_ms };
+    return { anchor_id: kept.anchor_id, kind: "persistent", T_tracking_anchor: pose, covariance: kept.covariance, capture_ms };
   }
 
   /**
    * Keep the place of a sheet, instead of the last one. Returns whether the browser does.
    *
-   * `covariance`: of the alignment at the sheet, in the axes of the sheet; empty: unknown. Call it while the frame is drawn.
+   * `covariance`: of the alignment at the sheet, in the axes of the sheet. Call it while the frame is drawn.
    */
   async keep(frame: XRFrame, space: XRReferenceSpace, anchor_id: string, T_tracking_anchor: wire.Pose, covariance: number[]): Promise<boolean> {
     const [x, y, z, qx, qy, qz, qw] = toRow(T_tracking_anchor);
+    let anchor: XRAnchor | undefined;
     try {
       const pose = new XRRigidTransform({ x: x!, y: y!, z: z! }, { x: qx!, y: qy!, z: qz!, w: qw! });
-      const anchor = await frame.createAnchor?.(pose, space);
+      anchor = await frame.createAnchor?.(pose, space);
       const handle = await anchor?.requestPersistentHandle?.();
-      if (!anchor || handle === undefined) {
+      const kept = handle === undefined ? null : { anchor_id, handle, covariance };
+      if (!anchor || !kept || !(await this.store.putValue(this.key, encode(kept)))) {
         anchor?.delete();
         return false;
       }
       const former = this.kept?.handle;
-      [this.kept, this.anchor] = [{ anchor_id, handle, covariance }, anchor];
-      await this.store.putValue(this.key, encode(this.kept));
+      [this.kept, this.anchor] = [kept, anchor];
       // Headsets keep few anchors of a site. One that they have forgotten already is no loss.
       if (former !== undefined) await this.session.deletePersistentAnchor?.(former).catch(() => undefined);
       return true;
     } catch {
+      anchor?.delete();
       return false;
     }
   }
+}
+
+function isNumbers(values: unknown, count: number): boolean {
+  return Array.isArray(values) && values.length === count && values.every(Number.isFinite);
 }
 
 function encode(value: object): Uint8Array {

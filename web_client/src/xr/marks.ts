@@ -1,7 +1,7 @@
 // Touched marks in a headset: gives `Touching` its frames and answers, sends what it reports, shows where the next mark is
 // expected and where tips are, and keeps the place for the next visit.
 
-import { BufferGeometry, Float32BufferAttribute, Group, Line, LineBasicMaterial, Mesh, MeshBasicMaterial, Quaternion, RingGeometry, SphereGeometry, Vector3 } from "three";
+import { BufferGeometry, Float32BufferAttribute, Group, Line, LineBasicMaterial, type Material, Mesh, MeshBasicMaterial, Quaternion, RingGeometry, SphereGeometry, Vector3 } from "three";
 
 import type { AnchorPlace, FromWorker, ObservationInput } from "../core/api.ts";
 import type { WorkerClient } from "../core/page_client.ts";
@@ -10,11 +10,11 @@ import type { Actions } from "../ui/actions.ts";
 import type { PageState } from "../ui/state.ts";
 import { Label } from "../view/labels.ts";
 import { keepTips, PlaceKeeper, recallTips } from "./kept_places.ts";
-import { invert, rotateCovariance } from "./poses.ts";
+import { covarianceAtAnchor } from "./poses.ts";
 import { moveTo } from "./props.ts";
 import { BUTTON, type FrameReading, type Side, toRow } from "./reading.ts";
 import { type Facts, locateAnchor, MIN_TOUCHES, type Outcome, Touching } from "./touching.ts";
-import { isPlaced } from "./words.ts";
+import { isPlaced, isViewOnly } from "./words.ts";
 
 /** Time between two reports of a kept place [ms]. */
 const REPORT_MS = 2000;
@@ -66,11 +66,11 @@ export class Marks {
     return this.findSheet() !== null;
   }
 
-  /** Return a reading without what is meant for the marks. `busy`: sides whose trigger has another meaning now. */
-  mask(reading: FrameReading, busy: readonly Side[]): FrameReading {
+  /** Return a reading without squeezes and buttons that are meant for the marks. */
+  mask(reading: FrameReading): FrameReading {
     if (!this.isActive) return reading;
     const left = ~(BUTTON.trigger | BUTTON.squeeze | BUTTON.lower | BUTTON.upper);
-    const inputs = reading.inputs.map((one) => ({ ...one, trigger: busy.includes(one.side) ? one.trigger : 0, squeeze: 0, buttons: one.buttons & left }));
+    const inputs = reading.inputs.map((one) => ({ ...one, squeeze: 0, buttons: one.buttons & left }));
     return { ...reading, inputs };
   }
 
@@ -102,7 +102,11 @@ export class Marks {
 
   dispose(): void {
     this.label.dispose();
-    for (const child of [...this.ring.children, ...this.tips]) if (child instanceof Mesh || child instanceof Line) child.geometry.dispose();
+    for (const child of [...this.ring.children, ...this.tips]) {
+      if (!(child instanceof Mesh || child instanceof Line)) continue;
+      child.geometry.dispose();
+      (child.material as Material).dispose();
+    }
     this.group.removeFromParent();
   }
 
@@ -125,10 +129,11 @@ export class Marks {
     else if (outcome.type === "pulse") this.pulse(outcome.side);
     else {
       this.memory = outcome.isConfirmed ? IS_CONFIRMED : "";
-      if (outcome.isConfirmed || alignment?.kind !== "measured" || alignment.offset || !this.keeper) return;
+      if (!outcome.isMeasured || alignment?.kind !== "measured" || alignment.offset || !this.keeper) return;
       const { anchor } = outcome;
       const T_tracking_anchor = locateAnchor(alignment, anchor);
-      const covariance = rotateCovariance(invert(anchor.T_world_anchor)[1], alignment.covariance);
+      const covariance = covarianceAtAnchor(alignment, anchor.T_world_anchor);
+      if (covariance.length === 0) return;
       void this.keeper.keep(frame, space, anchor.anchor_id, T_tracking_anchor, covariance).then((isKept) => (this.memory = isKept ? IS_KEPT : IS_NOT_KEPT));
     }
   }
@@ -137,9 +142,9 @@ export class Marks {
     this.client.post({ type: "observation", observation });
   }
 
-  /** Report where the kept place is, until the headset is aligned. */
+  /** Report where the kept place is, until it is confirmed: a new connection or run of the alignment knows nothing of it. */
   private reportKept(frame: XRFrame, space: XRReferenceSpace, now_ms: number, { isReady, alignment }: Facts): void {
-    if (!isReady || isPlaced(alignment) || now_ms - this.reported_ms < REPORT_MS) return;
+    if (!isReady || (isPlaced(alignment) && !isViewOnly(alignment)) || now_ms - this.reported_ms < REPORT_MS) return;
     const observation = this.keeper?.observe(frame, space, now_ms);
     if (!observation) return;
     this.reported_ms = now_ms;

@@ -44,14 +44,28 @@ export function distanceBetween(a: Vec3, b: Vec3): number {
   return Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]);
 }
 
-/** Return a covariance (6x6 row-major: position, rotation; or empty) of the axes B in the axes A. `q`: rotation `q_A_B`. */
-export function rotateCovariance(q: Quat, covariance: readonly number[]): number[] {
+/**
+ * Return the covariance of an alignment at an anchor, in its axes, empty where it is not known: what is kept with a
+ * persistent anchor (docs/protocol.md, section 5; `covariance_at_anchor` in `anchors/persistent.py`).
+ */
+export function covarianceAtAnchor(alignment: { covariance: readonly number[]; pivot_world: Vec3 }, [p, [w, x, y, z]]: wire.Pose): number[] {
+  const { covariance, pivot_world } = alignment;
   if (covariance.length !== 36) return [];
-  const columns = [rotate(q, [1, 0, 0]), rotate(q, [0, 1, 0]), rotate(q, [0, 0, 1])];
-  const turn = (row: number, column: number): number => (Math.trunc(row / 3) === Math.trunc(column / 3) ? columns[column % 3]![row % 3]! : 0);
+  // A small rotation v about the pivot moves the anchor by v x r; both are turned into its axes.
+  const back: Quat = [w, -x, -y, -z];
+  const r: Vec3 = [p[0] - pivot_world[0], p[1] - pivot_world[1], p[2] - pivot_world[2]];
+  const units: Vec3[] = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
+  const columns = [
+    ...units.map((unit) => [...rotate(back, unit), 0, 0, 0]),
+    ...units.map((unit) => [...rotate(back, cross(unit, r)), ...rotate(back, unit)]),
+  ];
   const indices = [0, 1, 2, 3, 4, 5];
-  const half = indices.map((i) => indices.map((j) => indices.reduce((sum, k) => sum + turn(i, k) * covariance[6 * k + j]!, 0)));
-  return indices.flatMap((i) => indices.map((j) => indices.reduce((sum, k) => sum + half[i]![k]! * turn(j, k), 0)));
+  const half = indices.map((i) => indices.map((j) => indices.reduce((sum, k) => sum + columns[k]![i]! * covariance[6 * k + j]!, 0)));
+  return indices.flatMap((i) => indices.map((j) => indices.reduce((sum, k) => sum + half[i]![k]! * columns[k]![j]!, 0)));
+}
+
+function cross([ax, ay, az]: Vec3, [bx, by, bz]: Vec3): Vec3 {
+  return [ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx];
 }
 
 /**

@@ -1,7 +1,7 @@
 // What a headset shows of its own: controllers, hands, rays, and panels. All in the tracking frame, in the axes of
 // three.js, below one group that is placed in the world by the alignment.
 
-import { BufferGeometry, CapsuleGeometry, Float32BufferAttribute, Group, Line, LineBasicMaterial, Mesh, MeshBasicMaterial, type Object3D, PerspectiveCamera, SphereGeometry, Vector3 } from "three";
+import { BufferGeometry, CapsuleGeometry, Float32BufferAttribute, Group, Line, LineBasicMaterial, type Material, Mesh, MeshBasicMaterial, type Object3D, PerspectiveCamera, SphereGeometry, Vector3 } from "three";
 
 import type * as wire from "../protocol/messages.g.ts";
 import { Label } from "../view/labels.ts";
@@ -88,8 +88,10 @@ export class Props {
     this.stop.material.dispose();
     this.rig.removeFromParent();
     for (const { controller, hand, ray } of this.props.values()) {
-      for (const { geometry } of [controller, hand, ray]) geometry.dispose();
-      (ray.material as LineBasicMaterial).dispose();
+      for (const { geometry, material } of [controller, hand, ray]) {
+        geometry.dispose();
+        (material as Material).dispose();
+      }
     }
   }
 

@@ -41,8 +41,8 @@ export interface FrameReading {
   head: wire.Pose | null;
   headTracked: boolean;
   inputs: InputReading[];
-  /** How many devices have a button of the e-stop pressed. */
-  stops: number;
+  /** Devices whose button of the e-stop is pressed, tracked or not. */
+  stops: readonly object[];
 }
 
 /** Bits of `Sample.buttons` by their place in the WebXR gamepad mapping `xr-standard`. */

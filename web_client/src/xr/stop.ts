@@ -28,12 +28,14 @@ export class WristStop {
     this.moveBall(find("left"), capture_ms);
     const right = find("right");
     if (this.center === null) this.isArmed = false;
-    if (this.center === null || !right?.tip || !right.pose || distance(right.tip, right.pose[0]) < STRETCHED_M) {
+    if (this.center === null || !right?.tip || !right.pose) {
       this.since_ms = null;
       return false;
     }
     const isInside = distance(this.center, right.tip) <= STOP_RADIUS_M;
-    if (!isInside) [this.isArmed, this.since_ms] = [true, null];
+    const isStretched = distance(right.tip, right.pose[0]) >= STRETCHED_M;
+    if (!isInside) this.isArmed = true;
+    if (!isInside || !isStretched) this.since_ms = null;
     else this.since_ms ??= capture_ms;
     if (!this.isArmed || this.since_ms === null || capture_ms - this.since_ms < TOUCH_MS) return false;
     this.isArmed = false;

@@ -36,8 +36,11 @@ export type Outcome =
   | { type: "pulse"; side: Side }
   /** A new alignment run is wanted. */
   | { type: "restart" }
-  /** Marks were touched, and the alignment is in force. `isConfirmed`: that of the kept place, by fewer marks. */
-  | { type: "finish"; anchor: AnchorPlace; isConfirmed: boolean };
+  /**
+   * Marks were touched, and the alignment is in force. `isConfirmed`: that of the kept place, by fewer marks. `isMeasured`:
+   * a new one, by the marks alone.
+   */
+  | { type: "finish"; anchor: AnchorPlace; isConfirmed: boolean; isMeasured: boolean };
 
 type Stage =
   | { name: "off" }
@@ -90,6 +93,9 @@ export class Touching {
   private wasAsked = false;
   private isDeclined = false;
   private wasPlaced = false;
+  private wasReady = false;
+  /** Version of the alignment when the first mark was touched. */
+  private version: number | undefined;
   private isConfirming = false;
   private wantsTip = false;
   /** There are hands, and no controller. */
@@ -122,8 +128,9 @@ export class Touching {
     const outcomes: Outcome[] = [];
     this.isBare = reading.inputs.length > 0 && reading.inputs.every(({ kind }) => kind === "hand");
     const placed = isPlaced(facts.alignment);
-    if (this.wasPlaced && !placed) this.reset();
-    this.wasPlaced = placed;
+    const isConnectedAnew = facts.isReady && !this.wasReady; // the session has forgotten the touches of the last connection
+    if ((this.wasPlaced && !placed) || (isConnectedAnew && this.touched.size > 0)) this.reset();
+    [this.wasPlaced, this.wasReady] = [placed, facts.isReady];
     if (facts.anchor?.anchor_id !== this.anchor?.anchor_id) {
       this.anchor = facts.anchor;
       this.reset();
@@ -270,7 +277,7 @@ export class Touching {
         return;
       case "tip":
       case "touch":
-        if (this.isConfirming && alignment?.kind === "measured") return this.finish(now_ms, outcomes);
+        if (this.isConfirming && alignment?.kind === "measured") return this.finish(alignment, now_ms, outcomes);
         if (buttons & BUTTON.lower) this.wantsTip = true;
         this.stage = { name: !this.wantsTip && this.canTouch(reading) ? "touch" : "tip" };
         for (const side of triggers) this.press(side, reading);
@@ -347,6 +354,7 @@ export class Touching {
     const p: [number, number, number] = [sum[0] / points.length, sum[1] / points.length, sum[2] / points.length];
     const tip = this.tips.get(device);
     this.isConfirming = this.touched.size === 0 ? alignment?.kind === "persistent" && tip !== undefined : this.isConfirming;
+    if (this.touched.size === 0) this.version = alignment?.version;
     this.touched.set(mark, p);
     this.advice = "";
     const q = touching.pose?.[1] ?? IDENTITY[1];
@@ -358,22 +366,23 @@ export class Touching {
 
   private stepWait(since_ms: number, now_ms: number, alignment: Facts["alignment"], outcomes: Outcome[]): void {
     const isAligned = isPlaced(alignment) && alignment?.kind !== "persistent";
-    if (isAligned && now_ms - since_ms >= REFUSAL_MS) this.finish(now_ms, outcomes);
+    if (isAligned && now_ms - since_ms >= REFUSAL_MS) this.finish(alignment, now_ms, outcomes);
     else if (now_ms - since_ms >= ANSWER_MS) {
       this.reset();
       [this.stage, this.advice] = [{ name: "touch" }, "The session did not answer: touch the marks once more."];
     }
   }
 
-  private finish(now_ms: number, outcomes: Outcome[]): void {
-    if (this.anchor) outcomes.push({ type: "finish", anchor: this.anchor, isConfirmed: this.isConfirming && this.touched.size < MIN_TOUCHES });
+  private finish(alignment: Facts["alignment"], now_ms: number, outcomes: Outcome[]): void {
+    const isMeasured = this.touched.size >= MIN_TOUCHES && alignment?.version !== this.version;
+    if (this.anchor) outcomes.push({ type: "finish", anchor: this.anchor, isConfirmed: this.isConfirming && this.touched.size < MIN_TOUCHES, isMeasured });
     this.stage = { name: "done", since_ms: now_ms };
   }
 
   /** End before all is touched: what is aligned so far counts. */
   private leave(alignment: Facts["alignment"], now_ms: number, outcomes: Outcome[]): void {
     this.isDeclined = true;
-    if (this.touched.size > 0 && isPlaced(alignment) && !isViewOnly(alignment)) this.finish(now_ms, outcomes);
+    if (this.touched.size > 0 && isPlaced(alignment) && !isViewOnly(alignment)) this.finish(alignment, now_ms, outcomes);
     else this.stage = { name: "off" };
   }
 

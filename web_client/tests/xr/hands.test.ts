@@ -12,6 +12,8 @@ function input(fields: Partial<InputReading> = {}): InputReading {
   return { side: "right", kind: "controller", pose: POSE, tracked: true, ray: null, trigger: 0, squeeze: 0, buttons: 0, tip: null, joints: [], ...fields };
 }
 
+const DEVICES = { left: {}, right: {} };
+
 let hands: Hands;
 let now = 0;
 beforeEach(() => {
@@ -21,11 +23,11 @@ beforeEach(() => {
 
 function reading(...inputs: InputReading[]): FrameReading {
   now += 10;
-  const stops = inputs.filter(({ buttons }) => buttons & STOP_BUTTONS).length;
+  const stops = inputs.filter(({ buttons }) => buttons & STOP_BUTTONS).map(({ side }) => DEVICES[side]);
   return { capture_ms: now, head: POSE, headTracked: true, inputs, stops };
 }
 
-const NOTHING: Context = { held: [], following: [], pointed: {}, aimed: {}, isEpisodeRunning: false, canPlace: false };
+const NOTHING: Context = { held: [], tenures: new Map(), following: [], pointed: {}, aimed: {}, isEpisodeRunning: false, canPlace: false, isTouching: false };
 
 function step(context: Partial<Context>, ...inputs: InputReading[]): Intent[] {
   return hands.update(reading(...inputs), { ...NOTHING, ...context });
@@ -246,30 +248,35 @@ describe("buttons", () => {
     expect(step({}, input({ buttons: BUTTON.upper }))).toEqual([]);
   });
 
-  test("a thumbstick stops, and the pad of a controller without one: once for each press", () => {
+  test("a thumbstick stops, and the pad of a controller without one: once for each press, of each controller", () => {
+    const stops = (...inputs: InputReading[]): boolean => hands.takeStops(reading(...inputs).stops);
     for (const buttons of [BUTTON.thumbstick, BUTTON.touchpad]) {
-      step({}, input());
-      expect(step({}, input({ buttons }))).toEqual([{ type: "estop" }]);
-      expect(step({}, input({ buttons }), input({ side: "left" }))).toEqual([]);
-      expect(step({}, input({ buttons }), input({ side: "left", buttons }))).toEqual([{ type: "estop" }]);
+      const [right, left] = [input({ buttons }), input({ side: "left", buttons })];
+      expect([stops(input()), stops(right), stops(right, input({ side: "left" }))]).toEqual([false, true, false]);
+      expect(stops(right, left)).toBe(true);
+      expect([stops(right), stops(left)]).toEqual([false, true]); // one is let go in the frame in which the other is pressed
     }
-  });
-
-  test("it stops with a controller that is not tracked, that has just appeared, and that was covered", () => {
-    const stop = [{ type: "estop" }];
-    const buttons = BUTTON.thumbstick;
-    expect(step({}, input({ buttons }))).toEqual(stop);
-    step({}, input());
-    expect(step({}, input({ tracked: false, buttons }))).toEqual(stop);
-    expect(step({}, input({ buttons }))).toEqual([]);
-    step({}, input());
-    hands.suspend();
-    expect(step({}, input({ buttons }))).toEqual(stop);
   });
 
   test("a hand that is not tracked asks for nothing else", () => {
     step({}, input());
     expect(step({ pointed: { right: "left" } }, input({ tracked: false, trigger: 1, buttons: BUTTON.lower }))).toEqual([]);
+  });
+});
+
+describe("while marks are touched", () => {
+  const touching = { isTouching: true, aimed: { right: "grant" as const } };
+
+  test("a trigger that is held on a mark gives no answer when its ray crosses one; a press at it does", () => {
+    step({ isTouching: true }, input());
+    expect(step({ isTouching: true }, input({ trigger: 1 }))).toEqual([]);
+    expect(step(touching, input({ trigger: 1 }))).toEqual([]);
+    expect(step(touching, input())).toEqual([]);
+    expect(step(touching, input({ trigger: 1 }))).toEqual([{ type: "answer", answer: "grant" }]);
+  });
+
+  test("a short press is no wish to be placed", () => {
+    for (const trigger of [0, 1, 0]) expect(step({ isTouching: true, canPlace: true }, input({ trigger }))).toEqual([]);
   });
 });
 
@@ -307,7 +314,8 @@ describe("samples", () => {
 
   test("a gripper stays as it is until the trigger has closed at least as far, and in each squeeze anew", () => {
     take("arm");
-    const following = { held: ["arm"], following: ["arm"] };
+    const tenures = new Map([["arm", "1"]]);
+    const following = { held: ["arm"], tenures, following: ["arm"] };
     const grip = (squeeze: number, trigger: number, context: Partial<Context> = following): number | null | undefined => sample(context, [input({ squeeze, trigger })])?.gripper;
     const wait = (trigger: number): void => {
       for (let i = 0; i < 100; i++) grip(1, trigger);
@@ -320,10 +328,31 @@ describe("samples", () => {
     expect(grip(1, 1)).toBe(1);
     wait(0);
     expect([grip(0, 0), grip(1, 0), grip(1, 0.3)]).toEqual([null, 0, 0.3]); // it is open
-    expect(grip(1, 0, { held: ["arm"] })).toBe(null); // the session holds the robot
+    expect(grip(1, 0, { held: ["arm"], tenures })).toBe(null); // the session holds the robot
     expect([grip(0, 0), grip(1, 0), grip(1, 0.5), grip(1, 1)]).toEqual([null, null, null, 1]);
     step({}, input());
     expect([grip(0, 0), grip(1, 0), grip(1, 0)]).toEqual([null, null, null]); // another participant had it
+  });
+
+  test("a gripper that others may have moved stays as it is", () => {
+    take("arm");
+    const grip = (squeeze: number, trigger: number, tenure?: string): number | null | undefined => {
+      const tenures = new Map(tenure === undefined ? [] : [["arm", tenure]]);
+      return sample({ held: ["arm"], tenures, following: ["arm"] }, [input({ squeeze, trigger })])?.gripper;
+    };
+    const open = (tenure?: string): void => {
+      grip(1, 1, tenure);
+      for (let i = 0; i < 100; i++) grip(1, 0, tenure);
+      expect(grip(1, 0, tenure)).toBe(0);
+    };
+    open("1 1");
+    expect([grip(0, 0, "1 1"), grip(1, 0, "1 1")]).toEqual([null, 0]); // only this person may have moved it
+    for (const other of ["2 1", "1 2", undefined]) {
+      open("1 1");
+      expect([grip(0, 0, "1 1"), grip(1, 0, other), grip(1, 0, other)]).toEqual([null, null, null]);
+    }
+    open(); // an agent drives while this person lets go, and grasps
+    expect([grip(0, 0), grip(1, 0)]).toEqual([null, null]);
   });
 
   test("a squeeze opens below where it closes", () => {

@@ -45,7 +45,7 @@ function show(duration_ms: number, { tip, left = {}, finger_m = 0.17 }: Frame): 
   let stops = 0;
   for (const end = now + duration_ms; now < end; now += FRAME_MS) {
     const inputs = [hand("left", { pose: [[...jitter(WRIST[0])], WRIST[1]], ...left }), hand("right", { tip: tip && jitter(tip), pose: tip && [[tip[0] - finger_m, tip[1], tip[2]], [1, 0, 0, 0]] })];
-    const reading: FrameReading = { capture_ms: now, head: null, headTracked: true, inputs, stops: 0 };
+    const reading: FrameReading = { capture_ms: now, head: null, headTracked: true, inputs, stops: [] };
     if (stop.update(reading)) stops += 1;
   }
   return stops;
@@ -84,6 +84,12 @@ test("no stop: one wrong reading, a finger that passes beside it, a fist, a hand
   expect(show(500, { tip: BALL, finger_m: 0.09 })).toBe(0);
   show(300, { tip: AWAY });
   expect(show(500, { tip: null })).toBe(0);
+});
+
+test("a fist beside the ball whose finger straightens into it stops", () => {
+  const beside: Vec3 = [BALL[0] - 0.07, BALL[1], BALL[2]];
+  expect(show(300, { tip: beside, finger_m: 0.09 })).toBe(0);
+  expect(show(100, { tip: BALL, finger_m: 0.16 })).toBe(1);
 });
 
 test("no stop: a finger that is there when the ball appears, or when a menu is gone", () => {

@@ -6,7 +6,7 @@ import type { AnchorPlace, ObservationInput, ParticipantInfo } from "../../src/c
 import { MemoryStore } from "../../src/core/storage.ts";
 import type * as wire from "../../src/protocol/messages.g.ts";
 import { keepTips, PlaceKeeper, recallTips } from "../../src/xr/kept_places.ts";
-import { compose, fitLevel, IDENTITY, invert, rotateCovariance, transform } from "../../src/xr/poses.ts";
+import { compose, covarianceAtAnchor, fitLevel, IDENTITY, invert, transform } from "../../src/xr/poses.ts";
 import { BUTTON, type FrameReading, type InputReading, type Vec3 } from "../../src/xr/reading.ts";
 import { BEGIN_MS, type Facts, type Outcome, REST_MS, TIP_POSES, Touching } from "../../src/xr/touching.ts";
 
@@ -16,7 +16,7 @@ const TIP: Vec3 = [0.1, 0, -0.02];
 const marks = Object.entries({ 1: [0.1, 0.1, 0], 2: [-0.1, -0.1, 0], 3: [0.1, -0.1, 0], 4: [-0.1, 0.1, 0] } as const).map(([id, p]) => ({ id, p_anchor: [...p] as [number, number, number] }));
 const anchor: AnchorPlace = { anchor_id: "table", T_world_anchor: [[1, 2, 0.7], [1, 0, 0, 0]], size_m: 0.14, error_m: 0, marks };
 const T_world_tracking: wire.Pose = [[0.5, -0.3, 0.1], [Math.cos(0.4), 0, 0, Math.sin(0.4)]];
-const alignment = { kind: "measured", error_at_robot_m: 0.006, offset: false, T_world_tracking } as Alignment;
+const alignment = { version: 1, kind: "measured", error_at_robot_m: 0.006, offset: false, T_world_tracking } as Alignment;
 const at = (mark: string): Vec3 => transform(invert(T_world_tracking), transform(anchor.T_world_anchor, marks.find(({ id }) => id === mark)!.p_anchor));
 
 let touching: Touching;
@@ -38,7 +38,7 @@ function hand(side: InputReading["side"], fingertip: Vec3, trigger = 0): InputRe
 
 function reading(...inputs: InputReading[]): FrameReading {
   now += 20;
-  return { capture_ms: now, head: IDENTITY, headTracked: true, inputs, stops: 0 };
+  return { capture_ms: now, head: IDENTITY, headTracked: true, inputs, stops: [] };
 }
 
 const step = (...inputs: InputReading[]): Outcome[] => touching.update(reading(...inputs), facts);
@@ -121,7 +121,7 @@ describe("touches", () => {
     expect(says()).toMatch(/^Touch mark 4 \(4 of 4\) So far: aligned ± 6.0 mm at the robot/);
     touch(at("4"));
     now += 2000;
-    expect(step(controller())).toEqual([{ type: "finish", anchor, isConfirmed: false }]);
+    expect(step(controller())).toEqual([{ type: "finish", anchor, isConfirmed: false, isMeasured: true }]);
     expect(touching.isActive).toBe(false);
     expect(says()).toBe("Aligned ± 6.0 mm at the robot");
   });
@@ -179,7 +179,34 @@ describe("touches", () => {
     touching.findExpected(facts)!.pose[0].forEach((value, i) => expect(value).toBeCloseTo(at("1")[i]!, 9));
     touch(at("1"));
     facts.alignment = alignment;
-    expect(step(controller())).toEqual([{ type: "finish", anchor, isConfirmed: true }]);
+    expect(step(controller())).toEqual([{ type: "finish", anchor, isConfirmed: true, isMeasured: false }]);
+  });
+
+  test("fewer than three marks, or an alignment of before, are no new place", () => {
+    const leave = (): Outcome[] => step(controller({ buttons: BUTTON.upper }));
+    const finished = { type: "finish", anchor, isConfirmed: false, isMeasured: false };
+    knowTip();
+    facts.alignment = alignment;
+    step(controller());
+    touching.begin();
+    touch(at("1"));
+    expect(leave()).toEqual([finished]);
+    step(controller());
+    touching.begin();
+    for (const mark of "123") touch(at(mark));
+    expect(leave()).toEqual([finished]); // the session has not taken these touches
+  });
+
+  test("a session that is joined again knows nothing of the touches", () => {
+    knowTip();
+    step(controller());
+    touch(at("1"));
+    expect(says()).toMatch(/^Touch mark 2 /);
+    facts.isReady = false;
+    step(controller());
+    facts.isReady = true;
+    step(controller());
+    expect(says()).toMatch(/^Touch mark 1 /);
   });
 });
 
@@ -252,16 +279,21 @@ describe("poses", () => {
     [...p, ...q].forEach((value, i) => expect(value).toBeCloseTo([0, 0, 0, 1, 0, 0, 0][i]!, 12));
   });
 
-  test("covariances turn with their axes", () => {
-    const C = Array.from({ length: 36 }, (_, i) => (i === 0 ? 4 : i === 21 ? 9 : 0)); // x, and about x
+  test("the covariance of an alignment at a sheet on a wall, in its axes", () => {
+    const covariance = [1, 4, 9, 100, 400, 900].flatMap((value, i) => Array.from({ length: 6 }, (_, k) => (k === i ? value : i + k === 5 && i * k === 0 ? 10 : 0)));
     const half = Math.SQRT1_2;
-    const turnedC = rotateCovariance([half, 0, 0, half], C); // 90 degrees about z: x becomes y
-    expect(turnedC[7]).toBeCloseTo(4, 12);
-    expect(turnedC[28]).toBeCloseTo(9, 12);
-    expect(turnedC[0]).toBeCloseTo(0, 12);
-    const eighth: wire.Pose[1] = [Math.cos(Math.PI / 8), 0, 0, Math.sin(Math.PI / 8)]; // x lies between x and y
-    expect(rotateCovariance(eighth, C)[1]).toBeCloseTo(2, 12);
-    expect(rotateCovariance([1, 0, 0, 0], [])).toEqual([]);
+    const kept = covarianceAtAnchor({ covariance, pivot_world: [1, 2, 0.5] }, [[1.3, 2.1, 1], [half, 0, half, 0]]);
+    // From `covariance_at_anchor` in anchors/persistent.py.
+    const expected = [
+      [46, 5, 60, 0, 120, -10],
+      [5, 110, -24, -270, 0, -50],
+      [60, -24, 108, 80, 200, 0],
+      [0, -270, 80, 900, 0, 0],
+      [120, 0, 200, 0, 400, 0],
+      [-10, -50, 0, 0, 0, 100],
+    ].flat();
+    kept.forEach((value, i) => expect(value).toBeCloseTo(expected[i]!, 9));
+    expect(covarianceAtAnchor({ covariance: [], pivot_world: [0, 0, 0] }, IDENTITY)).toEqual([]);
   });
 
   test("points on one vertical tell no turn", () => {
@@ -271,7 +303,15 @@ describe("poses", () => {
 
 describe("what is kept", () => {
   const space = {} as XRReferenceSpace;
-  const place = { transform: { position: { x: 0, y: 0, z: -1 }, orientation: { x: 0, y: 0, z: 0, w: 1 } } };
+  /** Keeps values after the page has ended, as long as there is room. */
+  class Disk extends MemoryStore {
+    isFull = false;
+    override async putValue(key: string, bytes: Uint8Array): Promise<boolean> {
+      if (!this.isFull) await super.putValue(key, bytes);
+      return !this.isFull;
+    }
+  }
+  const place = { transform: { position: { x: 0, y: 0, z: -1 }, orientation: { x: 0, y: Math.SQRT1_2, z: 0, w: Math.SQRT1_2 } } };
 
   test("tips of the same participant of the same session", async () => {
     const store = new MemoryStore();
@@ -283,13 +323,14 @@ describe("what is kept", () => {
 
   test("a place comes back with its covariance when the headset has found it; the former one is deleted", async () => {
     vi.stubGlobal("XRRigidTransform", class {});
-    const store = new MemoryStore();
-    const made = { anchorSpace: {}, requestPersistentHandle: async () => "handle" } as unknown as XRAnchor;
+    const store = new Disk();
+    let deleted = 0;
+    const made = { anchorSpace: {}, requestPersistentHandle: async () => "handle", delete: () => (deleted += 1) } as unknown as XRAnchor;
     const deletePersistentAnchor = vi.fn(async () => undefined);
     const session = { restorePersistentAnchor: async () => made, deletePersistentAnchor } as unknown as XRSession;
     const tracked = new Set<XRAnchor>();
     const frame = { createAnchor: async () => made, trackedAnchors: tracked, getPose: () => place } as unknown as XRFrame;
-    const C = Array.from({ length: 36 }, (_, i) => (i % 7 === 0 ? 1e-6 : 0));
+    const C = Array.from({ length: 36 }, (_, i) => (i % 7 === 0 ? 1e-6 * i : 0)); // axes of the sheet, wherever it lies now
     const before = new PlaceKeeper(session, store, "lab");
     expect(await before.keep(frame, space, "table", IDENTITY, C)).toBe(true);
     const after = new PlaceKeeper(session, store, "lab");
@@ -298,12 +339,29 @@ describe("what is kept", () => {
     tracked.add(made);
     const found = after.observe(frame, space, 5)!;
     expect(found).toMatchObject({ anchor_id: "table", kind: "persistent", covariance: C, capture_ms: 5 });
-    found.T_tracking_anchor.flat().forEach((value, i) => expect(value).toBeCloseTo([1, 0, 0, 1, 0, 0, 0][i]!, 12));
+    found.T_tracking_anchor[0].forEach((value, i) => expect(value).toBeCloseTo([1, 0, 0][i]!, 12));
+    store.isFull = true;
+    expect(await after.keep(frame, space, "table", IDENTITY, C)).toBe(false);
+    expect([deleted, deletePersistentAnchor.mock.calls.length]).toEqual([1, 0]); // the new one, not the former
+    store.isFull = false;
     await after.keep(frame, space, "table", IDENTITY, C);
     expect(deletePersistentAnchor).toHaveBeenCalledWith("handle");
     const elsewhere = new PlaceKeeper(session, store, "other lab");
     await elsewhere.restore();
     expect(elsewhere.observe(frame, space, 5)).toBeNull();
+  });
+
+  test("what is damaged is not used", async () => {
+    const store = new Disk();
+    const bytes = (value: object): Uint8Array => new TextEncoder().encode(JSON.stringify(value));
+    for (const tips of [null, [["controller/right", null]], [["controller/right", { p: [0, 0], covariance: [], error_m: 0 }]]]) {
+      await store.putValue("tips", bytes({ owner: "s1 p1", tips }));
+      expect(await recallTips(store, "s1 p1")).toEqual([]);
+    }
+    await store.putValue("place lab", bytes({ anchor_id: "table", handle: "handle", covariance: [null] }));
+    const keeper = new PlaceKeeper({} as XRSession, store, "lab");
+    await keeper.restore();
+    expect(keeper.observe({} as XRFrame, space, 5)).toBeNull();
   });
 
   test("a browser without anchors keeps nothing, and says so", async () => {
