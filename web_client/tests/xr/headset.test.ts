@@ -3,13 +3,15 @@
 import { Group } from "three";
 import { afterEach, beforeEach, expect, test, vi } from "vitest";
 
-import type { ToWorker } from "../../src/core/api.ts";
+import type { AnchorPlace, ToWorker } from "../../src/core/api.ts";
 import type { WorkerClient } from "../../src/core/page_client.ts";
 import type { Actions } from "../../src/ui/actions.ts";
 import { DESKTOP, PageState } from "../../src/ui/state.ts";
 import type { View } from "../../src/view/view.ts";
+import type { ConsentPanel } from "../../src/xr/consents.ts";
 import type { Hands } from "../../src/xr/hands.ts";
 import { Headset } from "../../src/xr/headset.ts";
+import type { Marks } from "../../src/xr/marks.ts";
 import { STOP_BUTTONS } from "../../src/xr/reading.ts";
 
 const POSE = { transform: { position: { x: 0, y: 1, z: 0 }, orientation: { x: 0, y: 0, z: 0, w: 1 } }, emulatedPosition: false };
@@ -65,7 +67,7 @@ function setSession(self: object, robots: readonly string[] = [], holder = "p1")
 const frame = { getViewerPose: () => POSE, getPose: () => POSE } as unknown as XRFrame;
 
 /** After 100 ms, show a frame with buttons of the controller, and return its sample. */
-function show(trigger = 0, squeeze = 0): { clutch?: boolean; tracked?: boolean } {
+function show(trigger = 0, squeeze = 0): { clutch?: boolean; tracked?: boolean; gripper?: number | null } {
   vi.advanceTimersByTime(100);
   session.buttons[0]!.value = trigger;
   session.buttons[1]!.value = squeeze;
@@ -73,7 +75,7 @@ function show(trigger = 0, squeeze = 0): { clutch?: boolean; tracked?: boolean }
   return lastSample();
 }
 
-function lastSample(): { clutch?: boolean; tracked?: boolean } {
+function lastSample(): { clutch?: boolean; tracked?: boolean; gripper?: number | null } {
   const last = posted.findLast((message) => message.type === "samples");
   return last!.samples.find(({ device }) => device === "controller/right")!;
 }
@@ -122,6 +124,69 @@ test("a button of the e-stop stops, whatever the controller's pose is", () => {
   session.buttons.forEach((button, i) => (button.pressed = ((STOP_BUTTONS >> i) & 1) === 1));
   headset.onFrame({ ...frame, getPose: () => null } as unknown as XRFrame, {} as XRReferenceSpace);
   expect(stops).toBe(1);
+});
+
+test("a button of the e-stop that is held when a menu goes counts again, and one of a frame that fails counts", () => {
+  const press = (isPressed: boolean): void => void (session.buttons[3]!.pressed = isPressed);
+  const { consent } = headset as unknown as { consent: ConsentPanel };
+  show();
+  press(true);
+  show();
+  show();
+  expect(stops).toBe(1);
+  session.show("visible-blurred");
+  show();
+  expect(stops).toBe(1);
+  session.show("visible");
+  show();
+  expect(stops).toBe(2);
+  press(false);
+  show();
+  press(true);
+  vi.spyOn(consent, "update").mockImplementation(() => {
+    throw new Error("a question that cannot be drawn");
+  });
+  expect(() => show()).toThrow();
+  expect(stops).toBe(3);
+});
+
+test("a gripper that was opened stays as it is after another lease or a reset, and while the robot is shared", () => {
+  const grip = (squeeze: number, trigger: number): number | null | undefined => show(trigger, squeeze).gripper;
+  const change = (lease: object, scene_epoch = 1): void => {
+    setSession({}, ["arm"]);
+    Object.assign(state.session!.leases[0]!, lease);
+    Object.assign(state.session!, { scene_epoch });
+  };
+  state.feedback.set("arm", { hold_reason: "", contact_n: 0, limits: [] } as unknown as NonNullable<ReturnType<PageState["feedback"]["get"]>>);
+  for (const [lease, scene_epoch] of [[{ lease_version: 2 }, 1], [{}, 2], [{ sub_holders: ["p1", "p2"] }, 1]] as const) {
+    change({});
+    grip(0, 0);
+    for (let i = 0; i < 3; i++) grip(1, 1);
+    for (let i = 0; i < 15; i++) grip(1, 0);
+    expect([grip(0, 0), grip(1, 0), grip(1, 0)]).toEqual([null, 0, 0]); // only this person may have moved it
+    grip(0, 0);
+    change(lease, scene_epoch);
+    expect([grip(0, 0), grip(1, 0), grip(1, 0)]).toEqual([null, null, null]);
+  }
+});
+
+test("a trigger that is held on a mark gives no answer when its ray crosses one, and a press at it does", () => {
+  const { consent, marks } = headset as unknown as { consent: ConsentPanel; marks: Marks };
+  const answer = vi.spyOn(consent, "answer").mockImplementation(() => undefined);
+  const aim = vi.spyOn(consent, "update").mockReturnValue([]);
+  const places = ["1", "2", "3"].map((id, i) => ({ id, p_anchor: [0.1 * i, 0.1 * (i % 2), 0] }));
+  setSession({});
+  state.session!.anchors = [{ anchor_id: "table", T_world_anchor: [[0, 0, 0], [1, 0, 0, 0]], size_m: 0, error_m: 0, marks: places }] as unknown as AnchorPlace[];
+  marks.touching.tips.set("controller/right", { p: [0, 0, 0], covariance: [], error_m: 0 });
+  show();
+  marks.touching.begin();
+  for (const trigger of [0, 0, 1, 0, 1, 1]) show(trigger);
+  expect([marks.isActive, requests]).toEqual([true, []]); // a short press is no wish to be placed
+  aim.mockReturnValue([{ side: "right", answer: "grant", distance: 1 }]);
+  for (const trigger of [1, 1, 0]) show(trigger);
+  expect(answer).not.toHaveBeenCalled();
+  show(1);
+  expect(answer).toHaveBeenCalledWith("grant");
 });
 
 test("a robot that was denied does not come to the hand when it is assigned later", async () => {
