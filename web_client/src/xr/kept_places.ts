@@ -25,7 +25,7 @@ export function keepTips(store: Store, owner: string, tips: ReadonlyMap<string, 
 export async function recallTips(store: Store, owner: string): Promise<[string, Tip][]> {
   const kept = decode<{ owner: string; tips: [string, Tip][] }>(await store.getValue(TIPS_KEY));
   if (kept?.owner !== owner || !Array.isArray(kept.tips)) return [];
-  return kept.tips.filter(([device, tip]) => typeof device === "string" && isNumbers(tip?.p, 3) && isNumbers(tip.covariance, 9));
+  return kept.tips.filter((entry) => typeof entry?.[0] === "string" && isNumbers(entry[1]?.p, 3) && isNumbers(entry[1].covariance, 9));
 }
 
 /** The place that this browser keeps for sessions of one name. */
@@ -45,7 +45,7 @@ export class PlaceKeeper {
   /** Ask the headset for the place that was kept. Nothing happens where there is none. */
   async restore(): Promise<void> {
     const kept = decode<KeptPlace>(await this.store.getValue(this.key));
-    if (!kept || !isNumbers(kept.covariance, 36)) return;
+    if (typeof kept?.anchor_id !== "string" || typeof kept.handle !== "string" || !isNumbers(kept.covariance, 36)) return;
     this.kept = kept;
     try {
       this.anchor = (await this.session.restorePersistentAnchor?.(this.kept.handle)) ?? null;
@@ -78,6 +78,7 @@ export class PlaceKeeper {
       const handle = await anchor?.requestPersistentHandle?.();
       const kept = handle === undefined ? null : { anchor_id, handle, covariance };
       if (!anchor || !kept || !(await this.store.putValue(this.key, encode(kept)))) {
+        if (handle !== undefined) await this.session.deletePersistentAnchor?.(handle); // nothing would restore it
         anchor?.delete();
         return false;
       }

@@ -324,9 +324,9 @@ describe("what is kept", () => {
   test("a place comes back with its covariance when the headset has found it; the former one is deleted", async () => {
     vi.stubGlobal("XRRigidTransform", class {});
     const store = new Disk();
-    let deleted = 0;
-    const made = { anchorSpace: {}, requestPersistentHandle: async () => "handle", delete: () => (deleted += 1) } as unknown as XRAnchor;
-    const deletePersistentAnchor = vi.fn(async () => undefined);
+    let [deleted, handles] = [0, 0];
+    const made = { anchorSpace: {}, requestPersistentHandle: async () => `handle ${++handles}`, delete: () => (deleted += 1) } as unknown as XRAnchor;
+    const deletePersistentAnchor = vi.fn(async (_: string) => undefined);
     const session = { restorePersistentAnchor: async () => made, deletePersistentAnchor } as unknown as XRSession;
     const tracked = new Set<XRAnchor>();
     const frame = { createAnchor: async () => made, trackedAnchors: tracked, getPose: () => place } as unknown as XRFrame;
@@ -342,10 +342,11 @@ describe("what is kept", () => {
     found.T_tracking_anchor[0].forEach((value, i) => expect(value).toBeCloseTo([1, 0, 0][i]!, 12));
     store.isFull = true;
     expect(await after.keep(frame, space, "table", IDENTITY, C)).toBe(false);
-    expect([deleted, deletePersistentAnchor.mock.calls.length]).toEqual([1, 0]); // the new one, not the former
+    expect(deleted).toBe(1);
+    expect(deletePersistentAnchor.mock.calls).toEqual([["handle 2"]]); // the new one, not the former: headsets keep few
     store.isFull = false;
     await after.keep(frame, space, "table", IDENTITY, C);
-    expect(deletePersistentAnchor).toHaveBeenCalledWith("handle");
+    expect(deletePersistentAnchor).toHaveBeenLastCalledWith("handle 1");
     const elsewhere = new PlaceKeeper(session, store, "other lab");
     await elsewhere.restore();
     expect(elsewhere.observe(frame, space, 5)).toBeNull();
@@ -354,14 +355,20 @@ describe("what is kept", () => {
   test("what is damaged is not used", async () => {
     const store = new Disk();
     const bytes = (value: object): Uint8Array => new TextEncoder().encode(JSON.stringify(value));
-    for (const tips of [null, [["controller/right", null]], [["controller/right", { p: [0, 0], covariance: [], error_m: 0 }]]]) {
+    for (const tips of [null, [null], [["controller/right", null]], [["controller/right", { p: [0, 0], covariance: [], error_m: 0 }]]]) {
       await store.putValue("tips", bytes({ owner: "s1 p1", tips }));
       expect(await recallTips(store, "s1 p1")).toEqual([]);
     }
-    await store.putValue("place lab", bytes({ anchor_id: "table", handle: "handle", covariance: [null] }));
-    const keeper = new PlaceKeeper({} as XRSession, store, "lab");
-    await keeper.restore();
-    expect(keeper.observe({} as XRFrame, space, 5)).toBeNull();
+    const found = {} as XRAnchor;
+    const session = { restorePersistentAnchor: async () => found } as unknown as XRSession;
+    const frame = { trackedAnchors: new Set([found]), getPose: () => place } as unknown as XRFrame;
+    const whole = { anchor_id: "table", handle: "handle", covariance: Array<number>(36).fill(0) };
+    for (const [damage, isUsed] of [[{}, true], [{ covariance: [null] }, false], [{ anchor_id: 5 }, false], [{ handle: null }, false]] as const) {
+      await store.putValue("place lab", bytes({ ...whole, ...damage }));
+      const keeper = new PlaceKeeper(session, store, "lab");
+      await keeper.restore();
+      expect(keeper.observe(frame, space, 5) !== null).toBe(isUsed);
+    }
   });
 
   test("a browser without anchors keeps nothing, and says so", async () => {
