@@ -79,6 +79,8 @@ const STICK_REST = 0.15;
 const CAP_REST = 0.05;
 /** A deflected cap reports about 100 times a second. After this long without a report its link is lost [ms]. */
 const CAP_SILENT_MS = 200;
+/** A cap at rest reports nothing. A dead-man that is held beside it may have been let go after this long without a report [ms]. */
+const BUTTON_SILENT_MS = 10_000;
 
 /** Return the intent of nothing pressed. */
 export function makeIdle(): Intent {
@@ -119,8 +121,9 @@ export function readSpaceMouse(state: SpaceMouseState, now_ms: number): Intent {
   const [x, y, z, rx, ry, rz] = state.axes.map((value) => cutRest(value, CAP_REST)) as [number, number, number, number, number, number];
   const isDeflected = [x, y, z, rx, ry, rz].some((value) => value !== 0);
   const { buttons } = state;
-  if (isDeflected && now_ms - state.moved_ms > CAP_SILENT_MS) return { ...makeIdle(), clutch: null };
   const isPressed = (button: number): boolean => buttons !== null && (buttons & (1 << button)) !== 0;
+  const isCapLost = isDeflected && now_ms - state.moved_ms > CAP_SILENT_MS;
+  if (isCapLost || (isPressed(0) && now_ms - state.reported_ms > BUTTON_SILENT_MS)) return { ...makeIdle(), clutch: null };
   const clutch = buttons === null ? null : isPressed(0);
   return { ...makeIdle(), clutch, move: [x, -y, -z], turn: [rx, -ry, -rz], toggle: isPressed(1) };
 }

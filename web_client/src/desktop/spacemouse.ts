@@ -14,18 +14,20 @@ export class SpaceMouseState {
   readonly axes = [0, 0, 0, 0, 0, 0];
   /** Bits of the pressed ones. Null until reported: they are reported when they change. */
   buttons: number | null = null;
-  /** When the axes were reported. */
+  /** When the axes were reported, and when axes or buttons were. */
   moved_ms = 0;
+  reported_ms = 0;
 
   /** Take an input report, without its id. Reports of other kinds, or too short ones, change nothing. */
   take(report: number, data: DataView, now_ms: number): void {
     if (report === REPORT.buttons && data.byteLength >= 1) {
       this.buttons = data.getUint8(0);
+      this.reported_ms = now_ms;
     } else if (report === REPORT.translation || report === REPORT.rotation) {
       const begin = report === REPORT.rotation ? 3 : 0;
       const count = Math.min(6 - begin, Math.floor(data.byteLength / 2));
       if (count < 3) return;
-      this.moved_ms = now_ms;
+      this.moved_ms = this.reported_ms = now_ms;
       for (let i = 0; i < count; i++) {
         this.axes[begin + i] = Math.min(1, Math.max(-1, data.getInt16(2 * i, true) / FULL));
       }

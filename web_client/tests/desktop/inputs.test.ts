@@ -162,6 +162,20 @@ it("a SpaceMouse whose button stays held while the focus is away has to be let g
   expect(tick()).toMatchObject({ clutch: true, gripper: null });
 });
 
+it("a SpaceMouse that reported nothing for ten seconds while its button was held has to be let go", () => {
+  reportButtons(0);
+  tick();
+  reportButtons(1);
+  expect(tick(9000).clutch).toBe(true);
+  expect(tick(1100).clutch).toBe(false);
+  mouse.dispatchEvent(Object.assign(new Event("inputreport"), { reportId: 1, data: new DataView(new ArrayBuffer(6)) }));
+  expect(tick().clutch).toBe(false);
+  reportButtons(0);
+  tick();
+  reportButtons(1);
+  expect(tick().clutch).toBe(true);
+});
+
 it("a SpaceMouse that comes back with its button held has to be let go", async () => {
   reportButtons(0);
   tick();

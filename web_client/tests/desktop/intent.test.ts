@@ -164,6 +164,17 @@ describe("a SpaceMouse", () => {
     state.take(1, report(0, 0, 0), 1300);
     expect(readSpaceMouse(state, 9000).clutch).toBe(true); // a cap at rest reports nothing
   });
+
+  it("has a dead-man that is not known after ten seconds without a report, if it was held", () => {
+    const state = new SpaceMouseState();
+    state.take(3, new DataView(Uint8Array.of(1, 0).buffer), 1000);
+    expect(readSpaceMouse(state, 11_000).clutch).toBe(true);
+    expect(readSpaceMouse(state, 11_001)).toEqual({ ...makeIdle(), clutch: null });
+    state.take(23, report(0, 0, 0), 12_000); // the receiver may send others without its link
+    expect(readSpaceMouse(state, 12_000).clutch).toBe(null);
+    state.take(3, new DataView(Uint8Array.of(0, 0).buffer), 13_000);
+    expect(readSpaceMouse(state, 60_000).clutch).toBe(false); // let go: the next press counts
+  });
 });
 
 describe("merge", () => {
