@@ -43,8 +43,14 @@ def wait_for_address(output: Path, process: subprocess.Popen[bytes]) -> str:
 
 
 #: Where the person with the headset stands, and where she looks.
-HEAD_WORLD: Final[Vec3] = (-0.55, 0.55, 1.1)
-LOOKED_AT_WORLD: Final[Vec3] = (0.4, -0.05, 0.25)
+HEAD_WORLD: Final[Vec3] = (0.1, -1.0, 0.85)
+LOOKED_AT_WORLD: Final[Vec3] = (0.12, 0.0, 0.3)
+LEFT_HAND_WORLD: Final[Vec3] = (-0.2, -0.55, 0.4)
+#: The emulator shows the page where a headset shows the room.
+HIDE_PAGE: Final = (
+    "document.body.style.visibility = 'hidden', document.querySelector('canvas').style.visibility = 'visible',"
+    " document.documentElement.style.background = '#59606b'"
+)
 
 
 def look_at(p_world: Vec3, target_world: Vec3) -> PoseTuple:
@@ -69,15 +75,18 @@ def shoot_ar(browser: Browser, scratch: Path, picture: Path) -> None:
         eve = quest.person.id
         quest.host.assign(["left"], eve)
         quest.enter("Enter AR")
-        quest.host.alignment.place(eve, T_WORLD_TRACKING)
         quest.place("quest", look_at(HEAD_WORLD, LOOKED_AT_WORLD))
         tip = quest.host.scene.tip_pose("left")
         assert tip
         quest.place("quest.controllers.right", aim_at(tip[0], 0.45))
+        quest.place("quest.controllers.left", look_at(LEFT_HAND_WORLD, LOOKED_AT_WORLD))
+        scenario.run_for(1.0)  # a headset that jumps is not aligned any more
+        quest.host.alignment.place(eve, T_WORLD_TRACKING)
         quest.wait(f"{HEADSET}.showsScene")
-        quest.engage("left")
+        quest.evaluate(HIDE_PAGE)
         ben.velocity = (0.0, 0.02, 0.0)
         scenario.run_for(SETTLE_S)
+        scenario.keep_engaged(ben)
         quest.in_page(lambda: page.screenshot(picture), "the picture is made")
         quest.close()
         page.close()
