@@ -15,7 +15,15 @@ import pytest
 from iris_session.client import Client
 from tests.e2e.browser import Browser, Page, printed_address, require_browser
 from tests.e2e.scenario import Hand, Scenario
-from tests.e2e.session_process import COMMAND, DEADLINE_S, END_WITH_PARENT, SessionProcess, kill_all, make_serve_command
+from tests.e2e.session_process import (
+    COMMAND,
+    DEADLINE_S,
+    END_WITH_PARENT,
+    SessionProcess,
+    kill_all,
+    make_serve_command,
+    run_in_process,
+)
 
 #: Emulated headsets leave the session within it; then they are killed [s].
 SHUTDOWN_S: Final = 10.0
@@ -59,6 +67,18 @@ def serve(tmp_path: Path) -> Iterator[Callable[..., SessionProcess]]:
 def own_scenario(serve: Callable[..., SessionProcess]) -> Iterator[Scenario]:
     """A session of the handover scene, without clients, that the test may end."""
     scenario = Scenario(serve())
+    yield scenario
+    scenario.close()
+
+
+@pytest.fixture
+def marked_scenario(serve: Callable[..., SessionProcess], tmp_path: Path) -> Iterator[Scenario]:
+    """A session of the handover scene whose sheet has marks."""
+    status, text, errors = run_in_process("anchors", "example", "handover", "--marks")
+    assert status == 0, errors
+    path = tmp_path / "anchors.toml"
+    path.write_text(text)
+    scenario = Scenario(serve("handover", "--anchors", str(path)))
     yield scenario
     scenario.close()
 

@@ -5,9 +5,6 @@ Everything passes real sockets: the tip, the touches, the answers, and what the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -19,7 +16,6 @@ from iris_session.protocol.common import Alignment
 from iris_session.protocol.names import AlignmentKind, DenialReason, HoldReason, RejectReason
 from iris_session.protocol.server_messages import Notice, SamplesRejected, TipCalibrated
 from tests.e2e.scenario import Hand, Scenario
-from tests.e2e.session_process import SessionProcess, run_in_process
 
 pytestmark = pytest.mark.e2e
 
@@ -32,15 +28,8 @@ TOUCH_SIGMA_M = 0.0015
 
 
 @pytest.fixture
-def marked(serve: Callable[..., SessionProcess], tmp_path: Path) -> Iterator[Scenario]:
-    """A session of the handover scene whose sheet has marks."""
-    status, text, errors = run_in_process("anchors", "example", "handover", "--marks")
-    assert status == 0, errors
-    path = tmp_path / "anchors.toml"
-    path.write_text(text)
-    scenario = Scenario(serve("handover", "--anchors", str(path)))
-    yield scenario
-    scenario.close()
+def scenario(marked_scenario: Scenario) -> Scenario:
+    return marked_scenario
 
 
 class Toucher:
@@ -119,8 +108,8 @@ def _to_tuple(values: Array) -> tuple[float, ...]:
     return tuple(values.tolist())
 
 
-def test_tip_four_touches_and_a_robot_that_follows(marked: Scenario) -> None:
-    ann = Toucher(marked, "ann", RIGHT)
+def test_tip_four_touches_and_a_robot_that_follows(scenario: Scenario) -> None:
+    ann = Toucher(scenario, "ann", RIGHT)
     assert {mark.id for mark in ann.client.mirror.anchors["table"].marks} == set("1234")
     found = ann.turn_in_a_hole()
     assert not found.refused
@@ -133,17 +122,17 @@ def test_tip_four_touches_and_a_robot_that_follows(marked: Scenario) -> None:
     assert ann.error_at(anchor, got) < 2.0 * got.error_at_anchor_m
     assert 0.0 < got.error_at_robot_m < 0.05
     hand = ann.hold_robot("left")
-    marked.engage(hand)
-    marked.server.finish()
+    scenario.engage(hand)
+    scenario.server.finish()
 
 
-def test_fingertip_may_look_and_is_denied_to_drive_until_a_tip_is_calibrated(marked: Scenario) -> None:
-    bob = Toucher(marked, "bob", FINGER)
+def test_fingertip_may_look_and_is_denied_to_drive_until_a_tip_is_calibrated(scenario: Scenario) -> None:
+    bob = Toucher(scenario, "bob", FINGER)
     bob.touch_marks(TIP, "1234", 0.005)
     got = bob.wait_for_alignment(AlignmentKind.FINGERTIP)
     assert 0.008 < got.error_at_anchor_m < 0.03
     hand = bob.hold_robot("left")
-    marked.run_for(0.3)
+    scenario.run_for(0.3)
     hand.clutch = True
 
     def was_told() -> bool:
@@ -151,20 +140,20 @@ def test_fingertip_may_look_and_is_denied_to_drive_until_a_tip_is_calibrated(mar
         notices = [one.reason for one in bob.events(Notice) if isinstance(one, Notice)]
         return RejectReason.VIEW_ONLY in rejected and DenialReason.VIEW_ONLY in notices
 
-    marked.run_until(was_told, "the session says why")
-    marked.run_until(lambda: "left" in bob.client.feedback, "feedback")
+    scenario.run_until(was_told, "the session says why")
+    scenario.run_until(lambda: "left" in bob.client.feedback, "feedback")
     assert bob.client.feedback["left"].hold_reason == HoldReason.VIEW_ONLY
-    assert not marked.is_following(hand)
+    assert not scenario.is_following(hand)
     hand.clutch, hand.device, bob.device = False, RIGHT, RIGHT
     found = bob.turn_in_a_hole()
     bob.touch_marks(found.p_grip_tip, "1234")
     bob.wait_for_alignment(AlignmentKind.MEASURED)
-    marked.engage(hand)
-    marked.server.finish()
+    scenario.engage(hand)
+    scenario.server.finish()
 
 
-def test_kept_place_comes_back_for_looking_and_a_touch_confirms_it(marked: Scenario) -> None:
-    dan = Toucher(marked, "dan", RIGHT)
+def test_kept_place_comes_back_for_looking_and_a_touch_confirms_it(scenario: Scenario) -> None:
+    dan = Toucher(scenario, "dan", RIGHT)
     found = dan.turn_in_a_hole()
     dan.touch_marks(found.p_grip_tip, "1234")
     aligned = dan.wait_for_alignment(AlignmentKind.MEASURED)
@@ -176,27 +165,27 @@ def test_kept_place_comes_back_for_looking_and_a_touch_confirms_it(marked: Scena
     # The page is loaded again: another tracking frame, in which the place P is found 5 mm off.
     dan.T_world_tracking = ((0.4, 0.9, -0.2), quat_from_yaw(-1.0))
     dan.client.alignment.report_tracking_jump()
-    marked.run_until(lambda: dan.current_kind == "", "the old alignment is void")
+    scenario.run_until(lambda: dan.current_kind == "", "the old alignment is void")
     (x, y, z), q = compose(compose(inverse(dan.T_world_tracking), T_WORLD_TRACKING), T_TRACKING_P)
     seen = compose(((x + 0.005, y, z), q), T_P_anchor)
     dan.client.alignment.observe("table", seen, kind="persistent", covariance=covariance)
     kept = dan.wait_for_alignment(AlignmentKind.PERSISTENT)
     assert kept.error_at_anchor_m > 0.01
     hand = dan.hold_robot("left")
-    marked.run_for(0.3)
-    assert not marked.is_following(hand)
+    scenario.run_for(0.3)
+    assert not scenario.is_following(hand)
     dan.touch_marks(found.p_grip_tip, "1")
     confirmed = dan.wait_for_alignment(AlignmentKind.MEASURED)
     assert confirmed.error_at_anchor_m < kept.error_at_anchor_m
     assert dan.error_at(world.p, confirmed) < 2.0 * confirmed.error_at_anchor_m
-    marked.engage(hand)
-    marked.server.finish()
+    scenario.engage(hand)
+    scenario.server.finish()
 
 
-def test_too_little_turning_is_refused_with_advice(marked: Scenario) -> None:
-    cay = Toucher(marked, "cay", RIGHT)
+def test_too_little_turning_is_refused_with_advice(scenario: Scenario) -> None:
+    cay = Toucher(scenario, "cay", RIGHT)
     cay.client.alignment.report_tip_poses(RIGHT, [((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))] * 40)
-    marked.run_until(lambda: cay.events(TipCalibrated), "the session answers")
+    scenario.run_until(lambda: cay.events(TipCalibrated), "the session answers")
     answer = cay.events(TipCalibrated)[-1]
     assert isinstance(answer, TipCalibrated)
     assert answer.refused

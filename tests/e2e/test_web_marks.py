@@ -23,7 +23,6 @@ from iris_session.protocol.names import AlignmentKind
 from tests.e2e.browser import Page, join_as
 from tests.e2e.emulated_quest import HEADSET, INSTALL, IWER, EmulatedQuest, holder
 from tests.e2e.scenario import Scenario, is_driven
-from tests.e2e.session_process import SessionProcess, run_in_process
 
 pytestmark = pytest.mark.e2e
 
@@ -174,15 +173,8 @@ def to_matrix(T: PoseTuple) -> Array:
 
 
 @pytest.fixture
-def scenario(serve: Callable[..., SessionProcess], tmp_path: Path) -> Iterator[Scenario]:
-    """A session of the handover scene whose sheet has marks."""
-    status, text, errors = run_in_process("anchors", "example", "handover", "--marks")
-    assert status == 0, errors
-    path = tmp_path / "anchors.toml"
-    path.write_text(text)
-    made = Scenario(serve("handover", "--anchors", str(path)))
-    yield made
-    made.close()
+def scenario(marked_scenario: Scenario) -> Scenario:
+    return marked_scenario
 
 
 @pytest.fixture
