@@ -80,34 +80,38 @@ function makeSheet(part: Deformable, arrays: DeformableArrays, material: ShaderM
   const { elements, uv } = arrays;
   const isThick = part.dim === 2 && part.radius > 0;
   const rim = isThick ? findRim(elements) : [];
-  // Drawn points: the vertex and its side (+1, -1; 0 without thickness). Triangles share them unless they are flat.
+  // Drawn points of one side: the vertices, once for each of their places in a texture, or every corner where it is flat.
   const vertex: number[] = [];
-  const side: number[] = [];
   const coordinate: number[] = [];
   const index: number[] = [];
   const known = new Map<string, number>();
-  const add = (v: number, s: number, corner: number, isFlat: boolean): void => {
-    const at = uv ? [uv[2 * corner]!, uv[2 * corner + 1]!] : [];
-    const key = `${v} ${s} ${at.join(" ")}`;
-    const before = isFlat ? undefined : known.get(key);
+  for (let c = 0; c < elements.length; c++) {
+    const at = uv ? [uv[2 * c]!, uv[2 * c + 1]!] : [];
+    const key = `${elements[c]!} ${at.join(" ")}`;
+    const before = part.flat ? undefined : known.get(key);
     index.push(before ?? vertex.length);
-    if (before !== undefined) return;
+    if (before !== undefined) continue;
     known.set(key, vertex.length);
-    vertex.push(v);
-    side.push(s);
+    vertex.push(elements[c]!);
     coordinate.push(...at);
-  };
-  for (let c = 0; c < elements.length; c += 3) {
-    for (const k of [0, 1, 2]) add(elements[c + k]!, isThick ? 1 : 0, c + k, part.flat);
-    if (isThick) for (const k of [0, 2, 1]) add(elements[c + k]!, -1, c + k, part.flat);
   }
-  const rimStart = vertex.length;
+  const upper = vertex.length;
+  if (isThick) {
+    for (let c = 0; c < elements.length; c += 3) for (const k of [0, 2, 1]) index.push(upper + index[c + k]!);
+    for (let i = 0, n = coordinate.length; i < n; i++) coordinate.push(coordinate[i]!);
+  }
+  // Then the points of the rim, which share nothing: vertices and distances from them.
+  const rimStart = isThick ? 2 * upper : upper;
+  const offset: number[] = [];
   for (const [a, b, ca, cb] of rim) {
-    for (const [v, s, c] of [[a, 1, ca], [a, -1, ca], [b, -1, cb], [a, 1, ca], [b, -1, cb], [b, 1, cb]] as const) {
-      add(v, s, c, true);
+    for (const [v, sign, c] of [[a, 1, ca], [a, -1, ca], [b, -1, cb], [a, 1, ca], [b, -1, cb], [b, 1, cb]] as const) {
+      index.push(rimStart + offset.length);
+      vertex.push(v);
+      offset.push(sign * part.radius);
+      if (uv) coordinate.push(uv[2 * c]!, uv[2 * c + 1]!);
     }
   }
-  const count = vertex.length;
+  const count = rimStart + offset.length;
   const position = new Float32Array(3 * count);
   const normal = new Float32Array(3 * count);
   const smooth = new Float32Array(3 * part.vertices);
@@ -118,23 +122,18 @@ function makeSheet(part: Deformable, arrays: DeformableArrays, material: ShaderM
   geometry.setAttribute("normal", normals);
   if (uv) geometry.setAttribute("uv", new BufferAttribute(new Float32Array(coordinate), 2));
   geometry.setIndex(new BufferAttribute(new Uint32Array(index), 1));
+  const corners = Uint32Array.from(elements, (v) => 3 * v);
   const from = Uint32Array.from(vertex, (v) => 3 * v);
-  const offset = Float32Array.from(side, (s) => s * part.radius);
   const write = (p: Float32Array): void => {
-    addUpNormals(p, elements, smooth);
-    for (let i = 0, at = 0; i < count; i++, at += 3) {
-      const v = from[i]!;
-      const distance = offset[i]!;
-      const sign = distance < 0 ? -1 : 1;
-      const [nx, ny, nz] = [smooth[v]!, smooth[v + 1]!, smooth[v + 2]!];
-      position[at] = p[v]! + distance * nx;
-      position[at + 1] = p[v + 1]! + distance * ny;
-      position[at + 2] = p[v + 2]! + distance * nz;
-      normal[at] = sign * nx;
-      normal[at + 1] = sign * ny;
-      normal[at + 2] = sign * nz;
+    addUpNormals(p, corners, smooth);
+    placeSides(p, smooth, from.subarray(0, upper), isThick ? part.radius : 0, position, normal);
+    for (let i = 0, at = 3 * rimStart; i < offset.length; i++) {
+      const v = from[upper + i]!;
+      for (let k = 0; k < 3; k++) position[at++] = p[v + k]! + offset[i]! * smooth[v + k]!;
     }
-    for (let i = part.flat ? 0 : rimStart; i < count; i += 3) setFlatNormal(position, normal, i);
+    for (let i = part.flat ? 0 : rimStart; i < count; i += 3) {
+      setFlatNormal(position, normal, i, i >= upper && i < rimStart ? -1 : 1);
+    }
     positions.needsUpdate = normals.needsUpdate = true;
   };
   return [new Mesh(geometry, material), geometry, write];
@@ -153,17 +152,37 @@ function findRim(elements: Uint16Array | Uint32Array): [number, number, number, 
   return [...edges.values()].filter((edge) => edge !== null);
 }
 
-/** Write the unit normals of vertices to `out`: the sum over their triangles, weighed by area. */
-function addUpNormals(p: Float32Array, elements: Uint16Array | Uint32Array, out: Float32Array): void {
+/**
+ * Write the unit normals of vertices to `out`: the sum over their triangles, weighed by area. `corners`: where each corner
+ * of the triangles begins in `p`. For every frame: written out, since arrays in between take V8 four times as long.
+ */
+function addUpNormals(p: Float32Array, corners: Uint32Array, out: Float32Array): void {
   out.fill(0);
-  for (let c = 0; c < elements.length; c += 3) {
-    const [a, b, d] = [3 * elements[c]!, 3 * elements[c + 1]!, 3 * elements[c + 2]!];
-    const [ux, uy, uz] = [p[b]! - p[a]!, p[b + 1]! - p[a + 1]!, p[b + 2]! - p[a + 2]!];
-    const [vx, vy, vz] = [p[d]! - p[a]!, p[d + 1]! - p[a + 1]!, p[d + 2]! - p[a + 2]!];
-    const [x, y, z] = [uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx];
-    addTo(out, a, x, y, z);
-    addTo(out, b, x, y, z);
-    addTo(out, d, x, y, z);
+  for (let c = 0; c < corners.length; c += 3) {
+    const a = corners[c]!;
+    const b = corners[c + 1]!;
+    const d = corners[c + 2]!;
+    const px = p[a]!;
+    const py = p[a + 1]!;
+    const pz = p[a + 2]!;
+    const ux = p[b]! - px;
+    const uy = p[b + 1]! - py;
+    const uz = p[b + 2]! - pz;
+    const vx = p[d]! - px;
+    const vy = p[d + 1]! - py;
+    const vz = p[d + 2]! - pz;
+    const x = uy * vz - uz * vy;
+    const y = uz * vx - ux * vz;
+    const z = ux * vy - uy * vx;
+    out[a]! += x;
+    out[a + 1]! += y;
+    out[a + 2]! += z;
+    out[b]! += x;
+    out[b + 1]! += y;
+    out[b + 2]! += z;
+    out[d]! += x;
+    out[d + 1]! += y;
+    out[d + 2]! += z;
   }
   for (let i = 0; i < out.length; i += 3) {
     const length = measure(out[i]!, out[i + 1]!, out[i + 2]!);
@@ -173,10 +192,41 @@ function addUpNormals(p: Float32Array, elements: Uint16Array | Uint32Array, out:
   }
 }
 
-function addTo(out: Float32Array, at: number, x: number, y: number, z: number): void {
-  out[at]! += x;
-  out[at + 1]! += y;
-  out[at + 2]! += z;
+/**
+ * Write points and normals of the upper side, and after them those of the lower side where there is a radius. `from`:
+ * where the vertex of each point begins in `p`.
+ */
+function placeSides(
+  p: Float32Array,
+  smooth: Float32Array,
+  from: Uint32Array,
+  radius: number,
+  position: Float32Array,
+  normal: Float32Array,
+): void {
+  const size = 3 * from.length;
+  for (let i = 0, at = 0; i < from.length; i++, at += 3) {
+    const v = from[i]!;
+    const nx = smooth[v]!;
+    const ny = smooth[v + 1]!;
+    const nz = smooth[v + 2]!;
+    const x = p[v]!;
+    const y = p[v + 1]!;
+    const z = p[v + 2]!;
+    position[at] = x + radius * nx;
+    position[at + 1] = y + radius * ny;
+    position[at + 2] = z + radius * nz;
+    normal[at] = nx;
+    normal[at + 1] = ny;
+    normal[at + 2] = nz;
+    if (radius === 0) continue;
+    position[size + at] = x - radius * nx;
+    position[size + at + 1] = y - radius * ny;
+    position[size + at + 2] = z - radius * nz;
+    normal[size + at] = -nx;
+    normal[size + at + 1] = -ny;
+    normal[size + at + 2] = -nz;
+  }
 }
 
 /** Return the length of a vector, 1 of none. `Math.hypot` takes ten times as long. */
@@ -184,12 +234,13 @@ function measure(x: number, y: number, z: number): number {
   return Math.sqrt(x * x + y * y + z * z) || 1;
 }
 
-function setFlatNormal(p: Float32Array, normal: Float32Array, corner: number): void {
+/** Write the normal of the triangle of three points. `sign`: -1 where it is drawn in the other order. */
+function setFlatNormal(p: Float32Array, normal: Float32Array, corner: number, sign: number): void {
   const [a, b, d] = [3 * corner, 3 * corner + 3, 3 * corner + 6];
   const [ux, uy, uz] = [p[b]! - p[a]!, p[b + 1]! - p[a + 1]!, p[b + 2]! - p[a + 2]!];
   const [vx, vy, vz] = [p[d]! - p[a]!, p[d + 1]! - p[a + 1]!, p[d + 2]! - p[a + 2]!];
   const [x, y, z] = [uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx];
-  const length = measure(x, y, z);
+  const length = sign * measure(x, y, z);
   for (const at of [a, b, d]) {
     normal[at] = x / length;
     normal[at + 1] = y / length;

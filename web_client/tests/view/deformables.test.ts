@@ -24,21 +24,21 @@ function draw(part: Partial<Deformable>, uv?: Float32Array): (name: string) => B
   return (name) => (name === "index" ? geometry.index! : geometry.getAttribute(name)) as BufferAttribute;
 }
 
-test("triangles of a thick sheet share their vertices, and follow them", () => {
-  const get = draw({});
+test.each([false, true])("both sides of a thick sheet follow its vertices, flat: %s", (flat) => {
+  const get = draw({ flat });
   expect(get("index").count).toBe(2 * 3 * FACES + 6 * RIM);
-  expect(get("position").count).toBe(2 * SIDE * SIDE + 6 * RIM);
   const [positions, normals] = [get("position"), get("normal")];
   for (let k = 0; k < 2 * 3 * FACES; k++) {
     const at = get("index").getX(k);
-    const side = normals.getZ(at);
-    expect(Math.abs(side)).toBeCloseTo(1);
+    const side = k < 3 * FACES ? 1 : -1;
+    expect(normals.getZ(at)).toBeCloseTo(side);
     expect(positions.getZ(at)).toBeCloseTo(0.5 + side * RADIUS);
   }
   for (let k = 2 * 3 * FACES; k < get("index").count; k++) expect(normals.getZ(get("index").getX(k))).toBeCloseTo(0);
 });
 
-test("flat triangles share nothing, and a seam of the texture parts vertices", () => {
+test("triangles share their vertices, unless they are flat or the texture has a seam", () => {
+  expect(draw({})("position").count).toBe(2 * SIDE * SIDE + 6 * RIM);
   expect(draw({ flat: true })("position").count).toBe(2 * 3 * FACES + 6 * RIM);
   const uv = Float32Array.from({ length: 2 * ELEMENTS.length }, (_, i) => Math.floor(i / 6)); // each triangle elsewhere
   expect(draw({}, uv)("position").count).toBe(2 * 3 * FACES + 6 * RIM);
