@@ -236,12 +236,18 @@ function measure(x: number, y: number, z: number): number {
 
 /** Write the normal of the triangle of three points. `sign`: -1 where it is drawn in the other order. */
 function setFlatNormal(p: Float32Array, normal: Float32Array, corner: number, sign: number): void {
-  const [a, b, d] = [3 * corner, 3 * corner + 3, 3 * corner + 6];
-  const [ux, uy, uz] = [p[b]! - p[a]!, p[b + 1]! - p[a + 1]!, p[b + 2]! - p[a + 2]!];
-  const [vx, vy, vz] = [p[d]! - p[a]!, p[d + 1]! - p[a + 1]!, p[d + 2]! - p[a + 2]!];
-  const [x, y, z] = [uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx];
+  const a = 3 * corner;
+  const ux = p[a + 3]! - p[a]!;
+  const uy = p[a + 4]! - p[a + 1]!;
+  const uz = p[a + 5]! - p[a + 2]!;
+  const vx = p[a + 6]! - p[a]!;
+  const vy = p[a + 7]! - p[a + 1]!;
+  const vz = p[a + 8]! - p[a + 2]!;
+  const x = uy * vz - uz * vy;
+  const y = uz * vx - ux * vz;
+  const z = ux * vy - uy * vx;
   const length = sign * measure(x, y, z);
-  for (const at of [a, b, d]) {
+  for (let at = a; at < a + 9; at += 3) {
     normal[at] = x / length;
     normal[at + 1] = y / length;
     normal[at + 2] = z / length;
