@@ -24,6 +24,7 @@ import argparse
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -390,8 +391,8 @@ class Lab:
         peaks = dict.fromkeys(self.processes, 0.0)
         while time.monotonic() < began + seconds or len(self._reports) < first + 2:
             self._require_alive()
-            for name, process in self.processes.items():
-                peaks[name] = max(peaks[name], process.memory_info().rss / MIB - self._base_mib.get(name, 0.0))
+            for name, used_mib in self._read_memory().items():
+                peaks[name] = max(peaks[name], used_mib - self._base_mib.get(name, 0.0))
             time.sleep(0.02)
         elapsed = time.monotonic() - began
         ages: dict[str, list[float]] = {}
@@ -404,11 +405,11 @@ class Lab:
 
     def set_base(self) -> None:
         """Remember the memory of all processes, from which growth is counted."""
-        self._base_mib = {name: process.memory_info().rss / MIB for name, process in self.processes.items()}
+        self._base_mib = self._read_memory()
 
     def front_growth_mib(self) -> float:
         """Return by how much the front has grown since `set_base` [MiB]."""
-        return float(self.processes["front"].memory_info().rss / MIB - self._base_mib["front"])
+        return self._read_memory()["front"] - self._base_mib["front"]
 
     def attack(self, chosen: Case, seconds: float) -> tuple[Window, dict[str, int], dict[str, Any]]:
         """Measure during an attack. Return that, the drops that it added, and what the attacker counted."""
@@ -488,6 +489,16 @@ class Lab:
 
     def _open_log(self, name: str) -> IO[bytes]:
         return self.stack.enter_context((self.folder / name).open("ab"))
+
+    def _read_memory(self) -> dict[str, float]:
+        """Return the memory of each process of the session [MiB]. One that was restarted ends the run."""
+        used: dict[str, float] = {}
+        for name, process in self.processes.items():
+            try:
+                used[name] = process.memory_info().rss / MIB
+            except psutil.NoSuchProcess:
+                raise SystemExit(f"hostile: the process of the {name} ended: see {self.folder}/serve.json") from None
+        return used
 
     def _require_alive(self) -> None:
         for name, process in (("session", self.server), ("honest clients", self.honest)):
@@ -612,8 +623,9 @@ def main() -> int:
         return 0
     seconds = 4.0 if options.quick else 10.0
     results: list[Result] = []
-    with tempfile.TemporaryDirectory(prefix="iris-hostile-") as folder, ExitStack() as stack:
-        lab = Lab(Path(folder), stack)
+    folder = Path(tempfile.mkdtemp(prefix="iris-hostile-"))
+    with ExitStack() as stack:
+        lab = Lab(folder, stack)
         lab.start()
         for name, chosen in CASES.items():
             if options.case and name not in options.case:
@@ -623,6 +635,10 @@ def main() -> int:
         results.append(lab.finish())
         print(f"recording: {'ok' if results[-1].ok else results[-1].problems}", file=sys.stderr, flush=True)
     ok = all(one.ok for one in results)
+    if ok:
+        shutil.rmtree(folder)
+    else:
+        print(f"logs and recording: {folder}", file=sys.stderr)
     if options.json:
         cases = [{"name": r.name, "ok": r.ok, "item": r.item, "problems": r.problems, **r.figures} for r in results]
         print(json.dumps({"cases": cases, "ok": ok}))

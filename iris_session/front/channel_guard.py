@@ -96,7 +96,7 @@ class ChannelGuard:
         self._bounds = bounds
         self._pending: tuple[tuple[int, TcpConnection, int], ...] = ()
         self._traffic = TrafficCounter(curve=curve)
-        self._tcp = TcpConnections()
+        self._tcp = TcpConnections(discards_unread=True)
         self._floods: deque[ChannelFlood] = deque(maxlen=MAX_REMEMBERED)
         self._next_ns = self._next_bytes_ns = 0
 

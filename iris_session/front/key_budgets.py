@@ -15,7 +15,7 @@ import msgspec
 from iris_session.link.config import SECOND, FrontLimits
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.limits import Drops, KeyedBuckets, KeyLimits, TokenBucket, find_network
-from iris_session.security.zap import ZAP_CONTROL, ZAP_INGEST
+from iris_session.security.zap import ZAP_CONTROL, ZAP_INGEST, ZAP_MEDIA, ZAP_STATE
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -251,6 +251,7 @@ class HandshakeLimiter:
         self._is_banned = is_banned
         self._backoff = backoff
         self._buckets = KeyedBuckets(limits.handshakes, limits.handshake_burst, MAX_KEYS)
+        self._subscribers = KeyedBuckets(limits.subscribers, limits.subscriber_burst, MAX_KEYS)
 
     def allow(self, domain: bytes, key_id: str, address: str, now_ns: int) -> bool:
         """Return whether a key may open one more connection to a channel, and use its token."""
@@ -261,7 +262,8 @@ class HandshakeLimiter:
             self._drops.count(KEY_BANNED)
             return False
         factor = self._limits.gateway_factor if self._is_gateway(key_id) else 1
-        if not self._buckets.take((domain, key_id), now_ns, factor=factor):
+        buckets = self._subscribers if domain in (ZAP_STATE, ZAP_MEDIA) else self._buckets
+        if not buckets.take((domain, key_id), now_ns, factor=factor):
             self._drops.count(KEY_CONNECTIONS)
             return False
         if domain == ZAP_INGEST:

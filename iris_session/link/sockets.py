@@ -191,13 +191,14 @@ def _borrowed(descriptor: int) -> Iterator[socket.socket]:
         borrowed.detach()
 
 
-def close_tcp(descriptor: int, peer: tuple[str, int]) -> bool:
+def close_tcp(descriptor: int, peer: tuple[str, int], *, discard: bool = False) -> bool:
     """Close one TCP connection, for which libzmq has no call.
 
     Args:
         descriptor: File descriptor of the connection.
         peer: Address and port of the peer at its `hello`. A connection with another peer, which has got the same
             descriptor since, stays open.
+        discard: Discard what the system has received and libzmq has not read yet, which it would read first.
 
     Returns:
         True when the connection was closed.
@@ -207,6 +208,10 @@ def close_tcp(descriptor: int, peer: tuple[str, int]) -> bool:
             if connection.getpeername()[:2] != peer:
                 return False
             connection.shutdown(socket.SHUT_RDWR)
+            if discard:
+                connection.recv(8 * STATE_RECEIVE_BYTES, socket.MSG_DONTWAIT)
+    except BlockingIOError:  # nothing left to discard
+        return True
     except OSError:
         return False
     return True
