@@ -207,11 +207,10 @@ def close_tcp(descriptor: int, peer: tuple[str, int], *, discard: bool = False) 
         with _borrowed(descriptor) as connection:
             if connection.getpeername()[:2] != peer:
                 return False
+            if discard:  # before the shutdown: after it libzmq closes the descriptor
+                with contextlib.suppress(BlockingIOError):
+                    connection.recv(8 * STATE_RECEIVE_BYTES, socket.MSG_DONTWAIT)
             connection.shutdown(socket.SHUT_RDWR)
-            if discard:
-                connection.recv(8 * STATE_RECEIVE_BYTES, socket.MSG_DONTWAIT)
-    except BlockingIOError:  # nothing left to discard
-        return True
     except OSError:
         return False
     return True

@@ -153,7 +153,7 @@ def test_memory_of_floods_is_bounded(rig: ControlSocketRig) -> None:
 def test_a_close_that_fails_is_tried_again(rig: ControlSocketRig, monkeypatch: pytest.MonkeyPatch) -> None:
     _, theirs = rig.open()
     with monkeypatch.context() as patch:
-        patch.setattr(connection_guard, "close_tcp", lambda *_: False)
+        patch.setattr(connection_guard, "close_tcp", lambda *_, **__: False)
         rig.look(11 * SECOND)
     assert not is_closed(theirs)
     rig.look()
@@ -174,6 +174,19 @@ def test_close_needs_no_new_descriptor(rig: ControlSocketRig) -> None:
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     assert is_closed(theirs)
+
+
+@pytest.mark.parametrize("discard", [False, True])
+def test_close_discards_what_is_unread(discard: bool) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        theirs = socket.create_connection(server.getsockname())
+        ours, address = server.accept()
+        with theirs, ours:
+            theirs.sendall(bytes(1000))
+            ours.recv(1, socket.MSG_PEEK)  # it has come
+            assert close_tcp(ours.fileno(), address, discard=discard)
+            assert len(ours.recv(2000)) == (0 if discard else 1000)
+            assert is_closed(theirs)
 
 
 def test_descriptors_that_are_not_tcp_stay_open() -> None:

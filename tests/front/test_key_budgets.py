@@ -26,7 +26,7 @@ from iris_session.protocol.entries import Entry
 from iris_session.protocol.limits import Drops, KeyLimits
 from iris_session.protocol.names import DenialReason
 from iris_session.protocol.server_messages import ProtocolFault, Refused, Reply
-from iris_session.security.zap import ZAP_CONTROL, ZAP_INGEST, ZAP_MEDIA, ZAP_STATE
+from iris_session.security.zap import ZAP_ASSETS, ZAP_CONTROL, ZAP_INGEST, ZAP_MEDIA, ZAP_STATE
 from tests.front.intake_rig import HELLO, IntakeRig
 
 MS = 1_000_000
@@ -266,10 +266,15 @@ def test_handshakes_of_a_key_are_limited_for_each_channel() -> None:
     def count_allowed(domain: bytes, key: str, now_ns: int = 0) -> int:
         return sum(limiter.allow(domain, key, "10.0.0.1", now_ns) for _ in range(1000))
 
-    assert count_allowed(ZAP_STATE, "hog") == limits.handshake_burst
-    assert count_allowed(ZAP_STATE, "hog", SECOND) == limits.handshakes
-    assert count_allowed(ZAP_CONTROL, "hog") == limits.handshake_burst, "each channel has its own"
-    assert count_allowed(ZAP_STATE, "gate") == limits.gateway_factor * limits.handshake_burst
+    for domain, rate, burst in (
+        (ZAP_CONTROL, limits.handshakes, limits.handshake_burst),
+        (ZAP_ASSETS, limits.handshakes, limits.handshake_burst),
+        (ZAP_STATE, limits.subscribers, limits.subscriber_burst),
+        (ZAP_MEDIA, limits.subscribers, limits.subscriber_burst),
+    ):
+        assert count_allowed(domain, "hog") == burst, "each channel has its own"
+        assert count_allowed(domain, "hog", SECOND) == rate
+        assert count_allowed(domain, "gate") == limits.gateway_factor * burst
     assert limiter.allow(ZAP_STATE, "ann", "10.0.0.1", 0)
     assert "key_banned" not in drops.by_reason
     assert count_allowed(ZAP_STATE, "flooder") == 0
