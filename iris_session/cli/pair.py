@@ -191,6 +191,8 @@ def _find_web_port(arguments: argparse.Namespace, note: RegisteredSession) -> in
         raise CommandError(
             f"session {note.name!r} serves no page: pip install 'iris-session[web]' there, or leave out --no-web"
         )
+    if arguments.web and note.web and port != note.web:
+        print(f"iris-session: session {note.name!r} serves its page at port {note.web}, not {port}", file=sys.stderr)
     return port
 
 

@@ -129,10 +129,12 @@ def open_web_page(config: SessionConfig, name: str) -> WebPage:
     """Open the port of a session's page, before its front starts, which tells clients the port.
 
     Raises:
-        StartError: A port that was asked for by number is not free.
+        StartError: A port that was asked for by number is not free, or a certificate was given that is not used.
     """
     if not config.web:
         return WebPage(config, name)
+    if config.web_cert and not needs_encryption(config):
+        raise StartError("web_cert: this session is not encrypted, and its page plain HTTP on this machine: add --curve")
     if not has_packages():
         return WebPage(config, name, note="no page for browsers: pip install 'iris-session[web]'")
     if config.curve_clients and needs_encryption(config):  # such a folder holds no identities of browsers
@@ -145,7 +147,7 @@ def open_web_page(config: SessionConfig, name: str) -> WebPage:
     except OSError as error:
         text = f"port {port} (web) cannot be used: {error.strerror}"
         if config.web_port is not None:
-            raise StartError(f"{text}; give another web_port, 0 for any free one") from None
+            raise StartError(f"{text}; give another web_port (--web-port), 0 for any free one") from None
         return WebPage(config, name, note=f"no page for browsers: {text}")
     return WebPage(config, name, sockets)
 

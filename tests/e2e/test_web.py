@@ -298,8 +298,12 @@ def test_a_browser_pairs_by_the_printed_link(
         assert guest.evaluate("irisSession.state.role") == "observer"
         assert guest.evaluate("[...document.querySelectorAll('[data-robot] button')].every((one) => one.hidden)")
         assert pairing.wait(30) == 0
+        assert guest.evaluate("[...document.querySelector('#self-role').options].map((one) => one.value)") == ["observer"]
+        chosen = json.dumps({"name": "Web", "role": "director", "roles": []})  # of a session that allowed it
+        guest.evaluate(f"localStorage.setItem('iris-session.page', {json.dumps(chosen)})")
         guest.reload()
         guest.wait_until_ready()  # paired once, for good
+        assert guest.evaluate("irisSession.state.role") == "observer"
         assert guest.errors == []
         guest.close()
     finally:

@@ -137,7 +137,7 @@ def test_keys_move_the_end_effector(scenario: Scenario, driver: Page) -> None:
     driver.hold("w")  # without the dead-man nothing moves
     tip.watch_for(0.5)
     assert np.linalg.norm(tip.place - begin) < REST_M
-    assert words(driver).startswith("Held: clutch open.")
+    assert words(driver).startswith("Held. Hold left Shift")
     driver.let_go("w")
     begin = drive_forward(driver, tip, 0.095)
     driver.wait("document.querySelector('.drive.engaged')")
@@ -153,7 +153,7 @@ def test_keys_move_the_end_effector(scenario: Scenario, driver: Page) -> None:
     assert np.linalg.norm(moved[[0, 2]]) < 0.005
     assert stopped_s < STOP_S
     driver.let_go("Shift")
-    driver.wait("document.querySelector('.drive .why').textContent.startsWith('Held: clutch open.')")
+    driver.wait("document.querySelector('.drive .why').textContent.startsWith('Held. Hold left Shift')")
     assert driver.errors == []
 
 
@@ -207,6 +207,14 @@ def test_the_estop_key_is_the_same_while_driving(scenario: Scenario, driver: Pag
     driver.let_go("Shift")
 
 
+def test_the_estop_key_presses_no_button_while_driving(driver: Page) -> None:
+    assert driver.evaluate("document.activeElement.id") == "scene", "keys are for the robot once it is driven"
+    driver.evaluate("document.querySelector('.drive button').focus()")
+    driver.press("Space")
+    driver.wait("irisSession.state.session.estop")
+    assert not driver.evaluate("document.querySelector('.drive').hidden")
+
+
 def test_the_mouse_drags_the_end_effector(scenario: Scenario, driver: Page) -> None:
     """Half a millimetre for a pixel: to the right along +X, and no farther when the button is let go."""
     tip = Tip(scenario)
@@ -217,7 +225,7 @@ def test_the_mouse_drags_the_end_effector(scenario: Scenario, driver: Page) -> N
     print(f"moved {1e3 * moved} mm")
     assert 0.02 < moved[0] < 0.055  # a page that draws slowly misses a part of the way, and adds nothing
     assert np.linalg.norm(moved[1:]) < 0.005
-    assert words(driver).startswith("Held: clutch open.")
+    assert words(driver).startswith("Held. Hold left Shift")
 
 
 def test_a_gamepad_drives_until_it_is_unplugged_and_again_once_let_go(scenario: Scenario, driver: Page) -> None:

@@ -35,12 +35,16 @@ export interface Drive {
   update(): void;
 }
 
-/** Make the panel. `getCamera`: from where the person looks, null without a picture. `warn`: shows a line for a while. */
+/**
+ * Make the panel. `getCamera`: from where the person looks, null without a picture. `warn`: shows a line for a while.
+ * `scene`: gets the focus, so that keys press no button meanwhile.
+ */
 export function makeDrive(
   state: PageState,
   client: WorkerClient,
   getCamera: () => CameraAxes | null,
   warn: (text: string) => void,
+  scene: HTMLElement,
 ): Drive {
   const device = new DesktopDevice((sample) => client.post({ type: "samples", samples: [sample] }));
   const chosen = recall(STORAGE_KEY, DEFAULTS);
@@ -126,6 +130,7 @@ export function makeDrive(
   function start(name: string): void {
     device.arm(name, nowMs());
     inputs.start();
+    scene.focus({ preventScroll: true });
     ticked_ms = nowMs();
     clearInterval(timer);
     timer = window.setInterval(tick, PERIOD_MS);
@@ -153,7 +158,7 @@ export function makeDrive(
     setText(mark, isHeld ? "held" : "engaged");
     mark.classList.toggle("good", !isHeld);
     element.classList.toggle("engaged", !isHeld);
-    setText(why, describe(device, state.session?.estop ?? false, reason, isHeld));
+    setText(why, state.isReady ? describe(device, state.session?.estop ?? false, reason, isHeld) : "Held: not connected.");
     setText(connected, inputs.listConnected().join(", "));
     connect.hidden = !inputs.spaceMouse.isSupported || inputs.spaceMouse.name !== "";
   }
@@ -179,5 +184,5 @@ function describe(device: DesktopDevice, isStopped: boolean, reason: string, isH
   if (!isHeld) return "The robot follows you.";
   if (device.isEngaged) return `Held by the session: ${holdReasonWords(reason)}.`;
   const how = device.mustLetGo ? "Let go of it, then hold it again." : "Hold left Shift, the right shoulder button or the handle to move it.";
-  return device.released ? `Held: ${device.released}. ${how}` : `Held: clutch open. ${how}`;
+  return device.released ? `Held: ${device.released}. ${how}` : `Held. ${how}`;
 }

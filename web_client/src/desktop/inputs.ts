@@ -2,6 +2,7 @@
 // dead-man from outside is reported at once; what the inputs mean is in `intent.ts`.
 
 import { nowMs } from "../core/api.ts";
+import { takesText } from "../ui/dom.ts";
 import { ClutchKey, DRIVE_KEYS, DragPath, type Intent, makeIdle, readKeys, readPad, readSpaceMouse } from "./intent.ts";
 import { SpaceMouse } from "./spacemouse.ts";
 
@@ -187,9 +188,4 @@ export class DesktopInputs {
 
 function listPads(): Gamepad[] {
   return [...(navigator.getGamepads?.() ?? [])].filter((pad): pad is Gamepad => pad !== null && pad.connected);
-}
-
-/** Return whether keys mean text or a choice to what has the focus. */
-function takesText(target: EventTarget | null): boolean {
-  return target instanceof HTMLElement && target.closest("input[type=text], textarea, [contenteditable], dialog") !== null;
 }

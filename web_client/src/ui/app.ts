@@ -73,9 +73,9 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
       software: SOFTWARE,
     });
   };
+  const listRoles = (): string[] => ROLES.filter((role) => remembered.roles.length === 0 || remembered.roles.includes(role));
   const joinByChoice = (): void => {
-    const allowed = remembered.roles.length > 0 ? ROLES.filter((role) => remembered.roles.includes(role)) : ROLES;
-    if (!remembered.role) untried.splice(0, untried.length, ...allowed);
+    if (!remembered.role) untried.splice(0, untried.length, ...listRoles());
     join(remembered.name, remembered.role || (untried.shift() ?? "observer"));
   };
   const pairing = makePairing(client, baseUrl, () => remembered.name, (name, roles) => {
@@ -112,7 +112,7 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   }
   const { view } = handle;
 
-  const drive = makeDrive(state, client, () => view?.viewpoint.axes ?? null, (text) => show(text, "warning"));
+  const drive = makeDrive(state, client, () => view?.viewpoint.axes ?? null, (text) => show(text, "warning"), stage.canvas);
   const cameras = makeCameras(state, view);
   stage.tools.append(cameras.menu);
   stage.element.append(cameras.element, drive.element);
@@ -122,8 +122,8 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   }));
   stage.tools.append(handle.headset.element);
   const badge = makeBadge(state, () => view?.delay_ms ?? 0);
-  const estop = makeEstop(state, actions);
-  const self = makeSelf(state, joinAs);
+  const estop = makeEstop(state, actions, () => drive.robot !== "");
+  const self = makeSelf(state, listRoles, joinAs);
   const title = h("h1", {}, "iris-session");
   const header = h("header", { class: "bar" }, title, badge.element, self.element, estop.stop);
   const neededStreams = (): string[] => (view ? (state.spec?.deformables.map((part) => part.stream) ?? []) : []);
@@ -170,6 +170,13 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   client.on("notice", ({ text, level }) => show(text, level));
   client.on("phase", (phase) => {
     if (phase.phase !== "refused") return;
+    if (phase.refusal === "role" && remembered.role) {
+      show(`${phase.text}. Joining with another role.`, "warning");
+      remembered.role = ""; // else every reload would be refused again
+      remember(STORAGE_KEY, remembered);
+      joinByChoice();
+      return;
+    }
     const next = phase.refusal === "role" ? untried.shift() : undefined;
     if (next !== undefined) join(remembered.name, next);
     else if (phase.refusal === "unpaired") pairing.open("", phase.text);

@@ -100,3 +100,8 @@ export class KeyedList<T> {
     if (this.empty) this.empty.hidden = items.length > 0;
   }
 }
+
+/** Return whether keys mean text or a choice to what has the focus. */
+export function takesText(target: EventTarget | null): boolean {
+  return target instanceof HTMLElement && target.closest("input[type=text], textarea, [contenteditable], dialog") !== null;
+}

@@ -1,7 +1,7 @@
 // The bar above everything: which session, how fresh the picture is, who you are, and the e-stop.
 
 import type { Actions } from "./actions.ts";
-import { button, h, setOptions, setText, setValue } from "./dom.ts";
+import { button, h, setOptions, setText, setValue, takesText } from "./dom.ts";
 import type { Panel } from "./panel.ts";
 import type { PageState } from "./state.ts";
 import { formatMilliseconds, roleWords } from "./words.ts";
@@ -39,13 +39,19 @@ export function makeBadge(state: PageState, getDelay: () => number): Panel {
   };
 }
 
-/** The e-stop: a large button and a key. Stopping needs one press, clearing is for directors. */
-export function makeEstop(state: PageState, actions: Actions): { stop: HTMLElement; banner: HTMLElement; update: () => void } {
+/**
+ * The e-stop: a large button and a key. Stopping needs one press, clearing is for directors. `isDriving`: a robot is driven
+ * from the desk, so the key stops whatever else it would press.
+ */
+export function makeEstop(state: PageState, actions: Actions, isDriving: () => boolean): { stop: HTMLElement; banner: HTMLElement; update: () => void } {
   const word = h("span", { class: "word" }, "E-STOP");
   const key = h("small", {}, "Space");
   const stop = h("button", { type: "button", class: "estop", id: "estop", aria: { keyshortcuts: "Space" } }, word, key);
   const press = (reason: string): void => {
     actions.estop(reason);
+    const { phase } = state.phase;
+    if (phase === "joining" || phase === "waiting") actions.show("Not connected: the e-stop is sent when the connection is back. Use the stop at the robot.", "error");
+    else if (!state.isReady && phase !== "syncing") actions.show("Not sent: this browser is not in the session. Use the stop at the robot.", "error");
     stop.classList.add("pressed");
     setTimeout(() => stop.classList.remove("pressed"), 300);
   };
@@ -54,7 +60,7 @@ export function makeEstop(state: PageState, actions: Actions): { stop: HTMLEleme
     "keydown",
     (event) => {
       if (event.key !== " " || event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
-      if (!event.shiftKey && takesSpace(event.target)) return;
+      if (!event.shiftKey && (isDriving() ? takesText(event.target) : takesSpace(event.target))) return;
       event.preventDefault();
       press("key in the dashboard");
     },
@@ -74,15 +80,19 @@ export function makeEstop(state: PageState, actions: Actions): { stop: HTMLEleme
     update: () => {
       const isStopped = state.session?.estop ?? false;
       stop.classList.toggle("active", isStopped);
-      stop.title = isStopped ? "The e-stop is in force. Press to stop again" : "Stop all robots";
+      stop.title = !state.isReady
+        ? "Not connected: use the stop at the robot"
+        : isStopped
+          ? "The e-stop is in force. Press to stop again"
+          : "Stop all robots";
       setText(word, isStopped ? "STOPPED" : "E-STOP");
       if (banner.hidden === isStopped) banner.hidden = !isStopped;
       if (!isStopped) return;
       const newest = state.status?.stops[0];
       const who = newest?.name ? ` by ${newest.name}` : "";
       setText(text, `Stopped${who}${newest?.reason ? `: ${newest.reason}` : ""}`);
-      setText(note, state.isDirector ? "All robots hold." : "All robots hold. A director can clear it.");
-      clear.hidden = !state.isDirector;
+      setText(note, !state.isReady ? "Before the connection was lost." : state.isDirector ? "All robots hold." : "All robots hold. A director can clear it.");
+      clear.hidden = !state.isDirector || !state.isReady;
     },
   };
 }
@@ -92,12 +102,11 @@ function takesSpace(target: EventTarget | null): boolean {
   return target instanceof HTMLElement && target.closest("button, input, select, textarea, summary, a, dialog") !== null;
 }
 
-/** Who this page is: name and role, to join again with others. */
-export function makeSelf(state: PageState, join: (name: string, role: string) => void): Panel {
+/** Who this page is: name and role, to join again with others. `listRoles`: those that this browser may have. */
+export function makeSelf(state: PageState, listRoles: () => readonly string[], join: (name: string, role: string) => void): Panel {
   const summary = h("summary", {});
   const name = h("input", { type: "text", id: "self-name", attributes: { maxlength: "64", spellcheck: "false", autocomplete: "nickname" } });
   const role = h("select", { id: "self-role" });
-  setOptions(role, ["director", "operator", "observer"].map((one) => [one, roleWords(one)] as const));
   const identity = h("p", { class: "note" });
   const form = h(
     "form",
@@ -117,6 +126,7 @@ export function makeSelf(state: PageState, join: (name: string, role: string) =>
     element,
     update: () => {
       const { self } = state;
+      setOptions(role, listRoles().map((one) => [one, roleWords(one)] as const));
       setText(summary, self ? `${self.name}, ${roleWords(self.role)}` : "Not joined");
       if (!element.open && self) {
         setValue(name, self.name);

@@ -59,7 +59,7 @@ function makeRow({ id }: ParticipantInfo, state: PageState, actions: Actions): R
     element,
     update: (item) => {
       dot.style.background = participantColor(id);
-      setText(name, item.name);
+      setText(name, state.nameOf(id));
       you.hidden = id !== state.selfId;
       const report = state.status?.participants.find((one) => one.id === id);
       const held = state.heldBy(id);

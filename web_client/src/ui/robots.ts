@@ -29,6 +29,7 @@ export function makeRobotsPanel(state: PageState, actions: Actions, drive: Drive
       section.setCount(robots.length > 0 ? String(robots.length) : "");
       rows.update(robots, (robot) => robot.name);
       state.consents = state.consents.filter((consent) => consent.until_ms > performance.now());
+      setText(empty, state.session ? "This scene has no robots." : "Not joined.");
       consents.update(state.consents, (consent) => String(consent.consent_id));
     },
   };
@@ -39,12 +40,12 @@ function makeRow({ name }: RobotInfo, state: PageState, actions: Actions, drive:
   const title = h("strong", { class: "name" }, name);
   const holder = h("span", { class: "holder" });
   const why = h("div", { class: "note" });
-  const take = button("Take", () => void actions.request({ type: "acquire", robots: [name] }, `You have ${name}.`), {
+  const take = button("Take", () => void actions.request({ type: "acquire", robots: [name] }, `The robot ${name} is yours.`), {
     class: "small primary",
   });
   const wait = button(
     "Wait for it",
-    () => void actions.request({ type: "acquire", robots: [name], wait: true }, `You have ${name}.`),
+    () => void actions.request({ type: "acquire", robots: [name], wait: true }, `The robot ${name} is yours.`),
     { class: "small" },
   );
   const release = button(
@@ -59,7 +60,7 @@ function makeRow({ name }: RobotInfo, state: PageState, actions: Actions, drive:
   const assign = h("select", { class: "small", aria: { label: `Assign ${name} to` } });
   assign.addEventListener("change", () => {
     const participant = assign.value;
-    const done = participant === FREE ? `${name} is free.` : `${state.nameOf(participant)} has ${name}.`;
+    const done = participant === FREE ? `The robot ${name} is free.` : `${state.nameOf(participant)} has the robot ${name}.`;
     void actions.request({ type: "assign", robots: [name], participant }, done).then((granted) => {
       if (!granted) assign.value = state.lease(name)?.holder ?? FREE;
     });
@@ -108,10 +109,10 @@ function makeRow({ name }: RobotInfo, state: PageState, actions: Actions, drive:
       take.setAttribute("aria-label", `${take.textContent ?? ""}: ${name}`);
       wait.hidden = !canTake || isFree || lease.queue.includes(state.selfId) || lease.mode === "takeover";
       wait.setAttribute("aria-label", `Wait for it: ${name}`);
-      steer.hidden = !isMine;
+      steer.hidden = !isMine || !state.isReady;
       setText(steer, drive.robot === name ? "Stop driving" : "Drive");
       steer.setAttribute("aria-label", `${steer.textContent ?? ""}: ${name}`);
-      release.hidden = !isMine;
+      release.hidden = !isMine || !state.isReady;
       release.setAttribute("aria-label", `Release: ${name}`);
       assignLabel.hidden = modeLabel.hidden = !state.isDirector;
       scaleLabel.hidden = !(state.isDirector || isMine) || isFree;
@@ -133,6 +134,7 @@ function describe(
   lease: ReturnType<PageState["lease"]>,
   report: NonNullable<PageState["status"]>["robots"][number] | undefined,
 ): string {
+  if (!state.isReady) return "not known: not connected";
   const feedback = state.feedback.get(robot);
   const reason = feedback?.hold_reason || report?.hold_reason || "";
   const parts: string[] = [];

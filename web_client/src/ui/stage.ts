@@ -88,6 +88,7 @@ export function makeStage(state: PageState, actions: { pair: () => void; retry: 
       const isStale = phase.phase === "ready" && phase.stalled;
       message.hidden = phase.phase === "ready" && !isStale;
       message.classList.toggle("slim", spec !== null);
+      canvas.classList.toggle("outdated", !message.hidden);
       setText(title, isStale ? "The session does not step" : (PHASE_WORDS[phase.phase] ?? phase.phase));
       setText(words, phase.text || info?.text || "");
       setText(advice, phase.advice);

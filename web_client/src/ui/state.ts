@@ -1,20 +1,21 @@
 // What the page knows: the newest update of each kind, the roster by id, the history of events. Panels read it.
 
-import type {
-  AssetProgress,
-  BudgetUpdate,
-  Filled,
-  IdentityUpdate,
-  InboxMessage,
-  InfoUpdate,
-  Lease,
-  ParticipantInfo,
-  PhaseUpdate,
-  SceneSpec,
-  SessionUpdate,
-  StatsUpdate,
-  StatusReport,
-  WelcomeUpdate,
+import {
+  type AssetProgress,
+  type BudgetUpdate,
+  type Filled,
+  type IdentityUpdate,
+  type InboxMessage,
+  type InfoUpdate,
+  type Lease,
+  nowMs,
+  type ParticipantInfo,
+  type PhaseUpdate,
+  type SceneSpec,
+  type SessionUpdate,
+  type StatsUpdate,
+  type StatusReport,
+  type WelcomeUpdate,
 } from "../core/api.ts";
 import type { WorkerClient } from "../core/page_client.ts";
 import type * as wire from "../protocol/messages.g.ts";
@@ -74,6 +75,7 @@ export class PageState {
   readonly log: LogEntry[] = [];
   consents: ConsentAsked[] = [];
   rtt_ms = Number.NaN;
+  private sessionOffset_ms = Number.NaN;
   /** Names of participants that left, for events about them. */
   private readonly formerNames = new Map<string, string>();
   private readonly listeners: ((state: PageState) => void)[] = [];
@@ -114,8 +116,9 @@ export class PageState {
       this.progress = progress;
       this.touch();
     });
-    client.on("clock", ({ rtt_ms }) => {
+    client.on("clock", ({ rtt_ms, session_offset_ms }) => {
       this.rtt_ms = rtt_ms;
+      this.sessionOffset_ms = session_offset_ms;
       this.touch();
     });
     client.on("inbox", ({ messages }) => {
@@ -166,8 +169,11 @@ export class PageState {
     return this.session?.participants.find((participant) => participant.id === id);
   }
 
+  /** Return the name of a participant, with the id where another present one has the same. */
   nameOf(id: string): string {
-    return this.participant(id)?.name ?? this.formerNames.get(id) ?? id;
+    const name = this.participant(id)?.name ?? this.formerNames.get(id) ?? id;
+    const isShared = this.session?.participants.some((other) => other.id !== id && other.name === name) ?? false;
+    return isShared ? `${name} (${id})` : name;
   }
 
   lease(robot: string): Lease | undefined {
@@ -182,14 +188,14 @@ export class PageState {
 
   /** Add a line of the page's own to the history. */
   note(text: string, level: EventLevel = "info"): void {
-    this.addLog(this.newestTime(), text, level);
+    this.addLog(this.sessionTime(), text, level);
     this.touch();
   }
 
   private take(message: InboxMessage): void {
     if (message.type === "feedback") this.feedback.set(message.robot, message);
     else if (message.type === "event") this.takeEvent(message);
-    else if (message.type === "protocol_fault") this.addLog(this.newestTime(), message.message, "warning");
+    else if (message.type === "protocol_fault") this.addLog(this.sessionTime(), message.message, "warning");
   }
 
   private takeEvent({ session_time, body }: Filled<wire.Event>): void {
@@ -205,8 +211,9 @@ export class PageState {
     if (words) this.addLog(session_time, words.text, words.level);
   }
 
-  private newestTime(): number {
-    return this.log[0]?.session_time ?? this.status?.session_time ?? 0;
+  /** Session time now [ns], 0 before the clock is known. */
+  private sessionTime(): number {
+    return Number.isNaN(this.sessionOffset_ms) ? 0 : Math.round(1e6 * (nowMs() + this.sessionOffset_ms));
   }
 
   private addLog(session_time: number, text: string, level: EventLevel): void {
