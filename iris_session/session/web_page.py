@@ -134,7 +134,7 @@ def open_web_page(config: SessionConfig, name: str) -> WebPage:
     if not config.web:
         return WebPage(config, name)
     if config.web_cert and not needs_encryption(config):
-        raise StartError("web_cert: this session is not encrypted, and its page plain HTTP on this machine: add --curve")
+        raise StartError("web_cert: this session is not encrypted, so its page is plain HTTP: add --curve")
     if not has_packages():
         return WebPage(config, name, note="no page for browsers: pip install 'iris-session[web]'")
     if config.curve_clients and needs_encryption(config):  # such a folder holds no identities of browsers

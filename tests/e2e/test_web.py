@@ -298,7 +298,8 @@ def test_a_browser_pairs_by_the_printed_link(
         assert guest.evaluate("irisSession.state.role") == "observer"
         assert guest.evaluate("[...document.querySelectorAll('[data-robot] button')].every((one) => one.hidden)")
         assert pairing.wait(30) == 0
-        assert guest.evaluate("[...document.querySelector('#self-role').options].map((one) => one.value)") == ["observer"]
+        offered = guest.evaluate("[...document.querySelector('#self-role').options].map((one) => one.value)")
+        assert offered == ["observer"]
         chosen = json.dumps({"name": "Web", "role": "director", "roles": []})  # of a session that allowed it
         guest.evaluate(f"localStorage.setItem('iris-session.page', {json.dumps(chosen)})")
         guest.reload()
