@@ -269,8 +269,8 @@ class SubscriberGuard:
 
     libzmq keeps every subscription, whether or not anything is ever published under it, byte for byte in one tree, and
     looks through the whole tree whenever a connection ends: 40 connections with 70 topics of 900 bytes each took 3.5 s,
-    in which no subscriber gets state. So a connection that subscribes to topics that do not exist is closed before the next
-    message is read, what it has sent besides is discarded, and a key can open few connections at once
+    in which no subscriber gets state. So a connection that subscribes to topics that do not exist is closed before the
+    next message is read, what it has sent besides is discarded, and a key can open few connections at once
     (`HandshakeLimiter`).
 
     `on_flood(address, detail, now_ns, key)` reports a flood, `on_accept(address, now_ns)` counts a new connection,
