@@ -42,6 +42,23 @@ _CHUNK_FRAMES: Final = 2
 UNKNOWN, TOO_MANY, TEMPORARY = 404, 429, 503
 
 
+class ByteRate:
+    """Rate of bytes that all senders share: each waits until what was reserved before is sent.
+
+    `bytes_per_s`: of all together.
+    """
+
+    def __init__(self, bytes_per_s: float) -> None:
+        self._bytes_per_s = bytes_per_s
+        self._due_s = 0.0
+
+    def reserve(self, n_bytes: int, now_s: float) -> float:
+        """Reserve `n_bytes` and return how long to wait before they are sent [s]."""
+        begin_s = max(self._due_s, now_s)
+        self._due_s = begin_s + n_bytes / self._bytes_per_s
+        return begin_s - now_s
+
+
 class AssetUnavailableError(Exception):
     """An asset cannot be given out. `status`: of HTTP."""
 

@@ -21,7 +21,7 @@ from aiohttp import WSCloseCode, WSMsgType, web
 from iris_session.protocol.assets import is_address
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.limits import Drops, TokenBucket
-from iris_session.web.assets import TOO_MANY, AssetUnavailableError, GatewayAssets
+from iris_session.web.assets import TOO_MANY, AssetUnavailableError, ByteRate, GatewayAssets
 from iris_session.web.hub import NAME_BYTES, Browser, Closing, Hub
 from iris_session.web.listener import Connection, Listener
 from iris_session.web.page import HostCheck, PageFiles, make_security_headers
@@ -64,6 +64,9 @@ ASSETS_PER_BROWSER: Final = 16
 ASSETS_IN_ALL: Final = 128
 #: Bytes of an asset that are written at a time, in between state is sent.
 ASSET_PIECE: Final = 65_536
+#: Bytes of assets per second, to all together: more than a headset takes over Wi-Fi, and encrypting them leaves most of
+#: the loop to the state of others.
+ASSET_BYTES_PER_S: Final = 48e6
 #: Messages a second on a media socket: wishes and tickets, nothing else.
 _WISHES_PER_S, _WISHES_BURST = 5.0, 20
 _RANGE: Final = re.compile(r"bytes=(\d{0,15})-(\d{0,15})")
@@ -211,6 +214,7 @@ class WebServer:
         self._listener: Listener | None = None
         self._media: dict[str, SocketWriter] = {}
         self._loads: dict[str, int] = {}
+        self._asset_rate = ByteRate(ASSET_BYTES_PER_S)
         self._fault_logged = 0.0
         application = web.Application(middlewares=[self._guard], client_max_size=4096)
         application.router.add_get("/v1/info", self._info)
@@ -370,6 +374,7 @@ class WebServer:
         await response.prepare(request)
         loop = asyncio.get_running_loop()
         for at in range(begin, end, ASSET_PIECE):
+            await asyncio.sleep(self._asset_rate.reserve(min(ASSET_PIECE, end - at), time.monotonic()))
             # Read by a thread: a file that is not in memory must not stop the loop.
             piece = await loop.run_in_executor(None, bytes, view[at : min(at + ASSET_PIECE, end)])
             try:

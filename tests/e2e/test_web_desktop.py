@@ -41,6 +41,13 @@ PAD = """void (window.shoulder = false, navigator.getGamepads = () => [{
   connected: true, id: "pad", index: 0, mapping: "standard", axes: [0, -1, 0, 0],
   buttons: Array.from({ length: 17 }, (_, i) => ({ pressed: i === 5 && window.shoulder })),
 }])"""
+#: Largest distance of a body of the scene from its pose of the newest state [m].
+FARTHEST_BODY = """(() => {
+  const { scene, shown } = irisSession.view;
+  const offsets = shown.bodies.map((id, row) => scene.bodies.get(id).position.distanceTo(
+    { x: shown.poses[7 * row], y: shown.poses[7 * row + 1], z: shown.poses[7 * row + 2] }));
+  return Math.max(...offsets);
+})()"""
 UNPLUG = 'void (navigator.getGamepads = () => [], window.dispatchEvent(new Event("gamepaddisconnected")))'
 
 
@@ -205,6 +212,17 @@ def test_the_estop_key_is_the_same_while_driving(scenario: Scenario, driver: Pag
     tip.watch_for(0.3)  # as a finger: a sample must have seen the key let go
     drive_forward(driver, tip, 0.01)
     driver.let_go("Shift")
+
+
+def test_bodies_that_rest_stay_where_they_are_when_the_scene_is_patched(scenario: Scenario, driver: Page) -> None:
+    tip = Tip(scenario)
+    drive_forward(driver, tip, 0.05)
+    driver.let_go("w")
+    driver.let_go("Shift")
+    tip.watch_for(1.0)
+    driver.evaluate("irisSession.view.setScene({...irisSession.view.scene.spec})")  # what a patch does
+    driver.evaluate("irisSession.view.scene.complete.then(() => null)")
+    driver.wait(f"{FARTHEST_BODY} < 1e-3")
 
 
 def test_the_estop_key_presses_no_button_while_driving(driver: Page) -> None:

@@ -78,6 +78,8 @@ export class SceneView {
       const group = new Group();
       group.name = body.name;
       setPose(group, body.T_world_body);
+      group.updateMatrix();
+      group.matrixAutoUpdate = false; // whoever moves a body updates it
       this.bodies.set(body.id, group);
       this.rest.set(body.id, new Matrix4().compose(group.position, group.quaternion, new Vector3(1, 1, 1)));
       this.world.add(group);
@@ -164,6 +166,8 @@ export class SceneView {
       if (shown) this.bodies.get(visual.body)?.remove(shown);
       shown = made;
       setPose(made, visual.T_body_visual);
+      made.updateMatrix();
+      made.matrixAutoUpdate = false;
       made.name = visual.name;
       made.userData = { visual: visual.id, body: visual.body } satisfies VisualTag;
       const isPlane = visual.geometry.kind === "plane";

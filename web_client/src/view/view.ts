@@ -235,6 +235,7 @@ export class View {
       onProblem: this.events.onProblem,
     });
     this.scene = scene;
+    this.poses = new Float32Array(0); // its bodies lie as they did at first, until they are moved
     this.sceneCount += 1;
     this.assets.keepOnly(listAddresses(spec));
     const isSameRoom = before !== null && before.spec.name === spec.name && before.spec.bodies.length === spec.bodies.length;
@@ -320,6 +321,7 @@ export class View {
       if (!group.visible) continue;
       group.position.set(x, y, z);
       group.quaternion.set(this.poses[at + 4]!, this.poses[at + 5]!, this.poses[at + 6]!, this.poses[at + 3]!);
+      group.updateMatrix();
     }
     return true;
   }
