@@ -79,7 +79,7 @@ export class SceneView {
       group.name = body.name;
       setPose(group, body.T_world_body);
       group.updateMatrix();
-      group.matrixAutoUpdate = false; // whoever moves a body updates it
+      group.matrixAutoUpdate = false; // it is updated when the body is moved
       this.bodies.set(body.id, group);
       this.rest.set(body.id, new Matrix4().compose(group.position, group.quaternion, new Vector3(1, 1, 1)));
       this.world.add(group);
