@@ -72,6 +72,8 @@ size_m = 0.16
 #: Within which the state age of honest clients must stay of that without the attack.
 AGE_SHARE: Final = 0.5
 AGE_MS: Final = 2.0
+#: Longest time without a state at honest clients on this machine [ms]. The session replaces a front after 1,500.
+PAUSE_MS: Final = 500.0
 #: An age that is too high once may be that of a busy machine: the case is measured again, and the best counts.
 TRIES: Final = 3
 
@@ -260,6 +262,7 @@ class Window:
     events: int
     peak_front_mib: float = 0.0
     peak_others_mib: float = 0.0
+    pause_ms: float = 0.0
 
     def p99_ms(self, names: tuple[str, ...]) -> float:
         """Return the p99 of all ages of these clients, infinity without any."""
@@ -401,7 +404,8 @@ class Lab:
                 ages.setdefault(name, []).extend(one["ages_ms"])
         grown = self.recording.stat().st_size - size
         others = max(peaks["authority"], peaks["recorder"])
-        return Window(elapsed, ages, grown, len(self.events), peaks["front"], others)
+        pause_ms = max(report[name]["pause_ms"] for report in self._reports[first + 1 :] for name in LOCAL)
+        return Window(elapsed, ages, grown, len(self.events), peaks["front"], others, pause_ms)
 
     def set_base(self) -> None:
         """Remember the memory of all processes, from which growth is counted."""
@@ -568,6 +572,9 @@ def run_once(lab: Lab, chosen: Case, seconds: float) -> Result:
         figures[f"age_ms_p99_{label}"], figures[f"age_ms_p99_{label}_without"] = round(age, 2), round(usual, 2)
         if age > usual + max(AGE_SHARE * usual, AGE_MS):
             result.problems.append(f"state age p99 of the {label} clients {age:.1f} ms, {usual:.1f} ms without")
+    figures["pause_ms"] = round(window.pause_ms, 1)
+    if window.pause_ms > PAUSE_MS:
+        result.problems.append(f"no state for {window.pause_ms:.0f} ms")
     figures["front_mib"], figures["others_mib"] = round(window.peak_front_mib, 1), round(window.peak_others_mib, 1)
     figures["disk_mib_per_s"] = round(max(0.0, window.disk_bytes / window.seconds - quiet_disk) / MIB, 2)
     figures["events_per_s"] = round(window.events / window.seconds, 1)
@@ -623,17 +630,21 @@ def main() -> int:
         return 0
     seconds = 4.0 if options.quick else 10.0
     results: list[Result] = []
-    folder = Path(tempfile.mkdtemp(prefix="iris-hostile-"))
-    with ExitStack() as stack:
-        lab = Lab(folder, stack)
-        lab.start()
-        for name, chosen in CASES.items():
-            if options.case and name not in options.case:
-                continue
-            results.append(run_case(lab, chosen, seconds))
-            print(f"{name}: {'ok' if results[-1].ok else results[-1].problems}", file=sys.stderr, flush=True)
-        results.append(lab.finish())
-        print(f"recording: {'ok' if results[-1].ok else results[-1].problems}", file=sys.stderr, flush=True)
+    folder = Path(tempfile.mkdtemp(prefix="iris-hostile-"))  # kept when something fails
+    try:
+        with ExitStack() as stack:
+            lab = Lab(folder, stack)
+            lab.start()
+            for name, chosen in CASES.items():
+                if options.case and name not in options.case:
+                    continue
+                results.append(run_case(lab, chosen, seconds))
+                print(f"{name}: {'ok' if results[-1].ok else results[-1].problems}", file=sys.stderr, flush=True)
+            results.append(lab.finish())
+            print(f"recording: {'ok' if results[-1].ok else results[-1].problems}", file=sys.stderr, flush=True)
+    except KeyboardInterrupt:
+        shutil.rmtree(folder)
+        return 130
     ok = all(one.ok for one in results)
     if ok:
         shutil.rmtree(folder)

@@ -52,6 +52,8 @@ from iris_session.security import KeyPair
 MIB: Final = 1 << 20
 SAMPLE_S: Final = 1.0 / 72.0
 REPORT_S: Final = 1.0
+#: A key that floods is refused for 3 s.
+AFTER_BAN_S: Final = 3.5
 Context = zmq.Context[zmq.Socket[bytes]]
 
 
@@ -104,6 +106,7 @@ class Honest:
         key = job.keys[name]
         self.name = name
         self.ages_ms: list[float] = []
+        self.pause_ms = 0.0  # longest session time between two states
         self.events = 0
         self._session_time = -1
         self._next_s = 0.0
@@ -120,6 +123,8 @@ class Honest:
 
     def _record(self, state: SceneState) -> None:
         if state.header.session_time != self._session_time:  # else sent again: its age says nothing
+            if self._session_time >= 0:
+                self.pause_ms = max(self.pause_ms, (state.header.session_time - self._session_time) * 1e-6)
             self._session_time = state.header.session_time
             self.ages_ms.append(state.age_ns * 1e-6)
 
@@ -135,9 +140,15 @@ class Honest:
     def report(self) -> dict[str, Any]:
         """Return what was seen since the last report."""
         ages, self.ages_ms = self.ages_ms, []
+        pause_ms, self.pause_ms = self.pause_ms, 0.0
         events, self.events = self.events, 0
-        connection = self.client.connection
-        return {"ready": self.client.ready, "generation": connection.generation, "ages_ms": ages, "events": events}
+        return {
+            "ready": self.client.ready,
+            "generation": self.client.connection.generation,
+            "ages_ms": ages,
+            "pause_ms": pause_ms,
+            "events": events,
+        }
 
 
 def run_honest(job: Job) -> None:
@@ -320,10 +331,16 @@ def attack_estops(attacker: Attacker) -> None:
 
 
 def attack_topics(attacker: Attacker) -> None:
-    """Subscribe to random topics of the state socket, by forty connections."""
+    """Subscribe to random topics of the state socket, by forty connections, and by as many new ones after each ban."""
     attacker.start()
-    subs = [attacker.open(zmq.XSUB, attacker.job.state) for _ in range(40)]
+    subs: list[zmq.Socket[bytes]] = []
+    again_s = 0.0
     for n in attacker.paced(20_000.0):
+        if time.monotonic() >= again_s:
+            again_s = time.monotonic() + AFTER_BAN_S
+            for sub in subs:
+                sub.close()
+            subs = [attacker.open(zmq.XSUB, attacker.job.state) for _ in range(40)]
         with contextlib.suppress(zmq.Again):
             subs[n % len(subs)].send(b"\x01" + attacker.random.randbytes(900), zmq.DONTWAIT)
             attacker.counts["sent"] += 1

@@ -251,7 +251,7 @@ class HandshakeLimiter:
         self._is_banned = is_banned
         self._backoff = backoff
         self._buckets = KeyedBuckets(limits.handshakes, limits.handshake_burst, MAX_KEYS)
-        self._subscribers = KeyedBuckets(limits.subscribers, limits.subscriber_burst, MAX_KEYS)
+        self._subscribers = KeyedBuckets(limits.subscriber_handshakes, limits.subscriber_handshake_burst, MAX_KEYS)
 
     def allow(self, domain: bytes, key_id: str, address: str, now_ns: int) -> bool:
         """Return whether a key may open one more connection to a channel, and use its token."""

@@ -160,7 +160,7 @@ class KeyLimits(msgspec.Struct, frozen=True):
         requests, request_burst: Work that requests cause, as stated by `weigh_request`.
         events, event_burst: Events that messages may cause, as stated by `count_events`: everyone gets each of them.
         handshakes, handshake_burst: TCP connections that finish a handshake, for each channel without subscriptions.
-        subscribers, subscriber_burst: The same for state, and for media.
+        subscriber_handshakes, subscriber_handshake_burst: The same for state, and for media.
         estops, estop_burst: E-stops that reach the authority; those above are merged into the next one.
         gateway_factor: Share of a gateway's key in everything but connections.
     """
@@ -176,8 +176,8 @@ class KeyLimits(msgspec.Struct, frozen=True):
     event_burst: int = 80
     handshakes: float = 4.0
     handshake_burst: int = 24
-    subscribers: float = 1.0
-    subscriber_burst: int = 8
+    subscriber_handshakes: float = 1.0
+    subscriber_handshake_burst: int = 8
     estops: float = 2.0
     estop_burst: int = 4
     gateway_factor: int = 8

@@ -269,8 +269,8 @@ def test_handshakes_of_a_key_are_limited_for_each_channel() -> None:
     for domain, rate, burst in (
         (ZAP_CONTROL, limits.handshakes, limits.handshake_burst),
         (ZAP_ASSETS, limits.handshakes, limits.handshake_burst),
-        (ZAP_STATE, limits.subscribers, limits.subscriber_burst),
-        (ZAP_MEDIA, limits.subscribers, limits.subscriber_burst),
+        (ZAP_STATE, limits.subscriber_handshakes, limits.subscriber_handshake_burst),
+        (ZAP_MEDIA, limits.subscriber_handshakes, limits.subscriber_handshake_burst),
     ):
         assert count_allowed(domain, "hog") == burst, "each channel has its own"
         assert count_allowed(domain, "hog", SECOND) == rate

@@ -120,7 +120,7 @@ def test_one_key_leaves_subscribers_to_others(lab: Lab) -> None:
     monitors = [one.get_monitor_socket(zmq.EVENT_DISCONNECTED) for one in subscribers]
     for one in subscribers:
         one.setsockopt(zmq.RECONNECT_IVL, -1)
-    excess = len(subscribers) - lab.session.config.limits.key.subscriber_burst
+    excess = len(subscribers) - lab.session.config.limits.key.subscriber_handshake_burst
     assert lab.session.wait_drops("key_connections") > 0
     lab.session.pump(lambda: sum(bool(m.poll(0)) for m in monitors) >= excess - 4, "the excess is closed")
     for one, monitor in zip(subscribers, monitors, strict=True):

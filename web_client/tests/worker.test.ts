@@ -389,6 +389,18 @@ describe("joined", () => {
     expect(bench.socket.messages().map(({ type }) => type)).toEqual(["hello", "estop"]);
   });
 
+  test("an e-stop that is not on its way is told at once", async () => {
+    bench.post({ type: "estop", reason: "button" });
+    expect(bench.last("notice").text).toMatch(/not sent/);
+    await bench.join();
+    bench.pass(1500);
+    bench.socket.end(1006);
+    bench.socket.end(1006);
+    expect(bench.last("phase").phase).toBe("waiting");
+    bench.post({ type: "estop", reason: "button" });
+    expect(bench.last("notice").text).toMatch(/when the connection is back/);
+  });
+
   test("samples carry fencing numbers and session time", async () => {
     await bench.join();
     const capture_ms = 1000 + bench.now / MS;

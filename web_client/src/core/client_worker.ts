@@ -88,6 +88,18 @@ export class ClientWorker {
     this.pump();
   }
 
+  /** Send an e-stop, and say so when it is not on its way. */
+  private sendEStop(reason: string): void {
+    let text = "The e-stop is not sent: this browser is not in the session. Use the stop at the robot.";
+    try {
+      if (this.connection?.send({ type: "estop", reason })) return;
+      if (this.connection) text = "Not connected: the e-stop is sent when the connection is back. Use the stop at the robot.";
+    } catch (error) {
+      if (!(error instanceof ClientError)) throw error;
+    }
+    this.environment.post({ type: "notice", level: "error", text }, []);
+  }
+
   private dispatch(command: ToWorker): void {
     const { connection } = this;
     switch (command.type) {
@@ -110,7 +122,7 @@ export class ClientWorker {
         connection?.send(command.message);
         break;
       case "estop":
-        connection?.send({ type: "estop", reason: command.reason });
+        this.sendEStop(command.reason);
         break;
       case "samples":
         this.sendSamples(command.samples);

@@ -9,7 +9,7 @@ import { denialWords } from "./words.ts";
 export class Actions {
   constructor(
     private readonly client: WorkerClient,
-    readonly show: (text: string, level: EventLevel) => void,
+    private readonly show: (text: string, level: EventLevel) => void,
   ) {}
 
   /** Send a request. Returns whether it was granted; shows why not. */

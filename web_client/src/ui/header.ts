@@ -49,9 +49,6 @@ export function makeEstop(state: PageState, actions: Actions, isDriving: () => b
   const stop = h("button", { type: "button", class: "estop", id: "estop", aria: { keyshortcuts: "Space" } }, word, key);
   const press = (reason: string): void => {
     actions.estop(reason);
-    const { phase } = state.phase;
-    if (phase === "joining" || phase === "waiting") actions.show("Not connected: the e-stop is sent when the connection is back. Use the stop at the robot.", "error");
-    else if (!state.isReady && phase !== "syncing") actions.show("Not sent: this browser is not in the session. Use the stop at the robot.", "error");
     stop.classList.add("pressed");
     setTimeout(() => stop.classList.remove("pressed"), 300);
   };
@@ -126,7 +123,8 @@ export function makeSelf(state: PageState, listRoles: () => readonly string[], j
     element,
     update: () => {
       const { self } = state;
-      setOptions(role, listRoles().map((one) => [one, roleWords(one)] as const));
+      const roles = new Set([...listRoles(), ...(self ? [self.role] : [])]); // a director may have given it another one
+      setOptions(role, [...roles].map((one) => [one, roleWords(one)] as const));
       setText(summary, self ? `${self.name}, ${roleWords(self.role)}` : "Not joined");
       if (!element.open && self) {
         setValue(name, self.name);
