@@ -80,6 +80,7 @@ class Job(msgspec.Struct, frozen=True):
         seconds: Length of an attack.
         robots, objects: Targets of an attack.
         allow_list: File of the allow-list.
+        cpu_share: Cores that the attack "busy" uses.
     """
 
     host: str
@@ -94,6 +95,7 @@ class Job(msgspec.Struct, frozen=True):
     robots: tuple[str, ...] = ()
     objects: tuple[str, ...] = ()
     allow_list: str = ""
+    cpu_share: float = 0.0
 
 
 # --- honest clients ---------------------------------------------------------------------------------------------------
@@ -330,6 +332,15 @@ def attack_estops(attacker: Attacker) -> None:
             raw.send(Hello("observer", "mallory", alignment="not_needed"))
 
 
+def attack_nothing(attacker: Attacker) -> None:
+    """Use the cores of `cpu_share` and send nothing: what an attacker costs by being on the same machine."""
+    attacker.start()
+    for _ in attacker.paced(100.0):
+        until_s = time.thread_time() + 0.01 * attacker.job.cpu_share
+        while time.thread_time() < until_s:
+            pass
+
+
 def attack_topics(attacker: Attacker) -> None:
     """Subscribe to random topics of the state socket, by forty connections, and by as many new ones after each ban."""
     attacker.start()
@@ -463,6 +474,7 @@ ATTACKS: Final[dict[str, Callable[[Attacker], None]]] = {
     "leases": attack_leases,
     "joins": attack_joins,
     "estops": attack_estops,
+    "busy": attack_nothing,
     "topics": attack_topics,
     "ingest_role": attack_ingest_role,
     "unfinished": attack_unfinished,
