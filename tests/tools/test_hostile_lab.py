@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -22,7 +23,7 @@ def test_quiet_windows_after_an_attack_are_not_pooled(tmp_path: Path, monkeypatc
     monkeypatch.setattr(lab, "measure", lambda seconds: Window(seconds, {"a": [next(ages)] * 100}, 0, 0))
     lab.director = SimpleNamespace(status=lambda: SimpleNamespace(drops={}))
     output = SimpleNamespace(readline=lambda: b"attacking\n", read=lambda: b"")
-    monkeypatch.setattr(lab, "_spawn", lambda *_: SimpleNamespace(stdout=output, wait=lambda _: 0))
+    monkeypatch.setattr(lab, "_spawn", lambda *_: SimpleNamespace(stdout=output, pid=os.getpid(), wait=lambda _: 0))
     monkeypatch.setattr(lab, "_make_job", lambda *_, **__: None)
     lab.keys = dict.fromkeys(name for one in CASES.values() for name in one.keys)
     lab.measure_quiet(1.0)
