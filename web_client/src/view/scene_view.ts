@@ -12,7 +12,6 @@ import {
   InstancedMesh,
   Matrix4,
   Mesh,
-  type Object3D,
   Quaternion,
   type ShaderMaterial,
   type Texture,
@@ -24,6 +23,7 @@ import { makeWorldRoot, setPose } from "./axes.ts";
 import { type Budget, chooseLevels, type LevelChoice } from "./budget.ts";
 import { DeformableView } from "./deformables.ts";
 import { Lighting } from "./lighting.ts";
+import { mergeMeshes } from "./merging.ts";
 import { addTextureCoordinates, buildHeightField, buildPrimitive, cubeDirections, ENDLESS_M } from "./shapes.ts";
 import { makeSky } from "./sky.ts";
 import type { Geometry, Material, Rgba, SceneSpec, Visual } from "./spec.ts";
@@ -43,12 +43,6 @@ const BEHIND_ALPHA = 0.3;
 /** Roles of the texture that gives a surface its colour. */
 const COLOR_ROLES = ["rgb", "rgba"];
 
-/** What `visual` is in the scene, for hit tests. */
-export interface VisualTag {
-  visual: number;
-  body: number;
-}
-
 /** One scene. `world` holds it, in the session's axes; `sky` belongs beside it. */
 export class SceneView {
   readonly world: Group = makeWorldRoot();
@@ -65,7 +59,7 @@ export class SceneView {
   private readonly geometries = new Map<string, Promise<BufferGeometry>>();
   private readonly textures = new Map<string, Promise<Texture>>();
   private readonly materials = new Map<string, ShaderMaterial>();
-  private readonly owned: { dispose(): void }[] = [];
+  private readonly owned = new Set<{ dispose(): void }>();
   private isDisposed = false;
 
   constructor(
@@ -122,7 +116,7 @@ export class SceneView {
           ]);
           if (this.isDisposed) return;
           const view = new DeformableView(part, arrays, material);
-          this.owned.push(view);
+          this.owned.add(view);
           this.deformables.push(view);
           this.world.add(view.object);
         }),
@@ -134,11 +128,26 @@ export class SceneView {
           const texture = (await this.loadTexture(spec.environment.skybox)) as CubeTexture;
           if (this.isDisposed) return;
           this.sky = makeSky(texture);
-          this.owned.push(this.sky.geometry, this.sky.material as ShaderMaterial);
+          this.owned.add(this.sky.geometry).add(this.sky.material as ShaderMaterial);
         }),
       );
     }
     await Promise.all(jobs);
+    if (!this.isDisposed) this.merge();
+  }
+
+  /** Merge what looks the same on each body, and release what is not drawn any more. */
+  private merge(): void {
+    for (const body of this.bodies.values()) for (const made of mergeMeshes(body)) this.owned.add(made);
+    const drawn = new Set<unknown>();
+    this.world.traverse((object) => drawn.add((object as Partial<Mesh>).geometry));
+    const release = (geometry: BufferGeometry): void => {
+      if (drawn.has(geometry)) return;
+      geometry.dispose();
+      this.owned.delete(geometry);
+    };
+    for (const loading of this.geometries.values()) loading.then(release, () => undefined); // what failed was reported
+    this.geometries.clear();
   }
 
   /** Run a part of the building; what fails is left out and reported. */
@@ -169,7 +178,6 @@ export class SceneView {
       made.updateMatrix();
       made.matrixAutoUpdate = false;
       made.name = visual.name;
-      made.userData = { visual: visual.id, body: visual.body } satisfies VisualTag;
       const isPlane = visual.geometry.kind === "plane";
       made.castShadow = castShadow && !isPlane && visual.rgba[3] >= 1;
       made.receiveShadow = true;
@@ -194,7 +202,7 @@ export class SceneView {
     const rgba: Rgba = [r, g, b, alpha * BEHIND_ALPHA];
     const material = await this.makeMaterial(visual.material, rgba, { geometry: visual.geometry, isBack: true });
     const back = new Mesh(geometry, material);
-    back.userData = { visual: visual.id, body: visual.body, isPlane: true };
+    back.userData.isPlane = true;
     return back;
   }
 
@@ -208,7 +216,7 @@ export class SceneView {
     if (!loading) {
       loading = this.readArrays(geometry, level).then((arrays) => {
         const made = toBufferGeometry(arrays, geometry, mapping, material ?? null, this.spec);
-        this.owned.push(made);
+        this.owned.add(made);
         return made;
       });
       this.geometries.set(key, loading);
@@ -234,7 +242,7 @@ export class SceneView {
       if (sites.length < 2) continue;
       const arrays = buildPrimitive({ kind: "cylinder", size: [1, 1, 0.5], mesh: -1, hfield: -1 });
       const geometry = toBufferGeometry(arrays, null, "", null, spec);
-      this.owned.push(geometry);
+      this.owned.add(geometry);
       void this.makeMaterial(tendon.material, tendon.rgba, {}).then((material) => {
         const pieces = new InstancedMesh(geometry, material, sites.length - 1);
         pieces.frustumCulled = false;
@@ -312,7 +320,7 @@ export class SceneView {
       loading = this.assets.loadPixels(level).then((pixels) => {
         const made =
           texture.kind === "2d" ? makeTexture(pixels, isSrgb, this.options.anisotropy) : makeCubeTexture(pixels, isSrgb);
-        this.owned.push(made);
+        this.owned.add(made);
         return made;
       });
       this.textures.set(key, loading);
@@ -353,10 +361,4 @@ export function pieceBetween(a: Vector3, b: Vector3, radius: number, out = new M
   const length = along.length();
   const turn = new Quaternion().setFromUnitVectors(Z, length > 0 ? along.divideScalar(length) : Z);
   return out.compose(new Vector3().addVectors(a, b).multiplyScalar(0.5), turn, new Vector3(radius, radius, length));
-}
-
-/** Return the visual that an object of the scene belongs to, null for others. */
-export function findVisual(object: Object3D): VisualTag | null {
-  const tag = object.userData as Partial<VisualTag>;
-  return tag.visual === undefined || tag.body === undefined ? null : { visual: tag.visual, body: tag.body };
 }
