@@ -75,6 +75,7 @@ if TYPE_CHECKING:
     from iris_session.session.session import Session
     from iris_session.session.status import DataFault
     from iris_session.session.stepper import OwnerRequest
+    from iris_session.streams.cloud import CloudFrame, decode_cloud, encode_cloud
     from iris_session.streams.deformable import DeformableDecoder, DeformableEncoder
     from iris_session.streams.deformable_topology import DeformableTopology
 
@@ -138,6 +139,7 @@ _PUBLIC: Final = {
     ),
     "iris_session.client.fetched_scene": ("fetch_scene", "FetchedScene"),
     "iris_session.client.deformables": ("Deformables",),
+    "iris_session.streams.cloud": ("encode_cloud", "decode_cloud", "CloudFrame"),
     "iris_session.streams.deformable": ("DeformableEncoder", "DeformableDecoder"),
     "iris_session.streams.deformable_topology": ("DeformableTopology",),
     "iris_session.recording": ("Recording", "RecordingError"),
@@ -207,6 +209,9 @@ __all__ = [
     "DeformableEncoder",
     "DeformableDecoder",
     "DeformableTopology",
+    "encode_cloud",
+    "decode_cloud",
+    "CloudFrame",
     # recordings
     "Recording",
     "RecordingError",

@@ -13,6 +13,7 @@ from typing import Final
 
 from iris_session.codegen import (
     arrays_golden,
+    cloud_golden,
     conversations,
     csharp,
     deformable_golden,
@@ -49,6 +50,7 @@ TARGETS: Final[dict[str, tuple[str, Callable[[str], str]]]] = {
     "conversations": ("docs/protocol/conversations.json", lambda _: conversations.render_conversations()),
     "arrays": ("docs/protocol/arrays.json", lambda _: arrays_golden.render_golden()),
     "deformable": ("docs/protocol/deformable.json", lambda _: deformable_golden.render_golden()),
+    "cloud": ("docs/protocol/cloud.json", lambda _: cloud_golden.render_golden()),
     "web": ("docs/protocol/web.json", lambda _: web_golden.render_golden()),
     "docs": (_DOCUMENT, update_document),
     "reference": ("docs/reference.md", lambda _: reference.render_reference()),

@@ -71,6 +71,7 @@ EXPLANATIONS: Final[Mapping[str, str]] = {
     "state_topic_unknown": "subscriptions to topics that do not exist",
     "state_closed_early": "connections to the state that ended before they subscribed to anything",
     "subscribers_too_many": "connections to the state closed because their key had too many",
+    "media_newest_rate": "newest frames not sent to clients that subscribe to a stream over and over",
     "media_source_refused": "media of keys without the role camera or source",
     "media_flood": "connections to media closed because they sent more than was read",
     "media_backoff": "connections to media refused of keys that sent more than was read before",

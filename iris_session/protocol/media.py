@@ -22,11 +22,14 @@ _TOPIC: Final = re.compile(rb"media/([1-9][0-9]{0,18})/([A-Za-z0-9][A-Za-z0-9._-
 
 
 class StreamBudget(msgspec.Struct, frozen=True):
-    """One media stream, and the class that a client gets. `mbit_per_s`: of that class, as measured."""
+    """One media stream, and the class that a client gets. `mbit_per_s`: of that class, as measured. `encoding`: of its
+    newest frame, so that a client knows what it would get before it subscribes.
+    """
 
     stream: Name
     budget_class: Name = BudgetClass.FULL
     mbit_per_s: float = 0.0
+    encoding: Name = MediaEncoding.BYTES
 
 
 class MediaHeader(msgspec.Struct, frozen=True, array_like=True):

@@ -343,6 +343,7 @@ class MediaEncoding:
 
     BYTES: Final = "bytes"  # only source and receiver know
     DEFORMABLE: Final = "deformable"  # vertices of a mesh of the scene, docs/deformables.md
+    CLOUD: Final = "cloud"  # points with colours, world frame, docs/clouds.md
 
 
 class LateCause:

@@ -12,6 +12,7 @@ import msgspec
 
 from iris_session.protocol.common import Count, Message, Name, Nanoseconds, Pose, Text
 from iris_session.protocol.media import StreamBudget
+from iris_session.protocol.names import MediaEncoding
 
 
 class GetStatus(Message, frozen=True, tag="get_status"):
@@ -215,7 +216,8 @@ class RecorderReport(msgspec.Struct, frozen=True):
 
 class MediaStreamReport(msgspec.Struct, frozen=True):
     """One media stream, at its best class. `source`: its publisher's name, empty for the session's own process.
-    `subscribers`: participants that subscribed to it.
+    `subscribers`: participants that subscribed to it. `encoding`, `age_ms`: of the newest frame; its age since the
+    session received it.
     """
 
     stream: Name
@@ -223,6 +225,8 @@ class MediaStreamReport(msgspec.Struct, frozen=True):
     mbit_per_s: float = 0.0
     source: Name = ""
     subscribers: Count = 0
+    encoding: Name = MediaEncoding.BYTES
+    age_ms: float = 0.0
 
 
 class AssetsReport(msgspec.Struct, frozen=True):

@@ -491,7 +491,7 @@ def test_fault_of_the_thread_loses_pending_work_and_is_logged_once(
         send = proxy._send
         monkeypatch.setattr(proxy, "_send", lambda *frame: 1 // 0 if next(faults, False) else send(*frame))
         with proxy.lock:
-            proxy.scheduler.set_subscribers({1: MediaSubscriber("", {})})
+            proxy.scheduler.set_subscribers({1: MediaSubscriber("", {})}, 0)
         proxy.start()
         source = MediaSource(endpoint)
         with context.socket(zmq.SUB) as viewer:

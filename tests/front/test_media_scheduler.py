@@ -26,7 +26,8 @@ class Wire:
         self.allow(**levels)
 
     def allow(self, ann: int = 0, bob: int = 0) -> None:
-        self.hub.set_subscribers({ANN: MediaSubscriber("a", {"cloud": ann}), BOB: MediaSubscriber("b", {"cloud": bob})})
+        listeners = {ANN: MediaSubscriber("a", {"cloud": ann}), BOB: MediaSubscriber("b", {"cloud": bob})}
+        self.hub.set_subscribers(listeners, self.now_ns)
 
     def send(self, topic: bytes, header: bytes, frame: bytes) -> bool:
         number = int(topic.split(b"/")[1])
@@ -52,8 +53,8 @@ class Wire:
 
 def test_subscribers_get_frames_of_their_level() -> None:
     wire = Wire(ann=0, bob=2)
-    assert wire.hub.subscribe(ANN, "cloud", "a", 1)
-    assert wire.hub.subscribe(BOB, "cloud", "b", 2)
+    assert wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
+    assert wire.hub.subscribe(BOB, "cloud", "b", 2, SECOND)
     wire.push(8)
     assert [len(wire.got[who]) for who in (ANN, BOB)] == [8, 2]
     header, frame = wire.got[BOB][-1]
@@ -66,8 +67,8 @@ def test_subscribers_get_frames_of_their_level() -> None:
 
 def test_coarser_class_is_sent_at_full_rate() -> None:
     wire = Wire(ann=1, bob=2)
-    wire.hub.subscribe(ANN, "cloud", "a", 1)
-    wire.hub.subscribe(BOB, "cloud", "b", 2)
+    wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
+    wire.hub.subscribe(BOB, "cloud", "b", 2, SECOND)
     wire.push(4, frames={"full": b"full", "half": b"half"})
     assert [frame for _, frame in wire.got[ANN]] == [b"half"] * 4
     assert [frame for _, frame in wire.got[BOB]] == [b"half"] * 2, "every second of the next better one"
@@ -75,8 +76,8 @@ def test_coarser_class_is_sent_at_full_rate() -> None:
 
 def test_full_connection_gets_the_newest_frame_later_and_delays_no_other() -> None:
     wire = Wire()
-    wire.hub.subscribe(ANN, "cloud", "a", 1)
-    wire.hub.subscribe(BOB, "cloud", "b", 2)
+    wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
+    wire.hub.subscribe(BOB, "cloud", "b", 2, SECOND)
     wire.full = {BOB}
     wire.push(5)
     assert (len(wire.got[ANN]), len(wire.got[BOB])) == (5, 0)
@@ -91,18 +92,18 @@ def test_full_connection_gets_the_newest_frame_later_and_delays_no_other() -> No
 
 def test_only_the_key_of_a_connection_may_subscribe_to_it() -> None:
     wire = Wire()
-    assert not wire.hub.subscribe(ANN, "cloud", "b", 2)
-    assert not wire.hub.subscribe(99, "cloud", "a", 1)
+    assert not wire.hub.subscribe(ANN, "cloud", "b", 2, SECOND)
+    assert not wire.hub.subscribe(99, "cloud", "a", 1, SECOND)
     assert wire.hub.pop_drops()[0] == {"media_refused": 2}
     assert wire.hub.list_subscriptions(ANN) == []
 
 
 def test_closed_connection_gets_nothing() -> None:
     wire = Wire()
-    wire.hub.subscribe(ANN, "cloud", "a", 1)
+    wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
     wire.full = {ANN}
     wire.push()
-    wire.hub.set_subscribers({BOB: MediaSubscriber("b", {})})
+    wire.hub.set_subscribers({BOB: MediaSubscriber("b", {})}, SECOND)
     wire.full = set()
     wire.push()
     assert wire.got[ANN] == []
@@ -112,8 +113,8 @@ def test_closed_connection_gets_nothing() -> None:
 def test_one_of_two_connections_of_a_client_closes() -> None:
     """It has connected again; the end of the connection before is noticed later."""
     wire = Wire()
-    wire.hub.subscribe(ANN, "cloud", "a", 1)
-    wire.hub.subscribe(ANN, "cloud", "a", 3)
+    wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
+    wire.hub.subscribe(ANN, "cloud", "a", 3, SECOND)
     wire.hub.remove_reader(1)
     wire.push()
     assert len(wire.got[ANN]) == 1
@@ -126,8 +127,8 @@ def test_one_of_two_connections_of_a_client_closes() -> None:
 
 def test_unsubscribing_does_not_affect_other_clients() -> None:
     wire = Wire()
-    wire.hub.subscribe(ANN, "cloud", "a", 1)
-    assert not wire.hub.subscribe(ANN, "cloud", "b", 2)
+    wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
+    assert not wire.hub.subscribe(ANN, "cloud", "b", 2, SECOND)
     wire.hub.unsubscribe(ANN, "cloud", 2)
     wire.hub.remove_reader(2)
     wire.push()
@@ -136,8 +137,8 @@ def test_unsubscribing_does_not_affect_other_clients() -> None:
 
 def test_memory_shortage_pauses_all_media() -> None:
     wire = Wire()
-    wire.hub.subscribe(ANN, "cloud", "a", 1)
-    wire.hub.subscribe(BOB, "cloud", "b", 2)
+    wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
+    wire.hub.subscribe(BOB, "cloud", "b", 2, SECOND)
     assert not wire.hub.release_frames(wire.now_ns + SECOND), "there is nothing"
     wire.full = {BOB}
     assert wire.push(frames={"full": bytes(STUCK_BYTES)})
@@ -156,8 +157,8 @@ def test_memory_shortage_pauses_all_media() -> None:
 
 def test_next_frame_is_sent_to_all_after_a_fault() -> None:
     wire = Wire()
-    assert wire.hub.subscribe(ANN, "cloud", "a", 11)
-    assert wire.hub.subscribe(BOB, "cloud", "b", 12)
+    assert wire.hub.subscribe(ANN, "cloud", "a", 11, SECOND)
+    assert wire.hub.subscribe(BOB, "cloud", "b", 12, SECOND)
 
     def fault(_topic: bytes, _header: bytes, _frame: bytes) -> bool:
         raise OSError
@@ -196,7 +197,7 @@ def test_streams_and_subscriptions_are_bounded() -> None:
     wire = Wire()
     for n in range(MAX_STREAMS + 1):
         assert wire.push(stream=f"s{n}") == (n < MAX_STREAMS)
-        assert wire.hub.subscribe(ANN, f"s{n}", "a", 1) == (n < MAX_STREAMS)
+        assert wire.hub.subscribe(ANN, f"s{n}", "a", 1, SECOND) == (n < MAX_STREAMS)
     assert wire.hub.pop_drops()[0] == {"media_streams_full": 1, "media_subscriptions_full": 1}
     wire.now_ns += 100 * SECOND
     wire.hub.sample_rates(wire.now_ns)
@@ -225,10 +226,53 @@ def test_rates_cover_the_last_seconds() -> None:
     assert facts.rates == pytest.approx((6250.0, 3125.0, 1562.5))
 
 
+def test_new_subscriber_gets_the_newest_frame_of_a_stream_at_rest() -> None:
+    wire = Wire(bob=1)
+    wire.push(3)
+    assert wire.hub.subscribe(ANN, "cloud", "a", 1, wire.now_ns)
+    assert wire.hub.subscribe(BOB, "cloud", "b", 2, wire.now_ns)
+    wire.hub.flush(wire.send, wire.now_ns)
+    assert [[head.budget_class for head, _ in wire.got[who]] for who in (ANN, BOB)] == [["full"], ["half"]]
+    assert wire.hub.read_counters(ANN) == DeliveryCounters(1, 1, wire.hub.read_counters(ANN).bytes)
+    wire.hub.flush(wire.send, wire.now_ns)
+    assert len(wire.got[ANN]) == 1
+
+
+def test_a_link_that_has_room_again_gets_the_newest_frame() -> None:
+    wire = Wire(ann=NONE_LEVEL)
+    wire.push()
+    wire.hub.subscribe(ANN, "cloud", "a", 1, wire.now_ns)
+    wire.hub.flush(wire.send, wire.now_ns)
+    assert not wire.got[ANN]
+    wire.allow(ann=2)
+    wire.hub.flush(wire.send, wire.now_ns)
+    assert [head.budget_class for head, _ in wire.got[ANN]] == ["quarter"]
+    wire.allow(ann=0)  # it has that frame
+    wire.hub.flush(wire.send, wire.now_ns)
+    assert len(wire.got[ANN]) == 1
+
+
+def test_subscribing_over_and_over_gets_no_frame_each_time() -> None:
+    wire = Wire()
+    wire.push()
+    for _ in range(200):
+        wire.now_ns += 5 * MS
+        wire.hub.subscribe(ANN, "cloud", "a", 1, wire.now_ns)
+        wire.hub.flush(wire.send, wire.now_ns)
+        wire.hub.unsubscribe(ANN, "cloud", 1)
+    assert MAX_STREAMS <= len(wire.got[ANN]) <= MAX_STREAMS + 2
+    assert wire.hub.pop_drops()[0]["media_newest_rate"] == 200 - len(wire.got[ANN])
+    wire.push()
+    wire.hub.subscribe(ANN, "cloud", "a", 1, wire.now_ns)
+    before = len(wire.got[ANN])
+    wire.push()
+    assert len(wire.got[ANN]) == before + 1  # frames after it come as ever
+
+
 def test_restarted_front_numbers_frames_above_its_predecessor() -> None:
     wire, later = Wire(), Wire()
-    wire.hub.subscribe(ANN, "cloud", "a", 1)
-    later.hub.subscribe(ANN, "cloud", "a", 1)
+    wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
+    later.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
     wire.push(30)
     later.now_ns = wire.now_ns
     later.push()

@@ -3,6 +3,7 @@
 import { zstdCompressSync } from "node:zlib";
 import { describe, test } from "vitest";
 import { decodeArrays } from "../src/core/arrays.ts";
+import { decodeCloud } from "../src/core/cloud.ts";
 import { encodeStruct } from "../src/core/codec.ts";
 import { DeformableDecoder, decodeTopology } from "../src/core/deformable.ts";
 import { RigidDecoder } from "../src/core/rigid.ts";
@@ -13,6 +14,7 @@ import { fromHex, readGolden } from "./golden.ts";
 
 const { rigid } = readGolden<{ rigid: { n_bodies: number; hex: string }[] }>("golden");
 const { meshes } = readGolden<{ meshes: { name: string; topology: string; frames: { hex: string }[] }[] }>("deformable");
+const { frames: clouds } = readGolden<{ frames: { hex: string }[] }>("cloud");
 const { assets } = readGolden<{ assets: { hex: string }[] }>("arrays");
 const { scenes } = readGolden<{ scenes: { hex: string }[] }>("scene");
 
@@ -33,6 +35,8 @@ describe("hostile bytes", () => {
     const decoder = new DeformableDecoder(decodeTopology(fromHex(cloth.topology)));
     fuzz((bytes) => decoder.decode(bytes), cloth.frames.map(({ hex }) => fromHex(hex)), true);
   });
+
+  test("point clouds", () => fuzz(decodeCloud, clouds.map(({ hex }) => fromHex(hex)), true));
 
   test("arrays", () => fuzz((bytes) => decodeArrays(bytes), assets.map(({ hex }) => fromHex(hex)), true));
 

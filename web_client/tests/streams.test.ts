@@ -5,6 +5,7 @@ import { describe, expect, test } from "vitest";
 import { decodeArrays, requireArray } from "../src/core/arrays.ts";
 import { fromThree, toThree } from "../src/core/axes.ts";
 import { decodeStruct, decodeUnionList, encodeStruct } from "../src/core/codec.ts";
+import { decodeCloud, unpackColor } from "../src/core/cloud.ts";
 import { crc32, DeformableDecoder, decodeTopology } from "../src/core/deformable.ts";
 import { MalformedError, WireError } from "../src/core/errors.ts";
 import { RigidDecoder } from "../src/core/rigid.ts";
@@ -86,6 +87,45 @@ describe("rigid state", () => {
       expect(there[i]).toBeCloseTo(three[i] as number, 14);
       expect(back[i]).toBeCloseTo(world[i] as number, 14);
     }
+  });
+});
+
+describe("point clouds", () => {
+  interface Cloud {
+    name: string;
+    hex: string;
+    error_m: number | null;
+    voxel_m: number;
+    positions: number[][];
+    colors: number[][];
+  }
+  const { frames } = readGolden<{ frames: Cloud[] }>("cloud");
+
+  test.each(frames)("$name", (frame) => {
+    const { points, origin, step_m, error_m, voxel_m } = decodeCloud(fromHex(frame.hex));
+    const rows = frame.positions.map((_, i) => origin.map((node, axis) => Math.fround((node + (points[4 * i + axis] as number)) * step_m)));
+    expect(rows).toEqual(frame.positions);
+    expect(frame.positions.map((_, i) => unpackColor(points[4 * i + 3] as number))).toEqual(frame.colors);
+    expect([error_m, voxel_m]).toEqual([frame.error_m ?? Number.POSITIVE_INFINITY, frame.voxel_m]);
+  });
+
+  const frame = fromHex((frames[0] as Cloud).hex);
+
+  test.each<[string, Uint8Array]>([
+    ["nothing", new Uint8Array()],
+    ["another format", withByte(frame, 0, 2)],
+    ["flags", withByte(frame, 1, 1)],
+    ["a lattice of 2^-40 m", withByte(frame, 2, 0xd8)],
+    ["reserved bytes", withByte(frame, 3, 1)],
+    ["another number of points", withByte(frame, 4, 23)],
+    ["2^31 points", withByte(frame, 7, 0x80)],
+    ["an origin far away", withByte(frame, 11, 0x7f)],
+    ["no error", frame.map((byte, i) => (i >= 20 && i < 24 ? 0 : byte))],
+    ["voxels of no size", frame.map((byte, i) => (i >= 24 && i < 28 ? 0xff : byte))],
+    ["a byte less", frame.subarray(0, -1)],
+    ["a byte more", new Uint8Array([...frame, 0])],
+  ])("refuses a frame: %s", (_name, bytes) => {
+    expect(() => decodeCloud(bytes)).toThrow(MalformedError);
   });
 });
 

@@ -200,7 +200,7 @@ class MediaProxy:
                 elif data[0] != _SUBSCRIBE:
                     self.scheduler.unsubscribe(*topic, descriptor)
                     self._out.setsockopt(zmq.UNSUBSCRIBE, data[1:])
-                elif self.scheduler.subscribe(*topic, user, descriptor):
+                elif self.scheduler.subscribe(*topic, user, descriptor, self._now_ns()):
                     self._out.setsockopt(zmq.SUBSCRIBE, data[1:])
 
     def _read_user_id(self, frame: zmq.Frame) -> str:

@@ -12,7 +12,9 @@ from typing import Any, Final, NamedTuple
 
 from iris_session.front.media.budget import MILLISECOND, NONE_LEVEL, SECOND
 from iris_session.protocol.codec import encode_media_header
+from iris_session.protocol.limits import TokenBucket
 from iris_session.protocol.media import CLASSES, MAX_STREAMS, MediaHeader, MediaPush, is_stream_name, make_topic
+from iris_session.protocol.names import MediaEncoding
 
 #: A stream without frames for `TAKEOVER_NS` may be taken over by another source; after `EXPIRE_NS` it is removed.
 TAKEOVER_NS: Final = 3 * SECOND
@@ -21,6 +23,9 @@ EXPIRE_NS: Final = 60 * SECOND
 STUCK_BYTES: Final = 1 << 20
 #: Rates are computed from so many samples: two seconds, with four samples in each.
 RATE_SAMPLES: Final = 9
+#: Newest frames that new subscriptions of one connection get: as many as it may have at once, then so many a second.
+#: Else subscribing anew, over and over, would have the largest frame sent as often as a link takes it.
+NEWEST_PER_S: Final = 2.0
 #: `send(topic, header, frame)`: returns false if that connection has no room.
 Send = Callable[[bytes, bytes, Any], bool]
 
@@ -51,12 +56,15 @@ class DeliveryCounters(NamedTuple):
 
 
 class StreamStats(NamedTuple):
-    """Measurements of a stream. `rates`: bytes per second at full, half, quarter. `hz`: frames per second."""
+    """Measurements of a stream. `rates`: bytes per second at full, half, quarter. `hz`: frames per second. `encoding`:
+    of the newest frame, which was received at `received_ns`."""
 
     rates: tuple[float, float, float]
     hz: float
     source: str
     subscribers: int
+    encoding: str
+    received_ns: int
 
 
 class _Subscription:
@@ -81,6 +89,7 @@ class _Stream:
         self.source = source
         self.seq = seq
         self.received_ns = 0
+        self.encoding: str = MediaEncoding.BYTES
         self.push: MediaPush | None = None
         self.frames: dict[int, Any] = {}
         self.count = 0
@@ -116,6 +125,7 @@ class MediaScheduler:
         self._subscriptions: dict[tuple[int, str], _Subscription] = {}
         self._by_reader: dict[int, set[tuple[int, str]]] = {}  # by descriptor
         self._ended_counters: dict[int, DeliveryCounters] = {}  # of subscriptions that have ended
+        self._newest_buckets: dict[int, TokenBucket] = {}
         self._pending: deque[tuple[int, str]] = deque()
         self._paused_until_ns = 0
         self._stuck: set[int] = set()
@@ -124,16 +134,21 @@ class MediaScheduler:
 
     # --- subscriptions -----------------------------------------------------------------------------------------------
 
-    def set_subscribers(self, listeners: Mapping[int, MediaSubscriber]) -> None:
+    def set_subscribers(self, listeners: Mapping[int, MediaSubscriber], now_ns: int) -> None:
         """Set the connections that may subscribe, and their levels from now on."""
+        stopped = [key for key in self._subscriptions if self._find_level(*key) >= NONE_LEVEL]
         self._subscribers = dict(listeners)
         for key in [key for key in self._subscriptions if key[0] not in self._subscribers]:
             del self._subscriptions[key]
-        for number in [number for number in self._ended_counters if number not in self._subscribers]:
-            del self._ended_counters[number]
+        for known in (self._ended_counters, self._newest_buckets):
+            for number in [number for number in known if number not in self._subscribers]:
+                del known[number]
+        for key in stopped:
+            self._offer_newest(key, now_ns)
 
-    def subscribe(self, number: int, stream: str, user_id: str, reader: int) -> bool:
-        """Subscribe a connection to a stream. `reader`: descriptor of the TCP connection that the request came by.
+    def subscribe(self, number: int, stream: str, user_id: str, reader: int, now_ns: int) -> bool:
+        """Subscribe a connection to a stream, and mark the newest frame due: the next one of a stream at rest may come
+        late, or never. `reader`: descriptor of the TCP connection that the request came by.
 
         Returns:
             False if the key is not that of the connection, or it has too many subscriptions.
@@ -147,6 +162,7 @@ class MediaScheduler:
             return False
         self._subscriptions.setdefault((number, stream), _Subscription()).readers.add(reader)
         self._by_reader.setdefault(reader, set()).add((number, stream))
+        self._offer_newest((number, stream), now_ns)
         return True
 
     def unsubscribe(self, number: int, stream: str, reader: int) -> None:
@@ -194,7 +210,7 @@ class MediaScheduler:
         stream = self._find_stream(push.stream, source, now_ns)
         if stream is None:
             return False
-        stream.received_ns, stream.push = now_ns, push
+        stream.received_ns, stream.encoding, stream.push = now_ns, push.encoding, push
         stream.frames = dict(zip(levels, frames, strict=True))
         stream.seq += 1
         stream.count += 1
@@ -236,7 +252,7 @@ class MediaScheduler:
             stream = self._streams[name]
             rates, hz = stream.compute_rates()
             subscribers = sum(wanted == name for _, wanted in self._subscriptions)
-            found[name] = StreamStats(rates, hz, stream.source, subscribers)
+            found[name] = StreamStats(rates, hz, stream.source, subscribers, stream.encoding, stream.received_ns)
         return found
 
     def release_frames(self, until_ns: int) -> bool:
@@ -307,6 +323,21 @@ class MediaScheduler:
     def _find_level(self, number: int, stream: str) -> int:
         listener = self._subscribers.get(number)
         return NONE_LEVEL if listener is None else listener.levels.get(stream, listener.default_level)
+
+    def _offer_newest(self, key: tuple[int, str], now_ns: int) -> None:
+        """Mark the newest frame of a stream due for a subscription that has not had it."""
+        subscription, stream = self._subscriptions.get(key), self._streams.get(key[1])
+        if subscription is None or stream is None or not stream.frames or subscription.pending:
+            return
+        if self._find_level(*key) >= NONE_LEVEL:
+            return
+        bucket = self._newest_buckets.setdefault(key[0], TokenBucket(NEWEST_PER_S, MAX_STREAMS, now_ns))
+        if not bucket.take(now_ns):
+            self._count_drop("media_newest_rate")
+            return
+        subscription.due += 1
+        subscription.pending = True
+        self._pending.append(key)
 
     def _mark_due(self, key: tuple[int, str], subscription: _Subscription, stream: _Stream) -> None:
         level = self._find_level(*key)

@@ -22,7 +22,7 @@ from iris_session.front.media.budget import (
 from iris_session.front.media.proxy import MediaProxy
 from iris_session.front.media.scheduler import DeliveryCounters, MediaSubscriber, StreamStats
 from iris_session.protocol.media import CLASSES, StreamBudget
-from iris_session.protocol.names import BudgetClass
+from iris_session.protocol.names import BudgetClass, MediaEncoding
 from iris_session.protocol.status import ClientReport, DeliveryBudget, MediaStreamReport
 
 PERIOD_NS: Final = 250 * MILLISECOND
@@ -99,10 +99,17 @@ class MediaService:
     # --- for the status ----------------------------------------------------------------------------------------------
 
     def report_streams(self) -> tuple[MediaStreamReport, ...]:
-        """Return a report of every stream, with the rate of its full level."""
+        """Return a report of every stream, with the rate of its full level and the age of its newest frame."""
+        now_ns = self._context.now_ns()
         return tuple(
             MediaStreamReport(
-                name, facts.hz, facts.rates[0] / MBIT, self._names.get(facts.source, ""), facts.subscribers
+                name,
+                facts.hz,
+                facts.rates[0] / MBIT,
+                self._names.get(facts.source, ""),
+                facts.subscribers,
+                facts.encoding,
+                (now_ns - facts.received_ns) / MILLISECOND,
             )
             for name, facts in self._stats.items()
         )
@@ -178,7 +185,7 @@ class MediaService:
             key = self._context.find_channel_key(self._connections.by_number[number])
             subscribers[number] = MediaSubscriber(key, state.grant.levels, _initial_level(state.grant))
         with self._proxy.lock:
-            self._proxy.scheduler.set_subscribers(subscribers)
+            self._proxy.scheduler.set_subscribers(subscribers, self._context.now_ns())
 
     def _refuse_flooder(self, flood: ChannelFlood, now_ns: int) -> None:
         """Refuse new connections of a source that flooded, and report it by the names of the keys that it may have."""
@@ -220,14 +227,16 @@ class MediaService:
         level = state.grant.levels.get(stream, _initial_level(state.grant))
         facts = self._stats.get(stream)
         rate = 0.0 if facts is None or level >= NONE_LEVEL else facts.rates[level]
-        return StreamBudget(stream, CLASSES[level], round(rate / MBIT, 3))
+        encoding = MediaEncoding.BYTES if facts is None else facts.encoding
+        return StreamBudget(stream, CLASSES[level], round(rate / MBIT, 3), encoding)
 
     def _send_budgets(self) -> None:
         """Send budgets that have changed, other than in their rates."""
         for number, state in self._states.items():
             streams = tuple(self._make_stream_budget(state, stream) for stream in self._stats)
             grant = state.grant
-            content = (tuple((s.stream, s.budget_class) for s in streams), _lowest_class(state), grant.reason)
+            shown = tuple((s.stream, s.budget_class, s.encoding) for s in streams)
+            content = (shown, _lowest_class(state), grant.reason)
             if content == state.budget:
                 continue
             bound = round(grant.bytes_per_s / MBIT, 3)

@@ -365,6 +365,7 @@ namespace IrisSession.Protocol
     {
         public const string Bytes = "bytes";
         public const string Deformable = "deformable";
+        public const string Cloud = "cloud";
     }
 
     /// <summary>
@@ -1705,13 +1706,15 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// One media stream, and the class that a client gets. mbit_per_s: of that class, as measured.
+    /// One media stream, and the class that a client gets. mbit_per_s: of that class, as measured. encoding: of its
+    /// newest frame, so that a client knows what it would get before it subscribes.
     /// </summary>
     public sealed class StreamBudget : WireValue
     {
         public string Stream = "";
         public string BudgetClass = "full";
         public double MbitPerS = 0.0;
+        public string Encoding = "bytes";
 
         public static StreamBudget Read(WireReader reader)
         {
@@ -1724,6 +1727,7 @@ namespace IrisSession.Protocol
                     case "stream": value.Stream = reader.ReadString(64); seen |= 1u; break;
                     case "budget_class": value.BudgetClass = reader.ReadString(64); break;
                     case "mbit_per_s": value.MbitPerS = reader.ReadDouble(); break;
+                    case "encoding": value.Encoding = reader.ReadString(64); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -1733,13 +1737,15 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(3);
+            writer.WriteMapHeader(4);
             writer.Write("stream");
             writer.Write(Stream);
             writer.Write("budget_class");
             writer.Write(BudgetClass);
             writer.Write("mbit_per_s");
             writer.Write(MbitPerS);
+            writer.Write("encoding");
+            writer.Write(Encoding);
         }
     }
 
@@ -2291,7 +2297,8 @@ namespace IrisSession.Protocol
 
     /// <summary>
     /// One media stream, at its best class. source: its publisher's name, empty for the session's own process.
-    /// subscribers: participants that subscribed to it.
+    /// subscribers: participants that subscribed to it. encoding, age_ms: of the newest frame; its age since the
+    /// session received it.
     /// </summary>
     public sealed class MediaStreamReport : WireValue
     {
@@ -2300,6 +2307,8 @@ namespace IrisSession.Protocol
         public double MbitPerS = 0.0;
         public string Source = "";
         public long Subscribers = 0;
+        public string Encoding = "bytes";
+        public double AgeMs = 0.0;
 
         public static MediaStreamReport Read(WireReader reader)
         {
@@ -2314,6 +2323,8 @@ namespace IrisSession.Protocol
                     case "mbit_per_s": value.MbitPerS = reader.ReadDouble(); break;
                     case "source": value.Source = reader.ReadString(64); break;
                     case "subscribers": value.Subscribers = reader.ReadLong(0, long.MaxValue); break;
+                    case "encoding": value.Encoding = reader.ReadString(64); break;
+                    case "age_ms": value.AgeMs = reader.ReadDouble(); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -2323,7 +2334,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(5);
+            writer.WriteMapHeader(7);
             writer.Write("stream");
             writer.Write(Stream);
             writer.Write("hz");
@@ -2334,6 +2345,10 @@ namespace IrisSession.Protocol
             writer.Write(Source);
             writer.Write("subscribers");
             writer.Write(Subscribers);
+            writer.Write("encoding");
+            writer.Write(Encoding);
+            writer.Write("age_ms");
+            writer.Write(AgeMs);
         }
     }
 

@@ -7,6 +7,7 @@
 //
 // Poses are world-frame, right-handed, Z up: rows of seven numbers `x y z qw qx qy qz`.
 
+import type { CloudFrame } from "./cloud.ts";
 import type * as wire from "../protocol/messages.g.ts";
 
 /** A value of the wire with all defaults filled in: what the worker posts has every field. */
@@ -130,6 +131,7 @@ export type FromWorker =
   | BudgetUpdate
   | StatusUpdate
   | DeformableUpdate
+  | CloudUpdate
   | MediaUpdate
   | AssetUpdate
   | AssetFailedUpdate
@@ -279,6 +281,16 @@ export interface DeformableUpdate {
   scene_epoch: number;
   seq: number;
   bound_m: number;
+}
+
+/** A frame of a point cloud. Its points are transferred. */
+export interface CloudUpdate {
+  type: "cloud";
+  stream: string;
+  cloud: CloudFrame;
+  /** Session time of capture [ms]. */
+  session_ms: number;
+  seq: number;
 }
 
 /** A frame of any other media stream, as it came. */

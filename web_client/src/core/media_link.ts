@@ -2,6 +2,7 @@
 
 import type { FromWorker } from "./api.ts";
 import type { ArrivalMeter } from "./arrival_meter.ts";
+import { decodeCloud } from "./cloud.ts";
 import { decodeMediaHeader } from "./codec.ts";
 import { MalformedError, WireError } from "./errors.ts";
 import type { SocketLike } from "./pairing_client.ts";
@@ -132,6 +133,11 @@ export class MediaLink {
       const vertices = decoder.decode(bytes);
       const session_ms = captureNs / MS_NS;
       this.environment.post({ type: "deformable", stream, vertices, session_ms, scene_epoch, seq, bound_m: decoder.boundM }, [vertices.buffer]);
+      return;
+    }
+    if (encoding === "cloud") {
+      const cloud = decodeCloud(bytes);
+      this.environment.post({ type: "cloud", stream, cloud, session_ms: captureNs / MS_NS, seq }, [cloud.points.buffer]);
       return;
     }
     const copy = bytes.slice();

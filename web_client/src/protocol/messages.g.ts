@@ -319,6 +319,7 @@ export type AssetRefusal = (typeof AssetRefusal)[keyof typeof AssetRefusal] | (s
 export const MediaEncoding = {
   BYTES: "bytes",
   DEFORMABLE: "deformable",
+  CLOUD: "cloud",
 } as const;
 export type MediaEncoding = (typeof MediaEncoding)[keyof typeof MediaEncoding] | (string & {});
 
@@ -592,11 +593,15 @@ export type Quantiles = [
   p99: number,
 ];
 
-/** One media stream, and the class that a client gets. `mbit_per_s`: of that class, as measured. */
+/**
+ * One media stream, and the class that a client gets. `mbit_per_s`: of that class, as measured. `encoding`: of its
+ * newest frame, so that a client knows what it would get before it subscribes.
+ */
 export interface StreamBudget {
   stream: string;
   budget_class?: BudgetClass;
   mbit_per_s?: number;
+  encoding?: string;
 }
 
 /** Observations of one anchor by a headset: their number in this run, and the age of the newest. */
@@ -735,7 +740,8 @@ export interface RecorderReport {
 
 /**
  * One media stream, at its best class. `source`: its publisher's name, empty for the session's own process.
- * `subscribers`: participants that subscribed to it.
+ * `subscribers`: participants that subscribed to it. `encoding`, `age_ms`: of the newest frame; its age since the
+ * session received it.
  */
 export interface MediaStreamReport {
   stream: string;
@@ -743,6 +749,8 @@ export interface MediaStreamReport {
   mbit_per_s?: number;
   source?: string;
   subscribers?: number;
+  encoding?: string;
+  age_ms?: number;
 }
 
 /**
@@ -2279,6 +2287,7 @@ export const VALUE_DEFAULTS = {
   StreamBudget: {
     budget_class: "full",
     mbit_per_s: 0.0,
+    encoding: "bytes",
   },
   AlignmentReport: {
     version: 0,
@@ -2354,6 +2363,8 @@ export const VALUE_DEFAULTS = {
     mbit_per_s: 0.0,
     source: "",
     subscribers: 0,
+    encoding: "bytes",
+    age_ms: 0.0,
   },
   AssetsReport: {
     served: 0,

@@ -183,6 +183,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["stream", ["str", 64, ""], []],
       ["budget_class", ["str", 64, ""], ["full"]],
       ["mbit_per_s", ["float"], [0.0]],
+      ["encoding", ["str", 64, ""], ["bytes"]],
     ],
   },
   AnchorSeen: {
@@ -322,6 +323,8 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["mbit_per_s", ["float"], [0.0]],
       ["source", ["str", 64, ""], [""]],
       ["subscribers", ["int", 0, null], [0]],
+      ["encoding", ["str", 64, ""], ["bytes"]],
+      ["age_ms", ["float"], [0.0]],
     ],
   },
   AssetsReport: {

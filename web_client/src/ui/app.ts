@@ -126,7 +126,10 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   const self = makeSelf(state, listRoles, joinAs);
   const title = h("h1", {}, "iris-session");
   const header = h("header", { class: "bar" }, title, badge.element, self.element, estop.stop);
-  const neededStreams = (): string[] => (view ? (state.spec?.deformables.map((part) => part.stream) ?? []) : []);
+  const listDrawable = (): string[] => {
+    const clouds = (state.budget?.streams ?? []).filter((one) => one.encoding === "cloud").map((one) => one.stream);
+    return view ? [...(state.spec?.deformables.map((part) => part.stream) ?? []), ...clouds] : [];
+  };
   const panels = [
     makeAdvicePanel(state),
     makeRobotsPanel(state, actions, drive),
@@ -136,7 +139,7 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
     makeEventsPanel(state),
     makeRecordingPanel(state, actions),
     makeLoopPanel(state, actions),
-    makeStreamsPanel(state, client, neededStreams),
+    makeStreamsPanel(state, client, listDrawable, (streams) => view?.clouds.setWanted(streams)),
     makeAnchorsPanel(state),
   ];
   const dashboard = h(

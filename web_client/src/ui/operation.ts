@@ -102,7 +102,12 @@ export function makeRecordingPanel(state: PageState, actions: Actions): Panel {
   };
 }
 
-export function makeStreamsPanel(state: PageState, client: WorkerClient, getNeeded: () => readonly string[]): Panel {
+export function makeStreamsPanel(
+  state: PageState,
+  client: WorkerClient,
+  getNeeded: () => readonly string[],
+  onWanted: (streams: readonly string[]) => void,
+): Panel {
   const list = h("ul", { class: "rows" });
   const empty = h("p", { class: "empty" }, "This session has no streams.");
   const reason = h("p", { class: "note" });
@@ -115,6 +120,7 @@ export function makeStreamsPanel(state: PageState, client: WorkerClient, getNeed
     const key = `${state.welcome?.connection_epoch ?? 0} ${JSON.stringify(wanted)}`;
     if (key === sent || !state.isReady) return;
     sent = key;
+    onWanted(wanted);
     client.post({ type: "want_streams", streams: wanted });
   };
   const rows = new KeyedList<{ stream: string }>(

@@ -8,6 +8,8 @@ export interface Budget {
   triangles: number;
   textureBytes: number;
   objects: number;
+  /** Points of clouds: here 0 means none. */
+  points: number;
 }
 
 export interface LevelChoice {
@@ -19,13 +21,13 @@ export interface LevelChoice {
   textureBytes: number;
 }
 
-export const NO_LIMIT: Budget = { triangles: 0, textureBytes: 0, objects: 0 };
+export const NO_LIMIT: Budget = { triangles: 0, textureBytes: 0, objects: 0, points: 0 };
 /** Where a Quest 3 begins to struggle; good for phones too. */
-export const HEADSET: Budget = { triangles: 750_000, textureBytes: 700 * 2 ** 20, objects: 200 };
+export const HEADSET: Budget = { triangles: 750_000, textureBytes: 700 * 2 ** 20, objects: 200, points: 100_000 };
 /** A desktop with a graphics card. */
-export const DESKTOP: Budget = { triangles: 6_000_000, textureBytes: 2 ** 31, objects: 0 };
+export const DESKTOP: Budget = { triangles: 6_000_000, textureBytes: 2 ** 31, objects: 0, points: 1_000_000 };
 /** No graphics card: the processor draws. */
-export const SOFTWARE: Budget = { triangles: 300_000, textureBytes: 256 * 2 ** 20, objects: 0 };
+export const SOFTWARE: Budget = { triangles: 300_000, textureBytes: 256 * 2 ** 20, objects: 0, points: 20_000 };
 
 const PRIMITIVE_TRIANGLES: Record<string, number> = {
   plane: 2,

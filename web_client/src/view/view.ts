@@ -21,6 +21,7 @@ import { Avatars } from "./avatars.ts";
 import { makeWorldRoot } from "./axes.ts";
 import { type Budget, DESKTOP, HEADSET, SOFTWARE } from "./budget.ts";
 import { Viewpoint } from "./camera.ts";
+import { CloudViews } from "./clouds.ts";
 import { CameraPictures } from "./pictures.ts";
 import type { DeformableView } from "./deformables.ts";
 import { DelayEstimator, FrameBuffer, interpolatePoses, interpolateValues, POSE_FLOATS } from "./interpolation.ts";
@@ -85,6 +86,7 @@ export class View {
   readonly viewpoint: Viewpoint;
   readonly device: Device;
   readonly pictures: CameraPictures;
+  readonly clouds: CloudViews;
   scene: SceneView | null = null;
   /** Frames drawn since the page began. */
   drawn = 0;
@@ -126,8 +128,9 @@ export class View {
     this.renderer.outputColorSpace = LinearSRGBColorSpace;
     this.root.background = new Color(BACKGROUND);
     this.pictures = new CameraPictures(this.renderer, this.device.budget === SOFTWARE);
+    this.clouds = new CloudViews(this.device.budget.points);
     this.overlay.add(this.avatars.group, this.anchors.group);
-    this.root.add(this.overlay);
+    this.root.add(this.overlay, this.clouds.group);
     this.assets = new WorkerAssets(client);
     this.viewpoint = new Viewpoint(canvas);
     this.frames = new FrameBuffer((values) => client.recycle(values));
@@ -168,12 +171,12 @@ export class View {
   }
 
   /**
-   * Draw the scene once in another size, without people, anchors and shadows, and return the picture as a data URL.
+   * Draw the scene once in another size, without people, anchors, clouds and shadows, and return the picture as a data URL.
    * `silhouette`: white on black, without planes and sky. For tests and for masks.
    */
   capture(width: number, height: number, silhouette: boolean): string {
     const { scene, root } = this;
-    const hidden: { visible: boolean }[] = [this.overlay];
+    const hidden: { visible: boolean }[] = [this.overlay, this.clouds.group];
     if (silhouette) {
       if (scene?.sky) hidden.push(scene.sky);
       scene?.world.traverse((object) => {
@@ -216,6 +219,7 @@ export class View {
       this.poses = new Float32Array(0);
     });
     client.on("scene", ({ spec }) => this.setScene(spec));
+    client.on("cloud", ({ stream, cloud }) => this.clouds.show(stream, cloud));
     client.on("frame", (frame) => this.takeFrame(frame));
     client.on("presence", ({ items }) => this.avatars.setPresence(items, this.sessionTime()));
     client.on("deformable", ({ stream, vertices, session_ms }) => {
@@ -285,6 +289,7 @@ export class View {
       this.moveBodies(session_ms),
       this.moveDeformables(session_ms),
       this.avatars.update(session_ms),
+      this.clouds.popChanged(),
       this.viewpoint.update(this.scene),
     ].some(Boolean);
     const now = nowMs();
@@ -344,10 +349,11 @@ export class View {
     return isMoved;
   }
 
-  /** Show or hide the scene, and what would cover the room: sky and planes. */
+  /** Show or hide the scene, and what would cover the room: sky, planes, and clouds of what is seen anyway. */
   private showFor(showsScene: boolean, isTransparent: boolean): void {
     const { scene } = this;
     this.overlay.visible = showsScene;
+    this.clouds.group.visible = showsScene && !isTransparent;
     if (!scene) return;
     scene.world.visible = showsScene;
     if (scene.sky) scene.sky.visible = !isTransparent;

@@ -1,0 +1,141 @@
+// Point clouds: the points of a frame go to the graphics card as they came, and are placed and coloured there.
+
+import {
+  BufferGeometry,
+  DynamicDrawUsage,
+  InterleavedBuffer,
+  InterleavedBufferAttribute,
+  Points,
+  ShaderMaterial,
+  Vector4,
+} from "three";
+
+import type { CloudFrame } from "../core/cloud.ts";
+import { makeWorldRoot } from "./axes.ts";
+
+/** Edge of a point that stands for itself [m]. */
+const POINT_M = 0.005;
+/** Room for more points than a frame has, so that not every larger one needs a new buffer. */
+const SPARE = 1.25;
+
+const VERTEX = /* glsl */ `
+attribute float packed;
+uniform float edge;
+uniform float pixels;
+varying vec3 vColor;
+void main() {
+  vec4 seen = viewMatrix * modelMatrix * vec4(position, 1.0);
+  gl_Position = projectionMatrix * seen;
+  gl_PointSize = clamp(edge * projectionMatrix[1][1] * pixels / gl_Position.w, 1.0, 64.0);
+  vColor = vec3(floor(packed / 2048.0), floor(mod(packed, 2048.0) / 32.0), mod(packed, 32.0)) / vec3(31.0, 63.0, 31.0);
+}`;
+
+const FRAGMENT = /* glsl */ `
+varying vec3 vColor;
+void main() {
+  gl_FragColor = vec4(vColor, 1.0);
+}`;
+
+/** The points of one stream. */
+class Cloud {
+  readonly object: Points<BufferGeometry, ShaderMaterial>;
+  drawn = 0;
+  private buffer = new InterleavedBuffer(new Uint16Array(0), 4);
+
+  constructor(name: string) {
+    const material = new ShaderMaterial({
+      uniforms: { edge: { value: POINT_M }, pixels: { value: 1 } },
+      vertexShader: VERTEX,
+      fragmentShader: FRAGMENT,
+    });
+    this.object = new Points(new BufferGeometry(), material);
+    this.object.name = name;
+    this.object.frustumCulled = false; // its points are nowhere but on the graphics card
+    const viewport = new Vector4();
+    this.object.onBeforeRender = (renderer) => {
+      renderer.getCurrentViewport(viewport);
+      material.uniforms.pixels!.value = viewport.w / 2;
+    };
+  }
+
+  /** Show a frame: as many of its points as may be drawn, which are a fair sample of all. */
+  show({ points, origin, step_m, voxel_m }: CloudFrame, maxPoints: number): void {
+    const count = Math.min(points.length / 4, maxPoints);
+    const { object } = this;
+    if (this.buffer.array.length < 4 * count) this.grow(Math.ceil(SPARE * count));
+    this.buffer.array.set(points.subarray(0, 4 * count));
+    this.buffer.clearUpdateRanges();
+    this.buffer.addUpdateRange(0, 4 * count);
+    this.buffer.needsUpdate = true;
+    object.geometry.setDrawRange(0, count);
+    object.scale.setScalar(step_m);
+    object.position.set(...origin).multiplyScalar(step_m);
+    object.material.uniforms.edge!.value = voxel_m || POINT_M;
+    object.visible = true;
+    this.drawn = count;
+  }
+
+  dispose(): void {
+    this.object.removeFromParent();
+    this.object.geometry.dispose();
+    this.object.material.dispose();
+  }
+
+  private grow(points: number): void {
+    const { object } = this;
+    object.geometry.dispose();
+    this.buffer = new InterleavedBuffer(new Uint16Array(4 * points), 4).setUsage(DynamicDrawUsage);
+    object.geometry = new BufferGeometry();
+    object.geometry.setAttribute("position", new InterleavedBufferAttribute(this.buffer, 3, 0));
+    object.geometry.setAttribute("packed", new InterleavedBufferAttribute(this.buffer, 1, 3));
+  }
+}
+
+/** The point clouds of a session. `group` holds them, in the session's axes. */
+export class CloudViews {
+  readonly group = makeWorldRoot();
+  private readonly clouds = new Map<string, Cloud>();
+  private wanted: readonly string[] = [];
+  private isChanged = false;
+
+  /** `maxPoints`: as many as this device draws, of all clouds together. */
+  constructor(private readonly maxPoints: number) {
+    this.group.name = "clouds";
+  }
+
+  /** Points drawn, by stream. */
+  get drawn(): Map<string, number> {
+    return new Map([...this.clouds].map(([name, cloud]) => [name, cloud.drawn] as const));
+  }
+
+  /** Show a frame of a stream instead of the one before. One that is not wanted was on its way. */
+  show(stream: string, frame: CloudFrame): void {
+    if (!this.wanted.includes(stream)) return;
+    let cloud = this.clouds.get(stream);
+    if (!cloud) {
+      cloud = new Cloud(stream);
+      this.clouds.set(stream, cloud);
+      this.group.add(cloud.object);
+    }
+    cloud.show(frame, Math.floor(this.maxPoints / this.clouds.size));
+    this.isChanged = true;
+  }
+
+  /** Set the streams whose clouds are shown, and remove the others. */
+  setWanted(streams: readonly string[]): void {
+    this.wanted = streams;
+    for (const [name, cloud] of this.clouds) {
+      if (streams.includes(name)) continue;
+      cloud.dispose();
+      this.clouds.delete(name);
+      this.isChanged = true;
+    }
+  }
+
+  /** Return whether something changed since the last call. */
+  popChanged(): boolean {
+    const { isChanged } = this;
+    this.isChanged = false;
+    return isChanged;
+  }
+}

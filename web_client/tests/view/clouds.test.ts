@@ -1,0 +1,63 @@
+// Point clouds in the scene: what goes to the graphics card, and where it lies there.
+
+import type { BufferGeometry, InterleavedBufferAttribute, Points } from "three";
+import { Vector3 } from "three";
+import { expect, test } from "vitest";
+
+import { decodeCloud } from "../../src/core/cloud.ts";
+import { CloudViews } from "../../src/view/clouds.ts";
+import { fromHex, readGolden } from "../golden.ts";
+
+interface Frame {
+  name: string;
+  hex: string;
+  positions: number[][];
+}
+
+const { frames } = readGolden<{ frames: Frame[] }>("cloud");
+const findFrame = (name: string): Frame => frames.find((frame) => frame.name === name) as Frame;
+
+function readPlaces(views: CloudViews, stream: string): number[][] {
+  const object = views.group.getObjectByName(stream) as Points<BufferGeometry>;
+  object.updateMatrix();
+  const nodes = object.geometry.getAttribute("position") as InterleavedBufferAttribute;
+  return Array.from({ length: object.geometry.drawRange.count }, (_, i) =>
+    new Vector3(nodes.getX(i), nodes.getY(i), nodes.getZ(i)).applyMatrix4(object.matrix).toArray(),
+  );
+}
+
+test("points lie where the frame has them, and a later frame replaces them", () => {
+  const views = new CloudViews(1000);
+  views.setWanted(["room"]);
+  for (const name of ["on a table/full", "a room/full", "on a table/quarter", "no point/full"]) {
+    const { hex, positions } = findFrame(name);
+    views.show("room", decodeCloud(fromHex(hex)));
+    const places = readPlaces(views, "room");
+    expect(places).toHaveLength(positions.length);
+    for (const [i, place] of places.entries()) for (const axis of [0, 1, 2]) expect(place[axis]).toBeCloseTo(positions[i]![axis]!, 5);
+    expect(views.popChanged()).toBe(true);
+    expect(views.popChanged()).toBe(false);
+  }
+});
+
+test("a device draws as many points as it can, of all clouds together", () => {
+  const views = new CloudViews(20);
+  views.setWanted(["left", "right"]);
+  const { hex } = findFrame("on a table/full");
+  views.show("left", decodeCloud(fromHex(hex)));
+  expect(views.drawn).toEqual(new Map([["left", 20]]));
+  views.show("right", decodeCloud(fromHex(hex)));
+  views.show("left", decodeCloud(fromHex(hex)));
+  expect(views.drawn).toEqual(new Map([["left", 10], ["right", 10]]));
+});
+
+test("a cloud that is not wanted any more is gone, also when a frame of it was on its way", () => {
+  const views = new CloudViews(20);
+  views.setWanted(["room"]);
+  const cloud = decodeCloud(fromHex(findFrame("on a table/full").hex));
+  views.show("room", cloud);
+  views.setWanted([]);
+  views.show("room", cloud);
+  expect(views.drawn.size).toBe(0);
+  expect(views.group.children).toHaveLength(0);
+});
