@@ -53,7 +53,8 @@ class CloudHeader(NamedTuple):
         origin: Lattice node to which those of the points are added.
         error_m: Where a point is stated to be within, 95 % of the time, with the calibration of its camera [m];
             infinite where that is not known.
-        voxel_m: Edge of the cell that a point stands for, 0 where it stands for itself [m].
+        voxel_m: Edge of the cell that a point stands for, in a coarser class a larger one; 0 where it stands for
+            itself [m].
     """
 
     exponent: int
@@ -131,7 +132,10 @@ def encode_cloud(
     frames = {}
     for name in classes:
         n = math.ceil(SHARES[name] * len(points))
-        head = _HEADER.pack(FORMAT, 0, exponent, 0, n, *origin, error_m, voxel_m, 0)
+        edge_m = min(
+            voxel_m / math.sqrt(SHARES[name]), MAX_VOXEL_M
+        )  # of surfaces, a point of `half` has twice the area
+        head = _HEADER.pack(FORMAT, 0, exponent, 0, n, *origin, error_m, edge_m, 0)
         frames[name] = head + points[:n].tobytes()
     return frames
 

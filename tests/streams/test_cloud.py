@@ -108,6 +108,7 @@ def test_classes_are_beginnings_of_the_whole() -> None:
     points, colors = make_room(1001)
     frames = encode_cloud(points, colors, voxel_m=0.02, classes=tuple(SHARES))
     assert [read_header(frames[name]).n_points for name in SHARES] == [1001, 501, 251]
+    assert [decode_cloud(frames[name]).voxel_m for name in SHARES] == pytest.approx([0.02, 0.02 * math.sqrt(2.0), 0.04])
     for frame in frames.values():
         assert frames[BudgetClass.FULL][HEADER_BYTES:].startswith(frame[HEADER_BYTES:])
 

@@ -70,7 +70,8 @@ class Cloud {
     object.geometry.setDrawRange(0, count);
     object.scale.setScalar(step_m);
     object.position.set(...origin).multiplyScalar(step_m);
-    object.material.uniforms.edge!.value = voxel_m || POINT_M;
+    // Points of surfaces: of fewer, each has more of the area.
+    object.material.uniforms.edge!.value = (voxel_m || POINT_M) * Math.sqrt(points.length / 4 / Math.max(count, 1));
     object.visible = true;
     this.drawn = count;
   }
