@@ -26,7 +26,17 @@ class CameraError(ValueError):
 
 @dataclass(frozen=True)
 class CameraModel:
-    """Image size [px], focal lengths and principal point [px], distortion coefficients."""
+    """Intrinsics of a camera, in OpenCV's model.
+
+    Attributes:
+        width, height: Size of its pictures [px].
+        fx, fy: Focal lengths [px].
+        cx, cy: Principal point [px]; the centre of the first pixel is at 0.
+        distortion: None, or 4, 5 or 8 coefficients of the lens (k1, k2, p1, p2, k3, ...).
+
+    Raises:
+        CameraError: A value is out of range.
+    """
 
     width: int
     height: int
@@ -45,10 +55,12 @@ class CameraModel:
 
     @property
     def matrix(self) -> Array:
+        """Matrix of the projection (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
     def coefficients(self) -> Array:
+        """Coefficients of the lens, zeros without distortion."""
         return np.array(self.distortion if self.distortion else (0.0,) * 4)
 
     def scaled(self, width: int, height: int) -> CameraModel:

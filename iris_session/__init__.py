@@ -16,6 +16,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
+    from anchors.camera import CameraModel
     from iris_session.assets.errors import AssetMissingError, AssetStoreError
     from iris_session.assets.store import AssetStore
     from iris_session.authority.config import AuthorityConfig
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     )
     from iris_session.client.deformables import Deformables
     from iris_session.client.fetched_scene import FetchedScene, fetch_scene
+    from iris_session.cloud.voxels import DepthLimits, PointSet, Rays, VoxelFilter, choose_voxel_m, make_rays
     from iris_session.control.config import ControlConfig
     from iris_session.demo.named_scenes import scene_by_name
     from iris_session.demo.scenes import n_arms_scene, scene_path
@@ -140,6 +142,8 @@ _PUBLIC: Final = {
     "iris_session.client.fetched_scene": ("fetch_scene", "FetchedScene"),
     "iris_session.client.deformables": ("Deformables",),
     "iris_session.streams.cloud": ("encode_cloud", "decode_cloud", "CloudFrame"),
+    "iris_session.cloud.voxels": ("VoxelFilter", "PointSet", "Rays", "DepthLimits", "make_rays", "choose_voxel_m"),
+    "anchors.camera": ("CameraModel",),
     "iris_session.streams.deformable": ("DeformableEncoder", "DeformableDecoder"),
     "iris_session.streams.deformable_topology": ("DeformableTopology",),
     "iris_session.recording": ("Recording", "RecordingError"),
@@ -212,6 +216,13 @@ __all__ = [
     "encode_cloud",
     "decode_cloud",
     "CloudFrame",
+    "CameraModel",
+    "VoxelFilter",
+    "PointSet",
+    "Rays",
+    "DepthLimits",
+    "make_rays",
+    "choose_voxel_m",
     # recordings
     "Recording",
     "RecordingError",

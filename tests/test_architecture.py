@@ -56,6 +56,7 @@ FORBIDDEN = {
     "streams": SOCKETS | CLOCKS | THREADS | RANDOM | {"mujoco", "rerun"},
     "scene": SOCKETS | RANDOM | {"rerun"},
     "assets": SOCKETS | {"mujoco", "rerun", "scipy", "cv2", "mink", "open3d"},
+    "cloud": SOCKETS | CLOCKS | RANDOM | {"mujoco", "rerun"},
     "security": (SOCKETS - {"zmq"}) | RANDOM | HEAVY,
     "system": SOCKETS | RANDOM | HEAVY,
     "link": {"mujoco", "rerun"},

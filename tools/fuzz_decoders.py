@@ -42,6 +42,7 @@ from iris_session.security.join_codes import JoinCode, JoinCodes
 from iris_session.security.known_servers import KnownServer, KnownServers
 from iris_session.security.private_folder import PrivateFolder
 from iris_session.security.session_registry import RegisteredSession, SessionRegistry
+from iris_session.streams.cloud import decode_cloud, encode_cloud
 from iris_session.streams.errors import StreamError
 from iris_session.streams.rigid import RigidDecoder, RigidEncoder
 from iris_session.web import wire
@@ -337,6 +338,24 @@ def make_rigid_check(n_bodies: int) -> Callable[[bytes], None]:
     return take
 
 
+def make_cloud_frame(rng: Random) -> bytes:
+    """Return a frame of a few points."""
+    numbers = np.random.default_rng(rng.getrandbits(32))
+    n = rng.choice((0, 1, 3, 12))
+    points = numbers.uniform(-1, 1, (n, 3)) * rng.choice((0.01, 1, 30, 1000)) + rng.choice((0, 5, 1e4))
+    colors = numbers.integers(0, 256, (n, 3)).astype(np.uint8)
+    return encode_cloud(points, colors, voxel_m=rng.choice((0.0, 0.01, 1.0)), error_m=rng.choice((0.01, math.inf)))[
+        "full"
+    ]
+
+
+def check_cloud(data: bytes) -> None:
+    frame = decode_cloud(data)
+    assert np.isfinite(frame.positions).all()
+    assert 8 * len(frame.positions) < len(data)
+    assert len(frame.colors) == len(frame.positions)
+
+
 def check_journal(data: bytes) -> None:
     """Decode the rows of a damaged file and check them as `verify` does."""
     for row in messages.decode_batch(data).rows:
@@ -521,6 +540,7 @@ DECODERS: Final[dict[str, Callable[[Random], Any]]] = {
     "beacon": lambda rng: Decoder(rng, [_beacons], check_beacon, _OURS),
     "introduction": lambda rng: Decoder(rng, [_introductions], check_introduction, _OURS),
     "rigid": lambda rng: Decoder(rng, [rigid_frames(7)], make_rigid_check(7), (StreamError,)),
+    "cloud": lambda rng: Decoder(rng, [make_cloud_frame], check_cloud, (StreamError,)),
     "address": lambda rng: Decoder(rng, [make_address], check_address, (ClientError,)),
     "entry": decode_plain(entries.Entry, entries.decode_entry, _ENTRIES),
     "entries": decode_plain(list[entries.Entry], entries.decode_entries, _ENTRIES),

@@ -24,7 +24,7 @@ EXTRAS: Final[Mapping[str, str]] = {
     "collada": "files",
     "PIL": "files",
     "lxml": "files",
-    "open3d": "cloud",
+    "numba": "cloud",
     "aiohttp": "web",
     "cryptography": "web",
 }

@@ -1,0 +1,208 @@
+"""Voxel filter: its means are those of a slow reference, with numba and without, in any order of cameras."""
+
+from __future__ import annotations
+
+import os
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from anchors.camera import CameraModel
+from iris_session.cloud.voxels import DepthLimits, PointSet, Rays, VoxelFilter, choose_voxel_m, make_rays
+
+VOXEL_M = 0.02
+CAMERA = CameraModel(80, 60, 70.0, 72.0, 39.5, 29.5)
+backends = pytest.mark.parametrize("use_numba", [True, False], ids=["numba", "numpy"])
+
+
+def make_picture(seed: int) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
+    """Return a bumpy wall with holes, a box before it, and noise."""
+    random = np.random.default_rng(seed)
+    v, u = np.mgrid[0:60, 0:80]
+    depth = 1500.0 + 60.0 * np.sin(u / 9.0) + 40.0 * np.cos(v / 7.0) + random.normal(0.0, 2.0, u.shape)
+    depth[20:40, 30:50] = 900.0
+    depth[random.random(u.shape) < 0.05] = 0.0
+    depth[random.random(u.shape) < 0.02] = 65_535.0
+    return depth.astype(np.uint16), random.integers(0, 256, (60, 80, 3)).astype(np.uint8)
+
+
+def make_pose(seed: int) -> NDArray[np.float64]:
+    """Return a camera's pose within a metre of the origin."""
+    random = np.random.default_rng(seed)
+    pose = np.eye(4)
+    pose[:3, :3], _ = cv2.Rodrigues(random.normal(size=3)) if seed else (np.eye(3), None)
+    pose[:3, 3] = random.uniform(-1.0, 1.0, 3)
+    return pose
+
+
+def filter_slowly(
+    pictures: list[Any], limits: DepthLimits, rays: Rays, min_around: int = 0
+) -> dict[tuple[int, ...], Any]:
+    """Return mean position, mean colour and number of points by cell, one pixel at a time."""
+    cells: dict[tuple[int, ...], list[Any]] = defaultdict(list)
+    for depth, color, pose in pictures:
+        height, width = depth.shape
+        for v in range(height):
+            for u in range(width):
+                unit = int(depth[v, u])
+                if unit in (0, 65_535) or not limits.nearest_m <= unit * 0.001 <= limits.farthest_m:
+                    continue
+                beside = [(v, u - 1), (v, u + 1), (v - 1, u), (v + 1, u)]
+                near = [int(depth[b, a]) for b, a in beside if 0 <= b < height and 0 <= a < width]
+                if any(one not in (0, 65_535) and abs(one - unit) > limits.jump * unit for one in near):
+                    continue
+                z = unit * 0.001
+                point = pose[:3, :3] @ (rays.x[v, u] * z, rays.y[v, u] * z, z) + pose[:3, 3]
+                if (point >= limits.low).all() and (point < limits.high).all():
+                    cells[tuple(np.floor(point / VOXEL_M).astype(int).tolist())].append((point, color[v, u]))
+    steps = [(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1) if (i, j, k) != (0, 0, 0)]
+    found = {}
+    for cell, members in cells.items():
+        around = sum(tuple(np.add(cell, step).tolist()) in cells for step in steps)
+        if around >= min_around:
+            points, colors = zip(*members, strict=True)
+            found[cell] = (np.mean(points, axis=0), np.mean(np.array(colors, float), axis=0), len(members))
+    return found
+
+
+def run_filter(pictures: list[Any], limits: DepthLimits, rays: Rays, *, use_numba: bool, **options: Any) -> PointSet:
+    found = VoxelFilter(VOXEL_M, use_numba=use_numba, threads=2)
+    for depth, color, pose in pictures:
+        found.add_depth(depth, color, rays, pose, limits=limits)
+    assert found.overflow == 0
+    return found.collect(**options)
+
+
+def compare(points: PointSet, expected: dict[tuple[int, ...], Any]) -> None:
+    assert len(points.positions) == len(expected)
+    positions = np.array([mean for mean, _, _ in expected.values()])
+    distance, at = cKDTree(points.positions).query(positions)
+    assert distance.max() < 2e-6
+    assert len(set(at.tolist())) == len(expected)
+    colors = np.array([color for _, color, _ in expected.values()])
+    assert np.abs(points.colors[at] - colors).max() <= 0.5 + 1e-3
+    assert points.counts[at].tolist() == [n for _, _, n in expected.values()]
+
+
+@backends
+@pytest.mark.parametrize("distortion", [(), (0.1, -0.05, 0.001, 0.002)])
+def test_means_are_those_of_a_slow_reference(use_numba: bool, distortion: tuple[float, ...]) -> None:
+    camera = CameraModel(80, 60, 70.0, 72.0, 39.5, 29.5, distortion)
+    rays, limits = make_rays(camera), DepthLimits((-1.0, -0.8, -2.0), (0.9, 2.0, 1.9), 0.5, 1.56, 0.03)
+    pictures = [(*make_picture(seed), make_pose(seed)) for seed in range(3)]
+    for options in ({}, {"min_around": 4}):
+        expected = filter_slowly(pictures, limits, rays, **options)
+        assert len(expected) > 500
+        compare(run_filter(pictures, limits, rays, use_numba=use_numba, **options), expected)
+
+
+@backends
+def test_the_order_of_cameras_does_not_matter(use_numba: bool) -> None:
+    rays, limits = make_rays(CAMERA), DepthLimits()
+    pictures = [(*make_picture(seed), make_pose(seed)) for seed in range(3)]
+    first, second = (run_filter(one, limits, rays, use_numba=use_numba) for one in (pictures, pictures[::-1]))
+    assert len(first.positions) == len(second.positions)
+    distance, at = cKDTree(first.positions).query(second.positions)
+    assert distance.max() < 2e-6
+    assert (first.counts[at] == second.counts).all()
+
+
+@backends
+def test_cells_beyond_the_bound_are_dropped_and_counted(use_numba: bool) -> None:
+    depth, color = make_picture(1)
+    small = VoxelFilter(VOXEL_M, max_cells=50, threads=1, use_numba=use_numba)
+    small.add_depth(depth, color, make_rays(CAMERA), np.eye(4))
+    whole = VoxelFilter(VOXEL_M, use_numba=use_numba)
+    whole.add_depth(depth, color, make_rays(CAMERA), np.eye(4))
+    kept = small.collect()
+    assert len(kept.positions) == 50
+    assert small.overflow == whole.collect().counts.sum() - kept.counts.sum() > 0
+    small.clear()
+    assert small.overflow == len(small.collect().positions) == 0
+
+
+@backends
+def test_single_cells_are_outliers_and_surfaces_are_not(use_numba: bool) -> None:
+    depth = np.full((60, 80), 1500, np.uint16)
+    depth[5::12, 5::12] = 700  # flying apart from everything
+    color = np.zeros((60, 80, 3), np.uint8)
+    rays, limits = make_rays(CAMERA), DepthLimits(jump=10.0)
+    every = run_filter([(depth, color, np.eye(4))], limits, rays, use_numba=use_numba)
+    kept = run_filter([(depth, color, np.eye(4))], limits, rays, use_numba=use_numba, min_around=2)
+    assert every.positions[:, 2].min() < 0.8
+    assert kept.positions[:, 2].min() > 1.4
+    assert (every.positions[:, 2] > 1.4).sum() - len(kept.positions) <= 4  # corners of the picture
+
+
+@backends
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"depth": np.zeros((60, 81), np.uint16)}, "depth"),
+        ({"depth": np.zeros((60, 80), np.float32)}, "depth"),
+        ({"color": np.zeros((60, 80), np.uint8)}, "colour"),
+        ({"color": np.zeros((30, 40, 3), np.uint8)}, "colour"),
+        ({"T_world_camera": np.full((4, 4), np.nan)}, "T_world_camera"),
+    ],
+)
+def test_pictures_that_do_not_fit_are_refused(use_numba: bool, change: dict[str, Any], named: str) -> None:
+    depth, color = make_picture(0)
+    arguments = {"depth": depth, "color": color, "rays": make_rays(CAMERA), "T_world_camera": np.eye(4), **change}
+    with pytest.raises(ValueError, match=named):
+        VoxelFilter(VOXEL_M, use_numba=use_numba).add_depth(**arguments)
+
+
+@pytest.mark.parametrize(("depth", "points"), [(0, 0), (65_535, 0), (1000, 4800)])
+@backends
+def test_pictures_without_measurements_have_no_points(use_numba: bool, depth: int, points: int) -> None:
+    picture = np.full((60, 80), depth, np.uint16)
+    found = run_filter(
+        [(picture, np.zeros((60, 80, 3), np.uint8), np.eye(4))], DepthLimits(), make_rays(CAMERA), use_numba=use_numba
+    )
+    assert found.counts.sum() == points
+
+
+def test_real_frames_make_one_room() -> None:
+    """Views of a moving camera, merged by their poses: surfaces of one view lie on those of the others."""
+    folder = Path(os.environ["IRIS_DATA"]) / "rgbd"
+    matrix = np.loadtxt(folder / "camera-intrinsics.txt")
+    camera = CameraModel(640, 480, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+    rays, limits = make_rays(camera), DepthLimits(farthest_m=3.5)
+    views = []
+    for number in (0, 10, 20):
+        depth = cv2.imread(str(folder / f"frame-{number:06d}.depth.png"), cv2.IMREAD_UNCHANGED)
+        color = cv2.imread(str(folder / f"frame-{number:06d}.color.jpg"))
+        assert depth is not None
+        assert color is not None
+        pose = np.loadtxt(folder / f"frame-{number:06d}.pose.txt")
+        one = VoxelFilter(0.01)
+        one.add_depth(depth.astype(np.uint16), color.astype(np.uint8), rays, pose, limits=limits)
+        views.append(one.collect(min_points=2, min_around=4).positions)
+        assert len(views[-1]) > 20_000
+    for first, second in ((0, 1), (1, 2), (0, 2)):
+        distance, _ = cKDTree(views[first]).query(views[second])
+        overlapping = distance[distance < 0.05]
+        assert len(overlapping) > 0.7 * len(distance)
+        assert overlapping.mean() < 0.015
+
+
+def test_the_edge_of_cells_meets_the_budget_and_then_stays() -> None:
+    random = np.random.default_rng(4)
+    for area_m2 in (0.01, 3.0, 40.0):
+        edges = [0.01]
+        for _ in range(40):
+            points = int(area_m2 / edges[-1] ** 2 * random.uniform(0.95, 1.05))
+            edges.append(choose_voxel_m(edges[-1], points, 10_000, 0.005))
+        assert len(set(edges[3:])) <= 2  # a budget at the border of two steps is met by the larger one
+        assert area_m2 / edges[-1] ** 2 <= 1.06 * 10_000
+        assert edges[-1] == 0.005 or area_m2 / edges[-1] ** 2 >= 0.5 * 10_000
+
+
+def test_an_empty_room_has_the_smallest_cells() -> None:
+    assert choose_voxel_m(0.5, 0, 10_000, 0.01) == pytest.approx(0.01)
