@@ -129,11 +129,9 @@ def _add(
             px = r00 * x + r01 * y + r02 * z + tx
             py = r10 * x + r11 * y + r12 * z + ty
             pz = r20 * x + r21 * y + r22 * z + tz
-            if px < box[0, 0] or py < box[0, 1] or pz < box[0, 2]:
-                continue
-            if px >= box[1, 0] or py >= box[1, 1] or pz >= box[1, 2]:
-                continue
-            if abs(px) >= _REACH - 1 or abs(py) >= _REACH - 1 or abs(pz) >= _REACH - 1:
+            if not (box[0, 0] <= px < box[1, 0] and box[0, 1] <= py < box[1, 1] and box[0, 2] <= pz < box[1, 2]):
+                continue  # so is what is not a number
+            if not (abs(px) < _REACH - 1 and abs(py) < _REACH - 1 and abs(pz) < _REACH - 1):
                 continue
             i, j, k = np.int64(np.floor(px)), np.int64(np.floor(py)), np.int64(np.floor(pz))
             key = ((i + _REACH) << 42) | ((j + _REACH) << 21) | (k + _REACH)

@@ -129,6 +129,8 @@ class VoxelFilter:
             raise ValueError(f"voxel_m is {voxel_m}: {MIN_VOXEL_M:g} to 10 m are possible")
         if not 1 <= max_cells <= 2**24:
             raise ValueError(f"max_cells is {max_cells}: 1 to {2**24} are possible")
+        if threads is not None and threads < 1:
+            raise ValueError(f"threads is {threads}: at least 1")
         if use_numba and kernels is None:
             raise MissingExtraError(describe_missing("numba", "use_numba=True"), name="numba")
         self.voxel_m = voxel_m
@@ -163,7 +165,7 @@ class VoxelFilter:
             limits: Which pixels count.
 
         Raises:
-            ValueError: Shapes or types that do not fit each other, or a transform that is not finite.
+            ValueError: Shapes or types that do not fit each other, or a transform or scale that is not finite.
         """
         shape = rays.x.shape
         if depth.shape != shape or depth.dtype != np.uint16:
@@ -173,6 +175,8 @@ class VoxelFilter:
         pose = np.asarray(T_world_camera, np.float64)
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise ValueError("T_world_camera must be 4 x 4 finite numbers")
+        if not 0.0 < depth_scale_m < 1.0:
+            raise ValueError(f"depth_scale_m is {depth_scale_m}: more than 0 and less than 1 m, usually 0.001")
         self.overflow += self._table.add_depth(
             np.ascontiguousarray(depth),
             np.ascontiguousarray(color),

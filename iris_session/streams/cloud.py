@@ -32,6 +32,9 @@ MAX_EXPONENT: Final = -4
 MAX_ORIGIN: Final = 2**23
 #: Edges of a cell that a point may stand for [m].
 MAX_VOXEL_M: Final = 10.0
+#: Least error that can be stated; from `MAX_ERROR_M` on it is not known [m].
+MIN_ERROR_M: Final = 1e-6
+MAX_ERROR_M: Final = 1e6
 _LAST_NODE: Final = 0xFFFF
 #: format u8, flags u8, exponent i8, reserved u8, points u32, origin 3 x i32, error and voxel f32 [m], reserved u32.
 _HEADER: Final = struct.Struct("<BBbBI3iffI")
@@ -116,8 +119,11 @@ def encode_cloud(
         )
     if unknown := [name for name in classes if name not in SHARES]:
         raise ValueError(f"{unknown[0]!r} is no class of a point cloud: expected {', '.join(SHARES)}")
-    if not 0.0 <= voxel_m <= MAX_VOXEL_M or not error_m > 0.0:
-        raise ValueError(f"voxel_m is {voxel_m}, error_m {error_m}: 0 to {MAX_VOXEL_M:g} m, and more than 0 m")
+    if not 0.0 <= voxel_m <= MAX_VOXEL_M or not error_m >= MIN_ERROR_M:
+        raise ValueError(
+            f"voxel_m is {voxel_m}, error_m {error_m}: 0 to {MAX_VOXEL_M:g} m, and {MIN_ERROR_M:g} m or more"
+        )
+    error_m = error_m if error_m < MAX_ERROR_M else math.inf
     rows = np.array(positions.T, order="C")  # whole rows are several times faster than columns
     if not np.isfinite(rows).all():
         finite = np.isfinite(rows).all(axis=0)

@@ -149,6 +149,8 @@ def test_single_cells_are_outliers_and_surfaces_are_not(use_numba: bool) -> None
         ({"color": np.zeros((60, 80), np.uint8)}, "colour"),
         ({"color": np.zeros((30, 40, 3), np.uint8)}, "colour"),
         ({"T_world_camera": np.full((4, 4), np.nan)}, "T_world_camera"),
+        ({"depth_scale_m": 0.0}, "depth_scale_m"),
+        ({"depth_scale_m": np.nan}, "depth_scale_m"),
     ],
 )
 def test_pictures_that_do_not_fit_are_refused(use_numba: bool, change: dict[str, Any], named: str) -> None:
@@ -156,6 +158,23 @@ def test_pictures_that_do_not_fit_are_refused(use_numba: bool, change: dict[str,
     arguments = {"depth": depth, "color": color, "rays": make_rays(CAMERA), "T_world_camera": np.eye(4), **change}
     with pytest.raises(ValueError, match=named):
         VoxelFilter(VOXEL_M, use_numba=use_numba).add_depth(**arguments)
+
+
+@backends
+def test_directions_that_are_no_numbers_have_no_points(use_numba: bool) -> None:
+    depth, color = make_picture(0)
+    rays = make_rays(CAMERA)
+    rays.x[:30] = np.nan
+    found = run_filter([(depth, color, np.eye(4))], DepthLimits(), rays, use_numba=use_numba)
+    below = run_filter([(depth, color, np.eye(4))], DepthLimits(), make_rays(CAMERA), use_numba=use_numba)
+    assert np.isfinite(found.positions).all()
+    assert 0 < found.counts.sum() < 0.7 * below.counts.sum()
+
+
+@pytest.mark.parametrize("options", [{"voxel_m": 0.0}, {"voxel_m": np.nan}, {"max_cells": 0}, {"threads": 0}])
+def test_filters_that_cannot_be_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=next(iter(options))):
+        VoxelFilter(**{"voxel_m": 0.01, **options})
 
 
 @pytest.mark.parametrize(("depth", "points"), [(0, 0), (65_535, 0), (1000, 4800)])

@@ -132,6 +132,10 @@ def test_the_order_of_the_source_does_not_matter() -> None:
     assert {tuple(p) for p in first.positions.tolist()} == {tuple(p) for p in second.positions.tolist()}
 
 
+def test_an_error_beyond_all_bounds_is_not_known() -> None:
+    assert decode_cloud(encode_cloud(*make_room(1), error_m=1e200)["full"]).error_m == math.inf
+
+
 def test_points_that_are_not_finite_are_left_out() -> None:
     points, colors = make_room(10)
     points[3, 1], points[7] = np.nan, np.inf
@@ -148,6 +152,7 @@ def test_points_that_are_not_finite_are_left_out() -> None:
         ({"classes": ("full", "none")}, "none"),
         ({"voxel_m": -0.1}, "voxel_m"),
         ({"error_m": math.nan}, "error_m"),
+        ({"error_m": 1e-60}, "error_m"),
         ({"positions": np.array([[0.0] * 3, [1.0] * 3, [2.0] * 3, [9000.0] * 3])}, "4 km"),
     ],
 )
