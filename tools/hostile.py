@@ -256,7 +256,7 @@ def descriptors(lab: Lab, result: Result, drops: dict[str, int]) -> None:
 
 @dataclass
 class Window:
-    """What was measured in a stretch of time. `cpu_share`: cores that the attacker used."""
+    """Measurements of a stretch of time. `cpu_share`: cores that the attacker used."""
 
     seconds: float
     ages_ms: dict[str, list[float]]

@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from iris_session.cloud import COLUMNS, REACH
+
 _EMPTY = -1
-_REACH = 2**20
-_COLUMNS = 7
 #: 2^64 divided by the golden ratio: multiples of it spread over the highest bits.
 _SPREAD = np.uint64(0x9E3779B97F4A7C15)
 
@@ -26,7 +26,7 @@ class Band:
         bits = max(4, (2 * max_cells - 1).bit_length())
         self._shift = np.uint64(64 - bits)
         self._keys = np.full(2**bits, _EMPTY, np.int64)
-        self._sums = np.zeros((2**bits, _COLUMNS), np.float32)
+        self._sums = np.zeros((2**bits, COLUMNS), np.float32)
         self._used = np.empty(max_cells, np.int32)
         self._n = 0
 
@@ -93,7 +93,7 @@ def _put(key: Any, sums_of: Any, keys: Any, sums: Any, used: Any, n: Any, shift:
         used[n] = place
         n += 1
     row = sums[place]
-    for k in range(_COLUMNS):
+    for k in range(COLUMNS):
         row[k] += sums_of[k]
     return n, True
 
@@ -105,7 +105,7 @@ def _add(
 ) -> Any:  # fmt: skip
     height, width = depth.shape
     dropped: Any = 0
-    here = np.zeros(_COLUMNS, np.float32)  # of the cell that the last pixel was in: pixels side by side share cells
+    here = np.zeros(COLUMNS, np.float32)  # of the cell that the last pixel was in: pixels side by side share cells
     present = np.int64(_EMPTY)
     r00, r01, r02, tx = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
     r10, r11, r12, ty = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
@@ -131,10 +131,10 @@ def _add(
             pz = r20 * x + r21 * y + r22 * z + tz
             if not (box[0, 0] <= px < box[1, 0] and box[0, 1] <= py < box[1, 1] and box[0, 2] <= pz < box[1, 2]):
                 continue  # so is what is not a number
-            if not (abs(px) < _REACH - 1 and abs(py) < _REACH - 1 and abs(pz) < _REACH - 1):
+            if not (abs(px) < REACH - 1 and abs(py) < REACH - 1 and abs(pz) < REACH - 1):
                 continue
             i, j, k = np.int64(np.floor(px)), np.int64(np.floor(py)), np.int64(np.floor(pz))
-            key = ((i + _REACH) << 42) | ((j + _REACH) << 21) | (k + _REACH)
+            key = ((i + REACH) << 42) | ((j + REACH) << 21) | (k + REACH)
             if key != present:
                 if present != _EMPTY:
                     n, fits = _put(present, here, keys, sums, used, n, shift)

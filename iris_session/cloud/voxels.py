@@ -2,7 +2,7 @@
 
 One pass over a picture: deprojection, range, flying pixels, crop, cell, sums. Since the lattice is that of the world,
 merging cameras is adding their cells. With numba the picture is passed in bands, each in a thread of its own that
-does not hold the interpreter lock; without it numpy does the same, several times slower.
+does not hold the interpreter lock; without it numpy does the same and takes longer.
 """
 
 from __future__ import annotations
@@ -17,12 +17,14 @@ import numpy as np
 import numpy.typing as npt
 
 from anchors.camera import CameraModel
+from iris_session.cloud import COLUMNS, REACH
 from iris_session.system.extras import MissingExtraError, describe_missing
 
+_HAS_NUMBA = True
 try:
     from iris_session.cloud import kernels
-except ImportError:  # numba is not installed
-    kernels = None  # type: ignore[assignment]
+except ImportError:  # not installed, or not for this version of numpy
+    _HAS_NUMBA = False
 
 log = logging.getLogger(__name__)
 
@@ -34,10 +36,6 @@ Depth = npt.NDArray[np.uint16]
 #: Cells of one filter, at most: what comes beyond is dropped and counted.
 MAX_CELLS: Final = 2**18
 MIN_VOXEL_M: Final = 0.001
-#: Cells to each side of the origin along an axis: 21 bits an axis make a key of 63.
-REACH: Final = 2**20
-#: Columns of the sums: number of points, then the sums of their coordinates [cells], red, green, blue.
-COLUMNS: Final = 7
 #: Cells around a cell, itself left out.
 _AROUND: Final = tuple((i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1) if (i, j, k) != (0, 0, 0))
 
@@ -110,6 +108,7 @@ class VoxelFilter:
         use_numba: Use numba. By default where it is installed.
 
     Attributes:
+        voxel_m: Edge of a cell [m]; `clear` sets it.
         overflow: Points that were dropped because there were too many cells, since `clear`.
 
     Raises:
@@ -125,22 +124,32 @@ class VoxelFilter:
         threads: int | None = None,
         use_numba: bool | None = None,
     ) -> None:
-        if not MIN_VOXEL_M <= voxel_m <= 10.0:
-            raise ValueError(f"voxel_m is {voxel_m}: {MIN_VOXEL_M:g} to 10 m are possible")
         if not 1 <= max_cells <= 2**24:
             raise ValueError(f"max_cells is {max_cells}: 1 to {2**24} are possible")
         if threads is not None and threads < 1:
             raise ValueError(f"threads is {threads}: at least 1")
-        if use_numba and kernels is None:
+        if use_numba and not _HAS_NUMBA:
             raise MissingExtraError(describe_missing("numba", "use_numba=True"), name="numba")
-        self.voxel_m = voxel_m
-        self.overflow = 0
-        wants = kernels is not None if use_numba is None else use_numba
+        if use_numba is None and not _HAS_NUMBA:
+            log.warning("depth pictures are filtered by numpy, which takes longer: %s", describe_missing("numba"))
+        wants = _HAS_NUMBA if use_numba is None else use_numba
         n = max(1, min(4, os.cpu_count() or 1)) if threads is None else threads
-        self._table: _Table = _NumbaTable(max_cells, n) if wants else _NumpyTable(max_cells)
+        self._table = _NumbaTable(max_cells, n) if wants else _NumpyTable(max_cells)
+        self.clear(voxel_m)
 
-    def clear(self) -> None:
-        """Remove all points."""
+    def clear(self, voxel_m: float | None = None) -> None:
+        """Remove all points.
+
+        Args:
+            voxel_m: Edge of the cells from now on [m], by default as before.
+
+        Raises:
+            ValueError: `voxel_m` is out of range.
+        """
+        if voxel_m is not None:
+            if not MIN_VOXEL_M <= voxel_m <= 10.0:
+                raise ValueError(f"voxel_m is {voxel_m}: {MIN_VOXEL_M:g} to 10 m are possible")
+            self.voxel_m = voxel_m
         self._table.clear()
         self.overflow = 0
 
@@ -177,15 +186,11 @@ class VoxelFilter:
             raise ValueError("T_world_camera must be 4 x 4 finite numbers")
         if not 0.0 < depth_scale_m < 1.0:
             raise ValueError(f"depth_scale_m is {depth_scale_m}: more than 0 and less than 1 m, usually 0.001")
-        self.overflow += self._table.add_depth(
-            np.ascontiguousarray(depth),
-            np.ascontiguousarray(color),
-            rays,
-            np.ascontiguousarray(pose[:3] / self.voxel_m),
-            depth_scale_m,
-            limits or DepthLimits(),
-            self.voxel_m,
-        )
+        chosen = limits or DepthLimits()
+        box = np.array((chosen.low, chosen.high)) / self.voxel_m
+        cells = np.ascontiguousarray(pose[:3] / self.voxel_m)
+        depth, color = np.ascontiguousarray(depth), np.ascontiguousarray(color)
+        self.overflow += self._table.add_depth(_Picture(depth, color, rays, cells, depth_scale_m, chosen, box))
 
     def collect(self, *, min_points: int = 1, min_around: int = 0) -> PointSet:
         """Return the mean of each cell.
@@ -243,31 +248,19 @@ def unpack_keys(keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 # --- tables of cells --------------------------------------------------------------------------------------------------
 
 
-class _Table:
-    """Sums by cell."""
+class _Picture(NamedTuple):
+    """A depth picture, with its pose in cells (3, 4)."""
 
-    def clear(self) -> None:
-        raise NotImplementedError
-
-    def add_depth(
-        self,
-        depth: Depth,
-        color: Colors,
-        rays: Rays,
-        T_cells_camera: Floats,
-        scale_m: float,
-        limits: DepthLimits,
-        voxel_m: float,
-    ) -> int:
-        """Add a picture. Return how many points were dropped. `T_cells_camera`: (3, 4), in cells."""
-        raise NotImplementedError
-
-    def read(self, min_points: int, min_around: int) -> tuple[npt.NDArray[np.int64], Floats]:
-        """Return keys (n,) and sums (n, COLUMNS)."""
-        raise NotImplementedError
+    depth: Depth
+    color: Colors
+    rays: Rays
+    T_cells_camera: Floats
+    scale_m: float
+    limits: DepthLimits
+    box: Floats
 
 
-class _NumbaTable(_Table):
+class _NumbaTable:
     """Open addressing, one table for each band of a picture."""
 
     def __init__(self, max_cells: int, threads: int) -> None:
@@ -278,22 +271,14 @@ class _NumbaTable(_Table):
         for band in self._bands:
             band.clear()
 
-    def add_depth(
-        self,
-        depth: Depth,
-        color: Colors,
-        rays: Rays,
-        T_cells_camera: Floats,
-        scale_m: float,
-        limits: DepthLimits,
-        voxel_m: float,
-    ) -> int:
-        box = np.array((limits.low, limits.high)) / voxel_m
+    def add_depth(self, picture: _Picture) -> int:
+        """Add a picture. Return how many points were dropped."""
+        depth, color, rays, pose, scale_m, limits, box = picture
         depths = (limits.nearest_m / scale_m, limits.farthest_m / scale_m, limits.jump)
         edges = np.linspace(0, depth.shape[0], len(self._bands) + 1).astype(int)
 
         def run(band: Any, first: int, last: int) -> int:
-            return int(band.add(depth, color, rays.x, rays.y, first, last, T_cells_camera, scale_m, box, depths))
+            return int(band.add(depth, color, rays.x, rays.y, first, last, pose, scale_m, box, depths))
 
         work = list(zip(self._bands, edges[:-1].tolist(), edges[1:].tolist(), strict=True))
         if self._pool is None:
@@ -310,36 +295,24 @@ class _NumbaTable(_Table):
         return keys, sums
 
 
-class _NumpyTable(_Table):
+class _NumpyTable:
     """Sorted cells, merged with those of each picture."""
 
     def __init__(self, max_cells: int) -> None:
         self._max_cells = max_cells
-        self._is_reported = False
         self.clear()
 
     def clear(self) -> None:
         self._keys = np.empty(0, np.int64)
         self._sums = np.empty((0, COLUMNS))
 
-    def add_depth(
-        self,
-        depth: Depth,
-        color: Colors,
-        rays: Rays,
-        T_cells_camera: Floats,
-        scale_m: float,
-        limits: DepthLimits,
-        voxel_m: float,
-    ) -> int:
-        if not self._is_reported:
-            self._is_reported = True
-            log.warning("depth pictures are filtered by numpy, which takes several times longer than numba")
+    def add_depth(self, picture: _Picture) -> int:
+        """Add a picture. Return how many points were dropped."""
+        depth, color, rays, pose, scale_m, limits, (low, high) = picture
         chosen = select_pixels(depth, scale_m, limits)
         z = depth[chosen] * scale_m
         camera = np.stack([rays.x[chosen] * z, rays.y[chosen] * z, z], axis=1)
-        points = camera @ T_cells_camera[:, :3].T + T_cells_camera[:, 3]
-        low, high = np.array(limits.low) / voxel_m, np.array(limits.high) / voxel_m
+        points = camera @ pose[:, :3].T + pose[:, 3]
         inside = ((points >= low) & (points < high) & (np.abs(points) < REACH - 1)).all(axis=1)
         points, colors = points[inside], color[chosen][inside]
         cells = np.floor(points).astype(np.int64)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -221,6 +223,38 @@ def test_the_edge_of_cells_meets_the_budget_and_then_stays() -> None:
         assert len(set(edges[3:])) <= 2  # a budget at the border of two steps is met by the larger one
         assert area_m2 / edges[-1] ** 2 <= 1.06 * 10_000
         assert edges[-1] == 0.005 or area_m2 / edges[-1] ** 2 >= 0.5 * 10_000
+
+
+def test_without_numba_numpy_filters_and_says_so() -> None:
+    code = (
+        "import sys, logging; sys.modules['numba'] = None; logging.basicConfig(stream=sys.stdout)\n"
+        "from iris_session import VoxelFilter\n"
+        "VoxelFilter(0.01)\n"
+        "try: VoxelFilter(0.01, use_numba=True)\n"
+        "except ImportError as error: print('refused:', error)"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    first, second = found.splitlines()
+    assert "numpy" in first
+    assert second.startswith("refused:")
+    assert "iris-session[cloud]" in first
+    assert "iris-session[cloud]" in second
+
+
+@backends
+def test_the_edge_of_cells_can_change_from_picture_to_picture(use_numba: bool) -> None:
+    depth, color = make_picture(1)
+    found = VoxelFilter(VOXEL_M, use_numba=use_numba)
+    found.add_depth(depth, color, make_rays(CAMERA), np.eye(4))
+    fine = found.collect()
+    found.clear(4.0 * VOXEL_M)
+    assert len(found.collect().positions) == 0
+    found.add_depth(depth, color, make_rays(CAMERA), np.eye(4))
+    coarse = found.collect()
+    assert coarse.counts.sum() == fine.counts.sum()
+    assert len(coarse.positions) < 0.3 * len(fine.positions)
+    with pytest.raises(ValueError, match="voxel_m"):
+        found.clear(0.0)
 
 
 def test_an_empty_room_has_the_smallest_cells() -> None:

@@ -288,9 +288,6 @@ export interface CloudUpdate {
   type: "cloud";
   stream: string;
   cloud: CloudFrame;
-  /** Session time of capture [ms]. */
-  session_ms: number;
-  seq: number;
 }
 
 /** A frame of any other media stream, as it came. */

@@ -137,7 +137,7 @@ export class MediaLink {
     }
     if (encoding === "cloud") {
       const cloud = decodeCloud(bytes);
-      this.environment.post({ type: "cloud", stream, cloud, session_ms: captureNs / MS_NS, seq }, [cloud.points.buffer]);
+      this.environment.post({ type: "cloud", stream, cloud }, [cloud.points.buffer]);
       return;
     }
     const copy = bytes.slice();

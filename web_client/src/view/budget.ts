@@ -3,12 +3,12 @@
 
 import type { Mesh, SceneSpec, Texture } from "./spec.ts";
 
-/** Limits of what is drawn; 0 means no limit. */
+/** Limits of what is drawn; but for `points`, 0 means no limit. */
 export interface Budget {
   triangles: number;
   textureBytes: number;
   objects: number;
-  /** Points of clouds: here 0 means none. */
+  /** Points of all clouds together. */
   points: number;
 }
 
@@ -21,7 +21,7 @@ export interface LevelChoice {
   textureBytes: number;
 }
 
-export const NO_LIMIT: Budget = { triangles: 0, textureBytes: 0, objects: 0, points: 0 };
+export const NO_LIMIT: Budget = { triangles: 0, textureBytes: 0, objects: 0, points: Number.POSITIVE_INFINITY };
 /** Where a Quest 3 begins to struggle; good for phones too. */
 export const HEADSET: Budget = { triangles: 750_000, textureBytes: 700 * 2 ** 20, objects: 200, points: 100_000 };
 /** A desktop with a graphics card. */

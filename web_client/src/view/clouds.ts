@@ -72,7 +72,6 @@ class Cloud {
     object.position.set(...origin).multiplyScalar(step_m);
     // Points of surfaces: of fewer, each has more of the area.
     object.material.uniforms.edge!.value = (voxel_m || POINT_M) * Math.sqrt(points.length / 4 / Math.max(count, 1));
-    object.visible = true;
     this.drawn = count;
   }
 

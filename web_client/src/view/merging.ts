@@ -4,8 +4,9 @@
 import { type BufferGeometry, type Group, Mesh, type ShaderMaterial } from "three";
 import { mergeGeometries } from "three/examples/jsm/utils/BufferGeometryUtils.js";
 
-/** Vertices from which on a mesh stays as it is: it may share its vertices with others, and they would be copied. */
+/** Vertices of a mesh, and of a merged one, at most: meshes share their vertices with others, and merging copies them. */
 const MAX_VERTICES = 20_000;
+const MAX_MERGED_VERTICES = 200_000;
 
 /**
  * Merge the opaque meshes of one body that share material and attributes. What is transparent stays apart, because it
@@ -19,13 +20,15 @@ export function mergeMeshes(body: Group): BufferGeometry[] {
     if (!(child instanceof Mesh) || child.userData.isPlane || child.children.length > 0) continue;
     const { geometry, material, castShadow } = child as Mesh<BufferGeometry, ShaderMaterial>;
     if (material.transparent || geometry.getAttribute("position").count > MAX_VERTICES) continue;
-    const key = [material.uuid, castShadow, ...Object.keys(geometry.attributes).sort()].join();
+    const attributes = Object.entries(geometry.attributes).map(([name, { array }]) => `${name} ${array.constructor.name}`);
+    const key = [material.uuid, castShadow, ...attributes.sort()].join();
     alike.set(key, [...(alike.get(key) ?? []), child as Mesh<BufferGeometry, ShaderMaterial>]);
   }
   const made: BufferGeometry[] = [];
   for (const meshes of alike.values()) {
     const [first] = meshes;
-    if (!first || meshes.length < 2) continue;
+    const vertices = meshes.reduce((sum, mesh) => sum + mesh.geometry.getAttribute("position").count, 0);
+    if (!first || meshes.length < 2 || vertices > MAX_MERGED_VERTICES) continue;
     const placed = meshes.map((mesh) => mesh.geometry.clone().applyMatrix4(mesh.matrix));
     const geometry = mergeGeometries(placed);
     const merged = new Mesh(geometry, first.material);

@@ -46,6 +46,13 @@ test("meshes that look the same become one, and nothing moves", () => {
   expect(shared.getAttribute("position").getX(0)).toBe(0.5); // the source is as it was
 });
 
+test("many meshes that share many vertices go on sharing them", () => {
+  const [body, material, shared] = [new Group(), new ShaderMaterial(), new SphereGeometry(1, 100, 100)];
+  for (let x = 0; x < 30; x++) addMesh(body, shared, material, x);
+  expect(mergeMeshes(body)).toHaveLength(0);
+  expect(body.children).toHaveLength(30);
+});
+
 test("planes, what casts a shadow and what does not, and large meshes stay apart", () => {
   const [body, material, box] = [new Group(), new ShaderMaterial(), new BoxGeometry()];
   const [plane, shaded] = [addMesh(body, box, material, 0), addMesh(body, box, material, 1)];
