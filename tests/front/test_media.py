@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -170,6 +172,40 @@ def test_unknown_topics_are_counted(media: Stage) -> None:
     good = media.viewer(ann)
     media.until(lambda: good.take() >= 20, "media")
     assert (bad.take(), other.take()) == (0, 0)
+
+
+def test_a_message_that_is_no_subscription_takes_no_ones_frames(media: Stage) -> None:
+    """libzmq would give the subscriptions that wait behind it to the connections of the next ones."""
+    session = media.session
+    ann = media.joined(session.client())
+    viewer = media.viewer(ann)
+    bad, other = (session.context.socket(zmq.XSUB) for _ in range(2))
+    for one in (bad, other):
+        one.linger = 0
+        one.connect(f"tcp://{session.host}:{session.ports.media}")
+        one.send(b"\1" + make_topic(ann.epoch, "cloud"))
+    media.until(lambda: viewer.take() >= 1 and bad.poll(0) and other.poll(0), "all are subscribed")
+    os.kill(session.process.pid, signal.SIGSTOP)  # so that all three wait together
+    try:
+        bad.send(b"no subscription")
+        viewer.socket.subscribe(make_topic(ann.epoch, "second"))
+        other.send(b"\1" + make_topic(ann.epoch, "third"))
+    finally:
+        os.kill(session.process.pid, signal.SIGCONT)
+    media.drops("media_flood")
+
+    def has_second() -> bool:
+        session.process.publish_media("second", b"second", session.process.link.now_ns, 1, "bytes")
+        viewer.take()
+        return any(header.stream == "second" for _, header, _ in viewer.got)
+
+    media.until(has_second, "the viewer gets what it subscribed to")
+    topics = set()
+    while other.poll(0):
+        topics.add(other.recv_multipart()[0])
+    assert make_topic(ann.epoch, "second") + b"full" not in topics
+    bad.close()
+    other.close()
 
 
 @pytest.mark.parametrize("port", ["media", "media_ingest"])

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import zmq
 
-from iris_session.front.channel_guard import ChannelFlood, ChannelGuard
+from iris_session.front.channel_guard import MAX_COUNTED_MESSAGES, ChannelFlood, ChannelGuard
 from iris_session.front.media.scheduler import MediaScheduler
 from iris_session.front.memory_guard import PendingConnection
 from iris_session.protocol.codec import decode_media_push
@@ -38,6 +38,7 @@ FAULT_S: Final = 0.25
 #: A subscription to a topic that does not exist counts as so many: libzmq keeps it as long as the connection lives.
 UNKNOWN_TOPIC_WEIGHT: Final = 64
 _SUBSCRIBE: Final = 1
+_SUBSCRIPTIONS: Final = (b"\0", b"\1")
 
 
 class MediaProxy:
@@ -79,6 +80,7 @@ class MediaProxy:
         self._now_ns = now_ns
         self._encrypted = encrypted
         self._stopping = False
+        self._order_lost = False
         self._reported_fault = ""
         self._thread = threading.Thread(target=self._run, name="iris-media", daemon=True)
         self.lock = threading.Lock()
@@ -178,30 +180,50 @@ class MediaProxy:
     # --- subscriptions -----------------------------------------------------------------------------------------------
 
     def _receive_subscriptions(self) -> None:
+        """Apply subscriptions.
+
+        libzmq applies one to the connection that it believes the last message came from. A message that is none, which
+        no client sends, shifts that by one connection until its queue is empty (4.3.5, `xpub_t::xrecv`): subscribers
+        would get the frames of others. So what follows such a message is not applied; its senders are disconnected, and
+        subscribe again when they reconnect.
+        """
         for _ in range(ROUND):
             try:
                 frame = self._out.recv(zmq.DONTWAIT, copy=False)
             except zmq.Again:
+                self._order_lost = False
                 return
             data = frame.bytes
-            topic = parse_topic(data[1:]) if data[:1] in (b"\0", b"\1") else None
+            is_subscription = data[:1] in _SUBSCRIPTIONS
+            self._order_lost |= not is_subscription
             descriptor = _read_descriptor(frame)
             if descriptor < 0:
                 continue  # libzmq unsubscribes a connection that has ended: its monitor reported that
             self._read_connection_events()
+            if not is_subscription:
+                weight = MAX_COUNTED_MESSAGES + 1
+            else:
+                weight = 1 if parse_topic(data[1:]) is not None else UNKNOWN_TOPIC_WEIGHT
             user = self._read_user_id(frame)
-            weight = 1 if topic is not None else UNKNOWN_TOPIC_WEIGHT
             cut = self._subscriber_guard.record_message(descriptor, user, (len(data),), counts=weight)
+            if is_subscription and self._order_lost and not cut:
+                cut = self._subscriber_guard.evict(descriptor, "media_order_lost")
             with self.lock:
-                if cut:
-                    self.scheduler.count_drop(cut)
-                elif topic is None:
-                    self.scheduler.count_drop("media_topic_unknown")
-                elif data[0] != _SUBSCRIBE:
-                    self.scheduler.unsubscribe(*topic, descriptor)
-                    self._out.setsockopt(zmq.UNSUBSCRIBE, data[1:])
-                elif self.scheduler.subscribe(*topic, user, descriptor, self._now_ns()):
-                    self._out.setsockopt(zmq.SUBSCRIBE, data[1:])
+                if cut or self._order_lost:
+                    self._count_reasons((cut,))
+                else:
+                    self._apply_subscription(data, user, descriptor)
+
+    def _apply_subscription(self, data: bytes, user: str, descriptor: int) -> None:
+        """Apply the last message that was received, a subscription or its end. The lock is held."""
+        topic = parse_topic(data[1:])
+        if topic is None:
+            self.scheduler.count_drop("media_topic_unknown")
+        elif data[0] != _SUBSCRIBE:
+            self.scheduler.unsubscribe(*topic, descriptor)
+            self._out.setsockopt(zmq.UNSUBSCRIBE, data[1:])
+        elif self.scheduler.subscribe(*topic, user, descriptor, self._now_ns()):
+            self._out.setsockopt(zmq.SUBSCRIBE, data[1:])
 
     def _read_user_id(self, frame: zmq.Frame) -> str:
         return str(frame.get("User-Id")) if self._encrypted else ""
