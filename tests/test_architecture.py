@@ -56,7 +56,7 @@ FORBIDDEN = {
     "streams": SOCKETS | CLOCKS | THREADS | RANDOM | {"mujoco", "rerun"},
     "scene": SOCKETS | RANDOM | {"rerun"},
     "assets": SOCKETS | {"mujoco", "rerun", "scipy", "cv2", "mink", "open3d"},
-    "cloud": SOCKETS | CLOCKS | RANDOM | {"mujoco", "rerun"},
+    "cloud": SOCKETS | RANDOM,
     "security": (SOCKETS - {"zmq"}) | RANDOM | HEAVY,
     "system": SOCKETS | RANDOM | HEAVY,
     "link": {"mujoco", "rerun"},
@@ -76,6 +76,8 @@ TRANSITIONAL: set[tuple[str, str]] = set()
 PURE = ("anchors", "protocol", "authority", "control", "streams")
 #: The feed and the process of the recorder use sockets; the rest of `recording` reads and writes files.
 RECORDING_SOCKETS = {"feed.py", "process.py"}
+#: Packages that only the sources of depth frames import. Clocks are for them and the process, the client for the latter.
+CLOUD_SOURCES = {"mujoco", "rerun", "mcap", "pyrealsense2", "pyorbbecsdk"}
 
 
 @cache
@@ -159,6 +161,11 @@ def test_rooms_import_what_the_table_allows() -> None:
         offenders += [f"{name}: {room} never imports {other}" for other in sorted(outside & FORBIDDEN.get(room, set()))]
         if room == "scene" and not path.name.startswith("mujoco_") and "mujoco" in outside:
             offenders.append(f"{name}: in scene only modules named mujoco_* import mujoco")
+        if room == "cloud" and "sources" not in name.parts:
+            shell = path.name == "process.py"
+            wrong = outside & (CLOUD_SOURCES if shell else CLOUD_SOURCES | CLOCKS)
+            wrong |= set() if shell else rooms_imported(path) & {"client"}
+            offenders += [f"{name}: in cloud only its sources and process import {one}" for one in sorted(wrong)]
         if room == "recording" and path.name not in RECORDING_SOCKETS and "zmq" in outside:
             offenders.append(f"{name}: in recording only {sorted(RECORDING_SOCKETS)} import zmq")
     assert not offenders, "\n".join(offenders)
