@@ -76,7 +76,7 @@ TRANSITIONAL: set[tuple[str, str]] = set()
 PURE = ("anchors", "protocol", "authority", "control", "streams")
 #: The feed and the process of the recorder use sockets; the rest of `recording` reads and writes files.
 RECORDING_SOCKETS = {"feed.py", "process.py"}
-#: Packages that only the sources of depth frames import. Clocks are for them and the process, the client for the latter.
+#: Packages that only the sources of depth frames import. Clocks: they and the process; the client: the process.
 CLOUD_SOURCES = {"mujoco", "rerun", "mcap", "pyrealsense2", "pyorbbecsdk"}
 
 
