@@ -535,9 +535,11 @@ def calibration_to_toml(result: dict[str, Any]) -> str:
             lines += ["", f"[{key}]", *_format_toml_pose(value)]
     for kind in ("cameras", "sheets"):
         for name, part in result.get(kind, {}).items():
+            quoted = name.replace("\\", "\\\\").replace('"', '\\"')
+            stated = [f"{key} = {part[key]!r}" for key in ("error_mm_p95", "sigma_deg") if key in part]
+            lines += ["", f'[{kind}."{quoted}"]', *stated] if stated else []
             for key, value in part.items():
                 if key.startswith("T_"):
-                    quoted = name.replace("\\", "\\\\").replace('"', '\\"')
                     lines += ["", f'[{kind}."{quoted}".{key}]', *_format_toml_pose(value)]
     return "\n".join([*lines, ""])
 

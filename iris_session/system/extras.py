@@ -25,6 +25,11 @@ EXTRAS: Final[Mapping[str, str]] = {
     "PIL": "files",
     "lxml": "files",
     "numba": "cloud",
+    "mcap": "mcap",
+    "mcap_ros2": "mcap",
+    "mcap_protobuf": "mcap",
+    "pyrealsense2": "realsense",
+    "pyorbbecsdk": "orbbec",
     "aiohttp": "web",
     "cryptography": "web",
 }

@@ -1,0 +1,86 @@
+"""A folder of pictures: `NAME.depth.png`, `NAME.color.jpg` or `.png`, and if known `NAME.pose.txt`.
+
+The pose is that of the camera's optical frame, 4 x 4 numbers. The names are those of the 7-Scenes data set.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from iris_session.cloud.camera_file import CameraSettings
+from iris_session.cloud.frames import DepthFrame, SourceError
+from iris_session.cloud.sources.playback import (
+    DEFAULT_HZ,
+    SECOND,
+    Playback,
+    decode_picture,
+    fit_color,
+    to_depth,
+    to_rgb,
+)
+from iris_session.system.extras import require_package
+
+
+class FolderSource:
+    """Plays the pictures of a folder, in the order of their names.
+
+    `pose` of the camera is the pose of the frame in which the poses of the files are, where there are such files.
+    """
+
+    def __init__(self, settings: CameraSettings, now_ns: Callable[[], int]) -> None:
+        require_package("cv2", "a folder of pictures")
+        if settings.intrinsics is None:
+            raise SourceError("intrinsics are missing: pictures in a folder do not tell them")
+        self.camera = settings.intrinsics
+        self.depth_scale_m = settings.depth_scale_m or 0.001
+        self._folder = Path(settings.path)
+        self._names = sorted(path.name.removesuffix(".depth.png") for path in self._folder.glob("*.depth.png"))
+        if not self._names:
+            raise SourceError(f"{self._folder} has no pictures named NAME.depth.png with NAME.color.jpg or .png")
+        self._has_poses = any(self._folder.glob("*.pose.txt"))
+        self._T_world_poses = settings.pose.to_matrix() if settings.pose else np.eye(4)
+        self._interval_ns = SECOND / (settings.hz or DEFAULT_HZ)
+        self._playback = Playback(self._list_frames, now_ns, name=str(self._folder), loop=settings.loop)
+
+    def read(self, timeout_s: float) -> DepthFrame | None:
+        """Return the next frame; see `DepthSource`."""
+        found = self._playback.next(timeout_s)
+        if found is None:
+            return None
+        name, capture_ns = found
+        file = self._folder / f"{name}.depth.png"
+        depth = to_depth(decode_picture(_read(file), str(file)), self.depth_scale_m, str(file))
+        color_file = self._folder / f"{name}.color.jpg"
+        if not color_file.exists():
+            color_file = color_file.with_suffix(".png")
+        color = to_rgb(decode_picture(_read(color_file), str(color_file)), str(color_file))
+        pose = self._T_world_poses @ self._read_pose(name) if self._has_poses else None
+        return DepthFrame(depth, fit_color(color, depth, str(file)), capture_ns, pose)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def _list_frames(self) -> Iterator[tuple[int, str]]:
+        for number, name in enumerate(self._names):
+            yield round(number * self._interval_ns), name
+
+    def _read_pose(self, name: str) -> npt.NDArray[np.float64]:
+        file = self._folder / f"{name}.pose.txt"
+        try:
+            pose = np.array([float(word) for word in _read(file).split()])
+        except ValueError as error:
+            raise SourceError(f"{file}: {error}; a pose is 4 x 4 numbers") from error
+        if pose.size != 16:
+            raise SourceError(f"{file} has {pose.size} numbers: a pose is 4 x 4")
+        return pose.reshape(4, 4)
+
+
+def _read(file: Path) -> bytes:
+    try:
+        return file.read_bytes()
+    except OSError as error:
+        raise SourceError(f"{file} cannot be read: {error.strerror}") from error

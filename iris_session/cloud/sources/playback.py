@@ -1,0 +1,245 @@
+"""Parts that sources share: playing a recording by the session's clock, pairing depth with colour, pictures,
+choosing among devices.
+
+A played recording is like a camera: a frame that was not read before the next one is due is skipped.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, Final, Generic, Literal, NamedTuple, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from iris_session.cloud.frames import SourceEndedError, SourceError
+
+T = TypeVar("T")
+SECOND: Final = 10**9
+#: Rate of what has no times of its own [Hz].
+DEFAULT_HZ: Final = 30.0
+#: Depth and colour of one frame are captured within this time.
+PAIR_NS: Final = 50_000_000
+#: A reader that is late by more than this did not read: the recording continues where it was.
+PAUSE_NS: Final = SECOND
+
+
+class Message(NamedTuple, Generic[T]):
+    """A picture of a recording, not decoded: its time in the recording, and of which kind it is."""
+
+    t_ns: int
+    kind: Literal["depth", "color"]
+    content: T
+
+
+class Playback(Generic[T]):
+    """Play frames at the rate of their times.
+
+    Args:
+        open_frames: Begins anew: frames with their times in the recording [ns], in order of these.
+        now_ns: Session time.
+        name: Of the recording, for errors.
+        loop: Begin anew at the end.
+        sleep: Waits [s].
+
+    Attributes:
+        skipped: Frames that were not read in time.
+
+    Raises:
+        SourceError: There are no frames.
+    """
+
+    def __init__(
+        self,
+        open_frames: Callable[[], Iterator[tuple[int, T]]],
+        now_ns: Callable[[], int],
+        *,
+        name: str,
+        loop: bool,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._open_frames, self._now_ns, self._name, self._loop, self._sleep = open_frames, now_ns, name, loop, sleep
+        self.skipped = 0
+        self._offset_ns: int | None = None  # session time minus time in the recording
+        self._interval_ns = round(SECOND / DEFAULT_HZ)
+        self._frames = open_frames()
+        self._next = next(self._frames, None)
+        if self._next is None:
+            raise SourceError(f"{name} has no frames")
+
+    def next(self, timeout_s: float) -> tuple[T, int] | None:
+        """Return the newest frame that is due, and the session time at which it became due.
+
+        Args:
+            timeout_s: Longest wait [s].
+
+        Returns:
+            None: none is due in time.
+
+        Raises:
+            SourceEndedError: The recording is over.
+        """
+        if self._next is None:
+            raise SourceEndedError(f"{self._name} is over: loop = true plays it again")
+        now_ns = self._now_ns()
+        if self._offset_ns is None or now_ns - (self._next[0] + self._offset_ns) > PAUSE_NS:
+            self._offset_ns = now_ns - self._next[0]
+        wait_s = (self._next[0] + self._offset_ns - now_ns) / SECOND
+        if wait_s > 0.0:
+            self._sleep(min(wait_s, timeout_s))
+        if wait_s > timeout_s:
+            return None
+        frame, due_ns = self._take()
+        while self._next is not None and self._next[0] + self._offset_ns <= now_ns:
+            frame, due_ns = self._take()
+            self.skipped += 1
+        return frame, due_ns
+
+    def close(self) -> None:
+        """Close the file that is read. Nothing is due afterwards."""
+        self._frames, self._next, self._loop = iter(()), None, False
+
+    def _take(self) -> tuple[T, int]:
+        """Return the next frame and when it is due, and look at the one after it."""
+        assert self._next is not None
+        assert self._offset_ns is not None
+        t_ns, frame = self._next
+        due_ns = t_ns + self._offset_ns
+        self._next = next(self._frames, None)
+        if self._next is not None:
+            self._interval_ns = max(self._next[0] - t_ns, 0) or self._interval_ns
+        elif self._loop:
+            self._frames = self._open_frames()
+            self._next = next(self._frames, None)
+            if self._next is not None:
+                self._offset_ns = due_ns + self._interval_ns - self._next[0]
+        return frame, due_ns
+
+
+def resample(frames: Iterator[tuple[int, T]], hz: float) -> Iterator[tuple[int, T]]:
+    """Yield frames with the times of a given rate [Hz] in place of theirs; 0: with theirs."""
+    for number, (t_ns, frame) in enumerate(frames):
+        yield (round(number * SECOND / hz) if hz else t_ns), frame
+
+
+def pair_pictures(messages: Iterable[Message[T]]) -> Iterator[tuple[int, tuple[T, T]]]:
+    """Yield depth with colour of the same time, and the time of the depth.
+
+    Args:
+        messages: In order of their times.
+    """
+    found: dict[str, Message[T]] = {}
+    for message in messages:
+        found[message.kind] = message
+        if len(found) < 2:
+            continue
+        depth, color = found["depth"], found["color"]
+        if abs(depth.t_ns - color.t_ns) <= PAIR_NS:
+            found.clear()
+            yield depth.t_ns, (depth.content, color.content)
+        else:
+            del found["color" if message.kind == "depth" else "depth"]
+
+
+def choose_channel(kind: str, wanted: str, there: Iterable[str], name: str) -> str:
+    """Return the topic or entity of the depth or colour pictures.
+
+    Args:
+        kind: Key in the camera file, `depth` or `color`.
+        wanted: Its value, empty: the only one that is there.
+        there: Those of the recording.
+        name: Of the recording, for errors.
+
+    Raises:
+        SourceError: It is not there, or there are several to choose from.
+    """
+    names = sorted(set(there))
+    if not names:
+        raise SourceError(f"{name} has no {kind} pictures")
+    if wanted in names or (not wanted and len(names) == 1):
+        return wanted or names[0]
+    wrong = f"{kind} {wanted!r} is not in {name}" if wanted else f"{name} has several {kind} pictures"
+    raise SourceError(f"{wrong}: give {kind} as one of {', '.join(names)}")
+
+
+def decode_picture(data: Any, name: str) -> npt.NDArray[Any]:
+    """Return the pixels of a compressed picture as OpenCV reads them: one channel, or blue, green, red.
+
+    Raises:
+        SourceError: It is not a picture.
+    """
+    import cv2
+
+    picture: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if len(data) else None
+    if picture is None:
+        raise SourceError(f"{name} is not a readable picture ({len(data)} bytes)")
+    return np.asarray(picture)
+
+
+def to_rgb(picture: npt.NDArray[Any], name: str) -> npt.NDArray[np.uint8]:
+    """Return a picture with one, three or four channels, as OpenCV reads it, as red, green, blue.
+
+    Raises:
+        SourceError: Its values are not 8 bits.
+    """
+    if picture.dtype != np.uint8:
+        raise SourceError(f"{name} is {picture.shape} of {picture.dtype}: a colour picture has 8 bits a channel")
+    if picture.ndim == 2:
+        return np.repeat(picture[..., None], 3, axis=2)
+    return np.ascontiguousarray(picture[..., 2::-1])
+
+
+def to_depth(picture: npt.NDArray[Any], depth_scale_m: float, name: str) -> npt.NDArray[np.uint16]:
+    """Return depth in units of `depth_scale_m`, from such units or from floating-point metres.
+
+    Raises:
+        SourceError: It is neither.
+    """
+    if picture.ndim == 2 and picture.dtype == np.uint16:
+        return picture
+    if picture.ndim == 2 and picture.dtype.kind == "f":
+        units = np.rint(np.nan_to_num(picture, nan=0.0, posinf=0.0, neginf=0.0) / depth_scale_m)
+        return np.where((units > 0.0) & (units < 65_535.0), units, 0.0).astype(np.uint16)
+    raise SourceError(
+        f"{name} is {picture.shape} of {picture.dtype}: depth has one channel of uint16, or of float32 in metres"
+    )
+
+
+def fit_color(color: npt.NDArray[np.uint8], depth: npt.NDArray[np.uint16], name: str) -> npt.NDArray[np.uint8]:
+    """Return colour on the grid of the depth: it is registered, and may have another resolution of the same view.
+
+    Raises:
+        SourceError: The pictures have another ratio of width to height, so that they do not show the same view.
+    """
+    (h, w), (height, width) = color.shape[:2], depth.shape
+    if (h, w) == (height, width):
+        return color
+    if h * width != w * height:
+        raise SourceError(
+            f"{name}: colour is {w} x {h}, depth {width} x {height}: they do not show the same view, register colour "
+            "to depth"
+        )
+    rows = ((np.arange(height) + 0.5) * (h / height)).astype(np.intp)
+    columns = ((np.arange(width) + 0.5) * (w / width)).astype(np.intp)
+    return np.ascontiguousarray(color[rows[:, None], columns[None, :]])
+
+
+def choose_device(kind: str, wanted: str, there: Mapping[str, str]) -> str:
+    """Return the serial number of a device.
+
+    Args:
+        kind: Kind of the device, for errors.
+        wanted: Its serial number, empty: the only one.
+        there: Names of the devices that are there, by serial number.
+
+    Raises:
+        SourceError: It is not there, or there are several to choose from.
+    """
+    if wanted in there or (not wanted and len(there) == 1):
+        return wanted or next(iter(there))
+    devices = ", ".join(f"{serial} ({name})" for serial, name in sorted(there.items()))
+    if not there:
+        raise SourceError(f"no {kind} camera is connected: check cable, power, and the vendor's udev rules")
+    wrong = f"no {kind} camera has the serial number {wanted!r}" if wanted else f"{len(there)} {kind} cameras"
+    raise SourceError(f"{wrong}: give path as one of {devices}")
