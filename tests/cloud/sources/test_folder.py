@@ -1,0 +1,128 @@
+"""Pictures in a folder: the real frames make one room; what is missing or damaged is named."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from anchors.camera import CameraModel
+from iris_session.cloud.camera_file import CameraPose, CameraSettings
+from iris_session.cloud.frames import DepthFrame, SourceEndedError, SourceError
+from iris_session.cloud.sources import open_source
+from iris_session.cloud.voxels import DepthLimits, VoxelFilter, make_rays
+
+CAMERA = CameraModel(64, 48, 50.0, 50.0, 31.5, 23.5)
+
+
+def make_settings(folder: Path, camera: CameraModel = CAMERA, *, loop: bool = False) -> CameraSettings:
+    return CameraSettings(name="front", source="folder", path=str(folder), intrinsics=camera, hz=240.0, loop=loop)
+
+
+def write_frame(folder: Path, name: str, depth: int, color: tuple[int, int, int] = (10, 20, 30)) -> None:
+    """Write a frame of one depth and one colour (red, green, blue)."""
+    cv2.imwrite(str(folder / f"{name}.depth.png"), np.full((48, 64), depth, np.uint16))
+    cv2.imwrite(str(folder / f"{name}.color.png"), np.full((48, 64, 3), color[::-1], np.uint8))
+
+
+def read_all(settings: CameraSettings) -> list[DepthFrame]:
+    ticks = iter(range(0, 10**12, 4_166_667))  # each call is a frame later
+    source = open_source(settings, lambda: next(ticks))
+    frames = []
+    try:
+        while (frame := source.read(1.0)) is not None:
+            frames.append(frame)
+    except SourceEndedError:
+        pass
+    source.close()
+    return frames
+
+
+def test_frames_are_read_in_order_of_their_names(tmp_path: Path) -> None:
+    for k in (1, 0, 2):
+        write_frame(tmp_path, f"frame-{k:03d}", 1000 + k, (k, 50, 200))
+    frames = read_all(make_settings(tmp_path))
+    assert [int(frame.depth[0, 0]) for frame in frames] == [1000, 1001, 1002]
+    assert [frame.color[5, 5].tolist() for frame in frames] == [[k, 50, 200] for k in range(3)]
+    assert all(frame.T_world_camera is None for frame in frames)
+    assert np.diff([frame.capture_ns for frame in frames]).tolist() == [4_166_667, 4_166_666]
+
+
+def test_poses_are_in_the_frame_that_the_camera_file_places(tmp_path: Path) -> None:
+    write_frame(tmp_path, "a", 1000)
+    pose = np.eye(4)
+    pose[:3, 3] = (1.0, 2.0, 3.0)
+    np.savetxt(tmp_path / "a.pose.txt", pose)
+    placed = CameraPose((0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0))  # half a turn about z
+    settings = CameraSettings(name="a", source="folder", path=str(tmp_path), intrinsics=CAMERA, pose=placed, loop=False)
+    [frame] = read_all(settings)
+    assert frame.T_world_camera is not None
+    assert np.allclose(frame.T_world_camera[:3, 3], (-1.0, -2.0, 4.0))
+
+
+def spoil(folder: Path, how: str) -> None:
+    if how == "no frames":
+        for file in folder.iterdir():
+            file.unlink()
+    elif how == "no colour":
+        (folder / "b.color.png").unlink()
+    elif how == "damaged depth":
+        (folder / "b.depth.png").write_bytes((folder / "b.depth.png").read_bytes()[:50])
+    elif how == "depth of 8 bits":
+        cv2.imwrite(str(folder / "b.depth.png"), np.zeros((48, 64), np.uint8))
+    elif how == "another view":
+        cv2.imwrite(str(folder / "b.color.png"), np.zeros((36, 64, 3), np.uint8))
+    elif how == "no pose":
+        np.savetxt(folder / "a.pose.txt", np.eye(4))
+    elif how == "half a pose":
+        for name in "ab":
+            np.savetxt(folder / f"{name}.pose.txt", np.eye(4)[:2])
+    elif how == "pose of words":
+        for name in "ab":
+            (folder / f"{name}.pose.txt").write_text("here")
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        "no frames", "no colour", "damaged depth", "depth of 8 bits", "another view", "no pose", "half a pose",
+        "pose of words",
+    ],
+)  # fmt: skip
+def test_what_is_missing_or_damaged_is_named(tmp_path: Path, how: str) -> None:
+    for name in "ab":
+        write_frame(tmp_path, name, 1000)
+    spoil(tmp_path, how)
+    with pytest.raises(SourceError) as caught:
+        read_all(make_settings(tmp_path))
+    assert not isinstance(caught.value, SourceEndedError)
+    assert str(tmp_path) in str(caught.value)
+
+
+def test_the_real_frames_make_one_room() -> None:
+    """All frames of a moving camera: surfaces of each view lie on those of the earlier ones."""
+    folder = Path(os.environ["IRIS_DATA"]) / "rgbd"
+    matrix = np.loadtxt(folder / "camera-intrinsics.txt")
+    camera = CameraModel(640, 480, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+    frames = read_all(make_settings(folder, camera))
+    assert len(frames) == 60
+    rays, limits = make_rays(camera), DepthLimits(farthest_m=3.5)
+    views: list[NDArray[np.float32]] = []
+    for frame in frames[::6]:
+        assert frame.T_world_camera is not None
+        assert frame.color.std() > 10.0
+        one = VoxelFilter(0.02)
+        one.add_depth(frame.depth, frame.color, rays, frame.T_world_camera, limits=limits)
+        views.append(one.collect(min_points=2, min_around=4).positions)
+    overlaps = 0
+    for first, second in zip(views[:-1], views[1:], strict=True):
+        distance, _ = cKDTree(first).query(second)
+        overlapping = distance[distance < 0.05]
+        overlaps += len(overlapping) > 0.5 * len(distance)
+        assert overlapping.mean() < 0.015
+    assert overlaps >= 7

@@ -1,0 +1,198 @@
+"""Recordings are played at their rate, depth is paired with colour, pictures become arrays of one kind."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+import pytest
+
+from iris_session.cloud.camera_file import CameraSettings
+from iris_session.cloud.frames import SourceEndedError, SourceError
+from iris_session.cloud.sources import open_source
+from iris_session.cloud.sources.playback import (
+    Message,
+    Playback,
+    choose_channel,
+    choose_device,
+    decode_picture,
+    fit_color,
+    pair_pictures,
+    resample,
+    to_depth,
+    to_rgb,
+)
+
+MS = 1_000_000
+
+
+class Clock:
+    """Time that passes when it is slept."""
+
+    def __init__(self) -> None:
+        self.t_ns = 5_000 * MS
+
+    def now_ns(self) -> int:
+        return self.t_ns
+
+    def sleep(self, seconds: float) -> None:
+        self.t_ns += round(1e9 * seconds)
+
+
+def play(clock: Clock, times_ms: list[int], *, loop: bool = False) -> Playback[int]:
+    """Return a playback whose frames are their numbers."""
+
+    def open_frames() -> Iterator[tuple[int, int]]:
+        return iter([(100 * MS + t * MS, k) for k, t in enumerate(times_ms)])
+
+    return Playback(open_frames, clock.now_ns, name="test", loop=loop, sleep=clock.sleep)
+
+
+def test_frames_come_at_their_times_and_again_after_the_end() -> None:
+    clock = Clock()
+    playback = play(clock, [0, 30, 60], loop=True)
+    seen = [playback.next(1.0) for _ in range(5)]
+    assert seen == [(0, 5_000 * MS), (1, 5_030 * MS), (2, 5_060 * MS), (0, 5_090 * MS), (1, 5_120 * MS)]
+    assert clock.t_ns == 5_120 * MS
+    assert playback.skipped == 0
+
+
+def test_a_recording_that_does_not_loop_ends() -> None:
+    clock = Clock()
+    playback = play(clock, [0, 30])
+    assert [playback.next(1.0) for _ in range(2)] == [(0, 5_000 * MS), (1, 5_030 * MS)]
+    with pytest.raises(SourceEndedError):
+        playback.next(1.0)
+
+
+def test_no_frame_within_the_timeout() -> None:
+    clock = Clock()
+    playback = play(clock, [0, 30])
+    playback.next(1.0)
+    assert playback.next(0.01) is None
+    assert clock.t_ns == 5_010 * MS
+    assert playback.next(0.05) == (1, 5_030 * MS)
+
+
+def test_a_late_reader_gets_the_newest_frame() -> None:
+    clock = Clock()
+    playback = play(clock, [0, 30, 60, 90, 120])
+    playback.next(1.0)
+    clock.sleep(0.1)
+    assert playback.next(1.0) == (3, 5_090 * MS)
+    assert playback.skipped == 2
+    clock.sleep(5.0)  # it did not read at all: the recording waited
+    assert playback.next(1.0) == (4, 10_100 * MS)
+
+
+def test_a_recording_of_one_picture_is_played_at_the_default_rate() -> None:
+    clock = Clock()
+    playback = play(clock, [0], loop=True)
+    assert [playback.next(1.0) for _ in range(2)] == [(0, 5_000 * MS), (0, 5_000 * MS + 33_333_333)]
+
+
+def test_an_empty_recording_is_refused() -> None:
+    with pytest.raises(SourceError):
+        play(Clock(), [])
+
+
+def test_closed_playback_is_over() -> None:
+    playback = play(Clock(), [0, 30], loop=True)
+    playback.close()
+    with pytest.raises(SourceEndedError):
+        playback.next(1.0)
+
+
+def test_depth_is_paired_with_colour_of_its_time() -> None:
+    messages = [
+        Message(0, "color", "c0"),
+        Message(10 * MS, "depth", "d0"),
+        Message(33 * MS, "color", "c1"),
+        Message(40 * MS, "color", "c2"),
+        Message(43 * MS, "depth", "d1"),
+        Message(100 * MS, "depth", "d2"),
+        Message(160 * MS, "color", "c3"),
+        Message(170 * MS, "depth", "d3"),
+    ]
+    pairs = list(pair_pictures(messages))
+    assert pairs == [(10 * MS, ("d0", "c0")), (43 * MS, ("d1", "c2")), (170 * MS, ("d3", "c3"))]
+    assert [t for t, _ in resample(iter(pairs), 10.0)] == [0, 100 * MS, 200 * MS]
+
+
+def test_a_channel_is_the_only_one_or_the_wanted_one() -> None:
+    assert choose_channel("depth", "", ["/a"], "file") == "/a"
+    assert choose_channel("depth", "/b", ["/a", "/b"], "file") == "/b"
+    for wanted, there in (("", ["/a", "/b"]), ("/c", ["/a"]), ("", [])):
+        with pytest.raises(SourceError) as caught:
+            choose_channel("depth", wanted, there, "file")
+        assert all(one in str(caught.value) for one in there)
+
+
+def test_a_device_is_the_only_one_or_the_wanted_one() -> None:
+    assert choose_device("Test", "", {"1": "D435"}) == "1"
+    assert choose_device("Test", "2", {"1": "D435", "2": "D455"}) == "2"
+    for wanted, there in (("", {"1": "D435", "2": "D455"}), ("3", {"1": "D435"}), ("", {})):
+        with pytest.raises(SourceError) as caught:
+            choose_device("Test", wanted, there)
+        assert all(serial in str(caught.value) and name in str(caught.value) for serial, name in there.items())
+
+
+def test_depth_in_metres_becomes_units() -> None:
+    metres = np.array([[1.0, 0.2501, np.nan], [np.inf, -1.0, 70.0]], np.float32)
+    assert to_depth(metres, 0.001, "x").tolist() == [[1000, 250, 0], [0, 0, 0]]
+    units = np.array([[1, 65_535]], np.uint16)
+    assert to_depth(units, 0.001, "x") is units
+    for wrong in (np.zeros((2, 2), np.uint8), np.zeros((2, 2, 3), np.uint16)):
+        with pytest.raises(SourceError):
+            to_depth(wrong, 0.001, "x")
+
+
+def test_colour_becomes_red_green_blue() -> None:
+    bgr = np.array([[[1, 2, 3]]], np.uint8)
+    assert to_rgb(bgr, "x").tolist() == [[[3, 2, 1]]]
+    assert to_rgb(np.array([[[1, 2, 3, 4]]], np.uint8), "x").tolist() == [[[3, 2, 1]]]
+    assert to_rgb(np.array([[7]], np.uint8), "x").tolist() == [[[7, 7, 7]]]
+    with pytest.raises(SourceError):
+        to_rgb(np.zeros((2, 2, 3), np.uint16), "x")
+
+
+@pytest.mark.parametrize("scale", [2, 3, 0.5])
+def test_colour_of_another_resolution_is_put_on_the_grid_of_the_depth(scale: float) -> None:
+    depth = np.zeros((12, 16), np.uint16)
+    height, width = round(12 * scale), round(16 * scale)
+    color = np.zeros((height, width, 3), np.uint8)
+    color[..., 0] = np.arange(width)  # its column
+    color[..., 1] = np.arange(height)[:, None]
+    fitted = fit_color(color, depth, "x")
+    assert fitted.shape == (12, 16, 3)
+    # Pixel centres of both grids: within half a pixel of the colour.
+    assert np.abs(fitted[0, :, 0] + 0.5 - (np.arange(16) + 0.5) * scale).max() <= 0.5
+    assert np.abs(fitted[:, 0, 1] + 0.5 - (np.arange(12) + 0.5) * scale).max() <= 0.5
+
+
+def test_colour_of_another_view_is_refused_with_both_sizes() -> None:
+    with pytest.raises(SourceError) as caught:
+        fit_color(np.zeros((9, 16, 3), np.uint8), np.zeros((12, 16), np.uint16), "x")
+    assert "16 x 9" in str(caught.value)
+    assert "16 x 12" in str(caught.value)
+
+
+def test_what_is_no_picture_is_refused() -> None:
+    for data in (b"", b"not a picture", cv2.imencode(".png", np.zeros((4, 4), np.uint16))[1].tobytes()[:20]):
+        with pytest.raises(SourceError):
+            decode_picture(data, "x")
+
+
+@pytest.mark.parametrize(
+    ("source", "package", "extra"),
+    [("realsense", "pyrealsense2", "realsense"), ("orbbec", "pyorbbecsdk", "orbbec"), ("mcap", "mcap", "mcap")],
+)
+def test_a_missing_package_is_named_with_its_extra(
+    source: str, package: str, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == package else object())
+    with pytest.raises(SourceError) as caught:
+        open_source(CameraSettings(name="front", source=source, path="x"), lambda: 0)  # type: ignore[arg-type]
+    assert "'front'" in str(caught.value)
+    assert f"iris-session[{extra}]" in str(caught.value)
