@@ -14,7 +14,9 @@ from iris_session.cloud.camera_file import CameraFileError, CameraPose, CloudSet
 
 POSE = "{ position_m = [0.0, 0.5, 1.0], quaternion_wxyz = [0.0, 1.0, 0.0, 0.0] }"
 INTRINSICS = "{ width = 640, height = 480, fx = 585.0, fy = 585.0, cx = 320.0, cy = 240.0 }"
-CAMERA = f'[[cameras]]\nname = "front"\nsource = "folder"\npath = "pictures"\nintrinsics = {INTRINSICS}\npose = {POSE}\n'
+CAMERA = (
+    f'[[cameras]]\nname = "front"\nsource = "folder"\npath = "pictures"\nintrinsics = {INTRINSICS}\npose = {POSE}\n'
+)
 
 
 def write(folder: Path, text: str) -> Path:

@@ -109,7 +109,7 @@ class McapSource:
         factories = (Ros2Decoders(), ProtobufDecoders())
         try:
             with open(self._path, "rb") as file:
-                for schema, channel, message in make_reader(file).iter_messages(topics):
+                for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages(topics):
                     if schema is None or schema.name not in wanted:
                         continue
                     if channel.id not in decoders:
@@ -122,11 +122,12 @@ class McapSource:
         except OSError as error:
             raise SourceError(f"{self._path} cannot be read: {error.strerror}") from error
         except Exception as error:  # of four packages, each with errors of its own
-            raise SourceError(f"{self._path} is damaged, or no MCAP file: {' '.join(str(error).split())}") from error
+            said = " ".join(str(error).split()) or type(error).__name__
+            raise SourceError(f"{self._path} cannot be read ({said}): `mcap recover` repairs a damaged file") from error
 
     def _choose_camera(self, cameras: list[tuple[str, CameraModel]]) -> CameraModel:
         """Return the intrinsics of the depth's size, of the topic that begins most like the depth's."""
-        cameras.sort(key=lambda one: -len(os.path.commonprefix([one[0], self._depth])))
+        cameras.sort(key=lambda one: -len(os.path.commonpath([one[0].strip("/"), self._depth.strip("/")])))
         for _, (depth, _) in self._list_frames():
             height, width = self._decode_depth(depth).shape
             found = next((one for _, one in cameras if (one.width, one.height) == (width, height)), None)

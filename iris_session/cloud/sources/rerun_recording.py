@@ -32,9 +32,11 @@ from iris_session.system.extras import require_package
 #: Archetypes of each kind of picture.
 _KINDS: Final = {"depth": ("DepthImage", "EncodedDepthImage"), "color": ("Image", "EncodedImage")}
 #: Rerun's `ChannelDatatype`.
-_TYPES: Final = {6: np.uint8, 8: np.uint16, 12: np.float16, 13: np.float32, 14: np.float64}
+_TYPES: Final = {6: np.uint8, 8: np.uint16, 33: np.float16, 34: np.float32, 35: np.float64}
 #: Rerun's `ColorModel`: its channels as OpenCV orders them.
-_CHANNELS: Final = {1: [0], 2: [2, 1, 0], 3: [2, 1, 0, 3], 4: [0, 1, 2], 5: [0, 1, 2, 3]}
+_CHANNELS: Final = {1: [0], 2: [2, 1, 0], 3: [2, 1, 0], 4: [0, 1, 2], 5: [0, 1, 2]}
+#: Number of channels of those.
+_N_CHANNELS: Final = {1: 1, 2: 3, 3: 4, 4: 3, 5: 4}
 
 
 class RerunSource:
@@ -49,7 +51,7 @@ class RerunSource:
         self._path, self._hz = settings.path, settings.hz
         kinds: dict[str, set[str]] = {"depth": set(), "color": set()}
         pinholes: dict[str, Any] = {}
-        meter = 0.0
+        self._meter = 0.0  # units of depth in a metre
         for chunk in self._read_chunks():
             batch = chunk.to_record_batch()
             for kind, archetypes in _KINDS.items():
@@ -57,10 +59,12 @@ class RerunSource:
                     kinds[kind].add(chunk.entity_path)
             if "Pinhole:image_from_camera" in batch.schema.names:
                 pinholes.setdefault(chunk.entity_path, batch)
-            meter = meter or _read_value(batch, ("DepthImage:meter", "EncodedDepthImage:meter"), 0) or 0.0
+            names = ("DepthImage:meter", "EncodedDepthImage:meter")
+            self._meter = self._meter or _read_value(batch, names, 0) or 0.0
         self._depth = choose_channel("depth", settings.depth, kinds["depth"], self._path)
         self._color = choose_channel("color", settings.color, kinds["color"], self._path)
-        self.depth_scale_m = settings.depth_scale_m or (1.0 / meter if meter else 0.001)
+        # Depth in whole metres is depth in numbers with a point.
+        self.depth_scale_m = settings.depth_scale_m or (1.0 / self._meter if self._meter > 1.0 else 0.001)
         self.camera = settings.intrinsics or self._find_camera(pinholes)
         self._playback = Playback(self._list_frames, now_ns, name=self._path, loop=settings.loop)
 
@@ -70,7 +74,10 @@ class RerunSource:
         if found is None:
             return None
         (depth, color), capture_ns = found
-        units = to_depth(_decode(depth, "depth", self._path), self.depth_scale_m, f"{self._path}: {self._depth}")
+        pixels = _decode(depth, "depth", self._path)
+        if pixels.dtype.kind == "f":
+            pixels = pixels / (self._meter or 1.0)
+        units = to_depth(pixels, self.depth_scale_m, f"{self._path}: {self._depth}")
         rgb = to_rgb(_decode(color, "color", self._path), f"{self._path}: {self._color}")
         return DepthFrame(units, fit_color(rgb, units, self._path), capture_ns)
 
@@ -144,9 +151,9 @@ def _decode(content: tuple[Any, str, int], kind: str, name: str) -> npt.NDArray[
     layout = _read_value(batch, (f"{archetype}:format",), row)
     if layout is None or layout["pixel_format"] is not None or layout["channel_datatype"] not in _TYPES:
         raise SourceError(f"{name}: {archetype} has format {layout}: raw pixels of 8, 16 or 32 bits are read")
-    channels = [0] if kind == "depth" else _CHANNELS.get(layout["color_model"] or 1, [0])
-    shape = (layout["height"], layout["width"], len(channels))
+    model = 1 if kind == "depth" else layout["color_model"] or 1
+    shape = (layout["height"], layout["width"], _N_CHANNELS[model])
     pixels = np.frombuffer(data, _TYPES[layout["channel_datatype"]])
     if pixels.size != np.prod(shape):
         raise SourceError(f"{name}: {archetype} has {data.size} bytes: its format is {shape} of {pixels.dtype}")
-    return pixels.reshape(shape)[..., channels] if len(channels) > 1 else pixels.reshape(shape[:2])
+    return pixels.reshape(shape)[..., _CHANNELS[model]] if shape[2] > 1 else pixels.reshape(shape[:2])

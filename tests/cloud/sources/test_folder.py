@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from pathlib import Path
 
@@ -105,7 +106,7 @@ def test_what_is_missing_or_damaged_is_named(tmp_path: Path, how: str) -> None:
 
 
 def test_the_real_frames_make_one_room() -> None:
-    """All frames of a moving camera: surfaces of each view lie on those of the earlier ones."""
+    """Views of a moving camera: surfaces of each lie on those of the view before."""
     folder = Path(os.environ["IRIS_DATA"]) / "rgbd"
     matrix = np.loadtxt(folder / "camera-intrinsics.txt")
     camera = CameraModel(640, 480, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
@@ -113,16 +114,14 @@ def test_the_real_frames_make_one_room() -> None:
     assert len(frames) == 60
     rays, limits = make_rays(camera), DepthLimits(farthest_m=3.5)
     views: list[NDArray[np.float32]] = []
-    for frame in frames[::6]:
+    for frame in frames[::4]:
         assert frame.T_world_camera is not None
         assert frame.color.std() > 10.0
-        one = VoxelFilter(0.02)
+        one = VoxelFilter(0.01)
         one.add_depth(frame.depth, frame.color, rays, frame.T_world_camera, limits=limits)
         views.append(one.collect(min_points=2, min_around=4).positions)
-    overlaps = 0
-    for first, second in zip(views[:-1], views[1:], strict=True):
-        distance, _ = cKDTree(first).query(second)
-        overlapping = distance[distance < 0.05]
-        overlaps += len(overlapping) > 0.5 * len(distance)
-        assert overlapping.mean() < 0.015
-    assert overlaps >= 7
+    distances = [cKDTree(first).query(second)[0] for first, second in itertools.pairwise(views)]
+    assert min((one < 0.05).mean() for one in distances) > 0.6
+    everything = np.concatenate(distances)
+    assert (everything < 0.05).mean() > 0.8
+    assert everything[everything < 0.05].mean() < 0.015

@@ -35,6 +35,7 @@ MODEL = """
   </worldbody>
 </mujoco>
 """
+SENSOR = 'sensorsize="0.01 0.01" focal="0.01 0.01" resolution="64 48"'
 
 
 def make_settings(folder: Path, text: str = MODEL, **values: object) -> CameraSettings:
@@ -157,9 +158,9 @@ def test_frames_come_at_the_rate(tmp_path: Path) -> None:
         (MODEL, "rear", "front"),
         ("<mujoco><worldbody/></mujoco>", "front", "no camera"),
         ("<mujoco>", "front", "model.xml"),
-        (MODEL.replace('fovy="55"', 'sensorsize="0.01 0.01" focal="0.01 0.01" resolution="64 48"'), "front", "sensorsize"),
+        (MODEL.replace('fovy="55"', SENSOR), "front", "sensorsize"),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_model_or_camera_is_named(tmp_path: Path, text: str, camera: str, named: str) -> None:
     with pytest.raises(SourceError) as caught:
         MujocoCamera(make_settings(tmp_path, text, camera=camera), lambda: 0)
