@@ -1,7 +1,8 @@
-"""From depth pictures to the points of a cloud: deprojection, crop, voxels, outliers. No sockets, no clocks.
+"""From depth cameras to the points of a cloud: deprojection, crop, voxels, outliers. No sockets, no clocks.
 
-`voxels` (the filter, and how it does without numba), `kernels` (its loops in numba). The encoding of the points is
-`iris_session.streams.cloud`.
+`voxels` (the filter, and how it does without numba), `kernels` (its loops in numba), `camera_file` (settings), `frames`
+(the interface of sources). Only `sources`, which reads cameras and recordings, has clocks and the packages that these
+need. The encoding of the points is `iris_session.streams.cloud`.
 """
 
 from __future__ import annotations

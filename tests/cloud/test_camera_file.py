@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 import numpy as np
 import pytest
 
 from iris_session.cli.anchors import calibration_to_toml
-from iris_session.cloud.camera_file import CameraFileError, CameraPose, CloudSettings, find_line, load_camera_file
+from iris_session.cloud.camera_file import (
+    CameraFileError,
+    CameraPose,
+    CameraSettings,
+    CloudSettings,
+    SourceName,
+    find_line,
+    load_camera_file,
+)
 
 POSE = "{ position_m = [0.0, 0.5, 1.0], quaternion_wxyz = [0.0, 1.0, 0.0, 0.0] }"
 INTRINSICS = "{ width = 640, height = 480, fx = 585.0, fy = 585.0, cx = 320.0, cy = 240.0 }"
@@ -182,3 +191,23 @@ def test_lines_of_tables(tmp_path: Path) -> None:
     text: Any = '[[cameras]]\nname = "a"\n[cameras.pose]\nposition_m = []\n[[cameras]]\nname = "b"\n'
     assert [find_line(text, "pose", 0), find_line(text, "pose", 1), find_line(text, "name", 1)] == [3, 5, 6]
     assert find_line(text, "stream") == 0
+
+
+def test_the_page_has_every_key_and_its_files_load(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "clouds.md").read_text(encoding="utf-8")
+    missing = {
+        key
+        for kind in (CloudSettings, CameraSettings)
+        for key in kind.__struct_fields__
+        if key != "cameras" and not re.search(rf"^\| [^|]*`{key}`", page, re.MULTILINE)
+    }
+    assert not missing
+    pose = "[T_base_camera]\nposition_m = [0.0, 0.0, 1.0]\nquaternion_wxyz = [1.0, 0.0, 0.0, 0.0]\n"
+    (tmp_path / "calibration.toml").write_text(pose)
+    (tmp_path / "hand.toml").write_text(pose.replace("base", "ee"))
+    (tmp_path / "intrinsics.toml").write_text("width = 640\nheight = 480\nfx = 1.0\nfy = 1.0\ncx = 1.0\ncy = 1.0\n")
+    for name in ("rgbd", "session.rrd", "robot.mcap"):
+        (tmp_path / name).touch()
+    files = re.findall(r"```toml\n(stream.*?)```", page, re.DOTALL)
+    cameras = [one for text in files for one in load_camera_file(write(tmp_path, text)).cameras]
+    assert {one.source for one in cameras} == set(get_args(SourceName))

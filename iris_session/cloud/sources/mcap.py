@@ -20,8 +20,8 @@ from anchors.camera import CameraError, CameraModel
 from iris_session.cloud.camera_file import CameraSettings
 from iris_session.cloud.frames import DepthFrame, SourceError
 from iris_session.cloud.sources.playback import (
-    Message,
     Playback,
+    RecordedPicture,
     choose_channel,
     decode_picture,
     fit_color,
@@ -94,9 +94,9 @@ class McapSource:
     def _list_frames(self) -> Iterator[tuple[int, tuple[Any, Any]]]:
         return resample(pair_pictures(self._list_pictures()), self._hz)
 
-    def _list_pictures(self) -> Iterator[Message[Any]]:
+    def _list_pictures(self) -> Iterator[RecordedPicture[Any]]:
         for _, topic, t_ns, message in self._read_messages([self._depth, self._color]):
-            yield Message(t_ns, "depth" if topic == self._depth else "color", message)
+            yield RecordedPicture(t_ns, "depth" if topic == self._depth else "color", message)
 
     def _read_messages(self, topics: list[str] | None = None) -> Iterator[tuple[str, str, int, Any]]:
         """Yield schema, topic, time and message of pictures and intrinsics, in order of their times."""

@@ -25,7 +25,7 @@ PAIR_NS: Final = 50_000_000
 PAUSE_NS: Final = SECOND
 
 
-class Message(NamedTuple, Generic[T]):
+class RecordedPicture(NamedTuple, Generic[T]):
     """A picture of a recording, not decoded: its time in the recording, and of which kind it is."""
 
     t_ns: int
@@ -123,13 +123,13 @@ def resample(frames: Iterator[tuple[int, T]], hz: float) -> Iterator[tuple[int, 
         yield (round(number * SECOND / hz) if hz else t_ns), frame
 
 
-def pair_pictures(messages: Iterable[Message[T]]) -> Iterator[tuple[int, tuple[T, T]]]:
+def pair_pictures(messages: Iterable[RecordedPicture[T]]) -> Iterator[tuple[int, tuple[T, T]]]:
     """Yield depth with colour of the same time, and the time of the depth.
 
     Args:
         messages: In order of their times.
     """
-    found: dict[str, Message[T]] = {}
+    found: dict[str, RecordedPicture[T]] = {}
     for message in messages:
         found[message.kind] = message
         if len(found) < 2:

@@ -17,8 +17,8 @@ from anchors.camera import CameraError, CameraModel
 from iris_session.cloud.camera_file import CameraSettings
 from iris_session.cloud.frames import DepthFrame, SourceError
 from iris_session.cloud.sources.playback import (
-    Message,
     Playback,
+    RecordedPicture,
     choose_channel,
     decode_picture,
     fit_color,
@@ -101,7 +101,7 @@ class RerunSource:
         both = (self._list_pictures("depth", self._depth), self._list_pictures("color", self._color))
         return resample(pair_pictures(heapq.merge(*both, key=lambda one: one.t_ns)), self._hz)
 
-    def _list_pictures(self, kind: Any, entity: str) -> Iterator[Message[Any]]:
+    def _list_pictures(self, kind: Any, entity: str) -> Iterator[RecordedPicture[Any]]:
         """Yield the pictures of an entity, as a batch and its row."""
         names = [f"{one}:{part}" for one in _KINDS[kind] for part in ("buffer", "blob")]
         for chunk in self._read_chunks(entity):
@@ -112,7 +112,7 @@ class RerunSource:
                 continue
             times = batch.column(timelines[0]).cast("int64").to_numpy(zero_copy_only=False)
             for row in range(batch.num_rows):
-                yield Message(int(times[row]), kind, (batch, found, row))
+                yield RecordedPicture(int(times[row]), kind, (batch, found, row))
 
     def _find_camera(self, pinholes: dict[str, Any]) -> CameraModel:
         entity = self._depth

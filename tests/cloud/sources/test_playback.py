@@ -12,8 +12,8 @@ from iris_session.cloud.camera_file import CameraSettings
 from iris_session.cloud.frames import SourceEndedError, SourceError
 from iris_session.cloud.sources import open_source
 from iris_session.cloud.sources.playback import (
-    Message,
     Playback,
+    RecordedPicture,
     choose_channel,
     choose_device,
     decode_picture,
@@ -106,14 +106,14 @@ def test_closed_playback_is_over() -> None:
 
 def test_depth_is_paired_with_colour_of_its_time() -> None:
     messages = [
-        Message(0, "color", "c0"),
-        Message(10 * MS, "depth", "d0"),
-        Message(33 * MS, "color", "c1"),
-        Message(40 * MS, "color", "c2"),
-        Message(43 * MS, "depth", "d1"),
-        Message(100 * MS, "depth", "d2"),
-        Message(160 * MS, "color", "c3"),
-        Message(170 * MS, "depth", "d3"),
+        RecordedPicture(0, "color", "c0"),
+        RecordedPicture(10 * MS, "depth", "d0"),
+        RecordedPicture(33 * MS, "color", "c1"),
+        RecordedPicture(40 * MS, "color", "c2"),
+        RecordedPicture(43 * MS, "depth", "d1"),
+        RecordedPicture(100 * MS, "depth", "d2"),
+        RecordedPicture(160 * MS, "color", "c3"),
+        RecordedPicture(170 * MS, "depth", "d3"),
     ]
     pairs = list(pair_pictures(messages))
     assert pairs == [(10 * MS, ("d0", "c0")), (43 * MS, ("d1", "c2")), (170 * MS, ("d3", "c3"))]
