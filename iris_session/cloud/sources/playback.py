@@ -1,7 +1,7 @@
 """Parts that sources share: playing a recording by the session's clock, pairing depth with colour, pictures,
 choosing among devices.
 
-A played recording is like a camera: a frame that was not read before the next one is due is skipped.
+A recording waits for a reader that is late: it is played more slowly, and no frame is skipped.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ SECOND: Final = 10**9
 DEFAULT_HZ: Final = 30.0
 #: Depth and colour of one frame are captured within this time.
 PAIR_NS: Final = 50_000_000
-#: A reader that is late by more than this did not read: the recording continues where it was.
-PAUSE_NS: Final = SECOND
+#: Jitter of a reader: one that is late by more is waited for.
+LATE_NS: Final = 50_000_000
 
 
 class RecordedPicture(NamedTuple, Generic[T]):
@@ -43,9 +43,6 @@ class Playback(Generic[T]):
         loop: Begin anew at the end.
         sleep: Waits [s].
 
-    Attributes:
-        skipped: Frames that were not read in time.
-
     Raises:
         SourceError: There are no frames.
     """
@@ -60,7 +57,6 @@ class Playback(Generic[T]):
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self._open_frames, self._now_ns, self._name, self._loop, self._sleep = open_frames, now_ns, name, loop, sleep
-        self.skipped = 0
         self._offset_ns: int | None = None  # session time minus time in the recording
         self._interval_ns = round(SECOND / DEFAULT_HZ)
         self._frames = open_frames()
@@ -69,7 +65,7 @@ class Playback(Generic[T]):
             raise SourceError(f"{name} has no frames")
 
     def next(self, timeout_s: float) -> tuple[T, int] | None:
-        """Return the newest frame that is due, and the session time at which it became due.
+        """Return the next frame, and the session time at which it was due.
 
         Args:
             timeout_s: Longest wait [s].
@@ -83,18 +79,14 @@ class Playback(Generic[T]):
         if self._next is None:
             raise SourceEndedError(f"{self._name} is over: loop = true plays it again")
         now_ns = self._now_ns()
-        if self._offset_ns is None or now_ns - (self._next[0] + self._offset_ns) > PAUSE_NS:
+        if self._offset_ns is None or now_ns - (self._next[0] + self._offset_ns) > LATE_NS:
             self._offset_ns = now_ns - self._next[0]
         wait_s = (self._next[0] + self._offset_ns - now_ns) / SECOND
         if wait_s > 0.0:
             self._sleep(min(wait_s, timeout_s))
         if wait_s > timeout_s:
             return None
-        frame, due_ns = self._take()
-        while self._next is not None and self._next[0] + self._offset_ns <= now_ns:
-            frame, due_ns = self._take()
-            self.skipped += 1
-        return frame, due_ns
+        return self._take()
 
     def close(self) -> None:
         """Close the file that is read. Nothing is due afterwards."""
