@@ -62,7 +62,7 @@ class FolderSource:
         return DepthFrame(depth, fit_color(color, depth, str(file)), capture_ns, pose)
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: files are open only while they are read."""
 
     def _list_frames(self) -> Iterator[tuple[int, str]]:
         for number, name in enumerate(self._names):

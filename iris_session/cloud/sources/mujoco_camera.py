@@ -47,7 +47,10 @@ class MujocoCamera:
         # Read when mujoco and OpenGL are imported; commands set it to "disable".
         if os.environ.get("MUJOCO_GL") not in ("egl", "osmesa"):
             os.environ["MUJOCO_GL"] = "egl"
-        import mujoco
+        try:
+            import mujoco
+        except (ImportError, AttributeError) as error:  # the latter by PyOpenGL, where the library is missing
+            raise _describe_missing_gl(error) from error
 
         self._mujoco: Any = mujoco
         self._now_ns, self._body_poses = now_ns, body_poses
@@ -83,13 +86,10 @@ class MujocoCamera:
             else:
                 from mujoco.egl import GLContext
             self._gl = GLContext(*self._size)
-        except (ImportError, AttributeError, RuntimeError) as error:
-            raise SourceError(
-                f"no OpenGL without a display ({' '.join(str(error).split())}): install libegl1 and Mesa's driver, or "
-                "libosmesa6 and set MUJOCO_GL=osmesa"
-            ) from error
-        self._gl.make_current()
-        self._context: Any = mujoco.MjrContext(model, int(mujoco.mjtFontScale.mjFONTSCALE_50))
+            self._gl.make_current()
+            self._context: Any = mujoco.MjrContext(model, int(mujoco.mjtFontScale.mjFONTSCALE_50))
+        except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
+            raise _describe_missing_gl(error) from error
         self._context.readDepthMap = int(mujoco.mjtDepthMap.mjDEPTH_ZEROFAR)
         mujoco.mjr_setBuffer(int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN), self._context)
         self._scene = mujoco.MjvScene(model, _MAX_GEOMS)
@@ -177,6 +177,13 @@ class _Bodies:
             body, position = getattr(model, f"{kind}_bodyid"), getattr(model, f"{kind}_pos")
             getattr(data, f"{kind}_xmat")[:] = (turn[body] @ rotation).reshape(-1, 9)
             getattr(data, f"{kind}_xpos")[:] = place[body] + np.einsum("nij,nj->ni", turn[body], position)
+
+
+def _describe_missing_gl(error: Exception) -> SourceError:
+    said = " ".join(str(error).split())
+    return SourceError(
+        f"no OpenGL here ({said}): install libegl1 and Mesa's driver, or libosmesa6 with MUJOCO_GL=osmesa"
+    )
 
 
 def _to_rotations(quaternions: Floats) -> Floats:

@@ -166,3 +166,13 @@ def test_a_wrong_model_or_camera_is_named(tmp_path: Path, text: str, camera: str
         MujocoCamera(make_settings(tmp_path, text, camera=camera), lambda: 0)
     assert named in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_missing_driver_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise mujoco.FatalError("gladLoadGL error")
+
+    monkeypatch.setattr(mujoco, "MjrContext", fail)
+    with pytest.raises(SourceError) as caught:
+        MujocoCamera(make_settings(tmp_path), lambda: 0)
+    assert "gladLoadGL" in str(caught.value)
