@@ -20,7 +20,7 @@ from iris_session.protocol import codec
 from iris_session.protocol.assets import AssetChunk, AssetRefused, AssetRequest
 from iris_session.protocol.client_messages import Bye, ClientEnvelope, Hello, Pair, Sample, wrap_message
 from iris_session.protocol.discovery import Beacon
-from iris_session.protocol.media import MediaHeader, MediaPush
+from iris_session.protocol.media import MediaHeader, MediaPush, StreamBudget
 from iris_session.protocol.names import PROTOCOL_VERSION
 from iris_session.protocol.server_messages import (
     Event,
@@ -29,6 +29,7 @@ from iris_session.protocol.server_messages import (
     Snapshot,
     StateHeader,
 )
+from iris_session.protocol.status import DeliveryBudget, MediaStreamReport, StatusReport
 
 _pack = msgspec.msgpack.encode
 #: Fields that messages got after their first vectors were written: a message without them must decode, too.
@@ -36,6 +37,8 @@ ADDED_FIELDS: Final[dict[type[msgspec.Struct], tuple[str, ...]]] = {
     Hello: ("certificate_hash",),
     Pair: ("identity",),
     Snapshot: ("anchors",),
+    MediaHeader: ("sent_ns", "received_ns"),
+    MediaPush: ("info", "sent_ns"),
 }
 #: Structs that are a message of their own, without an envelope.
 VERSIONED = (AssetRequest, AssetChunk, AssetRefused)
@@ -56,7 +59,12 @@ def render_golden() -> str:
         "asset_refused": list(_iterate_values("asset_refused", AssetRefused)),
         "beacon": list(_iterate_values("beacon", Beacon)),
         "decode_only": list(_iterate_decode_only()),
-        "decode_only_server": list(_iterate_earlier("server", codec.SERVER_TYPES.values())),
+        "decode_only_server": [
+            *_iterate_earlier("server", codec.SERVER_TYPES.values()),
+            *_iterate_earlier_streams(),
+        ],
+        "decode_only_media_header": [_make_earlier_array(MediaHeader)],
+        "decode_only_media_push": [_make_earlier_array(MediaPush)],
         "malformed": list(_iterate_malformed()),
         "conversions": list(_iterate_conversions()),
         "rigid": list(_iterate_rigid()),
@@ -148,6 +156,35 @@ def _iterate_earlier(side: str, kinds: Any) -> Iterator[dict[str, Any]]:
             data = _pack(_put_in_envelope(side, bare))
             value = _put_in_envelope(side, msgspec.structs.replace(full, **before))
             yield _describe_vector(f"{codec.get_tag(kind)} of before", data, value)
+
+
+def _iterate_earlier_streams() -> Iterator[dict[str, Any]]:
+    """Yield the messages that describe media streams, as they were before streams had a title."""
+    budget = {"stream": "room", "budget_class": "half", "mbit_per_s": 1.25, "encoding": "cloud"}
+    delivery = {"type": "delivery_budget", "budget_class": "half", "streams": [budget]}
+    stream = StreamBudget("room", "half", 1.25, "cloud")
+    yield _describe_vector(
+        "delivery_budget of before",
+        _pack(_put_in_envelope("server", delivery)),
+        _put_in_envelope("server", DeliveryBudget("half", streams=(stream,))),
+    )
+    report = {"stream": "room", "hz": 30.5, "source": "front", "subscribers": 2, "encoding": "cloud", "age_ms": 12.5}
+    status = {"type": "status_report", "request_id": 1, "session_id": "s", "session_name": "lab", "session_time": 2}
+    streams = (MediaStreamReport("room", 30.5, source="front", subscribers=2, encoding="cloud", age_ms=12.5),)
+    yield _describe_vector(
+        "status_report of before",
+        _pack(_put_in_envelope("server", {**status, "media": [report]})),
+        _put_in_envelope("server", StatusReport(1, "s", "lab", 2, media=streams)),
+    )
+
+
+def _make_earlier_array(kind: type[msgspec.Struct]) -> dict[str, Any]:
+    """Return a vector of an array as it was before it got `ADDED_FIELDS` at its end."""
+    added = ADDED_FIELDS[kind]
+    full = make_full(kind)
+    defaults = {field.name: field.default for field in msgspec.structs.fields(kind) if field.name in added}
+    bare = msgspec.structs.astuple(full)[: -len(added)]
+    return _describe_vector(f"{kind.__name__} of before", _pack(bare), msgspec.structs.replace(full, **defaults))
 
 
 def _iterate_malformed() -> Iterator[dict[str, Any]]:

@@ -106,6 +106,7 @@ def _render_limits() -> str:
         for kind, limit in table.items():
             rate = f"{limit.per_second:g} | {limit.burst}" if limit.burst else "- | -"
             lines.append(f"| `{kind.__struct_config__.tag}` | {to} | {limit.max_bytes:,} | {rate} |")
+    lines.append(f"| media push | session | {limits.MAX_MEDIA_PUSH_BYTES:,} | - | - |")
     for name, size in (
         ("state header", limits.MAX_STATE_HEADER_BYTES),
         ("presence", limits.MAX_PRESENCE_BYTES),

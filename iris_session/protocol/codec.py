@@ -27,12 +27,21 @@ from iris_session.protocol.limits import (
     MAX_INTRODUCTION_BYTES,
     MAX_MEDIA_FRAME_BYTES,
     MAX_MEDIA_HEADER_BYTES,
+    MAX_MEDIA_PUSH_BYTES,
     MAX_PRESENCE_BYTES,
     MAX_SERVER_BYTES,
     MAX_STATE_HEADER_BYTES,
     SERVER_LIMITS,
 )
-from iris_session.protocol.media import CLASSES, MediaHeader, MediaPush, describe_bad_stream_name, is_stream_name
+from iris_session.protocol.media import (
+    CLASSES,
+    MediaHeader,
+    MediaPush,
+    StreamInfo,
+    describe_bad_stream_name,
+    find_info_problem,
+    is_stream_name,
+)
 from iris_session.protocol.names import PROTOCOL_VERSION, BudgetClass
 from iris_session.protocol.server_messages import (
     EventKind,
@@ -237,7 +246,14 @@ def encode_media_push(push: MediaPush) -> bytes:
 
 
 def encode_media_frames(
-    stream: str, frames: bytes | Mapping[str, bytes], capture_ns: int, scene_epoch: int, encoding: str
+    stream: str,
+    frames: bytes | Mapping[str, bytes],
+    capture_ns: int,
+    scene_epoch: int,
+    encoding: str,
+    *,
+    info: StreamInfo | None = None,
+    sent_ns: int = 0,
 ) -> list[bytes]:
     """Return all frames of a source's message. `frames`: of class `full`, or by class. Raises `ValueError`."""
     by_class = frames if isinstance(frames, Mapping) else {BudgetClass.FULL: frames}
@@ -256,17 +272,20 @@ def encode_media_frames(
         # An array may be counted in rows, or lie in memory in pieces, which a socket refuses with half a message sent.
         payloads.append(data if isinstance(data, bytes) else view.tobytes())
     try:
-        push = MediaPush(stream, scene_epoch, operator.index(capture_ns), tuple(by_class), encoding)
+        push = MediaPush(stream, scene_epoch, operator.index(capture_ns), tuple(by_class), encoding, info, sent_ns)
         header = encode_media_push(push)
-        decode_media_push(header)
-    except (TypeError, OverflowError, ProtocolError) as error:  # a time or an encoding that is none
+        checked = decode_media_push(header).info
+    except (TypeError, OverflowError, ProtocolError) as error:  # a time, an encoding or an info that is none
         raise ValueError(f"a media frame of capture_ns {capture_ns!r}, encoding {encoding!r}: {error}") from None
+    problem = "" if checked is None else find_info_problem(checked)
+    if problem:
+        raise ValueError(problem)
     return [header, *payloads]
 
 
 def decode_media_push(data: Bytes) -> MediaPush:
     """Decode the first frame of a source's message. Raises `TooLargeError` or `MalformedError`."""
-    return _decode("media push", _media_push, data, MAX_MEDIA_HEADER_BYTES)
+    return _decode("media push", _media_push, data, MAX_MEDIA_PUSH_BYTES)
 
 
 def encode_asset_request(request: AssetRequest) -> bytes:

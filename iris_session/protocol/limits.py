@@ -129,13 +129,15 @@ SERVER_LIMITS: Final[Mapping[type[Message], Limit]] = MappingProxyType(
         Snapshot: Limit(32_000_000),
         Paired: Limit(8_000),
         StatusReport: Limit(4_000_000),
-        DeliveryBudget: Limit(16_000),
+        DeliveryBudget: Limit(64_000),
     }
 )
 MAX_SERVER_BYTES: Final = max(limit.max_bytes for limit in SERVER_LIMITS.values())
 MAX_STATE_HEADER_BYTES: Final = 128_000
 MAX_PRESENCE_BYTES: Final = 256_000
 MAX_MEDIA_HEADER_BYTES: Final = 2_000
+#: First frame of a source's message: two texts of 512 characters are the most of it.
+MAX_MEDIA_PUSH_BYTES: Final = 8_000
 #: One frame of media, of one class: a 1080p depth image without compression has half of it.
 MAX_MEDIA_FRAME_BYTES: Final = 8 * 1024 * 1024
 #: A request for a chunk of an asset, and the first frame of its answer.

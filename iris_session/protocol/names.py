@@ -344,6 +344,30 @@ class MediaEncoding:
     BYTES: Final = "bytes"  # only source and receiver know
     DEFORMABLE: Final = "deformable"  # vertices of a mesh of the scene, docs/deformables.md
     CLOUD: Final = "cloud"  # points with colours, world frame, docs/clouds.md
+    JPEG: Final = "jpeg"  # the picture of a camera, docs/clouds.md
+
+
+class StreamAudience:
+    """Who needs a media stream. Unknown values: as `all`."""
+
+    ALL: Final = "all"
+    REMOTE: Final = (
+        "remote"  # a person in the room sees it anyway: a client in passthrough does not subscribe by itself
+    )
+
+
+class StreamFault:
+    """Fault that the source of a media stream has found; empty without one."""
+
+    FROZEN: Final = "frozen"  # frames come, and are all the same
+    NO_DEPTH: Final = "no_depth"  # no pixel has a depth
+    SATURATED: Final = "saturated"  # depth or colour at the end of its range
+    SIZE: Final = "size"  # frames have another size than the intrinsics, or depth than colour
+    MOVED: Final = "moved"  # the camera is not where it was calibrated
+    POSE: Final = "pose"  # the pose is not finite, or that of its body is not known
+    CLOCK: Final = "clock"  # times of capture jump, or lie in the future
+    SLOW: Final = "slow"  # frames come later than the source means to hold
+    SOURCE: Final = "source"  # the device or recording delivers no frames
 
 
 class LateCause:

@@ -12,7 +12,7 @@ import msgspec
 
 from iris_session.protocol.common import Count, Message, Name, Nanoseconds, Pose, Text
 from iris_session.protocol.media import StreamBudget
-from iris_session.protocol.names import MediaEncoding
+from iris_session.protocol.names import MediaEncoding, StreamAudience
 
 
 class GetStatus(Message, frozen=True, tag="get_status"):
@@ -217,7 +217,7 @@ class RecorderReport(msgspec.Struct, frozen=True):
 class MediaStreamReport(msgspec.Struct, frozen=True):
     """One media stream, at its best class. `source`: its publisher's name, empty for the session's own process.
     `subscribers`: participants that subscribed to it. `encoding`, `age_ms`: of the newest frame; its age since the
-    session received it.
+    session received it. `title`, `audience`, `fault`, `detail`, `stale`: as in `StreamBudget`.
     """
 
     stream: Name
@@ -227,6 +227,11 @@ class MediaStreamReport(msgspec.Struct, frozen=True):
     subscribers: Count = 0
     encoding: Name = MediaEncoding.BYTES
     age_ms: float = 0.0
+    title: Text = ""
+    audience: Name = StreamAudience.ALL
+    fault: Name = ""
+    detail: Text = ""
+    stale: bool = False
 
 
 class AssetsReport(msgspec.Struct, frozen=True):

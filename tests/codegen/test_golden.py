@@ -67,6 +67,12 @@ def test_decode_only_vectors_decode_to_their_value() -> None:
     for vector in GOLDEN["decode_only_server"]:
         data = bytes.fromhex(vector["hex"])
         assert codec.decode_server(data) == msgspec.convert(vector["value"], ServerEnvelope), vector["name"]
+    for kind in ("media_header", "media_push"):
+        struct, encode, decode = CODECS[kind]
+        for vector in GOLDEN[f"decode_only_{kind}"]:
+            expected = msgspec.convert(vector["value"], struct)
+            assert decode(bytes.fromhex(vector["hex"])) == expected, vector["name"]
+            assert encode(expected).hex() != vector["hex"], vector["name"]
 
 
 def test_malformed_vectors_are_rejected_with_their_code() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -30,6 +31,7 @@ from iris_session.protocol.limits import (
     MAX_MEDIA_FRAME_BYTES,
     MAX_SERVER_BYTES,
 )
+from iris_session.protocol.media import StreamCamera, StreamInfo
 from iris_session.protocol.server_messages import Event, Presence, ProtocolFault, ServerEnvelope, StateHeader
 
 pack = msgspec.msgpack.encode
@@ -302,6 +304,10 @@ def test_equal_values_give_equal_bytes() -> None:
     assert codec.get_tag(Bye) == "bye"
 
 
+def _camera(**changes: Any) -> StreamCamera:
+    return msgspec.structs.replace(StreamCamera(640, 480, 585.0, 585.0, 319.5, 239.5), **changes)
+
+
 @pytest.mark.parametrize(
     ("given", "expected"),
     [
@@ -315,6 +321,19 @@ def test_equal_values_give_equal_bytes() -> None:
         ({"capture_ns": 0.5}, "capture_ns 0.5"),
         ({"capture_ns": 10**30}, "capture_ns 1000"),
         ({"encoding": 3}, "encoding 3"),
+        ({"sent_ns": 0.5}, "Expected `int`"),
+        ({"info": "room"}, "Expected `object . null`"),
+        ({"info": StreamInfo(title="x" * 513)}, "length <= 512"),
+        ({"info": StreamInfo(hz=math.nan)}, "hz of a media stream: nan"),
+        ({"info": StreamInfo(hz=-1.0)}, "hz of a media stream: -1"),
+        ({"info": StreamInfo(camera=_camera(width=4097))}, "camera of 4097 x 480"),
+        ({"info": StreamInfo(camera=_camera(height=0))}, "camera of 640 x 0"),
+        ({"info": StreamInfo(camera=_camera(fx=math.inf))}, "intrinsics"),
+        ({"info": StreamInfo(camera=_camera(fy=0.0))}, "intrinsics"),
+        ({"info": StreamInfo(camera=_camera(distortion=(0.0, math.nan, 0.0, 0.0)))}, "intrinsics"),
+        ({"info": StreamInfo(camera=_camera(distortion=(0.1,)))}, "1 distortion coefficients"),
+        ({"info": StreamInfo(camera=_camera(position=(0.0, math.nan, 0.0)))}, "position of a camera"),
+        ({"info": StreamInfo(camera=_camera(orientation=(0.0, 0.0, 0.0, 0.0)))}, "orientation of a camera"),
     ],
 )
 def test_invalid_media_are_rejected_at_publishing(given: dict[str, object], expected: str) -> None:
@@ -325,6 +344,15 @@ def test_invalid_media_are_rejected_at_publishing(given: dict[str, object], expe
     assert data == [b"points"]
     with pytest.raises(ValueError, match=expected):
         codec.encode_media_frames(**(good | given))  # type: ignore[arg-type]
+
+
+def test_media_info_of_any_allowed_length_is_encoded() -> None:
+    text = "\N{ROBOT FACE}" * 512
+    camera = _camera(body=text[:64], distortion=(0.1,) * 8)
+    info = StreamInfo(text, text[:64], camera, 30.0, text[:64], text)
+    header, _ = codec.encode_media_frames("x" * 48, b"", 2**62, 2**62, text[:64], info=info, sent_ns=2**62)
+    push = codec.decode_media_push(header)
+    assert (push.info, push.sent_ns) == (info, 2**62)
 
 
 def test_media_arrays_are_encoded_in_row_order() -> None:

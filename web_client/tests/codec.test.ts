@@ -47,6 +47,12 @@ describe("golden vectors", () => {
     for (const { name, hex, value } of golden.decode_only ?? []) {
       expect(toJson(codec.decodeClient(fromHex(hex))), name).toEqual(value);
     }
+    for (const { name, hex, value } of golden.decode_only_server ?? []) {
+      expect(toJson(codec.decodeServer(fromHex(hex))), name).toEqual(value);
+    }
+    for (const { name, hex, value } of golden.decode_only_media_header ?? []) {
+      expect(toJson(codec.decodeMediaHeader(fromHex(hex))), name).toEqual(value);
+    }
   });
 
   test("what must be refused is refused, with its code", () => {

@@ -366,6 +366,32 @@ namespace IrisSession.Protocol
         public const string Bytes = "bytes";
         public const string Deformable = "deformable";
         public const string Cloud = "cloud";
+        public const string Jpeg = "jpeg";
+    }
+
+    /// <summary>
+    /// Who needs a media stream. Unknown values: as all.
+    /// </summary>
+    public static class StreamAudience
+    {
+        public const string All = "all";
+        public const string Remote = "remote";
+    }
+
+    /// <summary>
+    /// Fault that the source of a media stream has found; empty without one.
+    /// </summary>
+    public static class StreamFault
+    {
+        public const string Frozen = "frozen";
+        public const string NoDepth = "no_depth";
+        public const string Saturated = "saturated";
+        public const string Size = "size";
+        public const string Moved = "moved";
+        public const string Pose = "pose";
+        public const string Clock = "clock";
+        public const string Slow = "slow";
+        public const string Source = "source";
     }
 
     /// <summary>
@@ -1706,8 +1732,131 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
+    /// Camera of a media stream: pinhole with OpenCV's distortion, and where it is.
+    ///
+    /// fx, fy, cx, cy [px]: the centre of the first pixel is at 0. distortion: 0, 4, 5 or 8 coefficients (k1, k2,
+    /// p1, p2, k3, ...). position, orientation: pose of the optical frame (x right, y down, z forward) in the frame of
+    /// body, a body of the scene; in the world if that is empty.
+    /// </summary>
+    public sealed class StreamCamera : WireValue
+    {
+        public long Width = 0;
+        public long Height = 0;
+        public double Fx = 0.0;
+        public double Fy = 0.0;
+        public double Cx = 0.0;
+        public double Cy = 0.0;
+        public double[] Distortion = new double[0];
+        public string Body = "";
+        public double[] Position = new double[] { 0.0, 0.0, 0.0 };
+        public double[] Orientation = new double[] { 1.0, 0.0, 0.0, 0.0 };
+
+        public static StreamCamera Read(WireReader reader)
+        {
+            StreamCamera value = new StreamCamera();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "width": value.Width = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
+                    case "height": value.Height = reader.ReadLong(0, long.MaxValue); seen |= 2u; break;
+                    case "fx": value.Fx = reader.ReadDouble(); seen |= 4u; break;
+                    case "fy": value.Fy = reader.ReadDouble(); seen |= 8u; break;
+                    case "cx": value.Cx = reader.ReadDouble(); seen |= 16u; break;
+                    case "cy": value.Cy = reader.ReadDouble(); seen |= 32u; break;
+                    case "distortion": value.Distortion = reader.ReadDoubles(0, 8); break;
+                    case "body": value.Body = reader.ReadString(64); break;
+                    case "position": value.Position = reader.ReadDoubles(3, 0); break;
+                    case "orientation": value.Orientation = reader.ReadDoubles(4, 0); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 63u) != 63u) throw new WireException("missing field of StreamCamera");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(10);
+            writer.Write("width");
+            writer.Write(Width);
+            writer.Write("height");
+            writer.Write(Height);
+            writer.Write("fx");
+            writer.Write(Fx);
+            writer.Write("fy");
+            writer.Write(Fy);
+            writer.Write("cx");
+            writer.Write(Cx);
+            writer.Write("cy");
+            writer.Write(Cy);
+            writer.Write("distortion");
+            writer.Write(Distortion);
+            writer.Write("body");
+            writer.Write(Body);
+            writer.Write("position");
+            writer.Write(Position);
+            writer.Write("orientation");
+            writer.Write(Orientation);
+        }
+    }
+
+    /// <summary>
+    /// Description of a stream by its source. title: for people; empty: the stream's name. hz: frames per second
+    /// that it means to hold, 0 for a stream at rest. fault: why its frames are wrong, or do not come; detail: the same
+    /// in one line, for people. The session passes on 64 characters of the title, and 256 of the detail.
+    /// </summary>
+    public sealed class StreamInfo : WireValue
+    {
+        public string Title = "";
+        public string Audience = "all";
+        public StreamCamera Camera = null;
+        public double Hz = 0.0;
+        public string Fault = "";
+        public string Detail = "";
+
+        public static StreamInfo Read(WireReader reader)
+        {
+            StreamInfo value = new StreamInfo();
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "title": value.Title = reader.ReadString(512); break;
+                    case "audience": value.Audience = reader.ReadString(64); break;
+                    case "camera": value.Camera = reader.TryReadNil() ? null : StreamCamera.Read(reader); break;
+                    case "hz": value.Hz = reader.ReadDouble(); break;
+                    case "fault": value.Fault = reader.ReadString(64); break;
+                    case "detail": value.Detail = reader.ReadString(512); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(6);
+            writer.Write("title");
+            writer.Write(Title);
+            writer.Write("audience");
+            writer.Write(Audience);
+            writer.Write("camera");
+            writer.Write(Camera);
+            writer.Write("hz");
+            writer.Write(Hz);
+            writer.Write("fault");
+            writer.Write(Fault);
+            writer.Write("detail");
+            writer.Write(Detail);
+        }
+    }
+
+    /// <summary>
     /// One media stream, and the class that a client gets. mbit_per_s: of that class, as measured. encoding: of its
-    /// newest frame, so that a client knows what it would get before it subscribes.
+    /// newest frame, so that a client knows what it would get before it subscribes. title, audience, camera, fault,
+    /// detail: of its newest StreamInfo. stale: no frame came for so long that the newest one shows what was.
     /// </summary>
     public sealed class StreamBudget : WireValue
     {
@@ -1715,6 +1864,12 @@ namespace IrisSession.Protocol
         public string BudgetClass = "full";
         public double MbitPerS = 0.0;
         public string Encoding = "bytes";
+        public string Title = "";
+        public string Audience = "all";
+        public StreamCamera Camera = null;
+        public string Fault = "";
+        public string Detail = "";
+        public bool Stale = false;
 
         public static StreamBudget Read(WireReader reader)
         {
@@ -1728,6 +1883,12 @@ namespace IrisSession.Protocol
                     case "budget_class": value.BudgetClass = reader.ReadString(64); break;
                     case "mbit_per_s": value.MbitPerS = reader.ReadDouble(); break;
                     case "encoding": value.Encoding = reader.ReadString(64); break;
+                    case "title": value.Title = reader.ReadString(512); break;
+                    case "audience": value.Audience = reader.ReadString(64); break;
+                    case "camera": value.Camera = reader.TryReadNil() ? null : StreamCamera.Read(reader); break;
+                    case "fault": value.Fault = reader.ReadString(64); break;
+                    case "detail": value.Detail = reader.ReadString(512); break;
+                    case "stale": value.Stale = reader.ReadBool(); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -1737,7 +1898,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(4);
+            writer.WriteMapHeader(10);
             writer.Write("stream");
             writer.Write(Stream);
             writer.Write("budget_class");
@@ -1746,6 +1907,18 @@ namespace IrisSession.Protocol
             writer.Write(MbitPerS);
             writer.Write("encoding");
             writer.Write(Encoding);
+            writer.Write("title");
+            writer.Write(Title);
+            writer.Write("audience");
+            writer.Write(Audience);
+            writer.Write("camera");
+            writer.Write(Camera);
+            writer.Write("fault");
+            writer.Write(Fault);
+            writer.Write("detail");
+            writer.Write(Detail);
+            writer.Write("stale");
+            writer.Write(Stale);
         }
     }
 
@@ -2298,7 +2471,7 @@ namespace IrisSession.Protocol
     /// <summary>
     /// One media stream, at its best class. source: its publisher's name, empty for the session's own process.
     /// subscribers: participants that subscribed to it. encoding, age_ms: of the newest frame; its age since the
-    /// session received it.
+    /// session received it. title, audience, fault, detail, stale: as in StreamBudget.
     /// </summary>
     public sealed class MediaStreamReport : WireValue
     {
@@ -2309,6 +2482,11 @@ namespace IrisSession.Protocol
         public long Subscribers = 0;
         public string Encoding = "bytes";
         public double AgeMs = 0.0;
+        public string Title = "";
+        public string Audience = "all";
+        public string Fault = "";
+        public string Detail = "";
+        public bool Stale = false;
 
         public static MediaStreamReport Read(WireReader reader)
         {
@@ -2325,6 +2503,11 @@ namespace IrisSession.Protocol
                     case "subscribers": value.Subscribers = reader.ReadLong(0, long.MaxValue); break;
                     case "encoding": value.Encoding = reader.ReadString(64); break;
                     case "age_ms": value.AgeMs = reader.ReadDouble(); break;
+                    case "title": value.Title = reader.ReadString(512); break;
+                    case "audience": value.Audience = reader.ReadString(64); break;
+                    case "fault": value.Fault = reader.ReadString(64); break;
+                    case "detail": value.Detail = reader.ReadString(512); break;
+                    case "stale": value.Stale = reader.ReadBool(); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -2334,7 +2517,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(7);
+            writer.WriteMapHeader(12);
             writer.Write("stream");
             writer.Write(Stream);
             writer.Write("hz");
@@ -2349,6 +2532,16 @@ namespace IrisSession.Protocol
             writer.Write(Encoding);
             writer.Write("age_ms");
             writer.Write(AgeMs);
+            writer.Write("title");
+            writer.Write(Title);
+            writer.Write("audience");
+            writer.Write(Audience);
+            writer.Write("fault");
+            writer.Write(Fault);
+            writer.Write("detail");
+            writer.Write(Detail);
+            writer.Write("stale");
+            writer.Write(Stale);
         }
     }
 
@@ -6077,7 +6270,8 @@ namespace IrisSession.Protocol
     ///
     /// seq: of the stream, as its source numbered it; at half and quarter some are left out. capture_ns: when it
     /// was captured or computed, published_ns: when it was passed to the socket, both session time. dropped: frames of
-    /// this subscriber that its link did not take before newer ones were there, since it subscribed.
+    /// this subscriber that its link did not take before newer ones were there, since it subscribed. sent_ns,
+    /// received_ns: when its source passed it to a socket and when the session received it, session time; 0: not known.
     /// </summary>
     public sealed class MediaHeader : WireValue
     {
@@ -6089,6 +6283,8 @@ namespace IrisSession.Protocol
         public long PublishedNs = 0;
         public string Encoding = "bytes";
         public long Dropped = 0;
+        public long SentNs = 0;
+        public long ReceivedNs = 0;
 
         public static MediaHeader Read(WireReader reader)
         {
@@ -6103,13 +6299,15 @@ namespace IrisSession.Protocol
             value.PublishedNs = reader.ReadLong(long.MinValue, long.MaxValue);
             if (n > 6) value.Encoding = reader.ReadString(64);
             if (n > 7) value.Dropped = reader.ReadLong(0, long.MaxValue);
-            for (int i = 8; i < n; i++) reader.Skip();
+            if (n > 8) value.SentNs = reader.ReadLong(long.MinValue, long.MaxValue);
+            if (n > 9) value.ReceivedNs = reader.ReadLong(long.MinValue, long.MaxValue);
+            for (int i = 10; i < n; i++) reader.Skip();
             return value;
         }
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteArrayHeader(8);
+            writer.WriteArrayHeader(10);
             writer.Write(Stream);
             writer.Write(BudgetClass);
             writer.Write(SceneEpoch);
@@ -6118,13 +6316,17 @@ namespace IrisSession.Protocol
             writer.Write(PublishedNs);
             writer.Write(Encoding);
             writer.Write(Dropped);
+            writer.Write(SentNs);
+            writer.Write(ReceivedNs);
         }
     }
 
     /// <summary>
     /// First frame of a source's message; a bulk frame for each of classes follows, in their order.
     ///
-    /// classes: full, and any of half and quarter that the source has in a coarser form.
+    /// classes: full, and any of half and quarter that the source has in a coarser form. info: of the stream,
+    /// with its first frames, when it changes, and once a second; null: as before. sent_ns: when the source passed the
+    /// message to its socket, session time; 0: not known.
     /// </summary>
     public sealed class MediaPush : WireValue
     {
@@ -6133,6 +6335,8 @@ namespace IrisSession.Protocol
         public long CaptureNs = 0;
         public string[] Classes = new string[] { "full" };
         public string Encoding = "bytes";
+        public StreamInfo Info = null;
+        public long SentNs = 0;
 
         public static MediaPush Read(WireReader reader)
         {
@@ -6144,18 +6348,22 @@ namespace IrisSession.Protocol
             value.CaptureNs = reader.ReadLong(long.MinValue, long.MaxValue);
             if (n > 3) value.Classes = reader.ReadStrings(0, 64);
             if (n > 4) value.Encoding = reader.ReadString(64);
-            for (int i = 5; i < n; i++) reader.Skip();
+            if (n > 5) value.Info = reader.TryReadNil() ? null : StreamInfo.Read(reader);
+            if (n > 6) value.SentNs = reader.ReadLong(long.MinValue, long.MaxValue);
+            for (int i = 7; i < n; i++) reader.Skip();
             return value;
         }
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteArrayHeader(5);
+            writer.WriteArrayHeader(7);
             writer.Write(Stream);
             writer.Write(SceneEpoch);
             writer.Write(CaptureNs);
             writer.Write(Classes);
             writer.Write(Encoding);
+            writer.Write(Info);
+            writer.Write(SentNs);
         }
     }
 

@@ -320,8 +320,30 @@ export const MediaEncoding = {
   BYTES: "bytes",
   DEFORMABLE: "deformable",
   CLOUD: "cloud",
+  JPEG: "jpeg",
 } as const;
 export type MediaEncoding = (typeof MediaEncoding)[keyof typeof MediaEncoding] | (string & {});
+
+/** Who needs a media stream. Unknown values: as `all`. */
+export const StreamAudience = {
+  ALL: "all",
+  REMOTE: "remote",
+} as const;
+export type StreamAudience = (typeof StreamAudience)[keyof typeof StreamAudience] | (string & {});
+
+/** Fault that the source of a media stream has found; empty without one. */
+export const StreamFault = {
+  FROZEN: "frozen",
+  NO_DEPTH: "no_depth",
+  SATURATED: "saturated",
+  SIZE: "size",
+  MOVED: "moved",
+  POSE: "pose",
+  CLOCK: "clock",
+  SLOW: "slow",
+  SOURCE: "source",
+} as const;
+export type StreamFault = (typeof StreamFault)[keyof typeof StreamFault] | (string & {});
 
 /** Part of a late tick that took the time. */
 export const LateCause = {
@@ -594,14 +616,55 @@ export type Quantiles = [
 ];
 
 /**
+ * Camera of a media stream: pinhole with OpenCV's distortion, and where it is.
+ *
+ * `fx`, `fy`, `cx`, `cy` [px]: the centre of the first pixel is at 0. `distortion`: 0, 4, 5 or 8 coefficients (k1, k2,
+ * p1, p2, k3, ...). `position`, `orientation`: pose of the optical frame (x right, y down, z forward) in the frame of
+ * `body`, a body of the scene; in the world if that is empty.
+ */
+export interface StreamCamera {
+  width: number;
+  height: number;
+  fx: number;
+  fy: number;
+  cx: number;
+  cy: number;
+  distortion?: number[];
+  body?: string;
+  position?: [number, number, number];
+  orientation?: [number, number, number, number];
+}
+
+/**
+ * Description of a stream by its source. `title`: for people; empty: the stream's name. `hz`: frames per second
+ * that it means to hold, 0 for a stream at rest. `fault`: why its frames are wrong, or do not come; `detail`: the same
+ * in one line, for people. The session passes on 64 characters of the title, and 256 of the detail.
+ */
+export interface StreamInfo {
+  title?: string;
+  audience?: StreamAudience;
+  camera?: StreamCamera | null;
+  hz?: number;
+  fault?: StreamFault;
+  detail?: string;
+}
+
+/**
  * One media stream, and the class that a client gets. `mbit_per_s`: of that class, as measured. `encoding`: of its
- * newest frame, so that a client knows what it would get before it subscribes.
+ * newest frame, so that a client knows what it would get before it subscribes. `title`, `audience`, `camera`, `fault`,
+ * `detail`: of its newest `StreamInfo`. `stale`: no frame came for so long that the newest one shows what was.
  */
 export interface StreamBudget {
   stream: string;
   budget_class?: BudgetClass;
   mbit_per_s?: number;
-  encoding?: string;
+  encoding?: MediaEncoding;
+  title?: string;
+  audience?: StreamAudience;
+  camera?: StreamCamera | null;
+  fault?: StreamFault;
+  detail?: string;
+  stale?: boolean;
 }
 
 /** Observations of one anchor by a headset: their number in this run, and the age of the newest. */
@@ -741,7 +804,7 @@ export interface RecorderReport {
 /**
  * One media stream, at its best class. `source`: its publisher's name, empty for the session's own process.
  * `subscribers`: participants that subscribed to it. `encoding`, `age_ms`: of the newest frame; its age since the
- * session received it.
+ * session received it. `title`, `audience`, `fault`, `detail`, `stale`: as in `StreamBudget`.
  */
 export interface MediaStreamReport {
   stream: string;
@@ -749,8 +812,13 @@ export interface MediaStreamReport {
   mbit_per_s?: number;
   source?: string;
   subscribers?: number;
-  encoding?: string;
+  encoding?: MediaEncoding;
   age_ms?: number;
+  title?: string;
+  audience?: StreamAudience;
+  fault?: StreamFault;
+  detail?: string;
+  stale?: boolean;
 }
 
 /**
@@ -1646,7 +1714,8 @@ export type Presence = [
  *
  * `seq`: of the stream, as its source numbered it; at `half` and `quarter` some are left out. `capture_ns`: when it
  * was captured or computed, `published_ns`: when it was passed to the socket, both session time. `dropped`: frames of
- * this subscriber that its link did not take before newer ones were there, since it subscribed.
+ * this subscriber that its link did not take before newer ones were there, since it subscribed. `sent_ns`,
+ * `received_ns`: when its source passed it to a socket and when the session received it, session time; 0: not known.
  */
 export type MediaHeader = [
   stream: string,
@@ -1657,12 +1726,16 @@ export type MediaHeader = [
   published_ns: number,
   encoding?: MediaEncoding,
   dropped?: number,
+  sent_ns?: number,
+  received_ns?: number,
 ];
 
 /**
  * First frame of a source's message; a bulk frame for each of `classes` follows, in their order.
  *
- * `classes`: `full`, and any of `half` and `quarter` that the source has in a coarser form.
+ * `classes`: `full`, and any of `half` and `quarter` that the source has in a coarser form. `info`: of the stream,
+ * with its first frames, when it changes, and once a second; null: as before. `sent_ns`: when the source passed the
+ * message to its socket, session time; 0: not known.
  */
 export type MediaPush = [
   stream: string,
@@ -1670,6 +1743,8 @@ export type MediaPush = [
   capture_ns: number,
   classes?: BudgetClass[],
   encoding?: MediaEncoding,
+  info?: StreamInfo | null,
+  sent_ns?: number,
 ];
 
 /**
@@ -2284,10 +2359,30 @@ export const VALUE_DEFAULTS = {
     error_m: 0.0,
     marks: [],
   },
+  StreamCamera: {
+    distortion: [],
+    body: "",
+    position: [0.0, 0.0, 0.0],
+    orientation: [1.0, 0.0, 0.0, 0.0],
+  },
+  StreamInfo: {
+    title: "",
+    audience: "all",
+    camera: null,
+    hz: 0.0,
+    fault: "",
+    detail: "",
+  },
   StreamBudget: {
     budget_class: "full",
     mbit_per_s: 0.0,
     encoding: "bytes",
+    title: "",
+    audience: "all",
+    camera: null,
+    fault: "",
+    detail: "",
+    stale: false,
   },
   AlignmentReport: {
     version: 0,
@@ -2365,6 +2460,11 @@ export const VALUE_DEFAULTS = {
     subscribers: 0,
     encoding: "bytes",
     age_ms: 0.0,
+    title: "",
+    audience: "all",
+    fault: "",
+    detail: "",
+    stale: false,
   },
   AssetsReport: {
     served: 0,

@@ -176,6 +176,34 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["p99", ["float"], []],
     ],
   },
+  StreamCamera: {
+    array: false,
+    tag: null,
+    fields: [
+      ["width", ["int", 0, null], []],
+      ["height", ["int", 0, null], []],
+      ["fx", ["float"], []],
+      ["fy", ["float"], []],
+      ["cx", ["float"], []],
+      ["cy", ["float"], []],
+      ["distortion", ["array", ["float"], 0, 8], [[]]],
+      ["body", ["str", 64, ""], [""]],
+      ["position", ["array", ["float"], 3, 0], [[0.0, 0.0, 0.0]]],
+      ["orientation", ["array", ["float"], 4, 0], [[1.0, 0.0, 0.0, 0.0]]],
+    ],
+  },
+  StreamInfo: {
+    array: false,
+    tag: null,
+    fields: [
+      ["title", ["str", 512, ""], [""]],
+      ["audience", ["str", 64, ""], ["all"]],
+      ["camera", ["null", ["struct", "StreamCamera"]], [null]],
+      ["hz", ["float"], [0.0]],
+      ["fault", ["str", 64, ""], [""]],
+      ["detail", ["str", 512, ""], [""]],
+    ],
+  },
   StreamBudget: {
     array: false,
     tag: null,
@@ -184,6 +212,12 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["budget_class", ["str", 64, ""], ["full"]],
       ["mbit_per_s", ["float"], [0.0]],
       ["encoding", ["str", 64, ""], ["bytes"]],
+      ["title", ["str", 512, ""], [""]],
+      ["audience", ["str", 64, ""], ["all"]],
+      ["camera", ["null", ["struct", "StreamCamera"]], [null]],
+      ["fault", ["str", 64, ""], [""]],
+      ["detail", ["str", 512, ""], [""]],
+      ["stale", ["bool"], [false]],
     ],
   },
   AnchorSeen: {
@@ -325,6 +359,11 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["subscribers", ["int", 0, null], [0]],
       ["encoding", ["str", 64, ""], ["bytes"]],
       ["age_ms", ["float"], [0.0]],
+      ["title", ["str", 512, ""], [""]],
+      ["audience", ["str", 64, ""], ["all"]],
+      ["fault", ["str", 64, ""], [""]],
+      ["detail", ["str", 512, ""], [""]],
+      ["stale", ["bool"], [false]],
     ],
   },
   AssetsReport: {
@@ -1136,6 +1175,8 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["published_ns", ["int", null, null], []],
       ["encoding", ["str", 64, ""], ["bytes"]],
       ["dropped", ["int", 0, null], [0]],
+      ["sent_ns", ["int", null, null], [0]],
+      ["received_ns", ["int", null, null], [0]],
     ],
   },
   MediaPush: {
@@ -1147,6 +1188,8 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["capture_ns", ["int", null, null], []],
       ["classes", ["array", ["str", 64, ""], 0, 0], [["full"]]],
       ["encoding", ["str", 64, ""], ["bytes"]],
+      ["info", ["null", ["struct", "StreamInfo"]], [null]],
+      ["sent_ns", ["int", null, null], [0]],
     ],
   },
   AssetRequest: {
@@ -1600,7 +1643,7 @@ export const SERVER_LIMITS: Readonly<Record<string, number>> = {
   snapshot: 32000000,
   paired: 8000,
   status_report: 4000000,
-  delivery_budget: 16000,
+  delivery_budget: 64000,
 };
 
 export const MAX_CLIENT_BYTES = 48000;
