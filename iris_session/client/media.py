@@ -16,7 +16,7 @@ from iris_session.client.errors import InvalidMessageError, NotConnectedError
 from iris_session.client.sockets import ClientSockets
 from iris_session.protocol.codec import decode_media_header, encode_media_frames
 from iris_session.protocol.errors import ProtocolError
-from iris_session.protocol.media import MediaHeader, describe_bad_stream_name, is_stream_name, make_topic
+from iris_session.protocol.media import MediaHeader, StreamInfo, describe_bad_stream_name, is_stream_name, make_topic
 from iris_session.protocol.names import BudgetClass, MediaEncoding
 from iris_session.protocol.status import ClientReport, DeliveryBudget, compute_quantiles
 
@@ -134,6 +134,7 @@ class ClientMedia:
         *,
         capture_ns: int | None = None,
         encoding: str = MediaEncoding.BYTES,
+        info: StreamInfo | None = None,
     ) -> bool:
         """Publish a frame of a stream, in role `camera` or `source`.
 
@@ -142,6 +143,7 @@ class ClientMedia:
             frames: Bytes of the frame, or of each of its levels by name; see `Session.publish_media`.
             capture_ns: Session time of capture [ns], default now.
             encoding: A `MediaEncoding`.
+            info: Description of the stream; see `Session.publish_media`.
 
         Returns:
             False: the link takes nothing now, the frame is dropped.
@@ -153,9 +155,10 @@ class ClientMedia:
         welcome = self._connection.welcome
         if welcome is None or not self._connection.is_joined:
             raise NotConnectedError(self._connection.describe())
-        now_ns = self._session_now_ns() if capture_ns is None else capture_ns
+        now_ns = self._session_now_ns()
+        capture_ns, epoch = now_ns if capture_ns is None else capture_ns, self._connection.mirror.scene_epoch
         try:
-            message = encode_media_frames(stream, frames, now_ns, self._connection.mirror.scene_epoch, encoding)
+            message = encode_media_frames(stream, frames, capture_ns, epoch, encoding, info=info, sent_ns=now_ns)
         except ValueError as error:
             raise InvalidMessageError(str(error)) from None
         with self._lock:

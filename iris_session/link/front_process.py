@@ -21,6 +21,7 @@ from iris_session.link.config import FrontConfig, FrontError, FrontStart, Ports,
 from iris_session.link.front_link import FrontLink
 from iris_session.link.media_source import MediaSource
 from iris_session.protocol.common import Pose
+from iris_session.protocol.media import StreamInfo
 from iris_session.system.process import ChildProcess
 
 #: Longest path of a folder that leaves room for the names of folder and socket in it [bytes].
@@ -190,10 +191,18 @@ class FrontProcess:
             raise _make_start_error(error) from error
 
     def publish_media(
-        self, stream: str, frames: bytes | Mapping[str, bytes], capture_ns: int, scene_epoch: int, encoding: str
+        self,
+        stream: str,
+        frames: bytes | Mapping[str, bytes],
+        capture_ns: int,
+        scene_epoch: int,
+        encoding: str,
+        *,
+        info: StreamInfo | None = None,
+        sent_ns: int = 0,
     ) -> bool:
         """Send a frame to the present front; see `MediaSource.publish`."""
-        return self._source.publish(stream, frames, capture_ns, scene_epoch, encoding)
+        return self._source.publish(stream, frames, capture_ns, scene_epoch, encoding, info=info, sent_ns=sent_ns)
 
     def _stop_process(self, patience_s: float) -> None:
         if self._process is not None:

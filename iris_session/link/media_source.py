@@ -9,7 +9,7 @@ from typing import Final
 import zmq
 
 from iris_session.protocol.codec import encode_media_frames
-from iris_session.protocol.media import MAX_STREAMS
+from iris_session.protocol.media import MAX_STREAMS, StreamInfo
 
 #: Frames queued for the front, one of every stream; when the queue is full new frames are dropped and counted.
 WAITING: Final = MAX_STREAMS
@@ -48,7 +48,15 @@ class MediaSource:
             return self._waiting()
 
     def publish(
-        self, stream: str, frames: bytes | Mapping[str, bytes], capture_ns: int, scene_epoch: int, encoding: str
+        self,
+        stream: str,
+        frames: bytes | Mapping[str, bytes],
+        capture_ns: int,
+        scene_epoch: int,
+        encoding: str,
+        *,
+        info: StreamInfo | None = None,
+        sent_ns: int = 0,
     ) -> bool:
         """Send one frame to the front.
 
@@ -58,6 +66,8 @@ class MediaSource:
             capture_ns: Session time of the capture [ns].
             scene_epoch: Scene epoch to which the frame belongs.
             encoding: Format of the bytes.
+            info: Description of the stream; `None`: as before.
+            sent_ns: Session time of this call [ns], 0 for not known.
 
         Returns:
             False when the frame is dropped: the queue is full, or the source is closed.
@@ -65,7 +75,7 @@ class MediaSource:
         Raises:
             ValueError: The front would reject the frame: a wrong name or class, or too many bytes.
         """
-        message = encode_media_frames(stream, frames, capture_ns, scene_epoch, encoding)
+        message = encode_media_frames(stream, frames, capture_ns, scene_epoch, encoding, info=info, sent_ns=sent_ns)
         with self._lock:
             try:
                 if self._send(message):

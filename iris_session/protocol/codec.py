@@ -255,11 +255,14 @@ def encode_media_frames(
     info: StreamInfo | None = None,
     sent_ns: int = 0,
 ) -> list[bytes]:
-    """Return all frames of a source's message. `frames`: of class `full`, or by class. Raises `ValueError`."""
+    """Return all frames of a source's message. `frames`: of class `full`, or by class; none with an `info` alone.
+    Raises `ValueError`.
+    """
     by_class = frames if isinstance(frames, Mapping) else {BudgetClass.FULL: frames}
     if not isinstance(stream, str) or not is_stream_name(stream):
         raise ValueError(describe_bad_stream_name(stream))
-    if BudgetClass.FULL not in by_class or any(name not in CLASSES[:-1] for name in by_class):
+    has_full = BudgetClass.FULL in by_class or (not by_class and info is not None)
+    if not has_full or any(name not in CLASSES[:-1] for name in by_class):
         raise ValueError(f"a media frame has class 'full', and may have 'half' and 'quarter', not {list(by_class)}")
     payloads = []
     for data in by_class.values():

@@ -368,6 +368,7 @@ class StreamFault:
     CLOCK: Final = "clock"  # times of capture jump, or lie in the future
     SLOW: Final = "slow"  # frames come later than the source means to hold
     SOURCE: Final = "source"  # the device or recording delivers no frames
+    ALL: Final = frozenset({"frozen", "no_depth", "saturated", "size", "moved", "pose", "clock", "slow", "source"})
 
 
 class LateCause:

@@ -17,6 +17,7 @@ from typing import Self
 from iris_session.physics import Pacer
 from iris_session.protocol.client_messages import ClearEStop, EStop, Marker
 from iris_session.protocol.entries import EntryMessage, OwnerListens, ScenePatched
+from iris_session.protocol.media import StreamInfo
 from iris_session.protocol.names import MediaEncoding
 from iris_session.protocol.scene import PatchOp, SceneError, SceneSpec
 from iris_session.protocol.server_messages import Event
@@ -154,22 +155,26 @@ class Owner:
         *,
         capture_ns: int | None = None,
         encoding: str = MediaEncoding.BYTES,
+        info: StreamInfo | None = None,
     ) -> bool:
         """Publish the newest frame of a media stream to every client that subscribed to it. From any thread.
 
         Args:
             stream: Name of the stream.
             frames: Bytes of the frame, or bytes by class: `full`, and the coarser `half` and `quarter`. For a class
-                that is left out, clients get every second or fourth frame of the next better one.
+                that is left out, clients get every second or fourth frame of the next better one. Empty, with `info`:
+                no frame, only the description.
             capture_ns: Session time of the capture [ns], as of `session.clock()`. Default: now.
             encoding: Format of the bytes, for the subscribers.
+            info: Description of the stream, for clients that have not subscribed to it and for status. Give it with the
+                first frames, when it changes, and once a second; the default leaves it as it was.
 
         Returns:
             False when the frame is dropped: the front accepts none now, or the session is closing.
 
         Raises:
             ValueError: A name that no stream can have or that belongs to a deformable of the scene, an unknown class,
-                or more than 8 MiB.
+                more than 8 MiB, or an `info` with a value out of range.
             OwnershipError: The session is not started.
         """
         processes = self._require_started()
@@ -180,7 +185,9 @@ class Owner:
             return False
         last = None if self._stepper is None else self._stepper.last
         epoch = 0 if last is None else last.decision.scene_epoch
-        return front.publish_media(stream, frames, self.clock() if capture_ns is None else capture_ns, epoch, encoding)
+        now_ns = self.clock()
+        capture_ns = now_ns if capture_ns is None else capture_ns
+        return front.publish_media(stream, frames, capture_ns, epoch, encoding, info=info, sent_ns=now_ns)
 
     def patch_scene(self, *ops: PatchOp) -> None:
         """Change how the scene is drawn for every client: colours, visibility, poses of visuals, decoration.

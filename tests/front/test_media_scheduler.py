@@ -2,14 +2,33 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from typing import Any
 
+import msgspec
 import pytest
 
 from iris_session.front.media.budget import NONE_LEVEL, SECOND
-from iris_session.front.media.scheduler import STUCK_BYTES, DeliveryCounters, MediaScheduler, MediaSubscriber
+from iris_session.front.media.scheduler import (
+    MAX_DETAIL,
+    MAX_TITLE,
+    STUCK_BYTES,
+    DeliveryCounters,
+    MediaScheduler,
+    MediaSubscriber,
+)
 from iris_session.protocol.codec import decode_media_header
-from iris_session.protocol.media import MAX_STREAMS, MediaHeader, MediaPush, make_topic, parse_topic
+from iris_session.protocol.limits import MAX_MEDIA_HEADER_BYTES
+from iris_session.protocol.media import (
+    MAX_STREAMS,
+    MediaHeader,
+    MediaPush,
+    StreamCamera,
+    StreamInfo,
+    make_topic,
+    parse_topic,
+)
 
 MS = 1_000_000
 ANN, BOB = 7, 8
@@ -277,6 +296,116 @@ def test_restarted_front_numbers_frames_above_its_predecessor() -> None:
     later.now_ns = wire.now_ns
     later.push()
     assert later.got[ANN][0][0].seq > wire.got[ANN][-1][0].seq
+
+
+def test_times_of_a_frame_reach_the_subscriber() -> None:
+    wire = Wire()
+    push = MediaPush("cloud", 3, 100, sent_ns=200)
+    assert wire.hub.push(push, [b"x"], "", 300)
+    wire.hub.subscribe(ANN, "cloud", "a", 1, 400)
+    wire.hub.flush(wire.send, 400)
+    ((header, _),) = wire.got[ANN]
+    assert (header.capture_ns, header.sent_ns, header.received_ns, header.published_ns) == (100, 200, 300, 400)
+    assert len(msgspec.msgpack.encode(header)) < MAX_MEDIA_HEADER_BYTES
+
+
+def describe(wire: Wire, info: StreamInfo | None, source: str = "", *frames: bytes) -> StreamInfo:
+    """Send an info, with a frame or alone, and return that of the stream then."""
+    push = MediaPush("cloud", 3, wire.now_ns, ("full",) * len(frames), info=info)
+    wire.hub.push(push, frames, source, wire.now_ns)
+    return wire.hub.read_streams()["cloud"].info
+
+
+def test_info_of_a_stream_stays_until_its_source_sends_another() -> None:
+    wire = Wire()
+    room = StreamInfo("Room", "remote", StreamCamera(640, 480, 585.0, 585.0, 319.5, 239.5), 30.0)
+    assert describe(wire, room, "", b"x") == room
+    assert describe(wire, None, "", b"x") == room
+    still = msgspec.structs.replace(room, fault="frozen", detail="the same picture for 2 s")
+    assert describe(wire, still, "", b"x") == still
+    wire.now_ns += 4 * SECOND
+    assert describe(wire, None, "other", b"x") == StreamInfo()
+    assert wire.hub.pop_drops()[0] == {}
+
+
+def test_info_may_come_without_a_frame() -> None:
+    """A camera that gives no picture tells so, before the first one and after the last."""
+    wire = Wire()
+    wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
+    dark = StreamInfo("Room", fault="source", detail="no such device")
+    assert describe(wire, dark) == dark
+    wire.push()
+    assert [frame for _, frame in wire.got[ANN]] == [b"x" * 100]
+    assert describe(wire, dark) == dark
+    assert not wire.hub.flush(wire.send, wire.now_ns)
+    wire.hub.subscribe(BOB, "cloud", "b", 2, SECOND)
+    wire.hub.flush(wire.send, wire.now_ns)
+    assert [len(wire.got[who]) for who in (ANN, BOB)] == [1, 1], "the newest frame is kept"
+    for _ in range(70):
+        wire.now_ns += SECOND
+        describe(wire, dark)
+        wire.hub.sample_rates(wire.now_ns)
+    wire.hub.unsubscribe(BOB, "cloud", 2)
+    wire.hub.subscribe(BOB, "cloud", "b", 2, SECOND)
+    wire.hub.flush(wire.send, wire.now_ns)
+    assert len(wire.got[BOB]) == 2, "kept as long as its source is there"
+    assert wire.hub.pop_drops()[0] == {}
+    assert not wire.hub.push(MediaPush("cloud", 3, 5, ()), [], "", wire.now_ns)
+    assert wire.hub.pop_drops()[0] == {"media_malformed": 1}
+
+
+def test_new_source_does_not_send_frames_of_the_one_before() -> None:
+    wire = Wire()
+    wire.push(source="camera-1")
+    wire.now_ns += 4 * SECOND
+    describe(wire, StreamInfo("another room"), "camera-2")
+    wire.hub.subscribe(ANN, "cloud", "a", 1, wire.now_ns)
+    wire.hub.flush(wire.send, wire.now_ns)
+    assert not wire.got[ANN]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"hz": math.nan},
+        {"hz": math.inf},
+        {"hz": -1.0},
+        {"camera": StreamCamera(2**40, 1, 1.0, 1.0, 0.0, 0.0)},
+        {"camera": StreamCamera(1, 1, math.nan, 1.0, 0.0, 0.0)},
+        {"camera": StreamCamera(1, 1, 1.0, 1.0, 0.0, 0.0, position=(1e300, 0.0, 0.0))},
+        {"camera": StreamCamera(1, 1, 1.0, 1.0, 0.0, 0.0, orientation=(math.nan, 0.0, 0.0, 0.0))},
+    ],
+)
+def test_impossible_info_is_counted_and_the_frame_is_taken(changes: dict[str, Any]) -> None:
+    wire = Wire()
+    wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
+    good = StreamInfo("Room")
+    describe(wire, good, "", b"x")
+    assert describe(wire, msgspec.structs.replace(good, **changes), "", b"y") == good
+    assert wire.hub.pop_drops()[0] == {"media_info_malformed": 1}
+    wire.hub.flush(wire.send, wire.now_ns)
+    assert wire.got[ANN][-1][1] == b"y"
+
+
+def test_texts_of_an_info_are_cut() -> None:
+    wire = Wire()
+    info = describe(wire, StreamInfo("t" * 512, detail="d" * 512), "", b"x")
+    assert (info.title, info.detail) == ("t" * MAX_TITLE, "d" * MAX_DETAIL)
+
+
+@pytest.mark.parametrize(("hz", "late_ns"), [(30.0, SECOND), (1.0, 3 * SECOND), (0.0, None)])
+def test_stream_is_stale_without_the_frames_that_it_means_to_have(hz: float, late_ns: int | None) -> None:
+    wire = Wire()
+    describe(wire, StreamInfo(hz=hz), "", b"x")
+    facts = wire.hub.read_streams()["cloud"]
+    last = facts.received_ns + (late_ns or 59 * SECOND)
+    assert not facts.is_stale(last)
+    assert facts.is_stale(last + MS) == (late_ns is not None)
+    wire.now_ns = last + MS
+    describe(wire, StreamInfo(hz=hz))
+    assert wire.hub.read_streams()["cloud"].is_stale(last + MS) == (late_ns is not None), "an info is no frame"
+    describe(wire, None, "", b"x")
+    assert not wire.hub.read_streams()["cloud"].is_stale(last + MS)
 
 
 def test_topics() -> None:

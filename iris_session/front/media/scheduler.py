@@ -1,7 +1,8 @@
 """The media scheduler: streams, subscriptions, levels, and which frames are due. Pure: no sockets, time is given.
 
-Of every stream only the newest frame is kept. A subscriber whose connection is full gets the newest frame as soon as
-there is room again; frames that were due in between are dropped and counted. No subscriber waits for another.
+Of every stream only the newest frame is kept, and the newest info of its source. A subscriber whose connection is full
+gets the newest frame as soon as there is room again; frames that were due in between are dropped and counted. No
+subscriber waits for another.
 """
 
 from __future__ import annotations
@@ -10,10 +11,21 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
+import msgspec
+
 from iris_session.front.media.budget import MILLISECOND, NONE_LEVEL, SECOND
 from iris_session.protocol.codec import encode_media_header
 from iris_session.protocol.limits import TokenBucket
-from iris_session.protocol.media import CLASSES, MAX_STREAMS, MediaHeader, MediaPush, is_stream_name, make_topic
+from iris_session.protocol.media import (
+    CLASSES,
+    MAX_STREAMS,
+    MediaHeader,
+    MediaPush,
+    StreamInfo,
+    find_info_problem,
+    is_stream_name,
+    make_topic,
+)
 from iris_session.protocol.names import MediaEncoding
 
 #: A stream without frames for `TAKEOVER_NS` may be taken over by another source; after `EXPIRE_NS` it is removed.
@@ -26,6 +38,12 @@ RATE_SAMPLES: Final = 9
 #: Newest frames that new subscriptions of one connection get: as many as it may have at once, then so many a second.
 #: Else subscribing anew, over and over, would have the largest frame sent as often as a link takes it.
 NEWEST_PER_S: Final = 2.0
+#: Characters of the texts of a `StreamInfo` that are kept: every client gets those of every stream in one message.
+MAX_TITLE: Final = 64
+MAX_DETAIL: Final = 256
+#: A stream of `StreamInfo.hz` without a frame for so long is stale: the longer of a time, and of a number of frames.
+STALE_NS: Final = SECOND
+STALE_FRAMES: Final = 3.0
 #: `send(topic, header, frame)`: returns false if that connection has no room.
 Send = Callable[[bytes, bytes, Any], bool]
 
@@ -57,7 +75,7 @@ class DeliveryCounters(NamedTuple):
 
 class StreamStats(NamedTuple):
     """Measurements of a stream. `rates`: bytes per second at full, half, quarter. `hz`: frames per second. `encoding`:
-    of the newest frame, which was received at `received_ns`."""
+    of the newest frame, which was received at `received_ns`. `info`: as of its source, with texts cut to length."""
 
     rates: tuple[float, float, float]
     hz: float
@@ -65,6 +83,12 @@ class StreamStats(NamedTuple):
     subscribers: int
     encoding: str
     received_ns: int
+    info: StreamInfo = StreamInfo()
+
+    def is_stale(self, now_ns: int) -> bool:
+        """Return whether the newest frame is too old for the rate that the source means to hold."""
+        hz = self.info.hz
+        return hz > 0.0 and now_ns - self.received_ns > max(STALE_NS, STALE_FRAMES / hz * SECOND)
 
 
 class _Subscription:
@@ -83,12 +107,15 @@ class _Subscription:
 
 
 class _Stream:
-    """One stream and its newest frame. `level_bytes`: bytes that each level would have had so far."""
+    """One stream and its newest frame, received at `received_ns`; before the first one, when the stream began.
+    `heard_ns`: of the newest message. `level_bytes`: bytes that each level would have had so far.
+    """
 
-    def __init__(self, source: str, seq: int) -> None:
+    def __init__(self, source: str, seq: int, now_ns: int) -> None:
         self.source = source
         self.seq = seq
-        self.received_ns = 0
+        self.received_ns = self.heard_ns = now_ns
+        self.info = StreamInfo()
         self.encoding: str = MediaEncoding.BYTES
         self.push: MediaPush | None = None
         self.frames: dict[int, Any] = {}
@@ -198,9 +225,12 @@ class MediaScheduler:
     # --- frames ------------------------------------------------------------------------------------------------------
 
     def push(self, push: MediaPush, frames: Sequence[Any], source: str, now_ns: int) -> bool:
-        """Store a frame of a source as the newest of its stream. Return false if it was dropped and counted."""
+        """Store a frame of a source as the newest of its stream, and its info. Return false if it was dropped and
+        counted.
+        """
         levels = [CLASSES.index(name) for name in push.classes if name in CLASSES[:NONE_LEVEL]]
-        fits = len(frames) == len(levels) == len(push.classes) == len(set(levels)) and 0 in levels
+        fits = len(frames) == len(levels) == len(push.classes) == len(set(levels))
+        fits = fits and (0 in levels or (not levels and push.info is not None))
         if not fits or not is_stream_name(push.stream):
             self._count_drop("media_malformed")
             return False
@@ -210,7 +240,12 @@ class MediaScheduler:
         stream = self._find_stream(push.stream, source, now_ns)
         if stream is None:
             return False
-        stream.received_ns, stream.encoding, stream.push = now_ns, push.encoding, push
+        stream.heard_ns, stream.encoding = now_ns, push.encoding
+        if push.info is not None:
+            self._take_info(stream, push.info)
+        if not frames:
+            return True
+        stream.received_ns, stream.push = now_ns, push
         stream.frames = dict(zip(levels, frames, strict=True))
         stream.seq += 1
         stream.count += 1
@@ -240,7 +275,7 @@ class MediaScheduler:
     def sample_rates(self, now_ns: int) -> None:
         """Sample the counters for the rates, and remove streams that have ended."""
         for name, stream in list(self._streams.items()):
-            if now_ns - stream.received_ns > EXPIRE_NS:
+            if now_ns - stream.heard_ns > EXPIRE_NS:
                 del self._streams[name]
             else:
                 stream.rate_samples.append((now_ns, stream.count, tuple(stream.level_bytes)))
@@ -252,7 +287,8 @@ class MediaScheduler:
             stream = self._streams[name]
             rates, hz = stream.compute_rates()
             subscribers = sum(wanted == name for _, wanted in self._subscriptions)
-            found[name] = StreamStats(rates, hz, stream.source, subscribers, stream.encoding, stream.received_ns)
+            source, encoding, received_ns, info = stream.source, stream.encoding, stream.received_ns, stream.info
+            found[name] = StreamStats(rates, hz, source, subscribers, encoding, received_ns, info)
         return found
 
     def release_frames(self, until_ns: int) -> bool:
@@ -312,13 +348,21 @@ class MediaScheduler:
                 self._count_drop("media_streams_full")
                 return None
             # A restarted front numbers above its predecessor: no stream has a thousand frames a second.
-            stream = self._streams[name] = _Stream(source, now_ns // MILLISECOND)
+            stream = self._streams[name] = _Stream(source, now_ns // MILLISECOND, now_ns)
         elif stream.source != source:
-            if now_ns - stream.received_ns < TAKEOVER_NS:
+            if now_ns - stream.heard_ns < TAKEOVER_NS:
                 self._count_drop("media_stream_taken")
                 return None
-            stream.source = source
+            stream.source, stream.info, stream.received_ns = source, StreamInfo(), now_ns
+            stream.push, stream.frames = None, {}
         return stream
+
+    def _take_info(self, stream: _Stream, info: StreamInfo) -> None:
+        if find_info_problem(info):
+            self._count_drop("media_info_malformed")
+            return
+        title, detail = info.title[:MAX_TITLE], info.detail[:MAX_DETAIL]
+        stream.info = msgspec.structs.replace(info, title=title, detail=detail)
 
     def _find_level(self, number: int, stream: str) -> int:
         listener = self._subscribers.get(number)
@@ -368,6 +412,8 @@ class MediaScheduler:
             now_ns,
             push.encoding,
             subscription.dropped,
+            push.sent_ns,
+            stream.received_ns,
         )
         topic = make_topic(number, name) + CLASSES[level].encode()
         if not send(topic, encode_media_header(header), frame):

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from typing import Any, Final
 
+import msgspec
+
 from iris_session.front.channel_guard import ChannelFlood
 from iris_session.front.context import FrontContext
 from iris_session.front.key_budgets import IngestBackoff
@@ -21,14 +23,19 @@ from iris_session.front.media.budget import (
 )
 from iris_session.front.media.proxy import MediaProxy
 from iris_session.front.media.scheduler import DeliveryCounters, MediaSubscriber, StreamStats
+from iris_session.protocol.limits import TokenBucket
 from iris_session.protocol.media import CLASSES, StreamBudget
-from iris_session.protocol.names import BudgetClass, MediaEncoding
+from iris_session.protocol.names import BudgetClass
 from iris_session.protocol.status import ClientReport, DeliveryBudget, MediaStreamReport
 
 PERIOD_NS: Final = 250 * MILLISECOND
 MBIT: Final = 125_000.0
 #: State frames between two reports of a client of which some should have arrived: a third of a second.
 MIN_EXPECTED_FRAMES: Final = 20
+#: Descriptions of streams are sent when they change: so often at once, then so many times a second. A source may change
+#: its own with every frame.
+DESCRIPTIONS_PER_S: Final = 1.0
+DESCRIPTION_BURST: Final = 4
 #: Refused keys that are remembered.
 MAX_REFUSED: Final = 256
 #: Sources that a warning names.
@@ -65,6 +72,8 @@ class MediaService:
         self._controller = BudgetController() if context.config.adapt_media else None
         self._states: dict[int, _ClientState] = {}
         self._stats: dict[str, StreamStats] = {}
+        self._described: dict[str, StreamBudget] = {}  # as every client gets it, but for class and rate
+        self._description_bucket = TokenBucket(DESCRIPTIONS_PER_S, DESCRIPTION_BURST, context.now_ns())
         self._names: dict[str, str] = {}  # of sources, by key
         self._next_ns = 0
         self._connections_changed = False  # since the last tick
@@ -110,6 +119,11 @@ class MediaService:
                 facts.subscribers,
                 facts.encoding,
                 (now_ns - facts.received_ns) / MILLISECOND,
+                facts.info.title,
+                facts.info.audience,
+                facts.info.fault,
+                facts.info.detail,
+                facts.is_stale(now_ns),
             )
             for name, facts in self._stats.items()
         )
@@ -121,7 +135,7 @@ class MediaService:
             return {}
         return {
             "budget_class": _lowest_class(state),
-            "media": tuple(self._make_stream_budget(state, stream) for stream in state.streams),
+            "media": tuple(self._grade_stream(state, self._name_stream(stream)) for stream in state.streams),
             "media_bytes_per_s": state.bytes_per_s,
             "media_drops": state.drops,
         }
@@ -155,7 +169,14 @@ class MediaService:
         for number, state in self._states.items():
             state.streams = wanted[number]
             self._update_client(number, state, tallies[number], now_ns)
+        self._describe_streams(now_ns)
         self._publish_levels()
+
+    def _describe_streams(self, now_ns: int) -> None:
+        """Update the descriptions of streams: at once of new ones, of others as often as the rate allows."""
+        found = {name: _describe_stream(name, facts, now_ns) for name, facts in self._stats.items()}
+        shown = {name: self._described.get(name, one) for name, one in found.items()}
+        self._described = found if shown == found or self._description_bucket.take(now_ns) else shown
 
     def _update_client(self, number: int, state: _ClientState, tally: DeliveryCounters, now_ns: int) -> None:
         before, state.counters = state.counters, tally
@@ -223,19 +244,24 @@ class MediaService:
             return None
         return entry.name
 
-    def _make_stream_budget(self, state: _ClientState, stream: str) -> StreamBudget:
-        level = state.grant.levels.get(stream, _initial_level(state.grant))
-        facts = self._stats.get(stream)
+    def _name_stream(self, stream: str) -> StreamBudget:
+        """Return a stream without its description, which a report has once, not with each of hundreds of clients."""
+        described = self._described.get(stream)
+        return StreamBudget(stream) if described is None else StreamBudget(stream, encoding=described.encoding)
+
+    def _grade_stream(self, state: _ClientState, described: StreamBudget) -> StreamBudget:
+        """Return the budget of a stream with the class of this client, and its rate."""
+        level = state.grant.levels.get(described.stream, _initial_level(state.grant))
+        facts = self._stats.get(described.stream)
         rate = 0.0 if facts is None or level >= NONE_LEVEL else facts.rates[level]
-        encoding = MediaEncoding.BYTES if facts is None else facts.encoding
-        return StreamBudget(stream, CLASSES[level], round(rate / MBIT, 3), encoding)
+        return msgspec.structs.replace(described, budget_class=CLASSES[level], mbit_per_s=round(rate / MBIT, 3))
 
     def _send_budgets(self) -> None:
         """Send budgets that have changed, other than in their rates."""
         for number, state in self._states.items():
-            streams = tuple(self._make_stream_budget(state, stream) for stream in self._stats)
+            streams = tuple(self._grade_stream(state, described) for described in self._described.values())
             grant = state.grant
-            shown = tuple((s.stream, s.budget_class, s.encoding) for s in streams)
+            shown = tuple(msgspec.structs.replace(one, mbit_per_s=0.0) for one in streams)
             content = (shown, _lowest_class(state), grant.reason)
             if content == state.budget:
                 continue
@@ -244,6 +270,20 @@ class MediaService:
                 self._connections.by_number[number], DeliveryBudget(_lowest_class(state), bound, grant.reason, streams)
             ):
                 state.budget = content
+
+
+def _describe_stream(name: str, facts: StreamStats, now_ns: int) -> StreamBudget:
+    info = facts.info
+    return StreamBudget(
+        name,
+        encoding=facts.encoding,
+        title=info.title,
+        audience=info.audience,
+        camera=info.camera,
+        fault=info.fault,
+        detail=info.detail,
+        stale=facts.is_stale(now_ns),
+    )
 
 
 def _initial_level(grant: BudgetGrant) -> int:

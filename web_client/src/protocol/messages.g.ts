@@ -1733,9 +1733,9 @@ export type MediaHeader = [
 /**
  * First frame of a source's message; a bulk frame for each of `classes` follows, in their order.
  *
- * `classes`: `full`, and any of `half` and `quarter` that the source has in a coarser form. `info`: of the stream,
- * with its first frames, when it changes, and once a second; null: as before. `sent_ns`: when the source passed the
- * message to its socket, session time; 0: not known.
+ * `classes`: `full`, and any of `half` and `quarter` that the source has in a coarser form; none in a message that has
+ * an `info` and no frame. `info`: of the stream, with its first frames, when it changes, and once a second; null: as
+ * before. `sent_ns`: when the source passed the message to its socket, session time; 0: not known.
  */
 export type MediaPush = [
   stream: string,

@@ -1,0 +1,163 @@
+"""Descriptions of streams that the front sends to clients and reports, without sockets."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import msgspec
+
+from iris_session.front.connections import FrontConnection, Peer, Route
+from iris_session.front.key_budgets import IngestBackoff
+from iris_session.front.media.scheduler import MAX_DETAIL, MAX_TITLE, MediaScheduler
+from iris_session.front.media.service import DESCRIPTION_BURST, PERIOD_NS, MediaService
+from iris_session.link import FrontConfig
+from iris_session.protocol.client_messages import Hello
+from iris_session.protocol.codec import decode_server, encode_server
+from iris_session.protocol.media import MAX_STREAMS, MediaPush, StreamBudget, StreamCamera, StreamInfo
+from iris_session.protocol.server_messages import ServerEnvelope
+from iris_session.protocol.status import DeliveryBudget
+from tests.front.fakes import make_context
+
+SECOND = 1_000_000_000
+CAMERA = StreamCamera(640, 480, 585.0, 585.0, 319.5, 239.5)
+ROOM = StreamInfo("Room", "remote", CAMERA, 30.0)
+
+
+class FakeProxy:
+    """The thread's data without the thread."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.scheduler = MediaScheduler()
+        self.sources: set[str] = set()
+        self.undecided: set[str] = set()
+        self.refused: set[str] = set()
+
+    def start(self) -> None: ...
+
+    def pop_floods(self) -> list[Any]:
+        return []
+
+
+class Room:
+    """A service with one client, and the budgets that it was sent."""
+
+    def __init__(self) -> None:
+        self.now_ns = 5 * SECOND
+        self.budgets: list[DeliveryBudget] = []
+        self.proxy = FakeProxy()
+        context = make_context(self, lambda: self.now_ns, FrontConfig(adapt_media=False))
+        client = FrontConnection(7, Route(b"ann"), Peer(1, ""), ("127.0.0.1", 1), "", Hello("observer", "ann"), 0)
+        client.admitted = True
+        context.connections.add(client)
+        proxy: Any = self.proxy
+        self.service = MediaService(context, proxy, IngestBackoff())
+        self.drops = context.drops
+
+    def send_to_route(self) -> None: ...
+
+    def send(self, _connection: FrontConnection, message: DeliveryBudget) -> bool:
+        self.budgets.append(message)
+        return True
+
+    def push(self, stream: str = "room", info: StreamInfo | None = ROOM, encoding: str = "cloud") -> None:
+        push = MediaPush(stream, 1, self.now_ns, encoding=encoding, info=info)
+        assert self.proxy.scheduler.push(push, [b"x"], "", self.now_ns)
+
+    def tick(self, periods: int = 1) -> int:
+        """Return how many budgets were sent."""
+        before = len(self.budgets)
+        for _ in range(periods):
+            self.now_ns += PERIOD_NS
+            self.service.tick(self.now_ns)
+        return len(self.budgets) - before
+
+    def find(self, stream: str = "room") -> StreamBudget:
+        (found,) = [one for one in self.budgets[-1].streams if one.stream == stream]
+        return found
+
+
+def test_client_gets_the_description_and_its_changes() -> None:
+    room = Room()
+    room.tick()
+    room.push()
+    assert room.tick() == 1
+    expected = StreamBudget("room", encoding="cloud", title="Room", audience="remote", camera=CAMERA)
+    assert room.find() == expected
+    room.push(info=None)
+    assert room.tick() == 0
+    room.push(info=msgspec.structs.replace(ROOM, fault="moved", detail="by 3 cm"))
+    assert room.tick() == 1
+    assert (room.find().fault, room.find().detail) == ("moved", "by 3 cm")
+    room.push()
+    assert room.tick() == 1
+    assert room.find() == expected
+
+
+def test_stale_stream_is_told_within_a_second_and_a_quarter() -> None:
+    room = Room()
+    room.push()
+    room.tick(4)
+    assert not room.find().stale
+    assert room.tick() == 1
+    assert room.find().stale
+    (report,) = room.service.report_streams()
+    assert (report.stale, report.title, report.audience, report.age_ms) == (True, "Room", "remote", 1250.0)
+    room.push(info=None)
+    assert room.tick() == 1
+    assert not room.find().stale
+    assert not room.service.report_streams()[0].stale
+
+
+def test_report_names_the_fault() -> None:
+    room = Room()
+    room.push(info=msgspec.structs.replace(ROOM, fault="no_depth", detail="covered"))
+    room.tick()
+    (report,) = room.service.report_streams()
+    assert (report.fault, report.detail) == ("no_depth", "covered")
+
+
+def test_changes_with_every_frame_are_sent_at_a_bounded_rate_and_the_last_one_is() -> None:
+    room = Room()
+    sent = 0
+    for n in range(80):  # 20 s
+        room.push(info=msgspec.structs.replace(ROOM, detail=str(n)), encoding=f"e{n}")
+        sent += room.tick()
+    assert DESCRIPTION_BURST < sent <= DESCRIPTION_BURST + 21
+    room.tick(4)
+    assert (room.find().detail, room.find().encoding) == ("79", "e79")
+
+
+def test_new_stream_is_described_at_once_whatever_others_do() -> None:
+    room = Room()
+    for n in range(20):
+        room.push(info=msgspec.structs.replace(ROOM, detail=str(n)))
+        room.tick()
+    room.push("hand", StreamInfo("Hand", "remote"))
+    room.push(info=msgspec.structs.replace(ROOM, detail="once more"))
+    assert room.tick() == 1
+    assert (room.find("hand").title, room.find("hand").audience) == ("Hand", "remote")
+
+
+def test_longest_descriptions_of_all_streams_fit_a_message() -> None:
+    room = Room()
+    text = "\N{ROBOT FACE}"
+    camera = msgspec.structs.replace(CAMERA, body=text * 64, distortion=(0.1,) * 8)
+    info = StreamInfo(text * 512, text * 64, camera, 30.0, text * 64, text * 512)
+    for n in range(MAX_STREAMS):
+        room.push(f"{n:x}".ljust(48, "x"), info, text * 64)
+    room.tick()
+    envelope = decode_server(encode_server(ServerEnvelope(1, 7, room.budgets[-1])))
+    assert isinstance(envelope.message, DeliveryBudget)
+    assert {len(one.title) for one in envelope.message.streams} == {MAX_TITLE}
+    assert {len(one.detail) for one in envelope.message.streams} == {MAX_DETAIL}
+
+
+def test_participants_are_reported_without_descriptions() -> None:
+    room = Room()
+    room.push()
+    room.tick()
+    room.proxy.scheduler.subscribe(7, "room", "", 1, room.now_ns)
+    room.tick()
+    assert room.service.report_participant(7)["media"] == (StreamBudget("room", encoding="cloud"),)
