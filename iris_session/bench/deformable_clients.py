@@ -22,7 +22,7 @@ import numpy as np
 
 from iris_session.bench.clients import JOIN_S, MAX_FRAMES, ClientJob, Job
 from iris_session.client import Client, ClientGroup, CurveKeys
-from iris_session.client.media import MediaFrame
+from iris_session.client.feeds import MediaFrame
 from iris_session.protocol.codec import encode_media_header
 from iris_session.protocol.media import make_topic
 from iris_session.streams.deformable import DeformableDecoder

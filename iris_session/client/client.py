@@ -80,7 +80,7 @@ class Client:
 
     Attributes:
         scene: The scene as it is now: newest state, poses by name, presence.
-        media: Media streams: subscribe, publish.
+        media: Media streams: subscribe, point clouds, publish.
         assets: Assets: fetch, cancel, cache.
         alignment: Alignment: the present one, observations of anchors, jumps of the tracking frame.
         connection: The connection without I/O: phase, counters, clock.

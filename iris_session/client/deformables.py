@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from iris_session.client.assets import AssetFetch
 from iris_session.client.client import Client
 from iris_session.client.errors import ClientError
-from iris_session.client.media import MediaFeed
+from iris_session.client.feeds import MediaFeed
 from iris_session.protocol.assets import is_address
 from iris_session.protocol.names import ArrayKind, ArrayName, MediaEncoding
 from iris_session.protocol.scene import Deformable, decode_scene

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from typing import Final
 
 import msgspec
@@ -13,53 +12,16 @@ import msgspec
 from iris_session.client.core.arrival_meter import PERIOD_NS
 from iris_session.client.core.connection import ClientConnection
 from iris_session.client.errors import InvalidMessageError, NotConnectedError
+from iris_session.client.feeds import CloudFeed, MediaFeed, MediaFrame
 from iris_session.client.sockets import ClientSockets
 from iris_session.protocol.codec import decode_media_header, encode_media_frames
 from iris_session.protocol.errors import ProtocolError
-from iris_session.protocol.media import MediaHeader, StreamInfo, describe_bad_stream_name, is_stream_name, make_topic
-from iris_session.protocol.names import BudgetClass, MediaEncoding
+from iris_session.protocol.media import StreamInfo, describe_bad_stream_name, is_stream_name, make_topic
+from iris_session.protocol.names import MediaEncoding
 from iris_session.protocol.status import ClientReport, DeliveryBudget, compute_quantiles
 
 #: Ages of frames kept between two reports: more than come in a second.
 MAX_AGES: Final = 256
-
-
-@dataclass(frozen=True, slots=True)
-class MediaFrame:
-    """One frame. `age_ns`: from its capture until it was passed to the application [ns]."""
-
-    header: MediaHeader
-    data: bytes
-    age_ns: int
-
-
-@dataclass(slots=True)
-class MediaFeed:
-    """One subscribed stream.
-
-    Attributes:
-        stream: Its name.
-        newest: The newest frame, `None` before the first.
-        budget_class: The class in which the session delivers it to us.
-        received: Frames that came.
-        superseded: Of those, frames that came together with a newer one.
-        dropped: Frames that the session had for us and our link did not take in time, since this connection began.
-    """
-
-    stream: str
-    newest: MediaFrame | None = None
-    budget_class: str = BudgetClass.FULL
-    received: int = 0
-    superseded: int = 0
-    dropped: int = 0
-    _popped: MediaFrame | None = field(default=None, repr=False)
-
-    def pop_newest(self) -> MediaFrame | None:
-        """Return the newest frame once: `None` until there is another."""
-        if self.newest is self._popped:
-            return None
-        self._popped = self.newest
-        return self.newest
 
 
 class ClientMedia:
@@ -86,6 +48,7 @@ class ClientMedia:
         self._lock = lock
         self._may_use_sockets = may_use_sockets
         self._feeds: dict[str, MediaFeed] = {}
+        self._clouds: dict[str, CloudFeed] = {}
         self._generation = -1
         self._subscribed: set[str] = set()
         self._bytes = 0
@@ -111,6 +74,24 @@ class ClientMedia:
                 self._subscribe_soon()
             return self._feeds[stream]
 
+    def cloud(self, stream: str) -> CloudFeed:
+        """Subscribe to a media stream of point clouds, and decode them.
+
+        Args:
+            stream: Name of the stream; one that does not exist yet comes when it does.
+
+        Returns:
+            The newest cloud with its age, and counters; the same object for the same name. It ends with `unsubscribe`.
+
+        Raises:
+            InvalidMessageError: `stream` cannot be the name of a stream.
+        """
+        with self._lock:
+            feed = self.subscribe(stream)
+            if stream not in self._clouds:
+                self._clouds[stream] = CloudFeed(feed, self._session_now_ns)
+            return self._clouds[stream]
+
     def unsubscribe(self, stream: str) -> None:
         """End a subscription.
 
@@ -118,6 +99,7 @@ class ClientMedia:
             stream: Name of the stream; one that is not subscribed to is ignored.
         """
         with self._lock:
+            self._clouds.pop(stream, None)
             if self._feeds.pop(stream, None) is not None:
                 self._subscribe_soon()
 

@@ -1,0 +1,140 @@
+"""Point clouds of a client: decoded once, with counters, age and the times of their way."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from iris_session.client import Client, InvalidMessageError
+from iris_session.client.feeds import CloudFeed, MediaFeed, MediaFrame
+from iris_session.protocol.media import MediaHeader, StreamCamera, StreamInfo
+from iris_session.streams.cloud import encode_cloud
+from tests.client.harness import LiveSession
+
+DEADLINE_S = 30.0
+POINTS = np.arange(30, dtype=np.float32).reshape(10, 3) / 10
+FRAME = encode_cloud(POINTS, np.full((10, 3), 255, np.uint8), voxel_m=0.02, error_m=0.01)["full"]
+
+
+class Rig:
+    """A feed whose frames come from the test."""
+
+    def __init__(self) -> None:
+        self.now_ns = 1_000
+        self.feed = MediaFeed("room")
+        self.cloud = CloudFeed(self.feed, lambda: self.now_ns)
+
+    def receive(self, data: bytes = FRAME, encoding: str = "cloud") -> None:
+        self.feed.received += 1
+        header = MediaHeader("room", "full", 1, self.feed.received, 100, 400, encoding, 0, 200, 300)
+        self.feed.newest = MediaFrame(header, data, 400)
+
+
+def test_cloud_is_decoded_once_and_polled_once() -> None:
+    rig = Rig()
+    assert rig.cloud.poll() is None
+    assert rig.cloud.newest is None
+    assert rig.cloud.age_ns is None
+    rig.receive()
+    cloud = rig.cloud.newest
+    assert cloud is not None
+    assert rig.cloud.poll() is cloud
+    assert rig.cloud.poll() is None
+    assert rig.cloud.newest is cloud
+    assert (rig.cloud.decoded, rig.cloud.undecodable, rig.cloud.skipped) == (1, 0, 0)
+    assert np.allclose(np.sort(cloud.positions, axis=0), POINTS, atol=1e-3)
+    assert (cloud.error_m, cloud.voxel_m) == pytest.approx((0.01, 0.02))
+    assert cloud.colors.tolist() == [[255] * 4] * 10
+
+
+def test_times_and_ages() -> None:
+    rig = Rig()
+    rig.receive()
+    cloud = rig.cloud.poll()
+    assert cloud is not None
+    assert tuple(cloud.times) == (100, 200, 300, 400, 500, 1_000)
+    rig.now_ns = 5_000
+    assert (cloud.age_ns, rig.cloud.age_ns) == (900, 4_900)
+
+
+def test_frames_that_were_not_looked_at_in_time_are_counted() -> None:
+    rig = Rig()
+    rig.receive()
+    assert rig.cloud.skipped == 0
+    rig.receive()
+    rig.receive()
+    assert rig.cloud.skipped == 2
+    assert rig.cloud.poll() is not None
+    assert (rig.cloud.skipped, rig.cloud.decoded) == (2, 1)
+
+
+@pytest.mark.parametrize(
+    ("data", "encoding", "fault"),
+    [(FRAME[:-1], "cloud", "do not make a frame"), (b"", "cloud", "shorter"), (FRAME, "jpeg", "'jpeg': 'cloud'")],
+)
+def test_frame_that_is_no_cloud_is_counted_and_leaves_the_one_before(data: bytes, encoding: str, fault: str) -> None:
+    rig = Rig()
+    rig.receive()
+    before = rig.cloud.poll()
+    rig.receive(data, encoding)
+    assert rig.cloud.newest is before
+    assert rig.cloud.poll() is None
+    assert (rig.cloud.decoded, rig.cloud.undecodable, rig.cloud.skipped) == (1, 1, 0)
+    assert fault in rig.cloud.fault
+    rig.receive()
+    assert rig.cloud.poll() is not None
+    assert rig.cloud.fault == ""
+
+
+def test_cloud_of_a_session(session: LiveSession, join: Callable[..., Client]) -> None:
+    camera, ann = join("cam", role="camera"), join("ann")
+    room = ann.media.cloud("room")
+    assert ann.media.cloud("room") is room
+    assert ann.media.subscribe("room") is room.feed
+    info = StreamInfo("Room", "remote", StreamCamera(640, 480, 585.0, 585.0, 319.5, 239.5), 30.0)
+
+    def comes(_: Client) -> bool:
+        camera.media.publish("room", FRAME, encoding="cloud", info=info)
+        camera.poll()
+        return room.newest is not None
+
+    assert ann.wait_for(comes, DEADLINE_S)
+    cloud = room.poll()
+    assert cloud is not None
+    assert len(cloud.positions) == 10
+    assert cloud.times.capture_ns == cloud.times.sent_ns
+    slack_ns = 50_000_000  # the clock of a client is an estimate
+    times = list(cloud.times)
+    assert all(later - earlier > -slack_ns for earlier, later in itertools.pairwise(times)), times
+    assert times[2] <= times[3]
+    assert times[-1] < session.now_ns + slack_ns
+
+    def is_described(one: Client) -> bool:
+        streams = one.media.delivery.streams if one.media.delivery else ()
+        return [(s.title, s.audience, s.camera, s.stale) for s in streams] == [("Room", "remote", info.camera, False)]
+
+    assert ann.wait_for(is_described, DEADLINE_S)
+    (report,) = ann.status().media
+    assert (report.title, report.audience) == ("Room", "remote")
+    ann.media.unsubscribe("room")
+    assert ann.media.cloud("room") is not room
+    with pytest.raises(InvalidMessageError, match="media stream"):
+        ann.media.cloud("a/b")
+
+
+def test_info_alone_tells_why_no_frame_comes(join: Callable[..., Client]) -> None:
+    camera, ann = join("cam", role="camera"), join("ann")
+    info = StreamInfo("Room", hz=30.0, fault="source", detail="no such device")
+
+    def is_stale(one: Client) -> bool:
+        camera.media.publish("room", {}, encoding="cloud", info=info)
+        camera.poll()
+        streams = one.media.delivery.streams if one.media.delivery else ()
+        return [(s.stream, s.fault, s.detail, s.stale) for s in streams] == [("room", "source", info.detail, True)]
+
+    assert ann.wait_for(is_stale, DEADLINE_S)
+    with pytest.raises(InvalidMessageError, match="has class 'full'"):
+        camera.media.publish("room", {})
