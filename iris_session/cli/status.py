@@ -289,7 +289,11 @@ def _format_media(report: StatusReport) -> Iterator[str]:
                     subscribers.append(f"{p.name} ({p.id}) {budget.budget_class}" + _format_dropped(p.media_drops))
         source = f" from {one.source}" if one.source else ""
         receivers = ", ".join(subscribers) or "no subscribers"
-        yield f"media {one.stream}: {one.hz:.0f} Hz, {one.mbit_per_s:.1f} Mbit/s{source}; {receivers}"
+        title = f" ({one.title})" if one.title else ""
+        fault = f"; FAULT {one.fault}{f': {one.detail}' if one.detail else ''}" if one.fault else ""
+        stale = f"; STALE, no frame for {one.age_ms * 1e-3:.1f} s" if one.stale else ""
+        rates = f"{one.hz:.0f} Hz, {one.mbit_per_s:.1f} Mbit/s"
+        yield f"media {one.stream}{title}: {rates}{source}; {receivers}{stale}{fault}"
 
 
 def _format_assets(report: StatusReport) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Checks of a `StatusReport`: alignments of headsets that have one, and media. Pure."""
+"""Checks of a `StatusReport`: alignments of headsets that have one. Pure."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Final
 
 from iris_session.doctor.findings import Finding, failed, ok, warning
 from iris_session.protocol.common import Nanoseconds
-from iris_session.protocol.names import AlarmKind, AlignmentKind, BudgetClass
+from iris_session.protocol.names import AlarmKind, AlignmentKind
 from iris_session.protocol.status import CrossCheckReport, ParticipantReport, StatusReport
 
 #: Tracking frames drift by millimetres a minute: after this time without a sheet the stated error is no longer true.
@@ -16,8 +16,6 @@ STALE_NS: Final = 600_000_000_000
 MAX_ERROR_RATIO: Final = 2.0
 #: Older cross-checks say nothing about the present.
 MAX_CROSS_CHECK_AGE_NS: Final = 600_000_000_000
-#: Fewer drops are normal while the budget of a link is being found: one second of a camera.
-MEDIA_DROPS: Final = 30
 ALARMS: Final = {
     AlarmKind.JUMP: "the tracking frame jumped",
     AlarmKind.CHANGED: "a sheet was seen elsewhere than seconds before",
@@ -117,22 +115,6 @@ def check_agreement(people: tuple[ParticipantReport, ...], checks: tuple[CrossCh
         return ok("agreement", "no two headsets have observed the same anchor in the last ten minutes")
     worst = max(recent, key=lambda one: one.error_m)
     return ok("agreement", f"{len(recent)} pairs compared, at most {worst.error_m * 1e3:.0f} mm apart, as expected")
-
-
-def check_media(people: tuple[ParticipantReport, ...]) -> Finding:
-    """Report participants that receive less of clouds, cameras and deformables than is published."""
-    texts = []
-    for p in people:
-        cut = [f"{one.stream} in class {one.budget_class}" for one in p.media if one.budget_class != BudgetClass.FULL]
-        lost = f"{p.media_drops} frames dropped" if p.media_drops >= MEDIA_DROPS else ""
-        if p.connected and (cut or lost):
-            texts.append(f"{p.name}: {', '.join([*cut, *([lost] if lost else [])])}")
-    if not texts:
-        wanted = any(p.media for p in people)
-        return ok("media", "every subscriber gets full streams" if wanted else "no participant subscribes to media")
-    why = "their link has no more capacity; state and control have priority"
-    advice = "a better network for them, or fewer and smaller streams; docs/evidence/links.md"
-    return warning("media", "; ".join(texts), why, advice)
 
 
 def _format_age(duration_ns: Nanoseconds) -> str:

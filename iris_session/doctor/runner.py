@@ -26,7 +26,7 @@ JOIN_CHECKS: Final = ("server_key", "key", "role", "join")
 STREAM_CHECKS: Final = ("clock", "state")
 SESSION_CHECKS: Final = (
     "session", "alignment", "alarm", "stale", "align_run", "correction", "agreement", "leases", "robots", "clients",
-    "age", "ticks", "media", "recorder", "disk", "drops",
+    "age", "ticks", "streams", "media", "recorder", "disk", "drops",
 )  # fmt: skip
 
 #: As a user asks: is there a route, am I admitted, does state arrive, how is the session?

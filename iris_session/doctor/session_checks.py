@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from iris_session.doctor import headset_checks
+from iris_session.doctor import headset_checks, stream_checks
 from iris_session.doctor.drop_explanations import explain_drops
 from iris_session.doctor.findings import Finding, failed, ok, warning
 from iris_session.protocol.common import Nanoseconds
@@ -71,7 +71,8 @@ def check_session_report(report: StatusReport, own_id: str = "") -> list[Finding
         check_clients(people),
         check_data_age(people, report),
         check_ticks(report),
-        headset_checks.check_media(people),
+        stream_checks.check_streams(report.media),
+        stream_checks.check_media(people),
     ]
     first = check_stepping(report)
     return [

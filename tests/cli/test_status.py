@@ -102,6 +102,18 @@ def test_status_shows_media_with_subscribers() -> None:
     assert "60 Hz, 2.0 Mbit/s" in text
 
 
+def test_status_shows_title_fault_and_age_of_streams() -> None:
+    well = MediaStreamReport("room", 30.0, 20.0, "cam-1", encoding="cloud", age_ms=20.0, title="The room")
+    faulty = msgspec.structs.replace(
+        well, stream="hand", stale=True, age_ms=2_500.0, fault="moved", detail="3 cm\x1b[2J"
+    )
+    lines = format_status(msgspec.structs.replace(REPORT, media=(well, faulty)))
+    assert "media room (The room): 30 Hz, 20.0 Mbit/s from cam-1; no subscribers" in lines
+    (shown,) = [line for line in lines if line.startswith("media hand")]
+    assert "STALE, no frame for 2.5 s; FAULT moved: 3 cm" in shown
+    assert shown.isprintable()
+
+
 def test_screen_has_no_control_characters() -> None:
     assert all(line.isprintable() for line in format_status(REPORT))
 

@@ -1,4 +1,4 @@
-"""Checks of alignments and media: one fault at a time."""
+"""Checks of alignments: one fault at a time."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ import msgspec
 import pytest
 
 from iris_session.doctor.findings import Finding
-from iris_session.doctor.headset_checks import ALARMS, MEDIA_DROPS, STALE_NS, is_consistent
+from iris_session.doctor.headset_checks import ALARMS, STALE_NS, is_consistent
 from iris_session.doctor.runner import SESSION_CHECKS
 from iris_session.doctor.session_checks import check_session_report
-from iris_session.protocol.media import StreamBudget
 from iris_session.protocol.names import AlarmKind
 from iris_session.protocol.status import AlignmentReport, AnchorSeen, CrossCheckReport, StatusReport
 from tests.doctor.test_session_checks import ANN, DOCTOR, LEFT, WELL, S, change
@@ -100,20 +99,6 @@ def test_disconnected_and_unaligned_roles_are_excluded() -> None:
     bad: Any = change(ALIGNED, alarm="jump", running=False, pending_m=1.0)
     agent = change(ANN, alignment="not_needed", alignment_report=bad)
     assert all(one.state == "ok" for one in check_session_report(change(WELL, participants=(agent, DOCTOR)), "p9"))
-
-
-def test_reduced_or_dropped_media_are_reported() -> None:
-    full, quarter = StreamBudget("cloud", "full", 20.0), StreamBudget("cloth", "quarter", 0.5)
-    cut = change(ANN, media=(full, quarter))
-    assert_only(change(WELL, participants=(cut, DOCTOR)), "media", "warning", "ann: cloth in class quarter", "links.md")
-    lossy = change(ANN, media=(full,), media_drops=MEDIA_DROPS)
-    assert_only(change(WELL, participants=(lossy, DOCTOR)), "media", "warning", f"ann: {MEDIA_DROPS} frames dropped")
-
-
-def test_healthy_media_are_ok() -> None:
-    for fields in ({"media": (StreamBudget("cloud"),), "media_drops": MEDIA_DROPS - 1}, {"media": ()}):
-        report = change(WELL, participants=(change(ANN, **fields), DOCTOR))
-        assert all(one.state == "ok" for one in check_session_report(report, "p9"))
 
 
 def test_reports_without_the_new_fields_are_read() -> None:

@@ -387,10 +387,11 @@ def test_impossible_info_is_counted_and_the_frame_is_taken(changes: dict[str, An
     assert wire.got[ANN][-1][1] == b"y"
 
 
-def test_texts_of_an_info_are_cut() -> None:
+def test_texts_of_an_info_are_cut_and_printable() -> None:
     wire = Wire()
     info = describe(wire, StreamInfo("t" * 512, detail="d" * 512), "", b"x")
     assert (info.title, info.detail) == ("t" * MAX_TITLE, "d" * MAX_DETAIL)
+    assert describe(wire, StreamInfo("a\x1b[2Jb", detail="c\nd")) == StreamInfo("a [2Jb", detail="c d")
 
 
 @pytest.mark.parametrize(("hz", "late_ns"), [(30.0, SECOND), (1.0, 3 * SECOND), (0.0, None)])

@@ -361,7 +361,7 @@ class MediaScheduler:
         if find_info_problem(info):
             self._count_drop("media_info_malformed")
             return
-        title, detail = info.title[:MAX_TITLE], info.detail[:MAX_DETAIL]
+        title, detail = _cut_text(info.title, MAX_TITLE), _cut_text(info.detail, MAX_DETAIL)
         stream.info = msgspec.structs.replace(info, title=title, detail=detail)
 
     def _find_level(self, number: int, stream: str) -> int:
@@ -424,3 +424,8 @@ class MediaScheduler:
 
     def _count_drop(self, reason: str) -> None:
         self.drops[reason] = self.drops.get(reason, 0) + 1
+
+
+def _cut_text(text: str, length: int) -> str:
+    """Return the beginning of a text without control characters: people see it in terminals and pages."""
+    return "".join(letter if letter.isprintable() else " " for letter in text[:length])
