@@ -22,6 +22,7 @@ from msgspec import inspect
 
 from iris_session.client.address import Address
 from iris_session.client.errors import ClientError
+from iris_session.front.media.scheduler import MediaScheduler, MediaSubscriber
 from iris_session.link import messages as link
 from iris_session.link.config import Ports, SceneInfo
 from iris_session.link.discovery import is_plausible
@@ -31,9 +32,19 @@ from iris_session.protocol.client_messages import ClientEnvelope
 from iris_session.protocol.codec import make_decoder
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.errors import ProtocolError
-from iris_session.protocol.media import CLASSES, MediaHeader, MediaPush, make_topic, parse_topic
+from iris_session.protocol.media import (
+    CLASSES,
+    MAX_STREAMS,
+    MediaHeader,
+    MediaPush,
+    StreamBudget,
+    StreamInfo,
+    make_topic,
+    parse_topic,
+)
 from iris_session.protocol.names import PROTOCOL_VERSION
 from iris_session.protocol.server_messages import Presence, ServerEnvelope, StateHeader
+from iris_session.protocol.status import DeliveryBudget
 from iris_session.recording import journal, messages
 from iris_session.security import KeysError
 from iris_session.security.allow_list import AllowedKey, AllowList
@@ -467,7 +478,29 @@ def make_media_push(rng: Random) -> bytes:
         return encoded(rng, MediaPush)
     classes = tuple(rng.sample(CLASSES, rng.randrange(1, len(CLASSES))))
     push = MediaPush(rng.choice(("cloud", "a", f"s{rng.randrange(100)}", "")), 1, rng.getrandbits(40), classes)
-    return codec.encode_media_push(push)
+    info = value(rng, schema(StreamInfo)) if rng.random() < 0.5 else None
+    if isinstance(info, dict):
+        info["detail"] = rng.choice(WORDS) * rng.choice((1, 8, 64, 600))
+    return msgspec.msgpack.encode([*msgspec.structs.astuple(push)[:5], info, rng.choice(INTS)])
+
+
+def check_media_push(data: bytes) -> None:
+    """Decode a push, and deliver it as the front does: its info reaches every client in one message."""
+    push = codec.decode_media_push(data)
+    scheduler = MediaScheduler()
+    scheduler.set_subscribers({1: MediaSubscriber("", {})}, 0)
+    scheduler.push(push, [b"x"] * min(len(push.classes), len(CLASSES)), "", 1)
+    for name, facts in scheduler.read_streams().items():
+        camera = facts.info.camera
+        numbers = () if camera is None else (camera.fx, camera.cy, *camera.distortion, *camera.position)
+        assert all(map(math.isfinite, (facts.info.hz, *numbers)))
+        assert not facts.is_stale(2**62) or facts.info.hz > 0.0
+        scheduler.subscribe(1, name, "", 2, 3)
+        info = facts.info
+        described = StreamBudget(name, title=info.title, camera=info.camera, fault=info.fault, detail=info.detail)
+        budgets = codec.encode_server(ServerEnvelope(1, 7, DeliveryBudget("full", streams=(described,) * MAX_STREAMS)))
+        codec.decode_server(budgets)
+    scheduler.flush(lambda _, header, __: bool(codec.decode_media_header(header)), 4)
 
 
 def check_media_topic(data: bytes) -> None:
@@ -562,7 +595,7 @@ DECODERS: Final[dict[str, Callable[[Random], Any]]] = {
     "keys-public": lambda rng: KeyFiles(rng, None, lambda f: load_public(f.path / "x.key"), "x.key", _certificate),
     "keys-secret": lambda rng: KeyFiles(rng, None, lambda f: load_secret(f.path / "x.key"), "x.key", _certificate),
     "media-header": lambda rng: Decoder(rng, [lambda r: encoded(r, MediaHeader)], codec.decode_media_header, _OURS),
-    "media-push": lambda rng: Decoder(rng, [make_media_push], codec.decode_media_push, _OURS),
+    "media-push": lambda rng: Decoder(rng, [make_media_push], check_media_push, _OURS),
     "media-topic": lambda rng: Decoder(rng, [make_media_topic], check_media_topic, (ValueError,)),
     "asset-request": lambda rng: Decoder(rng, [make_asset_request], codec.decode_asset_request, _OURS),
     "asset-chunk": lambda rng: Decoder(
