@@ -348,7 +348,7 @@ class MediaEncoding:
 
 
 class StreamAudience:
-    """Who needs a media stream. Unknown values: as `all`."""
+    """Audience of a media stream. Unknown values: as `all`."""
 
     ALL: Final = "all"
     REMOTE: Final = (

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from iris_session import Client, decode_cloud, encode_cloud
+from iris_session import Client, StreamCamera, StreamInfo, encode_cloud
 from tests.e2e.browser import Page
 from tests.e2e.session_process import SessionProcess, wait_until
 
@@ -26,16 +26,26 @@ def test_a_cloud_at_rest_reaches_who_joins_later(
     pink = np.full(wall.shape, (255, 0, 255), np.uint8)
     frames = encode_cloud(wall, pink, voxel_m=0.02, error_m=0.01, classes=("full", "half", "quarter"))
     with Client(server.address, role="source", name="camera") as source:
-        wait_until(lambda: source.media.publish("room", frames, encoding="cloud"), "the source has a connection")
+        info = StreamInfo("The room", "all", StreamCamera(640, 480, 585.0, 585.0, 319.5, 239.5))
+        wait_until(
+            lambda: source.media.publish("room", frames, encoding="cloud", info=info), "the source has a connection"
+        )
         wait_until(lambda: [one.stream for one in source.status().media] == ["room"], "the session has the cloud")
 
         with Client(server.address, role="observer", name="late") as late:
-            feed = late.media.subscribe("room")
-            wait_until(lambda: late.poll(0.05) and feed.newest is not None, "the newest frame has come")
-            assert feed.newest is not None
-            cloud = decode_cloud(feed.newest.data)
-            assert feed.received == 1
+            room = late.media.cloud("room")
+            wait_until(lambda: late.poll(0.05) and room.newest is not None, "the newest frame has come")
+            cloud = room.poll()
+            assert cloud is not None
+            assert (room.feed.received, room.decoded, room.undecodable) == (1, 1, 0)
             assert len(cloud.positions) == 10_000
+            times = cloud.times
+            assert times.capture_ns <= times.sent_ns
+            assert times.received_ns <= times.published_ns
+            assert times.arrived_ns <= times.decoded_ns
+            assert late.media.delivery is not None
+            (told,) = late.media.delivery.streams
+            assert (told.title, told.audience, told.camera, told.stale) == ("The room", "all", info.camera, False)
             assert (cloud.error_m, cloud.voxel_m) == pytest.approx((0.01, 0.02))
 
             page = open_page(server, "viewer")

@@ -370,7 +370,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Who needs a media stream. Unknown values: as all.
+    /// Audience of a media stream. Unknown values: as all.
     /// </summary>
     public static class StreamAudience
     {

@@ -324,7 +324,7 @@ export const MediaEncoding = {
 } as const;
 export type MediaEncoding = (typeof MediaEncoding)[keyof typeof MediaEncoding] | (string & {});
 
-/** Who needs a media stream. Unknown values: as `all`. */
+/** Audience of a media stream. Unknown values: as `all`. */
 export const StreamAudience = {
   ALL: "all",
   REMOTE: "remote",
