@@ -1,0 +1,186 @@
+"""Pipeline: which frames are joined, what happens to the others, the budget of points, poses of bodies, removal."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from anchors.camera import CameraModel
+from anchors.pose import PoseTuple
+from iris_session.cloud.frames import DepthFrame
+from iris_session.cloud.pipeline import CloudPipeline, PipelineCamera, PipelineSettings
+from iris_session.cloud.voxels import DepthLimits, Floats, PointSet, VoxelFilter
+from iris_session.streams.cloud import decode_cloud
+
+MS = 1_000_000
+CAMERA = CameraModel(80, 60, 70.0, 70.0, 39.5, 29.5)
+
+
+def make_frame(capture_ms: float, depth_mm: int = 1500, color: int = 100) -> DepthFrame:
+    """Return a wall before the camera."""
+    depth = np.full((60, 80), depth_mm, np.uint16)
+    return DepthFrame(depth, np.full((60, 80, 3), color, np.uint8), round(capture_ms * MS), None)
+
+
+def place(x: float) -> Floats:
+    """Return the pose of a camera at `x` that looks along z."""
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return pose
+
+
+def make_pipeline(*names: str, points: int = 50_000, **options: object) -> CloudPipeline:
+    cameras = [
+        PipelineCamera(name, DepthLimits(), 0.01 * (i + 1), place(10.0 * i), str(options.get("body", "")))
+        for i, name in enumerate(names)
+    ]
+    options.pop("body", None)
+    pipeline = CloudPipeline(
+        PipelineSettings(points, 0.02),
+        cameras,
+        iter(range(0, 10**9, MS)).__next__,
+        voxels=VoxelFilter(0.02, use_numba=False),
+        **options,  # type: ignore[arg-type]
+    )
+    for name in names:
+        pipeline.open_camera(name, CAMERA, 0.001)
+    return pipeline
+
+
+def test_one_camera_gives_its_newest_frame() -> None:
+    pipeline = make_pipeline("front")
+    assert pipeline.take_frames(0) == {}
+    for at in (0, 33, 66):
+        pipeline.offer("front", make_frame(at), at * MS)
+    frames = pipeline.take_frames(66 * MS)
+    assert frames["front"].frame.capture_ns == 66 * MS
+    assert pipeline.drops["superseded"] == 2
+    cloud = pipeline.make_cloud(frames)
+    assert (cloud.capture_ns, cloud.cameras, cloud.voxel_m) == (66 * MS, ("front",), 0.02)
+    assert cloud.stages_ms == {"voxels": 1.0, "outliers": 1.0, "budget": 1.0, "encode": 1.0}
+    assert set(cloud.frames) == {"full", "half", "quarter"}
+    shown = decode_cloud(cloud.frames["full"])
+    assert len(shown.positions) == cloud.n_points > 1000
+    assert np.allclose(shown.positions[:, 2], 1.5, atol=0.001)
+    assert shown.error_m == pytest.approx(0.01)
+    assert pipeline.take_frames(70 * MS) == {}, "a frame is used once"
+
+
+def test_frames_of_two_cameras_are_joined_when_captured_together() -> None:
+    pipeline = make_pipeline("left", "right")
+    pipeline.offer("left", make_frame(100), 110 * MS)
+    pipeline.offer("right", make_frame(60, color=200), 110 * MS)
+    cloud = pipeline.make_cloud(pipeline.take_frames(110 * MS))
+    assert (cloud.cameras, cloud.capture_ns) == (("left", "right"), 60 * MS)
+    assert cloud.error_m == pytest.approx(0.02), "the larger of the two"
+    x = decode_cloud(cloud.frames["full"]).positions[:, 0]
+    assert (x < 5.0).any()
+    assert (x > 5.0).any()
+
+
+def test_a_frame_that_is_too_old_to_be_joined_is_left_out_and_counted() -> None:
+    pipeline = make_pipeline("left", "right")
+    pipeline.offer("left", make_frame(40), 110 * MS)
+    pipeline.offer("right", make_frame(100), 110 * MS)
+    frames = pipeline.take_frames(110 * MS)
+    assert set(frames) == {"right"}
+    assert pipeline.drops["join"] == 1
+
+
+def test_a_camera_that_delivers_is_waited_for_and_one_that_stopped_is_not() -> None:
+    pipeline = make_pipeline("left", "right")
+    for name in ("left", "right"):
+        pipeline.offer(name, make_frame(0), 0)
+    assert set(pipeline.take_frames(0)) == {"left", "right"}
+    pipeline.offer("left", make_frame(100), 100 * MS)
+    assert pipeline.take_frames(100 * MS) == {}, "the right one is due"
+    assert pipeline.list_missing(100 * MS) == []
+    pipeline.offer("left", make_frame(501), 501 * MS)
+    assert set(pipeline.take_frames(501 * MS)) == {"left"}
+    assert pipeline.list_missing(501 * MS) == ["right"]
+
+
+def test_the_voxel_meets_the_budget_and_no_frame_is_above_it() -> None:
+    pipeline = make_pipeline("front", points=1000)
+    edges = []
+    for at in range(5):
+        pipeline.offer("front", make_frame(at), at * MS)
+        cloud = pipeline.make_cloud(pipeline.take_frames(at * MS))
+        assert cloud.n_points <= 1000
+        assert len(decode_cloud(cloud.frames["full"]).positions) == cloud.n_points
+        edges.append(cloud.voxel_m)
+    assert edges[0] == 0.02
+    assert edges[1] > 0.02
+    assert len(set(edges[2:])) == 1, "it has settled"
+    assert pipeline.drops["budget"] > 0
+    settled = pipeline.drops["budget"]
+    pipeline.offer("front", make_frame(9), 9 * MS)
+    pipeline.make_cloud(pipeline.take_frames(9 * MS))
+    assert pipeline.drops["budget"] == settled
+
+
+def test_a_camera_on_a_body_is_placed_by_the_pose_at_its_capture() -> None:
+    known: dict[int, PoseTuple] = {}
+    pipeline = make_pipeline("hand", body="gripper", body_pose=lambda body, at: known.get(at) if body else None)
+    pipeline.offer("hand", make_frame(10), 15 * MS)
+    assert pipeline.take_frames(15 * MS) == {}, "the state of that moment is not there yet"
+    pipeline.offer("hand", make_frame(43), 48 * MS)
+    known[10 * MS] = ((3.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    frames = pipeline.take_frames(50 * MS)
+    assert frames["hand"].frame.capture_ns == 10 * MS, "not replaced by one whose pose is not known"
+    assert frames["hand"].T_world_camera[0, 3] == 3.0
+    assert not pipeline.lacks_pose("hand")
+
+
+def test_a_frame_whose_pose_does_not_come_is_dropped_and_counted() -> None:
+    pipeline = make_pipeline("hand", body="gripper", body_pose=lambda body, at: None)
+    pipeline.offer("hand", make_frame(10), 10 * MS)
+    assert pipeline.take_frames(200 * MS) == {}
+    assert pipeline.drops["pose"] == 0
+    assert pipeline.take_frames(211 * MS) == {}
+    assert pipeline.drops["pose"] == 1
+    assert pipeline.lacks_pose("hand")
+
+
+def test_waiting_frames_are_bounded() -> None:
+    pipeline = make_pipeline("hand", body="gripper", body_pose=lambda body, at: None)
+    for at in range(10):
+        pipeline.offer("hand", make_frame(at), at * MS)
+    assert pipeline.drops["superseded"] == 7
+
+
+def test_a_frame_with_a_pose_of_its_own_is_placed_by_it() -> None:
+    pipeline = make_pipeline("front")
+    pipeline.offer("front", make_frame(0)._replace(T_world_camera=place(-7.0)), 0)
+    cloud = pipeline.make_cloud(pipeline.take_frames(0))
+    assert decode_cloud(cloud.frames["full"]).positions[:, 0].mean() == pytest.approx(-7.0, abs=0.05)
+
+
+def test_points_are_removed_at_the_time_of_capture() -> None:
+    asked = []
+
+    def remove(points: PointSet, at: int) -> PointSet:
+        asked.append(at)
+        kept = points.positions[:, 0] < 0.0
+        return PointSet(points.positions[kept], points.colors[kept], points.counts[kept])
+
+    pipeline = make_pipeline("front", remove_points=remove)
+    pipeline.offer("front", make_frame(20), 30 * MS)
+    cloud = pipeline.make_cloud(pipeline.take_frames(30 * MS))
+    assert asked == [20 * MS]
+    assert decode_cloud(cloud.frames["full"]).positions[:, 0].max() < 0.001
+
+
+def test_a_cloud_without_points_is_one() -> None:
+    pipeline = make_pipeline("front")
+    pipeline.offer("front", make_frame(0, depth_mm=0), 0)
+    cloud = pipeline.make_cloud(pipeline.take_frames(0))
+    assert cloud.n_points == 0
+    assert len(decode_cloud(cloud.frames["full"]).positions) == 0
+
+
+def test_another_clock_drops_what_waits() -> None:
+    pipeline = make_pipeline("front")
+    pipeline.offer("front", make_frame(0), 0)
+    pipeline.clear()
+    assert pipeline.take_frames(0) == {}
