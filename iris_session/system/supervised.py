@@ -1,0 +1,182 @@
+"""A child process that writes reports, and its successors: started in a thread, restarted after growing delays.
+
+The caller keeps the time and polls; nothing here waits for the process.
+"""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+from collections.abc import Callable
+from typing import Final, Generic, Protocol, TypeVar
+
+import msgspec
+
+from iris_session.system.backoff import Backoff
+from iris_session.system.process import ChildProcess
+
+SECOND: Final = 1_000_000_000
+RESTART_DELAYS_NS: Final = (0, SECOND // 2, SECOND, 2 * SECOND, 5 * SECOND)
+#: A process that lived this long counts as healthy again.
+HEALTHY_NS: Final = 30 * SECOND
+log = logging.getLogger(__name__)
+
+
+class ProcessReport(Protocol):
+    """Report of a process: what it has refused or dropped by reason, and why it ends, empty while all is well."""
+
+    @property
+    def drops(self) -> dict[str, int]: ...
+
+    @property
+    def fault(self) -> str: ...
+
+
+Report = TypeVar("Report", bound=ProcessReport)
+
+
+class SupervisedProcess(Generic[Report]):
+    """A process whose standard output are reports, a line of JSON each, and its successors.
+
+    Args:
+        title: Name for people, as `the web gateway`.
+        spawn: Starts the process. Called in a thread; what it raises is announced.
+        report_type: Type of the reports; without arguments it is that of a process that has not reported.
+        hang_ns: A process that has reported before and then does not for this long is ended; 0: never.
+
+    Attributes:
+        report: The newest report of the process.
+        heard_ns: Time of `poll` at which it came, `None` before the first.
+        restarts: How often it was restarted.
+    """
+
+    def __init__(
+        self, title: str, spawn: Callable[[], ChildProcess], report_type: type[Report], *, hang_ns: int = 0
+    ) -> None:
+        self._title = title
+        self._spawn = spawn
+        self._type = report_type
+        self._hang_ns = hang_ns
+        self._process: ChildProcess | None = None
+        self._thread: threading.Thread | None = None
+        self._backoff = Backoff(RESTART_DELAYS_NS)
+        self._started_ns = self._due_ns = 0
+        self._failure = self._hang = self._announced = ""
+        self._was_started = self._closed = False
+        self._earlier_drops: dict[str, int] = {}
+        self.report = report_type()
+        self.heard_ns: int | None = None
+        self.restarts = 0
+
+    @property
+    def pid(self) -> int:
+        """Process id, 0 while there is none."""
+        return self._process.pid if self._process is not None and self._process.is_running else 0
+
+    @property
+    def is_started(self) -> bool:
+        """True from `start` on."""
+        return self._was_started
+
+    @property
+    def failure(self) -> str:
+        """Why there is no process, in one line; empty while there is one."""
+        return "" if self.pid else self._announced
+
+    @property
+    def drops(self) -> dict[str, int]:
+        """Counters of what this process and those before it have refused or dropped, by reason."""
+        reasons = {**self._earlier_drops, **self.report.drops}
+        return {one: self._earlier_drops.get(one, 0) + self.report.drops.get(one, 0) for one in reasons}
+
+    def start(self, now_ns: int) -> None:
+        """Start the process, in a thread. `now_ns`: a monotonic time."""
+        self._was_started = True
+        self._started_ns, self._due_ns, self.heard_ns = now_ns, 0, None
+        self._thread = threading.Thread(target=self._run_spawn, name="iris-spawn", daemon=True)
+        self._thread.start()
+
+    def poll(self, now_ns: int) -> list[str]:
+        """Read reports, and start the process again when it has ended. Never waits.
+
+        Args:
+            now_ns: A monotonic time.
+
+        Returns:
+            What is to be announced, one line each.
+        """
+        if self._thread is not None:
+            if self._thread.is_alive():
+                return []
+            self._thread = None
+            if self._failure:
+                return self._announce(f"{self._title} does not start: {self._failure}", now_ns)
+        if self._process is None:
+            if self._due_ns and now_ns >= self._due_ns:
+                self.start(now_ns)
+            return []
+        self._read_reports(self._process, now_ns)
+        if self._process.is_running:
+            if self._hang_ns and self.heard_ns is not None and now_ns - self.heard_ns > self._hang_ns:
+                self._hang = f"did not report for {self._hang_ns / SECOND:g} s and was ended"
+                self._process.send_signal(signal.SIGKILL)
+            return []
+        fault = self.report.fault or self._hang or f"ended with status {self._process.exit_status}"
+        self._process.close()
+        self._process, self._hang = None, ""
+        self._earlier_drops, self.report = self.drops, self._type()
+        if now_ns - self._started_ns > HEALTHY_NS:
+            self._backoff.reset()
+            self._announced = ""
+        return self._announce(f"{self._title} {fault}; it is started again", now_ns)
+
+    def terminate(self) -> None:
+        """Ask the process to end: several end at the same time before each is closed."""
+        self._closed = True
+        if self._process is not None:
+            self._process.send_signal(signal.SIGTERM)
+
+    def close(self, timeout_s: float) -> None:
+        """End the process by SIGTERM, after `timeout_s` by SIGKILL. May be called twice."""
+        self._closed = True
+        if self._thread is not None:
+            self._thread.join(timeout_s)
+            self._thread = None
+        if self._process is not None:
+            self._process.close(terminate_s=timeout_s)
+            self._process = None
+
+    def _announce(self, text: str, now_ns: int) -> list[str]:
+        """Set when to try again. Return the line, unless it is the last one again."""
+        self._due_ns = now_ns + max(1, self._backoff.next_delay())
+        self.restarts += 1
+        if text == self._announced:
+            return []
+        self._announced = text
+        return [text]
+
+    def _run_spawn(self) -> None:
+        self._failure = ""
+        try:
+            process = self._spawn()
+        except Exception as error:  # no process, no memory, no certificate: the session goes on without it
+            self._failure = " ".join(str(error).split()) or type(error).__name__
+            return
+        if self._closed:
+            process.close()
+        else:
+            self._process = process
+
+    def _read_reports(self, process: ChildProcess, now_ns: int) -> None:
+        try:
+            lines = process.read_available_lines()
+        except OSError:
+            return
+        for line in lines:
+            try:
+                self.report = msgspec.json.decode(line, type=self._type)
+            except msgspec.MsgspecError:
+                log.warning("%s wrote a line that is no report", self._title)
+                continue
+            self.heard_ns = now_ns
