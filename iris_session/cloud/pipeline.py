@@ -6,6 +6,7 @@ stopped delivering does not stop the cloud of the others.
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
@@ -239,7 +240,7 @@ class CloudPipeline:
             points.positions, points.colors, voxel_m=voxel_m, error_m=error_m, classes=settings.classes
         )
         times.append(clock_ns())
-        durations = [(after - before) / MILLISECOND for before, after in zip(times, times[1:], strict=False)]
+        durations = [(after - before) / MILLISECOND for before, after in itertools.pairwise(times)]
         stages_ms = dict(zip(("voxels", "outliers", "budget", "encode"), durations, strict=True))
         return Cloud(encoded, capture_ns, len(points.positions), voxel_m, error_m, tuple(frames), stages_ms)
 
