@@ -140,7 +140,12 @@ class FrontSockets:
             return Keyring(drops=self._drops)
         try:
             return open_keyring(
-                config.key_home, config.curve_secret_file, config.curve_clients_dir, self._drops, config.gateway_key
+                config.key_home,
+                config.curve_secret_file,
+                config.curve_clients_dir,
+                self._drops,
+                config.gateway_key,
+                config.camera_keys,
             )
         except KeysError as error:
             raise FrontError(str(error)) from error

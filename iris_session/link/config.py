@@ -130,6 +130,8 @@ class FrontConfig(msgspec.Struct, frozen=True):
         forward_observations: Send raw observations to the authority too.
         recorder_endpoint: Endpoint of a PULL socket for raw samples, empty when nothing is recorded.
         gateway_key: Public key (Z85) of the session's own gateway, which is admitted without the list; empty for none.
+        camera_keys: Public keys (Z85) of the session's own camera processes, which are admitted without the list, as
+            cameras only.
     """
 
     host: str = "127.0.0.1"
@@ -166,6 +168,7 @@ class FrontConfig(msgspec.Struct, frozen=True):
     gateway_key: str = ""
     anchor_errors: dict[str, float] = {}
     anchor_marks: dict[str, dict[Name, Vec3]] = {}
+    camera_keys: tuple[str, ...] = ()
 
     @property
     def hosts(self) -> tuple[str, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -36,8 +36,9 @@ PAIRING_PREFIX: Final = "pair:"
 _log = logging.getLogger(__name__)
 
 
-#: Name of the session's own gateway.
+#: Names of the session's own gateway and camera processes.
 GATEWAY_NAME: Final = "web gateway"
+CAMERA_NAME: Final = "camera process"
 #: Roles in which people behind a gateway may join.
 _PERSONAL_ROLES: Final = tuple(sorted(Role.ALL - {Role.GATEWAY}))
 
@@ -60,7 +61,8 @@ class Keyring:
 
     `key`: key pair of the server, `None` on plain loopback. `home`: the key home where unknown keys may pair, else
     `None`. `files`: the worker that makes every change of its files. `own_gateway`: fingerprint of the session's own
-    gateway, which may join in any role without being listed; empty for none.
+    gateway, which may join in any role without being listed; empty for none. `camera_keys`: public keys (Z85) of its
+    own camera processes, which may join as cameras without being listed.
 
     Collected until the front takes them: `removed`, keys that were removed from the list or got other roles; `added`,
     new keys; `last_seen`, UTC at which keys joined. `pending_revocations`: keys that a director revoked and that are
@@ -75,9 +77,12 @@ class Keyring:
         signature: Callable[[], object] = lambda: None,
         drops: Drops | None = None,
         gateway_key: str = "",
+        camera_keys: Sequence[str] = (),
     ) -> None:
-        self._gateway = AllowedKey(GATEWAY_NAME, gateway_key) if gateway_key and key is not None else None
-        self.own_gateway = "" if self._gateway is None else self._gateway.fingerprint
+        gateway = AllowedKey(GATEWAY_NAME, gateway_key) if gateway_key and key is not None else None
+        self.own_gateway = "" if gateway is None else gateway.fingerprint
+        cameras = [AllowedKey(CAMERA_NAME, one, (Role.CAMERA,)) for one in camera_keys if key is not None]
+        self._own = {one.fingerprint: one for one in (gateway, *cameras) if one is not None}
         self.key = key
         self.home = home
         self._read = read
@@ -112,8 +117,7 @@ class Keyring:
     @property
     def fingerprints(self) -> Collection[str]:
         """Fingerprints of all allowed CURVE keys."""
-        own = [self.own_gateway] if self.own_gateway else []
-        return [*own, *(mark for mark, entry in self._keys.items() if entry.kind == CURVE)]
+        return [*self._own, *(mark for mark, entry in self._keys.items() if entry.kind == CURVE)]
 
     def find_entry(self, mark: str) -> AllowedKey | None:
         """Return the entry of the list with that fingerprint, of any kind."""
@@ -121,8 +125,9 @@ class Keyring:
 
     def find_key(self, mark: str) -> AllowedKey | None:
         """Return the allowed CURVE key with that fingerprint."""
-        if self._gateway is not None and mark == self.own_gateway:
-            return self._gateway
+        own = self._own.get(mark)
+        if own is not None:
+            return own
         entry = self._keys.get(mark)
         return entry if entry is not None and entry.kind == CURVE else None
 
@@ -219,7 +224,14 @@ class Keyring:
         return self._now_ns - self._missing_ns >= ABSENCE_NS
 
 
-def open_keyring(key_home: str, secret_file: str, clients_dir: str, drops: Drops, gateway_key: str = "") -> Keyring:
+def open_keyring(
+    key_home: str,
+    secret_file: str,
+    clients_dir: str,
+    drops: Drops,
+    gateway_key: str = "",
+    camera_keys: Sequence[str] = (),
+) -> Keyring:
     """Return the keyring of an encrypted session.
 
     Args:
@@ -228,6 +240,7 @@ def open_keyring(key_home: str, secret_file: str, clients_dir: str, drops: Drops
         clients_dir: Folder of public certificates (`*.key`) instead of the allow-list, or empty.
         drops: Counts files that cannot be read.
         gateway_key: Public key (Z85) of the session's own gateway, or empty.
+        camera_keys: Public keys (Z85) of its own camera processes.
 
     Raises:
         KeysError: A key or the allow-list cannot be used.
@@ -235,12 +248,12 @@ def open_keyring(key_home: str, secret_file: str, clients_dir: str, drops: Drops
     home = KeyHome(key_home)
     key = load_secret(secret_file) if secret_file else home.load_server_key()
     if not clients_dir:
-        return Keyring(key, home, home.clients.read, lambda: home.clients.signature, drops, gateway_key)
+        return Keyring(key, home, home.clients.read, lambda: home.clients.signature, drops, gateway_key, camera_keys)
     folder = Path(clients_dir)
     if not folder.is_dir():
         raise KeysError(f"{folder} is not a folder: it has to hold the public keys (*.key) of the allowed clients")
     certificates = _CertificateFolder(folder, drops)
-    return Keyring(key, None, certificates.read, certificates.signature, drops, gateway_key)
+    return Keyring(key, None, certificates.read, certificates.signature, drops, gateway_key, camera_keys)
 
 
 class _CertificateFolder:

@@ -88,3 +88,20 @@ def test_keyring_without_file_has_nothing_missing() -> None:
     keyring = Keyring()
     keyring.reload_if_changed()
     assert not keyring.is_missing
+
+
+def test_own_processes_join_without_the_list_in_their_roles_only(tmp_path: Path) -> None:
+    gateway, camera, other = (KeyPair.generate() for _ in range(3))
+    KeyHome(tmp_path / "home").load_server_key()
+    keyring = open_keyring(str(tmp_path / "home"), "", "", Drops(), gateway.public, (camera.public,))
+    try:
+        assert sorted(keyring.fingerprints) == sorted([gateway.fingerprint, camera.fingerprint])
+        assert keyring.find_roles(gateway.fingerprint) == ()
+        assert keyring.find_roles(camera.fingerprint) == ("camera",)
+        assert keyring.find_roles(other.fingerprint) is None
+        assert keyring.may_hand_in_media(camera.fingerprint)
+        assert keyring.may_be_gateway(gateway.fingerprint)
+        assert not keyring.may_be_gateway(camera.fingerprint)
+        assert keyring.own_gateway == gateway.fingerprint
+    finally:
+        keyring.close()
