@@ -44,14 +44,14 @@ class PipelineCamera(NamedTuple):
         name: Its name.
         limits: Which of its pixels count.
         error_m: Stated error of its points, 95 % [m].
-        T_body_camera: (4, 4), from its optical frame to the body, or to the world.
+        T_body_camera: (4, 4), from its optical frame to the body, or to the world; `None`: each frame has its own.
         body: Name of the body that carries it, empty for the world.
     """
 
     name: str
     limits: DepthLimits
     error_m: float
-    T_body_camera: Floats
+    T_body_camera: Floats | None
     body: str = ""
 
 
@@ -266,7 +266,7 @@ class CloudPipeline:
         """Return `T_world_camera` at the capture of a frame."""
         if frame.T_world_camera is not None:
             return np.asarray(frame.T_world_camera, np.float64)
-        if not camera.body:
+        if camera.T_body_camera is None or not camera.body:
             return camera.T_body_camera
         T_world_body = None if self._body_pose is None else self._body_pose(camera.body, frame.capture_ns)
         return None if T_world_body is None else pose_to_matrix(T_world_body) @ camera.T_body_camera

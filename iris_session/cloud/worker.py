@@ -1,0 +1,389 @@
+"""The work of one camera process without its connection: sources, pipeline, pictures, faults, reports.
+
+It publishes through an `Outlet`: a session, or nothing at all where a camera file is inspected. No sockets, no clocks.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import Final, Protocol
+
+import numpy as np
+
+from anchors.camera import CameraModel, pose_from_matrix
+from iris_session.cloud.camera_file import CameraSettings, CloudSettings
+from iris_session.cloud.config import CameraReport, SourceReport
+from iris_session.cloud.frames import DepthSource
+from iris_session.cloud.health import CameraHealth, Fault
+from iris_session.cloud.pipeline import (
+    CLASSES,
+    BodyPose,
+    Cloud,
+    CloudPipeline,
+    PipelineCamera,
+    PipelineSettings,
+    PointRemover,
+)
+from iris_session.cloud.reader import NewFrame, SourceReader
+from iris_session.cloud.voxels import Colors, DepthLimits, Floats, VoxelFilter, make_rays
+from iris_session.protocol.media import StreamCamera, StreamInfo
+from iris_session.protocol.names import MediaEncoding, StreamFault
+from iris_session.streams.cloud import encode_cloud
+from iris_session.system.extras import require_package
+
+MILLISECOND: Final = 1_000_000
+SECOND: Final = 1_000_000_000
+#: Period of the description of a stream, and of its newest frame while there is no new one.
+INFO_NS: Final = SECOND
+#: Sources whose pictures of a world at rest are all the same.
+RENDERED: Final = frozenset({"mujoco"})
+#: Of the cloud of cameras that have shown nothing yet.
+NO_POINTS: Final = (np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))
+#: Time for the threads to leave their sources [s].
+JOIN_S: Final = 0.5
+
+#: Opens the source of a camera, which stamps its frames by the clock [ns].
+OpenSource = Callable[[CameraSettings, Callable[[], int]], DepthSource]
+
+
+class Outlet(Protocol):
+    """The destination of frames."""
+
+    def now_ns(self) -> int:
+        """Return session time [ns]."""
+        ...
+
+    def publish(
+        self, stream: str, frames: bytes | Mapping[str, bytes], capture_ns: int, encoding: str, info: StreamInfo | None
+    ) -> bool:
+        """Publish a frame. False: it was dropped."""
+        ...
+
+
+class _Stream:
+    """One stream, and when it was described last."""
+
+    def __init__(self, name: str, encoding: str) -> None:
+        self.name = name
+        self.encoding = encoding
+        self.frames: bytes | dict[str, bytes] = b""
+        self.capture_ns = 0
+        self.published_ns = 0
+        self.due_ns = 0
+        self._fault: Fault | None = None
+        self._described_ns = -INFO_NS
+
+    def needs_info(self, fault: Fault | None, now_ns: int) -> bool:
+        return fault != self._fault or now_ns - self._described_ns >= INFO_NS
+
+    def note_published(self, fault: Fault | None, now_ns: int, *, described: bool) -> None:
+        self.published_ns = now_ns
+        if described:
+            self._fault, self._described_ns = fault, now_ns
+
+    def is_due(self, hz: float, now_ns: int) -> bool:
+        """Return whether another frame may be published, at most `hz` of them in the mean; count it then."""
+        if now_ns < self.due_ns:
+            return False
+        period_ns = round(SECOND / hz)
+        self.due_ns = max(self.due_ns + period_ns, now_ns - period_ns)
+        return True
+
+
+class CloudWorker:
+    """Sources, pipeline and streams of one camera file.
+
+    Args:
+        settings: The camera file.
+        outlet: Destination of the frames.
+        open_source: Opens a source.
+        clock_ns: Clock by which stages are measured [ns].
+        body_pose: Poses of bodies that carry cameras.
+        remove_points: Removes points from every cloud.
+
+    Attributes:
+        cloud: The newest cloud, `None` before the first.
+        poses: `T_world_camera` of the newest joined frames by camera.
+    """
+
+    def __init__(
+        self,
+        settings: CloudSettings,
+        outlet: Outlet,
+        open_source: OpenSource,
+        clock_ns: Callable[[], int],
+        *,
+        body_pose: BodyPose | None = None,
+        remove_points: PointRemover | None = None,
+    ) -> None:
+        if settings.picture_hz:
+            require_package("cv2", "pictures of cameras (picture_hz)")
+        self._settings = settings
+        self._outlet = outlet
+        self._clock_ns = clock_ns
+        self._wake = threading.Event()
+        self.cloud: Cloud | None = None
+        self.poses: dict[str, Floats] = {}
+        pipeline = PipelineSettings(
+            settings.points, settings.voxel_m, settings.min_points, settings.min_around, CLASSES
+        )
+        self.pipeline = CloudPipeline(
+            pipeline,
+            [make_pipeline_camera(settings, one) for one in settings.cameras],
+            clock_ns,
+            body_pose=body_pose,
+            remove_points=remove_points,
+            voxels=make_warm_filter(settings.voxel_m),
+        )
+        self._cameras = {one.name: one for one in settings.cameras}
+        self._readers = {one.name: self._make_reader(one, open_source) for one in settings.cameras}
+        self._openings: dict[str, int] = {}
+        self._models: dict[str, CameraModel] = {}
+        self._stream = _Stream(settings.stream, MediaEncoding.CLOUD)
+        self._pictures = {
+            one.name: _Stream(settings.name_picture_stream(one.name), MediaEncoding.JPEG)
+            for one in settings.cameras
+            if settings.picture_hz
+        }
+        self._drops: Counter[str] = Counter()
+        self._reported_ns: int | None = None
+        self._clouds = self._bytes = 0
+        self._age_ms = 0.0
+        self._stages: Counter[str] = Counter()  # sums of durations [ms], and how many
+        self._stage_counts: Counter[str] = Counter()
+
+    def _make_reader(self, camera: CameraSettings, open_source: OpenSource) -> SourceReader:
+        settings, now_ns = self._settings, self._outlet.now_ns
+        return SourceReader(
+            camera.name,
+            lambda: open_source(camera, now_ns),
+            CameraHealth(min(settings.hz, camera.hz or settings.hz), has_noise=camera.source not in RENDERED),
+            now_ns,
+            self._wake.set,
+        )
+
+    def start(self) -> None:
+        """Open the sources, each in its thread."""
+        for reader in self._readers.values():
+            reader.start()
+
+    def restart_clock(self) -> None:
+        """Forget all frames: session time is that of another session from now on."""
+        self.pipeline.clear()
+        for reader in self._readers.values():
+            reader.restart_clock()
+        for stream in (self._stream, *self._pictures.values()):
+            stream.due_ns = stream.published_ns = stream.capture_ns = 0
+            stream.frames = b""
+
+    def poll(self, timeout_s: float) -> bool:
+        """Do what is due: publish a cloud, pictures, faults.
+
+        Args:
+            timeout_s: Seconds to wait at most for a frame.
+
+        Returns:
+            True when a cloud was made.
+        """
+        self._wake.wait(timeout_s)
+        self._wake.clear()
+        now_ns = self._outlet.now_ns()
+        for name, reader in self._readers.items():
+            new = reader.take_frame()
+            if new is not None:
+                self._take_over(name, new, now_ns)
+        has_made = self._make_cloud(now_ns)
+        self._publish_at_rest(now_ns)
+        return has_made
+
+    def find_fault(self, now_ns: int) -> Fault | None:
+        """Return the fault of the cloud: that of the first camera that has one."""
+        for name in self._readers:
+            fault = self._find_camera_fault(name, now_ns)
+            if fault is not None:
+                return Fault(fault.fault, f"camera {name}: {fault.detail}")
+        return None
+
+    def make_report(self, *, connected: bool = True, fault: str = "") -> CameraReport:
+        """Return the state of the work, with rates and means since the last report."""
+        now_ns = self._outlet.now_ns()
+        elapsed_s = (now_ns - (now_ns if self._reported_ns is None else self._reported_ns)) / SECOND
+        self._reported_ns = now_ns
+        n, self._clouds = self._clouds, 0
+        sent, self._bytes = self._bytes, 0
+        age_ms, self._age_ms = self._age_ms, 0.0
+        stages_ms = {stage: total / self._stage_counts[stage] for stage, total in self._stages.items()}
+        self._stages.clear()
+        self._stage_counts.clear()
+        cloud = self.cloud
+        return CameraReport(
+            self._settings.stream,
+            connected,
+            n / elapsed_s if elapsed_s > 0.0 else 0.0,
+            0 if cloud is None else cloud.n_points,
+            0.0 if cloud is None else cloud.voxel_m,
+            None if cloud is None or math.isinf(cloud.error_m) else cloud.error_m,
+            sent / elapsed_s if elapsed_s > 0.0 else 0.0,
+            age_ms / n if n else 0.0,
+            stages_ms,
+            self.count_drops(),
+            {name: self._make_source_report(name, now_ns) for name in self._readers},
+            fault,
+        )
+
+    def count_drops(self) -> dict[str, int]:
+        """Return how much was left out, by reason, since the start."""
+        drops = self._drops + self.pipeline.drops
+        for reader in self._readers.values():
+            drops["superseded"] += reader.superseded
+            drops["unusable"] += reader.refused
+        return {reason: n for reason, n in drops.items() if n}
+
+    def close(self) -> bool:
+        """End the threads. Return false when one is kept by its source."""
+        for reader in self._readers.values():
+            reader.stop()
+        ended = [
+            reader.join(JOIN_S) for reader in self._readers.values()
+        ]  # every one, not only to the first that hangs
+        return all(ended)
+
+    # --- inside -------------------------------------------------------------------------------------------------------
+
+    def _take_over(self, name: str, new: NewFrame, now_ns: int) -> None:
+        if self._openings.get(name) != new.opening:
+            self._openings[name] = new.opening
+            self._models[name] = new.model
+            self.pipeline.open_camera(name, new.model, new.depth_scale_m)
+        self.pipeline.offer(name, new.frame, now_ns)
+        picture = self._pictures.get(name)
+        if picture is not None and picture.is_due(self._settings.picture_hz, now_ns):
+            began_ns = self._clock_ns()
+            picture.frames = encode_picture(new.frame.color, self._settings.picture_quality)
+            picture.capture_ns = new.frame.capture_ns
+            self._note_stage("jpeg", (self._clock_ns() - began_ns) / MILLISECOND)
+            self._publish(picture, self._find_camera_fault(name, now_ns), now_ns)
+
+    def _make_cloud(self, now_ns: int) -> bool:
+        if now_ns < self._stream.due_ns:
+            return False
+        frames = self.pipeline.take_frames(now_ns)
+        if not frames or not self._stream.is_due(self._settings.hz, now_ns):
+            return False
+        cloud = self.cloud = self.pipeline.make_cloud(frames)
+        self.poses = {name: one.T_world_camera for name, one in frames.items()}
+        self._stream.frames, self._stream.capture_ns = cloud.frames, cloud.capture_ns
+        self._note_stage("read", max(self._readers[name].read_ms for name in frames))
+        for stage, duration_ms in cloud.stages_ms.items():
+            self._note_stage(stage, duration_ms)
+        began_ns = self._clock_ns()
+        self._publish(self._stream, self.find_fault(now_ns), now_ns)
+        self._note_stage("send", (self._clock_ns() - began_ns) / MILLISECOND)
+        self._clouds += 1
+        self._age_ms += (self._outlet.now_ns() - cloud.capture_ns) / MILLISECOND
+        return True
+
+    def _publish_at_rest(self, now_ns: int) -> None:
+        """Publish the newest frames again while there are no new ones and a fault says why: a fault travels with a
+        frame. Without a first frame it is an empty cloud."""
+        fault = self.find_fault(now_ns)
+        if fault is not None and self._stream.needs_info(fault, now_ns):
+            self._stream.frames = self._stream.frames or encode_cloud(*NO_POINTS)
+            self._publish(self._stream, fault, now_ns)
+        for name, picture in self._pictures.items():
+            fault = self._find_camera_fault(name, now_ns)
+            if fault is not None and picture.frames and picture.needs_info(fault, now_ns):
+                self._publish(picture, fault, now_ns)
+
+    def _publish(self, stream: _Stream, fault: Fault | None, now_ns: int) -> None:
+        described = stream.needs_info(fault, now_ns)
+        info = self._make_info(stream, fault) if described else None
+        capture_ns = stream.capture_ns or now_ns
+        if not self._outlet.publish(stream.name, stream.frames, capture_ns, stream.encoding, info):
+            self._drops["send"] += 1
+            return
+        stream.note_published(fault, now_ns, described=described)
+        frames = stream.frames
+        self._bytes += len(frames) if isinstance(frames, bytes) else sum(map(len, frames.values()))
+
+    def _make_info(self, stream: _Stream, fault: Fault | None) -> StreamInfo:
+        settings = self._settings
+        names = [name for name, picture in self._pictures.items() if picture is stream]
+        name = names[0] if names else ""
+        camera = self._describe_camera(name or settings.cameras[0].name) if name or len(self._cameras) == 1 else None
+        return StreamInfo(
+            title=f"{settings.title}: {name}" if name else settings.title,
+            audience=settings.audience,
+            camera=camera,
+            hz=settings.picture_hz if name else settings.hz,
+            fault="" if fault is None else fault.fault,
+            detail="" if fault is None else fault.detail,
+        )
+
+    def _describe_camera(self, name: str) -> StreamCamera | None:
+        """Return intrinsics and pose of a camera, `None` while they are not known."""
+        model, camera = self._models.get(name), self._cameras[name]
+        if model is None:
+            return None
+        pose = None if camera.pose is None else camera.pose.to_matrix()
+        if not camera.body:
+            pose = self.poses.get(name, pose)
+        if pose is None:
+            return None
+        position, orientation = pose_from_matrix(pose)
+        return StreamCamera(
+            model.width, model.height, model.fx, model.fy, model.cx, model.cy, tuple(model.distortion),
+            camera.body, position, orientation,
+        )  # fmt: skip
+
+    def _find_camera_fault(self, name: str, now_ns: int) -> Fault | None:
+        fault = self._readers[name].find_fault(now_ns)
+        if fault is None and self.pipeline.lacks_pose(name):
+            detail = (
+                f"the session has no body {self._cameras[name].body!r}, or no state of it when a frame was captured"
+            )
+            fault = Fault(StreamFault.POSE, detail)
+        return fault
+
+    def _make_source_report(self, name: str, now_ns: int) -> SourceReport:
+        reader, fault = self._readers[name], self._find_camera_fault(name, now_ns)
+        return SourceReport(
+            reader.measure_hz(now_ns),
+            "" if fault is None else fault.fault,
+            "" if fault is None else fault.detail,
+            reader.failures,
+        )
+
+    def _note_stage(self, stage: str, duration_ms: float) -> None:
+        self._stages[stage] += duration_ms
+        self._stage_counts[stage] += 1
+
+
+def make_pipeline_camera(settings: CloudSettings, camera: CameraSettings) -> PipelineCamera:
+    """Return a camera of a camera file as the pipeline takes it."""
+    limits = DepthLimits(settings.low, settings.high, camera.nearest_m, camera.farthest_m)
+    error_m = math.inf if camera.error_mm is None else camera.error_mm / 1000.0
+    pose = None if camera.pose is None else camera.pose.to_matrix()
+    return PipelineCamera(camera.name, limits, error_m, pose, camera.body)
+
+
+def make_warm_filter(voxel_m: float) -> VoxelFilter:
+    """Return a filter that is compiled: the first picture would take seconds, in which nothing is reported."""
+    voxels = VoxelFilter(voxel_m)
+    depth, color = np.full((4, 4), 1000, np.uint16), np.zeros((4, 4, 3), np.uint8)
+    voxels.add_depth(depth, color, make_rays(CameraModel(4, 4, 4.0, 4.0, 2.0, 2.0)), np.eye(4))
+    voxels.collect(min_points=1, min_around=1)
+    return voxels
+
+
+def encode_picture(color: Colors, quality: int) -> bytes:
+    """Return a picture, RGB, as JPEG."""
+    import cv2
+
+    fits, data = cv2.imencode(".jpg", color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not fits:
+        raise ValueError(f"a picture of shape {color.shape} cannot be encoded as JPEG")
+    return bytes(data.tobytes())

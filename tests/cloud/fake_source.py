@@ -1,0 +1,88 @@
+"""A source and an outlet by the test."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from anchors.camera import CameraModel
+from iris_session.cloud.frames import DepthFrame
+from iris_session.protocol.media import StreamInfo
+
+CAMERA = CameraModel(40, 30, 35.0, 35.0, 19.5, 14.5)
+DEADLINE_S = 60.0
+
+
+class FakeSource:
+    """Returns what the test puts in; an error is raised.
+
+    Attributes:
+        closed: It was closed.
+    """
+
+    def __init__(self) -> None:
+        self.camera = CAMERA
+        self.depth_scale_m = 0.001
+        self.closed = False
+        self._items: list[DepthFrame | Exception] = []
+        self._changed = threading.Condition()
+
+    def put(self, item: DepthFrame | Exception) -> None:
+        with self._changed:
+            self._items.append(item)
+            self._changed.notify_all()
+
+    def read(self, timeout_s: float) -> DepthFrame | None:
+        with self._changed:
+            if not self._items:
+                self._changed.wait(timeout_s)
+            item = self._items.pop(0) if self._items else None
+        if isinstance(item, Exception):
+            raise item
+        return item
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def make_frame(capture_ns: int, depth_mm: int = 1500) -> DepthFrame:
+    """Return a wall with noise."""
+    random = np.random.default_rng(capture_ns % 2**32)
+    depth = (depth_mm + random.integers(0, 3, (30, 40))).astype(np.uint16)
+    return DepthFrame(depth, np.full((30, 40, 3), 90, np.uint8), capture_ns, None)
+
+
+class FakeOutlet:
+    """Keeps what was published. `takes`: whether it takes anything."""
+
+    def __init__(self) -> None:
+        self.published: list[tuple[str, bytes | Mapping[str, bytes], int, str, StreamInfo | None]] = []
+        self.takes = True
+
+    def now_ns(self) -> int:
+        return time.monotonic_ns()
+
+    def publish(
+        self, stream: str, frames: bytes | Mapping[str, bytes], capture_ns: int, encoding: str, info: StreamInfo | None
+    ) -> bool:
+        if self.takes:
+            self.published.append((stream, frames, capture_ns, encoding, info))
+        return self.takes
+
+    def list_streams(self) -> list[str]:
+        return [one[0] for one in self.published]
+
+    def newest_info(self, stream: str) -> StreamInfo | None:
+        """Return what was last said of a stream."""
+        return next((one[4] for one in reversed(self.published) if one[0] == stream and one[4] is not None), None)
+
+
+def wait_until(condition: Callable[[], object]) -> None:
+    """Poll `condition` until it is true."""
+    deadline = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.002)

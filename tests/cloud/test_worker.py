@@ -1,0 +1,186 @@
+"""The work of a camera process: clouds and pictures are published, faults travel with them, all is reported."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from iris_session.cloud.camera_file import CameraSettings
+from iris_session.cloud.frames import DepthFrame, SourceError
+from iris_session.cloud.worker import CloudWorker
+from iris_session.protocol.names import MediaEncoding, StreamFault
+from iris_session.streams.cloud import decode_cloud
+from tests.cloud.camera_settings import make_settings
+from tests.cloud.fake_source import DEADLINE_S, FakeOutlet, FakeSource, make_frame
+
+
+class Lab:
+    """A worker and its sources by camera."""
+
+    def __init__(self, *names: str, **options: Any) -> None:
+        self.outlet = FakeOutlet()
+        self.sources: dict[str, FakeSource] = {}
+        self.settings = make_settings(*names, **options)
+        self.worker = CloudWorker(self.settings, self.outlet, self._open, time.perf_counter_ns)
+        self.worker.start()
+        self.poll_until(lambda: len(self.sources) == len(names))
+
+    def _open(self, camera: CameraSettings, now_ns: Callable[[], int]) -> FakeSource:
+        self.sources[camera.name] = FakeSource()
+        return self.sources[camera.name]
+
+    def poll_until(self, condition: Callable[[], object]) -> None:
+        deadline = time.monotonic() + DEADLINE_S
+        while not condition():
+            assert time.monotonic() < deadline
+            self.worker.poll(0.01)
+
+    def show(self, name: str, **changes: Any) -> DepthFrame:
+        """Give a frame of a camera, and poll until it has been published."""
+        frame = make_frame(self.outlet.now_ns())._replace(**changes)
+        self.sources[name].put(frame)
+        self.poll_until(lambda: any(one[2] == frame.capture_ns for one in self.outlet.published))
+        return frame
+
+
+@pytest.fixture
+def open_lab() -> Iterator[Callable[..., Lab]]:
+    labs: list[Lab] = []
+
+    def start(*names: str, **options: Any) -> Lab:
+        labs.append(Lab(*names, **options))
+        return labs[-1]
+
+    yield start
+    for lab in labs:
+        assert lab.worker.close()
+        assert all(source.closed for source in lab.sources.values())
+
+
+def test_cloud_and_picture_of_a_camera(open_lab: Callable[..., Lab]) -> None:
+    lab = open_lab("front", picture_hz=10.0)
+    frame = lab.show("front")
+    lab.poll_until(lambda: len(lab.outlet.published) == 2)
+    (name, picture, picture_ns, encoding, info), (cloud_name, frames, cloud_ns, cloud_encoding, cloud_info) = (
+        lab.outlet.published
+    )
+    assert (name, encoding, picture_ns) == ("room-front", MediaEncoding.JPEG, frame.capture_ns)
+    assert isinstance(picture, bytes)
+    decoded = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
+    assert decoded is not None
+    assert decoded.shape == (30, 40, 3)
+    assert info is not None
+    assert info.camera is not None
+    assert (info.title, info.hz, info.camera.width, info.camera.fx) == ("Room: front", 10.0, 40, 35.0)
+    assert (cloud_name, cloud_encoding, cloud_ns) == ("room", MediaEncoding.CLOUD, frame.capture_ns)
+    assert not isinstance(frames, bytes)
+    assert set(frames) == {"full", "half", "quarter"}
+    assert len(decode_cloud(frames["full"]).positions) > 100
+    assert cloud_info is not None
+    assert (cloud_info.title, cloud_info.audience, cloud_info.fault) == ("Room", "remote", "")
+
+
+def test_the_description_comes_once_a_second(open_lab: Callable[..., Lab]) -> None:
+    lab = open_lab("front", hz=100.0)
+    began = time.monotonic()
+    while time.monotonic() - began < 1.5:
+        lab.show("front")
+    told = [one[2] for one in lab.outlet.published if one[4] is not None]
+    assert len(lab.outlet.published) > 5
+    gaps = [(b - a) * 1e-9 for a, b in itertools.pairwise(told)]
+    assert told
+    assert all(gap > 0.9 for gap in gaps)
+
+
+def test_the_rate_of_clouds_and_pictures_is_bounded(open_lab: Callable[..., Lab]) -> None:
+    lab = open_lab("front", hz=5.0, picture_hz=2.0)
+    began = time.monotonic()
+    while time.monotonic() - began < 2.0:
+        lab.sources["front"].put(make_frame(lab.outlet.now_ns()))
+        lab.worker.poll(0.01)
+    elapsed = time.monotonic() - began
+    assert lab.outlet.list_streams().count("room") <= 5.0 * elapsed + 2
+    assert lab.outlet.list_streams().count("room-front") <= 2.0 * elapsed + 2
+    assert lab.worker.count_drops()["superseded"] > 0
+
+
+def test_a_source_that_fails_before_its_first_frame_is_named_with_an_empty_cloud(open_lab: Callable[..., Lab]) -> None:
+    lab = open_lab("front")
+    lab.sources["front"].put(SourceError("no such device: 0, there are none"))
+    lab.poll_until(lambda: lab.outlet.published)
+    stream, frames, _, _, info = lab.outlet.published[0]
+    assert stream == "room"
+    assert not isinstance(frames, bytes)
+    assert len(decode_cloud(frames["full"]).positions) == 0
+    assert info is not None
+    assert (info.fault, info.detail) == (StreamFault.SOURCE, "camera front: no such device: 0, there are none")
+    assert info.camera is None
+    lab.poll_until(lambda: len(lab.sources) == 1 and not lab.sources["front"].closed)
+    lab.show("front")
+    lab.poll_until(lambda: (lab.outlet.newest_info("room") or info).fault == "")
+
+
+def test_a_fault_is_published_with_the_newest_frame_while_none_comes(open_lab: Callable[..., Lab]) -> None:
+    lab = open_lab("front", picture_hz=10.0)
+    frame = lab.show("front")
+    lab.poll_until(lambda: len(lab.outlet.published) == 2)
+    lab.sources["front"].put(SourceError("the cable is loose"))
+    lab.poll_until(lambda: len(lab.outlet.published) >= 4)
+    for stream, data, capture_ns, _, info in lab.outlet.published[2:4]:
+        assert data == next(one[1] for one in lab.outlet.published if one[0] == stream)
+        assert capture_ns == frame.capture_ns, "it is as old as it is"
+        assert info is not None
+        assert info.fault == StreamFault.SOURCE
+
+
+def test_a_camera_that_fails_does_not_stop_the_other(open_lab: Callable[..., Lab]) -> None:
+    lab = open_lab("left", "right")
+    lab.sources["right"].put(SourceError("gone"))
+    lab.show("left")
+    assert lab.worker.cloud is not None
+    assert lab.worker.cloud.cameras == ("left",)
+    lab.poll_until(lambda: (told := lab.outlet.newest_info("room")) is not None and told.detail == "camera right: gone")
+
+
+def test_frames_that_no_one_takes_are_counted(open_lab: Callable[..., Lab]) -> None:
+    lab = open_lab("front")
+    lab.outlet.takes = False
+    lab.sources["front"].put(make_frame(lab.outlet.now_ns()))
+    lab.poll_until(lambda: lab.worker.count_drops().get("send"))
+    lab.outlet.takes = True
+    lab.show("front")
+    assert lab.outlet.published[0][4] is not None, "what was dropped has described nothing"
+
+
+def test_another_session_gets_nothing_of_the_one_before(open_lab: Callable[..., Lab]) -> None:
+    lab = open_lab("front")
+    lab.show("front")
+    lab.worker.restart_clock()
+    lab.outlet.published.clear()
+    lab.worker.poll(0.0)
+    assert lab.outlet.published == []
+    lab.show("front")
+
+
+def test_the_report(open_lab: Callable[..., Lab]) -> None:
+    lab = open_lab("front", picture_hz=30.0, hz=30.0)
+    lab.worker.make_report()
+    began = time.monotonic()
+    while time.monotonic() - began < 1.0:
+        lab.show("front")
+    report = lab.worker.make_report()
+    assert report.stream == "room"
+    assert report.connected
+    assert 0.0 < report.hz <= 36.0
+    assert report.points > 100
+    assert report.bytes_per_s > report.hz * 8 * report.points
+    assert set(report.stages_ms) == {"read", "voxels", "outliers", "budget", "encode", "send", "jpeg"}
+    assert report.age_ms >= report.stages_ms["read"]
+    assert report.cameras["front"].hz > 0.0
+    assert report.cameras["front"].fault == ""
