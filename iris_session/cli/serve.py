@@ -42,6 +42,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iris-session serve scene.xml\n"
         "  iris-session serve scene.xml --robots robots.toml --assignment nearest --mode request\n"
         "  iris-session serve scene.xml --anchors anchors.toml\n"
+        "  iris-session serve scene.xml --camera room.toml    (a point cloud; see `iris-session cloud example`)\n"
         "  iris-session serve handover --assign ann=left --assign bob=right\n"
         "  iris-session serve aloha --seconds 30\n"
         "  iris-session serve handover --interface wlan0 --name lab-1\n"
@@ -72,6 +73,14 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         default=[],
         metavar="WHO",
         help="a role, device or key:FINGERPRINT that may drive without an alignment too, repeatable (remote VR)",
+    )
+    parser.add_argument(
+        "--camera",
+        action="append",
+        default=[],
+        type=Path,
+        metavar="TOML",
+        help="depth cameras to show as a point cloud, repeatable; see `iris-session cloud example`",
     )
     parser.add_argument(
         "--resume",
@@ -123,6 +132,7 @@ def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConf
         web_port=arguments.web_port,
         web_cert=arguments.web_cert,
         web_key=arguments.web_key,
+        cameras=tuple(getattr(arguments, "camera", ())),
         sites=arguments.sites,
         tendons=arguments.tendons,
         authority=authority,

@@ -113,6 +113,11 @@ EXPLANATIONS: Final[Mapping[str, str]] = {
     "allow_list_missing": "the list of keys was missing; its keys counted for two more seconds",
     "journal_rows": _DISK,
     "recorded_items": _DISK,
+    "camera_send": "frames of cameras that the session did not take in time",
+    "camera_join": "frames of a camera that were captured more than 50 ms before those of another one",
+    "camera_pose": "frames of a camera without a pose of the body that carries it",
+    "camera_unusable": "frames of cameras of a wrong size, or with a pose that is none",
+    "camera_cells": "points of cameras above the number of cells that a cloud has",
     "recorded_vertices": "frames of deformables that are missing in the recording",
 }
 

@@ -65,6 +65,7 @@ class SessionConfig:
         web_cert: Certificate (PEM) for HTTPS, instead of the one in the user's home of keys.
         web_key: Its key (PEM).
         assets: Offer meshes and textures to clients: True keeps them in the user's cache, a path in that folder.
+        cameras: Camera files, each with a process that publishes its point cloud; see `iris-session cloud example`.
         sites: Include the sites of a MuJoCo model in what clients draw.
         tendons: Include its tendons, with the sites they run through.
         adapt_media: Send fewer media to clients on slow links, so that their state stays fresh.
@@ -100,6 +101,7 @@ class SessionConfig:
     web_cert: str = ""
     web_key: str = ""
     assets: bool | str | Path = True
+    cameras: tuple[str | Path, ...] = ()
     sites: bool = False
     tendons: bool = False
     adapt_media: bool = True
@@ -177,6 +179,7 @@ _KINDS: Final[dict[str, tuple[type, ...]]] = {
     "bool | str | Path": (bool, str, Path),
     "str | Path | None": (str, Path, NoneType),
     "tuple[str, ...]": (tuple,),
+    "tuple[str | Path, ...]": (tuple,),
     "Mapping[str, PoseTuple]": (Mapping,),
     "Mapping[str, float]": (Mapping,),
     "Mapping[str, Mapping[str, Vec3]]": (Mapping,),
@@ -202,7 +205,8 @@ def check_types(config: Any) -> None:
         if kinds == (msgspec.Struct,):
             right = type(value).__name__ == annotation
         if kinds == (tuple,):
-            right = right and all(isinstance(part, str) for part in value)
+            parts = (str, Path) if "Path" in annotation else str
+            right = right and all(isinstance(part, parts) for part in value)
         if not right:
             raise ConfigError(f"{item.name} must be {annotation}, not {type(value).__name__} {value!r:.60}")
 

@@ -1,9 +1,9 @@
-"""The processes of a session besides the authority, front, recorder and web gateway: start, supervise, restart, end.
+"""The processes of a session besides the authority: front, recorder, web gateway, cameras; start, supervise, end.
 
 A front that dies is replaced on the same ports (clients reconnect and resume); a recorder that dies is replaced and
 continues in a new part of the recording; the web gateway is started with the first connection of a browser, and again
-when it dies. All of it is announced and logged, and stops no step. A process that dies again and again is restarted
-after growing delays.
+when it dies; camera processes are started with the session, and again when they die. All of it is announced and logged,
+and stops no step. A process that dies again and again is restarted after growing delays.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from iris_session.recording import (
 from iris_session.recording.environment import describe_environment, read_boot_id
 from iris_session.recording.feed import SILENCE_S
 from iris_session.scene.composed import ComposedScene
+from iris_session.session.cameras import SessionCameras
 from iris_session.session.config import SessionConfig
 from iris_session.session.core import SessionCore
 from iris_session.session.deformables import DeformableSourceMesh, DeformableStreams, list_flexes
@@ -80,7 +81,7 @@ class PublishedScene(NamedTuple):
 
 
 class SessionProcesses:
-    """Front, recorder and web gateway of one session.
+    """Front, recorder, web gateway and camera processes of one session.
 
     Args:
         config: Settings of the session.
@@ -121,6 +122,7 @@ class SessionProcesses:
         self.feed: RecorderFeed | None = None
         self.front: FrontProcess | None = None
         self.web: WebPage | None = None
+        self.cameras: SessionCameras | None = None
         self._deformables: DeformableStreams | None = None
         self._front_timer = RestartTimer()
         self.supervisor: RecorderSupervisor | None = None
@@ -139,6 +141,7 @@ class SessionProcesses:
         """
         if self.recording is not None and importlib.util.find_spec("rerun") is None:
             raise StartError("recording needs rerun: pip install 'iris-session[recording]', or record nothing")
+        self.cameras = SessionCameras(self._config)
         others = NameFinder(self._config.beacon_port)
         try:
             if self.recording is not None:
@@ -176,6 +179,8 @@ class SessionProcesses:
             if reachable != [self._address]:
                 self.notes.append(f"others reach it at {', '.join(reachable)}")
             self.notes += self.web.start(ports, self.scenes.asset_root)
+            self.notes += self.cameras.start(ports)
+            self.reporter.warning_sources.append(self.cameras.list_warnings)
         except (FrontError, RecordingError) as error:
             self.close()
             raise StartError(str(error)) from None  # the text says it all
@@ -217,6 +222,7 @@ class SessionProcesses:
             assets_port=config.state_port + ASSETS_OFFSET if config.state_port else 0,
             web_port=0 if web is None else web.port,
             gateway_key="" if web is None else web.public_key,
+            camera_keys=() if self.cameras is None else self.cameras.public_keys,
             adapt_media=config.adapt_media,
             session_id=self.session_id,
             session_name=self.name,
@@ -320,6 +326,9 @@ class SessionProcesses:
         if self.web is not None:
             for text in self.web.poll(now_ns):
                 self._announce(stepper, text)
+        if self.cameras is not None:
+            for text in self.cameras.poll(now_ns):
+                self._announce(stepper, text)
         self._report_overflows(stepper)
         if self.front is not None and self.reporter.is_due(now_ns):
             self.front.link.send_report(self.reporter.make_report(stepper, self.make_status()))
@@ -371,14 +380,20 @@ class SessionProcesses:
             drops["recorded_samples"] = 0 if last is None else last.samples_left_out
         if self.web is not None:
             drops |= self.web.drops
+        if self.cameras is not None:
+            drops |= self.cameras.drops
         drops |= self._overflows
         return {reason: count for reason, count in drops.items() if count}
 
     def count_restarts(self) -> dict[str, int]:
-        """Return how often front, recorder and, once it was started, the web gateway were restarted."""
+        """Return how often front and recorder were restarted, and the web gateway and cameras where they were."""
         recorder = 0 if self.supervisor is None else self.supervisor.restarts
-        web = {} if self.web is None or not self.web.restarts else {"web": self.web.restarts}
-        return {"front": self._front_timer.restarts, "recorder": recorder, **web}
+        others = {
+            "web": 0 if self.web is None else self.web.restarts,
+            "cameras": 0 if self.cameras is None else self.cameras.restarts,
+        }
+        restarted = {name: n for name, n in others.items() if n}
+        return {"front": self._front_timer.restarts, "recorder": recorder, **restarted}
 
     def close(self) -> str:
         """End the front, which notifies its clients, then finish the recording. May be called twice.
@@ -386,6 +401,8 @@ class SessionProcesses:
         Returns:
             Why the recording is incomplete, in one line; empty when it is complete or nothing is recorded.
         """
+        if self.cameras is not None:
+            self.cameras.terminate()
         if self.front is not None:
             self.front.link.receive()
             self._save_resume_note()
@@ -394,6 +411,9 @@ class SessionProcesses:
         if self.web is not None:
             self.web.close()
             self.web = None
+        if self.cameras is not None:
+            self.cameras.close()
+            self.cameras = None
         self.scenes.close()
         if self.supervisor is not None:
             self.supervisor.close()

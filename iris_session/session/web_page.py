@@ -70,9 +70,8 @@ class WebPage:
                 return [f"no page for browsers: {error}"]
             note = f" (certificate {self.certificate.fingerprint})"
         self.address = format_page_address(ports.reachable[0], self.port, secure=self._keys is not None)
-        host = ports.host.strip("[]")
         made = GatewayConfig(
-            host="127.0.0.1" if host == "localhost" else host,
+            host=find_connect_host(ports),
             control_port=ports.control,
             names=names,
             session_name=self._name,
@@ -81,7 +80,7 @@ class WebPage:
         if self._keys is not None and self.certificate is not None:
             made = msgspec.structs.replace(
                 made,
-                server_key=self._load_server_key(),
+                server_key=load_server_key(config),
                 public_key=self._keys.public,
                 secret_key=self._keys.secret,
                 certificate_path=str(self.certificate.certificate_path),
@@ -91,11 +90,6 @@ class WebPage:
             )
         self._gateway = made
         return [f"in a browser: {self.address}{note}"]
-
-    def _load_server_key(self) -> str:
-        """Return the public key (Z85) of the session. The front has read it before."""
-        given = self._config.curve_key
-        return (load_secret(given) if given else KeyHome().load_server_key()).public
 
     @property
     def pid(self) -> int:
@@ -155,6 +149,18 @@ def open_web_page(config: SessionConfig, name: str) -> WebPage:
 def find_hosts(config: SessionConfig) -> tuple[str, ...]:
     """Return the addresses on which a session listens."""
     return addresses_of(config.interfaces) if config.interfaces else (config.host,)
+
+
+def find_connect_host(ports: Ports) -> str:
+    """Return the address by which processes of this machine reach the front."""
+    host = ports.host.strip("[]")
+    return "127.0.0.1" if host == "localhost" else host
+
+
+def load_server_key(config: SessionConfig) -> str:
+    """Return the public key (Z85) of a session. The front has read it before."""
+    given = config.curve_key
+    return (load_secret(given) if given else KeyHome().load_server_key()).public
 
 
 def needs_encryption(config: SessionConfig) -> bool:

@@ -1,0 +1,225 @@
+"""The camera process: `python -m iris_session.cloud.process`, with `CameraStart` on standard input.
+
+It joins the session in the role `camera`, publishes the cloud and the pictures of one camera file, and joins again by
+itself when the connection is lost. It ends by SIGTERM, with its parent, and when the session refuses it for good.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import itertools
+import os
+import signal
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from functools import partial
+from types import FrameType
+from typing import Final
+
+import msgspec
+
+from anchors.pose import PoseTuple
+from iris_session.client.client import Client
+from iris_session.client.core.interpolation import interpolate
+from iris_session.client.core.scene_follower import pose_at
+from iris_session.client.core.state_stream import Poses, SceneState
+from iris_session.client.errors import ClientError, NotConnectedError
+from iris_session.client.sockets import CurveKeys
+from iris_session.cloud.camera_file import CloudSettings
+from iris_session.cloud.config import CameraReport, CameraStart
+from iris_session.cloud.sources import open_source
+from iris_session.cloud.worker import CloudWorker
+from iris_session.link.discovery import host_port
+from iris_session.protocol.media import StreamInfo
+from iris_session.protocol.names import Role
+from iris_session.system.extras import MissingExtraError
+from iris_session.system.log import configure_logging
+from iris_session.system.priority import lower_thread_priority
+from iris_session.system.process import die_with_parent, is_parent
+
+#: Longest wait for a frame, after which the loop looks whether it is to end [s].
+POLL_S: Final = 0.05
+REPORT_S: Final = 1.0
+#: Time to wait for a connection between two looks [s].
+CONNECT_S: Final = 0.1
+#: States that are kept for the poses of bodies: a second, more than any camera is late.
+MAX_STATES: Final = 64
+#: A pose that was sent longer before or after a capture says nothing about it.
+POSE_REACH_NS: Final = 100_000_000
+
+OnReport = Callable[[CameraReport], None]
+
+
+class BodyHistory:
+    """Poses of the scene's bodies over the last second: states come by `on_state`, in another thread."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self._lock = threading.Lock()
+        self._states: deque[tuple[int, Poses]] = deque(maxlen=MAX_STATES)
+        self._version: tuple[str, str, int] | None = None
+        self._places: dict[str, int] = {}
+
+    def on_state(self, state: SceneState) -> None:
+        """Take a state of `client`."""
+        version = self._client.scene.version
+        if version is None or self._client.scene.poses is None:
+            return
+        with self._lock:
+            if version != self._version:
+                self._states.clear()
+                self._version = version
+                self._places = dict(self._client.mirror.body_index)
+            self._states.append((state.header.session_time, self._client.scene.poses))
+
+    def read_newest(self) -> dict[str, PoseTuple]:
+        """Return `T_world_body` of every body as it is now."""
+        with self._lock:
+            poses = self._states[-1][1] if self._states else None
+            return {} if poses is None else {body: pose_at(poses, place) for body, place in self._places.items()}
+
+    def find_pose(self, body: str, time_ns: int) -> PoseTuple | None:
+        """Return `T_world_body` at a session time [ns], interpolated.
+
+        `None` while there is no state after it, for a time before all states, and for an unknown body.
+        """
+        with self._lock:
+            place, states = self._places.get(body), list(self._states)
+        if place is None:
+            return None
+        for (before_ns, before), (after_ns, after) in itertools.pairwise(states):
+            if before_ns <= time_ns <= after_ns and after_ns - before_ns <= 2 * POSE_REACH_NS:
+                share = (time_ns - before_ns) / max(1, after_ns - before_ns)
+                return pose_at(interpolate(before[place : place + 1], after[place : place + 1], share), 0)
+        return None
+
+
+class SessionOutlet:
+    """Publishes what a worker makes in the session of a client."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+
+    def now_ns(self) -> int:
+        return self._client.session_now_ns()
+
+    def publish(
+        self, stream: str, frames: bytes | Mapping[str, bytes], capture_ns: int, encoding: str, info: StreamInfo | None
+    ) -> bool:
+        try:
+            return self._client.media.publish(stream, frames, capture_ns=capture_ns, encoding=encoding, info=info)
+        except NotConnectedError:
+            return False
+
+
+def run_cameras(
+    settings: CloudSettings,
+    client: Client,
+    on_report: OnReport,
+    is_ending: Callable[[], bool],
+) -> str:
+    """Publish the cloud and the pictures of a camera file in a session.
+
+    Args:
+        settings: The camera file.
+        client: In role `camera`, not connected yet; it is closed at the end.
+        on_report: Called about once a second.
+        is_ending: Asked several times a second.
+
+    Returns:
+        Why it ended by itself: the session refuses it; empty otherwise.
+    """
+    history = BodyHistory(client)
+    client.on_state = history.on_state
+    worker = CloudWorker(
+        settings,
+        SessionOutlet(client),
+        partial(open_source, body_poses=history.read_newest),
+        time.perf_counter_ns,
+        body_pose=history.find_pose,
+    )
+    on_report(CameraReport(settings.stream))
+    session_id = ""
+    report_at = time.monotonic() + REPORT_S
+    try:
+        client.open()
+        client.start()
+        while not is_ending():
+            connected = client.wait_for(lambda one: one.ready, CONNECT_S)
+            welcome = client.connection.welcome
+            if connected and welcome is not None and welcome.session_id != session_id:
+                if session_id:
+                    worker.restart_clock()
+                else:
+                    worker.start()
+                session_id = welcome.session_id
+            if connected:
+                worker.poll(POLL_S)
+            if time.monotonic() >= report_at:
+                report_at = time.monotonic() + REPORT_S
+                on_report(worker.make_report(connected=connected))
+    except ClientError as error:
+        return str(error)
+    finally:
+        worker.close()
+        client.close()
+    return ""
+
+
+def make_client(start: CameraStart) -> Client:
+    """Return the client of a camera process."""
+    keys = (start.server_key, start.public_key, start.secret_key)
+    return Client(
+        host_port(start.host, start.control_port),
+        role=Role.CAMERA,
+        name=start.settings.stream,
+        curve=CurveKeys(*(one.encode() for one in keys)) if start.server_key else None,
+    )
+
+
+def write_report(report: CameraReport) -> None:
+    """Write a report to standard output. A parent that does not read it is not waited for."""
+    with contextlib.suppress(OSError):
+        os.write(sys.stdout.fileno(), msgspec.json.encode(report) + b"\n")
+
+
+def main() -> int:
+    """Run the camera process of one session. Exit status 1 if the session does not admit it."""
+    configure_logging()
+    lower_thread_priority()  # of this thread and those that it starts: no tick is to wait for a cloud
+    start = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=CameraStart)
+    os.set_blocking(sys.stdout.fileno(), False)
+    ending = threading.Event()
+
+    def on_signal(number: int, _frame: FrameType | None) -> None:
+        if number == signal.SIGTERM:
+            ending.set()
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, on_signal)
+    if start.parent_pid:
+        signal.signal(signal.SIGHUP, on_signal)  # wakes the loop, which looks for its parent
+        die_with_parent(signal.SIGHUP)
+
+    def is_ending() -> bool:
+        return ending.is_set() or (start.parent_pid != 0 and not is_parent(start.parent_pid))
+
+    gc.collect()
+    gc.freeze()
+    try:
+        fault = run_cameras(start.settings, make_client(start), write_report, is_ending)
+    except (ClientError, MissingExtraError) as error:
+        fault = str(error)
+    if fault:
+        write_report(CameraReport(start.settings.stream, fault=fault))
+    sys.stdout.flush()
+    # A driver that hangs in a thread would keep the interpreter from ending.
+    os._exit(1 if fault else 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

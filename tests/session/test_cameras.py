@@ -1,0 +1,112 @@
+"""The cameras of a session: files that go together, keys, warnings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from iris_session.link import Ports
+from iris_session.session import cameras as session_cameras
+from iris_session.session.cameras import SILENT_NS, SessionCameras, load_camera_files
+from iris_session.session.config import ConfigError, SessionConfig
+from iris_session.session.errors import StartError
+from iris_session.system.process import ChildProcess
+
+SECOND = 1_000_000_000
+
+
+def write_file(folder: Path, name: str, *cameras: str, stream: str = "", picture_hz: float = 10.0) -> Path:
+    """Write a camera file whose pictures do not exist: nothing opens them here."""
+    path = folder / f"{name}.toml"
+    path.write_text(
+        f'stream = "{stream or name}"\npicture_hz = {picture_hz}\n'
+        + "".join(
+            f'[[cameras]]\nname = "{camera}"\nsource = "folder"\npath = "{folder}"\n'
+            "intrinsics = {width = 40, height = 30, fx = 35.0, fy = 35.0, cx = 19.5, cy = 14.5}\n"
+            "pose = {position_m = [0.0, 0.0, 1.0], quaternion_wxyz = [1.0, 0.0, 0.0, 0.0]}\n"
+            for camera in cameras or ("front",)
+        )
+    )
+    return path
+
+
+def test_files_that_go_together(tmp_path: Path) -> None:
+    found = load_camera_files([write_file(tmp_path, "room"), str(write_file(tmp_path, "hall", "a", "b"))])
+    assert [settings.stream for settings in found] == ["room", "hall"]
+    assert load_camera_files(()) == ()
+
+
+def test_a_file_that_cannot_be_used_is_one_line_of_text(tmp_path: Path) -> None:
+    path = tmp_path / "camera.toml"
+    with pytest.raises(StartError, match=r"camera\.toml") as error:
+        load_camera_files([path])
+    assert "\n" not in str(error.value)
+    path.write_text("stream = 3")
+    with pytest.raises(StartError, match=r"camera\.toml"):
+        load_camera_files([path])
+
+
+def test_two_streams_of_one_name(tmp_path: Path) -> None:
+    first, second = write_file(tmp_path, "room"), write_file(tmp_path, "other", stream="room")
+    with pytest.raises(StartError, match=r"'room': .*room\.toml and .*other\.toml"):
+        load_camera_files([first, second])
+    pictures = write_file(tmp_path, "third", stream="room-front")
+    with pytest.raises(StartError, match="'room-front'"):
+        load_camera_files([first, pictures])
+
+
+def test_more_streams_than_a_session_has(tmp_path: Path) -> None:
+    names = [f"c{i}" for i in range(7)]
+    first, second = write_file(tmp_path, "room", *names), write_file(tmp_path, "hall", *names)
+    assert len(load_camera_files([first, second])) == 2
+    third = write_file(tmp_path, "yard")
+    with pytest.raises(StartError, match="18 streams, a session has at most 16"):
+        load_camera_files([first, second, third])
+
+
+def test_paths_are_checked_with_the_configuration() -> None:
+    with pytest.raises(ConfigError, match="cameras must be"):
+        SessionConfig(cameras="room.toml")  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="cameras must be"):
+        SessionConfig(cameras=(3,))  # type: ignore[arg-type]
+
+
+def test_each_process_of_an_encrypted_session_has_a_key(tmp_path: Path) -> None:
+    paths = (write_file(tmp_path, "room"), write_file(tmp_path, "hall"))
+    assert SessionCameras(SessionConfig(cameras=paths)).public_keys == ()
+    first, second = SessionCameras(SessionConfig(cameras=paths, curve=True)).public_keys
+    assert first != second
+    assert SessionCameras(SessionConfig(curve=True)).public_keys == ()
+
+
+def test_warnings_name_what_the_processes_cannot_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(start: object) -> ChildProcess:
+        raise OSError("no memory")
+
+    monkeypatch.setattr(session_cameras, "_spawn", fail)
+    cameras = SessionCameras(SessionConfig(cameras=(write_file(tmp_path, "room"),)))
+    assert cameras.start(Ports("127.0.0.1", 1, 2)) == ["cameras: room"]
+    assert cameras.list_warnings() == []
+    cameras.poll(SECOND)
+    process = cameras._processes["room"]
+    assert process._thread is not None
+    process._thread.join()
+    assert cameras.poll(SECOND) == ["the camera process of 'room' does not start: no memory"]
+    assert cameras.list_warnings() == ["the camera process of 'room' does not start: no memory"]
+    assert cameras.restarts == 1
+    cameras.close()
+    assert cameras.list_warnings() == []
+
+
+def test_a_process_that_is_silent_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cameras = SessionCameras(SessionConfig(cameras=(write_file(tmp_path, "room"),)))
+    cameras.start(Ports("127.0.0.1", 1, 2))
+    process = cameras._processes["room"]
+    monkeypatch.setattr(type(process), "pid", 4711)
+    process.heard_ns = 0
+    process._was_started = True
+    cameras.poll(SILENT_NS)
+    assert cameras.list_warnings() == []
+    cameras.poll(SILENT_NS + 1)
+    assert cameras.list_warnings() == ["the camera process of 'room' hangs: it is ended after 10 s"]
