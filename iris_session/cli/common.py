@@ -37,6 +37,8 @@ def list_expected_errors() -> tuple[type[Exception], ...]:
     """Return the errors whose text is meant for the user. Any other error is a defect and keeps its traceback."""
     from iris_session.assets.errors import AssetStoreError
     from iris_session.client import ClientError
+    from iris_session.cloud.camera_file import CameraFileError
+    from iris_session.cloud.frames import SourceError
     from iris_session.control import ControlError
     from iris_session.link import FrontError
     from iris_session.netsim.process import ImpairmentError
@@ -56,6 +58,8 @@ def list_expected_errors() -> tuple[type[Exception], ...]:
         FrontError,
         RecordingError,
         ClientError,
+        CameraFileError,
+        SourceError,
         ImpairmentError,
         ProfileError,
         KeysError,

@@ -13,6 +13,7 @@ from iris_session.cli import (
     INTERRUPTED,
     anchors,
     bench,
+    cloud,
     control,
     demo,
     doctor,
@@ -42,6 +43,7 @@ _EPILOG = """examples:
   iris-session robots scene.xml              the robots found in a model, as TOML to edit
   iris-session scene inspect scene.xml       what clients receive of a scene, and what is heavy
   iris-session anchors print --size 160mm    a sheet for headsets and cameras, as PDF
+  iris-session cloud example                 a file for depth cameras; inspect it, or run it in a session
   iris-session emulate --behaviour wander    one emulated headset joins the session on this machine
   iris-session status --watch                participants, robots, ages, late ticks, recorder of a session
   iris-session estop                         stop every robot of the session; clear-estop, pause, assign, ... as well
@@ -53,7 +55,8 @@ _EPILOG = """examples:
 
 #: In the order of `--help`.
 _MODULES = (
-    demo, serve, pair, web, keys, sessions, status, control, doctor, verify, emulate, robots, scene, anchors, bench,
+    demo, serve, pair, web, keys, sessions, status, control, doctor, verify, emulate, robots, scene, anchors, cloud,
+    bench,
 )  # fmt: skip
 
 

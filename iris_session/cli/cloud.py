@@ -1,0 +1,441 @@
+"""`iris-session cloud`: depth cameras as point clouds: run by hand, an example file, inspect a file or a session."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from iris_session.cli.common import (
+    CommandError,
+    add_address_options,
+    add_json_option,
+    check_session_reachable,
+    parse_seconds,
+    print_json,
+    to_printable,
+)
+
+if TYPE_CHECKING:
+    from iris_session.client import Client
+    from iris_session.client.media import MediaFeed, MediaFrame
+    from iris_session.cloud.camera_file import CloudSettings
+    from iris_session.cloud.config import CameraReport
+    from iris_session.cloud.worker import CloudWorker
+    from iris_session.protocol.media import StreamInfo
+
+#: Time for a camera to warm up before `inspect` measures, at most [s].
+FIRST_FRAME_S: Final = 10.0
+#: Time for the session to tell us its streams [s].
+STREAMS_S: Final = 5.0
+#: Without a terminal, a line of `run` that is like the one before is printed this often [s].
+QUIET_S: Final = 10.0
+MILLISECOND: Final = 1_000_000
+#: Stages of the age of a frame, and the times between which each lies.
+STAGES: Final = ("camera process", "to the front", "in the front", "to the client", "decoding")
+
+
+def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command `cloud` with its actions."""
+    parser = commands.add_parser(
+        "cloud",
+        help="point clouds of depth cameras: run, example, inspect",
+        description="Show what depth cameras see as a point cloud in a session. `serve --camera FILE` does so by "
+        "itself for cameras at its machine.",
+        epilog="examples:\n"
+        "  iris-session cloud example -o camera.toml           a commented camera file, to be edited\n"
+        "  iris-session cloud inspect camera.toml              rate, points, faults, without a session\n"
+        "  iris-session serve scene.xml --camera camera.toml   the cloud in a session of this machine\n"
+        "  iris-session cloud run camera.toml --address 192.168.1.20   in a session of another machine\n"
+        "  iris-session cloud inspect 192.168.1.20             what arrives here, and how old it is",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
+    for register_action in (_register_run, _register_example, _register_inspect):
+        register_action(actions)
+
+
+def _register_run(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = actions.add_parser(
+        "run",
+        help="publish the cloud of a camera file in a session",
+        description="Publish the cloud and the pictures of a camera file in a session until Ctrl-C. At an encrypted "
+        "session the key of this user must be allowed in role camera: `iris-session pair --role camera` there.",
+        epilog="examples:\n"
+        "  iris-session cloud run camera.toml\n"
+        "  iris-session cloud run camera.toml --address 192.168.1.20 --code 7KQ2-M4XD-9PTR    the first time\n"
+        "  iris-session cloud run camera.toml --session lab-1 --json",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("file", type=Path, help="camera file; `iris-session cloud example` prints one")
+    add_address_options(parser, option=True)
+    parser.add_argument("--seconds", type=parse_seconds, help="stop after this many seconds")
+    parser.add_argument("--json", action="store_true", help="one JSON object per second")
+    parser.set_defaults(run=run_file)
+
+
+def _register_example(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    from iris_session.cloud.example import SOURCES
+
+    parser = actions.add_parser(
+        "example",
+        help="print a commented camera file",
+        description="Print a commented camera file, to be edited.",
+        epilog="examples:\n"
+        "  iris-session cloud example > camera.toml\n"
+        "  iris-session cloud example --source realsense -o camera.toml",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--source", choices=sorted(SOURCES), default="folder", help="what the frames come from (default: %(default)s)"
+    )
+    parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="write it to a file that does not exist yet")
+    parser.set_defaults(run=run_example)
+
+
+def _register_inspect(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = actions.add_parser(
+        "inspect",
+        help="measure a camera file, or the clouds of a session",
+        description="Measure what a camera file gives, without a session: rate, points, stages, faults. Or, for an "
+        "address, join as an observer and measure the clouds and pictures that arrive: rate, points, age by stage. "
+        "Exit status 1 if there is a fault, or nothing comes.",
+        epilog="examples:\n"
+        "  iris-session cloud inspect camera.toml\n"
+        "  iris-session cloud inspect 192.168.1.20 --seconds 10\n"
+        "  iris-session cloud inspect 127.0.0.1:7721 --json",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("target", metavar="FILE|ADDRESS", help="camera file, or HOST:PORT or iris://... of a session")
+    parser.add_argument("--code", default="", help="join code, needed the first time at an encrypted session")
+    parser.add_argument("--seconds", type=parse_seconds, default=3.0, help="time to measure (default: %(default)s)")
+    add_json_option(parser)
+    parser.set_defaults(run=run_inspect)
+
+
+# --- run --------------------------------------------------------------------------------------------------------------
+
+
+def run_file(arguments: argparse.Namespace) -> int:
+    """Publish a camera file until Ctrl-C. Exit status 1 if the session does not admit us."""
+    from iris_session.client import Client
+    from iris_session.cloud.camera_file import load_camera_file
+    from iris_session.cloud.process import run_cameras
+    from iris_session.protocol.names import Role
+    from iris_session.system.priority import lower_thread_priority
+
+    settings = load_camera_file(arguments.file)
+    check_session_reachable(arguments)
+    lower_thread_priority()
+    client = Client(
+        arguments.address,
+        session=arguments.session,
+        join_code=arguments.code,
+        role=Role.CAMERA,
+        name=settings.stream,
+    )
+    until = None if arguments.seconds is None else time.monotonic() + arguments.seconds
+    printer = _ReportPrinter(as_json=arguments.json)
+    with _catch_signals() as ending:
+        fault = run_cameras(
+            settings, client, printer, lambda: ending.is_set() or (until is not None and time.monotonic() >= until)
+        )
+    printer.end()
+    if fault:
+        print(f"iris-session: {fault}", file=sys.stderr)
+    return 1 if fault else 0
+
+
+@contextmanager
+def _catch_signals() -> Iterator[threading.Event]:
+    """Yield an event that Ctrl-C and SIGTERM set, instead of interrupting a driver in the middle of its work."""
+    ending = threading.Event()
+    before = {one: signal.signal(one, lambda *_: ending.set()) for one in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield ending
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
+
+
+class _ReportPrinter:
+    """Prints reports: on a terminal one line that is written over, elsewhere lines when something has changed."""
+
+    def __init__(self, *, as_json: bool) -> None:
+        self._as_json = as_json
+        self._is_terminal = sys.stdout.isatty()
+        self._faults = ""
+        self._at = -QUIET_S
+
+    def __call__(self, report: CameraReport) -> None:
+        import msgspec
+
+        if self._as_json:
+            print_json(msgspec.to_builtins(report))
+            return
+        line = format_report(report)
+        if self._is_terminal:
+            print(f"\r\x1b[K{line[: _terminal_width() - 1]}", end="", flush=True)
+            return
+        faults = f"{report.connected} {format_faults(report)}"
+        if faults != self._faults or time.monotonic() - self._at >= QUIET_S:
+            self._faults, self._at = faults, time.monotonic()
+            print(line, flush=True)
+
+    def end(self) -> None:
+        """End the line that is written over."""
+        if self._is_terminal and not self._as_json:
+            print(flush=True)
+
+
+def _terminal_width() -> int:
+    import shutil
+
+    return shutil.get_terminal_size((120, 24)).columns
+
+
+def format_report(report: CameraReport) -> str:
+    """Return the state of a camera process on one line."""
+    if not report.connected:
+        return f"{report.stream}: no session yet"
+    rate = f"{report.hz:.1f} Hz, {report.points:,} points of {100.0 * report.voxel_m:.1f} cm"
+    line = f"{report.stream}: {rate}, {report.bytes_per_s * 8e-6:.1f} Mbit/s, {report.age_ms:.0f} ms old"
+    faults = format_faults(report)
+    return f"{line}    {faults}" if faults else line
+
+
+def format_faults(report: CameraReport) -> str:
+    """Return the faults of all cameras, empty while all is well."""
+    found = [f"{name}: {one.fault} ({one.detail})" for name, one in report.cameras.items() if one.fault]
+    return to_printable("; ".join(found))
+
+
+# --- example ----------------------------------------------------------------------------------------------------------
+
+
+def run_example(arguments: argparse.Namespace) -> int:
+    """Print or write a commented camera file."""
+    from iris_session.cloud.example import make_example
+
+    text = make_example(arguments.source)
+    if arguments.out is None:
+        sys.stdout.write(text)
+        return 0
+    try:
+        with arguments.out.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise CommandError(f"{arguments.out} exists: give another file, or remove it first") from None
+    except OSError as error:
+        raise CommandError(f"{arguments.out} cannot be written: {error.strerror}") from None
+    print(f"{arguments.out}: edit it, then `iris-session cloud inspect {arguments.out}`")
+    return 0
+
+
+# --- inspect ----------------------------------------------------------------------------------------------------------
+
+
+def run_inspect(arguments: argparse.Namespace) -> int:
+    """Measure a camera file, or the clouds of a session."""
+    path = Path(arguments.target)
+    if path.suffix == ".toml" or path.exists():
+        return _inspect_file(arguments, path)
+    return _inspect_session(arguments)
+
+
+class _NoOutlet:
+    """Takes frames of a worker and sends them nowhere."""
+
+    def __init__(self) -> None:
+        self.sizes: dict[str, int] = {}
+
+    def now_ns(self) -> int:
+        return time.monotonic_ns()
+
+    def publish(
+        self, stream: str, frames: bytes | Mapping[str, bytes], capture_ns: int, encoding: str, info: StreamInfo | None
+    ) -> bool:
+        self.sizes[stream] = len(frames if isinstance(frames, bytes) else frames["full"])
+        return True
+
+
+def _inspect_file(arguments: argparse.Namespace, path: Path) -> int:
+    import msgspec
+
+    from iris_session.cloud.camera_file import load_camera_file
+    from iris_session.cloud.sources import open_source
+    from iris_session.cloud.worker import CloudWorker
+
+    settings = load_camera_file(path)
+    worker = CloudWorker(settings, _NoOutlet(), open_source, time.perf_counter_ns)
+    worker.start()
+    try:
+        _run_worker(worker, FIRST_FRAME_S, lambda: worker.cloud is not None)
+        worker.make_report()  # its rates begin here
+        _run_worker(worker, arguments.seconds, lambda: False)
+        report = worker.make_report()
+    finally:
+        worker.close()
+    is_well = report.hz > 0.0 and not format_faults(report)
+    if arguments.json:
+        print_json({"ok": is_well, **msgspec.to_builtins(report)})
+    else:
+        print("\n".join(_format_inspection(settings, report)))
+    return 0 if is_well else 1
+
+
+def _run_worker(worker: CloudWorker, seconds: float, is_done: Any) -> None:
+    until = time.monotonic() + seconds
+    while time.monotonic() < until and not is_done():
+        worker.poll(0.05)
+
+
+def _format_inspection(settings: CloudSettings, report: CameraReport) -> Iterator[str]:
+    for name, one in report.cameras.items():
+        state = f"{one.fault}: {one.detail}" if one.fault else "well"
+        yield to_printable(f"camera {name}: {one.hz:.1f} frames per second, {state}")
+    points = f"{report.points:,} points of {100.0 * report.voxel_m:.1f} cm"
+    budget = f"budget {settings.points:,}, cells from {100.0 * settings.voxel_m:.1f} cm"
+    yield f"cloud {report.stream}: {report.hz:.1f} Hz, {points} ({budget})"
+    error = "error not stated" if report.error_m is None else f"stated error {1000.0 * report.error_m:.1f} mm"
+    yield f"  {error}, {report.bytes_per_s * 8e-6:.1f} Mbit/s with all classes"
+    if report.stages_ms:
+        stages = ", ".join(f"{stage} {ms:.1f}" for stage, ms in report.stages_ms.items())
+        yield f"  stages [ms]: {stages}; from capture to the last byte {report.age_ms:.0f}"
+    if report.drops:
+        yield f"  left out: {', '.join(f'{reason} {n}' for reason, n in sorted(report.drops.items()))}"
+
+
+def _inspect_session(arguments: argparse.Namespace) -> int:
+    from iris_session.client import Client
+    from iris_session.protocol.names import MediaEncoding
+
+    arguments.address, arguments.session = arguments.target, ""
+    check_session_reachable(arguments)
+    with Client(arguments.address, role="observer", name="cloud inspect", join_code=arguments.code) as client:
+        shown = (MediaEncoding.CLOUD, MediaEncoding.JPEG)
+
+        def list_streams() -> list[str]:
+            budget = client.media.delivery
+            return [] if budget is None else [one.stream for one in budget.streams if one.encoding in shown]
+
+        client.wait_for(lambda _: bool(list_streams()), STREAMS_S)
+        meters = [_StreamMeter(client, client.media.subscribe(stream)) for stream in list_streams()]
+        until = time.monotonic() + arguments.seconds
+        while meters and time.monotonic() < until:
+            client.poll(0.05)
+            for meter in meters:
+                meter.poll()
+        found = [meter.finish() for meter in meters]
+    is_well = bool(found) and all(one["hz"] > 0.0 and not one["fault"] and not one["stale"] for one in found)
+    if arguments.json:
+        print_json({"ok": is_well, "streams": found})
+    elif not found:
+        print("the session has no cloud: `iris-session serve --camera FILE`, or `iris-session cloud run FILE`")
+    else:
+        print("\n".join(line for one in found for line in _format_stream(one)))
+    return 0 if is_well else 1
+
+
+class _StreamMeter:
+    """Measures what arrives of one stream."""
+
+    def __init__(self, client: Client, feed: MediaFeed) -> None:
+        self._client = client
+        self._feed = feed
+        self._began = time.monotonic()
+        self._bytes = 0
+        self._n = 0
+        self._newest: dict[str, Any] = {}
+        self._ages: list[list[float]] = []
+
+    def poll(self) -> None:
+        """Take the newest frame, if there is another."""
+        frame = self._feed.pop_newest()
+        if frame is None:
+            return
+        self._n += 1
+        self._bytes += len(frame.data)
+        self._newest = _describe_frame(frame)
+        decoded_ns = self._client.session_now_ns()
+        head = frame.header
+        times = (
+            head.capture_ns,
+            head.sent_ns,
+            head.received_ns,
+            head.published_ns,
+            head.capture_ns + frame.age_ns,
+            decoded_ns,
+        )
+        known = [at for at in times if at]
+        self._ages.append([(b - a) / MILLISECOND for a, b in itertools.pairwise(times)] if len(known) == 6 else [])
+
+    def finish(self) -> dict[str, Any]:
+        """Return what was measured."""
+        import numpy as np
+
+        seconds = time.monotonic() - self._began
+        budget = self._client.media.delivery
+        told = next((one for one in budget.streams if one.stream == self._feed.stream), None) if budget else None
+        ages = [one for one in self._ages if one]
+        stages = dict(zip(STAGES, np.median(ages, axis=0).round(2).tolist(), strict=True)) if ages else {}
+        return {
+            "stream": self._feed.stream,
+            "title": "" if told is None else told.title,
+            "encoding": "" if told is None else told.encoding,
+            "budget_class": self._feed.budget_class,
+            "hz": self._n / seconds,
+            "mbit_per_s": self._bytes * 8e-6 / seconds,
+            "age_ms": float(sum(stages.values())),
+            "ages_ms": stages,
+            "dropped": self._feed.dropped,
+            "stale": told is not None and told.stale,
+            "fault": "" if told is None else told.fault,
+            "detail": "" if told is None else told.detail,
+            **self._newest,
+        }
+
+
+def _describe_frame(frame: MediaFrame) -> dict[str, Any]:
+    """Return the content of a cloud; decoding it is part of what is measured."""
+    from iris_session.protocol.names import MediaEncoding
+    from iris_session.streams.cloud import decode_cloud
+    from iris_session.streams.errors import StreamError
+
+    if frame.header.encoding != MediaEncoding.CLOUD:
+        return {"bytes": len(frame.data)}
+    try:
+        cloud = decode_cloud(frame.data)
+    except StreamError as error:
+        return {"bytes": len(frame.data), "fault": "malformed", "detail": str(error)}
+    n = len(cloud.positions)
+    error_mm = 1000.0 * cloud.error_m if math.isfinite(cloud.error_m) else None
+    return {
+        "bytes": len(frame.data),
+        "points": n,
+        "bytes_per_point": len(frame.data) / n if n else 0.0,
+        "voxel_m": cloud.voxel_m,
+        "error_mm": error_mm,
+    }
+
+
+def _format_stream(one: Mapping[str, Any]) -> Iterator[str]:
+    name = f"{one['stream']} ({one['title']})" if one["title"] not in ("", one["stream"]) else one["stream"]
+    yield to_printable(f"{name}: {one['hz']:.1f} Hz, class {one['budget_class']}, {one['mbit_per_s']:.1f} Mbit/s")
+    if "points" in one:
+        error = "" if one["error_mm"] is None else f", stated error {one['error_mm']:.1f} mm"
+        points = f"{one['points']:,} points of {100.0 * one['voxel_m']:.1f} cm"
+        yield f"  {points}, {one['bytes_per_point']:.2f} bytes each{error}"
+    if one["ages_ms"]:
+        stages = ", ".join(f"{stage} {ms:.1f}" for stage, ms in one["ages_ms"].items())
+        yield f"  age {one['age_ms']:.0f} ms, median: {stages}"
+    if one["fault"] or one["stale"]:
+        yield to_printable(f"  {one['fault'] or 'stale'}: {one['detail'] or 'no frames come'}")
