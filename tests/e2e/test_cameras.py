@@ -1,0 +1,355 @@
+"""Camera processes of real sessions: clouds and pictures, late joiners, failures, faults of frames, keys."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import psutil
+import pytest
+
+from iris_session import Client, CurveKeys, decode_cloud
+from iris_session.protocol.names import StreamFault
+from iris_session.protocol.status import MediaStreamReport
+from iris_session.security import KeyHome, KeyPair
+from tests.e2e.session_process import (
+    COMMAND,
+    DEADLINE_S,
+    END_WITH_PARENT,
+    FREE_PORTS,
+    SessionProcess,
+    assert_all_end,
+    list_descendants,
+    run_command,
+    run_in_process,
+    wait_until,
+)
+
+pytestmark = pytest.mark.e2e
+
+RGBD = Path(os.environ.get("IRIS_DATA", "")) / "rgbd"
+WIDTH, HEIGHT = 160, 120
+INTRINSICS = f"{{width = {WIDTH}, height = {HEIGHT}, fx = 146.0, fy = 146.0, cx = 79.5, cy = 59.5}}"
+POSE = "{position_m = [0.0, 0.0, 1.0], quaternion_wxyz = [0.5, -0.5, 0.5, -0.5]}"
+HZ = 5.0
+#: A room with a camera in it, for rendered frames.
+ROOM = """<mujoco><worldbody><light pos="0 0 3"/><geom type="plane" size="3 3 .1" rgba=".4 .6 .4 1"/>
+<geom type="box" size=".2 .2 .2" pos="1 0 .2" rgba=".8 .2 .2 1"/>
+<camera name="front" pos="-.5 0 1" xyaxes="0 -1 0 .5 0 .866"/></worldbody></mujoco>"""
+
+
+def write_pictures(folder: Path, n: int = 4, *, depth_mm: int = 1500, noise: bool = True) -> Path:
+    """Write pictures of a wall, as of a sensor or all the same."""
+    folder.mkdir()
+    random = np.random.default_rng(1)
+    for i in range(n):
+        changes = random.integers(0, 5, (HEIGHT, WIDTH)) if noise else 0
+        depth = np.full((HEIGHT, WIDTH), depth_mm, np.uint16) + (np.asarray(changes, np.uint16) if depth_mm else 0)
+        color = np.full((HEIGHT, WIDTH, 3), (40, 120, 200), np.uint8)
+        assert cv2.imwrite(str(folder / f"frame-{i:06}.depth.png"), depth.astype(np.uint16))
+        assert cv2.imwrite(str(folder / f"frame-{i:06}.color.png"), color)
+    return folder
+
+
+def write_file(path: Path, camera: str, **settings: Any) -> Path:
+    """Write a camera file with one camera."""
+    lines = {"stream": path.stem, "title": path.stem.title(), "hz": HZ, "picture_hz": 2.0, **settings}
+    path.write_text(
+        "".join(f"{key} = {json.dumps(value)}\n" for key, value in lines.items()) + "[[cameras]]\n" + camera
+    )
+    return path
+
+
+def folder_camera(folder: Path, name: str = "front") -> str:
+    return f'name = "{name}"\nsource = "folder"\npath = "{folder}"\nhz = {HZ}\n' + (
+        f"intrinsics = {INTRINSICS}\npose = {POSE}\n"
+    )
+
+
+@pytest.fixture
+def camera_file(tmp_path: Path) -> Path:
+    return write_file(tmp_path / "room.toml", folder_camera(write_pictures(tmp_path / "pictures")))
+
+
+@pytest.fixture
+def watch(serve: Callable[..., SessionProcess]) -> Iterator[Callable[..., Client]]:
+    """Join a session as an observer who subscribes to streams."""
+    clients: list[Client] = []
+
+    def join(server: SessionProcess, *streams: str, **options: Any) -> Client:
+        client = Client(server.address, role="observer", name="ann", **options).connect(DEADLINE_S)
+        clients.append(client)
+        for stream in streams:
+            client.media.subscribe(stream)
+        return client
+
+    yield join
+    for client in clients:
+        client.close()
+
+
+def find_cameras(server: SessionProcess) -> list[psutil.Process]:
+    """Return the camera processes of a session."""
+    found = []
+    for child in psutil.Process(server.process.pid).children():
+        try:
+            line = child.cmdline()
+        except psutil.Error:  # it has just ended
+            continue
+        if "iris_session.cloud.process" in line and child.status() != psutil.STATUS_ZOMBIE:
+            found.append(child)
+    return found
+
+
+def wait_for_frames(client: Client, stream: str, n: int = 1, timeout_s: float = DEADLINE_S) -> None:
+    """Wait for that many frames more."""
+    feed = client.media.subscribe(stream)
+    before = feed.received
+    assert client.wait_for(lambda _: feed.received >= before + n, timeout_s), f"no frames of {stream}"
+
+
+def find_stream(client: Client, stream: str) -> MediaStreamReport | None:
+    """Return the status of a stream, `None` when the session has none of that name."""
+    return next((one for one in client.status().media if one.stream == stream), None)
+
+
+def wait_for_fault(client: Client, stream: str, fault: str) -> MediaStreamReport:
+    """Wait until a stream has a fault, empty for none. Return its status."""
+    found: list[MediaStreamReport] = []
+
+    def is_there() -> bool:
+        client.sleep(0.1)
+        one = find_stream(client, stream)
+        found.extend([one] if one is not None else [])
+        return one is not None and one.fault == fault
+
+    wait_until(is_there, f"{stream} has the fault {fault!r}: {found[-1:]}")
+    return found[-1]
+
+
+@pytest.mark.skipif(not RGBD.is_dir(), reason="needs the test data")
+def test_clouds_of_two_processes_reach_who_joins_late(
+    serve: Callable[..., SessionProcess], watch: Callable[..., Client], tmp_path: Path
+) -> None:
+    (tmp_path / "scene.xml").write_text(ROOM)
+    intrinsics = "{width = 640, height = 480, fx = 585.0, fy = 585.0, cx = 319.5, cy = 239.5}"
+    real = f'name = "hand"\nsource = "folder"\npath = "{RGBD}"\nhz = {HZ}\nintrinsics = {intrinsics}\n'
+    rendered = 'name = "front"\nsource = "mujoco"\nmodel = "scene.xml"\ncamera = "front"\n'
+    rendered += f"width = {WIDTH}\nheight = {HEIGHT}\nhz = {HZ}\n"
+    files = (
+        write_file(tmp_path / "office.toml", real, low=[-5.0, -5.0, -5.0], high=[5.0, 5.0, 5.0], points=5_000),
+        write_file(tmp_path / "model.toml", rendered),
+    )
+    server = serve("handover", *(option for file in files for option in ("--camera", str(file))))
+    wait_until(lambda: "cameras: office, model" in server.output, "the cameras are named")
+    ann = watch(server, "office", "model", "office-hand", "model-front")
+    for stream in ("office", "model", "office-hand", "model-front"):
+        wait_for_frames(ann, stream, 2)
+    for stream, most in (("office", 5_000), ("model", 50_000)):
+        newest = ann.media.subscribe(stream).newest
+        assert newest is not None
+        cloud = decode_cloud(newest.data)
+        assert 500 < len(cloud.positions) <= most
+        assert newest.age_ns < 5_000_000_000
+    cloud = decode_cloud(newest.data)
+    floor = np.abs(cloud.positions[:, 2]) < 0.01
+    assert floor.mean() > 0.5, "the floor of the model is where it is"
+    picture = ann.media.subscribe("model-front").newest
+    assert picture is not None
+    decoded = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_COLOR)
+    assert decoded is not None
+    assert decoded.shape == (HEIGHT, WIDTH, 3)
+    told = find_stream(ann, "office")
+    assert told is not None
+    assert (told.title, told.audience, told.fault, told.stale) == ("Office", "remote", "", False)
+    late = watch(server, "office")
+    wait_for_frames(late, "office")
+    children = list_descendants(server.process.pid)
+    assert len(find_cameras(server)) == 2
+    server.stop()
+    assert_all_end(children)
+
+
+def test_a_killed_process_comes_back_and_is_announced(
+    serve: Callable[..., SessionProcess], watch: Callable[..., Client], camera_file: Path
+) -> None:
+    server = serve("handover", "--camera", str(camera_file))
+    ann = watch(server, "room")
+    wait_for_frames(ann, "room", 2)
+    (camera,) = find_cameras(server)
+    camera.kill()
+    began = time.monotonic()
+    wait_until(lambda: find_cameras(server) and find_cameras(server)[0].pid != camera.pid, "another process is there")
+    assert time.monotonic() - began < 2.0
+    wait_for_frames(ann, "room", 2)
+    wait_until(lambda: "the camera process of 'room' ended with status -9" in server.output, "it is announced")
+    assert ann.status().restarts["cameras"] == 1
+
+
+def test_a_process_that_hangs_is_named(
+    serve: Callable[..., SessionProcess], watch: Callable[..., Client], camera_file: Path
+) -> None:
+    server = serve("handover", "--camera", str(camera_file))
+    ann = watch(server, "room")
+    wait_for_frames(ann, "room", 2)
+    assert run_in_process("doctor", server.address)[0] in (0, 1)
+    (camera,) = find_cameras(server)
+    camera.send_signal(signal.SIGSTOP)
+
+    def is_stale() -> bool:
+        ann.sleep(0.1)
+        told = find_stream(ann, "room")
+        return told is not None and told.stale
+
+    wait_until(is_stale, "the stream is stale")
+    _, text, _ = run_in_process("doctor", server.address)
+    assert "room" in text
+    wait_until(
+        lambda: any("'room' hangs" in warning for warning in ann.status().warnings) or ann.sleep(0.2), "a warning"
+    )
+    wait_until(lambda: find_cameras(server) and find_cameras(server)[0].pid != camera.pid, "it is replaced")
+    wait_for_frames(ann, "room", 2)
+    assert not is_stale()
+
+
+def test_faults_of_frames_are_named_and_end_with_them(
+    serve: Callable[..., SessionProcess], watch: Callable[..., Client], tmp_path: Path
+) -> None:
+    frozen = write_pictures(tmp_path / "frozen", noise=False)
+    dark = write_pictures(tmp_path / "dark", depth_mm=0)
+    files = [
+        write_file(tmp_path / "frozen.toml", folder_camera(frozen)),
+        write_file(tmp_path / "dark.toml", folder_camera(dark)),
+    ]
+    server = serve("handover", *(option for file in files for option in ("--camera", str(file))))
+    ann = watch(server, "frozen", "dark")
+    assert "camera front: the same picture" in wait_for_fault(ann, "frozen", StreamFault.FROZEN).detail
+    assert "no pixel has a depth" in wait_for_fault(ann, "dark", StreamFault.NO_DEPTH).detail
+    _, text, _ = run_in_process("doctor", server.address)
+    assert "the same picture" in text
+    assert "no pixel has a depth" in text
+    good = write_pictures(tmp_path / "good")
+    for file in good.iterdir():
+        shutil.copy(file, dark / file.name)
+    wait_for_fault(ann, "dark", "")
+
+
+def test_files_that_cannot_be_used_end_serve_before_it_starts(tmp_path: Path, camera_file: Path) -> None:
+    again = tmp_path / "again.toml"
+    again.write_text(camera_file.read_text())
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text("stream = 3\n")
+    for files, expected in (
+        ([tmp_path / "missing.toml"], "missing.toml"),
+        ([wrong], "wrong.toml"),
+        ([camera_file, again], "'room'"),
+    ):
+        options = [option for file in files for option in ("--camera", str(file))]
+        result = run_command("serve", "handover", *FREE_PORTS, "--no-record", *options, cwd=tmp_path)
+        assert result.returncode == 2, result.stderr
+        assert expected in result.stderr
+        assert result.stderr.startswith("iris-session: ")
+        assert result.stderr.count("\n") == 1
+        assert result.stdout == ""
+
+
+def test_a_killed_session_leaves_no_camera_behind(serve: Callable[..., SessionProcess], camera_file: Path) -> None:
+    server = serve("handover", "--camera", str(camera_file))
+    wait_until(lambda: find_cameras(server), "the camera process runs")
+    children = list_descendants(server.process.pid)
+    server.kill()
+    assert_all_end(children)
+
+
+@pytest.fixture
+def run_camera(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
+    """Run `iris-session cloud run` in a process; its output is in `camera.out`."""
+    started: list[subprocess.Popen[bytes]] = []
+
+    def start(*arguments: str, home: Path | None = None) -> subprocess.Popen[bytes]:
+        environment = os.environ if home is None else {**os.environ, "IRIS_HOME": str(home)}
+        command = [*END_WITH_PARENT, *COMMAND, "cloud", "run", *arguments]
+        with (tmp_path / "camera.out").open("wb") as out:
+            process = subprocess.Popen(command, stdout=out, stderr=out, env=environment)
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+
+
+def test_a_camera_by_hand_at_an_encrypted_session_until_its_key_is_revoked(
+    serve: Callable[..., SessionProcess],
+    watch: Callable[..., Client],
+    run_camera: Callable[..., subprocess.Popen[bytes]],
+    tmp_path: Path,
+    camera_file: Path,
+) -> None:
+    """One process is started by the session, with a key of its own; the other has a key that was paired."""
+    home = KeyHome()
+    pair = KeyPair.generate()
+    server_key = home.load_server_key().public
+    home.clients.allow_key("ann", pair.public, ("observer",))
+    curve = CurveKeys(server_key.encode(), pair.public.encode(), pair.secret.encode())
+    hall = write_file(tmp_path / "hall.toml", folder_camera(write_pictures(tmp_path / "other")))
+    server = serve("handover", "--curve", "--no-beacon", "--camera", str(camera_file))
+    shown = run_command("pair", "--address", server.address, "--no-wait", "--json", "--role", "camera", cwd=tmp_path)
+    assert shown.returncode == 0, shown.stderr
+    code = json.loads(shown.stdout)["code"]
+    process = run_camera(str(hall), "--address", server.address, "--code", code, "--json", home=tmp_path / "home")
+    ann = watch(server, "room", "hall", curve=curve)
+    wait_for_frames(ann, "room", 2)
+    wait_for_frames(ann, "hall", 2)
+    report = json.loads((tmp_path / "camera.out").read_text().splitlines()[-1])
+    assert report["stream"] == "hall"
+    assert {p.role for p in ann.mirror.participants.values() if p.name in ("room", "hall")} == {"camera"}
+    (entry,) = [one for one in home.clients.read().values() if one.roles == ("camera",)]
+    home.clients.revoke_key(entry.fingerprint)
+    wait_until(lambda: process.poll() is not None, "the camera whose key was revoked has ended")
+    assert process.returncode == 1
+    assert "Traceback" not in (tmp_path / "camera.out").read_text()
+
+    def is_gone() -> bool:
+        ann.sleep(0.1)
+        told = find_stream(ann, "hall")
+        return told is None or told.stale
+
+    wait_until(is_gone, "its stream has ended")
+    wait_for_frames(ann, "room", 2)
+
+
+def test_a_camera_by_hand_ends_by_ctrl_c_and_waits_for_its_session(
+    serve: Callable[..., SessionProcess],
+    watch: Callable[..., Client],
+    run_camera: Callable[..., subprocess.Popen[bytes]],
+    tmp_path: Path,
+    camera_file: Path,
+) -> None:
+    server = serve("handover")
+    process = run_camera(str(camera_file), "--address", server.address)
+    ann = watch(server, "room")
+    wait_for_frames(ann, "room", 2)
+    result = run_in_process("cloud", "inspect", server.address, "--json", "--seconds", "2")
+    told = {one["stream"]: one for one in json.loads(result[1])["streams"]}
+    assert told["room"]["hz"] > 0.0
+    assert 8.0 <= told["room"]["bytes_per_point"] < 8.2
+    assert set(told) == {"room", "room-front"}
+    server.children()["front.main"].kill()
+    wait_for_frames(ann, "room", 2)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(DEADLINE_S) == 0
+    text = (tmp_path / "camera.out").read_text()
+    assert "Traceback" not in text
+    assert "room: " in text
