@@ -80,6 +80,16 @@ class DepthLimits(NamedTuple):
     jump: float = 0.03
 
 
+def load_kernels(use_numba: bool | None = None) -> Any:
+    """Return the module of the loops in numba, or `None` for those in numpy.
+
+    Raises `MissingExtraError` for `use_numba` where it is not installed.
+    """
+    if use_numba and not _HAS_NUMBA:
+        raise MissingExtraError(describe_missing("numba", "use_numba=True"), name="numba")
+    return kernels if _HAS_NUMBA and use_numba is not False else None
+
+
 def make_rays(camera: CameraModel) -> Rays:
     """Compute the directions of the pixels of a camera.
 
@@ -128,13 +138,10 @@ class VoxelFilter:
             raise ValueError(f"max_cells is {max_cells}: 1 to {2**24} are possible")
         if threads is not None and threads < 1:
             raise ValueError(f"threads is {threads}: at least 1")
-        if use_numba and not _HAS_NUMBA:
-            raise MissingExtraError(describe_missing("numba", "use_numba=True"), name="numba")
         if use_numba is None and not _HAS_NUMBA:
             log.warning("depth pictures are filtered by numpy, which takes longer: %s", describe_missing("numba"))
-        wants = _HAS_NUMBA if use_numba is None else use_numba
         n = max(1, min(4, os.cpu_count() or 1)) if threads is None else threads
-        self._table = _NumbaTable(max_cells, n) if wants else _NumpyTable(max_cells)
+        self._table = _NumpyTable(max_cells) if load_kernels(use_numba) is None else _NumbaTable(max_cells, n)
         self.clear(voxel_m)
 
     def clear(self, voxel_m: float | None = None) -> None:

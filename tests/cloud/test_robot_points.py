@@ -1,0 +1,153 @@
+"""Points on robots are found by model and state; what a gripper holds stays, and so does the room."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from anchors.camera import CameraModel
+from anchors.pose import PoseTuple
+from iris_session.cloud.robot_points import RobotPoints, find_robot_bodies
+from iris_session.demo.named_scenes import scene_by_name
+from iris_session.physics import find_objects, find_robots
+from iris_session.physics.names import list_body_names
+from iris_session.protocol.common import Pose
+from iris_session.protocol.scene import SceneSpec
+from iris_session.protocol.server_messages import BodyInfo, RobotInfo
+from iris_session.scene import AssetStore, EncodeOptions, MeshArrays, decode_mesh
+from iris_session.scene.mujoco_scene import parse_mujoco
+from tests.cloud.rays import cast_picture, look_at
+from tests.models import robot_models
+
+__all__ = ["robot_models"]
+
+EYES = ((1.3, -1.2, 0.9), (-1.2, -1.3, 0.8), (0.1, 1.6, 0.7))
+CAMERA = CameraModel(320, 240, 280.0, 280.0, 159.5, 119.5)
+IDENTITY = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+backends = pytest.mark.parametrize("use_numba", [True, False], ids=["numba", "numpy"])
+
+
+class Holding(NamedTuple):
+    """A scene whose first robot holds its first object, as clients know it, and the points that cameras see of it."""
+
+    spec: SceneSpec
+    meshes: dict[int, MeshArrays]
+    robots: tuple[RobotInfo, ...]
+    streamed: tuple[BodyInfo, ...]
+    body_pose: Callable[[str, int], PoseTuple | None]
+    points: NDArray[np.float32]
+    bodies: NDArray[np.int32]
+    thing: int
+
+    def find(self, *, known: bool = True, **options: Any) -> NDArray[np.bool_]:
+        """Return the points on robots. `known`: whether the session knows the object."""
+        streamed = [body if known else BodyInfo(body.id, body.name, body.moving) for body in self.streamed]
+        found = RobotPoints(self.spec, self.meshes, self.robots, streamed, **options)
+        return found.find(self.points, self.body_pose, 7)
+
+
+@lru_cache(maxsize=2)
+def hold_object(scene: str, folder: Path) -> Holding:
+    """Close the gripper of the first robot around the first object. Depth has a noise of 3 mm."""
+    model = scene_by_name(scene).model
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    names, robots, thing = list_body_names(model), find_robots(model), find_objects(model)[0].body
+    free = next(j for j in range(model.njnt) if model.jnt_bodyid[j] == names.index(thing))
+    start = model.jnt_qposadr[free]
+    data.qpos[start : start + 3] = data.site(robots[0].site).xpos
+    for joint in range(model.njnt):
+        if "finger" in model.joint(joint).name:
+            data.qpos[model.jnt_qposadr[joint]] = 0.013  # half the width of the objects
+    mujoco.mj_forward(model, data)
+    store = AssetStore(folder)
+    spec = parse_mujoco(model, store, options=EncodeOptions(levels=False)).spec
+    pictures = [cast_picture(model, data, CAMERA, look_at(eye, (0.0, 0.0, 0.2)), 0.003) for eye in EYES]
+
+    def body_pose(name: str, at_ns: int) -> PoseTuple | None:
+        x, y, z = data.body(name).xpos.tolist()
+        w, i, j, k = data.body(name).xquat.tolist()
+        return ((x, y, z), (w, i, j, k)) if at_ns == 7 else None
+
+    return Holding(
+        spec,
+        {number: decode_mesh(store.get(mesh.levels[0].address)) for number, mesh in enumerate(spec.meshes)},
+        tuple(RobotInfo(one.name, (), names.index(one.base_body), 1, IDENTITY, True) for one in robots),
+        tuple(BodyInfo(k, name, True, name == thing) for k, name in enumerate(names) if k),
+        body_pose,
+        np.concatenate([one.points for one in pictures]).astype(np.float32),
+        np.concatenate([model.geom_bodyid[one.geoms] for one in pictures]),
+        names.index(thing),
+    )
+
+
+@backends
+@pytest.mark.parametrize("scene", ["iiwa", "handover"])
+def test_robots_are_gone_and_the_object_in_the_gripper_is_not(
+    scene: str, use_numba: bool, robot_models: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    holding = hold_object(scene, tmp_path_factory.getbasetemp() / scene)
+    on_robot = holding.find(use_numba=use_numba)
+    robots = {body.id for body in find_robot_bodies(holding.spec, holding.robots)}
+    of_robot, of_thing = np.isin(holding.bodies, list(robots)), holding.bodies == holding.thing
+    assert of_robot.sum() > 10_000
+    assert of_thing.sum() > 500
+    assert on_robot[of_robot].mean() >= 0.99
+    assert on_robot[of_thing].mean() <= 0.05
+    assert on_robot[~of_robot & ~of_thing].mean() <= 0.01
+
+
+def test_of_an_object_that_the_session_does_not_know_what_touches_the_fingers_goes(
+    robot_models: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    holding = hold_object("handover", tmp_path_factory.getbasetemp() / "handover")
+    of_thing = holding.bodies == holding.thing
+    known, unknown = (holding.find(known=known)[of_thing].mean() for known in (True, False))
+    assert known < 0.5 * unknown
+    assert unknown <= 0.2
+    wider = holding.find(known=False, margin_m=0.05)[of_thing].mean()
+    assert wider > unknown
+
+
+def test_bodies_without_a_pose_are_counted_and_keep_their_points(
+    robot_models: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    holding = hold_object("handover", tmp_path_factory.getbasetemp() / "handover")
+    found = RobotPoints(holding.spec, holding.meshes, holding.robots, holding.streamed)
+    assert not found.find(holding.points, holding.body_pose, 8).any()
+    assert found.n_unknown == found.n_bodies > 10
+    assert found.find(holding.points, holding.body_pose, 7).any()
+    assert found.n_unknown == 0
+    # Bodies that are not streamed are where the specification has them.
+    at_rest = RobotPoints(holding.spec, holding.meshes, holding.robots, ())
+    assert at_rest.find(holding.points, lambda name, at_ns: None, 8).any()
+    assert at_rest.n_unknown == 0
+
+
+@backends
+def test_clouds_without_points_and_scenes_without_robots_have_none(
+    use_numba: bool, robot_models: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    holding = hold_object("handover", tmp_path_factory.getbasetemp() / "handover")
+    found = RobotPoints(holding.spec, holding.meshes, holding.robots, holding.streamed, use_numba=use_numba)
+    assert found.find(np.empty((0, 3), np.float32), holding.body_pose, 7).shape == (0,)
+    odd = np.array([[math.nan, 0.0, 0.2], [math.inf, 0.0, 0.0], [1e30, -1e30, 0.0]], np.float32)
+    assert not found.find(odd, holding.body_pose, 7).any()
+    without = RobotPoints(holding.spec, holding.meshes, (), holding.streamed, use_numba=use_numba)
+    assert without.n_bodies == 0
+    assert not without.find(holding.points, holding.body_pose, 7).any()
+
+
+@pytest.mark.parametrize("margin_m", [0.0, -1.0, math.nan, 1.0])
+def test_margins_out_of_range_are_refused(margin_m: float) -> None:
+    with pytest.raises(ValueError, match="margin_m"):
+        RobotPoints(SceneSpec(), {}, (), (), margin_m=margin_m)
