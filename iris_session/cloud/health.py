@@ -91,7 +91,7 @@ class CameraHealth:
         if bad is None or self._bad is None or bad.fault != self._bad.fault:
             self._bad_since_ns = now_ns
         self._bad = bad
-        picture = zlib.crc32(np.ascontiguousarray(frame.color), zlib.crc32(np.ascontiguousarray(frame.depth)))
+        picture = zlib.crc32(np.ascontiguousarray(frame.color).data, zlib.crc32(np.ascontiguousarray(frame.depth).data))
         if self._same_since_ns is None or picture != self._picture:
             self._picture, self._same_since_ns = picture, now_ns
         return True

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 
@@ -33,8 +33,18 @@ CLASSES: Final = (BudgetClass.FULL, BudgetClass.HALF, BudgetClass.QUARTER)
 
 #: `T_world_body` by name and session time [ns]; `None` while it is not known.
 BodyPose = Callable[[str, int], PoseTuple | None]
-#: Returns the points that stay, of those at a session time [ns].
-PointRemover = Callable[[PointSet, int], PointSet]
+
+
+class PointRemover(Protocol):
+    """Removes points of a cloud, such as those on robots."""
+
+    def is_ready(self, capture_ns: int) -> bool:
+        """Return whether it knows all that it needs about a session time [ns]; a frame waits for it."""
+        ...
+
+    def remove(self, points: PointSet, capture_ns: int) -> PointSet:
+        """Return the points that stay."""
+        ...
 
 
 class PipelineCamera(NamedTuple):
@@ -128,7 +138,7 @@ class CloudPipeline:
         cameras: At least one.
         clock_ns: Clock by which the stages are measured [ns].
         body_pose: Poses of bodies that carry cameras.
-        remove_points: Removes points of the merged cloud, such as those on robots.
+        remover: Removes points of the merged cloud.
         voxels: The filter, by default one that takes numba where it is installed.
 
     Attributes:
@@ -142,7 +152,7 @@ class CloudPipeline:
         clock_ns: Callable[[], int],
         *,
         body_pose: BodyPose | None = None,
-        remove_points: PointRemover | None = None,
+        remover: PointRemover | None = None,
         voxels: VoxelFilter | None = None,
     ) -> None:
         self.drops: Counter[str] = Counter()
@@ -150,7 +160,7 @@ class CloudPipeline:
         self._states = {camera.name: _CameraState(camera) for camera in cameras}
         self._clock_ns = clock_ns
         self._body_pose = body_pose
-        self.remove_points = remove_points
+        self._remover = remover
         self._voxels = voxels or VoxelFilter(settings.voxel_m)
         self._next_voxel_m = settings.voxel_m
 
@@ -182,7 +192,7 @@ class CloudPipeline:
         return [name for name, state in self._states.items() if not _is_delivering(state, now_ns)]
 
     def lacks_pose(self, name: str) -> bool:
-        """Return whether the newest frame of a camera was dropped because the pose of its body is not known."""
+        """Return whether the newest frame of a camera was dropped because a pose at its capture is not known."""
         return self._states[name].lacks_pose
 
     def take_frames(self, now_ns: int) -> dict[str, PlacedFrame]:
@@ -226,8 +236,8 @@ class CloudPipeline:
         times.append(clock_ns())
         points = self._voxels.collect(min_points=settings.min_points, min_around=settings.min_around)
         capture_ns = min(one.frame.capture_ns for one in frames.values())
-        if self.remove_points is not None:
-            points = self.remove_points(points, capture_ns)
+        if self._remover is not None:
+            points = self._remover.remove(points, capture_ns)
         times.append(clock_ns())
         voxel_m, n = self._voxels.voxel_m, len(points.positions)
         self._next_voxel_m = choose_voxel_m(voxel_m, n, settings.points, settings.voxel_m)
@@ -249,7 +259,7 @@ class CloudPipeline:
         for place in reversed(range(len(state.waiting))):
             frame, _ = state.waiting[place]
             pose = self._find_pose(state.camera, frame)
-            if pose is None:
+            if pose is None or (self._remover is not None and not self._remover.is_ready(frame.capture_ns)):
                 continue
             self.drops["superseded"] += place
             for _ in range(place):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import itertools
+import logging
 import os
 import signal
 import sys
@@ -28,10 +29,13 @@ from iris_session.client.core.interpolation import interpolate
 from iris_session.client.core.scene_follower import pose_at
 from iris_session.client.core.state_stream import Poses, SceneState
 from iris_session.client.errors import ClientError, NotConnectedError
+from iris_session.client.fetched_scene import fetch_scene
 from iris_session.client.sockets import CurveKeys
 from iris_session.cloud.camera_file import CloudSettings
 from iris_session.cloud.config import CameraReport, CameraStart
+from iris_session.cloud.robot_points import RobotPoints
 from iris_session.cloud.sources import open_source
+from iris_session.cloud.voxels import PointSet
 from iris_session.cloud.worker import CloudWorker
 from iris_session.link.discovery import host_port
 from iris_session.protocol.media import StreamInfo
@@ -51,6 +55,7 @@ MAX_STATES: Final = 64
 #: A pose that was sent longer before or after a capture says nothing about it.
 POSE_REACH_NS: Final = 100_000_000
 
+log = logging.getLogger(__name__)
 OnReport = Callable[[CameraReport], None]
 
 
@@ -82,6 +87,11 @@ class BodyHistory:
             poses = self._states[-1][1] if self._states else None
             return {} if poses is None else {body: pose_at(poses, place) for body, place in self._places.items()}
 
+    def covers(self, time_ns: int) -> bool:
+        """Return whether there are states before and after a session time [ns]."""
+        with self._lock:
+            return bool(self._states) and self._states[0][0] <= time_ns <= self._states[-1][0]
+
     def find_pose(self, body: str, time_ns: int) -> PoseTuple | None:
         """Return `T_world_body` at a session time [ns], interpolated.
 
@@ -96,6 +106,46 @@ class BodyHistory:
                 share = (time_ns - before_ns) / max(1, after_ns - before_ns)
                 return pose_at(interpolate(before[place : place + 1], after[place : place + 1], share), 0)
         return None
+
+
+class RobotRemover:
+    """Leaves out the points on the session's robots, by their shapes and the state at capture.
+
+    The shapes are fetched in a thread, and again for another scene. Until they are there all points stay.
+    """
+
+    def __init__(self, client: Client, history: BodyHistory) -> None:
+        self._client = client
+        self._history = history
+        self._scene: tuple[str, str] | None = None
+        self._thread: threading.Thread | None = None
+        self._found: RobotPoints | None = None
+
+    def is_ready(self, capture_ns: int) -> bool:
+        """Return whether the state of that time is there; begin to fetch the scene when it is another one."""
+        version = self._client.scene.version
+        is_fetching = self._thread is not None and self._thread.is_alive()
+        if version is not None and version[:2] != self._scene and not is_fetching:
+            self._scene, self._found = version[:2], None
+            self._thread = threading.Thread(target=self._fetch, name="iris-robots", daemon=True)
+            self._thread.start()
+        return self._found is None or self._history.covers(capture_ns)
+
+    def remove(self, points: PointSet, capture_ns: int) -> PointSet:
+        """Return the points that do not lie on robots."""
+        found = self._found
+        if found is None:
+            return points
+        kept = ~found.find(points.positions, self._history.find_pose, capture_ns)
+        return PointSet(points.positions[kept], points.colors[kept], points.counts[kept])
+
+    def _fetch(self) -> None:
+        mirror = self._client.mirror
+        try:
+            scene = fetch_scene(self._client)
+            self._found = RobotPoints(scene.spec, scene.meshes, mirror.robots.values(), mirror.bodies)
+        except (ClientError, ValueError) as error:
+            log.warning("points on robots stay in the cloud: %s", error)
 
 
 class SessionOutlet:
@@ -141,6 +191,7 @@ def run_cameras(
         partial(open_source, body_poses=history.read_newest),
         time.perf_counter_ns,
         body_pose=history.find_pose,
+        remover=RobotRemover(client, history) if settings.remove_robots else None,
     )
     on_report(CameraReport(settings.stream))
     session_id = ""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping
 from typing import Final, Protocol
 
@@ -42,6 +42,7 @@ INFO_NS: Final = SECOND
 RENDERED: Final = frozenset({"mujoco"})
 #: Of the cloud of cameras that have shown nothing yet.
 NO_POINTS: Final = (np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))
+NO_POSE: Final = "its frames have no pose, or the session no state of the time when they are captured"
 #: Time for the threads to leave their sources [s].
 JOIN_S: Final = 0.5
 
@@ -102,7 +103,7 @@ class CloudWorker:
         open_source: Opens a source.
         clock_ns: Clock by which stages are measured [ns].
         body_pose: Poses of bodies that carry cameras.
-        remove_points: Removes points from every cloud.
+        remover: Removes points from every cloud.
 
     Attributes:
         cloud: The newest cloud, `None` before the first.
@@ -117,7 +118,7 @@ class CloudWorker:
         clock_ns: Callable[[], int],
         *,
         body_pose: BodyPose | None = None,
-        remove_points: PointRemover | None = None,
+        remover: PointRemover | None = None,
     ) -> None:
         if settings.picture_hz:
             require_package("cv2", "pictures of cameras (picture_hz)")
@@ -135,7 +136,7 @@ class CloudWorker:
             [make_pipeline_camera(settings, one) for one in settings.cameras],
             clock_ns,
             body_pose=body_pose,
-            remove_points=remove_points,
+            remover=remover,
             voxels=make_warm_filter(settings.voxel_m),
         )
         self._cameras = {one.name: one for one in settings.cameras}
@@ -152,7 +153,7 @@ class CloudWorker:
         self._reported_ns: int | None = None
         self._clouds = self._bytes = 0
         self._age_ms = 0.0
-        self._stages: Counter[str] = Counter()  # sums of durations [ms], and how many
+        self._stages: defaultdict[str, float] = defaultdict(float)  # sums of durations [ms], and how many
         self._stage_counts: Counter[str] = Counter()
 
     def _make_reader(self, camera: CameraSettings, open_source: OpenSource) -> SourceReader:

@@ -157,17 +157,28 @@ def test_a_frame_with_a_pose_of_its_own_is_placed_by_it() -> None:
 
 
 def test_points_are_removed_at_the_time_of_capture() -> None:
-    asked = []
+    class Remover:
+        """Removes the right half, once it knows about that time."""
 
-    def remove(points: PointSet, at: int) -> PointSet:
-        asked.append(at)
-        kept = points.positions[:, 0] < 0.0
-        return PointSet(points.positions[kept], points.colors[kept], points.counts[kept])
+        def __init__(self) -> None:
+            self.known_ns = 0
+            self.asked: list[int] = []
 
-    pipeline = make_pipeline("front", remove_points=remove)
+        def is_ready(self, capture_ns: int) -> bool:
+            return capture_ns <= self.known_ns
+
+        def remove(self, points: PointSet, capture_ns: int) -> PointSet:
+            self.asked.append(capture_ns)
+            kept = points.positions[:, 0] < 0.0
+            return PointSet(points.positions[kept], points.colors[kept], points.counts[kept])
+
+    remover = Remover()
+    pipeline = make_pipeline("front", remover=remover)
     pipeline.offer("front", make_frame(20), 30 * MS)
-    cloud = pipeline.make_cloud(pipeline.take_frames(30 * MS))
-    assert asked == [20 * MS]
+    assert pipeline.take_frames(30 * MS) == {}, "the state of that moment is not there yet"
+    remover.known_ns = 25 * MS
+    cloud = pipeline.make_cloud(pipeline.take_frames(32 * MS))
+    assert remover.asked == [20 * MS]
     assert decode_cloud(cloud.frames["full"]).positions[:, 0].max() < 0.001
 
 
