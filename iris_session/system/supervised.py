@@ -81,7 +81,7 @@ class SupervisedProcess(Generic[Report]):
 
     @property
     def failure(self) -> str:
-        """Why there is no process, in one line; empty while there is one."""
+        """One line for people about why there is no process; empty while there is one."""
         return "" if self.pid else self._announced
 
     @property

@@ -70,7 +70,7 @@ class GatewayProcess:
 
     @property
     def restarts(self) -> int:
-        """How often it was restarted."""
+        """Number of its restarts."""
         return self._supervised.restarts
 
     @property
