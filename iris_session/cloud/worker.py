@@ -31,17 +31,14 @@ from iris_session.cloud.reader import NewFrame, SourceReader
 from iris_session.cloud.voxels import Colors, DepthLimits, Floats, VoxelFilter, make_rays
 from iris_session.protocol.media import StreamCamera, StreamInfo
 from iris_session.protocol.names import MediaEncoding, StreamFault
-from iris_session.streams.cloud import encode_cloud
 from iris_session.system.extras import require_package
 
 MILLISECOND: Final = 1_000_000
 SECOND: Final = 1_000_000_000
-#: Period of the description of a stream, and of its newest frame while there is no new one.
+#: Period of the description of a stream.
 INFO_NS: Final = SECOND
 #: Sources whose pictures of a world at rest are all the same.
 RENDERED: Final = frozenset({"mujoco"})
-#: Of the cloud of cameras that have shown nothing yet.
-NO_POINTS: Final = (np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))
 NO_POSE: Final = "its frames have no pose, or the session no state of the time when they are captured"
 #: Time for the threads to leave their sources [s].
 JOIN_S: Final = 0.5
@@ -60,7 +57,7 @@ class Outlet(Protocol):
     def publish(
         self, stream: str, frames: bytes | Mapping[str, bytes], capture_ns: int, encoding: str, info: StreamInfo | None
     ) -> bool:
-        """Publish a frame. False: it was dropped."""
+        """Publish a frame, or `info` only where `frames` is empty. False: it was dropped."""
         ...
 
 
@@ -70,9 +67,10 @@ class _Stream:
     def __init__(self, name: str, encoding: str) -> None:
         self.name = name
         self.encoding = encoding
-        self.frames: bytes | dict[str, bytes] = b""
-        self.capture_ns = 0
-        self.published_ns = 0
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew: for another session."""
         self.due_ns = 0
         self._fault: Fault | None = None
         self._described_ns = -INFO_NS
@@ -80,10 +78,8 @@ class _Stream:
     def needs_info(self, fault: Fault | None, now_ns: int) -> bool:
         return fault != self._fault or now_ns - self._described_ns >= INFO_NS
 
-    def note_published(self, fault: Fault | None, now_ns: int, *, described: bool) -> None:
-        self.published_ns = now_ns
-        if described:
-            self._fault, self._described_ns = fault, now_ns
+    def note_described(self, fault: Fault | None, now_ns: int) -> None:
+        self._fault, self._described_ns = fault, now_ns
 
     def is_due(self, hz: float, now_ns: int) -> bool:
         """Return whether another frame may be published, at most `hz` of them in the mean; count it then."""
@@ -177,8 +173,7 @@ class CloudWorker:
         for reader in self._readers.values():
             reader.restart_clock()
         for stream in (self._stream, *self._pictures.values()):
-            stream.due_ns = stream.published_ns = stream.capture_ns = 0
-            stream.frames = b""
+            stream.restart()
 
     def poll(self, timeout_s: float) -> bool:
         """Do what is due: publish a cloud, pictures, faults.
@@ -197,7 +192,7 @@ class CloudWorker:
             if new is not None:
                 self._take_over(name, new, now_ns)
         has_made = self._make_cloud(now_ns)
-        self._publish_at_rest(now_ns)
+        self._publish_faults(now_ns)
         return has_made
 
     def find_fault(self, now_ns: int) -> Fault | None:
@@ -263,10 +258,9 @@ class CloudWorker:
         picture = self._pictures.get(name)
         if picture is not None and picture.is_due(self._settings.picture_hz, now_ns):
             began_ns = self._clock_ns()
-            picture.frames = encode_picture(new.frame.color, self._settings.picture_quality)
-            picture.capture_ns = new.frame.capture_ns
+            data = encode_picture(new.frame.color, self._settings.picture_quality)
             self._note_stage("jpeg", (self._clock_ns() - began_ns) / MILLISECOND)
-            self._publish(picture, self._find_camera_fault(name, now_ns), now_ns)
+            self._publish(picture, data, new.frame.capture_ns, self._find_camera_fault(name, now_ns), now_ns)
 
     def _make_cloud(self, now_ns: int) -> bool:
         if now_ns < self._stream.due_ns:
@@ -276,38 +270,36 @@ class CloudWorker:
             return False
         cloud = self.cloud = self.pipeline.make_cloud(frames)
         self.poses = {name: one.T_world_camera for name, one in frames.items()}
-        self._stream.frames, self._stream.capture_ns = cloud.frames, cloud.capture_ns
         self._note_stage("read", max(self._readers[name].read_ms for name in frames))
         for stage, duration_ms in cloud.stages_ms.items():
             self._note_stage(stage, duration_ms)
         began_ns = self._clock_ns()
-        self._publish(self._stream, self.find_fault(now_ns), now_ns)
+        self._publish(self._stream, cloud.frames, cloud.capture_ns, self.find_fault(now_ns), now_ns)
         self._note_stage("send", (self._clock_ns() - began_ns) / MILLISECOND)
         self._clouds += 1
         self._age_ms += (self._outlet.now_ns() - cloud.capture_ns) / MILLISECOND
         return True
 
-    def _publish_at_rest(self, now_ns: int) -> None:
-        """Publish the newest frames again while there are no new ones and a fault says why: a fault travels with a
-        frame. Without a first frame it is an empty cloud."""
+    def _publish_faults(self, now_ns: int) -> None:
+        """Publish faults without a frame, while no frame comes that would carry them."""
         fault = self.find_fault(now_ns)
         if fault is not None and self._stream.needs_info(fault, now_ns):
-            self._stream.frames = self._stream.frames or encode_cloud(*NO_POINTS)
-            self._publish(self._stream, fault, now_ns)
+            self._publish(self._stream, {}, now_ns, fault, now_ns)
         for name, picture in self._pictures.items():
             fault = self._find_camera_fault(name, now_ns)
-            if fault is not None and picture.frames and picture.needs_info(fault, now_ns):
-                self._publish(picture, fault, now_ns)
+            if fault is not None and picture.needs_info(fault, now_ns):
+                self._publish(picture, {}, now_ns, fault, now_ns)
 
-    def _publish(self, stream: _Stream, fault: Fault | None, now_ns: int) -> None:
+    def _publish(
+        self, stream: _Stream, frames: bytes | dict[str, bytes], capture_ns: int, fault: Fault | None, now_ns: int
+    ) -> None:
         described = stream.needs_info(fault, now_ns)
         info = self._make_info(stream, fault) if described else None
-        capture_ns = stream.capture_ns or now_ns
-        if not self._outlet.publish(stream.name, stream.frames, capture_ns, stream.encoding, info):
+        if not self._outlet.publish(stream.name, frames, capture_ns, stream.encoding, info):
             self._drops["send"] += 1
             return
-        stream.note_published(fault, now_ns, described=described)
-        frames = stream.frames
+        if described:
+            stream.note_described(fault, now_ns)
         self._bytes += len(frames) if isinstance(frames, bytes) else sum(map(len, frames.values()))
 
     def _make_info(self, stream: _Stream, fault: Fault | None) -> StreamInfo:
