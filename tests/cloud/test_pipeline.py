@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
-from anchors.camera import CameraModel
-from anchors.pose import PoseTuple
+from anchors.camera import CameraModel, pose_to_matrix
+from anchors.pose import PoseTuple, quat_from_rotvec
 from iris_session.cloud.frames import DepthFrame
 from iris_session.cloud.pipeline import CloudPipeline, PipelineCamera, PipelineSettings
-from iris_session.cloud.voxels import DepthLimits, Floats, PointSet, VoxelFilter
+from iris_session.cloud.voxels import DepthLimits, Floats, PointSet, VoxelFilter, make_rays
 from iris_session.streams.cloud import decode_cloud
 
 MS = 1_000_000
@@ -195,3 +197,32 @@ def test_another_clock_drops_what_waits() -> None:
     pipeline.offer("front", make_frame(0), 0)
     pipeline.clear()
     assert pipeline.take_frames(0) == {}
+
+
+def test_a_camera_on_a_moving_hand_draws_a_still_wall() -> None:
+    """A wall at z = 2 m, seen from a hand that turns and moves."""
+    rays = make_rays(CAMERA)
+
+    def hand(capture_ns: int) -> PoseTuple:
+        t = capture_ns / 1000 / MS
+        return (0.3 * math.sin(3.0 * t), 0.2 * t, 0.1 * t), quat_from_rotvec((0.2 * t, -0.3 * t, 0.1))
+
+    T_hand_camera = pose_to_matrix(((0.05, 0.0, 0.1), quat_from_rotvec((0.1, 0.0, 0.0))))
+    camera = PipelineCamera("hand", DepthLimits(), 0.01, T_hand_camera, "hand")
+    pipeline = CloudPipeline(
+        PipelineSettings(50_000, 0.02),
+        [camera],
+        lambda: 0,
+        body_pose=lambda body, at: hand(at),
+        voxels=VoxelFilter(0.02, use_numba=False),
+    )
+    pipeline.open_camera("hand", CAMERA, 0.0001)
+    for at in (0, 300, 700):
+        pose = pose_to_matrix(hand(at * MS)) @ T_hand_camera
+        along = pose[2, 0] * rays.x + pose[2, 1] * rays.y + pose[2, 2]
+        depth = np.rint((2.0 - pose[2, 3]) / along / 0.0001).astype(np.uint16)
+        pipeline.offer("hand", make_frame(at)._replace(depth=depth), at * MS)
+        cloud = pipeline.make_cloud(pipeline.take_frames(at * MS))
+        z = decode_cloud(cloud.frames["full"]).positions[:, 2]
+        assert len(z) > 1000
+        assert np.abs(z - 2.0).max() < 0.001

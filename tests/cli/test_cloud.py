@@ -1,0 +1,96 @@
+"""`iris-session cloud`: example and inspect of files, its reports, and what cannot be used."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from iris_session.cli.cloud import format_faults, format_report
+from iris_session.cli.main import main
+from iris_session.cloud.camera_file import load_camera_file
+from iris_session.cloud.config import CameraReport, SourceReport
+from iris_session.protocol.names import StreamFault
+
+
+@pytest.fixture
+def camera_file(tmp_path: Path) -> Path:
+    """A camera file of pictures of a wall with noise."""
+    random = np.random.default_rng(1)
+    for i in range(3):
+        depth = (1500 + random.integers(0, 5, (60, 80))).astype(np.uint16)
+        cv2.imwrite(str(tmp_path / f"{i}.depth.png"), depth)
+        cv2.imwrite(str(tmp_path / f"{i}.color.png"), np.full((60, 80, 3), 90, np.uint8))
+    path = tmp_path / "camera.toml"
+    path.write_text(
+        'stream = "room"\nhz = 10.0\nvoxel_m = 0.05\n'
+        '[[cameras]]\nname = "front"\nsource = "folder"\npath = "."\nhz = 10.0\n'
+        "intrinsics = {width = 80, height = 60, fx = 70.0, fy = 70.0, cx = 39.5, cy = 29.5}\n"
+        "pose = {position_m = [0.0, 0.0, 1.0], quaternion_wxyz = [0.5, -0.5, 0.5, -0.5]}\nerror_mm = 12.0\n"
+    )
+    return path
+
+
+def test_an_example_is_written_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "camera.toml"
+    assert main(["cloud", "example", "--source", "mujoco", "-o", str(path)]) == 0
+    assert load_camera_file(path).cameras[0].source == "mujoco"
+    assert "cloud inspect" in capsys.readouterr().out
+    assert main(["cloud", "example", "-o", str(path)]) == 2
+    assert "exists" in capsys.readouterr().err
+    assert main(["cloud", "example", "-o", str(tmp_path / "no" / "camera.toml")]) == 2
+    assert "cannot be written" in capsys.readouterr().err
+    assert main(["cloud", "example"]) == 0
+    assert 'source = "folder"' in capsys.readouterr().out
+
+
+def test_a_file_is_inspected(camera_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["cloud", "inspect", str(camera_file), "--seconds", "1", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["ok"]
+    assert report["hz"] > 0.0
+    assert report["points"] > 100
+    assert report["error_m"] == pytest.approx(0.012)
+    assert report["cameras"]["front"]["fault"] == ""
+    assert main(["cloud", "inspect", str(camera_file), "--seconds", "1"]) == 0
+    text = capsys.readouterr().out
+    assert "camera front: " in text
+    assert "stated error 12.0 mm" in text
+    assert "stages [ms]: " in text
+
+
+def test_a_fault_is_shown_and_is_the_exit_status(camera_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for path in camera_file.parent.glob("*.depth.png"):
+        cv2.imwrite(str(path), np.zeros((60, 80), np.uint16))
+    assert main(["cloud", "inspect", str(camera_file), "--seconds", "1"]) == 1
+    assert "no_depth: no pixel has a depth" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("action", [["inspect"], ["run", "--address", "127.0.0.1:1"]])
+def test_a_file_that_cannot_be_used_is_one_line(
+    action: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["cloud", action[0], str(tmp_path / "missing.toml"), *action[1:]]) == 2
+    error = capsys.readouterr().err
+    assert "missing.toml" in error
+    assert error.count("\n") == 1
+
+
+def test_no_session_is_one_line(camera_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["cloud", "run", str(camera_file), "--address", "127.0.0.1:1"]) == 2
+    assert "no session answers at 127.0.0.1:1" in capsys.readouterr().err
+    assert main(["cloud", "inspect", "127.0.0.1:1"]) == 2
+    assert "no session answers at 127.0.0.1:1" in capsys.readouterr().err
+
+
+def test_a_report_is_one_line() -> None:
+    assert format_report(CameraReport("room")) == "room: no session yet"
+    well = CameraReport("room", True, 29.84, 34814, 0.0119, 0.01, 1.25e6, 47.2, cameras={"front": SourceReport(30.0)})
+    assert format_report(well) == "room: 29.8 Hz, 34,814 points of 1.2 cm, 10.0 Mbit/s, 47 ms old"
+    fault = SourceReport(30.0, StreamFault.FROZEN, "the same picture for 3 s\x1b[2J")
+    faulty = CameraReport("room", True, cameras={"front": fault, "back": SourceReport(30.0)})
+    assert format_faults(faulty) == "front: frozen (the same picture for 3 s\N{REPLACEMENT CHARACTER}[2J)"
+    assert format_report(faulty).endswith(format_faults(faulty))

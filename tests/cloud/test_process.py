@@ -1,0 +1,149 @@
+"""Poses of bodies at the capture of a frame, and the removal of robots, in the camera process."""
+
+from __future__ import annotations
+
+import threading
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from iris_session.client.errors import NotConnectedError
+from iris_session.cloud import process
+from iris_session.cloud.process import BodyHistory, RobotRemover
+from iris_session.cloud.voxels import PointSet
+
+MS = 1_000_000
+DEADLINE_S = 60.0
+
+
+class FakeClient:
+    """The scene and the bodies of a client, by the test."""
+
+    def __init__(self) -> None:
+        self.scene: Any = SimpleNamespace(version=("session", "scene", 1), poses=None)
+        self.mirror: Any = SimpleNamespace(body_index={"base": 0, "hand": 1}, robots={}, bodies=())
+
+
+class Lab:
+    """A history of the poses of two bodies, the second of which moves along x."""
+
+    def __init__(self) -> None:
+        self.client: Any = FakeClient()
+        self.history = BodyHistory(self.client)
+
+    def add(self, at_ms: float, x: float) -> None:
+        poses = np.zeros((2, 7))
+        poses[:, 3] = 1.0
+        poses[1, 0] = x
+        self.client.scene.poses = poses
+        state: Any = SimpleNamespace(header=SimpleNamespace(session_time=round(at_ms * MS)))
+        self.history.on_state(state)
+
+    def find_x(self, at_ms: float, body: str = "hand") -> float | None:
+        pose = self.history.find_pose(body, round(at_ms * MS))
+        return None if pose is None else pose[0][0]
+
+
+def test_poses_are_interpolated_between_states() -> None:
+    lab = Lab()
+    assert lab.find_x(0) is None
+    assert lab.history.read_newest() == {}
+    for at in (0, 16, 32):
+        lab.add(at, 0.01 * at)
+    assert lab.find_x(0) == 0.0
+    assert lab.find_x(20) == pytest.approx(0.2)
+    assert lab.find_x(32) == pytest.approx(0.32)
+    assert lab.find_x(20, "base") == 0.0
+    assert lab.find_x(20, "no such body") is None
+    assert lab.history.read_newest()["hand"] == ((0.32, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+
+
+def test_nothing_is_known_before_and_after_the_states_and_in_their_gaps() -> None:
+    lab = Lab()
+    for at in (100, 116, 500):
+        lab.add(at, 0.0)
+    assert lab.find_x(99) is None
+    assert lab.find_x(501) is None
+    assert lab.find_x(300) is None
+    assert [lab.history.covers(at * MS) for at in (99, 100, 300, 500, 501)] == [False, True, True, True, False]
+
+
+def test_another_scene_begins_anew() -> None:
+    lab = Lab()
+    for at in (0, 16):
+        lab.add(at, 1.0)
+    lab.client.scene.version = ("session", "other", 2)
+    lab.client.mirror.body_index = {"hand": 0, "base": 1}
+    lab.add(32, 7.0)
+    assert lab.find_x(8) is None
+    assert lab.find_x(32) is None, "one state is no interval"
+    lab.add(48, 7.0)
+    assert lab.find_x(40, "base") == 7.0
+
+
+class FakeRobotPoints:
+    """Finds the points at x > 0."""
+
+    def __init__(self, *_: object) -> None:
+        pass
+
+    def find(self, positions: Any, body_pose: object, capture_ns: int) -> Any:
+        return positions[:, 0] > 0.0
+
+
+def make_points() -> PointSet:
+    positions = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]], np.float32)
+    return PointSet(positions, np.zeros((2, 3), np.uint8), np.ones(2, np.int64))
+
+
+def wait_for_fetch(remover: RobotRemover) -> None:
+    assert remover._thread is not None
+    remover._thread.join(DEADLINE_S)
+    assert not remover._thread.is_alive()
+
+
+def test_points_on_robots_go_once_their_shapes_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    fetched: list[object] = []
+    is_there = threading.Event()
+
+    def fetch(client: object) -> Any:
+        assert is_there.wait(DEADLINE_S)
+        fetched.append(client)
+        return SimpleNamespace(spec=None, meshes={})
+
+    monkeypatch.setattr(process, "fetch_scene", fetch)
+    monkeypatch.setattr(process, "RobotPoints", FakeRobotPoints)
+    lab = Lab()
+    remover = RobotRemover(lab.client, lab.history)
+    assert len(remover.remove(make_points(), 0).positions) == 2
+    assert remover.is_ready(10 * MS), "frames do not wait for the shapes"
+    is_there.set()
+    wait_for_fetch(remover)
+    assert not remover.is_ready(10 * MS), "but for the state, from then on"
+    for at in (0, 16):
+        lab.add(at, 0.0)
+    assert remover.is_ready(10 * MS)
+    kept = remover.remove(make_points(), 10 * MS)
+    assert kept.positions.tolist() == [[-1.0, 0.0, 0.0]]
+    assert (len(kept.colors), len(kept.counts)) == (1, 1)
+    assert len(fetched) == 1
+    lab.client.scene.version = ("session", "other", 2)
+    remover.is_ready(10 * MS)
+    wait_for_fetch(remover)
+    assert len(fetched) == 2
+
+
+def test_without_shapes_all_points_stay(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    def fail(client: object) -> Any:
+        raise NotConnectedError("this session shares no specification")
+
+    monkeypatch.setattr(process, "fetch_scene", fail)
+    lab = Lab()
+    remover = RobotRemover(lab.client, lab.history)
+    assert remover.is_ready(0)
+    wait_for_fetch(remover)
+    assert remover.is_ready(0)
+    assert len(remover.remove(make_points(), 0).positions) == 2
+    assert "points on robots stay in the cloud: this session shares no specification" in caplog.text
