@@ -77,7 +77,7 @@ def in_future(frame: DepthFrame) -> DepthFrame:
 
 
 def going_back(frame: DepthFrame) -> DepthFrame:
-    return frame._replace(capture_ns=10**12 - frame.capture_ns)
+    return frame._replace(capture_ns=-frame.capture_ns)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,8 @@ import msgspec
 from iris_session.system.process import ChildProcess
 from iris_session.system.supervised import HEALTHY_NS, SECOND, SupervisedProcess
 
+DEADLINE_S = 60.0
+
 
 class Report(msgspec.Struct, frozen=True):
     drops: dict[str, int] = {}
@@ -50,6 +52,14 @@ class Child:
         return 0
 
 
+def wait_for_spawn() -> None:
+    """Wait until no thread starts a process."""
+    deadline = time.monotonic() + DEADLINE_S
+    while any(one.name == "iris-spawn" for one in threading.enumerate()):
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+
+
 class Lab:
     """A supervised process and the children that were started for it."""
 
@@ -58,8 +68,11 @@ class Lab:
         self.error: Exception | None = None
         self.process = SupervisedProcess("the helper", self._spawn, Report, **options)
         self.now_ns = 0
+        self.may_start = threading.Event()
+        self.may_start.set()
 
     def _spawn(self) -> ChildProcess:
+        assert self.may_start.wait(DEADLINE_S)
         if self.error is not None:
             raise self.error
         self.children.append(Child())
@@ -69,10 +82,7 @@ class Lab:
         """Poll after a while, with whatever thread has started by then at its end."""
         self.now_ns += round(seconds * SECOND)
         found = self.process.poll(self.now_ns)
-        deadline = time.monotonic() + 60.0
-        while any(one.name == "iris-spawn" for one in threading.enumerate()):
-            assert time.monotonic() < deadline
-            time.sleep(0.001)
+        wait_for_spawn()
         return found + self.process.poll(self.now_ns)
 
 
@@ -139,6 +149,8 @@ def test_what_happens_again_and_again_is_announced_once_after_growing_delays() -
     lab.poll(HEALTHY_NS / SECOND + 1.0)
     lab.children[-1].exit_status = 1
     assert len(lab.poll()) == 1, "it was healthy for a while"
+    lab.poll(0.001)
+    assert len(lab.children) == 6, "so it is started at once"
 
 
 def test_a_process_that_cannot_be_started_is_tried_again() -> None:
@@ -166,6 +178,10 @@ def test_a_process_that_hangs_is_ended_but_not_while_it_starts() -> None:
 
 def test_a_process_that_starts_while_all_ends_is_closed() -> None:
     lab = Lab()
+    lab.may_start.clear()
     lab.process.start(0)
-    lab.process.close(60.0)
-    assert all(child.closed for child in lab.children)
+    lab.process.close(0.0)
+    lab.may_start.set()
+    wait_for_spawn()
+    assert [child.closed for child in lab.children] == [True]
+    assert lab.process.pid == 0
