@@ -23,10 +23,10 @@ from iris_session.cli.common import (
     print_json,
     to_printable,
 )
+from iris_session.protocol.names import MediaEncoding
 
 if TYPE_CHECKING:
     from iris_session.client import Client
-    from iris_session.client.media import MediaFeed, MediaFrame
     from iris_session.cloud.camera_file import CloudSettings
     from iris_session.cloud.config import CameraReport
     from iris_session.cloud.worker import CloudWorker
@@ -309,7 +309,6 @@ def _format_inspection(settings: CloudSettings, report: CameraReport) -> Iterato
 
 def _inspect_session(arguments: argparse.Namespace) -> int:
     from iris_session.client import Client
-    from iris_session.protocol.names import MediaEncoding
 
     arguments.address, arguments.session = arguments.target, ""
     check_session_reachable(arguments)
@@ -321,7 +320,7 @@ def _inspect_session(arguments: argparse.Namespace) -> int:
             return [] if budget is None else [one.stream for one in budget.streams if one.encoding in shown]
 
         client.wait_for(lambda _: bool(list_streams()), STREAMS_S)
-        meters = [_StreamMeter(client, client.media.subscribe(stream)) for stream in list_streams()]
+        meters = [_StreamMeter(client, stream) for stream in list_streams()]
         until = time.monotonic() + arguments.seconds
         while meters and time.monotonic() < until:
             client.poll(0.05)
@@ -341,14 +340,14 @@ def _inspect_session(arguments: argparse.Namespace) -> int:
 class _StreamMeter:
     """Measures what arrives of one stream."""
 
-    def __init__(self, client: Client, feed: MediaFeed) -> None:
+    def __init__(self, client: Client, stream: str) -> None:
         self._client = client
-        self._feed = feed
+        self._feed = client.media.subscribe(stream)
+        self._cloud = client.media.cloud(stream)
         self._began = time.monotonic()
         self._bytes = 0
         self._n = 0
-        self._newest: dict[str, Any] = {}
-        self._ages: list[list[float]] = []
+        self._ages: list[tuple[float, ...]] = []
 
     def poll(self) -> None:
         """Take the newest frame, if there is another."""
@@ -357,19 +356,9 @@ class _StreamMeter:
             return
         self._n += 1
         self._bytes += len(frame.data)
-        self._newest = _describe_frame(frame)
-        decoded_ns = self._client.session_now_ns()
-        head = frame.header
-        times = (
-            head.capture_ns,
-            head.sent_ns,
-            head.received_ns,
-            head.published_ns,
-            head.capture_ns + frame.age_ns,
-            decoded_ns,
-        )
-        known = [at for at in times if at]
-        self._ages.append([(b - a) / MILLISECOND for a, b in itertools.pairwise(times)] if len(known) == 6 else [])
+        cloud = self._cloud.poll() if frame.header.encoding == MediaEncoding.CLOUD else None
+        if cloud is not None and all(cloud.times):
+            self._ages.append(tuple((b - a) / MILLISECOND for a, b in itertools.pairwise(cloud.times)))
 
     def finish(self) -> dict[str, Any]:
         """Return what was measured."""
@@ -377,47 +366,35 @@ class _StreamMeter:
 
         seconds = time.monotonic() - self._began
         budget = self._client.media.delivery
-        told = next((one for one in budget.streams if one.stream == self._feed.stream), None) if budget else None
-        ages = [one for one in self._ages if one]
-        stages = dict(zip(STAGES, np.median(ages, axis=0).round(2).tolist(), strict=True)) if ages else {}
-        return {
+        said = next((one for one in budget.streams if one.stream == self._feed.stream), None) if budget else None
+        stages = dict(zip(STAGES, np.median(self._ages, axis=0).round(2).tolist(), strict=True)) if self._ages else {}
+        found = {
             "stream": self._feed.stream,
-            "title": "" if told is None else told.title,
-            "encoding": "" if told is None else told.encoding,
+            "title": "" if said is None else said.title,
+            "encoding": "" if said is None else said.encoding,
             "budget_class": self._feed.budget_class,
             "hz": self._n / seconds,
             "mbit_per_s": self._bytes * 8e-6 / seconds,
             "age_ms": float(sum(stages.values())),
             "ages_ms": stages,
             "dropped": self._feed.dropped,
-            "stale": told is not None and told.stale,
-            "fault": "" if told is None else told.fault,
-            "detail": "" if told is None else told.detail,
-            **self._newest,
+            "stale": said is not None and said.stale,
+            "fault": "" if said is None else said.fault,
+            "detail": "" if said is None else said.detail,
         }
-
-
-def _describe_frame(frame: MediaFrame) -> dict[str, Any]:
-    """Return the content of a cloud; decoding it is part of what is measured."""
-    from iris_session.protocol.names import MediaEncoding
-    from iris_session.streams.cloud import decode_cloud
-    from iris_session.streams.errors import StreamError
-
-    if frame.header.encoding != MediaEncoding.CLOUD:
-        return {"bytes": len(frame.data)}
-    try:
-        cloud = decode_cloud(frame.data)
-    except StreamError as error:
-        return {"bytes": len(frame.data), "fault": "malformed", "detail": str(error)}
-    n = len(cloud.positions)
-    error_mm = 1000.0 * cloud.error_m if math.isfinite(cloud.error_m) else None
-    return {
-        "bytes": len(frame.data),
-        "points": n,
-        "bytes_per_point": len(frame.data) / n if n else 0.0,
-        "voxel_m": cloud.voxel_m,
-        "error_mm": error_mm,
-    }
+        if self._cloud.fault:
+            found |= {"fault": "malformed", "detail": self._cloud.fault}
+        is_cloud = found["encoding"] == MediaEncoding.CLOUD
+        cloud, frame = self._cloud.newest if is_cloud else None, self._feed.newest
+        if cloud is not None and frame is not None:
+            n = len(cloud.positions)
+            found |= {
+                "points": n,
+                "bytes_per_point": len(frame.data) / n if n else 0.0,
+                "voxel_m": cloud.voxel_m,
+                "error_mm": 1000.0 * cloud.error_m if math.isfinite(cloud.error_m) else None,
+            }
+        return found
 
 
 def _format_stream(one: Mapping[str, Any]) -> Iterator[str]:

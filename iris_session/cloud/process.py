@@ -185,40 +185,47 @@ def run_cameras(
     """
     history = BodyHistory(client)
     client.on_state = history.on_state
-    worker = CloudWorker(
-        settings,
-        SessionOutlet(client),
-        partial(open_source, body_poses=history.read_newest),
-        time.perf_counter_ns,
-        body_pose=history.find_pose,
-        remover=RobotRemover(client, history) if settings.remove_robots else None,
-    )
-    on_report(CameraReport(settings.stream))
-    session_id = ""
-    report_at = time.monotonic() + REPORT_S
     try:
         client.open()
-        client.start()
-        while not is_ending():
-            connected = client.wait_for(lambda one: one.ready, CONNECT_S)
-            welcome = client.connection.welcome
-            if connected and welcome is not None and welcome.session_id != session_id:
-                if session_id:
-                    worker.restart_clock()
-                else:
-                    worker.start()
-                session_id = welcome.session_id
-            if connected:
-                worker.poll(POLL_S)
-            if time.monotonic() >= report_at:
-                report_at = time.monotonic() + REPORT_S
-                on_report(worker.make_report(connected=connected))
+        client.start()  # it joins while the filter is compiled or loaded
+        worker = CloudWorker(
+            settings,
+            SessionOutlet(client),
+            partial(open_source, body_poses=history.read_newest),
+            time.perf_counter_ns,
+            body_pose=history.find_pose,
+            remover=RobotRemover(client, history) if settings.remove_robots else None,
+        )
+        on_report(CameraReport(settings.stream))
+        try:
+            _work(worker, client, on_report, is_ending)
+        finally:
+            worker.close()
     except ClientError as error:
         return str(error)
     finally:
-        worker.close()
         client.close()
     return ""
+
+
+def _work(worker: CloudWorker, client: Client, on_report: OnReport, is_ending: Callable[[], bool]) -> None:
+    """Publish until the end. Raises `ClientError` when the session refuses the client."""
+    session_id = ""
+    report_at = time.monotonic() + REPORT_S
+    while not is_ending():
+        connected = client.wait_for(lambda one: one.ready, CONNECT_S)
+        welcome = client.connection.welcome
+        if connected and welcome is not None and welcome.session_id != session_id:
+            if session_id:
+                worker.restart_clock()
+            else:
+                worker.start()
+            session_id = welcome.session_id
+        if connected:
+            worker.poll(POLL_S)
+        if time.monotonic() >= report_at:
+            report_at = time.monotonic() + REPORT_S
+            on_report(worker.make_report(connected=connected))
 
 
 def make_client(start: CameraStart) -> Client:
