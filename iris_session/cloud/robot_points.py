@@ -111,7 +111,7 @@ class RobotPoints:
             (n,) true for the points on robots.
         """
         distances, self.n_unknown = self._robots.measure(positions, body_pose, capture_ns)
-        found = distances != _FAR
+        found: npt.NDArray[np.bool_] = distances != _FAR
         if self._things.n and found.any():
             rows = np.flatnonzero(found)
             to_things, _ = self._things.measure(positions[rows], body_pose, capture_ns)
