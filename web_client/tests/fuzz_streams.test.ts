@@ -1,4 +1,4 @@
-// Hostile bytes for the decoders of state, deformables, arrays and scenes.
+// Hostile bytes for the decoders of state, deformables, clouds, pictures, arrays and scenes.
 
 import { zstdCompressSync } from "node:zlib";
 import { describe, test } from "vitest";
@@ -6,11 +6,13 @@ import { decodeArrays } from "../src/core/arrays.ts";
 import { decodeCloud } from "../src/core/cloud.ts";
 import { encodeStruct } from "../src/core/codec.ts";
 import { DeformableDecoder, decodeTopology } from "../src/core/deformable.ts";
+import { readJpegSize } from "../src/core/jpeg.ts";
 import { RigidDecoder } from "../src/core/rigid.ts";
 import { decodeScene } from "../src/core/scene.ts";
 import { decompressFrame } from "../src/core/zstd.ts";
 import { fuzz } from "./fuzz.ts";
 import { fromHex, readGolden } from "./golden.ts";
+import { makeJpeg, makeSegment } from "./jpegs.ts";
 
 const { rigid } = readGolden<{ rigid: { n_bodies: number; hex: string }[] }>("golden");
 const { meshes } = readGolden<{ meshes: { name: string; topology: string; frames: { hex: string }[] }[] }>("deformable");
@@ -37,6 +39,14 @@ describe("hostile bytes", () => {
   });
 
   test("point clouds", () => fuzz(decodeCloud, clouds.map(({ hex }) => fromHex(hex)), true));
+
+  test("sizes of pictures", () => {
+    const seeds = [makeJpeg(640, 480), makeJpeg(4096, 4096, { marker: 0xc2, before: [...makeSegment(0xdb, [0, 1]), 0xff] })];
+    fuzz((bytes) => {
+      const { width, height } = readJpegSize(bytes);
+      if (Math.min(width, height) < 1 || Math.max(width, height) > 4096) throw new Error(`${width} x ${height}`);
+    }, seeds);
+  });
 
   test("arrays", () => fuzz((bytes) => decodeArrays(bytes), assets.map(({ hex }) => fromHex(hex)), true));
 

@@ -48,3 +48,12 @@ test("buffers of frames go back", () => {
   new WorkerClient(port).recycle(new Float32Array(7));
   expect(port.posted[0]).toMatchObject({ type: "recycle" });
 });
+
+test("a cloud or a picture that came is taken, so that the worker passes on the next one", () => {
+  const port = new FakePort();
+  const client = new WorkerClient(port);
+  client.on("picture", () => undefined);
+  port.say({ type: "picture", stream: "front", bitmap: {} as ImageBitmap, capture_ms: 1 });
+  port.say({ type: "deformable", stream: "cloth", vertices: new Float32Array(), session_ms: 1, scene_epoch: 1, seq: 1, bound_m: 0 });
+  expect(port.posted).toEqual([{ type: "taken", stream: "front" }]);
+});

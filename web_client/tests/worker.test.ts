@@ -11,6 +11,7 @@ import type { SocketLike } from "../src/core/pairing_client.ts";
 import { MemoryStore } from "../src/core/storage.ts";
 import { unpackMessage } from "../src/core/wire.ts";
 import { fromHex, readGolden } from "./golden.ts";
+import { makeJpeg } from "./jpegs.ts";
 
 const MS = 1_000_000;
 const OFFSET_NS = 5_000 * MS;
@@ -71,6 +72,8 @@ class FakeSocket implements SocketLike {
   }
 }
 
+type FakeImage = ArrayBuffer & { isClosed: boolean };
+
 /** Everything around a worker. */
 class Bench {
   now = 0;
@@ -82,6 +85,8 @@ class Bench {
   store = new MemoryStore();
   info: object | null = { versions: [1], session_name: "lab", session_id: "s1", key: Buffer.from(S).toString("base64url"), pairing: true, software: "x" };
   status = 206;
+  /** Images that are being decoded. Buffers stand for decoded ones. */
+  decoding: { bytes: Uint8Array; finish: () => FakeImage; fail: () => void }[] = [];
   worker: ClientWorker;
   private nextTimer = 1;
 
@@ -101,9 +106,21 @@ class Bench {
         this.timers.set(id, { at: this.now + ms * MS, callback });
         return () => this.timers.delete(id);
       },
+      decodeImage: (bytes) => this.decodeImage(bytes),
       store: this.store,
       slot: "0",
       run: "0011223344556677",
+    });
+  }
+
+  decodeImage(bytes: Uint8Array): Promise<ImageBitmap> {
+    return new Promise((resolve, reject) => {
+      const finish = (): FakeImage => {
+        const image = Object.assign(new ArrayBuffer(4), { isClosed: false, close: () => void (image.isClosed = true) });
+        resolve(image as unknown as ImageBitmap);
+        return image;
+      };
+      this.decoding.push({ bytes, finish, fail: () => reject(new Error("damaged")) });
     });
   }
 
@@ -596,6 +613,86 @@ describe("assets and media", () => {
     expect(bench.sockets).toHaveLength(4);
     bench.post({ type: "want_streams", streams: [] });
     expect(bench.socket.readyState).toBe(3);
+  });
+});
+
+describe("clouds and pictures", () => {
+  const header = (stream: string, encoding: string, captureMs = 0): Uint8Array =>
+    encodeStruct("MediaHeader", [stream, "full", 1, 7, captureMs * MS, captureMs * MS, encoding]);
+  const send = (stream: string, encoding: string, bytes: Uint8Array, captureMs = 0): void =>
+    bench.socket.deliver(3, new Uint8Array(), header(stream, encoding, captureMs), bytes);
+  const wantStreams = (...streams: string[]): void => bench.post({ type: "want_streams", streams });
+  const readCounters = async (): Promise<object> => {
+    bench.pass(1100);
+    await bench.settle();
+    return bench.last("stats").media;
+  };
+
+  beforeEach(async () => {
+    await bench.join();
+    bench.socket.deliver(5, encodeValue({ type: "ticket", ticket: "t1", expires_s: 600 }));
+    wantStreams("front", "room");
+    bench.say({ type: "delivery_budget", budget_class: "full" });
+    bench.socket.open();
+  });
+
+  test("one picture of a stream is decoded at a time, and the newest that came meanwhile is next", async () => {
+    for (const captureMs of [1, 2, 3]) send("front", "jpeg", makeJpeg(64, 48), captureMs);
+    expect(bench.decoding).toHaveLength(1);
+    bench.decoding[0]!.finish();
+    await bench.until(() => bench.of("picture").length === 1);
+    expect(bench.last("picture")).toMatchObject({ stream: "front", capture_ms: 1 });
+    expect(bench.decoding).toHaveLength(1); // the page has not taken it yet
+    bench.post({ type: "taken", stream: "front" });
+    expect(bench.decoding).toHaveLength(2);
+    bench.decoding[1]!.finish();
+    await bench.until(() => bench.of("picture").length === 2);
+    expect(bench.last("picture").capture_ms).toBe(3);
+    expect(await readCounters()).toEqual({ front: { received: 3, superseded: 1, refused: 0 } });
+  });
+
+  test("what is no picture, too large or damaged is refused and counted, and the next one is shown", async () => {
+    for (const bytes of [new Uint8Array(), Uint8Array.of(0xff, 0xd8), new Uint8Array(500).fill(0xff), makeJpeg(4097, 8)]) send("front", "jpeg", bytes);
+    expect(bench.decoding).toHaveLength(0);
+    send("front", "jpeg", makeJpeg(4096, 4096));
+    bench.decoding[0]!.fail();
+    await bench.settle();
+    send("front", "jpeg", makeJpeg(8, 8), 9);
+    bench.decoding[1]!.finish();
+    await bench.until(() => bench.of("picture").length === 1);
+    expect(bench.last("picture").capture_ms).toBe(9);
+    expect(await readCounters()).toEqual({ front: { received: 6, superseded: 0, refused: 5 } });
+    expect(bench.last("stats").counters["media malformed"]).toBe(5);
+  });
+
+  test("a page that stands still gets the newest cloud when it runs again", async () => {
+    const cloud = fromHex(readGolden<{ frames: { hex: string }[] }>("cloud").frames[0]!.hex);
+    for (const captureMs of [1, 2, 3, 4]) send("room", "cloud", cloud, captureMs);
+    expect(bench.of("cloud").map(({ capture_ms }) => capture_ms)).toEqual([1]);
+    bench.post({ type: "taken", stream: "room" });
+    bench.post({ type: "taken", stream: "room" });
+    bench.post({ type: "taken", stream: "room" });
+    expect(bench.of("cloud").map(({ capture_ms }) => capture_ms)).toEqual([1, 4]);
+    send("room", "cloud", cloud.subarray(1), 5);
+    await bench.settle();
+    send("room", "cloud", cloud, 6);
+    expect(bench.last("cloud").capture_ms).toBe(6);
+    expect(await readCounters()).toEqual({ room: { received: 6, superseded: 2, refused: 1 } });
+  });
+
+  test("a picture that is not wanted any more is not decoded, or thrown away when it is", async () => {
+    send("front", "jpeg", makeJpeg(8, 8), 1);
+    send("front", "jpeg", makeJpeg(8, 8), 2);
+    wantStreams("room");
+    send("front", "jpeg", makeJpeg(8, 8), 3);
+    const image = bench.decoding[0]!.finish();
+    await bench.until(() => image.isClosed);
+    expect(bench.of("picture")).toHaveLength(0);
+    expect(bench.decoding).toHaveLength(1);
+    expect(await readCounters()).toEqual({});
+    wantStreams("front", "room");
+    send("front", "jpeg", makeJpeg(8, 8), 4);
+    expect(bench.decoding).toHaveLength(2);
   });
 });
 

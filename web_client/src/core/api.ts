@@ -98,6 +98,8 @@ export type ToWorker =
   | { type: "get_status" }
   /** Media streams wanted: replaces the last list. */
   | { type: "want_streams"; streams: string[] }
+  /** The page has the `cloud` or `picture` of a stream: the next one may come. `WorkerClient` answers so by itself. */
+  | { type: "taken"; stream: string }
   /** Assets wanted, the first first. Each comes once as `asset` or `asset_failed`. */
   | { type: "want_assets"; assets: AssetWish[] }
   /** Assets that are wanted no more. */
@@ -132,6 +134,7 @@ export type FromWorker =
   | StatusUpdate
   | DeformableUpdate
   | CloudUpdate
+  | PictureUpdate
   | MediaUpdate
   | AssetUpdate
   | AssetFailedUpdate
@@ -288,6 +291,26 @@ export interface CloudUpdate {
   type: "cloud";
   stream: string;
   cloud: CloudFrame;
+  /** Session time of the points [ms]. */
+  capture_ms: number;
+}
+
+/** A camera's picture, decoded. It is transferred: `close` it, or give it to a canvas. */
+export interface PictureUpdate {
+  type: "picture";
+  stream: string;
+  bitmap: ImageBitmap;
+  /** Session time of the picture [ms]. */
+  capture_ms: number;
+}
+
+/** Clouds or pictures of one stream since it was wanted. */
+export interface MediaCounters {
+  received: number;
+  /** Not decoded, because a newer one came before this device could take them. */
+  superseded: number;
+  /** Malformed, damaged, or too large. */
+  refused: number;
 }
 
 /** A frame of any other media stream, as it came. */
@@ -347,6 +370,8 @@ export interface StatsUpdate {
   reconnects: number;
   /** Counters of control and state channel by name, since the worker began. */
   counters: Record<string, number>;
+  /** By stream: clouds and pictures that are wanted. */
+  media: Record<string, MediaCounters>;
 }
 
 /** Who this browser is, for every gateway: the fingerprint on the allow-list. */

@@ -28,6 +28,8 @@ export interface Environment {
   fetch(url: string, init: RequestInit): Promise<Response>;
   /** Call back after `ms`; returns a function that cancels. */
   setTimer(ms: number, callback: () => void): () => void;
+  /** Decode a JPEG image; rejects for one that is damaged. */
+  decodeImage(bytes: Uint8Array): Promise<ImageBitmap>;
   store: Store;
   /** Number of this tab among those of the browser, empty for none. */
   slot: string;
@@ -141,6 +143,9 @@ export class ClientWorker {
         break;
       case "want_streams":
         this.media.setWishes(command.streams);
+        break;
+      case "taken":
+        this.media.onTaken(command.stream);
         break;
       case "want_assets":
         for (const wish of command.assets) this.assets.want(wish);
@@ -577,7 +582,8 @@ export class ClientWorker {
         media_bytes_per_s: arrivals.mediaBytesPerS,
         missed: arrivals.missed,
         reconnects: counters.reconnects,
-        counters: { ...numbers, ...Object.fromEntries([...state, ...byCode]) },
+        counters: { ...numbers, ...Object.fromEntries([...state, ...byCode]), "media malformed": this.media.malformed },
+        media: Object.fromEntries([...this.media.counters].map(([stream, counts]) => [stream, { ...counts }])),
       },
       [],
     );

@@ -1,10 +1,13 @@
-// The WebSocket for media: opened while streams are wanted, with the ticket of the session. Deformables are decoded here.
+// The WebSocket for media: opened while streams are wanted, with the ticket of the session. Deformables, clouds and pictures
+// are decoded here.
 
-import type { FromWorker } from "./api.ts";
+import type { FromWorker, MediaCounters } from "./api.ts";
 import type { ArrivalMeter } from "./arrival_meter.ts";
 import { decodeCloud } from "./cloud.ts";
 import { decodeMediaHeader } from "./codec.ts";
 import { MalformedError, WireError } from "./errors.ts";
+import { readJpegSize } from "./jpeg.ts";
+import { NewestFrames } from "./newest_frames.ts";
 import type { SocketLike } from "./pairing_client.ts";
 import type { SceneAssets } from "./scene_assets.ts";
 import { Channel, CloseCode, encodeTicket, encodeWishes, SUBPROTOCOL, unpackMessage } from "./wire.ts";
@@ -14,6 +17,15 @@ export interface MediaEnvironment {
   post(update: FromWorker, transfer: Transferable[]): void;
   openSocket(url: string, protocol: string): SocketLike;
   setTimer(ms: number, callback: () => void): () => void;
+  /** Decode a JPEG image; rejects for one that is damaged. */
+  decodeImage(bytes: Uint8Array): Promise<ImageBitmap>;
+}
+
+/** A cloud or a picture, not decoded yet. */
+interface Frame {
+  encoding: string;
+  bytes: Uint8Array;
+  capture_ms: number;
 }
 
 const MS_NS = 1_000_000;
@@ -26,6 +38,9 @@ const LONGEST_PAUSE_MS = 5_000;
 /** Streams of media for the page. */
 export class MediaLink {
   malformed = 0;
+  /** By stream: of clouds and pictures that are wanted now. */
+  readonly counters = new Map<string, MediaCounters>();
+  private readonly frames = new NewestFrames<Frame>((stream, frame) => this.begin(stream, frame));
   private wishes: string[] = [];
   private url = "";
   private ticket = "";
@@ -44,6 +59,8 @@ export class MediaLink {
   /** Set the streams that are wanted. */
   setWishes(streams: readonly string[]): void {
     this.wishes = streams.slice(0, MAX_STREAMS);
+    this.frames.keepOnly(this.wishes);
+    for (const stream of this.counters.keys()) if (!this.wishes.includes(stream)) this.counters.delete(stream);
     if (this.socket?.readyState === OPEN) this.socket.send(encodeWishes(this.wishes));
     this.update();
   }
@@ -61,6 +78,11 @@ export class MediaLink {
     this.epoch = connectionEpoch;
     this.closeSocket(); // it belongs to the connection before
     this.update();
+  }
+
+  /** Note that the page has taken the newest cloud or picture of a stream: another one may come. */
+  onTaken(stream: string): void {
+    this.frames.finish(stream);
   }
 
   /** Close the socket and forget ticket and wishes. */
@@ -135,12 +157,55 @@ export class MediaLink {
       this.environment.post({ type: "deformable", stream, vertices, session_ms, scene_epoch, seq, bound_m: decoder.boundM }, [vertices.buffer]);
       return;
     }
-    if (encoding === "cloud") {
-      const cloud = decodeCloud(bytes);
-      this.environment.post({ type: "cloud", stream, cloud }, [cloud.points.buffer]);
+    if (encoding === "cloud" || encoding === "jpeg") {
+      if (this.wishes.includes(stream)) this.takeNewest(stream, { encoding, bytes, capture_ms: captureNs / MS_NS });
       return;
     }
     const copy = bytes.slice();
     this.environment.post({ type: "media", header, bytes: copy }, [copy.buffer]);
+  }
+
+  /** Take a cloud or a picture: a page that stands still gets the newest one when it runs again, not all of them. */
+  private takeNewest(stream: string, frame: Frame): void {
+    const counters = this.count(stream);
+    counters.received += 1;
+    try {
+      if (frame.encoding === "jpeg") readJpegSize(frame.bytes);
+    } catch (error) {
+      counters.refused += 1;
+      throw error;
+    }
+    if (!this.frames.push(stream, frame)) counters.superseded += 1;
+  }
+
+  private begin(stream: string, frame: Frame): void {
+    void this.decode(stream, frame).catch(() => {
+      // A damaged image, with a reason in the words of the browser, or a malformed cloud.
+      this.malformed += 1;
+      this.count(stream).refused += 1;
+      this.frames.finish(stream);
+    });
+  }
+
+  /** Decode and post a frame. The page answers with `taken`. */
+  private async decode(stream: string, { encoding, bytes, capture_ms }: Frame): Promise<void> {
+    if (encoding === "cloud") {
+      const cloud = decodeCloud(bytes);
+      this.environment.post({ type: "cloud", stream, cloud, capture_ms }, [cloud.points.buffer]);
+      return;
+    }
+    const bitmap = await this.environment.decodeImage(bytes);
+    if (this.wishes.includes(stream)) {
+      this.environment.post({ type: "picture", stream, bitmap, capture_ms }, [bitmap]);
+      return;
+    }
+    bitmap.close();
+    this.frames.finish(stream);
+  }
+
+  private count(stream: string): MediaCounters {
+    const counters = this.counters.get(stream) ?? { received: 0, superseded: 0, refused: 0 };
+    if (this.wishes.includes(stream)) this.counters.set(stream, counters);
+    return counters;
   }
 }

@@ -60,6 +60,7 @@ export class WorkerClient {
       if (update.reply !== null) waiting?.resolve(update.reply);
       else waiting?.reject(new RequestError(update.error));
     }
+    if (update.type === "cloud" || update.type === "picture") this.post({ type: "taken", stream: update.stream });
     for (const listener of this.listeners.get(update.type) ?? []) (listener as (update: FromWorker) => void)(update);
   }
 }
