@@ -15,14 +15,16 @@ import {
   makeEventsPanel,
   makeLoopPanel,
   makeRecordingPanel,
-  makeStreamsPanel,
 } from "./operation.ts";
 import { makePairing } from "./pairing.ts";
+import { makePictures } from "./pictures.ts";
 import { makeParticipantsPanel } from "./participants.ts";
 import { makeRobotsPanel } from "./robots.ts";
 import { makeStage } from "./stage.ts";
 import { PageState } from "./state.ts";
 import { recall, remember } from "./storage.ts";
+import { StreamChoices } from "./stream_choices.ts";
+import { makeStreamsPanel } from "./streams.ts";
 import { type EventLevel, formatMillimetres } from "./words.ts";
 import { type HeadsetControls, makeHeadsetControls } from "../xr/controls.ts";
 
@@ -113,7 +115,8 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   const { view } = handle;
 
   const drive = makeDrive(state, client, () => view?.viewpoint.axes ?? null, (text) => show(text, "warning"), stage.canvas);
-  const cameras = makeCameras(state, view);
+  const choices = new StreamChoices(() => state.spec?.deformables.map((part) => part.stream) ?? [], () => view !== null);
+  const cameras = makeCameras(state, view, makePictures(state, client, choices));
   stage.tools.append(cameras.menu);
   stage.element.append(cameras.element, drive.element);
   handle.headset = makeHeadsetControls(view, state, client, (showInside) => new Actions(client, (text, level) => {
@@ -126,10 +129,6 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   const self = makeSelf(state, listRoles, joinAs);
   const title = h("h1", {}, "iris-session");
   const header = h("header", { class: "bar" }, title, badge.element, self.element, estop.stop);
-  const listDrawable = (): string[] => {
-    const clouds = (state.budget?.streams ?? []).filter((one) => one.encoding === "cloud").map((one) => one.stream);
-    return view ? [...(state.spec?.deformables.map((part) => part.stream) ?? []), ...clouds] : [];
-  };
   const panels = [
     makeAdvicePanel(state),
     makeRobotsPanel(state, actions, drive),
@@ -139,7 +138,7 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
     makeEventsPanel(state),
     makeRecordingPanel(state, actions),
     makeLoopPanel(state, actions),
-    makeStreamsPanel(state, client, listDrawable, (streams) => view?.clouds.setWanted(streams)),
+    makeStreamsPanel(state, client, choices, view?.clouds ?? null),
     makeAnchorsPanel(state),
   ];
   const dashboard = h(

@@ -1,9 +1,10 @@
 // Panels with the pictures of the scene's cameras, as a recording of them would show the scene: chosen in a menu,
-// remembered by name, with a warning when the gripper of a held robot leaves a picture.
+// remembered by name, with a warning when the gripper of a held robot leaves a picture. Those of real cameras are beside them.
 
 import { aspectOf, listWatched } from "../view/framing.ts";
 import type { View } from "../view/view.ts";
 import { h, KeyedList, type Row, setText } from "./dom.ts";
+import type { Pictures } from "./pictures.ts";
 import type { PageState } from "./state.ts";
 import { recall, remember } from "./storage.ts";
 
@@ -27,12 +28,15 @@ export interface Cameras {
   update(): void;
 }
 
-/** Make panels and menu. `view` null: no pictures, and no menu. */
-export function makeCameras(state: PageState, view: View | null): Cameras {
+/** Make panels and menu. `view` null: no pictures of the scene. `pictures`: of real cameras. */
+export function makeCameras(state: PageState, view: View | null, pictures: Pictures): Cameras {
   const remembered = recall<{ shown: string[] }>(STORAGE_KEY, { shown: [] });
-  const element = h("div", { class: "pictures" });
-  const choices = h("ul", { class: "popover" });
-  const menu = h("details", { class: "menu", hidden: true }, h("summary", { class: "small" }, "Recording cameras"), choices);
+  const scenePanels = h("div", { class: "same" });
+  const element = h("div", { class: "pictures" }, pictures.element, scenePanels);
+  const choices = h("ul");
+  const ofScene = h("section", {}, h("h3", {}, "As the scene's cameras record it"), choices);
+  const ofStreams = h("section", {}, h("h3", {}, "Real cameras"), pictures.choices);
+  const menu = h("details", { class: "menu", hidden: true }, h("summary", { class: "small" }, "Cameras"), h("div", { class: "popover" }, ofStreams, ofScene));
   const places = new Map<string, HTMLElement>();
   const warnings = new Map<string, { text: HTMLElement; panel: HTMLElement; outside: Set<string> }>();
   let listed: unknown = null;
@@ -51,7 +55,7 @@ export function makeCameras(state: PageState, view: View | null): Cameras {
     };
     return { element: h("li", {}, h("label", { class: "check" }, box, h("span", {}, name))), update };
   });
-  const panels = new KeyedList<SceneCamera>(element, (camera) => makePicture(camera));
+  const panels = new KeyedList<SceneCamera>(scenePanels, (camera) => makePicture(camera));
 
   function makePicture({ name }: SceneCamera): Row<SceneCamera> {
     const place = h("div", { class: "place", role: "img", aria: { label: `Picture of the camera ${name}` } });
@@ -96,7 +100,10 @@ export function makeCameras(state: PageState, view: View | null): Cameras {
     menu,
     update: () => {
       const cameras = listCameras(state);
-      menu.hidden = view === null || cameras.length === 0;
+      ofScene.hidden = view === null || cameras.length === 0;
+      ofStreams.hidden = !pictures.isOffered;
+      menu.hidden = ofScene.hidden && ofStreams.hidden;
+      pictures.update();
       rows.update(cameras, ({ name }) => name);
       const shown = listShown();
       panels.update(shown, ({ name }) => name);

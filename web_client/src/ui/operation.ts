@@ -1,6 +1,5 @@
-// The session itself: its loop, episodes, recording, streams, and the advice of its own checks.
+// The session itself: its loop, episodes, recording, and the advice of its own checks.
 
-import type { WorkerClient } from "../core/page_client.ts";
 import type { Actions } from "./actions.ts";
 import { button, h, KeyedList, setText } from "./dom.ts";
 import { makeFacts, makeSection, type Panel } from "./panel.ts";
@@ -98,70 +97,6 @@ export function makeRecordingPanel(state: PageState, actions: Actions): Panel {
       words.hidden = text === "";
       section.setCount(recorder?.state === "running" ? "running" : (recorder?.state ?? ""));
       form.hidden = !state.isReady;
-    },
-  };
-}
-
-export function makeStreamsPanel(
-  state: PageState,
-  client: WorkerClient,
-  getNeeded: () => readonly string[],
-  onWanted: (streams: readonly string[]) => void,
-): Panel {
-  const list = h("ul", { class: "rows" });
-  const empty = h("p", { class: "empty" }, "This session has no streams.");
-  const reason = h("p", { class: "note" });
-  const section = makeSection("streams", "Streams", h("div", {}, list, empty, reason), { open: false });
-  const switchedOff = new Set<string>();
-  let sent = "";
-  const send = (): void => {
-    const streams = (state.budget?.streams ?? []).map((one) => one.stream).filter((name) => !switchedOff.has(name));
-    const wanted = [...new Set([...streams.filter((name) => getNeeded().includes(name))])].sort();
-    const key = `${state.welcome?.connection_epoch ?? 0} ${JSON.stringify(wanted)}`;
-    if (key === sent || !state.isReady) return;
-    sent = key;
-    onWanted(wanted);
-    client.post({ type: "want_streams", streams: wanted });
-  };
-  const rows = new KeyedList<{ stream: string }>(
-    list,
-    ({ stream }) => {
-      const box = h("input", { type: "checkbox" });
-      box.checked = true;
-      box.addEventListener("change", () => {
-        if (box.checked) switchedOff.delete(stream);
-        else switchedOff.add(stream);
-        send();
-      });
-      const facts = h("span", { class: "note" });
-      const label = h("label", { class: "line" }, box, h("strong", { class: "name" }, stream), facts);
-      return {
-        element: h("li", { class: "row" }, label),
-        update: () => {
-          const mine = state.budget?.streams.find((one) => one.stream === stream);
-          const report = state.status?.media.find((one) => one.stream === stream);
-          const isDrawn = getNeeded().includes(stream);
-          box.disabled = !isDrawn;
-          const parts = [
-            isDrawn ? (mine?.budget_class ?? "") : "not drawn by this page",
-            report ? `${report.hz.toFixed(0)} Hz` : "",
-            report ? `${report.mbit_per_s.toFixed(1)} Mbit/s` : "",
-            report?.source ? `from ${report.source}` : "",
-          ];
-          setText(facts, parts.filter((part) => part !== "").join(" · "));
-        },
-      };
-    },
-    empty,
-  );
-  return {
-    element: section.element,
-    update: () => {
-      const streams = state.budget?.streams ?? [];
-      rows.update(streams, (one) => one.stream);
-      section.setCount(streams.length > 0 ? String(streams.length) : "");
-      setText(reason, state.budget?.reason ?? "");
-      send();
     },
   };
 }

@@ -19,6 +19,7 @@ import {
 } from "../core/api.ts";
 import type { WorkerClient } from "../core/page_client.ts";
 import type * as wire from "../protocol/messages.g.ts";
+import type { Mode } from "./stream_choices.ts";
 import { type EventLevel, eventWords } from "./words.ts";
 
 const MAX_EVENTS = 300;
@@ -60,6 +61,9 @@ const NO_PHASE: PhaseUpdate = {
 export class PageState {
   /** What this page is now: one with a screen, or a headset. */
   entry = DESKTOP;
+  mode: Mode = "screen";
+  /** This browser can enter AR. */
+  offersAr = false;
   phase: PhaseUpdate = NO_PHASE;
   info: InfoUpdate | null = null;
   identity: IdentityUpdate | null = null;
@@ -76,6 +80,8 @@ export class PageState {
   consents: ConsentAsked[] = [];
   rtt_ms = Number.NaN;
   private sessionOffset_ms = Number.NaN;
+  /** Session time of the newest cloud or picture of a stream [ms]. */
+  private readonly captured = new Map<string, number>();
   /** Names of participants that left, for events about them. */
   private readonly formerNames = new Map<string, string>();
   private readonly listeners: ((state: PageState) => void)[] = [];
@@ -110,8 +116,11 @@ export class PageState {
     });
     client.on("budget", ({ budget }) => {
       this.budget = budget;
+      for (const stream of this.captured.keys()) if (!budget.streams.some((one) => one.stream === stream)) this.captured.delete(stream);
       this.touch();
     });
+    client.on("cloud", ({ stream, capture_ms }) => this.captured.set(stream, capture_ms));
+    client.on("picture", ({ stream, capture_ms }) => this.captured.set(stream, capture_ms));
     client.on("asset_progress", (progress) => {
       this.progress = progress;
       this.touch();
@@ -178,6 +187,12 @@ export class PageState {
 
   lease(robot: string): Lease | undefined {
     return this.session?.leases.find((lease) => lease.target === robot && lease.kind === "robot");
+  }
+
+  /** Return how old the newest cloud or picture of a stream is [ms]; undefined: this page has none. */
+  ageOf(stream: string): number | undefined {
+    const captured = this.captured.get(stream);
+    return captured === undefined || Number.isNaN(this.sessionOffset_ms) ? undefined : nowMs() + this.sessionOffset_ms - captured;
   }
 
   /** Names of robots that a participant holds. */

@@ -66,6 +66,18 @@ const EPISODE_STATES: Record<string, string> = {
   discarded: "discarded",
 };
 
+const STREAM_FAULTS: Record<string, string> = {
+  frozen: "its camera repeats one frame",
+  no_depth: "its camera measures no depth",
+  saturated: "its depth is saturated",
+  size: "its frames have another size than configured",
+  moved: "its camera was moved: calibrate it again",
+  pose: "the pose of its camera is not valid",
+  clock: "its clock jumps",
+  slow: "its source is too slow",
+  source: "its source fails",
+};
+
 /** Return the words of a value, or the value itself for one that this page does not know. */
 const look = (table: Record<string, string>, value: string): string => table[value] ?? value.replaceAll("_", " ");
 
@@ -73,6 +85,7 @@ export const holdReasonWords = (reason: string): string => look(HOLD_REASONS, re
 export const leaseModeWords = (mode: string): string => look(LEASE_MODES, mode);
 export const roleWords = (role: string): string => look(ROLES, role);
 export const alignmentWords = (kind: string): string => look(ALIGNMENTS, kind);
+export const streamFaultWords = (fault: string): string => look(STREAM_FAULTS, fault);
 export const episodeStateWords = (state: string): string => look(EPISODE_STATES, state);
 
 export function formatMillimetres(metres: number): string {
@@ -97,6 +110,19 @@ export function formatAge(ns: number): string {
   if (s < 90) return `${s.toFixed(0)} s`;
   return s < 5400 ? `${(s / 60).toFixed(0)} min` : `${(s / 3600).toFixed(1)} h`;
 }
+
+/** Return how old the newest frame of a stream is, empty where that is not known. */
+export function streamAgeWords(ms: number): string {
+  return Number.isFinite(ms) ? `${ms < 1000 ? formatMilliseconds(Math.max(0, ms)) : formatAge(1e6 * ms)} old` : "";
+}
+
+/** Return why the newest frame of a stream shows what was, or what is wrong; empty for a good one. */
+export function streamStateWords({ stale, fault }: { stale: boolean; fault: string }): string {
+  return [stale ? "stale" : "", fault ? streamFaultWords(fault) : ""].filter((part) => part !== "").join(", ");
+}
+
+/** Return a whole number with groups of digits, such as `50,000`. */
+export const formatCount = (count: number): string => count.toLocaleString("en");
 
 /** Return a session time as minutes and seconds, `12:05.3`. */
 export function formatSessionTime(ns: number): string {

@@ -22,12 +22,15 @@ const VERTEX = /* glsl */ `
 attribute float packed;
 uniform float edge;
 uniform float pixels;
+uniform float dimmed;
 varying vec3 vColor;
 void main() {
   vec4 seen = viewMatrix * modelMatrix * vec4(position, 1.0);
   gl_Position = projectionMatrix * seen;
   gl_PointSize = clamp(edge * projectionMatrix[1][1] * pixels / gl_Position.w, 1.0, 64.0);
   vColor = vec3(floor(packed / 2048.0), floor(mod(packed, 2048.0) / 32.0), mod(packed, 32.0)) / vec3(31.0, 63.0, 31.0);
+  float gray = dot(vColor, vec3(0.3, 0.59, 0.11));
+  vColor = mix(vColor, 0.45 * mix(vec3(gray), vColor, 0.3), dimmed);
 }`;
 
 const FRAGMENT = /* glsl */ `
@@ -40,11 +43,12 @@ void main() {
 class Cloud {
   readonly object: Points<BufferGeometry, ShaderMaterial>;
   drawn = 0;
+  points = 0;
   private buffer = new InterleavedBuffer(new Uint16Array(0), 4);
 
   constructor(name: string) {
     const material = new ShaderMaterial({
-      uniforms: { edge: { value: POINT_M }, pixels: { value: 1 } },
+      uniforms: { edge: { value: POINT_M }, pixels: { value: 1 }, dimmed: { value: 0 } },
       vertexShader: VERTEX,
       fragmentShader: FRAGMENT,
     });
@@ -73,6 +77,15 @@ class Cloud {
     // Points of surfaces: of fewer, each has more of the area.
     object.material.uniforms.edge!.value = (voxel_m || POINT_M) * Math.sqrt(points.length / 4 / Math.max(count, 1));
     this.drawn = count;
+    this.points = points.length / 4;
+  }
+
+  /** Draw darker and greyer, as what shows what was or what is wrong. Returns whether that is new. */
+  setDimmed(isDimmed: boolean): boolean {
+    const { dimmed } = this.object.material.uniforms;
+    const isNew = dimmed!.value !== Number(isDimmed);
+    dimmed!.value = Number(isDimmed);
+    return isNew;
   }
 
   dispose(): void {
@@ -96,6 +109,7 @@ export class CloudViews {
   readonly group = makeWorldRoot();
   private readonly clouds = new Map<string, Cloud>();
   private wanted: readonly string[] = [];
+  private doubtful: readonly string[] = [];
   private isChanged = false;
 
   /** `maxPoints`: as many as this device draws, of all clouds together. */
@@ -108,6 +122,11 @@ export class CloudViews {
     return new Map([...this.clouds].map(([name, cloud]) => [name, cloud.drawn] as const));
   }
 
+  /** Return how many points the newest frame of a stream has and how many of them are drawn; undefined: it is not drawn. */
+  getPoints(stream: string): { drawn: number; points: number } | undefined {
+    return this.clouds.get(stream);
+  }
+
   /** Show a frame of a stream instead of the one before. One that is not wanted was on its way. */
   show(stream: string, frame: CloudFrame): void {
     if (!this.wanted.includes(stream)) return;
@@ -117,14 +136,20 @@ export class CloudViews {
       this.clouds.set(stream, cloud);
       this.group.add(cloud.object);
     }
+    cloud.setDimmed(this.doubtful.includes(stream));
     cloud.show(frame, Math.floor(this.maxPoints / this.clouds.size));
     this.isChanged = true;
   }
 
-  /** Set the streams whose clouds are shown, and remove the others. */
-  setWanted(streams: readonly string[]): void {
+  /**
+   * Set the streams whose clouds are shown, and remove the others. `doubtful`: streams whose newest frame shows what was,
+   * or what is wrong; they are dimmed.
+   */
+  setWanted(streams: readonly string[], doubtful: readonly string[] = []): void {
     this.wanted = streams;
+    this.doubtful = doubtful;
     for (const [name, cloud] of this.clouds) {
+      if (cloud.setDimmed(doubtful.includes(name))) this.isChanged = true;
       if (streams.includes(name)) continue;
       cloud.dispose();
       this.clouds.delete(name);

@@ -349,11 +349,11 @@ export class View {
     return isMoved;
   }
 
-  /** Show or hide the scene, and what would cover the room: sky, planes, and clouds of what is seen anyway. */
+  /** Show or hide the scene, and what would cover the room: sky and planes. */
   private showFor(showsScene: boolean, isTransparent: boolean): void {
     const { scene } = this;
     this.overlay.visible = showsScene;
-    this.clouds.group.visible = showsScene && !isTransparent;
+    this.clouds.group.visible = showsScene;
     if (!scene) return;
     scene.world.visible = showsScene;
     if (scene.sky) scene.sky.visible = !isTransparent;

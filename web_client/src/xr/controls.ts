@@ -53,6 +53,7 @@ export function makeHeadsetControls(view: View | null, state: PageState, client:
   const update = async (): Promise<void> => {
     const supported = await Promise.all(MODES.map(([mode]) => navigator.xr?.isSessionSupported(mode).catch(() => false) ?? false));
     buttons.forEach((one, i) => (one.hidden = !supported[i]));
+    state.offersAr = supported[0] ?? false;
     setText(words, supported.some(Boolean) ? "" : "No headset at this browser.");
   };
   navigator.xr?.addEventListener("devicechange", () => void update());

@@ -8,6 +8,7 @@ import type { WorkerClient } from "../core/page_client.ts";
 import type * as wire from "../protocol/messages.g.ts";
 import type { Actions } from "../ui/actions.ts";
 import { DESKTOP, type Entry, type PageState } from "../ui/state.ts";
+import type { Mode as PageMode } from "../ui/stream_choices.ts";
 import { participantColor } from "../view/avatars.ts";
 import { Label } from "../view/labels.ts";
 import type { View } from "../view/view.ts";
@@ -22,7 +23,7 @@ import { type FrameReading, type Side, toWorldRay, type Vec3 } from "./reading.t
 import { WristStop } from "./stop.ts";
 import { awaitsConsent, describeAlignment, describeRobot, describeUrgent, drawBar, findPulse, isPlaced, wrap } from "./words.ts";
 
-export type Mode = "immersive-ar" | "immersive-vr";
+export type Mode = Exclude<PageMode, "screen">;
 
 const ENTRY: Entry = { devices: ["head", "controller/left", "controller/right", "hand/left", "hand/right"], alignment: "measured" };
 /** Height of a robot's panel above its highest link [m]. */
@@ -70,6 +71,7 @@ export class Headset {
     private readonly actions: Actions,
   ) {
     this.isTransparent = mode === "immersive-ar";
+    state.mode = mode;
     this.reader = new FrameReader(session);
     this.marks = new Marks(session, this.isTransparent, state, client, actions);
     this.rig.add(this.marks.group);
@@ -131,6 +133,7 @@ export class Headset {
     for (const label of this.labels.values()) label.dispose();
     this.panels.removeFromParent();
     this.client.post({ type: "worn", worn: true });
+    this.state.mode = "screen";
     this.rejoin(DESKTOP);
   }
 

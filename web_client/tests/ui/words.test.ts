@@ -1,6 +1,6 @@
 import { expect, test } from "vitest";
 
-import { denialWords, eventWords, formatBytes, formatMillimetres, formatSessionTime } from "../../src/ui/words.ts";
+import { denialWords, eventWords, formatBytes, formatCount, formatMillimetres, formatSessionTime, streamAgeWords, streamStateWords } from "../../src/ui/words.ts";
 
 const nameOf = (id: string): string => ({ p1: "ann", p2: "ben" })[id] ?? "";
 type Body = Parameters<typeof eventWords>[0];
@@ -31,4 +31,15 @@ test("numbers have units that fit", () => {
   expect([formatMillimetres(0.0043), formatMillimetres(0.021), formatMillimetres(1.5)]).toEqual(["4.3 mm", "21 mm", "150 cm"]);
   expect([formatBytes(512), formatBytes(48_200_000)]).toEqual(["512 B", "48 MB"]);
   expect(formatSessionTime(754.3e9)).toBe("12:34.3");
+});
+
+test("a stream that is stale or faulty says so in words, also for a fault of another version", () => {
+  expect(streamStateWords({ stale: false, fault: "" })).toBe("");
+  expect(streamStateWords({ stale: true, fault: "frozen" })).toBe("stale, its camera repeats one frame");
+  expect(streamStateWords({ stale: false, fault: "lens_dirty" })).toBe("lens dirty");
+});
+
+test("ages of streams grow from milliseconds to hours", () => {
+  expect([45, 4200, 600_000, Number.NaN, -3].map(streamAgeWords)).toEqual(["45 ms old", "4 s old", "10 min old", "", "0.0 ms old"]);
+  expect(formatCount(50_000)).toBe("50,000");
 });

@@ -1,6 +1,6 @@
 // Point clouds in the scene: what goes to the graphics card, and where it lies there.
 
-import type { BufferGeometry, InterleavedBufferAttribute, Points } from "three";
+import type { BufferGeometry, InterleavedBufferAttribute, Points, ShaderMaterial } from "three";
 import { Vector3 } from "three";
 import { expect, test } from "vitest";
 
@@ -60,4 +60,27 @@ test("a cloud that is not wanted any more is gone, also when a frame of it was o
   views.show("room", cloud);
   expect(views.drawn.size).toBe(0);
   expect(views.group.children).toHaveLength(0);
+});
+
+test("a cloud that is stale or faulty is dimmed, until it is not", () => {
+  const views = new CloudViews(20);
+  const readDimmed = (): number => (views.group.getObjectByName("room") as Points<BufferGeometry, ShaderMaterial>).material.uniforms.dimmed!.value as number;
+  views.setWanted(["room"], ["room"]);
+  views.show("room", decodeCloud(fromHex(findFrame("on a table/full").hex)));
+  expect(readDimmed()).toBe(1);
+  views.popChanged();
+  views.setWanted(["room"], ["room"]);
+  expect(views.popChanged()).toBe(false);
+  views.setWanted(["room"], []);
+  expect(readDimmed()).toBe(0);
+  expect(views.popChanged()).toBe(true);
+});
+
+test("a cloud tells how many of its points are drawn", () => {
+  const views = new CloudViews(20);
+  views.setWanted(["room"]);
+  const { hex, positions } = findFrame("on a table/full");
+  views.show("room", decodeCloud(fromHex(hex)));
+  expect(views.getPoints("room")).toMatchObject({ drawn: 20, points: positions.length });
+  expect(views.getPoints("other")).toBeUndefined();
 });

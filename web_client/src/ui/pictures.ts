@@ -1,0 +1,96 @@
+// Panels with the pictures of real cameras, that is of streams of encoding `jpeg`: chosen in a menu, subscribed to while
+// they are open.
+
+import type { PictureUpdate } from "../core/api.ts";
+import type { WorkerClient } from "../core/page_client.ts";
+import { MediaEncoding } from "../protocol/messages.g.ts";
+import { h, KeyedList, type Row, setText } from "./dom.ts";
+import type { PageState } from "./state.ts";
+import type { Stream, StreamChoices } from "./stream_choices.ts";
+import { isDoubtful } from "./streams.ts";
+import { streamAgeWords, streamStateWords } from "./words.ts";
+
+export interface Pictures {
+  /** The open panels. */
+  element: HTMLElement;
+  /** A list to choose from, for the menu of cameras. */
+  choices: HTMLElement;
+  /** Whether the session has any. */
+  readonly isOffered: boolean;
+  update(): void;
+}
+
+export function makePictures(state: PageState, client: WorkerClient, choices: StreamChoices): Pictures {
+  const element = h("div", { class: "same" });
+  const list = h("ul");
+  const shown = new Map<string, (picture: PictureUpdate) => void>();
+  const listOffered = (): Stream[] => (state.budget?.streams ?? []).filter(({ encoding }) => encoding === MediaEncoding.JPEG);
+  const rows = new KeyedList<Stream>(list, (first) => {
+    let one = first;
+    const box = h("input", { type: "checkbox" });
+    box.addEventListener("change", () => {
+      choices.choose(one, box.checked, state.mode);
+      state.touch();
+    });
+    const title = h("span");
+    const update = (item: Stream): void => {
+      one = item;
+      box.checked = choices.isShown(one, "screen");
+      setText(title, one.title || one.stream);
+    };
+    return { element: h("li", {}, h("label", { class: "check" }, box, title)), update };
+  });
+  const panels = new KeyedList<Stream>(element, ({ stream }) => {
+    const { show, ...row } = makePanel(stream, state);
+    shown.set(stream, show);
+    return row;
+  });
+  client.on("picture", (picture) => {
+    const show = shown.get(picture.stream);
+    if (show) show(picture);
+    else picture.bitmap.close(); // its panel was closed while it was on its way
+  });
+  return {
+    element,
+    choices: list,
+    get isOffered() {
+      return listOffered().length > 0;
+    },
+    update: () => {
+      rows.update(listOffered(), ({ stream }) => stream);
+      const open = choices.listPanels(state.budget?.streams ?? []);
+      for (const stream of shown.keys()) if (!open.some((one) => one.stream === stream)) shown.delete(stream);
+      panels.update(open, ({ stream }) => stream);
+    },
+  };
+}
+
+function makePanel(stream: string, state: PageState): Row<Stream> & { show(picture: PictureUpdate): void } {
+  const title = h("span", { class: "title" });
+  const age = h("span", { class: "age" });
+  const canvas = h("canvas", { class: "place", role: "img" });
+  const context = canvas.getContext("bitmaprenderer");
+  const text = h("p", { class: "outside", role: "status" });
+  const element = h("figure", { class: "picture live", data: { stream } }, h("figcaption", {}, title, age), canvas, text);
+  let hasPicture = false;
+  return {
+    element,
+    show: ({ bitmap }) => {
+      hasPicture = true;
+      canvas.width = bitmap.width;
+      canvas.height = bitmap.height;
+      context?.transferFromImageBitmap(bitmap);
+    },
+    update: (one) => {
+      const name = one.title || stream;
+      setText(title, name);
+      canvas.setAttribute("aria-label", `Picture of the camera ${name}`);
+      if (!hasPicture) canvas.style.aspectRatio = String(one.camera ? one.camera.width / one.camera.height : 4 / 3);
+      else canvas.style.aspectRatio = "";
+      setText(age, hasPicture ? streamAgeWords(state.ageOf(stream) ?? Number.NaN) : "");
+      const words = [streamStateWords(one), one.detail].filter((part) => part !== "").join(": ");
+      setText(text, words || (hasPicture ? "" : "waiting for its next picture"));
+      element.classList.toggle("bad", isDoubtful(one));
+    },
+  };
+}
