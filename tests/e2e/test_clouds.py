@@ -1,10 +1,13 @@
-"""Point clouds from a program to those who join later: a Python client, and the page in a real Chromium."""
+"""Clouds and pictures from a program to a Python client that joins later, and to the page in a real Chromium."""
 
 from __future__ import annotations
 
+import contextlib
 import io
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import pytest
@@ -12,19 +15,70 @@ from PIL import Image
 
 from iris_session import Client, StreamCamera, StreamInfo, encode_cloud
 from tests.e2e.browser import Page
+from tests.e2e.emulated_quest import INSTALL, IWER
 from tests.e2e.session_process import SessionProcess, wait_until
 
 pytestmark = pytest.mark.e2e
+
+PINK: Final = (255, 0, 255)
+GREEN: Final = (0, 220, 60)
+
+
+def make_wall(color: tuple[int, int, int]) -> dict[str, bytes]:
+    """Return the frames of a wall of 10,000 points behind the robots."""
+    side = np.linspace(-1.0, 1.0, 100)
+    wall = np.stack(np.meshgrid(side, [-0.8], 1.0 + side, indexing="ij"), -1).reshape(-1, 3)
+    colors = np.full(wall.shape, color, np.uint8)
+    return encode_cloud(wall, colors, voxel_m=0.02, error_m=0.01, classes=("full", "half", "quarter"))
+
+
+def make_picture(width: int, height: int, color: tuple[int, int, int]) -> bytes:
+    """Return a JPEG image of one colour."""
+    stream = io.BytesIO()
+    Image.new("RGB", (width, height), color).save(stream, "JPEG", quality=90)
+    return stream.getvalue()
+
+
+class Camera:
+    """A program in a thread of its own: it publishes a picture and a cloud 20 times a second, and `extra` pictures."""
+
+    def __init__(self, address: str) -> None:
+        self.fault = self.detail = ""
+        self.extra: list[bytes] = []
+        self._ends = threading.Event()
+        self._thread = threading.Thread(target=self._run, args=(address,))
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Publish nothing more."""
+        self._ends.set()
+        self._thread.join()
+
+    def _run(self, address: str) -> None:
+        picture, wall = make_picture(320, 240, GREEN), make_wall(PINK)
+        with Client(address, role="source", name="camera") as source:
+            while not self._ends.is_set():
+                source.poll(0.05)
+                info = StreamInfo("The <b>room</b>", "remote", None, 20.0, self.fault, self.detail)
+                source.media.publish("room", wall, encoding="cloud", info=info)
+                info = StreamInfo("Front camera", "remote", None, 20.0, self.fault, self.detail)
+                source.media.publish("front", self.extra.pop() if self.extra else picture, encoding="jpeg", info=info)
+
+
+@contextlib.contextmanager
+def run_camera(server: SessionProcess) -> Iterator[Camera]:
+    camera = Camera(server.address)
+    try:
+        yield camera
+    finally:
+        camera.stop()
 
 
 def test_a_cloud_at_rest_reaches_who_joins_later(
     serve: Callable[..., SessionProcess], open_page: Callable[..., Page], tmp_path: Path
 ) -> None:
     server = serve("handover")
-    side = np.linspace(-1.0, 1.0, 100)
-    wall = np.stack(np.meshgrid(side, [-0.8], 1.0 + side, indexing="ij"), -1).reshape(-1, 3)
-    pink = np.full(wall.shape, (255, 0, 255), np.uint8)
-    frames = encode_cloud(wall, pink, voxel_m=0.02, error_m=0.01, classes=("full", "half", "quarter"))
+    frames = make_wall(PINK)
     with Client(server.address, role="source", name="camera") as source:
         info = StreamInfo("The room", "all", StreamCamera(640, 480, 585.0, 585.0, 319.5, 239.5))
         wait_until(
@@ -50,16 +104,100 @@ def test_a_cloud_at_rest_reaches_who_joins_later(
 
             page = open_page(server, "viewer")
             page.wait("irisSession.view.clouds.drawn.get('room') === 10000")
-            wait_until(lambda: measure_share(page, tmp_path / "on.png") > 0.01, "the points are seen")
+            wait_until(lambda: measure_share(page, PINK, tmp_path / "on.png") > 0.01, "the points are seen")
             page.evaluate("document.querySelector('#panel-streams input[type=checkbox]').click()")
             page.wait("irisSession.view.clouds.drawn.size === 0")
-            wait_until(lambda: measure_share(page, tmp_path / "off.png") < 0.001, "the points are gone")
+            wait_until(lambda: measure_share(page, PINK, tmp_path / "off.png") < 0.001, "the points are gone")
             wait_until(lambda: late.status().media[0].subscribers == 1, "the page gets no more frames")
             assert page.errors == []
 
 
-def measure_share(page: Page, path: Path) -> float:
-    """Return the share of the page that is in the colour of the points."""
+def test_a_camera_is_seen_in_the_page_and_said_to_be_faulty_and_stale(
+    serve: Callable[..., SessionProcess], open_page: Callable[..., Page], tmp_path: Path
+) -> None:
+    server = serve("handover")
+    panel = "document.querySelector('[data-stream=front].picture')"
+    with run_camera(server) as camera, Client(server.address, role="observer", name="host") as host:
+        page = open_page(server, "viewer")
+        page.wait("irisSession.state.budget?.streams.length === 2")
+        page.wait("irisSession.view.clouds.drawn.get('room') === 10000")
+        page.evaluate("document.querySelector('#panel-streams').open = true")
+        page.wait("document.querySelector('#panel-streams [data-stream=room]').innerText.includes('The <b>room</b>')")
+        wait_until(lambda: measure_share(page, PINK, tmp_path / "cloud.png") > 0.01, "the cloud is seen")
+
+        def count_subscribers() -> int:
+            return next(one.subscribers for one in host.status().media if one.stream == "front")
+
+        assert count_subscribers() == 0  # no panel is open
+        page.evaluate("document.querySelector('#panel-streams').open = false")
+        page.evaluate("document.querySelector('.menu').open = true")
+        page.check("Front camera")
+        page.evaluate("document.querySelector('.menu').open = false")
+        wait_until(lambda: measure_share(page, GREEN, tmp_path / "picture.png") > 0.03, "the picture is seen")
+        wait_until(lambda: count_subscribers() == 1, "the page subscribed")
+        page.wait(f"/^\\d+ ms old$/.test({panel}.querySelector('.age').textContent)")
+
+        picture = make_picture(4, 4, PINK)
+        camera.extra = [b"", b"no picture", picture[: len(picture) // 2], make_picture(5000, 4, PINK)]
+        page.wait("irisSession.state.stats.media.front?.refused >= 3")
+
+        camera.detail, camera.fault = "by <b>3 cm</b>", "moved"
+        page.wait(f"{panel}.innerText.includes('its camera was moved: calibrate it again: by <b>3 cm</b>')")
+        wait_until(lambda: measure_share(page, GREEN, tmp_path / "faulty.png") < 0.001, "the picture is dimmed")
+        wait_until(lambda: measure_share(page, PINK, tmp_path / "faulty.png") < 0.001, "the cloud is dimmed")
+        camera.detail = camera.fault = ""
+        wait_until(lambda: measure_share(page, GREEN, tmp_path / "mended.png") > 0.03, "the picture is good again")
+
+        camera.stop()
+        page.wait(f"{panel}.innerText.includes('stale') && {panel}.classList.contains('bad')")
+        page.wait("document.querySelector('#panel-streams .count').textContent === '2 · 2 stale or faulty'")
+        wait_until(lambda: measure_share(page, PINK, tmp_path / "stale.png") < 0.001, "the stale cloud is dimmed")
+        page.evaluate("document.querySelector('#panel-streams').open = true")
+        page.wait("document.querySelector('#panel-streams [data-stream=front]').innerText.includes('stale')")
+        page.evaluate("document.querySelector('#panel-streams [data-stream=front] input').click()")
+        page.wait(f"{panel} === null")
+        wait_until(lambda: count_subscribers() == 0, "a closed panel is not subscribed to")
+        assert page.errors == []
+
+
+def test_in_ar_what_is_for_remote_people_is_not_subscribed_unless_chosen(
+    serve: Callable[..., SessionProcess], open_page: Callable[..., Page]
+) -> None:
+    server = serve("handover")
+    drawn = "JSON.stringify([...irisSession.view.clouds.drawn.keys()].sort())"
+    with Client(server.address, role="source", name="camera") as source:
+        wall = make_wall(PINK)
+
+        def publish(stream: str, audience: str) -> bool:
+            return source.media.publish(stream, wall, encoding="cloud", info=StreamInfo(audience=audience))
+
+        wait_until(lambda: publish("room", "remote"), "the source has a connection")
+        wait_until(lambda: publish("sketch", "all"), "it takes another cloud")
+        page = open_page(server, "quest", width=900, height=500, before=[IWER.read_text(), INSTALL])
+        page.wait(f"""{drawn} === '["room","sketch"]'""")
+        page.click("button", "Enter AR")
+        page.wait("irisSession.state.mode === 'immersive-ar' && irisSession.state.phase.phase === 'ready'")
+        page.wait(f"""{drawn} === '["sketch"]'""")
+
+        def count_subscribers(stream: str) -> int:
+            return next(one.subscribers for one in source.status().media if one.stream == stream)
+
+        wait_until(lambda: count_subscribers("room") == 0, "the room is not subscribed to")
+        page.evaluate("irisSession.headset.headset.session.end().then(() => null)")
+        page.wait(f"""{drawn} === '["room","sketch"]'""")
+        page.evaluate("document.querySelector('#panel-streams [data-stream=room] .note input').click()")
+        # The emulator has laid its canvas over the button.
+        page.evaluate(
+            "[...document.querySelectorAll('.headset button')].find((b) => b.innerText === 'Enter AR').click()"
+        )
+        page.wait("irisSession.state.mode === 'immersive-ar' && irisSession.state.phase.phase === 'ready'")
+        wait_until(lambda: count_subscribers("room") == 1, "the room is chosen by hand")
+        page.wait(f"""{drawn} === '["room","sketch"]'""")
+        assert page.errors == []
+
+
+def measure_share(page: Page, color: tuple[int, int, int], path: Path) -> float:
+    """Return the share of the page that is in a colour."""
     page.screenshot(path)
     picture = np.asarray(Image.open(io.BytesIO(path.read_bytes())).convert("RGB")).astype(int)
-    return float(((picture[..., 0] > 200) & (picture[..., 1] < 80) & (picture[..., 2] > 200)).mean())
+    return float((np.abs(picture - color).max(-1) < 60).mean())
