@@ -150,7 +150,7 @@ def test_a_camera_is_seen_in_the_page_and_said_to_be_faulty_and_stale(
 
         camera.stop()
         page.wait(f"{panel}.innerText.includes('stale') && {panel}.classList.contains('bad')")
-        page.wait("document.querySelector('#panel-streams .count').textContent === '2 · 2 stale or faulty'")
+        page.wait("document.querySelector('#panel-streams .count').textContent === '2 · 2 with a problem'")
         wait_until(lambda: measure_share(page, PINK, tmp_path / "stale.png") < 0.001, "the stale cloud is dimmed")
         page.evaluate("document.querySelector('#panel-streams').open = true")
         page.wait("document.querySelector('#panel-streams [data-stream=front]').innerText.includes('stale')")

@@ -1,12 +1,14 @@
 // The panel "Streams": what media the session has, in which state they are, and which of them this page shows.
 
 import type { WorkerClient } from "../core/page_client.ts";
-import { StreamAudience } from "../protocol/messages.g.ts";
+import { BudgetClass, StreamAudience } from "../protocol/messages.g.ts";
 import { h, KeyedList, type Row, setText } from "./dom.ts";
 import { makeSection, type Panel } from "./panel.ts";
 import type { PageState } from "./state.ts";
 import type { Stream, StreamChoices } from "./stream_choices.ts";
 import { formatCount, streamAgeWords, streamStateWords } from "./words.ts";
+
+const REDUCED: readonly string[] = [BudgetClass.HALF, BudgetClass.QUARTER];
 
 /** What the view tells of the clouds that it draws. */
 export interface DrawnClouds {
@@ -38,7 +40,7 @@ export function makeStreamsPanel(state: PageState, client: WorkerClient, choices
       const streams = state.budget?.streams ?? [];
       rows.update(streams, (one) => one.stream);
       const doubtful = streams.filter(isDoubtful).length;
-      section.setCount(streams.length === 0 ? "" : `${streams.length}${doubtful > 0 ? ` · ${doubtful} stale or faulty` : ""}`);
+      section.setCount(streams.length === 0 ? "" : `${streams.length}${doubtful > 0 ? ` · ${doubtful} with a problem` : ""}`);
       section.element.classList.toggle("doubtful", doubtful > 0);
       setText(reason, state.budget?.reason ?? "");
       send();
@@ -47,8 +49,8 @@ export function makeStreamsPanel(state: PageState, client: WorkerClient, choices
 }
 
 /** Return whether the newest frame of a stream shows what was, or what is wrong. */
-export function isDoubtful({ stale, fault }: Stream): boolean {
-  return stale || fault !== "";
+export function isDoubtful(one: Stream): boolean {
+  return streamStateWords(one) !== "";
 }
 
 function makeRow(first: Stream, state: PageState, choices: StreamChoices, clouds: DrawnClouds | null): Row<Stream> {
@@ -76,10 +78,9 @@ function makeRow(first: Stream, state: PageState, choices: StreamChoices, clouds
       const report = state.status?.media.find((other) => other.stream === stream);
       const counters = state.stats?.media[stream];
       const shower = choices.findShower(one);
-      const isShown = choices.isShown(one, state.mode);
       const cloud = clouds?.getPoints(stream);
       box.disabled = shower === "";
-      box.checked = isShown;
+      box.checked = choices.isShown(one, state.mode);
       arLabel.hidden = !(state.offersAr && shower === "scene" && one.audience === StreamAudience.REMOTE && state.mode !== "immersive-ar");
       inAr.checked = choices.isShown(one, "immersive-ar");
       setText(title, one.title || stream);
@@ -87,12 +88,12 @@ function makeRow(first: Stream, state: PageState, choices: StreamChoices, clouds
       warning.hidden = warning.textContent === "";
       const parts = [
         one.title && one.title !== stream ? stream : "",
-        shower === "" ? "not drawn by this page" : one.budget_class === "full" || !isShown ? "" : `${one.budget_class} of it, since the link is slow`,
+        shower === "" ? "not drawn by this page" : REDUCED.includes(one.budget_class) ? `${one.budget_class}: the link is too slow for all of it` : "",
         cloud ? `${cloud.drawn < cloud.points ? `${formatCount(cloud.drawn)} of ` : ""}${formatCount(cloud.points)} points` : "",
         report ? `${report.hz.toFixed(0)} Hz` : "",
         report ? `${report.mbit_per_s.toFixed(1)} Mbit/s` : "",
         streamAgeWords(state.ageOf(stream) ?? report?.age_ms ?? Number.NaN),
-        counters && counters.superseded > 0 ? `${formatCount(counters.superseded)} not decoded: this device is too slow` : "",
+        counters && counters.superseded > 0 ? `${formatCount(counters.superseded)} of ${formatCount(counters.received)} left out for newer ones` : "",
         counters && counters.refused > 0 ? `${formatCount(counters.refused)} refused: damaged or too large` : "",
         report?.source ? `from ${report.source}` : "",
       ];

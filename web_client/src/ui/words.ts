@@ -2,6 +2,7 @@
 
 import type { Filled } from "../core/api.ts";
 import type * as wire from "../protocol/messages.g.ts";
+import { BudgetClass } from "../protocol/messages.g.ts";
 
 const HOLD_REASONS: Record<string, string> = {
   no_lease: "no participant has its lease",
@@ -117,8 +118,13 @@ export function streamAgeWords(ms: number): string {
 }
 
 /** Return why the newest frame of a stream shows what was, or what is wrong; empty for a good one. */
-export function streamStateWords({ stale, fault }: { stale: boolean; fault: string }): string {
-  return [stale ? "stale" : "", fault ? streamFaultWords(fault) : ""].filter((part) => part !== "").join(", ");
+export function streamStateWords(stream: { stale: boolean; fault: string; budget_class: string }): string {
+  const parts = [
+    stream.budget_class === BudgetClass.NONE ? "paused: the link is too slow" : "",
+    stream.stale ? "stale" : "",
+    stream.fault ? streamFaultWords(stream.fault) : "",
+  ];
+  return parts.filter((part) => part !== "").join(", ");
 }
 
 /** Return a whole number with groups of digits, such as `50,000`. */

@@ -34,9 +34,10 @@ test("numbers have units that fit", () => {
 });
 
 test("a stream that is stale or faulty says so in words, also for a fault of another version", () => {
-  expect(streamStateWords({ stale: false, fault: "" })).toBe("");
-  expect(streamStateWords({ stale: true, fault: "frozen" })).toBe("stale, its camera repeats one frame");
-  expect(streamStateWords({ stale: false, fault: "lens_dirty" })).toBe("lens dirty");
+  expect(streamStateWords({ stale: false, fault: "", budget_class: "quarter" })).toBe("");
+  expect(streamStateWords({ stale: true, fault: "frozen", budget_class: "full" })).toBe("stale, its camera repeats one frame");
+  expect(streamStateWords({ stale: false, fault: "lens_dirty", budget_class: "full" })).toBe("lens dirty");
+  expect(streamStateWords({ stale: false, fault: "", budget_class: "none" })).toBe("paused: the link is too slow");
 });
 
 test("ages of streams grow from milliseconds to hours", () => {
