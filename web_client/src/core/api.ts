@@ -291,8 +291,9 @@ export interface CloudUpdate {
   type: "cloud";
   stream: string;
   cloud: CloudFrame;
-  /** Session time of the points [ms]. */
+  /** Session time of the points, and when the session received them, 0 where that is not known [ms]. */
   capture_ms: number;
+  received_ms: number;
 }
 
 /** A camera's picture, decoded. It is transferred: `close` it, or give it to a canvas. */
@@ -300,8 +301,9 @@ export interface PictureUpdate {
   type: "picture";
   stream: string;
   bitmap: ImageBitmap;
-  /** Session time of the picture [ms]. */
+  /** As of a cloud. */
   capture_ms: number;
+  received_ms: number;
 }
 
 /** Clouds or pictures of one stream since it was wanted. */

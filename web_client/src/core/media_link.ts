@@ -26,6 +26,7 @@ interface Frame {
   encoding: string;
   bytes: Uint8Array;
   capture_ms: number;
+  received_ms: number;
 }
 
 const MS_NS = 1_000_000;
@@ -147,7 +148,7 @@ export class MediaLink {
 
   private process(head: Uint8Array, bytes: Uint8Array): void {
     const header = decodeMediaHeader(head);
-    const [stream, , scene_epoch, seq, captureNs, , encoding] = header;
+    const [stream, , scene_epoch, seq, captureNs, , encoding, , , receivedNs] = header;
     this.meter.recordMedia(head.length + bytes.length, Math.max(0, this.getSessionNs() - captureNs));
     if (encoding === "deformable") {
       const decoder = this.assets.findDecoder(stream);
@@ -158,7 +159,8 @@ export class MediaLink {
       return;
     }
     if (encoding === "cloud" || encoding === "jpeg") {
-      if (this.wishes.includes(stream)) this.takeNewest(stream, { encoding, bytes, capture_ms: captureNs / MS_NS });
+      const frame = { encoding, bytes, capture_ms: captureNs / MS_NS, received_ms: receivedNs / MS_NS };
+      if (this.wishes.includes(stream)) this.takeNewest(stream, frame);
       return;
     }
     const copy = bytes.slice();
@@ -188,15 +190,15 @@ export class MediaLink {
   }
 
   /** Decode and post a frame. The page answers with `taken`. */
-  private async decode(stream: string, { encoding, bytes, capture_ms }: Frame): Promise<void> {
+  private async decode(stream: string, { encoding, bytes, ...times }: Frame): Promise<void> {
     if (encoding === "cloud") {
       const cloud = decodeCloud(bytes);
-      this.environment.post({ type: "cloud", stream, cloud, capture_ms }, [cloud.points.buffer]);
+      this.environment.post({ type: "cloud", stream, cloud, ...times }, [cloud.points.buffer]);
       return;
     }
     const bitmap = await this.environment.decodeImage(bytes);
     if (this.wishes.includes(stream)) {
-      this.environment.post({ type: "picture", stream, bitmap, capture_ms }, [bitmap]);
+      this.environment.post({ type: "picture", stream, bitmap, ...times }, [bitmap]);
       return;
     }
     bitmap.close();

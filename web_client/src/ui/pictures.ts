@@ -7,8 +7,8 @@ import { MediaEncoding } from "../protocol/messages.g.ts";
 import { h, KeyedList, type Row, setText } from "./dom.ts";
 import type { PageState } from "./state.ts";
 import type { Stream, StreamChoices } from "./stream_choices.ts";
-import { isDoubtful } from "./streams.ts";
-import { streamAgeWords, streamStateWords } from "./words.ts";
+import { describeState } from "./streams.ts";
+import { budgetWords, streamAgeWords } from "./words.ts";
 
 export interface Pictures {
   /** The open panels. */
@@ -88,9 +88,10 @@ function makePanel(stream: string, state: PageState): Row<Stream> & { show(pictu
       if (!hasPicture) canvas.style.aspectRatio = String(one.camera ? one.camera.width / one.camera.height : 4 / 3);
       else canvas.style.aspectRatio = "";
       setText(age, hasPicture ? streamAgeWords(state.ageOf(stream) ?? Number.NaN) : "");
-      const words = [streamStateWords(one), one.detail].filter((part) => part !== "").join(": ");
-      setText(text, words || (hasPicture ? "" : "waiting for its next picture"));
-      element.classList.toggle("bad", isDoubtful(one));
+      const why = describeState(one, state);
+      const words = [why, one.detail].filter((part) => part !== "").join(": ");
+      setText(text, words || (hasPicture ? "" : budgetWords(one.budget_class) || "waiting for its next picture"));
+      element.classList.toggle("bad", why !== "");
     },
   };
 }

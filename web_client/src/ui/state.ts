@@ -23,6 +23,8 @@ import type { Mode } from "./stream_choices.ts";
 import { type EventLevel, eventWords } from "./words.ts";
 
 const MAX_EVENTS = 300;
+/** Behind the session's newest frame: more than frames need on their way. */
+const BEHIND_MS = 2000;
 
 export interface LogEntry {
   seq: number;
@@ -80,8 +82,8 @@ export class PageState {
   consents: ConsentAsked[] = [];
   rtt_ms = Number.NaN;
   private sessionOffset_ms = Number.NaN;
-  /** Session time of the newest cloud or picture of a stream [ms]. */
-  private readonly captured = new Map<string, number>();
+  /** Times of the newest cloud or picture of a stream, while it is subscribed to. */
+  private readonly newest = new Map<string, { capture_ms: number; received_ms: number }>();
   /** Names of participants that left, for events about them. */
   private readonly formerNames = new Map<string, string>();
   private readonly listeners: ((state: PageState) => void)[] = [];
@@ -116,11 +118,11 @@ export class PageState {
     });
     client.on("budget", ({ budget }) => {
       this.budget = budget;
-      for (const stream of this.captured.keys()) if (!budget.streams.some((one) => one.stream === stream)) this.captured.delete(stream);
+      this.forgetFrames((stream) => !budget.streams.some((one) => one.stream === stream));
       this.touch();
     });
-    client.on("cloud", ({ stream, capture_ms }) => this.captured.set(stream, capture_ms));
-    client.on("picture", ({ stream, capture_ms }) => this.captured.set(stream, capture_ms));
+    client.on("cloud", ({ stream, capture_ms, received_ms }) => this.newest.set(stream, { capture_ms, received_ms }));
+    client.on("picture", ({ stream, capture_ms, received_ms }) => this.newest.set(stream, { capture_ms, received_ms }));
     client.on("asset_progress", (progress) => {
       this.progress = progress;
       this.touch();
@@ -191,8 +193,21 @@ export class PageState {
 
   /** Return how old the newest cloud or picture of a stream is [ms]; undefined: this page has none. */
   ageOf(stream: string): number | undefined {
-    const captured = this.captured.get(stream);
-    return captured === undefined || Number.isNaN(this.sessionOffset_ms) ? undefined : nowMs() + this.sessionOffset_ms - captured;
+    const newest = this.newest.get(stream);
+    return newest === undefined || Number.isNaN(this.sessionOffset_ms) ? undefined : nowMs() + this.sessionOffset_ms - newest.capture_ms;
+  }
+
+  /** Return whether the session has had a newer cloud or picture of a stream than this page for so long that it shows what was. */
+  isBehind(stream: string): boolean {
+    const received_ms = this.newest.get(stream)?.received_ms ?? 0;
+    const report = this.status?.media.find((one) => one.stream === stream);
+    if (received_ms === 0 || !this.status || !report) return false;
+    return this.status.session_time / 1e6 - report.age_ms - received_ms > BEHIND_MS;
+  }
+
+  /** Forget the frames of streams that are not shown any more. */
+  forgetFrames(isForgotten: (stream: string) => boolean): void {
+    for (const stream of this.newest.keys()) if (isForgotten(stream)) this.newest.delete(stream);
   }
 
   /** Names of robots that a participant holds. */

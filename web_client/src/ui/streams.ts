@@ -1,14 +1,12 @@
 // The panel "Streams": what media the session has, in which state they are, and which of them this page shows.
 
 import type { WorkerClient } from "../core/page_client.ts";
-import { BudgetClass, StreamAudience } from "../protocol/messages.g.ts";
+import { StreamAudience } from "../protocol/messages.g.ts";
 import { h, KeyedList, type Row, setText } from "./dom.ts";
 import { makeSection, type Panel } from "./panel.ts";
 import type { PageState } from "./state.ts";
 import type { Stream, StreamChoices } from "./stream_choices.ts";
-import { formatCount, streamAgeWords, streamStateWords } from "./words.ts";
-
-const REDUCED: readonly string[] = [BudgetClass.HALF, BudgetClass.QUARTER];
+import { budgetWords, formatCount, streamAgeWords, streamStateWords } from "./words.ts";
 
 /** What the view tells of the clouds that it draws. */
 export interface DrawnClouds {
@@ -23,10 +21,12 @@ export function makeStreamsPanel(state: PageState, client: WorkerClient, choices
   const empty = h("p", { class: "empty" }, "This session has no streams.");
   const reason = h("p", { class: "note" });
   const section = makeSection("streams", "Streams", h("div", {}, list, empty, reason), { open: false });
+  const isDoubtful = (one: Stream): boolean => describeState(one, state) !== "";
   let sent = "";
   const send = (): void => {
     const streams = state.budget?.streams ?? [];
     const wanted = choices.listWanted(streams, state.mode);
+    state.forgetFrames((stream) => !wanted.includes(stream));
     clouds?.setWanted(wanted, streams.filter(isDoubtful).map(({ stream }) => stream));
     const key = `${state.welcome?.connection_epoch ?? 0} ${JSON.stringify(wanted)}`;
     if (key === sent || !state.isReady) return;
@@ -48,9 +48,9 @@ export function makeStreamsPanel(state: PageState, client: WorkerClient, choices
   };
 }
 
-/** Return whether the newest frame of a stream shows what was, or what is wrong. */
-export function isDoubtful(one: Stream): boolean {
-  return streamStateWords(one) !== "";
+/** Return why what is shown of a stream is not as things are now, in words; empty: it is. */
+export function describeState(one: Stream, state: PageState): string {
+  return streamStateWords(one, state.isBehind(one.stream));
 }
 
 function makeRow(first: Stream, state: PageState, choices: StreamChoices, clouds: DrawnClouds | null): Row<Stream> {
@@ -84,11 +84,11 @@ function makeRow(first: Stream, state: PageState, choices: StreamChoices, clouds
       arLabel.hidden = !(state.offersAr && shower === "scene" && one.audience === StreamAudience.REMOTE && state.mode !== "immersive-ar");
       inAr.checked = choices.isShown(one, "immersive-ar");
       setText(title, one.title || stream);
-      setText(warning, streamStateWords(one));
+      setText(warning, describeState(one, state));
       warning.hidden = warning.textContent === "";
       const parts = [
         one.title && one.title !== stream ? stream : "",
-        shower === "" ? "not drawn by this page" : REDUCED.includes(one.budget_class) ? `${one.budget_class}: the link is too slow for all of it` : "",
+        shower === "" ? "not drawn by this page" : warning.textContent === budgetWords(one.budget_class) ? "" : budgetWords(one.budget_class),
         cloud ? `${cloud.drawn < cloud.points ? `${formatCount(cloud.drawn)} of ` : ""}${formatCount(cloud.points)} points` : "",
         report ? `${report.hz.toFixed(0)} Hz` : "",
         report ? `${report.mbit_per_s.toFixed(1)} Mbit/s` : "",

@@ -117,10 +117,21 @@ export function streamAgeWords(ms: number): string {
   return Number.isFinite(ms) ? `${ms < 1000 ? formatMilliseconds(Math.max(0, ms)) : formatAge(1e6 * ms)} old` : "";
 }
 
-/** Return why the newest frame of a stream shows what was, or what is wrong; empty for a good one. */
-export function streamStateWords(stream: { stale: boolean; fault: string; budget_class: string }): string {
+const BUDGETS: Record<string, string> = {
+  full: "",
+  half: "half: the link is too slow for all of it",
+  quarter: "quarter: the link is too slow for all of it",
+  none: "paused: the link is too slow",
+};
+
+/** Return why a stream is delivered in another class than `full`, empty for that. */
+export const budgetWords = (budgetClass: string): string => look(BUDGETS, budgetClass);
+
+/** Return why the newest frame of a stream shows what was, or what is wrong; empty for a good one. `isBehind`: newer ones do not come here. */
+export function streamStateWords(stream: { stale: boolean; fault: string; budget_class: string }, isBehind: boolean): string {
+  const isPaused = stream.budget_class === BudgetClass.NONE;
   const parts = [
-    stream.budget_class === BudgetClass.NONE ? "paused: the link is too slow" : "",
+    isBehind && !stream.stale ? (isPaused ? budgetWords(stream.budget_class) : "newer frames do not come here") : "",
     stream.stale ? "stale" : "",
     stream.fault ? streamFaultWords(stream.fault) : "",
   ];

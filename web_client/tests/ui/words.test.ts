@@ -34,10 +34,13 @@ test("numbers have units that fit", () => {
 });
 
 test("a stream that is stale or faulty says so in words, also for a fault of another version", () => {
-  expect(streamStateWords({ stale: false, fault: "", budget_class: "quarter" })).toBe("");
-  expect(streamStateWords({ stale: true, fault: "frozen", budget_class: "full" })).toBe("stale, its camera repeats one frame");
-  expect(streamStateWords({ stale: false, fault: "lens_dirty", budget_class: "full" })).toBe("lens dirty");
-  expect(streamStateWords({ stale: false, fault: "", budget_class: "none" })).toBe("paused: the link is too slow");
+  const good = { stale: false, fault: "", budget_class: "full" };
+  expect(streamStateWords(good, false)).toBe("");
+  expect(streamStateWords({ ...good, stale: true, fault: "frozen" }, true)).toBe("stale, its camera repeats one frame");
+  expect(streamStateWords({ ...good, fault: "lens_dirty" }, false)).toBe("lens dirty");
+  expect(streamStateWords({ ...good, budget_class: "none" }, true)).toBe("paused: the link is too slow");
+  expect(streamStateWords({ ...good, budget_class: "none" }, false)).toBe(""); // a cloud at rest is still right
+  expect(streamStateWords(good, true)).toBe("newer frames do not come here");
 });
 
 test("ages of streams grow from milliseconds to hours", () => {

@@ -1,0 +1,55 @@
+// What the page knows of its streams: ages, and whether it shows the session's newest frame.
+
+import { afterEach, beforeEach, expect, test, vi } from "vitest";
+
+import { type FromWorker, nowMs } from "../../src/core/api.ts";
+import { WorkerClient, type WorkerPort } from "../../src/core/page_client.ts";
+import { PageState } from "../../src/ui/state.ts";
+
+const port: WorkerPort = { postMessage: () => undefined, onmessage: null };
+const say = (update: object): unknown => port.onmessage?.({ data: update as FromWorker } as MessageEvent<FromWorker>);
+const sayFrame = (received_ms: number): unknown => say({ type: "cloud", stream: "room", cloud: {}, capture_ms: received_ms - 50, received_ms });
+/** Report at `session_ms` that the newest frame of the session is `age_ms` old. */
+const sayStatus = (session_ms: number, age_ms: number): unknown =>
+  say({ type: "status", status: { session_time: 1e6 * session_ms, media: [{ stream: "room", age_ms }] } });
+
+let state: PageState;
+
+beforeEach(() => {
+  vi.stubGlobal("requestAnimationFrame", () => 0);
+  state = new PageState(new WorkerClient(port));
+});
+afterEach(() => vi.unstubAllGlobals());
+
+test("a page is behind when the session has had a newer frame for more than two seconds", () => {
+  sayStatus(10_000, 0);
+  expect(state.isBehind("room")).toBe(false); // it has no frame
+  sayFrame(10_000);
+  sayStatus(11_900, 0);
+  expect(state.isBehind("room")).toBe(false);
+  sayStatus(12_100, 0);
+  expect(state.isBehind("room")).toBe(true);
+  sayFrame(12_100);
+  expect(state.isBehind("room")).toBe(false);
+});
+
+test("a cloud at rest is not behind, however old it is, and neither is a session that does not tell", () => {
+  sayFrame(10_000);
+  sayStatus(70_000, 60_000);
+  expect(state.isBehind("room")).toBe(false);
+  sayFrame(0);
+  sayStatus(70_000, 0);
+  expect(state.isBehind("room")).toBe(false);
+});
+
+test("a frame has an age until its stream is forgotten", () => {
+  say({ type: "clock", session_offset_ms: 1000 - nowMs(), error_ms: 1, rtt_ms: 1, settled: true });
+  sayFrame(950);
+  expect(state.ageOf("room")).toBeGreaterThanOrEqual(100);
+  expect(state.ageOf("room")).toBeLessThan(1000);
+  state.forgetFrames((stream) => stream === "room");
+  expect(state.ageOf("room")).toBeUndefined();
+  sayFrame(950);
+  say({ type: "budget", budget: { streams: [] } });
+  expect(state.ageOf("room")).toBeUndefined();
+});
