@@ -22,6 +22,7 @@ pytestmark = pytest.mark.e2e
 
 PINK: Final = (255, 0, 255)
 GREEN: Final = (0, 220, 60)
+HZ: Final = 5.0
 
 
 def make_wall(color: tuple[int, int, int]) -> dict[str, bytes]:
@@ -40,7 +41,7 @@ def make_picture(width: int, height: int, color: tuple[int, int, int]) -> bytes:
 
 
 class Camera:
-    """A program in a thread of its own: it publishes a picture and a cloud 20 times a second, and `extra` pictures."""
+    """A program in a thread of its own: publishes a picture and a cloud `HZ` times a second, and `extra` pictures."""
 
     def __init__(self, address: str) -> None:
         self.fault = self.detail = ""
@@ -57,11 +58,11 @@ class Camera:
     def _run(self, address: str) -> None:
         picture, wall = make_picture(320, 240, GREEN), make_wall(PINK)
         with Client(address, role="source", name="camera") as source:
-            while not self._ends.is_set():
-                source.poll(0.05)
-                info = StreamInfo("The <b>room</b>", "remote", None, 20.0, self.fault, self.detail)
+            while not self._ends.wait(1.0 / HZ):
+                source.poll()
+                info = StreamInfo("The <b>room</b>", "remote", None, HZ, self.fault, self.detail)
                 source.media.publish("room", wall, encoding="cloud", info=info)
-                info = StreamInfo("Front camera", "remote", None, 20.0, self.fault, self.detail)
+                info = StreamInfo("Front camera", "remote", None, HZ, self.fault, self.detail)
                 source.media.publish("front", self.extra.pop() if self.extra else picture, encoding="jpeg", info=info)
 
 
@@ -118,7 +119,7 @@ def test_a_camera_is_seen_in_the_page_and_said_to_be_faulty_and_stale(
     server = serve("handover")
     panel = "document.querySelector('[data-stream=front].picture')"
     with run_camera(server) as camera, Client(server.address, role="observer", name="host") as host:
-        page = open_page(server, "viewer")
+        page = open_page(server, "viewer", width=900, height=500)
         page.wait("irisSession.state.budget?.streams.length === 2")
         page.wait("irisSession.view.clouds.drawn.get('room') === 10000")
         page.evaluate("document.querySelector('#panel-streams').open = true")
@@ -135,7 +136,7 @@ def test_a_camera_is_seen_in_the_page_and_said_to_be_faulty_and_stale(
         page.evaluate("document.querySelector('.menu').open = false")
         wait_until(lambda: measure_share(page, GREEN, tmp_path / "picture.png") > 0.03, "the picture is seen")
         wait_until(lambda: count_subscribers() == 1, "the page subscribed")
-        page.wait(f"/^\\d+ ms old$/.test({panel}.querySelector('.age').textContent)")
+        page.wait(f"/ old$/.test({panel}.querySelector('.age').textContent)")
 
         picture = make_picture(4, 4, PINK)
         camera.extra = [b"", b"no picture", picture[: len(picture) // 2], make_picture(5000, 4, PINK)]
