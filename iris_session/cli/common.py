@@ -77,6 +77,22 @@ def parse_seconds(text: str) -> float:
     return seconds
 
 
+def parse_cloud_rate(text: str) -> float:
+    """Parse `--record-clouds` [Hz]; 0 for `off`."""
+    from iris_session.session.config import MAX_CLOUDS_HZ, MIN_CLOUDS_HZ
+
+    number = text.lower().removesuffix("hz").strip()
+    try:
+        hz = 0.0 if number == "off" else float(number)
+    except ValueError:
+        hz = math.nan
+    if not (hz == 0.0 or MIN_CLOUDS_HZ <= hz <= MAX_CLOUDS_HZ):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a rate: give {MIN_CLOUDS_HZ:g} to {MAX_CLOUDS_HZ:g} a second, for example 2Hz, or off"
+        )
+    return hz
+
+
 def parse_port_base(text: str) -> int:
     """Parse `--port-base`."""
     if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= 65529:
@@ -192,6 +208,13 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--record", default=None, metavar="FILE", help="path of the recording (default: below sessions/)"
+    )
+    group.add_argument(
+        "--record-clouds",
+        type=parse_cloud_rate,
+        default=None,
+        metavar="RATE",
+        help="frames per second of each point cloud and picture in the recording, or off (default: 2Hz)",
     )
     group.add_argument(
         "--curve-clients", default="", metavar="DIR", help="public certificates to admit, instead of the allow-list"

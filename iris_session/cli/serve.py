@@ -125,6 +125,7 @@ def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConf
         control_port=control if base or arguments.control_port is None else arguments.control_port,
         state_port=state if base or arguments.state_port is None else arguments.state_port,
         record=False if arguments.no_record else arguments.record or True,
+        record_clouds_hz=defaults.record_clouds_hz if arguments.record_clouds is None else arguments.record_clouds,
         curve=arguments.curve,
         curve_key=arguments.curve_key,
         curve_clients=arguments.curve_clients,

@@ -27,6 +27,7 @@ from iris_session.front.downlink import Downlink
 from iris_session.front.intake import Intake
 from iris_session.front.key_budgets import HandshakeLimiter, IngestBackoff
 from iris_session.front.media.proxy import MediaProxy
+from iris_session.front.media.recorder import MediaRecorder
 from iris_session.front.media.service import MediaService
 from iris_session.front.memory_guard import MemoryGuard
 from iris_session.front.pairing import PairingService
@@ -275,7 +276,15 @@ def _make_media_proxy(context: FrontContext, sockets: FrontSockets) -> MediaProx
         sockets.ingest.socket,
         context.now_ns,
         encrypted=curve,
+        recorder=_make_media_recorder(context, sockets),
     )
+
+
+def _make_media_recorder(context: FrontContext, sockets: FrontSockets) -> MediaRecorder | None:
+    config = context.config
+    if not config.recorder_media_endpoint or not config.record_clouds_hz:
+        return None
+    return MediaRecorder(sockets.context, config.recorder_media_endpoint, config.record_clouds_hz)
 
 
 def _make_asset_server(context: FrontContext, sockets: FrontSockets) -> AssetServer:

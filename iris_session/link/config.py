@@ -129,6 +129,8 @@ class FrontConfig(msgspec.Struct, frozen=True):
         anchor_marks: Positions of marks by anchor id and id of the mark, in the anchor frame [m].
         forward_observations: Send raw observations to the authority too.
         recorder_endpoint: Endpoint of a PULL socket for raw samples, empty when nothing is recorded.
+        recorder_media_endpoint: Endpoint of a PULL socket for point clouds and pictures, empty for none.
+        record_clouds_hz: Frames per second of each stream that go there; 0: none.
         gateway_key: Public key (Z85) of the session's own gateway, which is admitted without the list; empty for none.
         camera_keys: Public keys (Z85) of the session's own camera processes, which are admitted without the list, as
             cameras only.
@@ -169,6 +171,8 @@ class FrontConfig(msgspec.Struct, frozen=True):
     anchor_errors: dict[str, float] = {}
     anchor_marks: dict[str, dict[Name, Vec3]] = {}
     camera_keys: tuple[str, ...] = ()
+    recorder_media_endpoint: str = ""
+    record_clouds_hz: float = 0.0
 
     @property
     def hosts(self) -> tuple[str, ...]:

@@ -29,7 +29,7 @@ from iris_session.recording.observations import (
     read_alignment_history,
 )
 from iris_session.recording.reader import Recording
-from iris_session.recording.record_batches import RawSample, RecordedState
+from iris_session.recording.record_batches import RawSample, RecordedCloud, RecordedPicture, RecordedState
 from iris_session.recording.supervise import RecorderProcess
 from iris_session.recording.verify import Core, Problem, VerifyReport, verify
 
@@ -54,6 +54,8 @@ __all__ = [
     "Recording",
     "RecordedState",
     "RawSample",
+    "RecordedCloud",
+    "RecordedPicture",
     "read_alignment_history",
     "AlignmentHistory",
     "RecordedObservation",

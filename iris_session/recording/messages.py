@@ -5,7 +5,8 @@ loaded last, if any, and the location of its assets; or `BATCH` with its own num
 authority: `RecorderStatus`. The feed keeps every batch until a status confirms that it is in the file; a new recorder
 process requests the header (`expecting` -1) and receives everything that is not confirmed.
 
-Vertices (`VertexFrame`, for the picture only) have a socket of their own, which drops frames when it is full.
+Vertices (`VertexFrame`, for the picture only) have a socket of their own, which drops frames when it is full. So have
+point clouds and pictures of cameras, which the front sends as `MediaHeader` and frame.
 """
 
 from __future__ import annotations
@@ -28,8 +29,9 @@ class RecorderConfig(msgspec.Struct, frozen=True):
     """Configuration of the recorder process.
 
     `path`: the recording; `part`: number of the file to write, which must not exist. Endpoints: `ipc://` sockets that
-    the recorder binds; without `vertices_endpoint` deformables are drawn at rest. `origin_ns`: session time zero on
-    CLOCK_MONOTONIC. `parent`: id of the parent process; the recorder ends after it, once the file is finished.
+    the recorder binds; without `vertices_endpoint` deformables are drawn at rest, without `media_endpoint` no point
+    clouds and pictures are recorded. `origin_ns`: session time zero on CLOCK_MONOTONIC. `parent`: id of the parent
+    process; the recorder ends after it, once the file is finished.
     """
 
     path: str
@@ -40,6 +42,7 @@ class RecorderConfig(msgspec.Struct, frozen=True):
     origin_ns: int
     parent: int
     vertices_endpoint: str = ""
+    media_endpoint: str = ""
 
 
 class EndMark(msgspec.Struct, frozen=True, array_like=True):
@@ -163,7 +166,8 @@ class RecorderStatus(msgspec.Struct, frozen=True, array_like=True):
     `vertices_refused`: number of vertex frames that are not in the picture, because the queue was full, they do not
     decode, or are of another scene. `fault`: one line if the file can no longer be written; the process then ends.
     `disk_free`: free bytes on its disk, at least 1; 0 if unknown. `samples_left_out`: raw messages that are not in the
-    file, because time and room of the disk were left to the journal.
+    file, because time and room of the disk were left to the journal. `media_refused`: frames of point clouds and
+    pictures that do not decode.
     """
 
     instance: int
@@ -178,6 +182,7 @@ class RecorderStatus(msgspec.Struct, frozen=True, array_like=True):
     disk_free: int = 0
     vertices_refused: int = 0
     samples_left_out: int = 0
+    media_refused: int = 0
 
 
 encode_batch = msgspec.msgpack.Encoder().encode

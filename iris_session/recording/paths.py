@@ -24,6 +24,9 @@ METRICS: Final = "/metrics"
 SCENE: Final = "/scene"
 PRESENCE: Final = "/presence"
 TRANSFORMS: Final = "/tf"
+#: Point clouds and pictures of cameras, an entity per stream.
+CLOUDS: Final = "/clouds"
+PICTURES: Final = "/pictures"
 
 _RESUME: Final = re.compile(r"(?P<stem>.*)\.resume(?P<number>[1-9][0-9]*)(?P<suffix>\.[^./]*)?", re.DOTALL)
 _PART: Final = re.compile(r"(?P<stem>.*)\.part(?P<part>[1-9][0-9]*)(?P<suffix>\.[^./]*)?", re.DOTALL)

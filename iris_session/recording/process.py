@@ -2,9 +2,9 @@
 
 Receives batches from the authority and raw samples from the front, and writes them into one Rerun file about seven
 times a second, so that killing any process loses at most 0.25 s. The journal comes first: raw samples are left out, and
-counted, while the disk is slow or nearly full, and vertices when time is short. Prints `ready` or `failed: <one line>`
-on standard output. Ends on SIGTERM, or when its parent process has ended, after writing everything that was received;
-SIGINT is left to the parent.
+counted, while the disk is slow or nearly full, and vertices and media when time is short. Prints `ready` or
+`failed: <one line>` on standard output. Ends on SIGTERM, or when its parent process has ended, after writing everything
+that was received; SIGINT is left to the parent.
 """
 
 from __future__ import annotations
@@ -54,6 +54,8 @@ DRAIN_MESSAGES: Final = 4096
 DRAIN_SAMPLES: Final = 64
 #: Maximum number of vertex frames per drain.
 DRAIN_VERTICES: Final = 32
+#: Maximum number of point clouds and pictures per drain, so sixty a second.
+DRAIN_MEDIA: Final = 2
 #: After SIGTERM or the end of the parent: without a message for this long, everything was received.
 QUIET_S: Final = 0.1
 FINISH_S: Final = 10.0
@@ -81,6 +83,7 @@ class RecorderLoop:
         self._front = self._bind(zmq.PULL, config.samples_endpoint, DRAIN_SAMPLES)
         vertices = config.vertices_endpoint
         self._vertices = self._bind(zmq.PULL, vertices, DRAIN_VERTICES) if vertices else None
+        self._media = self._bind(zmq.PULL, config.media_endpoint, DRAIN_MEDIA) if config.media_endpoint else None
         self._begin_part()
         if os.path.exists(config.path):  # the first file may have been moved away
             try:
@@ -215,7 +218,9 @@ class RecorderLoop:
             m += 1
             self._process_samples(data)
         if n < DRAIN_MESSAGES and m < DRAIN_SAMPLES and not self._is_short:
-            self._drain_vertices()  # else behind with more important data: vertices are dropped at their source
+            # Else behind with more important data: vertices and media are dropped at their source.
+            self._drain_vertices()
+            self._drain_media()
         return n + m
 
     @property
@@ -233,6 +238,15 @@ class RecorderLoop:
                 return
             except msgspec.DecodeError:
                 self._refused += 1
+
+    def _drain_media(self) -> None:
+        if self._media is None:
+            return
+        for _ in range(DRAIN_MEDIA):
+            try:
+                self._writer.add_media(self._media.recv_multipart(zmq.NOBLOCK))
+            except zmq.Again:
+                return
 
     def _process_message(self, frames: list[bytes]) -> None:
         """Process a header or a batch. Batches count in order only; those before the header are sent again after it."""
@@ -291,6 +305,7 @@ class RecorderLoop:
             self._disk_free,
             self._writer.vertices_refused,
             self._samples_left_out,
+            self._writer.media_refused,
         )
         with suppress(zmq.Again):
             self._feed.send(encode_status(status), zmq.NOBLOCK)

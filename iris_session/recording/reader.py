@@ -40,6 +40,8 @@ from iris_session.recording.probe import Prober
 from iris_session.recording.record_batches import (
     UNREADABLE,
     RawSample,
+    RecordedCloud,
+    RecordedPicture,
     RecordedState,
     count_joined_rows,
     group_spans,
@@ -48,6 +50,7 @@ from iris_session.recording.record_batches import (
 from iris_session.system.extras import require_package
 
 _T = TypeVar("_T")
+_Frame = TypeVar("_Frame", RecordedCloud, RecordedPicture)
 #: Maximum number of lines in `damage`: a file may be damaged in any number of places.
 MOST_DAMAGE: Final = 200
 MORE_DAMAGE: Final = "and more of it is damaged than is listed here"
@@ -242,6 +245,28 @@ class Recording:
     def samples(self) -> Iterator[RawSample]:
         """Yield the raw messages of clients, undecoded, in the order of receipt."""
         return (sample for _, sample in self._items(paths.SAMPLES, record_batches.decode_samples))
+
+    def clouds(self, stream: str = "") -> Iterator[RecordedCloud]:
+        """Yield the recorded frames of point clouds, exactly as they were sent.
+
+        Args:
+            stream: Name of a stream; empty: of all streams.
+
+        Returns:
+            Iterator over frames, those of one stream in the order of its `seq`, each once.
+
+        Raises:
+            NotARecordingError: A file can no longer be read.
+        """
+        return self._media(paths.CLOUDS, stream, record_batches.decode_clouds)
+
+    def pictures(self, stream: str = "") -> Iterator[RecordedPicture]:
+        """Yield the recorded pictures of cameras, as `clouds` does."""
+        return self._media(paths.PICTURES, stream, record_batches.decode_pictures)
+
+    def _media(self, folder: str, stream: str, decode: Callable[[Any], Iterator[_Frame]]) -> Iterator[_Frame]:
+        entity = f"{folder}/{stream or '**'}"
+        return self._unique(entity, decode, lambda frame: (frame.stream, frame.seq))
 
     def metrics(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
         """Return the plotted values by name.

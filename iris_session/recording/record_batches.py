@@ -55,6 +55,40 @@ class RecordedState(NamedTuple):
     bodies: tuple[BodyInfo, ...] = ()
 
 
+class RecordedCloud(NamedTuple):
+    """A frame of a point cloud.
+
+    Attributes:
+        stream: Name of the stream.
+        seq: Number of the frame in it; frames between two recorded ones are left out.
+        capture_ns: Session time of the capture, as its source states it.
+        received_ns: Session time at which the session received it.
+        positions: (n, 3) float32 [m], world frame.
+        colors: (n, 4) uint8, red, green, blue, and 255.
+        error_m: Where a point is stated to be within, 95 % of the time [m]; infinite where that is not known.
+        voxel_m: Edge of the cell that a point stands for [m]; 0 where it stands for itself.
+    """
+
+    stream: str
+    seq: int
+    capture_ns: int
+    received_ns: int
+    positions: NDArray[np.float32]
+    colors: NDArray[np.uint8]
+    error_m: float
+    voxel_m: float
+
+
+class RecordedPicture(NamedTuple):
+    """A picture of a camera. `jpeg`: the file as its source made it. The others are as in `RecordedCloud`."""
+
+    stream: str
+    seq: int
+    capture_ns: int
+    received_ns: int
+    jpeg: bytes
+
+
 class Scalar(NamedTuple):
     """A value of a plot. `session_time`: [ns]."""
 
@@ -121,6 +155,24 @@ def decode_scalars(batch: Any) -> Iterator[Scalar]:
     return (Scalar(get_entity(batch), *row) for row in zip(*columns, strict=True))
 
 
+def decode_clouds(batch: Any) -> Iterator[RecordedCloud]:
+    """Yield the frames of one stream."""
+    columns = (
+        *_read_times(batch),
+        (_read_points(row) for row in batch.column("Points3D:positions")),
+        (_read_colors(row) for row in batch.column("Points3D:colors")),
+        read_values(batch, "error_m"),
+        read_values(batch, "voxel_m"),
+    )
+    return (RecordedCloud(_read_stream(batch), *row) for row in zip(*columns, strict=True))
+
+
+def decode_pictures(batch: Any) -> Iterator[RecordedPicture]:
+    """Yield the pictures of one stream."""
+    blobs = (bytes(memoryview(np.asarray(row.values.flatten()))) for row in batch.column("EncodedImage:blob"))
+    return (RecordedPicture(_read_stream(batch), *row) for row in zip(*_read_times(batch), blobs, strict=True))
+
+
 def numbered_denial_decoder() -> Callable[[Any], Iterator[tuple[int, DenialRecord]]]:
     """Return a decoder of denials for batches in order, which numbers those of one step: two may be equal.
 
@@ -163,6 +215,23 @@ def read_values(batch: Any, column: str) -> list[Any]:
 def read_index(batch: Any, timeline: str) -> list[int]:
     """Return integer values of a timeline (durations in nanoseconds)."""
     return [int(v) for v in np.asarray(batch.column(timeline).cast("int64"))]
+
+
+def _read_stream(batch: Any) -> str:
+    return get_entity(batch).rpartition("/")[2]
+
+
+def _read_times(batch: Any) -> list[list[int]]:
+    return [read_values(batch, name) for name in ("seq", "capture_ns", "received_ns")]
+
+
+def _read_points(row: Any) -> NDArray[np.float32]:
+    return np.asarray(row.values.flatten(), np.float32).reshape(-1, 3)
+
+
+def _read_colors(row: Any) -> NDArray[np.uint8]:
+    """Return red, green, blue and alpha, which Rerun has in one number, red in its highest byte."""
+    return np.asarray(row.values, ">u4").view(np.uint8).reshape(-1, 4)
 
 
 def _read_plants(batch: Any) -> list[bytes]:

@@ -40,6 +40,7 @@ class RecorderProcess:
         self.feed_endpoint = f"ipc://{self._folder}/feed"
         self.samples_endpoint = f"ipc://{self._folder}/samples"
         self.vertices_endpoint = f"ipc://{self._folder}/vertices"
+        self.media_endpoint = f"ipc://{self._folder}/media"
         self._log = Path(self._folder) / "recorder.log"
         self._recording_id = uuid.uuid4().hex
         self._process: ChildProcess | None = None
@@ -131,6 +132,7 @@ class RecorderProcess:
             self._origin_ns,
             os.getpid(),
             self.vertices_endpoint,
+            self.media_endpoint,
         )
         # RERUN=off in a user's shell would silence the stream. Nothing is drawn here: MuJoCo need not load OpenGL.
         environment = {"RERUN": "on", "RUST_LOG": "error", "MUJOCO_GL": "disable"}

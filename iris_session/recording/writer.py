@@ -25,6 +25,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from iris_session.protocol.common import Applied
+from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.names import Device
 from iris_session.protocol.server_messages import (
     BodyInfo,
@@ -41,6 +42,7 @@ from iris_session.protocol.server_messages import (
 from iris_session.recording import paths, scene_geometry
 from iris_session.recording.errors import WriteError
 from iris_session.recording.journal import SessionHeader, seal_blob
+from iris_session.recording.media import MediaDrawer
 from iris_session.recording.messages import (
     Batch,
     DenialRecord,
@@ -71,8 +73,9 @@ _encode = msgspec.msgpack.Encoder().encode
 class RrdWriter:
     """Writer of one file.
 
-    `add`, `add_sample` and `add_vertices` only collect; `flush` writes and returns when the operating system has the
-    bytes. `vertices_refused`: number of vertex frames that are not in the picture.
+    `add`, `add_sample`, `add_vertices` and `add_media` only collect; `flush` writes and returns when the operating
+    system has the bytes. `vertices_refused`: number of vertex frames that are not in the picture. `media_refused`:
+    number of frames of point clouds and pictures that do not decode.
     """
 
     def __init__(self, path: str | Path, recording_id: str) -> None:
@@ -85,6 +88,9 @@ class RrdWriter:
         self._samples: list[tuple[int, int, bytes]] = []
         self._vertices: deque[VertexFrame] = deque()
         self.vertices_refused = 0
+        self._media: list[Sequence[bytes]] = []
+        self._drawer = MediaDrawer(self._rec)
+        self.media_refused = 0
         self._known: deque[Moment] = deque(maxlen=KNOWN_MOMENTS)  # of the newest states
         self._last_step = -2  # newest step with a state of the previous scene; the initial state has step -1
         self._bodies: tuple[BodyInfo, ...] = ()
@@ -137,6 +143,10 @@ class RrdWriter:
             self.vertices_refused += 1
         self._vertices.append(frame)
 
+    def add_media(self, message: Sequence[bytes]) -> None:
+        """Collect a frame of a camera: its encoded `MediaHeader`, and the frame."""
+        self._media.append(message)
+
     def flush(self, timeout_s: float = 10.0) -> None:
         """Write everything collected. Raises `WriteError`; the file is then valid up to an earlier flush."""
         batch, self._pending = self._pending, Batch()
@@ -151,6 +161,7 @@ class RrdWriter:
             self._write_metrics(batch.metrics)
             self._write_samples(samples)
             self._write_vertices()
+            self._write_media()
             self._stream.write(timeout_s)
             if batch.keyframes:
                 self._write_mark()
@@ -282,6 +293,18 @@ class RrdWriter:
                 bending.entity, _time_columns(moments), [*bending.build_columns([row for _, row in taken])]
             )
 
+    def _write_media(self) -> None:
+        """Draw clouds and pictures; a stream of pictures that is new gets a view."""
+        messages, self._media = self._media, []
+        views = len(self._drawer.pictures)
+        for message in messages:
+            try:
+                self._drawer.draw(message)
+            except (StreamError, ProtocolError):
+                self.media_refused += 1
+        if len(self._drawer.pictures) > views:
+            self._rec.send_blueprint(_build_blueprint(self._drawer.pictures))
+
     def _note_latencies(self, states: list[StateFrame]) -> None:
         """Record latencies for the plots, written once a second: from the capture of a sample to its step, per
         robot."""
@@ -406,12 +429,15 @@ def _presence_frame(participant: str, device: str) -> str:
     return f"presence/{participant}/{device}"
 
 
-def _build_blueprint() -> Any:
-    view = rrb.Spatial3DView(origin="/", name="scene", contents=["+ /**", "- /journal/**", "- /samples"])
+def _build_blueprint(pictures: Sequence[str] = ()) -> Any:
+    """Return the arrangement of views. `pictures`: streams of pictures, each with a view of its own."""
+    contents = ["+ /**", "- /journal/**", "- /samples", f"- {paths.PICTURES}/**"]
+    view = rrb.Spatial3DView(origin="/", name="scene", contents=contents)
     log = rrb.TextLogView(origin="/", name="events", contents=[f"+ {paths.EVENTS}", f"+ {paths.DENIALS}"])
     plots = rrb.TimeSeriesView(origin=paths.METRICS, name="metrics")
     about = rrb.TextDocumentView(origin=paths.INFO, name="session")
-    side = rrb.Vertical(log, plots, about)
+    images = [rrb.Spatial2DView(origin=f"{paths.PICTURES}/{name}", name=name) for name in pictures]
+    side = rrb.Vertical(*([rrb.Grid(*images)] if images else ()), log, plots, about)
     return rrb.Blueprint(rrb.Horizontal(view, side, column_shares=[2, 1]), collapse_panels=True)
 
 

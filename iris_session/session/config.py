@@ -33,6 +33,9 @@ from iris_session.session.errors import ConfigError, short_repr
 DEFAULT_ANCHORS: Final[Mapping[str, PoseTuple]] = MappingProxyType({"table": ((0.0, -0.45, 0.0), IDENTITY_QUAT)})
 #: Edge of the code printed on it [m].
 DEFAULT_SHEET_M: Final = 0.16
+#: Rates at which point clouds and pictures can be recorded.
+MIN_CLOUDS_HZ: Final = 0.01
+MAX_CLOUDS_HZ: Final = 60.0
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,8 @@ class SessionConfig:
         state_hz: Rate of the published state, 1 to 240 [Hz].
         record: True writes `sessions/<UTC stamp>-<name>/session.rrd` below the current folder, a path writes there,
             False records nothing.
+        record_clouds_hz: Frames per second of each point cloud and picture that go into the recording, 0 to 60 [Hz];
+            0: none.
         anchors: `T_world_anchor` by anchor id, as `((x, y, z), (w, x, y, z))` [m].
         anchor_sizes: Edge of the printed sheets [m] that are to be checked for a misprint. The default sheet has 0.16.
         anchor_errors: Stated p95 of the position error of anchors [m], which clients show.
@@ -88,6 +93,7 @@ class SessionConfig:
     state_port: int = 7722
     state_hz: float = 60.0
     record: bool | str | Path = True
+    record_clouds_hz: float = 2.0
     anchors: Mapping[str, PoseTuple] = field(default_factory=lambda: DEFAULT_ANCHORS)
     anchor_sizes: Mapping[str, float] = field(default_factory=dict)
     anchor_errors: Mapping[str, float] = field(default_factory=dict)
@@ -132,6 +138,11 @@ class SessionConfig:
             raise ConfigError(f"state_hz {self.state_hz} is out of range: 1 to 240")
         if not 0.5 <= self.keyframe_s <= 60.0:
             raise ConfigError(f"keyframe_s {self.keyframe_s} is out of range: 0.5 to 60")
+        if not (self.record_clouds_hz == 0.0 or MIN_CLOUDS_HZ <= self.record_clouds_hz <= MAX_CLOUDS_HZ):
+            raise ConfigError(
+                f"record_clouds_hz {self.record_clouds_hz} is out of range: {MIN_CLOUDS_HZ:g} to {MAX_CLOUDS_HZ:g}, "
+                "or 0 to record no clouds and pictures"
+            )
 
     def anchor_poses(self) -> dict[str, Pose]:
         """Return `T_world_anchor` of each anchor."""

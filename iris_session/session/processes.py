@@ -236,6 +236,8 @@ class SessionProcesses:
             anchor_errors={name: float(error_m) for name, error_m in config.anchor_errors.items()},
             anchor_marks=config.mark_positions(),
             recorder_endpoint="" if self.recorder is None else self.recorder.samples_endpoint,
+            recorder_media_endpoint="" if self.recorder is None else self.recorder.media_endpoint,
+            record_clouds_hz=config.record_clouds_hz,
         )
 
     @property
@@ -378,6 +380,7 @@ class SessionProcesses:
             refused = 0 if last is None else last.vertices_refused
             drops["recorded_vertices"] = self.feed.stats.dropped_vertices + refused
             drops["recorded_samples"] = 0 if last is None else last.samples_left_out
+            drops["recorded_media"] = 0 if last is None else last.media_refused
         if self.web is not None:
             drops |= self.web.drops
         if self.cameras is not None:
@@ -451,4 +454,5 @@ def make_settings(config: SessionConfig) -> Settings:
         config.adapt_media,
         anchor_sizes=config.sheet_sizes(),
         anchor_marks=config.mark_positions(),
+        record_clouds_hz=config.record_clouds_hz,
     )

@@ -16,6 +16,8 @@ from typing import Any, Final
 import zmq
 
 from iris_session.front.channel_guard import MAX_COUNTED_MESSAGES, ChannelFlood, ChannelGuard
+from iris_session.front.channel_guard import ChannelFlood, ChannelGuard
+from iris_session.front.media.recorder import MediaRecorder
 from iris_session.front.media.scheduler import MediaScheduler
 from iris_session.front.memory_guard import PendingConnection
 from iris_session.protocol.codec import decode_media_push
@@ -59,6 +61,7 @@ class MediaProxy:
         remote: Socket for frames of other machines.
         now_ns: Returns session time.
         encrypted: Whether subscribers and remote sources have keys.
+        recorder: Sends clouds and pictures to the recorder, `None` when they are not recorded.
     """
 
     def __init__(
@@ -71,6 +74,7 @@ class MediaProxy:
         now_ns: Callable[[], int],
         *,
         encrypted: bool,
+        recorder: MediaRecorder | None = None,
     ) -> None:
         self._out = out
         self._subscriber_guard = subscriber_guard
@@ -79,6 +83,7 @@ class MediaProxy:
         self._remote = remote
         self._now_ns = now_ns
         self._encrypted = encrypted
+        self._recorder = recorder
         self._stopping = False
         self._order_lost = False
         self._reported_fault = ""
@@ -119,6 +124,8 @@ class MediaProxy:
         for one in (self._out, self._local, self._remote):
             if one is not None:
                 one.close(linger=0)
+        if self._recorder is not None:
+            self._recorder.close()
 
     def _run(self) -> None:
         while not self._stopping:
@@ -156,6 +163,8 @@ class MediaProxy:
                 closed += [self._subscriber_guard.evict(fd, "media_memory") for fd in self.scheduler.pop_stuck()]
                 self._count_reasons(closed)
                 waits = self.scheduler.flush(self._send, self._now_ns())
+                if self._recorder is not None:
+                    self._recorder.tick(self.scheduler, self._now_ns())
 
     def _read_connection_events(self) -> None:
         now_ns = self._now_ns()

@@ -8,7 +8,7 @@ subscriber waits for another.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import msgspec
@@ -89,6 +89,16 @@ class StreamStats(NamedTuple):
         """Return whether the newest frame is too old for the rate that the source means to hold."""
         hz = self.info.hz
         return hz > 0.0 and now_ns - self.received_ns > max(STALE_NS, STALE_FRAMES / hz * SECOND)
+
+
+class NewestFrame(NamedTuple):
+    """The newest frame of a stream, class `full`. `received_ns`: when it came."""
+
+    stream: str
+    seq: int
+    push: MediaPush
+    frame: Any
+    received_ns: int
 
 
 class _Subscription:
@@ -290,6 +300,14 @@ class MediaScheduler:
             source, encoding, received_ns, info = stream.source, stream.encoding, stream.received_ns, stream.info
             found[name] = StreamStats(rates, hz, source, subscribers, encoding, received_ns, info)
         return found
+
+    def list_newest(self, encodings: Container[str]) -> list[NewestFrame]:
+        """Return the newest frame of every stream that has one in one of `encodings`."""
+        return [
+            NewestFrame(name, stream.seq, stream.push, stream.frames[0], stream.received_ns)
+            for name, stream in self._streams.items()
+            if stream.push is not None and stream.push.encoding in encodings
+        ]
 
     def release_frames(self, until_ns: int) -> bool:
         """Release every frame, and drop frames until then. Return whether there were any."""

@@ -1,0 +1,182 @@
+"""Point clouds and pictures in the file: read back exactly, drawn at their capture, refused if they do not decode."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zmq
+
+from iris_session.protocol.codec import encode_media_header
+from iris_session.protocol.media import MAX_STREAMS, MediaHeader
+from iris_session.recording import RecordedPicture, Recording
+from iris_session.recording import process as process_module
+from iris_session.recording.journal import SessionHeader
+from iris_session.recording.messages import RecorderConfig
+from iris_session.recording.writer import RrdWriter
+from iris_session.streams.cloud import decode_cloud, encode_cloud
+from tests.recording.support import column, read
+
+JPEG = b"\xff\xd8\xff\xe0 a picture"
+
+
+def make_frame(n: int, seed: int = 0, **stated: float) -> bytes:
+    random = np.random.default_rng(seed)
+    return encode_cloud(random.uniform(-2.0, 2.0, (n, 3)), random.integers(0, 256, (n, 3), np.uint8), **stated)["full"]
+
+
+def message(stream: str, frame: bytes, seq: int = 1, capture_ns: int = 100, encoding: str = "cloud") -> list[bytes]:
+    header = MediaHeader(stream, "full", 1, seq, capture_ns, 700, encoding, received_ns=500)
+    return [encode_media_header(header), frame]
+
+
+@pytest.fixture
+def writer(tmp_path: Path) -> RrdWriter:
+    writer = RrdWriter(tmp_path / "session.rrd", "id")
+    writer.write_header(SessionHeader("s", "n", "closed", 2_000_000))
+    return writer
+
+
+def test_clouds_are_read_back_exactly(writer: RrdWriter) -> None:
+    frames = [make_frame(n, n, voxel_m=0.02, error_m=0.01) for n in (1000, 0, 10)]
+    for seq, frame in enumerate(frames):
+        writer.add_media(message("room-1.a", frame, seq, 100 + seq))
+    writer.add_media(message("other", make_frame(3)))
+    writer.close()
+    assert writer.media_refused == 0
+    with Recording.open(writer.path) as recording:
+        found = list(recording.clouds("room-1.a"))
+        assert [(one.seq, one.capture_ns, one.received_ns) for one in found] == [
+            (0, 100, 500),
+            (1, 101, 500),
+            (2, 102, 500),
+        ]
+        for one, frame in zip(found, frames, strict=True):
+            sent = decode_cloud(frame)
+            assert one.positions.dtype == np.float32
+            assert np.array_equal(one.positions, sent.positions)
+            assert np.array_equal(one.colors, sent.colors)
+            assert (one.error_m, one.voxel_m) == (sent.error_m, sent.voxel_m)
+        (other,) = recording.clouds("other")
+        assert (other.error_m, other.voxel_m) == (np.inf, 0.0)
+        assert [one.stream for one in recording.clouds()].count("room-1.a") == 3
+        assert list(recording.clouds("room")) == []
+
+
+def test_pictures_are_read_back_exactly(writer: RrdWriter) -> None:
+    for seq in (1, 2):
+        writer.add_media(message("room-front", JPEG + bytes([seq]), seq, 10 * seq, "jpeg"))
+    writer.close()
+    with Recording.open(writer.path) as recording:
+        assert list(recording.pictures("room-front")) == [
+            RecordedPicture("room-front", 1, 10, 500, JPEG + b"\x01"),
+            RecordedPicture("room-front", 2, 20, 500, JPEG + b"\x02"),
+        ]
+
+
+def test_frames_are_drawn_at_their_capture_within_the_session(writer: RrdWriter) -> None:
+    writer.add_media(message("room", make_frame(4, voxel_m=0.02), 1, 100))
+    writer.add_media(message("room", make_frame(4), 2, 2**63 - 1))  # of the future, says its source
+    writer.add_media(message("room", make_frame(4), 3, -(2**63)))
+    writer.close()
+    rows = read(Path(writer.path))["/clouds/room"]
+    times = [value.value for batch in rows for value in batch.column("session_time")]
+    assert times == [100, 500, 0]
+    assert all("sim_time" not in batch.schema.names for batch in rows)
+    assert column(rows, "Points3D:radii")[0] == pytest.approx([0.01])
+    assert column(rows, "Points3D:radii")[1][0] < 0.0, "pixels"
+    with Recording.open(writer.path) as recording:
+        assert [one.capture_ns for one in recording.clouds()] == [100, 2**63 - 1, -(2**63)]
+
+
+def test_frames_that_do_not_decode_are_counted(writer: RrdWriter) -> None:
+    good = make_frame(10)
+    refused = [
+        message("room", good[:-1]),
+        message("room", b""),
+        message("room", good, encoding="bytes"),
+        message("room", b"GIF89a", encoding="jpeg"),
+        message("../room", good),
+        [b"\xc1", good],
+        [good],
+    ]
+    for bad in refused:
+        writer.add_media(bad)
+    writer.add_media(message("room", good))
+    writer.close()
+    assert writer.media_refused == len(refused)
+    with Recording.open(writer.path) as recording:
+        assert len(list(recording.clouds())) == 1
+        assert list(recording.pictures()) == []
+
+
+def test_views_of_pictures_are_bounded(writer: RrdWriter) -> None:
+    """Their number, and so the blueprints, of which each has 20 KB."""
+    for i in range(MAX_STREAMS + 5):
+        writer.add_media(message(f"s{i}", JPEG, encoding="jpeg"))
+        writer.flush()
+    writer.close()
+    assert len(writer._drawer.pictures) == MAX_STREAMS
+    with Recording.open(writer.path) as recording:
+        assert len(list(recording.pictures())) == MAX_STREAMS + 5
+
+
+def test_what_a_new_part_repeats_counts_once(tmp_path: Path) -> None:
+    for part, seqs in (("session.rrd", (1, 2)), ("session.part2.rrd", (2, 3))):
+        writer = RrdWriter(tmp_path / part, "id")
+        writer.write_header(SessionHeader("s", "n", "closed", 2_000_000))
+        for seq in seqs:
+            writer.add_media(message("room", make_frame(5), seq))
+        writer.close()
+    with Recording.open(tmp_path / "session.rrd") as recording:
+        assert [one.seq for one in recording.clouds("room")] == [1, 2, 3]
+
+
+def test_an_indexed_copy_reads_the_same(writer: RrdWriter, tmp_path: Path) -> None:
+    for seq in range(5):
+        writer.add_media(message("room", make_frame(2000, seq), seq, 100 + seq))
+        writer.add_media(message("room-front", JPEG + bytes([seq]), seq, 100 + seq, "jpeg"))
+        writer.flush()
+    writer.close()
+    rerun = Path(sys.executable).parent / "rerun"
+    command = [rerun, "rrd", "optimize", "session.rrd", "-o", "indexed.rrd"]
+    subprocess.run(command, cwd=tmp_path, capture_output=True, check=True, timeout=60)
+    with Recording.open(writer.path) as original, Recording.open(tmp_path / "indexed.rrd") as copy:
+        for one, other in zip(original.clouds(), copy.clouds(), strict=True):
+            assert np.array_equal(one.positions, other.positions)
+            assert one._replace(positions=None, colors=None) == other._replace(positions=None, colors=None)  # type: ignore[arg-type]
+        assert list(original.pictures()) == list(copy.pictures())
+
+
+def test_the_recorder_reads_media_only_while_nothing_more_important_waits(tmp_path: Path) -> None:
+    endpoint = f"ipc://{tmp_path}/m"
+    config = RecorderConfig(
+        str(tmp_path / "session.rrd"),
+        1,
+        "r",
+        f"ipc://{tmp_path}/f",
+        f"ipc://{tmp_path}/s",
+        0,
+        os.getpid(),
+        "",
+        endpoint,
+    )
+    loop = process_module.RecorderLoop(config)
+    assert loop._media is not None
+    with zmq.Context() as context, context.socket(zmq.PUSH) as front:
+        front.connect(endpoint)
+        front.send_multipart(message("room", make_frame(5)))
+        assert loop._media.poll(20_000)
+        loop._flush_s = 2 * process_module.SLOW_FLUSH_S
+        loop._drain()
+        assert loop._writer._media == []
+        loop._flush_s = 0.0
+        loop._drain()
+        assert len(loop._writer._media) == 1
+    loop._syncer.stop()
+    loop._writer.close()
+    loop._context.destroy(linger=0)
