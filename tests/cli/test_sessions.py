@@ -88,3 +88,12 @@ def test_emulate_reports_invalid_addresses(capsys: pytest.CaptureFixture[str]) -
     ):
         assert main(["emulate", *words]) == 2
         assert text in capsys.readouterr().err
+
+
+def test_rate_of_recorded_clouds() -> None:
+    for text, hz in (("2Hz", 2.0), ("0.5", 0.5), ("10 hz", 10.0), ("off", 0.0), ("0", 0.0)):
+        assert make_session_config(options("--record-clouds", text), "x").record_clouds_hz == hz
+    assert make_session_config(options(), "x").record_clouds_hz == 2.0
+    for text in ("fast", "-1", "61", "nan", "Hz"):
+        with pytest.raises(SystemExit):
+            options("--record-clouds", text)

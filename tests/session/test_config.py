@@ -29,6 +29,9 @@ from iris_session.protocol.specs import RobotSpec
         ({"state_hz": 0.5}, "1 to 240"),
         ({"state_hz": float("nan")}, "1 to 240"),
         ({"keyframe_s": 0.0}, "0.5 to 60"),
+        ({"record_clouds_hz": 61.0}, "record_clouds_hz 61.0 is out of range: 0.01 to 60, or 0"),
+        ({"record_clouds_hz": -1.0}, "record_clouds_hz -1.0"),
+        ({"record_clouds_hz": float("nan")}, "record_clouds_hz nan"),
     ],
 )
 def test_values_out_of_range(settings: dict[str, Any], expected: str) -> None:
