@@ -169,7 +169,7 @@ def decode_clouds(batch: Any) -> Iterator[RecordedCloud]:
 
 def decode_pictures(batch: Any) -> Iterator[RecordedPicture]:
     """Yield the pictures of one stream."""
-    blobs = (bytes(memoryview(np.asarray(row.values.flatten()))) for row in batch.column("EncodedImage:blob"))
+    blobs = (np.asarray(row.values.flatten(), np.uint8).tobytes() for row in batch.column("EncodedImage:blob"))
     return (RecordedPicture(_read_stream(batch), *row) for row in zip(*_read_times(batch), blobs, strict=True))
 
 

@@ -16,7 +16,6 @@ from typing import Any, Final
 import zmq
 
 from iris_session.front.channel_guard import MAX_COUNTED_MESSAGES, ChannelFlood, ChannelGuard
-from iris_session.front.channel_guard import ChannelFlood, ChannelGuard
 from iris_session.front.media.recorder import MediaRecorder
 from iris_session.front.media.scheduler import MediaScheduler
 from iris_session.front.memory_guard import PendingConnection

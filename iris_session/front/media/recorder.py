@@ -114,7 +114,7 @@ class MediaRecorder:
 
     def _send(self, one: NewestFrame, now_ns: int) -> str:
         """Send a frame. Return the drop reason if there is no room for it, else an empty string."""
-        if not self._connected or not self._socket.getsockopt(zmq.EVENTS) & zmq.POLLOUT:
+        if not self._connected or not int(self._socket.get(zmq.EVENTS)) & zmq.POLLOUT:
             return NOT_READ
         push = one.push
         if not self._bucket.take(now_ns, FILE_SHARE[push.encoding] * len(one.frame)):
