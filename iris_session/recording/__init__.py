@@ -29,7 +29,7 @@ from iris_session.recording.observations import (
     read_alignment_history,
 )
 from iris_session.recording.reader import Recording
-from iris_session.recording.record_batches import RawSample, RecordedCloud, RecordedPicture, RecordedState
+from iris_session.recording.record_batches import RawSample, RecordedCloud, RecordedImage, RecordedState
 from iris_session.recording.supervise import RecorderProcess
 from iris_session.recording.verify import Core, Problem, VerifyReport, verify
 
@@ -55,7 +55,7 @@ __all__ = [
     "RecordedState",
     "RawSample",
     "RecordedCloud",
-    "RecordedPicture",
+    "RecordedImage",
     "read_alignment_history",
     "AlignmentHistory",
     "RecordedObservation",

@@ -15,15 +15,15 @@ import pyarrow as pa  # type: ignore[import-untyped]
 import rerun as rr
 
 from iris_session.protocol.codec import decode_media_header
-from iris_session.protocol.media import MAX_STREAMS, MediaHeader, is_stream_name
-from iris_session.protocol.names import MediaEncoding
+from iris_session.protocol.media import MAX_IMAGE_SIZE, MAX_STREAMS, MediaHeader, is_stream_name
+from iris_session.protocol.names import AssetEncoding, MediaEncoding
 from iris_session.recording import paths
 from iris_session.recording.scene_geometry import WORLD
+from iris_session.scene import AssetDecodeError
+from iris_session.scene.images import read_stated_size
 from iris_session.streams.cloud import CloudFrame, decode_cloud
 from iris_session.streams.errors import StreamError
 
-#: What a JPEG file begins with: start of image, and the first byte of the marker after it.
-_JPEG_HEAD: Final = b"\xff\xd8\xff"
 #: Size of a point that stands for itself, in the viewer [px].
 _POINT_PX: Final = 1.5
 
@@ -62,8 +62,7 @@ class MediaDrawer:
         )
 
     def _draw_picture(self, header: MediaHeader, frame: bytes) -> None:
-        if not frame.startswith(_JPEG_HEAD):
-            raise StreamError(f"an image that begins with {frame[:3].hex()} is no JPEG file: ffd8ff is expected")
+        _check_size(frame)
         if header.stream not in self.pictures and len(self.pictures) < MAX_STREAMS:
             self.pictures.append(header.stream)
         self._log(paths.PICTURES, header, rr.EncodedImage(contents=frame, media_type="image/jpeg"))
@@ -75,3 +74,13 @@ class MediaDrawer:
         self._rec.set_time(paths.SESSION_TIME, duration=np.timedelta64(at_ns, "ns"))
         self._rec.log(f"{folder}/{header.stream}", *components, rr.AnyValues(**times), strict=True)
         self._rec.reset_time()
+
+
+def _check_size(frame: bytes) -> None:
+    """Check that a JPEG file states a size that a viewer can allocate. Raises `StreamError`."""
+    try:
+        size = read_stated_size(frame, AssetEncoding.JPEG)
+    except AssetDecodeError as error:
+        raise StreamError(str(error)) from None
+    if not 1 <= min(size) <= max(size) <= MAX_IMAGE_SIZE:
+        raise StreamError(f"an image of {size[0]} x {size[1]}: 1 to {MAX_IMAGE_SIZE} pixels are expected")

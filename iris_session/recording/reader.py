@@ -41,7 +41,7 @@ from iris_session.recording.record_batches import (
     UNREADABLE,
     RawSample,
     RecordedCloud,
-    RecordedPicture,
+    RecordedImage,
     RecordedState,
     count_joined_rows,
     group_spans,
@@ -50,7 +50,7 @@ from iris_session.recording.record_batches import (
 from iris_session.system.extras import require_package
 
 _T = TypeVar("_T")
-_Frame = TypeVar("_Frame", RecordedCloud, RecordedPicture)
+_Frame = TypeVar("_Frame", RecordedCloud, RecordedImage)
 #: Maximum number of lines in `damage`: a file may be damaged in any number of places.
 MOST_DAMAGE: Final = 200
 MORE_DAMAGE: Final = "and more of it is damaged than is listed here"
@@ -260,7 +260,7 @@ class Recording:
         """
         return self._media(paths.CLOUDS, stream, record_batches.decode_clouds)
 
-    def pictures(self, stream: str = "") -> Iterator[RecordedPicture]:
+    def pictures(self, stream: str = "") -> Iterator[RecordedImage]:
         """Yield the recorded pictures of cameras, as `clouds` does."""
         return self._media(paths.PICTURES, stream, record_batches.decode_pictures)
 

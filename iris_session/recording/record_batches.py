@@ -79,7 +79,7 @@ class RecordedCloud(NamedTuple):
     voxel_m: float
 
 
-class RecordedPicture(NamedTuple):
+class RecordedImage(NamedTuple):
     """A picture of a camera. `jpeg`: the file as its source made it. The others are as in `RecordedCloud`."""
 
     stream: str
@@ -167,10 +167,10 @@ def decode_clouds(batch: Any) -> Iterator[RecordedCloud]:
     return (RecordedCloud(_read_stream(batch), *row) for row in zip(*columns, strict=True))
 
 
-def decode_pictures(batch: Any) -> Iterator[RecordedPicture]:
+def decode_pictures(batch: Any) -> Iterator[RecordedImage]:
     """Yield the pictures of one stream."""
     blobs = (np.asarray(row.values.flatten(), np.uint8).tobytes() for row in batch.column("EncodedImage:blob"))
-    return (RecordedPicture(_read_stream(batch), *row) for row in zip(*_read_times(batch), blobs, strict=True))
+    return (RecordedImage(_read_stream(batch), *row) for row in zip(*_read_times(batch), blobs, strict=True))
 
 
 def numbered_denial_decoder() -> Callable[[Any], Iterator[tuple[int, DenialRecord]]]:

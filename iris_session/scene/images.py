@@ -70,7 +70,7 @@ def decode_image(data: bytes | bytearray | memoryview, encoding: str, max_bytes:
         return require_array(arrays, ArrayName.PIXELS, "u1", (None, None, None))
     if encoding not in (AssetEncoding.PNG, AssetEncoding.JPEG):
         raise AssetDecodeError(f"unknown encoding {encoding!r} of an image: arrays, png or jpeg")
-    width, height = _read_stated_size(bytes(data[:65_536]), encoding)
+    width, height = read_stated_size(bytes(data[:65_536]), encoding)
     if width * height * 4 > max_bytes:
         raise AssetDecodeError(f"an image of {width} x {height} pixels, at most {max_bytes} bytes are read")
     cv2 = _import_opencv()
@@ -113,7 +113,7 @@ def _choose_filter(pixels: Pixels) -> str:
     return min(sizes, key=lambda kind: sizes[kind])
 
 
-def _read_stated_size(head: bytes, encoding: str) -> tuple[int, int]:
+def read_stated_size(head: bytes, encoding: str) -> tuple[int, int]:
     """Return width and height in the header of the file, before anything is decoded."""
     if encoding == AssetEncoding.PNG:
         if head[:8] != _PNG or len(head) < 24:

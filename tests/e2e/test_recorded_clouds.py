@@ -20,7 +20,7 @@ def test_clouds_and_pictures_of_a_source_are_recorded(serve: Callable[..., Sessi
     server = serve("handover", "--record-clouds", "10Hz")
     positions = np.random.default_rng(0).uniform(-1.0, 1.0, (5000, 3))
     frames = encode_cloud(positions, np.full((5000, 3), 200, np.uint8), voxel_m=0.02, error_m=0.01)
-    picture = b"\xff\xd8\xff\xe0 a picture"
+    picture = b"\xff\xd8\xff\xc0\x00\x11\x08\x00\x02\x00\x03 of 3 x 2 pixels"
     with Client(server.address, role="source", name="camera") as source:
         publish(source, "room", frames, 1_000_000_007, "cloud")
         publish(source, "room-front", picture, 1_000_000_009, "jpeg")

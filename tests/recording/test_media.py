@@ -13,7 +13,7 @@ import zmq
 
 from iris_session.protocol.codec import encode_media_header
 from iris_session.protocol.media import MAX_STREAMS, MediaHeader
-from iris_session.recording import RecordedPicture, Recording
+from iris_session.recording import RecordedImage, Recording
 from iris_session.recording import process as process_module
 from iris_session.recording.journal import SessionHeader
 from iris_session.recording.messages import RecorderConfig
@@ -21,7 +21,8 @@ from iris_session.recording.writer import RrdWriter
 from iris_session.streams.cloud import decode_cloud, encode_cloud
 from tests.recording.support import column, read
 
-JPEG = b"\xff\xd8\xff\xe0 a picture"
+#: Start of image, and a start of frame of 2 x 3 pixels.
+JPEG = b"\xff\xd8\xff\xc0\x00\x11\x08\x00\x02\x00\x03 and the rest"
 
 
 def make_frame(n: int, seed: int = 0, **stated: float) -> bytes:
@@ -73,8 +74,8 @@ def test_pictures_are_read_back_exactly(writer: RrdWriter) -> None:
     writer.close()
     with Recording.open(writer.path) as recording:
         assert list(recording.pictures("room-front")) == [
-            RecordedPicture("room-front", 1, 10, 500, JPEG + b"\x01"),
-            RecordedPicture("room-front", 2, 20, 500, JPEG + b"\x02"),
+            RecordedImage("room-front", 1, 10, 500, JPEG + b"\x01"),
+            RecordedImage("room-front", 2, 20, 500, JPEG + b"\x02"),
         ]
 
 
@@ -100,6 +101,9 @@ def test_frames_that_do_not_decode_are_counted(writer: RrdWriter) -> None:
         message("room", b""),
         message("room", good, encoding="bytes"),
         message("room", b"GIF89a", encoding="jpeg"),
+        message("room", JPEG[:8], encoding="jpeg"),
+        message("room", JPEG.replace(b"\x00\x02", b"\xff\xff"), encoding="jpeg"),
+        message("room", JPEG.replace(b"\x00\x02", b"\x00\x00"), encoding="jpeg"),
         message("../room", good),
         [b"\xc1", good],
         [good],
