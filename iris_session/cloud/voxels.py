@@ -194,7 +194,7 @@ class VoxelFilter:
         if not 0.0 < depth_scale_m < 1.0:
             raise ValueError(f"depth_scale_m is {depth_scale_m}: more than 0 and less than 1 m, usually 0.001")
         chosen = limits or DepthLimits()
-        box = np.array((chosen.low, chosen.high)) / self.voxel_m
+        box = np.clip(np.array((chosen.low, chosen.high)) / self.voxel_m, 1 - REACH, REACH - 1)
         cells = np.ascontiguousarray(pose[:3] / self.voxel_m)
         depth, color = np.ascontiguousarray(depth), np.ascontiguousarray(color)
         self.overflow += self._table.add_depth(_Picture(depth, color, rays, cells, depth_scale_m, chosen, box))
@@ -207,14 +207,9 @@ class VoxelFilter:
             min_around: Cells with fewer occupied cells among the 26 around them are left out: they are outliers.
 
         Returns:
-            The points, in no particular order.
+            The points, ordered by their cells.
         """
-        keys, sums = self._table.read(min_points, min_around)
-        counts = sums[:, 0]
-        cells = unpack_keys(keys).astype(np.float64)
-        positions = (cells + sums[:, 1:4] / counts[:, None]) * self.voxel_m
-        colors = np.rint(sums[:, 4:7] / counts[:, None]).astype(np.uint8)
-        return PointSet(positions.astype(np.float32), colors, counts.astype(np.int64))
+        return PointSet(*self._table.read(min_points, min_around, self.voxel_m))
 
 
 def choose_voxel_m(voxel_m: float, n_points: int, budget: int, smallest_m: float) -> float:
@@ -297,9 +292,9 @@ class _NumbaTable:
             band.clear()
         return dropped
 
-    def read(self, min_points: int, min_around: int) -> tuple[npt.NDArray[np.int64], Floats]:
-        keys, sums = self._bands[0].read(min_points, min_around)
-        return keys, sums
+    def read(self, min_points: int, min_around: int, voxel_m: float) -> tuple[npt.NDArray[Any], ...]:
+        positions, colors, counts = self._bands[0].read(min_points, min_around, voxel_m)
+        return positions, colors, counts
 
 
 class _NumpyTable:
@@ -320,7 +315,7 @@ class _NumpyTable:
         z = depth[chosen] * scale_m
         camera = np.stack([rays.x[chosen] * z, rays.y[chosen] * z, z], axis=1)
         points = camera @ pose[:, :3].T + pose[:, 3]
-        inside = ((points >= low) & (points < high) & (np.abs(points) < REACH - 1)).all(axis=1)
+        inside = ((points >= low) & (points < high)).all(axis=1)
         points, colors = points[inside], color[chosen][inside]
         cells = np.floor(points).astype(np.int64)
         columns = np.concatenate([np.ones((len(points), 1)), points - cells, colors], axis=1)
@@ -336,11 +331,15 @@ class _NumpyTable:
         self._keys, self._sums = self._keys[: self._max_cells], self._sums[: self._max_cells]
         return int(dropped)
 
-    def read(self, min_points: int, min_around: int) -> tuple[npt.NDArray[np.int64], Floats]:
+    def read(self, min_points: int, min_around: int, voxel_m: float) -> tuple[npt.NDArray[Any], ...]:
         kept = self._sums[:, 0] >= min_points
         if min_around:
             kept &= self._count_around() >= min_around
-        return self._keys[kept], self._sums[kept]
+        cells, sums = unpack_keys(self._keys[kept]), self._sums[kept]
+        counts = sums[:, 0]
+        positions = (cells + sums[:, 1:4] / counts[:, None]) * voxel_m
+        colors = np.rint(sums[:, 4:7] / counts[:, None]).astype(np.uint8)
+        return positions.astype(np.float32), colors, counts.astype(np.int64)
 
     def _count_around(self) -> npt.NDArray[np.int64]:
         count = np.zeros(len(self._keys), np.int64)
