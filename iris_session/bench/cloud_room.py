@@ -1,4 +1,4 @@
-"""Depth pictures of a room with tables and boxes, made by intersecting rays, with the noise and the holes of a camera."""
+"""Depth pictures of a room with tables and boxes: by intersecting rays, with the noise and the holes of a camera."""
 
 from __future__ import annotations
 
@@ -89,7 +89,9 @@ def render_room(camera: CameraModel, T_world_camera: npt.NDArray[np.float64], se
         color[hit] = paint
     grain = random.integers(-12, 13, u.shape, np.int8)[..., None]
     color = np.clip(color.astype(np.int16) + grain, 0, 255).astype(np.uint8)
-    wide = random.standard_normal((z.shape[0] // NOISE_PIXELS, z.shape[1] // NOISE_PIXELS), np.float32) * np.float32(NOISE)
+    wide = random.standard_normal((z.shape[0] // NOISE_PIXELS, z.shape[1] // NOISE_PIXELS), np.float32) * np.float32(
+        NOISE
+    )
     noise = np.asarray(cv2.resize(wide, z.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
     z += (noise + random.standard_normal(z.shape, np.float32) * np.float32(GRAIN)) * z**2
     z[random.random(z.shape, np.float32) < HOLES] = 0.0

@@ -27,6 +27,9 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iris-session bench state --profile busy-wifi\n"
         "  iris-session bench alignment --pairs 2000 --seed 1 --check\n"
         "  iris-session bench deformable --check\n"
+        "  iris-session bench cloud --check\n"
+        "  iris-session bench cloud --beside --check\n"
+        "  iris-session bench cloud-stream --points 50000 --hz 60 --check\n"
         "  iris-session bench join --check\n"
         "  iris-session bench stop --check\n"
         "  iris-session bench web --clients 8 --curve --check\n"
@@ -34,12 +37,25 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "bench", choices=("state", "input", "slow-client", "alignment", "deformable", "join", "stop", "web")
+        "bench",
+        choices=(
+            "state",
+            "input",
+            "slow-client",
+            "alignment",
+            "deformable",
+            "cloud",
+            "cloud-stream",
+            "join",
+            "stop",
+            "web",
+        ),
     )
     parser.add_argument(
         "--clients",
         type=int,
-        help="state, slow-client, deformable, join, web: number of clients (default: 16; deformable, join: 4; web: 8)",
+        help="state, slow-client, deformable, cloud-stream, join, web: number of clients (default: 16; deformable, "
+        "cloud-stream, join: 4; web: 8)",
     )
     parser.add_argument(
         "--bodies", type=int, default=300, help="state, slow-client: moving bodies (default: %(default)s)"
@@ -53,6 +69,23 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         type=int,
         default=10_000,
         help="deformable, web: vertices of the cloth, a square number (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--points",
+        type=int,
+        help="cloud: pixels of a cloud, shared by its cameras (default: 2000000); cloud-stream: points of a cloud "
+        "(default: 50000)",
+    )
+    parser.add_argument("--cameras", type=int, default=1, help="cloud: number of cameras (default: %(default)s)")
+    parser.add_argument(
+        "--beside", action="store_true", help="cloud: beside a session in which two arms are driven, 500 ticks a second"
+    )
+    parser.add_argument("--hz", type=int, default=60, help="cloud-stream: clouds per second (default: %(default)s)")
+    parser.add_argument(
+        "--mbit",
+        type=float,
+        default=0.0,
+        help="cloud-stream: bandwidth of every client's link from the middle of the measured part on [Mbit/s]",
     )
     parser.add_argument("--objects", type=int, default=300, help="join: bodies with meshes (default: %(default)s)")
     parser.add_argument(
@@ -88,7 +121,9 @@ def run(arguments: argparse.Namespace) -> int:
     from iris_session.bench.report import BenchError
 
     if arguments.clients is None:
-        arguments.clients = {"deformable": 4, "join": 4, "web": 8}.get(arguments.bench, 16)
+        arguments.clients = {"deformable": 4, "cloud-stream": 4, "join": 4, "web": 8}.get(arguments.bench, 16)
+    if arguments.points is None:
+        arguments.points = 2_000_000 if arguments.bench == "cloud" else 50_000
     _check_sizes(arguments)
     if arguments.bench == "slow-client" and arguments.clients < 3:
         raise CommandError(f"--clients {arguments.clients}: bench slow-client needs 3 or more, two of which are slow")
@@ -114,6 +149,14 @@ def _check_sizes(arguments: argparse.Namespace) -> None:
         limits = {"pairs": (10, 100_000)}
     elif arguments.bench == "deformable":
         limits = {"clients": (1, 64), "vertices": (16, 10_000)}
+    elif arguments.bench == "cloud":
+        limits = {"points": (10_000, 20_000_000), "cameras": (1, 4)}
+        if arguments.curve or arguments.profile:
+            raise CommandError("bench cloud cannot be combined with --curve or --profile: it has no other clients")
+    elif arguments.bench == "cloud-stream":
+        limits = {"clients": (1, 16), "points": (1000, 1_000_000), "hz": (1, 120), "mbit": (0, 10_000)}
+        if arguments.profile:
+            raise CommandError("bench cloud-stream cannot be combined with --profile: --mbit limits its links")
     elif arguments.bench == "stop":
         limits = {}
         if arguments.curve or arguments.profile:
@@ -156,6 +199,16 @@ def _run_benchmark(arguments: argparse.Namespace, progress: Callable[[str], None
 
         sizes = (arguments.clients, arguments.vertices, arguments.seconds or 65.0)
         return run_web(*sizes, arguments.seed, arguments.curve, not arguments.no_tab, progress)
+    if arguments.bench == "cloud":
+        from iris_session.bench.cloud import run_cloud
+
+        sizes = (arguments.points, arguments.cameras, arguments.seconds or 20.0)
+        return run_cloud(*sizes, arguments.seed, arguments.beside, progress)
+    if arguments.bench == "cloud-stream":
+        from iris_session.bench.cloud_stream import run_cloud_stream
+
+        sizes = (arguments.points, arguments.hz, arguments.clients, arguments.seconds or 20.0)
+        return run_cloud_stream(*sizes, arguments.mbit, arguments.seed, arguments.curve, progress)
     common = {"curve": arguments.curve, "profile": arguments.profile, "seed": arguments.seed, "progress": progress}
     if arguments.bench == "state":
         from iris_session.bench.state import run_state

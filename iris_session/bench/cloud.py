@@ -1,0 +1,183 @@
+"""`bench cloud`: depth pictures to sent clouds, in a camera process; alone, or beside a two-arm session at 500 Hz.
+
+Alone, the session is a publisher whose scene does not move, and clouds are made one after the other. Beside a session
+pictures come at `BESIDE_HZ`, in every second of alternating intervals.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from iris_session.bench.clients import ClientJob
+from iris_session.bench.cloud_camera import CloudCase, CloudJob
+from iris_session.bench.harness import Action, BenchRun, group_clients, measure
+from iris_session.bench.report import BenchError, BenchReport, make_bar
+from iris_session.demo.scenes import n_arms_scene
+from iris_session.demo.scenes.generators import arm_names
+from iris_session.physics import PacerStats
+from iris_session.scene.builder import SceneBuilder
+from iris_session.session.config import SessionConfig
+from iris_session.session.scene_publisher import ScenePublisher
+from iris_session.system.extras import require_package
+from iris_session.system.process import PIPE, ChildProcess
+
+CAMERA: Final = "iris_session.bench.cloud_camera"
+MIN_HZ: Final = 30.0
+MIN_HZ_BESIDE: Final = 10.0
+BESIDE_HZ: Final = 15.0
+#: Late ticks that are allowed where there are fewer without a camera.
+LATE_SHARE: Final = 0.001
+#: Before the first interval, so that the camera has joined; and shortest interval [s].
+LEAD_S: Final = 1.0
+SHORTEST_S: Final = 0.5
+ROUNDS: Final = 4
+ROOM: Final = "room"
+#: In which the pictures are made and the filter is compiled, and in which a command is answered beyond its time [s].
+PREPARE_S: Final = 300.0
+ANSWER_S: Final = 120.0
+
+
+def run_cloud(
+    points: int = 2_000_000,
+    cameras: int = 1,
+    seconds: float = 20.0,
+    seed: int = 0,
+    beside: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
+) -> BenchReport:
+    """Make clouds of depth pictures, and send them.
+
+    Args:
+        points: Pixels of a cloud, shared by its cameras.
+        cameras: Number of cameras.
+        seconds: Length of the measured part, which the cases share.
+        seed: Random seed of noise and holes.
+        beside: Measure beside a session in which two arms are driven.
+        progress: Called with short texts.
+
+    Returns:
+        The report. Results are those of cells of 1 cm and 50,000 points; other cases are in objects of their own.
+    """
+    require_package("numba", "bench cloud")
+    require_package("cv2", "bench cloud")
+    cases = _make_cases(points, cameras, beside, progress)
+    params: dict[str, Any] = {"points": points, "cameras": cameras, "seconds": seconds, "seed": seed, "beside": beside}
+    with _open_camera(CloudJob(cases, seed), progress) as camera:
+        if beside:
+            return BenchReport("cloud", params, *_measure_beside(camera, seconds, seed, progress))
+        with ScenePublisher(
+            SceneBuilder("bench"), SessionConfig(control_port=0, state_port=0, record=False)
+        ) as session:
+            _ask(camera, f"connect {session.address}")
+            found = {}
+            for case in cases:
+                progress(f"measuring {case.name}")
+                found[case.name] = _ask(camera, f"run {case.name} {seconds / len(cases)}")
+        progress("measuring the filters of numpy and open3d")
+        results = {**found.pop(ROOM), **_ask(camera, "compare"), **found}
+    bars = [make_bar(results, "hz", ">=", MIN_HZ)]
+    bars += [make_bar(results, f"{name}.hz", ">=", MIN_HZ) for name in found]
+    return BenchReport("cloud", params, results, tuple(bars))
+
+
+def _make_cases(points: int, cameras: int, beside: bool, progress: Callable[[str], None]) -> tuple[CloudCase, ...]:
+    room = CloudCase(ROOM, cameras, points, 50_000, 0.01, BESIDE_HZ if beside else 0.0)
+    if beside:
+        return (room,)
+    cases = [room, CloudCase("room_2cm_10k", cameras, points, 10_000, 0.02)]
+    if (Path(os.environ.get("IRIS_DATA", "")) / "rgbd").is_dir():
+        cases.append(CloudCase("recorded", cameras, 0, 50_000, 0.01))
+    else:
+        progress("no recorded frames: IRIS_DATA names no folder that has rgbd/")
+    return tuple(cases)
+
+
+@contextlib.contextmanager
+def _open_camera(job: CloudJob, progress: Callable[[str], None]) -> Iterator[ChildProcess]:
+    """Start the camera process, and wait until its pictures are made."""
+    progress("making the pictures")
+    with ChildProcess(CAMERA, stdout=PIPE, own_group=True) as camera:
+        camera.write(msgspec.json.encode(job) + b"\n")
+        _read_answer(camera, PREPARE_S)
+        yield camera
+
+
+def _ask(camera: ChildProcess, command: str) -> dict[str, Any]:
+    camera.write(command.encode() + b"\n")
+    return _read_answer(camera, ANSWER_S)
+
+
+def _read_answer(camera: ChildProcess, timeout_s: float) -> dict[str, Any]:
+    try:
+        answer: dict[str, Any] = json.loads(camera.read_line(timeout_s))
+    except (EOFError, TimeoutError) as error:
+        raise BenchError(f"the camera process failed: {error}") from None
+    return answer
+
+
+# --- beside a session -------------------------------------------------------------------------------------------------
+
+
+def _measure_beside(
+    camera: ChildProcess, seconds: float, seed: int, progress: Callable[[str], None]
+) -> tuple[dict[str, Any], tuple[Any, ...]]:
+    """Return results and bars of intervals with and without clouds."""
+    rounds = max(1, min(ROUNDS, int((seconds - LEAD_S) / (2 * SHORTEST_S))))
+    length_s = max(SHORTEST_S, (seconds - LEAD_S) / (2 * rounds))
+    readings: list[PacerStats] = []  # at the end of the lead and of each interval
+
+    def read_ticks(arena: BenchRun) -> None:
+        stats = arena.session.lateness()
+        assert stats is not None
+        readings.append(stats)
+
+    def begin_clouds(_: BenchRun) -> None:
+        camera.write(f"run {ROOM} {length_s}\n".encode())
+
+    actions: list[Action] = [
+        (0.0, lambda arena: camera.write(f"connect {arena.session.address}\n".encode())),
+        (LEAD_S, read_ticks),
+    ]
+    for number in range(2 * rounds):  # without a camera first
+        begin_s = LEAD_S + number * length_s
+        actions += [(begin_s, begin_clouds)] if number % 2 else []
+        actions.append((begin_s + length_s, read_ticks))
+    arms = arm_names(2)
+    people = [ClientJob(f"operator{i}", "operator", arm, samples=True) for i, arm in enumerate(arms)]
+    got = measure(
+        n_arms_scene(2).compile(),
+        group_clients([*people, ClientJob("observer", "observer")]),
+        LEAD_S + 2 * rounds * length_s + 0.2,
+        seed=seed,
+        actions=actions,
+        progress=progress,
+    )
+    _read_answer(camera, ANSWER_S)  # to `connect`
+    runs = [_read_answer(camera, ANSWER_S) for _ in range(rounds)]
+    late = {"": 0, "_without": 0}
+    ticks = {"": 0, "_without": 0}
+    for number, (before, after) in enumerate(itertools.pairwise(readings)):
+        key = "" if number % 2 else "_without"
+        late[key] += after.late - before.late
+        ticks[key] += after.ticks - before.ticks
+    worst = min(runs, key=lambda run: float(run["hz"]))
+    results = {
+        **worst,
+        **{f"late_tick_share{key}": round(late[key] / max(1, ticks[key]), 6) for key in late},
+        "ticks": sum(ticks.values()),
+        "rounds": rounds,
+        "late_causes": got.late_causes,
+        "scheduling": got.scheduling,
+        "drops": got.drops,
+    }
+    bound = max(LATE_SHARE, results["late_tick_share_without"])
+    bars = (make_bar(results, "hz", ">=", MIN_HZ_BESIDE), make_bar(results, "late_tick_share", "<=", bound))
+    return results, bars

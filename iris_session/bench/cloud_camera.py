@@ -1,0 +1,248 @@
+"""Camera process of `bench cloud`: pictures that are ready in memory become clouds that are sent to the session.
+
+    python -m iris_session.bench.cloud_camera
+
+Commands on standard input, each answered by one JSON line: the cases, as JSON; `connect ADDRESS`; `run CASE SECONDS`;
+`compare`.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+import time
+from collections import defaultdict
+from pathlib import Path
+from statistics import median
+from typing import Any, Final
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from anchors.camera import CameraModel
+from iris_session.bench.cloud_room import WORKSPACE, RoomPicture, make_room_camera, make_room_pose, render_room
+from iris_session.client import Client
+from iris_session.cloud.frames import DepthFrame
+from iris_session.cloud.pipeline import Cloud, CloudPipeline, PipelineCamera, PipelineSettings, PlacedFrame
+from iris_session.cloud.voxels import DepthLimits, pack_keys
+from iris_session.streams.cloud import encode_cloud
+
+STREAM: Final = "room"
+STAGES: Final = ("read", "voxels", "outliers", "budget", "encode", "send")
+MIN_POINTS, MIN_AROUND = 2, 4
+ERROR_M: Final = 0.01
+#: Pictures of each camera, shown again and again.
+CYCLE: Final = 4
+#: Clouds before the measured ones: compilation, and the edge of the cells that meets the budget.
+WARM_UP: Final = 6
+REPEATS: Final = 5
+
+
+class CloudCase(msgspec.Struct, frozen=True):
+    """One case.
+
+    Attributes:
+        name: Its name.
+        cameras: Number of cameras.
+        pixels: Pixels of a cloud, shared by its cameras; 0 for the recorded frames.
+        points: Budget of points.
+        voxel_m: Least edge of the cells [m].
+        hz: Pictures per second; 0 for as many as can be processed.
+    """
+
+    name: str
+    cameras: int
+    pixels: int
+    points: int
+    voxel_m: float
+    hz: float = 0.0
+
+
+class CloudJob(msgspec.Struct, frozen=True):
+    """Cases of one process. `seed`: of the noise of the pictures."""
+
+    cases: tuple[CloudCase, ...]
+    seed: int
+
+
+class Rig(msgspec.Struct, frozen=True):
+    """The cameras of a case: intrinsics, limits, and for each camera its pictures."""
+
+    model: CameraModel
+    limits: DepthLimits
+    pictures: list[list[RoomPicture]]
+
+
+def make_rig(case: CloudCase, seed: int) -> Rig:
+    """Make the pictures of a case."""
+    if not case.pixels:
+        return _load_recorded_rig(case)
+    width = max(32, 8 * round(math.sqrt(case.pixels / case.cameras * 16.0 / 9.0) / 8.0))
+    model = make_room_camera(width, round(case.pixels / case.cameras / width))
+    limits = DepthLimits(*WORKSPACE, nearest_m=0.3, farthest_m=4.0)
+    pictures = [
+        [
+            render_room(model, make_room_pose(angle + 0.05 * math.sin(math.tau * i / CYCLE)), seed + CYCLE * number + i)
+            for i in range(CYCLE)
+        ]
+        for number, angle in enumerate(np.linspace(0.0, 1.2, case.cameras).tolist())
+    ]
+    return Rig(model, limits, pictures)
+
+
+def _load_recorded_rig(case: CloudCase) -> Rig:
+    """Load the recorded frames; each further camera begins some frames later in the recording."""
+    folder = Path(os.environ["IRIS_DATA"]) / "rgbd"
+    matrix = np.loadtxt(folder / "camera-intrinsics.txt")
+    files = sorted(folder.glob("*.depth.png"))[: CYCLE + case.cameras - 1]
+    pictures = [_load_picture(file) for file in files]
+    height, width = pictures[0].depth.shape
+    model = CameraModel(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+    return Rig(model, DepthLimits(farthest_m=3.5), [pictures[i : i + CYCLE] for i in range(case.cameras)])
+
+
+def _load_picture(file: Path) -> RoomPicture:
+    stem = str(file).removesuffix(".depth.png")
+    depth, color = cv2.imread(str(file), cv2.IMREAD_UNCHANGED), cv2.imread(f"{stem}.color.jpg")
+    assert depth is not None, file
+    assert color is not None, file
+    rgb = np.ascontiguousarray(color[:, :, ::-1], np.uint8)
+    return RoomPicture(depth.astype(np.uint16), rgb, np.loadtxt(f"{stem}.pose.txt"))
+
+
+class CloudCamera:
+    """The cameras of one case, and the pipeline that makes clouds of their pictures."""
+
+    def __init__(self, case: CloudCase, seed: int) -> None:
+        self.case = case
+        self.rig = make_rig(case, seed)
+        names = [f"camera{i}" for i in range(case.cameras)]
+        cameras = [PipelineCamera(name, self.rig.limits, ERROR_M, None) for name in names]
+        settings = PipelineSettings(case.points, case.voxel_m, MIN_POINTS, MIN_AROUND)
+        self._pipeline = CloudPipeline(settings, cameras, time.perf_counter_ns)
+        self._names = names
+        self._next = 0
+        for name in names:
+            self._pipeline.open_camera(name, self.rig.model, 0.001)
+        for _ in range(WARM_UP):
+            self.make_cloud(0)
+
+    def make_cloud(self, now_ns: int) -> tuple[Cloud, float]:
+        """Make a cloud of the next pictures. Return it, and the duration of their copying [ms]."""
+        began_ns = time.perf_counter_ns()
+        frames = {}
+        for name, pictures in zip(self._names, self.rig.pictures, strict=True):
+            depth, color, pose = pictures[self._next % len(pictures)]
+            frames[name] = PlacedFrame(DepthFrame(depth.copy(), color.copy(), now_ns), pose)
+        self._next += 1
+        read_ms = (time.perf_counter_ns() - began_ns) * 1e-6
+        return self._pipeline.make_cloud(frames), read_ms
+
+    def run(self, client: Client, seconds: float) -> dict[str, Any]:
+        """Make and send clouds for some seconds. Return the results."""
+        stages: dict[str, list[float]] = defaultdict(list)
+        totals, points, edges, refused = [], [], [], 0
+        cpu_s, begin = time.process_time(), time.perf_counter()
+        while (began := time.perf_counter()) - begin < seconds:
+            now_ns = client.session_now_ns()
+            cloud, stages_ms = self.make_cloud(now_ns)
+            made = time.perf_counter()
+            sent = client.media.publish(STREAM, cloud.frames, capture_ns=now_ns, encoding="cloud")
+            client.poll(0.0)
+            ended = time.perf_counter()
+            refused += not sent
+            for name, spent_ms in {"read": stages_ms, **cloud.stages_ms, "send": (ended - made) * 1e3}.items():
+                stages[name].append(spent_ms)
+            totals.append((ended - began) * 1e3)
+            points.append(cloud.n_points)
+            edges.append(cloud.voxel_m)
+            if self.case.hz:
+                client.poll(max(0.0, begin + len(totals) / self.case.hz - time.perf_counter()))
+        elapsed_s = time.perf_counter() - begin
+        return {
+            "hz": round((len(totals) - refused) / elapsed_s, 2),
+            "total_ms_p50": round(median(totals), 3),
+            "total_ms_p99": round(float(np.percentile(totals, 99)), 3),
+            "stages_ms": {name: round(median(stages[name]), 3) for name in STAGES},
+            "cpu_ms": round((time.process_time() - cpu_s) / len(totals) * 1e3, 3),
+            "points_out": round(median(points)),
+            "voxel_mm": round(median(edges) * 1e3, 2),
+            "frames_refused": refused,
+        }
+
+
+def compare_filters(rig: Rig, voxel_m: float) -> dict[str, float | None]:
+    """Return what the voxel filters of numpy and open3d take for a picture [ms].
+
+    Both get points that lie in memory, cropped, with colours, so that they deproject nothing and leave out no outliers.
+    """
+    depth, color, pose = rig.pictures[0][0]
+    camera, limits = rig.model, rig.limits
+    v, u = np.nonzero((depth > 0) & (depth < 0xFFFF) & (depth <= limits.farthest_m * 1000.0))
+    z = depth[v, u] * 0.001
+    points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)
+    points = points @ pose[:3, :3].T + pose[:3, 3]
+    inside = ((points >= limits.low) & (points < limits.high)).all(axis=1)
+    points, colors = points[inside], color[v, u][inside] / 255.0
+    return {
+        "numpy_voxel_ms": _time_ms(lambda: _filter_with_numpy(points, colors, voxel_m)),
+        "open3d_voxel_ms": _time_open3d_ms(points, colors, voxel_m),
+    }
+
+
+def _filter_with_numpy(points: NDArray[Any], colors: NDArray[Any], voxel_m: float) -> NDArray[Any]:
+    keys = pack_keys(np.floor(points / voxel_m).astype(np.int64))
+    _, cells, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    columns = [np.bincount(cells, values) / counts for values in (*points.T, *colors.T)]
+    return np.stack(columns, axis=1)
+
+
+def _time_open3d_ms(points: NDArray[Any], colors: NDArray[Any], voxel_m: float) -> float | None:
+    try:
+        import open3d
+    except (ImportError, OSError):  # not installed, or a library of the system is missing
+        return None
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+    cloud.colors = open3d.utility.Vector3dVector(colors)
+    return _time_ms(lambda: cloud.voxel_down_sample(voxel_m))
+
+
+def _time_ms(call: Any) -> float:
+    spent = []
+    for _ in range(REPEATS):
+        began = time.perf_counter()
+        call()
+        spent.append((time.perf_counter() - began) * 1e3)
+    return round(median(spent), 3)
+
+
+def main() -> None:
+    """Serve commands until the end of standard input."""
+    job = msgspec.json.decode(sys.stdin.readline(), type=CloudJob)
+    cameras = {case.name: CloudCamera(case, job.seed) for case in job.cases}
+    client: Client | None = None
+    print("{}", flush=True)
+    for line in sys.stdin:
+        command, *words = line.split()
+        answer: dict[str, Any] = {}
+        if command == "connect":
+            client = Client(words[0], role="camera", name="camera", alignment="not_needed")
+            client.connect(30.0)
+            nothing = encode_cloud(np.empty((0, 3)), np.empty((0, 3), np.uint8))
+            while not client.media.publish(STREAM, nothing, encoding="cloud"):  # the first call connects
+                client.poll(0.02)
+        elif command == "run" and client is not None:
+            answer = cameras[words[0]].run(client, float(words[1]))
+        elif command == "compare":
+            first = job.cases[0]
+            answer = compare_filters(cameras[first.name].rig, first.voxel_m)
+        print(msgspec.json.encode(answer).decode(), flush=True)
+    if client is not None:
+        client.close()
+
+
+if __name__ == "__main__":
+    main()
