@@ -1,0 +1,112 @@
+"""Source of `bench cloud-stream`: points in motion, encoded and published by a process of its own.
+
+    python -m iris_session.bench.cloud_source
+
+Commands on standard input, each answered by one JSON line: the job, as JSON; `connect ADDRESS [KEYS]`; `run SECONDS`.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.client import Client, CurveKeys
+from iris_session.cloud.pipeline import CLASSES
+from iris_session.streams.cloud import encode_cloud, order_points
+
+STREAM: Final = "room"
+VOXEL_M: Final = 0.01
+ERROR_M: Final = 0.01
+#: Amplitude of the motion [m], its frequency [Hz], and its wave number [rad/m].
+_SWING: Final = 0.15
+_HZ: Final = 0.4
+_WAVE: Final = 2.0
+_LOW, _HIGH = np.float32((-2.0, -2.0, 0.0)), np.float32((2.0, 2.0, 2.4))
+
+
+class SourceJob(msgspec.Struct, frozen=True):
+    """Job of the source. `seed`: of the points."""
+
+    points: int
+    hz: int
+    seed: int
+
+
+class MovingCloud:
+    """Points on the walls and the floor of a room, which swing: where they are depends on seed and frame only."""
+
+    def __init__(self, points: int, seed: int) -> None:
+        random = np.random.default_rng(seed)
+        self._base = random.uniform(_LOW, _HIGH, (points, 3)).astype(np.float32)
+        axis = random.integers(0, 3, points)
+        self._base[np.arange(points), axis] = _LOW[axis]
+        self._phase = _WAVE * self._base.sum(axis=1)
+        self.colors = random.integers(0, 256, (points, 3)).astype(np.uint8)
+
+    def compute_positions(self, t: float) -> NDArray[np.float32]:
+        """Return the positions (n, 3) at a time [s]."""
+        swing = np.sin(np.float32(2.0 * np.pi * _HZ * t) + self._phase) * np.float32(_SWING)
+        return self._base + swing[:, None]
+
+    def sort(self, t: float) -> NDArray[np.float64]:
+        """Return the positions at a time in the order of the points of a frame."""
+        positions = self.compute_positions(t)
+        return positions[order_points(positions.T, VOXEL_M)].astype(np.float64)
+
+    def encode(self, t: float) -> dict[str, bytes]:
+        """Return the frames at a time [s]."""
+        return encode_cloud(self.compute_positions(t), self.colors, voxel_m=VOXEL_M, error_m=ERROR_M, classes=CLASSES)
+
+
+def run(cloud: MovingCloud, client: Client, hz: int, seconds: float) -> dict[str, Any]:
+    """Publish for some seconds. Return captures [ns] of the frames by number, and what their encoding took [ms]."""
+    captures: dict[int, int] = {}
+    encode_ms, refused = [], 0
+    begin = time.perf_counter()
+    number = 0
+    while (now := time.perf_counter()) < begin + seconds:
+        if now < begin + number / hz:
+            client.poll(begin + number / hz - now)
+            continue
+        capture_ns = client.session_now_ns()
+        positions = cloud.compute_positions(number / hz)
+        began_ns = time.perf_counter_ns()
+        frames = encode_cloud(positions, cloud.colors, voxel_m=VOXEL_M, error_m=ERROR_M, classes=CLASSES)
+        encode_ms.append((time.perf_counter_ns() - began_ns) * 1e-6)
+        sent = client.media.publish(STREAM, frames, capture_ns=capture_ns, encoding="cloud")
+        refused += not sent
+        captures[number] = capture_ns
+        number = max(number + 1, int((time.perf_counter() - begin) * hz))  # frames without time for them are left out
+    return {"captures": captures, "encode_ms": encode_ms, "refused": refused}
+
+
+def main() -> None:
+    """Serve commands until the end of standard input."""
+    job = msgspec.json.decode(sys.stdin.readline(), type=SourceJob)
+    cloud = MovingCloud(job.points, job.seed)
+    client: Client | None = None
+    print("{}", flush=True)
+    for line in sys.stdin:
+        command, *words = line.split()
+        answer: dict[str, Any] = {}
+        if command == "connect":
+            curve = CurveKeys(*(key.encode() for key in words[1:])) if len(words) > 1 else None
+            client = Client(words[0], role="source", name="source", alignment="not_needed", curve=curve)
+            client.connect(30.0)
+            nothing = encode_cloud(np.empty((0, 3)), np.empty((0, 3), np.uint8))
+            while not client.media.publish(STREAM, nothing, encoding="cloud"):  # the first call connects
+                client.poll(0.02)
+        elif command == "run" and client is not None:
+            answer = run(cloud, client, job.hz, float(words[0]))
+        print(msgspec.json.encode(answer).decode(), flush=True)
+    if client is not None:
+        client.close()
+
+
+if __name__ == "__main__":
+    main()

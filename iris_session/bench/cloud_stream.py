@@ -1,0 +1,269 @@
+"""`bench cloud-stream`: a source process streams points in motion through a session to client processes.
+
+Intervals with and without the cloud alternate, so that the age of state with it is compared with that without it in
+one run. With `mbit` every client has a link of its own, whose bandwidth falls in the middle of the window: the cloud
+comes before, and after that; in the last part there is none.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import tempfile
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.bench.clients import ClientJob
+from iris_session.bench.cloud import open_child, read_answer
+from iris_session.bench.cloud_clients import CloudStreamJob
+from iris_session.bench.cloud_source import STREAM, MovingCloud, SourceJob
+from iris_session.bench.harness import Action, BenchRun, Log, Measurement, measure
+from iris_session.bench.report import Bar, BenchError, BenchReport, make_bar
+from iris_session.demo.scenes import free_bodies_scene
+from iris_session.netsim.process import make_link_address
+from iris_session.streams.cloud import decode_cloud, read_header
+
+SOURCE: Final = "iris_session.bench.cloud_source"
+CLIENTS: Final = "iris_session.bench.cloud_clients"
+#: Moving rigid bodies beside the cloud.
+BODIES: Final = 50
+ROUNDS: Final = 4
+#: Before the first interval, so that the source has joined; and shortest interval [s].
+LEAD_S: Final = 1.0
+SHORTEST_S: Final = 0.5
+#: From the fall of the bandwidth to the coarser class at every client [s].
+MAX_LOWER_S: Final = 1.0
+MAX_BYTES: Final = 9.1
+MAX_DECODE_MS: Final = 0.2
+WITHOUT, WITH, SLOW, SLOW_WITHOUT = "without", "with", "slow", "slow_without"
+CAPTURE, HANDED, SPENT, CHECKSUM, SIZE, POINTS, LEVEL = range(7)
+MS: Final = 1e-6
+
+
+class Interval(NamedTuple):
+    """A part of the window, in seconds from its beginning."""
+
+    kind: str
+    begin_s: float
+    end_s: float
+
+
+def plan_intervals(seconds: float, mbit: float) -> list[Interval]:
+    """Return the intervals of a window."""
+    if mbit:
+        kinds: tuple[str, ...] = (WITH, SLOW, SLOW_WITHOUT)
+    else:
+        rounds = max(1, min(ROUNDS, int((seconds - LEAD_S) / (2 * SHORTEST_S))))
+        kinds = (WITHOUT, WITH) * rounds
+    length_s = max(SHORTEST_S, (seconds - LEAD_S) / len(kinds))
+    return [Interval(kind, LEAD_S + i * length_s, LEAD_S + (i + 1) * length_s) for i, kind in enumerate(kinds)]
+
+
+def run_cloud_stream(
+    points: int = 50_000,
+    hz: int = 60,
+    clients: int = 4,
+    seconds: float = 20.0,
+    mbit: float = 0.0,
+    seed: int = 0,
+    curve: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
+) -> BenchReport:
+    """Stream a cloud to observers, beside 50 rigid bodies.
+
+    Args:
+        points: Points of the cloud.
+        hz: Clouds per second.
+        clients: Number of observers, each in a process of its own.
+        seconds: Length of the measured window.
+        mbit: Bandwidth to which the link of every client falls [Mbit/s]; 0 for no links.
+        seed: Random seed.
+        curve: Encrypt and authenticate.
+        progress: Called with short texts.
+    """
+    plan = plan_intervals(seconds, mbit)
+    specs = [ClientJob(f"client{i}", "observer") for i in range(clients)]
+    links: dict[str, str] = {}
+    if mbit:
+        specs = [msgspec.structs.replace(spec, link=make_link_address(i)) for i, spec in enumerate(specs)]
+        links = {spec.link: "none" for spec in specs}
+    with (
+        tempfile.TemporaryDirectory(prefix="iris-bench-") as folder,
+        open_child(SOURCE, SourceJob(points, hz, seed)) as source,
+    ):
+        profile = Path(folder) / "slow.json"
+        profile.write_text(json.dumps({"phases": [{"rate_mbit": mbit, "delay_ms": 2}]}))
+
+        def write(command: str) -> Callable[[BenchRun], None]:
+            return lambda _: source.write(f"{command}\n".encode())
+
+        def connect(arena: BenchRun) -> None:
+            job = arena.processes[0].job
+            keys = f" {job.server_public} {job.public} {job.secret}" if job.server_public else ""
+            source.write(f"connect {arena.session.address}{keys}\n".encode())
+
+        def slow_links(arena: BenchRun) -> None:
+            assert arena.proxy is not None
+            arena.proxy.send(f"profile {profile}")
+
+        actions: list[Action] = [(0.0, connect)]
+        for interval in plan:
+            length_s = interval.end_s - interval.begin_s
+            actions += [(interval.begin_s, slow_links)] if interval.kind == SLOW else []
+            actions += [(interval.begin_s, write(f"run {length_s}"))] if interval.kind in (WITH, SLOW) else []
+        got = measure(
+            free_bodies_scene(BODIES, seed).compile(),
+            [(spec,) for spec in specs],
+            plan[-1].end_s,
+            links=links,
+            seed=seed,
+            actions=actions,
+            curve=curve,
+            module=CLIENTS,
+            make_job=functools.partial(CloudStreamJob, stream=STREAM),
+            progress=progress,
+        )
+        read_answer(source)  # to `connect`
+        runs = [read_answer(source) for one in plan if one.kind in (WITH, SLOW)]
+    progress("comparing the delivered clouds with those of the source")
+    results = summarize(got, plan, runs, MovingCloud(points, seed), hz)
+    params: dict[str, Any] = {"points": points, "hz": hz, "clients": clients, "seconds": plan[-1].end_s}
+    params |= {"seed": seed, "curve": curve, "mbit": mbit, "bodies": BODIES}
+    return BenchReport("cloud-stream", params, results, tuple(_make_bars(results, hz, mbit)))
+
+
+def summarize(
+    got: Measurement, plan: Sequence[Interval], runs: Sequence[dict[str, Any]], cloud: MovingCloud, hz: int
+) -> dict[str, Any]:
+    """Return the results of a window."""
+    logs = list(got.logs.values())
+    clouds = np.concatenate([log["clouds"] for log in logs])
+    if not len(clouds):
+        raise BenchError("no cloud reached a client within the window")
+    streamed = [one for one in plan if one.kind == WITH]
+    fast = [np.concatenate([_select(log["clouds"], HANDED, got, one) for one in streamed]) for log in logs]
+    rows = np.concatenate(fast)
+    length_s = sum(one.end_s - one.begin_s for one in streamed)
+    counts = np.sum([log["counts"] for log in logs], axis=0).tolist()
+    superseded, dropped, malformed, overflow, heads = counts
+    whole = clouds[clouds[:, LEVEL] == 0]
+    encode_ms = np.concatenate([run["encode_ms"] for run in runs])
+    errors_m, stated_m = _compare(clouds, runs, cloud, hz)
+    results: dict[str, Any] = {
+        "delivered_hz_min": round(min(len(one) for one in fast) / length_s, 2),
+        "bytes_per_point": round((whole[:, SIZE].mean() + heads / len(clouds)) / whole[:, POINTS].mean(), 4),
+        "age_ms_p50": _percentile((rows[:, HANDED] - rows[:, CAPTURE]) * MS, 50),
+        "age_ms_p99": _percentile((rows[:, HANDED] - rows[:, CAPTURE]) * MS, 99),
+        "encode_ms_p50": _percentile(encode_ms, 50),
+        "encode_ms_p99": _percentile(encode_ms, 99),
+        "decode_ms_p50": _percentile(clouds[:, SPENT] * MS, 50),
+        "decode_ms_p99": _percentile(clouds[:, SPENT] * MS, 99),
+        "max_error_mm": round(errors_m * 1e3, 5),
+        "stated_error_mm": round(stated_m * 1e3, 5),
+        "mbit_per_s": round(float(whole[:, SIZE].mean()) * 8e-6 * hz, 1),
+    }
+    for kind, key in ((WITH, ""), (WITHOUT, "_without"), (SLOW, "_slow"), (SLOW_WITHOUT, "_slow_without")):
+        intervals = [one for one in plan if one.kind == kind]
+        if intervals:
+            p99s = [_compute_state_p99(logs, got, one) for one in intervals]
+            results[f"state_age_ms_p99{key}"] = round(float(np.median(p99s)), 3)
+    for slow in (one for one in plan if one.kind == SLOW):
+        results |= _summarize_slow(logs, got, slow)
+    return results | {
+        "frames_refused": sum(run["refused"] for run in runs),
+        "frames_superseded": superseded,
+        "frames_dropped": dropped,
+        "frames_malformed": malformed,
+        "frames_not_logged": overflow,
+        "late_tick_share": round(got.stats.late_share, 6),
+        "scheduling": got.scheduling,
+        "drops": got.drops,
+    }
+
+
+def _summarize_slow(logs: Sequence[Log], got: Measurement, slow: Interval) -> dict[str, float]:
+    """Return the time to the first cloud of a coarser class, the longest without a cloud, and the rate after that."""
+    lower_s, gaps_s, rates = [], [], []
+    for log in logs:
+        rows = _select(log["clouds"], HANDED, got, slow)
+        at_s = (rows[:, HANDED] - got.begin_ns) * 1e-9 - slow.begin_s
+        coarser = at_s[rows[:, LEVEL] > 0]
+        lower_s.append(float(coarser[0]) if len(coarser) else float("inf"))
+        length_s = slow.end_s - slow.begin_s
+        gaps_s.append(float(np.diff(np.concatenate([[0.0], at_s, [length_s]])).max()))
+        rates.append(float(np.count_nonzero(at_s >= MAX_LOWER_S)) / max(length_s - MAX_LOWER_S, 0.1))
+    return {
+        "lower_class_after_s": round(max(lower_s), 3),
+        "longest_gap_s": round(max(gaps_s), 3),
+        "slow_hz_min": round(min(rates), 2),
+    }
+
+
+def _make_bars(results: dict[str, Any], hz: int, mbit: float) -> list[Bar]:
+    bars = [
+        make_bar(results, "bytes_per_point", "<=", MAX_BYTES),
+        make_bar(results, "max_error_mm", "<=", results["stated_error_mm"]),
+    ]
+    if mbit:
+        bars.append(make_bar(results, "lower_class_after_s", "<=", MAX_LOWER_S))
+        bars.append(make_bar(results, "longest_gap_s", "<=", MAX_LOWER_S))
+        compared = (("state_age_ms_p99_slow", "state_age_ms_p99_slow_without"),)
+    else:
+        bars.append(make_bar(results, "delivered_hz_min", ">=", hz * 58.0 / 60.0))
+        bars.append(make_bar(results, "decode_ms_p50", "<", MAX_DECODE_MS))
+        compared = (("state_age_ms_p99", "state_age_ms_p99_without"),)
+    for key, without in compared:
+        alone = results[without]
+        bars.append(make_bar(results, key, "<=", round(alone + max(0.2 * alone, 1.0), 3)))
+    return bars
+
+
+# --- evaluation -------------------------------------------------------------------------------------------------------
+
+
+def _select(rows: NDArray[Any], column: int, got: Measurement, interval: Interval) -> NDArray[Any]:
+    """Return the rows with a session time within an interval."""
+    at_s = (rows[:, column] - got.begin_ns) * 1e-9
+    return np.asarray(rows[(at_s >= interval.begin_s) & (at_s < interval.end_s)])
+
+
+def _compute_state_p99(logs: Sequence[Log], got: Measurement, interval: Interval) -> float:
+    rows = [
+        _select(np.stack([log["handed_ns"], log["handed_ns"] - log["state_ns"]], axis=1), 0, got, interval)
+        for log in logs
+    ]
+    ages = np.concatenate(rows)[:, 1]
+    return float(np.percentile(ages, 99)) * MS if len(ages) else float("inf")
+
+
+def _compare(clouds: NDArray[Any], runs: Sequence[dict[str, Any]], cloud: MovingCloud, hz: int) -> tuple[float, float]:
+    """Return the largest error of the delivered clouds, and the smallest bound that their headers state [m].
+
+    Clouds are encoded again, and compared by their checksum with those that the clients received.
+    """
+    frames = {capture_ns: int(number) for run in runs for number, capture_ns in run["captures"].items()}
+    worst_m, stated_m = 0.0, float("inf")
+    unique = {tuple(row): None for row in clouds[:, [CAPTURE, CHECKSUM]].tolist()}
+    checksums: dict[int, set[int]] = {}
+    for capture_ns, checksum in unique:
+        if capture_ns in frames:  # not the empty one with which the source connects
+            checksums.setdefault(frames[capture_ns], set()).add(checksum)
+    for number, received in checksums.items():
+        made = cloud.encode(number / hz)
+        if not received <= {zlib.crc32(one) for one in made.values()}:
+            raise BenchError(f"a client received another cloud {number} than the source made")
+        whole = made["full"]
+        decoded = decode_cloud(whole).positions
+        worst_m = max(worst_m, float(np.linalg.norm(decoded - cloud.sort(number / hz), axis=1).max()))
+        stated_m = min(stated_m, read_header(whole).quantum_error_m)
+    return worst_m, stated_m
+
+
+def _percentile(values: NDArray[Any], q: float) -> float:
+    return round(float(np.percentile(values, q)), 3)
