@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.cloud import open_child, read_answer
+from iris_session.bench.cloud_clients import CloudColumn as Column
 from iris_session.bench.cloud_clients import CloudStreamJob
 from iris_session.bench.cloud_source import STREAM, MovingCloud, SourceJob
 from iris_session.bench.harness import Action, BenchRun, Log, Measurement, measure
@@ -42,7 +43,6 @@ MAX_LOWER_S: Final = 1.0
 MAX_BYTES: Final = 9.1
 MAX_DECODE_MS: Final = 0.2
 WITHOUT, WITH, SLOW, SLOW_WITHOUT = "without", "with", "slow", "slow_without"
-CAPTURE, HANDED, SPENT, CHECKSUM, SIZE, POINTS, LEVEL = range(7)
 MS: Final = 1e-6
 
 
@@ -147,26 +147,29 @@ def summarize(
     if not len(clouds):
         raise BenchError("no cloud reached a client within the window")
     streamed = [one for one in plan if one.kind == WITH]
-    fast = [np.concatenate([_select(log["clouds"], HANDED, got, one) for one in streamed]) for log in logs]
+    fast = [np.concatenate([_select(log["clouds"], Column.HANDED, got, one) for one in streamed]) for log in logs]
     rows = np.concatenate(fast)
     length_s = sum(one.end_s - one.begin_s for one in streamed)
     counts = np.sum([log["counts"] for log in logs], axis=0).tolist()
     superseded, dropped, malformed, overflow, heads = counts
-    whole = clouds[clouds[:, LEVEL] == 0]
+    whole = clouds[clouds[:, Column.LEVEL] == 0]
     encode_ms = np.concatenate([run["encode_ms"] for run in runs])
     errors_m, stated_m = _compare(clouds, runs, cloud, hz)
     results: dict[str, Any] = {
         "delivered_hz_min": round(min(len(one) for one in fast) / length_s, 2),
-        "bytes_per_point": round((whole[:, SIZE].mean() + heads / len(clouds)) / whole[:, POINTS].mean(), 4),
-        "age_ms_p50": _percentile((rows[:, HANDED] - rows[:, CAPTURE]) * MS, 50),
-        "age_ms_p99": _percentile((rows[:, HANDED] - rows[:, CAPTURE]) * MS, 99),
+        "bytes_per_point": round(
+            (whole[:, Column.SIZE].mean() + heads / len(clouds)) / whole[:, Column.POINTS].mean(), 4
+        ),
+        "age_ms_p50": _percentile((rows[:, Column.HANDED] - rows[:, Column.CAPTURE]) * MS, 50),
+        "age_ms_p99": _percentile((rows[:, Column.HANDED] - rows[:, Column.CAPTURE]) * MS, 99),
         "encode_ms_p50": _percentile(encode_ms, 50),
         "encode_ms_p99": _percentile(encode_ms, 99),
-        "decode_ms_p50": _percentile(clouds[:, SPENT] * MS, 50),
-        "decode_ms_p99": _percentile(clouds[:, SPENT] * MS, 99),
+        "decode_ms_p50": _percentile(clouds[:, Column.POSITIONS] * MS, 50),
+        "decode_ms_p99": _percentile(clouds[:, Column.POSITIONS] * MS, 99),
+        "decode_with_colors_ms_p50": _percentile(clouds[:, Column.WHOLE] * MS, 50),
         "max_error_mm": round(errors_m * 1e3, 5),
         "stated_error_mm": round(stated_m * 1e3, 5),
-        "mbit_per_s": round(float(whole[:, SIZE].mean()) * 8e-6 * hz, 1),
+        "mbit_per_s": round(float(whole[:, Column.SIZE].mean()) * 8e-6 * hz, 1),
     }
     for kind, key in ((WITH, ""), (WITHOUT, "_without"), (SLOW, "_slow"), (SLOW_WITHOUT, "_slow_without")):
         intervals = [one for one in plan if one.kind == kind]
@@ -191,9 +194,9 @@ def _summarize_slow(logs: Sequence[Log], got: Measurement, slow: Interval) -> di
     """Return the time to the first cloud of a coarser class, the longest without a cloud, and the rate after that."""
     lower_s, gaps_s, rates = [], [], []
     for log in logs:
-        rows = _select(log["clouds"], HANDED, got, slow)
-        at_s = (rows[:, HANDED] - got.begin_ns) * 1e-9 - slow.begin_s
-        coarser = at_s[rows[:, LEVEL] > 0]
+        rows = _select(log["clouds"], Column.HANDED, got, slow)
+        at_s = (rows[:, Column.HANDED] - got.begin_ns) * 1e-9 - slow.begin_s
+        coarser = at_s[rows[:, Column.LEVEL] > 0]
         lower_s.append(float(coarser[0]) if len(coarser) else float("inf"))
         length_s = slow.end_s - slow.begin_s
         gaps_s.append(float(np.diff(np.concatenate([[0.0], at_s, [length_s]])).max()))
@@ -249,7 +252,7 @@ def _compare(clouds: NDArray[Any], runs: Sequence[dict[str, Any]], cloud: Moving
     """
     frames = {capture_ns: int(number) for run in runs for number, capture_ns in run["captures"].items()}
     worst_m, stated_m = 0.0, float("inf")
-    unique = {tuple(row): None for row in clouds[:, [CAPTURE, CHECKSUM]].tolist()}
+    unique = {tuple(row): None for row in clouds[:, [Column.CAPTURE, Column.CHECKSUM]].tolist()}
     checksums: dict[int, set[int]] = {}
     for capture_ns, checksum in unique:
         if capture_ns in frames:  # not the empty one with which the source connects
