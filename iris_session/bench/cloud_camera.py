@@ -159,8 +159,9 @@ class CloudCamera:
             totals.append((ended - began) * 1e3)
             points.append(cloud.n_points)
             edges.append(cloud.voxel_m)
-            if self.case.hz:
-                client.poll(max(0.0, begin + len(totals) / self.case.hz - time.perf_counter()))
+            due = begin + len(totals) / self.case.hz if self.case.hz else 0.0
+            while (left := due - time.perf_counter()) > 0.0:
+                client.poll(left)
         elapsed_s = time.perf_counter() - begin
         return {
             "hz": round((len(totals) - refused) / elapsed_s, 2),

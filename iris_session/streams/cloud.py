@@ -151,7 +151,7 @@ def decode_cloud(payload: bytes | memoryview) -> CloudFrame:
     header = read_header(payload)
     return CloudFrame(
         decode_positions(payload, header),
-        unpack_colors(_view_points(payload, header)["color"]),
+        unpack_colors(view_points(payload, header)["color"]),
         header.error_m,
         header.voxel_m,
     )
@@ -159,7 +159,7 @@ def decode_cloud(payload: bytes | memoryview) -> CloudFrame:
 
 def decode_positions(payload: bytes | memoryview, header: CloudHeader) -> Floats:
     """Return the positions (n, 3) [m] of a frame with this header, for an application that takes no colours."""
-    nodes = _view_points(payload, header)["node"]
+    nodes = view_points(payload, header)["node"]
     step = np.float32(2.0**header.exponent)
     rows = np.empty((3, header.n_points), np.float32)
     for axis, origin in enumerate(header.origin):
@@ -168,8 +168,8 @@ def decode_positions(payload: bytes | memoryview, header: CloudHeader) -> Floats
     return rows.T
 
 
-def _view_points(payload: bytes | memoryview, header: CloudHeader) -> npt.NDArray[np.void]:
-    """Return the points of a frame as they are in its bytes."""
+def view_points(payload: bytes | memoryview, header: CloudHeader) -> npt.NDArray[np.void]:
+    """Return the points of a frame with this header as they are in its bytes."""
     return np.frombuffer(payload, POINT, header.n_points, HEADER_BYTES)
 
 
