@@ -73,11 +73,26 @@ def test_narrow_link_gets_a_lower_level_within_two_seconds() -> None:
     link.play(1.75)
     assert link.grants[-1][1].levels["cloud"] > 0, "lowered within 1.75 s"
     assert link.grants[-1][1].reason
-    assert link.grants[-1][1].bytes_per_s <= 8 * MBIT
+    assert compute_cost(CLOUD, link.grants[-1][1].levels) <= 8 * MBIT
     link.play(20)
     assert link.grants[-1][1].levels["cloud"] == 2
     held = [grant.levels["cloud"] for now, grant in link.grants if now > 10 * SECOND]
     assert held.count(2) > 0.8 * len(held)
+
+
+@pytest.mark.parametrize(("mbit", "levels"), [(300, {1}), (20, {4, 5}), (60, {2, 3})])
+def test_cloud_on_a_link_that_becomes_slow_is_coarser_or_rarer_but_goes_on(mbit: float, levels: set[int]) -> None:
+    """100,000 points of 8 bytes at 60 Hz, with two coarser classes."""
+    rates = {"cloud": tuple(384.0 * MBIT * share for share in (1.0, 0.5, 0.25, 0.125, 0.0625, 0.03125))}
+    link = Link(1000)
+    link.play(5, rates)
+    link.capacity = mbit * MBIT
+    assert link.play(1, rates).levels["cloud"] > 0, "lowered within a second"
+    link.play(2, rates)
+    held = [grant.levels["cloud"] for _, grant in link.grants[-8:]]
+    link.play(10, rates)
+    assert link.grants[-1][1].levels["cloud"] in levels
+    assert NONE_LEVEL not in held
 
 
 def test_level_rises_when_the_link_recovers() -> None:

@@ -93,6 +93,16 @@ def test_coarser_class_is_sent_at_full_rate() -> None:
     assert [frame for _, frame in wire.got[BOB]] == [b"half"] * 2, "every second of the next better one"
 
 
+def test_on_the_slowest_links_the_coarsest_class_is_rare_before_there_is_nothing() -> None:
+    wire = Wire(ann=3, bob=NONE_LEVEL - 1)
+    wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
+    wire.hub.subscribe(BOB, "cloud", "b", 2, SECOND)
+    wire.push(16, frames={"full": b"full", "half": b"half", "quarter": b"quarter"})
+    assert [frame for _, frame in wire.got[ANN]] == [b"quarter"] * 8
+    assert [frame for _, frame in wire.got[BOB]] == [b"quarter"] * 2
+    assert {header.budget_class for who in (ANN, BOB) for header, _ in wire.got[who]} == {"quarter"}
+
+
 def test_full_connection_gets_the_newest_frame_later_and_delays_no_other() -> None:
     wire = Wire()
     wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
@@ -242,7 +252,7 @@ def test_rates_cover_the_last_seconds() -> None:
         wire.hub.sample_rates(wire.now_ns)
     facts = wire.hub.read_streams()["cloud"]
     assert facts.hz == pytest.approx(62.5)
-    assert facts.rates == pytest.approx((6250.0, 3125.0, 1562.5))
+    assert facts.rates == pytest.approx(tuple(6250.0 / 2**level for level in range(NONE_LEVEL)))
 
 
 def test_new_subscriber_gets_the_newest_frame_of_a_stream_at_rest() -> None:

@@ -14,11 +14,14 @@ from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
 from iris_session.protocol.media import CLASSES
+from iris_session.protocol.names import BudgetClass
 
 MILLISECOND: Final = 1_000_000
 SECOND: Final = 1_000_000_000
-#: Index of `BudgetClass.NONE`.
-NONE_LEVEL: Final = len(CLASSES) - 1
+#: Class of each level. The finest have every frame of their class, the further ones every second, fourth and eighth of
+#: `quarter`: on the slowest links media are rare before there are none.
+LEVELS: Final = (*CLASSES[:-1], *(BudgetClass.QUARTER,) * 3, BudgetClass.NONE)
+NONE_LEVEL: Final = len(LEVELS) - 1
 
 #: State is late if it is so much older than 1.5 times its best age [ms]. A single large frame of media before it makes
 #: state tens of milliseconds older, which is no reason yet.
@@ -28,8 +31,9 @@ RISE_MS: Final = 80.0
 RISE_MISSED: Final = 0.6
 #: Reports of which the best counts: a minute.
 MAX_REPORTS: Final = 60
-#: Share of due frames that a connection did not take, in two measures in a row, from which on the link counts as full.
-BLOCKED: Final = 0.25
+#: Share of due frames that a connection did not take, in two measures in a row, from which on the link counts as full:
+#: 3 of the 15 frames of a measure at 60 Hz.
+BLOCKED: Final = 0.15
 #: After a change, frames that are under way still have to arrive.
 SETTLE_NS: Final = 500 * MILLISECOND
 #: Reports do not count for so long after a level was lowered: queues on the way have to drain, beside the media that
@@ -52,7 +56,7 @@ PROBE_NS: Final = 3 * SECOND
 #: Without any media, congestion that stays so long has other causes: it becomes the new normal of the link.
 RELEARN_NS: Final = 5 * SECOND
 
-#: Bytes per second of every stream at full, half and quarter, as a client would be sent.
+#: Bytes per second of every stream at each level but the last, as a client would be sent.
 Rates = Mapping[str, Sequence[float]]
 
 
@@ -80,7 +84,7 @@ class LinkMeasure(NamedTuple):
 
 
 class BudgetGrant(NamedTuple):
-    """Levels of one client. `levels`: index into `CLASSES` by stream. `bytes_per_s`: bound of all, 0 for none."""
+    """Levels of one client. `levels`: index into `LEVELS` by stream. `bytes_per_s`: bound of all, 0 for none."""
 
     levels: dict[str, int]
     bytes_per_s: float = 0.0

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 
-from iris_session.front.media.budget import MILLISECOND, NONE_LEVEL, SECOND
+from iris_session.front.media.budget import LEVELS, MILLISECOND, NONE_LEVEL, SECOND
 from iris_session.protocol.codec import encode_media_header
 from iris_session.protocol.limits import TokenBucket
 from iris_session.protocol.media import (
@@ -53,7 +53,7 @@ class MediaSubscriber(NamedTuple):
 
     Attributes:
         user_id: Key that its subscriptions must come with.
-        levels: Index into `CLASSES` by stream.
+        levels: Index into `LEVELS` by stream.
         default_level: Level of other streams.
     """
 
@@ -74,10 +74,10 @@ class DeliveryCounters(NamedTuple):
 
 
 class StreamStats(NamedTuple):
-    """Measurements of a stream. `rates`: bytes per second at full, half, quarter. `hz`: frames per second. `encoding`:
+    """Measurements of a stream. `rates`: bytes per second by level. `hz`: frames per second. `encoding`:
     of the newest frame, which was received at `received_ns`. `info`: as of its source, with texts cut to length."""
 
-    rates: tuple[float, float, float]
+    rates: tuple[float, ...]
     hz: float
     source: str
     subscribers: int
@@ -130,7 +130,7 @@ class _Stream:
         self.push: MediaPush | None = None
         self.frames: dict[int, Any] = {}
         self.count = 0
-        self.level_bytes = [0, 0, 0]
+        self.level_bytes = [0] * NONE_LEVEL
         self.rate_samples: deque[tuple[int, int, tuple[int, ...]]] = deque(maxlen=RATE_SAMPLES)
 
     def select_frame(self, level: int) -> tuple[Any, bool]:
@@ -138,14 +138,14 @@ class _Stream:
         offered = max(have for have in self.frames if have <= level)
         return self.frames[offered], self.seq % (1 << (level - offered)) == 0
 
-    def compute_rates(self) -> tuple[tuple[float, float, float], float]:
+    def compute_rates(self) -> tuple[tuple[float, ...], float]:
         """Return bytes per second by level, and frames per second."""
         if len(self.rate_samples) < 2 or self.rate_samples[-1][0] == self.rate_samples[0][0]:
-            return (0.0, 0.0, 0.0), 0.0
+            return (0.0,) * NONE_LEVEL, 0.0
         (since_ns, count, before), (now_ns, count_now, now) = self.rate_samples[0], self.rate_samples[-1]
         seconds = (now_ns - since_ns) * 1e-9
-        full, half, quarter = ((b - a) / seconds for a, b in zip(before, now, strict=True))
-        return (full, half, quarter), (count_now - count) / seconds
+        rates = tuple((b - a) / seconds for a, b in zip(before, now, strict=True))
+        return rates, (count_now - count) / seconds
 
 
 class MediaScheduler:
@@ -238,7 +238,7 @@ class MediaScheduler:
         """Store a frame of a source as the newest of its stream, and its info. Return false if it was dropped and
         counted.
         """
-        levels = [CLASSES.index(name) for name in push.classes if name in CLASSES[:NONE_LEVEL]]
+        levels = [CLASSES.index(name) for name in push.classes if name in CLASSES[:-1]]
         fits = len(frames) == len(levels) == len(push.classes) == len(set(levels))
         fits = fits and (0 in levels or (not levels and push.info is not None))
         if not fits or not is_stream_name(push.stream):
@@ -423,7 +423,7 @@ class MediaScheduler:
         push = stream.push
         header = MediaHeader(
             name,
-            CLASSES[level],
+            LEVELS[level],
             push.scene_epoch,
             stream.seq,
             push.capture_ns,
@@ -433,7 +433,7 @@ class MediaScheduler:
             push.sent_ns,
             stream.received_ns,
         )
-        topic = make_topic(number, name) + CLASSES[level].encode()
+        topic = make_topic(number, name) + LEVELS[level].encode()
         if not send(topic, encode_media_header(header), frame):
             return False
         subscription.delivered += 1

@@ -13,6 +13,7 @@ from iris_session.front.channel_guard import ChannelFlood
 from iris_session.front.context import FrontContext
 from iris_session.front.key_budgets import IngestBackoff
 from iris_session.front.media.budget import (
+    LEVELS,
     MILLISECOND,
     NONE_LEVEL,
     SECOND,
@@ -24,7 +25,7 @@ from iris_session.front.media.budget import (
 from iris_session.front.media.proxy import MediaProxy
 from iris_session.front.media.scheduler import DeliveryCounters, MediaSubscriber, StreamStats
 from iris_session.protocol.limits import TokenBucket
-from iris_session.protocol.media import CLASSES, StreamBudget
+from iris_session.protocol.media import StreamBudget
 from iris_session.protocol.names import BudgetClass
 from iris_session.protocol.status import ClientReport, DeliveryBudget, MediaStreamReport
 
@@ -254,7 +255,7 @@ class MediaService:
         level = state.grant.levels.get(described.stream, _initial_level(state.grant))
         facts = self._stats.get(described.stream)
         rate = 0.0 if facts is None or level >= NONE_LEVEL else facts.rates[level]
-        return msgspec.structs.replace(described, budget_class=CLASSES[level], mbit_per_s=round(rate / MBIT, 3))
+        return msgspec.structs.replace(described, budget_class=LEVELS[level], mbit_per_s=round(rate / MBIT, 3))
 
     def _send_budgets(self) -> None:
         """Send budgets that have changed, other than in their rates."""
@@ -292,4 +293,4 @@ def _initial_level(grant: BudgetGrant) -> int:
 
 
 def _lowest_class(state: _ClientState) -> str:
-    return CLASSES[max(state.grant.levels.values(), default=0)] if state.streams else BudgetClass.FULL
+    return LEVELS[max(state.grant.levels.values(), default=0)] if state.streams else BudgetClass.FULL
