@@ -24,13 +24,13 @@ from numpy.typing import NDArray
 
 from anchors.camera import CameraModel
 from iris_session.bench.cloud_room import WORKSPACE, RoomPicture, make_room_camera, make_room_pose, render_room
+from iris_session.bench.cloud_source import STREAM, publish
 from iris_session.client import Client
 from iris_session.cloud.frames import DepthFrame
 from iris_session.cloud.pipeline import Cloud, CloudPipeline, PipelineCamera, PipelineSettings, PlacedFrame
 from iris_session.cloud.voxels import DepthLimits, pack_keys
 from iris_session.streams.cloud import encode_cloud
 
-STREAM: Final = "room"
 STAGES: Final = ("read", "voxels", "outliers", "budget", "encode", "send")
 MIN_POINTS, MIN_AROUND = 2, 4
 ERROR_M: Final = 0.01
@@ -150,7 +150,7 @@ class CloudCamera:
             now_ns = client.session_now_ns()
             cloud, stages_ms = self.make_cloud(now_ns)
             made = time.perf_counter()
-            sent = client.media.publish(STREAM, cloud.frames, capture_ns=now_ns, encoding="cloud")
+            sent = publish(client, STREAM, cloud.frames, now_ns)
             client.poll(0.0)
             ended = time.perf_counter()
             refused += not sent

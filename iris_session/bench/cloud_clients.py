@@ -54,10 +54,14 @@ class CloudClient(BenchClient):
         self._origin_ns = job.origin_ns
         self.feed = self.client.media.subscribe(job.stream)
         self.rows: list[tuple[int, ...]] = []
+        self.levels: list[tuple[int, int]] = []  # session time at which the session told a class, and the class
         self.heads = 0
 
     def decode_newest(self) -> None:
         """Decode the newest cloud, as an application does before it draws."""
+        level = CLASSES.index(self.feed.budget_class)
+        if self.recording and (not self.levels or self.levels[-1][1] != level):
+            self.levels.append((time.monotonic_ns() - self._origin_ns, level))
         frame = self.feed.pop_newest()
         if frame is None:
             return
@@ -99,6 +103,7 @@ class CloudClient(BenchClient):
             "handed_ns": np.array(self.handed_ns, np.int64),
             "state_ns": np.array(self.state_ns, np.int64),
             "clouds": np.array(self.rows, np.int64).reshape(-1, len(CloudColumn)),
+            "levels": np.array(self.levels, np.int64).reshape(-1, 2),
             "counts": np.array(counts, np.int64),
         }
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.client import Client, CurveKeys
+from iris_session.client.errors import NotConnectedError
 from iris_session.cloud.pipeline import CLASSES
 from iris_session.streams.cloud import encode_cloud, order_points
 
@@ -63,6 +64,14 @@ class MovingCloud:
         return encode_cloud(self.compute_positions(t), self.colors, voxel_m=VOXEL_M, error_m=ERROR_M, classes=CLASSES)
 
 
+def publish(client: Client, stream: str, frames: dict[str, bytes], capture_ns: int) -> bool:
+    """Publish a cloud. Return false if the link takes nothing, or the client is reconnecting."""
+    try:
+        return client.media.publish(stream, frames, capture_ns=capture_ns, encoding="cloud")
+    except NotConnectedError:
+        return False
+
+
 def run(cloud: MovingCloud, client: Client, hz: int, seconds: float) -> dict[str, Any]:
     """Publish for some seconds. Return captures [ns] of the frames by number, and what their encoding took [ms]."""
     captures: dict[int, int] = {}
@@ -78,8 +87,7 @@ def run(cloud: MovingCloud, client: Client, hz: int, seconds: float) -> dict[str
         began_ns = time.perf_counter_ns()
         frames = encode_cloud(positions, cloud.colors, voxel_m=VOXEL_M, error_m=ERROR_M, classes=CLASSES)
         encode_ms.append((time.perf_counter_ns() - began_ns) * 1e-6)
-        sent = client.media.publish(STREAM, frames, capture_ns=capture_ns, encoding="cloud")
-        refused += not sent
+        refused += not publish(client, STREAM, frames, capture_ns)
         captures[number] = capture_ns
         number = max(number + 1, int((time.perf_counter() - begin) * hz))  # frames without time for them are left out
     return {"captures": captures, "encode_ms": encode_ms, "refused": refused}

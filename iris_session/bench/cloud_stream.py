@@ -191,21 +191,31 @@ def summarize(
 
 
 def _summarize_slow(logs: Sequence[Log], got: Measurement, slow: Interval) -> dict[str, float]:
-    """Return the time to the first cloud of a coarser class, the longest without a cloud, and the rate after that."""
-    lower_s, gaps_s, rates = [], [], []
+    """Return what happens after the bandwidth has fallen.
+
+    Times until the session told a coarser class, and until a cloud of one came; then the longest time without a cloud,
+    and the rate after `MAX_LOWER_S`.
+    """
+    told_s, lower_s, gaps_s, rates = [], [], [], []
     for log in logs:
         rows = _select(log["clouds"], Column.HANDED, got, slow)
         at_s = (rows[:, Column.HANDED] - got.begin_ns) * 1e-9 - slow.begin_s
-        coarser = at_s[rows[:, Column.LEVEL] > 0]
-        lower_s.append(float(coarser[0]) if len(coarser) else float("inf"))
+        levels = _select(log["levels"], 0, got, slow)
+        told_s.append(_first(((levels[:, 0] - got.begin_ns) * 1e-9 - slow.begin_s)[levels[:, 1] > 0]))
+        lower_s.append(_first(at_s[rows[:, Column.LEVEL] > 0]))
         length_s = slow.end_s - slow.begin_s
         gaps_s.append(float(np.diff(np.concatenate([[0.0], at_s, [length_s]])).max()))
         rates.append(float(np.count_nonzero(at_s >= MAX_LOWER_S)) / max(length_s - MAX_LOWER_S, 0.1))
     return {
-        "lower_class_after_s": round(max(lower_s), 3),
+        "lower_class_after_s": round(max(told_s), 3),
+        "lower_cloud_after_s": round(max(lower_s), 3),
         "longest_gap_s": round(max(gaps_s), 3),
         "slow_hz_min": round(min(rates), 2),
     }
+
+
+def _first(times_s: NDArray[Any]) -> float:
+    return float(times_s[0]) if len(times_s) else float("inf")
 
 
 def _make_bars(results: dict[str, Any], hz: int, mbit: float) -> list[Bar]:
