@@ -24,16 +24,15 @@ from iris_session.client import ClientGroup
 from iris_session.client.media import MediaFrame
 from iris_session.protocol.codec import encode_media_header
 from iris_session.protocol.media import CLASSES, make_topic
-from iris_session.streams.cloud import decode_positions, read_header, unpack_colors, view_points
+from iris_session.streams.cloud import decode_cloud
 
 
 class CloudColumn(IntEnum):
-    """Columns of the log of clouds: times [ns], decoding to positions, and the whole of it, then bytes and points."""
+    """Columns of the log of clouds: times [ns], checksum, bytes, points, level."""
 
     CAPTURE = 0
     HANDED = auto()
-    POSITIONS = auto()
-    WHOLE = auto()
+    DECODED = auto()
     CHECKSUM = auto()
     SIZE = auto()
     POINTS = auto()
@@ -54,7 +53,7 @@ class CloudClient(BenchClient):
         self._origin_ns = job.origin_ns
         self.feed = self.client.media.subscribe(job.stream)
         self.rows: list[tuple[int, ...]] = []
-        self.levels: list[tuple[int, int]] = []  # session time at which the session told a class, and the class
+        self.levels: list[tuple[int, int]] = []  # session time at which a class was received, and the class
         self.heads = 0
 
     def decode_newest(self) -> None:
@@ -66,11 +65,8 @@ class CloudClient(BenchClient):
         if frame is None:
             return
         began_ns = time.thread_time_ns()
-        header = read_header(frame.data)
-        positions = decode_positions(frame.data, header)
+        cloud = decode_cloud(frame.data)
         spent_ns = time.thread_time_ns() - began_ns
-        unpack_colors(view_points(frame.data, header)["color"])
-        with_colors_ns = time.thread_time_ns() - began_ns
         handed_ns = time.monotonic_ns() - self._origin_ns
         if not self.recording:
             return
@@ -83,10 +79,9 @@ class CloudClient(BenchClient):
                 frame.header.capture_ns,
                 handed_ns,
                 spent_ns,
-                with_colors_ns,
                 zlib.crc32(frame.data),
                 len(frame.data),
-                len(positions),
+                len(cloud.positions),
                 CLASSES.index(frame.header.budget_class),
             )
         )

@@ -27,6 +27,8 @@ ERROR_M: Final = 0.01
 _SWING: Final = 0.15
 _HZ: Final = 0.4
 _WAVE: Final = 2.0
+#: Red, green, blue of the walls and the floor.
+_PAINT: Final = np.array(((215, 210, 200), (190, 200, 215), (130, 110, 90)))
 _LOW, _HIGH = np.float32((-2.0, -2.0, 0.0)), np.float32((2.0, 2.0, 2.4))
 
 
@@ -47,7 +49,7 @@ class MovingCloud:
         axis = random.integers(0, 3, points)
         self._base[np.arange(points), axis] = _LOW[axis]
         self._phase = _WAVE * self._base.sum(axis=1)
-        self.colors = random.integers(0, 256, (points, 3)).astype(np.uint8)
+        self.colors = (_PAINT[axis] + random.integers(-12, 13, (points, 3))).astype(np.uint8)
 
     def compute_positions(self, t: float) -> NDArray[np.float32]:
         """Return the positions (n, 3) at a time [s]."""

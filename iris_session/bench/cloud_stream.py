@@ -164,9 +164,8 @@ def summarize(
         "age_ms_p99": _percentile((rows[:, Column.HANDED] - rows[:, Column.CAPTURE]) * MS, 99),
         "encode_ms_p50": _percentile(encode_ms, 50),
         "encode_ms_p99": _percentile(encode_ms, 99),
-        "decode_ms_p50": _percentile(clouds[:, Column.POSITIONS] * MS, 50),
-        "decode_ms_p99": _percentile(clouds[:, Column.POSITIONS] * MS, 99),
-        "decode_with_colors_ms_p50": _percentile(clouds[:, Column.WHOLE] * MS, 50),
+        "decode_ms_p50": _percentile(clouds[:, Column.DECODED] * MS, 50),
+        "decode_ms_p99": _percentile(clouds[:, Column.DECODED] * MS, 99),
         "max_error_mm": round(errors_m * 1e3, 5),
         "stated_error_mm": round(stated_m * 1e3, 5),
         "mbit_per_s": round(float(whole[:, Column.SIZE].mean()) * 8e-6 * hz, 1),
@@ -193,21 +192,21 @@ def summarize(
 def _summarize_slow(logs: Sequence[Log], got: Measurement, slow: Interval) -> dict[str, float]:
     """Return what happens after the bandwidth has fallen.
 
-    Times until the session told a coarser class, and until a cloud of one came; then the longest time without a cloud,
-    and the rate after `MAX_LOWER_S`.
+    Times until the client knew of a coarser class, and until a cloud of one came; the longest time without a cloud; and
+    the rate after `MAX_LOWER_S`.
     """
-    told_s, lower_s, gaps_s, rates = [], [], [], []
+    known_s, lower_s, gaps_s, rates = [], [], [], []
     for log in logs:
         rows = _select(log["clouds"], Column.HANDED, got, slow)
         at_s = (rows[:, Column.HANDED] - got.begin_ns) * 1e-9 - slow.begin_s
         levels = _select(log["levels"], 0, got, slow)
-        told_s.append(_first(((levels[:, 0] - got.begin_ns) * 1e-9 - slow.begin_s)[levels[:, 1] > 0]))
+        known_s.append(_first(((levels[:, 0] - got.begin_ns) * 1e-9 - slow.begin_s)[levels[:, 1] > 0]))
         lower_s.append(_first(at_s[rows[:, Column.LEVEL] > 0]))
         length_s = slow.end_s - slow.begin_s
         gaps_s.append(float(np.diff(np.concatenate([[0.0], at_s, [length_s]])).max()))
         rates.append(float(np.count_nonzero(at_s >= MAX_LOWER_S)) / max(length_s - MAX_LOWER_S, 0.1))
     return {
-        "lower_class_after_s": round(max(told_s), 3),
+        "lower_class_after_s": round(max(known_s), 3),
         "lower_cloud_after_s": round(max(lower_s), 3),
         "longest_gap_s": round(max(gaps_s), 3),
         "slow_hz_min": round(min(rates), 2),

@@ -222,8 +222,8 @@ def _merge(other_keys: Any, other_sums: Any, table: Any) -> Any:
 def _count_around(keys: Any) -> Any:
     """Return how many of the 26 cells around each cell there are. Keys are ascending.
 
-    Along an axis cells follow one another; the other neighbours lie in four rows ahead, which are swept along, and
-    what is ahead of one cell is behind the other.
+    Along an axis cells follow one another; the others lie in four rows ahead, which are swept along, and four behind:
+    one cell is ahead of the other.
     """
     n = keys.shape[0]
     around = np.zeros(n, np.uint8)

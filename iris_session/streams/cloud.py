@@ -149,28 +149,13 @@ def encode_cloud(
 def decode_cloud(payload: bytes | memoryview) -> CloudFrame:
     """Decode a frame. Raises `StreamError`."""
     header = read_header(payload)
-    return CloudFrame(
-        decode_positions(payload, header),
-        unpack_colors(view_points(payload, header)["color"]),
-        header.error_m,
-        header.voxel_m,
-    )
-
-
-def decode_positions(payload: bytes | memoryview, header: CloudHeader) -> Floats:
-    """Return the positions (n, 3) [m] of a frame with this header, for an application that takes no colours."""
-    nodes = view_points(payload, header)["node"]
+    points = np.frombuffer(payload, POINT, header.n_points, HEADER_BYTES)
     step = np.float32(2.0**header.exponent)
     rows = np.empty((3, header.n_points), np.float32)
     for axis, origin in enumerate(header.origin):
-        np.multiply(nodes[:, axis], step, out=rows[axis])
+        np.multiply(points["node"][:, axis], step, out=rows[axis])
         rows[axis] += np.float32(origin) * step
-    return rows.T
-
-
-def view_points(payload: bytes | memoryview, header: CloudHeader) -> npt.NDArray[np.void]:
-    """Return the points of a frame with this header as they are in its bytes."""
-    return np.frombuffer(payload, POINT, header.n_points, HEADER_BYTES)
+    return CloudFrame(rows.T, unpack_colors(points["color"]), header.error_m, header.voxel_m)
 
 
 def read_header(payload: bytes | memoryview) -> CloudHeader:

@@ -66,7 +66,7 @@ def test_report_of_a_stream(tmp_path: Path) -> None:
     assert 15.0 < got["delivered_hz_min"] <= 31.0
     assert 8.0 < got["bytes_per_point"] <= 9.1
     assert 0.0 < got["max_error_mm"] <= got["stated_error_mm"] < 0.2
-    assert 0.0 < got["decode_ms_p50"] < got["decode_with_colors_ms_p50"]
+    assert 0.0 < got["decode_ms_p50"] <= got["decode_ms_p99"]
     assert got["frames_malformed"] == got["frames_not_logged"] == 0
     assert all(math.isfinite(got[key]) for key in ("state_age_ms_p99", "state_age_ms_p99_without", "age_ms_p99"))
     keys = {one["key"] for one in result["bars"]}
