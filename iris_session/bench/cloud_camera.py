@@ -8,6 +8,7 @@ Commands on standard input, each answered by one JSON line: the cases, as JSON; 
 
 from __future__ import annotations
 
+import importlib
 import math
 import os
 import sys
@@ -203,7 +204,7 @@ def _filter_with_numpy(points: NDArray[Any], colors: NDArray[Any], voxel_m: floa
 
 def _time_open3d_ms(points: NDArray[Any], colors: NDArray[Any], voxel_m: float) -> float | None:
     try:
-        import open3d
+        open3d: Any = importlib.import_module("open3d")
     except (ImportError, OSError):  # not installed, or a library of the system is missing
         return None
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))

@@ -21,7 +21,7 @@ import numpy as np
 
 from iris_session.bench.clients import MAX_FRAMES, BenchClient, ClientJob, Job
 from iris_session.client import ClientGroup
-from iris_session.client.media import MediaFrame
+from iris_session.client.feeds import MediaFrame
 from iris_session.protocol.codec import encode_media_header
 from iris_session.protocol.media import CLASSES, make_topic
 from iris_session.streams.cloud import decode_cloud

@@ -78,11 +78,11 @@ def render_room(camera: CameraModel, T_world_camera: npt.NDArray[np.float64], se
     rays = (rays @ T_world_camera[:3, :3].T).astype(np.float32)
     rays[rays == 0.0] = 1e-9
     place = T_world_camera[:3, 3].astype(np.float32)
-    walls = (np.where(rays > 0.0, *(np.float32(corner) for corner in ROOM[::-1])) - place) / rays
+    walls = (np.where(rays > 0.0, *(np.array(corner, np.float32) for corner in ROOM[::-1])) - place) / rays
     z = walls.min(axis=2)
     color = np.array(((215, 210, 200), (205, 210, 215), (130, 120, 110)), np.uint8)[walls.argmin(axis=2)]
     for low, high, paint in BOXES:
-        sides = np.stack([(np.float32(corner) - place) / rays for corner in (low, high)])
+        sides = np.stack([(np.array(corner, np.float32) - place) / rays for corner in (low, high)])
         enter, leave = sides.min(axis=0).max(axis=2), sides.max(axis=0).min(axis=2)
         hit = (enter > 0.0) & (enter < leave) & (enter < z)
         z[hit] = enter[hit]

@@ -29,7 +29,7 @@ _HZ: Final = 0.4
 _WAVE: Final = 2.0
 #: Red, green, blue of the walls and the floor.
 _PAINT: Final = np.array(((215, 210, 200), (190, 200, 215), (130, 110, 90)))
-_LOW, _HIGH = np.float32((-2.0, -2.0, 0.0)), np.float32((2.0, 2.0, 2.4))
+_LOW, _HIGH = np.array(((-2.0, -2.0, 0.0), (2.0, 2.0, 2.4)), np.float32)
 
 
 class SourceJob(msgspec.Struct, frozen=True):
@@ -54,7 +54,7 @@ class MovingCloud:
     def compute_positions(self, t: float) -> NDArray[np.float32]:
         """Return the positions (n, 3) at a time [s]."""
         swing = np.sin(np.float32(2.0 * np.pi * _HZ * t) + self._phase) * np.float32(_SWING)
-        return self._base + swing[:, None]
+        return np.asarray(self._base + swing[:, None], np.float32)
 
     def sort(self, t: float) -> NDArray[np.float64]:
         """Return the positions at a time in the order of the points of a frame."""

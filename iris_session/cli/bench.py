@@ -207,8 +207,10 @@ def _run_benchmark(arguments: argparse.Namespace, progress: Callable[[str], None
     if arguments.bench == "cloud-stream":
         from iris_session.bench.cloud_stream import run_cloud_stream
 
-        sizes = (arguments.points, arguments.hz, arguments.clients, arguments.seconds or 20.0)
-        return run_cloud_stream(*sizes, arguments.mbit, arguments.seed, arguments.curve, progress)
+        counts = (arguments.points, arguments.hz, arguments.clients)
+        return run_cloud_stream(
+            *counts, arguments.seconds or 20.0, arguments.mbit, arguments.seed, arguments.curve, progress
+        )
     common = {"curve": arguments.curve, "profile": arguments.profile, "seed": arguments.seed, "progress": progress}
     if arguments.bench == "state":
         from iris_session.bench.state import run_state
