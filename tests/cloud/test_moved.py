@@ -1,0 +1,181 @@
+"""A bumped camera is found by the sheets it sees, on computed photographs; noise and single bad detections are not."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from anchors.camera import CameraModel, pose_from_matrix, pose_to_matrix
+from anchors.detection import DetectionError, SheetDetection, SheetDetector
+from anchors.pose import PoseTuple, compose, inverse, quat_from_rotvec
+from anchors.sheet import Sheet
+from anchors.sheet_print import to_pdf
+from iris_session.cloud.moved import CONFIRM_EVERY_NS, LOOK_EVERY_NS, MoveMonitor
+from tests.cloud.rays import look_at
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+
+from render_sheet import Conditions, Page, photograph
+
+CAMERA = CameraModel(640, 480, 585.0, 585.0, 319.5, 239.5, (0.08, -0.18, 0.0008, -0.0005, 0.0))
+TABLE, SHELF = Sheet("table", 0.160), Sheet("shelf", 0.160)
+ANCHORS: dict[str, PoseTuple] = {
+    "table": ((0.0, -0.45, 0.0), (1.0, 0.0, 0.0, 0.0)),
+    "shelf": ((0.3, -0.35, 0.0), quat_from_rotvec((0.0, 0.0, 0.4))),
+}
+POSE = look_at((0.3, -1.2, 0.9), (0.1, -0.4, 0.0))
+CALIBRATED = pose_from_matrix(POSE)
+BUMP: PoseTuple = ((0.03, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+SECOND_NS = 1_000_000_000
+#: Standard deviations of the position and rotation of a sheet a metre away.
+COVARIANCE = np.diag([0.0005**2, 0.0005**2, 0.002**2, *[math.radians(0.3) ** 2] * 3])
+
+
+@pytest.fixture(scope="module")
+def pages() -> dict[str, Page]:
+    return {sheet.anchor_id: Page(to_pdf(sheet)) for sheet in (TABLE, SHELF)}
+
+
+def take_picture(pages: dict[str, Page], T_world_camera: PoseTuple, seed: int, *names: str) -> NDArray[np.uint8]:
+    """Photograph sheets that lie where the session has them, from a camera. Return RGB."""
+    placed = [(pages[name], compose(inverse(T_world_camera), ANCHORS[name])) for name in names]
+    grey = photograph(placed, CAMERA, Conditions(rays=2), np.random.default_rng(seed))
+    return np.repeat(grey[:, :, None], 3, axis=2)
+
+
+def detect(name: str, T_world_camera: PoseTuple, random: np.random.Generator | None = None) -> SheetDetection:
+    """Return the detection of a sheet by a camera, with noise."""
+    error = np.zeros(6) if random is None else np.linalg.cholesky(COVARIANCE) @ random.normal(size=6)
+    p, q = compose(inverse(T_world_camera), ANCHORS[name])
+    rx, ry, rz = error[3:].tolist()
+    turned = compose(((0.0, 0.0, 0.0), quat_from_rotvec((rx, ry, rz))), ((0.0, 0.0, 0.0), q))[1]
+    x, y, z = (np.array(p) + error[:3]).tolist()
+    covariance = tuple(COVARIANCE.ravel().tolist())
+    return SheetDetection(name, "board", 0.16, ((x, y, z), turned), covariance, None, math.inf, 0.3, 4, True)
+
+
+def make_monitor(error_m: float = 0.010) -> MoveMonitor:
+    return MoveMonitor(CAMERA, [TABLE, SHELF], error_m=error_m)
+
+
+def test_a_bump_of_3_cm_is_found_within_a_second_and_cleared_when_it_is_undone(pages: dict[str, Page]) -> None:
+    monitor, now_ns = make_monitor(), 0
+    bumped = compose(CALIBRATED, BUMP)
+    for phase, pose in enumerate((CALIBRATED, bumped, CALIBRATED)):
+        changed_ns, until_ns = now_ns, now_ns + SECOND_NS
+        verdicts = []
+        while now_ns < until_ns:  # pictures at 30 Hz; a look when it is due
+            if monitor.is_due(now_ns):
+                picture = take_picture(pages, pose, now_ns % 9973, "table")
+                verdicts.append((now_ns - changed_ns, monitor.look(picture, POSE, ANCHORS, now_ns)))
+            now_ns += SECOND_NS // 30
+        assert monitor.seen_ns is not None
+        assert len(verdicts) <= 4
+        if phase != 1:
+            assert monitor.move is None
+            continue
+        assert monitor.move is not None
+        assert monitor.move.shift_m == pytest.approx(0.03, abs=0.006)
+        assert math.degrees(monitor.move.turn_rad) < 0.5
+        assert str(monitor.move).startswith("by ")
+        assert next(late_ns for late_ns, move in verdicts if move is not None) < SECOND_NS
+
+
+def test_noise_is_no_alarm_in_ten_minutes() -> None:
+    random, monitor = np.random.default_rng(3), make_monitor()
+    for step in range(10 * 60 * 2):
+        assert (
+            monitor.add_look([detect("table", CALIBRATED, random)], CALIBRATED, ANCHORS, step * LOOK_EVERY_NS) is None
+        )
+    # ... nor is an error of the calibration within what it states.
+    off = compose(CALIBRATED, ((0.009, 0.0, 0.0), quat_from_rotvec((0.0, 0.0, math.radians(0.5)))))
+    for step in range(1200):
+        assert monitor.add_look([detect("table", off, random)], CALIBRATED, ANCHORS, step * LOOK_EVERY_NS) is None
+
+
+def test_one_bad_detection_is_no_alarm_and_asks_for_another_look() -> None:
+    monitor = make_monitor()
+    bumped = compose(CALIBRATED, BUMP)
+    poses = [CALIBRATED] * 3 + ([bumped] * 2 + [CALIBRATED]) * 5
+    for step, pose in enumerate(poses):
+        assert monitor.add_look([detect("table", pose)], CALIBRATED, ANCHORS, step * SECOND_NS) is None
+        contradicts = pose == bumped
+        assert monitor.is_due(step * SECOND_NS + CONFIRM_EVERY_NS) == contradicts
+        assert monitor.is_due(step * SECOND_NS + LOOK_EVERY_NS)
+
+
+def test_a_sheet_that_was_moved_is_not_a_camera_that_was_moved() -> None:
+    monitor = make_monitor()
+    bumped = compose(CALIBRATED, BUMP)
+    for step in range(5):
+        seen = [detect("table", CALIBRATED), detect("shelf", bumped)]
+        assert monitor.add_look(seen, CALIBRATED, ANCHORS, step * SECOND_NS) is None
+    for step in range(5, 8):
+        seen = [detect("table", bumped), detect("shelf", bumped)]
+        move = monitor.add_look(seen, CALIBRATED, ANCHORS, step * SECOND_NS)
+    assert move is not None
+    assert move.shift_m == pytest.approx(0.03, abs=1e-6)
+
+
+def test_without_sheets_the_verdict_stays() -> None:
+    monitor = make_monitor()
+    bumped = compose(CALIBRATED, BUMP)
+    for step in range(3):
+        monitor.add_look([detect("table", bumped)], CALIBRATED, ANCHORS, step * SECOND_NS)
+    assert monitor.move is not None
+    ambiguous = replace(detect("table", CALIBRATED), mirrored=CALIBRATED, mirrored_ratio=1.0)
+    unknown = replace(detect("table", CALIBRATED), anchor_id="door")
+    for step in range(3, 9):
+        assert monitor.add_look([ambiguous, unknown], CALIBRATED, ANCHORS, step * SECOND_NS) is not None
+    assert monitor.seen_ns == 2 * SECOND_NS
+
+
+def test_a_turned_camera_is_found() -> None:
+    monitor = make_monitor()
+    turned = compose(CALIBRATED, ((0.0, 0.0, 0.0), quat_from_rotvec((0.0, math.radians(2.0), 0.0))))
+    for step in range(3):
+        move = monitor.add_look([detect("table", turned)], CALIBRATED, ANCHORS, step * SECOND_NS)
+    assert move is not None
+    assert math.degrees(move.turn_rad) == pytest.approx(2.0, abs=0.01)
+
+
+def test_a_camera_that_is_carried_is_compared_with_where_it_should_be() -> None:
+    """The pose by the calibration changes with the body that carries the camera."""
+    monitor = make_monitor()
+    for step in range(6):
+        carried = compose(((0.05 * step, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)), CALIBRATED)
+        pose = compose(carried, BUMP) if step > 2 else carried
+        move = monitor.add_look([detect("table", pose)], carried, ANCHORS, step * SECOND_NS)
+        assert (move is not None) == (step == 5)
+    assert move is not None
+    assert move.shift_m == pytest.approx(0.03, abs=1e-6)
+
+
+def test_pictures_of_another_size_are_refused() -> None:
+    with pytest.raises(DetectionError, match="320 x 240"):
+        make_monitor().look(np.zeros((240, 320, 3), np.uint8), pose_to_matrix(CALIBRATED), ANCHORS, 0)
+    with pytest.raises(DetectionError, match="same id"):
+        MoveMonitor(CAMERA, [TABLE, TABLE], error_m=0.01)
+
+
+def test_colours_are_red_green_blue() -> None:
+    """A detector takes blue first: a sheet on a coloured ground is as grey as it is to the eye."""
+    seen: list[NDArray[np.uint8]] = []
+    monitor = make_monitor()
+
+    class Detector(SheetDetector):
+        def detect(self, image: NDArray[np.uint8]) -> list[SheetDetection]:
+            seen.append(image)
+            return []
+
+    monitor._detector = Detector([TABLE], CAMERA)
+    red = np.zeros((480, 640, 3), np.uint8)
+    red[:, :, 0] = 255
+    monitor.look(red, POSE, ANCHORS, 0)
+    assert seen[0][0, 0].tolist() == [0, 0, 255]
