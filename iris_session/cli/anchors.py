@@ -10,6 +10,8 @@ import csv
 import json
 import math
 import re
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -202,10 +204,12 @@ def calibrate_cameras(arguments: argparse.Namespace) -> dict[str, Any]:
         CommandError: The options or files are unusable.
         CalibrationError: The pictures do not determine a result.
     """
-    sheets = _parse_sheets(arguments)
+    sheets = make_sheets(arguments.sheet)
     _check_options(arguments, sheets)
     if arguments.at:
-        return _solve_from_known_sheets(_read_pictures(arguments.folder, arguments.intrinsics, sheets), arguments)
+        return solve_from_known_sheets(
+            _read_pictures(arguments.folder, arguments.intrinsics, sheets), dict(arguments.at)
+        )
     poses = read_poses(arguments.poses)
     pictures = _read_pictures(arguments.folder, arguments.intrinsics, sheets)
     if len({picture.camera_name for picture in pictures}) > 1:
@@ -213,11 +217,12 @@ def calibrate_cameras(arguments: argparse.Namespace) -> dict[str, Any]:
     return _solve_from_robot_poses(pictures, poses, arguments)
 
 
-def _parse_sheets(arguments: argparse.Namespace) -> list[Sheet]:
+def make_sheets(sizes: Iterable[tuple[str, float]]) -> list[Sheet]:
+    """Return the sheets of the options `--sheet`: id and edge [m]."""
     from anchors.sheet import Sheet, SheetError
 
     try:
-        sheets = [Sheet(name, edge) for name, edge in arguments.sheet]
+        sheets = [Sheet(name, edge) for name, edge in sizes]
     except SheetError as error:
         raise CommandError(str(error)) from error
     if len({sheet.anchor_id for sheet in sheets}) != len(sheets):
@@ -391,13 +396,34 @@ def _solve_with_known_hand_pose(
     }
 
 
-def _solve_from_known_sheets(pictures: list[CalibrationPicture], arguments: argparse.Namespace) -> dict[str, Any]:
+def solve_from_known_sheets(
+    pictures: list[CalibrationPicture], known: Mapping[str, PoseTuple], *, at_rest: bool = False
+) -> dict[str, Any]:
+    """Solve the poses of cameras by sheets, of which some are at known poses.
+
+    Args:
+        pictures: Pictures of all cameras, and the sheets in them.
+        known: `T_base_sheet` by id.
+        at_rest: Nothing moved between the pictures of a camera: they share their errors, and count as one.
+
+    Returns:
+        The object that `--json` prints.
+
+    Raises:
+        CalibrationError: The pictures do not determine a result.
+    """
     from anchors.camera_rig import SheetView, solve_rig
     from anchors.pose import compose, inverse
     from anchors.robot_world import CalibrationError
 
+    times = Counter((p.camera_name, one.anchor_id) for p in pictures for one in p.sightings if not one.ambiguous)
     views = [
-        SheetView(picture.camera_name, one.anchor_id, one.T_camera_sheet, one.covariance)
+        SheetView(
+            picture.camera_name,
+            one.anchor_id,
+            one.T_camera_sheet,
+            tuple(v * (times[picture.camera_name, one.anchor_id] if at_rest else 1) for v in one.covariance),
+        )
         for picture in pictures
         for one in picture.sightings
         if not one.ambiguous
@@ -407,7 +433,7 @@ def _solve_from_known_sheets(pictures: list[CalibrationPicture], arguments: argp
     blind = {picture.camera_name for picture in pictures} - {view.camera for view in views}
     if blind:
         raise CalibrationError(f"camera {', '.join(sorted(blind))} saw no sheet: {_NO_SHEET_HINT}")
-    rig = solve_rig(views, dict(arguments.at))
+    rig = solve_rig(views, known)
     expected = {
         p.path: [compose(inverse(rig.cameras[p.camera_name]), rig.sheets[one.anchor_id]) for one in p.sightings]
         for p in pictures
@@ -526,7 +552,7 @@ def _list_poses(result: dict[str, Any]) -> list[tuple[str, dict[str, list[float]
 
 def calibration_to_toml(result: dict[str, Any]) -> str:
     """Return the result as TOML: named poses and residuals."""
-    lines = ["# Written by iris-session anchors calibrate-camera. Metres; quaternions w first."]
+    lines = ["# Written by iris-session. Metres; quaternions w first."]
     lines += [f'mode = "{result["mode"]}"']
     lines += [f"{key} = {result[key]!r}" for key in ("residual_mm_rms", "residual_deg_rms", "residual_px_rms")]
     lines += [f"{key} = {result[key]!r}" for key in ("error_mm_p95", "sigma_deg") if key in result]
@@ -568,7 +594,7 @@ def register_calibrate(actions: argparse._SubParsersAction[argparse.ArgumentPars
     one.add_argument("folder", type=Path, metavar="FOLDER", help="folder of the pictures")
     one.add_argument(
         "--sheet",
-        type=_parse_named_length,
+        type=parse_named_length,
         action="append",
         required=True,
         metavar="ID=LENGTH",
@@ -593,7 +619,7 @@ def register_calibrate(actions: argparse._SubParsersAction[argparse.ArgumentPars
     )
     one.add_argument(
         "--at",
-        type=_parse_named_pose,
+        type=parse_named_pose,
         action="append",
         default=[],
         metavar="ID=X,Y,Z,QW,QX,QY,QZ",
@@ -604,12 +630,14 @@ def register_calibrate(actions: argparse._SubParsersAction[argparse.ArgumentPars
     one.set_defaults(run=run_calibrate)
 
 
-def _parse_named_length(text: str) -> tuple[str, float]:
+def parse_named_length(text: str) -> tuple[str, float]:
+    """Parse `ID=LENGTH`, such as `table=160mm`."""
     name, _, rest = text.rpartition("=")
     return _check_sheet_id(name, text), parse_length(rest)
 
 
-def _parse_named_pose(text: str) -> tuple[str, PoseTuple]:
+def parse_named_pose(text: str) -> tuple[str, PoseTuple]:
+    """Parse `ID=X,Y,Z,QW,QX,QY,QZ`."""
     name, _, rest = text.rpartition("=")
     return _check_sheet_id(name, text), parse_pose(rest)
 
