@@ -207,9 +207,8 @@ def calibrate_cameras(arguments: argparse.Namespace) -> dict[str, Any]:
     sheets = make_sheets(arguments.sheet)
     _check_options(arguments, sheets)
     if arguments.at:
-        return solve_from_known_sheets(
-            _read_pictures(arguments.folder, arguments.intrinsics, sheets), dict(arguments.at)
-        )
+        pictures = _read_pictures(arguments.folder, arguments.intrinsics, sheets)
+        return solve_from_known_sheets(pictures, dict(arguments.at))[0]
     poses = read_poses(arguments.poses)
     pictures = _read_pictures(arguments.folder, arguments.intrinsics, sheets)
     if len({picture.camera_name for picture in pictures}) > 1:
@@ -398,7 +397,7 @@ def _solve_with_known_hand_pose(
 
 def solve_from_known_sheets(
     pictures: list[CalibrationPicture], known: Mapping[str, PoseTuple], *, at_rest: bool = False
-) -> dict[str, Any]:
+) -> tuple[dict[str, Any], dict[str, tuple[float, ...]]]:
     """Solve the poses of cameras by sheets, of which some are at known poses.
 
     Args:
@@ -407,7 +406,7 @@ def solve_from_known_sheets(
         at_rest: Nothing moved between the pictures of a camera: they share their errors, and count as one.
 
     Returns:
-        The object that `--json` prints.
+        The object that `--json` prints, and the covariances of the cameras (36 values, base frame).
 
     Raises:
         CalibrationError: The pictures do not determine a result.
@@ -443,13 +442,14 @@ def solve_from_known_sheets(
         name: {"T_base_camera": pose_to_dict(at), **_estimate_error(rig.covariances[name], at)}
         for name, at in rig.cameras.items()
     }
-    return {
+    result = {
         "mode": "sheets-of-known-place",
         **(next(iter(cameras.values())) if len(cameras) == 1 else {"cameras": cameras}),
         "sheets": {name: {"T_base_sheet": pose_to_dict(at)} for name, at in rig.sheets.items()},
         **_summarize_fit(rows),
         "pictures": rows,
     }
+    return result, rig.covariances
 
 
 _NO_SHEET_HINT: Final = (

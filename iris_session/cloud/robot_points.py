@@ -8,14 +8,14 @@ every point that is nearer to it than to the robot, of another one all but what 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from anchors.camera import pose_to_matrix
-from anchors.pose import PoseTuple
+from iris_session.cloud.pipeline import BodyPose
 from iris_session.cloud.voxels import Positions, load_kernels
 from iris_session.protocol.names import GeometryKind
 from iris_session.protocol.scene import Body, SceneSpec, Visual
@@ -35,9 +35,6 @@ _FAR: Final = 255
 #: Pieces that the longest edge of a triangle is cut into, at most: the floor below a robot is no part of it.
 _MAX_PIECES: Final = 512
 Distances = npt.NDArray[np.uint8]
-
-#: Return `T_world_body` of a body by name at a session time [ns], `None` while it is not known.
-BodyPose = Callable[[str, int], PoseTuple | None]
 
 
 def find_robot_bodies(spec: SceneSpec, robots: Iterable[RobotInfo]) -> tuple[Body, ...]:
