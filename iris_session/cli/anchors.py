@@ -415,14 +415,8 @@ def solve_from_known_sheets(
     from anchors.pose import compose, inverse
     from anchors.robot_world import CalibrationError
 
-    times = Counter((p.camera_name, one.anchor_id) for p in pictures for one in p.sightings if not one.ambiguous)
     views = [
-        SheetView(
-            picture.camera_name,
-            one.anchor_id,
-            one.T_camera_sheet,
-            tuple(v * (times[picture.camera_name, one.anchor_id] if at_rest else 1) for v in one.covariance),
-        )
+        SheetView(picture.camera_name, one.anchor_id, one.T_camera_sheet, one.covariance)
         for picture in pictures
         for one in picture.sightings
         if not one.ambiguous
@@ -433,13 +427,18 @@ def solve_from_known_sheets(
     if blind:
         raise CalibrationError(f"camera {', '.join(sorted(blind))} saw no sheet: {_NO_SHEET_HINT}")
     rig = solve_rig(views, known)
+    seen = Counter(picture.camera_name for picture in pictures if picture.sightings)
+    covariances = {
+        name: tuple(v * (seen[name] if at_rest else 1) for v in covariance)
+        for name, covariance in rig.covariances.items()
+    }
     expected = {
         p.path: [compose(inverse(rig.cameras[p.camera_name]), rig.sheets[one.anchor_id]) for one in p.sightings]
         for p in pictures
     }
     rows = _compute_residuals(pictures, expected, set())
     cameras = {
-        name: {"T_base_camera": pose_to_dict(at), **_estimate_error(rig.covariances[name], at)}
+        name: {"T_base_camera": pose_to_dict(at), **_estimate_error(covariances[name], at)}
         for name, at in rig.cameras.items()
     }
     result = {
@@ -449,7 +448,7 @@ def solve_from_known_sheets(
         **_summarize_fit(rows),
         "pictures": rows,
     }
-    return result, rig.covariances
+    return result, covariances
 
 
 _NO_SHEET_HINT: Final = (

@@ -14,6 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from iris_session.cli.cloud_calibrate import register_calibrate
+from iris_session.cli.cloud_scan import register_scan
 from iris_session.cli.common import (
     CommandError,
     add_address_options,
@@ -46,11 +48,12 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     """Add the command `cloud` with its actions."""
     parser = commands.add_parser(
         "cloud",
-        help="point clouds of depth cameras: run, example, inspect",
+        help="point clouds of depth cameras: run, example, inspect, calibrate, scan",
         description="Show what depth cameras see as a point cloud in a session. `serve --camera FILE` does so by "
         "itself for cameras at its machine.",
         epilog="examples:\n"
         "  iris-session cloud example -o camera.toml           a commented camera file, to be edited\n"
+        "  iris-session cloud calibrate camera.toml --out calibration.toml   poses of the cameras, by printed sheets\n"
         "  iris-session cloud inspect camera.toml              rate, points, faults, without a session\n"
         "  iris-session serve scene.xml --camera camera.toml   the cloud in a session of this machine\n"
         "  iris-session cloud run camera.toml --address 192.168.1.20   in a session of another machine\n"
@@ -58,7 +61,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    for register_action in (_register_run, _register_example, _register_inspect):
+    for register_action in (_register_run, _register_example, _register_inspect, register_calibrate, register_scan):
         register_action(actions)
 
 

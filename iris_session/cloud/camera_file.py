@@ -164,11 +164,12 @@ class CloudSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         return [self.stream, *pictures]
 
 
-def load_camera_file(path: str | Path) -> CloudSettings:
+def load_camera_file(path: str | Path, *, calibrated: bool = True) -> CloudSettings:
     """Read a camera file and the files that it names.
 
     Args:
         path: Path of the file.
+        calibrated: Every camera needs a pose. False to calibrate them: poses are left out, and need not be there.
 
     Returns:
         The settings; paths in them are absolute.
@@ -176,14 +177,15 @@ def load_camera_file(path: str | Path) -> CloudSettings:
     Raises:
         CameraFileError: The file cannot be read, or a value in it cannot be used.
     """
-    return _Reader(Path(path).expanduser().absolute()).read()
+    return _Reader(Path(path).expanduser().absolute(), calibrated).read()
 
 
 class _Reader:
     """Reads one file; knows its text, for the lines of errors."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, calibrated: bool) -> None:
         self._path = path
+        self._calibrated = calibrated
         self._text = _read_text(path, "camera file")
 
     def read(self) -> CloudSettings:
@@ -220,6 +222,9 @@ class _Reader:
                 table["intrinsics"] = _to_table(parse_camera(_read_text(file, "intrinsics")))
             except ValueError as error:
                 raise self._error("intrinsics", _name_file(file, error), index) from error
+        if not self._calibrated:
+            for key in ("calibration", "pose", "error_mm"):
+                table.pop(key, None)
         if (calibration := table.pop("calibration", None)) is None:
             return table
         if "pose" in table:
@@ -272,11 +277,11 @@ class _Reader:
             wanted = "a file, or { width, height, fx, fy, cx, cy } in pixels"
             raise self._error("intrinsics", f"intrinsics are missing: {wanted}", index)
         has_poses = camera.source == "folder" and any(Path(camera.path).glob("*.pose.txt"))
-        if camera.pose is None and not has_poses:
+        if camera.pose is None and not has_poses and self._calibrated:
             raise self._error(
                 "calibration",
-                "no calibration: `iris-session anchors calibrate-camera ... --out calibration.toml` writes one, then "
-                'calibration = "calibration.toml"; or pose = { position_m, quaternion_wxyz }',
+                f"no calibration: `iris-session cloud calibrate {self._path.name} --out calibration.toml` writes one, "
+                'then calibration = "calibration.toml"; or pose = { position_m, quaternion_wxyz }',
                 index,
             )
 

@@ -1,7 +1,7 @@
 """Refine the pose of a camera by its points: point-to-plane ICP against a reference cloud.
 
 Both clouds are in the world, by the present calibration. Points of the reference get normals by the plane through
-their neighbours; points of the camera are paired with the nearest of them, and a small motion of the camera brings
+the points around them; points of the camera are paired with the nearest of them, and a small motion of the camera brings
 them onto those planes, over and over, with ever shorter reach and robust weights (Chen and Medioni 1992; weights of
 Tukey). A result that is no better than the calibration is refused, and so is one that the scene does not determine: a
 wall fits as well wherever it slides along itself.
@@ -21,8 +21,8 @@ Reason = Literal["overlap", "slides", "worse", "far"]
 
 #: Points of the camera that are used at most: more cost time and tell nothing new.
 _MAX_POINTS: Final = 20_000
-#: Neighbours that make a plane; noise of depth averages out over them.
-_NEIGHBORS: Final = 24
+#: Nearest points that make a plane; noise of depth averages out over them.
+_AROUND: Final = 24
 #: Pairs further apart than this are not made: at first, and in the end [m].
 REACH_M: Final = 0.10
 _LAST_REACH_M: Final = 0.03
@@ -161,11 +161,11 @@ def _make_reference(points: Floats) -> _Reference:
     if len(points) < _MIN_PAIRS:
         raise RefinementRefusedError("overlap", f"the reference has {len(points)} points: at least {_MIN_PAIRS}")
     tree = cKDTree(points)
-    neighbors = points[tree.query(points, _NEIGHBORS)[1]]
-    away = neighbors - neighbors.mean(axis=1, keepdims=True)
+    around = points[tree.query(points, _AROUND)[1]]
+    away = around - around.mean(axis=1, keepdims=True)
     _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", away, away))
-    # The plane goes through the mean of the neighbours, not through the point with its own noise.
-    return _Reference(neighbors.mean(axis=1), vectors[:, :, 0], tree)
+    # The plane goes through the mean of the points around, not through the point with its own noise.
+    return _Reference(around.mean(axis=1), vectors[:, :, 0], tree)
 
 
 def _find_pairs(points: Floats, target: _Reference, reach_m: float) -> _Pairs:
