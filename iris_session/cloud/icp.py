@@ -1,7 +1,7 @@
 """Refine the pose of a camera by its points: point-to-plane ICP against a reference cloud.
 
-Both clouds are in the world, by the present calibration. Points of the reference get normals by the plane through
-the points around them; points of the camera are paired with the nearest of them, and a small motion of the camera brings
+Both clouds are in the world, by the present calibration. Points of the reference get normals by the plane through the
+points around them; points of the camera are paired with the nearest of them, and a small motion of the camera brings
 them onto those planes, over and over, with ever shorter reach and robust weights (Chen and Medioni 1992; weights of
 Tukey). A result that is no better than the calibration is refused, and so is one that the scene does not determine: a
 wall fits as well wherever it slides along itself.
