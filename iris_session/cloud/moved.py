@@ -1,15 +1,18 @@
-"""Find a camera that was moved: sheets that it sees are not where its calibration puts them. Pure: times are passed in.
+"""Find a camera that was moved: sheets that it sees are not where its calibration puts them. Times are passed in.
 
 One look is one picture. A look is off when no sheet in it fits, so a sheet that was moved beside one that was not is no
 alarm; several looks in a row decide, so one bad detection is none either. `anchors.drift` does not fit here: it has
-many detections a second without a covariance of their own, and compares them with each other.
+many detections a second without a covariance of their own, and compares them with each other. `MoveMonitor` is the
+pure part, for one camera; `MoveWatch` does its work for all cameras of a cloud in a thread.
 """
 
 from __future__ import annotations
 
+import logging
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -21,12 +24,17 @@ from anchors.detection import SheetDetection, SheetDetector
 from anchors.pose import PoseTuple, compose, distance, inverse, quat_angle, quat_conj, quat_mul, quat_to_rotvec
 from anchors.sheet import Sheet
 
+log = logging.getLogger(__name__)
 Floats = npt.NDArray[np.float64]
+#: Edges [m] and poses in the world of the session's sheets, by id.
+Sheets = Mapping[str, tuple[float, PoseTuple]]
 
 #: Time between looks, and until the next one after a look that contradicts the verdict: a bump is found within a
 #: second, for one detection every half second.
 LOOK_EVERY_NS: Final = 500_000_000
 CONFIRM_EVERY_NS: Final = 150_000_000
+#: Time until the next look after one without a sheet: such a picture takes the longest.
+BLIND_EVERY_NS: Final = 2_000_000_000
 #: Looks in a row that change the verdict.
 LOOKS: Final = 3
 #: Rotation that a calibration is not off by, 95 % [rad]; what a smaller one does at a distance is seen as a shift.
@@ -84,7 +92,7 @@ class MoveMonitor:
 
     def is_due(self, now_ns: int) -> bool:
         """Return whether it is time for a look."""
-        return self._due_ns is None or now_ns >= self._due_ns or self._due_ns - now_ns > LOOK_EVERY_NS
+        return self._due_ns is None or now_ns >= self._due_ns or self._due_ns - now_ns > BLIND_EVERY_NS
 
     def look(
         self,
@@ -119,10 +127,10 @@ class MoveMonitor:
     ) -> CameraMove | None:
         """Add the detections of one picture. Return `move`."""
         seen = tuple(one for one in detections if one.anchor_id in T_world_sheets and not one.ambiguous)
-        self._due_ns = now_ns + LOOK_EVERY_NS
         if not seen:
+            self._due_ns = now_ns + BLIND_EVERY_NS
             return self.move
-        self.seen_ns = now_ns
+        self.seen_ns, self._due_ns = now_ns, now_ns + LOOK_EVERY_NS
         off = all(self._is_off(one, T_world_camera, T_world_sheets[one.anchor_id]) for one in seen)
         self._looks.append(_Look(off, seen, T_world_camera))
         agreed = len(self._looks) == LOOKS and len({look.off for look in self._looks}) == 1
@@ -156,6 +164,69 @@ class MoveMonitor:
                 views.append(SheetView("camera", name, one.T_camera_sheet, one.covariance))
         p, q = solve_rig(views, known).cameras["camera"]
         return CameraMove(distance(p, (0.0, 0.0, 0.0)), quat_angle(q, (1.0, 0.0, 0.0, 0.0)))
+
+
+class MoveWatch:
+    """Looks for moved cameras in a thread: one picture at a time, those of other cameras meanwhile are left out.
+
+    Args:
+        find_sheets: Returns the sheets of the session.
+    """
+
+    def __init__(self, find_sheets: Callable[[], Sheets]) -> None:
+        self._find_sheets = find_sheets
+        self._pool = ThreadPoolExecutor(1, "iris-moved")
+        self._look: Future[None] | None = None
+        self._monitors: dict[str, tuple[MoveMonitor, CameraModel, Mapping[str, float]]] = {}
+
+    def offer(
+        self,
+        name: str,
+        camera: CameraModel,
+        error_m: float,
+        color: npt.NDArray[np.uint8],
+        T_world_camera: npt.NDArray[Any],
+        now_ns: int,
+    ) -> None:
+        """Take a picture, if it is time for one of this camera. Returns at once.
+
+        Args:
+            name: Name of the camera.
+            camera: Its intrinsics.
+            error_m: Stated error of its calibration, 95 % [m].
+            color: (height, width, 3) uint8, RGB; it must not change afterwards.
+            T_world_camera: (4, 4) by the calibration, at the time of the picture.
+            now_ns: That time.
+        """
+        if self._look is not None and not self._look.done():
+            return
+        if name in self._monitors and not self._monitors[name][0].is_due(now_ns):
+            return
+        sheets = self._find_sheets()
+        sizes = {anchor_id: edge_m for anchor_id, (edge_m, _) in sheets.items()}
+        poses = {anchor_id: pose for anchor_id, (_, pose) in sheets.items()}
+        if name not in self._monitors or self._monitors[name][1:] != (camera, sizes):
+            known = [Sheet(anchor_id, edge_m) for anchor_id, edge_m in sizes.items()]
+            self._monitors[name] = MoveMonitor(camera, known, error_m=error_m), camera, sizes
+        if sizes:
+            monitor = self._monitors[name][0]
+            self._look = self._pool.submit(_look_safely, monitor, color, T_world_camera, poses, now_ns)
+
+    def find_move(self, name: str) -> CameraMove | None:
+        """Return how far a camera was moved, `None` where it fits or is not known."""
+        found = self._monitors.get(name)
+        return None if found is None else found[0].move
+
+    def close(self) -> None:
+        """End the thread; a look that has begun is not waited for."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _look_safely(monitor: MoveMonitor, *picture: Any) -> None:
+    try:
+        monitor.look(*picture)
+    except (ValueError, ArithmeticError) as error:  # of pictures that cannot be used; others come
+        log.warning("a picture was not compared with the calibration: %s", error)
 
 
 def _exceeds(d: Floats, covariance: Floats, allowed: float, floor: float) -> bool:

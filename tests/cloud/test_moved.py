@@ -16,7 +16,7 @@ from anchors.detection import DetectionError, SheetDetection, SheetDetector
 from anchors.pose import PoseTuple, compose, inverse, quat_from_rotvec
 from anchors.sheet import Sheet
 from anchors.sheet_print import to_pdf
-from iris_session.cloud.moved import CONFIRM_EVERY_NS, LOOK_EVERY_NS, MoveMonitor
+from iris_session.cloud.moved import CONFIRM_EVERY_NS, LOOK_EVERY_NS, MoveMonitor, MoveWatch
 from tests.cloud.rays import look_at
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
@@ -132,6 +132,9 @@ def test_without_sheets_the_verdict_stays() -> None:
     ambiguous = replace(detect("table", CALIBRATED), mirrored=CALIBRATED, mirrored_ratio=1.0)
     unknown = replace(detect("table", CALIBRATED), anchor_id="door")
     for step in range(3, 9):
+        assert monitor.is_due(step * SECOND_NS) == (step % 2 == 1)
+        if step % 2 == 0:
+            continue
         assert monitor.add_look([ambiguous, unknown], CALIBRATED, ANCHORS, step * SECOND_NS) is not None
     assert monitor.seen_ns == 2 * SECOND_NS
 
@@ -179,3 +182,29 @@ def test_colours_are_red_green_blue() -> None:
     red[:, :, 0] = 255
     monitor.look(red, POSE, ANCHORS, 0)
     assert seen[0][0, 0].tolist() == [0, 0, 255]
+
+
+def test_looks_are_taken_in_a_thread_of_the_sheets_that_the_session_has(
+    pages: dict[str, Page], caplog: pytest.LogCaptureFixture
+) -> None:
+    sheets: dict[str, tuple[float, PoseTuple]] = {}
+    watch = MoveWatch(lambda: sheets)
+    bumped = compose(CALIBRATED, BUMP)
+    picture = take_picture(pages, bumped, 1, "table")
+    watch.offer("front", CAMERA, 0.01, picture, POSE, 0)  # no sheets yet: nothing to look for
+    assert watch._look is None
+    sheets["table"] = (0.160, ANCHORS["table"])
+    for step in range(1, 4):
+        watch.offer("front", CAMERA, 0.01, picture, POSE, step * SECOND_NS)
+        watch.offer("front", CAMERA, 0.01, picture, POSE, step * SECOND_NS + 1)  # not due, or one is under way
+        assert watch._look is not None
+        watch._look.result(60.0)
+        assert (watch.find_move("front") is not None) == (step == 3)
+    assert watch.find_move("left") is None
+    # Another set of sheets, or a camera that was opened anew with other intrinsics, begins anew.
+    sheets["shelf"] = (0.160, ANCHORS["shelf"])
+    watch.offer("front", CAMERA, 0.01, np.zeros((4, 4, 3), np.uint8), POSE, 9 * SECOND_NS)
+    watch._look.result(60.0)
+    assert watch.find_move("front") is None
+    assert "4 x 4" in caplog.text
+    watch.close()
