@@ -37,6 +37,8 @@ CONFIRM_EVERY_NS: Final = 150_000_000
 BLIND_EVERY_NS: Final = 2_000_000_000
 #: Looks in a row that change the verdict.
 LOOKS: Final = 3
+#: Error of a calibration that states none, 95 % [m].
+UNKNOWN_ERROR_M: Final = 0.02
 #: Rotation that a calibration is not off by, 95 % [rad]; what a smaller one does at a distance is seen as a shift.
 ERROR_RAD: Final = math.radians(1.0)
 #: Standard deviations of a detection that are allowed beyond the stated error.

@@ -33,6 +33,7 @@ from iris_session.client.fetched_scene import fetch_scene
 from iris_session.client.sockets import CurveKeys
 from iris_session.cloud.camera_file import CloudSettings
 from iris_session.cloud.config import CameraReport, CameraStart
+from iris_session.cloud.moved import MoveWatch, Sheets
 from iris_session.cloud.robot_points import RobotPoints
 from iris_session.cloud.sources import open_source
 from iris_session.cloud.voxels import PointSet
@@ -40,7 +41,7 @@ from iris_session.cloud.worker import CloudWorker
 from iris_session.link.discovery import host_port
 from iris_session.protocol.media import StreamInfo
 from iris_session.protocol.names import Role
-from iris_session.system.extras import MissingExtraError
+from iris_session.system.extras import MissingExtraError, require_package
 from iris_session.system.log import configure_logging
 from iris_session.system.priority import lower_thread_priority
 from iris_session.system.process import die_with_parent, is_parent
@@ -195,6 +196,7 @@ def run_cameras(
             time.perf_counter_ns,
             body_pose=history.find_pose,
             remover=RobotRemover(client, history) if settings.remove_robots else None,
+            watch=_make_watch(client),
         )
         on_report(CameraReport(settings.stream))
         try:
@@ -226,6 +228,22 @@ def _work(worker: CloudWorker, client: Client, on_report: OnReport, is_ending: C
         if time.monotonic() >= report_at:
             report_at = time.monotonic() + REPORT_S
             on_report(worker.make_report(connected=connected))
+
+
+def _make_watch(client: Client) -> MoveWatch | None:
+    """Return what finds moved cameras by the sheets of the session; `None` where packages for that are missing."""
+    try:
+        for package in ("cv2", "scipy"):
+            require_package(package, "finding moved cameras")
+    except MissingExtraError as error:
+        log.warning("%s", error)
+        return None
+
+    def find_sheets() -> Sheets:
+        anchors = tuple(client.mirror.anchors.values())
+        return {one.id: (one.size_m, (one.T_world_anchor.p, one.T_world_anchor.q)) for one in anchors if one.size_m}
+
+    return MoveWatch(find_sheets)
 
 
 def make_client(start: CameraStart) -> Client:

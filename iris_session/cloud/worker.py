@@ -18,6 +18,7 @@ from iris_session.cloud.camera_file import CameraSettings, CloudSettings
 from iris_session.cloud.config import CameraReport, SourceReport
 from iris_session.cloud.frames import DepthSource
 from iris_session.cloud.health import CameraHealth, Fault
+from iris_session.cloud.moved import UNKNOWN_ERROR_M, MoveWatch
 from iris_session.cloud.pipeline import (
     CLASSES,
     BodyPose,
@@ -100,6 +101,7 @@ class CloudWorker:
         clock_ns: Clock by which stages are measured [ns].
         body_pose: Poses of bodies that carry cameras.
         remover: Removes points from every cloud.
+        watch: Looks for cameras that were moved.
 
     Attributes:
         cloud: The newest cloud, `None` before the first.
@@ -115,6 +117,7 @@ class CloudWorker:
         *,
         body_pose: BodyPose | None = None,
         remover: PointRemover | None = None,
+        watch: MoveWatch | None = None,
     ) -> None:
         if settings.picture_hz:
             require_package("cv2", "pictures of cameras (picture_hz)")
@@ -135,6 +138,7 @@ class CloudWorker:
             remover=remover,
             voxels=make_warm_filter(settings.voxel_m),
         )
+        self._watch = watch
         self._cameras = {one.name: one for one in settings.cameras}
         self._readers = {one.name: self._make_reader(one, open_source) for one in settings.cameras}
         self._openings: dict[str, int] = {}
@@ -242,6 +246,8 @@ class CloudWorker:
         """End the threads. Return false when one is kept by its source."""
         for reader in self._readers.values():
             reader.stop()
+        if self._watch is not None:
+            self._watch.close()
         ended = [
             reader.join(JOIN_S) for reader in self._readers.values()
         ]  # every one, not only to the first that hangs
@@ -270,6 +276,11 @@ class CloudWorker:
             return False
         cloud = self.cloud = self.pipeline.make_cloud(frames)
         self.poses = {name: one.T_world_camera for name, one in frames.items()}
+        if self._watch is not None:
+            for name, (frame, pose) in frames.items():
+                error_mm = self._cameras[name].error_mm
+                error_m = UNKNOWN_ERROR_M if error_mm is None else error_mm / 1000.0
+                self._watch.offer(name, self._models[name], error_m, frame.color, pose, frame.capture_ns)
         self._note_stage("read", max(self._readers[name].read_ms for name in frames))
         for stage, duration_ms in cloud.stages_ms.items():
             self._note_stage(stage, duration_ms)
@@ -339,6 +350,9 @@ class CloudWorker:
                 f"the session has no body {self._cameras[name].body!r}, or no state of it when a frame was captured"
             )
             fault = Fault(StreamFault.POSE, detail)
+        move = None if self._watch is None else self._watch.find_move(name)
+        if move is not None and (fault is None or fault.fault == StreamFault.SLOW):
+            fault = Fault(StreamFault.MOVED, f"{move}: calibrate it again, `iris-session cloud calibrate`")
         return fault
 
     def _make_source_report(self, name: str, now_ns: int) -> SourceReport:

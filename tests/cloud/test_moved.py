@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -16,7 +18,13 @@ from anchors.detection import DetectionError, SheetDetection, SheetDetector
 from anchors.pose import PoseTuple, compose, inverse, quat_from_rotvec
 from anchors.sheet import Sheet
 from anchors.sheet_print import to_pdf
+from iris_session.cloud.camera_file import CameraPose
+from iris_session.cloud.frames import DepthFrame
 from iris_session.cloud.moved import CONFIRM_EVERY_NS, LOOK_EVERY_NS, MoveMonitor, MoveWatch
+from iris_session.cloud.worker import CloudWorker
+from iris_session.protocol.names import StreamFault
+from tests.cloud.camera_settings import make_settings
+from tests.cloud.fake_source import DEADLINE_S, FakeOutlet, FakeSource
 from tests.cloud.rays import look_at
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
@@ -208,3 +216,33 @@ def test_looks_are_taken_in_a_thread_of_the_sheets_that_the_session_has(
     assert watch.find_move("front") is None
     assert "4 x 4" in caplog.text
     watch.close()
+
+
+def test_the_cloud_of_a_moved_camera_is_flagged_until_it_is_back(pages: dict[str, Page]) -> None:
+    outlet, source = FakeOutlet(), FakeSource()
+    source.camera = CAMERA
+    settings = make_settings("front")
+    (front,) = settings.cameras
+    settings = msgspec.structs.replace(
+        settings, cameras=(msgspec.structs.replace(front, pose=CameraPose(*CALIBRATED)),)
+    )
+    watch = MoveWatch(lambda: {"table": (0.160, ANCHORS["table"])})
+    worker = CloudWorker(settings, outlet, lambda camera, now_ns: source, time.perf_counter_ns, watch=watch)
+    worker.start()
+    noise = np.random.default_rng(5)
+
+    def show(picture: NDArray[np.uint8], fault: str) -> None:
+        deadline = time.monotonic() + DEADLINE_S
+        found = None
+        while found is None or found.fault != fault:
+            assert time.monotonic() < deadline
+            depth = noise.integers(1000, 1003, (480, 640)).astype(np.uint16)
+            source.put(DepthFrame(depth, picture, outlet.now_ns(), None))
+            worker.poll(0.05)
+            found = outlet.newest_info("room")
+        assert found.detail.startswith("camera front: by 3" if fault else "")
+
+    show(take_picture(pages, CALIBRATED, 1, "table"), "")
+    show(take_picture(pages, compose(CALIBRATED, BUMP), 2, "table"), StreamFault.MOVED)
+    show(take_picture(pages, CALIBRATED, 3, "table"), "")
+    assert worker.close()
