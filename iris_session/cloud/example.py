@@ -11,7 +11,7 @@ _INTRINSICS: Final = """\
 intrinsics = {width = 640, height = 480, fx = 585.0, fy = 585.0, cx = 319.5, cy = 239.5, distortion = []}
 """
 _POSE: Final = """\
-# Where the camera is: measured by a printed sheet with `iris-session anchors calibrate-camera`, which writes this file.
+# Where the camera is: measured by printed sheets with `iris-session cloud calibrate`, which writes this file.
 calibration = "calibration.toml"
 # Or by hand. Optical frame: x right, y down, z forward; here 1 m above the origin, looking along +x.
 # pose = {position_m = [0.0, 0.0, 1.0], quaternion_wxyz = [0.5, -0.5, 0.5, -0.5]}
