@@ -11,8 +11,9 @@ from __future__ import annotations
 import logging
 import math
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ from anchors.camera import CameraModel, pose_from_matrix
 from anchors.camera_rig import SheetView, solve_rig
 from anchors.detection import SheetDetection, SheetDetector
 from anchors.pose import PoseTuple, compose, distance, inverse, quat_angle, quat_conj, quat_mul, quat_to_rotvec
-from anchors.sheet import Sheet
+from anchors.sheet import Sheet, SheetError
 
 log = logging.getLogger(__name__)
 Floats = npt.NDArray[np.float64]
@@ -103,7 +104,7 @@ class MoveMonitor:
         T_world_sheets: Mapping[str, PoseTuple],
         now_ns: int,
     ) -> CameraMove | None:
-        """Detect sheets in a picture and compare them with the calibration. Takes some 30 ms.
+        """Detect sheets in a picture and compare them with the calibration.
 
         Args:
             color: (height, width, 3) uint8, RGB.
@@ -117,6 +118,7 @@ class MoveMonitor:
         Raises:
             DetectionError: The picture is not of this camera's size or type.
         """
+        self._due_ns = now_ns + BLIND_EVERY_NS  # also of a picture that cannot be used
         seen = self._detector.detect(color[:, :, ::-1])
         return self.add_look(seen, pose_from_matrix(np.asarray(T_world_camera)), T_world_sheets, now_ns)
 
@@ -129,10 +131,10 @@ class MoveMonitor:
     ) -> CameraMove | None:
         """Add the detections of one picture. Return `move`."""
         seen = tuple(one for one in detections if one.anchor_id in T_world_sheets and not one.ambiguous)
+        self._due_ns = now_ns + (LOOK_EVERY_NS if seen else BLIND_EVERY_NS)
         if not seen:
-            self._due_ns = now_ns + BLIND_EVERY_NS
             return self.move
-        self.seen_ns, self._due_ns = now_ns, now_ns + LOOK_EVERY_NS
+        self.seen_ns = now_ns
         off = all(self._is_off(one, T_world_camera, T_world_sheets[one.anchor_id]) for one in seen)
         self._looks.append(_Look(off, seen, T_world_camera))
         agreed = len(self._looks) == LOOKS and len({look.off for look in self._looks}) == 1
@@ -208,7 +210,7 @@ class MoveWatch:
         sizes = {anchor_id: edge_m for anchor_id, (edge_m, _) in sheets.items()}
         poses = {anchor_id: pose for anchor_id, (_, pose) in sheets.items()}
         if name not in self._monitors or self._monitors[name][1:] != (camera, sizes):
-            known = [Sheet(anchor_id, edge_m) for anchor_id, edge_m in sizes.items()]
+            known = list(_make_sheets(sizes))
             self._monitors[name] = MoveMonitor(camera, known, error_m=error_m), camera, sizes
         if sizes:
             monitor = self._monitors[name][0]
@@ -224,10 +226,17 @@ class MoveWatch:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
 
+def _make_sheets(sizes: Mapping[str, float]) -> Iterator[Sheet]:
+    """Yield the sheets of anchors; one whose name or size no sheet can have is no printed sheet."""
+    for anchor_id, edge_m in sizes.items():
+        with suppress(SheetError):
+            yield Sheet(anchor_id, edge_m)
+
+
 def _look_safely(monitor: MoveMonitor, *picture: Any) -> None:
     try:
         monitor.look(*picture)
-    except (ValueError, ArithmeticError) as error:  # of pictures that cannot be used; others come
+    except Exception as error:  # of OpenCV or SciPy, for pictures that cannot be used; others come
         log.warning("a picture was not compared with the calibration: %s", error)
 
 

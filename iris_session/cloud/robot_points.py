@@ -32,7 +32,7 @@ _CELL_M: Final = 0.005
 _MAX_CELLS: Final = 4_000_000
 #: Beyond the margin; distances are in millimetres.
 _FAR: Final = 255
-#: Pieces that the longest edge of a triangle is cut into, at most: the floor below a robot is no part of it.
+#: Pieces that the longest edge of a triangle is cut into, at most: 2.5 m of a robot.
 _MAX_PIECES: Final = 512
 Distances = npt.NDArray[np.uint8]
 

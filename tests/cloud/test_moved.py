@@ -211,8 +211,12 @@ def test_looks_are_taken_in_a_thread_of_the_sheets_that_the_session_has(
     assert watch.find_move("left") is None
     # Another set of sheets, or a camera that was opened anew with other intrinsics, begins anew.
     sheets["shelf"] = (0.160, ANCHORS["shelf"])
+    sheets["\N{LATIN SMALL LETTER U WITH DIAERESIS}ber"] = (0.160, ANCHORS["shelf"])  # no name of a printed sheet
     watch.offer("front", CAMERA, 0.01, np.zeros((4, 4, 3), np.uint8), POSE, 9 * SECOND_NS)
-    watch._look.result(60.0)
+    bad = watch._look
+    bad.result(60.0)
+    watch.offer("front", CAMERA, 0.01, picture, POSE, 9 * SECOND_NS + 1)
+    assert watch._look is bad  # not at once: the next one may be as bad
     assert watch.find_move("front") is None
     assert "4 x 4" in caplog.text
     watch.close()
