@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -235,18 +237,21 @@ def test_the_cloud_of_a_moved_camera_is_flagged_until_it_is_back(pages: dict[str
     worker.start()
     noise = np.random.default_rng(5)
 
-    def show(picture: NDArray[np.uint8], fault: str) -> None:
+    def show(picture: NDArray[np.uint8], until: Callable[[str], bool]) -> str:
         deadline = time.monotonic() + DEADLINE_S
         found = None
-        while found is None or found.fault != fault:
+        while found is None or not until(found.fault):
             assert time.monotonic() < deadline
             depth = noise.integers(1000, 1003, (480, 640)).astype(np.uint16)
             source.put(DepthFrame(depth, picture, outlet.now_ns(), None))
             worker.poll(0.05)
             found = outlet.newest_info("room")
-        assert found.detail.startswith("camera front: by 3" if fault else "")
+        return found.detail
 
-    show(take_picture(pages, CALIBRATED, 1, "table"), "")
-    show(take_picture(pages, compose(CALIBRATED, BUMP), 2, "table"), StreamFault.MOVED)
-    show(take_picture(pages, CALIBRATED, 3, "table"), "")
+    # On a busy machine the frames are too slow as well, which is another fault.
+    show(take_picture(pages, CALIBRATED, 1, "table"), lambda fault: fault != StreamFault.MOVED)
+    bumped = take_picture(pages, compose(CALIBRATED, BUMP), 2, "table")
+    detail = show(bumped, lambda fault: fault == StreamFault.MOVED)
+    assert re.match(r"camera front: by (2[5-9]|3[0-5]) mm, 0\.\d deg", detail)
+    show(take_picture(pages, CALIBRATED, 3, "table"), lambda fault: fault != StreamFault.MOVED)
     assert worker.close()
