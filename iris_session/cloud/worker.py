@@ -73,14 +73,15 @@ class _Stream:
     def restart(self) -> None:
         """Begin anew: for another session."""
         self.due_ns = 0
-        self._fault: Fault | None = None
+        self._kind = ""
         self._described_ns = -INFO_NS
 
     def needs_info(self, fault: Fault | None, now_ns: int) -> bool:
-        return fault != self._fault or now_ns - self._described_ns >= INFO_NS
+        """Return whether the description is due: the kind of fault is another one, or a second has passed."""
+        return _kind(fault) != self._kind or now_ns - self._described_ns >= INFO_NS
 
     def note_described(self, fault: Fault | None, now_ns: int) -> None:
-        self._fault, self._described_ns = fault, now_ns
+        self._kind, self._described_ns = _kind(fault), now_ns
 
     def is_due(self, hz: float, now_ns: int) -> bool:
         """Return whether another frame may be published, at most `hz` of them in the mean; count it then."""
@@ -367,6 +368,10 @@ class CloudWorker:
     def _note_stage(self, stage: str, duration_ms: float) -> None:
         self._stages[stage] += duration_ms
         self._stage_counts[stage] += 1
+
+
+def _kind(fault: Fault | None) -> str:
+    return "" if fault is None else fault.fault
 
 
 def make_pipeline_camera(settings: CloudSettings, camera: CameraSettings) -> PipelineCamera:
