@@ -66,6 +66,7 @@ def test_only_the_polling_thread_uses_the_socket(join: Callable[..., Client], mo
     ann.start()
     cloud, depth = ann.media.subscribe("cloud"), ann.media.subscribe("depth")
     assert ann.wait_for(lambda _: cloud.received >= 1, DEADLINE_S)
+    assert ann.wait_for(lambda one: "depth" in one.media._subscribed, DEADLINE_S)  # else there is nothing to end
     ann.media.unsubscribe("depth")
     assert ann.wait_for(lambda _: "unsubscribe_media" in dict(touched), DEADLINE_S)
     assert {thread for _, thread in touched} == {ann._loop._thread}
