@@ -117,7 +117,7 @@ def test_a_cloud_other_than_that_of_the_source_is_found() -> None:
     runs = [{"captures": {"7": 1234}}]
 
     def rows(payload: bytes) -> Any:
-        return np.array([[1234, 0, 0, 0, zlib.crc32(payload), len(payload), 500, 0]])
+        return np.array([[1234, 0, 0, zlib.crc32(payload), len(payload), 500, 0]])
 
     error_m, stated_m = _compare(np.concatenate([rows(made["full"]), rows(made["half"])]), runs, cloud, 30)
     assert 0.0 < error_m <= stated_m < 2e-4
