@@ -144,7 +144,7 @@ class ClientMedia:
         except ValueError as error:
             raise InvalidMessageError(str(error)) from None
         with self._lock:
-            return self._sockets.send_media(welcome.endpoints.media_ingest, message)
+            return self._sockets.send_media(welcome.endpoints.media_ingest, stream, message)
 
     # --- for the client, which holds the lock ----------------------------------------------------------------------
 

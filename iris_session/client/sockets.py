@@ -18,6 +18,7 @@ import zmq
 from iris_session.client.errors import IdentityError
 from iris_session.link.discovery import host_port
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES
+from iris_session.protocol.media import MAX_STREAMS
 from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID
 from iris_session.security import KeysError, load_public, load_secret
 from iris_session.system.priority import run_at_low_priority
@@ -116,6 +117,7 @@ class ClientSockets:
         self._state_of = (0, 0)
         self._media: zmq.Socket[bytes] | None = None
         self._ingest: zmq.Socket[bytes] | None = None
+        self._published: set[str] = set()
         self._assets: zmq.Socket[bytes] | None = None
         self._assets_monitor: zmq.Socket[bytes] | None = None
         #: Changes whenever a socket is opened or closed.
@@ -195,20 +197,28 @@ class ClientSockets:
         """Return messages of the media channel, oldest first."""
         return _drain(self._media)
 
-    def send_media(self, port: int, frames: Sequence[bytes]) -> bool:
-        """Publish a frame of a source. False: the socket is full."""
+    def send_media(self, port: int, stream: str, frames: Sequence[bytes]) -> bool:
+        """Publish a frame of a source. False: the socket is full. It has room for `MEDIA_HWM` frames of each stream."""
         if self._ingest is None:
             if not port:
                 return False
             self._ingest = self._new_socket(zmq.PUSH)
-            self._ingest.setsockopt(zmq.SNDHWM, MEDIA_HWM)
             self._ingest.setsockopt(zmq.IMMEDIATE, 1)
+            self._published.clear()
+            self._reserve_ingest(stream)
             self._ingest.connect(f"tcp://{host_port(self._host, port)}")
+        self._reserve_ingest(stream)
         try:
             self._ingest.send_multipart(frames, zmq.NOBLOCK)
         except zmq.Again:
             return False
         return True
+
+    def _reserve_ingest(self, stream: str) -> None:
+        """Give the ingest socket room for a stream that it did not have before."""
+        if self._ingest is not None and stream not in self._published and len(self._published) < MAX_STREAMS:
+            self._published.add(stream)
+            self._ingest.setsockopt(zmq.SNDHWM, MEDIA_HWM * len(self._published))
 
     @property
     def has_assets(self) -> bool:

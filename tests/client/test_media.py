@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 
 import pytest
+import zmq
 
 from iris_session.client import Client, InvalidMessageError, NotConnectedError
+from iris_session.client.sockets import ClientSockets
 from tests.client.harness import LiveSession
 
 DEADLINE_S = 30.0
@@ -135,3 +138,21 @@ def test_frames_of_an_unsubscribed_stream_are_late_and_not_malformed(join: Calla
     ann.media.unsubscribe("cloud")
     assert ann.wait_for(lambda one: one.media.late > 0, DEADLINE_S)
     assert ann.media.malformed == 0
+
+
+@pytest.mark.parametrize("streams", [1, 8])
+def test_source_queues_two_frames_of_each_stream(streams: int) -> None:
+    """The session does not read. A camera process sends a cloud and the pictures of its cameras at once."""
+    with zmq.Context() as context, context.socket(zmq.PULL) as session:
+        session.setsockopt(zmq.RCVHWM, 1)
+        session.setsockopt(zmq.LINGER, 0)
+        port = session.bind_to_random_port("tcp://127.0.0.1")
+        sockets = ClientSockets()
+        sockets.set_target("127.0.0.1", 0, None)
+        frame = bytes(4 << 20)  # more than the system buffers
+        deadline = time.monotonic() + DEADLINE_S
+        while not sockets.send_media(port, "0", [frame]):
+            assert time.monotonic() < deadline
+        taken = [sockets.send_media(port, str(i % streams), [frame]) for i in range(4 * streams)]
+        sockets.close()
+    assert 2 * streams - 1 <= sum(taken) <= 2 * streams + 2
