@@ -34,8 +34,8 @@ export function makeCameras(state: PageState, view: View | null, pictures: Pictu
   const scenePanels = h("div", { class: "same" });
   const element = h("div", { class: "pictures" }, pictures.element, scenePanels);
   const choices = h("ul");
-  const ofScene = h("section", {}, h("h3", {}, "As the scene's cameras record it"), choices);
-  const ofStreams = h("section", {}, h("h3", {}, "Real cameras"), pictures.choices);
+  const ofScene = h("section", {}, h("p", { class: "heading" }, "As the scene's cameras record it"), choices);
+  const ofStreams = h("section", {}, h("p", { class: "heading" }, "Real cameras"), pictures.choices);
   const menu = h("details", { class: "menu", hidden: true }, h("summary", { class: "small" }, "Cameras"), h("div", { class: "popover" }, ofStreams, ofScene));
   const places = new Map<string, HTMLElement>();
   const warnings = new Map<string, { text: HTMLElement; panel: HTMLElement; outside: Set<string> }>();
