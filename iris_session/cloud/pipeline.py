@@ -202,13 +202,16 @@ class CloudPipeline:
             now_ns: Session time [ns].
         """
         placed = {name: one for name, state in self._states.items() if (one := self._place_newest(state, now_ns))}
-        if any(_is_delivering(state, now_ns) and name not in placed for name, state in self._states.items()):
+        awaited = (
+            name for name, state in self._states.items() if _is_delivering(state, now_ns) and not state.lacks_pose
+        )
+        if any(name not in placed for name in awaited):
             return {}
         newest_ns = max((one.frame.capture_ns for one in placed.values()), default=0)
         joined = {name: one for name, one in placed.items() if newest_ns - one.frame.capture_ns <= JOIN_NS}
         self.drops["join"] += len(placed) - len(joined)
         for name in placed:
-            self._states[name].waiting.clear()
+            self._states[name].waiting.popleft()  # what came after it still waits for its pose
         return joined
 
     def make_cloud(self, frames: dict[str, PlacedFrame]) -> Cloud:

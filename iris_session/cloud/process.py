@@ -28,7 +28,7 @@ from iris_session.client.client import Client
 from iris_session.client.core.interpolation import interpolate
 from iris_session.client.core.scene_follower import pose_at
 from iris_session.client.core.state_stream import Poses, SceneState
-from iris_session.client.errors import ClientError, NotConnectedError
+from iris_session.client.errors import ClientError, InvalidMessageError, NotConnectedError
 from iris_session.client.fetched_scene import fetch_scene
 from iris_session.client.sockets import CurveKeys
 from iris_session.cloud.camera_file import CloudSettings
@@ -154,6 +154,7 @@ class SessionOutlet:
 
     def __init__(self, client: Client) -> None:
         self._client = client
+        self._refused = ""
 
     def now_ns(self) -> int:
         return self._client.session_now_ns()
@@ -164,6 +165,11 @@ class SessionOutlet:
         try:
             return self._client.media.publish(stream, frames, capture_ns=capture_ns, encoding=encoding, info=info)
         except NotConnectedError:
+            return False
+        except InvalidMessageError as error:  # one camera's values end neither this process nor the other cameras
+            if str(error) != self._refused:
+                self._refused = str(error)
+                log.warning("a frame of %r cannot be sent: %s", stream, error)
             return False
 
 

@@ -30,6 +30,7 @@ from iris_session.cloud.pipeline import (
 )
 from iris_session.cloud.reader import NewFrame, SourceReader
 from iris_session.cloud.voxels import Colors, DepthLimits, Floats, VoxelFilter, make_rays
+from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.media import StreamCamera, StreamInfo
 from iris_session.protocol.names import MediaEncoding, StreamFault
 from iris_session.system.extras import require_package
@@ -205,7 +206,7 @@ class CloudWorker:
         for name in self._readers:
             fault = self._find_camera_fault(name, now_ns)
             if fault is not None:
-                return Fault(fault.fault, f"camera {name}: {fault.detail}")
+                return Fault(fault.fault, f"camera {name}: {fault.detail}"[:MAX_TEXT])
         return None
 
     def make_report(self, *, connected: bool = True, fault: str = "") -> CameraReport:

@@ -76,10 +76,14 @@ class MediaDrawer:
         self._rec.reset_time()
 
 
+#: Beginning of a JPEG file in which its size has to be: a longer one could be filled with what is searched in vain.
+HEAD_BYTES: Final = 65_536
+
+
 def _check_size(frame: bytes) -> None:
     """Check that a JPEG file states a size that a viewer can allocate. Raises `StreamError`."""
     try:
-        size = read_stated_size(frame, AssetEncoding.JPEG)
+        size = read_stated_size(frame[:HEAD_BYTES], AssetEncoding.JPEG)
     except AssetDecodeError as error:
         raise StreamError(str(error)) from None
     if not 1 <= min(size) <= max(size) <= MAX_IMAGE_SIZE:

@@ -132,6 +132,8 @@ def test_a_camera_on_a_body_is_placed_by_the_pose_at_its_capture() -> None:
     assert frames["hand"].frame.capture_ns == 10 * MS, "not replaced by one whose pose is not known"
     assert frames["hand"].T_world_camera[0, 3] == 3.0
     assert not pipeline.lacks_pose("hand")
+    known[43 * MS] = known[10 * MS]
+    assert pipeline.take_frames(60 * MS)["hand"].frame.capture_ns == 43 * MS, "the later one still waited"
 
 
 def test_a_frame_whose_pose_does_not_come_is_dropped_and_counted() -> None:
