@@ -31,6 +31,7 @@ from iris_session.cloud.frames import DepthFrame
 from iris_session.cloud.pipeline import Cloud, CloudPipeline, PipelineCamera, PipelineSettings, PlacedFrame
 from iris_session.cloud.voxels import DepthLimits, pack_keys
 from iris_session.streams.cloud import encode_cloud
+from iris_session.system.priority import lower_thread_priority
 
 STAGES: Final = ("read", "voxels", "outliers", "budget", "encode", "send")
 MIN_POINTS, MIN_AROUND = 2, 4
@@ -223,6 +224,7 @@ def _time_ms(call: Any) -> float:
 
 def main() -> None:
     """Serve commands until the end of standard input."""
+    lower_thread_priority()  # of this thread and those that it starts, as in a camera process
     job = msgspec.json.decode(sys.stdin.readline(), type=CloudJob)
     cameras = {case.name: CloudCamera(case, job.seed) for case in job.cases}
     client: Client | None = None

@@ -198,7 +198,8 @@ class ClientSockets:
         return _drain(self._media)
 
     def send_media(self, port: int, stream: str, frames: Sequence[bytes]) -> bool:
-        """Publish a frame of a source. False: the socket is full. It has room for `MEDIA_HWM` frames of each stream."""
+        """Publish a frame of a source. False: the socket is full. It has room for `MEDIA_HWM` times as many
+        frames as it has streams, whichever they are of."""
         if self._ingest is None:
             if not port:
                 return False
@@ -215,7 +216,7 @@ class ClientSockets:
         return True
 
     def _reserve_ingest(self, stream: str) -> None:
-        """Give the ingest socket room for a stream that it did not have before."""
+        """Give the ingest socket room for frames of a stream that it did not have before."""
         if self._ingest is not None and stream not in self._published and len(self._published) < MAX_STREAMS:
             self._published.add(stream)
             self._ingest.setsockopt(zmq.SNDHWM, MEDIA_HWM * len(self._published))

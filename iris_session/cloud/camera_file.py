@@ -27,7 +27,7 @@ from msgspec import Meta
 from anchors.camera import CameraError, CameraModel, parse_camera, pose_to_matrix
 from anchors.pose import quat_normalize
 from iris_session.protocol.common import Name, Quat, Text, Vec3
-from iris_session.protocol.media import MAX_STREAMS, describe_bad_stream_name, is_stream_name
+from iris_session.protocol.media import MAX_IMAGE_SIZE, MAX_STREAMS, describe_bad_stream_name, is_stream_name
 
 SourceName = Literal["folder", "mujoco", "opencv", "rerun", "mcap", "realsense", "orbbec"]
 AudienceName = Literal["remote", "all"]
@@ -36,7 +36,7 @@ _CHOICES: Final = {"source": get_args(SourceName), "audience": get_args(Audience
 #: Points of a frame: below, a room cannot be recognised; above, a frame from another process is refused.
 _Budget = Annotated[int, Meta(ge=1_000, le=1_000_000)]
 _Rate = Annotated[float, Meta(ge=0.0, le=240.0)]
-_Size = Annotated[int, Meta(ge=16, le=8192)]
+_Size = Annotated[int, Meta(ge=16, le=MAX_IMAGE_SIZE)]
 #: Quaternions in hand-written files have few digits.
 _UNIT_TOLERANCE: Final = 1e-3
 #: Sources whose `path` is a file or folder; of the others it names a device.
@@ -177,7 +177,11 @@ def load_camera_file(path: str | Path, *, calibrated: bool = True) -> CloudSetti
     Raises:
         CameraFileError: The file cannot be read, or a value in it cannot be used.
     """
-    return _Reader(Path(path).expanduser().absolute(), calibrated).read()
+    try:
+        found = Path(path).expanduser().absolute()
+    except RuntimeError as error:  # the home of an unknown user
+        raise CameraFileError(f"camera file {path}: {error}") from error
+    return _Reader(found, calibrated).read()
 
 
 class _Reader:
@@ -211,13 +215,13 @@ class _Reader:
     def _resolve(self, table: dict[str, Any], index: int) -> dict[str, Any]:
         """Return the table of a camera with the contents of the files that it names."""
         table = dict(table)
-        folder, source = self._path.parent, table.get("source")
+        source = table.get("source")
         if isinstance(table.get("path"), str) and source in _READ_FROM_DISK:
-            table["path"] = str(folder / Path(table["path"]).expanduser())
+            table["path"] = str(self._locate("path", table["path"], index))
         if isinstance(table.get("model"), str):
-            table["model"] = str(folder / Path(table["model"]).expanduser())
+            table["model"] = str(self._locate("model", table["model"], index))
         if isinstance(table.get("intrinsics"), str):
-            file = folder / Path(table["intrinsics"]).expanduser()
+            file = self._locate("intrinsics", table["intrinsics"], index)
             try:
                 table["intrinsics"] = _to_table(parse_camera(_read_text(file, "intrinsics")))
             except ValueError as error:
@@ -231,7 +235,7 @@ class _Reader:
             raise self._error("pose", "pose and calibration are both given: one of them is enough", index)
         if not isinstance(calibration, str):
             raise self._error("calibration", f"{calibration!r} is not the path of a file", index)
-        file = folder / Path(calibration).expanduser()
+        file = self._locate("calibration", calibration, index)
         try:
             pose, error_mm = read_calibration(file, str(table.get("name", "")), on_body=bool(table.get("body")))
         except CameraFileError as error:
@@ -240,6 +244,13 @@ class _Reader:
         if error_mm is not None:
             table.setdefault("error_mm", error_mm)
         return table
+
+    def _locate(self, key: str, given: str, index: int) -> Path:
+        """Return the path of a file that a camera names, relative to the camera file."""
+        try:
+            return self._path.parent / Path(given).expanduser()
+        except RuntimeError as error:  # the home of an unknown user
+            raise self._error(key, f"{given!r}: {error}", index) from error
 
     # --- checks ---
 
@@ -408,8 +419,8 @@ def _list_keys(key: str) -> list[str]:
 def _read_text(path: Path, kind: str) -> str:
     try:
         return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        said = getattr(error, "strerror", None) or "it is not UTF-8 text"
+    except (OSError, ValueError) as error:  # not UTF-8, or a path with a null byte
+        said = getattr(error, "strerror", None) or str(error)
         raise CameraFileError(f"{kind} {path} cannot be read: {said}") from error
 
 

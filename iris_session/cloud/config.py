@@ -61,6 +61,7 @@ class CameraReport(msgspec.Struct, frozen=True):
         drops: Frames and points that were left out, by reason, since the start.
         cameras: State of each source by name of the camera.
         fault: Why the process ends, empty while all is well.
+        warning: One line for people about what the cloud lacks, empty for nothing.
     """
 
     stream: str = ""
@@ -75,3 +76,4 @@ class CameraReport(msgspec.Struct, frozen=True):
     drops: dict[str, int] = {}
     cameras: dict[str, SourceReport] = {}
     fault: str = ""
+    warning: str = ""

@@ -105,8 +105,10 @@ class CameraHealth:
             return stopped
         if self._bad is not None and now_ns - self._bad_since_ns >= LASTING_NS:
             return self._bad
-        if self._has_noise and self._same_since_ns is not None and now_ns - self._same_since_ns >= FROZEN_NS:
-            return Fault(StreamFault.FROZEN, f"the same picture for {(now_ns - self._same_since_ns) / SECOND:.0f} s")
+        if self._has_noise and self.arrived_ns is not None and self._same_since_ns is not None:
+            same_ns = self.arrived_ns - self._same_since_ns  # one picture of a slow camera is not frozen
+            if same_ns >= FROZEN_NS:
+                return Fault(StreamFault.FROZEN, f"the same picture for {same_ns / SECOND:.0f} s")
         if self._clock is not None and now_ns - self._clock_ns < CLOCK_SHOWN_NS:
             return self._clock
         return self._find_slowness(now_ns)

@@ -184,7 +184,7 @@ class CloudPipeline:
         state.arrived_ns = now_ns
         state.waiting.append((frame, now_ns))
         if len(state.waiting) > MAX_WAITING:
-            state.waiting.popleft()
+            del state.waiting[-2]  # the oldest stays: its pose is the next to come, or shows that none does
             self.drops["superseded"] += 1
 
     def list_missing(self, now_ns: int) -> list[str]:

@@ -51,8 +51,11 @@ POLL_S: Final = 0.05
 REPORT_S: Final = 1.0
 #: Time to wait for a connection between two looks [s].
 CONNECT_S: Final = 0.1
-#: States that are kept for the poses of bodies: a second, more than any camera is late.
-MAX_STATES: Final = 64
+#: States are kept for so long, for the poses of bodies: longer than any camera is late. And so many at most.
+STATES_NS: Final = 1_000_000_000
+MAX_STATES: Final = 256
+#: After shapes of robots could not be fetched, the next attempt begins with a frame so much later.
+FETCH_AGAIN_NS: Final = 5_000_000_000
 #: A pose that was sent longer before or after a capture says nothing about it.
 POSE_REACH_NS: Final = 100_000_000
 
@@ -80,7 +83,10 @@ class BodyHistory:
                 self._states.clear()
                 self._version = version
                 self._places = dict(self._client.mirror.body_index)
-            self._states.append((state.header.session_time, self._client.scene.poses))
+            now_ns = state.header.session_time
+            self._states.append((now_ns, self._client.scene.poses))
+            while now_ns - self._states[0][0] > STATES_NS:
+                self._states.popleft()
 
     def read_newest(self) -> dict[str, PoseTuple]:
         """Return `T_world_body` of every body as it is now."""
@@ -112,24 +118,32 @@ class BodyHistory:
 class RobotRemover:
     """Leaves out the points on the session's robots, by their shapes and the state at capture.
 
-    The shapes are fetched in a thread, and again for another scene. Until they are there all points stay.
+    The shapes are fetched in a thread, again for another scene and after a failure. Until they are there all points
+    stay.
+
+    Attributes:
+        warning: One line for people about shapes that are missing; empty while all is well.
     """
 
     def __init__(self, client: Client, history: BodyHistory) -> None:
         self._client = client
         self._history = history
         self._scene: tuple[str, str] | None = None
+        self._again_ns = 0
         self._thread: threading.Thread | None = None
         self._found: RobotPoints | None = None
+        self.warning = ""
 
     def is_ready(self, capture_ns: int) -> bool:
-        """Return whether the state of that time is there; begin to fetch the scene when it is another one."""
+        """Return whether the state of that time is there; begin to fetch the shapes when they are needed."""
         version = self._client.scene.version
         is_fetching = self._thread is not None and self._thread.is_alive()
-        if version is not None and version[:2] != self._scene and not is_fetching:
-            self._scene, self._found = version[:2], None
-            self._thread = threading.Thread(target=self._fetch, name="iris-robots", daemon=True)
-            self._thread.start()
+        if version is not None and not is_fetching:
+            is_other = version[:2] != self._scene
+            if is_other or (self._found is None and capture_ns >= self._again_ns):
+                self._scene, self._found, self._again_ns = version[:2], None, capture_ns + FETCH_AGAIN_NS
+                self._thread = threading.Thread(target=self._fetch, name="iris-robots", daemon=True)
+                self._thread.start()
         return self._found is None or self._history.covers(capture_ns)
 
     def remove(self, points: PointSet, capture_ns: int) -> PointSet:
@@ -144,9 +158,17 @@ class RobotRemover:
         mirror = self._client.mirror
         try:
             scene = fetch_scene(self._client)
-            self._found = RobotPoints(scene.spec, scene.meshes, mirror.robots.values(), mirror.bodies)
-        except (ClientError, ValueError) as error:
-            log.warning("points on robots stay in the cloud: %s", error)
+            found = RobotPoints(scene.spec, scene.meshes, mirror.robots.values(), mirror.bodies)
+        except Exception as error:  # of a connection, or of a scene: the cloud goes on with the points on robots
+            self._warn(f"points on robots stay in the cloud: {error}")
+            return
+        self._warn(f"points on robots stay in part: {len(scene.failed)} shapes are missing" if scene.failed else "")
+        self._found = found
+
+    def _warn(self, text: str) -> None:
+        if text and text != self.warning:
+            log.warning("%s", text)
+        self.warning = text
 
 
 class SessionOutlet:
@@ -191,6 +213,7 @@ def run_cameras(
         Why it ended by itself: the session refuses it; empty otherwise.
     """
     history = BodyHistory(client)
+    remover = RobotRemover(client, history) if settings.remove_robots else None
     client.on_state = history.on_state
     try:
         client.open()
@@ -201,12 +224,16 @@ def run_cameras(
             partial(open_source, body_poses=history.read_newest),
             time.perf_counter_ns,
             body_pose=history.find_pose,
-            remover=RobotRemover(client, history) if settings.remove_robots else None,
+            remover=remover,
             watch=_make_watch(client),
         )
         on_report(CameraReport(settings.stream))
+
+        def report(one: CameraReport) -> None:
+            on_report(one if remover is None else msgspec.structs.replace(one, warning=remover.warning))
+
         try:
-            _work(worker, client, on_report, is_ending)
+            _work(worker, client, report, is_ending)
         finally:
             worker.close()
     except ClientError as error:

@@ -77,6 +77,7 @@ class SourceReader:
         self._on_frame = on_frame
         self._lock = threading.Lock()
         self._stopping = threading.Event()
+        self._is_outdated = False  # the source was opened by the clock of another session
         self._newest: NewFrame | None = None
         self._failure = ""
         self._opening = 0
@@ -108,9 +109,10 @@ class SourceReader:
             return self._health.measure_hz(now_ns)
 
     def restart_clock(self) -> None:
-        """Forget what was captured by another session's clock."""
+        """Forget what was captured by another session's clock, and open the source anew: it has times of that clock."""
         with self._lock:
             self._newest = None
+            self._is_outdated = True
             self._health.restart(self._now_ns())
 
     def stop(self) -> None:
@@ -126,6 +128,8 @@ class SourceReader:
     def _run(self) -> None:
         backoff = Backoff(REOPEN_S)
         while not self._stopping.is_set():
+            with self._lock:
+                self._is_outdated = False
             try:
                 source = self._open_source()
                 try:
@@ -136,6 +140,8 @@ class SourceReader:
                 finally:
                     with suppress(Exception):  # of a device that is gone
                         source.close()
+                backoff.reset()
+                continue
             except SourceEndedError as error:
                 self._fail(str(error))
                 return
@@ -153,9 +159,9 @@ class SourceReader:
         self._on_frame()
 
     def _read(self, source: DepthSource, backoff: Backoff[float]) -> None:
-        """Read frames until the thread is to end. Raises what the source raises."""
+        """Read frames until the thread is to end, or the clock is another one. Raises what the source raises."""
         frames = 0
-        while not self._stopping.is_set():
+        while not self._stopping.is_set() and not self._is_outdated:
             frame = source.read(READ_S)
             if frame is None:
                 continue
@@ -169,6 +175,8 @@ class SourceReader:
 
     def _take_over(self, new: NewFrame) -> None:
         with self._lock:
+            if self._is_outdated:
+                return
             self._failure = ""
             if not self._health.check_frame(new.frame, new.model, self._now_ns()):
                 self.refused += 1

@@ -11,6 +11,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping
 from typing import Final, Protocol
 
+import msgspec
 import numpy as np
 
 from anchors.camera import CameraModel, pose_from_matrix
@@ -31,7 +32,7 @@ from iris_session.cloud.pipeline import (
 from iris_session.cloud.reader import NewFrame, SourceReader
 from iris_session.cloud.voxels import Colors, DepthLimits, Floats, VoxelFilter, make_rays
 from iris_session.protocol.common import MAX_TEXT
-from iris_session.protocol.media import StreamCamera, StreamInfo
+from iris_session.protocol.media import StreamCamera, StreamInfo, find_info_problem
 from iris_session.protocol.names import MediaEncoding, StreamFault
 from iris_session.system.extras import require_package
 
@@ -42,8 +43,8 @@ INFO_NS: Final = SECOND
 #: Sources whose pictures of a world at rest are all the same.
 RENDERED: Final = frozenset({"mujoco"})
 NO_POSE: Final = "its frames have no pose, or the session no state of the time when they are captured"
-#: Time for the threads to leave their sources [s].
-JOIN_S: Final = 0.5
+#: Time for the threads to leave their sources.
+JOIN_NS: Final = SECOND // 2
 
 #: Opens the source of a camera, which stamps its frames by the clock [ns].
 OpenSource = Callable[[CameraSettings, Callable[[], int]], DepthSource]
@@ -250,9 +251,8 @@ class CloudWorker:
             reader.stop()
         if self._watch is not None:
             self._watch.close()
-        ended = [
-            reader.join(JOIN_S) for reader in self._readers.values()
-        ]  # every one, not only to the first that hangs
+        end_ns = self._clock_ns() + JOIN_NS  # of all together
+        ended = [reader.join(max(0, end_ns - self._clock_ns()) / SECOND) for reader in self._readers.values()]
         return all(ended)
 
     # --- inside -------------------------------------------------------------------------------------------------------
@@ -320,14 +320,16 @@ class CloudWorker:
         names = [name for name, picture in self._pictures.items() if picture is stream]
         name = names[0] if names else ""
         camera = self._describe_camera(name or settings.cameras[0].name) if name or len(self._cameras) == 1 else None
-        return StreamInfo(
-            title=f"{settings.title}: {name}" if name else settings.title,
+        info = StreamInfo(
+            title=(f"{settings.title}: {name}" if name else settings.title)[:MAX_TEXT],
             audience=settings.audience,
             camera=camera,
             hz=settings.picture_hz if name else settings.hz,
             fault="" if fault is None else fault.fault,
-            detail="" if fault is None else fault.detail,
+            detail="" if fault is None else fault.detail[:MAX_TEXT],
         )
+        # Pictures that are too large for the protocol, or a camera too far away, are no reason to publish nothing.
+        return msgspec.structs.replace(info, camera=None) if find_info_problem(info) else info
 
     def _describe_camera(self, name: str) -> StreamCamera | None:
         """Return intrinsics and pose of a camera, `None` while they are not known."""

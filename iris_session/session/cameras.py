@@ -7,6 +7,7 @@ stops no step.
 from __future__ import annotations
 
 import os
+import time
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
@@ -104,6 +105,8 @@ class SessionCameras:
                 found.append(process.failure)
             elif silent:
                 found.append(f"the camera process of {stream!r} hangs: it is ended after {HANG_NS // SECOND} s")
+            elif process.report.warning:
+                found.append(f"cameras of {stream!r}: {process.report.warning}")
         return found
 
     @property
@@ -132,8 +135,9 @@ class SessionCameras:
     def close(self) -> None:
         """End the processes. May be called twice."""
         self.terminate()
+        deadline_s = time.monotonic() + EXIT_S  # of all together
         for process in self._processes.values():
-            process.close(EXIT_S)
+            process.close(max(0.0, deadline_s - time.monotonic()))
         self._processes.clear()
 
 

@@ -20,6 +20,8 @@ SECOND: Final = 1_000_000_000
 RESTART_DELAYS_NS: Final = (0, SECOND // 2, SECOND, 2 * SECOND, 5 * SECOND)
 #: A process that lived this long counts as healthy again.
 HEALTHY_NS: Final = 30 * SECOND
+#: A process that has not reported yet is given longer: on a busy machine it imports and compiles for tens of seconds.
+START_NS: Final = 60 * SECOND
 log = logging.getLogger(__name__)
 
 
@@ -118,8 +120,9 @@ class SupervisedProcess(Generic[Report]):
             return []
         self._read_reports(self._process, now_ns)
         if self._process.is_running:
-            if self._hang_ns and self.heard_ns is not None and now_ns - self.heard_ns > self._hang_ns:
-                self._hang = f"did not report for {self._hang_ns / SECOND:g} s and was ended"
+            limit_ns = START_NS if self.heard_ns is None else self._hang_ns
+            if self._hang_ns and now_ns - (self.heard_ns or self._started_ns) > limit_ns:
+                self._hang = f"did not report for {limit_ns / SECOND:g} s and was ended"
                 self._process.send_signal(signal.SIGKILL)
             return []
         fault = self.report.fault or self._hang or f"ended with status {self._process.exit_status}"

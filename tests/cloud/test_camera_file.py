@@ -211,3 +211,23 @@ def test_the_page_has_every_key_and_its_files_load(tmp_path: Path) -> None:
     files = re.findall(r"```toml\n(stream.*?)```", page, re.DOTALL)
     cameras = [one for text in files for one in load_camera_file(write(tmp_path, text)).cameras]
     assert {one.source for one in cameras} == set(get_args(SourceName))
+
+
+@pytest.mark.parametrize(
+    ("key", "given"),
+    [
+        ("path", "~no-such-user/file"),
+        ("intrinsics", "~no-such-user/file"),
+        ("calibration", "~no-such-user/file"),
+        ("intrinsics", "a\\u0000b"),
+        ("calibration", "a\\u0000b"),
+    ],
+)
+def test_paths_that_are_none_are_one_line(tmp_path: Path, key: str, given: str) -> None:
+    lines = {"path": '"pictures"', "intrinsics": INTRINSICS, "pose": POSE}
+    if key == "calibration":
+        del lines["pose"]
+    lines[key] = f'"{given}"'
+    text = 'stream = "room"\n[[cameras]]\nname = "front"\nsource = "folder"\n'
+    text += "".join(f"{name} = {value}\n" for name, value in lines.items())
+    assert refuse(tmp_path, text).key == key

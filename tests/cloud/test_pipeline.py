@@ -228,3 +228,43 @@ def test_a_camera_on_a_moving_hand_draws_a_still_wall() -> None:
         z = decode_cloud(cloud.frames["full"]).positions[:, 2]
         assert len(z) > 1000
         assert np.abs(z - 2.0).max() < 0.001
+
+
+def test_a_camera_without_a_pose_does_not_stop_the_other() -> None:
+    """Its body may not be in this scene. Until that is known, it is waited for."""
+    pipeline = CloudPipeline(
+        PipelineSettings(50_000, 0.02),
+        [
+            PipelineCamera("front", DepthLimits(), 0.01, place(0.0)),
+            PipelineCamera("hand", DepthLimits(), 0.01, place(0.0), "gripper"),
+        ],
+        iter(range(0, 10**9, MS)).__next__,
+        body_pose=lambda body, at: None,
+        voxels=VoxelFilter(0.02, use_numba=False),
+    )
+    made = []
+    for at in range(0, 600, 30):
+        for name in ("front", "hand"):
+            pipeline.offer(name, make_frame(at), at * MS)
+        made.append(set(pipeline.take_frames(at * MS)))
+    assert made[0] == set()
+    assert made[-1] == {"front"}
+    assert pipeline.lacks_pose("hand")
+
+
+@pytest.mark.parametrize("hz", [15, 60])
+def test_states_that_come_late_cost_no_cloud(hz: int) -> None:
+    """As over a slow link: the pose at a capture is known 150 ms after it."""
+    now = [0]
+    pose: PoseTuple = ((1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    pipeline = make_pipeline(
+        "hand", body="gripper", body_pose=lambda body, at: pose if at + 150 * MS <= now[0] else None
+    )
+    made = 0
+    for number in range(hz):  # a second
+        now[0] = round(number * 1000 / hz) * MS
+        pipeline.offer("hand", make_frame(now[0] / MS), now[0])
+        made += bool(pipeline.take_frames(now[0]))
+    assert made >= 8
+    assert not pipeline.lacks_pose("hand")
+    assert pipeline.drops["pose"] == 0

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from iris_session.client.errors import NotConnectedError
+from iris_session.client.errors import InvalidMessageError, NotConnectedError
 from iris_session.cloud import process
-from iris_session.cloud.process import BodyHistory, RobotRemover
+from iris_session.cloud.process import FETCH_AGAIN_NS, BodyHistory, RobotRemover, SessionOutlet
 from iris_session.cloud.voxels import PointSet
 
 MS = 1_000_000
@@ -111,7 +111,7 @@ def test_points_on_robots_go_once_their_shapes_are_there(monkeypatch: pytest.Mon
     def fetch(client: object) -> Any:
         assert is_there.wait(DEADLINE_S)
         fetched.append(client)
-        return SimpleNamespace(spec=None, meshes={})
+        return SimpleNamespace(spec=None, meshes={}, failed={})
 
     monkeypatch.setattr(process, "fetch_scene", fetch)
     monkeypatch.setattr(process, "RobotPoints", FakeRobotPoints)
@@ -135,9 +135,12 @@ def test_points_on_robots_go_once_their_shapes_are_there(monkeypatch: pytest.Mon
     assert len(fetched) == 2
 
 
-def test_without_shapes_all_points_stay(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize("error", [NotConnectedError("this session shares no specification"), KeyError("any other")])
+def test_without_shapes_all_points_stay_until_they_are_there(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, error: Exception
+) -> None:
     def fail(client: object) -> Any:
-        raise NotConnectedError("this session shares no specification")
+        raise error
 
     monkeypatch.setattr(process, "fetch_scene", fail)
     lab = Lab()
@@ -146,4 +149,42 @@ def test_without_shapes_all_points_stay(monkeypatch: pytest.MonkeyPatch, caplog:
     wait_for_fetch(remover)
     assert remover.is_ready(0)
     assert len(remover.remove(make_points(), 0).positions) == 2
-    assert "points on robots stay in the cloud: this session shares no specification" in caplog.text
+    assert f"points on robots stay in the cloud: {error}" in caplog.text
+    assert remover.warning
+    monkeypatch.setattr(process, "RobotPoints", FakeRobotPoints)
+    monkeypatch.setattr(process, "fetch_scene", lambda _: SimpleNamespace(spec=None, meshes={}, failed={}))
+    remover.is_ready(FETCH_AGAIN_NS - 1)
+    assert remover.is_ready(FETCH_AGAIN_NS - 1), "not tried again at once"
+    remover.is_ready(FETCH_AGAIN_NS)
+    wait_for_fetch(remover)
+    assert len(remover.remove(make_points(), 0).positions) == 1
+    assert remover.warning == ""
+
+
+def test_shapes_that_are_missing_are_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(process, "RobotPoints", FakeRobotPoints)
+    monkeypatch.setattr(process, "fetch_scene", lambda _: SimpleNamespace(spec=None, meshes={}, failed={"a": "lost"}))
+    lab = Lab()
+    remover = RobotRemover(lab.client, lab.history)
+    remover.is_ready(0)
+    wait_for_fetch(remover)
+    assert remover.warning == "points on robots stay in part: 1 shapes are missing"
+
+
+def test_states_of_a_second_are_kept_at_any_rate() -> None:
+    lab = Lab()
+    for at in range(0, 3000, 5):  # 200 states a second
+        lab.add(at, 0.001 * at)
+    assert lab.find_x(2100) == pytest.approx(2.1)
+    assert lab.find_x(1900) is None
+
+
+@pytest.mark.parametrize("error", [NotConnectedError("away"), InvalidMessageError("too large")])
+def test_a_frame_that_cannot_be_sent_is_dropped(error: Exception) -> None:
+    def publish(*_: object, **__: object) -> bool:
+        raise error
+
+    client: Any = SimpleNamespace(media=SimpleNamespace(publish=publish))
+    outlet = SessionOutlet(client)
+    assert not outlet.publish("room", b"", 0, "cloud", None)
+    assert not outlet.publish("room", b"", 0, "cloud", None)

@@ -108,3 +108,20 @@ def test_another_clock_forgets_the_frames(lab: Lab) -> None:
     wait_until(lambda: lab.reader.measure_hz(time.monotonic_ns()) > 0.0)
     lab.reader.restart_clock()
     assert lab.reader.take_frame() is None
+
+
+def test_another_clock_opens_the_source_anew(lab: Lab) -> None:
+    """A recording that is due by the old clock would be silent for as long as the old session ran."""
+    lab.reader.start()
+    wait_until(lambda: lab.sources)
+    lab.reader.restart_clock()
+    lab.sources[0].put(make_frame(1))  # of the old clock
+    wait_until(lambda: len(lab.sources) == 2)
+    assert lab.sources[0].closed
+    assert lab.reader.take_frame() is None
+    lab.sources[1].put(make_frame(time.monotonic_ns()))
+    wait_until(lambda: lab.reader.measure_hz(time.monotonic_ns()) > 0.0)
+    new = lab.reader.take_frame()
+    assert new is not None
+    assert new.opening == 2
+    assert lab.reader.failures == 0

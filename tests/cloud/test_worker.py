@@ -15,6 +15,7 @@ from iris_session.cloud.camera_file import CameraSettings
 from iris_session.cloud.frames import DepthFrame, SourceError
 from iris_session.cloud.health import Fault
 from iris_session.cloud.worker import CloudWorker
+from iris_session.protocol.media import find_info_problem
 from iris_session.protocol.names import MediaEncoding, StreamFault
 from iris_session.streams.cloud import decode_cloud
 from tests.cloud.camera_settings import make_settings
@@ -162,10 +163,12 @@ def test_frames_that_no_one_takes_are_counted(open_lab: Callable[..., Lab]) -> N
 def test_another_session_gets_nothing_of_the_one_before(open_lab: Callable[..., Lab]) -> None:
     lab = open_lab("front")
     lab.show("front")
+    before = lab.sources["front"]
     lab.worker.restart_clock()
     lab.outlet.published.clear()
     lab.worker.poll(0.0)
     assert lab.outlet.published == []
+    lab.poll_until(lambda: lab.sources["front"] is not before)
     lab.show("front")
 
 
@@ -185,3 +188,14 @@ def test_the_report(open_lab: Callable[..., Lab]) -> None:
     assert report.age_ms >= report.stages_ms["read"]
     assert report.cameras["front"].hz > 0.0
     assert report.cameras["front"].fault == ""
+
+
+def test_a_camera_that_the_protocol_does_not_describe_is_published(open_lab: Callable[..., Lab]) -> None:
+    lab = open_lab("front", title="x" * 600, picture_hz=10.0)
+    far = np.eye(4)
+    far[0, 3] = 1e7
+    lab.show("front", T_world_camera=far)
+    info = lab.outlet.newest_info("room-front")
+    assert info is not None
+    assert find_info_problem(info) == ""
+    assert len(info.title) <= 512

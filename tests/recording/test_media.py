@@ -102,6 +102,7 @@ def test_frames_that_do_not_decode_are_counted(writer: RrdWriter) -> None:
         message("room", good, encoding="bytes"),
         message("room", b"GIF89a", encoding="jpeg"),
         message("room", JPEG[:8], encoding="jpeg"),
+        message("room", JPEG[:2] + b"\xff" * 70_000 + JPEG[2:], encoding="jpeg"),
         message("room", JPEG.replace(b"\x00\x02", b"\xff\xff"), encoding="jpeg"),
         message("room", JPEG.replace(b"\x00\x02", b"\x00\x00"), encoding="jpeg"),
         message("../room", good),

@@ -9,7 +9,7 @@ import time
 import msgspec
 
 from iris_session.system.process import ChildProcess
-from iris_session.system.supervised import HEALTHY_NS, SECOND, SupervisedProcess
+from iris_session.system.supervised import HEALTHY_NS, SECOND, START_NS, SupervisedProcess
 
 DEADLINE_S = 60.0
 
@@ -174,6 +174,16 @@ def test_a_process_that_hangs_is_ended_but_not_while_it_starts() -> None:
     announced = lab.poll(0.2)
     assert lab.children[0].signals == [signal.SIGKILL]
     assert announced == ["the helper did not report for 5 s and was ended; it is started again"]
+
+
+def test_a_process_that_never_reports_is_ended() -> None:
+    lab = start(hang_ns=5 * SECOND)
+    announced = lab.poll(START_NS / SECOND + 0.1)
+    assert lab.children[0].signals == [signal.SIGKILL]
+    assert announced == ["the helper did not report for 60 s and was ended; it is started again"]
+    quiet = start()  # without such a limit
+    assert quiet.poll(1000.0) == []
+    assert quiet.children[0].signals == []
 
 
 def test_a_process_that_starts_while_all_ends_is_closed() -> None:
