@@ -38,7 +38,7 @@ def test_sessions_are_listed_with_known_keys(found: list[FoundSession], capsys: 
     assert "not encrypted" in plain
     assert "(new: join" in new
     assert known.split()[:3] == ["lab-2", "10.0.0.6:7721", "replay"]
-    assert "new" not in known
+    assert "(new" not in known
     assert main(["sessions", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["sessions"]
     assert [(row["encrypted"], row["known"]) for row in rows] == [(False, False), (True, False), (True, True)]
