@@ -11,12 +11,12 @@ unexport PYTHONDONTWRITEBYTECODE
 help:
 	@echo "make demo     two emulated operators hand a hammer over, recorded and verified"
 	@echo "make web      builds the page for browsers, web_client, into iris_session/web/page"
-	@echo "make test     lint, strict types, every test: the five below"
+	@echo "make test     lint, strict types and tests: the four below"
 	@echo "  make check      lint, format, strict types"
 	@echo "  make test-unit  tests in one process;  make test-unit T=tests/control  those of one room"
 	@echo "  make test-e2e   tests that start real processes;  make test-e2e T=tests/e2e/test_operators.py"
 	@echo "  make test-web   strict types and tests of web_client"
-	@echo "  make coverage   the bounds of coverage, after test-unit"
+	@echo "make test FULL=1  also tests marked `long`, and the bounds of coverage: what continuous integration runs"
 	@echo "make test-random  the unit tests with other random examples than the usual ones"
 	@echo "make bench    the benchmarks of docs/benchmarks.md"
 	@echo "make screenshots  records the demo anew and makes the pictures of README and docs"
@@ -80,15 +80,18 @@ JOBS ?= 3
 JOBS_E2E ?= 2
 T ?= tests
 
-UNIT = $(BIN)/python -m pytest -q -m "not e2e" -n $(JOBS) --dist worksteal --cov --cov-report=
+# Tracing for coverage makes the unit tests take half as long again, and a tenth of the tests take a third of the time.
+FULL ?=
+KINDS := $(if $(FULL),,and not long)
+UNIT = $(BIN)/python -m pytest -q -m "not e2e $(KINDS)" -n $(JOBS) --dist worksteal $(if $(FULL),--cov --cov-report=)
 # A file stays on one worker, because its tests share sessions; the longest begin first (tests/e2e/conftest.py).
-E2E = $(BIN)/python -m pytest -q -m e2e -n $(JOBS_E2E) --dist loadfile --no-loadscope-reorder
+E2E = $(BIN)/python -m pytest -q -m "e2e $(KINDS)" -n $(JOBS_E2E) --dist loadfile --no-loadscope-reorder
 
 test: check
 	$(MAKE) --no-print-directory test-unit
 	$(MAKE) --no-print-directory test-e2e
 	$(MAKE) --no-print-directory test-web
-	$(MAKE) --no-print-directory coverage
+	$(if $(FULL),$(MAKE) --no-print-directory coverage)
 
 test-unit: install-dev
 	$(UNIT) $(T)

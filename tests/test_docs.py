@@ -184,6 +184,7 @@ def _emulate(words: list[str], folder: Path) -> None:
     assert json.loads(done.stdout.splitlines()[-1])["frames"] > 0
 
 
+@pytest.mark.long
 @pytest.mark.e2e
 def test_key_files_of_the_network_page_work(tmp_path: Path, run_python: Callable[..., str]) -> None:
     run_python(_network_page("create_certificates"))
@@ -193,6 +194,7 @@ def test_key_files_of_the_network_page_work(tmp_path: Path, run_python: Callable
         _emulate([address if LAB_ADDRESS in word else word for word in _network_command("--curve-server")], tmp_path)
 
 
+@pytest.mark.long
 @pytest.mark.e2e
 def test_join_code_of_the_network_page_works(tmp_path: Path, run_python: Callable[..., str]) -> None:
     join = _network_page("join_code=")

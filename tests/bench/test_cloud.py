@@ -48,6 +48,7 @@ def test_report_of_clouds(tmp_path: Path) -> None:
     assert [one["key"] for one in result["bars"]] == ["hz", "room_2cm_10k.hz", "recorded.hz"]
 
 
+@pytest.mark.long
 @pytest.mark.e2e
 def test_report_beside_a_session(tmp_path: Path) -> None:
     got = run_bench(tmp_path, "cloud", "--beside", "--points", "20000", "--seconds", "4")["results"]
@@ -58,6 +59,7 @@ def test_report_beside_a_session(tmp_path: Path) -> None:
     assert 0.0 <= got["late_tick_share_without"] <= 1.0
 
 
+@pytest.mark.long
 @pytest.mark.e2e
 def test_report_of_a_stream(tmp_path: Path) -> None:
     arguments = ("--points", "2000", "--hz", "30", "--clients", "2", "--seconds", "3", "--curve")
@@ -73,6 +75,7 @@ def test_report_of_a_stream(tmp_path: Path) -> None:
     assert keys == {"bytes_per_point", "max_error_mm", "delivered_hz_min", "decode_ms_p50", "state_age_ms_p99"}
 
 
+@pytest.mark.long
 @pytest.mark.e2e
 def test_report_over_a_slow_link(tmp_path: Path) -> None:
     arguments = ("--points", "20000", "--mbit", "20", "--clients", "1", "--seconds", "10")

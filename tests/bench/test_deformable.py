@@ -33,6 +33,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache" / "iris-session" / "bench"
 
 
+@pytest.mark.long
 @pytest.mark.e2e
 def test_report(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "iris_session.cli.main", "bench", "deformable", "--json"]

@@ -14,6 +14,7 @@ KEYS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.e2e
 def test_join_of_a_small_scene(tmp_path: Path) -> None:
     options = ("--objects", "70", "--assets-mb", "3", "--clients", "1", "--seconds", "10")

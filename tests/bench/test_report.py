@@ -74,6 +74,7 @@ def test_input(tmp_path: Path) -> None:
     assert isinstance(got["rejected"], dict)
 
 
+@pytest.mark.long
 @pytest.mark.e2e
 def test_slow_client(tmp_path: Path) -> None:
     """One round. The stopped client and the one with a stalled link get fresh state again."""
@@ -84,6 +85,7 @@ def test_slow_client(tmp_path: Path) -> None:
     assert all(result["results"][f"{link}resume_first_age_ms"] < 1000.0 for link in ("", "link_"))
 
 
+@pytest.mark.long
 @pytest.mark.e2e
 @pytest.mark.parametrize("arguments", [("state", "--bodies", "20"), ("input", "--operators", "1", "--robots", "1")])
 def test_benchmarks_over_an_impaired_link(tmp_path: Path, arguments: tuple[str, ...]) -> None:

@@ -78,6 +78,7 @@ def test_bars_follow_the_baseline_and_the_length() -> None:
     assert "heap_growth_mib" not in {bar.key for bar in make_web_bars(results | tab, 65.0)}
 
 
+@pytest.mark.long
 @pytest.mark.e2e
 def test_web(tmp_path: Path, robot_models: Path) -> None:
     """A tab, a browser that is disturbed, another one, and a client beside them, encrypted."""

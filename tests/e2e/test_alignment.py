@@ -149,6 +149,7 @@ def start_table(serve: Callable[..., SessionProcess], tmp_path: Path) -> Iterato
         table.close()
 
 
+@pytest.mark.long
 def test_four_headsets_stay_aligned_through_bump_recentring_and_drift(
     start_table: Callable[..., AlignmentScenario],
 ) -> None:

@@ -62,6 +62,7 @@ def test_hammer_is_handed_over_and_the_recording_verifies(tmp_path: Path) -> Non
     assert report["finished"]
 
 
+@pytest.mark.long
 def test_failed_operators_begin_again_from_a_reset_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     listed = run._EmulatorGroup.list_failures
     failed: list[str] = []
@@ -119,6 +120,7 @@ def test_ctrl_c_leaves_no_process_and_a_finished_recording(demo: subprocess.Pope
     assert run_verify(recording)["finished"]
 
 
+@pytest.mark.long
 def test_killed_demo_leaves_no_process_and_a_finished_recording(demo: subprocess.Popen[bytes], tmp_path: Path) -> None:
     children = list_descendants(demo.pid)
     assert len(children) == CHILDREN
@@ -130,6 +132,7 @@ def test_killed_demo_leaves_no_process_and_a_finished_recording(demo: subprocess
     assert run_verify(recording)["finished"]
 
 
+@pytest.mark.long
 def test_handover_over_busy_wifi(tmp_path: Path) -> None:
     recording = tmp_path / "session.rrd"
     options = ("--profile", "busy-wifi", "--seed", "3", "--record", str(recording), *DEMO_OPTIONS)

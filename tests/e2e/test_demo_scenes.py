@@ -27,6 +27,7 @@ def run_demo(folder: Path, *arguments: str, max_takes: int = 1) -> dict[str, Any
     return result
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("robot_models")
 def test_aloha_operators_exchange_boards(tmp_path: Path) -> None:
     result = run_demo(tmp_path, "aloha", max_takes=2)  # a board is dropped in about one of twelve, by physics alone
@@ -39,12 +40,14 @@ def test_aloha_operators_exchange_boards(tmp_path: Path) -> None:
         assert 0.0 < error["at_sheet"] < 2.0 * error["stated_p95"]
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("robot_models")
 def test_iiwa_operators_hand_over_a_hammer(tmp_path: Path) -> None:
     result = run_demo(tmp_path, "iiwa")
     assert [(h["object"], h["giver"], h["receiver"]) for h in result["handovers"]] == [("object1", "left", "right")]
 
 
+@pytest.mark.long
 def test_two_operators_stow_two_soft_bodies(tmp_path: Path) -> None:
     goals = run_demo(tmp_path, "soft")["goals"]
     assert sorted((goal["deformable"], goal["goal"]) for goal in goals) == [("mint", "stowed"), ("rose", "stowed")]

@@ -155,6 +155,7 @@ def test_replayed_hello_does_not_take_over(shared_session: SessionProcess) -> No
         one.close()
 
 
+@pytest.mark.long
 def test_hundred_stalled_subscribers_do_not_delay_state(shared_scenario: Scenario) -> None:
     scenario = shared_scenario
     ann = scenario.join("Ann", "observer")

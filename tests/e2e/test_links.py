@@ -120,6 +120,7 @@ def write_profile(folder: Path, **phase: Any) -> str:
     return str(path)
 
 
+@pytest.mark.long
 def test_blackout_of_five_seconds(linked: LinkScenario) -> None:
     """The robot holds within 150 ms of session time and keeps its lease, others go on; then the client resumes."""
     scenario, watcher = linked.scenario, linked.watcher

@@ -279,6 +279,7 @@ def check_reset(scenario: Scenario, hand: Hand, director: Client) -> None:
     scenario.engage(hand)
 
 
+@pytest.mark.long
 def test_four_headsets_drive_four_arms(
     serve: Callable[..., SessionProcess], emulate: Callable[..., subprocess.Popen[bytes]], tmp_path: Path
 ) -> None:

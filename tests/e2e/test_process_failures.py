@@ -121,6 +121,7 @@ def test_front_and_recorder_killed_at_once(scenario: Scenario, driving: Hand) ->
     assert scenario.server.finish()["parts"] == 2
 
 
+@pytest.mark.long
 def test_operators_finish_although_recorder_and_front_were_killed(
     scenario: Scenario, emulate: Callable[..., subprocess.Popen[bytes]]
 ) -> None:

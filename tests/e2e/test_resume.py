@@ -66,6 +66,7 @@ def wait_reconnected(scenario: Scenario, server: SessionProcess, *clients: Clien
     scenario.run_until(lambda: all(map(is_back, clients)), "all clients have reconnected")
 
 
+@pytest.mark.long
 def test_operators_finish_the_handover_although_the_authority_was_killed(
     scenario: Scenario, emulate: Callable[..., subprocess.Popen[bytes]], resume: Resume
 ) -> None:

@@ -66,6 +66,7 @@ def wait_for_epoch(scenario: Scenario, epoch: int) -> None:
     scenario.run_until(have_all_arrived, f"all clients have state of scene epoch {epoch}")
 
 
+@pytest.mark.long
 def test_operators_continue_in_another_scene_and_it_replays(scenario: Scenario) -> None:
     ann, bob = scenario.join("ann"), scenario.join("bob")
     assert {client.scene.tick_period_ns for client in scenario.clients} == {2_000_000}

@@ -17,6 +17,7 @@ from soak import check_log, check_memory  # noqa: E402
 RECORDED = {1: 11, 2: 22, 3: 33, 4: 44, 5: 55}
 
 
+@pytest.mark.long
 @pytest.mark.e2e
 def test_short_soak_finds_no_problem(tmp_path: Path) -> None:
     """Three participants over busy Wi-Fi: all are connected at the end, no event is lost, the recording verifies."""

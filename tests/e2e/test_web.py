@@ -95,7 +95,9 @@ class Reference:
         return picture, (number >= 0) & ~is_plane
 
 
-@pytest.mark.parametrize(("scene", "distances"), [("handover", 1.35), ("cloth", 1.35), ("aloha", 0.9)])
+@pytest.mark.parametrize(
+    ("scene", "distances"), [("handover", 1.35), ("cloth", 1.35), pytest.param("aloha", 0.9, marks=pytest.mark.long)]
+)
 def test_the_page_draws_what_mujoco_draws(
     serve: Callable[..., SessionProcess], open_page: Callable[..., Page], scene: str, distances: float
 ) -> None:
@@ -395,6 +397,7 @@ async def list_holders(browser: WebBrowser) -> dict[str, str]:
     return {lease.target: lease.holder for lease in (await browser.snapshot()).leases if lease.holder}
 
 
+@pytest.mark.long
 def test_all_come_back_with_their_robots(serve: Callable[..., SessionProcess], open_page: Callable[..., Page]) -> None:
     """A tab and seven browsers without a picture hold a robot each; the gateway is killed, and then the front."""
     server = serve("arms")

@@ -280,6 +280,7 @@ def test_media_reach_the_browser_that_wishes_for_them(serve: Serve) -> None:
     run(work())
 
 
+@pytest.mark.long
 def test_a_thousand_silent_sockets_harm_no_one(page: str) -> None:
     host, port = re.findall(r"//([\d.]+):(\d+)/", page)[0]
 
@@ -372,6 +373,7 @@ def test_killed_gateway_comes_back_and_leases_stay(serve: Serve) -> None:
     assert "web gateway ended" in server.output
 
 
+@pytest.mark.long
 def test_all_browsers_of_a_killed_gateway_resume_and_nothing_leaks(serve: Serve) -> None:
     server = serve()
     page = page_of(server)

@@ -252,6 +252,7 @@ def test_marks_align_and_a_touch_confirms_the_kept_place_after_a_reload(quest: M
     assert quest.page.errors == []
 
 
+@pytest.mark.long
 def test_a_fingertip_aligns_to_look(quest: MarkedQuest) -> None:
     quest.look_at_sheet()
     quest.enter("Enter AR")

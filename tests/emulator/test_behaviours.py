@@ -20,7 +20,11 @@ def _in_phase(robot: str, phase: str):  # type: ignore[no-untyped-def]
 
 @pytest.mark.parametrize(
     ("seed", "thing", "giver", "receiver"),
-    [(1, "hammer", "left", "right"), (2, "hammer", "left", "right"), (3, "board", "right", "left")],
+    [
+        (1, "hammer", "left", "right"),
+        pytest.param(2, "hammer", "left", "right", marks=pytest.mark.long),
+        pytest.param(3, "board", "right", "left", marks=pytest.mark.long),
+    ],
 )
 def test_handover_in_mid_air(seed: int, thing: str, giver: str, receiver: str) -> None:
     """Friction alone holds the object; between the two grips it touches nothing else; it ends on the table."""
@@ -33,6 +37,7 @@ def test_handover_in_mid_air(seed: int, thing: str, giver: str, receiver: str) -
     assert side * rig.world.view().object_pose(thing).p[0] > 0.1  # on the receiver's side of the table
 
 
+@pytest.mark.long
 def test_two_handovers_of_four_operators_at_once() -> None:
     """Four arms around a table: adjacent operators hand over a hammer and a board at the same time."""
     behaviours: dict[str, Behaviour] = {}
@@ -100,6 +105,7 @@ def test_giver_clutches_again_after_a_lost_engagement(phase: str) -> None:
     assert rig.behaviours["left"].hand.reclutches >= 1  # type: ignore[attr-defined]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("phase", ["carry", "put"])
 def test_receiver_clutches_again_after_a_lost_engagement(phase: str) -> None:
     rig = handover(7)
@@ -110,6 +116,7 @@ def test_receiver_clutches_again_after_a_lost_engagement(phase: str) -> None:
     assert verdict(rig, "left", "right") == ""
 
 
+@pytest.mark.long
 def test_giver_retries_when_the_object_moved_before_the_grasp() -> None:
     """The gripper closes on nothing; the giver sees it, opens and tries again."""
     rig = handover(8)

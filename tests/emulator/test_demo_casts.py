@@ -14,6 +14,7 @@ from tests.models import robot_models
 __all__ = ["robot_models"]
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("robot_models", "untraced")
 def test_every_object_is_handed_over() -> None:
     """By friction, in mid-air, onto a table. Two iiwa, and ALOHA: `tests/e2e/test_demo_scenes.py`."""
@@ -23,6 +24,7 @@ def test_every_object_is_handed_over() -> None:
     assert rig.fastest_hand < 0.5
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("untraced")
 def test_eight_arms_around_a_table() -> None:
     rig = demo(make_demo("handover", 8), seed=3)

@@ -18,6 +18,7 @@ from tests.emulator.deformable_rig import SoftRig, soft_demo
 from tests.emulator.handover_rig import LateView
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("untraced")
 def test_two_people_fold_a_cloth() -> None:
     rig = soft_demo(make_demo("cloth"), seed=1)
@@ -26,6 +27,7 @@ def test_two_people_fold_a_cloth() -> None:
     assert rig.world.dropped_counts == {}
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("untraced")
 def test_two_people_stow_soft_bodies_and_recover_dropped_ones() -> None:
     """At the first attempt a gripper is opened halfway."""

@@ -71,6 +71,7 @@ def test_damaged_length_hides_one_message(path: Path, monkeypatch: pytest.Monkey
     assert report.last_step == 199
 
 
+@pytest.mark.long
 def test_any_flipped_bit_is_found(path: Path) -> None:
     """For every bit of the file only the room's own error is raised, and the file is never reported as ok."""
     data = path.read_bytes()

@@ -44,7 +44,9 @@ def check(model: mujoco.MjModel, store: AssetStore, views: slice) -> None:
         assert np.mean(difference.max(axis=2) > VISIBLE) <= VISIBLE_SHARE
 
 
-@pytest.mark.parametrize(("name", "views"), [("aloha", slice(2, 5)), ("kuka_iiwa_14", slice(0, 3))])
+@pytest.mark.parametrize(
+    ("name", "views"), [pytest.param("aloha", slice(2, 5), marks=pytest.mark.long), ("kuka_iiwa_14", slice(0, 3))]
+)
 def test_real_robots_look_the_same(robot_models: Path, tmp_path: Path, name: str, views: slice) -> None:
     model = mujoco.MjModel.from_xml_path(str(robot_models / "models" / name / "scene.xml"))
     check(model, AssetStore(tmp_path), views)

@@ -105,6 +105,7 @@ def test_what_is_missing_or_damaged_is_named(tmp_path: Path, how: str) -> None:
     assert str(tmp_path) in str(caught.value)
 
 
+@pytest.mark.long
 def test_the_real_frames_make_one_room() -> None:
     """Views of a moving camera: surfaces of each lie on those of the view before."""
     folder = Path(os.environ["IRIS_DATA"]) / "rgbd"
