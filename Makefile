@@ -16,7 +16,7 @@ help:
 	@echo "  make test-unit  tests in one process;  make test-unit T=tests/control  those of one room"
 	@echo "  make test-e2e   tests that start real processes;  make test-e2e T=tests/e2e/test_operators.py"
 	@echo "  make test-web   strict types and tests of web_client"
-	@echo "make test FULL=1  also tests marked `long`, and the bounds of coverage: what continuous integration runs"
+	@echo "make test FULL=1  also tests marked long, and the bounds of coverage: what continuous integration runs"
 	@echo "make test-random  the unit tests with other random examples than the usual ones"
 	@echo "make bench    the benchmarks of docs/benchmarks.md"
 	@echo "make screenshots  records the demo anew and makes the pictures of README and docs"
