@@ -28,8 +28,8 @@ export interface Environment {
   fetch(url: string, init: RequestInit): Promise<Response>;
   /** Call back after `ms`; returns a function that cancels. */
   setTimer(ms: number, callback: () => void): () => void;
-  /** Decode a JPEG image; rejects for one that is damaged. */
-  decodeImage(bytes: Uint8Array): Promise<ImageBitmap>;
+  /** Decode a JPEG image to this width [pixels]; rejects for one that is damaged. */
+  decodeImage(bytes: Uint8Array, width: number): Promise<ImageBitmap>;
   store: Store;
   /** Number of this tab among those of the browser, empty for none. */
   slot: string;

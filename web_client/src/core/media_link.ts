@@ -17,14 +17,16 @@ export interface MediaEnvironment {
   post(update: FromWorker, transfer: Transferable[]): void;
   openSocket(url: string, protocol: string): SocketLike;
   setTimer(ms: number, callback: () => void): () => void;
-  /** Decode a JPEG image; rejects for one that is damaged. */
-  decodeImage(bytes: Uint8Array): Promise<ImageBitmap>;
+  /** Decode a JPEG image to this width [pixels]; rejects for one that is damaged. */
+  decodeImage(bytes: Uint8Array, width: number): Promise<ImageBitmap>;
 }
 
 /** A cloud or a picture, not decoded yet. */
 interface Frame {
   encoding: string;
   bytes: Uint8Array;
+  /** Of a picture, as it is decoded [pixels]. */
+  width: number;
   capture_ms: number;
   received_ms: number;
 }
@@ -33,6 +35,11 @@ const MS_NS = 1_000_000;
 const OPEN = 1;
 /** Streams that a session has at most. */
 const MAX_STREAMS = 16;
+/**
+ * Larger pictures are decoded to this width or height [pixels]: no panel shows more, and one of 4096 x 4096 would cost a
+ * headset several frames on its way to the graphics card.
+ */
+const MAX_SHOWN = 1024;
 const FIRST_PAUSE_MS = 200;
 const LONGEST_PAUSE_MS = 5_000;
 
@@ -159,7 +166,7 @@ export class MediaLink {
       return;
     }
     if (encoding === "cloud" || encoding === "jpeg") {
-      const frame = { encoding, bytes, capture_ms: captureNs / MS_NS, received_ms: receivedNs / MS_NS };
+      const frame = { encoding, bytes, width: 0, capture_ms: captureNs / MS_NS, received_ms: receivedNs / MS_NS };
       if (this.wishes.includes(stream)) this.takeNewest(stream, frame);
       return;
     }
@@ -172,7 +179,7 @@ export class MediaLink {
     const counters = this.count(stream);
     counters.received += 1;
     try {
-      if (frame.encoding === "jpeg") readJpegSize(frame.bytes);
+      if (frame.encoding === "jpeg") frame.width = fitWidth(readJpegSize(frame.bytes));
     } catch (error) {
       counters.refused += 1;
       throw error;
@@ -190,13 +197,13 @@ export class MediaLink {
   }
 
   /** Decode and post a frame. The page answers with `taken`. */
-  private async decode(stream: string, { encoding, bytes, ...times }: Frame): Promise<void> {
+  private async decode(stream: string, { encoding, bytes, width, ...times }: Frame): Promise<void> {
     if (encoding === "cloud") {
       const cloud = decodeCloud(bytes);
       this.environment.post({ type: "cloud", stream, cloud, ...times }, [cloud.points.buffer]);
       return;
     }
-    const bitmap = await this.environment.decodeImage(bytes);
+    const bitmap = await this.environment.decodeImage(bytes, width);
     if (this.wishes.includes(stream)) {
       this.environment.post({ type: "picture", stream, bitmap, ...times }, [bitmap]);
       return;
@@ -210,4 +217,8 @@ export class MediaLink {
     if (this.wishes.includes(stream)) this.counters.set(stream, counters);
     return counters;
   }
+}
+
+function fitWidth({ width, height }: { width: number; height: number }): number {
+  return Math.max(1, Math.round(width * Math.min(1, MAX_SHOWN / Math.max(width, height))));
 }

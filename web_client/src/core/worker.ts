@@ -24,7 +24,7 @@ async function start(): Promise<void> {
       const timer = setTimeout(callback, ms);
       return () => clearTimeout(timer);
     },
-    decodeImage: (bytes) => createImageBitmap(new Blob([bytes as Uint8Array<ArrayBuffer>], { type: "image/jpeg" })),
+    decodeImage: (bytes, resizeWidth) => createImageBitmap(new Blob([bytes as Uint8Array<ArrayBuffer>], { type: "image/jpeg" }), { resizeWidth }),
     store,
     slot,
     run: [...run].map((byte) => byte.toString(16).padStart(2, "0")).join(""),

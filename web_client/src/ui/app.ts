@@ -119,7 +119,7 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   const cameras = makeCameras(state, view, makePictures(state, client, choices));
   stage.tools.append(cameras.menu);
   stage.element.append(cameras.element, drive.element);
-  handle.headset = makeHeadsetControls(view, state, client, (showInside) => new Actions(client, (text, level) => {
+  handle.headset = makeHeadsetControls(view, state, client, choices, (showInside) => new Actions(client, (text, level) => {
     show(text, level);
     showInside(text);
   }));

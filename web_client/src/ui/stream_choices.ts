@@ -34,21 +34,21 @@ export class StreamChoices {
     return this.hasView() && (encoding === MediaEncoding.CLOUD || this.listDeformables().includes(stream)) ? "scene" : "";
   }
 
-  /** Return whether a stream is shown, but for panels that no one can see in a headset. */
+  /** Return whether a stream is shown. */
   isShown(one: Stream, mode: Mode): boolean {
     const shower = this.findShower(one);
-    if (shower === "panel") return this.remembered.shown.includes(one.stream);
     if (shower === "") return false;
-    const chosen = this.outside.get(one.stream);
-    if (mode !== "immersive-ar") return chosen ?? true;
+    const isChosen = shower === "panel" ? this.remembered.shown.includes(one.stream) : (this.outside.get(one.stream) ?? true);
+    if (mode !== "immersive-ar") return isChosen;
     const isSeenAnyway = one.audience === StreamAudience.REMOTE;
-    return this.inAr.get(one.stream) ?? (chosen !== false && !isSeenAnyway);
+    return this.inAr.get(one.stream) ?? (isChosen && !isSeenAnyway);
   }
 
-  /** Show a stream or not, as the person chose while the page was in `mode`. One panel too many closes the oldest one. */
+  /** Show a stream or not, as the person chose for `mode`. One panel too many closes the oldest one, but in AR. */
   choose(one: Stream, isShown: boolean, mode: Mode): void {
     const { stream } = one;
-    if (this.findShower(one) !== "panel") {
+    const isPanel = this.findShower(one) === "panel";
+    if (mode === "immersive-ar" || !isPanel) {
       (mode === "immersive-ar" ? this.inAr : this.outside).set(stream, isShown);
       return;
     }
@@ -58,14 +58,13 @@ export class StreamChoices {
   }
 
   /** Return the streams of a session with an open panel. */
-  listPanels(streams: readonly Stream[]): Stream[] {
-    return streams.filter((one) => this.findShower(one) === "panel" && this.isShown(one, "screen")).slice(0, MAX_PANELS);
+  listPanels(streams: readonly Stream[], mode: Mode): Stream[] {
+    return streams.filter((one) => this.findShower(one) === "panel" && this.isShown(one, mode)).slice(0, MAX_PANELS);
   }
 
   /** Return the streams to subscribe to. */
   listWanted(streams: readonly Stream[], mode: Mode): string[] {
-    const panels = mode === "screen" ? this.listPanels(streams) : [];
     const drawn = streams.filter((one) => this.findShower(one) === "scene" && this.isShown(one, mode));
-    return [...drawn, ...panels].map(({ stream }) => stream).sort();
+    return [...drawn, ...this.listPanels(streams, mode)].map(({ stream }) => stream).sort();
   }
 }

@@ -81,7 +81,7 @@ function makeRow(first: Stream, state: PageState, choices: StreamChoices, clouds
       const cloud = clouds?.getPoints(stream);
       box.disabled = shower === "";
       box.checked = choices.isShown(one, state.mode);
-      arLabel.hidden = !(state.offersAr && shower === "scene" && one.audience === StreamAudience.REMOTE && state.mode !== "immersive-ar");
+      arLabel.hidden = !(state.offersAr && shower !== "" && one.audience === StreamAudience.REMOTE && state.mode !== "immersive-ar");
       inAr.checked = choices.isShown(one, "immersive-ar");
       setText(title, one.title || stream);
       setText(warning, describeState(one, state));

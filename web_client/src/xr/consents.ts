@@ -20,7 +20,7 @@ const ANSWER_WORDS = { grant: "Give it", refuse: "Keep it" } as const;
 /** An answer that a hand points at. */
 export interface Aim {
   side: Side;
-  answer: Answer;
+  target: Answer;
   /** Along the ray [m]. */
   distance: number;
 }
@@ -62,10 +62,10 @@ export class ConsentPanel {
     this.answers = (isAnswerable && this.place?.answers) || null;
     const aims = inputs.flatMap(({ side, ray, tracked }): Aim[] => {
       const found = ray && tracked && this.answers ? findAnswer(ray, this.answers) : null;
-      return found ? [{ side, ...found }] : [];
+      return found ? [{ side, target: found.answer, distance: found.distance }] : [];
     });
     const lines = asked ? describeConsent(this.state.nameOf(asked.requester), asked.target, asked.until_ms - now) : [waiting];
-    this.draw(lines, aims.map(({ answer }) => answer));
+    this.draw(lines, aims.map(({ target }) => target));
     return aims;
   }
 

@@ -4,6 +4,7 @@ import type { WorkerClient } from "../core/page_client.ts";
 import type { Actions } from "../ui/actions.ts";
 import { button, h, setText } from "../ui/dom.ts";
 import type { PageState } from "../ui/state.ts";
+import type { StreamChoices } from "../ui/stream_choices.ts";
 import type { View } from "../view/view.ts";
 import { Headset, type Mode } from "./headset.ts";
 
@@ -24,7 +25,13 @@ export function describeMissing(isSecure: boolean, hasWebXr: boolean): string {
   return hasWebXr ? "" : "No AR and VR: this browser has no WebXR.";
 }
 
-export function makeHeadsetControls(view: View | null, state: PageState, client: WorkerClient, makeActions: (show: (text: string) => void) => Actions): HeadsetControls {
+export function makeHeadsetControls(
+  view: View | null,
+  state: PageState,
+  client: WorkerClient,
+  choices: StreamChoices,
+  makeActions: (show: (text: string) => void) => Actions,
+): HeadsetControls {
   const words = h("span", { class: "check note" });
   const element = h("span", { class: "headset" }, words);
   const controls: HeadsetControls = { element, headset: null };
@@ -36,7 +43,7 @@ export function makeHeadsetControls(view: View | null, state: PageState, client:
     const enter = async (): Promise<void> => {
       for (const one of buttons) one.disabled = true;
       try {
-        controls.headset = await begin(mode, view, state, client, makeActions);
+        controls.headset = await begin(mode, view, (session, show) => new Headset(session, mode, view, state, client, choices, makeActions(show)));
         controls.headset.session.addEventListener("end", () => {
           controls.headset = null;
           for (const one of buttons) one.disabled = false;
@@ -61,9 +68,9 @@ export function makeHeadsetControls(view: View | null, state: PageState, client:
   return controls;
 }
 
-async function begin(mode: Mode, view: View, state: PageState, client: WorkerClient, makeActions: (show: (text: string) => void) => Actions): Promise<Headset> {
+async function begin(mode: Mode, view: View, make: (session: XRSession, show: (text: string) => void) => Headset): Promise<Headset> {
   const session = await navigator.xr!.requestSession(mode, { requiredFeatures: ["local-floor"], optionalFeatures: ["hand-tracking", "anchors"] });
-  const headset: Headset = new Headset(session, mode, view, state, client, makeActions((text) => headset.show(text)));
+  const headset: Headset = make(session, (text) => headset.show(text));
   session.addEventListener("end", () => headset.dispose());
   try {
     await view.present(session, headset);

@@ -1,12 +1,13 @@
 // What a person's hands mean, frame by frame: which hand drives which robot, what is asked of the session, and the samples
 // that are sent. Pure.
 //
-// A trigger pressed at a robot acquires it; held at one's own robot it releases it; pressed at an answer it gives it. A
-// squeeze moves the robot of that hand, and the trigger is its gripper meanwhile. While marks are touched, only answers are
-// given. Buttons that are held when a hand appears count from their next press; only the e-stop counts always.
+// A trigger pressed at a robot acquires it; held at one's own robot it releases it; pressed at an answer it gives it, at an
+// item of a menu it chooses it. A squeeze moves the robot of that hand, and the trigger is its gripper meanwhile. While marks
+// are touched, only answers are given. Buttons that are held when a hand appears count from their next press; only the e-stop counts always.
 
 import type { SampleInput } from "../core/api.ts";
 import { Grips } from "./grips.ts";
+import type { MenuItem } from "./picture_places.ts";
 import type { Answer } from "./question.ts";
 import { BUTTON, type FrameReading, type InputReading, type Side } from "./reading.ts";
 
@@ -24,10 +25,13 @@ const GRANTED_MS = 2000;
 /** The clutch of a hand that has got a robot stays open this long [ms]: a session engages after it has seen it open. */
 const OPEN_MS = 100;
 
+/** What a hand can point at, and press, that is no robot. */
+export type Target = Answer | MenuItem;
+
 export type Intent =
   | { type: "acquire"; robot: string }
   | { type: "release"; robot: string }
-  | { type: "answer"; answer: Answer }
+  | { type: "press"; target: Target }
   | { type: "episode"; action: "start" | "success" | "discard" }
   /** Stay where the scene is shown. */
   | { type: "place" };
@@ -42,12 +46,12 @@ export interface Context {
   following: readonly string[];
   /** The robot that each hand points at. */
   pointed: Partial<Record<Side, string>>;
-  /** The answer to a question that each hand points at; it is nearer than robots. */
-  aimed: Partial<Record<Side, Answer>>;
+  /** The answer to a question, or the item of a menu, that each hand points at; it is nearer than robots. */
+  aimed: Partial<Record<Side, Target>>;
   isEpisodeRunning: boolean;
   /** This participant may place itself, and is not aligned. */
   canPlace: boolean;
-  /** The person touches marks: a trigger that is not pressed at an answer is meant for them. */
+  /** The person touches marks: a trigger that is pressed at no target is meant for them. */
   isTouching: boolean;
 }
 
@@ -181,11 +185,11 @@ export class Hands {
 
   private readTrigger(side: Side, hand: Hand, wasPressed: boolean, now_ms: number, context: Context, intents: Intent[]): void {
     const robot = context.pointed[side];
-    const answer = context.aimed[side];
+    const target = context.aimed[side];
     const isPress = hand.trigger && !wasPressed && !hand.squeeze;
     if (!hand.trigger || hand.squeeze || robot !== hand.pressedAt) hand.pressed_ms = null;
-    if (hand.squeeze || robot !== undefined || answer !== undefined) hand.tapped_ms = null;
-    if (isPress && answer !== undefined) intents.push({ type: "answer", answer });
+    if (hand.squeeze || robot !== undefined || target !== undefined) hand.tapped_ms = null;
+    if (isPress && target !== undefined) intents.push({ type: "press", target });
     else if (context.isTouching) [hand.pressed_ms, hand.tapped_ms] = [null, null];
     else if (isPress && robot !== undefined) this.pressAt(robot, side, hand, now_ms, context, intents);
     else if (isPress) hand.tapped_ms = now_ms;

@@ -8,14 +8,15 @@ import type { WorkerClient } from "../core/page_client.ts";
 import type * as wire from "../protocol/messages.g.ts";
 import type { Actions } from "../ui/actions.ts";
 import { DESKTOP, type Entry, type PageState } from "../ui/state.ts";
-import type { Mode as PageMode } from "../ui/stream_choices.ts";
+import type { Mode as PageMode, StreamChoices } from "../ui/stream_choices.ts";
 import { participantColor } from "../view/avatars.ts";
 import { Label } from "../view/labels.ts";
 import type { View } from "../view/view.ts";
 import { ConsentPanel } from "./consents.ts";
 import { FrameReader } from "./frame_reader.ts";
-import { type Context, Hands, type Intent } from "./hands.ts";
+import { type Context, Hands, type Intent, type Target } from "./hands.ts";
 import { Marks } from "./marks.ts";
+import { PicturePanels } from "./picture_panels.ts";
 import { placeBeforeScene } from "./placement.ts";
 import { type Chain, findPointed, listChains } from "./pointing.ts";
 import { Props } from "./props.ts";
@@ -46,6 +47,7 @@ export class Headset {
   private readonly props = new Props();
   private readonly marks: Marks;
   private readonly consent: ConsentPanel;
+  private readonly pictures: PicturePanels;
   private readonly reader: FrameReader;
   /** Panels at robots, in the session's world. */
   readonly panels = new Group();
@@ -68,6 +70,7 @@ export class Headset {
     private readonly view: View,
     private readonly state: PageState,
     private readonly client: WorkerClient,
+    choices: StreamChoices,
     private readonly actions: Actions,
   ) {
     this.isTransparent = mode === "immersive-ar";
@@ -76,7 +79,8 @@ export class Headset {
     this.marks = new Marks(session, this.isTransparent, state, client, actions);
     this.rig.add(this.marks.group);
     this.consent = new ConsentPanel(state, actions);
-    this.rig.add(this.consent.group);
+    this.pictures = new PicturePanels(state, choices, client);
+    this.rig.add(this.consent.group, this.pictures.group);
     this.endListening = client.on("inbox", (update) => this.takeInbox(update));
     session.addEventListener("visibilitychange", () => this.onVisibility());
     this.rejoin(ENTRY);
@@ -129,6 +133,7 @@ export class Headset {
     this.endListening();
     this.marks.dispose();
     this.consent.dispose();
+    this.pictures.dispose();
     this.props.dispose();
     for (const label of this.labels.values()) label.dispose();
     this.panels.removeFromParent();
@@ -203,16 +208,21 @@ export class Headset {
     };
   }
 
-  /** Find the answers and robots that hands point at. Returns how far away they are [m]. */
+  /** Find the answers, items of the menu and robots that hands point at. Returns how far away they are [m]. */
   private point(reading: FrameReading, T_world_tracking: wire.Pose | null): Partial<Record<Side, number>> {
     this.pointed = {};
     this.aimed = {};
     const hits: Partial<Record<Side, number>> = {};
-    for (const { side, answer, distance } of this.consent.update(reading, this.describeWaiting())) {
-      if (this.hands.isSqueezing(side)) continue;
-      this.aimed[side] = answer;
-      hits[side] = distance;
-    }
+    const take = (aims: readonly { side: Side; target: Target; distance: number }[]): void => {
+      for (const { side, target, distance } of aims) {
+        if (this.hands.isSqueezing(side) || this.aimed[side]) continue;
+        this.aimed[side] = target;
+        hits[side] = distance;
+      }
+    };
+    take(this.consent.update(reading, this.describeWaiting()));
+    const aims = this.pictures.move(reading);
+    if (!this.marks.isActive) take(aims);
     const { session, spec } = this.state;
     if (T_world_tracking === null || !session || !spec || this.marks.isActive) return hits;
     if (this.chainsOf?.[0] !== session.robots || this.chainsOf[1] !== spec) {
@@ -250,7 +260,7 @@ export class Headset {
   private ask(intents: readonly Intent[]): void {
     for (const intent of intents) {
       if (intent.type === "episode") void this.actions.request({ type: "episode", action: intent.action });
-      else if (intent.type === "answer") this.consent.answer(intent.answer);
+      else if (intent.type === "press") this.press(intent.target);
       else if (intent.type === "acquire") void this.acquire(intent.robot);
       else if (intent.type === "place") this.placeSelf();
       else {
@@ -258,6 +268,11 @@ export class Headset {
         if (lease) this.actions.release([[intent.robot, lease.lease_version, "robot"]]);
       }
     }
+  }
+
+  private press(target: Target): void {
+    if (target === "grant" || target === "refuse") this.consent.answer(target);
+    else this.pictures.press(target);
   }
 
   private placeSelf(): void {
@@ -314,6 +329,7 @@ export class Headset {
     const driven = [...this.hands.driven].map(([side, robot]) => `${side} hand: ${robot}`);
     const color = participantColor(state.selfId);
     this.props.status.setText([state.self?.name ?? "", ...wrap(describeAlignment(alignment)), ...driven], color);
+    this.pictures.update();
     const robots = session?.robots ?? [];
     for (const name of this.labels.keys()) if (!robots.some((robot) => robot.name === name)) this.removePanel(name);
     for (const { name } of robots) this.updatePanel(name, reading);

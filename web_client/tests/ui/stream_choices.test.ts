@@ -35,10 +35,17 @@ test("in AR what is for remote people only is not wanted, and in VR it is", () =
   expect(choices.listWanted([makeStream("new", "cloud", "of another version")], "immersive-ar")).toEqual(["new"]);
 });
 
-test("panels are not seen in a headset", () => {
-  choices.choose(FRONT, true, "screen");
-  expect(choices.listWanted(STREAMS, "immersive-ar")).not.toContain("front");
-  expect(choices.listWanted(STREAMS, "immersive-vr")).not.toContain("front");
+test("panels that are open on the screen are in a headset, but in AR those for remote people only when they are chosen there", () => {
+  const open = (one: Stream, mode: "screen" | "immersive-ar" | "immersive-vr"): boolean => choices.listWanted([one], mode).length > 0;
+  const room = makeStream("room camera", "jpeg", "remote");
+  for (const one of [FRONT, room]) choices.choose(one, true, "screen");
+  expect([open(FRONT, "immersive-ar"), open(FRONT, "immersive-vr"), open(room, "immersive-vr")]).toEqual([true, true, true]);
+  expect(open(room, "immersive-ar")).toBe(false);
+  choices.choose(room, true, "immersive-ar");
+  choices.choose(FRONT, false, "immersive-ar");
+  expect([open(room, "immersive-ar"), open(FRONT, "immersive-ar"), open(FRONT, "screen")]).toEqual([true, false, true]);
+  choices.choose(room, false, "immersive-vr");
+  expect([open(room, "screen"), open(room, "immersive-ar")]).toEqual([false, true]);
 });
 
 test("what was chosen by hand wins, in AR what was chosen for AR", () => {
@@ -62,9 +69,9 @@ test("a cloud switched on on the screen is still left out in AR: it was chosen w
 test("one panel too many closes the oldest one", () => {
   const cameras = Array.from({ length: MAX_PANELS + 1 }, (_, i) => makeStream(`camera${i}`, "jpeg"));
   for (const camera of cameras) choices.choose(camera, true, "screen");
-  expect(choices.listPanels(cameras).map(({ stream }) => stream)).toEqual(["camera1", "camera2", "camera3", "camera4"]);
+  expect(choices.listPanels(cameras, "screen").map(({ stream }) => stream)).toEqual(["camera1", "camera2", "camera3", "camera4"]);
   choices.choose(cameras[2]!, true, "screen");
-  expect(choices.listPanels(cameras)).toHaveLength(MAX_PANELS);
+  expect(choices.listPanels(cameras, "screen")).toHaveLength(MAX_PANELS);
 });
 
 test("without a picture of the scene only panels are wanted", () => {

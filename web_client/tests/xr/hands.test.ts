@@ -220,7 +220,7 @@ describe("answers", () => {
 
   test("a trigger pressed at an answer gives it, once, and does nothing to a robot behind it", () => {
     take("left");
-    expect(step(context, input({ trigger: 1 }))).toEqual([{ type: "answer", answer: "grant" }]);
+    expect(step(context, input({ trigger: 1 }))).toEqual([{ type: "press", target: "grant" }]);
     now += RELEASE_MS;
     expect(step(context, input({ trigger: 1 }))).toEqual([]);
   });
@@ -272,7 +272,7 @@ describe("while marks are touched", () => {
     expect(step({ isTouching: true }, input({ trigger: 1 }))).toEqual([]);
     expect(step(touching, input({ trigger: 1 }))).toEqual([]);
     expect(step(touching, input())).toEqual([]);
-    expect(step(touching, input({ trigger: 1 }))).toEqual([{ type: "answer", answer: "grant" }]);
+    expect(step(touching, input({ trigger: 1 }))).toEqual([{ type: "press", target: "grant" }]);
   });
 
   test("a short press is no wish to be placed", () => {

@@ -7,6 +7,7 @@ import type { AnchorPlace, ToWorker } from "../../src/core/api.ts";
 import type { WorkerClient } from "../../src/core/page_client.ts";
 import type { Actions } from "../../src/ui/actions.ts";
 import { DESKTOP, PageState } from "../../src/ui/state.ts";
+import { StreamChoices } from "../../src/ui/stream_choices.ts";
 import type { View } from "../../src/view/view.ts";
 import type { ConsentPanel } from "../../src/xr/consents.ts";
 import type { Hands } from "../../src/xr/hands.ts";
@@ -54,7 +55,7 @@ beforeEach(() => {
     estop: () => (stops += 1),
   } as unknown as Actions;
   const view = { viewpoint: { axes: { forward: [1, 0, 0] } }, scene: { bodies: new Map([[1, new Group()]]) } } as unknown as View;
-  headset = new Headset(session as unknown as XRSession, "immersive-vr", view, state, client, actions);
+  headset = new Headset(session as unknown as XRSession, "immersive-vr", view, state, client, new StreamChoices(() => [], () => true), actions);
 });
 
 function setSession(self: object, robots: readonly string[] = [], holder = "p1"): void {
@@ -182,7 +183,7 @@ test("a trigger that is held on a mark gives no answer when its ray crosses one,
   marks.touching.begin();
   for (const trigger of [0, 0, 1, 0, 1, 1]) show(trigger);
   expect([marks.isActive, requests]).toEqual([true, []]); // a short press is no wish to be placed
-  aim.mockReturnValue([{ side: "right", answer: "grant", distance: 1 }]);
+  aim.mockReturnValue([{ side: "right", target: "grant", distance: 1 }]);
   for (const trigger of [1, 1, 0]) show(trigger);
   expect(answer).not.toHaveBeenCalled();
   show(1);
