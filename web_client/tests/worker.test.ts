@@ -86,7 +86,7 @@ class Bench {
   info: object | null = { versions: [1], session_name: "lab", session_id: "s1", key: Buffer.from(S).toString("base64url"), pairing: true, software: "x" };
   status = 206;
   /** Images that are being decoded. Buffers stand for decoded ones. */
-  decoding: { bytes: Uint8Array; finish: () => FakeImage; fail: () => void }[] = [];
+  decoding: { bytes: Uint8Array; width: number; finish: () => FakeImage; fail: () => void }[] = [];
   worker: ClientWorker;
   private nextTimer = 1;
 
@@ -106,21 +106,21 @@ class Bench {
         this.timers.set(id, { at: this.now + ms * MS, callback });
         return () => this.timers.delete(id);
       },
-      decodeImage: (bytes) => this.decodeImage(bytes),
+      decodeImage: (bytes, width) => this.decodeImage(bytes, width),
       store: this.store,
       slot: "0",
       run: "0011223344556677",
     });
   }
 
-  decodeImage(bytes: Uint8Array): Promise<ImageBitmap> {
+  decodeImage(bytes: Uint8Array, width: number): Promise<ImageBitmap> {
     return new Promise((resolve, reject) => {
       const finish = (): FakeImage => {
         const image = Object.assign(new ArrayBuffer(4), { isClosed: false, close: () => void (image.isClosed = true) });
         resolve(image as unknown as ImageBitmap);
         return image;
       };
-      this.decoding.push({ bytes, finish, fail: () => reject(new Error("damaged")) });
+      this.decoding.push({ bytes, width, finish, fail: () => reject(new Error("damaged")) });
     });
   }
 
@@ -663,6 +663,16 @@ describe("clouds and pictures", () => {
     expect(bench.last("picture").capture_ms).toBe(9);
     expect(await readCounters()).toEqual({ front: { received: 6, superseded: 0, refused: 5 } });
     expect(bench.last("stats").counters["media malformed"]).toBe(5);
+  });
+
+  test("pictures that are larger than any panel are decoded smaller", async () => {
+    const sizes = [[640, 480], [1920, 1080], [1080, 1920], [2, 4096]] as const;
+    for (const [width, height] of sizes) {
+      send("front", "jpeg", makeJpeg(width, height));
+      bench.decoding.at(-1)!.fail();
+      await bench.settle();
+    }
+    expect(bench.decoding.map(({ width }) => width)).toEqual([640, 1024, 576, 1]);
   });
 
   test("a page that stands still gets the newest cloud when it runs again", async () => {

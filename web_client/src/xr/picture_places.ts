@@ -20,7 +20,7 @@ const HEIGHT_M = 0.32;
 const MENU = 0.63;
 const MENU_WIDTH_M = 0.4;
 const ROW_M = 0.05;
-const FIRST_M = 0.1;
+const FIRST_M = 0.25;
 
 /** What the menu offers: to open or close itself, and to open or close the panel of a stream. */
 export type MenuItem = "menu" | `picture ${string}`;
