@@ -197,6 +197,7 @@ def test_in_ar_what_is_for_remote_people_is_not_subscribed_unless_chosen(
         page.wait(f"""{drawn} === '["room","sketch"]'""")
         assert page.errors == []
 
+
 def test_a_camera_is_a_panel_in_the_headset_while_it_is_chosen(
     serve: Callable[..., SessionProcess], open_page: Callable[..., Page], tmp_path: Path
 ) -> None:
