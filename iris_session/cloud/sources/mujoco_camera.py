@@ -1,22 +1,25 @@
 """A camera of a MuJoCo model: depth and colour as rendered, without a display.
 
 The bodies stand as in the model's initial state, or as `body_poses` gives them; nothing is simulated.
+`python -m iris_session.cloud.sources.mujoco_camera` tells whether this machine can draw: see `main`.
 """
 
 from __future__ import annotations
 
 import math
 import os
+import sys
 import time
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from anchors.camera import CameraModel, pose_to_matrix
 from anchors.pose import PoseTuple
-from iris_session.cloud.camera_file import CameraSettings
+from iris_session.cloud.camera_file import CameraSettings, CloudSettings
 from iris_session.cloud.frames import DepthFrame, SourceError
 from iris_session.cloud.sources.playback import DEFAULT_HZ, SECOND
 
@@ -182,7 +185,8 @@ class _Bodies:
 def _describe_missing_gl(error: Exception) -> SourceError:
     said = " ".join(str(error).split())
     return SourceError(
-        f"no OpenGL here ({said}): install libegl1 and Mesa's driver, or libosmesa6 with MUJOCO_GL=osmesa"
+        f"no OpenGL here ({said}): install libegl1 and Mesa's driver (Debian: libegl1 libgl1-mesa-dri), or libosmesa6 "
+        "with MUJOCO_GL=osmesa"
     )
 
 
@@ -190,3 +194,24 @@ def _to_rotations(quaternions: Floats) -> Floats:
     """Return the rotation matrices (n, 3, 3) of quaternions (n, 4), w first."""
     turns = [pose_to_matrix(((0.0, 0.0, 0.0), tuple(q)))[:3, :3] for q in quaternions]
     return np.array(turns).reshape(-1, 3, 3)
+
+
+def main() -> int:
+    """Open the drawn cameras of a camera file and close them again: in a process that has nothing else to lose.
+
+    The file is on standard input, as `CloudSettings` in MessagePack. Why a camera cannot be drawn goes to standard
+    output, on one line, with exit status 1.
+    """
+    settings = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=CloudSettings)
+    try:
+        for camera in settings.cameras:
+            if camera.source == "mujoco":
+                MujocoCamera(camera, time.monotonic_ns).close()
+    except SourceError as error:
+        print(error)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
