@@ -58,7 +58,7 @@ class MujocoCamera:
         self._mujoco: Any = mujoco
         self._now_ns, self._body_poses = now_ns, body_poses
         self.depth_scale_m = settings.depth_scale_m or 0.001
-        self._interval_ns, self._due_ns = round(SECOND / (settings.hz or DEFAULT_HZ)), now_ns()
+        self._interval_ns, self._number = round(SECOND / (settings.hz or DEFAULT_HZ)), -1
         try:
             self._model = mujoco.MjModel.from_xml_path(settings.model)
         except ValueError as error:
@@ -81,7 +81,7 @@ class MujocoCamera:
 
     def _open_context(self) -> None:
         mujoco, model = self._mujoco, self._model
-        model.vis.quality.offsamples = 0
+        model.vis.quality.offsamples = model.vis.quality.shadowsize = 0  # no buffers of what is not drawn
         model.vis.global_.offwidth, model.vis.global_.offheight = self._size
         try:
             if os.environ["MUJOCO_GL"] == "osmesa":
@@ -103,13 +103,18 @@ class MujocoCamera:
 
     def read(self, timeout_s: float) -> DepthFrame | None:
         """Return the next frame; see `DepthSource`."""
-        wait_s = (self._due_ns - self._now_ns()) / SECOND
+        # Frames are captured at multiples of the period, by all cameras of one rate together, also when drawing takes
+        # longer: frames that are further apart than a pipeline joins would be left out.
+        number, late_ns = divmod(self._now_ns(), self._interval_ns)
+        if number <= self._number or late_ns > self._interval_ns // 4:
+            number = max(number, self._number) + 1
+        wait_s = (number * self._interval_ns - self._now_ns()) / SECOND
         if wait_s > 0.0:
             time.sleep(min(wait_s, timeout_s))
         if wait_s > timeout_s:
             return None
+        self._number = number
         capture_ns = self._now_ns()
-        self._due_ns = max(self._due_ns + self._interval_ns, capture_ns)
         if self._body_poses is not None:
             self._bodies.place(self._data, self._body_poses())
         color, depth_m = self._render()
