@@ -194,7 +194,9 @@ class EmulatedOperator:
         report.samples_not_sent = client.connection.counters.samples_not_sent
         report.reconnects = client.connection.counters.reconnects
         report.clock_error_ms = client.clock_error_ns() / 1e6
-        report.streams = tuple(meter.measure(self._now_ns) for meter in self._meters.values())
+        report.streams = tuple(
+            self._meters[name].measure(self._now_ns) for name in self.spec.streams if name in self._meters
+        )
         report.mirror_hash, report.event_seq = client.mirror.mirror_hash(), client.mirror.event_seq
         return report
 
