@@ -1,4 +1,4 @@
-"""What arrives of a media stream at a client: rate, size, and age by stage, with what the session says of it."""
+"""Measure a media stream at a client: rate, size, and age by stage, with what the session says of it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MAX_AGES: Final = 4_000
 
 
 class StreamMeasurement(msgspec.Struct, frozen=True):
-    """What arrived of a stream.
+    """Measurement of a stream at a client.
 
     Attributes:
         stream: Its name.

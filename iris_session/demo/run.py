@@ -403,7 +403,7 @@ def _check_cameras(play: Demo) -> None:
 
 
 def _list_camera_faults(play: Demo, reports: dict[str, HeadsetReport], session: Session) -> tuple[list[str], list[str]]:
-    """Return the faults of the cameras, as observers were told and as their processes say: problems and notes.
+    """Return the faults of the cameras, as the session says to observers, and as their processes say: problems and notes.
 
     Cameras that are slow are no problem: they get what ticks and headsets leave them of the processors.
     """
