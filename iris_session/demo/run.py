@@ -403,7 +403,7 @@ def _check_cameras(play: Demo) -> None:
 
 
 def _list_camera_faults(play: Demo, reports: dict[str, HeadsetReport], session: Session) -> tuple[list[str], list[str]]:
-    """Return the faults of the cameras, as the session says to observers, and as their processes say: problems and notes.
+    """Return problems and notes about the cameras, by what observers saw and what their processes say.
 
     Cameras that are slow are no problem: they get what ticks and headsets leave them of the processors.
     """
