@@ -16,7 +16,7 @@ from iris_session.protocol.status import compute_quantiles
 
 #: Stages of the age of a cloud, and the times between which each lies.
 STAGES: Final = ("camera process", "to the front", "in the front", "to the client", "decoding")
-#: Frames whose ages are kept.
+#: Frames whose ages and points are kept.
 MAX_AGES: Final = 4_000
 
 
@@ -34,9 +34,9 @@ class StreamMeasurement(msgspec.Struct, frozen=True):
             99th percentile [ms]; `None` before the first.
         ages_ms: Medians of the stages of a cloud's age.
         dropped: Frames that our link did not take in time.
-        points: Of the newest cloud; `None` for other encodings, as are the next three.
-        bytes_per_point: Size of its frame by its points.
-        voxel_m: Edge of its cells [m].
+        points: Of a cloud, median; `None` for other encodings, as are the next three.
+        bytes_per_point: Size of all clouds by their points.
+        voxel_m: Edge of the cells of the newest cloud [m].
         error_mm: Its stated error [mm], `None` where it is not known.
     """
 
@@ -76,6 +76,8 @@ class StreamMeter:
         self._cloud = client.media.cloud(stream)
         self._began_ns = now_ns
         self._bytes = self._frames = 0
+        self._points: deque[int] = deque(maxlen=MAX_AGES)
+        self._all_points = 0
         self._ages_ns: deque[int] = deque(maxlen=MAX_AGES)
         self._stages_ns: deque[tuple[int, ...]] = deque(maxlen=MAX_AGES)
 
@@ -88,6 +90,9 @@ class StreamMeter:
         self._bytes += len(frame.data)
         cloud = self._cloud.poll() if frame.header.encoding == MediaEncoding.CLOUD else None
         self._ages_ns.append(frame.age_ns if cloud is None else cloud.age_ns)
+        if cloud is not None:
+            self._points.append(len(cloud.positions))
+            self._all_points += len(cloud.positions)
         if cloud is not None and all(cloud.times):
             self._stages_ns.append(tuple(b - a for a, b in itertools.pairwise(cloud.times)))
 
@@ -101,7 +106,6 @@ class StreamMeter:
         ages = compute_quantiles(self._ages_ns)
         stages = (compute_quantiles(one) for one in zip(*self._stages_ns, strict=True))
         cloud = self._cloud.newest if said.encoding == MediaEncoding.CLOUD else None
-        frame, n = self._feed.newest, 0 if cloud is None else len(cloud.positions)
         return StreamMeasurement(
             stream=name,
             title=said.title,
@@ -118,8 +122,8 @@ class StreamMeter:
             stale=said.stale,
             fault="malformed" if self._cloud.fault else said.fault,
             detail=self._cloud.fault or said.detail,
-            points=None if cloud is None else n,
-            bytes_per_point=len(frame.data) / n if n and frame is not None else None,
+            points=sorted(self._points)[len(self._points) // 2] if self._points else None,
+            bytes_per_point=self._bytes / self._all_points if self._all_points else None,
             voxel_m=None if cloud is None else cloud.voxel_m,
             error_mm=None if cloud is None or math.isinf(cloud.error_m) else 1000.0 * cloud.error_m,
         )
