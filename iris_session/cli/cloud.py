@@ -326,7 +326,7 @@ def _inspect_session(arguments: argparse.Namespace) -> int:
         while meters and time.monotonic() < until:
             client.poll(0.05)
             for meter in meters:
-                meter.poll()
+                meter.poll(time.monotonic_ns())
         found = [meter.measure(time.monotonic_ns()) for meter in meters]
     is_well = bool(found) and all(one.frames and not one.fault and not one.stale for one in found)
     if arguments.json:

@@ -29,6 +29,7 @@ class StreamMeasurement(msgspec.Struct, frozen=True):
         budget_class: Class in which it is delivered.
         seconds: Time since the measurement began.
         frames: Frames that came.
+        silent_s: Time since the newest one came, or since the measurement began [s].
         hz, mbit_per_s: Of these, over that time.
         age_ms, age_ms_p99: From the capture of a frame until it was here, of a cloud until it was decoded: median and
             99th percentile [ms]; `None` before the first.
@@ -46,6 +47,7 @@ class StreamMeasurement(msgspec.Struct, frozen=True):
     budget_class: str = ""
     seconds: float = 0.0
     frames: int = 0
+    silent_s: float = 0.0
     hz: float = 0.0
     mbit_per_s: float = 0.0
     age_ms: float | None = None
@@ -74,19 +76,20 @@ class StreamMeter:
         self._client = client
         self._feed = client.media.subscribe(stream)
         self._cloud = client.media.cloud(stream)
-        self._began_ns = now_ns
+        self._began_ns = self._came_ns = now_ns
         self._bytes = self._frames = 0
         self._points: deque[int] = deque(maxlen=MAX_AGES)
         self._all_points = 0
         self._ages_ns: deque[int] = deque(maxlen=MAX_AGES)
         self._stages_ns: deque[tuple[int, ...]] = deque(maxlen=MAX_AGES)
 
-    def poll(self) -> None:
-        """Take the newest frame, if there is another. Call it more often than frames come."""
+    def poll(self, now_ns: int) -> None:
+        """Take the newest frame, if there is another, at `now_ns`. Call it more often than frames come."""
         frame = self._feed.pop_newest()
         if frame is None:
             return
         self._frames += 1
+        self._came_ns = now_ns
         self._bytes += len(frame.data)
         cloud = self._cloud.poll() if frame.header.encoding == MediaEncoding.CLOUD else None
         self._ages_ns.append(frame.age_ns if cloud is None else cloud.age_ns)
@@ -113,6 +116,7 @@ class StreamMeter:
             budget_class=self._feed.budget_class,
             seconds=seconds,
             frames=self._frames,
+            silent_s=(now_ns - self._came_ns) * 1e-9,
             hz=self._frames / seconds if seconds > 0.0 else 0.0,
             mbit_per_s=self._bytes * 8e-6 / seconds if seconds > 0.0 else 0.0,
             age_ms=None if ages is None else ages.p50,

@@ -52,6 +52,10 @@ TAKE_S: Final = 30.0
 #: Every stream of a camera is measured for so long, and it is waited for so long after all operators are done [s].
 MEASURE_S: Final = 3.0
 STREAMS_S: Final = 20.0
+#: Without a frame for so long at the end, a stream has stopped [s]; before, these faults, or none but staleness, may be
+#: those of a busy computer.
+SILENT_S: Final = 5.0
+LATE_FAULTS: Final = ("", StreamFault.SLOW, StreamFault.SOURCE, StreamFault.POSE)
 #: Time to find out whether cameras can be drawn here, on a busy machine [s].
 DRAW_S: Final = 60.0
 #: Operators per process, when there are more than two; observers per process.
@@ -198,12 +202,12 @@ def run_demo(
 
         session.run(seconds=timeout_s + 5.0, until=finished)
         run_s = max(session.clock() - max(began_ns, take_ns), 1) * 1e-9
+        watched = people.reports  # while the session ran
         people.close()
-        camera_problems, camera_notes = _list_camera_faults(demo, people.reports, session)
+        camera_problems, camera_notes = _list_camera_faults(demo, watched, session)
         interrupted = session.stopping
         status = session.status()
-        seconds = session.clock() * 1e-9
-        recording = session.recording
+        seconds, recording = session.clock() * 1e-9, session.recording
     reports = people.reports
     handovers = tuple(one for one in status.handovers if one.at_s * 1e9 >= take_ns)
     # Ctrl-C requests an immediate end; `iris-session verify` has all the time it needs.
@@ -237,7 +241,7 @@ def run_demo(
         interrupted=interrupted,
         goals=judge.get_status(),
         takes=1 + len(failed_takes),
-        streams={name: r.streams for name, r in reports.items() if r.streams},
+        streams={name: r.streams for name, r in watched.items() if r.streams},
     )
 
 
@@ -383,8 +387,7 @@ class _EmulatorGroup:
         return _list_failures(self.reports)
 
     def close(self) -> None:
-        # Observers first: no state comes any more, without which clouds stop.
-        for process in (*self._observers, *self._workers):
+        for process in (*self._workers, *self._observers):
             process.close()
 
 
@@ -405,7 +408,7 @@ def _check_cameras(play: Demo) -> None:
 def _list_camera_faults(play: Demo, reports: dict[str, HeadsetReport], session: Session) -> tuple[list[str], list[str]]:
     """Return problems and notes about the cameras, by what observers saw and what their processes say.
 
-    Cameras that are slow are no problem: they get what ticks and headsets leave them of the processors.
+    Cameras whose frames come late are no problem: they get what ticks and headsets leave them of the processors.
     """
     problems: list[str] = []
     notes: list[str] = []
@@ -416,9 +419,10 @@ def _list_camera_faults(play: Demo, reports: dict[str, HeadsetReport], session: 
             said = f"{one.fault}: {one.detail}" if one.fault else ""
             if not one.frames:
                 problems.append(f"{spec.name}: no frame of the stream '{stream}' came{said and ', '}{said}")
-            elif one.stale or said:
-                text = f"{spec.name}: the stream '{stream}' is {said or 'stale at the end'}"
-                (notes if one.fault == StreamFault.SLOW and not one.stale else problems).append(text)
+            elif one.stale or said or one.silent_s > SILENT_S:
+                late = one.fault in LATE_FAULTS and one.silent_s <= SILENT_S
+                text = f"{spec.name}: the stream '{stream}' is {said or 'stale'}, newest frame {one.silent_s:.1f} s ago"
+                (notes if late else problems).append(text)
     cameras = session.processes.cameras
     if cameras is not None:
         problems += cameras.list_warnings()

@@ -207,7 +207,7 @@ class EmulatedOperator:
             if one.stream in self.spec.streams and one.stream not in self._meters:
                 self._meters[one.stream] = StreamMeter(self.client, one.stream, now_ns)
         for meter in self._meters.values():
-            meter.poll()
+            meter.poll(now_ns)
 
     # --- one sampling instant -----------------------------------------------------------------------------------------
 

@@ -38,9 +38,10 @@ def test_streams_that_came_to_the_end_are_no_problem() -> None:
     [
         ({"stream": "other"}, "eve: no frame of the stream 'room' came$"),
         ({"frames": 0, "fault": "source", "detail": "no OpenGL here"}, "'room' came, source: no OpenGL here$"),
-        ({"stale": True}, "eve: the stream 'room' is stale at the end$"),
-        ({"fault": "no_depth", "detail": "camera front: no pixel"}, "'room' is no_depth: camera front: no pixel$"),
-        ({"fault": "slow", "detail": "1 of 10", "stale": True}, "'room' is slow: 1 of 10$"),
+        ({"stale": True, "silent_s": 6.0}, "eve: the stream 'room' is stale, newest frame 6.0 s ago$"),
+        ({"silent_s": 6.0}, "eve: the stream 'room' is stale, newest frame 6.0 s ago$"),
+        ({"fault": "no_depth", "detail": "camera front: no pixel"}, "'room' is no_depth: camera front: no pixel, "),
+        ({"fault": "source", "detail": "no frame for 7 s", "silent_s": 7.0}, "'room' is source: no frame for 7 s, "),
         ({"restarts": 2}, "started again, 2 times$"),
     ],
 )
@@ -54,8 +55,18 @@ def test_warnings_of_camera_processes_are_problems() -> None:
     assert judge("the camera process of 'room' hangs") == ("the camera process of 'room' hangs", "")
 
 
-def test_slow_cameras_are_noted() -> None:
-    assert judge(fault="slow", detail="3 of 10") == ("", "eve: the stream 'room' is slow: 3 of 10")
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ({"fault": "slow", "detail": "3 of 10"}, "'room' is slow: 3 of 10, newest frame 1.5 s ago$"),
+        ({"fault": "source", "detail": "no frame for 1 s", "stale": True}, "'room' is source: no frame for 1 s, "),
+        ({"stale": True}, "'room' is stale, newest frame 1.5 s ago$"),
+    ],
+)
+def test_cameras_whose_frames_come_late_are_noted(values: dict[str, Any], text: str) -> None:
+    problems, notes = judge(silent_s=1.5, **values)
+    assert problems == ""
+    assert re.search(text, notes), notes
 
 
 def test_cameras_that_cannot_be_drawn_end_a_demo_before_it_starts(

@@ -62,7 +62,7 @@ def test_depth_cameras_show_the_room_of_a_handover(tmp_path: Path) -> None:
         assert one["frames"] > 0
         assert one["hz"] == pytest.approx(one["frames"] / one["seconds"])
         assert 0.0 < one["age_ms"] <= one["age_ms_p99"] < 10_000.0
-        assert (one["stale"], one["fault"] in ("", "slow")) == (False, True)
+        assert one["silent_s"] < 5.0
     assert streams[0]["points"] > 10_000
     assert streams[0]["voxel_m"] == pytest.approx(0.01)
     assert sum(streams[0]["ages_ms"].values()) == pytest.approx(streams[0]["age_ms"], rel=0.5)
