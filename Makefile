@@ -98,9 +98,9 @@ test-unit: install-dev
 
 # Emulated people need their share of the cores in time, or they drop what they hold: not beside all the others.
 DEMOS := tests/e2e/test_demo_scenes.py tests/e2e/test_demo_handover.py
-# A browser that draws in software takes both cores: its tests run after those with real time.
+# A browser that draws in software takes both cores, drawn cameras one: their tests run after those with real time.
 BROWSER := tests/e2e/test_web.py tests/e2e/test_web_xr.py tests/e2e/test_web_marks.py tests/e2e/test_web_desktop.py \
-  tests/e2e/test_clouds.py tests/bench/test_web.py
+  tests/e2e/test_clouds.py tests/e2e/test_demo_cloud.py tests/bench/test_web.py
 test-e2e: install-dev $(PAGE)
 ifeq ($(T),tests)
 	$(E2E) --dist load $(DEMOS)

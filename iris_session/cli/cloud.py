@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import itertools
-import math
 import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -28,7 +26,7 @@ from iris_session.cli.common import (
 from iris_session.protocol.names import MediaEncoding
 
 if TYPE_CHECKING:
-    from iris_session.client import Client
+    from iris_session.client.stream_meter import StreamMeasurement
     from iris_session.cloud.camera_file import CloudSettings
     from iris_session.cloud.config import CameraReport
     from iris_session.cloud.worker import CloudWorker
@@ -39,9 +37,6 @@ FIRST_FRAME_S: Final = 10.0
 STREAMS_S: Final = 5.0
 #: Without a terminal, a line of `run` that is like the one before is printed this often [s].
 QUIET_S: Final = 10.0
-MILLISECOND: Final = 1_000_000
-#: Stages of the age of a frame, and the times between which each lies.
-STAGES: Final = ("camera process", "to the front", "in the front", "to the client", "decoding")
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -311,7 +306,10 @@ def _format_inspection(settings: CloudSettings, report: CameraReport) -> Iterato
 
 
 def _inspect_session(arguments: argparse.Namespace) -> int:
+    import msgspec
+
     from iris_session.client import Client
+    from iris_session.client.stream_meter import StreamMeter
 
     arguments.address, arguments.session = arguments.target, ""
     check_session_reachable(arguments)
@@ -323,16 +321,16 @@ def _inspect_session(arguments: argparse.Namespace) -> int:
             return [] if budget is None else [one.stream for one in budget.streams if one.encoding in shown]
 
         client.wait_for(lambda _: bool(list_streams()), STREAMS_S)
-        meters = [_StreamMeter(client, stream) for stream in list_streams()]
+        meters = [StreamMeter(client, stream, time.monotonic_ns()) for stream in list_streams()]
         until = time.monotonic() + arguments.seconds
         while meters and time.monotonic() < until:
             client.poll(0.05)
             for meter in meters:
-                meter.poll()
-        found = [meter.finish() for meter in meters]
-    is_well = bool(found) and all(one["hz"] > 0.0 and not one["fault"] and not one["stale"] for one in found)
+                meter.poll(time.monotonic_ns())
+        found = [meter.measure(time.monotonic_ns()) for meter in meters]
+    is_well = bool(found) and all(one.frames and not one.fault and not one.stale for one in found)
     if arguments.json:
-        print_json({"ok": is_well, "streams": found})
+        print_json({"ok": is_well, "streams": msgspec.to_builtins(found)})
     elif not found:
         print("the session has no cloud: `iris-session serve --camera FILE`, or `iris-session cloud run FILE`")
     else:
@@ -340,75 +338,15 @@ def _inspect_session(arguments: argparse.Namespace) -> int:
     return 0 if is_well else 1
 
 
-class _StreamMeter:
-    """Measures what arrives of one stream."""
-
-    def __init__(self, client: Client, stream: str) -> None:
-        self._client = client
-        self._feed = client.media.subscribe(stream)
-        self._cloud = client.media.cloud(stream)
-        self._began = time.monotonic()
-        self._bytes = 0
-        self._n = 0
-        self._ages: list[tuple[float, ...]] = []
-
-    def poll(self) -> None:
-        """Take the newest frame, if there is another."""
-        frame = self._feed.pop_newest()
-        if frame is None:
-            return
-        self._n += 1
-        self._bytes += len(frame.data)
-        cloud = self._cloud.poll() if frame.header.encoding == MediaEncoding.CLOUD else None
-        if cloud is not None and all(cloud.times):
-            self._ages.append(tuple((b - a) / MILLISECOND for a, b in itertools.pairwise(cloud.times)))
-
-    def finish(self) -> dict[str, Any]:
-        """Return what was measured."""
-        import numpy as np
-
-        seconds = time.monotonic() - self._began
-        budget = self._client.media.delivery
-        said = next((one for one in budget.streams if one.stream == self._feed.stream), None) if budget else None
-        stages = dict(zip(STAGES, np.median(self._ages, axis=0).round(2).tolist(), strict=True)) if self._ages else {}
-        found = {
-            "stream": self._feed.stream,
-            "title": "" if said is None else said.title,
-            "encoding": "" if said is None else said.encoding,
-            "budget_class": self._feed.budget_class,
-            "hz": self._n / seconds,
-            "mbit_per_s": self._bytes * 8e-6 / seconds,
-            "age_ms": float(sum(stages.values())),
-            "ages_ms": stages,
-            "dropped": self._feed.dropped,
-            "stale": said is not None and said.stale,
-            "fault": "" if said is None else said.fault,
-            "detail": "" if said is None else said.detail,
-        }
-        if self._cloud.fault:
-            found |= {"fault": "malformed", "detail": self._cloud.fault}
-        is_cloud = found["encoding"] == MediaEncoding.CLOUD
-        cloud, frame = self._cloud.newest if is_cloud else None, self._feed.newest
-        if cloud is not None and frame is not None:
-            n = len(cloud.positions)
-            found |= {
-                "points": n,
-                "bytes_per_point": len(frame.data) / n if n else 0.0,
-                "voxel_m": cloud.voxel_m,
-                "error_mm": 1000.0 * cloud.error_m if math.isfinite(cloud.error_m) else None,
-            }
-        return found
-
-
-def _format_stream(one: Mapping[str, Any]) -> Iterator[str]:
-    name = f"{one['stream']} ({one['title']})" if one["title"] not in ("", one["stream"]) else one["stream"]
-    yield to_printable(f"{name}: {one['hz']:.1f} Hz, class {one['budget_class']}, {one['mbit_per_s']:.1f} Mbit/s")
-    if "points" in one:
-        error = "" if one["error_mm"] is None else f", stated error {one['error_mm']:.1f} mm"
-        points = f"{one['points']:,} points of {100.0 * one['voxel_m']:.1f} cm"
-        yield f"  {points}, {one['bytes_per_point']:.2f} bytes each{error}"
-    if one["ages_ms"]:
-        stages = ", ".join(f"{stage} {ms:.1f}" for stage, ms in one["ages_ms"].items())
-        yield f"  age {one['age_ms']:.0f} ms, median: {stages}"
-    if one["fault"] or one["stale"]:
-        yield to_printable(f"  {one['fault'] or 'stale'}: {one['detail'] or 'no frames come'}")
+def _format_stream(one: StreamMeasurement) -> Iterator[str]:
+    name = f"{one.stream} ({one.title})" if one.title not in ("", one.stream) else one.stream
+    yield to_printable(f"{name}: {one.hz:.1f} Hz, class {one.budget_class}, {one.mbit_per_s:.1f} Mbit/s")
+    if one.points is not None and one.voxel_m is not None:
+        error = "" if one.error_mm is None else f", stated error {one.error_mm:.1f} mm"
+        size = "" if one.bytes_per_point is None else f", {one.bytes_per_point:.2f} bytes each"
+        yield f"  {one.points:,} points of {100.0 * one.voxel_m:.1f} cm{size}{error}"
+    if one.age_ms is not None:
+        stages = ", ".join(f"{stage} {ms:.1f}" for stage, ms in one.ages_ms.items())
+        yield f"  age {one.age_ms:.0f} ms, median{': ' if stages else ''}{stages}"
+    if one.fault or one.stale:
+        yield to_printable(f"  {one.fault or 'stale'}: {one.detail or 'no frames come'}")

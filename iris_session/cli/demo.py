@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from iris_session.cli.common import add_json_option, add_session_options, parse_seconds, print_json
 
 if TYPE_CHECKING:
+    from iris_session.client.stream_meter import StreamMeasurement
     from iris_session.demo.run import DemoResult
     from iris_session.session.session import Session
 
@@ -27,14 +28,16 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iiwa       the same with KUKA iiwa 14 arms\n"
         "  aloha      two ALOHA stations: two operators with two arms each exchange a red and a blue board\n"
         "  cloth      two operators fold a cloth: each takes a corner\n"
-        "  soft       two operators stow a soft body each in one box\n\n"
+        "  soft       two operators stow a soft body each in one box\n"
+        "  cloud      handover before two depth cameras; an observer watches their point cloud and pictures. The\n"
+        "             cameras are drawn: needs OpenGL without a display (Debian: libegl1 libgl1-mesa-dri)\n\n"
         "The models of iiwa and aloha are read from the folder in IRIS_DATA.",
         epilog="examples:\n  iris-session demo handover\n  iris-session demo handover --seed 7 --json\n"
         "  iris-session demo handover --operators 8 --observers 8\n  iris-session demo aloha --profile busy-wifi\n"
-        "  iris-session demo iiwa --latency 40",
+        "  iris-session demo iiwa --latency 40\n  iris-session demo cloud --record cloud.rrd",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("demo", choices=("handover", "iiwa", "aloha", "cloth", "soft"))
+    parser.add_argument("demo", choices=("handover", "iiwa", "aloha", "cloth", "soft", "cloud"))
     parser.add_argument(
         "--operators", type=int, default=2, metavar="N", help="operators, in pairs; 2 to 8 (default: 2)"
     )
@@ -118,7 +121,16 @@ def format_summary(result: DemoResult) -> str:
     pace = f"lateness p99 {result.lateness_ms_p99:.2f} ms, real-time factor {result.real_time_factor:.3f}"
     lines.append(f"  late ticks {result.late_tick_share * 100:.3f} %, {pace}")
     lines += [f"  state age p99 at {name}: {age:.1f} ms" for name, age in result.state_age_ms_p99.items()]
+    lines += [_format_stream(name, one) for name, streams in result.streams.items() for one in streams]
     lines.append(f"  recording {result.recording}: {result.verification}" if result.recording else "  not recorded")
     lines += [f"  note: {note}" for note in result.notes]
     lines += [f"  problem: {problem}" for problem in result.problems]
     return "\n".join(lines)
+
+
+def _format_stream(observer: str, one: StreamMeasurement) -> str:
+    size = (
+        "" if one.points is None or one.voxel_m is None else f"{one.points:,} points of {100.0 * one.voxel_m:.1f} cm, "
+    )
+    age = "" if one.age_ms is None else f", age {one.age_ms:.0f} ms, p99 {one.age_ms_p99:.0f} ms"
+    return f"  {one.encoding} {one.stream} at {observer}: {size}{one.hz:.1f} Hz{age}"

@@ -179,7 +179,12 @@ def create_session(arguments: argparse.Namespace) -> Session:
     scene = open_scene(arguments.scene)
     robots = None if arguments.robots is None else load_robots_toml(arguments.robots, scene.model)
     config = make_session_config(arguments, make_session_name(Path(arguments.scene)))
-    config = dataclasses.replace(config, anchors=scene.anchors, anchor_sizes=scene.anchor_sizes)
+    config = dataclasses.replace(
+        config,
+        anchors=scene.anchors,
+        anchor_sizes=scene.anchor_sizes,
+        cameras=(*scene.cameras, *config.cameras),
+    )
     config = apply_anchors_file(config, arguments.anchors)
     return Session(scene.model, config=config, robots=robots)
 

@@ -2,7 +2,8 @@
 
 `handover`: two arms drawn from primitives and a hammer, or up to eight around a round table; needs no data.
 `iiwa`: the same with KUKA iiwa 14 arms. `aloha`: two ALOHA stations, two operators with two arms each. `cloth`: two
-operators fold a cloth. `soft`: two operators stow a soft body each.
+operators fold a cloth. `soft`: two operators stow a soft body each. `cloud`: `handover` before two depth cameras, whose
+cloud and pictures observers watch.
 """
 
 from __future__ import annotations
@@ -11,11 +12,14 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final
 
+import msgspec
 import mujoco
 
 from anchors.pose import PoseTuple, Vec3
+from iris_session.cloud.camera_file import load_camera_file
 from iris_session.demo.goals import FoldGoal, Goal, StowGoal
 from iris_session.demo.named_scenes import (
     NamedScene,
@@ -50,6 +54,8 @@ class Demo:
         objects: Objects that must be handed over.
         notes: Remarks about the cast for the reader of the result.
         goals: Goals for deformables.
+        cameras: Camera files of the depth cameras of the scene.
+        streams: Media streams of these cameras, which every observer watches.
     """
 
     name: str
@@ -60,6 +66,8 @@ class Demo:
     notes: tuple[str, ...] = ()
     anchor_sizes: Mapping[str, float] = field(default_factory=dict)
     goals: tuple[Goal, ...] = ()
+    cameras: tuple[Path, ...] = ()
+    streams: tuple[str, ...] = ()
 
 
 def make_demo(name: str, operators: int = 2, observers: int = 0, seed: int = 0) -> Demo:
@@ -69,8 +77,13 @@ def make_demo(name: str, operators: int = 2, observers: int = 0, seed: int = 0) 
     if not 0 <= observers <= MAX_OBSERVERS:
         raise ConfigError(f"--observers {observers} is out of range: 0 to {MAX_OBSERVERS}")
     play = DEMOS[name](operators, seed)
+    if play.streams:
+        observers = max(1, observers)
     sheet = play.anchors[DEFAULT_ANCHOR_ID]
-    watching = tuple(_make_observer(i, observers, sheet, seed) for i in range(observers))
+    watching = tuple(
+        msgspec.structs.replace(_make_observer(i, observers, sheet, seed), streams=play.streams)
+        for i in range(observers)
+    )
     return dataclasses.replace(play, headsets=(*play.headsets, *watching))
 
 
@@ -99,7 +112,7 @@ def _make_iiwa(operators: int, seed: int) -> Demo:
 
 def _make_without_cast(name: str, scene: NamedScene, objects: tuple[str, ...]) -> Demo:
     """Return a demo without its cast."""
-    return Demo(name, scene.model, scene.anchors, (), objects, anchor_sizes=scene.anchor_sizes)
+    return Demo(name, scene.model, scene.anchors, (), objects, anchor_sizes=scene.anchor_sizes, cameras=scene.cameras)
 
 
 def _check_operators(demo: str, operators: int) -> None:
@@ -148,6 +161,16 @@ def _compute_seat(i: int, operators: int, radius: float, sheet: Vec3) -> Vec3:
         return (0.35 * (2 * i - 1), sheet[1] - 0.5, _EYES)
     bearing = compute_bearing(i, operators)
     return ((radius + _BEHIND) * math.cos(bearing), (radius + _BEHIND) * math.sin(bearing), _EYES)
+
+
+def _make_cloud(operators: int, seed: int) -> Demo:
+    if operators != 2:
+        raise ConfigError(
+            f"demo cloud has two arms at one table: 2 operators, not {operators}. More people may watch: --observers N"
+        )
+    play = _make_without_cast("cloud", scene_by_name("cloud"), ("hammer",))
+    streams = tuple(name for path in play.cameras for name in load_camera_file(path).list_streams())
+    return dataclasses.replace(_cast_around_table(play, operators, 0.6, "arm", seed), streams=streams)
 
 
 # --- two ALOHA stations -----------------------------------------------------------------------------------------------
@@ -242,6 +265,7 @@ DEMOS: Final[dict[str, Callable[[int, int], Demo]]] = {
     "aloha": _make_aloha,
     "cloth": _make_cloth,
     "soft": _make_soft,
+    "cloud": _make_cloud,
 }
 
 

@@ -5,9 +5,11 @@ Each comes with the pose of its alignment sheet. Names like `arms4` say how many
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final
 
 import mujoco
@@ -29,10 +31,16 @@ ANCHOR_ID: Final = next(iter(DEFAULT_ANCHORS))
 
 @dataclass(frozen=True)
 class NamedScene:
-    """A model and the poses of its sheets; the default is for scenes that do not specify one."""
+    """A scene ready to be served.
+
+    Attributes:
+        anchors: Poses of its sheets; the default is for scenes that do not specify one.
+        cameras: Camera files of the depth cameras that look at it.
+    """
 
     model: mujoco.MjModel
     anchors: Mapping[str, PoseTuple] = field(default_factory=lambda: DEFAULT_ANCHORS)
+    cameras: tuple[Path, ...] = ()
 
     @property
     def anchor_sizes(self) -> dict[str, float]:
@@ -67,6 +75,11 @@ def make_soft() -> NamedScene:
     return NamedScene(soft_scene().compile(), _place_sheet(get_sheet_position(2)))
 
 
+def make_cloud() -> NamedScene:
+    """Return the scene `handover` with two drawn depth cameras, which see it and the room around it."""
+    return dataclasses.replace(load_packaged("handover"), cameras=(scene_path("cloud").with_suffix(".toml"),))
+
+
 def load_packaged(name: str) -> NamedScene:
     """Return a scene from an MJCF file of the package."""
     return NamedScene(load_model(scene_path(name)))
@@ -87,6 +100,7 @@ SCENES: Final[dict[str, Callable[[], NamedScene]]] = {
     "aloha": make_aloha,
     "cloth": make_cloth,
     "soft": make_soft,
+    "cloud": make_cloud,
     "bodies": lambda: NamedScene(free_bodies_scene().compile()),
 }
 NUMBERED: Final[dict[str, Callable[[int], NamedScene]]] = {"arms": make_arms, "iiwa": make_iiwa}

@@ -1,7 +1,8 @@
 """Run a demo: a session in this process, emulated operators in others, and a result with a verdict.
 
 A run succeeds only if the session's own detector saw every handover by contact alone, if every goal with a deformable
-was reached (`goals`; recorded as the verdict of an episode), and if the recording verifies bit for bit. When an
+was reached (`goals`; recorded as the verdict of an episode), if the streams of its cameras reach every observer, and if
+the recording verifies bit for bit. When an
 operator fails, such as after dropping an object where it cannot be grasped, the scene is reset and all begin again, as
 people do who record demonstrations. The demos themselves are in `demos`.
 """
@@ -19,17 +20,21 @@ from typing import Any, Final, Self
 
 import msgspec
 
+from iris_session.client.stream_meter import StreamMeasurement
+from iris_session.cloud.camera_file import load_camera_file
+from iris_session.cloud.frames import SourceError
 from iris_session.demo.demos import Demo
 from iris_session.demo.goals import GoalMonitor
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
 from iris_session.netsim.process import ImpairmentProcess, make_link_address
 from iris_session.protocol.client_messages import Episode
-from iris_session.protocol.names import EpisodeAction
+from iris_session.protocol.names import EpisodeAction, StreamFault
 from iris_session.session.config import SessionConfig
 from iris_session.session.ledger import HandoverStatus
 from iris_session.session.session import Session
 from iris_session.session.verification import verify_recording
-from iris_session.system.process import PIPE, ChildProcess
+from iris_session.system.extras import require_package
+from iris_session.system.process import DEVNULL, PIPE, ChildProcess
 
 #: Period at which the reports of the emulated headsets are read [ns].
 READ_PERIOD_NS: Final = 100_000_000
@@ -44,6 +49,15 @@ HEADSET_NICE: Final = -5
 #: Attempts at the whole demo, each after a reset, and time that must be left for another one [s].
 MAX_TAKES: Final = 3
 TAKE_S: Final = 30.0
+#: Every stream of a camera is measured for so long, and it is waited for so long after all operators are done [s].
+MEASURE_S: Final = 3.0
+STREAMS_S: Final = 20.0
+#: Without a frame for so long at the end, a stream has stopped [s]; before, these faults, or none but staleness, may be
+#: those of a busy computer.
+SILENT_S: Final = 5.0
+LATE_FAULTS: Final = ("", StreamFault.SLOW, StreamFault.SOURCE, StreamFault.POSE)
+#: Time to find out whether cameras can be drawn here, on a busy machine [s].
+DRAW_S: Final = 60.0
 #: Operators per process, when there are more than two; observers per process.
 WORKERS_PER_PROCESS: Final = 2
 OBSERVERS_PER_PROCESS: Final = 4
@@ -111,7 +125,8 @@ class DemoResult(msgspec.Struct, frozen=True):
     """Result of a demo, as printed by `demo NAME --json`.
 
     `alignment_mm`: stated p95 and true error at the sheet [mm], by name of the headset, of the aligned ones only.
-    `takes`: attempts, each from a reset scene; `handovers` and `goals` are those of the last one.
+    `takes`: attempts, each from a reset scene; `handovers` and `goals` are those of the last one. `streams`: the cloud
+    and the pictures of the cameras as they came to each observer, with rate and age, by its name.
     """
 
     ok: bool
@@ -132,6 +147,7 @@ class DemoResult(msgspec.Struct, frozen=True):
     interrupted: bool = False
     goals: tuple[GoalStatus, ...] = ()
     takes: int = 1
+    streams: dict[str, tuple[StreamMeasurement, ...]] = {}
 
 
 def run_demo(
@@ -145,23 +161,19 @@ def run_demo(
     """Run `demo` to its end. `on_session`: a context around the running session that yields a function for every loop.
 
     `profile`: each emulator process joins over an impaired link of this profile, with `seed`; empty: directly.
+    Raises `SourceError` before anything is started if the cameras of the demo cannot be drawn here.
     """
-    session = Session(
-        demo.model, config=dataclasses.replace(config, anchors=demo.anchors, anchor_sizes=demo.anchor_sizes)
-    )
+    _check_cameras(demo)
+    cameras = (*demo.cameras, *config.cameras)
+    config = dataclasses.replace(config, anchors=demo.anchors, anchor_sizes=demo.anchor_sizes, cameras=cameras)
+    session = Session(demo.model, config=config)
     judge = _GoalTracker(demo, session)
     with ExitStack() as stack:
         stack.enter_context(session.signals())
         stack.enter_context(session)
         update = stack.enter_context(on_session(session)) if on_session is not None else (lambda: None)
         groups = _group_by_process(demo.headsets)
-        links = {make_link_address(i): profile for i in range(len(groups))} if profile else {}
-        if links:
-            ports = session.processes.front_ports
-            stack.enter_context(ImpairmentProcess(links, ports.for_clients, target=ports.host, seed=seed))
-        addresses = [f"{link}:{session.processes.front_ports.control}" for link in links] or [session.address] * len(
-            groups
-        )
+        addresses = _open_links(stack, session, len(groups), profile, seed)
         people = stack.enter_context(_EmulatorGroup(addresses, groups, timeout_s))
         next_read_ns = began_ns = take_ns = 0
         failed_takes: list[str] = []
@@ -176,6 +188,7 @@ def run_demo(
                 return False
             next_read_ns = now_ns + READ_PERIOD_NS
             is_over = (people.is_finished() and judge.is_settled()) or judge.is_reached_for(LEAVE_S)
+            is_over = is_over and people.have_seen_streams(now_ns)
             failures = judge.list_failures(people.list_failures(), is_over)
             left_s = timeout_s - (now_ns - began_ns) * 1e-9
             if failures and len(failed_takes) < MAX_TAKES - 1 and left_s > TAKE_S:
@@ -189,11 +202,12 @@ def run_demo(
 
         session.run(seconds=timeout_s + 5.0, until=finished)
         run_s = max(session.clock() - max(began_ns, take_ns), 1) * 1e-9
+        watched = people.reports  # while the session ran
         people.close()
+        camera_problems, camera_notes = _list_camera_faults(demo, watched, session)
         interrupted = session.stopping
         status = session.status()
-        seconds = session.clock() * 1e-9
-        recording = session.recording
+        seconds, recording = session.clock() * 1e-9, session.recording
     reports = people.reports
     handovers = tuple(one for one in status.handovers if one.at_s * 1e9 >= take_ns)
     # Ctrl-C requests an immediate end; `iris-session verify` has all the time it needs.
@@ -203,8 +217,7 @@ def run_demo(
         problems = ["interrupted before its end"]
     elif problems or not demo.goals:
         problems = _list_problems(demo, reports, handovers, timeout_s) + problems
-    if verified is False:
-        problems.append(verification)
+    problems += ([] if interrupted else camera_problems) + ([verification] if verified is False else [])
     return DemoResult(
         ok=not problems and len(reports) == len(demo.headsets),
         demo=demo.name,
@@ -224,11 +237,22 @@ def run_demo(
         real_time_factor=round(status.sim_time / run_s, 3),
         state_age_ms_p99={name: round(r.age_ms_p99, 2) for name, r in reports.items() if math.isfinite(r.age_ms_p99)},
         problems=tuple(problems),
-        notes=(*demo.notes, *failed_takes),
+        notes=(*demo.notes, *failed_takes, *camera_notes),
         interrupted=interrupted,
         goals=judge.get_status(),
         takes=1 + len(failed_takes),
+        streams={name: r.streams for name, r in watched.items() if r.streams},
     )
+
+
+def _open_links(stack: ExitStack, session: Session, n: int, profile: str, seed: int) -> list[str]:
+    """Return the address of the session for each of `n` processes, over an impaired link each with a `profile`."""
+    if not profile:
+        return [session.address] * n
+    ports, links = session.processes.front_ports, [make_link_address(i) for i in range(n)]
+    profiles = dict.fromkeys(links, profile)
+    stack.enter_context(ImpairmentProcess(profiles, ports.for_clients, target=ports.host, seed=seed))
+    return [f"{link}:{ports.control}" for link in links]
 
 
 class _GoalTracker:
@@ -318,6 +342,7 @@ class _EmulatorGroup:
         """End all processes, and start them anew."""
         self.close()
         self._workers, self._observers = [], []
+        self._awaited_ns = 0
         try:
             for address, group in zip(self._addresses, self._groups, strict=True):
                 if group[0].observer:
@@ -345,6 +370,18 @@ class _EmulatorGroup:
             process.poll()
         return not any(process.is_running and process.is_busy for process in self._workers)
 
+    def have_seen_streams(self, now_ns: int) -> bool:
+        """Return True when all streams were measured for long enough, or `STREAMS_S` after the first call."""
+        self._awaited_ns = self._awaited_ns or now_ns
+        seen = {
+            (name, one.stream)
+            for name, report in self.reports.items()
+            for one in report.streams
+            if one.frames and one.seconds >= MEASURE_S
+        }
+        missing = {(spec.name, stream) for group in self._groups for spec in group for stream in spec.streams} - seen
+        return not missing or now_ns - self._awaited_ns > STREAMS_S * 1e9
+
     def list_failures(self) -> list[str]:
         """Return one line per operator that has failed."""
         return _list_failures(self.reports)
@@ -352,6 +389,46 @@ class _EmulatorGroup:
     def close(self) -> None:
         for process in (*self._workers, *self._observers):
             process.close()
+
+
+def _check_cameras(play: Demo) -> None:
+    """Raise `SourceError` if cameras cannot be drawn here: a session would only say it of its streams."""
+    for path in play.cameras:
+        require_package("cv2", "pictures of cameras")
+        config = msgspec.msgpack.encode(load_camera_file(path))
+        module = "iris_session.cloud.sources.mujoco_camera"
+        with ChildProcess(module, config=config, stdout=PIPE, stderr=DEVNULL) as child:
+            status = child.wait(DRAW_S)
+            said = b" ".join(child.read_available_lines()).decode(errors="replace")
+        if status != 0:
+            why = said or f"opening them ended with status {status}"
+            raise SourceError(f"demo {play.name} draws what its cameras see: {why}")
+
+
+def _list_camera_faults(play: Demo, reports: dict[str, HeadsetReport], session: Session) -> tuple[list[str], list[str]]:
+    """Return problems and notes about the cameras, by what observers saw and what their processes say.
+
+    Cameras whose frames come late are no problem: they get what ticks and headsets leave them of the processors.
+    """
+    problems: list[str] = []
+    notes: list[str] = []
+    for spec in play.headsets:
+        measured = {one.stream: one for one in reports[spec.name].streams} if spec.name in reports else {}
+        for stream in spec.streams:
+            one = measured.get(stream, StreamMeasurement(stream))
+            said = f"{one.fault}: {one.detail}" if one.fault else ""
+            if not one.frames:
+                problems.append(f"{spec.name}: no frame of the stream '{stream}' came{said and ', '}{said}")
+            elif one.stale or said or one.silent_s > SILENT_S:
+                late = one.fault in LATE_FAULTS and one.silent_s <= SILENT_S
+                text = f"{spec.name}: the stream '{stream}' is {said or 'stale'}, newest frame {one.silent_s:.1f} s ago"
+                (notes if late else problems).append(text)
+    cameras = session.processes.cameras
+    if cameras is not None:
+        problems += cameras.list_warnings()
+        if cameras.restarts:
+            problems.append(f"the camera process ended and was started again, {cameras.restarts} times")
+    return problems, notes
 
 
 def _list_problems(

@@ -12,5 +12,6 @@ SCENE_NAMES: Final = {
     "aloha": "two ALOHA stations face to face, four arms",
     "cloth": "two arms and a cloth",
     "soft": "two arms, two soft bodies, an open box",
+    "cloud": "the scene handover, two drawn depth cameras and what they see of a room around it",
     "bodies": "300 bodies that fly about, no robot",
 }

@@ -22,6 +22,7 @@ from anchors.pose import IDENTITY_POSE, PoseTuple, Vec3, apply, compose, distanc
 from iris_session.client import Client, CurveKeys, PoseBuffer, SceneState, ShownPoses
 from iris_session.client.core.scene_follower import pose_at
 from iris_session.client.deformables import Deformables
+from iris_session.client.stream_meter import StreamMeter
 from iris_session.emulator.behaviours import Behaviour, CombinedBehaviour, HandInput, make_behaviour
 from iris_session.emulator.gaze import Gaze, interpolate_pose
 from iris_session.emulator.headset import EmulatedHeadset
@@ -81,6 +82,7 @@ class EmulatedOperator:
         )
         self.display = HeadsetDisplay(self.client, spec.display_delay_s)
         self._deformables = Deformables(self.client)
+        self._meters: dict[str, StreamMeter] = {}
         #: Samples and observations in flight, and those of the present frame, which are sent together.
         self._uplink: DelayLine[tuple[tuple[Sample, ...], Observation | None]]
         self._uplink = DelayLine(spec.model.link, self.headset.rng)
@@ -130,6 +132,7 @@ class EmulatedOperator:
             for name in self._deformables.update():
                 shapes = self._deformables
                 self.display.add_vertices(name, shapes.vertices[name], shapes.capture_ns[name])
+        self._measure_streams(now_ns)
         for samples, seen in self._uplink.pop(now_ns):
             sent = self.client.send_samples(samples) if len(samples) > 1 else self.client.send(samples[0])
             self.report.samples += len(samples) if sent else 0
@@ -191,8 +194,20 @@ class EmulatedOperator:
         report.samples_not_sent = client.connection.counters.samples_not_sent
         report.reconnects = client.connection.counters.reconnects
         report.clock_error_ms = client.clock_error_ns() / 1e6
+        report.streams = tuple(
+            self._meters[name].measure(self._now_ns) for name in self.spec.streams if name in self._meters
+        )
         report.mirror_hash, report.event_seq = client.mirror.mirror_hash(), client.mirror.event_seq
         return report
+
+    def _measure_streams(self, now_ns: int) -> None:
+        """Measure the streams of the spec, each from when the session has it."""
+        delivery = self.client.media.delivery if len(self._meters) < len(self.spec.streams) else None
+        for one in () if delivery is None else delivery.streams:
+            if one.stream in self.spec.streams and one.stream not in self._meters:
+                self._meters[one.stream] = StreamMeter(self.client, one.stream, now_ns)
+        for meter in self._meters.values():
+            meter.poll(now_ns)
 
     # --- one sampling instant -----------------------------------------------------------------------------------------
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from anchors.pose import PoseTuple, Vec3
+from iris_session.client.stream_meter import StreamMeasurement
 from iris_session.emulator.headset import DEFAULT_ANCHOR_ID, DEFAULT_SHEET_M, DEFAULT_T_WORLD_ANCHOR, HeadsetModel
 from iris_session.protocol.names import Device
 
@@ -43,7 +44,8 @@ class HeadsetSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     `don_at_s`: seconds after joining at which the tracking frame jumps, jumps undetected by the headset (by `bump_m`
     and `bump_yaw_rad` about the head), the headset is taken off, and put on again. `drift_m_per_min`: of the tracking
     frame between the orders `drift` and `steady`; until then that of `model`. `display_delay_s`: age of the displayed
-    state: interpolation delay plus the path to the headset. `identity_file`: keeps the identity across restarts.
+    state: interpolation delay plus the path to the headset. `streams`: media streams to which it subscribes when the
+    session has them, and which it measures. `identity_file`: keeps the identity across restarts.
     `curve_server`, `curve_key`: files with the session's public CURVE key and our own secret one; needed off loopback.
     """
 
@@ -76,6 +78,7 @@ class HeadsetSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     doff_at_s: float | None = None
     don_at_s: float | None = None
     phase_timeout_s: float = 30.0
+    streams: tuple[str, ...] = ()
     identity_file: str = ""
     curve_server: str = ""
     curve_key: str = ""
@@ -116,7 +119,8 @@ class HeadsetReport(msgspec.Struct, kw_only=True):
     shown at `T_true_shown * x` of the true world; `None` while not aligned. `disturbed_ns`: session time of the last of
     each kind.
     `alarms`: alarms of this alignment that were received, without jumps. `session`, `address`: the session that it
-    joined. `lost_s`: seconds since the connection to it was lost, 0 while there is one.
+    joined. `lost_s`: seconds since the connection to it was lost, 0 while there is one. `streams`: of `spec.streams`,
+    those that the session has.
     """
 
     name: str
@@ -151,3 +155,4 @@ class HeadsetReport(msgspec.Struct, kw_only=True):
     phases: dict[str, float] = {}
     mirror_hash: str = ""
     event_seq: int = 0
+    streams: tuple[StreamMeasurement, ...] = ()

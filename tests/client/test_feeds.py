@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from iris_session.client import Client, InvalidMessageError
 from iris_session.client.feeds import CloudFeed, MediaFeed, MediaFrame
-from iris_session.protocol.media import MediaHeader, StreamCamera, StreamInfo
+from iris_session.client.stream_meter import STAGES, StreamMeter
+from iris_session.protocol.media import MediaHeader, StreamBudget, StreamCamera, StreamInfo
+from iris_session.protocol.status import DeliveryBudget
 from iris_session.streams.cloud import encode_cloud
 from tests.client.harness import LiveSession
 
@@ -87,6 +91,49 @@ def test_frame_that_is_no_cloud_is_counted_and_leaves_the_one_before(data: bytes
     rig.receive()
     assert rig.cloud.poll() is not None
     assert rig.cloud.fault == ""
+
+
+def measure(rig: Rig, encoding: str, n: int, *, told: bool = True) -> Any:
+    """Return the measurement of `n` frames in two seconds."""
+    budget = StreamBudget("room", encoding=encoding, title="Room", fault="slow", detail="3 of 10")
+    delivery = DeliveryBudget("full", streams=(budget,) if told else ())
+    media = SimpleNamespace(subscribe=lambda _: rig.feed, cloud=lambda _: rig.cloud, delivery=delivery)
+    client: Any = SimpleNamespace(media=media)
+    meter = StreamMeter(client, "room", 1_000_000_000)
+    for _ in range(n):
+        rig.receive(FRAME if encoding == "cloud" else b"picture", encoding)
+        meter.poll(2_500_000_000)
+        meter.poll(2_700_000_000)
+    return meter.measure(3_000_000_000)
+
+
+def test_what_comes_of_a_cloud_is_measured() -> None:
+    found = measure(Rig(), "cloud", 3)
+    assert (found.frames, found.seconds, found.hz, found.silent_s) == (3, 2.0, 1.5, 0.5)
+    assert found.mbit_per_s == pytest.approx(1.5 * len(FRAME) * 8e-6)
+    assert (found.points, found.bytes_per_point) == (10, len(FRAME) / 10)
+    assert (found.voxel_m, found.error_mm) == pytest.approx((0.02, 10.0))
+    assert (found.age_ms, found.age_ms_p99) == pytest.approx((900e-6, 900e-6))
+    assert found.ages_ms == pytest.approx(dict(zip(STAGES, (1e-4, 1e-4, 1e-4, 1e-4, 5e-4), strict=True)))
+    assert (found.title, found.stale, found.fault, found.detail) == ("Room", False, "slow", "3 of 10")
+
+
+def test_what_comes_of_a_picture_is_measured() -> None:
+    found = measure(Rig(), "jpeg", 1)
+    assert (found.frames, found.hz, found.encoding, found.age_ms) == (1, 0.5, "jpeg", pytest.approx(400e-6))
+    assert (found.points, found.voxel_m, found.ages_ms) == (None, None, {})
+
+
+def test_a_frame_that_is_no_cloud_is_a_fault_of_the_measured_stream() -> None:
+    rig = Rig()
+    rig.receive(b"", "cloud")
+    found = measure(rig, "cloud", 0)
+    assert (found.frames, found.points, found.fault) == (0, None, "malformed")
+
+
+def test_a_stream_that_the_session_has_no_more_is_stale() -> None:
+    found = measure(Rig(), "cloud", 0, told=False)
+    assert (found.stale, found.age_ms, found.hz) == (True, None, 0.0)
 
 
 def test_cloud_of_a_session(session: LiveSession, join: Callable[..., Client]) -> None:

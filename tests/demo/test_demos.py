@@ -29,6 +29,7 @@ CASTS = [
     ("aloha", 2),
     ("cloth", 2),
     ("soft", 2),
+    ("cloud", 2),
 ]
 
 
@@ -124,6 +125,14 @@ def test_people_without_a_partner_move_freely_and_are_reported() -> None:
     assert "eli has" in play.notes[0]
 
 
+@pytest.mark.parametrize(("observers", "names"), [(0, ["watcher1"]), (2, ["watcher1", "watcher2"])])
+def test_every_observer_of_the_cloud_watches_all_its_streams(observers: int, names: list[str]) -> None:
+    play = make_demo("cloud", observers=observers)
+    watching = {person.name: person.streams for person in play.headsets if person.observer}
+    assert watching == dict.fromkeys(names, ("room", "room-front", "room-back"))
+    assert not any(person.streams for person in play.headsets if not person.observer)
+
+
 @pytest.mark.parametrize(
     ("demo", "operators", "observers", "why"),
     [
@@ -133,7 +142,8 @@ def test_people_without_a_partner_move_freely_and_are_reported() -> None:
         ("handover", 2, 17, "--observers 17 .*0 to 16"),
         ("cloth", 3, 0, "2 operators, not 3"),
         ("soft", 8, 0, "2 operators, not 8"),
-        ("juggle", 2, 0, "'juggle': handover, iiwa, aloha, cloth, soft"),
+        ("cloud", 3, 0, "2 operators, not 3.*--observers"),
+        ("juggle", 2, 0, "'juggle': handover, iiwa, aloha, cloth, soft, cloud"),
     ],
 )
 def test_unsuitable_casts_are_rejected_with_reason(demo: str, operators: int, observers: int, why: str) -> None:

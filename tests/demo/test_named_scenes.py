@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import mujoco
 import pytest
 
+from iris_session.cloud.camera_file import load_camera_file
 from iris_session.demo.named_scenes import SCENES, scene_by_name
 from iris_session.demo.scene_names import SCENE_NAMES
 from iris_session.emulator.headset import DEFAULT_ANCHOR_ID, DEFAULT_SHEET_M
@@ -28,10 +30,24 @@ def test_scene_has_its_robots_and_a_sheet_of_known_size(name: str, robots: int) 
         assert tuple(scene.anchors[DEFAULT_ANCHOR_ID][0]) == pytest.approx(tuple(drawn))
 
 
+def test_cameras_of_the_cloud_draw_every_body_of_the_session_and_more() -> None:
+    scene = scene_by_name("cloud")
+    assert scene_by_name("handover").cameras == ()
+    (path,) = scene.cameras
+    cameras = load_camera_file(path).cameras
+    assert len({one.camera for one in cameras}) == 2
+    drawn = mujoco.MjModel.from_xml_path(cameras[0].model)
+    assert {one.model for one in cameras} == {cameras[0].model}
+    assert {one.camera for one in cameras} <= {drawn.camera(k).name for k in range(drawn.ncam)}
+    bodies = [scene.model.body(k).name for k in range(scene.model.nbody)]
+    assert bodies == [drawn.body(k).name for k in range(drawn.nbody)]  # what is more is fixed to the world
+    assert drawn.ngeom > scene.model.ngeom
+
+
 @pytest.mark.parametrize(
     ("name", "text"),
     [
-        ("alohas", "handover, arm, arms, iiwa, aloha, cloth, soft, bodies"),
+        ("alohas", "handover, arm, arms, iiwa, aloha, cloth, soft, cloud, bodies"),
         ("handover2", "one of handover"),
         ("arms0", "scene 'arms0': .* 1 to 12"),
         ("iiwa9", "1 to 8"),

@@ -1,22 +1,25 @@
 """A camera of a MuJoCo model: depth and colour as rendered, without a display.
 
 The bodies stand as in the model's initial state, or as `body_poses` gives them; nothing is simulated.
+`python -m iris_session.cloud.sources.mujoco_camera` tells whether this machine can draw: see `main`.
 """
 
 from __future__ import annotations
 
 import math
 import os
+import sys
 import time
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from anchors.camera import CameraModel, pose_to_matrix
 from anchors.pose import PoseTuple
-from iris_session.cloud.camera_file import CameraSettings
+from iris_session.cloud.camera_file import CameraSettings, CloudSettings
 from iris_session.cloud.frames import DepthFrame, SourceError
 from iris_session.cloud.sources.playback import DEFAULT_HZ, SECOND
 
@@ -55,7 +58,7 @@ class MujocoCamera:
         self._mujoco: Any = mujoco
         self._now_ns, self._body_poses = now_ns, body_poses
         self.depth_scale_m = settings.depth_scale_m or 0.001
-        self._interval_ns, self._due_ns = round(SECOND / (settings.hz or DEFAULT_HZ)), now_ns()
+        self._interval_ns, self._number = round(SECOND / (settings.hz or DEFAULT_HZ)), -1
         try:
             self._model = mujoco.MjModel.from_xml_path(settings.model)
         except ValueError as error:
@@ -78,7 +81,7 @@ class MujocoCamera:
 
     def _open_context(self) -> None:
         mujoco, model = self._mujoco, self._model
-        model.vis.quality.offsamples = 0
+        model.vis.quality.offsamples = model.vis.quality.shadowsize = 0  # no buffers of what is not drawn
         model.vis.global_.offwidth, model.vis.global_.offheight = self._size
         try:
             if os.environ["MUJOCO_GL"] == "osmesa":
@@ -100,13 +103,18 @@ class MujocoCamera:
 
     def read(self, timeout_s: float) -> DepthFrame | None:
         """Return the next frame; see `DepthSource`."""
-        wait_s = (self._due_ns - self._now_ns()) / SECOND
+        # Frames are captured at multiples of the period, by all cameras of one rate together, also when drawing takes
+        # longer: frames that are further apart than a pipeline joins would be left out.
+        number, late_ns = divmod(self._now_ns(), self._interval_ns)
+        if number <= self._number or late_ns > self._interval_ns // 4:
+            number = max(number, self._number) + 1
+        wait_s = (number * self._interval_ns - self._now_ns()) / SECOND
         if wait_s > 0.0:
             time.sleep(min(wait_s, timeout_s))
         if wait_s > timeout_s:
             return None
+        self._number = number
         capture_ns = self._now_ns()
-        self._due_ns = max(self._due_ns + self._interval_ns, capture_ns)
         if self._body_poses is not None:
             self._bodies.place(self._data, self._body_poses())
         color, depth_m = self._render()
@@ -182,7 +190,8 @@ class _Bodies:
 def _describe_missing_gl(error: Exception) -> SourceError:
     said = " ".join(str(error).split())
     return SourceError(
-        f"no OpenGL here ({said}): install libegl1 and Mesa's driver, or libosmesa6 with MUJOCO_GL=osmesa"
+        f"no OpenGL here ({said}): install libegl1 and Mesa's driver (Debian: libegl1 libgl1-mesa-dri), or libosmesa6 "
+        "with MUJOCO_GL=osmesa"
     )
 
 
@@ -190,3 +199,24 @@ def _to_rotations(quaternions: Floats) -> Floats:
     """Return the rotation matrices (n, 3, 3) of quaternions (n, 4), w first."""
     turns = [pose_to_matrix(((0.0, 0.0, 0.0), tuple(q)))[:3, :3] for q in quaternions]
     return np.array(turns).reshape(-1, 3, 3)
+
+
+def main() -> int:
+    """Open the drawn cameras of a camera file and close them again: in a process that has nothing else to lose.
+
+    The file is on standard input, as `CloudSettings` in MessagePack. Why a camera cannot be drawn goes to standard
+    output, on one line, with exit status 1.
+    """
+    settings = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=CloudSettings)
+    try:
+        for camera in settings.cameras:
+            if camera.source == "mujoco":
+                MujocoCamera(camera, time.monotonic_ns).close()
+    except SourceError as error:
+        print(error)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

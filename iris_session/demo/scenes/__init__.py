@@ -1,7 +1,8 @@
 """Scenes of the package: MJCF files for the demos, and generators for demos and benchmarks.
 
-`handover.xml`: two arms, a hammer, a board. `arm.xml`: the arm that every scene here uses. `generators`: N arms around
-a table, free bodies in a hall. Everything is drawn from primitives, so no asset files are needed.
+`handover.xml`: two arms, a hammer, a board. `cloud.xml`, `cloud.toml`: what two drawn depth cameras see of it.
+`arm.xml`: the arm that every scene here uses. `generators`: N arms around a table, free bodies in a hall. Everything is
+drawn from primitives, so no asset files are needed.
 """
 
 from __future__ import annotations

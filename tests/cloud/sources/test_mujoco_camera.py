@@ -141,15 +141,16 @@ def test_bodies_and_the_camera_stand_where_they_are_told_to(camera: MujocoCamera
     assert np.abs(np.linalg.norm(points[blue] - lid, axis=1) - 0.06).max() < 0.01
 
 
-def test_frames_come_at_the_rate(tmp_path: Path) -> None:
-    times = [0]
-    source = MujocoCamera(make_settings(tmp_path, hz=10.0, width=64, height=48), lambda: times[0])
-    assert source.read(0.0) is not None
-    times[0] = 60_000_000
-    assert source.read(0.0) is None
-    times[0] = 100_000_000
-    assert source.read(0.0) is not None
+def test_frames_come_at_the_rate_and_at_its_multiples(tmp_path: Path) -> None:
+    """So those of two cameras that were opened at different times are captured together."""
+    times = [60]
+    source = MujocoCamera(make_settings(tmp_path, hz=10.0, width=64, height=48), lambda: times[0] * 1_000_000)
+    taken = []
+    for times[0] in (60, 70, 99, 100, 170, 210, 299, 300, 399, 420, 700, 799, 800):
+        if source.read(0.0) is not None:
+            taken.append(times[0])
     source.close()
+    assert taken == [100, 210, 300, 420, 700, 800]
 
 
 @pytest.mark.parametrize(
