@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import itertools
 import math
 import signal
 import sys
@@ -40,7 +39,7 @@ STREAMS_S: Final = 5.0
 #: Without a terminal, a line of `run` that is like the one before is printed this often [s].
 QUIET_S: Final = 10.0
 MILLISECOND: Final = 1_000_000
-#: Stages of the age of a frame, and the times between which each lies.
+#: Stages of the age of a frame. Each ends at the next of the times after the capture; the last is only of clouds.
 STAGES: Final = ("camera process", "to the front", "in the front", "to the client", "decoding")
 
 
@@ -350,7 +349,7 @@ class _StreamMeter:
         self._began = time.monotonic()
         self._bytes = 0
         self._n = 0
-        self._ages: list[tuple[float, ...]] = []
+        self._ages: dict[str, list[float]] = {}  # durations of the stages [ms]
 
     def poll(self) -> None:
         """Take the newest frame, if there is another."""
@@ -359,9 +358,14 @@ class _StreamMeter:
             return
         self._n += 1
         self._bytes += len(frame.data)
-        cloud = self._cloud.poll() if frame.header.encoding == MediaEncoding.CLOUD else None
-        if cloud is not None and all(cloud.times):
-            self._ages.append(tuple((b - a) / MILLISECOND for a, b in itertools.pairwise(cloud.times)))
+        header = frame.header
+        cloud = self._cloud.poll() if header.encoding == MediaEncoding.CLOUD else None
+        times = (header.sent_ns, header.received_ns, header.published_ns, header.capture_ns + frame.age_ns)
+        before_ns = header.capture_ns
+        for stage, at_ns in zip(STAGES, (*times, 0 if cloud is None else cloud.times.decoded_ns), strict=True):
+            if at_ns:  # else it is not known: the next stage has its time, too
+                self._ages.setdefault(stage, []).append((at_ns - before_ns) / MILLISECOND)
+                before_ns = at_ns
 
     def finish(self) -> dict[str, Any]:
         """Return what was measured."""
@@ -370,7 +374,7 @@ class _StreamMeter:
         seconds = time.monotonic() - self._began
         budget = self._client.media.delivery
         said = next((one for one in budget.streams if one.stream == self._feed.stream), None) if budget else None
-        stages = dict(zip(STAGES, np.median(self._ages, axis=0).round(2).tolist(), strict=True)) if self._ages else {}
+        stages = {stage: round(float(np.median(ages)), 2) for stage, ages in self._ages.items()}
         found = {
             "stream": self._feed.stream,
             "title": "" if said is None else said.title,
