@@ -14,14 +14,19 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import mujoco
 import numpy as np
 import psutil
 import pytest
+from numpy.typing import NDArray
 
-from iris_session import Client, CurveKeys, decode_cloud
+from anchors.camera import CameraModel, pose_from_matrix
+from iris_session import Client, CurveKeys, Recording, decode_cloud
+from iris_session.demo.named_scenes import scene_by_name
 from iris_session.protocol.media import StreamBudget
 from iris_session.protocol.names import StreamFault
 from iris_session.security import KeyHome, KeyPair
+from tests.cloud.rays import cast_picture, look_at
 from tests.e2e.session_process import (
     COMMAND,
     DEADLINE_S,
@@ -253,6 +258,40 @@ def test_faults_of_frames_are_named_and_end_with_them(
     wait_for_fault(ann, "dark", "")
 
 
+def test_a_camera_that_sees_robots_and_no_sheet_is_found_when_it_is_bumped(
+    serve: Callable[..., SessionProcess], watch: Callable[..., Client], tmp_path: Path
+) -> None:
+    pose = look_at((1.1, -1.0, 0.8), (0.0, 0.0, 0.2))
+    bumped = pose.copy()
+    bumped[:3, 3] += (0.0, 0.03, 0.0)
+    model = scene_by_name("handover").model
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    shown = write_pictures(tmp_path / "pictures", n=2)
+
+    def show(T_world_camera: NDArray[np.float64]) -> None:
+        """Let the camera see the robots from there, with another noise in each picture."""
+        for number, file in enumerate(sorted(shown.glob("*.depth.png"))):
+            camera = CameraModel(WIDTH, HEIGHT, 146.0, 146.0, 79.5, 59.5)
+            depth = cast_picture(model, data, camera, T_world_camera, 0.003, number).depth
+            assert cv2.imwrite(str(tmp_path / "next.png"), depth)
+            (tmp_path / "next.png").rename(file)
+
+    show(pose)
+    p, q = pose_from_matrix(pose)
+    placed = f"{{position_m = {list(p)}, quaternion_wxyz = {list(q)}}}"
+    camera = f"{folder_camera(shown).replace(POSE, placed)}error_mm = 10.0\n"
+    server = serve("handover", "--camera", str(write_file(tmp_path / "room.toml", camera)))
+    ann = watch(server, "room")
+    wait_for_frames(ann, "room", 2)
+    show(bumped)
+    detail = wait_for_fault(ann, "room", StreamFault.MOVED).detail
+    assert re.match(r"camera front: by (2[5-9]|3[0-5]) mm, 0\.\d deg", detail), detail
+    show(pose)
+    wait_for_fault(ann, "room", "")
+
+
 def test_files_that_cannot_be_used_end_serve_before_it_starts(tmp_path: Path, camera_file: Path) -> None:
     again = tmp_path / "again.toml"
     again.write_text(camera_file.read_text())
@@ -337,6 +376,17 @@ def test_a_camera_by_hand_at_an_encrypted_session_until_its_key_is_revoked(
 
     wait_until(is_gone, "its stream has ended")
     wait_for_frames(ann, "room", 2)
+    ann.close()
+    server.finish()
+    with Recording.open(server.recording) as recording:
+        first, *_, last = recording.streams("hall")
+        assert first.info is not None
+        assert (first.encoding, first.info.title, first.info.hz) == ("cloud", "Hall", HZ)
+        assert last.info is None, "it ends before the session does"
+        *_, last = recording.streams("room")
+        assert last.info is not None
+        assert last.info.camera is not None
+        assert last.info.camera.position == (0.0, 0.0, 1.0)
 
 
 def test_a_camera_by_hand_ends_by_ctrl_c_and_waits_for_its_session(
@@ -355,6 +405,12 @@ def test_a_camera_by_hand_ends_by_ctrl_c_and_waits_for_its_session(
     assert told["room"]["hz"] > 0.0
     assert 8.0 <= told["room"]["bytes_per_point"] < 8.2
     assert set(told) == {"room", "room-front"}
+    stages = ["camera process", "to the front", "in the front", "to the client", "decoding"]
+    assert list(told["room"]["ages_ms"]) == stages
+    assert list(told["room-front"]["ages_ms"]) == stages[:-1]
+    _, text, _ = run_in_process("cloud", "inspect", server.address, "--seconds", "1")
+    for some in (stages, stages[:-1]):
+        assert re.search("age [0-9]+ ms, median: " + ", ".join(f"{one} -?[0-9.]+" for one in some) + "\n", text), text
     server.children()["front.main"].kill()
     wait_for_frames(ann, "room", 2)
     process.send_signal(signal.SIGINT)
