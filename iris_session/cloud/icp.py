@@ -81,7 +81,7 @@ class RefinementRefusedError(Exception):
         self.reason: Reason = reason
 
 
-class _Reference(NamedTuple):
+class Reference(NamedTuple):
     """Points with a normal each, and a tree of them."""
 
     points: Floats
@@ -89,7 +89,7 @@ class _Reference(NamedTuple):
     tree: Any
 
 
-class _Pairs(NamedTuple):
+class Pairs(NamedTuple):
     """Rows of the camera's points that have a pair, normals of their planes, and distances from these [m]."""
 
     rows: npt.NDArray[np.int64]
@@ -123,16 +123,16 @@ def refine_pose(
     source = np.asarray(points, np.float64)
     source = source[:: max(1, math.ceil(len(source) / _MAX_POINTS))]
     target = _make_reference(np.asarray(reference, np.float64))
-    first = _find_pairs(source, target, reach_m)
+    first = find_pairs(source, target, reach_m)
     _check_overlap(first, source, reach_m)
     moved, T, reach = source, np.eye(4), reach_m
     for _ in range(_ITERATIONS):
-        pairs = _find_pairs(moved, target, reach)
+        pairs = find_pairs(moved, target, reach)
         _check_overlap(pairs, source, reach)
-        information, gradient, center, size = _normal_equations(moved, pairs)
+        information, gradient, center, size = make_normal_equations(moved, pairs)
         values, vectors = np.linalg.eigh(information)
         step = -vectors @ ((vectors.T @ gradient) / (values + _DAMPING))
-        move = _to_matrix(step[:3], step[3:] / size, center)
+        move = make_motion(step[:3], step[3:] / size, center)
         T = move @ T
         moved = source @ T[:3, :3].T + T[:3, 3]
         if reach == _LAST_REACH_M and np.abs(step).max() < _SETTLED:
@@ -145,7 +145,7 @@ def refine_pose(
         after,
         len(pairs.rows) / len(source),
         float(np.linalg.norm(T[:3, :3] @ center + T[:3, 3] - center)),
-        _angle(T[:3, :3]),
+        measure_turn(T[:3, :3]),
         information * np.outer(scale := np.array([1.0] * 3 + [size] * 3), scale),
         center,
         float(values[-1] / max(values[0], 1e-12)),
@@ -154,7 +154,7 @@ def refine_pose(
     return result
 
 
-def _make_reference(points: Floats) -> _Reference:
+def _make_reference(points: Floats) -> Reference:
     """Compute the normals of a cloud."""
     from scipy.spatial import cKDTree
 
@@ -165,17 +165,17 @@ def _make_reference(points: Floats) -> _Reference:
     away = around - around.mean(axis=1, keepdims=True)
     _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", away, away))
     # The plane goes through the mean of the points around, not through the point with its own noise.
-    return _Reference(around.mean(axis=1), vectors[:, :, 0], tree)
+    return Reference(around.mean(axis=1), vectors[:, :, 0], tree)
 
 
-def _find_pairs(points: Floats, target: _Reference, reach_m: float) -> _Pairs:
+def find_pairs(points: Floats, target: Reference, reach_m: float) -> Pairs:
     distance, at = target.tree.query(points, distance_upper_bound=reach_m)
     rows = np.flatnonzero(np.isfinite(distance))
     normals = target.normals[at[rows]]
-    return _Pairs(rows, normals, np.einsum("ij,ij->i", points[rows] - target.points[at[rows]], normals))
+    return Pairs(rows, normals, np.einsum("ij,ij->i", points[rows] - target.points[at[rows]], normals))
 
 
-def _normal_equations(points: Floats, pairs: _Pairs) -> tuple[Floats, Floats, Floats, float]:
+def make_normal_equations(points: Floats, pairs: Pairs) -> tuple[Floats, Floats, Floats, float]:
     """Return matrix (6, 6) and gradient (6,) per pair, centre and size of the overlap [m]. Rotations are in units of
     its size, so that all six are lengths."""
     scale = max(_MIN_SCALE_M, 1.4826 * float(np.median(np.abs(pairs.residuals))))
@@ -189,7 +189,7 @@ def _normal_equations(points: Floats, pairs: _Pairs) -> tuple[Floats, Floats, Fl
     return (J * weights[:, None]).T @ J, J.T @ (weights * pairs.residuals), center, size
 
 
-def _check_overlap(pairs: _Pairs, source: Floats, reach_m: float) -> None:
+def _check_overlap(pairs: Pairs, source: Floats, reach_m: float) -> None:
     n, share = len(pairs.rows), len(pairs.rows) / max(1, len(source))
     if n < _MIN_PAIRS or share < MIN_OVERLAP:
         raise RefinementRefusedError(
@@ -223,15 +223,15 @@ def _check_result(result: Refinement, least: float, free: Floats, max_shift_m: f
         )
 
 
-def _measure_rmse(points: Floats, target: _Reference) -> float:
+def _measure_rmse(points: Floats, target: Reference) -> float:
     """Return the rms distance from the planes [m]; what is further away than the last reach counts with that."""
-    pairs = _find_pairs(points, target, _LAST_REACH_M)
+    pairs = find_pairs(points, target, _LAST_REACH_M)
     squares = np.full(len(points), _LAST_REACH_M**2)
     squares[pairs.rows] = pairs.residuals**2
     return math.sqrt(float(squares.mean()))
 
 
-def _to_matrix(shift: Floats, turn: Floats, center: Floats) -> Floats:
+def make_motion(shift: Floats, turn: Floats, center: Floats) -> Floats:
     """Return the motion (4, 4) that turns by a rotation vector about `center`, and shifts."""
     from scipy.spatial.transform import Rotation
 
@@ -241,5 +241,5 @@ def _to_matrix(shift: Floats, turn: Floats, center: Floats) -> Floats:
     return move
 
 
-def _angle(R: Floats) -> float:
+def measure_turn(R: Floats) -> float:
     return math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(R)) - 1.0))))
