@@ -1,9 +1,10 @@
-"""Find a camera that was moved: sheets that it sees are not where its calibration puts them. Times are passed in.
+"""Find a camera that was moved: what it sees is not where its calibration puts it. Times are passed in.
 
-One look is one picture. A look is off when no sheet in it fits, so a sheet that was moved beside one that was not is no
-alarm; several looks in a row decide, so one bad detection is none either. `anchors.drift` does not fit here: it has
-many detections a second without a covariance of their own, and compares them with each other. `MoveMonitor` is the
-pure part, for one camera; `MoveWatch` does its work for all cameras of a cloud in a thread.
+What it sees are printed sheets, or while it sees none the robots' surface (`iris_session.cloud.robot_surface`). One
+look is one picture; several looks in a row decide, so one bad detection is no alarm. A look at sheets is off when none
+of them fits, so a sheet that was moved beside one that was not is no alarm either. `anchors.drift` does not fit here:
+it has many detections a second without a covariance of their own, and compares them with each other. `MoveMonitor` and
+`RobotMonitor` are the pure part, for one camera; `MoveWatch` does their work for all cameras of a cloud in a thread.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +25,10 @@ from anchors.camera_rig import SheetView, solve_rig
 from anchors.detection import SheetDetection, SheetDetector
 from anchors.pose import PoseTuple, compose, distance, inverse, quat_angle, quat_conj, quat_mul, quat_to_rotvec
 from anchors.sheet import Sheet, SheetError
+from iris_session.cloud.frames import DepthFrame
+from iris_session.cloud.icp import measure_turn
+from iris_session.cloud.pipeline import POSE_NS
+from iris_session.cloud.robot_surface import PlacedSurface, SurfaceLook, compare_depth
 
 log = logging.getLogger(__name__)
 Floats = npt.NDArray[np.float64]
@@ -31,13 +36,18 @@ Floats = npt.NDArray[np.float64]
 Sheets = Mapping[str, tuple[float, PoseTuple]]
 
 #: Time between looks, and until the next one after a look that contradicts the verdict: a bump is found within a
-#: second, for one detection every half second.
+#: second by a sheet, for one detection every half second, and within two by a robot.
 LOOK_EVERY_NS: Final = 500_000_000
+ROBOT_EVERY_NS: Final = 1_000_000_000
 CONFIRM_EVERY_NS: Final = 150_000_000
 #: Time until the next look after one without a sheet: such a picture takes the longest.
 BLIND_EVERY_NS: Final = 2_000_000_000
+#: A sheet that was seen so long ago does not keep the robots from being looked at.
+SHEET_NS: Final = 5_000_000_000
 #: Looks in a row that change the verdict.
 LOOKS: Final = 3
+#: Looks at robots agree when their corrections move the camera to within this distance [m].
+_AGREE_M: Final = 0.02
 #: Error of a calibration that states none, 95 % [m].
 UNKNOWN_ERROR_M: Final = 0.02
 #: Rotation that a calibration is not off by, 95 % [rad]; what a smaller one does at a distance is seen as a shift.
@@ -49,13 +59,38 @@ _FLOOR: Final = (0.0005, math.radians(0.1))
 
 
 class CameraMove(NamedTuple):
-    """By how much a camera is not where its calibration has it: of its centre [m], and of its axes [rad]."""
+    """By how much a camera is not where its calibration has it: of its centre [m], and of its axes [rad].
+
+    Both are NaN where that could not be measured.
+    """
 
     shift_m: float
     turn_rad: float
 
     def __str__(self) -> str:
+        if math.isnan(self.shift_m):
+            return "by an unknown distance"
         return f"by {1e3 * self.shift_m:.0f} mm, {math.degrees(self.turn_rad):.1f} deg"
+
+
+class WatchedFrame(NamedTuple):
+    """A frame of a camera that is watched.
+
+    Attributes:
+        frame: The frame; its arrays must not change afterwards.
+        camera: Intrinsics.
+        depth_scale_m: Length of one unit of depth [m].
+        T_world_camera: (4, 4) by the calibration, at the capture.
+        error_m: Stated error of the calibration, 95 % [m].
+        body: Name of the body that carries the camera, empty for the world.
+    """
+
+    frame: DepthFrame
+    camera: CameraModel
+    depth_scale_m: float
+    T_world_camera: Floats
+    error_m: float
+    body: str = ""
 
 
 class _Look(NamedTuple):
@@ -66,7 +101,59 @@ class _Look(NamedTuple):
     T_world_camera: PoseTuple
 
 
-class MoveMonitor:
+class SurfaceFinder(Protocol):
+    """The robots of a session."""
+
+    def is_ready(self, capture_ns: int) -> bool:
+        """Return whether it knows all that it needs about a session time [ns]; a look waits for it."""
+        ...
+
+    def place_surface(self, capture_ns: int, carrier: str) -> PlacedSurface | None:
+        """Place the surface of the robots, for a camera on a body; `None` where there is none."""
+        ...
+
+
+class _HasOff(Protocol):
+    @property
+    def off(self) -> bool: ...
+
+
+_AnyLook = TypeVar("_AnyLook", bound=_HasOff)
+
+
+class _Monitor(Generic[_AnyLook]):
+    """Looks in a row, and the verdict that they change.
+
+    Attributes:
+        move: The verdict: how far the camera was moved; `None` while it fits, and before the first looks.
+        seen_ns: Time of the last look that had something to compare in it; `None` before the first.
+        decided_ns: Time of the last look that agreed with those before it; `None` before the first.
+    """
+
+    def __init__(self) -> None:
+        self._looks: deque[_AnyLook] = deque(maxlen=LOOKS)
+        self._due_ns: int | None = None
+        self.move: CameraMove | None = None
+        self.seen_ns: int | None = None
+        self.decided_ns: int | None = None
+
+    def is_due(self, now_ns: int) -> bool:
+        """Return whether it is time for a look."""
+        return self._due_ns is None or now_ns >= self._due_ns or self._due_ns - now_ns > BLIND_EVERY_NS
+
+    def _take(self, look: _AnyLook, now_ns: int, every_ns: int) -> bool:
+        """Take a look. Return whether the last ones agree; if not, and it contradicts the verdict, the next is soon."""
+        self.seen_ns, self._due_ns = now_ns, now_ns + every_ns
+        self._looks.append(look)
+        if len(self._looks) == LOOKS and len({one.off for one in self._looks}) == 1:
+            self.decided_ns = now_ns
+            return True
+        if look.off != (self.move is not None):
+            self._due_ns = now_ns + CONFIRM_EVERY_NS
+        return False
+
+
+class MoveMonitor(_Monitor[_Look]):
     """Compare the sheets that one camera sees with its calibration.
 
     Args:
@@ -75,10 +162,6 @@ class MoveMonitor:
         error_m: Stated error of the calibration, 95 % [m].
         error_rad: Stated error of its rotation, 95 % [rad].
 
-    Attributes:
-        move: The verdict: how far the camera was moved; `None` while it fits, and before the first looks.
-        seen_ns: Time of the last look that had a sheet in it; `None` before the first.
-
     Raises:
         DetectionError: Two sheets have the same id.
     """
@@ -86,16 +169,9 @@ class MoveMonitor:
     def __init__(
         self, camera: CameraModel, sheets: Sequence[Sheet], *, error_m: float, error_rad: float = ERROR_RAD
     ) -> None:
+        super().__init__()
         self._detector = SheetDetector(sheets, camera)
         self._error = (error_m, error_rad)
-        self._looks: deque[_Look] = deque(maxlen=LOOKS)
-        self._due_ns: int | None = None
-        self.move: CameraMove | None = None
-        self.seen_ns: int | None = None
-
-    def is_due(self, now_ns: int) -> bool:
-        """Return whether it is time for a look."""
-        return self._due_ns is None or now_ns >= self._due_ns or self._due_ns - now_ns > BLIND_EVERY_NS
 
     def look(
         self,
@@ -131,17 +207,12 @@ class MoveMonitor:
     ) -> CameraMove | None:
         """Add the detections of one picture. Return `move`."""
         seen = tuple(one for one in detections if one.anchor_id in T_world_sheets and not one.ambiguous)
-        self._due_ns = now_ns + (LOOK_EVERY_NS if seen else BLIND_EVERY_NS)
         if not seen:
+            self._due_ns = now_ns + BLIND_EVERY_NS
             return self.move
-        self.seen_ns = now_ns
         off = all(self._is_off(one, T_world_camera, T_world_sheets[one.anchor_id]) for one in seen)
-        self._looks.append(_Look(off, seen, T_world_camera))
-        agreed = len(self._looks) == LOOKS and len({look.off for look in self._looks}) == 1
-        if agreed:
+        if self._take(_Look(off, seen, T_world_camera), now_ns, LOOK_EVERY_NS):
             self.move = self._measure(T_world_sheets) if off else None
-        elif off != (self.move is not None):
-            self._due_ns = now_ns + CONFIRM_EVERY_NS
         return self.move
 
     def _is_off(self, seen: SheetDetection, T_world_camera: PoseTuple, T_world_sheet: PoseTuple) -> bool:
@@ -170,60 +241,142 @@ class MoveMonitor:
         return CameraMove(distance(p, (0.0, 0.0, 0.0)), quat_angle(q, (1.0, 0.0, 0.0, 0.0)))
 
 
+class _RobotLook(NamedTuple):
+    """One picture with robots in it, and how far the camera is off, `None` where that is too far to be measured."""
+
+    off: bool
+    T_camera_camera: Floats | None
+
+
+class RobotMonitor(_Monitor[_RobotLook]):
+    """Judge looks of one camera at the robots."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._has_fitted = False
+
+    def add_look(self, look: SurfaceLook, T_world_camera: npt.NDArray[Any], now_ns: int) -> CameraMove | None:
+        """Add the comparison of one picture.
+
+        Args:
+            look: The comparison.
+            T_world_camera: (4, 4) by the calibration, at the time of the picture.
+            now_ns: Time of the picture.
+
+        Returns:
+            `move`.
+        """
+        # Robots that were never seen may be those of a simulation, in a room without any.
+        if not look.verdict or (look.verdict == "lost" and not self._has_fitted):
+            self._due_ns = now_ns + ROBOT_EVERY_NS
+            return self.move
+        pose = np.asarray(T_world_camera)
+        # Relative to the pose by the calibration, which moves with the body that carries the camera.
+        correction = None if look.verdict == "lost" else np.linalg.inv(pose) @ look.T_world_world @ pose
+        off = look.verdict != "fits"
+        if off and any(one.off and _disagree(one.T_camera_camera, correction) for one in self._looks):
+            self._looks.clear()
+        if self._take(_RobotLook(off, correction), now_ns, ROBOT_EVERY_NS):
+            self._has_fitted |= not off
+            self.move = self._measure() if off else None
+        return self.move
+
+    def _measure(self) -> CameraMove:
+        """Return the move by the last looks that measured it."""
+        found = [one.T_camera_camera for one in self._looks if one.T_camera_camera is not None]
+        if not found:
+            return CameraMove(math.nan, math.nan)
+        shift = np.mean([one[:3, 3] for one in found], axis=0)
+        return CameraMove(float(np.linalg.norm(shift)), float(np.mean([measure_turn(one[:3, :3]) for one in found])))
+
+
 class MoveWatch:
     """Looks for moved cameras in a thread: one picture at a time, those of other cameras meanwhile are left out.
 
     Args:
         find_sheets: Returns the sheets of the session.
+        robots: The robots of the session; `None`: only sheets are looked for.
     """
 
-    def __init__(self, find_sheets: Callable[[], Sheets]) -> None:
+    def __init__(self, find_sheets: Callable[[], Sheets], robots: SurfaceFinder | None = None) -> None:
         self._find_sheets = find_sheets
+        self._robots = robots
         self._pool = ThreadPoolExecutor(1, "iris-moved")
         self._look: Future[None] | None = None
-        self._monitors: dict[str, tuple[MoveMonitor, CameraModel, Mapping[str, float]]] = {}
+        self._by_sheets: dict[str, tuple[MoveMonitor, CameraModel, Mapping[str, float]]] = {}
+        self._by_robots: dict[str, RobotMonitor] = {}
+        self._waiting: dict[str, WatchedFrame] = {}
 
-    def offer(
-        self,
-        name: str,
-        camera: CameraModel,
-        error_m: float,
-        color: npt.NDArray[np.uint8],
-        T_world_camera: npt.NDArray[Any],
-        now_ns: int,
-    ) -> None:
-        """Take a picture, if it is time for one of this camera. Returns at once.
+    def offer(self, name: str, watched: WatchedFrame) -> None:
+        """Take a frame, if it is time for one of this camera. Returns at once.
 
         Args:
             name: Name of the camera.
-            camera: Its intrinsics.
-            error_m: Stated error of its calibration, 95 % [m].
-            color: (height, width, 3) uint8, RGB; it must not change afterwards.
-            T_world_camera: (4, 4) by the calibration, at the time of the picture.
-            now_ns: That time.
+            watched: The frame.
         """
         if self._look is not None and not self._look.done():
             return
-        if name in self._monitors and not self._monitors[name][0].is_due(now_ns):
-            return
+        now_ns = watched.frame.capture_ns
+        if name not in self._by_sheets or self._by_sheets[name][0].is_due(now_ns):
+            self._offer_to_sheets(name, watched)
+        seen_ns = self._by_sheets[name][0].seen_ns
+        if (self._look is None or self._look.done()) and (seen_ns is None or abs(now_ns - seen_ns) > SHEET_NS):
+            self._offer_to_robots(name, watched)
+
+    def _offer_to_sheets(self, name: str, watched: WatchedFrame) -> None:
         sheets = self._find_sheets()
         sizes = {anchor_id: edge_m for anchor_id, (edge_m, _) in sheets.items()}
         poses = {anchor_id: pose for anchor_id, (_, pose) in sheets.items()}
-        if name not in self._monitors or self._monitors[name][1:] != (camera, sizes):
+        if name not in self._by_sheets or self._by_sheets[name][1:] != (watched.camera, sizes):
             known = list(_make_sheets(sizes))
-            self._monitors[name] = MoveMonitor(camera, known, error_m=error_m), camera, sizes
+            self._by_sheets[name] = MoveMonitor(watched.camera, known, error_m=watched.error_m), watched.camera, sizes
         if sizes:
-            monitor = self._monitors[name][0]
-            self._look = self._pool.submit(_look_safely, monitor, color, T_world_camera, poses, now_ns)
+            monitor, frame = self._by_sheets[name][0], watched.frame
+            arguments = (frame.color, watched.T_world_camera, poses, frame.capture_ns)
+            self._look = self._pool.submit(_do_safely, monitor.look, *arguments)
+
+    def _offer_to_robots(self, name: str, watched: WatchedFrame) -> None:
+        if self._robots is None:
+            return
+        monitor = self._by_robots.setdefault(name, RobotMonitor())
+        if name not in self._waiting and monitor.is_due(watched.frame.capture_ns):
+            self._waiting[name] = watched
+        waiting = self._waiting.get(name)
+        if waiting is None:
+            return
+        if self._robots.is_ready(waiting.frame.capture_ns):
+            self._look = self._pool.submit(_do_safely, self._look_at_robots, monitor, self._waiting.pop(name))
+        elif abs(watched.frame.capture_ns - waiting.frame.capture_ns) > POSE_NS:
+            del self._waiting[name]
+
+    def _look_at_robots(self, monitor: RobotMonitor, watched: WatchedFrame) -> None:
+        assert self._robots is not None
+        frame, pose = watched.frame, watched.T_world_camera
+        surface = self._robots.place_surface(frame.capture_ns, watched.body)
+        if surface is not None:
+            look = compare_depth(surface, frame.depth, watched.camera, watched.depth_scale_m, pose, watched.error_m)
+            monitor.add_look(look, pose, frame.capture_ns)
 
     def find_move(self, name: str) -> CameraMove | None:
         """Return how far a camera was moved, `None` where it fits or is not known."""
-        found = self._monitors.get(name)
-        return None if found is None else found[0].move
+        monitors: list[_Monitor[Any]] = [self._by_sheets[name][0]] if name in self._by_sheets else []
+        monitors += [self._by_robots[name]] if name in self._by_robots else []
+        decided = [(one.decided_ns, one.move) for one in monitors if one.decided_ns is not None]
+        return max(decided, key=lambda one: one[0])[1] if decided else None
+
+    def restart(self) -> None:
+        """Forget all looks: session time is that of another session."""
+        self._by_sheets.clear()
+        self._by_robots.clear()
+        self._waiting.clear()
 
     def close(self) -> None:
         """End the thread; a look that has begun is not waited for."""
         self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _disagree(one: Floats | None, other: Floats | None) -> bool:
+    return one is not None and other is not None and bool(np.linalg.norm((one - other)[:3, 3]) > _AGREE_M)
 
 
 def _make_sheets(sizes: Mapping[str, float]) -> Iterator[Sheet]:
@@ -233,9 +386,9 @@ def _make_sheets(sizes: Mapping[str, float]) -> Iterator[Sheet]:
             yield Sheet(anchor_id, edge_m)
 
 
-def _look_safely(monitor: MoveMonitor, *picture: Any) -> None:
+def _do_safely(look: Callable[..., object], *arguments: Any) -> None:
     try:
-        monitor.look(*picture)
+        look(*arguments)
     except Exception as error:  # of OpenCV or SciPy, for pictures that cannot be used; others come
         log.warning("a picture was not compared with the calibration: %s", error)
 

@@ -35,12 +35,14 @@ from iris_session.cloud.camera_file import CloudSettings
 from iris_session.cloud.config import CameraReport, CameraStart
 from iris_session.cloud.moved import MoveWatch, Sheets
 from iris_session.cloud.robot_points import RobotPoints
+from iris_session.cloud.robot_surface import PlacedSurface, RobotSurface
 from iris_session.cloud.sources import open_source
 from iris_session.cloud.voxels import PointSet
 from iris_session.cloud.worker import CloudWorker
 from iris_session.link.discovery import host_port
 from iris_session.protocol.media import StreamInfo
 from iris_session.protocol.names import Role
+from iris_session.scene.budget import Budget
 from iris_session.system.extras import MissingExtraError, require_package
 from iris_session.system.log import configure_logging
 from iris_session.system.priority import lower_thread_priority
@@ -56,6 +58,8 @@ STATES_NS: Final = 1_000_000_000
 MAX_STATES: Final = 256
 #: After shapes of robots could not be fetched, the next attempt begins with a frame so much later.
 FETCH_AGAIN_NS: Final = 5_000_000_000
+#: Of the scene only the shapes matter.
+COARSE_TEXTURES: Final = Budget(texture_bytes=1)
 #: A pose that was sent longer before or after a capture says nothing about it.
 POSE_REACH_NS: Final = 100_000_000
 
@@ -115,60 +119,77 @@ class BodyHistory:
         return None
 
 
-class RobotRemover:
-    """Leaves out the points on the session's robots, by their shapes and the state at capture.
+class SessionRobots:
+    """The session's robots, by their shapes and the state at capture: which points lie on them, where they are seen.
 
-    The shapes are fetched in a thread, again for another scene and after a failure. Until they are there all points
-    stay.
+    The shapes are fetched in a thread, again for another scene and after a failure, and not for a session without
+    robots. Until they are there all points stay.
+
+    Args:
+        client: Client of the session.
+        history: Poses of its bodies.
+        removes: Points are to be removed.
 
     Attributes:
-        warning: One line for people about shapes that are missing; empty while all is well.
+        warning: One line for people about points that stay because shapes are missing; empty while all is well.
     """
 
-    def __init__(self, client: Client, history: BodyHistory) -> None:
+    def __init__(self, client: Client, history: BodyHistory, *, removes: bool) -> None:
         self._client = client
         self._history = history
+        self._removes = removes
         self._scene: tuple[str, str] | None = None
         self._again_ns = 0
         self._thread: threading.Thread | None = None
-        self._found: RobotPoints | None = None
-        self.warning = ""
+        self._points: RobotPoints | None = None
+        self._surface: RobotSurface | None = None
+        self._said = self.warning = ""
 
     def is_ready(self, capture_ns: int) -> bool:
         """Return whether the state of that time is there; begin to fetch the shapes when they are needed."""
         version = self._client.scene.version
         is_fetching = self._thread is not None and self._thread.is_alive()
-        if version is not None and not is_fetching:
+        if version is not None and not is_fetching and self._client.mirror.robots:
             is_other = version[:2] != self._scene
-            if is_other or (self._found is None and capture_ns >= self._again_ns):
-                self._scene, self._found, self._again_ns = version[:2], None, capture_ns + FETCH_AGAIN_NS
+            if is_other or (self._surface is None and capture_ns >= self._again_ns):
+                self._scene, self._again_ns = version[:2], capture_ns + FETCH_AGAIN_NS
+                self._points = self._surface = None
                 self._thread = threading.Thread(target=self._fetch, name="iris-robots", daemon=True)
                 self._thread.start()
-        return self._found is None or self._history.covers(capture_ns)
+        return self._surface is None or self._history.covers(capture_ns)
 
     def remove(self, points: PointSet, capture_ns: int) -> PointSet:
         """Return the points that do not lie on robots."""
-        found = self._found
+        found = self._points
         if found is None:
             return points
         kept = ~found.find(points.positions, self._history.find_pose, capture_ns)
         return PointSet(points.positions[kept], points.colors[kept], points.counts[kept])
 
+    def place_surface(self, capture_ns: int, carrier: str) -> PlacedSurface | None:
+        """Place the surface of the robots, for a camera on a body; `None` until their shapes are there."""
+        found = self._surface
+        return None if found is None else found.place(self._history.find_pose, capture_ns, carrier)
+
     def _fetch(self) -> None:
         mirror = self._client.mirror
         try:
-            scene = fetch_scene(self._client)
-            found = RobotPoints(scene.spec, scene.meshes, mirror.robots.values(), mirror.bodies)
+            scene = fetch_scene(self._client, COARSE_TEXTURES)
+            shapes = scene.spec, scene.meshes, tuple(mirror.robots.values()), mirror.bodies
+            if self._removes:
+                self._points = RobotPoints(*shapes)
+            self._surface = RobotSurface(*shapes)
         except Exception as error:  # of a connection, or of a scene: the cloud goes on with the points on robots
-            self._warn(f"points on robots stay in the cloud: {error}")
+            self._warn(str(error))
             return
-        self._warn(f"points on robots stay in part: {len(scene.failed)} shapes are missing" if scene.failed else "")
-        self._found = found
+        self._warn(f"{len(scene.failed)} shapes are missing" if scene.failed else "")
 
-    def _warn(self, text: str) -> None:
-        if text and text != self.warning:
-            log.warning("%s", text)
-        self.warning = text
+    def _warn(self, reason: str) -> None:
+        lack = "points on robots stay in the cloud" if self._removes else "cameras are not compared with the robots"
+        if reason and reason != self._said:
+            log.warning("%s: %s", lack, reason)
+        self._said = reason
+        self.warning = f"{lack}: {reason}" if reason and self._removes else ""
 
 
 class SessionOutlet:
@@ -213,7 +234,7 @@ def run_cameras(
         Why it ended by itself: the session refuses it; empty otherwise.
     """
     history = BodyHistory(client)
-    remover = RobotRemover(client, history) if settings.remove_robots else None
+    robots = SessionRobots(client, history, removes=settings.remove_robots)
     client.on_state = history.on_state
     try:
         client.open()
@@ -224,13 +245,13 @@ def run_cameras(
             partial(open_source, body_poses=history.read_newest),
             time.perf_counter_ns,
             body_pose=history.find_pose,
-            remover=remover,
-            watch=_make_watch(client),
+            remover=robots if settings.remove_robots else None,
+            watch=_make_watch(client, robots),
         )
         on_report(CameraReport(settings.stream))
 
         def report(one: CameraReport) -> None:
-            on_report(one if remover is None else msgspec.structs.replace(one, warning=remover.warning))
+            on_report(msgspec.structs.replace(one, warning=robots.warning))
 
         try:
             _work(worker, client, report, is_ending)
@@ -263,8 +284,8 @@ def _work(worker: CloudWorker, client: Client, on_report: OnReport, is_ending: C
             on_report(worker.make_report(connected=connected))
 
 
-def _make_watch(client: Client) -> MoveWatch | None:
-    """Return what finds moved cameras by the sheets of the session; `None` where packages for that are missing."""
+def _make_watch(client: Client, robots: SessionRobots) -> MoveWatch | None:
+    """Return what finds moved cameras by sheets and robots; `None` where packages for that are missing."""
     try:
         for package in ("cv2", "scipy"):
             require_package(package, "finding moved cameras")
@@ -276,7 +297,7 @@ def _make_watch(client: Client) -> MoveWatch | None:
         anchors = tuple(client.mirror.anchors.values())
         return {one.id: (one.size_m, (one.T_world_anchor.p, one.T_world_anchor.q)) for one in anchors if one.size_m}
 
-    return MoveWatch(find_sheets)
+    return MoveWatch(find_sheets, robots)
 
 
 def make_client(start: CameraStart) -> Client:

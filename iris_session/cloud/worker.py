@@ -19,7 +19,7 @@ from iris_session.cloud.camera_file import CameraSettings, CloudSettings
 from iris_session.cloud.config import CameraReport, SourceReport
 from iris_session.cloud.frames import DepthSource
 from iris_session.cloud.health import CameraHealth, Fault
-from iris_session.cloud.moved import UNKNOWN_ERROR_M, MoveWatch
+from iris_session.cloud.moved import UNKNOWN_ERROR_M, MoveWatch, WatchedFrame
 from iris_session.cloud.pipeline import (
     CLASSES,
     BodyPose,
@@ -145,7 +145,7 @@ class CloudWorker:
         self._cameras = {one.name: one for one in settings.cameras}
         self._readers = {one.name: self._make_reader(one, open_source) for one in settings.cameras}
         self._openings: dict[str, int] = {}
-        self._models: dict[str, CameraModel] = {}
+        self._models: dict[str, tuple[CameraModel, float]] = {}  # and the length of one unit of depth [m]
         self._stream = _Stream(settings.stream, MediaEncoding.CLOUD)
         self._pictures = {
             one.name: _Stream(settings.name_picture_stream(one.name), MediaEncoding.JPEG)
@@ -177,6 +177,8 @@ class CloudWorker:
     def restart_clock(self) -> None:
         """Forget all frames: session time is that of another session from now on."""
         self.pipeline.clear()
+        if self._watch is not None:
+            self._watch.restart()
         for reader in self._readers.values():
             reader.restart_clock()
         for stream in (self._stream, *self._pictures.values()):
@@ -260,7 +262,7 @@ class CloudWorker:
     def _take_over(self, name: str, new: NewFrame, now_ns: int) -> None:
         if self._openings.get(name) != new.opening:
             self._openings[name] = new.opening
-            self._models[name] = new.model
+            self._models[name] = new.model, new.depth_scale_m
             self.pipeline.open_camera(name, new.model, new.depth_scale_m)
         self.pipeline.offer(name, new.frame, now_ns)
         picture = self._pictures.get(name)
@@ -282,7 +284,9 @@ class CloudWorker:
             for name, (frame, pose) in frames.items():
                 error_mm = self._cameras[name].error_mm
                 error_m = UNKNOWN_ERROR_M if error_mm is None else error_mm / 1000.0
-                self._watch.offer(name, self._models[name], error_m, frame.color, pose, frame.capture_ns)
+                model, scale_m = self._models[name]
+                body = self._cameras[name].body if frame.T_world_camera is None else ""
+                self._watch.offer(name, WatchedFrame(frame, model, scale_m, pose, error_m, body))
         self._note_stage("read", max(self._readers[name].read_ms for name in frames))
         for stage, duration_ms in cloud.stages_ms.items():
             self._note_stage(stage, duration_ms)
@@ -333,9 +337,10 @@ class CloudWorker:
 
     def _describe_camera(self, name: str) -> StreamCamera | None:
         """Return intrinsics and pose of a camera, `None` while they are not known."""
-        model, camera = self._models.get(name), self._cameras[name]
-        if model is None:
+        camera = self._cameras[name]
+        if name not in self._models:
             return None
+        model, _ = self._models[name]
         pose = None if camera.pose is None else camera.pose.to_matrix()
         if not camera.body:
             pose = self.poses.get(name, pose)
