@@ -22,7 +22,18 @@ from anchors.sheet import Sheet
 from anchors.sheet_print import to_pdf
 from iris_session.cloud.camera_file import CameraPose
 from iris_session.cloud.frames import DepthFrame
-from iris_session.cloud.moved import CONFIRM_EVERY_NS, LOOK_EVERY_NS, MoveMonitor, MoveWatch
+from iris_session.cloud.moved import (
+    CONFIRM_EVERY_NS,
+    LOOK_EVERY_NS,
+    ROBOT_EVERY_NS,
+    SHEET_NS,
+    CameraMove,
+    MoveMonitor,
+    MoveWatch,
+    RobotMonitor,
+    WatchedFrame,
+)
+from iris_session.cloud.robot_surface import PlacedSurface, SurfaceLook, Verdict
 from iris_session.cloud.worker import CloudWorker
 from iris_session.protocol.names import StreamFault
 from tests.cloud.camera_settings import make_settings
@@ -68,6 +79,11 @@ def detect(name: str, T_world_camera: PoseTuple, random: np.random.Generator | N
     x, y, z = (np.array(p) + error[:3]).tolist()
     covariance = tuple(COVARIANCE.ravel().tolist())
     return SheetDetection(name, "board", 0.16, ((x, y, z), turned), covariance, None, math.inf, 0.3, 4, True)
+
+
+def watched(picture: NDArray[np.uint8], at_ns: int) -> WatchedFrame:
+    """Return a frame of the camera with that picture, and without depth."""
+    return WatchedFrame(DepthFrame(np.zeros((480, 640), np.uint16), picture, at_ns), CAMERA, 0.001, POSE, 0.01)
 
 
 def make_monitor(error_m: float = 0.010) -> MoveMonitor:
@@ -201,12 +217,12 @@ def test_looks_are_taken_in_a_thread_of_the_sheets_that_the_session_has(
     watch = MoveWatch(lambda: sheets)
     bumped = compose(CALIBRATED, BUMP)
     picture = take_picture(pages, bumped, 1, "table")
-    watch.offer("front", CAMERA, 0.01, picture, POSE, 0)  # no sheets yet: nothing to look for
+    watch.offer("front", watched(picture, 0))  # no sheets yet: nothing to look for
     assert watch._look is None
     sheets["table"] = (0.160, ANCHORS["table"])
     for step in range(1, 4):
-        watch.offer("front", CAMERA, 0.01, picture, POSE, step * SECOND_NS)
-        watch.offer("front", CAMERA, 0.01, picture, POSE, step * SECOND_NS + 1)  # not due, or one is under way
+        watch.offer("front", watched(picture, step * SECOND_NS))
+        watch.offer("front", watched(picture, step * SECOND_NS + 1))  # not due, or one is under way
         assert watch._look is not None
         watch._look.result(60.0)
         assert (watch.find_move("front") is not None) == (step == 3)
@@ -214,13 +230,101 @@ def test_looks_are_taken_in_a_thread_of_the_sheets_that_the_session_has(
     # Another set of sheets, or a camera that was opened anew with other intrinsics, begins anew.
     sheets["shelf"] = (0.160, ANCHORS["shelf"])
     sheets["\N{LATIN SMALL LETTER U WITH DIAERESIS}ber"] = (0.160, ANCHORS["shelf"])  # no name of a printed sheet
-    watch.offer("front", CAMERA, 0.01, np.zeros((4, 4, 3), np.uint8), POSE, 9 * SECOND_NS)
+    watch.offer("front", watched(np.zeros((4, 4, 3), np.uint8), 9 * SECOND_NS))
     bad = watch._look
     bad.result(60.0)
-    watch.offer("front", CAMERA, 0.01, picture, POSE, 9 * SECOND_NS + 1)
+    watch.offer("front", watched(picture, 9 * SECOND_NS + 1))
     assert watch._look is bad  # not at once: the next one may be as bad
     assert watch.find_move("front") is None
     assert "4 x 4" in caplog.text
+    watch.close()
+
+
+def look(verdict: Verdict, bump: PoseTuple = BUMP) -> SurfaceLook:
+    """Return a look of the camera at robots, which finds it off by `bump`."""
+    correction = POSE @ pose_to_matrix(bump) @ np.linalg.inv(POSE)
+    return SurfaceLook(verdict, correction if verdict == "off" else np.eye(4), 0.03)
+
+
+def add_looks(monitor: RobotMonitor, start_s: int, *looks: SurfaceLook) -> list[CameraMove | None]:
+    return [monitor.add_look(one, POSE, (start_s + step) * SECOND_NS) for step, one in enumerate(looks)]
+
+
+def test_three_looks_at_robots_that_agree_decide() -> None:
+    monitor = RobotMonitor()
+    assert add_looks(monitor, 0, look("fits"), look("off"), look("off"), look("fits"), look("off")) == [None] * 5
+    assert monitor.is_due(4 * SECOND_NS + CONFIRM_EVERY_NS), "the next look is soon"
+    *_, move = add_looks(monitor, 5, look(""), look("off"), look(""), look("off"))
+    assert move is not None
+    assert move.shift_m == pytest.approx(0.03)
+    assert not monitor.is_due(8 * SECOND_NS + CONFIRM_EVERY_NS)
+    assert monitor.is_due(8 * SECOND_NS + ROBOT_EVERY_NS)
+    assert add_looks(monitor, 9, *[look("")] * 5) == [move] * 5, "pictures that do not tell leave the verdict"
+    assert add_looks(monitor, 14, *[look("fits")] * 3) == [move, move, None]
+
+
+def test_looks_at_robots_that_disagree_are_no_move() -> None:
+    """What moves about before robots may be taken for them, each time elsewhere."""
+    other: PoseTuple = ((-0.03, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    assert add_looks(RobotMonitor(), 0, *[look("off"), look("off", other)] * 5) == [None] * 10
+
+
+def test_robots_that_were_never_seen_may_be_none_of_this_room() -> None:
+    monitor = RobotMonitor()
+    assert add_looks(monitor, 0, *[look("lost")] * 5) == [None] * 5
+    add_looks(monitor, 5, *[look("fits")] * 3)
+    *_, move = add_looks(monitor, 8, *[look("lost")] * 3)
+    assert str(move) == "by an unknown distance"
+    *_, move = add_looks(monitor, 11, *[look("off")] * 3)
+    assert str(move) == "by 30 mm, 0.0 deg"
+
+
+class FakeRobots:
+    """Robots whose state is there or not."""
+
+    def __init__(self) -> None:
+        self.ready = True
+        self.asked: list[tuple[int, str]] = []
+
+    def is_ready(self, capture_ns: int) -> bool:
+        return self.ready
+
+    def place_surface(self, capture_ns: int, carrier: str) -> PlacedSurface | None:
+        self.asked.append((capture_ns, carrier))
+        return None
+
+
+def test_robots_are_looked_at_while_no_sheet_is_seen_and_their_state_is_there(pages: dict[str, Page]) -> None:
+    robots = FakeRobots()
+    sheets = {"table": (0.160, ANCHORS["table"])}
+    watch = MoveWatch(lambda: sheets, robots)
+
+    def offer(picture: NDArray[np.uint8], at_ns: int) -> None:
+        watch.offer("front", watched(picture, at_ns)._replace(body="hand"))
+        if watch._look is not None:
+            watch._look.result(60.0)
+
+    dark = np.zeros((480, 640, 3), np.uint8)
+    with_sheet = take_picture(pages, CALIBRATED, 1, "table")
+    offer(with_sheet, SECOND_NS)
+    offer(dark, SECOND_NS + 1)  # a second has not passed, and the sheet was just seen
+    assert robots.asked == []
+    later_ns = SECOND_NS + SHEET_NS
+    offer(dark, later_ns)  # is there a sheet? No.
+    robots.ready = False
+    offer(dark, later_ns + 2)
+    assert robots.asked == []
+    robots.ready = True
+    offer(dark, later_ns + 3)  # the frame that waited is compared
+    assert robots.asked == [(later_ns + 2, "hand")]
+    robots.ready = False
+    offer(dark, later_ns + 4)
+    offer(dark, later_ns + SECOND_NS)  # the state of the one before never came
+    robots.ready = True
+    offer(dark, later_ns + SECOND_NS + 1)
+    assert robots.asked[1:] == [(later_ns + SECOND_NS + 1, "hand")]
+    watch.restart()
+    assert watch.find_move("front") is None
     watch.close()
 
 

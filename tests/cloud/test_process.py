@@ -11,7 +11,7 @@ import pytest
 
 from iris_session.client.errors import InvalidMessageError, NotConnectedError
 from iris_session.cloud import process
-from iris_session.cloud.process import FETCH_AGAIN_NS, BodyHistory, RobotRemover, SessionOutlet
+from iris_session.cloud.process import FETCH_AGAIN_NS, BodyHistory, SessionOutlet, SessionRobots
 from iris_session.cloud.voxels import PointSet
 
 MS = 1_000_000
@@ -23,7 +23,7 @@ class FakeClient:
 
     def __init__(self) -> None:
         self.scene: Any = SimpleNamespace(version=("session", "scene", 1), poses=None)
-        self.mirror: Any = SimpleNamespace(body_index={"base": 0, "hand": 1}, robots={}, bodies=())
+        self.mirror: Any = SimpleNamespace(body_index={"base": 0, "hand": 1}, robots={"left": None}, bodies=())
 
 
 class Lab:
@@ -93,45 +93,58 @@ class FakeRobotPoints:
         return positions[:, 0] > 0.0
 
 
+class FakeRobotSurface:
+    """Placed as the arguments say."""
+
+    def __init__(self, *_: object) -> None:
+        pass
+
+    def place(self, body_pose: object, capture_ns: int, carrier: str) -> Any:
+        return capture_ns, carrier
+
+
 def make_points() -> PointSet:
     positions = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]], np.float32)
     return PointSet(positions, np.zeros((2, 3), np.uint8), np.ones(2, np.int64))
 
 
-def wait_for_fetch(remover: RobotRemover) -> None:
-    assert remover._thread is not None
-    remover._thread.join(DEADLINE_S)
-    assert not remover._thread.is_alive()
+def wait_for_fetch(robots: SessionRobots) -> None:
+    assert robots._thread is not None
+    robots._thread.join(DEADLINE_S)
+    assert not robots._thread.is_alive()
 
 
 def test_points_on_robots_go_once_their_shapes_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
     fetched: list[object] = []
     is_there = threading.Event()
 
-    def fetch(client: object) -> Any:
+    def fetch(client: object, budget: object) -> Any:
         assert is_there.wait(DEADLINE_S)
         fetched.append(client)
         return SimpleNamespace(spec=None, meshes={}, failed={})
 
     monkeypatch.setattr(process, "fetch_scene", fetch)
     monkeypatch.setattr(process, "RobotPoints", FakeRobotPoints)
+    monkeypatch.setattr(process, "RobotSurface", FakeRobotSurface)
     lab = Lab()
-    remover = RobotRemover(lab.client, lab.history)
-    assert len(remover.remove(make_points(), 0).positions) == 2
-    assert remover.is_ready(10 * MS), "frames do not wait for the shapes"
+    robots = SessionRobots(lab.client, lab.history, removes=True)
+    assert len(robots.remove(make_points(), 0).positions) == 2
+    assert robots.is_ready(10 * MS), "frames do not wait for the shapes"
     is_there.set()
-    wait_for_fetch(remover)
-    assert not remover.is_ready(10 * MS), "but for the state, from then on"
+    wait_for_fetch(robots)
+    assert not robots.is_ready(10 * MS), "but for the state, from then on"
     for at in (0, 16):
         lab.add(at, 0.0)
-    assert remover.is_ready(10 * MS)
-    kept = remover.remove(make_points(), 10 * MS)
+    assert robots.is_ready(10 * MS)
+    kept = robots.remove(make_points(), 10 * MS)
     assert kept.positions.tolist() == [[-1.0, 0.0, 0.0]]
     assert (len(kept.colors), len(kept.counts)) == (1, 1)
     assert len(fetched) == 1
+    placed: Any = robots.place_surface(10 * MS, "hand")
+    assert placed == (10 * MS, "hand")
     lab.client.scene.version = ("session", "other", 2)
-    remover.is_ready(10 * MS)
-    wait_for_fetch(remover)
+    robots.is_ready(10 * MS)
+    wait_for_fetch(robots)
     assert len(fetched) == 2
 
 
@@ -139,36 +152,55 @@ def test_points_on_robots_go_once_their_shapes_are_there(monkeypatch: pytest.Mon
 def test_without_shapes_all_points_stay_until_they_are_there(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, error: Exception
 ) -> None:
-    def fail(client: object) -> Any:
+    def fail(client: object, budget: object) -> Any:
         raise error
 
     monkeypatch.setattr(process, "fetch_scene", fail)
     lab = Lab()
-    remover = RobotRemover(lab.client, lab.history)
-    assert remover.is_ready(0)
-    wait_for_fetch(remover)
-    assert remover.is_ready(0)
-    assert len(remover.remove(make_points(), 0).positions) == 2
+    robots = SessionRobots(lab.client, lab.history, removes=True)
+    assert robots.is_ready(0)
+    wait_for_fetch(robots)
+    assert robots.is_ready(0)
+    assert len(robots.remove(make_points(), 0).positions) == 2
     assert f"points on robots stay in the cloud: {error}" in caplog.text
-    assert remover.warning
+    assert robots.warning
     monkeypatch.setattr(process, "RobotPoints", FakeRobotPoints)
-    monkeypatch.setattr(process, "fetch_scene", lambda _: SimpleNamespace(spec=None, meshes={}, failed={}))
-    remover.is_ready(FETCH_AGAIN_NS - 1)
-    assert remover.is_ready(FETCH_AGAIN_NS - 1), "not tried again at once"
-    remover.is_ready(FETCH_AGAIN_NS)
-    wait_for_fetch(remover)
-    assert len(remover.remove(make_points(), 0).positions) == 1
-    assert remover.warning == ""
+    monkeypatch.setattr(process, "RobotSurface", FakeRobotSurface)
+    monkeypatch.setattr(process, "fetch_scene", lambda *_: SimpleNamespace(spec=None, meshes={}, failed={}))
+    robots.is_ready(FETCH_AGAIN_NS - 1)
+    assert robots.is_ready(FETCH_AGAIN_NS - 1), "not tried again at once"
+    robots.is_ready(FETCH_AGAIN_NS)
+    wait_for_fetch(robots)
+    assert len(robots.remove(make_points(), 0).positions) == 1
+    assert robots.warning == ""
 
 
 def test_shapes_that_are_missing_are_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process, "RobotPoints", FakeRobotPoints)
-    monkeypatch.setattr(process, "fetch_scene", lambda _: SimpleNamespace(spec=None, meshes={}, failed={"a": "lost"}))
+    monkeypatch.setattr(process, "RobotSurface", FakeRobotSurface)
+    monkeypatch.setattr(process, "fetch_scene", lambda *_: SimpleNamespace(spec=None, meshes={}, failed={"a": "lost"}))
     lab = Lab()
-    remover = RobotRemover(lab.client, lab.history)
-    remover.is_ready(0)
-    wait_for_fetch(remover)
-    assert remover.warning == "points on robots stay in part: 1 shapes are missing"
+    robots = SessionRobots(lab.client, lab.history, removes=True)
+    robots.is_ready(0)
+    wait_for_fetch(robots)
+    assert robots.warning == "points on robots stay in the cloud: 1 shapes are missing"
+
+
+def test_shapes_are_not_fetched_in_vain(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    monkeypatch.setattr(process, "fetch_scene", lambda *_: SimpleNamespace(spec=None, meshes={}, failed={"a": "lost"}))
+    monkeypatch.setattr(process, "RobotSurface", FakeRobotSurface)
+    monkeypatch.delattr(process, "RobotPoints")
+    lab = Lab()
+    lab.client.mirror.robots = {}
+    robots = SessionRobots(lab.client, lab.history, removes=False)
+    assert robots.is_ready(0)
+    assert robots._thread is None, "a session without robots"
+    lab.client.mirror.robots = {"left": None}
+    robots.is_ready(0)
+    wait_for_fetch(robots)
+    assert robots.place_surface(0, "") is not None, "without points to remove"
+    assert "cameras are not compared with the robots: 1 shapes are missing" in caplog.text
+    assert robots.warning == "", "the cloud lacks nothing"
 
 
 def test_states_of_a_second_are_kept_at_any_rate() -> None:

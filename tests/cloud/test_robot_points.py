@@ -16,22 +16,18 @@ from numpy.typing import NDArray
 from anchors.camera import CameraModel
 from anchors.pose import PoseTuple
 from iris_session.cloud.robot_points import RobotPoints, find_robot_bodies
-from iris_session.demo.named_scenes import scene_by_name
-from iris_session.physics import find_objects, find_robots
-from iris_session.physics.names import list_body_names
-from iris_session.protocol.common import Pose
+from iris_session.physics import find_robots
 from iris_session.protocol.scene import SceneSpec
 from iris_session.protocol.server_messages import BodyInfo, RobotInfo
-from iris_session.scene import AssetStore, EncodeOptions, MeshArrays, decode_mesh
-from iris_session.scene.mujoco_scene import parse_mujoco
+from iris_session.scene import MeshArrays
 from tests.cloud.rays import cast_picture, look_at
+from tests.cloud.robot_scene import load_robots
 from tests.models import robot_models
 
 __all__ = ["robot_models"]
 
 EYES = ((1.3, -1.2, 0.9), (-1.2, -1.3, 0.8), (0.1, 1.6, 0.7))
 CAMERA = CameraModel(320, 240, 280.0, 280.0, 159.5, 119.5)
-IDENTITY = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 backends = pytest.mark.parametrize("use_numba", [True, False], ids=["numba", "numpy"])
 
 
@@ -57,36 +53,27 @@ class Holding(NamedTuple):
 @lru_cache(maxsize=2)
 def hold_object(scene: str, folder: Path) -> Holding:
     """Close the gripper of the first robot around the first object. Depth has a noise of 3 mm."""
-    model = scene_by_name(scene).model
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    mujoco.mj_forward(model, data)
-    names, robots, thing = list_body_names(model), find_robots(model), find_objects(model)[0].body
-    free = next(j for j in range(model.njnt) if model.jnt_bodyid[j] == names.index(thing))
+    known = load_robots(scene, folder)
+    model, data = known.model, known.data
+    thing = next(body.id for body in known.streamed if body.object)
+    free = next(j for j in range(model.njnt) if model.jnt_bodyid[j] == thing)
     start = model.jnt_qposadr[free]
-    data.qpos[start : start + 3] = data.site(robots[0].site).xpos
+    data.qpos[start : start + 3] = data.site(find_robots(model)[0].site).xpos
     for joint in range(model.njnt):
         if "finger" in model.joint(joint).name:
             data.qpos[model.jnt_qposadr[joint]] = 0.013  # half the width of the objects
     mujoco.mj_forward(model, data)
-    store = AssetStore(folder)
-    spec = parse_mujoco(model, store, options=EncodeOptions(levels=False)).spec
     pictures = [cast_picture(model, data, CAMERA, look_at(eye, (0.0, 0.0, 0.2)), 0.003) for eye in EYES]
 
-    def body_pose(name: str, at_ns: int) -> PoseTuple | None:
-        x, y, z = data.body(name).xpos.tolist()
-        w, i, j, k = data.body(name).xquat.tolist()
-        return ((x, y, z), (w, i, j, k)) if at_ns == 7 else None
-
     return Holding(
-        spec,
-        {number: decode_mesh(store.get(mesh.levels[0].address)) for number, mesh in enumerate(spec.meshes)},
-        tuple(RobotInfo(one.name, (), names.index(one.base_body), 1, IDENTITY, True) for one in robots),
-        tuple(BodyInfo(k, name, True, name == thing) for k, name in enumerate(names) if k),
-        body_pose,
+        known.spec,
+        known.meshes,
+        known.robots,
+        known.streamed,
+        lambda name, at_ns: known.read_pose(name) if at_ns == 7 else None,
         np.concatenate([one.points for one in pictures]).astype(np.float32),
         np.concatenate([model.geom_bodyid[one.geoms] for one in pictures]),
-        names.index(thing),
+        thing,
     )
 
 
