@@ -14,14 +14,19 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import mujoco
 import numpy as np
 import psutil
 import pytest
+from numpy.typing import NDArray
 
+from anchors.camera import CameraModel, pose_from_matrix
 from iris_session import Client, CurveKeys, decode_cloud
+from iris_session.demo.named_scenes import scene_by_name
 from iris_session.protocol.media import StreamBudget
 from iris_session.protocol.names import StreamFault
 from iris_session.security import KeyHome, KeyPair
+from tests.cloud.rays import cast_picture, look_at
 from tests.e2e.session_process import (
     COMMAND,
     DEADLINE_S,
@@ -251,6 +256,40 @@ def test_faults_of_frames_are_named_and_end_with_them(
     for file in good.iterdir():
         shutil.copy(file, dark / file.name)
     wait_for_fault(ann, "dark", "")
+
+
+def test_a_camera_that_sees_robots_and_no_sheet_is_found_when_it_is_bumped(
+    serve: Callable[..., SessionProcess], watch: Callable[..., Client], tmp_path: Path
+) -> None:
+    pose = look_at((1.1, -1.0, 0.8), (0.0, 0.0, 0.2))
+    bumped = pose.copy()
+    bumped[:3, 3] += (0.0, 0.03, 0.0)
+    model = scene_by_name("handover").model
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    shown = write_pictures(tmp_path / "pictures", n=2)
+
+    def show(T_world_camera: NDArray[np.float64]) -> None:
+        """Let the camera see the robots from there, with another noise in each picture."""
+        for number, file in enumerate(sorted(shown.glob("*.depth.png"))):
+            camera = CameraModel(WIDTH, HEIGHT, 146.0, 146.0, 79.5, 59.5)
+            depth = cast_picture(model, data, camera, T_world_camera, 0.003, number).depth
+            assert cv2.imwrite(str(tmp_path / "next.png"), depth)
+            (tmp_path / "next.png").rename(file)
+
+    show(pose)
+    p, q = pose_from_matrix(pose)
+    placed = f"{{position_m = {list(p)}, quaternion_wxyz = {list(q)}}}"
+    camera = f"{folder_camera(shown).replace(POSE, placed)}error_mm = 10.0\n"
+    server = serve("handover", "--camera", str(write_file(tmp_path / "room.toml", camera)))
+    ann = watch(server, "room")
+    wait_for_frames(ann, "room", 2)
+    show(bumped)
+    detail = wait_for_fault(ann, "room", StreamFault.MOVED).detail
+    assert re.match(r"camera front: by (2[5-9]|3[0-5]) mm, 0\.\d deg", detail), detail
+    show(pose)
+    wait_for_fault(ann, "room", "")
 
 
 def test_files_that_cannot_be_used_end_serve_before_it_starts(tmp_path: Path, camera_file: Path) -> None:
