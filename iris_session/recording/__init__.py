@@ -29,7 +29,7 @@ from iris_session.recording.observations import (
     read_alignment_history,
 )
 from iris_session.recording.reader import Recording
-from iris_session.recording.record_batches import RawSample, RecordedCloud, RecordedImage, RecordedState
+from iris_session.recording.record_batches import RawSample, RecordedCloud, RecordedImage, RecordedState, RecordedStream
 from iris_session.recording.supervise import RecorderProcess
 from iris_session.recording.verify import Core, Problem, VerifyReport, verify
 
@@ -53,6 +53,7 @@ __all__ = [
     # read a recording
     "Recording",
     "RecordedState",
+    "RecordedStream",
     "RawSample",
     "RecordedCloud",
     "RecordedImage",

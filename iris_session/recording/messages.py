@@ -6,7 +6,7 @@ authority: `RecorderStatus`. The feed keeps every batch until a status confirms 
 process requests the header (`expecting` -1) and receives everything that is not confirmed.
 
 Vertices (`VertexFrame`, for the picture only) have a socket of their own, which drops frames when it is full. So have
-point clouds and pictures of cameras, which the front sends as `MediaHeader` and frame.
+point clouds and pictures of cameras; the messages are in `front.media.recorder`.
 """
 
 from __future__ import annotations

@@ -27,6 +27,8 @@ TRANSFORMS: Final = "/tf"
 #: Point clouds and pictures of cameras, an entity per stream.
 CLOUDS: Final = "/clouds"
 PICTURES: Final = "/pictures"
+#: Their descriptions.
+STREAMS: Final = "/streams"
 
 _RESUME: Final = re.compile(r"(?P<stem>.*)\.resume(?P<number>[1-9][0-9]*)(?P<suffix>\.[^./]*)?", re.DOTALL)
 _PART: Final = re.compile(r"(?P<stem>.*)\.part(?P<part>[1-9][0-9]*)(?P<suffix>\.[^./]*)?", re.DOTALL)

@@ -43,6 +43,7 @@ from iris_session.recording.record_batches import (
     RecordedCloud,
     RecordedImage,
     RecordedState,
+    RecordedStream,
     count_joined_rows,
     group_spans,
     join_pieces,
@@ -263,6 +264,21 @@ class Recording:
     def pictures(self, stream: str = "") -> Iterator[RecordedImage]:
         """Yield the recorded pictures of cameras, as `clouds` does."""
         return self._media(paths.PICTURES, stream, record_batches.decode_pictures)
+
+    def streams(self, stream: str = "") -> Iterator[RecordedStream]:
+        """Yield what clouds and pictures are: descriptions as sources gave them, when they changed.
+
+        Args:
+            stream: Name of a stream; empty: of all streams.
+
+        Returns:
+            Iterator over descriptions, those of one stream in the order of time, the first one again at the beginning
+            of each part. Empty for files of versions that did not record them.
+
+        Raises:
+            NotARecordingError: A file can no longer be read.
+        """
+        return (one for _, one in self._items(f"{paths.STREAMS}/{stream or '**'}", record_batches.decode_streams))
 
     def _media(self, folder: str, stream: str, decode: Callable[[Any], Iterator[_Frame]]) -> Iterator[_Frame]:
         entity = f"{folder}/{stream or '**'}"

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.protocol.common import Applied
+from iris_session.protocol.media import StreamInfo
 from iris_session.protocol.server_messages import BodyInfo, Event, PresenceItem
 from iris_session.recording import paths
 from iris_session.recording.journal import JournalRow, Keyframe, open_blob
@@ -27,6 +28,7 @@ _WRITE: Final = 8
 _T = TypeVar("_T")
 
 _decode_presence = msgspec.msgpack.Decoder(tuple[PresenceItem, ...]).decode
+_decode_info = msgspec.json.Decoder(StreamInfo).decode
 _decode_applied = msgspec.msgpack.Decoder(tuple[Applied, ...]).decode
 
 
@@ -87,6 +89,23 @@ class RecordedImage(NamedTuple):
     capture_ns: int
     received_ns: int
     jpeg: bytes
+
+
+class RecordedStream(NamedTuple):
+    """A description of a stream of clouds or pictures, valid until the next one of this stream.
+
+    Attributes:
+        stream: Name of the stream.
+        session_time: Capture of the first frame that it describes, or the time when it changed or ended [ns].
+        encoding: Encoding of the frames, `cloud` or `jpeg`.
+        info: What its source says of it: title, audience, camera with intrinsics and pose, rate, fault. `None`: the
+            stream has ended.
+    """
+
+    stream: str
+    session_time: int
+    encoding: str
+    info: StreamInfo | None
 
 
 class Scalar(NamedTuple):
@@ -157,6 +176,9 @@ def decode_scalars(batch: Any) -> Iterator[Scalar]:
 
 def decode_clouds(batch: Any) -> Iterator[RecordedCloud]:
     """Yield the frames of one stream."""
+    batch = _select_frames(batch)
+    if not batch.num_rows:
+        return iter(())
     columns = (
         *_read_times(batch),
         (_read_points(row) for row in batch.column("Points3D:positions")),
@@ -169,8 +191,18 @@ def decode_clouds(batch: Any) -> Iterator[RecordedCloud]:
 
 def decode_pictures(batch: Any) -> Iterator[RecordedImage]:
     """Yield the pictures of one stream."""
+    batch = _select_frames(batch)
+    if not batch.num_rows:
+        return iter(())
     blobs = (np.asarray(row.values.flatten(), np.uint8).tobytes() for row in batch.column("EncodedImage:blob"))
     return (RecordedImage(_read_stream(batch), *row) for row in zip(*_read_times(batch), blobs, strict=True))
+
+
+def decode_streams(batch: Any) -> Iterator[RecordedStream]:
+    """Yield the descriptions of one stream."""
+    columns = (read_index(batch, paths.SESSION_TIME), read_values(batch, "encoding"), read_values(batch, "info"))
+    for at_ns, encoding, info in zip(*columns, strict=True):
+        yield RecordedStream(_read_stream(batch), at_ns, encoding, _decode_info(info) if info else None)
 
 
 def numbered_denial_decoder() -> Callable[[Any], Iterator[tuple[int, DenialRecord]]]:
@@ -219,6 +251,11 @@ def read_index(batch: Any, timeline: str) -> list[int]:
 
 def _read_stream(batch: Any) -> str:
     return get_entity(batch).rpartition("/")[2]
+
+
+def _select_frames(batch: Any) -> Any:
+    """Return the rows of a stream that have a frame; the others clear the picture when the stream ends."""
+    return batch.filter(batch.column("seq").is_valid()) if "seq" in batch.schema.names else batch.slice(0, 0)
 
 
 def _read_times(batch: Any) -> list[list[int]]:

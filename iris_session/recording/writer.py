@@ -144,7 +144,7 @@ class RrdWriter:
         self._vertices.append(frame)
 
     def add_media(self, message: Sequence[bytes]) -> None:
-        """Collect a frame of a camera: its encoded `MediaHeader`, and the frame."""
+        """Collect a message about a stream of clouds or pictures, as `MediaDrawer.draw` takes it."""
         self._media.append(message)
 
     def flush(self, timeout_s: float = 10.0) -> None:

@@ -21,7 +21,7 @@ import pytest
 from numpy.typing import NDArray
 
 from anchors.camera import CameraModel, pose_from_matrix
-from iris_session import Client, CurveKeys, decode_cloud
+from iris_session import Client, CurveKeys, Recording, decode_cloud
 from iris_session.demo.named_scenes import scene_by_name
 from iris_session.protocol.media import StreamBudget
 from iris_session.protocol.names import StreamFault
@@ -376,6 +376,17 @@ def test_a_camera_by_hand_at_an_encrypted_session_until_its_key_is_revoked(
 
     wait_until(is_gone, "its stream has ended")
     wait_for_frames(ann, "room", 2)
+    ann.close()
+    server.finish()
+    with Recording.open(server.recording) as recording:
+        first, *_, last = recording.streams("hall")
+        assert first.info is not None
+        assert (first.encoding, first.info.title, first.info.hz) == ("cloud", "Hall", HZ)
+        assert last.info is None, "it ends before the session does"
+        *_, last = recording.streams("room")
+        assert last.info is not None
+        assert last.info.camera is not None
+        assert last.info.camera.position == (0.0, 0.0, 1.0)
 
 
 def test_a_camera_by_hand_ends_by_ctrl_c_and_waits_for_its_session(

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 import zmq
 
@@ -16,7 +17,7 @@ from iris_session.front.media.scheduler import MediaScheduler
 from iris_session.link.sockets import IO_THREADS
 from iris_session.protocol.codec import decode_media_header
 from iris_session.protocol.limits import MAX_MEDIA_FRAME_BYTES
-from iris_session.protocol.media import MediaHeader, MediaPush
+from iris_session.protocol.media import MediaHeader, MediaPush, StreamInfo
 
 SECOND = 1_000_000_000
 PERIOD_NS = SECOND // 2
@@ -31,6 +32,7 @@ class Rig:
         self.scheduler = MediaScheduler()
         self.now_ns = 10 * SECOND
         self.got: list[tuple[MediaHeader, bytes]] = []
+        self.infos: list[tuple[MediaHeader, StreamInfo | None]] = []  # of messages without a frame, or with an info
         self.socket = self.listen()
         self.media = MediaRecorder(self.context, self.endpoint, 2.0)
         self.wait(lambda: self.media._connected)
@@ -55,13 +57,20 @@ class Rig:
     def tick(self, *, take: bool = True) -> None:
         """Pass a tick, and take what was sent."""
         self.wait(lambda: bool(self.media._socket.getsockopt(zmq.EVENTS) & zmq.POLLOUT)) if take else None
-        before = [stream.seq for stream in self.media._streams.values()]
+        before = self.list_sent()
         self.media.tick(self.scheduler, self.now_ns)
-        sent = [stream.seq for stream in self.media._streams.values()] != before
+        sent = self.list_sent() != before
         while take and self.socket.poll(20_000 if sent else 0):
-            head, frame = self.socket.recv_multipart()
-            self.got.append((decode_media_header(head), frame))
+            head, frame, info = self.socket.recv_multipart()
+            header = decode_media_header(head)
+            if header.budget_class == "full":
+                self.got.append((header, frame))
+            if info or header.budget_class == "none":
+                self.infos.append((header, msgspec.json.decode(info, type=StreamInfo) if info else None))
             sent = False
+
+    def list_sent(self) -> dict[str, tuple[int, StreamInfo | None]]:
+        return {name: (stream.seq, stream.info) for name, stream in self.media._streams.items() if stream.seq >= 0}
 
     def drops(self) -> dict[str, int]:
         return self.scheduler.pop_drops()[0]
@@ -99,6 +108,39 @@ def test_frame_at_rest_goes_once(rig: Rig) -> None:
         rig.tick()
         rig.now_ns += PERIOD_NS
     assert len(rig.got) == 1
+
+
+def test_descriptions_go_when_they_change_and_the_end_of_a_stream(rig: Rig) -> None:
+    def describe(info: StreamInfo) -> None:
+        push = MediaPush("room", 3, 0, (), "cloud", info)
+        assert rig.scheduler.push(push, [], "", rig.now_ns)
+
+    room = StreamInfo("Room", hz=30.0)
+    slow = msgspec.structs.replace(room, fault="slow", detail="3 frames per second come")
+    describe(room)
+    rig.push("room")
+    rig.tick()
+    assert [one for _, one in rig.infos] == [room]
+    for info in (room, slow, msgspec.structs.replace(slow, detail="4 frames per second come"), room):
+        describe(msgspec.structs.replace(info))
+        rig.push("room") if info is room else None
+        rig.now_ns += PERIOD_NS
+        rig.tick()
+    assert [one for _, one in rig.infos] == [room, slow, room]
+    changed = rig.infos[1][0]
+    assert (changed.budget_class, changed.capture_ns) == ("none", 10 * SECOND + 2 * PERIOD_NS)
+    assert len(rig.got) == 3
+    rig.scheduler.release_frames(rig.now_ns)  # for want of memory: the stream is still there
+    rig.tick()
+    rig.scheduler.stop_sources([""])
+    for _ in range(3):
+        rig.now_ns += PERIOD_NS
+        rig.tick()
+    assert [(header.stream, header.encoding, one) for header, one in rig.infos[3:]] == [("room", "cloud", None)]
+    rig.push("room", b"again")
+    rig.tick()
+    assert rig.infos[4:] == [(rig.got[-1][0], StreamInfo())]
+    assert rig.drops() == {}
 
 
 def test_only_clouds_and_pictures_go(rig: Rig) -> None:

@@ -7,13 +7,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import zmq
 
 from iris_session.protocol.codec import encode_media_header
-from iris_session.protocol.media import MAX_STREAMS, MediaHeader
-from iris_session.recording import RecordedImage, Recording
+from iris_session.protocol.media import MAX_STREAMS, MediaHeader, StreamCamera, StreamInfo
+from iris_session.recording import RecordedImage, RecordedStream, Recording
 from iris_session.recording import process as process_module
 from iris_session.recording.journal import SessionHeader
 from iris_session.recording.messages import RecorderConfig
@@ -30,9 +31,18 @@ def make_frame(n: int, seed: int = 0, **stated: float) -> bytes:
     return encode_cloud(random.uniform(-2.0, 2.0, (n, 3)), random.integers(0, 256, (n, 3), np.uint8), **stated)["full"]
 
 
-def message(stream: str, frame: bytes, seq: int = 1, capture_ns: int = 100, encoding: str = "cloud") -> list[bytes]:
-    header = MediaHeader(stream, "full", 1, seq, capture_ns, 700, encoding, received_ns=500)
-    return [encode_media_header(header), frame]
+def message(
+    stream: str,
+    frame: bytes | None = None,
+    seq: int = 1,
+    capture_ns: int = 100,
+    encoding: str = "cloud",
+    info: StreamInfo | None = None,
+) -> list[bytes]:
+    """Return a message of the front: a frame, a description, or both; with neither the stream has ended."""
+    kind = "none" if frame is None else "full"
+    header = MediaHeader(stream, kind, 1, seq, capture_ns, 700, encoding, received_ns=max(500, capture_ns))
+    return [encode_media_header(header), frame or b"", b"" if info is None else msgspec.json.encode(info)]
 
 
 @pytest.fixture
@@ -81,7 +91,8 @@ def test_pictures_are_read_back_exactly(writer: RrdWriter) -> None:
 
 def test_frames_are_drawn_at_their_capture_within_the_session(writer: RrdWriter) -> None:
     writer.add_media(message("room", make_frame(4, voxel_m=0.02), 1, 100))
-    writer.add_media(message("room", make_frame(4), 2, 2**63 - 1))  # of the future, says its source
+    header = MediaHeader("room", "full", 1, 2, 2**63 - 1, 700, "cloud", received_ns=500)  # of the future
+    writer.add_media([encode_media_header(header), make_frame(4), b""])
     writer.add_media(message("room", make_frame(4), 3, -(2**63)))
     writer.close()
     rows = read(Path(writer.path))["/clouds/room"]
@@ -106,8 +117,11 @@ def test_frames_that_do_not_decode_are_counted(writer: RrdWriter) -> None:
         message("room", JPEG.replace(b"\x00\x02", b"\xff\xff"), encoding="jpeg"),
         message("room", JPEG.replace(b"\x00\x02", b"\x00\x00"), encoding="jpeg"),
         message("../room", good),
-        [b"\xc1", good],
+        [b"\xc1", good, b""],
         [good],
+        message("room", good)[:2],
+        [*message("room", good)[:2], b'{"hz": "fast"}'],
+        message("room", encoding="bytes"),
     ]
     for bad in refused:
         writer.add_media(bad)
@@ -141,11 +155,49 @@ def test_what_a_new_part_repeats_counts_once(tmp_path: Path) -> None:
         assert [one.seq for one in recording.clouds("room")] == [1, 2, 3]
 
 
+def test_streams_say_what_they_are_until_they_end(writer: RrdWriter) -> None:
+    camera = StreamCamera(640, 480, 585.0, 585.0, 319.5, 239.5, (0.1, -0.2, 0.0, 0.0), "hand", (0.1, 0.2, 0.3))
+    room = StreamInfo("The room", "remote", camera, 30.0)
+    blind = msgspec.structs.replace(room, fault="no_depth", detail="no pixel has a depth: is the projector on?")
+    writer.add_media(message("room", make_frame(5), 1, 100, info=room))
+    writer.add_media(message("room", make_frame(6), 2, 200))
+    writer.add_media(message("room-front", JPEG, 1, 150, "jpeg", StreamInfo()))
+    writer.add_media(message("room", None, 2, 300, info=blind))
+    writer.flush()
+    writer.add_media(message("room", None, 2, 400))
+    writer.add_media(message("room-front", None, 2, 500, "jpeg"))
+    writer.close()
+    assert writer.media_refused == 0
+    with Recording.open(writer.path) as recording:
+        assert list(recording.streams("room")) == [
+            RecordedStream("room", 100, "cloud", room),
+            RecordedStream("room", 300, "cloud", blind),
+            RecordedStream("room", 400, "cloud", None),
+        ]
+        assert [(one.stream, one.info) for one in recording.streams()].count(("room-front", StreamInfo())) == 1
+        assert [one.seq for one in recording.clouds()] == [1, 2]
+        assert [one.seq for one in recording.pictures()] == [1]
+        assert recording.damage == []
+    for entity, at_ns in (("/clouds/room", 400), ("/pictures/room-front", 500)):
+        cleared = [one for one in read(Path(writer.path))[entity] if "Clear:is_recursive" in one.schema.names]
+        (batch,) = cleared
+        assert [value.value for value in batch.column("session_time")] == [at_ns], "what the viewer shows ends there"
+
+
+def test_files_without_descriptions_have_none(writer: RrdWriter) -> None:
+    writer.close()
+    with Recording.open(writer.path) as recording:
+        assert list(recording.streams()) == []
+
+
 def test_an_indexed_copy_reads_the_same(writer: RrdWriter, tmp_path: Path) -> None:
     for seq in range(5):
         writer.add_media(message("room", make_frame(2000, seq), seq, 100 + seq))
-        writer.add_media(message("room-front", JPEG + bytes([seq]), seq, 100 + seq, "jpeg"))
+        writer.add_media(message("room-front", JPEG + bytes([seq]), seq, 100 + seq, "jpeg", StreamInfo(f"{seq}")))
         writer.flush()
+    for stream, encoding in (("room", "cloud"), ("room-front", "jpeg")):
+        writer.add_media(message(stream, None, 5, 200, encoding))
+    writer.add_media(message("room", make_frame(20), 6, 300))  # it is back
     writer.close()
     rerun = Path(sys.executable).parent / "rerun"
     command = [rerun, "rrd", "optimize", "session.rrd", "-o", "indexed.rrd"]
@@ -155,6 +207,10 @@ def test_an_indexed_copy_reads_the_same(writer: RrdWriter, tmp_path: Path) -> No
             assert np.array_equal(one.positions, other.positions)
             assert one._replace(positions=None, colors=None) == other._replace(positions=None, colors=None)  # type: ignore[arg-type]
         assert list(original.pictures()) == list(copy.pictures())
+        assert len(list(copy.clouds())) == 6
+        assert list(original.streams()) == list(copy.streams())
+        assert len(list(copy.streams("room-front"))) == 6
+        assert copy.damage == []
 
 
 def test_the_recorder_reads_media_only_while_nothing_more_important_waits(tmp_path: Path) -> None:

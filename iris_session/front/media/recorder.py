@@ -3,20 +3,24 @@
 The recorder has a socket for them alone, with room for one frame, and a send never waits: media cost the journal
 nothing. A frame that is due stays due, and is replaced by newer ones, until there is room for it; what is missing at
 the chosen rate is counted by reason (`MediaScheduler.drops`) and logged once.
+
+A message has three parts: a `MediaHeader`, the frame, and the `StreamInfo` as JSON, empty while it is as before. Class
+`none` says that there is no frame; without an info, that the stream has ended.
 """
 
 from __future__ import annotations
 
 import logging
-from typing import Final
+from typing import Any, Final
 
+import msgspec
 import zmq
 
 from iris_session.front.media.scheduler import MediaScheduler, NewestFrame
 from iris_session.link.sockets import MEDIA_THREAD, next_tcp_event, readable, watch_tcp
 from iris_session.protocol.codec import encode_media_header
 from iris_session.protocol.limits import MAX_MEDIA_FRAME_BYTES, TokenBucket
-from iris_session.protocol.media import MediaHeader
+from iris_session.protocol.media import MediaHeader, StreamInfo
 from iris_session.protocol.names import BudgetClass, MediaEncoding
 
 log = logging.getLogger(__name__)
@@ -41,16 +45,27 @@ _ADVICE: Final = {
 class _Stream:
     """Progress of one stream.
 
-    `seq`: of the newest frame that was sent, -1 for none. `due_ns`: time of the next one. `missing_ns`: time at which a
-    frame that waits for room counts as missing; 0 while none waits.
+    `seq`, `info`: of the newest frame that was sent, -1 and `None` for none. `due_ns`: time of the next one.
+    `missing_ns`: time at which a frame that waits for room counts as missing; 0 while none waits.
     """
 
-    __slots__ = ("due_ns", "missing_ns", "seq")
+    __slots__ = ("due_ns", "encoding", "info", "missing_ns", "seq")
 
-    def __init__(self, now_ns: int) -> None:
+    def __init__(self, encoding: str, now_ns: int) -> None:
+        self.encoding = encoding
+        self.restart(now_ns)
+
+    def restart(self, now_ns: int) -> None:
+        """Begin anew: for another recorder."""
         self.seq = -1
+        self.info: StreamInfo | None = None
         self.due_ns = now_ns
         self.missing_ns = 0
+
+    def is_new_info(self, info: StreamInfo) -> bool:
+        """Return whether an info says something else, other than in its `detail`, which may count seconds."""
+        known = self.info
+        return known is None or (info is not known and msgspec.structs.replace(info, detail=known.detail) != known)
 
 
 class MediaRecorder:
@@ -80,18 +95,20 @@ class MediaRecorder:
 
     def tick(self, scheduler: MediaScheduler, now_ns: int) -> None:
         """Send the frames that are due, as far as there is room, the one that waits for longest first."""
-        self._read_connection_events()
+        self._read_connection_events(now_ns)
         newest = scheduler.list_newest(FILE_SHARE)
-        self._streams = {one.stream: self._streams.get(one.stream) or _Stream(now_ns) for one in newest}
+        for one in newest:
+            self._streams.setdefault(one.stream, _Stream(one.push.encoding, now_ns)).encoding = one.push.encoding
+        self._end_streams(scheduler, now_ns)
         due = [one for one in newest if self._is_due(one, now_ns)]
         due.sort(key=lambda one: self._streams[one.stream].due_ns)
         for place, one in enumerate(due):
-            reason = self._send(one, now_ns)
+            reason = self._send_newest(one, now_ns)
             if reason:
                 self._count_missing(scheduler, due[place:], reason, now_ns)
                 return
             stream = self._streams[one.stream]
-            stream.seq, stream.missing_ns = one.seq, 0
+            stream.seq, stream.info, stream.missing_ns = one.seq, one.info, 0
             # A frame that is a little late does not delay those after it.
             stream.due_ns = max(stream.due_ns, now_ns - self._period_ns // 4) + self._period_ns
 
@@ -101,45 +118,66 @@ class MediaRecorder:
         self._monitor.close(linger=0)
         self._socket.close()
 
-    def _read_connection_events(self) -> None:
+    def _read_connection_events(self, now_ns: int) -> None:
         """Notice a recorder that begins a part of the file: it needs the newest frame of streams at rest, too."""
         while readable(self._monitor):
             self._connected = next_tcp_event(self._monitor)[0] == zmq.EVENT_HANDSHAKE_SUCCEEDED
             if self._connected:
-                self._streams.clear()
+                for stream in self._streams.values():
+                    stream.restart(now_ns)
+
+    def _end_streams(self, scheduler: MediaScheduler, now_ns: int) -> None:
+        """Tell the recorder of streams that have ended, as soon as there is room."""
+        for name in [name for name in self._streams if not scheduler.has_stream(name)]:
+            stream = self._streams[name]
+            header = MediaHeader(name, BudgetClass.NONE, 0, 0, now_ns, now_ns, stream.encoding, received_ns=now_ns)
+            if stream.seq < 0 or self._send(header, b"", b""):
+                del self._streams[name]
 
     def _is_due(self, one: NewestFrame, now_ns: int) -> bool:
         stream = self._streams[one.stream]
-        return one.seq != stream.seq and now_ns >= stream.due_ns
+        return now_ns >= stream.due_ns and (one.seq != stream.seq or stream.is_new_info(one.info))
 
-    def _send(self, one: NewestFrame, now_ns: int) -> str:
-        """Send a frame. Return the drop reason if there is no room for it, else an empty string."""
-        if not self._connected or not int(self._socket.get(zmq.EVENTS)) & zmq.POLLOUT:
+    def _send_newest(self, one: NewestFrame, now_ns: int) -> str:
+        """Send a frame, or the info alone. Return the drop reason if there is no room for it, else an empty string."""
+        stream, push = self._streams[one.stream], one.push
+        has_frame = one.seq != stream.seq
+        if not self._has_room():
             return NOT_READ
-        push = one.push
-        if not self._bucket.take(now_ns, FILE_SHARE[push.encoding] * len(one.frame)):
+        if has_frame and not self._bucket.take(now_ns, FILE_SHARE[push.encoding] * len(one.frame)):
             return BYTES_SHARE
         header = MediaHeader(
             one.stream,
-            BudgetClass.FULL,
+            BudgetClass.FULL if has_frame else BudgetClass.NONE,
             push.scene_epoch,
             one.seq,
-            push.capture_ns,
+            push.capture_ns if has_frame else now_ns,
             now_ns,
             push.encoding,
             sent_ns=push.sent_ns,
-            received_ns=one.received_ns,
+            received_ns=one.received_ns if has_frame else now_ns,
         )
+        info = msgspec.json.encode(one.info) if stream.is_new_info(one.info) else b""
+        return "" if self._send(header, one.frame if has_frame else b"", info) else NOT_READ
+
+    def _has_room(self) -> bool:
+        return self._connected and bool(int(self._socket.get(zmq.EVENTS)) & zmq.POLLOUT)
+
+    def _send(self, header: MediaHeader, frame: Any, info: bytes) -> bool:
+        if not self._has_room():
+            return False
         try:
-            self._socket.send_multipart((encode_media_header(header), one.frame), zmq.DONTWAIT, copy=False)
+            self._socket.send_multipart((encode_media_header(header), frame, info), zmq.DONTWAIT, copy=False)
         except zmq.Again:
-            return NOT_READ
-        return ""
+            return False
+        return True
 
     def _count_missing(self, scheduler: MediaScheduler, waiting: list[NewestFrame], reason: str, now_ns: int) -> None:
         """Count the frames that the recording lacks at its rate: one for every period that a stream waits for room."""
         for one in waiting:
             stream = self._streams[one.stream]
+            if one.seq == stream.seq:  # only its info waits
+                continue
             stream.missing_ns = stream.missing_ns or now_ns + self._period_ns
             while now_ns >= stream.missing_ns:
                 stream.missing_ns += self._period_ns

@@ -92,13 +92,14 @@ class StreamStats(NamedTuple):
 
 
 class NewestFrame(NamedTuple):
-    """The newest frame of a stream, class `full`. `received_ns`: when it came."""
+    """The newest frame of a stream, class `full`. `received_ns`: when it came. `info`: of the stream."""
 
     stream: str
     seq: int
     push: MediaPush
     frame: Any
     received_ns: int
+    info: StreamInfo
 
 
 class _Subscription:
@@ -304,10 +305,14 @@ class MediaScheduler:
     def list_newest(self, encodings: Container[str]) -> list[NewestFrame]:
         """Return the newest frame of every stream that has one in one of `encodings`."""
         return [
-            NewestFrame(name, stream.seq, stream.push, stream.frames[0], stream.received_ns)
+            NewestFrame(name, stream.seq, stream.push, stream.frames[0], stream.received_ns, stream.info)
             for name, stream in self._streams.items()
             if stream.push is not None and stream.push.encoding in encodings
         ]
+
+    def has_stream(self, name: str) -> bool:
+        """Return whether a stream is there: with a frame, or without."""
+        return name in self._streams
 
     def release_frames(self, until_ns: int) -> bool:
         """Release every frame, and drop frames until then. Return whether there were any."""
