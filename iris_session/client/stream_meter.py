@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections import deque
 from typing import Final
@@ -14,7 +13,7 @@ from iris_session.protocol.media import StreamBudget
 from iris_session.protocol.names import MediaEncoding
 from iris_session.protocol.status import compute_quantiles
 
-#: Stages of the age of a cloud, and the times between which each lies.
+#: Stages of the age of a frame. Each ends at the next of the times after the capture; the last is only of clouds.
 STAGES: Final = ("camera process", "to the front", "in the front", "to the client", "decoding")
 #: Frames whose ages and points are kept.
 MAX_AGES: Final = 4_000
@@ -33,7 +32,7 @@ class StreamMeasurement(msgspec.Struct, frozen=True):
         hz, mbit_per_s: Of these, over that time.
         age_ms, age_ms_p99: From the capture of a frame until it was here, of a cloud until it was decoded: median and
             99th percentile [ms]; `None` before the first.
-        ages_ms: Medians of the stages of a cloud's age.
+        ages_ms: Medians of the stages of the age. One whose end is not known is left out, and part of the next.
         dropped: Frames that our link did not take in time.
         points: Of a cloud, median; `None` for other encodings, as are the next three.
         bytes_per_point: Size of all clouds by their points.
@@ -81,7 +80,7 @@ class StreamMeter:
         self._points: deque[int] = deque(maxlen=MAX_AGES)
         self._all_points = 0
         self._ages_ns: deque[int] = deque(maxlen=MAX_AGES)
-        self._stages_ns: deque[tuple[int, ...]] = deque(maxlen=MAX_AGES)
+        self._stages_ns: dict[str, deque[int]] = {stage: deque(maxlen=MAX_AGES) for stage in STAGES}
 
     def poll(self, now_ns: int) -> None:
         """Take the newest frame, if there is another, at `now_ns`. Call it more often than frames come."""
@@ -96,8 +95,13 @@ class StreamMeter:
         if cloud is not None:
             self._points.append(len(cloud.positions))
             self._all_points += len(cloud.positions)
-        if cloud is not None and all(cloud.times):
-            self._stages_ns.append(tuple(b - a for a, b in itertools.pairwise(cloud.times)))
+        header = frame.header
+        times = (header.sent_ns, header.received_ns, header.published_ns, header.capture_ns + frame.age_ns)
+        before_ns = header.capture_ns
+        for stage, at_ns in zip(STAGES, (*times, 0 if cloud is None else cloud.times.decoded_ns), strict=True):
+            if at_ns:
+                self._stages_ns[stage].append(at_ns - before_ns)
+                before_ns = at_ns
 
     def measure(self, now_ns: int) -> StreamMeasurement:
         """Return what was measured until `now_ns`."""
@@ -107,7 +111,7 @@ class StreamMeter:
         said = told[0] if told else StreamBudget(name, encoding="", stale=True)
         seconds = (now_ns - self._began_ns) * 1e-9
         ages = compute_quantiles(self._ages_ns)
-        stages = (compute_quantiles(one) for one in zip(*self._stages_ns, strict=True))
+        stages = {stage: compute_quantiles(found) for stage, found in self._stages_ns.items()}
         cloud = self._cloud.newest if said.encoding == MediaEncoding.CLOUD else None
         return StreamMeasurement(
             stream=name,
@@ -121,7 +125,7 @@ class StreamMeter:
             mbit_per_s=self._bytes * 8e-6 / seconds if seconds > 0.0 else 0.0,
             age_ms=None if ages is None else ages.p50,
             age_ms_p99=None if ages is None else ages.p99,
-            ages_ms={stage: one.p50 for stage, one in zip(STAGES, stages, strict=False) if one is not None},
+            ages_ms={stage: one.p50 for stage, one in stages.items() if one is not None},
             dropped=self._feed.dropped,
             stale=said.stale,
             fault="malformed" if self._cloud.fault else said.fault,

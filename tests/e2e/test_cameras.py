@@ -405,6 +405,12 @@ def test_a_camera_by_hand_ends_by_ctrl_c_and_waits_for_its_session(
     assert told["room"]["hz"] > 0.0
     assert 8.0 <= told["room"]["bytes_per_point"] < 8.2
     assert set(told) == {"room", "room-front"}
+    stages = ["camera process", "to the front", "in the front", "to the client", "decoding"]
+    assert list(told["room"]["ages_ms"]) == stages
+    assert list(told["room-front"]["ages_ms"]) == stages[:-1]
+    _, text, _ = run_in_process("cloud", "inspect", server.address, "--seconds", "1")
+    for some in (stages, stages[:-1]):
+        assert re.search("age [0-9]+ ms, median: " + ", ".join(f"{one} -?[0-9.]+" for one in some) + "\n", text), text
     server.children()["front.main"].kill()
     wait_for_frames(ann, "room", 2)
     process.send_signal(signal.SIGINT)
