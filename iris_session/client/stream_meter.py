@@ -32,7 +32,7 @@ class StreamMeasurement(msgspec.Struct, frozen=True):
         hz, mbit_per_s: Of these, over that time.
         age_ms, age_ms_p99: From the capture of a frame until it was here, of a cloud until it was decoded: median and
             99th percentile [ms]; `None` before the first.
-        ages_ms: Medians of the stages of the age, without those whose end is not known.
+        ages_ms: Medians of the stages of the age. One whose end is not known is left out, and part of the next.
         dropped: Frames that our link did not take in time.
         points: Of a cloud, median; `None` for other encodings, as are the next three.
         bytes_per_point: Size of all clouds by their points.
@@ -80,7 +80,7 @@ class StreamMeter:
         self._points: deque[int] = deque(maxlen=MAX_AGES)
         self._all_points = 0
         self._ages_ns: deque[int] = deque(maxlen=MAX_AGES)
-        self._stages_ns: dict[str, deque[int]] = {}
+        self._stages_ns: dict[str, deque[int]] = {stage: deque(maxlen=MAX_AGES) for stage in STAGES}
 
     def poll(self, now_ns: int) -> None:
         """Take the newest frame, if there is another, at `now_ns`. Call it more often than frames come."""
@@ -90,17 +90,17 @@ class StreamMeter:
         self._frames += 1
         self._came_ns = now_ns
         self._bytes += len(frame.data)
-        header = frame.header
-        cloud = self._cloud.poll() if header.encoding == MediaEncoding.CLOUD else None
+        cloud = self._cloud.poll() if frame.header.encoding == MediaEncoding.CLOUD else None
         self._ages_ns.append(frame.age_ns if cloud is None else cloud.age_ns)
         if cloud is not None:
             self._points.append(len(cloud.positions))
             self._all_points += len(cloud.positions)
+        header = frame.header
         times = (header.sent_ns, header.received_ns, header.published_ns, header.capture_ns + frame.age_ns)
         before_ns = header.capture_ns
         for stage, at_ns in zip(STAGES, (*times, 0 if cloud is None else cloud.times.decoded_ns), strict=True):
-            if at_ns:  # else it is not known: the next stage has its time, too
-                self._stages_ns.setdefault(stage, deque(maxlen=MAX_AGES)).append(at_ns - before_ns)
+            if at_ns:
+                self._stages_ns[stage].append(at_ns - before_ns)
                 before_ns = at_ns
 
     def measure(self, now_ns: int) -> StreamMeasurement:
@@ -111,7 +111,7 @@ class StreamMeter:
         said = told[0] if told else StreamBudget(name, encoding="", stale=True)
         seconds = (now_ns - self._began_ns) * 1e-9
         ages = compute_quantiles(self._ages_ns)
-        stages = {stage: compute_quantiles(spans) for stage, spans in self._stages_ns.items()}
+        stages = {stage: compute_quantiles(found) for stage, found in self._stages_ns.items()}
         cloud = self._cloud.newest if said.encoding == MediaEncoding.CLOUD else None
         return StreamMeasurement(
             stream=name,

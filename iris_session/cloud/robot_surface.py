@@ -127,22 +127,25 @@ class RobotSurface:
             The samples of bodies whose pose is known then and `DELAY_NS` before; `None` where there are none.
         """
 
-        def find(name: str, rest: Floats, at_ns: int) -> Floats | None:
-            pose = body_pose(name, at_ns) if name else None
-            return rest if not name else None if pose is None else pose_to_matrix(pose)
+        times = (capture_ns, capture_ns - DELAY_NS)
 
-        bases = [find(carrier, np.eye(4), at_ns) for at_ns in (capture_ns, capture_ns - DELAY_NS)]
-        if bases[0] is None or bases[1] is None:
+        def find(name: str, rest: Floats) -> list[Floats | None]:
+            if not name:
+                return [rest, rest]
+            poses = [body_pose(name, at_ns) for at_ns in times]
+            return [None if pose is None else pose_to_matrix(pose) for pose in poses]
+
+        carrier_now, carrier_before = find(carrier, np.eye(4))
+        if carrier_now is None or carrier_before is None:
             return None
-        back = np.linalg.inv(bases[1])
         parts = []
         for name, rest, points, normals in self._bodies:
-            now, before = (find(name, rest, at_ns) for at_ns in (capture_ns, capture_ns - DELAY_NS))
+            now, before = find(name, rest)
             if now is None or before is None:
                 continue
             placed = points @ now[:3, :3].T + now[:3, 3]
             # Where its points were then, carried to the present by what carries the camera.
-            T = bases[0] @ back @ before
+            T = carrier_now @ np.linalg.inv(carrier_before) @ before
             moved = np.abs(points @ T[:3, :3].T + T[:3, 3] - placed).max()
             parts.append((placed, normals @ now[:3, :3].T, np.full(len(points), moved <= STILL_M)))
         return PlacedSurface(*map(np.concatenate, zip(*parts, strict=True))) if parts else None
@@ -165,7 +168,7 @@ class _Count(NamedTuple):
 
     @property
     def is_good(self) -> bool:
-        """Whether most of the robots are seen where they should be."""
+        """True if most of the robots are seen where they should be."""
         shown = self.fits + self.behind
         return (
             self.fits >= _LEAST_FITTING
@@ -249,7 +252,7 @@ def _project(points: Floats, view: _View, T_world_camera: Floats) -> tuple[Rows,
     if not len(rows):
         return rows, np.empty((0, 2), np.int64), np.empty(0)
     pixels = np.rint(view.camera.project(inside[rows])).astype(np.int64)
-    # One pixel of border, for the neighbours.
+    # One pixel of border: a sample covers the pixels around it.
     ok = ((pixels >= 1) & (pixels < (view.camera.width - 1, view.camera.height - 1))).all(axis=1)
     return rows[ok], pixels[ok], z[rows[ok]]
 
@@ -258,7 +261,7 @@ def _find_visible(surface: PlacedSurface, view: _View, T_world_camera: Floats) -
     """Return the rows of the samples that face the camera and are hidden by no others."""
     rows, pixels, z = _project(surface.points, view, T_world_camera)
     nearest = np.full(view.depth.shape, np.inf)
-    for i in (-1, 0, 1):  # each sample covers its neighbours: at 0.5 m samples are three pixels apart
+    for i in (-1, 0, 1):  # each sample covers the pixels around it: at 0.5 m samples are three pixels apart
         for j in (-1, 0, 1):
             np.minimum.at(nearest, (pixels[:, 1] + i, pixels[:, 0] + j), z)
     away = surface.points[rows] - T_world_camera[:3, 3]
