@@ -243,7 +243,7 @@ class RenderedRoom:
             camera="front",
             width=160,
             height=120,
-            hz=15.0,
+            hz=HZ,
         )
         self.source = MujocoCamera(settings, lambda: self.now_ns, self._place_bodies)
         self.watch = MoveWatch(dict, self)
