@@ -94,7 +94,7 @@ def _sample_surface(model: Any, data: Any, assets: Path) -> NDArray[np.float64]:
     for visual in spec.visuals:
         if visual.group <= 2 and visual.geometry.kind != GeometryKind.PLANE:
             turn = data.xmat[visual.body].reshape(3, 3)
-            surface.append(_sample_visual(visual, {}) @ turn.T + data.xpos[visual.body])
+            surface.append(_sample_visual(visual, {})[0] @ turn.T + data.xpos[visual.body])
     assert len(find_objects(model)) == 2
     points = np.concatenate(surface)
     cells = np.floor(points / 0.002).astype(np.int64) + 2**20

@@ -384,9 +384,9 @@ def test_a_camera_by_hand_at_an_encrypted_session_until_its_key_is_revoked(
     ann.close()
     server.finish()
     with Recording.open(server.recording) as recording:
-        first, *_, last = recording.streams("hall")
-        assert first.info is not None
-        assert (first.encoding, first.info.title, first.info.hz) == ("cloud", "Hall", HZ)
+        *told, last = recording.streams("hall")
+        # Its first frames may come before its description does, which is published once a second.
+        assert ("cloud", "Hall", HZ) in [(one.encoding, one.info.title, one.info.hz) for one in told if one.info]
         assert last.info is None, "it ends before the session does"
         *_, last = recording.streams("room")
         assert last.info is not None
