@@ -24,6 +24,7 @@ from iris_session import Client, CurveKeys, Recording, decode_cloud
 from iris_session.demo.named_scenes import scene_by_name
 from iris_session.protocol.media import StreamBudget
 from iris_session.protocol.names import StreamFault
+from iris_session.recording import NotARecordingError
 from iris_session.security import KeyHome, KeyPair
 from tests.cloud.rays import cast_picture, look_at
 from tests.e2e.session_process import (
@@ -125,6 +126,16 @@ def wait_for_frames(client: Client, stream: str, n: int = 1, timeout_s: float = 
     feed = client.media.subscribe(stream)
     before = feed.received
     assert client.wait_for(lambda _: feed.received >= before + n, timeout_s), f"no frames of {stream}"
+
+
+def list_recorded(path: Path, stream: str) -> list[tuple[str, str, float]]:
+    """Return encoding, title and rate by the descriptions of a stream that are in a recording so far."""
+    try:
+        with Recording.open(path, warn=False) as recording:
+            told = [(one.encoding, one.info) for one in recording.streams(stream)]
+    except NotARecordingError:
+        return []
+    return [(encoding, info.title, info.hz) for encoding, info in told if info is not None]
 
 
 def find_stream(client: Client, stream: str) -> StreamBudget | None:
@@ -368,6 +379,7 @@ def test_a_camera_by_hand_at_an_encrypted_session_until_its_key_is_revoked(
     report = json.loads((tmp_path / "camera.out").read_text().splitlines()[-1])
     assert report["stream"] == "hall"
     assert {p.role for p in ann.mirror.participants.values() if p.name in ("room", "hall")} == {"camera"}
+    wait_until(lambda: ("cloud", "Hall", HZ) in list_recorded(server.recording, "hall"), "what it is is recorded")
     (entry,) = [one for one in home.clients.read().values() if one.roles == ("camera",)]
     home.clients.revoke_key(entry.fingerprint)
     wait_until(lambda: process.poll() is not None, "the camera whose key was revoked has ended")
@@ -384,9 +396,7 @@ def test_a_camera_by_hand_at_an_encrypted_session_until_its_key_is_revoked(
     ann.close()
     server.finish()
     with Recording.open(server.recording) as recording:
-        *told, last = recording.streams("hall")
-        # Its first frames may come before its description does, which is published once a second.
-        assert ("cloud", "Hall", HZ) in [(one.encoding, one.info.title, one.info.hz) for one in told if one.info]
+        *_, last = recording.streams("hall")
         assert last.info is None, "it ends before the session does"
         *_, last = recording.streams("room")
         assert last.info is not None
