@@ -20,6 +20,7 @@ from iris_session.cli import (
     emulate,
     keys,
     pair,
+    recording,
     robots,
     scene,
     serve,
@@ -49,14 +50,15 @@ _EPILOG = """examples:
   iris-session estop                         stop every robot of the session; clear-estop, pause, assign, ... as well
   iris-session doctor 192.168.1.20           what is wrong, why, and what to do
   iris-session verify sessions/*/session.rrd re-simulate a recording and compare it bit for bit
+  iris-session recording inspect sessions    what recordings hold: who, what, how long, damage
   iris-session bench state --check           measure the state stream and compare it with its bars
 """
 
 
 #: In the order of `--help`.
 _MODULES = (
-    demo, serve, pair, web, keys, sessions, status, control, doctor, verify, emulate, robots, scene, anchors, cloud,
-    bench,
+    demo, serve, pair, web, keys, sessions, status, control, doctor, verify, recording, emulate, robots, scene, anchors,
+    cloud, bench,
 )  # fmt: skip
 
 

@@ -30,6 +30,7 @@ from iris_session.recording.observations import (
 )
 from iris_session.recording.reader import Recording
 from iris_session.recording.record_batches import RawSample, RecordedCloud, RecordedImage, RecordedState, RecordedStream
+from iris_session.recording.summary import RecordingSummary, summarise
 from iris_session.recording.supervise import RecorderProcess
 from iris_session.recording.verify import Core, Problem, VerifyReport, verify
 
@@ -63,6 +64,8 @@ __all__ = [
     "TrackingFrame",
     "AlignmentPeriod",
     "RecordedParticipant",
+    "summarise",
+    "RecordingSummary",
     "verify",
     "VerifyReport",
     "Problem",

@@ -11,7 +11,7 @@ import tempfile
 import warnings
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -39,12 +39,16 @@ from iris_session.recording.messages import DenialRecord, decode_header
 from iris_session.recording.probe import Prober
 from iris_session.recording.record_batches import (
     UNREADABLE,
+    DrawnVertices,
+    FrameTime,
     RawSample,
     RecordedCloud,
     RecordedImage,
     RecordedState,
     RecordedStream,
+    RowTimes,
     count_joined_rows,
+    get_entity,
     group_spans,
     join_pieces,
 )
@@ -55,6 +59,12 @@ _Frame = TypeVar("_Frame", RecordedCloud, RecordedImage)
 #: Maximum number of lines in `damage`: a file may be damaged in any number of places.
 MOST_DAMAGE: Final = 200
 MORE_DAMAGE: Final = "and more of it is damaged than is listed here"
+#: Entities of the picture that are fixed to the world, deformables among them, in the first scenes of a part.
+_DRAWN: Final = tuple(f"{paths.SCENE}/{n}/world/**" for n in range(1, 17))
+_OUTLINE: Final = (
+    *(paths.EVENTS, paths.DENIALS, paths.ROWS, *_DRAWN),
+    *(f"{folder}/**" for folder in (paths.CLOUDS, paths.PICTURES, paths.STREAMS)),
+)
 #: Upper bound of the items that a new part repeats: the content of the feed's window, minutes of rows.
 REPEATED_ITEMS: Final = 200_000
 
@@ -301,6 +311,19 @@ class Recording:
             values.append(scalar.value)
         return {name: (np.array(t, np.int64), np.array(v, np.float64)) for name, (t, v) in found.items()}
 
+    def outline(self) -> Iterator[Event | DenialRecord | RowTimes | FrameTime | RecordedStream | DrawnVertices]:
+        """Yield what a summary needs, in one pass over the files; a pass takes most of the time of any reading.
+
+        Returns:
+            Iterator over events and denials, each once; times of the rows of the journal, where steps that two parts
+            hold come twice; numbers and times of the frames of clouds and pictures, each once; their descriptions; and
+            how often the vertices of elements of the picture are in the files. Those of one kind are in order.
+
+        Raises:
+            NotARecordingError: A file can no longer be read.
+        """
+        return (item for _, item in self._unique(_OUTLINE, _outline_decoder(), lambda pair: pair[0]))
+
     def changed_spans(self) -> list[str]:
         """Compare the bytes of all parts with the recorder's checksums.
 
@@ -335,7 +358,7 @@ class Recording:
         self.close()
 
     def _unique(
-        self, entity: str, decode: Callable[[Any], Iterator[_T]], key: Callable[[_T], Hashable]
+        self, entities: str | Sequence[str], decode: Callable[[Any], Iterator[_T]], key: Callable[[_T], Hashable]
     ) -> Iterator[_T]:
         """Yield the items of all parts; what a part repeats from the end of the previous one counts once.
 
@@ -345,7 +368,7 @@ class Recording:
         tail: deque[Hashable] = deque(maxlen=REPEATED_ITEMS)
         seen: set[Hashable] = set()  # those keys in `tail` that came from a rewritten file
         part = 0
-        for i, item in self._items(entity, decode):
+        for i, item in self._items(entities, decode):
             if i != part:
                 part, before = i, frozenset(tail)
             name = key(item)
@@ -358,22 +381,22 @@ class Recording:
             tail.append(name)
             yield item
 
-    def _items(self, entity: str, decode: Callable[[Any], Iterator[_T]]) -> Iterator[tuple[int, _T]]:
+    def _items(self, entities: str | Sequence[str], decode: Callable[[Any], Iterator[_T]]) -> Iterator[tuple[int, _T]]:
         """Yield part number and item. Undecodable items are skipped with the rest of their chunk, see `damage`."""
-        for i, pieces in self._spans(entity):
+        for i, pieces in self._spans(entities):
             try:
                 yield from ((i, item) for item in decode(join_pieces(pieces)))
             except UNREADABLE as error:
-                place = f"{os.path.basename(self.files[i])}: {entity}"
+                place = f"{os.path.basename(self.files[i])}: {get_entity(pieces[0])}"
                 self._harmed(f"{place} holds something damaged, which is left out: {_format_error(error)}")
 
     def _count(self, entity: str) -> int:
         return sum(count_joined_rows(pieces) for _, pieces in self._spans(entity))
 
-    def _spans(self, entity: str) -> Iterator[tuple[int, list[Any]]]:
-        """Yield part number (from 0) and the record batches of some rows of an entity, over all parts in order."""
+    def _spans(self, entities: str | Sequence[str]) -> Iterator[tuple[int, list[Any]]]:
+        """Yield part number (from 0) and the record batches of some rows of one entity, over all parts in order."""
         for i, path in enumerate(self._readable):
-            for pieces in group_spans(chunk.to_record_batch() for chunk in rrd_file.read_chunks(path, entity)):
+            for pieces in group_spans(chunk.to_record_batch() for chunk in rrd_file.read_chunks(path, entities)):
                 yield i, pieces
 
     def _add_part(self, path: str, prober: Prober) -> None:
@@ -476,8 +499,8 @@ class Recording:
         if self.writers:
             raise NotARecordingError(f"{path} {describe_writers(self.writers)}, and holds nothing to read yet")
         said = self.damage + self.notes
-        why = f" ({said[0]})" if said else ": nothing was recorded, or it is not ours"
-        raise NotARecordingError(f"{path} holds no session header{why}")
+        why = f" ({said[0]})" if said else " (nothing was recorded, or it is not ours)"
+        raise NotARecordingError(f"{path} holds no session header{why}: give the .rrd file of a session")
 
     def _leave_out_others(self) -> None:
         """Leave out parts with another header: files of another session that were moved into this folder."""
@@ -487,6 +510,30 @@ class Recording:
                 if intact and blob_root(blob) != self.root:
                     self._harmed(f"{os.path.basename(self.files[i])} is of another session, and left out")
                     del self.files[i], self._readable[i]
+
+
+def _outline_decoder() -> Callable[[Any], Iterator[tuple[Hashable, Any]]]:
+    """Return a decoder of the entities of an outline: key of what counts once, and item."""
+    decode_denials = record_batches.numbered_denial_decoder()
+
+    def decode(batch: Any) -> Iterator[tuple[Hashable, Any]]:
+        entity = get_entity(batch)
+        if entity == paths.EVENTS:
+            yield from ((event.event_seq, event) for event in record_batches.decode_events(batch))
+        elif entity == paths.DENIALS:
+            yield from ((pair, pair[1]) for pair in decode_denials(batch))
+        elif entity.startswith(paths.STREAMS + "/"):
+            yield from (
+                ((entity, one.session_time, one.info is None), one) for one in record_batches.decode_streams(batch)
+            )
+        elif entity.startswith((paths.CLOUDS + "/", paths.PICTURES + "/")):
+            yield from (((entity, one.seq), one) for one in record_batches.decode_frame_times(batch))
+        else:
+            first = batch.column(record_batches.ROW_ID)[0].as_py()
+            read = record_batches.decode_row_times if entity == paths.ROWS else record_batches.decode_drawn_vertices
+            yield (entity, first), read(batch)
+
+    return decode
 
 
 def _format_error(error: Exception) -> str:

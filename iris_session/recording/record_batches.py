@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.common import Applied
 from iris_session.protocol.media import StreamInfo
+from iris_session.protocol.names import MediaEncoding
 from iris_session.protocol.server_messages import BodyInfo, Event, PresenceItem
 from iris_session.recording import paths
 from iris_session.recording.journal import JournalRow, Keyframe, open_blob
@@ -23,6 +24,8 @@ from iris_session.recording.rrd_file import Mark
 
 #: Errors of decoding bytes that mean something else; the last one is Arrow's, for types that it cannot convert.
 UNREADABLE: Final = (msgspec.DecodeError, LookupError, TypeError, ValueError, ArithmeticError, NotImplementedError)
+#: Columns with the vertices of surfaces and of ropes.
+_VERTICES: Final = ("Mesh3D:vertex_positions", "LineStrips3D:strips")
 #: Bytes of a row id that are the time of the write.
 _WRITE: Final = 8
 _T = TypeVar("_T")
@@ -116,6 +119,29 @@ class Scalar(NamedTuple):
     value: float
 
 
+class RowTimes(NamedTuple):
+    """Steps and session times [ns] of some rows of the journal, int64, shape (n,)."""
+
+    steps: NDArray[np.int64]
+    session_times: NDArray[np.int64]
+
+
+class FrameTime(NamedTuple):
+    """Number and capture [ns] of a frame of a cloud or picture. `encoding`: `cloud` or `jpeg`."""
+
+    stream: str
+    encoding: str
+    seq: int
+    capture_ns: int
+
+
+class DrawnVertices(NamedTuple):
+    """Number of times that vertices of an element of the picture are in some rows."""
+
+    entity: str
+    n: int
+
+
 def decode_rows(batch: Any) -> Iterator[JournalRow]:
     """Yield rows of the journal."""
     columns = zip(
@@ -203,6 +229,29 @@ def decode_streams(batch: Any) -> Iterator[RecordedStream]:
     columns = (read_index(batch, paths.SESSION_TIME), read_values(batch, "encoding"), read_values(batch, "info"))
     for at_ns, encoding, info in zip(*columns, strict=True):
         yield RecordedStream(_read_stream(batch), at_ns, encoding, _decode_info(info) if info else None)
+
+
+def decode_row_times(batch: Any) -> RowTimes:
+    """Return the times of rows of the journal, which is much quicker than the rows."""
+    step, time = (np.asarray(batch.column(name).cast("int64")) for name in (paths.STEP, paths.SESSION_TIME))
+    return RowTimes(step, time)
+
+
+def decode_frame_times(batch: Any) -> Iterator[FrameTime]:
+    """Yield number and capture of the frames of one stream."""
+    batch = _select_frames(batch)
+    if not batch.num_rows:
+        return iter(())
+    columns = (read_values(batch, name) for name in ("seq", "capture_ns"))
+    is_cloud = get_entity(batch).startswith(paths.CLOUDS + "/")
+    encoding = MediaEncoding.CLOUD if is_cloud else MediaEncoding.JPEG
+    return (FrameTime(_read_stream(batch), encoding, *row) for row in zip(*columns, strict=True))
+
+
+def decode_drawn_vertices(batch: Any) -> DrawnVertices:
+    """Return how often vertices of an element of the picture are in a batch."""
+    columns = [batch.column(name) for name in _VERTICES if name in batch.schema.names]
+    return DrawnVertices(get_entity(batch), sum(len(column) - column.null_count for column in columns))
 
 
 def numbered_denial_decoder() -> Callable[[Any], Iterator[tuple[int, DenialRecord]]]:

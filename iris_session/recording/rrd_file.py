@@ -75,7 +75,9 @@ def scan_file(path: str | Path) -> Scan:
     holes: list[tuple[int, int]] = []
     with open(path, "rb") as file:
         if file.read(FILE_HEAD)[: len(MAGIC)] != MAGIC:
-            raise NotARecordingError(f"{path} is not a Rerun file (it does not begin with {MAGIC.decode()})")
+            raise NotARecordingError(
+                f"{path} is not a Rerun file (it does not begin with {MAGIC.decode()}): give the .rrd file of a session"
+            )
         at = FILE_HEAD
         while at < size:
             message = _message_at(file, at, size)
@@ -161,8 +163,10 @@ def _crc(file: BinaryIO, mark: Mark) -> int:
     return crc
 
 
-def read_chunks(path: str | Path, entity: str) -> Iterator[Any]:
-    """Yield the chunks of one entity in the order of the file. The file must be readable, see `Prober`.
+def read_chunks(path: str | Path, entities: str | Sequence[str]) -> Iterator[Any]:
+    """Yield the chunks of one entity or several in the order of the file. The file must be readable, see `Prober`.
+
+    `/clouds/**` stands for all entities below `/clouds`.
 
     Raises `NotARecordingError` if the file can no longer be read.
     """
@@ -171,7 +175,7 @@ def read_chunks(path: str | Path, entity: str) -> Iterator[Any]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a file without a footer is normal here: the recorder may have been killed
-            stream = RrdReader(str(path)).stream().filter(content=entity)
+            stream = RrdReader(str(path)).stream().filter(content=entities)
         yield from stream
     except (OSError, RuntimeError, ValueError) as error:
         said = " ".join(str(error).split())

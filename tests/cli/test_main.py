@@ -16,7 +16,7 @@ from iris_session.authority.config import UNALIGNED
 from iris_session.cli.main import build_parser, main
 from iris_session.cli.serve import make_session_config
 
-COMMANDS = ("demo", "serve", "sessions", "verify", "emulate", "robots", "bench")
+COMMANDS = ("demo", "serve", "sessions", "verify", "recording", "emulate", "robots", "bench")
 
 
 def _help(command: str, capsys: pytest.CaptureFixture[str]) -> str:

@@ -1,0 +1,322 @@
+"""`iris-session recording inspect`: what a recording holds, or one line for every recording of a folder."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from threading import Timer
+from typing import TYPE_CHECKING, Final, Self
+
+from iris_session.cli.common import CommandError, add_json_option, print_json, to_printable
+
+if TYPE_CHECKING:
+    from iris_session.recording.summary import PersonSummary, RecordingSummary, StopSummary, StreamSummary
+
+#: A file that takes longer shows how far it was read [s].
+PROGRESS_AFTER_S: Final = 1.0
+PROGRESS_PERIOD_S: Final = 0.2
+#: Lines of one kind that are printed; `--json` has all.
+MOST_LINES: Final = 20
+SUFFIX: Final = ".rrd"
+_CLASSES: Final = {
+    "closed": "closed: `verify` re-simulates authority, control and physics",
+    "open": "open: `verify` re-simulates authority and control, physics is taken from the file",
+}
+
+
+def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command `recording`."""
+    parser = commands.add_parser(
+        "recording",
+        help="show what a recording holds",
+        description="Show what a recording holds.",
+        epilog="examples:\n"
+        "  iris-session recording inspect sessions/20261121T093000.000000Z-handover/session.rrd\n"
+        "  iris-session recording inspect sessions",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
+    inspect = actions.add_parser(
+        "inspect",
+        help="who took part, what happened, how long, what is damaged",
+        description="Show what a recording holds: scene, people, robots that they held, episodes, handovers, e-stops, "
+        "clouds and pictures, alignment, drops, damage. Of a folder: every recording below it, one line each. "
+        "Exit status 1 if something is damaged or missing inside.",
+        epilog="examples:\n"
+        "  iris-session recording inspect sessions/20261121T093000.000000Z-handover/session.rrd\n"
+        "  iris-session recording inspect session.rrd --json\n"
+        "  iris-session recording inspect sessions    a line for every recording",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    inspect.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or a folder with recordings below it")
+    add_json_option(inspect)
+    inspect.set_defaults(run=run_inspect)
+
+
+def run_inspect(arguments: argparse.Namespace) -> int:
+    """Print the summary of a recording, or a line for each of a folder."""
+    import msgspec
+
+    from iris_session.system.extras import require_package
+
+    path: Path = arguments.path
+    if not os.path.exists(path):
+        raise CommandError(f"{path} does not exist: give a recording (session{SUFFIX}), or a folder with recordings")
+    require_package("rerun", "reading recordings")
+    if path.is_dir():
+        return _inspect_folder(path, as_json=arguments.json)
+    summary = _summarise_file(path)
+    if arguments.json:
+        print_json(msgspec.to_builtins(summary))
+    else:
+        print("\n".join(format_summary(summary)))
+    return 0 if summary.ok else 1
+
+
+def _inspect_folder(folder: Path, *, as_json: bool) -> int:
+    """Print a line for every recording below a folder. One that cannot be read does not hide the others."""
+    import msgspec
+
+    from iris_session.recording import RecordingError
+
+    files = find_recordings(folder)
+    if not files:
+        raise CommandError(
+            f"there is no recording below the folder {folder}: give a {SUFFIX} file that `serve` or `demo` wrote, or a "
+            "folder with such files"
+        )
+    rows: list[dict[str, object]] = []
+    for file in files:
+        try:
+            summary = _summarise_file(file)
+        except RecordingError as error:
+            rows.append({"path": str(file), "ok": False, "error": str(error)})
+            print(to_printable(f"iris-session: {error}"), file=sys.stderr)
+            continue
+        rows.append(msgspec.to_builtins(summary))
+        if not as_json:
+            print(format_line(summary), flush=True)
+    ok = all(row["ok"] for row in rows)
+    if as_json:
+        print_json({"ok": ok, "recordings": rows})
+    return 0 if ok else 1
+
+
+def find_recordings(folder: Path) -> list[Path]:
+    """Return the first file of every recording in a folder and the folders below it, in the order of their names."""
+    from iris_session.recording.paths import split_part
+
+    first: dict[str, tuple[int, Path]] = {}
+    for where, _, names in os.walk(folder):
+        for name in names:
+            base, part = split_part(os.path.join(where, name))
+            if name.endswith(SUFFIX) and (base not in first or part < first[base][0]):
+                first[base] = part, Path(where, name)
+    return [first[base][1] for base in sorted(first)]
+
+
+def _summarise_file(path: Path) -> RecordingSummary:
+    from iris_session.recording import Recording
+    from iris_session.recording.summary import summarise
+
+    with _Progress(path) as progress, Recording.open(path, warn=False) as recording:
+        return summarise(recording, progress.show)
+
+
+class _Progress:
+    """A line on standard error, where that is a terminal, while a file takes more than `PROGRESS_AFTER_S`."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = to_printable(str(path))
+        self._due_s = time.monotonic() + PROGRESS_AFTER_S
+        self._shows = sys.stderr.isatty()
+        self._shown = False
+        self._opening = Timer(PROGRESS_AFTER_S, self._print, ["opening"])  # takes about as long as reading
+        self._opening.daemon = True
+
+    def show(self, done: int, total: int) -> None:
+        """Show how many steps were read; `total` 0 if unknown."""
+        self._opening.cancel()
+        if self._shows and time.monotonic() >= self._due_s:
+            self._due_s = time.monotonic() + PROGRESS_PERIOD_S
+            self._print(f"step {done} of {total}" if total else f"step {done}")
+
+    def _print(self, text: str) -> None:
+        self._shown = True
+        print(f"\r{self._path}: {text}", end="", file=sys.stderr, flush=True)
+
+    def __enter__(self) -> Self:
+        if self._shows:
+            self._opening.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._opening.cancel()
+        if self._shown:
+            print(file=sys.stderr)
+
+
+def format_line(summary: RecordingSummary) -> str:
+    """Return a recording as one line."""
+    people = [person.name for person in summary.people if person.held_s] or [one.name for one in summary.people]
+    parts = [
+        summary.path,
+        _format_day(summary),
+        _format_duration(summary.duration_s),
+        summary.session_name,
+        _join(people) if people else "no people",
+    ]
+    if summary.episodes:
+        verdicts = [episode.verdict for episode in summary.episodes]
+        parts.append(f"{_count(len(verdicts), 'episode')} ({_format_counts(_count_all(verdicts))})")
+    if summary.handovers:
+        parts.append(_count(len(summary.handovers), "handover"))
+    if summary.stops:
+        parts.append(_count(len(summary.stops), "e-stop"))
+    if summary.ending:
+        parts.append(summary.ending.partition(":")[0])
+    if summary.damage:
+        parts.append(f"DAMAGED: {summary.damage[0]}")
+    return to_printable("  ".join(parts))
+
+
+def format_summary(summary: RecordingSummary) -> list[str]:
+    """Return a recording as printable lines."""
+    return [to_printable(line) for line in _format_lines(summary)]
+
+
+def _format_lines(summary: RecordingSummary) -> Iterator[str]:
+    yield f"{summary.session_name}  {_format_day(summary)}  {_format_duration(summary.duration_s)}"
+    files = f", {len(summary.files)} parts: {_join(summary.files)}" if len(summary.files) > 1 else ""
+    yield f"  file       {summary.path}, {summary.bytes / 1e6:.1f} MB, format {summary.format}{files}"
+    yield f"  class      {_CLASSES.get(summary.recording_class, summary.recording_class)}"
+    if summary.continues:
+        yield f"  continues  {summary.continues}, {_format_duration(summary.drops.down_s)} later"
+    yield f"  end        {summary.ending or 'finished'}; {summary.steps:,} steps from {summary.begin_s:.2f} s"
+    yield f"  robots     {_join(summary.robots)}"
+    yield f"  objects    {_join(summary.objects)}"
+    if summary.deformables:
+        yield f"  deforming  {_join(summary.deformables)}"
+    yield from _format_list("people", [_format_person(person) for person in summary.people])
+    yield from _format_list("alignment", [*_format_alignments(summary.people)])
+    episodes = [
+        f"{one.number} {one.verdict}{f' {one.label!r}' if one.label else ''} at {one.at_s:.2f} s, "
+        f"{_format_duration(one.duration_s)}, by {one.by}"
+        for one in summary.episodes
+    ]
+    yield from _format_list("episodes", episodes)
+    handovers = [
+        f"{one.object}: {_format_hand(one.giver, one.giver_name)} to {_format_hand(one.receiver, one.receiver_name)} "
+        f"at {one.at_s:.2f} s, both held it for {one.both_held_s:.2f} s"
+        for one in summary.handovers
+    ]
+    yield from _format_list("handovers", handovers)
+    yield from _format_list("e-stops", [_format_stop(stop) for stop in summary.stops])
+    if summary.pauses:
+        yield from _format_list("pauses", [_format_stop(pause) for pause in summary.pauses])
+    if summary.scene_changes:
+        yield from _format_list("scene", [f"{one.cause} at {one.at_s:.2f} s" for one in summary.scene_changes])
+    if summary.streams:
+        yield from _format_list("streams", [_format_stream(stream) for stream in summary.streams])
+    yield from _format_list("drops", [*_format_drops(summary)])
+    yield from _format_list("damage", summary.damage)
+    if summary.notes:
+        yield from _format_list("notes", summary.notes)
+
+
+def _format_list(title: str, lines: Sequence[str]) -> Iterator[str]:
+    for i, line in enumerate(lines[:MOST_LINES] or ["none"]):
+        yield f"  {title if i == 0 else '':9s}  {line}"
+    if len(lines) > MOST_LINES:
+        yield f"  {'':9s}  and {len(lines) - MOST_LINES} more: --json has all"
+
+
+def _format_person(person: PersonSummary) -> str:
+    held = ", ".join(f"{robot} for {_format_duration(seconds)}" for robot, seconds in person.held_s.items())
+    joins = f", joined {person.joins} times" if person.joins > 1 else ""
+    devices = f", {_join(person.devices)}" if person.devices else ""
+    left = ", there at the end" if person.stayed else ""
+    rejected = f"; {_format_counts(person.rejected)} rejected samples" if person.rejected else ""
+    return (
+        f"{person.name} ({person.role or 'joined before the recording'}{devices}): "
+        f"{_format_duration(person.present_s)}{joins}{left}; {f'held {held}' if held else 'held no robot'}{rejected}"
+    )
+
+
+def _format_alignments(people: Sequence[PersonSummary]) -> Iterator[str]:
+    for person in people:
+        one = person.alignment
+        if not one.changes and not one.alarms:
+            continue
+        stated = "no stated error"
+        if one.error_at_robot_m > 0.0:
+            stated = (
+                f"stated error {one.error_at_anchor_m * 1e3:.1f} mm at the anchor, {one.error_at_robot_m * 1e3:.1f} mm "
+                f"at the robot (worst {one.worst_error_at_robot_m * 1e3:.1f} mm), 95 %"
+            )
+        alarms = f"; alarms: {_format_counts(one.alarms)}" if one.alarms else ""
+        yield f"{person.name}: {one.kind}, {stated}; {_count(one.changes, 'change')}{alarms}"
+
+
+def _format_hand(robot: str, name: str) -> str:
+    return f"{robot} ({name})" if name and name != robot else robot
+
+
+def _format_stop(stop: StopSummary) -> str:
+    who = stop.by or "a connection that had not joined"
+    reason = f" ({stop.reason})" if stop.reason else ""
+    lasted = f"for {_format_duration(stop.duration_s)}" if stop.ended else "to the end"
+    return f"at {stop.at_s:.2f} s by {who}{reason}, {lasted}"
+
+
+def _format_stream(stream: StreamSummary) -> str:
+    title = f" ({stream.title})" if stream.title else ""
+    fault = f"; FAULT {stream.fault}" if stream.fault else ""
+    frames = _count(stream.frames, "frame")
+    lasted = _format_duration(stream.duration_s)
+    return f"{stream.name}{title}: {stream.encoding}, {frames} in {lasted}, {stream.hz:.1f} Hz{fault}"
+
+
+def _format_drops(summary: RecordingSummary) -> Iterator[str]:
+    drops = summary.drops
+    if drops.rejected_samples:
+        yield f"rejected samples: {_format_counts(drops.rejected_samples)}"
+    if drops.denials:
+        yield f"denied requests: {_format_counts(drops.denials)}"
+    if drops.lost_steps:
+        yield f"{_count(drops.lost_steps, 'step')} did not fit into the recording"
+    if drops.stalls:
+        yield f"no step {_count(drops.stalls, 'time')}, for {_format_duration(drops.stalled_s)} in all"
+
+
+def _format_day(summary: RecordingSummary) -> str:
+    day = summary.created_utc
+    return f"{day[:10]} {day[11:19]} UTC" if len(day) >= 19 else "an unknown day"
+
+
+def _format_duration(seconds: float) -> str:
+    if seconds < 100.0:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes < 100 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def _format_counts(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{n} {name}" for name, n in sorted(counts.items(), key=lambda item: -item[1]))
+
+
+def _count_all(names: Sequence[str]) -> dict[str, int]:
+    return {name: names.count(name) for name in dict.fromkeys(names)}
+
+
+def _count(n: int, noun: str) -> str:
+    return f"{n:,} {noun}{'' if n == 1 else 's'}"
+
+
+def _join(names: Sequence[str]) -> str:
+    shown = ", ".join(names[:MOST_LINES]) or "none"
+    return f"{shown} and {len(names) - MOST_LINES} more" if len(names) > MOST_LINES else shown

@@ -1,0 +1,163 @@
+"""`recording inspect`: a recording as text and JSON, a folder as lines, and files that are none."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from iris_session.cli import recording
+from iris_session.cli.main import main
+from iris_session.cli.recording import MOST_LINES, find_recordings, format_line, format_summary
+from iris_session.recording.summary import (
+    AlignmentSummary,
+    DropSummary,
+    EpisodeSummary,
+    HandoverSummary,
+    PersonSummary,
+    RecordingSummary,
+    StopSummary,
+    StreamSummary,
+)
+from tests.recording.support import journal, write
+from tests.recording.test_summary import write_session
+
+SUMMARY = RecordingSummary(
+    path="s/session.rrd",
+    ok=False,
+    files=("session.rrd", "session.part2.rrd"),
+    bytes=7_100_000,
+    session_name="lab",
+    session_id="s1",
+    created_utc="2026-11-25T16:28:51.270+00:00",
+    format=4,
+    recording_class="closed",
+    finished=False,
+    ending="not closed after 25 s: what may have followed is missing, 0.25 s after a kill",
+    begin_s=1.0,
+    duration_s=125.0,
+    steps=12_345,
+    continues="",
+    robots=("left", "right"),
+    objects=(),
+    deformables=("cloth",),
+    bodies=26,
+    people=(
+        PersonSummary(
+            *("ann", "operator", ("p1",), ("head", "hand/left"), 2, 24.0, True, {"left": 20.0}),
+            AlignmentSummary("measured", 0.003, 0.012, 0.02, 3, {"jump": 1}),
+            {"stale": 12},
+        ),
+        PersonSummary("bob\x1b[2J", "observer", ("p2",)),
+    ),
+    episodes=(EpisodeSummary(1, "success", "pour", 2.0, 5.0, "ann"), EpisodeSummary(2, "success", "", 8.0, 5.0, "ann")),
+    handovers=(HandoverSummary("hammer", "left", "ann", "right", "bob", 3.25, 0.56),),
+    stops=(StopSummary(4.0, "", "hand in the way", 1.0, True), StopSummary(9.0, "ann", "", 1.0, False)),
+    pauses=(),
+    scene_changes=(),
+    streams=(StreamSummary("room", "cloud", "Room", 48, 24.0, 1.96, "stuck"),),
+    drops=DropSummary({"stale": 12}, {"held": 1}, 7, 1, 0.3),
+    damage=tuple(f"bytes {i} are gone" for i in range(MOST_LINES + 5)),
+    notes=(),
+)
+
+
+def test_a_summary_is_lines_for_people() -> None:
+    text = "\n".join(format_summary(SUMMARY))
+    for line in (
+        "lab  2026-11-25 16:28:51 UTC  2 min 5 s",
+        "  file       s/session.rrd, 7.1 MB, format 4, 2 parts: session.rrd, session.part2.rrd",
+        "  end        not closed after 25 s: what may have followed is missing, 0.25 s after a kill; 12,345 steps",
+        "  objects    none",
+        "  deforming  cloth",
+        "  people     ann (operator, head, hand/left): 24.0 s, joined 2 times, there at the end; held left for 20.0 s; "
+        "12 stale rejected samples",
+        "             bob\N{REPLACEMENT CHARACTER}[2J (observer): 0.0 s; held no robot",
+        "  alignment  ann: measured, stated error 3.0 mm at the anchor, 12.0 mm at the robot (worst 20.0 mm), 95 %; "
+        "3 changes; alarms: 1 jump",
+        "  episodes   1 success 'pour' at 2.00 s, 5.0 s, by ann",
+        "  handovers  hammer: left (ann) to right (bob) at 3.25 s, both held it for 0.56 s",
+        "  e-stops    at 4.00 s by a connection that had not joined (hand in the way), for 1.0 s",
+        "             at 9.00 s by ann, to the end",
+        "  streams    room (Room): cloud, 48 frames in 24.0 s, 2.0 Hz; FAULT stuck",
+        "             7 steps did not fit into the recording",
+        "  damage     bytes 0 are gone",
+        "             and 5 more: --json has all",
+    ):
+        assert line in text, text
+    assert format_line(SUMMARY) == (
+        "s/session.rrd  2026-11-25 16:28:51 UTC  2 min 5 s  lab  ann  2 episodes (2 success)  1 handover  2 e-stops  "
+        "not closed after 25 s  DAMAGED: bytes 0 are gone"
+    )
+
+
+def test_inspect_shows_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_session(tmp_path / "session.rrd")
+    assert main(["recording", "inspect", str(path)]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert "ann (operator, head, hand/left): 0.4 s, there at the end; held left for 0.4 s" in out
+    assert "  damage     none" in out
+    assert main(["recording", "inspect", str(path), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert sorted(result) == sorted(RecordingSummary.__struct_fields__)
+    assert (result["ok"], result["steps"], result["people"][0]["held_s"]) == (True, 200, {"left": 0.358})
+
+
+def test_a_folder_is_a_line_for_every_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("a/session.rrd", "b/session.part2.rrd", "b/session.part3.rrd", "b/session.resume2.rrd"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"no recording")
+    (tmp_path / "notes.txt").write_text("none either")
+    names = [path.relative_to(tmp_path).as_posix() for path in find_recordings(tmp_path)]
+    assert names == ["a/session.rrd", "b/session.resume2.rrd", "b/session.part2.rrd"]
+    write(tmp_path / "a/session.rrd", *journal(20))
+    assert main(["recording", "inspect", str(tmp_path)]) == 1
+    out, err = capsys.readouterr()
+    assert out.startswith(f"{tmp_path}/a/session.rrd  ")
+    assert out.count("\n") == 1
+    assert err.count("iris-session: ") == err.count("\n") == 2
+    assert main(["recording", "inspect", str(tmp_path), "--json"]) == 1
+    result = json.loads(capsys.readouterr().out)
+    assert [row["ok"] for row in result["recordings"]] == [True, False, False]
+    assert "not a Rerun file" in result["recordings"][1]["error"]
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [(None, "give a recording"), (b"", "holds no session header"), (b"x" * 99, "not a Rerun file")],
+)
+def test_what_is_no_recording_is_one_line(
+    content: bytes | None, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "x.rrd"
+    if content is not None:
+        path.write_bytes(content)
+    assert main(["recording", "inspect", str(path)]) == 2
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert expected in err
+    assert str(path) in err
+    assert ": give " in err
+
+
+def test_a_folder_without_recordings_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["recording", "inspect", str(tmp_path)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"iris-session: there is no recording below the folder {tmp_path}: give a .rrd file")
+    assert main(["recording", "inspect", "x" * 5000]) == 2
+
+
+def test_a_long_file_shows_how_far_it_was_read(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(recording, "PROGRESS_AFTER_S", 0.0)
+    monkeypatch.setattr(recording, "PROGRESS_PERIOD_S", 0.0)
+    for terminal in (True, False):
+        monkeypatch.setattr("sys.stderr.isatty", lambda terminal=terminal: terminal)
+        with recording._Progress(Path("a.rrd")) as progress:
+            progress.show(3, 9)
+            progress.show(4, 0)
+        shown = capsys.readouterr().err
+        assert shown.endswith("\ra.rrd: step 3 of 9\ra.rrd: step 4\n") if terminal else shown == ""
