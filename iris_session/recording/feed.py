@@ -214,9 +214,9 @@ class RecorderFeed:
                 record = DenialRecord(step, session_time, outgoing.connection, message.denial)
                 self._add(self._batch.denials, record)
 
-    def add_metric(self, name: str, value: float) -> None:
-        """Add a scalar at the newest row's step and time, plotted as `/metrics/<name>`."""
-        self._add(self._batch.metrics, MetricRecord(*self._now, name, float(value)))
+    def add_metric(self, step: int, session_time: int, name: str, value: float) -> None:
+        """Add a scalar, plotted as `/metrics/<name>`."""
+        self._add(self._batch.metrics, MetricRecord(step, session_time, name, float(value)))
 
     def send_vertices(self, stream: str, frame: bytes, session_time: int) -> None:
         """Send a frame (level `full`) of a deformable as published with the state of `session_time`, for the picture.

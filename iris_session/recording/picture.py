@@ -92,10 +92,10 @@ class ScenePicture:
             self._with_scene(self._update)
             self._rec.reset_time()
 
-    def draw(self, moment: Moment) -> None:
-        """Draw the scene given to `set_scene`, once, from `moment` on."""
+    def draw(self, moment: Moment) -> bool:
+        """Draw the scene given to `set_scene`, once, from `moment` on. Return whether it was drawn now."""
         if not self._waits:
-            return
+            return False
         self._waits = False
         self._number += 1
         self._visuals.clear()
@@ -105,6 +105,7 @@ class ScenePicture:
         self._set_time(moment)
         self._with_scene(self._draw_all)
         self._rec.reset_time()
+        return True
 
     @property
     def _folder(self) -> str:

@@ -98,6 +98,7 @@ class RrdWriter:
         self._frames: list[str] = []
         self._last_poses: NDArray[np.float64] | None = None
         self._newest_row = (-1, b"")
+        self._begins_ns: int | None = None  # session time of the first row
         self._clock = (0, 0)  # tick and sim_time [ns] of the newest state, for what has neither
         self._applied: dict[str, Applied] = {}
         self._latencies: list[MetricRecord] = []
@@ -223,6 +224,8 @@ class RrdWriter:
         ]
         self._send_columns(paths.ROWS, times, columns)
         self._newest_row = (rows[-1].step, rows[-1].chain)
+        if self._begins_ns is None:
+            self._begins_ns = rows[0].now_ns
 
     def _write_scenes(self, scenes: list[SceneModel], assets: list[SceneAssets]) -> None:
         """Write models for verification, and change the picture."""
@@ -251,9 +254,8 @@ class RrdWriter:
             return
         poses = np.stack([np.frombuffer(s.poses, np.float64).reshape(-1, 7) for s in states])
         moments = [(s.step, s.tick, round(s.sim_time * 1e9), s.session_time) for s in states]
-        step, _, sim_ns, session_ns = moments[0]
-        self._picture.draw((step, 0, min(0, sim_ns), session_ns))  # a reset begins ticks and simulated time again
         times = np.array(moments, np.int64).T
+        seen = self._draw_scene(moments[0], times)
         columns = [
             matrix_column("poses", poses.reshape(len(states), -1)),
             scalar_column("sim_time_s", [s.sim_time for s in states], pa.float64()),
@@ -263,9 +265,24 @@ class RrdWriter:
         self._send_columns(paths.STATE, _time_columns(times), columns)
         self._note_latencies(states)
         if poses.shape[1] == len(self._bodies):  # a new recorder also gets pending states of the scene before
-            self._write_transforms(states, poses, times)
+            self._write_transforms(states, poses, seen)
         self._clock = moments[-1][1:3]
         self._known.extend(moments)
+
+    def _draw_scene(self, first: Moment, times: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Draw the scene if it is new. Return the times of the states as the picture has them.
+
+        The picture begins with the first row, not with the state after it: the viewer opens at the first moment.
+        """
+        step, _, sim_ns, session_ns = first
+        if self._begins_ns is not None and not self._known:
+            session_ns = min(session_ns, self._begins_ns)
+        moment = (step, 0, min(0, sim_ns), session_ns)  # a reset begins ticks and simulated time again
+        if not self._picture.draw(moment):
+            return times
+        seen = times.copy()
+        seen[:, 0] = moment
+        return seen
 
     def _write_vertices(self) -> None:
         """Write vertices whose states are in the file. Frames of another scene than the drawn one are refused."""

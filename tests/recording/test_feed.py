@@ -260,7 +260,7 @@ def test_states_events_and_denials_are_sent_with_the_rows(feed: RecorderFeed, pl
     replies = (OutgoingMessage(4, Reply(1, False, denial)), OutgoingMessage(5, Reply(2, True)))
     feed.add_decision(3, 70, Decision(commands=(), outgoing=replies, presence=(head,)))
     feed.add_state(3, 9, 0.1, 70, np.arange(21.0).reshape(3, 7))
-    feed.add_metric("late_ms", 2.5)
+    feed.add_metric(3, 70, "late_ms", 2.5)
     feed.add_keyframe(Keyframe(2, b"p", b"a", b"c"), ROOT)
     batch = decode_batch(played[0].take(1)[0][2])
     assert [(d.connection, d.denial) for d in batch.denials] == [(4, denial)]
@@ -273,7 +273,7 @@ def test_states_events_and_denials_are_sent_with_the_rows(feed: RecorderFeed, pl
 
 def test_lists_are_bounded_without_steps(feed: RecorderFeed) -> None:
     for i in range(BATCH_ITEMS + 10):
-        feed.add_metric("m", i)
+        feed.add_metric(i, i, "m", i)
     assert feed.stats.dropped_items == 10
 
 

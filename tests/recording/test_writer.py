@@ -27,13 +27,13 @@ from iris_session.protocol.scene import (
 from iris_session.protocol.server_messages import BodyInfo, EStopChanged, Event, PresenceItem
 from iris_session.recording import Recording, SessionHeader, pack_model
 from iris_session.recording import scene_geometry as scene
-from iris_session.recording.messages import Batch, DenialRecord, SceneAssets, SceneModel, StateFrame
+from iris_session.recording.messages import Batch, DenialRecord, MetricRecord, SceneAssets, SceneModel, StateFrame
 from iris_session.recording.picture import build_components
 from iris_session.recording.scene_geometry import VisualShape
 from iris_session.recording.writer import RrdWriter
 from iris_session.scene import AssetStore
 from iris_session.scene.mujoco_scene import parse_mujoco
-from tests.recording.support import XML, column, make_header, read
+from tests.recording.support import XML, column, journal, make_header, read
 from tests.scene.models import every_shape
 
 IDENTITY_Q = (1.0, 0.0, 0.0, 0.0)
@@ -41,6 +41,11 @@ IDENTITY_Q = (1.0, 0.0, 0.0, 0.0)
 
 def frame(step: int, poses: np.ndarray, presence: tuple[PresenceItem, ...] = ()) -> StateFrame:
     return StateFrame(step, step + 1, step * 0.002, step * 2_000_000 + 7, poses.tobytes(), presence)
+
+
+def times(batches: list[Any]) -> list[int]:
+    """Return the session times of the rows of an entity [ns]."""
+    return [value.value for batch in batches for value in batch.column("session_time")]
 
 
 def test_transforms_are_the_poses_of_moving_bodies_when_they_change(tmp_path: Path) -> None:
@@ -88,6 +93,26 @@ def test_static_geometry_is_written_once_per_frame(tmp_path: Path) -> None:
     assert column(found["/scene/1/arm\\/link\\ 1/visual_2"], "Capsules3D:lengths") == [[pytest.approx(0.4)]]
     assert not any("post" in entity for entity in found), "group 3 is not visible"
     assert "small" in column(found["/session"], "TextDocument:text")[0][0]
+
+
+def test_picture_begins_with_the_first_row(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    header, batch = journal(1)
+    state = frame(1, np.zeros((len(header.bodies), 7)))  # later than its row, by the duration of the step
+    batch.metrics = [MetricRecord(1, state.session_time, "late_ms", 1.0)]
+    writer = RrdWriter(path, "id")
+    writer.write_header(header)
+    batch.states = [state, frame(9, np.ones((len(header.bodies), 7)))]
+    writer.add(batch)
+    writer.close()
+    found = read(path)
+    (row,) = times(found["/journal/rows"])
+    assert row < state.session_time
+    assert set(times(found["/scene/1/ball/g\\/ball"])) == {row}
+    moving = sum(body.moving for body in header.bodies)
+    assert times(found["/tf"]) == [row] * moving + [batch.states[1].session_time] * moving
+    assert min(min(times(chunks)) for chunks in found.values() if "session_time" in chunks[0].schema.names) == row
+    assert times(found["/state"])[0] == state.session_time, "data have their own times"
 
 
 def test_scene_without_a_state_is_drawn(tmp_path: Path) -> None:
