@@ -23,6 +23,8 @@ DENIALS: Final = "/denials"
 METRICS: Final = "/metrics"
 SCENE: Final = "/scene"
 PRESENCE: Final = "/presence"
+#: States over time: holders, clutches, e-stop, episodes.
+LANES: Final = "/lanes"
 TRANSFORMS: Final = "/tf"
 #: Point clouds and pictures of cameras, an entity per stream.
 CLOUDS: Final = "/clouds"
