@@ -226,8 +226,8 @@ class RecorderFeed:
             self._add(self._batch.events, event)
             if isinstance(event.body, ParticipantJoined | ParticipantChanged):
                 self._people[event.body.participant.id] = event.body.participant
-            elif isinstance(event.body, ParticipantLeft) and not event.body.grace:
-                self._people.pop(event.body.participant, None)
+            elif isinstance(event.body, ParticipantLeft):
+                self._forget(event.body)
         for command in decision.commands:
             if self._holds.get(command.robot, "") != command.hold_reason:
                 self._holds[command.robot] = command.hold_reason
@@ -317,6 +317,12 @@ class RecorderFeed:
         self._socket.close(0)
         self._context.term()
         return self._complete
+
+    def _forget(self, left: ParticipantLeft) -> None:
+        for key in [key for key in self._presence if key[0] == left.participant]:
+            del self._presence[key]
+        if not left.grace:
+            self._people.pop(left.participant, None)
 
     def _leave_out_picture(self, batch: Batch) -> None:
         """Leave what the file shows, but verification does not need, out of a batch: the rest is for the journal."""

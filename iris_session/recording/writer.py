@@ -329,7 +329,7 @@ class RrdWriter:
                 self._drawer.draw(message)
             except (StreamError, ProtocolError):
                 self.media_refused += 1
-        if len(self._drawer.pictures) > views:
+        if len(self._drawer.pictures) > views and self._arranged:
             self._send_blueprint()
 
     def _note_latencies(self, states: list[StateFrame]) -> None:
@@ -438,10 +438,14 @@ class RrdWriter:
 
     def _to_times(self, steps: list[int], session_times: list[int]) -> list[Any]:
         """Return the times of rows that have no tick: it is that of the newest state before them."""
-        known = np.array(self._known or [(0, 0, 0, 0)], np.int64)
-        at = np.searchsorted(known[:, 3], session_times, side="right") - 1
-        tick, sim_ns = known[np.maximum(at, 0), 1:3].T
-        return _time_columns(np.array([steps, tick, sim_ns, session_times], np.int64))
+        known = self._known or ((0, 0, 0, 0),)
+        before = [max(0, bisect_right(known, now_ns, key=_get_session_time) - 1) for now_ns in session_times]
+        moments = [(step, *known[i][1:3], now_ns) for step, i, now_ns in zip(steps, before, session_times, strict=True)]
+        return _time_columns(np.array(moments, np.int64).T)
+
+
+def _get_session_time(moment: Moment) -> int:
+    return moment[3]
 
 
 def _time_columns(times: NDArray[np.int64]) -> list[Any]:

@@ -290,10 +290,14 @@ def test_state_has_all_presence_since_the_last(feed: RecorderFeed, played) -> No
         feed.add_decision(step, step, Decision(commands=(), presence=items))
     feed.add_state(3, 9, 0.1, 70, np.zeros((0, 7)))
     feed.add_state(4, 10, 0.2, 80, np.zeros((0, 7)))
+    feed.add_decision(5, 5, Decision(commands=(), presence=(ann, bob)))
+    feed.add_decision(6, 6, Decision(commands=(), events=(Event(1, 6, 6, ParticipantLeft("p1", "bye")),)))
+    feed.add_state(6, 11, 0.3, 90, np.zeros((0, 7)))
     feed.flush()
-    first, second = decode_batch(played[0].take(1)[0][2]).states
+    first, second, third = decode_batch(played[0].take(1)[0][2]).states
     assert set(first.presence) == {newer, bob}
     assert second.presence == ()
+    assert third.presence == (bob,), "who has left is not seen again"
 
 
 def test_changed_reasons_to_hold_are_sent_once(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
