@@ -1,4 +1,4 @@
-"""Picture of participants in a recording: heads and hands at the poses that the session had of them.
+"""Picture of participants in a recording: heads and hands at the poses that the session had of them, names at robots.
 
 A device is drawn in a frame of its own, whose motion is rows of `/tf`. It appears with its first pose, and is cleared
 when its participant leaves or no pose came for `STALE_NS`. Nothing is static, as Rerun shows static data at all times.
@@ -6,7 +6,7 @@ when its participant leaves or no pose came for `STALE_NS`. Nothing is static, a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import rerun as rr
@@ -16,7 +16,7 @@ from iris_session.protocol.server_messages import PresenceItem
 from iris_session.recording import paths
 from iris_session.recording.messages import StateFrame
 from iris_session.recording.picture import Moment, escape_entity_part, set_moment
-from iris_session.recording.story import SessionStory
+from iris_session.recording.story import FREE, Rgb, SessionStory
 
 #: A device without a pose for so long is not drawn: it is not tracked any more [ns].
 STALE_NS: Final = 250_000_000
@@ -36,6 +36,13 @@ class DeviceRow(NamedTuple):
     pose: tuple[float, ...]
 
 
+class Base(NamedTuple):
+    """Base of a robot, where its label is. `position`: in `frame` [m]."""
+
+    frame: str
+    position: tuple[float, float, float]
+
+
 class _Shown(NamedTuple):
     """A device as it is in the picture. `label`: text at it."""
 
@@ -45,12 +52,35 @@ class _Shown(NamedTuple):
 
 
 class PeoplePicture:
-    """Devices of participants in one file."""
+    """Devices of participants in one file. `is_first`: the file is no later part, whose robots may have holders."""
 
-    def __init__(self, recording: rr.RecordingStream, story: SessionStory) -> None:
+    def __init__(self, recording: rr.RecordingStream, story: SessionStory, *, is_first: bool) -> None:
         self._rec = recording
+        self._is_first = is_first
         self._story = story
         self._shown: dict[_Key, _Shown] = {}
+        self._bases: dict[str, Base] = {}
+
+    def label_robots(self, bases: Mapping[str, Base], moment: Moment) -> None:
+        """Label all robots by their names, without holders. Others have no label any more."""
+        if self._bases:
+            set_moment(self._rec, moment)
+            self._rec.log(paths.ROBOTS, rr.Clear(recursive=True), strict=True)
+            self._rec.reset_time()
+        self._bases = dict(bases)
+        for robot in bases if self._is_first else ():
+            self.label_robot(robot, "", FREE, moment)
+
+    def label_robot(self, robot: str, holder: str, colour: Rgb, moment: Moment) -> None:
+        """Label a robot by its name and that of its holder."""
+        base = self._bases.get(robot)
+        if base is None:
+            return
+        label = f"{robot}: {holder}" if holder else robot
+        point = rr.Points3D([base.position], colors=[colour], radii=[0.01], labels=[label], show_labels=True)
+        set_moment(self._rec, moment)
+        self._rec.log(f"{paths.ROBOTS}/{escape_entity_part(robot)}", rr.CoordinateFrame(base.frame), point, strict=True)
+        self._rec.reset_time()
 
     def draw(self, states: Sequence[StateFrame], moments: Sequence[Moment]) -> list[DeviceRow]:
         """Draw devices that appear in `states`, clear those that are stale, and return the poses that are new."""

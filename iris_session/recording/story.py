@@ -67,6 +67,9 @@ _AMBER: Final = (200, 150, 50)
 _RED: Final = (200, 60, 60)
 _GREY: Final = (130, 135, 140)
 
+#: Colour of a robot without a holder.
+FREE: Final = _GREY
+
 #: Maximum number of participants known by name, and of colours of one lane: sessions may last for weeks.
 MAX_PEOPLE: Final = 1024
 MAX_COLOURS: Final = 64

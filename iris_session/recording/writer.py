@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.common import Applied
 from iris_session.protocol.errors import ProtocolError
-from iris_session.protocol.server_messages import BodyInfo, Event, ParticipantLeft
+from iris_session.protocol.server_messages import BodyInfo, Event, ParticipantLeft, SceneChanged
+from iris_session.protocol.specs import RobotSpec
 from iris_session.recording import paths, scene_geometry
 from iris_session.recording.errors import WriteError
 from iris_session.recording.journal import SessionHeader, seal_blob
@@ -44,10 +45,10 @@ from iris_session.recording.messages import (
     encode_header,
     encode_scene,
 )
-from iris_session.recording.people import PeoplePicture
+from iris_session.recording.people import Base, PeoplePicture
 from iris_session.recording.picture import Moment, ScenePicture, SceneSource, escape_entity_part
 from iris_session.recording.rrd_file import END_MESSAGE, FILE_HEAD, MAGIC, Mark, end_of_messages
-from iris_session.recording.story import CRITICAL, ERROR, INFO, WARN, LaneChange, LogLine, Rgb, SessionStory
+from iris_session.recording.story import CRITICAL, ERROR, FREE, INFO, WARN, LaneChange, LogLine, Rgb, SessionStory
 from iris_session.streams.errors import StreamError
 
 #: Interval of latencies, a chunk per robot: once a second is enough, as `/state` holds what they are computed from.
@@ -90,6 +91,7 @@ class RrdWriter:
         self._bodies: tuple[BodyInfo, ...] = ()
         self._moving: NDArray[np.intp] = np.empty(0, np.intp)
         self._frames: list[str] = []
+        self._robots: tuple[RobotSpec, ...] = ()
         self._last_poses: NDArray[np.float64] | None = None
         self._newest_row = (-1, b"")
         self._begins_ns: int | None = None  # session time of the first row
@@ -98,7 +100,7 @@ class RrdWriter:
         self._latencies: list[MetricRecord] = []
         self._latencies_due_ns = 0
         self._story = SessionStory()
-        self._people = PeoplePicture(self._rec, self._story)
+        self._people = PeoplePicture(self._rec, self._story, is_first=paths.split_part(self.path)[1] == 1)
         self._lane_colours: dict[str, dict[str, Rgb]] = {}
         self._eye: Any = None
         self._arranged = False
@@ -109,6 +111,7 @@ class RrdWriter:
         self._log_static(paths.HEADER, rr.AnyValues(blob=pa.array([seal_blob(encode_header(header))], pa.binary())))
         self._log_static(paths.INFO, rr.TextDocument(describe_session(header), media_type="text/markdown"))
         self._set_bodies(header.bodies)
+        self._robots = header.robots
         root = rr.Transform3D(parent_frame="tf#/", child_frame=scene_geometry.WORLD)  # tf#/: frame of the root entity
         self._log_static(paths.TRANSFORMS + "_static", root)
         self._log_static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
@@ -261,6 +264,7 @@ class RrdWriter:
         if not self._arranged:
             if poses.shape[1] == len(self._bodies):
                 self._eye = place_eye(poses[0, self._moving if len(self._moving) else slice(None), :3])
+                self._people.label_robots(self._find_bases(poses[0]), tuple(seen[:, 0].tolist()))
             self._send_blueprint()
         columns = [
             matrix_column("poses", poses.reshape(len(states), -1)),
@@ -289,6 +293,17 @@ class RrdWriter:
         seen = times.copy()
         seen[:, 0] = moment
         return seen
+
+    def _find_bases(self, poses: NDArray[np.float64]) -> dict[str, Base]:
+        """Return the bases of the robots of the header, in the frame of the world if they do not move."""
+        known = {body.name: (body, pose) for body, pose in zip(self._bodies, poses, strict=True)}
+        found = {robot.name: known[robot.base_body] for robot in self._robots if robot.base_body in known}
+        return {
+            name: Base(body.name, (0.0, 0.0, 0.0))
+            if body.moving
+            else Base(scene_geometry.WORLD, tuple(pose[:3].tolist()))
+            for name, (body, pose) in found.items()
+        }
 
     def _write_vertices(self) -> None:
         """Write vertices whose states are in the file. Frames of another scene than the drawn one are refused."""
@@ -382,7 +397,9 @@ class RrdWriter:
         for event, (_, changed) in zip(events, told, strict=True):
             changes += [(event.step, event.session_time, change) for change in changed]
             if isinstance(event.body, ParticipantLeft) and not event.body.grace:
-                self._people.remove(event.body.participant, (event.step, *self._clock, event.session_time))
+                self._people.remove(event.body.participant, self._find_moment(event.step, event.session_time))
+            elif isinstance(event.body, SceneChanged) and event.body.cause == "new_scene":
+                self._people.label_robots({}, self._find_moment(event.step, event.session_time))
         text = rr.TextLog.columns(text=[line.text for line, _ in told], level=[line.level for line, _ in told])
         columns = [*text, bytes_column("event", [_encode(event) for event in events])]
         times = self._to_times([e.step for e in events], [e.session_time for e in events])
@@ -399,6 +416,10 @@ class RrdWriter:
         for change in changes:
             entity = "/".join((paths.LANES, *map(escape_entity_part, change[2].lane)))
             by_lane.setdefault(entity, []).append(change)
+            folder, name, *kind = (*change[2].lane, "")
+            if folder == "robots" and kind[0] == "holder":
+                state, colours = change[2].state, change[2].colours
+                self._people.label_robot(name, state, colours.get(state, FREE), self._find_moment(*change[:2]))
         for entity, rows in by_lane.items():
             colours = {state: colour for *_, change in rows for state, colour in change.colours.items()}
             if colours and self._lane_colours.get(entity) != colours:
@@ -438,10 +459,13 @@ class RrdWriter:
 
     def _to_times(self, steps: list[int], session_times: list[int]) -> list[Any]:
         """Return the times of rows that have no tick: it is that of the newest state before them."""
-        known = self._known or ((0, 0, 0, 0),)
-        before = [max(0, bisect_right(known, now_ns, key=_get_session_time) - 1) for now_ns in session_times]
-        moments = [(step, *known[i][1:3], now_ns) for step, i, now_ns in zip(steps, before, session_times, strict=True)]
+        moments = [self._find_moment(*times) for times in zip(steps, session_times, strict=True)]
         return _time_columns(np.array(moments, np.int64).T)
+
+    def _find_moment(self, step: int, session_ns: int) -> Moment:
+        known = self._known or ((0, 0, 0, 0),)
+        _, tick, sim_ns, _ = known[max(0, bisect_right(known, session_ns, key=_get_session_time) - 1)]
+        return step, tick, sim_ns, session_ns
 
 
 def _get_session_time(moment: Moment) -> int:

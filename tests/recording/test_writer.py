@@ -34,6 +34,7 @@ from iris_session.protocol.server_messages import (
     ParticipantLeft,
     PresenceItem,
 )
+from iris_session.protocol.specs import RobotSpec
 from iris_session.recording import Recording, SessionHeader, pack_model
 from iris_session.recording import scene_geometry as scene
 from iris_session.recording.messages import (
@@ -45,6 +46,7 @@ from iris_session.recording.messages import (
     SceneModel,
     StateFrame,
 )
+from iris_session.recording.paths import part_path
 from iris_session.recording.picture import build_components
 from iris_session.recording.scene_geometry import VisualShape
 from iris_session.recording.writer import RrdWriter, place_eye
@@ -236,6 +238,26 @@ def test_states_that_last_are_lanes(tmp_path: Path) -> None:
     assert column([look], "StateConfiguration:values") == [["Ada"]]
     assert column([look], "StateConfiguration:colors") == [[0x56B4E9FF]]
     assert column(found["/lanes/robots/left\\/1/hold"], "StateChange:state") == [["clutch open"], [""]]
+
+
+def test_robots_are_labelled_by_their_holders(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    robots = (RobotSpec("left", (), (), "site", "base"), RobotSpec("cart", (), (), "site", "wheels"))
+    bodies = (BodyInfo(1, "base", False), BodyInfo(2, "wheels", True))
+    poses = np.array([[1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0]] * 2)
+    take = Event(2, 4, 8_000_100, LeaseChanged(Lease("left", "robot", "exclusive", "p1", 1), "acquired"))
+    for part in (str(path), part_path(str(path), 2)):
+        writer = RrdWriter(part, "id")
+        writer.write_header(SessionHeader("s", "n", "closed", 2_000_000, robots=robots, bodies=bodies))
+        writer.add(Batch(states=[frame(0, poses), frame(4, poses)], events=[joined("p1", "Ada"), take]))
+        writer.close()
+    found = read(path)
+    assert column(found["/robots/left"], "Points3D:labels") == [["left"], ["left: Ada"]]
+    assert column(found["/robots/left"], "Points3D:positions") == [[[1.0, 2.0, 3.0]]] * 2
+    assert times(found["/robots/left"]) == [7, 8_000_100]
+    assert column(found["/robots/cart"], "CoordinateFrame:frame") == [["wheels"]]
+    later = read(Path(part_path(str(path), 2)))
+    assert column(later["/robots/left"], "Points3D:labels") == [["left: Ada"]], "its robots had holders before"
 
 
 def test_rows_have_the_simulated_time_of_the_state_before_them(tmp_path: Path) -> None:
