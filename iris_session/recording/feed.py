@@ -25,13 +25,22 @@ import zmq
 from numpy.typing import NDArray
 
 from iris_session.protocol.common import Applied
-from iris_session.protocol.server_messages import BodyInfo, PresenceItem, Reply
+from iris_session.protocol.server_messages import (
+    BodyInfo,
+    ParticipantChanged,
+    ParticipantInfo,
+    ParticipantJoined,
+    ParticipantLeft,
+    PresenceItem,
+    Reply,
+)
 from iris_session.protocol.steps import Decision
 from iris_session.recording import messages
 from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader, seal_keyframe
 from iris_session.recording.messages import (
     Batch,
     DenialRecord,
+    HoldRecord,
     MetricRecord,
     RecorderStatus,
     SceneAssets,
@@ -130,7 +139,11 @@ class RecorderFeed:
         self._last_status_ns = 0
         #: Session time since the last status of a recorder that has something to write: it may hang.
         self.silence_ns = 0
-        self._presence: tuple[PresenceItem, ...] = ()
+        self._presence: dict[
+            tuple[str, str], PresenceItem
+        ] = {}  # new since the newest state, by participant and device
+        self._holds: dict[str, str] = {}  # reason by robot
+        self._people: dict[str, ParticipantInfo] = {}
 
     @property
     def wants_keyframe(self) -> bool:
@@ -153,6 +166,7 @@ class RecorderFeed:
     ) -> None:
         """Send the model of a scene, before the row that loads it. Later states are of its `bodies`."""
         self._vertex_limit.reset()
+        self._holds.clear()
         scene = SceneModel(*self._now, model_hash, packed_model, bodies)
         self._send_scene_data(Batch(scenes=[scene], assets=[SceneAssets(*self._now, root, scene_hash)]))
 
@@ -197,26 +211,36 @@ class RecorderFeed:
         poses: NDArray[np.float64],
         applied: Sequence[Applied] = (),
     ) -> None:
-        """Add world poses (n_bodies, 7) `x y z qw qx qy qz` of the header's bodies, at the state rate; presence with
-        it."""
-        frame = StateFrame(step, tick, sim_time, session_time, poses.tobytes(), self._presence, tuple(applied))
+        """Add world poses (n_bodies, 7) `x y z qw qx qy qz` of the header's bodies, at the state rate; presence since
+        the last state with it."""
+        presence = tuple(self._presence.values())
+        self._presence.clear()
+        frame = StateFrame(step, tick, sim_time, session_time, poses.tobytes(), presence, tuple(applied))
         self._add(self._batch.states, frame)
 
     def add_decision(self, step: int, session_time: int, decision: Decision) -> None:
-        """Add events and denials of one step; its presence is sent with the next state."""
-        if decision.presence:
-            self._presence = decision.presence
+        """Add events, denials and changed reasons to hold of one step; its presence is sent with the next state."""
+        for item in decision.presence:
+            self._presence[item.participant, item.device] = item
         for event in decision.events:
             self._add(self._batch.events, event)
+            if isinstance(event.body, ParticipantJoined | ParticipantChanged):
+                self._people[event.body.participant.id] = event.body.participant
+            elif isinstance(event.body, ParticipantLeft):
+                self._forget(event.body)
+        for command in decision.commands:
+            if self._holds.get(command.robot, "") != command.hold_reason:
+                self._holds[command.robot] = command.hold_reason
+                self._add(self._batch.holds, HoldRecord(step, session_time, command.robot, command.hold_reason))
         for outgoing in decision.outgoing:
             message = outgoing.message
             if type(message) is Reply and message.denial is not None:
                 record = DenialRecord(step, session_time, outgoing.connection, message.denial)
                 self._add(self._batch.denials, record)
 
-    def add_metric(self, name: str, value: float) -> None:
-        """Add a scalar at the newest row's step and time, plotted as `/metrics/<name>`."""
-        self._add(self._batch.metrics, MetricRecord(*self._now, name, float(value)))
+    def add_metric(self, step: int, session_time: int, name: str, value: float) -> None:
+        """Add a scalar, plotted as `/metrics/<name>`."""
+        self._add(self._batch.metrics, MetricRecord(step, session_time, name, float(value)))
 
     def send_vertices(self, stream: str, frame: bytes, session_time: int) -> None:
         """Send a frame (level `full`) of a deformable as published with the state of `session_time`, for the picture.
@@ -242,7 +266,7 @@ class RecorderFeed:
         """Number the pending batch and send what the window allows. Never blocks."""
         batch = self._batch
         lists: tuple[list[Any], ...] = (batch.states, batch.events, batch.denials, batch.metrics, batch.keyframes)
-        lists += (batch.scenes, batch.assets)
+        lists += (batch.scenes, batch.assets, batch.holds)
         if self._spill.pending_bytes > JOURNAL_SHARE * self._spill_limit:
             self._leave_out_picture(batch)
         if batch.rows or any(lists):
@@ -294,9 +318,15 @@ class RecorderFeed:
         self._context.term()
         return self._complete
 
+    def _forget(self, left: ParticipantLeft) -> None:
+        for key in [key for key in self._presence if key[0] == left.participant]:
+            del self._presence[key]
+        if not left.grace:
+            self._people.pop(left.participant, None)
+
     def _leave_out_picture(self, batch: Batch) -> None:
         """Leave what the file shows, but verification does not need, out of a batch: the rest is for the journal."""
-        for items in (batch.states, batch.metrics):
+        for items in (batch.states, batch.metrics, batch.holds):
             self.stats.dropped_items += len(items)
             items.clear()
 
@@ -360,6 +390,7 @@ class RecorderFeed:
         if status.expecting < 0 and self._header and self._header_sent_to != self._instance and not status.fault:
             self._header_sent_to = self._instance
             first = self._window[0][0] if self._window else self._next
+            self._scene.people = list(self._people.values())
             known = messages.encode_batch(self._scene)
             head = (messages.FRAME.pack(messages.HEADER, first), self._header, known)
             self._socket.send_multipart(head, zmq.NOBLOCK)

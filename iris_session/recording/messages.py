@@ -18,7 +18,7 @@ import msgspec
 
 from iris_session.protocol.codec import make_decoder
 from iris_session.protocol.common import Applied, Count, Denial, Name, Nanoseconds
-from iris_session.protocol.server_messages import BodyInfo, Event, PresenceItem
+from iris_session.protocol.server_messages import BodyInfo, Event, ParticipantInfo, PresenceItem
 from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader
 
 #: Prefix of the line on standard error with the reason why the recorder ended; other lines are Rerun's.
@@ -114,6 +114,15 @@ class SceneAssets(msgspec.Struct, frozen=True, array_like=True):
     scene_hash: str = ""
 
 
+class HoldRecord(msgspec.Struct, frozen=True, array_like=True):
+    """A robot holds for another reason (`HoldReason`) from this step on, or moves (empty). For the picture only."""
+
+    step: Count
+    session_time: Nanoseconds
+    robot: Name
+    reason: Name
+
+
 class VertexFrame(msgspec.Struct, frozen=True, array_like=True):
     """Vertices of one deformable as published with the state of `session_time`.
 
@@ -129,7 +138,8 @@ class Batch(msgspec.Struct, array_like=True):
     """Records of about 20 ms.
 
     `dropped_rows`: rows dropped before this batch since the feed began. `scenes` precede all other records of the
-    batch, then `assets`: those of the newest of these scenes, or a patch of the present one.
+    batch, then `assets`: those of the newest of these scenes, or a patch of the present one. `people`: participants
+    that are present, for a recorder that starts later.
     """
 
     rows: list[JournalRow] = []
@@ -141,6 +151,8 @@ class Batch(msgspec.Struct, array_like=True):
     dropped_rows: Count = 0
     scenes: list[SceneModel] = []
     assets: list[SceneAssets] = []
+    holds: list[HoldRecord] = []
+    people: list[ParticipantInfo] = []
 
 
 class _Essence(msgspec.Struct, array_like=True):

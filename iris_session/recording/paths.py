@@ -23,6 +23,10 @@ DENIALS: Final = "/denials"
 METRICS: Final = "/metrics"
 SCENE: Final = "/scene"
 PRESENCE: Final = "/presence"
+#: States over time: holders, clutches, e-stop, episodes.
+LANES: Final = "/lanes"
+#: Labels of robots.
+ROBOTS: Final = "/robots"
 TRANSFORMS: Final = "/tf"
 #: Point clouds and pictures of cameras, an entity per stream.
 CLOUDS: Final = "/clouds"

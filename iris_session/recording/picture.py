@@ -78,7 +78,7 @@ class ScenePicture:
         begun = not self._waits and self._source is not None
         self.set_scene(source)
         if begun:
-            self._set_time(moment)
+            set_moment(self._rec, moment)
             self._rec.log(self._folder, rr.Clear(recursive=True), strict=True)
             self.draw(moment)
 
@@ -88,23 +88,24 @@ class ScenePicture:
             return
         self._source = self._source._replace(assets=assets)
         if not self._waits:
-            self._set_time(moment)
+            set_moment(self._rec, moment)
             self._with_scene(self._update)
             self._rec.reset_time()
 
-    def draw(self, moment: Moment) -> None:
-        """Draw the scene given to `set_scene`, once, from `moment` on."""
+    def draw(self, moment: Moment) -> bool:
+        """Draw the scene given to `set_scene`, once, from `moment` on. Return whether it was drawn now."""
         if not self._waits:
-            return
+            return False
         self._waits = False
         self._number += 1
         self._visuals.clear()
         self._names.clear()
         self.deformables.clear()
         self.since_ns = moment[3]
-        self._set_time(moment)
+        set_moment(self._rec, moment)
         self._with_scene(self._draw_all)
         self._rec.reset_time()
+        return True
 
     @property
     def _folder(self) -> str:
@@ -125,13 +126,6 @@ class ScenePicture:
 
     def _log_error(self, text: str) -> None:
         self._rec.log(f"{paths.EVENTS}/recorder", rr.TextLog(text, level="ERROR"), strict=True)
-
-    def _set_time(self, moment: Moment) -> None:
-        step, tick, sim_ns, session_ns = moment
-        self._rec.set_time(paths.STEP, sequence=step)
-        self._rec.set_time(paths.TICK, sequence=tick)
-        self._rec.set_time(paths.SIM_TIME, duration=np.timedelta64(sim_ns, "ns"))
-        self._rec.set_time(paths.SESSION_TIME, duration=np.timedelta64(session_ns, "ns"))
 
     def _draw_all(self, spec: SceneSpec, reader: SceneReader) -> None:
         for visual in spec.visuals:
@@ -256,6 +250,15 @@ def build_colour(kind: str, rgba: scene_geometry.Rgba8) -> Any:
         scene_geometry.CAPSULE: rr.Capsules3D,
     }
     return primitives[kind].from_fields(colors=[rgba])
+
+
+def set_moment(recording: rr.RecordingStream, moment: Moment) -> None:
+    """Set the times of what is logged next, on all timelines."""
+    step, tick, sim_ns, session_ns = moment
+    recording.set_time(paths.STEP, sequence=step)
+    recording.set_time(paths.TICK, sequence=tick)
+    recording.set_time(paths.SIM_TIME, duration=np.timedelta64(sim_ns, "ns"))
+    recording.set_time(paths.SESSION_TIME, duration=np.timedelta64(session_ns, "ns"))
 
 
 def escape_entity_part(name: str) -> str:

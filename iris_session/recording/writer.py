@@ -15,7 +15,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import msgspec
 import numpy as np
@@ -26,19 +26,8 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.common import Applied
 from iris_session.protocol.errors import ProtocolError
-from iris_session.protocol.names import Device
-from iris_session.protocol.server_messages import (
-    BodyInfo,
-    ConsentRequested,
-    EpisodeChanged,
-    EStopChanged,
-    Event,
-    Gap,
-    Handover,
-    Notice,
-    ParticipantLeft,
-    SamplesRejected,
-)
+from iris_session.protocol.server_messages import BodyInfo, Event, ParticipantLeft, SceneChanged
+from iris_session.protocol.specs import RobotSpec
 from iris_session.recording import paths, scene_geometry
 from iris_session.recording.errors import WriteError
 from iris_session.recording.journal import SessionHeader, seal_blob
@@ -47,6 +36,7 @@ from iris_session.recording.messages import (
     Batch,
     DenialRecord,
     EndMark,
+    HoldRecord,
     MetricRecord,
     SceneAssets,
     SceneModel,
@@ -55,16 +45,22 @@ from iris_session.recording.messages import (
     encode_header,
     encode_scene,
 )
+from iris_session.recording.people import Base, PeoplePicture
 from iris_session.recording.picture import Moment, ScenePicture, SceneSource, escape_entity_part
 from iris_session.recording.rrd_file import END_MESSAGE, FILE_HEAD, MAGIC, Mark, end_of_messages
+from iris_session.recording.story import CRITICAL, ERROR, FREE, INFO, WARN, LaneChange, LogLine, Rgb, SessionStory
 from iris_session.streams.errors import StreamError
 
-#: Colours of participants in the order of their appearance.
-PALETTE = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167))
 #: Interval of latencies, a chunk per robot: once a second is enough, as `/state` holds what they are computed from.
 LATENCIES_NS = 1_000_000_000
 #: Number of newest states whose times are kept for vertices that arrive later: 4 s at 60 Hz.
 KNOWN_MOMENTS = 256
+#: Eye of the 3D view: offset from the centre of the bodies, in halves of the diagonal of their box; least half [m].
+EYE = 1.45 * np.array((0.25, -1.75, 0.95))
+MIN_SIZE_M = 0.3
+BACKGROUND = (205, 214, 224)
+#: Maximum number of lanes whose colours are known to be in the file: participants that come and go have one each.
+MAX_LANES = 4096
 #: Maximum number of pending vertex frames whose states are not in the file yet.
 MAX_PENDING_VERTICES = 256
 _encode = msgspec.msgpack.Encoder().encode
@@ -82,7 +78,6 @@ class RrdWriter:
         self.path = str(path)
         self._stream = RrdStream(self.path, paths.APPLICATION, recording_id)
         self._rec = self._stream.recording
-        self._rec.send_blueprint(_build_blueprint())
         self._picture = ScenePicture(self._rec)
         self._pending = Batch()
         self._samples: list[tuple[int, int, bytes]] = []
@@ -96,14 +91,19 @@ class RrdWriter:
         self._bodies: tuple[BodyInfo, ...] = ()
         self._moving: NDArray[np.intp] = np.empty(0, np.intp)
         self._frames: list[str] = []
+        self._robots: tuple[RobotSpec, ...] = ()
         self._last_poses: NDArray[np.float64] | None = None
         self._newest_row = (-1, b"")
+        self._begins_ns: int | None = None  # session time of the first row
         self._clock = (0, 0)  # tick and sim_time [ns] of the newest state, for what has neither
         self._applied: dict[str, Applied] = {}
         self._latencies: list[MetricRecord] = []
         self._latencies_due_ns = 0
-        self._people: dict[str, tuple[int, int, int]] = {}
-        self._devices: dict[tuple[str, str], int] = {}  # newest capture time drawn
+        self._story = SessionStory()
+        self._people = PeoplePicture(self._rec, self._story, is_first=paths.split_part(self.path)[1] == 1)
+        self._lane_colours: dict[str, dict[str, Rgb]] = {}
+        self._eye: Any = None
+        self._arranged = False
 
     def write_header(self, header: SessionHeader) -> None:
         """Write the header and the scene. Must be called before the first flush with data."""
@@ -111,6 +111,7 @@ class RrdWriter:
         self._log_static(paths.HEADER, rr.AnyValues(blob=pa.array([seal_blob(encode_header(header))], pa.binary())))
         self._log_static(paths.INFO, rr.TextDocument(describe_session(header), media_type="text/markdown"))
         self._set_bodies(header.bodies)
+        self._robots = header.robots
         root = rr.Transform3D(parent_frame="tf#/", child_frame=scene_geometry.WORLD)  # tf#/: frame of the root entity
         self._log_static(paths.TRANSFORMS + "_static", root)
         self._log_static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
@@ -129,7 +130,8 @@ class RrdWriter:
             self.flush()
             self._write_scenes(batch.scenes, batch.assets)
         pending = self._pending
-        for name in ("rows", "states", "events", "denials", "metrics", "keyframes"):
+        self._story.add_people(batch.people)
+        for name in ("rows", "states", "events", "denials", "metrics", "keyframes", "holds"):
             getattr(pending, name).extend(getattr(batch, name))
 
     def add_sample(self, connection: int, receive_ns: int, data: bytes) -> None:
@@ -154,9 +156,11 @@ class RrdWriter:
         try:
             self._write_rows(batch)
             self._write_keyframes(batch)
+            told = [self._story.add(event) for event in batch.events]  # names and roles are known when people appear
             for _, states in groupby(batch.states, key=lambda state: len(state.poses)):
                 self._write_states(list(states))
-            self._write_events(batch.events)
+            self._write_events(batch.events, told)
+            self._write_holds(batch.holds)
             self._write_denials(batch.denials)
             self._write_metrics(batch.metrics)
             self._write_samples(samples)
@@ -173,6 +177,8 @@ class RrdWriter:
         self._write_latencies()
         self.flush()
         self._picture.draw((-1, 0, 0, 0))  # without a state the scene is drawn nevertheless
+        if not self._arranged:
+            self._send_blueprint()
         self.flush()
         self._write_mark()
         mark = EndMark(*self._newest_row)
@@ -223,6 +229,8 @@ class RrdWriter:
         ]
         self._send_columns(paths.ROWS, times, columns)
         self._newest_row = (rows[-1].step, rows[-1].chain)
+        if self._begins_ns is None:
+            self._begins_ns = rows[0].now_ns
 
     def _write_scenes(self, scenes: list[SceneModel], assets: list[SceneAssets]) -> None:
         """Write models for verification, and change the picture."""
@@ -251,9 +259,13 @@ class RrdWriter:
             return
         poses = np.stack([np.frombuffer(s.poses, np.float64).reshape(-1, 7) for s in states])
         moments = [(s.step, s.tick, round(s.sim_time * 1e9), s.session_time) for s in states]
-        step, _, sim_ns, session_ns = moments[0]
-        self._picture.draw((step, 0, min(0, sim_ns), session_ns))  # a reset begins ticks and simulated time again
         times = np.array(moments, np.int64).T
+        seen = self._draw_scene(moments[0], times)
+        if not self._arranged:
+            if poses.shape[1] == len(self._bodies):
+                self._eye = place_eye(poses[0, self._moving if len(self._moving) else slice(None), :3])
+                self._people.label_robots(self._find_bases(poses[0]), tuple(seen[:, 0].tolist()))
+            self._send_blueprint()
         columns = [
             matrix_column("poses", poses.reshape(len(states), -1)),
             scalar_column("sim_time_s", [s.sim_time for s in states], pa.float64()),
@@ -263,9 +275,35 @@ class RrdWriter:
         self._send_columns(paths.STATE, _time_columns(times), columns)
         self._note_latencies(states)
         if poses.shape[1] == len(self._bodies):  # a new recorder also gets pending states of the scene before
-            self._write_transforms(states, poses, times)
+            self._write_transforms(states, poses, seen)
         self._clock = moments[-1][1:3]
         self._known.extend(moments)
+
+    def _draw_scene(self, first: Moment, times: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Draw the scene if it is new. Return the times of the states as the picture has them.
+
+        The picture begins with the first row, not with the state after it: the viewer opens at the first moment.
+        """
+        step, _, sim_ns, session_ns = first
+        if self._begins_ns is not None and not self._known:
+            session_ns = min(session_ns, self._begins_ns)
+        moment = (step, 0, min(0, sim_ns), session_ns)  # a reset begins ticks and simulated time again
+        if not self._picture.draw(moment):
+            return times
+        seen = times.copy()
+        seen[:, 0] = moment
+        return seen
+
+    def _find_bases(self, poses: NDArray[np.float64]) -> dict[str, Base]:
+        """Return the bases of the robots of the header, in the frame of the world if they do not move."""
+        known = {body.name: (body, pose) for body, pose in zip(self._bodies, poses, strict=True)}
+        found = {robot.name: known[robot.base_body] for robot in self._robots if robot.base_body in known}
+        return {
+            name: Base(body.name, (0.0, 0.0, 0.0))
+            if body.moving
+            else Base(scene_geometry.WORLD, tuple(pose[:3].tolist()))
+            for name, (body, pose) in found.items()
+        }
 
     def _write_vertices(self) -> None:
         """Write vertices whose states are in the file. Frames of another scene than the drawn one are refused."""
@@ -293,6 +331,10 @@ class RrdWriter:
                 bending.entity, _time_columns(moments), [*bending.build_columns([row for _, row in taken])]
             )
 
+    def _send_blueprint(self) -> None:
+        self._arranged = True
+        self._rec.send_blueprint(build_blueprint(self._eye, self._drawer.pictures))
+
     def _write_media(self) -> None:
         """Draw clouds and pictures; a stream of pictures that is new gets a view."""
         messages, self._media = self._media, []
@@ -302,8 +344,8 @@ class RrdWriter:
                 self._drawer.draw(message)
             except (StreamError, ProtocolError):
                 self.media_refused += 1
-        if len(self._drawer.pictures) > views:
-            self._rec.send_blueprint(_build_blueprint(self._drawer.pictures))
+        if len(self._drawer.pictures) > views and self._arranged:
+            self._send_blueprint()
 
     def _note_latencies(self, states: list[StateFrame]) -> None:
         """Record latencies for the plots, written once a second: from the capture of a sample to its step, per
@@ -333,11 +375,11 @@ class RrdWriter:
         frame, body = np.nonzero((moving != before).any(axis=2))
         values = moving[frame, body]
         names = [self._frames[i] for i in body]
-        people = self._list_device_rows(states)
+        people = self._people.draw(states, [tuple(moment) for moment in times.T.tolist()])
         if people:
-            frame = np.concatenate([frame, np.array([row[0] for row in people], np.intp)])
-            values = np.concatenate([values, np.array([row[2] for row in people], np.float64)])
-            names += [row[1] for row in people]
+            frame = np.concatenate([frame, np.array([row.state for row in people], np.intp)])
+            values = np.concatenate([values, np.array([row.pose for row in people], np.float64)])
+            names += [row.frame for row in people]
         if not names:
             return
         columns = rr.Transform3D.columns(
@@ -348,39 +390,45 @@ class RrdWriter:
         )
         self._send_columns(paths.TRANSFORMS, _time_columns(times[:, frame]), [*columns])
 
-    def _list_device_rows(self, states: list[StateFrame]) -> list[tuple[int, str, tuple[float, ...]]]:
-        rows: list[tuple[int, str, tuple[float, ...]]] = []
-        for i, state in enumerate(states):
-            for item in state.presence:
-                key = (item.participant, item.device)
-                if key not in self._devices:
-                    self._write_device(*key)
-                elif item.capture_ns and item.capture_ns == self._devices[key]:
-                    continue
-                self._devices[key] = item.capture_ns
-                rows.append((i, _presence_frame(*key), (*item.pose.p, *item.pose.q)))
-        return rows
-
-    def _write_device(self, participant: str, device: str) -> None:
-        """Write static geometry of a device that appears for the first time: a box for a head, a ball for a hand."""
-        color = self._people.setdefault(participant, PALETTE[len(self._people) % len(PALETTE)])
-        frame = rr.CoordinateFrame(_presence_frame(participant, device))
-        entity = f"{paths.PRESENCE}/{escape_entity_part(participant)}/{escape_entity_part(device)}"
-        solid = rr.components.FillMode.Solid
-        if device == Device.HEAD:
-            shape = rr.Boxes3D(half_sizes=[(0.06, 0.09, 0.05)], colors=[color], labels=[participant], fill_mode=solid)
-        else:
-            shape = rr.Ellipsoids3D(half_sizes=[(0.05, 0.03, 0.03)], colors=[color], fill_mode=solid)
-        self._log_static(entity, frame, shape)
-
-    def _write_events(self, events: list[Event]) -> None:
+    def _write_events(self, events: list[Event], told: list[tuple[LogLine, list[LaneChange]]]) -> None:
         if not events:
             return
-        lines = [describe_event(event) for event in events]
-        text = rr.TextLog.columns(text=[line.text for line in lines], level=[line.level for line in lines])
+        changes = []
+        for event, (_, changed) in zip(events, told, strict=True):
+            changes += [(event.step, event.session_time, change) for change in changed]
+            if isinstance(event.body, ParticipantLeft) and not event.body.grace:
+                self._people.remove(event.body.participant, self._find_moment(event.step, event.session_time))
+            elif isinstance(event.body, SceneChanged) and event.body.cause == "new_scene":
+                self._people.label_robots({}, self._find_moment(event.step, event.session_time))
+        text = rr.TextLog.columns(text=[line.text for line, _ in told], level=[line.level for line, _ in told])
         columns = [*text, bytes_column("event", [_encode(event) for event in events])]
         times = self._to_times([e.step for e in events], [e.session_time for e in events])
         self._send_columns(paths.EVENTS, times, columns)
+        self._write_lanes(changes)
+
+    def _write_holds(self, holds: list[HoldRecord]) -> None:
+        changes = [(h.step, h.session_time, c) for h in holds for c in self._story.add_hold(h.robot, h.reason)]
+        self._write_lanes(changes)
+
+    def _write_lanes(self, changes: list[tuple[int, int, LaneChange]]) -> None:
+        """Write changed lanes, and the colours of their states when those are new."""
+        by_lane: dict[str, list[tuple[int, int, LaneChange]]] = {}
+        for change in changes:
+            entity = "/".join((paths.LANES, *map(escape_entity_part, change[2].lane)))
+            by_lane.setdefault(entity, []).append(change)
+            folder, name, *kind = (*change[2].lane, "")
+            if folder == "robots" and kind[0] == "holder":
+                state, colours = change[2].state, change[2].colours
+                self._people.label_robot(name, state, colours.get(state, FREE), self._find_moment(*change[:2]))
+        for entity, rows in by_lane.items():
+            colours = {state: colour for *_, change in rows for state, colour in change.colours.items()}
+            if colours and self._lane_colours.get(entity) != colours:
+                if len(self._lane_colours) >= MAX_LANES:
+                    self._lane_colours.clear()
+                self._lane_colours[entity] = colours
+                self._log_static(entity, rr.StateConfiguration(values=[*colours], colors=[*colours.values()]))
+            times = self._to_times([step for step, _, _ in rows], [now_ns for _, now_ns, _ in rows])
+            self._send_columns(entity, times, [*rr.StateChange.columns(state=[row.state for _, _, row in rows])])
 
     def _write_denials(self, denials: list[DenialRecord]) -> None:
         if not denials:
@@ -410,8 +458,18 @@ class RrdWriter:
         self._send_columns(paths.SAMPLES, [duration_index(paths.SESSION_TIME, [s[1] for s in samples])], columns)
 
     def _to_times(self, steps: list[int], session_times: list[int]) -> list[Any]:
-        moments = [(step, *self._clock, now_ns) for step, now_ns in zip(steps, session_times, strict=True)]
+        """Return the times of rows that have no tick: it is that of the newest state before them."""
+        moments = [self._find_moment(*times) for times in zip(steps, session_times, strict=True)]
         return _time_columns(np.array(moments, np.int64).T)
+
+    def _find_moment(self, step: int, session_ns: int) -> Moment:
+        known = self._known or ((0, 0, 0, 0),)
+        _, tick, sim_ns, _ = known[max(0, bisect_right(known, session_ns, key=_get_session_time) - 1)]
+        return step, tick, sim_ns, session_ns
+
+
+def _get_session_time(moment: Moment) -> int:
+    return moment[3]
 
 
 def _time_columns(times: NDArray[np.int64]) -> list[Any]:
@@ -425,20 +483,48 @@ def _time_columns(times: NDArray[np.int64]) -> list[Any]:
     ]
 
 
-def _presence_frame(participant: str, device: str) -> str:
-    return f"presence/{participant}/{device}"
+def place_eye(positions: NDArray[np.float64]) -> Any:
+    """Return the eye that sees bodies at `positions` (n, 3) [m] from the front and above; `None` without any."""
+    known = positions[np.isfinite(positions).all(axis=1)]
+    if not len(known):
+        return None
+    low, high = np.percentile(known, (1.0, 99.0), axis=0)  # a few bodies may be parked far away
+    centre = (low + high) / 2.0
+    size_m = max(float(np.linalg.norm(high - low)) / 2.0, MIN_SIZE_M)
+    return rrb.EyeControls3D(position=centre + size_m * EYE, look_target=centre, eye_up=(0.0, 0.0, 1.0))
 
 
-def _build_blueprint(pictures: Sequence[str] = ()) -> Any:
-    """Return the arrangement of views. `pictures`: streams of pictures, each with a view of its own."""
-    contents = ["+ /**", "- /journal/**", "- /samples", f"- {paths.PICTURES}/**"]
-    view = rrb.Spatial3DView(origin="/", name="scene", contents=contents)
-    log = rrb.TextLogView(origin="/", name="events", contents=[f"+ {paths.EVENTS}", f"+ {paths.DENIALS}"])
-    plots = rrb.TimeSeriesView(origin=paths.METRICS, name="metrics")
-    about = rrb.TextDocumentView(origin=paths.INFO, name="session")
+def build_blueprint(eye: Any, pictures: Sequence[str] = ()) -> Any:
+    """Return the arrangement of views. `eye`: where the scene is seen from, `None`: the viewer chooses.
+
+    `pictures`: streams of pictures, each with a view of its own.
+    """
+    hidden = ("/journal/**", paths.SAMPLES, f"{paths.PICTURES}/**", f"{paths.LANES}/**", f"{paths.METRICS}/**")
+    scene = rrb.Spatial3DView(
+        origin="/",
+        name="Scene",
+        contents=["+ /**", *(f"- {entity}" for entity in hidden)],
+        background=BACKGROUND,
+        line_grid=False,
+        eye_controls=eye,
+    )
+    lanes = rrb.StateTimelineView(origin=paths.LANES, name="Who does what")
+    log = rrb.TextLogView(
+        origin="/",
+        name="What happened",
+        contents=[f"+ {paths.EVENTS}/**", f"+ {paths.DENIALS}"],
+        columns=rrb.TextLogColumns(timeline_columns=[paths.SESSION_TIME], text_log_columns=["loglevel", "body"]),
+        rows=rrb.TextLogRows(filter_by_log_level=[INFO, WARN, ERROR, CRITICAL]),
+    )
+    about = rrb.TextDocumentView(origin=paths.INFO, name="About")
+    plots = rrb.TimeSeriesView(origin=paths.METRICS, name="Delays [ms]")
     images = [rrb.Spatial2DView(origin=f"{paths.PICTURES}/{name}", name=name) for name in pictures]
-    side = rrb.Vertical(*([rrb.Grid(*images)] if images else ()), log, plots, about)
-    return rrb.Blueprint(rrb.Horizontal(view, side, column_shares=[2, 1]), collapse_panels=True)
+    side = rrb.Vertical(rrb.Tabs(log, about), *([rrb.Grid(*images)] if images else ()), plots)
+    return rrb.Blueprint(
+        rrb.Horizontal(rrb.Vertical(scene, lanes, row_shares=[5, 2]), side, column_shares=[5, 3]),
+        rrb.TimePanel(timeline=paths.SESSION_TIME, play_state="paused"),
+        collapse_panels=True,
+    )
 
 
 # --- file -------------------------------------------------------------------------------------------------------------
@@ -560,33 +646,6 @@ def duration_index(timeline: str, values: Any) -> Any:
 # --- text for the viewer ----------------------------------------------------------------------------------------------
 
 
-class LogLine(NamedTuple):
-    """A line of the viewer's log. `level`: a Rerun log level (`INFO`, `WARN`, `CRITICAL`)."""
-
-    level: str
-    text: str
-
-
-_LEVELS: dict[type, str] = {
-    EStopChanged: "CRITICAL",
-    Gap: "ERROR",
-    Notice: "WARN",
-    SamplesRejected: "WARN",
-    ParticipantLeft: "WARN",
-    ConsentRequested: "INFO",
-    EpisodeChanged: "INFO",
-    Handover: "INFO",
-}
-
-
-def describe_event(event: Event) -> LogLine:
-    """Return `#12 lease_changed target=left holder=p1 ...`: the number, the kind, and every field with a value."""
-    body: dict[str, Any] = msgspec.to_builtins(event.body)
-    kind = body.pop("event")
-    fields = " ".join(_list_fields(body))
-    return LogLine(_LEVELS.get(type(event.body), "INFO"), f"#{event.event_seq} {kind} {fields}".rstrip())
-
-
 def describe_denial(record: DenialRecord) -> LogLine:
     """Return the log line of a denial: connection, reason, message, holder and advice."""
     denial = record.denial
@@ -595,7 +654,7 @@ def describe_denial(record: DenialRecord) -> LogLine:
         parts.append(f"held by {denial.holder_name or denial.holder}")
     if denial.advice:
         parts.append(denial.advice)
-    return LogLine("WARN", "; ".join(parts))
+    return LogLine(WARN, "; ".join(parts))
 
 
 def describe_session(header: SessionHeader) -> str:
@@ -609,17 +668,3 @@ def describe_session(header: SessionHeader) -> str:
         f"Bodies: {len(header.bodies)}. Tick: {header.tick_period_ns / 1e6:g} ms.\n\n"
         f"| library | version |\n|---|---|\n{versions}\n"
     )
-
-
-def _list_fields(body: dict[str, Any], prefix: str = "") -> list[str]:
-    out = []
-    for name, value in body.items():
-        if isinstance(value, dict):
-            out += _list_fields(value, f"{prefix}{name}.")
-        elif name == "covariance" or value in ("", None, [], ()):
-            continue
-        elif isinstance(value, float):
-            out.append(f"{prefix}{name}={value:.6g}")
-        else:
-            out.append(f"{prefix}{name}={value}")
-    return out

@@ -99,7 +99,7 @@ class RecorderPort(Protocol):
 
     def add_decision(self, step: int, session_time: int, decision: Decision) -> None: ...
 
-    def add_metric(self, name: str, value: float) -> None: ...
+    def add_metric(self, step: int, session_time: int, name: str, value: float) -> None: ...
 
     def take_gap(self) -> int: ...
 
@@ -403,7 +403,7 @@ class Stepper:
             self.on_state(header, self._poses)
         if self.recorder is not None:
             self.recorder.add_state(self._newest_step, tick, sim_time, end_ns, self._poses, applied)
-            self.recorder.add_metric("lateness_ms", self.lateness_ns * 1e-6)
+            self.recorder.add_metric(self._newest_step, end_ns, "lateness_ms", self.lateness_ns * 1e-6)
             self.lateness_ns = 0
 
     def _record(

@@ -148,7 +148,7 @@ class SmallSession:
         if step % 50 == 0:
             events = (Event(step // 50 + 1, step, now_ns, MarkerAdded("p1", f"event {step}")),)
         feed.add_decision(step, now_ns, Decision(commands=(), events=events, presence=(head,)))
-        feed.add_metric("late_ms", step / 10)
+        feed.add_metric(step, now_ns, "late_ms", step / 10)
         if step % 8 == 0:
             poses = np.concatenate([core.data.xpos[1:], core.data.xquat[1:]], axis=1)
             self.poses.append(poses.copy())

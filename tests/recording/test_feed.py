@@ -6,13 +6,23 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import zmq
 
 from iris_session.protocol.common import Denial, Pose
-from iris_session.protocol.server_messages import BodyInfo, PresenceItem, Reply
-from iris_session.protocol.steps import Decision, OutgoingMessage
+from iris_session.protocol.server_messages import (
+    BodyInfo,
+    Event,
+    ParticipantChanged,
+    ParticipantInfo,
+    ParticipantJoined,
+    ParticipantLeft,
+    PresenceItem,
+    Reply,
+)
+from iris_session.protocol.steps import Command, Decision, OutgoingMessage
 from iris_session.recording import Keyframe, RecorderFeed, make_row
 from iris_session.recording.feed import BATCH_ITEMS, BATCH_ROWS, JOURNAL_SHARE, VERTEX_FRAMES
 from iris_session.recording.journal import check_keyframe
@@ -260,7 +270,7 @@ def test_states_events_and_denials_are_sent_with_the_rows(feed: RecorderFeed, pl
     replies = (OutgoingMessage(4, Reply(1, False, denial)), OutgoingMessage(5, Reply(2, True)))
     feed.add_decision(3, 70, Decision(commands=(), outgoing=replies, presence=(head,)))
     feed.add_state(3, 9, 0.1, 70, np.arange(21.0).reshape(3, 7))
-    feed.add_metric("late_ms", 2.5)
+    feed.add_metric(3, 70, "late_ms", 2.5)
     feed.add_keyframe(Keyframe(2, b"p", b"a", b"c"), ROOT)
     batch = decode_batch(played[0].take(1)[0][2])
     assert [(d.connection, d.denial) for d in batch.denials] == [(4, denial)]
@@ -271,9 +281,62 @@ def test_states_events_and_denials_are_sent_with_the_rows(feed: RecorderFeed, pl
     assert batch.keyframes[0].chain == ROOT
 
 
+def test_state_has_all_presence_since_the_last(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
+    played[0].say(feed, 1, -1, -1)
+    played[0].take(1)
+    pose = Pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0))
+    ann, bob, newer = (PresenceItem(who, "head", pose, at) for who, at in (("p1", 5), ("p2", 6), ("p1", 7)))
+    for step, items in enumerate(((ann,), (bob,), (), (newer,))):
+        feed.add_decision(step, step, Decision(commands=(), presence=items))
+    feed.add_state(3, 9, 0.1, 70, np.zeros((0, 7)))
+    feed.add_state(4, 10, 0.2, 80, np.zeros((0, 7)))
+    feed.add_decision(5, 5, Decision(commands=(), presence=(ann, bob)))
+    feed.add_decision(6, 6, Decision(commands=(), events=(Event(1, 6, 6, ParticipantLeft("p1", "bye")),)))
+    feed.add_state(6, 11, 0.3, 90, np.zeros((0, 7)))
+    feed.flush()
+    first, second, third = decode_batch(played[0].take(1)[0][2]).states
+    assert set(first.presence) == {newer, bob}
+    assert second.presence == ()
+    assert third.presence == (bob,), "who has left is not seen again"
+
+
+def test_changed_reasons_to_hold_are_sent_once(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
+    played[0].say(feed, 1, -1, -1)
+    played[0].take(1)
+    for step, reason in enumerate(("no_sample", "no_sample", "", "stale")):
+        kind = "hold" if reason else "pose"
+        feed.add_decision(step, 10 * step, Decision(commands=(Command("left", kind, reason),)))
+    feed.flush()
+    holds = decode_batch(played[0].take(1)[0][2]).holds
+    assert [(h.step, h.session_time, h.robot, h.reason) for h in holds] == [
+        (0, 0, "left", "no_sample"),
+        (2, 20, "left", ""),
+        (3, 30, "left", "stale"),
+    ]
+
+
+def test_recorder_that_starts_later_knows_who_is_present(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
+    ann, bob, eve = (
+        ParticipantInfo(f"p{i}", name, "operator", True) for i, name in ((1, "ann"), (2, "bob"), (3, "eve"))
+    )
+    bodies = (
+        ParticipantJoined(ann),
+        ParticipantJoined(bob),
+        ParticipantJoined(eve),
+        ParticipantChanged(msgspec.structs.replace(bob, name="rob")),
+        ParticipantLeft("p1", "timeout", grace=True),
+        ParticipantLeft("p3", "bye"),
+    )
+    feed.add_decision(0, 0, Decision(commands=(), events=tuple(Event(i, 0, 0, body) for i, body in enumerate(bodies))))
+    played[0].say(feed, 2, -1, -1)
+    played[0].take(1)
+    people = decode_batch(played[0].more[0]).people
+    assert [(one.id, one.name) for one in people] == [("p1", "ann"), ("p2", "rob")]
+
+
 def test_lists_are_bounded_without_steps(feed: RecorderFeed) -> None:
     for i in range(BATCH_ITEMS + 10):
-        feed.add_metric("m", i)
+        feed.add_metric(i, i, "m", i)
     assert feed.stats.dropped_items == 10
 
 

@@ -142,7 +142,7 @@ def test_batch_beyond_a_limit_is_counted_and_its_journal_kept(tmp_path: Path) ->
     with recorder(path) as (process, feed):
         session = SmallSession(feed)
         session.take(5)
-        feed.add_metric("n" * 100, 1.0)
+        feed.add_metric(4, 5 * TICK_NS, "n" * 100, 1.0)
         session.take(100)
         assert feed.close(20.0)
         assert feed.stats.recorder is not None

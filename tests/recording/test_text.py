@@ -2,25 +2,201 @@
 
 from __future__ import annotations
 
+import re
+from typing import get_args
+
+import msgspec
+
 from iris_session.protocol.common import Alignment, Denial, Lease, Pose
-from iris_session.protocol.server_messages import AlignmentChanged, Event, Gap, LeaseChanged
+from iris_session.protocol.server_messages import (
+    AlignmentAlarmed,
+    AlignmentChanged,
+    AlignmentRun,
+    AnchorMoved,
+    Audited,
+    ConsentRequested,
+    EngagementChanged,
+    EpisodeChanged,
+    EStopChanged,
+    Event,
+    EventKind,
+    Gap,
+    Handover,
+    HeadsetsCompared,
+    Intervention,
+    LeaseChanged,
+    LeasesChanged,
+    MarkerAdded,
+    Notice,
+    ObjectGrasped,
+    ParticipantChanged,
+    ParticipantInfo,
+    ParticipantJoined,
+    ParticipantLeft,
+    PauseChanged,
+    SamplesRejected,
+    ScaleChanged,
+    SceneChanged,
+    TipCalibrated,
+)
 from iris_session.recording import environment as versions
 from iris_session.recording.messages import DenialRecord
-from iris_session.recording.writer import describe_denial, describe_event, describe_session
+from iris_session.recording.story import LogLine, SessionStory
+from iris_session.recording.writer import describe_denial, describe_session
 from tests.recording.support import make_header
 
+POSE = Pose((0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0))
 
-def test_event_text_has_kind_and_non_empty_fields() -> None:
-    line = describe_event(Event(3, 1, 2, LeaseChanged(Lease("left", "robot", "exclusive", "p1", 4), "acquired")))
-    assert line.level == "INFO"
-    assert line.text.startswith("#3 lease_changed lease.target=left lease.kind=robot")
-    assert "queue" not in line.text
-    pose = Pose((0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0))
-    aligned = AlignmentChanged("p1", Alignment(2, "measured", pose, covariance=(0.5,) * 36))
-    text = describe_event(Event(4, 1, 2, aligned)).text
-    assert "alignment.kind=measured" in text
-    assert "0.5" not in text, "36 numbers are for the data, not for people"
-    assert describe_event(Event(5, 1, 2, Gap("recording", 7))).level == "ERROR"
+
+def lease(target: str, holder: str, previous: str = "", cause: str = "acquired") -> LeaseChanged:
+    return LeaseChanged(Lease(target, "robot", "exclusive", holder, 4), cause, previous)
+
+
+def ann_and_bob() -> SessionStory:
+    story = SessionStory()
+    story.add_people([ParticipantInfo("p1", "ann", "operator", True), ParticipantInfo("p2", "bob", "operator", True)])
+    return story
+
+
+def tell(story: SessionStory, *bodies: EventKind) -> list[LogLine]:
+    return [story.add(Event(i, i, i, body))[0] for i, body in enumerate(bodies)]
+
+
+def test_events_are_sentences_with_names() -> None:
+    measured = Alignment(2, "measured", POSE, covariance=(0.5,) * 36, error_at_robot_m=0.0017)
+    assert tell(
+        SessionStory(),
+        ParticipantJoined(ParticipantInfo("p1", "ann", "operator", True)),
+        ParticipantJoined(ParticipantInfo("p2", "bob", "observer", True)),
+        AlignmentChanged("p1", measured),
+        lease("left", "p1"),
+        lease("left", "p2", "p1", "takeover"),
+        Handover("hammer", "left", "right", "p1", "p2", 560_000_000),
+        Handover("hammer", "left", "right", "p2", "p2", 560_000_000),
+        ParticipantChanged(ParticipantInfo("p2", "eve", "observer", True)),
+        lease("left", "", "p2", "released"),
+        EpisodeChanged(3, "success", "folded", "p1"),
+        EStopChanged(True, "", "", 1),
+        Notice("info", "look", "p7"),
+        Audited("flood", "p1", count=3),
+    ) == [
+        ("INFO", "ann joins as operator"),
+        ("INFO", "bob joins as observer"),
+        ("INFO", "ann is aligned to 1.7 mm (measured)"),
+        ("INFO", "ann takes left"),
+        ("INFO", "bob takes left from ann (takeover)"),
+        ("INFO", "hammer handed over: ann to bob, both held it for 0.56 s"),
+        ("INFO", "hammer handed over: left to right, both held it for 0.56 s"),
+        ("INFO", "bob is called eve from now on"),
+        ("INFO", "eve gives left back"),
+        ("INFO", "episode 3: success, folded (ann)"),
+        ("CRITICAL", "E-STOP by a connection that has not joined"),
+        ("INFO", "p7: look"),
+        ("INFO", "audited: kind=flood subject=p1 count=3"),
+    ]
+
+
+def test_frequent_events_are_for_debugging() -> None:
+    lines = tell(
+        ann_and_bob(),
+        SamplesRejected("p1", "controller/left", "lease_version", 3),
+        HeadsetsCompared("p1", "p2", "table", 0.0014, 0.01, 0.003, (0.0, 0.0, 0.0), 9),
+        EngagementChanged("left", "p1", True),
+        EngagementChanged("left", "p1", False, "clutch_open"),
+    )
+    assert {line.level for line in lines} == {"DEBUG"}
+    assert lines[0].text == "ann's left controller: 3 samples rejected (lease version)"
+    several = LeasesChanged((lease("left", "p1").lease, lease("right", "p1").lease), "acquired", ("", ""))
+    assert tell(ann_and_bob(), several) == [("INFO", "ann takes left; ann takes right")]
+    faults = tell(ann_and_bob(), Gap("recording", 7, 12), EngagementChanged("left", "p1", False, "stale"))
+    assert [line.level for line in faults] == ["ERROR", "INFO"]
+
+
+def test_every_kind_of_event_has_a_line_without_ids() -> None:
+    ann = ParticipantInfo("p1", "ann", "operator", True)
+    every = (
+        ParticipantJoined(ann, resumed=True),
+        ParticipantChanged(msgspec.structs.replace(ann, worn=False)),
+        ParticipantLeft("p1", "timeout", grace=True),
+        lease("left", "p1"),
+        LeasesChanged((lease("left", "p2").lease,), "queue", ("p2",)),
+        ConsentRequested(1, "left", "p2", "p1"),
+        Intervention("left", "p1", "p2", True),
+        EngagementChanged("left", "p1", True),
+        ScaleChanged("left", 0.5, "p1"),
+        AlignmentChanged("p1", Alignment(1, "none", POSE)),
+        AlignmentRun("p1", True, 1),
+        AlignmentAlarmed("p1", "jump", "table", 0.1),
+        AnchorMoved("table", POSE, "p1"),
+        TipCalibrated("p1", "controller/left", refused=True, advice="turn it"),
+        HeadsetsCompared("p1", "p2", "table", 0.001, 0.01, 0.003, (0.0, 0.0, 0.0), 9),
+        SceneChanged(1, 1, "new_scene"),
+        EStopChanged(False, "p1"),
+        PauseChanged(False, "p1"),
+        EpisodeChanged(1, "running", "", "p1"),
+        ObjectGrasped("cup", "p1", "hand/left", True),
+        Handover("cup", "left", "right", "p1", "p2", 1),
+        MarkerAdded("p1", "now"),
+        SamplesRejected("p1", "head", "seq", 1),
+        Gap("stalled", 1),
+        Notice("warning", "look", "p1"),
+        Audited("flood", name="ann"),
+    )
+    assert {type(body) for body in every} == set(get_args(EventKind))
+    for body, line in zip(every, tell(ann_and_bob(), *every), strict=True):
+        assert line.text, body
+        assert not {"p1", "p2"} & set(re.findall(r"\w+", line.text)), line.text
+
+
+def changes(story: SessionStory, *bodies: EventKind) -> list[tuple[str, str]]:
+    """Return the changed lanes and their new states."""
+    found = [change for body in bodies for change in story.add(Event(1, 1, 1, body))[1]]
+    return [("/".join(change.lane), change.state) for change in found]
+
+
+def test_states_that_last_are_lanes() -> None:
+    story = ann_and_bob()
+    robot = lease("left", "p1")
+    assert changes(
+        story,
+        robot,
+        EngagementChanged("left", "p1", True),
+        AlignmentChanged("p1", Alignment(2, "placed", POSE)),
+        AlignmentChanged("p1", Alignment(3, "placed", POSE)),
+        ObjectGrasped("cup", "p1", "hand/left", True),
+        ObjectGrasped("cup", "p1", "hand/left", False),
+        Handover("hammer", "left", "right", "p1", "p2", 1),
+        EStopChanged(True, "p1"),
+        PauseChanged(True, "p1"),
+        EpisodeChanged(1, "running"),
+        EpisodeChanged(1, "failure"),
+        SceneChanged(2, 0, "patch"),
+    ) == [
+        ("robots/left/holder", "ann"),
+        ("robots/left/clutch", "closed"),
+        ("alignment/ann", "placed"),
+        ("objects/cup", "ann"),
+        ("objects/cup", ""),
+        ("objects/hammer", "handed to bob"),
+        ("e-stop", "stopped"),
+        ("pause", "paused"),
+        ("episode", "episode 1"),
+        ("episode", "failure"),
+    ]
+    assert changes(story, SceneChanged(3, 0, "reset")) == [("robots/left/clutch", ""), ("objects/hammer", "")]
+    assert changes(story, ParticipantLeft("p1", "lost", grace=True)) == []
+    assert changes(story, ParticipantLeft("p1", "bye")) == [("alignment/ann", "")]
+    assert [(c.lane, c.state) for c in story.add_hold("left", "no_lease")] == [], "the lane of the holder says so"
+    assert [(c.lane, c.state) for c in story.add_hold("left", "not_worn")] == [(("robots", "left", "hold"), "not worn")]
+
+
+def test_colours_follow_the_order_of_joining() -> None:
+    story = SessionStory()
+    (change,) = story.add(Event(1, 1, 1, lease("left", "p2")))[1]
+    assert change.colours == {"p2": story.find_colour("p2")}
+    assert len({story.find_colour(f"p{i}") for i in range(1, 8)}) == 7
+    assert story.find_colour("p8") == story.find_colour("p1")
+    assert story.find_colour("host") == story.find_colour("host")
 
 
 def test_denial_text_has_holder_and_advice() -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from anchors.pose import apply
 from iris_session.physics.load import compute_scene_hash, encode_model
-from iris_session.protocol.common import Applied, Denial, Pose
+from iris_session.protocol.common import Applied, Denial, Lease, Pose
 from iris_session.protocol.scene import (
     AddVisual,
     Geometry,
@@ -24,16 +24,35 @@ from iris_session.protocol.scene import (
     apply_patch,
     encode_scene,
 )
-from iris_session.protocol.server_messages import BodyInfo, EStopChanged, Event, PresenceItem
+from iris_session.protocol.server_messages import (
+    BodyInfo,
+    EStopChanged,
+    Event,
+    LeaseChanged,
+    ParticipantInfo,
+    ParticipantJoined,
+    ParticipantLeft,
+    PresenceItem,
+)
+from iris_session.protocol.specs import RobotSpec
 from iris_session.recording import Recording, SessionHeader, pack_model
 from iris_session.recording import scene_geometry as scene
-from iris_session.recording.messages import Batch, DenialRecord, SceneAssets, SceneModel, StateFrame
+from iris_session.recording.messages import (
+    Batch,
+    DenialRecord,
+    HoldRecord,
+    MetricRecord,
+    SceneAssets,
+    SceneModel,
+    StateFrame,
+)
+from iris_session.recording.paths import part_path
 from iris_session.recording.picture import build_components
 from iris_session.recording.scene_geometry import VisualShape
-from iris_session.recording.writer import RrdWriter
+from iris_session.recording.writer import RrdWriter, place_eye
 from iris_session.scene import AssetStore
 from iris_session.scene.mujoco_scene import parse_mujoco
-from tests.recording.support import XML, column, make_header, read
+from tests.recording.support import XML, column, journal, make_header, read
 from tests.scene.models import every_shape
 
 IDENTITY_Q = (1.0, 0.0, 0.0, 0.0)
@@ -41,6 +60,11 @@ IDENTITY_Q = (1.0, 0.0, 0.0, 0.0)
 
 def frame(step: int, poses: np.ndarray, presence: tuple[PresenceItem, ...] = ()) -> StateFrame:
     return StateFrame(step, step + 1, step * 0.002, step * 2_000_000 + 7, poses.tobytes(), presence)
+
+
+def times(batches: list[Any]) -> list[int]:
+    """Return the session times of the rows of an entity [ns]."""
+    return [value.value for batch in batches for value in batch.column("session_time")]
 
 
 def test_transforms_are_the_poses_of_moving_bodies_when_they_change(tmp_path: Path) -> None:
@@ -90,6 +114,26 @@ def test_static_geometry_is_written_once_per_frame(tmp_path: Path) -> None:
     assert "small" in column(found["/session"], "TextDocument:text")[0][0]
 
 
+def test_picture_begins_with_the_first_row(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    header, batch = journal(1)
+    state = frame(1, np.zeros((len(header.bodies), 7)))  # later than its row, by the duration of the step
+    batch.metrics = [MetricRecord(1, state.session_time, "late_ms", 1.0)]
+    writer = RrdWriter(path, "id")
+    writer.write_header(header)
+    batch.states = [state, frame(9, np.ones((len(header.bodies), 7)))]
+    writer.add(batch)
+    writer.close()
+    found = read(path)
+    (row,) = times(found["/journal/rows"])
+    assert row < state.session_time
+    assert set(times(found["/scene/1/ball/g\\/ball"])) == {row}
+    moving = sum(body.moving for body in header.bodies)
+    assert times(found["/tf"]) == [row] * moving + [batch.states[1].session_time] * moving
+    assert min(min(times(chunks)) for chunks in found.values() if "session_time" in chunks[0].schema.names) == row
+    assert times(found["/state"])[0] == state.session_time, "data have their own times"
+
+
 def test_scene_without_a_state_is_drawn(tmp_path: Path) -> None:
     path = tmp_path / "w.rrd"
     writer = RrdWriter(path, "id")
@@ -121,6 +165,10 @@ def test_latencies_of_applied_samples_are_plotted_once_each(tmp_path: Path) -> N
     assert column(read(path)["/metrics/input_to_step_ms/left"], "Scalars:scalars") == [[5.0], [3.0]]
 
 
+def joined(participant: str, name: str, role: str = "operator") -> Event:
+    return Event(1, 0, 1, ParticipantJoined(ParticipantInfo(participant, name, role, connected=True)))
+
+
 def test_participants_are_drawn_once_and_move_with_their_captures(tmp_path: Path) -> None:
     path = tmp_path / "w.rrd"
     writer = RrdWriter(path, "id")
@@ -131,13 +179,95 @@ def test_participants_are_drawn_once_and_move_with_their_captures(tmp_path: Path
         return (PresenceItem("p 1", "head", Pose((x, 0.0, 1.6), IDENTITY_Q), capture_ns),)
 
     states = [frame(0, none, person(0.1, 10)), frame(8, none, person(0.1, 10)), frame(16, none, person(0.3, 20))]
-    writer.add(Batch(states=states))
+    writer.add(Batch(states=states, events=[joined("p 1", "Ada")]))
     writer.close()
     found = read(path)
     assert column(found["/tf"], "Transform3D:child_frame") == [["presence/p 1/head"]] * 2
     assert column(found["/tf"], "step") == [0, 16]
     assert column(found["/presence/p\\ 1/head"], "CoordinateFrame:frame") == [["presence/p 1/head"]]
-    assert column(found["/presence/p\\ 1/head"], "Boxes3D:labels") == [["p 1"]]
+    assert column(found["/presence/p\\ 1/head"], "Boxes3D:labels") == [["Ada · operator"]]
+    assert times(found["/presence/p\\ 1/head"]) == [7], (
+        "with the first pose: a frame without one is an error in the viewer"
+    )
+    assert column(found["/presence/p\\ 1/head/view"], "Arrows3D:vectors") == [[[pytest.approx(0.3), 0.0, 0.0]]]
+
+
+def test_participants_are_cleared_when_they_leave_or_have_no_pose(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    writer.write_header(SessionHeader("s", "n", "closed", 2_000_000))
+    none, ms = np.zeros((0, 7)), 1_000_000
+
+    def seen(step: int, *devices: tuple[str, str]) -> StateFrame:
+        items = tuple(PresenceItem(*key, Pose((0.0, 0.0, 1.0), IDENTITY_Q), step * 2 * ms) for key in devices)
+        return frame(step, none, items)
+
+    head, hand, other = ("p1", "head"), ("p1", "hand/left"), ("p2", "head")
+    states = [seen(0, head, hand, other), seen(120, head, other), seen(130, head, other), seen(140, head, hand)]
+    left = Event(2, 141, 282 * ms, ParticipantLeft("p2", "bye"))
+    away = Event(3, 141, 282 * ms, ParticipantLeft("p1", "timeout", grace=True))
+    writer.add(Batch(states=states, events=[joined("p1", "Ada"), left, away]))
+    writer.close()
+    found = read(path)
+    hands = found["/presence/p1/hand\\/left"]
+    cleared = [batch for batch in hands if any("Clear" in name for name in batch.schema.names)]
+    assert times(cleared) == [260 * ms + 7], "the first state 0.25 s after its pose"
+    assert sorted(times(hands)) == [7, 260 * ms + 7, 280 * ms + 7], "and it is drawn again with the next"
+    assert times(found["/presence/p1/head"]) == [7], "who is disconnected stays until poses are old"
+    assert sorted(times(found["/presence/p2/head"])) == [7, 282 * ms]
+    looks = [[b for b in found[f"/presence/{who}/head"] if "Boxes3D:colors" in b.schema.names] for who in ("p1", "p2")]
+    assert column(looks[0], "Boxes3D:colors") != column(looks[1], "Boxes3D:colors")
+
+
+def test_states_that_last_are_lanes(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    writer.write_header(SessionHeader("s", "n", "closed", 2_000_000))
+    take = LeaseChanged(Lease("left/1", "robot", "exclusive", "p1", 1), "acquired")
+    free = LeaseChanged(Lease("left/1", "robot", "exclusive", "", 2), "released", "p1")
+    events = [joined("p1", "Ada"), Event(2, 3, 30, take), Event(3, 9, 90, free)]
+    holds = [HoldRecord(4, 40, "left/1", "clutch_open"), HoldRecord(6, 60, "left/1", "")]
+    writer.add(Batch(events=events, holds=holds))
+    writer.close()
+    found = read(path)
+    lane = found["/lanes/robots/left\\/1/holder"]
+    states = [batch for batch in lane if "session_time" in batch.schema.names]
+    assert column(states, "StateChange:state") == [["Ada"], [""]]
+    assert times(states) == [30, 90]
+    (look,) = [batch for batch in lane if "session_time" not in batch.schema.names]
+    assert column([look], "StateConfiguration:values") == [["Ada"]]
+    assert column([look], "StateConfiguration:colors") == [[0x56B4E9FF]]
+    assert column(found["/lanes/robots/left\\/1/hold"], "StateChange:state") == [["clutch open"], [""]]
+
+
+def test_robots_are_labelled_by_their_holders(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    robots = (RobotSpec("left", (), (), "site", "base"), RobotSpec("cart", (), (), "site", "wheels"))
+    bodies = (BodyInfo(1, "base", False), BodyInfo(2, "wheels", True))
+    poses = np.array([[1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0]] * 2)
+    take = Event(2, 4, 8_000_100, LeaseChanged(Lease("left", "robot", "exclusive", "p1", 1), "acquired"))
+    for part in (str(path), part_path(str(path), 2)):
+        writer = RrdWriter(part, "id")
+        writer.write_header(SessionHeader("s", "n", "closed", 2_000_000, robots=robots, bodies=bodies))
+        writer.add(Batch(states=[frame(0, poses), frame(4, poses)], events=[joined("p1", "Ada"), take]))
+        writer.close()
+    found = read(path)
+    assert column(found["/robots/left"], "Points3D:labels") == [["left"], ["left: Ada"]]
+    assert column(found["/robots/left"], "Points3D:positions") == [[[1.0, 2.0, 3.0]]] * 2
+    assert times(found["/robots/left"]) == [7, 8_000_100]
+    assert column(found["/robots/cart"], "CoordinateFrame:frame") == [["wheels"]]
+    later = read(Path(part_path(str(path), 2)))
+    assert column(later["/robots/left"], "Points3D:labels") == [["left: Ada"]], "its robots had holders before"
+
+
+def test_rows_have_the_simulated_time_of_the_state_before_them(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    writer.write_header(SessionHeader("s", "n", "closed", 2_000_000))
+    states = [frame(step, np.zeros((0, 7))) for step in (0, 8, 16)]
+    writer.add(Batch(states=states, metrics=[MetricRecord(9, states[1].session_time, "late_ms", 1.0)]))
+    writer.close()
+    assert column(read(path)["/metrics/late_ms"], "tick") == [9]
 
 
 def test_events_and_denials_are_text_lines(tmp_path: Path) -> None:
@@ -149,8 +279,7 @@ def test_events_and_denials_are_text_lines(tmp_path: Path) -> None:
     writer.add(Batch(events=[stop], denials=[denied]))
     writer.close()
     found = read(path)
-    line = "#4 estop_changed active=True participant=p1 reason=smoke stop_seq=2"
-    assert column(found["/events"], "TextLog:text") == [[line]]
+    assert column(found["/events"], "TextLog:text") == [["E-STOP by p1: smoke"]]
     assert column(found["/events"], "TextLog:level") == [["CRITICAL"]]
     expected = "connection 3: held: left is held; held by Ada; ask for it"
     assert column(found["/denials"], "TextLog:text") == [[expected]]
@@ -173,6 +302,28 @@ def test_file_contains_a_blueprint(tmp_path: Path) -> None:
         reader = RrdReader(str(path))
     assert len(reader.blueprints()) == 1
     assert reader.recordings()[0].recording_id == "id"
+
+
+def test_eye_is_placed_by_the_moving_bodies_of_the_first_state(tmp_path: Path) -> None:
+    from rerun.chunk import RrdReader
+
+    path = tmp_path / "w.rrd"
+    bodies = (BodyInfo(1, "a", True), BodyInfo(2, "far", False), BodyInfo(3, "b", True))
+    writer = RrdWriter(path, "id")
+    writer.write_header(SessionHeader("s", "n", "closed", 2_000_000, bodies=bodies))
+    poses = np.zeros((3, 7))
+    poses[:, 0] = (1.0, 900.0, 3.0)
+    writer.add(Batch(states=[frame(0, poses), frame(8, poses + 5.0)]))
+    writer.close()
+    with pytest.warns(match="footer"):
+        reader = RrdReader(str(path))
+    (store,) = reader.blueprints()
+    chunks = [chunk.to_record_batch() for chunk in reader.stream(store=store)]
+    (eye,) = [chunk for chunk in chunks if "EyeControls3D:position" in chunk.schema.names]
+    assert column([eye], "EyeControls3D:look_target") == [[[2.0, 0.0, 0.0]]], "not what stands 900 m away"
+    ((position,),) = column([eye], "EyeControls3D:position")
+    assert position[1] == pytest.approx(-1.75 * 1.45 * 0.98), "98 % of half the distance between the bodies"
+    assert place_eye(np.full((2, 3), np.nan)) is None
 
 
 OTHER = """

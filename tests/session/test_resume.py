@@ -470,7 +470,7 @@ class Journal:
     def add_decision(self, step: int, session_time: int, decision: Decision) -> None:
         pass
 
-    def add_metric(self, name: str, value: float) -> None:
+    def add_metric(self, step: int, session_time: int, name: str, value: float) -> None:
         pass
 
     def take_gap(self) -> int:

@@ -57,7 +57,7 @@ class Recorder:
         self.keyframes: list[Keyframe] = []
         self.states = 0
         self.state_times: list[int] = []
-        self.metrics: list[tuple[str, float]] = []
+        self.metrics: list[tuple[int, int, str, float]] = []
         self.scenes: list[tuple[int, str]] = []  # rows before it, hash
         self.drawn: list[tuple[str, str]] = []
 
@@ -102,8 +102,8 @@ class Recorder:
     def add_decision(self, step: int, session_time: int, decision: Decision) -> None:
         pass
 
-    def add_metric(self, name: str, value: float) -> None:
-        self.metrics.append((name, value))
+    def add_metric(self, step: int, session_time: int, name: str, value: float) -> None:
+        self.metrics.append((step, session_time, name, value))
 
     def take_gap(self) -> int:
         gap, self.gap = self.gap, 0
@@ -298,4 +298,5 @@ def test_worst_lateness_between_two_states_is_recorded_once() -> None:
     rig.stepper.step(1)
     rig.now_ns += 17 * MS
     rig.stepper.step(1)
-    assert rig.recorder.metrics == [("lateness_ms", 3.0), ("lateness_ms", 0.0)]
+    times = rig.recorder.state_times
+    assert rig.recorder.metrics == [(0, times[0], "lateness_ms", 3.0), (1, times[1], "lateness_ms", 0.0)]

@@ -1,0 +1,143 @@
+"""Picture of participants in a recording: heads and hands at the poses that the session had of them, names at robots.
+
+A device is drawn in a frame of its own, whose motion is rows of `/tf`. It appears with its first pose, and is cleared
+when its participant leaves or no pose came for `STALE_NS`. Nothing is static, as Rerun shows static data at all times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+import rerun as rr
+
+from iris_session.protocol.names import Device
+from iris_session.protocol.server_messages import PresenceItem
+from iris_session.recording import paths
+from iris_session.recording.messages import StateFrame
+from iris_session.recording.picture import Moment, escape_entity_part, set_moment
+from iris_session.recording.story import FREE, Rgb, SessionStory
+
+#: A device without a pose for so long is not drawn: it is not tracked any more [ns].
+STALE_NS: Final = 250_000_000
+#: Half extents of a head and of a hand, and length of the arrow in the direction of view [m]. Heads look along x.
+HEAD_HALF_M: Final = (0.06, 0.09, 0.05)
+HAND_HALF_M: Final = (0.05, 0.03, 0.03)
+VIEW_M: Final = 0.3
+
+_Key = tuple[str, str]  # participant, device
+
+
+class DeviceRow(NamedTuple):
+    """Pose of a device at a state. `state`: its index. `pose`: `x y z qw qx qy qz`."""
+
+    state: int
+    frame: str
+    pose: tuple[float, ...]
+
+
+class Base(NamedTuple):
+    """Base of a robot, where its label is. `position`: in `frame` [m]."""
+
+    frame: str
+    position: tuple[float, float, float]
+
+
+class _Shown(NamedTuple):
+    """A device as it is in the picture. `label`: text at it."""
+
+    item: PresenceItem
+    seen_ns: int
+    label: str
+
+
+class PeoplePicture:
+    """Devices of participants in one file. `is_first`: the file is no later part, whose robots may have holders."""
+
+    def __init__(self, recording: rr.RecordingStream, story: SessionStory, *, is_first: bool) -> None:
+        self._rec = recording
+        self._is_first = is_first
+        self._story = story
+        self._shown: dict[_Key, _Shown] = {}
+        self._bases: dict[str, Base] = {}
+
+    def label_robots(self, bases: Mapping[str, Base], moment: Moment) -> None:
+        """Label all robots by their names, without holders. Others have no label any more."""
+        if self._bases:
+            set_moment(self._rec, moment)
+            self._rec.log(paths.ROBOTS, rr.Clear(recursive=True), strict=True)
+            self._rec.reset_time()
+        self._bases = dict(bases)
+        for robot in bases if self._is_first else ():
+            self.label_robot(robot, "", FREE, moment)
+
+    def label_robot(self, robot: str, holder: str, colour: Rgb, moment: Moment) -> None:
+        """Label a robot by its name and that of its holder."""
+        base = self._bases.get(robot)
+        if base is None:
+            return
+        label = f"{robot}: {holder}" if holder else robot
+        point = rr.Points3D([base.position], colors=[colour], radii=[0.01], labels=[label], show_labels=True)
+        set_moment(self._rec, moment)
+        self._rec.log(f"{paths.ROBOTS}/{escape_entity_part(robot)}", rr.CoordinateFrame(base.frame), point, strict=True)
+        self._rec.reset_time()
+
+    def draw(self, states: Sequence[StateFrame], moments: Sequence[Moment]) -> list[DeviceRow]:
+        """Draw devices that appear in `states`, clear those that are stale, and return the poses that are new."""
+        rows: list[DeviceRow] = []
+        for i, (state, moment) in enumerate(zip(states, moments, strict=True)):
+            for item in state.presence:
+                key = (item.participant, item.device)
+                shown = self._shown.get(key)
+                if shown is not None and shown.item == item:
+                    continue
+                label = self._label(key)
+                if shown is None or shown.label != label:
+                    self._draw_device(key, label, moment)
+                self._shown[key] = _Shown(item, state.session_time, label)
+                rows.append(DeviceRow(i, _frame(key), (*item.pose.p, *item.pose.q)))
+            for key in [key for key, shown in self._shown.items() if state.session_time - shown.seen_ns > STALE_NS]:
+                self._clear(key, moment)
+        return rows
+
+    def remove(self, participant: str, moment: Moment) -> None:
+        """Clear everything of a participant who has left."""
+        for key in [key for key in self._shown if key[0] == participant]:
+            self._clear(key, moment)
+
+    def _label(self, key: _Key) -> str:
+        if key[1] != Device.HEAD:
+            return ""
+        person = self._story.find_person(key[0])
+        return f"{person.name} · {person.role}" if person.role else person.name
+
+    def _draw_device(self, key: _Key, label: str, moment: Moment) -> None:
+        """Draw a box for a head, with an arrow in the direction of view, and a ball for a hand."""
+        colours = [self._story.find_colour(key[0])]
+        frame, solid = rr.CoordinateFrame(_frame(key)), rr.components.FillMode.Solid
+        set_moment(self._rec, moment)
+        if key[1] == Device.HEAD:
+            box: Any = rr.Boxes3D(
+                half_sizes=[HEAD_HALF_M], colors=colours, labels=[label], show_labels=True, fill_mode=solid
+            )
+            arrow = rr.Arrows3D(vectors=[(VIEW_M, 0.0, 0.0)], colors=colours, radii=[0.008])
+            self._rec.log(_entity(key), frame, box, strict=True)
+            self._rec.log(f"{_entity(key)}/view", frame, arrow, strict=True)
+        else:
+            ball = rr.Ellipsoids3D(half_sizes=[HAND_HALF_M], colors=colours, fill_mode=solid)
+            self._rec.log(_entity(key), frame, ball, strict=True)
+        self._rec.reset_time()
+
+    def _clear(self, key: _Key, moment: Moment) -> None:
+        del self._shown[key]
+        set_moment(self._rec, moment)
+        self._rec.log(_entity(key), rr.Clear(recursive=True), strict=True)
+        self._rec.reset_time()
+
+
+def _frame(key: _Key) -> str:
+    return f"presence/{key[0]}/{key[1]}"
+
+
+def _entity(key: _Key) -> str:
+    return f"{paths.PRESENCE}/{escape_entity_part(key[0])}/{escape_entity_part(key[1])}"
