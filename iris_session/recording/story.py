@@ -84,6 +84,8 @@ _PAUSE: Final = {PAUSED: _AMBER}
 _EPISODE: Final = {"success": _GREEN, "failure": _RED, "discarded": _GREY}
 _ALIGNMENT: Final = {AlignmentKind.MEASURED: _GREEN, AlignmentKind.PLACED: _BLUE, AlignmentKind.NOT_NEEDED: _GREY}
 
+#: Ends of an engagement that its holder wanted.
+_WANTED_HOLDS: Final = (HoldReason.CLUTCH_OPEN, HoldReason.REARM, HoldReason.NO_LEASE)
 _NOTICES: Final = {"info": INFO, "warning": WARN, "error": ERROR}
 _SCENES: Final = {
     "reset": "the scene is reset",
@@ -205,7 +207,7 @@ class SessionStory:
                 if grace:
                     return LogLine(WARN, f"{self._name(who)} is disconnected ({reason})")
                 self._set_alignment(who, None)
-                return LogLine(WARN, f"{self._name(who)} leaves ({reason})")
+                return LogLine(INFO, f"{self._name(who)} leaves ({reason})")
             case LeaseChanged():
                 return self._describe_lease(body)
             case LeasesChanged():
@@ -221,7 +223,7 @@ class SessionStory:
                 self._set(("robots", robot, "clutch"), CLOSED if engaged else "", _CLUTCH)
                 if engaged:
                     return LogLine(DEBUG, f"{self._name(who)} closes the clutch of {robot}")
-                level = DEBUG if reason == HoldReason.CLUTCH_OPEN else INFO
+                level = DEBUG if reason in _WANTED_HOLDS else INFO
                 return LogLine(level, f"{self._name(who)} no longer moves {robot} ({_to_words(reason)})")
             case ScaleChanged(robot=robot, scale=scale, participant=who):
                 return LogLine(INFO, f"{self._name(who)} sets the motion scaling of {robot} to {scale:g}")
@@ -287,7 +289,8 @@ class SessionStory:
             case MarkerAdded(participant=who, text=text):
                 return LogLine(INFO, f"{self._name(who)}: {text}")
             case Notice(level=level, text=text, participant=who):
-                return LogLine(_NOTICES.get(level, WARN), f"{self._name(who)}: {text}" if who else text)
+                named = not who or self._name(who) in text
+                return LogLine(_NOTICES.get(level, WARN), text if named else f"{self._name(who)}: {text}")
             case Gap(kind=kind, duration_ns=duration_ns, rows=rows):
                 if kind == "recording":
                     return LogLine(ERROR, f"{rows} rows of the recording are lost")

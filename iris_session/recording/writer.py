@@ -521,8 +521,8 @@ def build_blueprint(eye: Any, pictures: Sequence[str] = ()) -> Any:
     images = [rrb.Spatial2DView(origin=f"{paths.PICTURES}/{name}", name=name) for name in pictures]
     side = rrb.Vertical(rrb.Tabs(log, about), *([rrb.Grid(*images)] if images else ()), plots)
     return rrb.Blueprint(
-        rrb.Horizontal(rrb.Vertical(scene, lanes, row_shares=[5, 2]), side, column_shares=[5, 3]),
-        rrb.TimePanel(timeline=paths.SESSION_TIME, play_state="paused"),
+        rrb.Horizontal(rrb.Vertical(scene, lanes, row_shares=[5, 3]), side, column_shares=[5, 3]),
+        rrb.TimePanel(state="collapsed", timeline=paths.SESSION_TIME, play_state="paused"),
         collapse_panels=True,
     )
 

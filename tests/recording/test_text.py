@@ -78,6 +78,7 @@ def test_events_are_sentences_with_names() -> None:
         EpisodeChanged(3, "success", "folded", "p1"),
         EStopChanged(True, "", "", 1),
         Notice("info", "look", "p7"),
+        Notice("info", "eve: look", "p2"),
         Audited("flood", "p1", count=3),
     ) == [
         ("INFO", "ann joins as operator"),
@@ -92,6 +93,7 @@ def test_events_are_sentences_with_names() -> None:
         ("INFO", "episode 3: success, folded (ann)"),
         ("CRITICAL", "E-STOP by a connection that has not joined"),
         ("INFO", "p7: look"),
+        ("INFO", "eve: look"),
         ("INFO", "audited: kind=flood subject=p1 count=3"),
     ]
 
