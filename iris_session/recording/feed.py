@@ -65,6 +65,8 @@ JOURNAL_SHARE: Final = 0.75
 SILENCE_S: Final = 1.0
 #: Maximum length of each list of one batch. A flush comes long before, unless the caller never takes a step.
 BATCH_ITEMS: Final = 4096
+#: Maximum number of participants whose names a later recorder gets; batches that it gets again are about past ones too.
+PEOPLE: Final = 256
 #: Maximum number of vertex frames in transit. The recorder receives them thirty times a second.
 VERTEX_FRAMES: Final = 32
 
@@ -226,8 +228,11 @@ class RecorderFeed:
             self._add(self._batch.events, event)
             if isinstance(event.body, ParticipantJoined | ParticipantChanged):
                 self._people[event.body.participant.id] = event.body.participant
+                if len(self._people) > PEOPLE:
+                    del self._people[next(iter(self._people))]
             elif isinstance(event.body, ParticipantLeft):
-                self._forget(event.body)
+                for key in [key for key in self._presence if key[0] == event.body.participant]:
+                    del self._presence[key]
         for command in decision.commands:
             if self._holds.get(command.robot, "") != command.hold_reason:
                 self._holds[command.robot] = command.hold_reason
@@ -317,12 +322,6 @@ class RecorderFeed:
         self._socket.close(0)
         self._context.term()
         return self._complete
-
-    def _forget(self, left: ParticipantLeft) -> None:
-        for key in [key for key in self._presence if key[0] == left.participant]:
-            del self._presence[key]
-        if not left.grace:
-            self._people.pop(left.participant, None)
 
     def _leave_out_picture(self, batch: Batch) -> None:
         """Leave what the file shows, but verification does not need, out of a batch: the rest is for the journal."""

@@ -139,7 +139,7 @@ class Batch(msgspec.Struct, array_like=True):
 
     `dropped_rows`: rows dropped before this batch since the feed began. `scenes` precede all other records of the
     batch, then `assets`: those of the newest of these scenes, or a patch of the present one. `people`: participants
-    that are present, for a recorder that starts later.
+    so far, for a recorder that starts later.
     """
 
     rows: list[JournalRow] = []

@@ -122,9 +122,13 @@ class Person(NamedTuple):
 
 
 class SessionStory:
-    """State of a session as far as its events tell it. Give it every event, in order."""
+    """State of a session as far as its events tell it. Give it every event, in order.
 
-    def __init__(self) -> None:
+    `is_first`: the file is no later part of a recording, in whose lanes something may be in force from the start.
+    """
+
+    def __init__(self, *, is_first: bool = True) -> None:
+        self._before = "" if is_first else None
         self._people: dict[str, Person] = {}
         self._holders: dict[str, list[str]] = {}
         self._lanes: dict[tuple[str, ...], str] = {}  # those in which something is in force
@@ -171,12 +175,12 @@ class SessionStory:
         return before
 
     def _set(self, lane: tuple[str, ...], state: str, colours: Mapping[str, Rgb] | None = None) -> None:
-        if self._lanes.get(lane, "") == state:
+        if self._lanes.get(lane, self._before) == state:
             return
         if state:
             self._lanes[lane] = state
         else:
-            del self._lanes[lane]
+            self._lanes.pop(lane, None)
         self._changes.append(LaneChange(lane, state, colours or {}))
 
     def _set_people(self, lane: tuple[str, ...], people: list[str], state: str = "{}") -> None:

@@ -99,8 +99,9 @@ class RrdWriter:
         self._applied: dict[str, Applied] = {}
         self._latencies: list[MetricRecord] = []
         self._latencies_due_ns = 0
-        self._story = SessionStory()
-        self._people = PeoplePicture(self._rec, self._story, is_first=paths.split_part(self.path)[1] == 1)
+        is_first = paths.split_part(self.path)[1] == 1
+        self._story = SessionStory(is_first=is_first)
+        self._people = PeoplePicture(self._rec, self._story, is_first=is_first)
         self._lane_colours: dict[str, dict[str, Rgb]] = {}
         self._eye: Any = None
         self._arranged = False

@@ -24,7 +24,7 @@ from iris_session.protocol.server_messages import (
 )
 from iris_session.protocol.steps import Command, Decision, OutgoingMessage
 from iris_session.recording import Keyframe, RecorderFeed, make_row
-from iris_session.recording.feed import BATCH_ITEMS, BATCH_ROWS, JOURNAL_SHARE, VERTEX_FRAMES
+from iris_session.recording.feed import BATCH_ITEMS, BATCH_ROWS, JOURNAL_SHARE, PEOPLE, VERTEX_FRAMES
 from iris_session.recording.journal import check_keyframe
 from iris_session.recording.messages import (
     BATCH,
@@ -315,7 +315,7 @@ def test_changed_reasons_to_hold_are_sent_once(feed: RecorderFeed, played) -> No
     ]
 
 
-def test_recorder_that_starts_later_knows_who_is_present(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
+def test_recorder_that_starts_later_knows_participants_by_name(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
     ann, bob, eve = (
         ParticipantInfo(f"p{i}", name, "operator", True) for i, name in ((1, "ann"), (2, "bob"), (3, "eve"))
     )
@@ -324,14 +324,18 @@ def test_recorder_that_starts_later_knows_who_is_present(feed: RecorderFeed, pla
         ParticipantJoined(bob),
         ParticipantJoined(eve),
         ParticipantChanged(msgspec.structs.replace(bob, name="rob")),
-        ParticipantLeft("p1", "timeout", grace=True),
-        ParticipantLeft("p3", "bye"),
+        ParticipantLeft("p3", "bye"),  # which the later recorder may still have to write
     )
     feed.add_decision(0, 0, Decision(commands=(), events=tuple(Event(i, 0, 0, body) for i, body in enumerate(bodies))))
     played[0].say(feed, 2, -1, -1)
     played[0].take(1)
     people = decode_batch(played[0].more[0]).people
-    assert [(one.id, one.name) for one in people] == [("p1", "ann"), ("p2", "rob")]
+    assert [(one.id, one.name) for one in people] == [("p1", "ann"), ("p2", "rob"), ("p3", "eve")]
+    some = [ParticipantInfo(f"p{i}", "bot", "agent", True) for i in range(4, 6 + PEOPLE)]
+    feed.add_decision(
+        1, 1, Decision(commands=(), events=tuple(Event(i, 1, 1, ParticipantJoined(p)) for i, p in enumerate(some)))
+    )
+    assert len(feed._people) == PEOPLE
 
 
 def test_lists_are_bounded_without_steps(feed: RecorderFeed) -> None:

@@ -192,6 +192,15 @@ def test_states_that_last_are_lanes() -> None:
     assert [(c.lane, c.state) for c in story.add_hold("left", "not_worn")] == [(("robots", "left", "hold"), "not worn")]
 
 
+def test_lanes_of_a_later_part_end_what_began_before_it() -> None:
+    free = lease("left", "", "p1", "released")
+    assert changes(SessionStory(), free) == []
+    later = SessionStory(is_first=False)
+    later.add_people([ParticipantInfo("p1", "ann", "operator", True)])
+    assert changes(later, free) == [("robots/left/holder", "")]
+    assert changes(later, ParticipantLeft("p1", "bye")) == [("alignment/ann", "")]
+
+
 def test_colours_follow_the_order_of_joining() -> None:
     story = SessionStory()
     (change,) = story.add(Event(1, 1, 1, lease("left", "p2")))[1]
