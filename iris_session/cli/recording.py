@@ -6,7 +6,7 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from threading import Timer
 from typing import TYPE_CHECKING, Final, Self
@@ -83,19 +83,23 @@ def _inspect_folder(folder: Path, *, as_json: bool) -> int:
 
     from iris_session.recording import RecordingError
 
-    files = find_recordings(folder)
-    if not files:
+    rows: list[dict[str, object]] = []
+
+    def refuse(path: str, why: str) -> None:
+        rows.append({"path": path, "ok": False, "error": why})
+        print(to_printable(f"iris-session: {why}"), file=sys.stderr)
+
+    files = find_recordings(folder, lambda error: refuse(str(error.filename), str(error)))
+    if not files and not rows:
         raise CommandError(
             f"there is no recording below the folder {folder}: give a {SUFFIX} file that `serve` or `demo` wrote, or a "
             "folder with such files"
         )
-    rows: list[dict[str, object]] = []
     for file in files:
         try:
             summary = _summarise_file(file)
         except RecordingError as error:
-            rows.append({"path": str(file), "ok": False, "error": str(error)})
-            print(to_printable(f"iris-session: {error}"), file=sys.stderr)
+            refuse(str(file), str(error))
             continue
         rows.append(msgspec.to_builtins(summary))
         if not as_json:
@@ -106,12 +110,15 @@ def _inspect_folder(folder: Path, *, as_json: bool) -> int:
     return 0 if ok else 1
 
 
-def find_recordings(folder: Path) -> list[Path]:
-    """Return the first file of every recording in a folder and the folders below it, in the order of their names."""
+def find_recordings(folder: Path, on_error: Callable[[OSError], None]) -> list[Path]:
+    """Return the first file of every recording in a folder and the folders below it, in the order of their names.
+
+    `on_error`: called for every folder that cannot be read.
+    """
     from iris_session.recording.paths import split_part
 
     first: dict[str, tuple[int, Path]] = {}
-    for where, _, names in os.walk(folder):
+    for where, _, names in os.walk(folder, onerror=on_error):
         for name in names:
             base, part = split_part(os.path.join(where, name))
             if name.endswith(SUFFIX) and (base not in first or part < first[base][0]):

@@ -169,6 +169,7 @@ def _make_reference(points: Floats) -> Reference:
 
 
 def find_pairs(points: Floats, target: Reference, reach_m: float) -> Pairs:
+    """Pair points (n, 3) with the nearest ones of a reference within `reach_m` [m]."""
     distance, at = target.tree.query(points, distance_upper_bound=reach_m)
     rows = np.flatnonzero(np.isfinite(distance))
     normals = target.normals[at[rows]]
@@ -242,4 +243,5 @@ def make_motion(shift: Floats, turn: Floats, center: Floats) -> Floats:
 
 
 def measure_turn(R: Floats) -> float:
+    """Return the angle of a rotation matrix (3, 3) [rad]."""
     return math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(R)) - 1.0))))

@@ -176,9 +176,9 @@ class SessionRobots:
         try:
             scene = fetch_scene(self._client, COARSE_TEXTURES)
             shapes = scene.spec, scene.meshes, tuple(mirror.robots.values()), mirror.bodies
-            if self._removes:
-                self._points = RobotPoints(*shapes)
-            self._surface = RobotSurface(*shapes)
+            points = RobotPoints(*shapes) if self._removes else None
+            # Both at once: `is_ready` waits for states, which removing points needs, as soon as there is a surface.
+            self._surface, self._points = RobotSurface(*shapes), points
         except Exception as error:  # of a connection, or of a scene: the cloud goes on with the points on robots
             self._warn(str(error))
             return

@@ -2,9 +2,8 @@
 
 A run succeeds only if the session's own detector saw every handover by contact alone, if every goal with a deformable
 was reached (`goals`; recorded as the verdict of an episode), if the streams of its cameras reach every observer, and if
-the recording verifies bit for bit. When an
-operator fails, such as after dropping an object where it cannot be grasped, the scene is reset and all begin again, as
-people do who record demonstrations. The demos themselves are in `demos`.
+the recording verifies bit for bit. When an operator fails, such as after dropping an object where it cannot be grasped,
+the scene is reset and all begin again, as people do who record demonstrations. The demos themselves are in `demos`.
 """
 
 from __future__ import annotations
@@ -401,7 +400,8 @@ def _check_cameras(play: Demo) -> None:
             status = child.wait(DRAW_S)
             said = b" ".join(child.read_available_lines()).decode(errors="replace")
         if status != 0:
-            why = said or f"opening them ended with status {status}"
+            ended = f"did not end within {DRAW_S:.0f} s" if status is None else f"ended with status {status}"
+            why = said or f"opening them {ended}"
             raise SourceError(f"demo {play.name} draws what its cameras see: {why}")
 
 

@@ -141,10 +141,10 @@ class RecorderFeed:
         self._last_status_ns = 0
         #: Session time since the last status of a recorder that has something to write: it may hang.
         self.silence_ns = 0
-        self._presence: dict[
-            tuple[str, str], PresenceItem
-        ] = {}  # new since the newest state, by participant and device
-        self._holds: dict[str, str] = {}  # reason by robot
+        #: New since the newest state, by participant and device.
+        self._presence: dict[tuple[str, str], PresenceItem] = {}
+        #: Reason to hold by robot; `None`: the file does not have it.
+        self._holds: dict[str, str | None] = {}
         self._people: dict[str, ParticipantInfo] = {}
 
     @property
@@ -328,6 +328,7 @@ class RecorderFeed:
         for items in (batch.states, batch.metrics, batch.holds):
             self.stats.dropped_items += len(items)
             items.clear()
+        self._holds = dict.fromkeys(self._holds)  # what was left out is sent when there is room
 
     def _add(self, items: list[_T], item: _T) -> None:
         if len(items) < BATCH_ITEMS:

@@ -27,8 +27,6 @@ from iris_session.streams.errors import StreamError
 
 #: Size of a point that stands for itself, in the viewer [px].
 _POINT_PX: Final = 1.5
-
-
 #: Folders of entities by the encodings that are recorded.
 _FOLDERS: Final = {MediaEncoding.CLOUD: paths.CLOUDS, MediaEncoding.JPEG: paths.PICTURES}
 

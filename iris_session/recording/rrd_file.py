@@ -75,9 +75,7 @@ def scan_file(path: str | Path) -> Scan:
     holes: list[tuple[int, int]] = []
     with open(path, "rb") as file:
         if file.read(FILE_HEAD)[: len(MAGIC)] != MAGIC:
-            raise NotARecordingError(
-                f"{path} is not a Rerun file (it does not begin with {MAGIC.decode()}): give the .rrd file of a session"
-            )
+            raise NotARecordingError(f"{path} is not a Rerun file (it does not begin with {MAGIC.decode()})")
         at = FILE_HEAD
         while at < size:
             message = _message_at(file, at, size)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -105,12 +107,31 @@ def test_inspect_shows_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture
     assert (result["ok"], result["steps"], result["people"][0]["held_s"]) == (True, 200, {"left": 0.358})
 
 
+def test_a_folder_that_cannot_be_read_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The tests may run as root, for whom every folder can be read."""
+    scan = os.scandir
+
+    def refuse(path: str) -> object:
+        if str(path).endswith("locked"):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return scan(path)
+
+    (tmp_path / "locked").mkdir()
+    monkeypatch.setattr(os, "scandir", refuse)
+    assert main(["recording", "inspect", str(tmp_path), "--json"]) == 1
+    out, err = capsys.readouterr()
+    assert [row["path"] for row in json.loads(out)["recordings"]] == [str(tmp_path / "locked")]
+    assert err.count("\n") == 1
+
+
 def test_a_folder_is_a_line_for_every_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("a/session.rrd", "b/session.part2.rrd", "b/session.part3.rrd", "b/session.resume2.rrd"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"no recording")
     (tmp_path / "notes.txt").write_text("none either")
-    names = [path.relative_to(tmp_path).as_posix() for path in find_recordings(tmp_path)]
+    names = [path.relative_to(tmp_path).as_posix() for path in find_recordings(tmp_path, pytest.fail)]
     assert names == ["a/session.rrd", "b/session.resume2.rrd", "b/session.part2.rrd"]
     write(tmp_path / "a/session.rrd", *journal(20))
     assert main(["recording", "inspect", str(tmp_path)]) == 1

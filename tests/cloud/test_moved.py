@@ -264,7 +264,7 @@ def test_three_looks_at_robots_that_agree_decide() -> None:
 
 
 def test_looks_at_robots_that_disagree_are_no_move() -> None:
-    """What moves about before robots may be taken for them, each time elsewhere."""
+    """Things that move in front of robots may be taken for robots, each time at another place."""
     other: PoseTuple = ((-0.03, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
     assert add_looks(RobotMonitor(), 0, *[look("off"), look("off", other)] * 5) == [None] * 10
 

@@ -123,22 +123,28 @@ def test_points_on_robots_go_once_their_shapes_are_there(monkeypatch: pytest.Mon
         fetched.append(client)
         return SimpleNamespace(spec=None, meshes={}, failed={})
 
+    def make_surface(*_: object) -> FakeRobotSurface:
+        kept.append(len(robots.remove(make_points(), 0).positions))
+        return FakeRobotSurface()
+
+    kept: list[int] = []
     monkeypatch.setattr(process, "fetch_scene", fetch)
     monkeypatch.setattr(process, "RobotPoints", FakeRobotPoints)
-    monkeypatch.setattr(process, "RobotSurface", FakeRobotSurface)
+    monkeypatch.setattr(process, "RobotSurface", make_surface)
     lab = Lab()
     robots = SessionRobots(lab.client, lab.history, removes=True)
     assert len(robots.remove(make_points(), 0).positions) == 2
     assert robots.is_ready(10 * MS), "frames do not wait for the shapes"
     is_there.set()
     wait_for_fetch(robots)
+    assert kept == [2], "no points go before frames wait for states"
     assert not robots.is_ready(10 * MS), "but for the state, from then on"
     for at in (0, 16):
         lab.add(at, 0.0)
     assert robots.is_ready(10 * MS)
-    kept = robots.remove(make_points(), 10 * MS)
-    assert kept.positions.tolist() == [[-1.0, 0.0, 0.0]]
-    assert (len(kept.colors), len(kept.counts)) == (1, 1)
+    left = robots.remove(make_points(), 10 * MS)
+    assert left.positions.tolist() == [[-1.0, 0.0, 0.0]]
+    assert (len(left.colors), len(left.counts)) == (1, 1)
     assert len(fetched) == 1
     placed: Any = robots.place_surface(10 * MS, "hand")
     assert placed == (10 * MS, "hand")

@@ -111,7 +111,7 @@ def test_what_the_calibration_states_is_allowed(scene: RobotScene, placed: Place
 
 def test_a_camera_that_was_moved_far_sees_no_robot_where_it_should(scene: RobotScene, placed: PlacedSurface) -> None:
     assert compare(placed, see(scene, POSE @ shift(0.35, 0.0, 0.0))).verdict == "lost"
-    # One that is covered, or has somebody before it, tells nothing.
+    # A picture of a covered camera, or of a person close to it, gives no verdict.
     assert compare(placed, np.zeros((120, 160), np.uint16)).verdict == ""
     assert compare(placed, np.full((120, 160), 400, np.uint16)).verdict == ""
     assert compare(placed, np.full((120, 160), 65_535, np.uint16)).verdict == ""
@@ -128,7 +128,7 @@ def test_things_and_people_beside_robots_are_no_bump(scene: RobotScene, placed: 
         boxes = f'<geom type="box" size="{HAND[0]} {HAND[1]} {HAND[2]}" pos="{x} {y} {z}" quat="{turn}"/>'
         verdicts.append(compare(placed, see(scene, POSE, boxes=boxes)).verdict)
     assert verdicts == ["fits"] * 8
-    # Somebody leans against the left arm, and hides some of both.
+    # A person leans against the left arm, and hides a part of both arms.
     x, y, _ = placed.points[: len(placed.points) // 2].mean(axis=0) + np.array([0.15, -0.15, 0.0])
     person = f'<geom type="capsule" size="0.15 0.8" pos="{x} {y} 0.8"/>'
     assert compare(placed, see(scene, POSE, boxes=person)).verdict in ("fits", "")

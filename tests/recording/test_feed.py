@@ -315,6 +315,22 @@ def test_changed_reasons_to_hold_are_sent_once(feed: RecorderFeed, played) -> No
     ]
 
 
+def test_reasons_to_hold_that_were_left_out_are_sent_again(played) -> None:  # type: ignore[no-untyped-def]
+    """Else a lane of the picture would show the reason before for as long as the robot holds."""
+    _, endpoint, folder = played
+    feed = RecorderFeed(endpoint, folder, window_bytes=2000, spill_bytes=60_000)
+    feed.send_header(make_header())
+    held = Decision(commands=(Command("left", "hold", "stale"),))
+    feed.add_decision(0, 0, Decision(commands=(Command("left", "hold", "no_sample"),)))
+    feed.flush()
+    feed.add_decision(1, 10, held)
+    assert len(feed._batch.holds) == 1
+    feed._leave_out_picture(feed._batch)
+    feed.add_decision(2, 20, held)
+    assert [(one.step, one.reason) for one in feed._batch.holds] == [(2, "stale")]
+    feed.close(0.0)
+
+
 def test_recorder_that_starts_later_knows_participants_by_name(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
     ann, bob, eve = (
         ParticipantInfo(f"p{i}", name, "operator", True) for i, name in ((1, "ann"), (2, "bob"), (3, "eve"))
