@@ -76,7 +76,8 @@ def test_two_people_align_and_drive_while_one_observes(session: LiveSession) -> 
         assert report.observations >= 12
         assert report.samples > 100
         assert report.frames > 50
-        assert set(report.rejected) <= {"alignment_version", "stale"}  # stale: this machine stalled
+        # A machine that stalls makes samples stale, and the first estimates of the clocks differ.
+        assert set(report.rejected) <= {"alignment_version", "stale", "future"}
     samples = [(e.connection, e.receive_ns, e.message.device) for e in session.messages_of(Sample)]  # type: ignore[union-attr]
     heads = {(connection, at) for connection, at, device in samples if device == Device.HEAD}
     hands = {(connection, at) for connection, at, device in samples if device != Device.HEAD}
