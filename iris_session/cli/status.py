@@ -286,14 +286,18 @@ def _format_media(report: StatusReport) -> Iterator[str]:
         for p in report.participants:
             for budget in p.media:
                 if budget.stream == one.stream:
-                    subscribers.append(f"{p.name} ({p.id}) {budget.budget_class}" + _format_dropped(p.media_drops))
+                    subscribers.append(f"{p.name} ({p.id}) {budget.budget_class}")
         source = f" from {one.source}" if one.source else ""
         receivers = ", ".join(subscribers) or "no subscribers"
         title = f" ({one.title})" if one.title else ""
         fault = f"; FAULT {one.fault}{f': {one.detail}' if one.detail else ''}" if one.fault else ""
-        stale = f"; STALE, no frame for {one.age_ms * 1e-3:.1f} s" if one.stale else ""
+        age = f"newest frame {one.age_ms:.0f} ms old" if one.age_ms < 1000.0 else f"no frame for {one.age_ms * 1e-3:.1f} s"
+        age = f"STALE, {age}" if one.stale else age
         rates = f"{one.hz:.0f} Hz, {one.mbit_per_s:.1f} Mbit/s"
-        yield f"media {one.stream}{title}: {rates}{source}; {receivers}{stale}{fault}"
+        yield f"media {one.stream}{title}: {rates}{source}; {receivers}; {age}{fault}"
+    dropped = [f"{p.media_drops} to {p.name} ({p.id})" for p in report.participants if p.media_drops]
+    if dropped:
+        yield f"media frames that a link did not take: {', '.join(dropped)}"
 
 
 def _format_assets(report: StatusReport) -> Iterator[str]:
@@ -303,10 +307,6 @@ def _format_assets(report: StatusReport) -> Iterator[str]:
         refused = f", {one.refusals} refused" if one.refusals else ""
         waiting = f"; {one.waiting} clients waiting" if one.waiting else ""
         yield f"assets: {one.served} served, {one.bytes_sent / 1e6:.1f} MB sent{refused}{waiting}"
-
-
-def _format_dropped(n: int) -> str:
-    return f", {n} dropped" if n else ""
 
 
 def _format_quantiles(values: Quantiles | None) -> str:

@@ -178,7 +178,7 @@ class ClientSockets:
     def subscribe_media(self, port: int, topics: Sequence[bytes]) -> None:
         """Add subscriptions. Port 0: the session has no media."""
         if self._media is None and port:
-            media = self._media = self._new_socket(zmq.SUB)
+            media = self._media = self._new_socket(zmq.SUB, bulk_context())
             media.setsockopt(zmq.RCVHWM, MEDIA_HWM)
             media.setsockopt(zmq.RCVBUF, MEDIA_RCVBUF)
             media.connect(f"tcp://{host_port(self._host, port)}")
@@ -203,7 +203,7 @@ class ClientSockets:
         if self._ingest is None:
             if not port:
                 return False
-            self._ingest = self._new_socket(zmq.PUSH)
+            self._ingest = self._new_socket(zmq.PUSH, bulk_context())
             self._ingest.setsockopt(zmq.IMMEDIATE, 1)
             self._published.clear()
             self._reserve_ingest(stream)
@@ -229,7 +229,7 @@ class ClientSockets:
     def open_assets(self, port: int) -> None:
         """Connect to the assets channel unless it is open."""
         if self._assets is None:
-            assets = self._assets = self._new_socket(zmq.DEALER, asset_context())
+            assets = self._assets = self._new_socket(zmq.DEALER, bulk_context())
             assets.setsockopt(zmq.MAXMSGSIZE, MAX_ASSET_CHUNK_BYTES)
             assets.setsockopt(zmq.SNDHWM, ASSETS_SEND_HWM)
             assets.setsockopt(zmq.RCVHWM, ASSETS_HWM)
@@ -410,8 +410,9 @@ _lock = threading.Lock()
 _context: tuple[int, zmq.Context[zmq.Socket[bytes]]] | None = None
 
 
-def asset_context() -> zmq.Context[zmq.Socket[bytes]]:
-    """Return the ZeroMQ context of assets, one per process; a forked child gets its own."""
+def bulk_context() -> zmq.Context[zmq.Socket[bytes]]:
+    """Return the ZeroMQ context of assets and media, one per process; a forked child gets its own. State and control
+    do not wait in its thread while megabytes are read or deciphered."""
     global _context  # noqa: PLW0603
     with _lock:
         if _context is None or _context[0] != os.getpid():

@@ -76,7 +76,7 @@ class StreamMeter:
         self._feed = client.media.subscribe(stream)
         self._cloud = client.media.cloud(stream)
         self._began_ns = self._came_ns = now_ns
-        self._bytes = self._frames = 0
+        self._bytes = self._frames = self._cloud_bytes = 0
         self._points: deque[int] = deque(maxlen=MAX_AGES)
         self._all_points = 0
         self._ages_ns: deque[int] = deque(maxlen=MAX_AGES)
@@ -95,6 +95,7 @@ class StreamMeter:
         if cloud is not None:
             self._points.append(len(cloud.positions))
             self._all_points += len(cloud.positions)
+            self._cloud_bytes += len(frame.data)
         header = frame.header
         times = (header.sent_ns, header.received_ns, header.published_ns, header.capture_ns + frame.age_ns)
         before_ns = header.capture_ns
@@ -131,7 +132,7 @@ class StreamMeter:
             fault="malformed" if self._cloud.fault else said.fault,
             detail=self._cloud.fault or said.detail,
             points=sorted(self._points)[len(self._points) // 2] if self._points else None,
-            bytes_per_point=self._bytes / self._all_points if self._all_points else None,
+            bytes_per_point=self._cloud_bytes / self._all_points if self._all_points else None,
             voxel_m=None if cloud is None else cloud.voxel_m,
             error_mm=None if cloud is None or math.isinf(cloud.error_m) else 1000.0 * cloud.error_m,
         )

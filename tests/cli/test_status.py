@@ -98,7 +98,8 @@ def test_status_shows_media_with_subscribers() -> None:
     )
     streams = (MediaStreamReport("cloud", 30.0, 20.0, "cam-1", 2), MediaStreamReport("cloth", 60.0, 2.0))
     text = "\n".join(format_status(msgspec.structs.replace(REPORT, participants=(ann, bob), media=streams)))
-    assert "ann (p1) full, bob (p2) quarter, 7 dropped" in text
+    assert "ann (p1) full, bob (p2) quarter; newest frame" in text
+    assert "7 to bob (p2)" in text
     assert "60 Hz, 2.0 Mbit/s" in text
 
 
@@ -108,7 +109,7 @@ def test_status_shows_title_fault_and_age_of_streams() -> None:
         well, stream="hand", stale=True, age_ms=2_500.0, fault="moved", detail="3 cm\x1b[2J"
     )
     lines = format_status(msgspec.structs.replace(REPORT, media=(well, faulty)))
-    assert "media room (The room): 30 Hz, 20.0 Mbit/s from cam-1; no subscribers" in lines
+    assert "media room (The room): 30 Hz, 20.0 Mbit/s from cam-1; no subscribers; newest frame 20 ms old" in lines
     (shown,) = [line for line in lines if line.startswith("media hand")]
     assert "STALE, no frame for 2.5 s; FAULT moved: 3 cm" in shown
     assert shown.isprintable()

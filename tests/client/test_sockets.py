@@ -17,7 +17,7 @@ CODE = """
 import os, time
 from contextlib import suppress
 from pathlib import Path
-from iris_session.client.sockets import asset_context
+from iris_session.client.sockets import bulk_context
 from iris_session.system.priority import LOW_PRIORITY_NICE
 
 EXPECTED = min(19, os.getpriority(os.PRIO_PROCESS, 0) + LOW_PRIORITY_NICE)
@@ -32,7 +32,7 @@ def lower():
 
 def check():
     assert lower() == 0
-    assert asset_context() is asset_context()
+    assert bulk_context() is bulk_context()
     end = time.monotonic() + 30
     while lower() != 1:
         assert time.monotonic() < end
