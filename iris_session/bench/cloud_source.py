@@ -19,6 +19,7 @@ from iris_session.client import Client, CurveKeys
 from iris_session.client.errors import NotConnectedError
 from iris_session.cloud.pipeline import CLASSES
 from iris_session.streams.cloud import encode_cloud, order_points
+from iris_session.system.priority import lower_thread_priority
 
 STREAM: Final = "room"
 VOXEL_M: Final = 0.01
@@ -97,6 +98,7 @@ def run(cloud: MovingCloud, client: Client, hz: int, seconds: float) -> dict[str
 
 def main() -> None:
     """Serve commands until the end of standard input."""
+    lower_thread_priority()  # of this thread and those that it starts, as in a camera process
     job = msgspec.json.decode(sys.stdin.readline(), type=SourceJob)
     cloud = MovingCloud(job.points, job.seed)
     client: Client | None = None

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,11 @@ import pytest
 from iris_session.bench.cloud_camera import STAGES, CloudCamera, CloudCase
 from iris_session.bench.cloud_room import BOXES, ROOM, make_room_camera, make_room_pose, render_room
 from iris_session.bench.cloud_source import MovingCloud
-from iris_session.bench.cloud_stream import _compare, plan_intervals
+from iris_session.bench.cloud_stream import Interval, _compare, plan_intervals, summarize
 from iris_session.bench.report import BenchError
 from iris_session.cli.main import main
 from iris_session.cloud.voxels import make_rays
+from iris_session.streams.cloud import read_header
 
 
 def run_bench(folder: Path, *arguments: str) -> dict[str, Any]:
@@ -82,7 +84,7 @@ def test_report_over_a_slow_link(tmp_path: Path) -> None:
     got = run_bench(tmp_path, "cloud-stream", *arguments)["results"]
     assert 0.0 < got["lower_class_after_s"] < 3.0
     assert got["slow_hz_min"] > 0.0
-    assert math.isfinite(got["state_age_ms_p99_slow"])
+    assert math.isfinite(got["state_age_ms_p99_slow_lowered"])
 
 
 def test_pictures_show_the_room_with_noise_and_holes() -> None:
@@ -126,6 +128,26 @@ def test_a_cloud_other_than_that_of_the_source_is_found() -> None:
     assert 0.0 < error_m <= stated_m < 2e-4
     with pytest.raises(BenchError, match="another cloud 7"):
         _compare(rows(cloud.encode(8 / 30)["full"]), runs, cloud, 30)
+
+
+@pytest.mark.parametrize(("level", "hz"), [(0, 30.0), (2, 0.0)])
+def test_clouds_of_a_coarser_class_do_not_count_as_delivered(level: int, hz: float) -> None:
+    cloud = MovingCloud(500, 3)
+    frames = {n: cloud.encode(n / 30) for n in range(31)}
+    plan = [Interval("without", 0.0, 1.0), Interval("with", 1.0, 2.0)]
+    rows = []
+    for n, made in frames.items():  # the first one is whole, and comes before the interval
+        at_ns = 1_000_000_000 + (n - 1) * 33_333_333 if n else 500_000_000
+        data = made["quarter" if n and level else "full"]
+        n_points = read_header(data).n_points
+        rows.append([n, at_ns, 1000, zlib.crc32(data), len(data), n_points, level if n else 0])
+    at_ns = np.arange(0, 2_000_000_000, 16_666_667)
+    log = {"clouds": np.array(rows), "counts": np.zeros(5, int), "handed_ns": at_ns, "state_ns": at_ns - 1_000_000}
+    got: Any = SimpleNamespace(
+        logs={"a": log}, begin_ns=0, stats=SimpleNamespace(late_share=0.0), scheduling="", drops=0
+    )
+    runs: Any = [{"captures": {str(n): n for n in frames}, "encode_ms": [1.0], "refused": 0}]
+    assert summarize(got, plan, runs, cloud, 30)["delivered_hz_min"] == hz
 
 
 def test_points_move_and_depend_on_the_seed_only() -> None:
