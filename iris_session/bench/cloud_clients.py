@@ -26,7 +26,6 @@ from iris_session.protocol.codec import encode_media_header
 from iris_session.protocol.media import CLASSES, make_topic
 from iris_session.streams.cloud import decode_cloud
 
-
 #: Of every so many clouds the checksum is logged: its computation keeps a state that has come waiting.
 CHECK_EVERY = 10
 UNCHECKED = -1

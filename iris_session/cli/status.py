@@ -291,7 +291,8 @@ def _format_media(report: StatusReport) -> Iterator[str]:
         receivers = ", ".join(subscribers) or "no subscribers"
         title = f" ({one.title})" if one.title else ""
         fault = f"; FAULT {one.fault}{f': {one.detail}' if one.detail else ''}" if one.fault else ""
-        age = f"newest frame {one.age_ms:.0f} ms old" if one.age_ms < 1000.0 else f"no frame for {one.age_ms * 1e-3:.1f} s"
+        seconds = one.age_ms * 1e-3
+        age = f"newest frame {one.age_ms:.0f} ms old" if seconds < 1.0 else f"no frame for {seconds:.1f} s"
         age = f"STALE, {age}" if one.stale else age
         rates = f"{one.hz:.0f} Hz, {one.mbit_per_s:.1f} Mbit/s"
         yield f"media {one.stream}{title}: {rates}{source}; {receivers}; {age}{fault}"
