@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import sys
 import time
@@ -146,7 +147,9 @@ def run_calibrate(arguments: argparse.Namespace) -> int:
         return 0
     print("\n".join([*format_calibration(result), *_format_icp(result)]))
     if arguments.out is not None:
-        print(f'{arguments.out}: name it in each camera of {arguments.file}: calibration = "{arguments.out.name}"')
+        is_beside = arguments.out.absolute().parent == arguments.file.absolute().parent
+        name = json.dumps(arguments.out.name if is_beside else str(arguments.out.absolute()), ensure_ascii=False)
+        print(f"{arguments.out}: name it in each camera of {arguments.file}: calibration = {name}")
     return 0
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
+import shlex
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar, get_args
@@ -64,7 +65,9 @@ class CameraPose(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     quaternion_wxyz: Quat
 
     def __post_init__(self) -> None:
-        if abs(math.hypot(*self.quaternion_wxyz) - 1.0) > _UNIT_TOLERANCE:
+        if not all(map(math.isfinite, self.position_m)):
+            raise ValueError(f"position_m {list(self.position_m)} must be finite numbers")
+        if not abs(math.hypot(*self.quaternion_wxyz) - 1.0) <= _UNIT_TOLERANCE:  # also of NaN
             raise ValueError(f"quaternion_wxyz {list(self.quaternion_wxyz)} must have length 1, w first")
 
     def to_matrix(self) -> npt.NDArray[np.float64]:
@@ -289,9 +292,10 @@ class _Reader:
             raise self._error("intrinsics", f"intrinsics are missing: {wanted}", index)
         has_poses = camera.source == "folder" and any(Path(camera.path).glob("*.pose.txt"))
         if camera.pose is None and not has_poses and self._calibrated:
+            file, out = (shlex.quote(str(one)) for one in (self._path, self._path.with_name("calibration.toml")))
             raise self._error(
                 "calibration",
-                f"no calibration: `iris-session cloud calibrate {self._path.name} --out calibration.toml` writes one, "
+                f"no calibration: `iris-session cloud calibrate {file} --out {out}` writes one, "
                 'then calibration = "calibration.toml"; or pose = { position_m, quaternion_wxyz }',
                 index,
             )
@@ -349,7 +353,7 @@ class _Reader:
         return CameraFileError(f"{where}: {which}{message}", key, line)
 
 
-def read_calibration(path: Path, camera: str, *, on_body: bool) -> tuple[dict[str, Any], float | None]:
+def read_calibration(path: Path, camera: str, *, on_body: bool) -> tuple[CameraPose, float | None]:
     """Read what `iris-session anchors calibrate-camera --out` writes.
 
     Args:
@@ -358,10 +362,10 @@ def read_calibration(path: Path, camera: str, *, on_body: bool) -> tuple[dict[st
         on_body: The camera is fixed to a body of the scene, such as a robot's hand.
 
     Returns:
-        The pose, as keys and values of `CameraPose`, and the stated 95 % bound of its error [mm], None: not stated.
+        The pose, and the stated 95 % bound of its error [mm], None: not stated.
 
     Raises:
-        CameraFileError: The file cannot be read, or does not have the pose of this camera.
+        CameraFileError: The file cannot be read, or does not have a usable pose of this camera.
     """
     try:
         document = tomllib.loads(_read_text(path, "calibration"))
@@ -378,14 +382,27 @@ def read_calibration(path: Path, camera: str, *, on_body: bool) -> tuple[dict[st
             f"{path} is of a camera on the robot's hand: name the body of the scene that carries it, body",
             "calibration",
         )
-    pose = part.get("T_base_camera", part.get("T_ee_camera"))
-    if not isinstance(pose, dict):
+    table = "T_base_camera" if "T_base_camera" in part else "T_ee_camera"
+    if not isinstance(part.get(table), dict):
         raise CameraFileError(
-            f"{path} has no [T_base_camera]: `iris-session anchors calibrate-camera ... --out {path.name}` writes one",
+            f"{path} has no [T_base_camera]: `iris-session cloud calibrate` or `iris-session anchors calibrate-camera` "
+            "writes one with --out",
             "calibration",
         )
+    try:
+        pose = msgspec.convert(part[table], CameraPose)
+    except msgspec.ValidationError as error:
+        message = re.sub(r" - at `\$\.?(.*)`$", r" in \1", str(error)).replace("`", "")
+        raise CameraFileError(f"{path}, [{table}]: {message}", "calibration") from error
     error_mm = part.get("error_mm_p95")
-    return pose, error_mm if isinstance(error_mm, float) and math.isfinite(error_mm) and error_mm > 0.0 else None
+    if error_mm is None:
+        return pose, None
+    if isinstance(error_mm, bool) or not isinstance(error_mm, int | float) or not 0.0 < error_mm < 1e6:
+        raise CameraFileError(
+            f"{path}: error_mm_p95 is {error_mm!r}: a number above 0 is needed; leave it out where it is not known",
+            "calibration",
+        )
+    return pose, float(error_mm)
 
 
 def find_line(text: str, key: str, camera: int | None = None) -> int:

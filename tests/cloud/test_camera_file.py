@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 from typing import Any, get_args
 
@@ -91,6 +92,43 @@ def test_intrinsics_and_calibration_are_read_from_their_files(tmp_path: Path) ->
     (tmp_path / "calibration.toml").write_text(calibration_to_toml(on_hand))
     assert refuse(tmp_path, text).key == "calibration"
     assert load_camera_file(write(tmp_path, text + 'body = "hand"\n')).cameras[0].body == "hand"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("2.0, 3.0]", "nan, 3.0]", "position_m [1.0, nan, 3.0]"),
+        ("[1.0, 0.0,", "[nan, 0.0,", "quaternion_wxyz [nan, 0.0, 0.0, 0.0]"),
+        ("[1.0, 0.0,", "[2.0, 0.0,", "must have length 1"),
+        ("2.0, 3.0]", "3.0]", "length 3, got 2 in position_m"),
+        ("position_m", "position_mm", "unknown field position_mm"),
+        ("= 12", "= nan", "error_mm_p95 is nan"),
+        ("= 12", "= 0", "error_mm_p95 is 0"),
+        ("= 12", "= true", "error_mm_p95 is True"),
+        ("= 12", "= '12'", "error_mm_p95 is '12'"),
+    ],
+)
+def test_a_wrong_value_of_a_calibration_is_named_with_its_file(tmp_path: Path, old: str, new: str, said: str) -> None:
+    file = tmp_path / "calibration.toml"
+    text = "error_mm_p95 = 12\n[T_base_camera]\nposition_m = [1.0, 2.0, 3.0]\nquaternion_wxyz = [1.0, 0.0, 0.0, 0.0]\n"
+    camera = f'stream = "room"\n{CAMERA}'.replace(f"pose = {POSE}", 'calibration = "calibration.toml"')
+    file.write_text(text)
+    assert load_camera_file(write(tmp_path, camera)).cameras[0].error_mm == 12.0
+    assert old in text
+    file.write_text(text.replace(old, new))
+    error = refuse(tmp_path, camera)
+    assert (error.key, error.line) == ("calibration", 7)
+    assert str(file) in str(error)
+    assert said in str(error)
+
+
+def test_the_command_that_calibrates_is_one_for_any_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "my cameras"
+    folder.mkdir()
+    error = refuse(folder, 'stream = "room"\n[[cameras]]\nname = "a"\nsource = "orbbec"\n')
+    command = shlex.split(str(error).partition("`")[2].partition("`")[0])
+    wanted = ["iris-session", "cloud", "calibrate", f"{folder}/camera.toml", "--out", f"{folder}/calibration.toml"]
+    assert command == wanted
 
 
 def test_pictures_with_poses_and_rendered_cameras_need_no_calibration(tmp_path: Path) -> None:
