@@ -8,7 +8,7 @@ import math
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -198,19 +198,21 @@ def open_camera(camera: CameraSettings) -> Iterator[DepthSource]:
     try:
         yield source
     finally:
-        source.close()
+        with suppress(Exception):  # of a device that is gone
+            source.close()
 
 
 def _take_frames(camera: CameraSettings, n: int) -> CameraFrames:
     """Take the next frames of a camera; of a recording that ends, as many as it has."""
     from iris_session.cloud.frames import SourceEndedError
+    from iris_session.cloud.sources import read_frame
 
     frames: list[DepthFrame] = []
     until = time.monotonic() + FRAMES_S
     with open_camera(camera) as source:
         try:
             while len(frames) < n and time.monotonic() < until:
-                frame = source.read(0.5)
+                frame = read_frame(camera, source, 0.5)
                 if frame is None:
                     continue
                 if frame.T_world_camera is not None and camera.source != "mujoco":
@@ -272,15 +274,14 @@ def _make_cloud(settings: CloudSettings, one: CameraFrames, T_world_camera: Floa
 
     voxels = VoxelFilter(_ICP_VOXEL_M)
     limits = DepthLimits(settings.low, settings.high, one.settings.nearest_m, one.settings.farthest_m)
+    rays = make_rays(one.camera)
     for frame in one.frames:
-        voxels.add_depth(
-            frame.depth,
-            frame.color,
-            make_rays(one.camera),
-            T_world_camera,
-            depth_scale_m=one.depth_scale_m,
-            limits=limits,
-        )
+        try:
+            voxels.add_depth(
+                frame.depth, frame.color, rays, T_world_camera, depth_scale_m=one.depth_scale_m, limits=limits
+            )
+        except ValueError as error:
+            raise CommandError(f"camera {one.settings.name!r}: {error}") from error
     found = voxels.collect(min_points=settings.min_points, min_around=settings.min_around)
     return np.asarray(found.positions, np.float64)
 

@@ -112,6 +112,7 @@ def _join(names: list[str]) -> str:
 def scan_cameras(settings: CloudSettings, voxels: VoxelFilter, seconds: float, *, as_json: bool) -> RoomScan:
     """Collect the frames of all cameras for some seconds, or until all recordings have ended."""
     from iris_session.cloud.frames import SourceEndedError
+    from iris_session.cloud.sources import read_frame
     from iris_session.cloud.voxels import DepthLimits, make_rays
 
     frames = dict.fromkeys((camera.name for camera in settings.cameras), 0)
@@ -122,7 +123,7 @@ def scan_cameras(settings: CloudSettings, voxels: VoxelFilter, seconds: float, *
         while opened and (passed := time.monotonic() - start) < seconds:
             for camera, source in tuple(opened):
                 try:
-                    frame: DepthFrame | None = source.read(0.05)
+                    frame: DepthFrame | None = read_frame(camera, source, 0.05)
                 except SourceEndedError:
                     opened.remove((camera, source))
                     continue

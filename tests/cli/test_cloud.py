@@ -79,6 +79,15 @@ def test_a_file_that_cannot_be_used_is_one_line(
     assert error.count("\n") == 1
 
 
+def test_a_picture_that_cannot_be_read_is_one_line(camera_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (camera_file.parent / "0.depth.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(4) + b"IHDR" + b"\xff" * 9)
+    assert main(["cloud", "scan", str(camera_file), "-o", str(camera_file.parent / "room.ply")]) == 2
+    error = capsys.readouterr().err
+    assert "camera 'front'" in error
+    assert "0.depth.png" in error
+    assert error.count("\n") == 1
+
+
 def test_no_session_is_one_line(camera_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["cloud", "run", str(camera_file), "--address", "127.0.0.1:1"]) == 2
     assert "no session answers at 127.0.0.1:1" in capsys.readouterr().err

@@ -7,10 +7,12 @@ parts that recordings share.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 
 from anchors.pose import PoseTuple
 from iris_session.cloud.camera_file import CameraSettings
-from iris_session.cloud.frames import DepthSource, SourceError
+from iris_session.cloud.frames import DepthFrame, DepthSource, SourceEndedError, SourceError
+from iris_session.protocol.media import MAX_IMAGE_SIZE
 from iris_session.system.extras import MissingExtraError
 
 #: Poses of bodies of the session's scene by name, as ((x, y, z), (w, x, y, z)).
@@ -31,12 +33,56 @@ def open_source(
         The source. Close it after use.
 
     Raises:
-        SourceError: There is no such device or file, or a package is missing; one line that starts with the camera.
+        SourceError: There is no such device, it or the file cannot be used, or a package is missing; one line that
+            starts with the camera.
     """
     try:
-        return _open(settings, now_ns, body_poses)
-    except (MissingExtraError, SourceError) as error:
-        raise SourceError(f"camera {settings.name!r}: {error}") from error
+        source = _open(settings, now_ns, body_poses)
+    except Exception as error:
+        raise _name_camera(settings, error) from error
+    width, height = source.camera.width, source.camera.height
+    wrong = ""
+    if max(width, height) > MAX_IMAGE_SIZE:  # directions of so many pixels may be more than the memory holds
+        wrong = f"intrinsics are of {width} x {height} pixels: at most {MAX_IMAGE_SIZE} x {MAX_IMAGE_SIZE} are possible"
+    elif not 0.0 < source.depth_scale_m < 1.0:
+        wrong = f"unit of depth is {source.depth_scale_m:g} m: give depth_scale_m, usually 0.001"
+    if wrong:
+        with suppress(Exception):
+            source.close()
+        raise SourceError(f"camera {settings.name!r}: the {wrong}")
+    return source
+
+
+def read_frame(settings: CameraSettings, source: DepthSource, timeout_s: float) -> DepthFrame | None:
+    """Read the next frame of a source, for who does not read it in a `SourceReader`.
+
+    Args:
+        settings: The camera.
+        source: Its source.
+        timeout_s: Longest wait [s].
+
+    Returns:
+        The frame, None if none came in time.
+
+    Raises:
+        SourceEndedError: The recording is over.
+        SourceError: The source failed, also in a vendor's package; one line that starts with the camera.
+    """
+    try:
+        return source.read(timeout_s)
+    except SourceEndedError:
+        raise
+    except Exception as error:
+        raise _name_camera(settings, error) from error
+
+
+def _name_camera(settings: CameraSettings, error: Exception) -> SourceError:
+    """Return the error of a source, or of a package or a file that it does not expect, as one line with the camera."""
+    said = " ".join(str(error).split())
+    if not isinstance(error, SourceError | MissingExtraError):
+        what = f"source {settings.source!r}" + (f", path {settings.path!r}" if settings.path else "")
+        said = f"{what} failed ({type(error).__name__}: {said}): is what it reads damaged?"
+    return SourceError(f"camera {settings.name!r}: {said}")
 
 
 def _open(settings: CameraSettings, now_ns: Callable[[], int], body_poses: BodyPoses | None) -> DepthSource:

@@ -14,8 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from iris_session.cloud.frames import SourceEndedError, SourceError
+from iris_session.protocol.media import MAX_IMAGE_SIZE
+from iris_session.protocol.names import AssetEncoding
+from iris_session.scene import AssetDecodeError
+from iris_session.scene.images import read_stated_size
 
 T = TypeVar("T")
+_PNG: Final = b"\x89PNG"
 SECOND: Final = 10**9
 #: Rate of what has no times of its own [Hz].
 DEFAULT_HZ: Final = 30.0
@@ -156,16 +161,28 @@ def choose_channel(kind: str, wanted: str, there: Iterable[str], name: str) -> s
 
 
 def decode_picture(data: Any, name: str) -> npt.NDArray[Any]:
-    """Return the pixels of a compressed picture as OpenCV reads them: one channel, or blue, green, red.
+    """Return the pixels of a PNG or JPEG as OpenCV reads them: one channel, or blue, green, red.
 
     Raises:
-        SourceError: It is not a picture.
+        SourceError: It is neither, is damaged, or states a size above `MAX_IMAGE_SIZE`: some bytes can claim any size.
     """
     import cv2
 
-    picture: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if len(data) else None
+    head = bytes(data)
+    try:
+        size = read_stated_size(head, AssetEncoding.PNG if head[:4] == _PNG else AssetEncoding.JPEG)
+    except AssetDecodeError as error:
+        raise SourceError(f"{name} is not a readable PNG or JPEG ({len(head)} bytes)") from error
+    if max(size) > MAX_IMAGE_SIZE:
+        raise SourceError(
+            f"{name} is a picture of {size[0]} x {size[1]}: at most {MAX_IMAGE_SIZE} x {MAX_IMAGE_SIZE} are read"
+        )
+    try:
+        picture: Any = cv2.imdecode(np.frombuffer(head, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise SourceError(f"{name} is a damaged picture: {' '.join(str(error).split())}") from error
     if picture is None:
-        raise SourceError(f"{name} is not a readable picture ({len(data)} bytes)")
+        raise SourceError(f"{name} is not a readable picture ({len(head)} bytes)")
     return np.asarray(picture)
 
 

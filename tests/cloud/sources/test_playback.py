@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Iterator
 
 import cv2
 import numpy as np
 import pytest
 
+from anchors.camera import CameraModel
 from iris_session.cloud.camera_file import CameraSettings
-from iris_session.cloud.frames import SourceEndedError, SourceError
-from iris_session.cloud.sources import open_source
+from iris_session.cloud.frames import DepthFrame, DepthSource, SourceEndedError, SourceError
+from iris_session.cloud.sources import open_source, read_frame
 from iris_session.cloud.sources.playback import (
     Playback,
     RecordedPicture,
@@ -174,6 +177,56 @@ def test_colour_of_another_view_is_refused_with_both_sizes() -> None:
         fit_color(np.zeros((9, 16, 3), np.uint8), np.zeros((12, 16), np.uint16), "x")
     assert "16 x 9" in str(caught.value)
     assert "16 x 12" in str(caught.value)
+
+
+def claim(data: bytes, size: int) -> bytes:
+    """Return a PNG or JPEG whose header claims a width and height of `size`."""
+    if data[:4] == b"\x89PNG":
+        header = b"IHDR" + struct.pack(">II", size, size) + data[24:29]
+        return data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:]
+    at = data.index(b"\xff\xc0") + 5
+    return data[:at] + struct.pack(">HH", size, size) + data[at + 4 :]
+
+
+@pytest.mark.parametrize("end", [".png", ".jpg"])
+def test_a_picture_that_claims_to_be_huge_is_refused_by_its_header(end: str) -> None:
+    data = cv2.imencode(end, np.zeros((4, 4, 3), np.uint8))[1].tobytes()
+    assert decode_picture(claim(data, 4), "x").shape == (4, 4, 3)
+    for size in (65_535, 4_097):
+        with pytest.raises(SourceError, match=f"{size} x {size}: at most 4096 x 4096"):
+            decode_picture(claim(data, size), "x")
+
+
+def test_errors_of_packages_are_one_line_with_the_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Broken:
+        camera, depth_scale_m, closed = CameraModel(64, 48, 50.0, 50.0, 31.5, 23.5), 0.001, 0
+
+        def read(self, timeout_s: float) -> DepthFrame | None:
+            raise RuntimeError("the cable\nis loose")
+
+        def close(self) -> None:
+            self.closed += 1
+            raise RuntimeError("no device")
+
+    def fail(*_: object) -> DepthSource:
+        raise KeyError("data")
+
+    broken = Broken()
+    settings = CameraSettings(name="front", source="mcap", path="/a.mcap")
+    monkeypatch.setattr("iris_session.cloud.sources._open", lambda *_: broken)
+    source = open_source(settings, lambda: 0)
+    with pytest.raises(SourceError, match=r"camera 'front': .*'/a.mcap'.*RuntimeError: the cable is loose"):
+        read_frame(settings, source, 1.0)
+    broken.depth_scale_m = 0.0
+    with pytest.raises(SourceError, match=r"camera 'front': .*depth_scale_m"):
+        open_source(settings, lambda: 0)
+    broken.camera = CameraModel(100_000, 100_000, 1.0, 1.0, 1.0, 1.0)
+    with pytest.raises(SourceError, match=r"camera 'front': .*100000 x 100000"):
+        open_source(settings, lambda: 0)
+    assert broken.closed == 2
+    monkeypatch.setattr("iris_session.cloud.sources._open", fail)
+    with pytest.raises(SourceError, match=r"camera 'front': .*KeyError: 'data'"):
+        open_source(settings, lambda: 0)
 
 
 def test_what_is_no_picture_is_refused() -> None:
