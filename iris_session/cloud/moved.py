@@ -173,6 +173,18 @@ class MoveMonitor(_Monitor[_Look]):
         self._detector = SheetDetector(sheets, camera)
         self._error = (error_m, error_rad)
 
+    def replace_sheets(self, sheets: Sequence[Sheet]) -> None:
+        """Look for other sheets from now on. The verdict stays, and so do looks at sheets that are still the same.
+
+        Raises:
+            DetectionError: Two sheets have the same id.
+        """
+        self._detector = SheetDetector(sheets, self._detector.camera)
+        edges_m = {one.anchor_id: one.edge_m for one in sheets}
+        same = [look for look in self._looks if all(edges_m.get(one.anchor_id) == one.edge_m for one in look.seen)]
+        self._looks.clear()
+        self._looks.extend(same)
+
     def look(
         self,
         color: npt.NDArray[np.uint8],
@@ -327,11 +339,15 @@ class MoveWatch:
         sheets = self._find_sheets()
         sizes = {anchor_id: edge_m for anchor_id, (edge_m, _) in sheets.items()}
         poses = {anchor_id: pose for anchor_id, (_, pose) in sheets.items()}
-        if name not in self._by_sheets or self._by_sheets[name][1:] != (watched.camera, sizes):
+        if name not in self._by_sheets or self._by_sheets[name][1] != watched.camera:
             known = list(_make_sheets(sizes))
             self._by_sheets[name] = MoveMonitor(watched.camera, known, error_m=watched.error_m), watched.camera, sizes
+        monitor, camera, before = self._by_sheets[name]
+        if before != sizes:
+            monitor.replace_sheets(list(_make_sheets(sizes)))
+            self._by_sheets[name] = monitor, camera, sizes
         if sizes:
-            monitor, frame = self._by_sheets[name][0], watched.frame
+            frame = watched.frame
             arguments = (frame.color, watched.T_world_camera, poses, frame.capture_ns)
             self._look = self._pool.submit(_do_safely, monitor.look, *arguments)
 

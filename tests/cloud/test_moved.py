@@ -227,7 +227,7 @@ def test_looks_are_taken_in_a_thread_of_the_sheets_that_the_session_has(
         watch._look.result(60.0)
         assert (watch.find_move("front") is not None) == (step == 3)
     assert watch.find_move("left") is None
-    # Another set of sheets, or a camera that was opened anew with other intrinsics, begins anew.
+    # Another set of sheets puts no camera back.
     sheets["shelf"] = (0.160, ANCHORS["shelf"])
     sheets["\N{LATIN SMALL LETTER U WITH DIAERESIS}ber"] = (0.160, ANCHORS["shelf"])  # no name of a printed sheet
     watch.offer("front", watched(np.zeros((4, 4, 3), np.uint8), 9 * SECOND_NS))
@@ -235,9 +235,25 @@ def test_looks_are_taken_in_a_thread_of_the_sheets_that_the_session_has(
     bad.result(60.0)
     watch.offer("front", watched(picture, 9 * SECOND_NS + 1))
     assert watch._look is bad  # not at once: the next one may be as bad
-    assert watch.find_move("front") is None
     assert "4 x 4" in caplog.text
+    assert watch.find_move("front") is not None
+    # A camera that was opened anew with other intrinsics begins anew.
+    watch.offer("front", watched(picture, 20 * SECOND_NS)._replace(camera=replace(CAMERA, fx=586.0)))
+    assert watch.find_move("front") is None
     watch.close()
+
+
+def test_sheets_that_come_and_go_leave_looks_at_the_others_and_the_verdict() -> None:
+    monitor, bumped = make_monitor(), compose(CALIBRATED, BUMP)
+    for step in range(2):
+        assert monitor.add_look([detect("table", bumped)], CALIBRATED, ANCHORS, step * SECOND_NS) is None
+    monitor.replace_sheets([TABLE, SHELF, Sheet("door", 0.160)])
+    assert monitor.add_look([detect("table", bumped)], CALIBRATED, ANCHORS, 2 * SECOND_NS) is not None
+    # Of looks at sheets that are gone nothing is known any more.
+    monitor.replace_sheets([SHELF])
+    shelf = {"shelf": ANCHORS["shelf"]}
+    found = [monitor.add_look([detect("shelf", CALIBRATED)], CALIBRATED, shelf, n * SECOND_NS) for n in range(3, 6)]
+    assert [one is None for one in found] == [False, False, True]
 
 
 def look(verdict: Verdict, bump: PoseTuple = BUMP) -> SurfaceLook:
