@@ -141,6 +141,10 @@ class _Monitor(Generic[_AnyLook]):
         """Return whether it is time for a look."""
         return self._due_ns is None or now_ns >= self._due_ns or self._due_ns - now_ns > BLIND_EVERY_NS
 
+    def postpone(self, now_ns: int, every_ns: int) -> None:
+        """Set when the next look is due, should this one come to nothing."""
+        self._due_ns = now_ns + every_ns
+
     def _take(self, look: _AnyLook, now_ns: int, every_ns: int) -> bool:
         """Take a look. Return whether the last ones agree; if not, and it contradicts the verdict, the next is soon."""
         self.seen_ns, self._due_ns = now_ns, now_ns + every_ns
@@ -206,7 +210,7 @@ class MoveMonitor(_Monitor[_Look]):
         Raises:
             DetectionError: The picture is not of this camera's size or type.
         """
-        self._due_ns = now_ns + BLIND_EVERY_NS  # also of a picture that cannot be used
+        self.postpone(now_ns, BLIND_EVERY_NS)  # also of a picture that cannot be used
         seen = self._detector.detect(color[:, :, ::-1])
         return self.add_look(seen, pose_from_matrix(np.asarray(T_world_camera)), T_world_sheets, now_ns)
 
@@ -220,7 +224,7 @@ class MoveMonitor(_Monitor[_Look]):
         """Add the detections of one picture. Return `move`."""
         seen = tuple(one for one in detections if one.anchor_id in T_world_sheets and not one.ambiguous)
         if not seen:
-            self._due_ns = now_ns + BLIND_EVERY_NS
+            self.postpone(now_ns, BLIND_EVERY_NS)
             return self.move
         off = all(self._is_off(one, T_world_camera, T_world_sheets[one.anchor_id]) for one in seen)
         if self._take(_Look(off, seen, T_world_camera), now_ns, LOOK_EVERY_NS):
@@ -280,7 +284,7 @@ class RobotMonitor(_Monitor[_RobotLook]):
         """
         # Robots that were never seen may be those of a simulation, in a room without any.
         if not look.verdict or (look.verdict == "lost" and not self._has_fitted):
-            self._due_ns = now_ns + ROBOT_EVERY_NS
+            self.postpone(now_ns, ROBOT_EVERY_NS)
             return self.move
         pose = np.asarray(T_world_camera)
         # Relative to the pose by the calibration, which moves with the body that carries the camera.
@@ -361,6 +365,7 @@ class MoveWatch:
         if waiting is None:
             return
         if self._robots.is_ready(waiting.frame.capture_ns):
+            monitor.postpone(waiting.frame.capture_ns, ROBOT_EVERY_NS)  # also of a look that fails
             self._look = self._pool.submit(_do_safely, self._look_at_robots, monitor, self._waiting.pop(name))
         elif abs(watched.frame.capture_ns - waiting.frame.capture_ns) > POSE_NS:
             del self._waiting[name]

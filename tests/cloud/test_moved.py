@@ -26,7 +26,6 @@ from iris_session.cloud.moved import (
     CONFIRM_EVERY_NS,
     LOOK_EVERY_NS,
     ROBOT_EVERY_NS,
-    SHEET_NS,
     CameraMove,
     MoveMonitor,
     MoveWatch,
@@ -298,49 +297,61 @@ def test_robots_that_were_never_seen_may_be_none_of_this_room() -> None:
 class FakeRobots:
     """Robots whose state is there or not."""
 
-    def __init__(self) -> None:
+    def __init__(self, surface: PlacedSurface | None = None) -> None:
         self.ready = True
         self.asked: list[tuple[int, str]] = []
+        self._surface = surface
 
     def is_ready(self, capture_ns: int) -> bool:
         return self.ready
 
     def place_surface(self, capture_ns: int, carrier: str) -> PlacedSurface | None:
         self.asked.append((capture_ns, carrier))
-        return None
+        return self._surface
 
 
-def test_robots_are_looked_at_while_no_sheet_is_seen_and_their_state_is_there(pages: dict[str, Page]) -> None:
+def test_robots_are_looked_at_while_no_sheet_is_seen_and_their_state_is_there() -> None:
     robots = FakeRobots()
-    sheets = {"table": (0.160, ANCHORS["table"])}
-    watch = MoveWatch(lambda: sheets, robots)
+    watch = MoveWatch(dict, robots)
 
-    def offer(picture: NDArray[np.uint8], at_ns: int) -> None:
-        watch.offer("front", watched(picture, at_ns)._replace(body="hand"))
+    def offer(at_ns: int) -> None:
+        watch.offer("front", watched(np.zeros((480, 640, 3), np.uint8), at_ns)._replace(body="hand"))
         if watch._look is not None:
             watch._look.result(60.0)
 
-    dark = np.zeros((480, 640, 3), np.uint8)
-    with_sheet = take_picture(pages, CALIBRATED, 1, "table")
-    offer(with_sheet, SECOND_NS)
-    offer(dark, SECOND_NS + 1)  # a second has not passed, and the sheet was just seen
-    assert robots.asked == []
-    later_ns = SECOND_NS + SHEET_NS
-    offer(dark, later_ns)  # is there a sheet? No.
+    offer(0)
+    offer(SECOND_NS // 2)
+    assert robots.asked == [(0, "hand")], "once a second, also if there was nothing to compare"
     robots.ready = False
-    offer(dark, later_ns + 2)
-    assert robots.asked == []
+    offer(SECOND_NS + 2)
+    assert robots.asked == [(0, "hand")]
     robots.ready = True
-    offer(dark, later_ns + 3)  # the frame that waited is compared
-    assert robots.asked == [(later_ns + 2, "hand")]
+    offer(SECOND_NS + 3)  # the frame that waited is compared
+    assert robots.asked == [(0, "hand"), (SECOND_NS + 2, "hand")]
     robots.ready = False
-    offer(dark, later_ns + 4)
-    offer(dark, later_ns + SECOND_NS)  # the state of the one before never came
+    offer(3 * SECOND_NS)
+    offer(4 * SECOND_NS)  # the state of the one before never came
     robots.ready = True
-    offer(dark, later_ns + SECOND_NS + 1)
-    assert robots.asked[1:] == [(later_ns + SECOND_NS + 1, "hand")]
+    offer(4 * SECOND_NS + 1)
+    assert robots.asked[2:] == [(4 * SECOND_NS + 1, "hand")]
     watch.restart()
     assert watch.find_move("front") is None
+    watch.close()
+
+
+def test_a_look_at_robots_that_fails_is_not_repeated_at_every_cloud(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(*_: object) -> SurfaceLook:
+        raise ValueError("no depth")
+
+    monkeypatch.setattr("iris_session.cloud.moved.compare_depth", fail)
+    watch = MoveWatch(dict, FakeRobots(PlacedSurface(np.zeros((1, 3)), np.zeros((1, 3)), np.ones(1, bool))))
+    for step in range(60):
+        watch.offer("front", watched(np.zeros((480, 640, 3), np.uint8), step * SECOND_NS // 30))
+        if watch._look is not None:
+            watch._look.result(60.0)
+    assert caplog.text.count("no depth") == 2
     watch.close()
 
 
