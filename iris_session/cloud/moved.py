@@ -1,6 +1,6 @@
 """Find a camera that was moved: what it sees is not where its calibration puts it. Times are passed in.
 
-What it sees are printed sheets, or while it sees none the robots' surface (`iris_session.cloud.robot_surface`). One
+What it sees are printed sheets, or where it sees none the robots' surface (`iris_session.cloud.robot_surface`). One
 look is one picture; several looks in a row decide, so one bad detection is no alarm. A look at sheets is off when none
 of them fits, so a sheet that was moved beside one that was not is no alarm either. `anchors.drift` does not fit here:
 it has many detections a second without a covariance of their own, and compares them with each other. `MoveMonitor` and
@@ -42,7 +42,8 @@ ROBOT_EVERY_NS: Final = 1_000_000_000
 CONFIRM_EVERY_NS: Final = 150_000_000
 #: Time until the next look after one without a sheet: such a picture takes the longest.
 BLIND_EVERY_NS: Final = 2_000_000_000
-#: A sheet that was seen so long ago does not keep the robots from being looked at.
+#: Robots decide when sheets have not for so long. Until then they are looked at this often: a camera that sees neither
+#: sheets nor robots any more can only be found if it is known to have seen the robots before.
 SHEET_NS: Final = 5_000_000_000
 #: Looks in a row that change the verdict.
 LOOKS: Final = 3
@@ -307,7 +308,7 @@ class RobotMonitor(_Monitor[_RobotLook]):
 
 
 class MoveWatch:
-    """Looks for moved cameras in a thread: one picture at a time, those of other cameras meanwhile are left out.
+    """Looks for moved cameras in a thread: one picture at a time, of the camera whose last look is the oldest.
 
     Args:
         find_sheets: Returns the sheets of the session.
@@ -321,25 +322,45 @@ class MoveWatch:
         self._look: Future[None] | None = None
         self._by_sheets: dict[str, tuple[MoveMonitor, CameraModel, Mapping[str, float]]] = {}
         self._by_robots: dict[str, RobotMonitor] = {}
-        self._waiting: dict[str, WatchedFrame] = {}
+        self._robots_ns: dict[str, int] = {}  # captures of the last looks at robots
+        self._newest: dict[str, WatchedFrame] = {}  # frames that were not looked at
+        self._waiting: dict[str, WatchedFrame] = {}  # for the state of the robots
+        self._turns: dict[str, int] = {}  # number of the last look of each camera
 
     def offer(self, name: str, watched: WatchedFrame) -> None:
-        """Take a frame, if it is time for one of this camera. Returns at once.
+        """Take a frame, and begin a look if one is due and none is under way. Returns at once.
 
         Args:
             name: Name of the camera.
             watched: The frame.
         """
+        self._newest[name] = watched
         if self._look is not None and not self._look.done():
             return
-        now_ns = watched.frame.capture_ns
-        if name not in self._by_sheets or self._by_sheets[name][0].is_due(now_ns):
-            self._offer_to_sheets(name, watched)
-        seen_ns = self._by_sheets[name][0].seen_ns
-        if (self._look is None or self._look.done()) and (seen_ns is None or abs(now_ns - seen_ns) > SHEET_NS):
-            self._offer_to_robots(name, watched)
+        for one in sorted(self._newest, key=lambda camera: self._turns.get(camera, 0)):
+            if self._begin_look(one, self._newest[one]):
+                del self._newest[one]
+                self._turns[one] = max(self._turns.values(), default=0) + 1
+                return
 
-    def _offer_to_sheets(self, name: str, watched: WatchedFrame) -> None:
+    def _begin_look(self, name: str, watched: WatchedFrame) -> bool:
+        """Begin the look of a camera that is due. Return whether there is one."""
+        now_ns = watched.frame.capture_ns
+        seen_ns = self._by_sheets[name][0].seen_ns if name in self._by_sheets else None
+        if _has_passed(self._robots_ns.get(name), now_ns):
+            kinds = [self._offer_to_robots, self._offer_to_sheets]
+        elif _has_passed(seen_ns, now_ns):
+            kinds = [self._offer_to_sheets, self._offer_to_robots]
+        else:
+            kinds = [self._offer_to_sheets]
+        looks = (offer(name, watched) for offer in kinds)
+        look = next((one for one in looks if one is not None), None)
+        self._look = look or self._look
+        return look is not None
+
+    def _offer_to_sheets(self, name: str, watched: WatchedFrame) -> Future[None] | None:
+        if name in self._by_sheets and not self._by_sheets[name][0].is_due(watched.frame.capture_ns):
+            return None
         sheets = self._find_sheets()
         sizes = {anchor_id: edge_m for anchor_id, (edge_m, _) in sheets.items()}
         poses = {anchor_id: pose for anchor_id, (_, pose) in sheets.items()}
@@ -350,25 +371,30 @@ class MoveWatch:
         if before != sizes:
             monitor.replace_sheets(list(_make_sheets(sizes)))
             self._by_sheets[name] = monitor, camera, sizes
-        if sizes:
-            frame = watched.frame
-            arguments = (frame.color, watched.T_world_camera, poses, frame.capture_ns)
-            self._look = self._pool.submit(_do_safely, monitor.look, *arguments)
+        frame = watched.frame
+        if not sizes:
+            monitor.postpone(frame.capture_ns, LOOK_EVERY_NS)
+            return None
+        arguments = (frame.color, watched.T_world_camera, poses, frame.capture_ns)
+        return self._pool.submit(_do_safely, monitor.look, *arguments)
 
-    def _offer_to_robots(self, name: str, watched: WatchedFrame) -> None:
+    def _offer_to_robots(self, name: str, watched: WatchedFrame) -> Future[None] | None:
         if self._robots is None:
-            return
+            return None
         monitor = self._by_robots.setdefault(name, RobotMonitor())
         if name not in self._waiting and monitor.is_due(watched.frame.capture_ns):
             self._waiting[name] = watched
         waiting = self._waiting.get(name)
         if waiting is None:
-            return
+            return None
         if self._robots.is_ready(waiting.frame.capture_ns):
-            monitor.postpone(waiting.frame.capture_ns, ROBOT_EVERY_NS)  # also of a look that fails
-            self._look = self._pool.submit(_do_safely, self._look_at_robots, monitor, self._waiting.pop(name))
-        elif abs(watched.frame.capture_ns - waiting.frame.capture_ns) > POSE_NS:
             del self._waiting[name]
+            self._robots_ns[name] = waiting.frame.capture_ns
+            monitor.postpone(waiting.frame.capture_ns, ROBOT_EVERY_NS)  # also of a look that fails
+            return self._pool.submit(_do_safely, self._look_at_robots, monitor, waiting)
+        if abs(watched.frame.capture_ns - waiting.frame.capture_ns) > POSE_NS:
+            del self._waiting[name]
+        return None
 
     def _look_at_robots(self, monitor: RobotMonitor, watched: WatchedFrame) -> None:
         assert self._robots is not None
@@ -380,20 +406,26 @@ class MoveWatch:
 
     def find_move(self, name: str) -> CameraMove | None:
         """Return how far a camera was moved, `None` where it fits or is not known."""
-        monitors: list[_Monitor[Any]] = [self._by_sheets[name][0]] if name in self._by_sheets else []
-        monitors += [self._by_robots[name]] if name in self._by_robots else []
-        decided = [(one.decided_ns, one.move) for one in monitors if one.decided_ns is not None]
-        return max(decided, key=lambda one: one[0])[1] if decided else None
+        sheets = self._by_sheets[name][0] if name in self._by_sheets else None
+        robots = self._by_robots.get(name)
+        if robots is None or robots.decided_ns is None:
+            return None if sheets is None else sheets.move
+        if sheets is None or sheets.decided_ns is None or robots.decided_ns - sheets.decided_ns > SHEET_NS:
+            return robots.move
+        return sheets.move
 
     def restart(self) -> None:
         """Forget all looks: session time is that of another session."""
-        self._by_sheets.clear()
-        self._by_robots.clear()
-        self._waiting.clear()
+        for kept in (self._by_sheets, self._by_robots, self._robots_ns, self._newest, self._waiting):
+            kept.clear()
 
     def close(self) -> None:
         """End the thread; a look that has begun is not waited for."""
         self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _has_passed(since_ns: int | None, now_ns: int) -> bool:
+    return since_ns is None or abs(now_ns - since_ns) > SHEET_NS
 
 
 def _disagree(one: Floats | None, other: Floats | None) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -255,6 +256,28 @@ def test_sheets_that_come_and_go_leave_looks_at_the_others_and_the_verdict() -> 
     assert [one is None for one in found] == [False, False, True]
 
 
+def test_cameras_are_looked_at_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A look may take longer than the time between two clouds, and then every camera of a cloud is due at once."""
+    looked: list[int] = []
+    may_end = threading.Semaphore(0)
+
+    def look(self: MoveMonitor, color: NDArray[np.uint8], *_: object) -> None:
+        looked.append(int(color[0, 0, 0]))
+        may_end.acquire(timeout=DEADLINE_S)
+
+    monkeypatch.setattr(MoveMonitor, "look", look)
+    watch = MoveWatch(lambda: {"table": (0.160, ANCHORS["table"])})
+    for cloud in range(6):
+        for number in range(3):
+            picture = np.full((480, 640, 3), number, np.uint8)
+            watch.offer(f"camera {number}", watched(picture, cloud * SECOND_NS))
+        assert watch._look is not None
+        may_end.release()
+        watch._look.result(60.0)
+    assert looked == [0, 1, 2, 0, 1, 2]
+    watch.close()
+
+
 def look(verdict: Verdict, bump: PoseTuple = BUMP) -> SurfaceLook:
     """Return a look of the camera at robots, which finds it off by `bump`."""
     correction = POSE @ pose_to_matrix(bump) @ np.linalg.inv(POSE)
@@ -336,6 +359,38 @@ def test_robots_are_looked_at_while_no_sheet_is_seen_and_their_state_is_there() 
     assert robots.asked[2:] == [(4 * SECOND_NS + 1, "hand")]
     watch.restart()
     assert watch.find_move("front") is None
+    watch.close()
+
+
+def test_a_camera_that_lost_sheets_and_robots_at_once_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Robots are looked at beside sheets, so that it is known that the camera has seen them."""
+    verdict: Verdict = "off"
+
+    def see(
+        self: MoveMonitor, color: NDArray[np.uint8], _pose: object, poses: dict[str, PoseTuple], at_ns: int
+    ) -> None:
+        self.add_look([detect("table", CALIBRATED)] if color.any() else [], CALIBRATED, poses, at_ns)
+
+    monkeypatch.setattr(MoveMonitor, "look", see)
+    monkeypatch.setattr("iris_session.cloud.moved.compare_depth", lambda *_: look(verdict))
+    robots = FakeRobots(PlacedSurface(np.zeros((1, 3)), np.zeros((1, 3)), np.ones(1, bool)))
+    watch = MoveWatch(lambda: {"table": (0.160, ANCHORS["table"])}, robots)
+    dark, with_sheet = np.zeros((480, 640, 3), np.uint8), np.ones((480, 640, 3), np.uint8)
+
+    def show(picture: NDArray[np.uint8], start_s: int, end_s: int) -> CameraMove | None:
+        for half in range(2 * start_s, 2 * end_s):
+            watch.offer("front", watched(picture, half * SECOND_NS // 2))
+            if watch._look is not None:
+                watch._look.result(60.0)
+        return watch.find_move("front")
+
+    assert show(with_sheet, 0, 20) is None, "while sheets are seen they decide"
+    assert len(robots.asked) == 4
+    verdict = "fits"
+    assert show(with_sheet, 20, 40) is None
+    verdict = "lost"
+    assert str(show(dark, 40, 50)) == "by an unknown distance"
+    assert show(with_sheet, 50, 53) is None
     watch.close()
 
 
