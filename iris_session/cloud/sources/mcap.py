@@ -11,7 +11,7 @@ import json
 import os
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -45,10 +45,20 @@ _COLORS: Final = {
     "8UC3": [0, 1, 2],
     "mono8": [0],
 }
+#: Models of the lens that are OpenCV's, as `sensor_msgs/distortion_models.hpp` names them; empty: not said.
+_LENSES: Final = ("", "plumb_bob", "rational_polynomial")
 #: Of image_transport's `compressedDepth`: the bytes before the PNG.
 _CONFIG_HEADER: Final = 12
 #: Messages that are looked at to tell depth from colour, and for intrinsics.
 _FIRST: Final = 500
+
+
+class _RecordedCamera(NamedTuple):
+    """Intrinsics of a topic. `lens`: distortion model; `model` has no distortion where that is none of OpenCV's."""
+
+    topic: str
+    model: CameraModel
+    lens: str
 
 
 class McapSource:
@@ -60,10 +70,10 @@ class McapSource:
         self._path, self._hz = settings.path, settings.hz
         self.depth_scale_m = settings.depth_scale_m or 0.001
         kinds: dict[str, set[str]] = {"depth": set(), "color": set()}
-        cameras: list[tuple[str, CameraModel]] = []
+        cameras: list[_RecordedCamera] = []
         for number, (schema, topic, _, message) in enumerate(self._read_messages()):
             if schema in _CAMERA:
-                cameras += [(topic, one) for one in _to_camera(message)]
+                cameras += _to_camera(topic, message)
             else:
                 kinds["depth" if _is_depth(message) else "color"].add(topic)
             if number >= _FIRST:
@@ -125,15 +135,20 @@ class McapSource:
             said = " ".join(str(error).split()) or type(error).__name__
             raise SourceError(f"{self._path} cannot be read ({said}): `mcap recover` repairs a damaged file") from error
 
-    def _choose_camera(self, cameras: list[tuple[str, CameraModel]]) -> CameraModel:
+    def _choose_camera(self, cameras: list[_RecordedCamera]) -> CameraModel:
         """Return the intrinsics of the depth's size, of the topic that begins most like the depth's."""
-        cameras.sort(key=lambda one: -len(os.path.commonpath([one[0].strip("/"), self._depth.strip("/")])))
+        cameras.sort(key=lambda one: -len(os.path.commonpath([one.topic.strip("/"), self._depth.strip("/")])))
         for _, (depth, _) in self._list_frames():
             height, width = self._decode_depth(depth).shape
-            found = next((one for _, one in cameras if (one.width, one.height) == (width, height)), None)
-            if found is not None:
-                return found
-            break
+            found = next((one for one in cameras if (one.model.width, one.model.height) == (width, height)), None)
+            if found is None:
+                break
+            if found.lens not in _LENSES:
+                raise SourceError(
+                    f"{self._path}: {found.topic} has the distortion model {found.lens!r}, and "
+                    f"{' and '.join(_LENSES[1:])} are read: rectify the pictures and give intrinsics"
+                )
+            return found.model
         raise SourceError(f"{self._path} has no CameraInfo or CameraCalibration of the depth's size: give intrinsics")
 
 
@@ -180,13 +195,18 @@ def _decode(message: Any, name: str) -> npt.NDArray[Any]:
     return pixels.reshape(message.height, message.width, -1)[..., channels] if len(channels) > 1 else pixels
 
 
-def _to_camera(message: Any) -> list[CameraModel]:
-    """Return the intrinsics of a message, none if they are those of no lens that OpenCV's model has."""
-    matrix, lens = (getattr(message, name, None) or getattr(message, name.lower(), None) for name in ("K", "D"))
+def _to_camera(topic: str, message: Any) -> list[_RecordedCamera]:
+    """Return the intrinsics of a message, none if they are those of no camera."""
+    matrix, coefficients = (getattr(message, name, None) or getattr(message, name.lower(), None) for name in ("K", "D"))
     if matrix is None:
         return []
+    lens = str(getattr(message, "distortion_model", ""))
+    used = coefficients if lens in _LENSES and coefficients is not None and any(coefficients) else ()
     try:
-        distortion = tuple(float(k) for k in lens) if lens is not None and any(lens) else ()
-        return [CameraModel(message.width, message.height, matrix[0], matrix[4], matrix[2], matrix[5], distortion)]
+        distortion = tuple(float(k) for k in used)
+        size = message.width, message.height
+        return [
+            _RecordedCamera(topic, CameraModel(*size, matrix[0], matrix[4], matrix[2], matrix[5], distortion), lens)
+        ]
     except CameraError:
         return []

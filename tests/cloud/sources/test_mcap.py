@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from anchors.camera import CameraModel
 from iris_session.cloud.camera_file import CameraSettings
 from iris_session.cloud.frames import DepthFrame, SourceEndedError, SourceError
 from iris_session.cloud.sources import open_source
@@ -33,7 +34,14 @@ INFO = "uint32 height\nuint32 width\nstring distortion_model\nfloat64[] d\nfloat
 MATRIX = [50.0, 0.0, 31.0, 0.0, 51.0, 23.0, 0.0, 0.0, 1.0]
 
 
-def write_ros2(path: Path, *, depth: str = "16UC1", color: str = "rgb8", info: bool = True) -> None:
+def write_ros2(
+    path: Path,
+    *,
+    depth: str = "16UC1",
+    color: str = "rgb8",
+    info: bool = True,
+    lens: tuple[str, list[float]] = ("plumb_bob", [0.0] * 5),
+) -> None:
     from mcap_ros2.writer import Writer
 
     header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "cam"}
@@ -59,8 +67,8 @@ def write_ros2(path: Path, *, depth: str = "16UC1", color: str = "rgb8", info: b
                 camera = {
                     "height": SHAPE[0],
                     "width": SHAPE[1],
-                    "distortion_model": "plumb_bob",
-                    "d": [0.0] * 5,
+                    "distortion_model": lens[0] if topic.startswith("/depth") else "plumb_bob",
+                    "d": lens[1],
                     "k": matrix,
                 }
                 send(topic, "CameraInfo", k, camera)
@@ -174,6 +182,27 @@ def check(source: Any, frames: list[DepthFrame]) -> None:
 def test_messages_of_ros_2(tmp_path: Path, depth: str, color: str) -> None:
     write_ros2(tmp_path / "a.mcap", depth=depth, color=color)
     check(*read_all(tmp_path / "a.mcap"))
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients"),
+    [("", [0.1, 0.2, 0.3, 0.4]), ("rational_polynomial", [0.1] * 8), ("plumb_bob", [0.1] * 5)],
+)
+def test_a_lens_of_opencv_s_model_is_taken(tmp_path: Path, model: str, coefficients: list[float]) -> None:
+    write_ros2(tmp_path / "a.mcap", lens=(model, coefficients))
+    assert read_all(tmp_path / "a.mcap")[0].camera.distortion == tuple(coefficients)
+
+
+@pytest.mark.parametrize("coefficients", [[0.1, 0.2, 0.3, 0.4], [0.0] * 4, [0.1] * 7])
+def test_another_lens_is_refused_unless_the_camera_file_has_intrinsics(
+    tmp_path: Path, coefficients: list[float]
+) -> None:
+    """Four coefficients of a fisheye are not those of OpenCV's other model, and zeros are a fisheye, too."""
+    write_ros2(tmp_path / "a.mcap", lens=("equidistant", coefficients))
+    with pytest.raises(SourceError, match=r"/depth/camera_info .*'equidistant'.*give intrinsics"):
+        read_all(tmp_path / "a.mcap")
+    given = CameraModel(64, 48, 50.0, 51.0, 31.0, 23.0)
+    assert read_all(tmp_path / "a.mcap", intrinsics=given)[0].camera == given
 
 
 @pytest.mark.parametrize("form", ["json", "protobuf"])
