@@ -536,8 +536,8 @@ def format_calibration(result: dict[str, Any]) -> list[str]:
         lines.append(f"{name}  p = [{place}] m  q = [{', '.join(f'{v:.6f}' for v in q)}]")
     for name, part in [("", result), *result.get("cameras", {}).items()]:
         if "error_mm_p95" in part:
-            text = f"stated error {part['error_mm_p95']:.2f} mm (95 %), {part['sigma_deg']:.3f} deg (sigma)"
-            lines.append(f"{name + ': ' if name else ''}{text}")
+            turn = f", {part['sigma_deg']:.3f} deg (sigma)" if "sigma_deg" in part else ""
+            lines.append(f"{name + ': ' if name else ''}stated error {part['error_mm_p95']:.2f} mm (95 %){turn}")
     return lines
 
 

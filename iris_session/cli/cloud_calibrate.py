@@ -7,7 +7,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -53,11 +53,12 @@ _ERROR_POINTS: Final = 200
 
 
 class KnownSheets(NamedTuple):
-    """Sheets to look for, `T_world_sheet` of those at known poses, and the largest stated error of these [m]."""
+    """Sheets to look for, `T_world_sheet` of those at known poses, and the errors that the session states of them [m],
+    0 for those of which it states none. Poses that the user gives are exact: they say where the world is."""
 
     sheets: list[Sheet]
     poses: dict[str, PoseTuple]
-    error_m: float
+    errors_m: dict[str, float]
 
 
 class CameraFrames(NamedTuple):
@@ -146,6 +147,11 @@ def run_calibrate(arguments: argparse.Namespace) -> int:
         print_json(result)
         return 0
     print("\n".join([*format_calibration(result), *_format_icp(result)]))
+    if result["sheets_without_error"]:
+        print(
+            f"not in the stated errors: that of the pose of {', '.join(result['sheets_without_error'])}, of which the "
+            "session states none (`error_m` in its anchors file)"
+        )
     if arguments.out is not None:
         is_beside = arguments.out.absolute().parent == arguments.file.absolute().parent
         name = json.dumps(arguments.out.name if is_beside else str(arguments.out.absolute()), ensure_ascii=False)
@@ -164,7 +170,7 @@ def _find_known_sheets(arguments: argparse.Namespace) -> KnownSheets:
     unknown = sorted({name for name, _ in arguments.at} - {sheet.anchor_id for sheet in sheets})
     if unknown:
         raise CommandError(f"--at {unknown[0]}: no size is given, add --sheet {unknown[0]}=160mm")
-    return KnownSheets(sheets, dict(arguments.at), 0.0)
+    return KnownSheets(sheets, dict(arguments.at), {})
 
 
 def _ask_session(arguments: argparse.Namespace, sheets: list[Sheet]) -> KnownSheets:
@@ -185,7 +191,7 @@ def _ask_session(arguments: argparse.Namespace, sheets: list[Sheet]) -> KnownShe
     return KnownSheets(
         [*make_sheets((one.id, one.size_m) for one in anchors), *(s for s in sheets if s.anchor_id not in named)],
         {one.id: (one.T_world_anchor.p, one.T_world_anchor.q) for one in anchors},
-        max(one.error_m for one in anchors),
+        {one.id: one.error_m for one in anchors},
     )
 
 
@@ -242,15 +248,18 @@ def calibrate(
     pictures = [picture for one in taken for picture in _detect_sheets(one, known.sheets)]
     result, covariances = solve_from_known_sheets(pictures, known.poses, at_rest=True)
     cameras = result.get("cameras") or {taken[0].settings.name: result}
+    seen = {name: error_m for name, error_m in known.errors_m.items() if name in result["sheets"]}
+    result["sheets_without_error"] = sorted(name for name, error_m in seen.items() if error_m == 0.0)
+    sheet_m = max(seen.values(), default=0.0)
     clouds = {}
     for one in taken:
         part = cameras[one.settings.name]
         T = pose_to_matrix(_read_pose(part["T_base_camera"]))
         clouds[one.settings.name] = _make_cloud(settings, one, T)
         error_m = _state_error(covariances[one.settings.name], T, clouds[one.settings.name])
-        part["error_mm_p95"] = 1e3 * math.hypot(error_m, known.error_m)
+        part["error_mm_p95"] = 1e3 * math.hypot(error_m, sheet_m)
     if icp:
-        result["icp"] = _refine(cameras, clouds)
+        result["icp"] = _refine(cameras, clouds, covariances, sheet_m)
     return result
 
 
@@ -301,8 +310,14 @@ def _state_error(covariance: tuple[float, ...], T_world_camera: Floats, points: 
     return float(np.quantile(bounds, 0.95))
 
 
-def _refine(cameras: dict[str, Any], clouds: dict[str, Floats]) -> dict[str, Any]:
-    """Fit cameras one by one to those before them, in the order of their stated errors. Change their poses."""
+def _refine(
+    cameras: dict[str, Any], clouds: dict[str, Floats], covariances: Mapping[str, tuple[float, ...]], sheet_m: float
+) -> dict[str, Any]:
+    """Fit cameras one by one to those before them, in the order of their stated errors. Change their poses and errors.
+
+    A camera that was fitted has the error of the first one at its own points, and twice what its surfaces are apart
+    from those that it was fitted to, as these may be from the first one's.
+    """
     import numpy as np
 
     from anchors.camera import pose_from_matrix, pose_to_matrix
@@ -310,6 +325,8 @@ def _refine(cameras: dict[str, Any], clouds: dict[str, Floats]) -> dict[str, Any
 
     first, *others = sorted(cameras, key=lambda name: float(cameras[name]["error_mm_p95"]))
     reference = clouds[first]
+    T_first = pose_to_matrix(_read_pose(cameras[first]["T_base_camera"]))
+    errors_m = [sheet_m]
     found: dict[str, Any] = {}
     for name in others:
         try:
@@ -319,8 +336,12 @@ def _refine(cameras: dict[str, Any], clouds: dict[str, Floats]) -> dict[str, Any
             continue
         T = one.T_world_world
         pose = pose_from_matrix(T @ pose_to_matrix(_read_pose(cameras[name]["T_base_camera"])))
-        cameras[name]["T_base_camera"] = pose_to_dict(pose)
-        reference = np.concatenate([reference, clouds[name] @ T[:3, :3].T + T[:3, 3]])
+        points = clouds[name] @ T[:3, :3].T + T[:3, 3]
+        reference = np.concatenate([reference, points])
+        errors_m.append(2.0 * one.rmse_after_m)
+        error_m = math.hypot(_state_error(covariances[first], T_first, points), *errors_m)
+        cameras[name] |= {"T_base_camera": pose_to_dict(pose), "error_mm_p95": 1e3 * error_m}
+        del cameras[name]["sigma_deg"]  # of the pose by the sheets
         found[name] = {
             "refined": True,
             "shift_mm": 1e3 * one.shift_m,
