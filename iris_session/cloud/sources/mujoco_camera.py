@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Mapping
 from typing import Any, Final
@@ -27,6 +28,7 @@ Floats = npt.NDArray[np.float64]
 _MAX_GEOMS: Final = 10_000
 #: From OpenGL's camera (y up, z backward) to the optical frame (y down, z forward).
 _FLIP: Final = np.diag([1.0, -1.0, -1.0])
+_loading = threading.Lock()
 
 
 class MujocoCamera:
@@ -60,8 +62,8 @@ class MujocoCamera:
         self.depth_scale_m = settings.depth_scale_m or 0.001
         self._interval_ns, self._number = round(SECOND / (settings.hz or DEFAULT_HZ)), -1
         try:
-            self._model = mujoco.MjModel.from_xml_path(settings.model)
-        except ValueError as error:
+            self._model = _load_model(mujoco, settings.model)
+        except (ValueError, mujoco.FatalError) as error:
             raise SourceError(f"model {settings.model} cannot be loaded: {' '.join(str(error).split())}") from error
         self._camera_id = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_CAMERA, settings.camera)
         if self._camera_id < 0:
@@ -185,6 +187,23 @@ class _Bodies:
             body, position = getattr(model, f"{kind}_bodyid"), getattr(model, f"{kind}_pos")
             getattr(data, f"{kind}_xmat")[:] = (turn[body] @ rotation).reshape(-1, 9)
             getattr(data, f"{kind}_xpos")[:] = place[body] + np.einsum("nij,nj->ni", turn[body], position)
+
+
+def _load_model(mujoco: Any, path: str) -> Any:
+    """Load an MJCF or MJB file. Raises `ValueError` or `mujoco.FatalError`."""
+    if not path.lower().endswith(".mjb"):
+        return mujoco.MjModel.from_xml_path(path)
+    why: list[str] = []
+    with _loading:  # MuJoCo has one handler of warnings, which have the reason; without one it writes a file
+        before = mujoco.get_mju_user_warning()
+        mujoco.set_mju_user_warning(why.append)
+        try:
+            return mujoco.MjModel.from_binary_path(path)
+        except (ValueError, mujoco.FatalError) as error:
+            reason = "; ".join(why) or error
+            raise ValueError(f"{reason}; damaged, or not of MuJoCo {mujoco.__version__}: save it again") from error
+        finally:
+            mujoco.set_mju_user_warning(before)
 
 
 def _describe_missing_gl(error: Exception) -> SourceError:
