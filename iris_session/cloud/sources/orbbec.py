@@ -44,7 +44,11 @@ class OrbbecCamera:
             config.enable_stream(colors.get_video_stream_profile(*size, ob.OBFormat.RGB, hz))
             self._pipeline.enable_frame_sync()
             self._pipeline.start(config)
-            self._align = ob.AlignFilter(align_to_stream=ob.OBStreamType.DEPTH_STREAM)
+            try:
+                self._align = ob.AlignFilter(align_to_stream=ob.OBStreamType.DEPTH_STREAM)
+            except BaseException:
+                self._pipeline.stop()
+                raise
         except Exception as error:  # the package has its own errors, of no common base
             text = f"{settings.width} x {settings.height} at {hz} Hz"
             raise SourceError(

@@ -92,7 +92,7 @@ class OrbbecStandIn(ModuleType):
     def __init__(self) -> None:
         super().__init__("pyorbbecsdk")
         self.enabled: list[Any] = []
-        self.fails = self.stopped = False
+        self.fails = self.cannot_align = self.stopped = False
         self.frames: Any = self
 
     def Context(self) -> Any:
@@ -108,6 +108,8 @@ class OrbbecStandIn(ModuleType):
 
     def AlignFilter(self, align_to_stream: str) -> Any:
         assert align_to_stream == "to depth"
+        if self.cannot_align:
+            raise RuntimeError("no filter")
         return SimpleNamespace(process=lambda frames: SimpleNamespace(as_frame_set=lambda: frames))
 
     def get_depth_frame(self) -> Any:
@@ -221,3 +223,10 @@ def test_orbbec_that_is_not_there_or_does_not_start_is_named(orbbec: OrbbecStand
     with pytest.raises(SourceError) as caught:
         open_source(make_settings("orbbec"), lambda: 0)
     assert "64 x 48 at 30 Hz" in str(caught.value)
+
+
+def test_orbbec_that_cannot_align_is_released(orbbec: OrbbecStandIn) -> None:
+    orbbec.cannot_align = True
+    with pytest.raises(SourceError, match="no filter"):
+        open_source(make_settings("orbbec"), lambda: 0)
+    assert orbbec.stopped
