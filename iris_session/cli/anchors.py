@@ -31,6 +31,7 @@ from iris_session.cli.common import (
     parse_pose,
     pose_to_dict,
     print_json,
+    write_file,
 )
 
 if TYPE_CHECKING:
@@ -131,10 +132,7 @@ def run_print(arguments: argparse.Namespace) -> int:
         drawn = to_pdf(sheet, arguments.paper) if out.suffix.lower() == ".pdf" else to_svg(sheet, arguments.paper)
     except SheetError as error:
         raise CommandError(str(error)) from error
-    try:
-        out.write_bytes(drawn if isinstance(drawn, bytes) else drawn.encode())
-    except OSError as error:
-        raise CommandError(f"{out} cannot be written: {error.strerror}") from error
+    write_file(out, drawn)
     if arguments.json:
         print_json(
             {
@@ -656,10 +654,7 @@ def run_calibrate(arguments: argparse.Namespace) -> int:
     except CalibrationError as error:
         raise CommandError(str(error), status=1) from error
     if arguments.out is not None:
-        try:
-            arguments.out.write_text(calibration_to_toml(result), encoding="utf-8")
-        except OSError as error:
-            raise CommandError(f"{arguments.out} cannot be written: {error.strerror}") from error
+        write_file(arguments.out, calibration_to_toml(result))
     if arguments.json:
         print_json(result)
     else:

@@ -20,6 +20,7 @@ from iris_session.cli.common import (
     pose_to_dict,
     print_json,
     to_printable,
+    write_file,
 )
 from iris_session.cli.status import add_watch_options, open_status, watch_status
 from iris_session.doctor.headset_checks import is_consistent
@@ -496,10 +497,7 @@ def _resolve_frames(looks: AlignmentHistory, anchors: Any, sizes: dict[str, floa
 def _write_constellation(path: Path, relative: RelativePoses) -> str:
     """Write the constellation as a file for `serve --anchors`. Return its path."""
     assert relative.solved is not None
-    try:
-        path.write_text(relative.solved.constellation.to_toml(), encoding="utf-8")
-    except OSError as error:
-        raise CommandError(f"{path} cannot be written: {error.strerror}") from error
+    write_file(path, relative.solved.constellation.to_toml())
     return str(path)
 
 

@@ -28,6 +28,7 @@ from iris_session.cli.common import (
     check_session_reachable,
     pose_to_dict,
     print_json,
+    write_file,
 )
 
 if TYPE_CHECKING:
@@ -139,10 +140,7 @@ def run_calibrate(arguments: argparse.Namespace) -> int:
     except CalibrationError as error:
         raise CommandError(str(error), status=1) from error
     if arguments.out is not None:
-        try:
-            arguments.out.write_text(calibration_to_toml(result), encoding="utf-8")
-        except OSError as error:
-            raise CommandError(f"{arguments.out} cannot be written: {error.strerror}") from error
+        write_file(arguments.out, calibration_to_toml(result))
     if arguments.json:
         print_json(result)
         return 0

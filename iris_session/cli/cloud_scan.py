@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from iris_session.cli.cloud_calibrate import open_camera, print_progress
-from iris_session.cli.common import CommandError, add_json_option, parse_length, parse_seconds, print_json
+from iris_session.cli.common import CommandError, add_json_option, parse_length, parse_seconds, print_json, write_file
 
 if TYPE_CHECKING:
     from iris_session.cloud.camera_file import CloudSettings
@@ -77,10 +77,7 @@ def run_scan(arguments: argparse.Namespace) -> int:
             else "no points: is the crop box (low, high) around what the cameras see?",
             status=1,
         )
-    try:
-        write_ply(arguments.out, scan.points)
-    except OSError as error:
-        raise CommandError(f"{arguments.out} cannot be written: {error.strerror}") from error
+    write_file(arguments.out, to_ply(scan.points))
     low, high = scan.points.positions.min(axis=0).tolist(), scan.points.positions.max(axis=0).tolist()
     if arguments.json:
         print_json(
@@ -153,8 +150,8 @@ def scan_cameras(settings: CloudSettings, voxels: VoxelFilter, seconds: float, *
     )
 
 
-def write_ply(path: Path, points: PointSet) -> None:
-    """Write positions and colours as binary PLY, little-endian."""
+def to_ply(points: PointSet) -> bytes:
+    """Return positions and colours as binary PLY, little-endian."""
     import numpy as np
 
     columns = [(axis, "<f4") for axis in "xyz"] + [(color, "u1") for color in ("red", "green", "blue")]
@@ -165,4 +162,4 @@ def write_ply(path: Path, points: PointSet) -> None:
         rows[color] = points.colors[:, k]
     properties = [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in columns]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *properties, "end_header", ""]
-    path.write_bytes("\n".join(header).encode() + rows.tobytes())
+    return "\n".join(header).encode() + rows.tobytes()

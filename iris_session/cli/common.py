@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from iris_session.protocol.names import AssignmentPolicy, LeaseMode
+from iris_session.system.files import write_output
 
 if TYPE_CHECKING:
     import mujoco
@@ -31,6 +32,14 @@ class CommandError(Exception):
     def __init__(self, text: str, status: int = 2) -> None:
         super().__init__(text)
         self.status = status
+
+
+def write_file(path: Path, content: bytes | str) -> None:
+    """Write the file of an option, completely or not at all. Raises `CommandError`."""
+    try:
+        write_output(path, content.encode() if isinstance(content, str) else content)
+    except OSError as error:
+        raise CommandError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def list_expected_errors() -> tuple[type[Exception], ...]:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -39,7 +38,7 @@ from iris_session.scene.shapes import (
     build_primitive,
     repeat_texture_coordinates,
 )
-from iris_session.system.files import write_atomic
+from iris_session.system.files import write_output
 
 _FLOAT, _UINT = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963
@@ -68,11 +67,7 @@ def write_glb(spec: SceneSpec, store: AssetStore, path: Path) -> int:
     large, and `OSError`.
     """
     data = _GlbWriter(spec, store).encode()
-    target = Path(os.path.realpath(path))  # a link remains a link
-    if target.exists() and not target.is_file():  # a pipe or a device; opening a folder raises
-        target.write_bytes(data)
-        return len(data)
-    write_atomic(target, data, permissions=None)
+    write_output(path, data)
     return len(data)
 
 

@@ -98,6 +98,17 @@ def write_atomic(
         replacement.file.write(data)
 
 
+def write_output(path: Path, data: bytes) -> None:
+    """Write a file that a person named, completely or not at all. A link remains a link; a pipe or a device is written
+    as it is. Raises `OSError`.
+    """
+    target = Path(os.path.realpath(path))
+    if target.exists() and not target.is_file():  # opening a folder raises
+        target.write_bytes(data)
+    else:
+        write_atomic(target, data, permissions=None)
+
+
 def sync_folder(folder: Path) -> None:
     """Make the names in a folder durable: else a power cut may bring back a file that was replaced."""
     if os.name != "posix":

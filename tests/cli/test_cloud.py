@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from iris_session.cli.main import main
 from iris_session.cloud.camera_file import load_camera_file
 from iris_session.cloud.config import CameraReport, SourceReport
 from iris_session.protocol.names import StreamFault
+from iris_session.system.files import Replacement
 
 
 @pytest.fixture
@@ -86,6 +88,22 @@ def test_a_picture_that_cannot_be_read_is_one_line(camera_file: Path, capsys: py
     assert "camera 'front'" in error
     assert "0.depth.png" in error
     assert error.count("\n") == 1
+
+
+def test_a_scan_that_cannot_be_written_leaves_the_file_as_it_was(
+    camera_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(self: Replacement) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    out = camera_file.parent / "room.ply"
+    out.write_bytes(b"the scan of yesterday")
+    before = sorted(camera_file.parent.iterdir())
+    monkeypatch.setattr(Replacement, "finish", fail)
+    assert main(["cloud", "scan", str(camera_file), "--seconds", "0.3", "-o", str(out)]) == 2
+    assert "room.ply cannot be written: No space left on device" in capsys.readouterr().err
+    assert out.read_bytes() == b"the scan of yesterday"
+    assert sorted(camera_file.parent.iterdir()) == before
 
 
 def test_no_session_is_one_line(camera_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
