@@ -46,7 +46,7 @@ from iris_session.scene.budget import Budget
 from iris_session.system.extras import MissingExtraError, require_package
 from iris_session.system.log import configure_logging
 from iris_session.system.priority import lower_thread_priority
-from iris_session.system.process import die_with_parent, is_parent
+from iris_session.system.process import die_with_parent, is_parent, take_stdout
 
 #: Longest wait for a frame, after which the loop looks whether it is to end [s].
 POLL_S: Final = 0.05
@@ -311,10 +311,10 @@ def make_client(start: CameraStart) -> Client:
     )
 
 
-def write_report(report: CameraReport) -> None:
-    """Write a report to standard output. A parent that does not read it is not waited for."""
+def write_report(descriptor: int, report: CameraReport) -> None:
+    """Write a report for the parent. One that does not read it is not waited for."""
     with contextlib.suppress(OSError):
-        os.write(sys.stdout.fileno(), msgspec.json.encode(report) + b"\n")
+        os.write(descriptor, msgspec.json.encode(report) + b"\n")
 
 
 def main() -> int:
@@ -322,7 +322,8 @@ def main() -> int:
     configure_logging()
     lower_thread_priority()  # of this thread and those that it starts: no tick is to wait for a cloud
     start = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=CameraStart)
-    os.set_blocking(sys.stdout.fileno(), False)
+    reports = take_stdout()  # packages of cameras print
+    os.set_blocking(reports, False)
     ending = threading.Event()
 
     def on_signal(number: int, _frame: FrameType | None) -> None:
@@ -341,12 +342,11 @@ def main() -> int:
     gc.collect()
     gc.freeze()
     try:
-        fault = run_cameras(start.settings, make_client(start), write_report, is_ending)
+        fault = run_cameras(start.settings, make_client(start), partial(write_report, reports), is_ending)
     except (ClientError, MissingExtraError) as error:
         fault = str(error)
     if fault:
-        write_report(CameraReport(start.settings.stream, fault=fault))
-    sys.stdout.flush()
+        write_report(reports, CameraReport(start.settings.stream, fault=fault))
     # A driver that hangs in a thread would keep the interpreter from ending.
     os._exit(1 if fault else 0)
 

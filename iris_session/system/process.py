@@ -73,6 +73,16 @@ def _is_editable_here(found: Distribution) -> bool:
     return bool(origin.get("dir_info", {}).get("editable")) and origin.get("url") == ROOT.as_uri()
 
 
+def take_stdout() -> int:
+    """Return a descriptor of standard output for this process's own lines; what libraries print there goes to standard
+    error from now on.
+    """
+    sys.stdout.flush()
+    own = os.dup(sys.stdout.fileno())
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    return own
+
+
 def _open_memory_file() -> IO[bytes]:
     """Open a file without a name. Outside of Linux it lies on disk."""
     if not hasattr(os, "memfd_create"):

@@ -65,7 +65,7 @@ class SupervisedProcess(Generic[Report]):
         self._backoff = Backoff(RESTART_DELAYS_NS)
         self._started_ns = self._due_ns = 0
         self._failure = self._hang = self._announced = ""
-        self._was_started = self._closed = False
+        self._was_started = self._closed = self._has_warned = False
         self._earlier_drops: dict[str, int] = {}
         self.report = report_type()
         self.heard_ns: int | None = None
@@ -94,7 +94,7 @@ class SupervisedProcess(Generic[Report]):
 
     def start(self, now_ns: int) -> None:
         """Start the process, in a thread. `now_ns`: a monotonic time."""
-        self._was_started = True
+        self._was_started, self._has_warned = True, False
         self._started_ns, self._due_ns, self.heard_ns = now_ns, 0, None
         self._thread = threading.Thread(target=self._run_spawn, name="iris-spawn", daemon=True)
         self._thread.start()
@@ -180,6 +180,8 @@ class SupervisedProcess(Generic[Report]):
             try:
                 self.report = msgspec.json.decode(line, type=self._type)
             except msgspec.MsgspecError:
-                log.warning("%s wrote a line that is no report", self._title)
+                if not self._has_warned:  # there may be one for every frame of a camera
+                    log.warning("%s wrote a line that is no report: %.80r", self._title, line)
+                self._has_warned = True
                 continue
             self.heard_ns = now_ns

@@ -140,3 +140,18 @@ def test_child_exits_at_the_end_of_its_input(module_folder: Path) -> None:
     assert [child.read_line(30.0), child.read_line(30.0)] == [b"A", b"B"]
     assert child.stop(exit_s=30.0) == 0
     child.close()
+
+
+def test_what_libraries_print_does_not_reach_who_reads_standard_output() -> None:
+    code = (
+        "import os, sys\n"
+        "from iris_session.system.process import take_stdout\n"
+        "own = take_stdout()\n"
+        "os.write(own, b'report\\n')\n"
+        "print('by Python', flush=True)\n"
+        "os.write(1, b'by a library')\n"
+        "os.write(own, b'report\\n')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, timeout=60)
+    assert done.stdout == b"report\nreport\n"
+    assert done.stderr.splitlines() == [b"by Python", b"by a library"]

@@ -7,6 +7,7 @@ import threading
 import time
 
 import msgspec
+import pytest
 
 from iris_session.system.process import ChildProcess
 from iris_session.system.supervised import HEALTHY_NS, SECOND, START_NS, SupervisedProcess
@@ -106,6 +107,16 @@ def test_reports_are_read() -> None:
     assert lab.process.report.n == 2
     assert lab.process.heard_ns == SECOND
     assert lab.process.failure == ""
+
+
+def test_lines_that_are_no_reports_are_a_warning_once(caplog: pytest.LogCaptureFixture) -> None:
+    lab = start()
+    for _ in range(3):
+        lab.children[0].lines += [b"Frameset dropped " + b"." * 200] * 100
+        lab.poll(1.0)
+    (record,) = caplog.records
+    assert "the helper wrote a line that is no report: b'Frameset dropped" in record.getMessage()
+    assert len(record.getMessage()) < 200
 
 
 def test_a_process_that_ends_is_started_again_and_announced() -> None:
