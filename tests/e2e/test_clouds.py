@@ -1,23 +1,35 @@
-"""Clouds and pictures from a program to a Python client that joins later, and to the page in a real Chromium."""
+"""Clouds and pictures from a program to a Python client that joins later, and to the page in a real Chromium.
+
+And clouds of camera processes to clients over a good and a slow link, while keys come and go.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import io
+import json
+import os
+import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Final
+from statistics import median
+from typing import Any, Final
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from iris_session import Client, StreamCamera, StreamInfo, encode_cloud
+from iris_session import Client, CurveKeys, Recording, StreamCamera, StreamInfo, encode_cloud
 from iris_session.codegen.conversions import from_three, to_three
+from iris_session.netsim.process import ImpairmentProcess, make_link_address
+from iris_session.protocol.names import BudgetClass
+from iris_session.security import KeyHome, KeyPair
 from tests.e2e.browser import Page
 from tests.e2e.emulated_quest import HEADSET, INSTALL, IWER, aim_at
-from tests.e2e.session_process import SessionProcess, wait_until
+from tests.e2e.scenario import Scenario
+from tests.e2e.session_process import COMMAND, END_WITH_PARENT, SessionProcess, run_command, wait_until
+from tests.e2e.test_cameras import find_stream, folder_camera, write_file, write_pictures
 
 pytestmark = pytest.mark.e2e
 
@@ -272,6 +284,116 @@ def test_a_camera_is_a_panel_in_the_headset_while_it_is_chosen(
         press("picture front", f"{panel} === undefined")
         wait_until(lambda: count_subscribers() == 0, "nothing is subscribed to")
         assert page.errors == []
+
+
+@contextlib.contextmanager
+def run_paired_camera(server: SessionProcess, file: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Pair a key in role camera, and run `iris-session cloud run` with it, as on another machine."""
+    shown = run_command("pair", "--address", server.address, "--no-wait", "--json", "--role", "camera", cwd=file.parent)
+    assert shown.returncode == 0, shown.stderr
+    options = [str(file), "--address", server.address, "--code", json.loads(shown.stdout)["code"]]
+    environment = {**os.environ, "IRIS_HOME": str(file.parent / "home")}
+    with (file.parent / "camera.out").open("wb") as out:
+        command = [*END_WITH_PARENT, *COMMAND, "cloud", "run", *options]
+        process = subprocess.Popen(command, stdout=out, stderr=out, env=environment)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.long
+def test_two_cameras_reach_clients_over_good_and_slow_links_until_a_key_is_revoked(
+    serve: Callable[..., SessionProcess], tmp_path: Path
+) -> None:
+    """One camera is the session's, one has a paired key. Ann is here, eve behind a slow link, bob joins late."""
+    home = KeyHome()
+    server_key = home.load_server_key().public.encode()
+    keys = {name: KeyPair.generate() for name in ("ann", "eve", "bob")}
+    for name, pair in keys.items():
+        home.clients.allow_key(name, pair.public, ("observer",))
+    every = {"picture_hz": 0.0, "min_points": 1, "min_around": 0}  # of some 19,000 pixels
+    room, hall = (
+        write_file(tmp_path / f"{name}.toml", folder_camera(write_pictures(tmp_path / name)), **every)
+        for name in ("room", "hall")
+    )
+    server = serve("handover", "--curve", "--no-beacon", "--camera", str(room))
+    scenario = Scenario(server)
+    host, _, port = server.address.rpartition(":")
+    link, slow = make_link_address(71), tmp_path / "slow.json"
+    # Both clouds have 12 Mbit/s, a quarter of them 3 Mbit/s.
+    slow.write_text(json.dumps({"window_kib": 512, "phases": [{"delay_ms": 20, "rate_mbit": 5}]}))
+
+    def join(name: str, address: str = host, **options: Any) -> Client:
+        pair = keys[name]
+        curve = CurveKeys(server_key, pair.public.encode(), pair.secret.encode())
+        client = Client(f"{address}:{port}", role="observer", name=name, alignment="not_needed", curve=curve, **options)
+        return scenario.add(client)
+
+    with contextlib.ExitStack() as stack:
+        stack.callback(scenario.close)
+        camera = stack.enter_context(run_paired_camera(server, hall))
+        ann = join("ann")
+        here = [ann.media.cloud(name) for name in ("room", "hall")]
+        scenario.run_until(lambda: all(one.newest for one in here), "both clouds reach ann")
+        assert ann.connection.welcome is not None
+        endpoints = ann.connection.welcome.endpoints
+        ports = [int(port), endpoints.state, endpoints.media]
+        proxy = stack.enter_context(ImpairmentProcess({link: "lan"}, ports, target=host))
+        ages_ms: list[float] = []
+        eve = join("eve", link, on_state=lambda state: ages_ms.append(state.age_ns * 1e-6))
+        there = [eve.media.cloud(name) for name in ("room", "hall")]
+        scenario.run_until(lambda: all(one.newest for one in there), "both clouds reach eve")
+
+        proxy.execute(f"profile {slow}")
+
+        def has_settled() -> bool:
+            others = all(one.feed.budget_class == BudgetClass.FULL for one in here)
+            coarse = all(one.newest and one.newest.header.budget_class == BudgetClass.QUARTER for one in there)
+            return others and coarse and median(ages_ms[-60:]) < 150.0
+
+        scenario.run_until(has_settled, "eve has a quarter of the points and fresh state, ann has all")
+        received = [one.feed.received for one in there]
+        scenario.run_until(
+            lambda: all(one.feed.received > before + 5 for one, before in zip(there, received, strict=True)),
+            "points go on coming over the slow link",
+        )
+        assert eve.media.delivery is not None
+        assert eve.media.delivery.reason
+        for fine, coarse in zip(here, there, strict=True):
+            assert fine.newest is not None
+            assert coarse.newest is not None
+            assert len(coarse.newest.positions) == pytest.approx(len(fine.newest.positions) / 4, rel=0.1)
+            extents = [np.ptp(one.newest.positions, axis=0)[1:] for one in (fine, coarse) if one.newest is not None]
+            assert extents[1] == pytest.approx(extents[0], rel=0.1), "every prefix is a fair sample of the wall"
+
+        late = [join("bob").media.cloud(name) for name in ("room", "hall")]
+        scenario.run_until(lambda: all(one.newest for one in late), "both clouds reach bob")
+
+        (entry,) = [one for one in home.clients.read().values() if one.roles == ("camera",)]
+        home.clients.revoke_key(entry.fingerprint)
+        scenario.run_until(lambda: camera.poll() is not None, "the camera whose key was revoked has ended")
+
+        def is_over(client: Client) -> bool:
+            told = find_stream(client, "hall")
+            return told is None or told.stale
+
+        scenario.run_until(lambda: all(map(is_over, scenario.clients)), "everyone knows that the hall has ended")
+        rooms = (here[0], there[0], late[0])
+        received = [one.feed.received for one in rooms]
+        scenario.run_until(
+            lambda: all(one.feed.received > before for one, before in zip(rooms, received, strict=True)),
+            "the room goes on for everyone",
+        )
+    server.finish()
+    with Recording.open(server.recording) as recording:
+        for name, ends in (("room", False), ("hall", True)):
+            clouds = list(recording.clouds(name))
+            assert len(clouds) > 2
+            assert all(len(one.positions) > 5_000 for one in clouds)
+            *_, last = recording.streams(name)
+            assert (last.info is None) == ends
 
 
 def measure_share(page: Page, color: tuple[int, int, int], path: Path) -> float:
