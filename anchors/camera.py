@@ -121,7 +121,7 @@ def parse_camera(text: str, width: int = 0, height: int = 0) -> CameraModel:
     wanted = "width, height, fx, fy, cx, cy [pixels], and if known distortion = [k1, k2, p1, p2, k3]"
     try:
         table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # also a number or a nesting that Python does not take
         raise CameraError(f"neither a 3x3 matrix nor TOML ({error}); wanted: {wanted}") from error
     try:
         fx, fy, cx, cy = (float(table[key]) for key in ("fx", "fy", "cx", "cy"))

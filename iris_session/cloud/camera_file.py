@@ -198,7 +198,7 @@ class _Reader:
     def read(self) -> CloudSettings:
         try:
             document = tomllib.loads(self._text)
-        except tomllib.TOMLDecodeError as error:
+        except (ValueError, RecursionError) as error:  # also a number or a nesting that Python does not take
             line = re.search(r"line (\d+)", str(error))
             raise CameraFileError(f"{self._path}: {error}", line=int(line[1]) if line else 0) from error
         self._check_finite(document)
@@ -286,7 +286,7 @@ class _Reader:
             if not camera.path:
                 raise self._error("path", f"path is missing: source {camera.source!r} reads a file or folder", index)
             if not Path(camera.path).exists():
-                raise self._error("path", f"{camera.path} does not exist", index)
+                raise self._error("path", f"{camera.path!r} does not exist", index)
         if camera.source in ("folder", "opencv") and camera.intrinsics is None:
             wanted = "a file, or { width, height, fx, fy, cx, cy } in pixels"
             raise self._error("intrinsics", f"intrinsics are missing: {wanted}", index)
@@ -367,9 +367,10 @@ def read_calibration(path: Path, camera: str, *, on_body: bool) -> tuple[CameraP
     Raises:
         CameraFileError: The file cannot be read, or does not have a usable pose of this camera.
     """
+    text = _read_text(path, "calibration")
     try:
-        document = tomllib.loads(_read_text(path, "calibration"))
-    except tomllib.TOMLDecodeError as error:
+        document = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
         raise CameraFileError(f"{path}: {error}", "calibration") from error
     cameras = document.get("cameras")
     part = document if not isinstance(cameras, dict) else cameras.get(camera)

@@ -225,6 +225,15 @@ def test_the_line_of_a_bad_value_is_that_of_toml(tmp_path: Path) -> None:
     assert refuse(tmp_path, 'stream = "room"\n\npoints = = 3\n').line == 3
 
 
+@pytest.mark.parametrize("wrong", ["a = " + "[" * 10_000, "a = " + "9" * 5_000], ids=["nesting", "digits"])
+def test_what_python_cannot_read_is_one_line(tmp_path: Path, wrong: str) -> None:
+    refuse(tmp_path, wrong)
+    (tmp_path / "wrong.toml").write_text(wrong)
+    text = f'stream = "room"\n{CAMERA}'
+    assert refuse(tmp_path, text.replace(INTRINSICS, '"wrong.toml"')).key == "intrinsics"
+    assert refuse(tmp_path, text.replace(f"pose = {POSE}", 'calibration = "wrong.toml"')).key == "calibration"
+
+
 def test_lines_of_tables(tmp_path: Path) -> None:
     text: Any = '[[cameras]]\nname = "a"\n[cameras.pose]\nposition_m = []\n[[cameras]]\nname = "b"\n'
     assert [find_line(text, "pose", 0), find_line(text, "pose", 1), find_line(text, "name", 1)] == [3, 5, 6]
