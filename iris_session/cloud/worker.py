@@ -42,6 +42,7 @@ SECOND: Final = 1_000_000_000
 INFO_NS: Final = SECOND
 #: Sources whose pictures of a world at rest are all the same.
 RENDERED: Final = frozenset({"mujoco"})
+LEFT_OUT: Final = "its frames are in no cloud: they are captured, or dated, more than 50 ms before those of the others"
 NO_POSE: Final = "its frames have no pose, or the session no state of the time when they are captured"
 #: Time for the threads to leave their sources.
 JOIN_NS: Final = SECOND // 2
@@ -359,6 +360,8 @@ class CloudWorker:
                 f"the session has no body {self._cameras[name].body!r}, or no state of it when a frame was captured"
             )
             fault = Fault(StreamFault.POSE, detail)
+        if fault is None and self.pipeline.is_left_out(name, now_ns):
+            fault = Fault(StreamFault.CLOCK, LEFT_OUT)
         move = None if self._watch is None else self._watch.find_move(name)
         if move is not None and (fault is None or fault.fault == StreamFault.SLOW):
             fault = Fault(StreamFault.MOVED, f"{move}: calibrate it again, `iris-session cloud calibrate`")

@@ -31,7 +31,7 @@ FAULTS: Final = {
         "check its pose and the name of its body against the scene",
     ),
     StreamFault.CLOCK: (
-        "its times of capture jump or lie in the future",
+        "its times of capture jump, lie in the future, or are not those of the other cameras",
         "check the clock of the machine with the camera, and its driver",
     ),
     StreamFault.SLOW: (

@@ -80,6 +80,17 @@ class FakeOutlet:
         return next((one[4] for one in reversed(self.published) if one[0] == stream and one[4] is not None), None)
 
 
+class TimedOutlet(FakeOutlet):
+    """Its clock stands still until the test moves it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.time_ns = 10**12
+
+    def now_ns(self) -> int:
+        return self.time_ns
+
+
 def wait_until(condition: Callable[[], object]) -> None:
     """Poll `condition` until it is true."""
     deadline = time.monotonic() + DEADLINE_S

@@ -19,14 +19,14 @@ from iris_session.protocol.media import find_info_problem
 from iris_session.protocol.names import MediaEncoding, StreamFault
 from iris_session.streams.cloud import decode_cloud
 from tests.cloud.camera_settings import make_settings
-from tests.cloud.fake_source import DEADLINE_S, FakeOutlet, FakeSource, make_frame
+from tests.cloud.fake_source import DEADLINE_S, FakeOutlet, FakeSource, TimedOutlet, make_frame, wait_until
 
 
 class Lab:
     """A worker and its sources by camera."""
 
-    def __init__(self, *names: str, **options: Any) -> None:
-        self.outlet = FakeOutlet()
+    def __init__(self, *names: str, outlet: FakeOutlet | None = None, **options: Any) -> None:
+        self.outlet = FakeOutlet() if outlet is None else outlet
         self.sources: dict[str, FakeSource] = {}
         self.settings = make_settings(*names, **options)
         self.worker = CloudWorker(self.settings, self.outlet, self._open, time.perf_counter_ns)
@@ -49,6 +49,42 @@ class Lab:
         self.sources[name].put(frame)
         self.poll_until(lambda: any(one[2] == frame.capture_ns for one in self.outlet.published))
         return frame
+
+
+class TimedLab(Lab):
+    """A lab whose clock is moved by the test: reader and worker are done with each step before the next."""
+
+    outlet: TimedOutlet
+
+    def __init__(self, *names: str, **options: Any) -> None:
+        super().__init__(*names, outlet=TimedOutlet(), **options)
+
+    def step(self, ms: float, *names: str, late_ms: float = 0.0) -> None:
+        """Let time pass, give a frame of each of these cameras, and poll. `late_ms`: they were captured before."""
+        self.outlet.time_ns += round(ms * 1e6)
+        now_ns = self.outlet.time_ns
+        for name in names:
+            self.sources[name].put(make_frame(now_ns - round(late_ms * 1e6)))
+            reader = self.worker._readers[name]
+            wait_until(lambda reader=reader: reader._health.arrived_ns == now_ns)
+        self.worker.poll(0.0)
+
+    def fault(self, stream: str = "room") -> tuple[str, str]:
+        info = self.outlet.newest_info(stream)
+        return ("", "") if info is None else (info.fault, info.detail)
+
+
+@pytest.fixture
+def open_timed_lab() -> Iterator[Callable[..., TimedLab]]:
+    labs: list[TimedLab] = []
+
+    def start(*names: str, **options: Any) -> TimedLab:
+        labs.append(TimedLab(*names, **options))
+        return labs[-1]
+
+    yield start
+    for lab in labs:
+        assert lab.worker.close()
 
 
 @pytest.fixture
@@ -148,6 +184,22 @@ def test_a_camera_that_fails_does_not_stop_the_other(open_lab: Callable[..., Lab
     assert lab.worker.cloud is not None
     assert lab.worker.cloud.cameras == ("left",)
     lab.poll_until(lambda: (told := lab.outlet.newest_info("room")) is not None and told.detail == "camera right: gone")
+
+
+def test_a_camera_that_is_in_no_cloud_is_named(open_timed_lab: Callable[..., TimedLab]) -> None:
+    lab = open_timed_lab("left", "right")
+    for _ in range(50):
+        lab.step(10, "right", late_ms=1000)
+        lab.step(30, "left")
+    assert lab.worker.cloud is not None
+    assert lab.worker.cloud.cameras == ("left",)
+    fault, detail = lab.fault()
+    assert (fault, detail[:35]) == (StreamFault.CLOCK, "camera right: its frames are in no ")
+    for _ in range(50):
+        lab.step(10, "right")
+        lab.step(30, "left")
+    assert lab.worker.cloud.cameras == ("left", "right")
+    assert lab.fault() == ("", "")
 
 
 def test_frames_that_no_one_takes_are_counted(open_lab: Callable[..., Lab]) -> None:
