@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import Final, NamedTuple
 
 from anchors.camera import CameraModel
-from iris_session.cloud.frames import DepthFrame, DepthSource, SourceEndedError, SourceError
+from iris_session.cloud.frames import DepthFrame, DepthSource, RecordedSource, SourceEndedError, SourceError
 from iris_session.cloud.health import CameraHealth, Fault
 from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.names import StreamFault
@@ -170,14 +170,16 @@ class SourceReader:
             frames += 1
             if frames == HEALTHY_FRAMES:
                 backoff.reset()
-            self._take_over(NewFrame(frame, source.camera, source.depth_scale_m, self._opening))
+            recorded_hz = source.recorded_hz if isinstance(source, RecordedSource) else 0.0
+            self._take_over(NewFrame(frame, source.camera, source.depth_scale_m, self._opening), recorded_hz)
             self._on_frame()
 
-    def _take_over(self, new: NewFrame) -> None:
+    def _take_over(self, new: NewFrame, recorded_hz: float) -> None:
         with self._lock:
             if self._is_outdated:
                 return
             self._failure = ""
+            self._health.limit_rate(recorded_hz)
             if not self._health.check_frame(new.frame, new.model, self._now_ns()):
                 self.refused += 1
                 return

@@ -30,6 +30,7 @@ from iris_session.cloud.pipeline import (
     PointRemover,
 )
 from iris_session.cloud.reader import NewFrame, SourceReader
+from iris_session.cloud.sources.playback import DEFAULT_HZ
 from iris_session.cloud.voxels import Colors, DepthLimits, Floats, VoxelFilter, make_rays
 from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.media import StreamCamera, StreamInfo, find_info_problem
@@ -162,10 +163,11 @@ class CloudWorker:
 
     def _make_reader(self, camera: CameraSettings, open_source: OpenSource) -> SourceReader:
         settings, now_ns = self._settings, self._outlet.now_ns
+        hz = min(settings.hz, camera.hz or DEFAULT_HZ)  # a recording with times of its own limits it further
         return SourceReader(
             camera.name,
             lambda: open_source(camera, now_ns),
-            CameraHealth(min(settings.hz, camera.hz or settings.hz), has_noise=camera.source not in RENDERED),
+            CameraHealth(hz, has_noise=camera.source not in RENDERED),
             now_ns,
             self._wake.set,
         )

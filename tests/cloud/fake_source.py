@@ -48,6 +48,12 @@ class FakeSource:
         self.closed = True
 
 
+class FakeRecording(FakeSource):
+    """A recording at 5 Hz."""
+
+    recorded_hz = 5.0
+
+
 def make_frame(capture_ns: int, depth_mm: int = 1500) -> DepthFrame:
     """Return a wall with noise."""
     random = np.random.default_rng(capture_ns % 2**32)
