@@ -44,7 +44,7 @@ from iris_session.protocol.media import StreamInfo
 from iris_session.protocol.names import Role
 from iris_session.scene.budget import Budget
 from iris_session.system.extras import MissingExtraError, require_package
-from iris_session.system.log import configure_logging
+from iris_session.system.log import configure_logging, describe_error
 from iris_session.system.priority import lower_thread_priority
 from iris_session.system.process import die_with_parent, is_parent
 
@@ -251,7 +251,8 @@ def run_cameras(
         on_report(CameraReport(settings.stream))
 
         def report(one: CameraReport) -> None:
-            on_report(msgspec.structs.replace(one, warning=robots.warning))
+            warning = "; ".join(filter(None, (one.warning, robots.warning)))
+            on_report(msgspec.structs.replace(one, warning=warning))
 
         try:
             _work(worker, client, report, is_ending)
@@ -344,6 +345,9 @@ def main() -> int:
         fault = run_cameras(start.settings, make_client(start), write_report, is_ending)
     except (ClientError, MissingExtraError) as error:
         fault = str(error)
+    except Exception as error:
+        fault = describe_error(error)
+        log.exception("the camera process of %r ends", start.settings.stream)
     if fault:
         write_report(CameraReport(start.settings.stream, fault=fault))
     sys.stdout.flush()

@@ -17,6 +17,7 @@ from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.names import StreamFault
 from iris_session.system.backoff import Backoff
 from iris_session.system.extras import MissingExtraError
+from iris_session.system.log import describe_error
 
 MILLISECOND: Final = 1_000_000
 #: Delays before a source that failed is opened again [s].
@@ -148,7 +149,7 @@ class SourceReader:
             except (SourceError, MissingExtraError) as error:
                 self._fail(str(error))
             except Exception as error:  # of a driver: the other cameras go on
-                self._fail(f"{type(error).__name__}: {error}")
+                self._fail(describe_error(error))
             self._stopping.wait(backoff.next_delay())
 
     def _fail(self, text: str) -> None:

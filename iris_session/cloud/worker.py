@@ -5,6 +5,7 @@ It publishes through an `Outlet`: a session, or nothing at all where a camera fi
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 from collections import Counter, defaultdict
@@ -36,6 +37,7 @@ from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.media import StreamCamera, StreamInfo, find_info_problem
 from iris_session.protocol.names import MediaEncoding, StreamFault
 from iris_session.system.extras import require_package
+from iris_session.system.log import describe_error
 
 MILLISECOND: Final = 1_000_000
 SECOND: Final = 1_000_000_000
@@ -48,6 +50,7 @@ NO_POSE: Final = "its frames have no pose, or the session no state of the time w
 #: Time for the threads to leave their sources.
 JOIN_NS: Final = SECOND // 2
 
+log = logging.getLogger(__name__)
 #: Opens the source of a camera, which stamps its frames by the clock [ns].
 OpenSource = Callable[[CameraSettings, Callable[[], int]], DepthSource]
 
@@ -155,6 +158,7 @@ class CloudWorker:
             if settings.picture_hz
         }
         self._drops: Counter[str] = Counter()
+        self._failures: dict[str, str] = {}  # by stream: why its last frame could not be made
         self._reported_ns: int | None = None
         self._clouds = self._bytes = 0
         self._age_ms = 0.0
@@ -208,12 +212,13 @@ class CloudWorker:
         return has_made
 
     def find_fault(self, now_ns: int) -> Fault | None:
-        """Return the fault of the cloud: that of the first camera that has one."""
+        """Return the fault of the cloud: that of the first camera that has one, or why it cannot be made."""
         for name in self._readers:
             fault = self._find_camera_fault(name, now_ns)
             if fault is not None:
                 return Fault(fault.fault, f"camera {name}: {fault.detail}"[:MAX_TEXT])
-        return None
+        failure = self._failures.get(self._stream.name)
+        return None if failure is None else Fault(StreamFault.SOURCE, failure[:MAX_TEXT])
 
     def make_report(self, *, connected: bool = True, fault: str = "") -> CameraReport:
         """Return the state of the work, with rates and means since the last report."""
@@ -240,6 +245,7 @@ class CloudWorker:
             self.count_drops(),
             {name: self._make_source_report(name, now_ns) for name in self._readers},
             fault,
+            "; ".join(self._failures.values()),
         )
 
     def count_drops(self) -> dict[str, int]:
@@ -271,7 +277,12 @@ class CloudWorker:
         picture = self._pictures.get(name)
         if picture is not None and picture.is_due(self._settings.picture_hz, now_ns):
             began_ns = self._clock_ns()
-            data = encode_picture(new.frame.color, self._settings.picture_quality)
+            try:
+                data = encode_picture(new.frame.color, self._settings.picture_quality)
+            except Exception as error:
+                self._note_failure(picture, error)
+                return
+            self._failures.pop(picture.name, None)
             self._note_stage("jpeg", (self._clock_ns() - began_ns) / MILLISECOND)
             self._publish(picture, data, new.frame.capture_ns, self._find_camera_fault(name, now_ns), now_ns)
 
@@ -281,7 +292,12 @@ class CloudWorker:
         frames = self.pipeline.take_frames(now_ns)
         if not frames or not self._stream.is_due(self._settings.hz, now_ns):
             return False
-        cloud = self.cloud = self.pipeline.make_cloud(frames)
+        try:
+            cloud = self.cloud = self.pipeline.make_cloud(frames)
+        except Exception as error:
+            self._note_failure(self._stream, error)
+            return False
+        self._failures.pop(self._stream.name, None)
         self.poses = {name: one.T_world_camera for name, one in frames.items()}
         if self._watch is not None:
             for name, (frame, pose) in frames.items():
@@ -299,6 +315,14 @@ class CloudWorker:
         self._clouds += 1
         self._age_ms += (self._outlet.now_ns() - cloud.capture_ns) / MILLISECOND
         return True
+
+    def _note_failure(self, stream: _Stream, error: Exception) -> None:
+        """Note that a frame could not be made: that ends neither this process nor the other streams."""
+        self._drops["failed"] += 1
+        failure = f"frames of {stream.name!r} cannot be made: {describe_error(error)}"
+        if failure != self._failures.get(stream.name):
+            log.warning("%s", failure, exc_info=log.isEnabledFor(logging.DEBUG))
+        self._failures[stream.name] = failure
 
     def _publish_faults(self, now_ns: int) -> None:
         """Publish faults without a frame, while no frame comes that would carry them."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -84,6 +85,24 @@ def test_no_session_is_one_line(camera_file: Path, capsys: pytest.CaptureFixture
     assert "no session answers at 127.0.0.1:1" in capsys.readouterr().err
     assert main(["cloud", "inspect", "127.0.0.1:1"]) == 2
     assert "no session answers at 127.0.0.1:1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("action", [["inspect"], ["run", "--address", "127.0.0.1:1"]])
+def test_an_unexpected_error_is_one_line(
+    action: list[str], camera_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*given: Any) -> None:
+        if len(given) > 2:
+            given[1].close()  # the client of `run_cameras`
+        raise RuntimeError("bus 3\nis away")
+
+    monkeypatch.setattr("iris_session.cloud.worker.CloudWorker.poll", fail)
+    monkeypatch.setattr("iris_session.cloud.process.run_cameras", fail)
+    monkeypatch.setattr("iris_session.cli.cloud.check_session_reachable", lambda _: None)
+    assert main(["cloud", action[0], str(camera_file), *action[1:]]) == 1
+    text = capsys.readouterr().err
+    assert "the cameras of 'room' ended: RuntimeError: bus 3 is away; " in text
+    assert text.count("\n") == 1
 
 
 def test_a_report_is_one_line() -> None:

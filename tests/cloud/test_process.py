@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
 from iris_session.client.errors import InvalidMessageError, NotConnectedError
 from iris_session.cloud import process
+from iris_session.cloud.config import CameraReport, CameraStart
 from iris_session.cloud.process import FETCH_AGAIN_NS, BodyHistory, SessionOutlet, SessionRobots
 from iris_session.cloud.voxels import PointSet
+from tests.cloud.camera_settings import make_settings
 
 MS = 1_000_000
 DEADLINE_S = 60.0
@@ -112,6 +117,21 @@ def wait_for_fetch(robots: SessionRobots) -> None:
     assert robots._thread is not None
     robots._thread.join(DEADLINE_S)
     assert not robots._thread.is_alive()
+
+
+def test_an_error_that_nobody_expected_is_reported() -> None:
+    program = (
+        "from iris_session.cloud import process\n"
+        "def fail(*_):\n    raise KeyError('no such\\ncell')\n"
+        "process.run_cameras = fail\n"
+        "process.main()\n"
+    )
+    start = msgspec.msgpack.encode(CameraStart(make_settings("front")))
+    ended = subprocess.run([sys.executable, "-c", program], input=start, capture_output=True, check=False)
+    assert ended.returncode == 1
+    report = msgspec.json.decode(ended.stdout, type=CameraReport)
+    assert (report.stream, report.fault) == ("room", r"KeyError: 'no such\ncell'")
+    assert ended.stderr.count(b"Traceback") == 1
 
 
 def test_points_on_robots_go_once_their_shapes_are_there(monkeypatch: pytest.MonkeyPatch) -> None:

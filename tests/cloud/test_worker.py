@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from iris_session.cloud import worker
 from iris_session.cloud.camera_file import CameraSettings
 from iris_session.cloud.frames import DepthFrame, SourceError
 from iris_session.cloud.health import Fault
@@ -184,6 +185,31 @@ def test_a_camera_that_fails_does_not_stop_the_other(open_lab: Callable[..., Lab
     assert lab.worker.cloud is not None
     assert lab.worker.cloud.cameras == ("left",)
     lab.poll_until(lambda: (told := lab.outlet.newest_info("room")) is not None and told.detail == "camera right: gone")
+
+
+def test_frames_that_cannot_be_made_end_nothing(
+    open_timed_lab: Callable[..., TimedLab], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    lab = open_timed_lab("front", picture_hz=30.0)
+
+    def fail(*_: object) -> Any:
+        raise RuntimeError("no such\ncell")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(worker, "encode_picture", fail)
+        patch.setattr(lab.worker.pipeline, "make_cloud", fail)
+        for _ in range(5):
+            lab.step(40, "front")
+    assert {info.fault for *_, info in lab.outlet.published if info is not None} == {StreamFault.SOURCE}
+    assert lab.fault() == (StreamFault.SOURCE, "frames of 'room' cannot be made: RuntimeError: no such cell")
+    report = lab.worker.make_report()
+    assert "frames of 'room-front' cannot be made: RuntimeError: no such cell" in report.warning
+    assert report.drops["failed"] == 10
+    assert caplog.text.count("no such cell") == 2
+    lab.outlet.published.clear()
+    lab.step(40, "front")
+    assert {one[0] for one in lab.outlet.published if one[1]} == {"room", "room-front"}
+    assert (lab.fault(), lab.worker.make_report().warning) == (("", ""), "")
 
 
 def test_a_camera_that_is_in_no_cloud_is_named(open_timed_lab: Callable[..., TimedLab]) -> None:
