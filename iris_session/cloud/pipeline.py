@@ -7,6 +7,7 @@ its next frame can still be one of those: one that is slower, late or has stoppe
 from __future__ import annotations
 
 import itertools
+import math
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from statistics import median
@@ -17,7 +18,17 @@ import numpy as np
 from anchors.camera import CameraModel, pose_to_matrix
 from anchors.pose import PoseTuple
 from iris_session.cloud.frames import DepthFrame
-from iris_session.cloud.voxels import DepthLimits, Floats, PointSet, Rays, VoxelFilter, choose_voxel_m, make_rays
+from iris_session.cloud.voxels import (
+    FULL,
+    DepthLimits,
+    Floats,
+    PointSet,
+    Rays,
+    VoxelFilter,
+    choose_max_cells,
+    choose_voxel_m,
+    make_rays,
+)
 from iris_session.protocol.names import BudgetClass
 from iris_session.streams.cloud import encode_cloud, order_points
 
@@ -222,7 +233,7 @@ class CloudPipeline:
         self._clock_ns = clock_ns
         self._body_pose = body_pose
         self._remover = remover
-        self._voxels = voxels or VoxelFilter(settings.voxel_m)
+        self._voxels = voxels or VoxelFilter(settings.voxel_m, max_cells=choose_max_cells(settings.points))
         self._next_voxel_m = settings.voxel_m
         self._captures: dict[str, int] = {}  # of the last frames that were taken
         self._taken_ns = 0
@@ -316,7 +327,7 @@ class CloudPipeline:
             points = self._remover.remove(points, capture_ns)
         times.append(clock_ns())
         voxel_m, n = self._voxels.voxel_m, len(points.positions)
-        self._next_voxel_m = choose_voxel_m(voxel_m, n, settings.points, settings.voxel_m)
+        self._next_voxel_m = choose_voxel_m(voxel_m, self._count_needed(n), settings.points, settings.voxel_m)
         if n > settings.points:  # as at the beginning, and when a camera turns to something near
             self.drops["budget"] += n - settings.points
             points = _take_sample(points, settings.points, voxel_m)
@@ -329,6 +340,13 @@ class CloudPipeline:
         durations = [(after - before) / MILLISECOND for before, after in itertools.pairwise(times)]
         stages_ms = dict(zip(("voxels", "outliers", "budget", "encode"), durations, strict=True))
         return Cloud(encoded, capture_ns, len(points.positions), voxel_m, error_m, tuple(frames), stages_ms)
+
+    def _count_needed(self, n_points: int) -> int:
+        """Return the number of points by which the next cells are chosen: more where the filter is too full."""
+        voxels, budget = self._voxels, self._settings.points
+        if voxels.overflow:
+            return max(n_points, 2 * budget)  # nobody knows how many cells would have been enough
+        return max(n_points, math.ceil(budget * voxels.n_cells / (FULL * voxels.max_cells)))
 
     def _is_awaited(self, state: _CameraState, behind_ns: int, now_ns: int) -> bool:
         """Return whether a frame of a camera can still come that was captured within `JOIN_NS` of those here."""

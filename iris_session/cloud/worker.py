@@ -32,7 +32,7 @@ from iris_session.cloud.pipeline import (
 )
 from iris_session.cloud.reader import NewFrame, SourceReader
 from iris_session.cloud.sources.playback import DEFAULT_HZ
-from iris_session.cloud.voxels import Colors, DepthLimits, Floats, VoxelFilter, make_rays
+from iris_session.cloud.voxels import Colors, DepthLimits, Floats, VoxelFilter, choose_max_cells, make_rays
 from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.media import StreamCamera, StreamInfo, find_info_problem
 from iris_session.protocol.names import MediaEncoding, StreamFault
@@ -144,7 +144,7 @@ class CloudWorker:
             clock_ns,
             body_pose=body_pose,
             remover=remover,
-            voxels=make_warm_filter(settings.voxel_m),
+            voxels=make_warm_filter(settings),
         )
         self._watch = watch
         self._cameras = {one.name: one for one in settings.cameras}
@@ -419,9 +419,9 @@ def make_pipeline_camera(settings: CloudSettings, camera: CameraSettings) -> Pip
     return PipelineCamera(camera.name, limits, error_m, pose, camera.body)
 
 
-def make_warm_filter(voxel_m: float) -> VoxelFilter:
+def make_warm_filter(settings: CloudSettings) -> VoxelFilter:
     """Return a filter that is compiled: the first picture would take seconds, in which nothing is reported."""
-    voxels = VoxelFilter(voxel_m)
+    voxels = VoxelFilter(settings.voxel_m, max_cells=choose_max_cells(settings.points))
     depth, color = np.full((4, 4), 1000, np.uint16), np.zeros((4, 4, 3), np.uint8)
     voxels.add_depth(depth, color, make_rays(CameraModel(4, 4, 4.0, 4.0, 2.0, 2.0)), np.eye(4))
     voxels.collect(min_points=1, min_around=1)

@@ -14,7 +14,15 @@ from anchors.camera import CameraModel, pose_to_matrix
 from anchors.pose import PoseTuple, quat_from_rotvec
 from iris_session.cloud.frames import DepthFrame
 from iris_session.cloud.pipeline import CloudPipeline, PipelineCamera, PipelineSettings
-from iris_session.cloud.voxels import DepthLimits, Floats, PointSet, VoxelFilter, make_rays
+from iris_session.cloud.voxels import (
+    MAX_CELLS,
+    DepthLimits,
+    Floats,
+    PointSet,
+    VoxelFilter,
+    choose_max_cells,
+    make_rays,
+)
 from iris_session.streams.cloud import decode_cloud
 
 MS = 1_000_000
@@ -34,7 +42,9 @@ def place(x: float) -> Floats:
     return pose
 
 
-def make_pipeline(*names: str, points: int = 50_000, **options: object) -> CloudPipeline:
+def make_pipeline(
+    *names: str, points: int = 50_000, voxels: VoxelFilter | None = None, **options: object
+) -> CloudPipeline:
     cameras = [
         PipelineCamera(name, DepthLimits(), 0.01 * (i + 1), place(10.0 * i), str(options.get("body", "")))
         for i, name in enumerate(names)
@@ -44,7 +54,7 @@ def make_pipeline(*names: str, points: int = 50_000, **options: object) -> Cloud
         PipelineSettings(points, 0.02),
         cameras,
         iter(range(0, 10**9, MS)).__next__,
-        voxels=VoxelFilter(0.02, use_numba=False),
+        voxels=VoxelFilter(0.02, use_numba=False) if voxels is None else voxels,
         **options,  # type: ignore[arg-type]
     )
     for name in names:
@@ -251,6 +261,27 @@ def test_the_voxel_meets_the_budget_and_no_frame_is_above_it() -> None:
     pipeline.offer("front", make_frame(9), 9 * MS)
     pipeline.make_cloud(pipeline.take_frames(9 * MS))
     assert pipeline.drops["budget"] == settled
+
+
+def test_cells_grow_until_they_are_enough() -> None:
+    """Fewer cells than the budget has points: else what comes last in a picture would never be seen."""
+    voxels = VoxelFilter(0.02, max_cells=300, use_numba=False)
+    pipeline = make_pipeline("front", points=50_000, voxels=voxels)
+    overflows, edges = [], []
+    for at in range(12):
+        pipeline.offer("front", make_frame(at), at * MS)
+        edges.append(pipeline.make_cloud(pipeline.take_frames(at * MS)).voxel_m)
+        overflows.append(voxels.overflow)
+    assert overflows[0] > 0
+    assert overflows[-6:] == [0] * 6
+    assert len(set(edges[-6:])) == 1, "it has settled"
+    assert voxels.n_cells > 100, "cells are no larger than needed"
+
+
+def test_there_are_cells_for_every_budget() -> None:
+    assert choose_max_cells(1_000) == MAX_CELLS
+    assert choose_max_cells(1_000_000) >= 1_500_000
+    assert VoxelFilter(0.01, max_cells=choose_max_cells(1_000_000)).max_cells >= 1_500_000
 
 
 def test_a_camera_on_a_body_is_placed_by_the_pose_at_its_capture() -> None:
