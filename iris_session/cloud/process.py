@@ -82,12 +82,12 @@ class BodyHistory:
         version = self._client.scene.version
         if version is None or self._client.scene.poses is None:
             return
+        now_ns = state.header.session_time
         with self._lock:
-            if version != self._version:
+            if version != self._version or (self._states and now_ns < self._states[-1][0]):  # or it was resumed
                 self._states.clear()
                 self._version = version
                 self._places = dict(self._client.mirror.body_index)
-            now_ns = state.header.session_time
             self._states.append((now_ns, self._client.scene.poses))
             while now_ns - self._states[0][0] > STATES_NS:
                 self._states.popleft()
@@ -151,7 +151,8 @@ class SessionRobots:
         is_fetching = self._thread is not None and self._thread.is_alive()
         if version is not None and not is_fetching and self._client.mirror.robots:
             is_other = version[:2] != self._scene
-            if is_other or (self._surface is None and capture_ns >= self._again_ns):
+            is_due = not 0 < self._again_ns - capture_ns <= FETCH_AGAIN_NS  # or session time went back
+            if is_other or (self._surface is None and is_due):
                 self._scene, self._again_ns = version[:2], capture_ns + FETCH_AGAIN_NS
                 self._points = self._surface = None
                 self._thread = threading.Thread(target=self._fetch, name="iris-robots", daemon=True)

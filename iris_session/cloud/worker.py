@@ -47,6 +47,8 @@ INFO_NS: Final = SECOND
 RENDERED: Final = frozenset({"mujoco"})
 LEFT_OUT: Final = "its frames are in no cloud: they are captured, or dated, more than 50 ms before those of the others"
 NO_POSE: Final = "its frames have no pose, or the session no state of the time when they are captured"
+#: Session time that runs back by more than its slewing explains is that of another clock: the session was resumed.
+BACK_NS: Final = 50 * MILLISECOND
 #: Time for the threads to leave their sources.
 JOIN_NS: Final = SECOND // 2
 
@@ -159,6 +161,7 @@ class CloudWorker:
         }
         self._drops: Counter[str] = Counter()
         self._failures: dict[str, str] = {}  # by stream: why its last frame could not be made
+        self._polled_ns: int | None = None
         self._reported_ns: int | None = None
         self._clouds = self._bytes = 0
         self._age_ms = 0.0
@@ -183,6 +186,7 @@ class CloudWorker:
 
     def restart_clock(self) -> None:
         """Forget all frames: session time is that of another session from now on."""
+        self._polled_ns = self._reported_ns = None
         self.pipeline.clear()
         if self._watch is not None:
             self._watch.restart()
@@ -203,6 +207,12 @@ class CloudWorker:
         self._wake.wait(timeout_s)
         self._wake.clear()
         now_ns = self._outlet.now_ns()
+        if self._polled_ns is not None and now_ns < self._polled_ns - BACK_NS:
+            log.warning(
+                "session time went back by %.1f s: sources are opened anew", (self._polled_ns - now_ns) / SECOND
+            )
+            self.restart_clock()
+        self._polled_ns = now_ns
         for name, reader in self._readers.items():
             new = reader.take_frame()
             if new is not None:

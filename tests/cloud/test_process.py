@@ -88,6 +88,19 @@ def test_another_scene_begins_anew() -> None:
     assert lab.find_x(40, "base") == 7.0
 
 
+def test_states_of_a_session_whose_time_went_back_begin_anew() -> None:
+    """As of one that is resumed after a reboot."""
+    lab = Lab()
+    for at in (5000, 5016):
+        lab.add(at, 1.0)
+    for at in (3000, 3016):
+        lab.add(at, 2.0)
+    assert lab.find_x(3008) == 2.0
+    assert lab.find_x(5008) is None
+    assert lab.history.covers(3016 * MS)
+    assert not lab.history.covers(5008 * MS)
+
+
 class FakeRobotPoints:
     """Finds the points at x > 0."""
 
@@ -174,9 +187,12 @@ def test_points_on_robots_go_once_their_shapes_are_there(monkeypatch: pytest.Mon
     assert len(fetched) == 2
 
 
-@pytest.mark.parametrize("error", [NotConnectedError("this session shares no specification"), KeyError("any other")])
+@pytest.mark.parametrize(
+    ("error", "goes_back"),
+    [(NotConnectedError("this session shares no specification"), False), (KeyError("any other"), True)],
+)
 def test_without_shapes_all_points_stay_until_they_are_there(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, error: Exception
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, error: Exception, goes_back: bool
 ) -> None:
     def fail(client: object, budget: object) -> Any:
         raise error
@@ -195,7 +211,10 @@ def test_without_shapes_all_points_stay_until_they_are_there(
     monkeypatch.setattr(process, "fetch_scene", lambda *_: SimpleNamespace(spec=None, meshes={}, failed={}))
     robots.is_ready(FETCH_AGAIN_NS - 1)
     assert robots.is_ready(FETCH_AGAIN_NS - 1), "not tried again at once"
-    robots.is_ready(FETCH_AGAIN_NS)
+    if goes_back:
+        robots.is_ready(-1)
+    else:
+        robots.is_ready(FETCH_AGAIN_NS)
     wait_for_fetch(robots)
     assert len(robots.remove(make_points(), 0).positions) == 1
     assert robots.warning == ""

@@ -250,6 +250,23 @@ def test_another_session_gets_nothing_of_the_one_before(open_lab: Callable[..., 
     lab.show("front")
 
 
+def test_session_time_that_goes_back_opens_the_sources_anew(open_timed_lab: Callable[..., TimedLab]) -> None:
+    """As of a session that is resumed after a reboot: frames would be due for as long as it ran before."""
+    lab = open_timed_lab("front", picture_hz=30.0)
+    for _ in range(3):
+        lab.step(40, "front")
+    lab.step(-40)
+    before = lab.sources["front"]
+    assert not lab.worker._readers["front"]._is_outdated, "by so much a clock is slewed"
+    lab.step(-60_000)
+    lab.poll_until(lambda: lab.sources["front"] is not before)
+    assert before.closed
+    lab.outlet.published.clear()
+    lab.step(40, "front")
+    assert {one[0] for one in lab.outlet.published if one[1]} == {"room", "room-front"}
+    assert lab.fault() == ("", "")
+
+
 def test_the_report(open_lab: Callable[..., Lab]) -> None:
     lab = open_lab("front", picture_hz=30.0, hz=30.0)
     lab.worker.make_report()
