@@ -284,6 +284,12 @@ def _inspect_file(arguments: argparse.Namespace, path: Path) -> int:
     from iris_session.cloud.worker import CloudWorker
 
     settings = load_camera_file(path)
+    for camera in settings.cameras:
+        if camera.body:
+            raise CommandError(
+                f"camera {camera.name!r} is on body {camera.body!r}: only a session knows where that is; `iris-session "
+                f"cloud run {path}`, then `iris-session cloud inspect ADDRESS`"
+            )
     with _name_unexpected_error(settings):
         worker = CloudWorker(settings, _NoOutlet(), open_source, time.perf_counter_ns)
         worker.start()

@@ -46,7 +46,8 @@ INFO_NS: Final = SECOND
 #: Sources whose pictures of a world at rest are all the same.
 RENDERED: Final = frozenset({"mujoco"})
 LEFT_OUT: Final = "its frames are in no cloud: they are captured, or dated, more than 50 ms before those of the others"
-NO_POSE: Final = "its frames have no pose, or the session no state of the time when they are captured"
+NO_BODY: Final = "the session has no body {!r}, or no state of it when a frame was captured"
+NO_STATE: Final = "the session has no state of its robots when a frame was captured, which remove_robots needs"
 #: Session time that runs back by more than its slewing explains is that of another clock: the session was resumed.
 BACK_NS: Final = 50 * MILLISECOND
 #: Time for the threads to leave their sources.
@@ -392,10 +393,8 @@ class CloudWorker:
     def _find_camera_fault(self, name: str, now_ns: int) -> Fault | None:
         fault = self._readers[name].find_fault(now_ns)
         if fault is None and self.pipeline.lacks_pose(name):
-            detail = (
-                f"the session has no body {self._cameras[name].body!r}, or no state of it when a frame was captured"
-            )
-            fault = Fault(StreamFault.POSE, detail)
+            body = self._cameras[name].body
+            fault = Fault(StreamFault.POSE, NO_BODY.format(body) if body else NO_STATE)
         if fault is None and self.pipeline.is_left_out(name, now_ns):
             fault = Fault(StreamFault.CLOCK, LEFT_OUT)
         move = None if self._watch is None else self._watch.find_move(name)

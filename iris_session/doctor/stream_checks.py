@@ -27,8 +27,9 @@ FAULTS: Final = {
     ),
     StreamFault.MOVED: ("the camera is not where it was calibrated", "put it back, or calibrate it again"),
     StreamFault.POSE: (
-        "the pose of the camera has values that are no numbers, or that of the body which carries it is not known",
-        "check its pose and the name of its body against the scene",
+        "the pose of the camera has values that are no numbers, or that of the body which carries it or of the robots "
+        "to be removed is not known when it sees something",
+        "check its pose and the name of its body against the scene, and the network to the camera",
     ),
     StreamFault.CLOCK: (
         "its times of capture jump, lie in the future, or are not those of the other cameras",

@@ -87,6 +87,16 @@ def test_no_session_is_one_line(camera_file: Path, capsys: pytest.CaptureFixture
     assert "no session answers at 127.0.0.1:1" in capsys.readouterr().err
 
 
+def test_a_camera_on_a_body_cannot_be_inspected_without_a_session(
+    camera_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera_file.write_text(camera_file.read_text() + 'body = "left/hand"\n')
+    assert main(["cloud", "inspect", str(camera_file)]) == 2
+    error = capsys.readouterr().err
+    assert "camera 'front' is on body 'left/hand': only a session knows where that is" in error
+    assert error.count("\n") == 1
+
+
 @pytest.mark.parametrize("action", [["inspect"], ["run", "--address", "127.0.0.1:1"]])
 def test_an_unexpected_error_is_one_line(
     action: list[str], camera_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

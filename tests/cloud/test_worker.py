@@ -5,9 +5,11 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
@@ -30,7 +32,8 @@ class Lab:
         self.outlet = FakeOutlet() if outlet is None else outlet
         self.sources: dict[str, FakeSource] = {}
         self.settings = make_settings(*names, **options)
-        self.worker = CloudWorker(self.settings, self.outlet, self._open, time.perf_counter_ns)
+        self.remover: Any = SimpleNamespace(is_ready=lambda at_ns: True, remove=lambda points, at_ns: points)
+        self.worker = CloudWorker(self.settings, self.outlet, self._open, time.perf_counter_ns, remover=self.remover)
         self.worker.start()
         self.poll_until(lambda: len(self.sources) == len(names))
 
@@ -248,6 +251,23 @@ def test_another_session_gets_nothing_of_the_one_before(open_lab: Callable[..., 
     assert lab.outlet.published == []
     lab.poll_until(lambda: lab.sources["front"] is not before)
     lab.show("front")
+
+
+def test_what_has_no_pose_is_named(open_timed_lab: Callable[..., TimedLab]) -> None:
+    lab = open_timed_lab("front", "hand")
+    assert not lab.settings.cameras[0].body
+    cameras = lab.worker._cameras
+    cameras["hand"] = msgspec.structs.replace(cameras["hand"], body="left/hand")
+    lab.remover.is_ready = lambda at_ns: False
+    for _ in range(10):
+        lab.step(40, "front", "hand")
+    sources = lab.worker.make_report().cameras
+    assert {one.fault for one in sources.values()} == {StreamFault.POSE}
+    assert "no state of its robots" in sources["front"].detail
+    assert "no body 'left/hand'" in sources["hand"].detail
+    lab.remover.is_ready = lambda at_ns: True
+    lab.step(40, "front", "hand")
+    assert lab.fault() == ("", "")
 
 
 def test_session_time_that_goes_back_opens_the_sources_anew(open_timed_lab: Callable[..., TimedLab]) -> None:
