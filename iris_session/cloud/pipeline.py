@@ -323,8 +323,9 @@ class CloudPipeline:
         times.append(clock_ns())
         points = self._voxels.collect(min_points=settings.min_points, min_around=settings.min_around)
         capture_ns = min(one.frame.capture_ns for one in frames.values())
-        if self._remover is not None:
-            points = self._remover.remove(points, capture_ns)
+        if self._remover is not None:  # a robot that moves is where each of the cameras saw it
+            for at_ns in sorted({one.frame.capture_ns for one in frames.values()}):
+                points = self._remover.remove(points, at_ns)
         times.append(clock_ns())
         voxel_m, n = self._voxels.voxel_m, len(points.positions)
         self._next_voxel_m = choose_voxel_m(voxel_m, self._count_needed(n), settings.points, settings.voxel_m)

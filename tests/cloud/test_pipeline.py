@@ -349,6 +349,24 @@ def test_points_are_removed_at_the_time_of_capture() -> None:
     assert decode_cloud(cloud.frames["full"]).positions[:, 0].max() < 0.001
 
 
+def test_points_are_removed_at_the_time_of_each_camera() -> None:
+    asked: list[int] = []
+
+    class Remover:
+        def is_ready(self, capture_ns: int) -> bool:
+            return True
+
+        def remove(self, points: PointSet, capture_ns: int) -> PointSet:
+            asked.append(capture_ns)
+            return points
+
+    pipeline = make_pipeline("left", "middle", "right", remover=Remover())
+    for name, at in (("left", 60), ("middle", 20), ("right", 60)):
+        pipeline.offer(name, make_frame(at), 60 * MS)
+    assert pipeline.make_cloud(pipeline.take_frames(60 * MS)).capture_ns == 20 * MS
+    assert asked == [20 * MS, 60 * MS]
+
+
 def test_a_cloud_without_points_is_one() -> None:
     pipeline = make_pipeline("front")
     pipeline.offer("front", make_frame(0, depth_mm=0), 0)
