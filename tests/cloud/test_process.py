@@ -105,9 +105,14 @@ class FakeRobotPoints:
     """Finds the points at x > 0."""
 
     def __init__(self, *_: object) -> None:
-        pass
+        self.n_unknown = 0
+        self.is_warm = False
+
+    def warm_up(self) -> None:
+        self.is_warm = True
 
     def find(self, positions: Any, body_pose: object, capture_ns: int) -> Any:
+        assert self.is_warm
         return positions[:, 0] > 0.0
 
 
@@ -209,26 +214,60 @@ def test_without_shapes_all_points_stay_until_they_are_there(
     monkeypatch.setattr(process, "RobotPoints", FakeRobotPoints)
     monkeypatch.setattr(process, "RobotSurface", FakeRobotSurface)
     monkeypatch.setattr(process, "fetch_scene", lambda *_: SimpleNamespace(spec=None, meshes={}, failed={}))
-    robots.is_ready(FETCH_AGAIN_NS - 1)
-    assert robots.is_ready(FETCH_AGAIN_NS - 1), "not tried again at once"
+    robots.is_ready(FETCH_AGAIN_NS[0] - 1)
+    assert robots.is_ready(FETCH_AGAIN_NS[0] - 1), "not tried again at once"
     if goes_back:
         robots.is_ready(-1)
     else:
-        robots.is_ready(FETCH_AGAIN_NS)
+        robots.is_ready(FETCH_AGAIN_NS[0])
     wait_for_fetch(robots)
     assert len(robots.remove(make_points(), 0).positions) == 1
     assert robots.warning == ""
 
 
-def test_shapes_that_are_missing_are_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shapes_that_are_missing_are_a_warning_and_fetched_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    built: list[object] = []
+    failed = {"a": "lost", "b": "lost"}
+    monkeypatch.setattr(process, "RobotPoints", FakeRobotPoints)
+    monkeypatch.setattr(process, "RobotSurface", lambda *_: built.append(1) or FakeRobotSurface())
+    monkeypatch.setattr(process, "fetch_scene", lambda *_: SimpleNamespace(spec=None, meshes={}, failed=dict(failed)))
+    lab = Lab()
+    robots = SessionRobots(lab.client, lab.history, removes=True)
+    at_ns = 0
+
+    def fetch_again() -> str:
+        nonlocal at_ns
+        robots.is_ready(at_ns)
+        wait_for_fetch(robots)
+        at_ns += max(FETCH_AGAIN_NS)
+        return robots.warning
+
+    assert fetch_again() == "points on robots stay in the cloud: 2 shapes are missing"
+    assert len(robots.remove(make_points(), 0).positions) == 1, "those that are there are used"
+    fetch_again()
+    assert len(built) == 1, "nothing has come"
+    del failed["a"]
+    assert fetch_again() == "points on robots stay in the cloud: 1 shapes are missing"
+    failed.clear()
+    assert fetch_again() == ""
+    assert len(built) == 3
+    thread = robots._thread
+    robots.is_ready(at_ns)
+    assert robots._thread is thread, "all are there"
+
+
+def test_bodies_without_poses_are_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process, "RobotPoints", FakeRobotPoints)
     monkeypatch.setattr(process, "RobotSurface", FakeRobotSurface)
-    monkeypatch.setattr(process, "fetch_scene", lambda *_: SimpleNamespace(spec=None, meshes={}, failed={"a": "lost"}))
+    monkeypatch.setattr(process, "fetch_scene", lambda *_: SimpleNamespace(spec=None, meshes={}, failed={}))
     lab = Lab()
     robots = SessionRobots(lab.client, lab.history, removes=True)
     robots.is_ready(0)
     wait_for_fetch(robots)
-    assert robots.warning == "points on robots stay in the cloud: 1 shapes are missing"
+    assert robots.warning == ""
+    points: Any = robots._points
+    points.n_unknown = 3
+    assert robots.warning == "points on robots stay in the cloud: the session sends no poses of 3 bodies of robots"
 
 
 def test_shapes_are_not_fetched_in_vain(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
