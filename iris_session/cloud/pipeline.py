@@ -38,8 +38,8 @@ SECOND: Final = 1_000_000_000
 JOIN_NS: Final = 50 * MILLISECOND
 #: A camera without a frame for this long, and a period, is not waited for.
 SILENCE_NS: Final = 500 * MILLISECOND
-#: A camera whose frames arrive later than this after their capture is not waited for.
-LATE_NS: Final = 200 * MILLISECOND
+#: A camera whose frames arrive later than this after their capture is not waited for: no device needs so long.
+LATE_NS: Final = 500 * MILLISECOND
 #: A camera whose frames come and are in no cloud for so long, for three periods, and in so many clouds, is left out.
 LEFT_OUT_NS: Final = SECOND
 LEFT_OUT_CLOUDS: Final = 3

@@ -95,11 +95,13 @@ class BodyHistory:
             while now_ns - self._states[0][0] > STATES_NS:
                 self._states.popleft()
 
-    def read_newest(self) -> dict[str, PoseTuple]:
-        """Return `T_world_body` of every body as it is now."""
+    def read_newest(self) -> tuple[int, dict[str, PoseTuple]] | None:
+        """Return the session time [ns] of the newest state, and `T_world_body` of every body in it."""
         with self._lock:
-            poses = self._states[-1][1] if self._states else None
-            return {} if poses is None else {body: pose_at(poses, place) for body, place in self._places.items()}
+            if not self._states:
+                return None
+            at_ns, poses = self._states[-1]
+            return at_ns, {body: pose_at(poses, place) for body, place in self._places.items()}
 
     def covers(self, time_ns: int) -> bool:
         """Return whether there are states before and after a session time [ns]."""

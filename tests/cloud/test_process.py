@@ -54,7 +54,7 @@ class Lab:
 def test_poses_are_interpolated_between_states() -> None:
     lab = Lab()
     assert lab.find_x(0) is None
-    assert lab.history.read_newest() == {}
+    assert lab.history.read_newest() is None
     for at in (0, 16, 32):
         lab.add(at, 0.01 * at)
     assert lab.find_x(0) == 0.0
@@ -62,7 +62,9 @@ def test_poses_are_interpolated_between_states() -> None:
     assert lab.find_x(32) == pytest.approx(0.32)
     assert lab.find_x(20, "base") == 0.0
     assert lab.find_x(20, "no such body") is None
-    assert lab.history.read_newest()["hand"] == ((0.32, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    newest = lab.history.read_newest()
+    assert newest is not None
+    assert (newest[0], newest[1]["hand"]) == (32 * MS, ((0.32, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
 
 
 def test_nothing_is_known_before_and_after_the_states_and_in_their_gaps() -> None:
