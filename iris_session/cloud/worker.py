@@ -399,7 +399,7 @@ class CloudWorker:
             fault = Fault(StreamFault.CLOCK, LEFT_OUT)
         move = None if self._watch is None else self._watch.find_move(name)
         if move is not None and (fault is None or fault.fault == StreamFault.SLOW):
-            fault = Fault(StreamFault.MOVED, f"{move}: calibrate it again, `iris-session cloud calibrate`")
+            fault = Fault(StreamFault.MOVED, f"{move}: calibrate it again, `iris-session cloud calibrate`, and restart")
         return fault
 
     def _make_source_report(self, name: str, now_ns: int) -> SourceReport:
