@@ -50,6 +50,8 @@ NO_BODY: Final = "the session has no body {!r}, or no state of it when a frame w
 NO_STATE: Final = "the session has no state of its robots when a frame was captured, which remove_robots needs"
 #: Session time that runs back by more than its slewing explains is that of another clock: the session was resumed.
 BACK_NS: Final = 50 * MILLISECOND
+#: Time in which a new connection takes nothing: what is not sent then is no drop.
+CONNECT_NS: Final = SECOND
 #: Time for the threads to leave their sources.
 JOIN_NS: Final = SECOND // 2
 
@@ -161,6 +163,8 @@ class CloudWorker:
             if settings.picture_hz
         }
         self._drops: Counter[str] = Counter()
+        self._refused_ns: int | None = None  # time of the first frame that was not taken before any was
+        self._has_sent = False
         self._failures: dict[str, str] = {}  # by stream: why its last frame could not be made
         self._polled_ns: int | None = None
         self._reported_ns: int | None = None
@@ -187,7 +191,8 @@ class CloudWorker:
 
     def restart_clock(self) -> None:
         """Forget all frames: session time is that of another session from now on."""
-        self._polled_ns = self._reported_ns = None
+        self._polled_ns = self._reported_ns = self._refused_ns = None
+        self._has_sent = False
         self.pipeline.clear()
         if self._watch is not None:
             self._watch.restart()
@@ -351,8 +356,10 @@ class CloudWorker:
         described = stream.needs_info(fault, now_ns)
         info = self._make_info(stream, fault) if described else None
         if not self._outlet.publish(stream.name, frames, capture_ns, stream.encoding, info):
-            self._drops["send"] += 1
+            self._refused_ns = now_ns if self._refused_ns is None else self._refused_ns
+            self._drops["send"] += self._has_sent or now_ns - self._refused_ns >= CONNECT_NS
             return
+        self._has_sent = True
         if described:
             stream.note_described(fault, now_ns)
         self._bytes += len(frames) if isinstance(frames, bytes) else sum(map(len, frames.values()))

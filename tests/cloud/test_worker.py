@@ -231,14 +231,28 @@ def test_a_camera_that_is_in_no_cloud_is_named(open_timed_lab: Callable[..., Tim
     assert lab.fault() == ("", "")
 
 
-def test_frames_that_no_one_takes_are_counted(open_lab: Callable[..., Lab]) -> None:
-    lab = open_lab("front")
+def test_frames_that_no_one_takes_are_counted_once_there_is_a_connection(
+    open_timed_lab: Callable[..., TimedLab],
+) -> None:
+    lab = open_timed_lab("front")
     lab.outlet.takes = False
-    lab.sources["front"].put(make_frame(lab.outlet.now_ns()))
-    lab.poll_until(lambda: lab.worker.count_drops().get("send"))
+    for _ in range(20):
+        lab.step(40, "front")
+    assert not lab.worker.count_drops(), "the first frames connect"
     lab.outlet.takes = True
-    lab.show("front")
+    lab.step(40, "front")
     assert lab.outlet.published[0][4] is not None, "what was dropped has described nothing"
+    lab.outlet.takes = False
+    lab.step(40, "front")
+    assert lab.worker.count_drops() == {"send": 1}
+
+
+def test_a_connection_that_never_takes_anything_is_no_secret(open_timed_lab: Callable[..., TimedLab]) -> None:
+    lab = open_timed_lab("front")
+    lab.outlet.takes = False
+    for _ in range(30):
+        lab.step(40, "front")
+    assert lab.worker.count_drops()["send"] >= 4
 
 
 def test_another_session_gets_nothing_of_the_one_before(open_lab: Callable[..., Lab]) -> None:
