@@ -168,12 +168,13 @@ def _catch_signals() -> Iterator[threading.Event]:
 
 @contextmanager
 def _name_unexpected_error(settings: CloudSettings) -> Iterator[None]:
-    """Turn an error that nobody expected into one line: of drivers and the packages that read recordings."""
+    """Turn an unexpected error into one line: of a driver, or a package that reads recordings."""
     from iris_session.system.log import LEVEL_VARIABLE, describe_error
 
+    expected: tuple[type[Exception], ...] = (CommandError, ImportError, *list_expected_errors())
     try:
         yield
-    except (CommandError, ImportError, *list_expected_errors()):
+    except expected:
         raise
     except Exception as error:
         log.debug("the cameras of %r end", settings.stream, exc_info=True)

@@ -1,7 +1,8 @@
 """Faults of the frames of one camera, as they can be seen in the frames. Pure: times are arguments.
 
 A fault that makes a frame unusable (`size`, `pose`) is reported with the frame; one that a single bad frame may have is
-reported when it has lasted, and within a second. All clear when frames are good again.
+reported when it has lasted, and within a second; a low rate by those of two seconds or three periods. All clear when
+frames are good again, `clock` two seconds later.
 """
 
 from __future__ import annotations
@@ -170,9 +171,13 @@ def find_size_fault(frame: DepthFrame, camera: CameraModel) -> Fault | None:
 def find_pose_fault(frame: DepthFrame) -> Fault | None:
     """Return a fault when the pose that a frame brings is not one."""
     pose = frame.T_world_camera
-    if pose is None or (np.shape(pose) == (4, 4) and np.isfinite(pose).all()):
+    if pose is None:
         return None
-    return Fault(StreamFault.POSE, "the pose of the camera has numbers that are not finite")
+    if np.shape(pose) != (4, 4):
+        return Fault(StreamFault.POSE, f"the pose of the camera has shape {np.shape(pose)}, it must be 4 x 4")
+    if not np.isfinite(pose).all():
+        return Fault(StreamFault.POSE, "the pose of the camera has numbers that are not finite")
+    return None
 
 
 def find_depth_fault(frame: DepthFrame) -> Fault | None:

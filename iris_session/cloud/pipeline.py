@@ -346,7 +346,7 @@ class CloudPipeline:
         """Return the number of points by which the next cells are chosen: more where the filter is too full."""
         voxels, budget = self._voxels, self._settings.points
         if voxels.overflow:
-            return max(n_points, 2 * budget)  # nobody knows how many cells would have been enough
+            return max(n_points, 2 * budget)  # how many cells would have been enough is not known
         return max(n_points, math.ceil(budget * voxels.n_cells / (FULL * voxels.max_cells)))
 
     def _is_awaited(self, state: _CameraState, behind_ns: int, now_ns: int) -> bool:
@@ -398,7 +398,7 @@ def _join_frames(
     The camera that is behind sets the time: of each other one it is the frame nearest to its newest.
     """
     left = {name: list(frames) for name, frames in placed.items()}
-    too_old = []
+    too_old: list[tuple[str, PlacedFrame]] = []
     while left:
         behind_ns = min(frames[-1].frame.capture_ns for frames in left.values())
         found = {

@@ -1,6 +1,7 @@
 """The work of one camera process without its connection: sources, pipeline, pictures, faults, reports.
 
-It publishes through an `Outlet`: a session, or nothing at all where a camera file is inspected. No sockets, no clocks.
+It publishes through an `Outlet`: a session, or nothing at all where a camera file is inspected. No sockets: session
+time is that of the outlet, and the clock that measures stages is an argument.
 """
 
 from __future__ import annotations

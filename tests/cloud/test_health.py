@@ -6,10 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from anchors.camera import CameraModel
 from iris_session.cloud.frames import DepthFrame
-from iris_session.cloud.health import CameraHealth
+from iris_session.cloud.health import CameraHealth, find_pose_fault
 from iris_session.protocol.names import StreamFault
 
 MS = 1_000_000
@@ -117,6 +118,15 @@ def test_frames_that_cannot_be_used_are_refused() -> None:
     assert not health.check_frame(of_other_size(make_frame(2)), CAMERA, 2 * MS)
     assert not health.check_frame(without_pose(make_frame(3)), CAMERA, 3 * MS)
     assert health.check_frame(without_depth(make_frame(4)), CAMERA, 4 * MS)
+
+
+@pytest.mark.parametrize(
+    ("pose", "said"), [(np.eye(3), "shape (3, 3)"), (np.full((4, 4), np.inf), "not finite"), (np.eye(4), "")]
+)
+def test_what_is_wrong_with_a_pose_is_said(pose: NDArray[np.float64], said: str) -> None:
+    fault = find_pose_fault(make_frame(1)._replace(T_world_camera=pose))
+    assert said in ("" if fault is None else fault.detail)
+    assert (fault is None) == (said == "")
 
 
 def test_a_rate_far_below_what_is_asked_for() -> None:
