@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import signal
 import sys
 import threading
@@ -19,6 +20,7 @@ from iris_session.cli.common import (
     add_address_options,
     add_json_option,
     check_session_reachable,
+    list_expected_errors,
     parse_seconds,
     print_json,
     to_printable,
@@ -37,6 +39,7 @@ FIRST_FRAME_S: Final = 10.0
 STREAMS_S: Final = 5.0
 #: Without a terminal, a line of `run` that is like the one before is printed this often [s].
 QUIET_S: Final = 10.0
+log = logging.getLogger(__name__)
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -141,7 +144,7 @@ def run_file(arguments: argparse.Namespace) -> int:
     )
     until = None if arguments.seconds is None else time.monotonic() + arguments.seconds
     printer = _ReportPrinter(as_json=arguments.json)
-    with _catch_signals() as ending:
+    with _catch_signals() as ending, _name_unexpected_error(settings):
         fault = run_cameras(
             settings, client, printer, lambda: ending.is_set() or (until is not None and time.monotonic() >= until)
         )
@@ -161,6 +164,22 @@ def _catch_signals() -> Iterator[threading.Event]:
     finally:
         for one, handler in before.items():
             signal.signal(one, handler)
+
+
+@contextmanager
+def _name_unexpected_error(settings: CloudSettings) -> Iterator[None]:
+    """Turn an unexpected error into one line: of a driver, or a package that reads recordings."""
+    from iris_session.system.log import LEVEL_VARIABLE, describe_error
+
+    expected: tuple[type[Exception], ...] = (CommandError, ImportError, *list_expected_errors())
+    try:
+        yield
+    except expected:
+        raise
+    except Exception as error:
+        log.debug("the cameras of %r end", settings.stream, exc_info=True)
+        text = f"the cameras of {settings.stream!r} ended: {describe_error(error)}; {LEVEL_VARIABLE}=DEBUG shows where"
+        raise CommandError(text, status=1) from error
 
 
 class _ReportPrinter:
@@ -210,9 +229,9 @@ def format_report(report: CameraReport) -> str:
 
 
 def format_faults(report: CameraReport) -> str:
-    """Return the faults of all cameras, empty while all is well."""
+    """Return the faults of all cameras and what the cloud lacks, empty while all is well."""
     found = [f"{name}: {one.fault} ({one.detail})" for name, one in report.cameras.items() if one.fault]
-    return to_printable("; ".join(found))
+    return to_printable("; ".join([*found, report.warning] if report.warning else found))
 
 
 # --- example ----------------------------------------------------------------------------------------------------------
@@ -266,15 +285,22 @@ def _inspect_file(arguments: argparse.Namespace, path: Path) -> int:
     from iris_session.cloud.worker import CloudWorker
 
     settings = load_camera_file(path)
-    worker = CloudWorker(settings, _NoOutlet(), open_source, time.perf_counter_ns)
-    worker.start()
-    try:
-        _run_worker(worker, FIRST_FRAME_S, lambda: worker.cloud is not None)
-        worker.make_report()  # its rates begin here
-        _run_worker(worker, arguments.seconds, lambda: False)
-        report = worker.make_report()
-    finally:
-        worker.close()
+    for camera in settings.cameras:
+        if camera.body:
+            raise CommandError(
+                f"camera {camera.name!r} is on body {camera.body!r}: only a session knows where that is; `iris-session "
+                f"cloud run {path}`, then `iris-session cloud inspect ADDRESS`"
+            )
+    with _name_unexpected_error(settings):
+        worker = CloudWorker(settings, _NoOutlet(), open_source, time.perf_counter_ns)
+        worker.start()
+        try:
+            _run_worker(worker, FIRST_FRAME_S, lambda: worker.cloud is not None)
+            worker.make_report()  # its rates begin here
+            _run_worker(worker, arguments.seconds, lambda: False)
+            report = worker.make_report()
+        finally:
+            worker.close()
     is_well = report.hz > 0.0 and not format_faults(report)
     if arguments.json:
         print_json({"ok": is_well, **msgspec.to_builtins(report)})
@@ -293,6 +319,8 @@ def _format_inspection(settings: CloudSettings, report: CameraReport) -> Iterato
     for name, one in report.cameras.items():
         state = f"{one.fault}: {one.detail}" if one.fault else "well"
         yield to_printable(f"camera {name}: {one.hz:.1f} frames per second, {state}")
+    if report.warning:
+        yield to_printable(report.warning)
     points = f"{report.points:,} points of {100.0 * report.voxel_m:.1f} cm"
     budget = f"budget {settings.points:,}, cells from {100.0 * settings.voxel_m:.1f} cm"
     yield f"cloud {report.stream}: {report.hz:.1f} Hz, {points} ({budget})"

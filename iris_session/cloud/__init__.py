@@ -1,8 +1,10 @@
-"""From depth cameras to the points of a cloud: deprojection, crop, voxels, outliers. No sockets, no clocks.
+"""Depth cameras as point clouds: deprojection, crop, voxels, outliers, and the process that publishes them.
 
 `voxels` (the filter, and how it does without numba), `kernels` (its loops in numba), `camera_file` (settings), `frames`
-(the interface of sources). Only `sources`, which reads cameras and recordings, has clocks and the packages that these
-need. The encoding of the points is `iris_session.streams.cloud`.
+(the interface of sources), `pipeline` (frames of several cameras to one cloud), `health` (faults), `reader` (a thread
+for each source), `worker` (the loop that publishes). They take times and clocks as arguments; only `sources`, which
+reads cameras and recordings, and `process`, which has the connection, bring clocks, sockets and the packages for these.
+The encoding of the points is `iris_session.streams.cloud`.
 """
 
 from __future__ import annotations

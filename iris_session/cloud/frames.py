@@ -5,7 +5,7 @@ The sources themselves are in `iris_session.cloud.sources`.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -64,3 +64,15 @@ class DepthSource(Protocol):
     def close(self) -> None:
         """Release the device or file."""
         ...
+
+
+@runtime_checkable
+class RecordedSource(Protocol):
+    """A source whose frames have a rate of their own.
+
+    Attributes:
+        recorded_hz: Frames per second by their times, 0 while it is not known.
+    """
+
+    @property
+    def recorded_hz(self) -> float: ...

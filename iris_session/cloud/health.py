@@ -1,7 +1,8 @@
 """Faults of the frames of one camera, as they can be seen in the frames. Pure: times are arguments.
 
 A fault that makes a frame unusable (`size`, `pose`) is reported with the frame; one that a single bad frame may have is
-reported when it has lasted, and within a second. All clear when frames are good again.
+reported when it has lasted, and within a second; a low rate by those of two seconds or three periods. All clear when
+frames are good again, `clock` two seconds later.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ class CameraHealth:
     """
 
     def __init__(self, hz: float, *, has_noise: bool = True) -> None:
-        self._hz = hz
+        self._asked_hz = self._hz = hz
         self._has_noise = has_noise
         self.restart(0)
 
@@ -70,6 +71,10 @@ class CameraHealth:
         self._unusable: Fault | None = None
         self._clock: Fault | None = None
         self._clock_ns = 0
+
+    def limit_rate(self, recorded_hz: float) -> None:
+        """Expect no more frames per second than a recording has; 0: that is not known."""
+        self._hz = min(self._asked_hz, recorded_hz or self._asked_hz)
 
     def check_frame(self, frame: DepthFrame, camera: CameraModel, now_ns: int) -> bool:
         """Look at a frame.
@@ -119,9 +124,13 @@ class CameraHealth:
         return self._arrivals[-1] if self._arrivals else None
 
     def measure_hz(self, now_ns: int) -> float:
-        """Return the rate of the frames over the last `RATE_NS`."""
-        recent = [at for at in self._arrivals if now_ns - at <= RATE_NS]
-        return len(recent) / (RATE_NS / SECOND)
+        """Return the rate of the frames over the last `RATE_NS`, or three periods."""
+        recent = [at for at in self._arrivals if now_ns - at < self._window_ns]
+        return len(recent) / (self._window_ns / SECOND)
+
+    @property
+    def _window_ns(self) -> float:
+        return max(RATE_NS, 3.0 * SECOND / self._hz if self._hz else 0.0)
 
     def _check_clock(self, capture_ns: int, now_ns: int) -> None:
         before_ns, self._captured_ns = self._captured_ns, capture_ns
@@ -142,7 +151,7 @@ class CameraHealth:
         return Fault(StreamFault.SOURCE, f"no frame for {silence_ns / SECOND:.0f} s")
 
     def _find_slowness(self, now_ns: int) -> Fault | None:
-        if now_ns - self._began_ns < RATE_NS or not self._hz:
+        if now_ns - self._began_ns < self._window_ns or not self._hz:
             return None
         hz = self.measure_hz(now_ns)
         if hz >= LEAST_RATE * self._hz:
@@ -162,9 +171,13 @@ def find_size_fault(frame: DepthFrame, camera: CameraModel) -> Fault | None:
 def find_pose_fault(frame: DepthFrame) -> Fault | None:
     """Return a fault when the pose that a frame brings is not one."""
     pose = frame.T_world_camera
-    if pose is None or (np.shape(pose) == (4, 4) and np.isfinite(pose).all()):
+    if pose is None:
         return None
-    return Fault(StreamFault.POSE, "the pose of the camera has numbers that are not finite")
+    if np.shape(pose) != (4, 4):
+        return Fault(StreamFault.POSE, f"the pose of the camera has shape {np.shape(pose)}, it must be 4 x 4")
+    if not np.isfinite(pose).all():
+        return Fault(StreamFault.POSE, "the pose of the camera has numbers that are not finite")
+    return None
 
 
 def find_depth_fault(frame: DepthFrame) -> Fault | None:

@@ -38,6 +38,10 @@ class Band:
         tables = (self._used, self._blocks, self._hashed, np.uint64(64 - bits))
         self._table = (self._n, self._keys, self._sums, self._grids, *tables)
 
+    @property
+    def n_cells(self) -> int:
+        return int(self._n[0])
+
     def clear(self) -> None:
         self._hashed[self._used[: self._n[1]]] = _EMPTY
         self._n[:] = 0

@@ -1,14 +1,16 @@
 """From frames of one or several cameras to the encoded frames of one cloud. No sockets, no clocks: times are arguments.
 
-The newest frames of the cameras are joined when they were captured within `JOIN_NS` of each other. A camera that has
-stopped delivering does not stop the cloud of the others.
+Frames of the cameras are joined when they were captured within `JOIN_NS` of each other. A camera is waited for while
+its next frame can still be one of those: one that is slower, late or has stopped does not stop the cloud of the others.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from statistics import median
 from typing import Final, NamedTuple, Protocol
 
 import numpy as np
@@ -16,15 +18,33 @@ import numpy as np
 from anchors.camera import CameraModel, pose_to_matrix
 from anchors.pose import PoseTuple
 from iris_session.cloud.frames import DepthFrame
-from iris_session.cloud.voxels import DepthLimits, Floats, PointSet, Rays, VoxelFilter, choose_voxel_m, make_rays
+from iris_session.cloud.voxels import (
+    FULL,
+    DepthLimits,
+    Floats,
+    PointSet,
+    Rays,
+    VoxelFilter,
+    choose_max_cells,
+    choose_voxel_m,
+    make_rays,
+)
 from iris_session.protocol.names import BudgetClass
 from iris_session.streams.cloud import encode_cloud, order_points
 
 MILLISECOND: Final = 1_000_000
+SECOND: Final = 1_000_000_000
 #: Captured further apart, frames of two cameras show another world: at walking speed 7 cm.
 JOIN_NS: Final = 50 * MILLISECOND
-#: A camera without a frame for this long is not waited for.
+#: A camera without a frame for this long, and a period, is not waited for.
 SILENCE_NS: Final = 500 * MILLISECOND
+#: A camera whose frames arrive later than this after their capture is not waited for: no device needs so long.
+LATE_NS: Final = 500 * MILLISECOND
+#: A camera whose frames come and are in no cloud for so long, for three periods, and in so many clouds, is left out.
+LEFT_OUT_NS: Final = SECOND
+LEFT_OUT_CLOUDS: Final = 3
+#: Frames by which the period and the delay of a camera are known.
+RECENT: Final = 5
 #: Time for the pose of a body at the capture of a frame to arrive: states come after what cameras see.
 POSE_NS: Final = 200 * MILLISECOND
 #: Frames of one camera that wait for a pose.
@@ -113,7 +133,7 @@ class Cloud(NamedTuple):
 
 
 class _CameraState:
-    """The frames of one camera that wait, the oldest first, with the time at which each arrived."""
+    """One camera: its frames that wait, the oldest first, with the time at which each arrived, and how they come."""
 
     def __init__(self, camera: PipelineCamera) -> None:
         self.camera = camera
@@ -121,8 +141,60 @@ class _CameraState:
         self.rays: Rays | None = None
         self.depth_scale_m = 0.001
         self.waiting: deque[tuple[DepthFrame, int]] = deque()
-        self.arrived_ns: int | None = None
         self.lacks_pose = False
+        self.restart()
+
+    def restart(self) -> int:
+        """Forget the frames: those that come next are of another source or clock. Return how many waited."""
+        dropped = len(self.waiting)
+        self.waiting.clear()
+        self._recent: deque[tuple[int, int]] = deque(maxlen=RECENT)  # times of capture and arrival
+        self._shown_ns: int | None = None  # time of the last cloud that it was in, at first of its first frame
+        self._clouds_without = 0
+        return dropped
+
+    def add(self, frame: DepthFrame, now_ns: int) -> None:
+        self.waiting.append((frame, now_ns))
+        self._recent.append((frame.capture_ns, now_ns))
+        if self._shown_ns is None:
+            self._shown_ns = now_ns
+
+    def remove(self, frame: DepthFrame) -> int:
+        """Remove a frame that waits, and those before it. Return how many those were."""
+        place = next(place for place, (one, _) in enumerate(self.waiting) if one is frame)
+        for _ in range(place + 1):
+            self.waiting.popleft()
+        return place
+
+    @property
+    def period_ns(self) -> float:
+        """Median time between captures [ns], 0 while it is not known."""
+        gaps = [after - before for (before, _), (after, _) in itertools.pairwise(self._recent)]
+        return max(0.0, median(gaps)) if gaps else 0.0
+
+    @property
+    def late_ns(self) -> int:
+        """Greatest time from capture to arrival [ns]."""
+        return max((arrived_ns - captured_ns for captured_ns, arrived_ns in self._recent), default=0)
+
+    @property
+    def next_ns(self) -> float:
+        """Capture of the next frame that it can give: one that waits for its pose, or the one to come."""
+        return self.waiting[0][0].capture_ns if self.waiting else self._recent[-1][0] + self.period_ns
+
+    def is_delivering(self, now_ns: int) -> bool:
+        return bool(self._recent) and now_ns - self._recent[-1][1] <= SILENCE_NS + self.period_ns
+
+    def note_cloud(self, *, has_it: bool, now_ns: int) -> None:
+        """Count a cloud, with a frame of this camera or without."""
+        self._clouds_without = 0 if has_it else self._clouds_without + 1
+        if has_it:
+            self._shown_ns = now_ns
+
+    def is_left_out(self, now_ns: int) -> bool:
+        if self._shown_ns is None or self._clouds_without < LEFT_OUT_CLOUDS or not self.is_delivering(now_ns):
+            return False
+        return now_ns - self._shown_ns >= max(LEFT_OUT_NS, 3.0 * self.period_ns)
 
 
 class CloudPipeline:
@@ -161,8 +233,11 @@ class CloudPipeline:
         self._clock_ns = clock_ns
         self._body_pose = body_pose
         self._remover = remover
-        self._voxels = voxels or VoxelFilter(settings.voxel_m)
+        self._voxels = voxels or VoxelFilter(settings.voxel_m, max_cells=choose_max_cells(settings.points))
         self._next_voxel_m = settings.voxel_m
+        self._captures: dict[str, int] = {}  # of the last frames that were taken
+        self._taken_ns = 0
+        self._waited_from_ns: int | None = None  # capture of the frame with which waiting for a camera began
 
     def open_camera(self, name: str, model: CameraModel, depth_scale_m: float) -> None:
         """Take the intrinsics of a camera whose source was opened. Frames that wait are dropped."""
@@ -170,26 +245,25 @@ class CloudPipeline:
         if model != state.model:
             state.model, state.rays = model, make_rays(model)
         state.depth_scale_m = depth_scale_m
-        state.waiting.clear()
+        self.drops["superseded"] += state.restart()
 
     def clear(self) -> None:
         """Drop all frames that wait: the clock by which they were captured is another."""
-        for state in self._states.values():
-            state.waiting.clear()
-            state.arrived_ns = None
+        self.drops["superseded"] += sum(state.restart() for state in self._states.values())
+        self._captures.clear()
+        self._waited_from_ns = None
 
     def offer(self, name: str, frame: DepthFrame, now_ns: int) -> None:
-        """Take a frame of a camera. It replaces the one before, unless that waits for the pose of its camera."""
+        """Take a frame of a camera. One from the future counts as captured now."""
         state = self._states[name]
-        state.arrived_ns = now_ns
-        state.waiting.append((frame, now_ns))
+        state.add(frame._replace(capture_ns=min(frame.capture_ns, now_ns)), now_ns)
         if len(state.waiting) > MAX_WAITING:
-            del state.waiting[-2]  # the oldest stays: its pose is the next to come, or shows that none does
+            del state.waiting[-2]  # the oldest stays: its pose or partner is the next to come, or shows that none does
             self.drops["superseded"] += 1
 
-    def list_missing(self, now_ns: int) -> list[str]:
-        """Return the cameras that are left out because no frame of theirs came for `SILENCE_NS`."""
-        return [name for name, state in self._states.items() if not _is_delivering(state, now_ns)]
+    def is_left_out(self, name: str, now_ns: int) -> bool:
+        """Return whether the frames of a camera come, but are captured too long before those of the others."""
+        return self._states[name].is_left_out(now_ns)
 
     def lacks_pose(self, name: str) -> bool:
         """Return whether the newest frame of a camera was dropped because a pose at its capture is not known."""
@@ -201,17 +275,27 @@ class CloudPipeline:
         Args:
             now_ns: Session time [ns].
         """
-        placed = {name: one for name, state in self._states.items() if (one := self._place_newest(state, now_ns))}
-        awaited = (
-            name for name, state in self._states.items() if _is_delivering(state, now_ns) and not state.lacks_pose
-        )
-        if any(name not in placed for name in awaited):
+        placed = {name: found for name, state in self._states.items() if (found := self._list_placed(state, now_ns))}
+        joined, left_out = _join_frames(placed)
+        for name, one in left_out:
+            self.drops["superseded"] += self._states[name].remove(one.frame)
+            self.drops["join"] += 1
+        if not joined:
+            self._waited_from_ns = None
             return {}
-        newest_ns = max((one.frame.capture_ns for one in placed.values()), default=0)
-        joined = {name: one for name, one in placed.items() if newest_ns - one.frame.capture_ns <= JOIN_NS}
-        self.drops["join"] += len(placed) - len(joined)
-        for name in placed:
-            self._states[name].waiting.popleft()  # what came after it still waits for its pose
+        behind_ns = min(one.frame.capture_ns for one in joined.values())
+        if self._waited_from_ns is None:
+            self._waited_from_ns = behind_ns
+        if any(
+            self._is_awaited(state, behind_ns, now_ns) for name, state in self._states.items() if name not in joined
+        ):
+            return {}
+        self._waited_from_ns, self._taken_ns = None, now_ns
+        for name, state in self._states.items():
+            state.note_cloud(has_it=name in joined, now_ns=now_ns)
+        for name, one in joined.items():
+            self.drops["superseded"] += self._states[name].remove(one.frame)
+            self._captures[name] = one.frame.capture_ns
         return joined
 
     def make_cloud(self, frames: dict[str, PlacedFrame]) -> Cloud:
@@ -239,11 +323,12 @@ class CloudPipeline:
         times.append(clock_ns())
         points = self._voxels.collect(min_points=settings.min_points, min_around=settings.min_around)
         capture_ns = min(one.frame.capture_ns for one in frames.values())
-        if self._remover is not None:
-            points = self._remover.remove(points, capture_ns)
+        if self._remover is not None:  # a robot that moves is where each of the cameras saw it
+            for at_ns in sorted({one.frame.capture_ns for one in frames.values()}):
+                points = self._remover.remove(points, at_ns)
         times.append(clock_ns())
         voxel_m, n = self._voxels.voxel_m, len(points.positions)
-        self._next_voxel_m = choose_voxel_m(voxel_m, n, settings.points, settings.voxel_m)
+        self._next_voxel_m = choose_voxel_m(voxel_m, self._count_needed(n), settings.points, settings.voxel_m)
         if n > settings.points:  # as at the beginning, and when a camera turns to something near
             self.drops["budget"] += n - settings.points
             points = _take_sample(points, settings.points, voxel_m)
@@ -257,23 +342,43 @@ class CloudPipeline:
         stages_ms = dict(zip(("voxels", "outliers", "budget", "encode"), durations, strict=True))
         return Cloud(encoded, capture_ns, len(points.positions), voxel_m, error_m, tuple(frames), stages_ms)
 
-    def _place_newest(self, state: _CameraState, now_ns: int) -> PlacedFrame | None:
-        """Return the newest frame whose pose is known; drop those before it, and those whose pose does not come."""
-        for place in reversed(range(len(state.waiting))):
-            frame, _ = state.waiting[place]
-            pose = self._find_pose(state.camera, frame)
-            if pose is None or (self._remover is not None and not self._remover.is_ready(frame.capture_ns)):
-                continue
-            self.drops["superseded"] += place
-            for _ in range(place):
+    def _count_needed(self, n_points: int) -> int:
+        """Return the number of points by which the next cells are chosen: more where the filter is too full."""
+        voxels, budget = self._voxels, self._settings.points
+        if voxels.overflow:
+            return max(n_points, 2 * budget)  # how many cells would have been enough is not known
+        return max(n_points, math.ceil(budget * voxels.n_cells / (FULL * voxels.max_cells)))
+
+    def _is_awaited(self, state: _CameraState, behind_ns: int, now_ns: int) -> bool:
+        """Return whether a frame of a camera can still come that was captured within `JOIN_NS` of those here."""
+        if state.lacks_pose or not state.is_delivering(now_ns) or state.next_ns > behind_ns + JOIN_NS:
+            return False
+        if state.waiting:
+            return True  # for `POSE_NS` at most
+        assert self._waited_from_ns is not None
+        return state.late_ns <= LATE_NS and now_ns <= self._waited_from_ns + JOIN_NS + state.late_ns
+
+    def _list_placed(self, state: _CameraState, now_ns: int) -> list[PlacedFrame]:
+        """Return the frames of a camera whose pose is known; drop those that come too late, or whose pose does."""
+        if now_ns - self._taken_ns <= SILENCE_NS:  # else times may have gone back
+            others = (at_ns for name, at_ns in self._captures.items() if name != state.camera.name)
+            first_ns = max(others, default=0) - JOIN_NS
+            while state.waiting and state.waiting[0][0].capture_ns < first_ns:
                 state.waiting.popleft()
+                self.drops["join"] += 1
+        placed = []
+        for frame, _ in state.waiting:
+            pose = self._find_pose(state.camera, frame)
+            if pose is not None and (self._remover is None or self._remover.is_ready(frame.capture_ns)):
+                placed.append(PlacedFrame(frame, pose))
+        if placed:
             state.lacks_pose = False
-            return PlacedFrame(frame, pose)
+            return placed
         while state.waiting and now_ns - state.waiting[0][1] > POSE_NS:
             state.waiting.popleft()
             self.drops["pose"] += 1
             state.lacks_pose = True
-        return None
+        return placed
 
     def _find_pose(self, camera: PipelineCamera, frame: DepthFrame) -> Floats | None:
         """Return `T_world_camera` at the capture of a frame."""
@@ -285,8 +390,29 @@ class CloudPipeline:
         return None if T_world_body is None else pose_to_matrix(T_world_body) @ camera.T_body_camera
 
 
-def _is_delivering(state: _CameraState, now_ns: int) -> bool:
-    return state.arrived_ns is not None and now_ns - state.arrived_ns <= SILENCE_NS
+def _join_frames(
+    placed: Mapping[str, list[PlacedFrame]],
+) -> tuple[dict[str, PlacedFrame], list[tuple[str, PlacedFrame]]]:
+    """Return frames that were captured within `JOIN_NS` of each other, by camera, and those that are too old for it.
+
+    The camera that is behind sets the time: of each other one it is the frame nearest to its newest.
+    """
+    left = {name: list(frames) for name, frames in placed.items()}
+    too_old: list[tuple[str, PlacedFrame]] = []
+    while left:
+        behind_ns = min(frames[-1].frame.capture_ns for frames in left.values())
+        found = {
+            name: min(frames, key=lambda one: abs(one.frame.capture_ns - behind_ns)) for name, frames in left.items()
+        }
+        oldest = min(found, key=lambda name: found[name].frame.capture_ns)
+        newest_ns = max(one.frame.capture_ns for one in found.values())
+        if newest_ns - found[oldest].frame.capture_ns <= JOIN_NS:
+            return found, too_old
+        too_old.append((oldest, found[oldest]))
+        left[oldest] = [one for one in left[oldest] if one.frame.capture_ns > found[oldest].frame.capture_ns]
+        if not left[oldest]:
+            del left[oldest]
+    return {}, too_old
 
 
 def _take_sample(points: PointSet, n: int, voxel_m: float) -> PointSet:

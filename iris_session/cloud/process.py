@@ -43,8 +43,9 @@ from iris_session.link.discovery import host_port
 from iris_session.protocol.media import StreamInfo
 from iris_session.protocol.names import Role
 from iris_session.scene.budget import Budget
+from iris_session.system.backoff import Backoff
 from iris_session.system.extras import MissingExtraError, require_package
-from iris_session.system.log import configure_logging
+from iris_session.system.log import configure_logging, describe_error
 from iris_session.system.priority import lower_thread_priority
 from iris_session.system.process import die_with_parent, is_parent, take_stdout
 
@@ -56,12 +57,14 @@ CONNECT_S: Final = 0.1
 #: States are kept for so long, for the poses of bodies: longer than any camera is late. And so many at most.
 STATES_NS: Final = 1_000_000_000
 MAX_STATES: Final = 256
-#: After shapes of robots could not be fetched, the next attempt begins with a frame so much later.
-FETCH_AGAIN_NS: Final = 5_000_000_000
+#: After shapes of robots could not be fetched, the next attempts begin with a frame so much later.
+FETCH_AGAIN_NS: Final = tuple(seconds * 1_000_000_000 for seconds in (5, 10, 30, 60, 300))
 #: Of the scene only the shapes matter.
 COARSE_TEXTURES: Final = Budget(texture_bytes=1)
 #: A pose that was sent longer before or after a capture says nothing about it.
 POSE_REACH_NS: Final = 100_000_000
+
+_STAY: Final = "points on robots stay in the cloud"
 
 log = logging.getLogger(__name__)
 OnReport = Callable[[CameraReport], None]
@@ -82,21 +85,23 @@ class BodyHistory:
         version = self._client.scene.version
         if version is None or self._client.scene.poses is None:
             return
+        now_ns = state.header.session_time
         with self._lock:
-            if version != self._version:
+            if version != self._version or (self._states and now_ns < self._states[-1][0]):  # or it was resumed
                 self._states.clear()
                 self._version = version
                 self._places = dict(self._client.mirror.body_index)
-            now_ns = state.header.session_time
             self._states.append((now_ns, self._client.scene.poses))
             while now_ns - self._states[0][0] > STATES_NS:
                 self._states.popleft()
 
-    def read_newest(self) -> dict[str, PoseTuple]:
-        """Return `T_world_body` of every body as it is now."""
+    def read_newest(self) -> tuple[int, dict[str, PoseTuple]] | None:
+        """Return the session time [ns] of the newest state, and `T_world_body` of every body in it."""
         with self._lock:
-            poses = self._states[-1][1] if self._states else None
-            return {} if poses is None else {body: pose_at(poses, place) for body, place in self._places.items()}
+            if not self._states:
+                return None
+            at_ns, poses = self._states[-1]
+            return at_ns, {body: pose_at(poses, place) for body, place in self._places.items()}
 
     def covers(self, time_ns: int) -> bool:
         """Return whether there are states before and after a session time [ns]."""
@@ -122,16 +127,13 @@ class BodyHistory:
 class SessionRobots:
     """The session's robots, by their shapes and the state at capture: which points lie on them, where they are seen.
 
-    The shapes are fetched in a thread, again for another scene and after a failure, and not for a session without
-    robots. Until they are there all points stay.
+    The shapes are fetched in a thread, again for another scene and while some are missing, and not for a session
+    without robots. Until they are there all points stay.
 
     Args:
         client: Client of the session.
         history: Poses of its bodies.
         removes: Points are to be removed.
-
-    Attributes:
-        warning: One line for people about points that stay because shapes are missing; empty while all is well.
     """
 
     def __init__(self, client: Client, history: BodyHistory, *, removes: bool) -> None:
@@ -139,11 +141,21 @@ class SessionRobots:
         self._history = history
         self._removes = removes
         self._scene: tuple[str, str] | None = None
-        self._again_ns = 0
+        self._backoff = Backoff(FETCH_AGAIN_NS)
+        self._again_ns = self._delay_ns = 0
         self._thread: threading.Thread | None = None
         self._points: RobotPoints | None = None
         self._surface: RobotSurface | None = None
-        self._said = self.warning = ""
+        self._n_missing = 0  # shapes that the points and the surface lack
+        self._said = ""
+
+    @property
+    def warning(self) -> str:
+        """One line for people about points on robots that stay; empty while all is well."""
+        n = 0 if self._points is None else self._points.n_unknown
+        unknown = f"the session sends no poses of {n} bodies of robots" if n else ""
+        why = "; ".join(filter(None, (self._said, unknown)))
+        return f"{_STAY}: {why}" if why and self._removes else ""
 
     def is_ready(self, capture_ns: int) -> bool:
         """Return whether the state of that time is there; begin to fetch the shapes when they are needed."""
@@ -151,9 +163,15 @@ class SessionRobots:
         is_fetching = self._thread is not None and self._thread.is_alive()
         if version is not None and not is_fetching and self._client.mirror.robots:
             is_other = version[:2] != self._scene
-            if is_other or (self._surface is None and capture_ns >= self._again_ns):
-                self._scene, self._again_ns = version[:2], capture_ns + FETCH_AGAIN_NS
+            if is_other:
+                self._scene, self._n_missing = version[:2], 0
                 self._points = self._surface = None
+                self._backoff.reset()
+            lacks = self._surface is None or self._n_missing
+            is_due = not 0 < self._again_ns - capture_ns <= self._delay_ns  # or session time went back
+            if is_other or (lacks and is_due):
+                self._delay_ns = self._backoff.next_delay()
+                self._again_ns = capture_ns + self._delay_ns
                 self._thread = threading.Thread(target=self._fetch, name="iris-robots", daemon=True)
                 self._thread.start()
         return self._surface is None or self._history.covers(capture_ns)
@@ -175,21 +193,26 @@ class SessionRobots:
         mirror = self._client.mirror
         try:
             scene = fetch_scene(self._client, COARSE_TEXTURES)
+            if self._surface is not None and len(scene.failed) >= self._n_missing:
+                return  # it is as it was
             shapes = scene.spec, scene.meshes, tuple(mirror.robots.values()), mirror.bodies
             points = RobotPoints(*shapes) if self._removes else None
-            # Both at once: `is_ready` waits for states, which removing points needs, as soon as there is a surface.
-            self._surface, self._points = RobotSurface(*shapes), points
+            surface = RobotSurface(*shapes)
+            if points is not None:
+                points.warm_up()  # in the loop that reports it might look as if the process hangs
         except Exception as error:  # of a connection, or of a scene: the cloud goes on with the points on robots
-            self._warn(str(error))
+            if self._surface is None:
+                self._warn(str(error))
             return
-        self._warn(f"{len(scene.failed)} shapes are missing" if scene.failed else "")
+        # Both at once: `is_ready` waits for states, which removing points needs, as soon as there is a surface.
+        self._surface, self._points = surface, points
+        self._n_missing = len(scene.failed)
+        self._warn(f"{self._n_missing} shapes are missing" if scene.failed else "")
 
     def _warn(self, reason: str) -> None:
-        lack = "points on robots stay in the cloud" if self._removes else "cameras are not compared with the robots"
         if reason and reason != self._said:
-            log.warning("%s: %s", lack, reason)
+            log.warning("%s: %s", _STAY if self._removes else "cameras are not compared with the robots", reason)
         self._said = reason
-        self.warning = f"{lack}: {reason}" if reason and self._removes else ""
 
 
 class SessionOutlet:
@@ -251,7 +274,8 @@ def run_cameras(
         on_report(CameraReport(settings.stream))
 
         def report(one: CameraReport) -> None:
-            on_report(msgspec.structs.replace(one, warning=robots.warning))
+            warning = "; ".join(filter(None, (one.warning, robots.warning)))
+            on_report(msgspec.structs.replace(one, warning=warning))
 
         try:
             _work(worker, client, report, is_ending)
@@ -345,6 +369,9 @@ def main() -> int:
         fault = run_cameras(start.settings, make_client(start), partial(write_report, reports), is_ending)
     except (ClientError, MissingExtraError) as error:
         fault = str(error)
+    except Exception as error:
+        fault = describe_error(error)
+        log.exception("the camera process of %r ends", start.settings.stream)
     if fault:
         write_report(reports, CameraReport(start.settings.stream, fault=fault))
     # A driver that hangs in a thread would keep the interpreter from ending.

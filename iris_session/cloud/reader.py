@@ -11,12 +11,13 @@ from contextlib import suppress
 from typing import Final, NamedTuple
 
 from anchors.camera import CameraModel
-from iris_session.cloud.frames import DepthFrame, DepthSource, SourceEndedError, SourceError
+from iris_session.cloud.frames import DepthFrame, DepthSource, RecordedSource, SourceEndedError, SourceError
 from iris_session.cloud.health import CameraHealth, Fault
 from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.names import StreamFault
 from iris_session.system.backoff import Backoff
 from iris_session.system.extras import MissingExtraError
+from iris_session.system.log import describe_error
 
 MILLISECOND: Final = 1_000_000
 #: Delays before a source that failed is opened again [s].
@@ -148,7 +149,7 @@ class SourceReader:
             except (SourceError, MissingExtraError) as error:
                 self._fail(str(error))
             except Exception as error:  # of a driver: the other cameras go on
-                self._fail(f"{type(error).__name__}: {error}")
+                self._fail(describe_error(error))
             self._stopping.wait(backoff.next_delay())
 
     def _fail(self, text: str) -> None:
@@ -170,14 +171,16 @@ class SourceReader:
             frames += 1
             if frames == HEALTHY_FRAMES:
                 backoff.reset()
-            self._take_over(NewFrame(frame, source.camera, source.depth_scale_m, self._opening))
+            recorded_hz = source.recorded_hz if isinstance(source, RecordedSource) else 0.0
+            self._take_over(NewFrame(frame, source.camera, source.depth_scale_m, self._opening), recorded_hz)
             self._on_frame()
 
-    def _take_over(self, new: NewFrame) -> None:
+    def _take_over(self, new: NewFrame, recorded_hz: float) -> None:
         with self._lock:
             if self._is_outdated:
                 return
             self._failure = ""
+            self._health.limit_rate(recorded_hz)
             if not self._health.check_frame(new.frame, new.model, self._now_ns()):
                 self.refused += 1
                 return

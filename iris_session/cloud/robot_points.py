@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from anchors.camera import pose_to_matrix
+from anchors.pose import PoseTuple
 from iris_session.cloud.pipeline import BodyPose
 from iris_session.cloud.voxels import Positions, load_kernels
 from iris_session.protocol.names import GeometryKind
@@ -34,6 +35,7 @@ _MAX_CELLS: Final = 4_000_000
 _FAR: Final = 255
 #: Pieces that the longest edge of a triangle is cut into, at most: 2.5 m of a robot.
 _MAX_PIECES: Final = 512
+_ORIGIN: Final[PoseTuple] = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 Distances = npt.NDArray[np.uint8]
 
 
@@ -95,6 +97,11 @@ class RobotPoints:
         self._things = _Shapes(sample_bodies(spec, meshes, things), names, margin_m, kernels)
         self.n_bodies = self._robots.n
         self.n_unknown = 0
+
+    def warm_up(self) -> None:
+        """Let numba compile what `find` needs: the first time takes seconds."""
+        for shapes in (self._robots, self._things):
+            shapes.measure(np.zeros((1, 3), np.float32), lambda name, at_ns: _ORIGIN, 0)
 
     def find(self, positions: Positions, body_pose: BodyPose, capture_ns: int) -> npt.NDArray[np.bool_]:
         """Return which points lie on a robot.

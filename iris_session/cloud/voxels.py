@@ -33,8 +33,10 @@ Positions = npt.NDArray[np.float32]
 Colors = npt.NDArray[np.uint8]
 Depth = npt.NDArray[np.uint16]
 
-#: Cells of one filter, at most: what comes beyond is dropped and counted.
+#: Cells of one filter by default: what comes beyond is dropped and counted.
 MAX_CELLS: Final = 2**18
+#: Share of the cells above which a filter is too full: few remain for what moves into the picture.
+FULL: Final = 0.9
 MIN_VOXEL_M: Final = 0.001
 #: Cells around a cell, itself left out.
 _AROUND: Final = tuple((i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1) if (i, j, k) != (0, 0, 0))
@@ -119,6 +121,7 @@ class VoxelFilter:
 
     Attributes:
         voxel_m: Edge of a cell [m]; `clear` sets it.
+        max_cells: Cells at most.
         overflow: Points that were dropped because there were too many cells, since `clear`.
 
     Raises:
@@ -141,6 +144,7 @@ class VoxelFilter:
         if use_numba is None and not _HAS_NUMBA:
             log.warning("depth pictures are filtered by numpy, which takes longer: %s", describe_missing("numba"))
         n = max(1, min(4, os.cpu_count() or 1)) if threads is None else threads
+        self.max_cells = max_cells
         self._table = _NumpyTable(max_cells) if load_kernels(use_numba) is None else _NumbaTable(max_cells, n)
         self.clear(voxel_m)
 
@@ -199,6 +203,11 @@ class VoxelFilter:
         depth, color = np.ascontiguousarray(depth), np.ascontiguousarray(color)
         self.overflow += self._table.add_depth(_Picture(depth, color, rays, cells, depth_scale_m, chosen, box))
 
+    @property
+    def n_cells(self) -> int:
+        """Number of cells with points, outliers among them."""
+        return self._table.n_cells
+
     def collect(self, *, min_points: int = 1, min_around: int = 0) -> PointSet:
         """Return the mean of each cell.
 
@@ -210,6 +219,11 @@ class VoxelFilter:
             The points, ordered by their cells.
         """
         return PointSet(*self._table.read(min_points, min_around, self.voxel_m))
+
+
+def choose_max_cells(budget: int) -> int:
+    """Choose how many cells a filter needs for a budget of points: outliers have cells, too."""
+    return max(MAX_CELLS, 2 * budget)
 
 
 def choose_voxel_m(voxel_m: float, n_points: int, budget: int, smallest_m: float) -> float:
@@ -292,6 +306,10 @@ class _NumbaTable:
             band.clear()
         return dropped
 
+    @property
+    def n_cells(self) -> int:
+        return int(self._bands[0].n_cells)
+
     def read(self, min_points: int, min_around: int, voxel_m: float) -> tuple[npt.NDArray[Any], ...]:
         positions, colors, counts = self._bands[0].read(min_points, min_around, voxel_m)
         return positions, colors, counts
@@ -330,6 +348,10 @@ class _NumpyTable:
         dropped = self._sums[self._max_cells :, 0].sum()
         self._keys, self._sums = self._keys[: self._max_cells], self._sums[: self._max_cells]
         return int(dropped)
+
+    @property
+    def n_cells(self) -> int:
+        return len(self._keys)
 
     def read(self, min_points: int, min_around: int, voxel_m: float) -> tuple[npt.NDArray[Any], ...]:
         kept = self._sums[:, 0] >= min_points

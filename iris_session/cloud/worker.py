@@ -1,10 +1,12 @@
 """The work of one camera process without its connection: sources, pipeline, pictures, faults, reports.
 
-It publishes through an `Outlet`: a session, or nothing at all where a camera file is inspected. No sockets, no clocks.
+It publishes through an `Outlet`: a session, or nothing at all where a camera file is inspected. No sockets: session
+time is that of the outlet, and the clock that measures stages is an argument.
 """
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 from collections import Counter, defaultdict
@@ -30,11 +32,13 @@ from iris_session.cloud.pipeline import (
     PointRemover,
 )
 from iris_session.cloud.reader import NewFrame, SourceReader
-from iris_session.cloud.voxels import Colors, DepthLimits, Floats, VoxelFilter, make_rays
+from iris_session.cloud.sources.playback import DEFAULT_HZ
+from iris_session.cloud.voxels import Colors, DepthLimits, Floats, VoxelFilter, choose_max_cells, make_rays
 from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.media import StreamCamera, StreamInfo, find_info_problem
 from iris_session.protocol.names import MediaEncoding, StreamFault
 from iris_session.system.extras import require_package
+from iris_session.system.log import describe_error
 
 MILLISECOND: Final = 1_000_000
 SECOND: Final = 1_000_000_000
@@ -42,10 +46,17 @@ SECOND: Final = 1_000_000_000
 INFO_NS: Final = SECOND
 #: Sources whose pictures of a world at rest are all the same.
 RENDERED: Final = frozenset({"mujoco"})
-NO_POSE: Final = "its frames have no pose, or the session no state of the time when they are captured"
+LEFT_OUT: Final = "its frames are in no cloud: they are captured, or dated, more than 50 ms before those of the others"
+NO_BODY: Final = "the session has no body {!r}, or no state of it when a frame was captured"
+NO_STATE: Final = "the session has no state of its robots when a frame was captured, which remove_robots needs"
+#: Session time that runs back by more than its slewing explains is that of another clock: the session was resumed.
+BACK_NS: Final = 50 * MILLISECOND
+#: Time in which a new connection takes nothing: what is not sent then is no drop.
+CONNECT_NS: Final = SECOND
 #: Time for the threads to leave their sources.
 JOIN_NS: Final = SECOND // 2
 
+log = logging.getLogger(__name__)
 #: Opens the source of a camera, which stamps its frames by the clock [ns].
 OpenSource = Callable[[CameraSettings, Callable[[], int]], DepthSource]
 
@@ -139,7 +150,7 @@ class CloudWorker:
             clock_ns,
             body_pose=body_pose,
             remover=remover,
-            voxels=make_warm_filter(settings.voxel_m),
+            voxels=make_warm_filter(settings),
         )
         self._watch = watch
         self._cameras = {one.name: one for one in settings.cameras}
@@ -153,6 +164,10 @@ class CloudWorker:
             if settings.picture_hz
         }
         self._drops: Counter[str] = Counter()
+        self._refused_ns: int | None = None  # time of the first frame that was not taken before any was
+        self._has_sent = False
+        self._failures: dict[str, str] = {}  # by stream: why its last frame could not be made
+        self._polled_ns: int | None = None
         self._reported_ns: int | None = None
         self._clouds = self._bytes = 0
         self._age_ms = 0.0
@@ -161,10 +176,11 @@ class CloudWorker:
 
     def _make_reader(self, camera: CameraSettings, open_source: OpenSource) -> SourceReader:
         settings, now_ns = self._settings, self._outlet.now_ns
+        hz = min(settings.hz, camera.hz or DEFAULT_HZ)  # a recording with times of its own limits it further
         return SourceReader(
             camera.name,
             lambda: open_source(camera, now_ns),
-            CameraHealth(min(settings.hz, camera.hz or settings.hz), has_noise=camera.source not in RENDERED),
+            CameraHealth(hz, has_noise=camera.source not in RENDERED),
             now_ns,
             self._wake.set,
         )
@@ -176,6 +192,8 @@ class CloudWorker:
 
     def restart_clock(self) -> None:
         """Forget all frames: session time is that of another session from now on."""
+        self._polled_ns = self._reported_ns = self._refused_ns = None
+        self._has_sent = False
         self.pipeline.clear()
         if self._watch is not None:
             self._watch.restart()
@@ -196,6 +214,12 @@ class CloudWorker:
         self._wake.wait(timeout_s)
         self._wake.clear()
         now_ns = self._outlet.now_ns()
+        if self._polled_ns is not None and now_ns < self._polled_ns - BACK_NS:
+            log.warning(
+                "session time went back by %.1f s: sources are opened anew", (self._polled_ns - now_ns) / SECOND
+            )
+            self.restart_clock()
+        self._polled_ns = now_ns
         for name, reader in self._readers.items():
             new = reader.take_frame()
             if new is not None:
@@ -205,12 +229,13 @@ class CloudWorker:
         return has_made
 
     def find_fault(self, now_ns: int) -> Fault | None:
-        """Return the fault of the cloud: that of the first camera that has one."""
+        """Return the fault of the cloud: that of the first camera that has one, or why it cannot be made."""
         for name in self._readers:
             fault = self._find_camera_fault(name, now_ns)
             if fault is not None:
                 return Fault(fault.fault, f"camera {name}: {fault.detail}"[:MAX_TEXT])
-        return None
+        failure = self._failures.get(self._stream.name)
+        return None if failure is None else Fault(StreamFault.SOURCE, failure[:MAX_TEXT])
 
     def make_report(self, *, connected: bool = True, fault: str = "") -> CameraReport:
         """Return the state of the work, with rates and means since the last report."""
@@ -237,6 +262,7 @@ class CloudWorker:
             self.count_drops(),
             {name: self._make_source_report(name, now_ns) for name in self._readers},
             fault,
+            "; ".join(self._failures.values()),
         )
 
     def count_drops(self) -> dict[str, int]:
@@ -268,7 +294,12 @@ class CloudWorker:
         picture = self._pictures.get(name)
         if picture is not None and picture.is_due(self._settings.picture_hz, now_ns):
             began_ns = self._clock_ns()
-            data = encode_picture(new.frame.color, self._settings.picture_quality)
+            try:
+                data = encode_picture(new.frame.color, self._settings.picture_quality)
+            except Exception as error:
+                self._note_failure(picture, error)
+                return
+            self._failures.pop(picture.name, None)
             self._note_stage("jpeg", (self._clock_ns() - began_ns) / MILLISECOND)
             self._publish(picture, data, new.frame.capture_ns, self._find_camera_fault(name, now_ns), now_ns)
 
@@ -278,7 +309,12 @@ class CloudWorker:
         frames = self.pipeline.take_frames(now_ns)
         if not frames or not self._stream.is_due(self._settings.hz, now_ns):
             return False
-        cloud = self.cloud = self.pipeline.make_cloud(frames)
+        try:
+            cloud = self.cloud = self.pipeline.make_cloud(frames)
+        except Exception as error:
+            self._note_failure(self._stream, error)
+            return False
+        self._failures.pop(self._stream.name, None)
         self.poses = {name: one.T_world_camera for name, one in frames.items()}
         if self._watch is not None:
             for name, (frame, pose) in frames.items():
@@ -297,6 +333,14 @@ class CloudWorker:
         self._age_ms += (self._outlet.now_ns() - cloud.capture_ns) / MILLISECOND
         return True
 
+    def _note_failure(self, stream: _Stream, error: Exception) -> None:
+        """Note that a frame could not be made: that ends neither this process nor the other streams."""
+        self._drops["failed"] += 1
+        failure = f"frames of {stream.name!r} cannot be made: {describe_error(error)}"
+        if failure != self._failures.get(stream.name):
+            log.warning("%s", failure, exc_info=log.isEnabledFor(logging.DEBUG))
+        self._failures[stream.name] = failure
+
     def _publish_faults(self, now_ns: int) -> None:
         """Publish faults without a frame, while no frame comes that would carry them."""
         fault = self.find_fault(now_ns)
@@ -313,8 +357,10 @@ class CloudWorker:
         described = stream.needs_info(fault, now_ns)
         info = self._make_info(stream, fault) if described else None
         if not self._outlet.publish(stream.name, frames, capture_ns, stream.encoding, info):
-            self._drops["send"] += 1
+            self._refused_ns = now_ns if self._refused_ns is None else self._refused_ns
+            self._drops["send"] += self._has_sent or now_ns - self._refused_ns >= CONNECT_NS
             return
+        self._has_sent = True
         if described:
             stream.note_described(fault, now_ns)
         self._bytes += len(frames) if isinstance(frames, bytes) else sum(map(len, frames.values()))
@@ -355,13 +401,13 @@ class CloudWorker:
     def _find_camera_fault(self, name: str, now_ns: int) -> Fault | None:
         fault = self._readers[name].find_fault(now_ns)
         if fault is None and self.pipeline.lacks_pose(name):
-            detail = (
-                f"the session has no body {self._cameras[name].body!r}, or no state of it when a frame was captured"
-            )
-            fault = Fault(StreamFault.POSE, detail)
+            body = self._cameras[name].body
+            fault = Fault(StreamFault.POSE, NO_BODY.format(body) if body else NO_STATE)
+        if fault is None and self.pipeline.is_left_out(name, now_ns):
+            fault = Fault(StreamFault.CLOCK, LEFT_OUT)
         move = None if self._watch is None else self._watch.find_move(name)
         if move is not None and (fault is None or fault.fault == StreamFault.SLOW):
-            fault = Fault(StreamFault.MOVED, f"{move}: calibrate it again, `iris-session cloud calibrate`")
+            fault = Fault(StreamFault.MOVED, f"{move}: calibrate it again, `iris-session cloud calibrate`, and restart")
         return fault
 
     def _make_source_report(self, name: str, now_ns: int) -> SourceReport:
@@ -390,9 +436,9 @@ def make_pipeline_camera(settings: CloudSettings, camera: CameraSettings) -> Pip
     return PipelineCamera(camera.name, limits, error_m, pose, camera.body)
 
 
-def make_warm_filter(voxel_m: float) -> VoxelFilter:
+def make_warm_filter(settings: CloudSettings) -> VoxelFilter:
     """Return a filter that is compiled: the first picture would take seconds, in which nothing is reported."""
-    voxels = VoxelFilter(voxel_m)
+    voxels = VoxelFilter(settings.voxel_m, max_cells=choose_max_cells(settings.points))
     depth, color = np.full((4, 4), 1000, np.uint16), np.zeros((4, 4, 3), np.uint8)
     voxels.add_depth(depth, color, make_rays(CameraModel(4, 4, 4.0, 4.0, 2.0, 2.0)), np.eye(4))
     voxels.collect(min_points=1, min_around=1)

@@ -118,6 +118,7 @@ EXPLANATIONS: Final[Mapping[str, str]] = {
     "camera_pose": "frames of a camera without a pose of the body that carries it",
     "camera_unusable": "frames of cameras of a wrong size, or with a pose that is none",
     "camera_cells": "points of cameras above the number of cells that a cloud has",
+    "camera_failed": "clouds and pictures of cameras that could not be made: the stream's fault says why",
     "media_record_share": "frames of point clouds and pictures that are missing in the recording: above 4 MB/s in all",
     "media_record_queue_full": "frames of point clouds and pictures that are missing in the recording: disk is slow",
     "recorded_media": "frames of point clouds and pictures that are not recorded: their source encodes them wrongly",

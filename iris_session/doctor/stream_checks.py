@@ -25,13 +25,14 @@ FAULTS: Final = {
         "its pictures have another size than its intrinsics, or depth another than colour",
         "set the size of the calibration, with depth registered to colour, or calibrate it in this size",
     ),
-    StreamFault.MOVED: ("the camera is not where it was calibrated", "put it back, or calibrate it again"),
+    StreamFault.MOVED: ("the camera is not where it was calibrated", "put it back, or calibrate it again and restart"),
     StreamFault.POSE: (
-        "the pose of the camera has values that are no numbers, or that of the body which carries it is not known",
-        "check its pose and the name of its body against the scene",
+        "the pose of the camera has values that are no numbers, or that of the body which carries it or of the robots "
+        "to be removed is not known when it sees something",
+        "check its pose and the name of its body against the scene, and the network to the camera",
     ),
     StreamFault.CLOCK: (
-        "its times of capture jump or lie in the future",
+        "its times of capture jump, lie in the future, or are not those of the other cameras",
         "check the clock of the machine with the camera, and its driver",
     ),
     StreamFault.SLOW: (

@@ -36,7 +36,7 @@ SILENT_NS: Final = 3 * SECOND
 EXIT_S: Final = 1.0
 #: Of the drops of a camera process, those that a session reports: frames that are replaced by newer ones, as at every
 #: camera that is faster than its stream, are none.
-REPORTED_DROPS: Final = frozenset({"send", "join", "pose", "unusable", "cells"})
+REPORTED_DROPS: Final = frozenset({"send", "join", "pose", "unusable", "cells", "failed"})
 _MODULE: Final = "iris_session.cloud.process"
 
 

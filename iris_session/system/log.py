@@ -37,3 +37,8 @@ def configure_logging() -> None:
             handler = _StandardErrorHandler()
             handler.setFormatter(logging.Formatter(_FORMAT))
             logger.addHandler(handler)
+
+
+def describe_error(error: BaseException) -> str:
+    """Return an unexpected error on one line: its type and text."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -111,6 +112,34 @@ def test_no_session_is_one_line(camera_file: Path, capsys: pytest.CaptureFixture
     assert "no session answers at 127.0.0.1:1" in capsys.readouterr().err
     assert main(["cloud", "inspect", "127.0.0.1:1"]) == 2
     assert "no session answers at 127.0.0.1:1" in capsys.readouterr().err
+
+
+def test_a_camera_on_a_body_cannot_be_inspected_without_a_session(
+    camera_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera_file.write_text(camera_file.read_text() + 'body = "left/hand"\n')
+    assert main(["cloud", "inspect", str(camera_file)]) == 2
+    error = capsys.readouterr().err
+    assert "camera 'front' is on body 'left/hand': only a session knows where that is" in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("action", [["inspect"], ["run", "--address", "127.0.0.1:1"]])
+def test_an_unexpected_error_is_one_line(
+    action: list[str], camera_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*given: Any) -> None:
+        if len(given) > 2:
+            given[1].close()  # the client of `run_cameras`
+        raise RuntimeError("bus 3\nis away")
+
+    monkeypatch.setattr("iris_session.cloud.worker.CloudWorker.poll", fail)
+    monkeypatch.setattr("iris_session.cloud.process.run_cameras", fail)
+    monkeypatch.setattr("iris_session.cli.cloud.check_session_reachable", lambda _: None)
+    assert main(["cloud", action[0], str(camera_file), *action[1:]]) == 1
+    text = capsys.readouterr().err
+    assert "the cameras of 'room' ended: RuntimeError: bus 3 is away; " in text
+    assert text.count("\n") == 1
 
 
 def test_a_report_is_one_line() -> None:

@@ -48,6 +48,12 @@ class FakeSource:
         self.closed = True
 
 
+class FakeRecording(FakeSource):
+    """A recording at 5 Hz."""
+
+    recorded_hz = 5.0
+
+
 def make_frame(capture_ns: int, depth_mm: int = 1500) -> DepthFrame:
     """Return a wall with noise."""
     random = np.random.default_rng(capture_ns % 2**32)
@@ -78,6 +84,17 @@ class FakeOutlet:
     def newest_info(self, stream: str) -> StreamInfo | None:
         """Return what was last said of a stream."""
         return next((one[4] for one in reversed(self.published) if one[0] == stream and one[4] is not None), None)
+
+
+class TimedOutlet(FakeOutlet):
+    """Its clock stands still until the test moves it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.time_ns = 10**12
+
+    def now_ns(self) -> int:
+        return self.time_ns
 
 
 def wait_until(condition: Callable[[], object]) -> None:

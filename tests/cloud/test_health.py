@@ -6,10 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from anchors.camera import CameraModel
 from iris_session.cloud.frames import DepthFrame
-from iris_session.cloud.health import CameraHealth
+from iris_session.cloud.health import CameraHealth, find_pose_fault
 from iris_session.protocol.names import StreamFault
 
 MS = 1_000_000
@@ -119,11 +120,40 @@ def test_frames_that_cannot_be_used_are_refused() -> None:
     assert health.check_frame(without_depth(make_frame(4)), CAMERA, 4 * MS)
 
 
+@pytest.mark.parametrize(
+    ("pose", "said"), [(np.eye(3), "shape (3, 3)"), (np.full((4, 4), np.inf), "not finite"), (np.eye(4), "")]
+)
+def test_what_is_wrong_with_a_pose_is_said(pose: NDArray[np.float64], said: str) -> None:
+    fault = find_pose_fault(make_frame(1)._replace(T_world_camera=pose))
+    assert said in ("" if fault is None else fault.detail)
+    assert (fault is None) == (said == "")
+
+
 def test_a_rate_far_below_what_is_asked_for() -> None:
     watch = Watch()
     assert watch.run(4000, hz=10) == "", "half of it is a camera that has no more"
     assert watch.run(4000, hz=5) == StreamFault.SLOW
     assert watch.run(3000) == ""
+
+
+@pytest.mark.parametrize("hz", [0.2, 0.3, 0.45, 1.0])
+def test_a_slow_camera_that_keeps_its_rate_is_not_slow(hz: float) -> None:
+    health = CameraHealth(hz)
+    health.restart(0)
+    for at_ms in range(0, 60_000, 100):
+        if at_ms % (100 * round(10 / hz)) == 0:
+            health.check_frame(make_frame(at_ms), CAMERA, at_ms * MS)
+        assert health.find_fault(at_ms * MS) is None
+    assert health.measure_hz(at_ms * MS) == pytest.approx(hz, rel=0.35)
+
+
+def test_the_rate_of_a_recording_is_enough_and_half_of_it_is_not() -> None:
+    watch = Watch()
+    watch.health.limit_rate(5.0)
+    assert watch.run(5000, hz=5) == ""
+    assert watch.run(5000, hz=1) == StreamFault.SLOW
+    watch.health.limit_rate(0.0)
+    assert watch.run(4000, hz=5) == StreamFault.SLOW, "20 frames per second are asked for"
 
 
 def test_a_source_that_stops() -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -11,7 +14,15 @@ from anchors.camera import CameraModel, pose_to_matrix
 from anchors.pose import PoseTuple, quat_from_rotvec
 from iris_session.cloud.frames import DepthFrame
 from iris_session.cloud.pipeline import CloudPipeline, PipelineCamera, PipelineSettings
-from iris_session.cloud.voxels import DepthLimits, Floats, PointSet, VoxelFilter, make_rays
+from iris_session.cloud.voxels import (
+    MAX_CELLS,
+    DepthLimits,
+    Floats,
+    PointSet,
+    VoxelFilter,
+    choose_max_cells,
+    make_rays,
+)
 from iris_session.streams.cloud import decode_cloud
 
 MS = 1_000_000
@@ -31,7 +42,9 @@ def place(x: float) -> Floats:
     return pose
 
 
-def make_pipeline(*names: str, points: int = 50_000, **options: object) -> CloudPipeline:
+def make_pipeline(
+    *names: str, points: int = 50_000, voxels: VoxelFilter | None = None, **options: object
+) -> CloudPipeline:
     cameras = [
         PipelineCamera(name, DepthLimits(), 0.01 * (i + 1), place(10.0 * i), str(options.get("body", "")))
         for i, name in enumerate(names)
@@ -41,7 +54,7 @@ def make_pipeline(*names: str, points: int = 50_000, **options: object) -> Cloud
         PipelineSettings(points, 0.02),
         cameras,
         iter(range(0, 10**9, MS)).__next__,
-        voxels=VoxelFilter(0.02, use_numba=False),
+        voxels=VoxelFilter(0.02, use_numba=False) if voxels is None else voxels,
         **options,  # type: ignore[arg-type]
     )
     for name in names:
@@ -80,26 +93,156 @@ def test_frames_of_two_cameras_are_joined_when_captured_together() -> None:
     assert (x > 5.0).any()
 
 
-def test_a_frame_that_is_too_old_to_be_joined_is_left_out_and_counted() -> None:
+def test_a_frame_that_is_too_old_to_be_joined_is_left_out_alone_and_counted() -> None:
     pipeline = make_pipeline("left", "right")
-    pipeline.offer("left", make_frame(40), 110 * MS)
+    pipeline.offer("left", make_frame(40), 50 * MS)
     pipeline.offer("right", make_frame(100), 110 * MS)
-    frames = pipeline.take_frames(110 * MS)
-    assert set(frames) == {"right"}
+    assert pipeline.take_frames(110 * MS) == {}, "the next one of the left camera can still be joined"
     assert pipeline.drops["join"] == 1
+    pipeline.offer("left", make_frame(106), 116 * MS)
+    assert set(pipeline.take_frames(116 * MS)) == {"left", "right"}
+    assert pipeline.drops == {"join": 1, "superseded": 0}
 
 
-def test_a_camera_that_delivers_is_waited_for_and_one_that_stopped_is_not() -> None:
-    pipeline = make_pipeline("left", "right")
-    for name in ("left", "right"):
-        pipeline.offer(name, make_frame(0), 0)
-    assert set(pipeline.take_frames(0)) == {"left", "right"}
-    pipeline.offer("left", make_frame(100), 100 * MS)
-    assert pipeline.take_frames(100 * MS) == {}, "the right one is due"
-    assert pipeline.list_missing(100 * MS) == []
-    pipeline.offer("left", make_frame(501), 501 * MS)
-    assert set(pipeline.take_frames(501 * MS)) == {"left"}
-    assert pipeline.list_missing(501 * MS) == ["right"]
+class Sight(NamedTuple):
+    """What clouds showed from the second second on: times at which they were taken [ms], by their cameras."""
+
+    clouds: list[tuple[float, frozenset[str]]]
+    pipeline: CloudPipeline
+    left_out: set[str]
+
+    def count(self, *names: str) -> int:
+        return sum(shown >= set(names) for _, shown in self.clouds)
+
+
+def run_cameras(*cameras: Callable[[int], tuple[float, float]], seconds: float = 3.0) -> Sight:
+    """Run cameras "0", "1", ..., each of which gives the times of capture and arrival of its frame by number [ms]."""
+    pipeline = make_pipeline(*(str(i) for i in range(len(cameras))))
+    arrivals = []
+    for i, camera in enumerate(cameras):
+        number = 0
+        while (times := camera(number))[1] < 1000.0 * seconds:
+            arrivals.append((times[1], times[0], str(i)))
+            number += 1
+    arrivals.sort(reverse=True)
+    sight = Sight([], pipeline, set())
+    for at in range(0, round(1000 * seconds), 5):
+        while arrivals and arrivals[-1][0] <= at:
+            _, captured, name = arrivals.pop()
+            pipeline.offer(name, make_frame(captured), at * MS)
+        frames = pipeline.take_frames(at * MS)
+        if frames and at >= 1000:
+            sight.clouds.append((at, frozenset(frames)))
+        sight.left_out.update(name for name in map(str, range(len(cameras))) if pipeline.is_left_out(name, at * MS))
+    return sight
+
+
+def capture_evenly(hz: float, phase_ms: float = 0.0, late_ms: float = 5.0) -> Callable[[int], tuple[float, float]]:
+    return lambda number: (1000.0 * number / hz + phase_ms, 1000.0 * number / hz + phase_ms + late_ms)
+
+
+@pytest.mark.parametrize(
+    ("hz", "phase_ms"),
+    [
+        (30, 0),
+        (30, 14),
+        (30, 20),
+        (15, 14),
+        (15, 33),
+        (15, 52),
+        (10, 20),
+        (10, 60),
+        (5, 14),
+        (5, 45),
+        (5, 160),
+        (1, 14),
+    ],
+)
+def test_cameras_of_any_rate_and_phase_are_joined(hz: int, phase_ms: int) -> None:
+    sight = run_cameras(capture_evenly(hz), capture_evenly(hz, phase_ms), seconds=max(3.0, 6.0 / hz))
+    assert sight.count("0", "1") >= max(2 * hz - 1, 3)
+    assert sight.count("0", "1") >= len(sight.clouds) - 2
+    assert sight.pipeline.drops["join"] <= 1
+    assert not sight.left_out
+
+
+@pytest.mark.parametrize(("hz", "phase_ms"), [(8, 60), (5, 100), (1, 500)])
+def test_cameras_that_are_never_close_in_time_are_shown_in_turn(hz: int, phase_ms: int) -> None:
+    sight = run_cameras(capture_evenly(hz), capture_evenly(hz, phase_ms))
+    assert sight.count("0", "1") == 0
+    assert min(sight.count("0"), sight.count("1")) >= 2 * hz - 1
+    assert not sight.left_out
+
+
+def test_frames_that_arrive_late_and_unevenly_are_joined() -> None:
+    random = np.random.default_rng(1)
+    jitter = random.uniform(0.0, 12.0, (3, 200, 2))
+
+    def capture(camera: int, late_ms: float) -> Callable[[int], tuple[float, float]]:
+        def at(number: int) -> tuple[float, float]:
+            captured = number * 1000.0 / 30.0 + jitter[camera, number, 0]
+            return captured, captured + late_ms + jitter[camera, number, 1]
+
+        return at
+
+    sight = run_cameras(capture(0, 5.0), capture(1, 110.0), capture(2, 40.0))
+    assert sight.count("0", "1", "2") >= 0.9 * len(sight.clouds)
+    assert len(sight.clouds) >= 0.6 * 60
+    assert not sight.left_out
+
+
+def test_a_slow_camera_does_not_slow_down_the_cloud() -> None:
+    sight = run_cameras(capture_evenly(30), capture_evenly(1, 10))
+    assert len(sight.clouds) >= 50
+    assert max(after - before for (before, _), (after, _) in itertools.pairwise(sight.clouds)) < 100
+    assert sight.count("0", "1") == 2
+    assert not sight.left_out
+
+
+def test_a_camera_that_stops_does_not_stop_the_cloud() -> None:
+    def stop(number: int) -> tuple[float, float]:
+        captured = 1000.0 * number / 30.0 + (1e6 if number > 45 else 0.0)
+        return captured, captured + 5.0
+
+    sight = run_cameras(capture_evenly(30), stop)
+    assert sight.count("1") >= 14
+    assert max(after - before for (before, _), (after, _) in itertools.pairwise(sight.clouds)) < 150
+    assert len([at for at, _ in sight.clouds if at > 2100]) >= 26, "it is not waited for any more"
+
+
+@pytest.mark.parametrize(("late_ms", "least"), [(100.0, 18), (200.0, 10), (400.0, 5)])
+def test_frames_that_take_long_are_joined(late_ms: float, least: int) -> None:
+    """As drawn ones do on a slow machine."""
+    sight = run_cameras(capture_evenly(30), capture_evenly(30, late_ms=late_ms))
+    assert sight.count("0", "1") >= least
+    assert sight.count("0", "1") >= len(sight.clouds) - 1
+    assert not sight.left_out
+
+
+@pytest.mark.parametrize("late_ms", [600.0, 5000.0])
+def test_a_camera_whose_captures_are_dated_too_early_is_named(late_ms: float) -> None:
+    """Its driver dates frames by another clock."""
+    sight = run_cameras(capture_evenly(30), capture_evenly(30, -late_ms, late_ms + 5.0))
+    assert sight.left_out == {"1"}
+    assert len(sight.clouds) >= 50
+    assert sight.pipeline.drops["join"] >= 50
+
+
+def test_a_camera_whose_captures_are_dated_too_late_is_shown() -> None:
+    def ahead(number: int) -> tuple[float, float]:
+        return 1000.0 * number / 30.0 + 5000.0, 1000.0 * number / 30.0 + 5.0
+
+    sight = run_cameras(capture_evenly(30), ahead)
+    assert sight.count("0", "1") >= 50
+
+
+def test_captures_of_all_cameras_may_go_back() -> None:
+    def back(number: int) -> tuple[float, float]:
+        captured = 1000.0 * number / 30.0
+        return captured - (900.0 if number > 45 else 0.0), captured + 5.0
+
+    sight = run_cameras(back, back)
+    assert len([at for at, _ in sight.clouds if at > 2100]) >= 24
 
 
 def test_the_voxel_meets_the_budget_and_no_frame_is_above_it() -> None:
@@ -119,6 +262,27 @@ def test_the_voxel_meets_the_budget_and_no_frame_is_above_it() -> None:
     pipeline.offer("front", make_frame(9), 9 * MS)
     pipeline.make_cloud(pipeline.take_frames(9 * MS))
     assert pipeline.drops["budget"] == settled
+
+
+def test_cells_grow_until_they_are_enough() -> None:
+    """Fewer cells than the budget has points: else what comes last in a picture would never be seen."""
+    voxels = VoxelFilter(0.02, max_cells=300, use_numba=False)
+    pipeline = make_pipeline("front", points=50_000, voxels=voxels)
+    overflows, edges = [], []
+    for at in range(12):
+        pipeline.offer("front", make_frame(at), at * MS)
+        edges.append(pipeline.make_cloud(pipeline.take_frames(at * MS)).voxel_m)
+        overflows.append(voxels.overflow)
+    assert overflows[0] > 0
+    assert overflows[-6:] == [0] * 6
+    assert len(set(edges[-6:])) == 1, "it has settled"
+    assert voxels.n_cells > 100, "cells are no larger than needed"
+
+
+def test_there_are_cells_for_every_budget() -> None:
+    assert choose_max_cells(1_000) == MAX_CELLS
+    assert choose_max_cells(1_000_000) >= 1_500_000
+    assert VoxelFilter(0.01, max_cells=choose_max_cells(1_000_000)).max_cells >= 1_500_000
 
 
 def test_a_camera_on_a_body_is_placed_by_the_pose_at_its_capture() -> None:
@@ -184,6 +348,24 @@ def test_points_are_removed_at_the_time_of_capture() -> None:
     cloud = pipeline.make_cloud(pipeline.take_frames(32 * MS))
     assert remover.asked == [20 * MS]
     assert decode_cloud(cloud.frames["full"]).positions[:, 0].max() < 0.001
+
+
+def test_points_are_removed_at_the_time_of_each_camera() -> None:
+    asked: list[int] = []
+
+    class Remover:
+        def is_ready(self, capture_ns: int) -> bool:
+            return True
+
+        def remove(self, points: PointSet, capture_ns: int) -> PointSet:
+            asked.append(capture_ns)
+            return points
+
+    pipeline = make_pipeline("left", "middle", "right", remover=Remover())
+    for name, at in (("left", 60), ("middle", 20), ("right", 60)):
+        pipeline.offer(name, make_frame(at), 60 * MS)
+    assert pipeline.make_cloud(pipeline.take_frames(60 * MS)).capture_ns == 20 * MS
+    assert asked == [20 * MS, 60 * MS]
 
 
 def test_a_cloud_without_points_is_one() -> None:

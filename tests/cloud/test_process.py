@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
 from iris_session.client.errors import InvalidMessageError, NotConnectedError
 from iris_session.cloud import process
+from iris_session.cloud.config import CameraReport, CameraStart
 from iris_session.cloud.process import FETCH_AGAIN_NS, BodyHistory, SessionOutlet, SessionRobots
 from iris_session.cloud.voxels import PointSet
+from tests.cloud.camera_settings import make_settings
 
 MS = 1_000_000
 DEADLINE_S = 60.0
@@ -49,7 +54,7 @@ class Lab:
 def test_poses_are_interpolated_between_states() -> None:
     lab = Lab()
     assert lab.find_x(0) is None
-    assert lab.history.read_newest() == {}
+    assert lab.history.read_newest() is None
     for at in (0, 16, 32):
         lab.add(at, 0.01 * at)
     assert lab.find_x(0) == 0.0
@@ -57,7 +62,9 @@ def test_poses_are_interpolated_between_states() -> None:
     assert lab.find_x(32) == pytest.approx(0.32)
     assert lab.find_x(20, "base") == 0.0
     assert lab.find_x(20, "no such body") is None
-    assert lab.history.read_newest()["hand"] == ((0.32, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    newest = lab.history.read_newest()
+    assert newest is not None
+    assert (newest[0], newest[1]["hand"]) == (32 * MS, ((0.32, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
 
 
 def test_nothing_is_known_before_and_after_the_states_and_in_their_gaps() -> None:
@@ -83,13 +90,31 @@ def test_another_scene_begins_anew() -> None:
     assert lab.find_x(40, "base") == 7.0
 
 
+def test_states_of_a_session_whose_time_went_back_begin_anew() -> None:
+    """As of one that is resumed after a reboot."""
+    lab = Lab()
+    for at in (5000, 5016):
+        lab.add(at, 1.0)
+    for at in (3000, 3016):
+        lab.add(at, 2.0)
+    assert lab.find_x(3008) == 2.0
+    assert lab.find_x(5008) is None
+    assert lab.history.covers(3016 * MS)
+    assert not lab.history.covers(5008 * MS)
+
+
 class FakeRobotPoints:
     """Finds the points at x > 0."""
 
     def __init__(self, *_: object) -> None:
-        pass
+        self.n_unknown = 0
+        self.is_warm = False
+
+    def warm_up(self) -> None:
+        self.is_warm = True
 
     def find(self, positions: Any, body_pose: object, capture_ns: int) -> Any:
+        assert self.is_warm
         return positions[:, 0] > 0.0
 
 
@@ -112,6 +137,21 @@ def wait_for_fetch(robots: SessionRobots) -> None:
     assert robots._thread is not None
     robots._thread.join(DEADLINE_S)
     assert not robots._thread.is_alive()
+
+
+def test_an_error_that_nobody_expected_is_reported() -> None:
+    program = (
+        "from iris_session.cloud import process\n"
+        "def fail(*_):\n    raise KeyError('no such\\ncell')\n"
+        "process.run_cameras = fail\n"
+        "process.main()\n"
+    )
+    start = msgspec.msgpack.encode(CameraStart(make_settings("front")))
+    ended = subprocess.run([sys.executable, "-c", program], input=start, capture_output=True, check=False)
+    assert ended.returncode == 1
+    report = msgspec.json.decode(ended.stdout, type=CameraReport)
+    assert (report.stream, report.fault) == ("room", r"KeyError: 'no such\ncell'")
+    assert ended.stderr.count(b"Traceback") == 1
 
 
 def test_points_on_robots_go_once_their_shapes_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,9 +194,12 @@ def test_points_on_robots_go_once_their_shapes_are_there(monkeypatch: pytest.Mon
     assert len(fetched) == 2
 
 
-@pytest.mark.parametrize("error", [NotConnectedError("this session shares no specification"), KeyError("any other")])
+@pytest.mark.parametrize(
+    ("error", "goes_back"),
+    [(NotConnectedError("this session shares no specification"), False), (KeyError("any other"), True)],
+)
 def test_without_shapes_all_points_stay_until_they_are_there(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, error: Exception
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, error: Exception, goes_back: bool
 ) -> None:
     def fail(client: object, budget: object) -> Any:
         raise error
@@ -173,23 +216,60 @@ def test_without_shapes_all_points_stay_until_they_are_there(
     monkeypatch.setattr(process, "RobotPoints", FakeRobotPoints)
     monkeypatch.setattr(process, "RobotSurface", FakeRobotSurface)
     monkeypatch.setattr(process, "fetch_scene", lambda *_: SimpleNamespace(spec=None, meshes={}, failed={}))
-    robots.is_ready(FETCH_AGAIN_NS - 1)
-    assert robots.is_ready(FETCH_AGAIN_NS - 1), "not tried again at once"
-    robots.is_ready(FETCH_AGAIN_NS)
+    robots.is_ready(FETCH_AGAIN_NS[0] - 1)
+    assert robots.is_ready(FETCH_AGAIN_NS[0] - 1), "not tried again at once"
+    if goes_back:
+        robots.is_ready(-1)
+    else:
+        robots.is_ready(FETCH_AGAIN_NS[0])
     wait_for_fetch(robots)
     assert len(robots.remove(make_points(), 0).positions) == 1
     assert robots.warning == ""
 
 
-def test_shapes_that_are_missing_are_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shapes_that_are_missing_are_a_warning_and_fetched_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    built: list[object] = []
+    failed = {"a": "lost", "b": "lost"}
+    monkeypatch.setattr(process, "RobotPoints", FakeRobotPoints)
+    monkeypatch.setattr(process, "RobotSurface", lambda *_: built.append(1) or FakeRobotSurface())
+    monkeypatch.setattr(process, "fetch_scene", lambda *_: SimpleNamespace(spec=None, meshes={}, failed=dict(failed)))
+    lab = Lab()
+    robots = SessionRobots(lab.client, lab.history, removes=True)
+    at_ns = 0
+
+    def fetch_again() -> str:
+        nonlocal at_ns
+        robots.is_ready(at_ns)
+        wait_for_fetch(robots)
+        at_ns += max(FETCH_AGAIN_NS)
+        return robots.warning
+
+    assert fetch_again() == "points on robots stay in the cloud: 2 shapes are missing"
+    assert len(robots.remove(make_points(), 0).positions) == 1, "those that are there are used"
+    fetch_again()
+    assert len(built) == 1, "nothing has come"
+    del failed["a"]
+    assert fetch_again() == "points on robots stay in the cloud: 1 shapes are missing"
+    failed.clear()
+    assert fetch_again() == ""
+    assert len(built) == 3
+    thread = robots._thread
+    robots.is_ready(at_ns)
+    assert robots._thread is thread, "all are there"
+
+
+def test_bodies_without_poses_are_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process, "RobotPoints", FakeRobotPoints)
     monkeypatch.setattr(process, "RobotSurface", FakeRobotSurface)
-    monkeypatch.setattr(process, "fetch_scene", lambda *_: SimpleNamespace(spec=None, meshes={}, failed={"a": "lost"}))
+    monkeypatch.setattr(process, "fetch_scene", lambda *_: SimpleNamespace(spec=None, meshes={}, failed={}))
     lab = Lab()
     robots = SessionRobots(lab.client, lab.history, removes=True)
     robots.is_ready(0)
     wait_for_fetch(robots)
-    assert robots.warning == "points on robots stay in the cloud: 1 shapes are missing"
+    assert robots.warning == ""
+    points: Any = robots._points
+    points.n_unknown = 3
+    assert robots.warning == "points on robots stay in the cloud: the session sends no poses of 3 bodies of robots"
 
 
 def test_shapes_are_not_fetched_in_vain(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:

@@ -12,7 +12,7 @@ from iris_session.cloud.frames import SourceEndedError, SourceError
 from iris_session.cloud.health import CameraHealth
 from iris_session.cloud.reader import SourceReader
 from iris_session.protocol.names import StreamFault
-from tests.cloud.fake_source import CAMERA, FakeSource, make_frame, wait_until
+from tests.cloud.fake_source import CAMERA, FakeRecording, FakeSource, make_frame, wait_until
 
 
 class Lab:
@@ -125,3 +125,19 @@ def test_another_clock_opens_the_source_anew(lab: Lab) -> None:
     assert new is not None
     assert new.opening == 2
     assert lab.reader.failures == 0
+
+
+def test_a_recording_is_expected_to_come_at_its_own_rate() -> None:
+    now = [0]
+    source = FakeRecording()
+    health = CameraHealth(30.0)
+    reader = SourceReader("front", lambda: source, health, lambda: now[0], threading.Event().set)
+    reader.start()
+    for number in range(1, 26):
+        now[0] = number * 200_000_000
+        source.put(make_frame(now[0]))
+        wait_until(lambda: health.arrived_ns == now[0])
+    assert reader.find_fault(now[0]) is None
+    assert reader.measure_hz(now[0]) == 5.0
+    reader.stop()
+    assert reader.join(60.0)

@@ -120,6 +120,24 @@ def test_bodies_without_a_pose_are_counted_and_keep_their_points(
     assert at_rest.n_unknown == 0
 
 
+def test_what_is_compiled_at_the_beginning_is_what_is_called(
+    robot_models: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    holding = hold_object("handover", tmp_path_factory.getbasetemp() / "handover")
+    called: list[tuple[Any, ...]] = []
+
+    class Kernels:
+        def measure_distances(self, *arrays: NDArray[Any]) -> None:
+            called.append(tuple((one.dtype, one.ndim, one.flags.c_contiguous) for one in arrays))
+
+    found = RobotPoints(holding.spec, holding.meshes, holding.robots, holding.streamed)
+    found._robots._kernels = Kernels()
+    found.warm_up()
+    assert len(called) == 1
+    found.find(holding.points, holding.body_pose, 7)
+    assert called[0] == called[1]
+
+
 @backends
 def test_clouds_without_points_and_scenes_without_robots_have_none(
     use_numba: bool, robot_models: Path, tmp_path_factory: pytest.TempPathFactory

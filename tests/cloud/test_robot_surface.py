@@ -280,10 +280,11 @@ class RenderedRoom:
             verdicts.append(self.watch.find_move("front"))
         return verdicts
 
-    def _place_bodies(self) -> dict[str, PoseTuple]:
+    def _place_bodies(self) -> tuple[int, dict[str, PoseTuple]]:
         names = [body.name for body in self._scene.streamed if "/" in body.name]
         poses = {name: self.find_pose(name, self.now_ns - self._delay_ns) for name in names}
-        return {**poses, "mount": pose_from_matrix(self.mount), "bystander": (self.hand, (1.0, 0.0, 0.0, 0.0))}
+        others = {"mount": pose_from_matrix(self.mount), "bystander": (self.hand, (1.0, 0.0, 0.0, 0.0))}
+        return self.now_ns, {**poses, **others}
 
 
 @pytest.fixture

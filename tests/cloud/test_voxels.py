@@ -124,6 +124,7 @@ def test_cells_beyond_the_bound_are_dropped_and_counted(use_numba: bool) -> None
     whole.add_depth(depth, color, make_rays(CAMERA), np.eye(4))
     kept = small.collect()
     assert len(kept.positions) == 50
+    assert small.n_cells == len(kept.positions)
     assert small.overflow == whole.collect().counts.sum() - kept.counts.sum() > 0
     small.clear()
     assert small.overflow == len(small.collect().positions) == 0

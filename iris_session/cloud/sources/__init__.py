@@ -15,8 +15,9 @@ from iris_session.cloud.frames import DepthFrame, DepthSource, SourceEndedError,
 from iris_session.protocol.media import MAX_IMAGE_SIZE
 from iris_session.system.extras import MissingExtraError
 
-#: Poses of bodies of the session's scene by name, as ((x, y, z), (w, x, y, z)).
-BodyPoses = Callable[[], Mapping[str, PoseTuple]]
+#: Newest poses of bodies of the session's scene by name, as ((x, y, z), (w, x, y, z)), and their session time [ns];
+#: `None` before the first.
+BodyPoses = Callable[[], tuple[int, Mapping[str, PoseTuple]] | None]
 
 
 def open_source(
@@ -27,7 +28,7 @@ def open_source(
     Args:
         settings: The camera, from `load_camera_file`.
         now_ns: Session time.
-        body_poses: Present poses of bodies, which rendered cameras draw.
+        body_poses: Newest poses of bodies, which rendered cameras draw.
 
     Returns:
         The source. Close it after use.

@@ -37,7 +37,8 @@ class MujocoCamera:
     Args:
         settings: With the model file and the name of the camera in it.
         now_ns: Session time.
-        body_poses: Present poses of bodies by name; names that the model lacks are ignored.
+        body_poses: Newest poses of bodies by name, and their session time, of which frames are then: a state comes
+            some milliseconds after it was so. Names that the model lacks are ignored.
 
     Raises:
         SourceError: The model, the camera or a way to draw without a display is missing.
@@ -47,7 +48,7 @@ class MujocoCamera:
         self,
         settings: CameraSettings,
         now_ns: Callable[[], int],
-        body_poses: Callable[[], Mapping[str, PoseTuple]] | None = None,
+        body_poses: Callable[[], tuple[int, Mapping[str, PoseTuple]] | None] | None = None,
     ) -> None:
         # Read when mujoco and OpenGL are imported; commands set it to "disable".
         if os.environ.get("MUJOCO_GL") not in ("egl", "osmesa"):
@@ -58,7 +59,7 @@ class MujocoCamera:
             raise _describe_missing_gl(error) from error
 
         self._mujoco: Any = mujoco
-        self._now_ns, self._body_poses = now_ns, body_poses
+        self._now_ns, self._body_poses, self._captured_ns = now_ns, body_poses, 0
         self.depth_scale_m = settings.depth_scale_m or 0.001
         self._interval_ns, self._number = round(SECOND / (settings.hz or DEFAULT_HZ)), -1
         try:
@@ -117,8 +118,11 @@ class MujocoCamera:
             return None
         self._number = number
         capture_ns = self._now_ns()
-        if self._body_poses is not None:
-            self._bodies.place(self._data, self._body_poses())
+        state = None if self._body_poses is None else self._body_poses()
+        if state is not None:
+            capture_ns, poses = state
+            self._bodies.place(self._data, poses)
+        self._captured_ns = capture_ns = max(capture_ns, self._captured_ns)  # the first states are older than no state
         color, depth_m = self._render()
         units = np.rint(depth_m / self.depth_scale_m)
         depth = np.where(units < 65_535.0, units, 0.0).astype(np.uint16)

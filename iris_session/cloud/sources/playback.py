@@ -7,7 +7,9 @@ A recording waits for a reader that is late: it is played more slowly, and no fr
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from statistics import median
 from typing import Any, Final, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -26,6 +28,8 @@ SECOND: Final = 10**9
 DEFAULT_HZ: Final = 30.0
 #: Depth and colour of one frame are captured within this time.
 PAIR_NS: Final = 50_000_000
+#: Frames by which the rate of a recording is known.
+RATE_FRAMES: Final = 30
 #: Jitter of a reader: one that is late by more is waited for.
 LATE_NS: Final = 50_000_000
 
@@ -64,6 +68,7 @@ class Playback(Generic[T]):
         self._open_frames, self._now_ns, self._name, self._loop, self._sleep = open_frames, now_ns, name, loop, sleep
         self._offset_ns: int | None = None  # session time minus time in the recording
         self._interval_ns = round(SECOND / DEFAULT_HZ)
+        self._intervals: deque[int] = deque(maxlen=RATE_FRAMES)
         self._frames = open_frames()
         self._next = next(self._frames, None)
         if self._next is None:
@@ -93,6 +98,11 @@ class Playback(Generic[T]):
             return None
         return self._take()
 
+    @property
+    def hz(self) -> float:
+        """Frames per second by their times, 0 before the first. Pauses between them do not count."""
+        return SECOND / median(self._intervals) if self._intervals else 0.0
+
     def close(self) -> None:
         """Close the file that is read. Nothing is due afterwards."""
         self._frames, self._next, self._loop = iter(()), None, False
@@ -106,6 +116,7 @@ class Playback(Generic[T]):
         self._next = next(self._frames, None)
         if self._next is not None:
             self._interval_ns = max(self._next[0] - t_ns, 0) or self._interval_ns
+            self._intervals.append(self._interval_ns)
         elif self._loop:
             self._frames = self._open_frames()
             self._next = next(self._frames, None)

@@ -81,6 +81,11 @@ class RerunSource:
         rgb = to_rgb(_decode(color, "color", self._path), f"{self._path}: {self._color}")
         return DepthFrame(units, fit_color(rgb, units, self._path), capture_ns)
 
+    @property
+    def recorded_hz(self) -> float:
+        """Frames per second by their times, or as they are played; see `RecordedSource`."""
+        return self._playback.hz
+
     def close(self) -> None:
         """Stop reading."""
         self._playback.close()

@@ -173,6 +173,7 @@ def check(source: Any, frames: list[DepthFrame]) -> None:
         assert np.array_equal(frame.depth, make_depth(k))
         assert np.array_equal(frame.color, make_color(k))
         assert frame.capture_ns == k * STEP_NS
+    assert source.recorded_hz == pytest.approx(1e9 / STEP_NS)
     camera = source.camera
     assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (64, 48, 50.0, 51.0, 31.0, 23.0)
 

@@ -45,10 +45,12 @@ def make_settings(folder: Path, text: str = MODEL, **values: object) -> CameraSe
 
 
 class Poses(dict[str, PoseTuple]):
-    """Poses of bodies, as a callable."""
+    """Poses of bodies, as a callable, and their session time."""
 
-    def __call__(self) -> Poses:
-        return self
+    at_ns = 7
+
+    def __call__(self) -> tuple[int, Poses] | None:
+        return (self.at_ns, self) if self.at_ns else None
 
 
 @pytest.fixture
@@ -58,7 +60,7 @@ def poses() -> Poses:
 
 @pytest.fixture
 def camera(tmp_path: Path, poses: Poses) -> Iterator[MujocoCamera]:
-    source = MujocoCamera(make_settings(tmp_path), lambda: 7, poses)
+    source = MujocoCamera(make_settings(tmp_path), lambda: 9, poses)
     yield source
     source.close()
 
@@ -115,6 +117,18 @@ def test_colour_is_that_of_the_same_pixels(camera: MujocoCamera) -> None:
     assert floor.sum() > 1000
     assert (colors[top, 0] > 2 * colors[top, 1]).mean() > 0.98
     assert (colors[floor, 1] > 2 * colors[floor, 0]).mean() > 0.98
+
+
+def test_a_frame_is_of_the_time_of_the_state_that_it_shows(tmp_path: Path, poses: Poses) -> None:
+    now = [10**9]
+    source = MujocoCamera(make_settings(tmp_path, width=64, height=48), lambda: now[0], poses)
+    captured = []
+    for at_ns in (0, now[0] - 20, now[0] + 80, now[0] + 80):  # no state yet; one from before; then a later one, twice
+        poses.at_ns = at_ns
+        captured.append(read(source).capture_ns)
+        now[0] += 100_000_000
+    source.close()
+    assert captured == [10**9, 10**9, 10**9 + 80, 10**9 + 80]
 
 
 def test_bodies_and_the_camera_stand_where_they_are_told_to(camera: MujocoCamera, poses: Poses) -> None:

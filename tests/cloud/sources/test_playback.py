@@ -87,6 +87,14 @@ def test_a_late_reader_is_waited_for() -> None:
     assert [playback.next(1.0) for _ in range(2)] == [(3, 10_060 * MS), (4, 10_090 * MS)]
 
 
+def test_the_rate_is_that_of_the_times() -> None:
+    playback = play(Clock(), [0, 200, 400, 9000, 9200, 9400])
+    assert playback.hz == 0.0
+    for _ in range(5):
+        playback.next(10.0)
+        assert playback.hz == 5.0
+
+
 def test_a_recording_of_one_picture_is_played_at_the_default_rate() -> None:
     clock = Clock()
     playback = play(clock, [0], loop=True)

@@ -94,6 +94,7 @@ def test_pictures_are_read_back(tmp_path: Path, depth: str, color: str) -> None:
         assert np.array_equal(frame.color, make_color(k))
         assert (frame.capture_ns, frame.T_world_camera) == (k * 10_000_000, None)
     assert source.depth_scale_m == 0.0005
+    assert source.recorded_hz == pytest.approx(100.0)
     camera = source.camera
     assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (64, 48, 50.0, 51.0, 31.0, 23.0)
 
