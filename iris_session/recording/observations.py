@@ -191,17 +191,15 @@ def read_alignment_history(
     return found
 
 
-def read_owners(recording: Recording) -> dict[int, tuple[str, str]]:
-    """Return id and newest name of the participant of each connection whose join is in the recording.
+def read_owners(recording: Recording) -> dict[int, str]:
+    """Return the id of the participant of each connection whose join is in the recording.
 
     Raises:
         NotARecordingError: A file can no longer be read.
     """
     events = [event for event in recording.events() if isinstance(event.body, _KINDS)]
-    changes = (event.body for event in events if isinstance(event.body, ParticipantJoined | ParticipantChanged))
-    names = {body.participant.id: body.participant.name for body in changes}
     owners = _replay_events(recording, events, AlignmentHistory(), lambda done: None).owners
-    return {connection: (participant, names[participant]) for connection, (participant, _) in owners.items()}
+    return {connection: participant for connection, (participant, _) in owners.items()}
 
 
 def _replay_events(

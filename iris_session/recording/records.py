@@ -33,6 +33,17 @@ ID_LIST_FIELDS: Final = frozenset(("previous_holders", "sub_holders", "queue"))
 _decode = msgspec.msgpack.Decoder(Sample | Observation).decode
 
 
+def read_names(recording: Recording) -> dict[str, str]:
+    """Return the newest name of each participant by its id.
+
+    Raises:
+        NotARecordingError: A file can no longer be read.
+    """
+    bodies = (event.body for event in recording.events())
+    joined = (body.participant for body in bodies if isinstance(body, ParticipantJoined | ParticipantChanged))
+    return {one.id: one.name for one in joined}
+
+
 def list_event_records(recording: Recording) -> Iterator[dict[str, Any]]:
     """Yield the events as dictionaries of plain values.
 
@@ -130,14 +141,15 @@ def iterate_samples(recording: Recording) -> Iterator[DecodedSample]:
     Raises:
         NotARecordingError: A file can no longer be read.
     """
-    owners = read_owners(recording)
+    owners, names = read_owners(recording), read_names(recording)
     for raw in recording.samples():
         try:
             message = _decode(raw.data)
         except BAD_BYTES:
             continue
         if isinstance(message, Sample):
-            yield DecodedSample(*owners.get(raw.connection, ("", "")), raw.receive_ns, message)
+            participant = owners.get(raw.connection, "")
+            yield DecodedSample(participant, names.get(participant, ""), raw.receive_ns, message)
 
 
 def read_device_samples(recording: Recording, participant: str, device: str) -> DeviceSamples:

@@ -26,14 +26,15 @@ from iris_session.session.core import SessionCore
 
 #: Names of the numbers of a pose: position [m], unit quaternion from the frame to the world.
 POSE: Final = ("x", "y", "z", "qw", "qx", "qy", "qz")
+FORCE: Final = ("normal_n",)
 SPEED: Final = ("linear_m_s", "angular_rad_s")
 
 JOINTS: Final = "joints"
 VELOCITIES: Final = "velocities"
 END_EFFECTOR: Final = "end_effector"
 TIP_SPEED: Final = "tip_speed"
-GRIPPER: Final = "gripper_opening"
-CONTACT_FORCE: Final = "contact_force_n"
+GRIPPER: Final = "gripper"
+CONTACT_FORCE: Final = "contact_force"
 POSES: Final = "pose"
 CTRL: Final = "ctrl"
 
@@ -92,14 +93,14 @@ class PlantReader:
         if spec.gripper_actuator:
             found[GRIPPER] = Quantity(("opening",), self._make_opening(spec))
         if spec.finger_bodies:
-            found[CONTACT_FORCE] = Quantity(("force",), lambda: (self._solve_forces()[0][index],))
+            found[CONTACT_FORCE] = Quantity(FORCE, lambda: (self._solve_forces()[0][index],))
         return found
 
     def _list_object(self, index: int, name: str) -> dict[str, Quantity]:
         view = self.world.view()
         return {
             POSES: Quantity(POSE, lambda: _to_numbers(view.object_pose(name))),
-            CONTACT_FORCE: Quantity(("force",), lambda: (self._solve_forces()[1][index],)),
+            CONTACT_FORCE: Quantity(FORCE, lambda: (self._solve_forces()[1][index],)),
         }
 
     def _make_ctrl(self, spec: RobotSpec) -> Quantity:

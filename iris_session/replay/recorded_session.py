@@ -270,7 +270,7 @@ class SessionRecording(RecordedFile):
         """Yield the selected steps of scenes in which a robot or object exists."""
         selector = StepSelector(hz, self.header.tick_period_ns)
         replay = Replay(self, with_control=with_control)
-        known: dict[str, None] = {}
+        known = dict.fromkeys(one.name for one in (self.header.robots if target == ROBOT else self.header.objects))
         for step, reader in read_steps(replay, selector):
             names = reader.robots if target == ROBOT else reader.objects
             if name in names:
