@@ -51,8 +51,8 @@ def list_event_records(recording: Recording) -> Iterator[dict[str, Any]]:
         recording: An open recording.
 
     Returns:
-        Iterator over records: `event_seq`, `step`, `session_time_ns`, `time_s` (session time [s]), `event` (its kind,
-        such as `lease_changed`), and the fields of the event. Beside a field with the id of a participant stands
+        Iterator over records: `event_seq`, `session_time_ns` (that of its step), `time_s` (the same [s]), `event` (its
+        kind, such as `lease_changed`), and the fields of the event. Beside a field with the id of a participant stands
         `FIELD_name` with its name at that time, empty if it is not known: it joined in an earlier recording.
 
     Raises:
@@ -66,10 +66,12 @@ def list_event_records(recording: Recording) -> Iterator[dict[str, Any]]:
 
 
 def make_event_record(event: Event, names: dict[str, str]) -> dict[str, Any]:
-    """Return one event as a dictionary. `names`: of participants by id."""
+    """Return one event as a dictionary. `names`: of participants by id.
+
+    `Event.step` is left out: the authority counts steps in another way than the journal, so that only times agree.
+    """
     head = {
         "event_seq": event.event_seq,
-        "step": event.step,
         "session_time_ns": event.session_time,
         "time_s": event.session_time * 1e-9,
     }

@@ -107,7 +107,7 @@ _SAMPLE: Final = (
     Column("twist", _FLOAT, ("vx", "vy", "vz", "wx", "wy", "wz")),
 )
 _EVENT: Final = (
-    *(Column(key, _INT) for key in ("event_seq", "step", "session_time_ns")),
+    *(Column(key, _INT) for key in ("event_seq", "session_time_ns")),
     *(Column(key, _TEXT) for key in ("event", "fields")),
 )
 
@@ -421,7 +421,7 @@ def _write_samples(recording: SessionRecording, staging: _Staging, say: Callable
 def _write_events(recording: SessionRecording, staging: _Staging) -> None:
     """Write the events. Every kind has other fields, so these are one column, as JSON."""
     table = staging.make_table(EVENTS, "", _EVENT)
-    head = ("event_seq", "step", "session_time_ns", "event")
+    head = ("event_seq", "session_time_ns", "event")
     for record in list_event_records(recording):
         fields = {key: value for key, value in record.items() if key not in (*head, "time_s")}
         table.add((*(record[key] for key in head), msgspec.json.encode(fields).decode()))

@@ -238,8 +238,8 @@ class SessionRecording(RecordedFile):
         """Return the events as dictionaries of plain values, with names of participants beside their ids.
 
         Returns:
-            Records with `event_seq`, `step`, `session_time_ns`, `time_s`, `event` (its kind), and the fields of the
-            event: `giver_participant` and `giver_participant_name` of a `handover`, for example.
+            Records with `event_seq`, `session_time_ns` (that of its step), `time_s`, `event` (its kind), and the fields
+            of the event: `giver_participant` and `giver_participant_name` of a `handover`, for example.
         """
         return list(list_event_records(self))
 
