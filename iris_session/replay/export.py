@@ -20,7 +20,6 @@ from typing import Any, Final, NamedTuple, Protocol, Self
 import msgspec
 import numpy as np
 
-from iris_session.physics import UnknownNameError
 from iris_session.protocol.client_messages import Sample
 from iris_session.recording import RecordingError
 from iris_session.recording.records import iterate_samples, list_event_records, list_numbers, read_names
@@ -258,6 +257,10 @@ def export_recording(
     if to not in FORMATS or not set(options.tables) <= set(TABLES):
         raise ValueError(f"{to!r} with tables {options.tables}: give one of {FORMATS}, and some of {TABLES}")
     selector = StepSelector(options.hz, recording.header.tick_period_ns)
+    for name in options.robots:
+        recording.robot(name)
+    for name in options.objects:
+        recording.object(name)
     try:
         with _Staging(folder, to, force=options.force) as staging:
             left_out = _write_steps(recording, staging, options, selector, say)
@@ -333,8 +336,6 @@ def _write_steps(
     """Replay the session into the tables of robots, objects and commands. Return what was left out."""
     if not {ROBOTS, OBJECTS, COMMANDS} & set(options.tables):
         return ()
-    header = recording.header
-    known = {ROBOT: {one.name for one in header.robots}, OBJECT: {one.name for one in header.objects}}
     replay = Replay(
         recording,
         with_control=COMMANDS in options.tables,
@@ -343,12 +344,6 @@ def _write_steps(
     writer = _StepWriter(staging, options, read_names(recording))
     for step, reader in read_steps(replay, selector):
         writer.add(step, reader)
-        known[ROBOT].update(reader.robots)
-        known[OBJECT].update(reader.objects)
-    for target, names in ((ROBOT, options.robots), (OBJECT, options.objects)):
-        for name in names:
-            if name not in known[target]:
-                raise UnknownNameError(target, name, sorted(known[target]))
     return replay.left_out
 
 
