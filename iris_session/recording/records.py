@@ -70,12 +70,13 @@ def make_event_record(event: Event, names: dict[str, str]) -> dict[str, Any]:
 
     `Event.step` is left out: the authority counts steps in another way than the journal, so that only times agree.
     """
-    head = {
+    head: dict[str, Any] = {
         "event_seq": event.event_seq,
         "session_time_ns": event.session_time,
         "time_s": event.session_time * 1e-9,
     }
-    return head | _add_names(msgspec.to_builtins(event.body), names)
+    fields: dict[str, Any] = _add_names(msgspec.to_builtins(event.body), names)
+    return head | fields
 
 
 def _add_names(value: Any, names: dict[str, str]) -> Any:

@@ -129,13 +129,13 @@ class _ArrowSink:
         types = {_INT: pa.int64(), _FLOAT: pa.float64(), _BOOL: pa.bool_(), _TEXT: pa.string()}
         self._schema = pa.schema([(name, types[one.kind]) for one in columns for name in one.list_names()])
         if is_csv:
-            from pyarrow import csv  # type: ignore[import-untyped]
+            from pyarrow import csv
 
             self._writer = csv.CSVWriter(
                 str(path), self._schema, write_options=csv.WriteOptions(quoting_style="needed")
             )
         else:
-            from pyarrow import parquet  # type: ignore[import-untyped]
+            from pyarrow import parquet
 
             self._writer = parquet.ParquetWriter(str(path), self._schema)
 

@@ -20,7 +20,7 @@ from iris_session.physics.names import find_element_id
 from iris_session.physics.tree import KinematicTree
 from iris_session.physics.world import STATE
 from iris_session.protocol.common import Pose
-from iris_session.protocol.specs import RobotSpec
+from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.replay.simulation import Replay, ReplayedStep, StepSelector
 from iris_session.session.core import SessionCore
 
@@ -69,14 +69,14 @@ class PlantReader:
         self.world = core.world
         self._model, self._data = self.world.model, self.world.data
         self._specs = core.scene.robots
-        self._object_names = [spec.name for spec in core.scene.objects]
-        self._tables = ContactTables(self._model, self._specs, core.scene.objects, KinematicTree(self._model))
+        self._tree = KinematicTree(self._model)
+        self._tables = ContactTables(self._model, self._specs, core.scene.objects, self._tree)
         self._scratch: Any = None
         self._solved = b""
         self._gripper_forces: tuple[float, ...] = ()
         self._object_forces: tuple[float, ...] = ()
         self.robots = {spec.name: self._list_robot(i, spec) for i, spec in enumerate(self._specs)}
-        self.objects = {name: self._list_object(i, name) for i, name in enumerate(self._object_names)}
+        self.objects = {spec.name: self._list_object(i, spec) for i, spec in enumerate(core.scene.objects)}
         self.ctrl = {spec.name: self._make_ctrl(spec) for spec in self._specs}
 
     def _list_robot(self, index: int, spec: RobotSpec) -> dict[str, Quantity]:
@@ -96,12 +96,13 @@ class PlantReader:
             found[CONTACT_FORCE] = Quantity(FORCE, lambda: (self._solve_forces()[0][index],))
         return found
 
-    def _list_object(self, index: int, name: str) -> dict[str, Quantity]:
-        view = self.world.view()
-        return {
-            POSES: Quantity(POSE, lambda: _to_numbers(view.object_pose(name))),
-            CONTACT_FORCE: Quantity(FORCE, lambda: (self._solve_forces()[1][index],)),
-        }
+    def _list_object(self, index: int, spec: ObjectSpec) -> dict[str, Quantity]:
+        view, name = self.world.view(), spec.name
+        found = {POSES: Quantity(POSE, lambda: _to_numbers(view.object_pose(name)))}
+        bodies = self._tree.list_subtree(find_element_id(self._model, "body", spec.body))
+        if any(int(self._model.body_geomnum[body]) for body in bodies):  # without geoms nothing touches it
+            found[CONTACT_FORCE] = Quantity(FORCE, lambda: (self._solve_forces()[1][index],))
+        return found
 
     def _make_ctrl(self, spec: RobotSpec) -> Quantity:
         names = (*spec.actuators, spec.gripper_actuator) if spec.gripper_actuator else spec.actuators

@@ -51,7 +51,7 @@ class TimeSeries(NamedTuple):
     @property
     def times_s(self) -> NDArray[np.float64]:
         """Session time of each row [s], shape (n,)."""
-        return self.session_time_ns * 1e-9
+        return self.session_time_ns.astype(np.float64) * 1e-9
 
     def to_dict(self) -> dict[str, NDArray[Any]]:
         """Return all columns by name, each of shape (n,), for example for `pandas.DataFrame`."""
@@ -88,7 +88,7 @@ class CommandSeries(NamedTuple):
     @property
     def times_s(self) -> NDArray[np.float64]:
         """Session time of each row [s], shape (n,)."""
-        return self.session_time_ns * 1e-9
+        return self.session_time_ns.astype(np.float64) * 1e-9
 
 
 class RecordedRobot:
@@ -145,8 +145,8 @@ class RecordedRobot:
     def commands(self, hz: float | None = None) -> CommandSeries:
         """Return the command of each step and the `ctrl` that the actuators got for it.
 
-        In recordings of class `open` authority and control run again for it; `ctrl` of a robot that nobody drives is
-        its owner's.
+        In recordings of class `open` authority and control run again for it; `ctrl` of a robot that no participant
+        drives is its owner's.
         """
         return self._recording._read_commands(self.name, hz)
 
@@ -168,31 +168,14 @@ class RecordedObject:
     def contact_force(self, hz: float | None = None) -> TimeSeries:
         """Return the sum of the normal contact forces on its bodies [N], by whatever touches it: grippers, a table.
 
-        They are those that MuJoCo solves for the state of the row; friction is not in it. In a published world nothing
-        is simulated, and they mean nothing.
+        They are those that MuJoCo solves for the state of the row; friction is not in it. Objects of a published world
+        have none: nothing is simulated there.
         """
         return self._recording._read_series(OBJECT, self.name, plant_reader.CONTACT_FORCE, hz)
 
 
 class SessionRecording(RecordedFile):
-    """A recording open for reading, all parts in order. Make it with `Recording.open`.
-
-    Use it as a context manager, or call `close`: damaged parts have temporary copies. All times are session time in
-    nanoseconds unless noted otherwise, all poses are in the world frame unless noted otherwise.
-
-    Attributes:
-        header: What is needed to understand and re-simulate the session: configuration, model, bodies, versions.
-        files: Paths of the parts, in order; parts that cannot be read are left out.
-        root: Chain value (16 bytes) before the first row.
-        end: Step and chain of the newest row as noted when the last part was closed; None if its recorder was killed
-            or a part is missing at the end.
-        damage: One line per place that could not be read. Reading on may add lines.
-        missing: One line per missing part, or range of parts.
-        notes: One line per empty part and per file that holds more than one recording.
-        cuts: One line per part that ends in the middle of a write, as a kill leaves it.
-        writers: Processes that were writing the recording when it was opened, as far as the system lists them. What
-            they have written so far is read, from a copy.
-    """
+    # `Recording` for users: its docstring is inherited, and what is read from the file.
 
     def robot(self, name: str) -> RecordedRobot:
         """Return access to the numbers of a robot: joints, end effector, gripper, forces, commands.
