@@ -20,6 +20,7 @@ from iris_session.physics.names import find_element_id
 from iris_session.physics.tree import KinematicTree
 from iris_session.physics.world import STATE
 from iris_session.protocol.common import Pose
+from iris_session.protocol.server_messages import BodyInfo
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.replay.simulation import Replay, ReplayedStep, StepSelector
 from iris_session.session.core import SessionCore
@@ -61,7 +62,8 @@ class PlantReader:
     Attributes:
         world: The world that is read.
         robots: Quantities by robot and kind: those that it has.
-        objects: Quantities by object and kind.
+        objects: Quantities by object and kind. In a world without robots and objects, as most published ones are: of
+            the bodies that move.
         ctrl: `ctrl` of the actuators of each robot, its gripper last.
     """
 
@@ -77,6 +79,8 @@ class PlantReader:
         self._object_forces: tuple[float, ...] = ()
         self.robots = {spec.name: self._list_robot(i, spec) for i, spec in enumerate(self._specs)}
         self.objects = {spec.name: self._list_object(i, spec) for i, spec in enumerate(core.scene.objects)}
+        if not (self.robots or self.objects):
+            self.objects = {name: self._list_body(name) for name in list_moving(self.world.bodies)}
         self.ctrl = {spec.name: self._make_ctrl(spec) for spec in self._specs}
 
     def _list_robot(self, index: int, spec: RobotSpec) -> dict[str, Quantity]:
@@ -103,6 +107,10 @@ class PlantReader:
         if any(int(self._model.body_geomnum[body]) for body in bodies):  # without geoms nothing touches it
             found[CONTACT_FORCE] = Quantity(FORCE, lambda: (self._solve_forces()[1][index],))
         return found
+
+    def _list_body(self, name: str) -> dict[str, Quantity]:
+        body, data = find_element_id(self._model, "body", name), self._data
+        return {POSES: Quantity(POSE, lambda: (*data.xpos[body].tolist(), *data.xquat[body].tolist()))}
 
     def _make_ctrl(self, spec: RobotSpec) -> Quantity:
         names = (*spec.actuators, spec.gripper_actuator) if spec.gripper_actuator else spec.actuators
@@ -159,6 +167,11 @@ class PlantReader:
             self._object_forces = self._tables.object_forces(self._model, self._scratch)
             self._solved = state
         return self._gripper_forces, self._object_forces
+
+
+def list_moving(bodies: Sequence[BodyInfo]) -> list[str]:
+    """Return the names of the bodies that move."""
+    return [body.name for body in bodies if body.moving]
 
 
 def read_steps(replay: Replay, selector: StepSelector) -> Iterator[tuple[ReplayedStep, PlantReader]]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import sys
 import warnings
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -24,7 +24,7 @@ from iris_session.recording import Recording as RecordedFile
 from iris_session.recording import RecordingError, paths, record_batches
 from iris_session.recording.records import DeviceSamples, list_event_records, read_device_samples
 from iris_session.replay import plant_reader
-from iris_session.replay.plant_reader import PlantReader, Quantity, read_steps
+from iris_session.replay.plant_reader import PlantReader, Quantity, list_moving, read_steps
 from iris_session.replay.simulation import Replay, ReplayedStep, StepSelector
 
 ROBOT: Final = "robot"
@@ -187,19 +187,20 @@ class SessionRecording(RecordedFile):
         Raises:
             UnknownNameError: There is no such robot.
         """
-        self._require(ROBOT, name, [robot.name for robot in self.header.robots])
+        self._require(ROBOT, name)
         return RecordedRobot(self, name)
 
     def object(self, name: str) -> RecordedObject:
         """Return access to the numbers of an object: poses, contact force.
 
         Args:
-            name: As in `header.objects`, or of a scene that was loaded later.
+            name: As in `header.objects`, or of a scene that was loaded later. In a world without robots and objects, as
+                most published ones are: a body that moves.
 
         Raises:
             UnknownNameError: There is no such object.
         """
-        self._require(OBJECT, name, [one.name for one in self.header.objects])
+        self._require(OBJECT, name)
         return RecordedObject(self, name)
 
     def device_samples(self, participant: str, device: str) -> DeviceSamples:
@@ -226,8 +227,16 @@ class SessionRecording(RecordedFile):
         """
         return list(list_event_records(self))
 
-    def _require(self, kind: str, name: str, known: Sequence[str]) -> None:
+    def _list_names(self, kind: str) -> list[str]:
+        """Return the names of robots or objects of the first scene."""
+        header = self.header
+        if kind == OBJECT and not (header.robots or header.objects):
+            return list_moving(header.bodies)
+        return [one.name for one in (header.robots if kind == ROBOT else header.objects)]
+
+    def _require(self, kind: str, name: str) -> None:
         """Raise `UnknownNameError` at once where only the first scene can have the name."""
+        known = self._list_names(kind)
         if name not in known and next(self._items(paths.MODELS, record_batches.decode_models), None) is None:
             raise UnknownNameError(kind, name, known)
 
@@ -253,7 +262,7 @@ class SessionRecording(RecordedFile):
         """Yield the selected steps of scenes in which a robot or object exists."""
         selector = StepSelector(hz, self.header.tick_period_ns)
         replay = Replay(self, with_control=with_control)
-        known = dict.fromkeys(one.name for one in (self.header.robots if target == ROBOT else self.header.objects))
+        known = dict.fromkeys(self._list_names(target))
         for step, reader in read_steps(replay, selector):
             names = reader.robots if target == ROBOT else reader.objects
             if name in names:

@@ -94,23 +94,25 @@ def play(
     make_entries: Callable[[int], Sequence[Entry]] = entries,
     scenes: Sequence[SceneModel] = (),
     core: SessionCore | None = None,
+    make_plant: Callable[[int], bytes] | None = None,
 ) -> Played:
     """Play a session in which ann joins, takes the left robot and moves it, and return it, to be written.
 
-    Class `open`: the plant is advanced here, and moved as only its owner knows.
+    Class `open`: the plant is advanced here, and moved as only its owner knows; or it is that of `make_plant`.
     """
+    recording_class = OPEN if make_plant else recording_class
     core = core or make_core(user_owned_loop=recording_class == OPEN)
     header = make_header(core, recording_class)
     chain = header_root(header)
     played = Played(path, header, core, Batch(keyframes=[keyframe_of(core, -1, chain)], scenes=list(scenes)))
     model, data = core.world.model, core.world.make_initial_data()
     for step in range(steps):
-        plant = b""
-        if recording_class == OPEN:
+        plant = make_plant(step) if make_plant else b""
+        if recording_class == OPEN and make_plant is None:
             data.qvel[core.world.model.joint("right/joint1").dofadr[0]] = np.sin(step / 20)
             plant = read_plant_state(model, data)
         chain = _take(played, step, list(make_entries(step)), plant, chain)
-        if recording_class == OPEN:
+        if recording_class == OPEN and make_plant is None:
             data.ctrl[:] = core.world.data.ctrl
             mujoco.mj_step(model, data)
     return played
@@ -118,15 +120,17 @@ def play(
 
 def _take(played: Played, step: int, taken: list[Entry], plant: bytes, chain: bytes) -> bytes:
     core, now_ns = played.core, step_ns(step)
-    outcome = core.step(now_ns, taken, 1, plant)
-    row = make_row(chain, step, now_ns, 1, taken, outcome.digest, plant)
+    # A step without a plant in class `open` has no tick.
+    n_ticks = int(bool(plant) or not core.config.authority.user_owned_loop)
+    outcome = core.step(now_ns, taken, n_ticks, plant)
+    row = make_row(chain, step, now_ns, n_ticks, taken, outcome.digest, plant)
     played.batch.rows.append(row)
     played.batch.events += outcome.decision.events
     played.samples += [entry for entry in taken if type(entry.message).__name__ == "Sample"]
     data = core.world.data
     for numbers, now in ((played.qpos, data.qpos), (played.qvel, data.qvel), (played.ctrl, data.ctrl)):
         numbers.append(now.copy())
-    played.tips.append(np.array(data.site(core.scene.robots[0].site).xpos))
+    played.tips += [np.array(data.site(robot.site).xpos) for robot in core.scene.robots[:1]]
     played.bodies.append(np.concatenate([data.xpos, data.xquat], axis=1))
     played.session_time.append(now_ns)
     if step % KEYFRAME_STEPS == KEYFRAME_STEPS - 1:

@@ -11,13 +11,17 @@ import numpy as np
 import pytest
 
 from iris_session import Recording, RecordingError
+from iris_session.authority import AuthorityConfig
+from iris_session.control import ControlConfig
 from iris_session.demo.scenes import n_arms_scene
 from iris_session.physics import UnknownNameError, decode_model, find_objects, find_robots
+from iris_session.physics.carrier import Carrier
 from iris_session.physics.load import compute_scene_hash, encode_model
+from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Entry, SceneLoaded
 from iris_session.recording import OPEN
 from iris_session.replay.recorded_session import CommandSeries, TimeSeries
-from iris_session.session.core import SessionCore
+from iris_session.session.core import CoreConfig, SessionCore
 from tests.physics.models import arm
 from tests.physics.models import model as compile_model
 from tests.replay.support import Played, play, scene_model, step_ns
@@ -264,3 +268,26 @@ def test_a_series_is_immutable(closed: Played) -> None:
     assert isinstance(joints, TimeSeries)
     with pytest.raises(AttributeError):
         joints.names = ()  # type: ignore[misc]
+
+
+def test_bodies_of_a_published_world_have_poses(tmp_path: Path) -> None:
+    """A carrier of bodies, moved by frames of a publisher; the rows between them have no plant."""
+    carrier = Carrier(("crate", "drum"), (Pose((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0)),) * 2)
+    core = SessionCore(carrier.model, CoreConfig(AuthorityConfig(user_owned_loop=True), ControlConfig(), (), ()))
+    frames = {3: 0.25, 6: 0.5}
+
+    def make_plant(step: int) -> bytes:
+        if step not in frames:
+            return b""
+        return carrier.encode_state(frames[step], np.array([(frames[step], 0, 1, 1, 0, 0, 0), (0, 0, 1, 1, 0, 0, 0)]))
+
+    played = play(tmp_path / "session.rrd", 9, core=core, make_entries=lambda _: [], make_plant=make_plant)
+    with Recording.open(played.write()) as recording:
+        crate = recording.object("crate").poses()
+        with pytest.raises(RecordingError, match="object 'crate' has no contact_force: it has pose"):
+            recording.object("crate").contact_force()
+        with pytest.raises(UnknownNameError, match="Available objects: crate, drum"):
+            recording.object("cup")
+    assert crate.values[:, 0].tolist() == [0.0] * 3 + [0.25] * 3 + [0.5] * 3
+    assert crate.values[0].tolist() == [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0]
+    assert crate.sim_time_s[-1] == 0.5
