@@ -45,12 +45,12 @@ def test_a_line_for_each_table(played: Played, tmp_path: Path, capsys: pytest.Ca
 
 
 def test_damage_is_said_and_is_a_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    gap = play(tmp_path / "session.rrd", 60)
+    gap = play(tmp_path / "session.rrd", 45)
     del gap.batch.rows[30]
     path = gap.write()
     assert main(["recording", "export", str(path), "--to", "npz", "-o", str(tmp_path / "tables")]) == 1
     shown = capsys.readouterr()
-    assert shown.err == f"iris-session: {path} is damaged: steps 30 to 49 are left out\n"
+    assert shown.err == f"iris-session: {path} is damaged: steps 30 to 39 are left out\n"
     assert f"{tmp_path / 'tables'}/events.npz" in shown.out
 
 

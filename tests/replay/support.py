@@ -20,7 +20,7 @@ from iris_session.recording.writer import RrdWriter
 from iris_session.session.core import SessionCore, read_plant_state
 from tests.session.play import TICK_NS, entries, make_core
 
-KEYFRAME_STEPS = 50
+KEYFRAME_STEPS = 20
 #: Times of steps are off by up to this, as on a machine that has other things to do.
 JITTER_NS = 400_000
 

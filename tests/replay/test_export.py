@@ -32,7 +32,7 @@ from iris_session.replay.recorded_session import SessionRecording
 from iris_session.session.core import SessionCore
 from tests.replay.support import Played, play
 
-STEPS = 120
+STEPS = 70
 
 
 @pytest.fixture(scope="module")
@@ -124,14 +124,14 @@ def test_what_is_not_asked_for_is_not_written(played: Played, tmp_path: Path, mo
         played, tmp_path / "some", "csv", tables=(ROBOTS, OBJECTS, COMMANDS), robots=("right",), objects=("board",)
     )
     assert [one.file for one in only.tables] == ["robot-right.csv", "object-board.csv", "commands-right.csv"]
-    assert [one.rows for one in only.tables] == [24, 24, 24], "100 rows a second"
+    assert [one.rows for one in only.tables] == [14, 14, 14], "100 rows a second"
     monkeypatch.delattr(SessionCore, "step")
     history = write(played, tmp_path / "history", "csv", tables=(SAMPLES, EVENTS))
     assert [one.file for one in history.tables] == ["samples.csv", "events.csv"], "nothing is simulated for them"
 
 
 def test_open_sessions_are_exported_too(tmp_path: Path) -> None:
-    opened = play(tmp_path / "session.rrd", 30, recording_class=OPEN)
+    opened = play(tmp_path / "session.rrd", 10, recording_class=OPEN)
     opened.write()
     report = write(opened, tmp_path / "tables", "parquet", hz=None)
     table = read(Path(report.folder) / "robot-right.parquet")
@@ -140,12 +140,12 @@ def test_open_sessions_are_exported_too(tmp_path: Path) -> None:
 
 
 def test_what_is_left_out_is_reported(tmp_path: Path) -> None:
-    gap = play(tmp_path / "session.rrd", 110)
-    del gap.batch.rows[60]
+    gap = play(tmp_path / "session.rrd", 50)
+    del gap.batch.rows[25]
     gap.write()
     report = write(gap, tmp_path / "tables", "csv", hz=None)
-    assert report.left_out == ((60, 99),)
-    assert report.tables[0].rows == 70
+    assert report.left_out == ((25, 39),)
+    assert report.tables[0].rows == 35
 
 
 # --- files ------------------------------------------------------------------------------------------------------------

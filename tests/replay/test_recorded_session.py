@@ -108,7 +108,7 @@ def close_gripper(step: int) -> list[Entry]:
 
 
 def test_a_gripper_opens_from_0_to_1(tmp_path: Path) -> None:
-    played = play(tmp_path / "session.rrd", 300, make_entries=close_gripper)
+    played = play(tmp_path / "session.rrd", 250, make_entries=close_gripper)
     with Recording.open(played.write()) as recording:
         opening = recording.robot("left").gripper(hz=500)
         commands = recording.robot("left").commands(hz=500)
@@ -184,11 +184,11 @@ def test_a_part_that_a_robot_does_not_have_is_an_error(tmp_path: Path) -> None:
 
 
 def test_steps_that_are_left_out_are_a_warning(tmp_path: Path) -> None:
-    played = play(tmp_path / "session.rrd", 120)
-    del played.batch.rows[60]
-    with Recording.open(played.write()) as recording, pytest.warns(UserWarning, match=r"40 steps are .*: 60 to 99$"):
+    played = play(tmp_path / "session.rrd", 50)
+    del played.batch.rows[25]
+    with Recording.open(played.write()) as recording, pytest.warns(UserWarning, match=r"15 steps are .*: 25 to 39$"):
         joints = recording.robot("left").joints()
-    assert joints.steps.tolist() == [*range(60), *range(100, 120)]
+    assert joints.steps.tolist() == [*range(25), *range(40, 50)]
     assert joints.values.tobytes() == np.array(played.qpos)[:, played.columns()][joints.steps].tobytes()
 
 
