@@ -175,7 +175,7 @@ class RecordedObject:
 
 
 class SessionRecording(RecordedFile):
-    # `Recording` for users: its docstring is inherited, and what is read from the file.
+    # `Recording` for users. Its docstring is that of the reader, inherited: it is the first text of the reference.
 
     def robot(self, name: str) -> RecordedRobot:
         """Return access to the numbers of a robot: joints, end effector, gripper, forces, commands.
@@ -250,7 +250,7 @@ class SessionRecording(RecordedFile):
         return TimeSeries(*builder.build())
 
     def _read_commands(self, name: str, hz: float | None) -> CommandSeries:
-        builder, columns = _SeriesBuilder(), CommandColumns()
+        builder, columns = _SeriesBuilder(), _CommandColumns()
         for step, reader in self._read_steps(ROBOT, name, hz, with_control=True):
             if builder.add(step, reader, reader.ctrl[name]):
                 columns.add(find_command(step, name))
@@ -302,7 +302,7 @@ class _SeriesBuilder:
         return names, *times, values
 
 
-class CommandColumns:
+class _CommandColumns:
     """Columns of commands while they are read."""
 
     def __init__(self) -> None:
