@@ -60,7 +60,8 @@ if TYPE_CHECKING:
     )
     from iris_session.protocol.server_messages import ParticipantJoined
     from iris_session.protocol.specs import ObjectSpec, RobotSpec
-    from iris_session.recording import Recording, RecordingError
+    from iris_session.recording import RecordingError
+    from iris_session.replay.recorded_session import Recording
     from iris_session.scene.budget import QUEST_3, Budget
     from iris_session.scene.builder import SceneBuilder
     from iris_session.scene.errors import SceneBuildError
@@ -148,7 +149,8 @@ _PUBLIC: Final = {
     "anchors.camera": ("CameraModel",),
     "iris_session.streams.deformable": ("DeformableEncoder", "DeformableDecoder"),
     "iris_session.streams.deformable_topology": ("DeformableTopology",),
-    "iris_session.recording": ("Recording", "RecordingError"),
+    "iris_session.recording": ("RecordingError",),
+    "iris_session.replay.recorded_session": ("Recording",),
 }
 _HOME: Final = {name: module for module, names in _PUBLIC.items() for name in names}
 

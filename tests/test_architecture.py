@@ -63,6 +63,7 @@ FORBIDDEN = {
     "alignment": SOCKETS | CLOCKS | RANDOM | {"mujoco", "rerun"},
     "front": {"mujoco", "rerun"},
     "recording": set(),
+    "replay": SOCKETS | CLOCKS | THREADS | RANDOM | {"zmq", "rerun"},
     "client": {"mujoco", "rerun"},
     "web": {"mujoco", "rerun"},
     "netsim": {"zmq", "mujoco", "rerun"},

@@ -51,6 +51,7 @@ _EPILOG = """examples:
   iris-session doctor 192.168.1.20           what is wrong, why, and what to do
   iris-session verify sessions/*/session.rrd re-simulate a recording and compare it bit for bit
   iris-session recording inspect sessions    what recordings hold: who, what, how long, damage
+  iris-session recording export session.rrd --to csv -o tables
   iris-session bench state --check           measure the state stream and compare it with its bars
 """
 

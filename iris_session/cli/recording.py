@@ -1,4 +1,4 @@
-"""`iris-session recording inspect`: what a recording holds, or one line for every recording of a folder."""
+"""`iris-session recording`, and its action `inspect`: what a recording holds, or one line for each of a folder."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 from threading import Timer
 from typing import TYPE_CHECKING, Final, Self
 
+from iris_session.cli import recording_export
 from iris_session.cli.common import CommandError, add_json_option, print_json, to_printable
 
 if TYPE_CHECKING:
@@ -32,11 +33,12 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     """Add the command `recording`."""
     parser = commands.add_parser(
         "recording",
-        help="show what a recording holds",
-        description="Show what a recording holds.",
+        help="show what a recording holds, export it as tables",
+        description="Show what a recording holds, or export it as tables.",
         epilog="examples:\n"
         "  iris-session recording inspect sessions/20261121T093000.000000Z-handover/session.rrd\n"
-        "  iris-session recording inspect sessions",
+        "  iris-session recording inspect sessions\n"
+        "  iris-session recording export session.rrd --to csv -o tables",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
@@ -55,6 +57,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     inspect.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or a folder with recordings below it")
     add_json_option(inspect)
     inspect.set_defaults(run=run_inspect)
+    recording_export.register(actions)
 
 
 def run_inspect(arguments: argparse.Namespace) -> int:

@@ -23,6 +23,13 @@ REACHED: Final = {
         "iris_session.client.assets.AssetFetch",
         "iris_session.client.alignment.ClientAlignment",
     ),
+    "Recording": (
+        "iris_session.replay.recorded_session.RecordedRobot",
+        "iris_session.replay.recorded_session.RecordedObject",
+        "iris_session.replay.recorded_session.TimeSeries",
+        "iris_session.replay.recorded_session.CommandSeries",
+        "iris_session.recording.records.DeviceSamples",
+    ),
 }
 #: Title of each section and the first public name in it, in the order of `__all__`.
 SECTIONS: Final = (

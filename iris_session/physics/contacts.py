@@ -157,6 +157,23 @@ class ContactTables:
                 forces[robot] += normal
         return tuple(forces)
 
+    def object_forces(self, model: mujoco.MjModel, data: Any) -> tuple[float, ...]:
+        """Return per object the sum of the normal contact forces on its bodies [N]. Valid as for `gripper_forces`.
+
+        Contacts between bodies of one object do not count.
+        """
+        forces = [0.0] * len(self._object_names)
+        if not data.ncon or not forces:
+            return tuple(forces)
+        pairs = self._geom_object[data.contact.geom]
+        contact_force = np.empty(6)
+        for row in np.nonzero(pairs[:, 0] != pairs[:, 1])[0].tolist():
+            mujoco.mj_contactForce(model, data, row, contact_force)
+            for index in pairs[row].tolist():
+                if index >= 0:
+                    forces[index] += float(contact_force[0])
+        return tuple(forces)
+
 
 def _find_roots(model: mujoco.MjModel, tree: KinematicTree, spec: RobotSpec) -> tuple[int, int]:
     """Return the base body of a robot, and the highest body that one of its joints moves."""

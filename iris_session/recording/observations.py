@@ -191,6 +191,17 @@ def read_alignment_history(
     return found
 
 
+def read_owners(recording: Recording) -> dict[int, str]:
+    """Return the id of the participant of each connection whose join is in the recording.
+
+    Raises:
+        NotARecordingError: A file can no longer be read.
+    """
+    events = [event for event in recording.events() if isinstance(event.body, _KINDS)]
+    owners = _replay_events(recording, events, AlignmentHistory(), lambda done: None).owners
+    return {connection: participant for connection, (participant, _) in owners.items()}
+
+
 def _replay_events(
     recording: Recording, events: list[Event], found: AlignmentHistory, say: Callable[[int], None]
 ) -> _Roster:

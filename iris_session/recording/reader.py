@@ -121,7 +121,7 @@ class Recording:
         return self.end is not None
 
     @classmethod
-    def open(cls, path: str | Path, *, warn: bool = True) -> Recording:
+    def open(cls, path: str | Path, *, warn: bool = True) -> Self:
         """Open a recording by its first file, or by the only part that is left of it.
 
         Later parts are found by their names, also after a missing one. A damaged part is read from a temporary copy of

@@ -159,9 +159,7 @@ class SessionCore:
         `ctrl`. The ticks then write `world.data.ctrl` for the caller to apply, of the robots in `sharing.driven`, and
         do not advance physics.
         """
-        for entry in entries:
-            if isinstance(entry.message, SceneLoaded) and entry.connection == entry.connection_epoch == HOST:
-                self._load_scene(entry.message)
+        self._load_scenes(entries)
         world = self.world
         if plant:
             world.restore_state(plant)
@@ -187,6 +185,15 @@ class SessionCore:
             self.sharing.apply(world.ctrl, owner_ctrl, n_ticks, estop=decision.estop)
         self._status = self.controller.get_status()
         return StepOutcome(decision, self._status, self._digest(decision) if digest else b"", world.diverged)
+
+    def show(self, entries: Sequence[Entry], plant: bytes) -> None:
+        """Show the plant of a step of an open session without taking the step; empty: as it was.
+
+        Scenes in `entries` are loaded. For reading a recording: authority and control stay as they were.
+        """
+        self._load_scenes(entries)
+        if plant:
+            self.world.restore_state(plant)
 
     def write_rest_controls(self, plant: bytes) -> None:
         """Write the last `world.data.ctrl` for the plant in state `plant`: driven robots at rest, objects released.
@@ -216,6 +223,11 @@ class SessionCore:
         config = self.config
         scene = SceneLoaded("", config.robots, config.objects, config.initial_state)
         return make_plant(self._model, scene, config.control)
+
+    def _load_scenes(self, entries: Sequence[Entry]) -> None:
+        for entry in entries:
+            if isinstance(entry.message, SceneLoaded) and entry.connection == entry.connection_epoch == HOST:
+                self._load_scene(entry.message)
 
     def _load_scene(self, scene: SceneLoaded) -> None:
         """Replace the scene, from the beginning of this step on."""

@@ -11,6 +11,8 @@ import pytest
 
 from iris_session.demo.scenes.deformables import BOX_HIGH, BOX_LOW, FOLD_PAIRS, cloth_scene, soft_scene
 from iris_session.physics import UnknownNameError, World, find_objects, find_robots
+from iris_session.physics.contacts import ContactTables
+from iris_session.physics.tree import KinematicTree
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import ObjectContact, WorldView
 from tests.physics.models import GRIPPER_TENDON, model
@@ -327,3 +329,28 @@ def test_unknown_deformable_is_rejected_with_known_ones(soft: Any) -> None:
     for ask in (world.flexes.read_vertices, world.flexes.find_touching_robots):
         with pytest.raises(UnknownNameError, match="rose"):
             ask("cloth")
+
+
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_forces_on_objects_carry_their_weight_and_the_grip(cone: str) -> None:
+    world = grasp_world(cone)
+    model, robots, objects = world.model, find_robots(world.model), find_objects(world.model)
+    tables = ContactTables(model, robots, objects, KinematicTree(model))
+
+    def forces() -> dict[str, float]:
+        mujoco.mj_forward(model, world.data)
+        return dict(zip([one.name for one in objects], tables.object_forces(model, world.data), strict=True))
+
+    for _ in range(500):
+        world.tick()
+    at_rest = forces()
+    assert at_rest["cube"] == pytest.approx(0.11 * 9.81, rel=0.01), "with the lid, which is a part of it"
+    assert at_rest["spare"] == pytest.approx(0.1 * 9.81, rel=0.01)
+    assert at_rest["lonely"] == 0.0
+    world.ctrl[3] = -20.0
+    for _ in range(500):
+        world.tick()
+    world.ctrl[0] = 0.1
+    for _ in range(500):
+        world.tick()
+    assert forces()["cube"] == pytest.approx(20.0, rel=0.02), "two fingers, and nothing below"

@@ -1,0 +1,124 @@
+"""`iris-session recording export`: a recording as tables, for pandas, NumPy, MATLAB or a spreadsheet."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from pathlib import Path
+from typing import Final
+
+from iris_session.cli.common import add_json_option, print_json, to_printable
+
+#: Least time between two lines of progress [s].
+PROGRESS_PERIOD_S: Final = 0.2
+DEFAULT_HZ: Final = 100.0
+
+
+def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the action `export` of `recording`."""
+    parser = actions.add_parser(
+        "export",
+        help="write joints, poses, forces, commands, samples and events as tables",
+        description="Write a recording as tables: one per robot (joints, end effector, gripper, contact force), per "
+        "object (pose, contact force) and of the commands of each robot, one of raw samples, one of events. Rows are "
+        "steps of the session as they were: of class closed it is simulated again and compared bit for bit, of class "
+        "open the states are in the recording. Exit status 1 if something is damaged or missing.",
+        epilog="examples:\n"
+        "  iris-session recording export session.rrd --to parquet -o tables\n"
+        "  iris-session recording export session.rrd --to csv -o tables --hz 30 --robot left --table robots\n"
+        "  iris-session recording export session.rrd --to npz -o tables --hz 500    every step at 500 Hz",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or its folder")
+    parser.add_argument("--to", required=True, choices=("csv", "parquet", "npz"), help="format of the tables")
+    parser.add_argument("-o", "--out", required=True, type=Path, metavar="FOLDER", help="folder for the tables")
+    parser.add_argument(
+        "--hz",
+        type=parse_hz,
+        default=DEFAULT_HZ,
+        metavar="RATE",
+        help="rows per second of robots, objects and commands; at the rate of the session, every step (default: 100)",
+    )
+    parser.add_argument("--robot", action="append", default=[], metavar="NAME", help="only this robot; repeatable")
+    parser.add_argument("--object", action="append", default=[], metavar="NAME", help="only this object; repeatable")
+    parser.add_argument(
+        "--table",
+        action="append",
+        default=[],
+        choices=("robots", "objects", "commands", "samples", "events"),
+        help="only tables of this kind; repeatable",
+    )
+    parser.add_argument(
+        "--force", action="store_true", help="write into a folder that is not empty, replace its tables"
+    )
+    add_json_option(parser)
+    parser.set_defaults(run=run_export)
+
+
+def parse_hz(text: str) -> float:
+    """Parse `--hz`."""
+    try:
+        hz = float(text)
+    except ValueError:
+        hz = math.nan
+    if not (math.isfinite(hz) and hz > 0.0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a rate: give rows per second above 0, for example 100")
+    return hz
+
+
+def run_export(arguments: argparse.Namespace) -> int:
+    """Write the tables, and print a line for each."""
+    import msgspec
+
+    from iris_session.replay.export import TABLES, ExportOptions, export_recording
+    from iris_session.replay.recorded_session import SessionRecording
+    from iris_session.system.extras import require_package
+
+    require_package("rerun", "reading recordings")
+    options = ExportOptions(
+        arguments.hz,
+        tuple(arguments.table) or TABLES,
+        tuple(arguments.robot),
+        tuple(arguments.object),
+        arguments.force,
+    )
+    progress = _Progress(arguments.path)
+    try:
+        with SessionRecording.open(arguments.path, warn=False) as recording:
+            report = export_recording(recording, arguments.out, arguments.to, options, progress.show)
+    finally:
+        progress.end()
+    if arguments.json:
+        print_json(msgspec.to_builtins(report))
+    else:
+        for table in report.tables:
+            print(to_printable(f"{arguments.out / table.file}: {table.rows:,} rows, {table.columns} columns"))
+    problems = [f"steps {first} to {last} are left out" for first, last in report.left_out] + list(report.damage)
+    if problems:
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        print(to_printable(f"iris-session: {arguments.path} is damaged: {problems[0]}{more}"), file=sys.stderr)
+    return 1 if problems else 0
+
+
+class _Progress:
+    """A line on standard error that says how far an export is, where that is a terminal."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = to_printable(str(path))
+        self._shows = sys.stderr.isatty()
+        self._shown = False
+        self._due_s = 0.0
+
+    def show(self, text: str) -> None:
+        """Show a text in place of the last one."""
+        if self._shows and time.monotonic() >= self._due_s:
+            self._due_s = time.monotonic() + PROGRESS_PERIOD_S
+            self._shown = True
+            print(f"\r\x1b[K{self._path}: {text}", end="", file=sys.stderr, flush=True)
+
+    def end(self) -> None:
+        """End the line."""
+        if self._shown:
+            print(file=sys.stderr)

@@ -1,0 +1,198 @@
+"""Numbers of robots and objects, read from the world of a replayed step.
+
+Everything but contact forces is read as MuJoCo has it after the step. Contact forces exist only while a step is solved,
+so they are solved once more, in data of their own: those of the state that the other numbers are of, with the `ctrl` of
+the last tick. They differ by one tick from `Feedback.contact_n`, which has those that the last tick was solved with.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Final, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.physics.contacts import ContactTables
+from iris_session.physics.names import find_element_id
+from iris_session.physics.tree import KinematicTree
+from iris_session.physics.world import STATE
+from iris_session.protocol.common import Pose
+from iris_session.protocol.server_messages import BodyInfo
+from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.replay.simulation import Replay, ReplayedStep, StepSelector
+from iris_session.session.core import SessionCore
+
+#: Names of the numbers of a pose: position [m], unit quaternion from the frame to the world.
+POSE: Final = ("x", "y", "z", "qw", "qx", "qy", "qz")
+FORCE: Final = ("normal_n",)
+SPEED: Final = ("linear_m_s", "angular_rad_s")
+
+JOINTS: Final = "joints"
+VELOCITIES: Final = "velocities"
+END_EFFECTOR: Final = "end_effector"
+TIP_SPEED: Final = "tip_speed"
+GRIPPER: Final = "gripper"
+CONTACT_FORCE: Final = "contact_force"
+POSES: Final = "pose"
+CTRL: Final = "ctrl"
+
+_FIXED: Final = int(mujoco.mjtGain.mjGAIN_FIXED)
+_AFFINE: Final = int(mujoco.mjtBias.mjBIAS_AFFINE)
+#: Dynamics with which `ctrl` is a position: none, and filters of it.
+_FOLLOWS: Final = (
+    int(mujoco.mjtDyn.mjDYN_NONE),
+    int(mujoco.mjtDyn.mjDYN_FILTER),
+    int(mujoco.mjtDyn.mjDYN_FILTEREXACT),
+)
+
+
+class Quantity(NamedTuple):
+    """Numbers that belong together. `read` returns them as they are now, one per name."""
+
+    names: tuple[str, ...]
+    read: Callable[[], Sequence[float]]
+
+
+class PlantReader:
+    """Reads the world of a core as it is now. Make another one when the core has another world (a scene was loaded).
+
+    Attributes:
+        world: The world that is read.
+        robots: Quantities by robot and kind: those that it has.
+        objects: Quantities by object and kind. In a world without robots and objects, as most published ones are: of
+            the bodies that move.
+        ctrl: `ctrl` of the actuators of each robot, its gripper last.
+    """
+
+    def __init__(self, core: SessionCore) -> None:
+        self.world = core.world
+        self._model, self._data = self.world.model, self.world.data
+        self._specs = core.scene.robots
+        self._tree = KinematicTree(self._model)
+        self._tables = ContactTables(self._model, self._specs, core.scene.objects, self._tree)
+        self._scratch: Any = None
+        self._solved = b""
+        self._gripper_forces: tuple[float, ...] = ()
+        self._object_forces: tuple[float, ...] = ()
+        self.robots = {spec.name: self._list_robot(i, spec) for i, spec in enumerate(self._specs)}
+        self.objects = {spec.name: self._list_object(i, spec) for i, spec in enumerate(core.scene.objects)}
+        if not (self.robots or self.objects):
+            self.objects = {name: self._list_body(name) for name in list_moving(self.world.bodies)}
+        self.ctrl = {spec.name: self._make_ctrl(spec) for spec in self._specs}
+
+    def _list_robot(self, index: int, spec: RobotSpec) -> dict[str, Quantity]:
+        joints = [find_element_id(self._model, "joint", joint) for joint in spec.joints]
+        qpos = np.asarray(self._model.jnt_qposadr, np.intp)[joints]
+        dof = np.asarray(self._model.jnt_dofadr, np.intp)[joints]
+        view, name = self.world.view(), spec.name
+        found = {
+            JOINTS: Quantity(spec.joints, _make_reader(self._data.qpos, qpos)),
+            VELOCITIES: Quantity(spec.joints, _make_reader(self._data.qvel, dof)),
+            END_EFFECTOR: Quantity(POSE, lambda: _to_numbers(view.tip_pose(name))),
+            TIP_SPEED: Quantity(SPEED, self._make_speed(spec)),
+        }
+        if spec.gripper_actuator:
+            found[GRIPPER] = Quantity(("opening",), self._make_opening(spec))
+        if spec.finger_bodies:
+            found[CONTACT_FORCE] = Quantity(FORCE, lambda: (self._solve_forces()[0][index],))
+        return found
+
+    def _list_object(self, index: int, spec: ObjectSpec) -> dict[str, Quantity]:
+        view, name = self.world.view(), spec.name
+        found = {POSES: Quantity(POSE, lambda: _to_numbers(view.object_pose(name)))}
+        bodies = self._tree.list_subtree(find_element_id(self._model, "body", spec.body))
+        if any(int(self._model.body_geomnum[body]) for body in bodies):  # without geoms nothing touches it
+            found[CONTACT_FORCE] = Quantity(FORCE, lambda: (self._solve_forces()[1][index],))
+        return found
+
+    def _list_body(self, name: str) -> dict[str, Quantity]:
+        body, data = find_element_id(self._model, "body", name), self._data
+        return {POSES: Quantity(POSE, lambda: (*data.xpos[body].tolist(), *data.xquat[body].tolist()))}
+
+    def _make_ctrl(self, spec: RobotSpec) -> Quantity:
+        names = (*spec.actuators, spec.gripper_actuator) if spec.gripper_actuator else spec.actuators
+        rows = np.array([find_element_id(self._model, "actuator", name) for name in names], np.intp)
+        return Quantity(names, _make_reader(self._data.ctrl, rows))
+
+    def _make_speed(self, spec: RobotSpec) -> Callable[[], Sequence[float]]:
+        """Return a function that returns linear [m/s] and angular [rad/s] speed of the end-effector site."""
+        site = find_element_id(self._model, "site", spec.site)
+        velocity: NDArray[np.float64] = np.empty(6)
+
+        def read() -> Sequence[float]:
+            mujoco.mj_objectVelocity(self._model, self._data, int(mujoco.mjtObj.mjOBJ_SITE), site, velocity, 0)
+            wx, wy, wz, vx, vy, vz = velocity.tolist()
+            return math.hypot(vx, vy, vz), math.hypot(wx, wy, wz)
+
+        return read
+
+    def _make_opening(self, spec: RobotSpec) -> Callable[[], Sequence[float]]:
+        """Return a function that returns the measured opening of a gripper: 0 closed, 1 open.
+
+        It is where a position actuator is now, in units of its `ctrl`, between the values that close and open it. Other
+        actuators do not say where they are, and give NaN.
+        """
+        model, actuator = self._model, find_element_id(self._model, "actuator", spec.gripper_actuator)
+        gain = float(model.actuator_gainprm[actuator, 0])
+        offset, slope = (float(b) for b in model.actuator_biasprm[actuator, :2])
+        span = spec.gripper_open - spec.gripper_closed
+        is_position = (
+            int(model.actuator_gaintype[actuator]) == _FIXED
+            and int(model.actuator_biastype[actuator]) == _AFFINE
+            and int(model.actuator_dyntype[actuator]) in _FOLLOWS
+            and 0.0 not in (gain, slope, span)
+        )
+        if not is_position:
+            return lambda: (math.nan,)
+
+        def read() -> Sequence[float]:
+            # force = gain * ctrl + offset + slope * length + damping; it is zero at rest at this ctrl.
+            ctrl = -(offset + slope * float(self._data.actuator_length[actuator])) / gain
+            return ((ctrl - spec.gripper_closed) / span,)
+
+        return read
+
+    def _solve_forces(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return the forces on grippers and objects [N], solved once per state."""
+        state = self.world.save_state()
+        if state != self._solved:
+            if self._scratch is None:
+                self._scratch = mujoco.MjData(self._model)
+            mujoco.mj_setState(self._model, self._scratch, np.frombuffer(state).copy(), STATE)
+            mujoco.mj_forward(self._model, self._scratch)
+            self._gripper_forces = self._tables.gripper_forces(self._model, self._scratch)
+            self._object_forces = self._tables.object_forces(self._model, self._scratch)
+            self._solved = state
+        return self._gripper_forces, self._object_forces
+
+
+def list_moving(bodies: Sequence[BodyInfo]) -> list[str]:
+    """Return the names of the bodies that move."""
+    return [body.name for body in bodies if body.moving]
+
+
+def read_steps(replay: Replay, selector: StepSelector) -> Iterator[tuple[ReplayedStep, PlantReader]]:
+    """Take the steps of a replay again, and yield the selected ones with a reader of the world after each."""
+    reader: PlantReader | None = None
+    for step in replay.steps():
+        if selector.selects(step.session_time):
+            if reader is None or reader.world is not replay.core.world:
+                reader = PlantReader(replay.core)
+            yield step, reader
+
+
+def _make_reader(numbers: NDArray[np.float64], rows: NDArray[np.intp]) -> Callable[[], Sequence[float]]:
+    """Return a function that returns some of the numbers as they are then."""
+
+    def read() -> Sequence[float]:
+        picked: list[float] = numbers[rows].tolist()
+        return picked
+
+    return read
+
+
+def _to_numbers(pose: Pose) -> tuple[float, ...]:
+    return *pose.p, *pose.q

@@ -1,0 +1,193 @@
+"""Replay: every step as the session had it, gaps left out to the next keyframe, other results refused."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from iris_session.recording import OPEN, Continues, Recording, make_row
+from iris_session.recording.journal import CRASHED
+from iris_session.replay.simulation import Replay, ReplayError, StepSelector
+from iris_session.session.core import CoreState, SessionCore
+from tests.replay.support import KEYFRAME_STEPS, Played, damaged, play
+from tests.session.play import TICK_NS
+
+
+def replay(path: Path, *, with_control: bool = True) -> tuple[list[int], list[bytes], Replay]:
+    """Return steps and positions after each."""
+    with Recording.open(path, warn=False) as recording:
+        taken = Replay(recording, with_control=with_control)
+        rows = [(step.step, taken.core.world.data.qpos.tobytes()) for step in taken.steps()]
+    return [step for step, _ in rows], [qpos for _, qpos in rows], taken
+
+
+def assert_equals(played: Played, steps: list[int], positions: list[bytes]) -> None:
+    assert positions == [played.qpos[step].tobytes() for step in steps]
+
+
+def test_steps_are_taken_again_bit_for_bit(tmp_path: Path) -> None:
+    played = play(tmp_path / "session.rrd", 100)
+    steps, positions, taken = replay(played.write())
+    assert steps == list(range(100))
+    assert_equals(played, steps, positions)
+    assert len(set(positions)) == 100, "something moves"
+    assert not taken.left_out
+
+
+def test_open_sessions_have_the_plants_of_their_rows(tmp_path: Path) -> None:
+    played = play(tmp_path / "session.rrd", 80, recording_class=OPEN)
+    path = played.write()
+    for with_control in (False, True):
+        steps, positions, _ = replay(path, with_control=with_control)
+        assert steps == list(range(80))
+        assert_equals(played, steps, positions)
+
+
+def test_open_sessions_need_no_control(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = play(tmp_path / "session.rrd", 5, recording_class=OPEN).write()
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("a step was taken")
+
+    monkeypatch.setattr(SessionCore, "step", refuse)
+    assert len(replay(path, with_control=False)[0]) == 5
+    with pytest.raises(ReplayError, match="step 0 cannot be taken again: AssertionError: a step was taken"):
+        replay(path)
+
+
+def test_after_a_gap_it_goes_on_at_the_next_keyframe(tmp_path: Path) -> None:
+    played = play(tmp_path / "session.rrd", 70)
+    del played.batch.rows[25:27]
+    steps, positions, taken = replay(played.write())
+    assert steps == [*range(25), *range(2 * KEYFRAME_STEPS, 70)]
+    assert_equals(played, steps, positions)
+    assert taken.left_out == [(25, 39)]
+    assert "15 steps are missing" in taken.describe_left_out()
+
+
+@pytest.mark.parametrize("field", ["digest", "step"])
+def test_a_damaged_row_is_a_gap(tmp_path: Path, field: str) -> None:
+    played = play(tmp_path / "session.rrd", 70)
+    row = played.batch.rows[25]
+    played.batch.rows[25] = damaged(row) if field == "digest" else msgspec.structs.replace(row, step=9025)
+    steps, positions, taken = replay(played.write())
+    assert steps == [*range(25), *range(40, 70)]
+    assert_equals(played, steps, positions)
+    assert taken.left_out == [(25, 39)]
+
+
+def test_a_damaged_keyframe_is_not_used(tmp_path: Path) -> None:
+    played = play(tmp_path / "session.rrd", 70)
+    del played.batch.rows[25]
+    at = next(i for i, one in enumerate(played.batch.keyframes) if one.step == 39)
+    played.batch.keyframes[at] = msgspec.structs.replace(played.batch.keyframes[at], plant=b"other")
+    steps, positions, taken = replay(played.write())
+    assert steps == [*range(25), *range(60, 70)]
+    assert_equals(played, steps, positions)
+    assert taken.left_out == [(25, 59)]
+
+
+def test_another_result_is_an_error_with_its_step(tmp_path: Path) -> None:
+    played = play(tmp_path / "session.rrd", 10)
+    rows = played.batch.rows
+    rows[5] = make_row(rows[4].chain, 5, rows[5].now_ns, 1, [], b"another result..")  # intact, but not so
+    played.header = msgspec.structs.replace(played.header, versions={"mujoco": "1.2.3"})
+    with pytest.raises(ReplayError, match=r"step 5 gives another result .* \(mujoco: recorded 1\.2\.3, here ") as found:
+        replay(played.write())
+    assert "\n" not in str(found.value)
+
+
+def test_a_step_that_ended_the_session_has_no_result(tmp_path: Path) -> None:
+    played = play(tmp_path / "session.rrd", 5)
+    last = played.batch.rows[-1]
+    played.batch.rows.append(make_row(last.chain, 5, last.now_ns + TICK_NS, 1, [], CRASHED))
+    assert replay(played.write())[0] == list(range(5))
+
+
+def test_a_resumed_session_begins_at_its_keyframe(tmp_path: Path) -> None:
+    played = play(tmp_path / "session.resume2.rrd", 70)
+    rows, keyframes = played.batch.rows, played.batch.keyframes
+    continues = Continues("session.rrd", 39, rows[39].chain)
+    played.header = msgspec.structs.replace(played.header, continues=continues)
+    played.batch.rows, played.batch.keyframes = rows[40:], [one for one in keyframes if one.step == 39]
+    steps, positions, taken = replay(played.write())
+    assert steps == list(range(40, 70))
+    assert_equals(played, steps, positions)
+    assert not taken.left_out
+
+
+def test_a_header_that_is_none_is_one_line(tmp_path: Path) -> None:
+    played = play(tmp_path / "session.rrd", 5)
+    played.header = msgspec.structs.replace(played.header, config=b"config")
+    with pytest.raises(ReplayError, match="the session cannot be built from the header: ") as found:
+        replay(played.write())
+    assert "\n" not in str(found.value)
+
+
+def test_a_keyframe_of_something_else_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    played = play(tmp_path / "session.rrd", 45)
+    del played.batch.rows[25]
+
+    def refuse(self: SessionCore, state: CoreState) -> None:
+        raise KeyError("foreign\nbytes")
+
+    path = played.write()
+    monkeypatch.setattr(SessionCore, "restore", refuse)
+    with pytest.raises(ReplayError, match="the keyframe after step 39 cannot be restored: KeyError"):
+        replay(path)
+
+
+def test_progress_reaches_the_end(tmp_path: Path) -> None:
+    path = play(tmp_path / "session.rrd", 5).write()
+    seen: list[tuple[int, int]] = []
+    with Recording.open(path) as recording:
+        for _ in Replay(recording, progress=lambda done, total: seen.append((done, total))).steps():
+            pass
+    assert seen == [(0, 5), (5, 5)]
+
+
+# --- selection --------------------------------------------------------------------------------------------------------
+
+
+def jittered(steps: int, seed: int = 3) -> Iterator[int]:
+    """Yield times of steps of 2 ms, each up to 0.9 ms late."""
+    rng = np.random.default_rng(seed)
+    return (step * TICK_NS + int(late) for step, late in enumerate(rng.integers(0, 900_000, steps)))
+
+
+def select(hz: float | None, times: Iterator[int]) -> list[int]:
+    selector = StepSelector(hz, TICK_NS)
+    return [i for i, now_ns in enumerate(times) if selector.selects(now_ns)]
+
+
+@pytest.mark.parametrize("hz", [None, 500, 499.9, 501.0, 1e6])
+def test_the_rate_of_the_session_is_every_step(hz: float | None) -> None:
+    assert select(hz, jittered(1000)) == list(range(1000))
+
+
+@pytest.mark.parametrize(("hz", "every"), [(250.0, 2), (100.0, 5), (50, 10), (1.0, 500)])
+def test_a_fraction_of_the_rate_is_every_nth_step(hz: float, every: int) -> None:
+    assert select(hz, iter(range(0, 4000 * TICK_NS, TICK_NS))) == list(range(0, 4000, every))
+    assert select(hz, jittered(4000)) == list(range(0, 4000, every)), "within half a tick"
+
+
+def test_any_rate_is_kept_over_a_long_time() -> None:
+    taken = select(60.0, jittered(5000))
+    assert len(taken) == 600, "10 s"
+    assert np.diff(taken).min() >= 7
+
+
+def test_a_stall_does_not_give_a_burst() -> None:
+    times = [*range(0, 100 * TICK_NS, TICK_NS), *range(10**9, 10**9 + 50 * TICK_NS, TICK_NS)]
+    taken = select(50.0, iter(times))
+    assert taken == [*range(0, 100, 10), *range(100, 150, 10)]
+
+
+@pytest.mark.parametrize("hz", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_rate_that_is_none_is_refused(hz: float) -> None:
+    with pytest.raises(ValueError, match="give a rate above 0"):
+        StepSelector(hz, TICK_NS)
