@@ -230,6 +230,7 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
     )
     add_page_options(group)
     group.add_argument("--no-record", action="store_true", help="record nothing")
+    group.add_argument("--view", action="store_true", help="show the recording in Rerun's viewer while it is written")
     group.add_argument("--no-web", action="store_true", help="serve no page for browsers")
     group.add_argument("--sites", action="store_true", help="send the model's sites to clients")
     group.add_argument("--tendons", action="store_true", help="send the model's spatial tendons to clients")

@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING
 
 from iris_session.cli.common import add_json_option, add_session_options, parse_seconds, print_json
+from iris_session.cli.view import live_viewer
 
 if TYPE_CHECKING:
     from iris_session.client.stream_meter import StreamMeasurement
@@ -92,10 +93,13 @@ def run(arguments: argparse.Namespace) -> int:
     config = make_session_config(arguments, arguments.demo)
     out = sys.stderr if arguments.json else sys.stdout
 
-    def show(session: Session) -> AbstractContextManager[Callable[[], None]]:
+    @contextmanager
+    def show(session: Session) -> Iterator[Callable[[], None]]:
         for note in session.notes:  # the address of the page among them
             print(note, file=out, flush=True)
-        return TerminalView(session, out, f"demo {arguments.demo} on {session.address}").open()
+        view = TerminalView(session, out, f"demo {arguments.demo} on {session.address}")
+        with live_viewer(session.recording, out) if arguments.view else nullcontext(), view.open() as update:
+            yield update
 
     result = run_demo(play, config, arguments.timeout, show, profile, arguments.seed)
     if arguments.json:
@@ -125,6 +129,8 @@ def format_summary(result: DemoResult) -> str:
     lines.append(f"  recording {result.recording}: {result.verification}" if result.recording else "  not recorded")
     lines += [f"  note: {note}" for note in result.notes]
     lines += [f"  problem: {problem}" for problem in result.problems]
+    if result.recording:
+        lines.append(f"look at it: iris-session view {result.recording}")
     return "\n".join(lines)
 
 

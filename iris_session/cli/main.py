@@ -27,6 +27,7 @@ from iris_session.cli import (
     sessions,
     status,
     verify,
+    view,
     web,
 )
 from iris_session.cli.common import CommandError, join_negative_poses, list_expected_errors
@@ -49,6 +50,7 @@ _EPILOG = """examples:
   iris-session status --watch                participants, robots, ages, late ticks, recorder of a session
   iris-session estop                         stop every robot of the session; clear-estop, pause, assign, ... as well
   iris-session doctor 192.168.1.20           what is wrong, why, and what to do
+  iris-session view                          the newest recording in Rerun's viewer
   iris-session verify sessions/*/session.rrd re-simulate a recording and compare it bit for bit
   iris-session recording inspect sessions    what recordings hold: who, what, how long, damage
   iris-session recording export session.rrd --to csv -o tables
@@ -58,8 +60,8 @@ _EPILOG = """examples:
 
 #: In the order of `--help`.
 _MODULES = (
-    demo, serve, pair, web, keys, sessions, status, control, doctor, verify, recording, emulate, robots, scene, anchors,
-    cloud, bench,
+    demo, serve, pair, web, keys, sessions, status, control, doctor, view, verify, recording, emulate, robots, scene,
+    anchors, cloud, bench,
 )  # fmt: skip
 
 

@@ -5,21 +5,17 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from threading import Timer
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final
 
-from iris_session.cli import recording_export
+from iris_session.cli import recording_export, recording_repair
 from iris_session.cli.common import CommandError, add_json_option, print_json, to_printable
+from iris_session.cli.progress import ReadingProgress
 
 if TYPE_CHECKING:
     from iris_session.recording.summary import PersonSummary, RecordingSummary, StopSummary, StreamSummary
 
-#: A file that takes longer shows how far it was read [s].
-PROGRESS_AFTER_S: Final = 1.0
-PROGRESS_PERIOD_S: Final = 0.2
 #: Lines of one kind that are printed; `--json` has all.
 MOST_LINES: Final = 20
 SUFFIX: Final = ".rrd"
@@ -33,12 +29,13 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     """Add the command `recording`."""
     parser = commands.add_parser(
         "recording",
-        help="show what a recording holds, export it as tables",
-        description="Show what a recording holds, or export it as tables.",
+        help="show what a recording holds, export it as tables, repair it",
+        description="Show what a recording holds, export it as tables, or repair it.",
         epilog="examples:\n"
         "  iris-session recording inspect sessions/20261121T093000.000000Z-handover/session.rrd\n"
         "  iris-session recording inspect sessions\n"
-        "  iris-session recording export session.rrd --to csv -o tables",
+        "  iris-session recording export session.rrd --to csv -o tables\n"
+        "  iris-session recording repair session.rrd -o repaired.rrd",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
@@ -58,6 +55,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     add_json_option(inspect)
     inspect.set_defaults(run=run_inspect)
     recording_export.register(actions)
+    recording_repair.register(actions)
 
 
 def run_inspect(arguments: argparse.Namespace) -> int:
@@ -118,13 +116,14 @@ def find_recordings(folder: Path, on_error: Callable[[OSError], None]) -> list[P
 
     `on_error`: called for every folder that cannot be read.
     """
-    from iris_session.recording.paths import split_part
+    from iris_session.recording.paths import is_view_copy, split_part
 
     first: dict[str, tuple[int, Path]] = {}
     for where, _, names in os.walk(folder, onerror=on_error):
         for name in names:
             base, part = split_part(os.path.join(where, name))
-            if name.endswith(SUFFIX) and (base not in first or part < first[base][0]):
+            is_recording = name.endswith(SUFFIX) and not is_view_copy(name)
+            if is_recording and (base not in first or part < first[base][0]):
                 first[base] = part, Path(where, name)
     return [first[base][1] for base in sorted(first)]
 
@@ -133,41 +132,8 @@ def _summarise_file(path: Path) -> RecordingSummary:
     from iris_session.recording import Recording
     from iris_session.recording.summary import summarise
 
-    with _Progress(path) as progress, Recording.open(path, warn=False) as recording:
+    with ReadingProgress(path) as progress, Recording.open(path, warn=False) as recording:
         return summarise(recording, progress.show)
-
-
-class _Progress:
-    """A line on standard error, where that is a terminal, while a file takes more than `PROGRESS_AFTER_S`."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = to_printable(str(path))
-        self._due_s = time.monotonic() + PROGRESS_AFTER_S
-        self._shows = sys.stderr.isatty()
-        self._shown = False
-        self._opening = Timer(PROGRESS_AFTER_S, self._print, ["opening"])  # takes about as long as reading
-        self._opening.daemon = True
-
-    def show(self, done: int, total: int) -> None:
-        """Show how many steps were read; `total` 0 if unknown."""
-        self._opening.cancel()
-        if self._shows and time.monotonic() >= self._due_s:
-            self._due_s = time.monotonic() + PROGRESS_PERIOD_S
-            self._print(f"step {done} of {total}" if total else f"step {done}")
-
-    def _print(self, text: str) -> None:
-        self._shown = True
-        print(f"\r{self._path}: {text}", end="", file=sys.stderr, flush=True)
-
-    def __enter__(self) -> Self:
-        if self._shows:
-            self._opening.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._opening.cancel()
-        if self._shown:
-            print(file=sys.stderr)
 
 
 def format_line(summary: RecordingSummary) -> str:

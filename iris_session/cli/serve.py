@@ -22,6 +22,7 @@ from iris_session.cli.common import (
     print_json,
 )
 from iris_session.cli.scene import add_file_options, check_file_options, find_scene_file, make_builder
+from iris_session.cli.view import live_viewer
 from iris_session.protocol.names import AssignmentPolicy
 
 if TYPE_CHECKING:
@@ -102,6 +103,8 @@ def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConf
     from iris_session.authority import AuthorityConfig
     from iris_session.session.config import SessionConfig
 
+    if arguments.view and arguments.no_record:
+        raise CommandError("--view shows the recording: leave --no-record out")
     defaults = SessionConfig()
     assigned = parse_assignments(getattr(arguments, "assign", []))
     policy = arguments.assignment or (AssignmentPolicy.CONFIG if assigned else None)
@@ -280,14 +283,16 @@ def _serve(
             print(note, file=out, flush=True)
         if session.recording is not None:
             print(f"recording to {session.recording}", file=out, flush=True)
-        _run_with_live_view(arguments, session, out)
+        with live_viewer(session.recording, out) if arguments.view else nullcontext():
+            _run_with_live_view(arguments, session, out)
         status = session.status()
         recording = None if session.recording is None else str(session.recording)
     fault = session.recording_fault
     if arguments.json:
         print_json({"ok": not fault, "recording": recording, "recording_fault": fault, **status.as_dict()})
     elif recording:
-        print(f"recording: {recording}    check it: iris-session verify {recording}")
+        print(f"recording: {recording}")
+        print(f"  look at it: iris-session view {recording}    check it: iris-session verify {recording}")
     if fault:
         print(f"iris-session: {fault}", file=sys.stderr)
     return 1 if fault else 0

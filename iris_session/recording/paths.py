@@ -8,6 +8,9 @@ from typing import Final
 APPLICATION: Final = "iris-session"
 #: Name of the first file of a session in its folder.
 FIRST_FILE: Final = "session.rrd"
+SUFFIX: Final = ".rrd"
+#: Ending of copies for the viewer, see `view_copy.py`. They lie beside recordings and are none.
+VIEW_SUFFIX: Final = ".view.rrd"
 
 HEADER: Final = "/session/header"
 INFO: Final = "/session"
@@ -69,3 +72,13 @@ def resume_path(path: str, number: int) -> str:
         return path
     stem, dot, suffix = path.rpartition(".")
     return f"{stem}.resume{number}.{suffix}" if dot else f"{path}.resume{number}"
+
+
+def view_path(path: str) -> str:
+    """Return the copy for the viewer of the session whose first file is `path`: `session.view.rrd`."""
+    return path.removesuffix(SUFFIX) + VIEW_SUFFIX
+
+
+def is_view_copy(path: str) -> bool:
+    """Return whether a file is a copy for the viewer, by its name."""
+    return path.endswith(VIEW_SUFFIX)

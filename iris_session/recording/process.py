@@ -23,6 +23,7 @@ import msgspec
 import zmq
 
 from iris_session.recording.errors import RecorderError, WriteError
+from iris_session.recording.footer import start_indexing
 from iris_session.recording.journal import SessionHeader
 from iris_session.recording.lock import RecordingLock
 from iris_session.recording.messages import (
@@ -116,6 +117,9 @@ class RecorderLoop:
             self._send_status(self._received)
             if self._header is None:
                 self._remove()
+            else:
+                with suppress(OSError):  # without an index the file opens more slowly
+                    self._indexing = start_indexing(self._writer.path)
         except WriteError as error:
             self._fault = str(error)
             self._send_status(-1)

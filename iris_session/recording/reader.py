@@ -65,6 +65,8 @@ _OUTLINE: Final = (
     *(paths.EVENTS, paths.DENIALS, paths.ROWS, *_DRAWN),
     *(f"{folder}/**" for folder in (paths.CLOUDS, paths.PICTURES, paths.STREAMS)),
 )
+#: Messages at the end of a file among which a recorder's last mark is: it, the end of the journal, and the end message.
+LAST_MESSAGES: Final = 8
 #: Upper bound of the items that a new part repeats: the content of the feed's window, minutes of rows.
 REPEATED_ITEMS: Final = 200_000
 
@@ -78,6 +80,7 @@ class Recording:
     Attributes:
         header: What is needed to understand and re-simulate the session: configuration, model, bodies, versions.
         files: Paths of the parts, in order; parts that cannot be read are left out.
+        unreadable_files: Those of which nothing can be read.
         root: Chain value (16 bytes) before the first row.
         end: Step and chain of the newest row as noted when the last part was closed; None if its recorder was killed
             or a part is missing at the end.
@@ -92,6 +95,7 @@ class Recording:
     def __init__(self, files: list[str]) -> None:
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self.files: list[str] = []
+        self.unreadable_files: list[str] = []
         self._readable: list[str] = []
         self.damage: list[str] = []
         self.missing: list[str] = []
@@ -119,6 +123,11 @@ class Recording:
     def finished(self) -> bool:
         """True if the recorder closed the last part; otherwise the last 0.25 s of the session may be missing."""
         return self.end is not None
+
+    @property
+    def readable_files(self) -> tuple[str, ...]:
+        """Files that the parts are read from, in order, until `close`: a temporary copy of a damaged part."""
+        return tuple(self._readable)
 
     @classmethod
     def open(cls, path: str | Path, *, warn: bool = True) -> Self:
@@ -148,6 +157,9 @@ class Recording:
                 )
         if not os.path.isfile(first):
             raise NotARecordingError(f"there is no recording {first}")
+        if paths.is_view_copy(first):
+            right = first.removesuffix(paths.VIEW_SUFFIX) + paths.SUFFIX
+            raise NotARecordingError(f"{first} is a copy for the viewer, not the recording: give {right}")
         require_package("rerun", "reading recordings")
         base, number = paths.split_part(first)
         folder = os.path.dirname(first)
@@ -416,16 +428,29 @@ class Recording:
             readable = path if whole else self._salvaged(path, prober)
         except NotARecordingError as error:
             self._harmed(str(error))
+            self.unreadable_files.append(path)
             return
         except OSError as error:
             self._harmed(f"{path} cannot be read: {error.strerror or error}")
             return
-        if found.indexed:
+        if found.indexed and not (whole and self._is_of_recorder(path, found)):
             self._rewritten.add(readable)
             if whole and (n := prober.count_recordings(path)) > 1:
                 self._several.append((os.path.basename(path), n))
         self._readable.append(readable)
         self.files.append(path)
+
+    def _is_of_recorder(self, path: str, found: rrd_file.Scan) -> bool:
+        """Return whether a readable file with an index is a recorder's: one of its last marks is where it says."""
+        last, copy = found.messages[-LAST_MESSAGES:], self._make_copy_path(path)
+        infos = [m for m in found.messages[:-LAST_MESSAGES] if m.kind == rrd_file.KIND_STORE_INFO]
+        rrd_file.copy_messages(path, [*infos, *(m for m in last if m.kind != rrd_file.KIND_END)], copy)
+        places = {m.offset for m in last}
+        with suppress(*UNREADABLE, NotARecordingError):
+            for chunk in rrd_file.read_chunks(copy, paths.MARKS):
+                if any(mark.end in places for mark in record_batches.decode_marks(chunk.to_record_batch())):
+                    return True
+        return False
 
     def _copied(self, path: str, n_bytes: int) -> str:
         """Copy the whole messages of a part that is being written: they stay the same while it is read."""

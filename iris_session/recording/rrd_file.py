@@ -27,9 +27,14 @@ KIND_END: Final = 0
 KIND_STORE_INFO: Final = 1
 KIND_ARROW: Final = 2
 KIND_LAST: Final = 3
-#: The last message of a closed file. In Rerun's own files its body is a footer, followed by a tail.
+#: The last message of a closed file. Its body may be an index, the footer, which is followed by a tail.
 END_MESSAGE: Final = _HEAD.pack(KIND_END, 0)
 _ARROW_HEAD: Final = struct.pack("<Q", KIND_ARROW)
+#: Kinds of stores.
+RECORDING: Final = 1
+BLUEPRINT: Final = 2
+#: Upper bound of the bytes at the beginning of a message in which the id of its store stands.
+ID_BYTES: Final = 160
 #: Number of messages tested together; a group that fails is halved until the bad messages are isolated.
 GROUP: Final = 256
 #: Bytes searched at a time for messages after a damaged one.
@@ -48,8 +53,8 @@ class Scan(NamedTuple):
     """Messages of a file. `holes`: unreadable spans between messages. `good_bytes`: end of the last readable message.
 
     `cut`: the file ends in the middle of a message, as after a kill or a full disk. Bytes after the end message do not
-    belong to the file, except the tail in Rerun's own files. `indexed`: the file ends with Rerun's index, which a
-    recorder does not write: it was made by one of Rerun's tools, from one file or several.
+    belong to the file, except the tail after an index. `indexed`: the file ends with Rerun's index: it was made by one
+    of Rerun's tools, from one file or several, or it is a recorder's, with the index of `footer.py`.
     """
 
     messages: list[RrdMessage]
@@ -79,6 +84,9 @@ def scan_file(path: str | Path) -> Scan:
         at = FILE_HEAD
         while at < size:
             message = _message_at(file, at, size)
+            if message is None and (grown := os.fstat(file.fileno()).st_size) > size:
+                size = grown  # the index was added meanwhile, or the recorder still writes
+                continue
             if message is None:
                 after = _next_message(file, at + 1, size)
                 if after is None:
@@ -136,13 +144,14 @@ def _next_message(file: BinaryIO, begin: int, size: int) -> int | None:
 def changed_spans(path: str | Path, marks: Sequence[Mark]) -> list[str]:
     """Return a line per span of the file whose bytes differ from the recorder's checksum.
 
-    Empty for a file that another tool has rewritten: in it the marks do not end between messages.
+    Empty for a file that another tool has rewritten: in it most marks do not end between messages.
     """
     found = scan_file(path)
-    if found.indexed:
-        return []
     ends = {m.offset for m in found.messages} | {found.size}
-    if not any(mark.end in ends for mark in marks):
+    placed = sum(mark.end in ends for mark in marks)
+    # Half is enough with an index: of the two marks of a short recording, one may be what was changed. Without one,
+    # no tool has written the file.
+    if not placed or (found.indexed and 2 * placed < len(marks)):
         return []
     out = []
     with open(path, "rb") as file:
@@ -227,10 +236,37 @@ class _Trial:
         return self.bad_ones(group[:half]) + self.bad_ones(group[half:])
 
 
+def read_message_head(data: bytes) -> tuple[int, int]:
+    """Return kind and length of the message that `data` begins with."""
+    kind, length = _HEAD.unpack_from(data)
+    return kind, length
+
+
+def find_store_id(message: bytes, store: int) -> bytes:
+    """Return the id of the `RECORDING` or `BLUEPRINT` that a message belongs to, empty if it belongs to none.
+
+    Messages begin with it: kind in field 1, id in field 2, behind at most a row id.
+    """
+    head = message[:ID_BYTES]
+    at = head.find(bytes((0x08, store, 0x12)))
+    return head[at + 4 : at + 4 + head[at + 3]] if 0 <= at < len(head) - 3 else b""
+
+
+def read_message(file: BinaryIO, message: RrdMessage) -> bytes:
+    """Return head and body of a message of an open file."""
+    file.seek(message.offset)
+    return file.read(_HEAD.size + message.length)
+
+
+def copy_messages(path: str | Path, messages: Sequence[RrdMessage], copy: str | Path) -> None:
+    """Write messages of a file to `copy`."""
+    with open(path, "rb") as file:
+        _write(file, messages, Path(copy))
+
+
 def _write(file: BinaryIO, messages: Sequence[RrdMessage], path: Path) -> None:
     file.seek(0)
     with open(path, "wb") as out:
         out.write(file.read(FILE_HEAD))
         for message in messages:
-            file.seek(message.offset)
-            out.write(file.read(_HEAD.size + message.length))
+            out.write(read_message(file, message))

@@ -334,6 +334,7 @@ class SummaryBuilder:
         self._last_step = begins_after
         self._step_ns: int | None = None  # session time of that step
         self._step_gaps: list[str] = []
+        self._lost_steps = self._lost_ns = 0
         self._event_gaps: list[str] = []
         self._event_seq: int | None = None if resumed else 0
         self._event_ns = 0
@@ -374,6 +375,8 @@ class SummaryBuilder:
             since = self._step_ns if i == 0 else int(times[i - 1])
             span = f"before {until}" if since is None else f"from {_to_s(since):g} s to {until}"
             self._add_gap(self._step_gaps, f"{_format_range('step', int(before[i]) + 1, int(steps[i]) - 1)}, {span}")
+            self._lost_steps += int(steps[i] - before[i]) - 1
+            self._lost_ns += 0 if since is None else int(times[i]) - since
         self.steps += len(steps)
         self._last_step, self._step_ns = int(steps.max()), int(times[-1])
         self.end_ns = max(self.end_ns, self._step_ns)
@@ -502,6 +505,11 @@ class SummaryBuilder:
         if end is not None and end.step > self._last_step:
             gaps.append(f"{_format_range('step', self._last_step + 1, end.step)}, after {_to_s(self.end_ns):g} s")
         return gaps + self._event_gaps
+
+    def count_lost_steps(self, end: EndMark | None = None) -> tuple[int, float]:
+        """Return how many steps are missing, and the time that they span, without those at the end [s]."""
+        at_end = 0 if end is None else max(0, end.step - self._last_step)
+        return self._lost_steps + at_end, _to_s(self._lost_ns)
 
     def list_people(self) -> tuple[PersonSummary, ...]:
         """Return the participants in the order of their first joins, those of one name and role together."""

@@ -17,6 +17,7 @@ EXTRAS: Final[Mapping[str, str]] = {
     "mink": "control",
     "daqp": "control",
     "rerun": "recording",
+    "rerun_cli": "recording",
     "pyarrow": "recording",
     "rich": "terminal",
     "trimesh": "files",

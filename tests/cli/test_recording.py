@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from iris_session.cli import recording
+from iris_session.cli import progress
 from iris_session.cli.main import main
 from iris_session.cli.recording import MOST_LINES, find_recordings, format_line, format_summary
 from iris_session.recording.summary import (
@@ -173,12 +173,14 @@ def test_a_folder_without_recordings_is_one_line(tmp_path: Path, capsys: pytest.
 def test_a_long_file_shows_how_far_it_was_read(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(recording, "PROGRESS_AFTER_S", 0.0)
-    monkeypatch.setattr(recording, "PROGRESS_PERIOD_S", 0.0)
+    monkeypatch.setattr(progress, "PROGRESS_AFTER_S", 0.0)
+    monkeypatch.setattr(progress, "PROGRESS_PERIOD_S", 0.0)
     for terminal in (True, False):
         monkeypatch.setattr("sys.stderr.isatty", lambda terminal=terminal: terminal)
-        with recording._Progress(Path("a.rrd")) as progress:
-            progress.show(3, 9)
-            progress.show(4, 0)
+        with progress.ReadingProgress(Path("a.rrd")) as shown_progress:
+            shown_progress.show(3, 9)
+            shown_progress.show(4, 0)
+            shown_progress.show_bytes(5_000_000, 9_000_000)
         shown = capsys.readouterr().err
-        assert shown.endswith("\ra.rrd: step 3 of 9\ra.rrd: step 4\n") if terminal else shown == ""
+        lines = "\ra.rrd: step 3 of 9\ra.rrd: step 4\ra.rrd: read 5 of 9 MB\n"
+        assert shown.endswith(lines) if terminal else shown == ""

@@ -1,0 +1,295 @@
+"""`iris-session view`: show a recording in Rerun's viewer, on this machine only."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, nullcontext, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, TextIO
+from urllib.parse import quote
+
+from iris_session.cli.common import CommandError, to_printable
+from iris_session.cli.progress import ReadingProgress
+from iris_session.cli.recording import find_recordings
+
+if TYPE_CHECKING:
+    from iris_session.recording.view_copy import ViewFile
+
+HOST: Final = "127.0.0.1"
+#: A viewer that has not begun to listen by then has failed [s]. It takes a second on an idle machine.
+START_S: Final = 60.0
+#: Seconds for the viewer to end by itself before it is killed.
+END_S: Final = 3.0
+POLL_S: Final = 0.05
+#: Memory that the server of a page may take at least, in bytes: Rerun's default.
+MIN_MEMORY: Final = 1 << 30
+#: Added to the nice value of a viewer beside a session that runs.
+LIVE_NICE: Final = 10
+#: Other sessions of a folder that are listed.
+MOST_LISTED: Final = 20
+
+
+def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command `view`."""
+    parser = commands.add_parser(
+        "view",
+        help="show a recording in Rerun's viewer",
+        description="Show a recording in Rerun's viewer: the whole session, with its parts and resumed recordings, "
+        "also if it was killed, cut or damaged. A copy that opens at once is kept beside it (session.view.rrd); the "
+        "recording is never changed. The viewer listens on this machine only. Ctrl-C ends it.",
+        epilog="examples:\n"
+        "  iris-session view                          the newest session below the folder sessions\n"
+        "  iris-session view sessions/20261121T093000.000000Z-handover\n"
+        "  iris-session view session.rrd --web        in a browser on this machine\n"
+        "  iris-session view session.rrd --no-open    only make the copy\n"
+        "  iris-session view --live                   follow the session that runs",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "path",
+        nargs="?",
+        type=Path,
+        default=Path("sessions"),
+        metavar="RECORDING",
+        help="a .rrd of a session, or a folder: the newest session in or below it (default: %(default)s)",
+    )
+    parser.add_argument("--web", action="store_true", help="in a browser; the default where there is no display")
+    parser.add_argument(
+        "--no-open", action="store_true", help="open no window: only make the copy, or with --web serve the page"
+    )
+    parser.add_argument("--live", action="store_true", help="follow a session that runs, as it is recorded")
+    parser.add_argument(
+        "--port",
+        type=int,
+        default=0,
+        metavar="N",
+        help="port of the viewer; with --web of the page, which gets its data from port N+1 (default: free ones)",
+    )
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Make the copy and show it until the viewer is closed, or Ctrl-C."""
+    from iris_session.recording.rerun_tool import find_rerun
+    from iris_session.recording.view_copy import open_view_file
+
+    if not 0 <= arguments.port < 65535:
+        raise CommandError(f"--port {arguments.port} is not a port: give 1 to 65534")
+    tool = find_rerun()
+    path = choose_recording(arguments.path)
+    if arguments.live:
+        return _show_live(tool, arguments, path)
+    with _ending_as_interrupts(), ReadingProgress(path) as progress, open_view_file(path, progress.show_bytes) as view:
+        progress.end()
+        _print_file(view)
+        if arguments.no_open and not arguments.web:
+            if not view.kept:
+                raise CommandError(f"{view.session.parent} cannot be written: there is nowhere to keep the copy", 1)
+            return 0
+        return _show(tool, arguments, view.path)
+
+
+def _show_live(tool: str, arguments: argparse.Namespace, path: Path) -> int:
+    from iris_session.recording.lock import find_writers
+    from iris_session.recording.paths import split_part
+
+    if not find_writers(split_part(str(path))[0]):
+        raise CommandError(f"no session is writing {path}: leave --live out")
+    os.nice(LIVE_NICE)  # the session comes first
+    print(f"follows {to_printable(str(path))} until the session ends", flush=True)
+    with _ending_as_interrupts():
+        return _show(tool, arguments, None, path)
+
+
+def choose_recording(path: Path) -> Path:
+    """Return the recording to show. The newest of a folder; the others are listed.
+
+    Raises:
+        CommandError: There is none.
+    """
+    if not path.is_dir():
+        if not path.exists():
+            raise CommandError(f"{path} does not exist: give a recording (session.rrd), or a folder with recordings")
+        return path
+    from iris_session.recording.paths import split_part, split_resume
+
+    sessions: dict[str, list[Path]] = {}
+    for file in find_recordings(path, lambda error: print(f"iris-session: {error}", file=sys.stderr)):
+        sessions.setdefault(split_resume(split_part(str(file))[0])[0], []).append(file)
+    if not sessions:
+        raise CommandError(f"there is no recording below the folder {path}: give a .rrd that `serve` or `demo` wrote")
+    newest = sorted(sessions.values(), key=_find_newest_s, reverse=True)
+    if len(newest) > 1:
+        print(f"{len(newest)} sessions below {to_printable(str(path))}, the newest is shown; the others:")
+        for files in newest[1 : MOST_LISTED + 1]:
+            print(f"  {_format_time(_find_newest_s(files))}  {to_printable(str(files[0]))}")
+        if len(newest) > MOST_LISTED + 1:
+            print(f"  and {len(newest) - MOST_LISTED - 1} more")
+    return newest[0][0]
+
+
+def _find_newest_s(files: Sequence[Path]) -> float:
+    return max(file.stat().st_mtime for file in files)
+
+
+def _format_time(seconds: float) -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(seconds))
+
+
+def _print_file(view: ViewFile) -> None:
+    """Print what is shown, and what is wrong with it."""
+    lines = [f"shows {', '.join(file.name for file in view.files)} of {view.session.parent}"]
+    if view.path not in view.files:
+        size = view.path.stat().st_size / 1e6
+        lines.append(f"{'made' if view.made else 'uses'} the copy {view.path} ({size:.1f} MB)")
+    lines += view.notes
+    if view.damage:
+        more = f" (and {len(view.damage) - 1} more)" if len(view.damage) > 1 else ""
+        lines.append(f"DAMAGED: {view.damage[0]}{more}; see `iris-session recording inspect`")
+    print("\n".join(map(to_printable, lines)), flush=True)
+
+
+def _show(tool: str, arguments: argparse.Namespace, file: Path | None, live: Path | None = None) -> int:
+    """Show a file, or a recording that is being written, until the viewer is closed or Ctrl-C."""
+    is_page = arguments.web or not _has_display()
+    port = arguments.port or _find_free_port()
+    data = port + 1 if is_page else port
+    command = [tool, "--bind", HOST, "--port", str(data)]
+    if is_page:
+        # The server keeps what it read for later browsers, and would drop the oldest.
+        memory = MIN_MEMORY if file is None else max(MIN_MEMORY, 4 * file.stat().st_size)
+        mode = "--web-viewer" if _has_display() and not arguments.no_open else "--serve-web"
+        command += [mode, "--web-viewer-port", str(port), "--server-memory-limit", f"{memory}B"]
+    command += ["--hide-welcome-screen"] if file is None else [str(file.absolute())]
+    with _started(command) as process:
+        _wait_until_open(port, process)
+        end = "Ctrl-C ends it" if is_page else "it ends with its window, or with Ctrl-C"
+        where = f"in a browser on this machine: {format_page_address(port)}" if is_page else "the viewer is open"
+        print(f"{where}    {end}", flush=True)
+        with nullcontext() if live is None else _fed(live, data):
+            return _wait(process)
+
+
+def _has_display() -> bool:
+    return sys.platform == "darwin" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def format_page_address(port: int) -> str:
+    """Return the address of the page at a port: it gets its data from the next one."""
+    source = quote(f"rerun+http://{HOST}:{port + 1}/proxy", safe="")
+    return f"http://{HOST}:{port}/?url={source}"
+
+
+def _wait_until_open(port: int, process: subprocess.Popen[bytes]) -> None:
+    deadline = time.monotonic() + START_S
+    while not _is_open(port):
+        if process.poll() is not None:
+            _wait(process)
+            raise CommandError("Rerun's viewer ended at once: its messages are above", 1)
+        if time.monotonic() > deadline:
+            raise CommandError(f"Rerun's viewer did not listen on port {port} within {START_S:g} s", 1)
+        time.sleep(POLL_S)
+
+
+@contextmanager
+def _fed(recording: Path, port: int) -> Iterator[None]:
+    """Send what is written into a recording to the viewer at a port while the block runs."""
+    from iris_session.system.process import ChildProcess
+
+    url = f"rerun+http://{HOST}:{port}/proxy"
+    # Rerun's client reports that a viewer was closed.
+    feed = ChildProcess(
+        "iris_session.recording.live_feed",
+        [str(recording.absolute()), url],
+        environment={"RUST_LOG": "off"},
+        own_group=True,
+    )
+    with feed:
+        yield
+
+
+@contextmanager
+def live_viewer(recording: Path | None, out: TextIO) -> Iterator[None]:
+    """Show a recording in a viewer while the block runs, by `iris-session view --live` in a process of its own."""
+    from iris_session.system.process import DEVNULL, PIPE, ChildProcess
+
+    port = _find_free_port()
+    if not _has_display():
+        print(f"the recording, in a browser on this machine: {format_page_address(port)}", file=out, flush=True)
+    command = ["view", str(recording), "--live", "--port", str(port)]
+    # In a group of its own, so that Ctrl-C ends the session first.
+    viewer = ChildProcess("iris_session.cli.main", command, stdout=DEVNULL, stderr=PIPE, own_group=True)
+    try:
+        yield
+        if viewer.exit_status:
+            print(viewer.read_stderr().strip(), file=sys.stderr)
+    finally:
+        viewer.close(terminate_s=END_S + 1.0)
+
+
+def _wait(process: subprocess.Popen[bytes]) -> int:
+    """Wait until the viewer ends; Ctrl-C is a way to end it. Return the exit status of the command."""
+    try:
+        status = process.wait()
+    except KeyboardInterrupt:
+        return 0
+    if status:
+        raise CommandError(f"Rerun's viewer ended with exit status {status}: its messages are above", 1)
+    return 0
+
+
+@contextmanager
+def _ending_as_interrupts() -> Iterator[None]:
+    """Take SIGTERM and a closed terminal as Ctrl-C, so that nothing is left behind."""
+    before = {number: signal.signal(number, signal.default_int_handler) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _started(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
+    """Start the viewer, which ends with this block."""
+    from iris_session.recording.rerun_tool import make_environment
+
+    # In a group of its own, so that Ctrl-C reaches this process alone, which then ends it in order.
+    process = subprocess.Popen(
+        command,
+        env=make_environment(),
+        process_group=0,
+        stdin=subprocess.DEVNULL,
+    )
+    try:
+        yield process
+    finally:
+        process.terminate()
+        try:
+            process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _find_free_port() -> int:
+    """Return a port that is free, and so is the next."""
+    while True:
+        with closing(socket.socket()) as one, closing(socket.socket()) as next_one, suppress(OSError, OverflowError):
+            one.bind((HOST, 0))
+            port = int(one.getsockname()[1])
+            next_one.bind((HOST, port + 1))
+            return port
+
+
+def _is_open(port: int) -> bool:
+    with closing(socket.socket()) as client:
+        client.settimeout(1.0)
+        return client.connect_ex((HOST, port)) == 0

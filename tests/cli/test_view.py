@@ -1,0 +1,121 @@
+"""`view` and `recording repair` on the command line: what is chosen, what is said, and exit statuses."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from iris_session.cli.main import main
+from iris_session.recording.repair import RepairReport
+from iris_session.recording.rrd_file import scan_file
+from tests.recording.support import journal, write
+
+
+@pytest.fixture(scope="module")
+def closed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("closed") / "session.rrd", *journal(40))
+
+
+@pytest.fixture
+def path(closed: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copy(closed, tmp_path))
+
+
+def test_newest_session_of_a_folder_is_chosen(
+    closed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the newest file of a session, which may be a part or a resumed recording."""
+    for i, name in enumerate(
+        ("sessions/a/session.rrd", "sessions/b/session.rrd", "sessions/c/session.rrd", "sessions/b/session.resume2.rrd")
+    ):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(closed, tmp_path / name)
+        os.utime(tmp_path / name, (1e9 + i, 1e9 + i))
+    monkeypatch.chdir(tmp_path)
+    assert main(["view", "--no-open"]) == 0
+    out, err = capsys.readouterr()
+    lines = out.splitlines()
+    assert lines[0] == "3 sessions below sessions, the newest is shown; the others:"
+    assert [line.split()[-1] for line in lines[1:3]] == ["sessions/c/session.rrd", "sessions/a/session.rrd"]
+    assert lines[3] == "shows session.rrd, session.resume2.rrd of sessions/b"
+    assert lines[4].startswith("made the copy sessions/b/session.view.rrd (")
+    assert err == ""
+    assert main(["view", "sessions/b", "--no-open"]) == 0
+    assert capsys.readouterr().out.splitlines()[1].startswith("uses the copy sessions/b/session.view.rrd (")
+
+
+def test_damage_is_named(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = bytearray(path.read_bytes())
+    victim = scan_file(path).messages[-8]
+    data[victim.offset + 60 : victim.offset + victim.length] = bytes(victim.length - 60)
+    path.write_bytes(data)
+    assert main(["view", str(path), "--no-open"]) == 0
+    assert f"DAMAGED: session.rrd: message of {victim.length} bytes at byte" in capsys.readouterr().out
+
+
+def test_unusable_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "other.rrd").write_bytes(b"x" * 99)
+    (tmp_path / "empty").mkdir()
+    for arguments, why in (
+        ((str(tmp_path / "no.rrd"),), "does not exist: give a recording"),
+        ((str(tmp_path / "empty"),), "there is no recording below the folder"),
+        ((str(tmp_path / "other.rrd"),), "not a Rerun file"),
+        ((str(tmp_path / "other.rrd"), "--port", "70000"), "--port 70000 is not a port"),
+    ):
+        assert main(["view", *arguments]) == 2
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert err.count("\n") == 1
+        assert why in err
+
+
+def test_viewer_that_fails_is_a_line(
+    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["view", str(path), "--no-open"]) == 0
+    capsys.readouterr()
+    tool = tmp_path / "tool"
+    tool.write_text("#!/bin/sh\nexit 3\n")
+    tool.chmod(0o755)
+    monkeypatch.setenv("RERUN_CLI_PATH", str(tool))
+    for display in ("", ":77"):
+        monkeypatch.setenv("DISPLAY", display)
+        assert main(["view", str(path)]) == 1
+        assert "Rerun's viewer ended with exit status 3" in capsys.readouterr().err
+
+
+def test_repair_says_what_is_lost(path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "repaired.rrd"
+    assert main(["recording", "repair", str(path), "-o", str(output)]) == 0
+    out, err = capsys.readouterr()
+    assert out.startswith(f"{output}: 40 steps, 0.1 s, ")
+    assert "  lost    nothing" in out
+    assert err == ""
+    assert main(["recording", "repair", str(path), "-o", str(output)]) == 2
+    assert "--force" in capsys.readouterr().err
+    victim = scan_file(path).messages[-8]
+    data = bytearray(path.read_bytes())
+    data[victim.offset + 60 : victim.offset + victim.length] = bytes(victim.length - 60)
+    path.write_bytes(data[: scan_file(path).messages[-2].offset + 3])
+    assert main(["recording", "repair", str(path), "-o", str(output), "--force"]) == 1
+    out = capsys.readouterr().out
+    assert f"{victim.length + 16 + 3:,} bytes that cannot be read; what may have followed the last step" in out
+    assert f"  found   session.rrd: message of {victim.length} bytes at byte {victim.offset}" in out
+    assert main(["recording", "repair", str(path), "-o", str(output), "--force", "--json"]) == 1
+    result = json.loads(capsys.readouterr().out)
+    assert sorted(result) == sorted(RepairReport.__struct_fields__)
+    assert (result["ok"], result["lost_bytes"]) == (False, victim.length + 19)
+
+
+def test_repair_of_nothing_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "session.rrd").write_bytes(b"x" * 99)
+    for name, why in (("no.rrd", "does not exist"), ("session.rrd", "not a Rerun file"), (".", "not a Rerun file")):
+        assert main(["recording", "repair", str(tmp_path / name), "-o", str(tmp_path / "out.rrd")]) == 2
+        err = capsys.readouterr().err
+        assert err.count("\n") == 1
+        assert why in err
+    assert not (tmp_path / "out.rrd").exists()

@@ -1,0 +1,181 @@
+"""The index of a closed file: it changes no byte that was recorded, and nothing else is touched."""
+
+from __future__ import annotations
+
+import errno
+import os
+import random
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from iris_session.recording import NotARecordingError, Recording, footer, rrd_file, verify
+from iris_session.recording.footer import add_index
+from iris_session.recording.rerun_tool import find_rerun
+from iris_session.recording.rrd_file import END_MESSAGE, FILE_TAIL, scan_file
+from tests.recording.support import SmallCore, journal, recorder, wait_until, write
+
+STEPS = 200
+
+
+def has_index(path: Path) -> bool:
+    """Return whether Rerun finds a valid index."""
+    done = subprocess.run([find_rerun(), "rrd", "verify", path], capture_output=True, check=False)
+    return done.returncode == 0
+
+
+@pytest.fixture(scope="module")
+def closed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("closed") / "session.rrd", *journal(STEPS))
+
+
+@pytest.fixture(scope="module")
+def indexed(closed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = Path(shutil.copy(closed, tmp_path_factory.mktemp("indexed")))
+    assert add_index(path)
+    return path
+
+
+@pytest.fixture
+def path(closed: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copy(closed, tmp_path))
+
+
+def test_index_follows_the_messages_as_they_were(closed: Path, indexed: Path) -> None:
+    original, data = closed.read_bytes(), indexed.read_bytes()
+    assert original.endswith(END_MESSAGE)
+    assert data.startswith(original.removesuffix(END_MESSAGE))
+    found = scan_file(indexed)
+    assert (found.indexed, found.cut, found.holes, found.good_bytes) == (True, False, [], len(data))
+    assert has_index(indexed)
+    assert not has_index(closed)
+    assert add_index(indexed), "once is enough"
+    assert indexed.read_bytes() == data
+
+
+def test_indexed_file_reads_and_verifies_like_before(closed: Path, indexed: Path) -> None:
+    with Recording.open(closed) as before, Recording.open(indexed) as after:
+        assert list(after.rows()) == list(before.rows())
+        assert (after.finished, after.damage, after.notes) == (True, [], [])
+        assert after._rewritten == set(), "it is no copy of Rerun's tools"
+    report = verify(indexed, SmallCore)
+    assert report.ok, report.line()
+    assert report.finished
+
+
+def test_changed_bytes_of_an_indexed_file_are_found(indexed: Path, tmp_path: Path) -> None:
+    """The recorder's checksums count, unlike in a copy by Rerun's tools."""
+    path = tmp_path / "session.rrd"
+    data = indexed.read_bytes()
+    end = scan_file(indexed).messages[-1].offset
+    rng = random.Random(7)
+    for at in (*(rng.randrange(100, end) for _ in range(3)), rng.randrange(end + 16, len(data) - FILE_TAIL)):
+        damaged = bytearray(data)
+        damaged[at] ^= 1 << rng.randrange(8)
+        path.write_bytes(damaged)
+        try:
+            report = verify(path, None)
+        except NotARecordingError:  # the header is damaged
+            continue
+        assert not report.ok, f"byte {at} of {len(data)}"
+
+
+def test_file_that_was_not_closed_or_is_damaged_stays_as_it_is(path: Path) -> None:
+    whole = path.read_bytes()
+    messages = scan_file(path).messages
+    hole = bytearray(whole)
+    hole[messages[-5].offset + 12] ^= 0x40
+    for data in (whole[: messages[-1].offset], whole[: messages[-1].offset - 7], whole + b"x", bytes(hole)):
+        path.write_bytes(data)
+        assert not add_index(path)
+        assert path.read_bytes() == data
+
+
+def test_other_output_of_rerun_is_not_taken(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = path.read_bytes()
+    for program in ("exit 3", 'cat "$3"', 'tr a b < "$3"', 'cat "$3"; echo more'):
+        tool = tmp_path / "tool"
+        tool.write_text(f"#!/bin/sh\n{program}\n")
+        tool.chmod(0o755)
+        monkeypatch.setenv("RERUN_CLI_PATH", str(tool))
+        assert not add_index(path), program
+        assert path.read_bytes() == before
+
+
+def test_full_disk_leaves_the_file_as_it_was(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = path.read_bytes()
+    write_bytes = os.pwrite
+    calls = []
+
+    def refuse(descriptor: int, data: bytes, offset: int) -> int:
+        calls.append(len(data))
+        if len(calls) > 1:
+            return write_bytes(descriptor, data, offset)
+        write_bytes(descriptor, data[:1000], offset)
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "pwrite", refuse)
+    assert not add_index(path)
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize(("name", "value"), [("RESERVE_BYTES", 1 << 60), ("MEMORY_SHARE", 0.0)])
+def test_short_disk_or_memory_is_left_alone(
+    path: Path, monkeypatch: pytest.MonkeyPatch, name: str, value: float
+) -> None:
+    monkeypatch.setattr(footer, name, value)
+    before = path.read_bytes()
+    assert not add_index(path)
+    assert path.read_bytes() == before
+
+
+def test_file_changed_meanwhile_stays_as_it_is(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_index = footer._make_index
+
+    def change(path: Path, *arguments: object) -> bytes:
+        index = make_index(path, *arguments)  # type: ignore[arg-type]
+        os.truncate(path, 5000)
+        return index
+
+    monkeypatch.setattr(footer, "_make_index", change)
+    assert not add_index(path)
+    assert path.stat().st_size == 5000
+
+
+def test_kill_during_the_write_leaves_a_finished_file(indexed: Path, tmp_path: Path) -> None:
+    path = tmp_path / "session.rrd"
+    data = indexed.read_bytes()
+    end = scan_file(indexed).messages[-1].offset
+    for size in (end + 16, end + 5000, len(data) - FILE_TAIL - 1):
+        path.write_bytes(data[:size])
+        report = verify(path, SmallCore)
+        assert report.ok, report.line()
+        assert (report.finished, report.steps) == (True, STEPS)
+
+
+def test_file_may_get_its_index_while_it_is_scanned(
+    closed: Path, indexed: Path, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = indexed.read_bytes()
+    size = os.path.getsize(closed)
+    monkeypatch.setattr(os.path, "getsize", lambda _: size)
+    path.write_bytes(data)
+    found = rrd_file.scan_file(path)
+    assert (found.cut, found.indexed, found.good_bytes, found.size) == (False, True, len(data), len(data))
+
+
+def test_recorder_adds_the_index_after_it_has_ended(tmp_path: Path) -> None:
+    from tests.recording.support import SmallSession
+
+    path = tmp_path / "session.rrd"
+    with recorder(path) as (process, feed):
+        SmallSession(feed).take(60)
+        assert feed.close(20.0)
+        assert process.close()
+    wait_until(lambda: scan_file(path).indexed)
+    assert has_index(path)
+    report = verify(path, SmallCore)
+    assert report.ok, report.line()
+    assert (report.steps, report.finished) == (60, True)

@@ -1,0 +1,157 @@
+"""Recordings that are being written reach a viewer: every message once, in order, over parts, and nothing waits."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import psutil
+import pytest
+
+from iris_session.recording import NotARecordingError, live_feed
+from iris_session.recording.live_feed import LiveFeed, MessageTail
+from iris_session.recording.lock import RecordingLock
+from iris_session.recording.rerun_tool import find_rerun, make_environment
+from iris_session.recording.rrd_file import KIND_END, read_message, scan_file
+from iris_session.system.process import ChildProcess
+from tests.recording.support import column, journal, read, wait_until, write
+
+STEPS = 60
+
+
+@pytest.fixture(scope="module")
+def closed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("closed") / "session.rrd", *journal(STEPS))
+
+
+def messages_of(path: Path) -> list[bytes]:
+    with open(path, "rb") as file:
+        return [read_message(file, m) for m in scan_file(path).messages if m.kind != KIND_END]
+
+
+def test_tail_reads_whole_messages_of_a_growing_file_and_its_parts(
+    closed: Path, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    path, data, expected = tmp_path / "session.rrd", closed.read_bytes(), messages_of(closed)
+    tail, found = MessageTail(str(path)), []
+    request.addfinalizer(tail.close)
+    assert tail.read(1 << 20) == [], "there is no file yet"
+    with open(path, "wb", buffering=0) as file:
+        for i in range(0, len(data), 997):  # cuts heads and bodies
+            file.write(data[i : i + 997])
+            found += tail.read(1 << 20)
+    assert found == expected
+    assert tail.read(1 << 20) == [], "the end message is none"
+    part = tmp_path / "session.part2.rrd"
+    part.touch()
+    assert tail.read(1 << 20) == tail.read(1 << 20) == []
+    part.write_bytes(data)
+    sizes = []
+    while got := tail.read(5000):
+        sizes.append(sum(map(len, got)))
+        found += got
+    assert found == expected * 2
+    assert max(sizes) < 5000 + max(map(len, expected))
+
+
+def test_other_files_are_not_followed(closed: Path, tmp_path: Path) -> None:
+    path = tmp_path / "session.rrd"
+    whole = closed.read_bytes()[: scan_file(closed).messages[5].offset]
+    for data in (b"x" * 99, whole + b"\xff" * 99):
+        path.write_bytes(data)
+        tail = MessageTail(str(path))
+        with closing(tail), pytest.raises(NotARecordingError):
+            [*iter(lambda: tail.read(1 << 20), [])]  # noqa: B023 - called here
+
+
+@contextmanager
+def receiver(path: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
+    """Start Rerun's server, which writes what it gets to `path`; yield it and its address."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        port = listener.getsockname()[1]
+    command = [find_rerun(), "--bind", "127.0.0.1", "--port", str(port), "--save", path]
+    server = subprocess.Popen(command, env=make_environment(), stderr=subprocess.DEVNULL)
+    try:
+        yield server, f"rerun+http://127.0.0.1:{port}/proxy"
+    finally:
+        server.send_signal(signal.SIGCONT)
+        server.kill()
+        server.wait()
+
+
+def steps_received(path: Path) -> list[int]:
+    try:
+        return sorted(set(column(read(path)["/journal/rows"], "step")))
+    except (OSError, LookupError, ValueError):  # not there yet, or cut
+        return []
+
+
+def test_viewer_gets_everything_and_follows(closed: Path, tmp_path: Path) -> None:
+    from rerun.chunk import RrdReader
+
+    got = tmp_path / "got.rrd"
+    with receiver(got) as (_, url):
+        feed = LiveFeed(str(closed), url)
+        while feed.poll():
+            pass
+        feed.close()
+        wait_until(lambda: steps_received(got) == list(range(STEPS)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the server has been killed: it wrote no index
+        reader = RrdReader(str(got))
+    assert len(reader.recordings()) == 1
+    (blueprint,) = reader.blueprints()
+    states = [
+        (batch.column("rerun.controls.RowId")[0].as_py(), batch.column("TimePanelBlueprint:play_state")[0].as_py())
+        for batch in (chunk.to_record_batch() for chunk in reader.stream(store=blueprint))
+        if "TimePanelBlueprint:play_state" in batch.schema.names
+    ]
+    assert len(states) == 2
+    assert max(states)[1] == [3], "following, in place of paused"
+
+
+def test_viewer_that_stands_still_makes_only_the_feed_wait(closed: Path, tmp_path: Path) -> None:
+    got, path = tmp_path / "got.rrd", tmp_path / "session.rrd"
+    data = closed.read_bytes()
+    half = scan_file(closed).messages[20].offset
+    path.write_bytes(data[:half])
+    lock = RecordingLock(path, shared=True)
+    with receiver(got) as (server, url):
+        feed = ChildProcess("iris_session.recording.live_feed", [str(path), url], environment={"RUST_LOG": "off"})
+        with feed:
+            wait_until(lambda: bool(steps_received(got)))
+            server.send_signal(signal.SIGSTOP)
+            with open(path, "ab") as file:
+                file.write(data[half:])
+            time.sleep(live_feed.SEND_S)
+            assert feed.is_running
+            server.send_signal(signal.SIGCONT)
+            wait_until(lambda: steps_received(got) == list(range(STEPS)))
+            assert feed.is_running, "the session still runs"
+            lock.release()
+            assert feed.wait(20.0) == 0
+
+
+def test_feed_ends_with_its_parent_whatever_the_viewer_does(closed: Path) -> None:
+    program = (
+        "import sys; from iris_session.system.process import ChildProcess\n"
+        "child = ChildProcess('iris_session.recording.live_feed', sys.argv[1:], environment={'RUST_LOG': 'off'})\n"
+        "print(child.pid, flush=True); sys.stdin.read()"
+    )
+    command = [sys.executable, "-c", program, str(closed), "rerun+http://127.0.0.1:1/proxy"]
+    parent = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    feed = psutil.Process(int(parent.stdout.readline()))
+    wait_until(lambda: feed.num_threads() > 3)  # Rerun's client has begun to send, to nothing
+    parent.kill()
+    parent.communicate()
+    psutil.wait_procs([feed], 20.0)
+    assert not feed.is_running() or feed.status() == psutil.STATUS_ZOMBIE

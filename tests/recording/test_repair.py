@@ -1,0 +1,214 @@
+"""Repaired files: every whole message before a fault is in them, and what is lost is stated."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import subprocess
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from iris_session.recording import NotARecordingError, Recording, paths, verify
+from iris_session.recording.errors import RecorderError
+from iris_session.recording.lock import RecordingLock
+from iris_session.recording.paths import part_path
+from iris_session.recording.repair import RepairReport, repair
+from iris_session.recording.rerun_tool import INDEX, find_rerun, rewrite
+from iris_session.recording.rrd_file import KIND_END, read_message, scan_file
+from iris_session.recording.summary import summarise
+from tests.recording.support import SmallCore, journal, write
+
+STEPS = 60
+
+
+class Original(NamedTuple):
+    """A whole file. `unmarked`: messages without the recorder's checksums. `n_header`: messages up to its header."""
+
+    path: Path
+    unmarked: frozenset[bytes]
+    n_header: int
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Original:
+    folder = tmp_path_factory.mktemp("original")
+    path = write(folder / "session.rrd", *journal(STEPS), rows_per_chunk=6)
+    with open(folder / "unmarked.rrd", "wb") as file:
+        rewrite(INDEX, [str(path)], file, options=("--drop-entity", paths.MARKS))
+    return Original(path, frozenset(list_messages(folder / "unmarked.rrd")), count_header_messages(path, folder))
+
+
+def count_header_messages(path: Path, folder: Path) -> int:
+    cut = folder / "cut.rrd"
+    for n, message in enumerate(scan_file(path).messages):
+        cut.write_bytes(path.read_bytes()[: message.offset])
+        with suppress(NotARecordingError), Recording.open(cut):
+            return n
+    raise AssertionError("no header")
+
+
+def list_messages(path: Path) -> list[bytes]:
+    with open(path, "rb") as file:
+        return [read_message(file, m) for m in scan_file(path).messages if m.kind != KIND_END]
+
+
+def has_index(path: Path) -> bool:
+    done = subprocess.run([find_rerun(), "rrd", "verify", path], capture_output=True, check=False)
+    return done.returncode == 0
+
+
+def check_repair(original: Original, damaged: bytes, fault: int, folder: Path) -> str:
+    """Repair a file with a fault in byte `fault`; return what became of it: `whole`, `damaged` or `none`."""
+    path, output = folder / "damaged.rrd", folder / "repaired.rrd"
+    path.write_bytes(damaged)
+    messages = scan_file(original.path).messages
+    n_before = sum(m.offset + 16 + m.length <= fault and m.kind != KIND_END for m in messages)
+    expected = list_messages(original.path)[:n_before]
+    if n_before < original.n_header:
+        with suppress(NotARecordingError):  # without a header it is no recording
+            repair(path, output, overwrite=True)
+        return "none"
+    report = repair(path, output, overwrite=True)
+    assert path.read_bytes() == damaged
+    assert has_index(output), f"byte {fault}"
+    kept = list_messages(output)
+    if report.damage:
+        expected = [data for data in expected if data in original.unmarked]
+        kept = [data for data in kept if data in set(expected)]
+    assert kept[: len(expected)] == expected, f"byte {fault}"
+    with Recording.open(path, warn=False) as recording:
+        summary = summarise(recording)
+    assert summary.ok == report.ok, f"byte {fault}"
+    assert set(report.damage) == set(summary.damage)
+    return "whole" if report.ok else "damaged"
+
+
+def truncate(original: Original, folder: Path, n: int) -> None:
+    """Cut the file around the beginning of `n` messages, in their heads and bodies."""
+    rng, data = random.Random(3), original.path.read_bytes()
+    messages = scan_file(original.path).messages
+    for message in rng.sample(messages, min(len(messages), n)):
+        at = message.offset + rng.choice((0, 1, 8, 15, 16, 17, 16 + message.length // 2))
+        assert check_repair(original, data[:at], at, folder) != "damaged", "a cut is no damage"
+
+
+def flip_bits(original: Original, folder: Path, n: int, seed: int) -> None:
+    data, rng = original.path.read_bytes(), random.Random(seed)
+    outcomes = []
+    for _ in range(n):
+        at = rng.randrange(len(data))
+        damaged = bytearray(data)
+        damaged[at] ^= 1 << rng.randrange(8)
+        outcomes.append(check_repair(original, bytes(damaged), at, folder))
+    assert outcomes.count("damaged") > n // 2
+
+
+def test_truncated_file_is_repaired_up_to_its_last_whole_message(original: Original, tmp_path: Path) -> None:
+    truncate(original, tmp_path, 8)
+
+
+def test_flipped_bits_cost_one_message(original: Original, tmp_path: Path) -> None:
+    flip_bits(original, tmp_path, 6, 1)
+
+
+@pytest.mark.long
+def test_truncation_in_every_message(original: Original, tmp_path: Path) -> None:
+    truncate(original, tmp_path, 1000)
+
+
+@pytest.mark.long
+def test_many_flipped_bits(original: Original, tmp_path: Path) -> None:
+    flip_bits(original, tmp_path, 60, 2)
+
+
+def test_cut_file_keeps_its_checksums(original: Original, tmp_path: Path) -> None:
+    path, output = tmp_path / "session.rrd", tmp_path / "repaired.rrd"
+    path.write_bytes(original.path.read_bytes()[: scan_file(original.path).messages[-4].offset + 20])
+    report = repair(path, output)
+    assert (report.ok, report.finished, report.damage, report.lost_steps) == (True, False, (), 0)
+    assert report.lost_bytes == 20
+    assert len(report.cuts) == 1
+    found = verify(output, SmallCore)
+    assert found.ok, found.line()
+    assert (found.steps, found.finished) == (report.steps, False)
+    data = bytearray(output.read_bytes())
+    data[scan_file(output).messages[5].offset + 100] ^= 1
+    output.write_bytes(data)
+    with Recording.open(output, warn=False) as recording:
+        assert recording.damage or recording.changed_spans()
+
+
+def destroy_rows(original: Path, path: Path) -> None:
+    """Destroy the message with the rows 30 to 35."""
+    with Recording.open(original) as recording:
+        chain = next(row.chain for row in recording.rows() if row.step == 30)
+    data = bytearray(original.read_bytes())
+    at = data.find(chain)
+    (victim,) = (m for m in scan_file(original).messages if m.offset < at < m.offset + m.length)
+    data[victim.offset + 100 : victim.offset + victim.length] = bytes(victim.length - 100)
+    path.write_bytes(data)
+
+
+def test_lost_rows_are_counted(original: Original, tmp_path: Path) -> None:
+    path, output = tmp_path / "session.rrd", tmp_path / "repaired.rrd"
+    destroy_rows(original.path, path)
+    report = repair(path, output)
+    assert not report.ok
+    assert (report.steps, report.lost_steps, report.lost_s) == (STEPS - 6, 6, 0.014)
+    assert report.lost_bytes > 500
+    assert any("steps 30 to 35 are missing (6)" in line for line in report.damage)
+    with Recording.open(output, warn=False) as recording:
+        assert recording.damage == []
+        assert [row.step for row in recording.rows()] == [*range(30), *range(36, STEPS)]
+
+
+def test_parts_become_one_file(tmp_path: Path) -> None:
+    header, batch = journal(STEPS)
+    first = tmp_path / "session.rrd"
+    rows, keyframes = batch.rows, batch.keyframes
+    batch.rows, batch.keyframes = rows[:30], keyframes[:1]
+    write(first, header, batch)
+    batch.rows, batch.keyframes = rows[25:], keyframes[1:]
+    write(Path(part_path(str(first), 2)), header, batch)
+    Path(part_path(str(first), 3)).write_bytes(b"RRF2 and nothing that is a message")
+    report = repair(tmp_path, tmp_path / "repaired.rrd")
+    assert (report.files, report.steps, report.lost_steps) == (("session.rrd", "session.part2.rrd"), STEPS, 0)
+    assert report.finished
+    found = verify(tmp_path / "repaired.rrd", SmallCore)
+    assert found.ok, found.line()
+    assert (found.steps, found.finished) == (STEPS, True)
+
+
+def test_nothing_is_overwritten_without_a_word(original: Original, tmp_path: Path) -> None:
+    path, output = Path(shutil.copy(original.path, tmp_path)), tmp_path / "repaired.rrd"
+    output.write_bytes(b"mine")
+    link = tmp_path / "link.rrd"
+    link.symlink_to(path)
+    for target, overwrite, why in (
+        (output, False, "--force"),
+        (path, True, "the recording itself"),
+        (link, True, "the recording itself"),
+        (tmp_path, True, "a folder"),
+        (tmp_path / "no" / "folder.rrd", True, "No such file"),
+    ):
+        with pytest.raises(RecorderError, match=why):
+            repair(path, target, overwrite=overwrite)
+    assert output.read_bytes() == b"mine"
+    assert path.read_bytes() == original.path.read_bytes()
+    report = repair(path, output, overwrite=True)
+    assert isinstance(report, RepairReport)
+    assert (report.ok, report.lost_bytes) == (True, 0)
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["link.rrd", "repaired.rrd", "session.rrd"]
+
+
+def test_running_session_is_not_repaired(original: Original, tmp_path: Path) -> None:
+    path = Path(shutil.copy(original.path, tmp_path))
+    lock = RecordingLock(path, shared=True)
+    try:
+        with pytest.raises(RecorderError, match="is being written by process"):
+            repair(path, tmp_path / "repaired.rrd")
+    finally:
+        lock.release()
