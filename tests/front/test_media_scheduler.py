@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import sys
+from collections.abc import Callable, Mapping
+from types import FrameType
 from typing import Any
 
 import msgspec
@@ -232,6 +234,45 @@ def test_streams_and_subscriptions_are_bounded() -> None:
     wire.hub.sample_rates(wire.now_ns)
     assert wire.hub.read_streams() == {}
     assert wire.push(stream="another")
+
+
+def count_lines(action: Callable[[], object]) -> int:
+    """Return how many lines an action runs."""
+    lines, before = 0, sys.gettrace()
+
+    def trace(_frame: FrameType, event: str, _argument: object) -> Any:
+        nonlocal lines
+        lines += event == "line"
+        return trace
+
+    sys.settrace(trace)
+    try:
+        action()
+    finally:
+        sys.settrace(before)
+    return lines
+
+
+def test_work_for_one_client_or_stream_does_not_grow_with_the_others() -> None:
+    """The front's main thread waits for the first two, for every client, four times a second."""
+    wire = Wire()
+    wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
+
+    def count() -> list[int]:
+        wire.push()
+        actions = (lambda: wire.hub.list_subscriptions(ANN), lambda: wire.hub.read_counters(ANN), wire.push)
+        return [count_lines(action) for action in actions]
+
+    alone = count()
+    others = range(100, 130)
+    wire.hub.set_subscribers({n: MediaSubscriber("", {}) for n in others} | {ANN: MediaSubscriber("a", {})}, SECOND)
+    for number in others:
+        for n in range(MAX_STREAMS):
+            assert wire.hub.subscribe(number, f"s{n}", "", number, SECOND)
+    assert count() == alone
+    wire.allow()
+    assert all(wire.hub.list_subscriptions(number) == [] for number in others)
+    assert wire.hub.list_subscriptions(ANN) == ["cloud"]
 
 
 def test_stream_belongs_to_its_source_while_it_sends() -> None:

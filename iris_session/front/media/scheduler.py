@@ -161,6 +161,8 @@ class MediaScheduler:
         self._streams: dict[str, _Stream] = {}
         self._subscribers: dict[int, MediaSubscriber] = {}
         self._subscriptions: dict[tuple[int, str], _Subscription] = {}
+        self._by_number: dict[int, set[str]] = {}  # subscribed streams by connection
+        self._by_stream: dict[str, dict[int, _Subscription]] = {}  # the same by stream and connection
         self._by_reader: dict[int, set[tuple[int, str]]] = {}  # by descriptor
         self._ended_counters: dict[int, DeliveryCounters] = {}  # of subscriptions that have ended
         self._newest_buckets: dict[int, TokenBucket] = {}
@@ -176,8 +178,9 @@ class MediaScheduler:
         """Set the connections that may subscribe, and their levels from now on."""
         stopped = [key for key in self._subscriptions if self._find_level(*key) >= NONE_LEVEL]
         self._subscribers = dict(listeners)
-        for key in [key for key in self._subscriptions if key[0] not in self._subscribers]:
-            del self._subscriptions[key]
+        for number in [number for number in self._by_number if number not in self._subscribers]:
+            for stream in self.list_subscriptions(number):
+                self._remove_subscription(number, stream)
         for known in (self._ended_counters, self._newest_buckets):
             for number in [number for number in known if number not in self._subscribers]:
                 del known[number]
@@ -195,10 +198,13 @@ class MediaScheduler:
         if listener is None or listener.user_id != user_id:
             self._count_drop("media_refused")
             return False
-        if (number, stream) not in self._subscriptions and len(self.list_subscriptions(number)) >= MAX_STREAMS:
-            self._count_drop("media_subscriptions_full")
-            return False
-        self._subscriptions.setdefault((number, stream), _Subscription()).readers.add(reader)
+        subscription = self._subscriptions.get((number, stream))
+        if subscription is None:
+            if len(self._by_number.get(number, ())) >= MAX_STREAMS:
+                self._count_drop("media_subscriptions_full")
+                return False
+            subscription = self._add_subscription(number, stream)
+        subscription.readers.add(reader)
         self._by_reader.setdefault(reader, set()).add((number, stream))
         self._offer_newest((number, stream), now_ns)
         return True
@@ -211,7 +217,7 @@ class MediaScheduler:
             return
         subscription.readers.remove(reader)
         if not subscription.readers:
-            del self._subscriptions[number, stream]
+            self._remove_subscription(number, stream)
             self._ended_counters[number] = self._ended_counters.get(number, DeliveryCounters()).combine(
                 subscription.counters
             )
@@ -223,14 +229,13 @@ class MediaScheduler:
 
     def list_subscriptions(self, number: int) -> list[str]:
         """Return the streams that a connection subscribed to."""
-        return sorted(stream for owner, stream in self._subscriptions if owner == number)
+        return sorted(self._by_number.get(number, ()))
 
     def read_counters(self, number: int) -> DeliveryCounters:
         """Return the counters of all subscriptions of a connection."""
         total = self._ended_counters.get(number, DeliveryCounters())
-        for (owner, _), subscription in self._subscriptions.items():
-            if owner == number:
-                total = total.combine(subscription.counters)
+        for stream in self._by_number.get(number, ()):
+            total = total.combine(self._subscriptions[number, stream].counters)
         return total
 
     # --- frames ------------------------------------------------------------------------------------------------------
@@ -263,9 +268,8 @@ class MediaScheduler:
         for level in range(NONE_LEVEL):
             frame, due = stream.select_frame(level)
             stream.level_bytes[level] += len(frame) if due else 0
-        for key, subscription in self._subscriptions.items():
-            if key[1] == push.stream:
-                self._mark_due(key, subscription, stream)
+        for number, subscription in self._by_stream.get(push.stream, {}).items():
+            self._mark_due((number, push.stream), subscription, stream)
         return True
 
     def flush(self, send: Send, now_ns: int) -> bool:
@@ -297,7 +301,7 @@ class MediaScheduler:
         for name in sorted(self._streams):
             stream = self._streams[name]
             rates, hz = stream.compute_rates()
-            subscribers = sum(wanted == name for _, wanted in self._subscriptions)
+            subscribers = len(self._by_stream.get(name, ()))
             source, encoding, received_ns, info = stream.source, stream.encoding, stream.received_ns, stream.info
             found[name] = StreamStats(rates, hz, source, subscribers, encoding, received_ns, info)
         return found
@@ -363,6 +367,22 @@ class MediaScheduler:
             del self._streams[name]
 
     # --- helpers -----------------------------------------------------------------------------------------------------
+
+    def _add_subscription(self, number: int, stream: str) -> _Subscription:
+        subscription = self._subscriptions[number, stream] = _Subscription()
+        self._by_number.setdefault(number, set()).add(stream)
+        self._by_stream.setdefault(stream, {})[number] = subscription
+        return subscription
+
+    def _remove_subscription(self, number: int, stream: str) -> None:
+        del self._subscriptions[number, stream]
+        streams, numbers = self._by_number[number], self._by_stream[stream]
+        streams.remove(stream)
+        del numbers[number]
+        if not streams:
+            del self._by_number[number]
+        if not numbers:
+            del self._by_stream[stream]
 
     def _find_stream(self, name: str, source: str, now_ns: int) -> _Stream | None:
         stream = self._streams.get(name)
