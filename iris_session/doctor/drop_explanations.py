@@ -71,7 +71,7 @@ EXPLANATIONS: Final[Mapping[str, str]] = {
     "state_topic_unknown": "subscriptions to topics that do not exist",
     "state_closed_early": "connections to the state that ended before they subscribed to anything",
     "subscribers_too_many": "connections to the state closed because their key had too many",
-    "media_newest_rate": "newest frames not sent to clients that subscribe to a stream over and over",
+    "media_newest_rate": "newest frames sent later to clients that subscribe over and over",
     "media_info_malformed": "descriptions of media streams with values out of range; their frames were taken",
     "media_source_refused": "media of keys without the role camera or source",
     "media_flood": "connections to media closed because they sent more than was read, or what is no subscription",

@@ -319,7 +319,19 @@ def test_a_link_that_has_room_again_gets_the_newest_frame() -> None:
     assert [head.budget_class for head, _ in wire.got[ANN]] == ["quarter"]
     wire.allow(ann=0)  # it has that frame
     wire.hub.flush(wire.send, wire.now_ns)
+    wire.allow(ann=NONE_LEVEL)
+    wire.allow(ann=0)
+    wire.hub.flush(wire.send, wire.now_ns)
     assert len(wire.got[ANN]) == 1
+
+
+def test_client_that_has_connected_again_gets_the_newest_frame_again() -> None:
+    wire = Wire()
+    wire.push()
+    for reader in (1, 2, 2):
+        wire.hub.subscribe(ANN, "cloud", "a", reader, wire.now_ns)
+        wire.hub.flush(wire.send, wire.now_ns)
+    assert len(wire.got[ANN]) == 2
 
 
 def test_subscribing_over_and_over_gets_no_frame_each_time() -> None:
@@ -337,6 +349,29 @@ def test_subscribing_over_and_over_gets_no_frame_each_time() -> None:
     before = len(wire.got[ANN])
     wire.push()
     assert len(wire.got[ANN]) == before + 1  # frames after it come as ever
+
+
+def test_stream_at_rest_comes_later_to_who_subscribed_over_and_over() -> None:
+    wire = Wire()
+    for n in range(3):
+        wire.push(stream=f"s{n}")
+    for _ in range(2 * MAX_STREAMS):
+        wire.hub.subscribe(ANN, "cloud", "a", 1, wire.now_ns)
+        wire.push()
+        wire.hub.unsubscribe(ANN, "cloud", 1)
+        wire.hub.subscribe(ANN, "cloud", "a", 1, wire.now_ns)
+        wire.hub.flush(wire.send, wire.now_ns)
+        wire.hub.unsubscribe(ANN, "cloud", 1)
+    wire.got[ANN].clear()
+    for n in range(3):
+        wire.hub.subscribe(ANN, f"s{n}", "a", 1, wire.now_ns)
+    wire.hub.unsubscribe(ANN, "s1", 1)
+    assert not wire.hub.flush(wire.send, wire.now_ns)
+    assert wire.got[ANN] == []
+    for _ in range(40):
+        wire.now_ns += 50 * MS
+        wire.hub.flush(wire.send, wire.now_ns)
+    assert [header.stream for header, _ in wire.got[ANN]] == ["s0", "s2"]
 
 
 def test_restarted_front_numbers_frames_above_its_predecessor() -> None:

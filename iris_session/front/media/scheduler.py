@@ -103,12 +103,13 @@ class NewestFrame(NamedTuple):
 
 
 class _Subscription:
-    """One connection's subscription to one stream."""
+    """One connection's subscription to one stream. `seq`: of the frame that its readers got last, -1 for none."""
 
-    __slots__ = ("bytes", "delivered", "dropped", "due", "pending", "readers")
+    __slots__ = ("bytes", "delivered", "dropped", "due", "pending", "readers", "seq")
 
     def __init__(self) -> None:
         self.pending = False
+        self.seq = -1
         self.readers: set[int] = set()  # descriptors
         self.due = self.delivered = self.dropped = self.bytes = 0
 
@@ -166,6 +167,7 @@ class MediaScheduler:
         self._by_reader: dict[int, set[tuple[int, str]]] = {}  # by descriptor
         self._ended_counters: dict[int, DeliveryCounters] = {}  # of subscriptions that have ended
         self._newest_buckets: dict[int, TokenBucket] = {}
+        self._delayed: dict[int, dict[str, None]] = {}  # streams by connection that wait for its bucket
         self._pending: deque[tuple[int, str]] = deque()
         self._paused_until_ns = 0
         self._stuck: set[int] = set()
@@ -181,7 +183,7 @@ class MediaScheduler:
         for number in [number for number in self._by_number if number not in self._subscribers]:
             for stream in self.list_subscriptions(number):
                 self._remove_subscription(number, stream)
-        for known in (self._ended_counters, self._newest_buckets):
+        for known in (self._ended_counters, self._newest_buckets, self._delayed):
             for number in [number for number in known if number not in self._subscribers]:
                 del known[number]
         for key in stopped:
@@ -204,7 +206,9 @@ class MediaScheduler:
                 self._count_drop("media_subscriptions_full")
                 return False
             subscription = self._add_subscription(number, stream)
-        subscription.readers.add(reader)
+        if reader not in subscription.readers:
+            subscription.readers.add(reader)
+            subscription.seq = -1  # a client that has connected again may have lost what it had
         self._by_reader.setdefault(reader, set()).add((number, stream))
         self._offer_newest((number, stream), now_ns)
         return True
@@ -274,6 +278,7 @@ class MediaScheduler:
 
     def flush(self, send: Send, now_ns: int) -> bool:
         """Send due frames to connections with room. Return whether some are still pending."""
+        self._offer_delayed(now_ns)
         for _ in range(len(self._pending)):
             key = self._pending.popleft()
             subscription = self._subscriptions.get(key)
@@ -411,17 +416,38 @@ class MediaScheduler:
         listener = self._subscribers.get(number)
         return NONE_LEVEL if listener is None else listener.levels.get(stream, listener.default_level)
 
-    def _offer_newest(self, key: tuple[int, str], now_ns: int) -> None:
-        """Mark the newest frame of a stream due for a subscription that has not had it."""
+    def _needs_newest(self, key: tuple[int, str]) -> bool:
+        """Return whether a subscription has not had the newest frame of its stream, and is not about to get it."""
         subscription, stream = self._subscriptions.get(key), self._streams.get(key[1])
         if subscription is None or stream is None or not stream.frames or subscription.pending:
-            return
-        if self._find_level(*key) >= NONE_LEVEL:
+            return False
+        return subscription.seq != stream.seq and self._find_level(*key) < NONE_LEVEL
+
+    def _offer_newest(self, key: tuple[int, str], now_ns: int) -> None:
+        """Mark the newest frame of a stream due for a subscription that has not had it: now, or when its connection may
+        have another."""
+        if not self._needs_newest(key):
             return
         bucket = self._newest_buckets.setdefault(key[0], TokenBucket(NEWEST_PER_S, MAX_STREAMS, now_ns))
-        if not bucket.take(now_ns):
+        if bucket.take(now_ns):
+            self._mark_newest(key)
+        else:
+            self._delayed.setdefault(key[0], {})[key[1]] = None
             self._count_drop("media_newest_rate")
-            return
+
+    def _offer_delayed(self, now_ns: int) -> None:
+        for number, streams in list(self._delayed.items()):
+            for stream in list(streams):
+                if self._needs_newest((number, stream)):
+                    if not self._newest_buckets[number].take(now_ns):
+                        break
+                    self._mark_newest((number, stream))
+                del streams[stream]
+            if not streams:
+                del self._delayed[number]
+
+    def _mark_newest(self, key: tuple[int, str]) -> None:
+        subscription = self._subscriptions[key]
         subscription.due += 1
         subscription.pending = True
         self._pending.append(key)
@@ -461,6 +487,7 @@ class MediaScheduler:
         topic = make_topic(number, name) + LEVELS[level].encode()
         if not send(topic, encode_media_header(header), frame):
             return False
+        subscription.seq = stream.seq
         subscription.delivered += 1
         subscription.bytes += len(topic) + len(frame)
         return True
