@@ -495,6 +495,30 @@ def test_stream_is_stale_without_the_frames_that_it_means_to_have(hz: float, lat
     assert not wire.hub.read_streams()["cloud"].is_stale(last + MS)
 
 
+def test_stream_at_rest_is_stale_while_its_frame_is_missing() -> None:
+    """Its source does not know that a front was restarted or had to release the frame."""
+    wire = Wire()
+
+    def is_stale() -> bool:
+        wire.now_ns += SECOND + MS
+        return wire.hub.read_streams()["cloud"].is_stale(wire.now_ns)
+
+    describe(wire, StreamInfo("Room"))
+    assert is_stale()
+    wire.push(frames={"full": b""})
+    assert not is_stale()
+    wire.hub.release_frames(wire.now_ns)
+    assert is_stale()
+    wire.push()
+    assert not is_stale()
+    wire.hub.reset()
+    assert is_stale()
+    wire.push()
+    wire.hub.subscribe(ANN, "cloud", "a", 1, wire.now_ns)
+    wire.hub.flush(wire.send, wire.now_ns)
+    assert len(wire.got[ANN]) == 1
+
+
 def test_topics() -> None:
     assert parse_topic(make_topic(12, "cloud.1")) == (12, "cloud.1")
     for bad in (b"", b"media/", b"media/0/x/", b"media/1/x", b"media/1/a/b/", b"media/1//", b"media/-1/x/", b"\xff"):

@@ -42,6 +42,7 @@ NEWEST_PER_S: Final = 2.0
 MAX_TITLE: Final = 64
 MAX_DETAIL: Final = 256
 #: A stream of `StreamInfo.hz` without a frame for so long is stale: the longer of a time, and of a number of frames.
+#: One at rest is while it has none, for the first time.
 STALE_NS: Final = SECOND
 STALE_FRAMES: Final = 3.0
 #: `send(topic, header, frame)`: returns false if that connection has no room.
@@ -75,7 +76,8 @@ class DeliveryCounters(NamedTuple):
 
 class StreamStats(NamedTuple):
     """Measurements of a stream. `rates`: bytes per second by level. `hz`: frames per second. `encoding`:
-    of the newest frame, which was received at `received_ns`. `info`: as of its source, with texts cut to length."""
+    of the newest frame, which was received at `received_ns`. `info`: as of its source, with texts cut to length.
+    `frame_bytes`: of the newest frame, class `full`; `None` before the first one, and when it had to be released."""
 
     rates: tuple[float, ...]
     hz: float
@@ -84,11 +86,14 @@ class StreamStats(NamedTuple):
     encoding: str
     received_ns: int
     info: StreamInfo = StreamInfo()
+    frame_bytes: int | None = None
 
     def is_stale(self, now_ns: int) -> bool:
-        """Return whether the newest frame is too old for the rate that the source means to hold."""
+        """Return whether the newest frame is too old for the rate that the source means to hold, or missing."""
         hz = self.info.hz
-        return hz > 0.0 and now_ns - self.received_ns > max(STALE_NS, STALE_FRAMES / hz * SECOND)
+        if hz > 0.0:
+            return now_ns - self.received_ns > max(STALE_NS, STALE_FRAMES / hz * SECOND)
+        return self.frame_bytes is None and now_ns - self.received_ns > STALE_NS
 
 
 class NewestFrame(NamedTuple):
@@ -307,8 +312,16 @@ class MediaScheduler:
             stream = self._streams[name]
             rates, hz = stream.compute_rates()
             subscribers = len(self._by_stream.get(name, ()))
-            source, encoding, received_ns, info = stream.source, stream.encoding, stream.received_ns, stream.info
-            found[name] = StreamStats(rates, hz, source, subscribers, encoding, received_ns, info)
+            found[name] = StreamStats(
+                rates,
+                hz,
+                stream.source,
+                subscribers,
+                stream.encoding,
+                stream.received_ns,
+                stream.info,
+                len(stream.frames[0]) if stream.frames else None,
+            )
         return found
 
     def list_newest(self, encodings: Container[str]) -> list[NewestFrame]:
