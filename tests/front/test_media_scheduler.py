@@ -13,6 +13,7 @@ import pytest
 
 from iris_session.front.media.budget import NONE_LEVEL, SECOND
 from iris_session.front.media.scheduler import (
+    LOCAL,
     MAX_DETAIL,
     MAX_TITLE,
     STUCK_BYTES,
@@ -284,6 +285,41 @@ def test_stream_belongs_to_its_source_while_it_sends() -> None:
     assert wire.push(source="camera-2")
     wire.hub.stop_sources({"camera-2"})
     assert wire.hub.read_streams() == {}
+
+
+def test_stream_belongs_to_one_connection_of_its_key() -> None:
+    """On plain loopback all sources have the key "", and two processes may have the key of one user."""
+    wire = Wire()
+    wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
+
+    def push(connection: int | None, info: StreamInfo | None = None) -> bool:
+        push = MediaPush("cloud", 3, wire.now_ns, info=info)
+        return wire.hub.push(push, [b"%d" % (connection or 0)], "", wire.now_ns, connection)
+
+    room = StreamInfo("Room")
+    assert push(11, room)
+    assert [push(12), push(None), push(LOCAL), push(11)] == [False, False, False, True]
+    assert wire.hub.pop_drops()[0] == {"media_stream_taken": 3}
+    assert wire.hub.read_streams()["cloud"].refused_ns == wire.now_ns
+    wire.hub.release_streams(12)
+    assert not push(12)
+    wire.hub.release_streams(11)
+    assert push(None), "frames of the one that has ended may come after its end"
+    assert push(12)
+    assert wire.hub.read_streams()["cloud"].info == room, "a source that has connected again is the same one"
+    assert not push(11)
+    wire.now_ns += 4 * SECOND
+    assert push(11)
+    assert not push(12)
+
+
+def test_another_key_waits_when_a_source_has_ended() -> None:
+    wire = Wire()
+    push = MediaPush("cloud", 3, 0)
+    assert wire.hub.push(push, [b"x"], "camera-1", wire.now_ns, 11)
+    wire.hub.release_streams(11)
+    assert not wire.hub.push(push, [b"x"], "camera-2", wire.now_ns, 12)
+    assert wire.hub.push(push, [b"x"], "camera-1", wire.now_ns, 13)
 
 
 def test_rates_cover_the_last_seconds() -> None:

@@ -28,7 +28,7 @@ from iris_session.protocol.media import (
 )
 from iris_session.protocol.names import MediaEncoding
 
-#: A stream without frames for `TAKEOVER_NS` may be taken over by another source; after `EXPIRE_NS` it is removed.
+#: A stream may be taken over by another source when nothing came for `TAKEOVER_NS`; it is removed after `EXPIRE_NS`.
 TAKEOVER_NS: Final = 3 * SECOND
 EXPIRE_NS: Final = 60 * SECOND
 #: A reader without room for frames of this size holds much: closing it frees memory. One of smaller frames is slow.
@@ -45,6 +45,8 @@ MAX_DETAIL: Final = 256
 #: One at rest is while it has none, for the first time.
 STALE_NS: Final = SECOND
 STALE_FRAMES: Final = 3.0
+#: The connection of this machine's session itself; others are descriptors of TCP connections.
+LOCAL: Final = -1
 #: `send(topic, header, frame)`: returns false if that connection has no room.
 Send = Callable[[bytes, bytes, Any], bool]
 
@@ -77,7 +79,8 @@ class DeliveryCounters(NamedTuple):
 class StreamStats(NamedTuple):
     """Measurements of a stream. `rates`: bytes per second by level. `hz`: frames per second. `encoding`:
     of the newest frame, which was received at `received_ns`. `info`: as of its source, with texts cut to length.
-    `frame_bytes`: of the newest frame, class `full`; `None` before the first one, and when it had to be released."""
+    `frame_bytes`: of the newest frame, class `full`; `None` before the first one, and when it had to be released.
+    `refused_ns`: when something of another source was refused last, `None` for never."""
 
     rates: tuple[float, ...]
     hz: float
@@ -87,6 +90,7 @@ class StreamStats(NamedTuple):
     received_ns: int
     info: StreamInfo = StreamInfo()
     frame_bytes: int | None = None
+    refused_ns: int | None = None
 
     def is_stale(self, now_ns: int) -> bool:
         """Return whether the newest frame is too old for the rate that the source means to hold, or missing."""
@@ -125,11 +129,14 @@ class _Subscription:
 
 class _Stream:
     """One stream and its newest frame, received at `received_ns`; before the first one, when the stream began.
-    `heard_ns`: of the newest message. `level_bytes`: bytes that each level would have had so far.
+    `source`, `connection`: key and connection that it belongs to; `None` when that has ended. `heard_ns`: of the newest
+    message. `level_bytes`: bytes that each level would have had so far.
     """
 
-    def __init__(self, source: str, seq: int, now_ns: int) -> None:
+    def __init__(self, source: str, connection: int | None, seq: int, now_ns: int) -> None:
         self.source = source
+        self.connection = connection
+        self.refused_ns: int | None = None
         self.seq = seq
         self.received_ns = self.heard_ns = now_ns
         self.info = StreamInfo()
@@ -249,9 +256,11 @@ class MediaScheduler:
 
     # --- frames ------------------------------------------------------------------------------------------------------
 
-    def push(self, push: MediaPush, frames: Sequence[Any], source: str, now_ns: int) -> bool:
+    def push(
+        self, push: MediaPush, frames: Sequence[Any], source: str, now_ns: int, connection: int | None = LOCAL
+    ) -> bool:
         """Store a frame of a source as the newest of its stream, and its info. Return false if it was dropped and
-        counted.
+        counted. `source`, `connection`: its key, and its connection, `None` for one that has ended meanwhile.
         """
         levels = [CLASSES.index(name) for name in push.classes if name in CLASSES[:-1]]
         fits = len(frames) == len(levels) == len(push.classes) == len(set(levels))
@@ -262,7 +271,7 @@ class MediaScheduler:
         if now_ns < self._paused_until_ns:
             self._count_drop("media_memory")
             return False
-        stream = self._find_stream(push.stream, source, now_ns)
+        stream = self._find_stream(push.stream, source, connection, now_ns)
         if stream is None:
             return False
         stream.heard_ns, stream.encoding = now_ns, push.encoding
@@ -321,6 +330,7 @@ class MediaScheduler:
                 stream.received_ns,
                 stream.info,
                 len(stream.frames[0]) if stream.frames else None,
+                stream.refused_ns,
             )
         return found
 
@@ -378,6 +388,12 @@ class MediaScheduler:
         """Count a frame that was dropped before it came here."""
         self._count_drop(reason)
 
+    def release_streams(self, connection: int) -> None:
+        """Let the streams of a connection that has ended be taken over by the next one of the same key."""
+        for stream in self._streams.values():
+            if stream.connection == connection:
+                stream.connection = None
+
     def stop_sources(self, gone: Iterable[str]) -> None:
         """Remove the streams of sources that may not hand in frames any more."""
         ended = set(gone)
@@ -402,20 +418,24 @@ class MediaScheduler:
         if not numbers:
             del self._by_stream[stream]
 
-    def _find_stream(self, name: str, source: str, now_ns: int) -> _Stream | None:
+    def _find_stream(self, name: str, source: str, connection: int | None, now_ns: int) -> _Stream | None:
         stream = self._streams.get(name)
         if stream is None:
             if len(self._streams) >= MAX_STREAMS:
                 self._count_drop("media_streams_full")
                 return None
             # A restarted front numbers above its predecessor: no stream has a thousand frames a second.
-            stream = self._streams[name] = _Stream(source, now_ns // MILLISECOND, now_ns)
-        elif stream.source != source:
-            if now_ns - stream.heard_ns < TAKEOVER_NS:
+            stream = self._streams[name] = _Stream(source, connection, now_ns // MILLISECOND, now_ns)
+        elif (stream.source, stream.connection) != (source, connection):
+            has_ended = stream.source == source and stream.connection is None
+            if not has_ended and now_ns - stream.heard_ns < TAKEOVER_NS:
+                stream.refused_ns = now_ns
                 self._count_drop("media_stream_taken")
                 return None
-            stream.source, stream.info, stream.received_ns = source, StreamInfo(), now_ns
-            stream.push, stream.frames = None, {}
+            if stream.source != source:
+                stream.source, stream.info, stream.received_ns = source, StreamInfo(), now_ns
+                stream.push, stream.frames = None, {}
+            stream.connection = connection
         return stream
 
     def _take_info(self, stream: _Stream, info: StreamInfo) -> None:

@@ -37,6 +37,8 @@ MIN_EXPECTED_FRAMES: Final = 20
 #: its own with every frame.
 DESCRIPTIONS_PER_S: Final = 1.0
 DESCRIPTION_BURST: Final = 4
+#: Two sources of one stream are reported for so long after something was refused.
+REFUSED_NS: Final = 3 * SECOND
 #: Refused keys that are remembered.
 MAX_REFUSED: Final = 256
 #: Sources that a warning names.
@@ -127,6 +129,14 @@ class MediaService:
                 facts.is_stale(now_ns),
             )
             for name, facts in self._stats.items()
+        )
+
+    def list_warnings(self, now_ns: int) -> tuple[str, ...]:
+        """Return a warning for every stream that two sources send."""
+        return tuple(
+            f"another source sends the stream {name!r}, too, and is refused: give it a stream of another name"
+            for name, facts in self._stats.items()
+            if facts.refused_ns is not None and now_ns - facts.refused_ns < REFUSED_NS
         )
 
     def report_participant(self, number: int) -> dict[str, Any]:
