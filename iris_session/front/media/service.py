@@ -197,8 +197,10 @@ class MediaService:
             fresh = StateReport(report.age_ms_p50, self._missed_share(state, report))
         state.report = report or state.report
         limit = max(0.0, state.report.media_limit_mbit_per_s) * MBIT if state.report is not None else 0.0
-        measure = LinkMeasure(fresh, tally.delivered - before.delivered, tally.due - before.due, limit)
-        rates = {stream: self._stats[stream].rates for stream in state.streams if stream in self._stats}
+        streams = {stream: self._stats[stream] for stream in state.streams if stream in self._stats}
+        newest = {stream: facts.frame_bytes or 0 for stream, facts in streams.items()}
+        measure = LinkMeasure(fresh, tally.delivered - before.delivered, tally.due - before.due, limit, newest)
+        rates = {stream: facts.rates for stream, facts in streams.items()}
         if self._controller is not None:
             state.grant = self._controller.update(number, measure, rates, now_ns)
 
