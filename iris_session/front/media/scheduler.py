@@ -342,9 +342,10 @@ class MediaScheduler:
             if stream.push is not None and stream.push.encoding in encodings
         ]
 
-    def has_stream(self, name: str) -> bool:
-        """Return whether a stream is there: with a frame, or without."""
-        return name in self._streams
+    def has_stream(self, name: str, encoding: str) -> bool:
+        """Return whether a stream is there whose newest frame, if it has one, has this encoding."""
+        stream = self._streams.get(name)
+        return stream is not None and (stream.push is None or stream.push.encoding == encoding)
 
     def release_frames(self, until_ns: int) -> bool:
         """Release every frame, and drop frames until then. Return whether there were any."""
