@@ -361,6 +361,18 @@ def test_a_link_that_has_room_again_gets_the_newest_frame() -> None:
     assert len(wire.got[ANN]) == 1
 
 
+def test_last_frame_of_a_stream_comes_with_a_better_level() -> None:
+    wire = Wire(ann=5)
+    wire.hub.subscribe(ANN, "cloud", "a", 1, wire.now_ns)
+    while not wire.got[ANN]:
+        wire.push()
+    wire.push()
+    assert len(wire.got[ANN]) == 1
+    wire.allow(ann=0)
+    wire.hub.flush(wire.send, wire.now_ns)
+    assert [head.seq - wire.got[ANN][0][0].seq for head, _ in wire.got[ANN]] == [0, 1]
+
+
 def test_client_that_has_connected_again_gets_the_newest_frame_again() -> None:
     wire = Wire()
     wire.push()

@@ -189,8 +189,9 @@ class MediaScheduler:
     # --- subscriptions -----------------------------------------------------------------------------------------------
 
     def set_subscribers(self, listeners: Mapping[int, MediaSubscriber], now_ns: int) -> None:
-        """Set the connections that may subscribe, and their levels from now on."""
-        stopped = [key for key in self._subscriptions if self._find_level(*key) >= NONE_LEVEL]
+        """Set the connections that may subscribe, and their levels from now on. Who gets more gets the newest frame: it
+        may be the last one, and have been left out."""
+        before = {key: self._find_level(*key) for key in self._subscriptions}
         self._subscribers = dict(listeners)
         for number in [number for number in self._by_number if number not in self._subscribers]:
             for stream in self.list_subscriptions(number):
@@ -198,8 +199,9 @@ class MediaScheduler:
         for known in (self._ended_counters, self._newest_buckets, self._delayed):
             for number in [number for number in known if number not in self._subscribers]:
                 del known[number]
-        for key in stopped:
-            self._offer_newest(key, now_ns)
+        for key, level in before.items():
+            if self._find_level(*key) < level:
+                self._offer_newest(key, now_ns)
 
     def subscribe(self, number: int, stream: str, user_id: str, reader: int, now_ns: int) -> bool:
         """Subscribe a connection to a stream, and mark the newest frame due: the next one of a stream at rest may come
