@@ -494,7 +494,7 @@ def check_media_push(data: bytes) -> None:
         camera = facts.info.camera
         numbers = () if camera is None else (camera.fx, camera.cy, *camera.distortion, *camera.position)
         assert all(map(math.isfinite, (facts.info.hz, *numbers)))
-        assert not facts.is_stale(2**62) or facts.info.hz > 0.0
+        assert not facts.is_stale(2**62) or facts.info.hz > 0.0 or facts.frame_bytes is None
         scheduler.subscribe(1, name, "", 2, 3)
         info = facts.info
         described = StreamBudget(name, title=info.title, camera=info.camera, fault=info.fault, detail=info.detail)

@@ -120,6 +120,8 @@ class ClientMedia:
     ) -> bool:
         """Publish a frame of a stream, in role `camera` or `source`.
 
+        Publish that of a stream at rest again at least every 10 s: a session may have lost it.
+
         Args:
             stream: Name of the stream.
             frames: Bytes of the frame, or of each of its levels by name; see `Session.publish_media`.

@@ -45,13 +45,13 @@ FAULTS: Final = {
     ),
 }
 _SILENT: Final = (
-    "its source has ended, hangs, or cannot reach the session",
+    "its source has ended, hangs, cannot reach the session, or does not repeat the frame of a stream at rest",
     "check the program that publishes it, and the network to it",
 )
 
 
 def check_streams(streams: tuple[MediaStreamReport, ...]) -> Finding:
-    """Report streams whose source found a fault, or whose newest frame is too old for the rate it means to hold."""
+    """Report streams whose source found a fault, or whose newest frame is missing or too old for their rate."""
     bad = [one for one in streams if one.fault or one.stale]
     if not bad:
         return ok("streams", ", ".join(one.stream for one in streams) or "none")

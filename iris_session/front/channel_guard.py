@@ -115,6 +115,10 @@ class ChannelGuard:
             self._traffic.reset(descriptor)
         return changed
 
+    def has_connection(self, descriptor: int) -> bool:
+        """Return whether a connection is open, as far as `read_events` has read."""
+        return self._tcp.find(descriptor) is not None
+
     def record_message(self, descriptor: int, user: str, lengths: Iterable[int], *, counts: int) -> str:
         """Record a message with frames of these lengths. `counts`: as how many it counts towards a flood.
 

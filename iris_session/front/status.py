@@ -145,7 +145,7 @@ class StatusService:
             step_to_publish=compute_quantiles(delays) if len(delays) >= MIN_DELAYS else None,
             participants=tuple(self._merge_row(row, by_participant.get(row.id), now_ns) for row in half.participants),
             drops=drops,
-            warnings=(*half.warnings, *self._guard.list_warnings(now_ns)),
+            warnings=(*half.warnings, *self._guard.list_warnings(now_ns), *self._media.list_warnings(now_ns)),
             connections=len(self._connections),
             entries_per_s=self._entries_per_s,
             authority_silent_ns=now_ns - authority.heard_ns if authority.heard_ns else -1,

@@ -159,6 +159,8 @@ class Owner:
     ) -> bool:
         """Publish the newest frame of a media stream to every client that subscribed to it. From any thread.
 
+        Publish that of a stream at rest again at least every 10 s: a front that is restarted has lost it.
+
         Args:
             stream: Name of the stream.
             frames: Bytes of the frame, or bytes by class: `full`, and the coarser `half` and `quarter`. For a class

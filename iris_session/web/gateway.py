@@ -86,6 +86,7 @@ class SessionLink:
         keys = (config.server_key, config.public_key, config.secret_key)
         self._keys = CurveKeys(*(one.encode() for one in keys)) if config.server_key else None
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(1)
+        self._media_context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(1)  # a large frame does not delay state
         hello = Hello(
             Role.GATEWAY,
             "web",
@@ -240,7 +241,7 @@ class SessionLink:
         """Return a subscription to media for a browser."""
         welcome = self.connection.welcome
         port = 0 if welcome is None else welcome.endpoints.media
-        media = open_socket(self._context, zmq.SUB, self._config.host, self._keys)
+        media = open_socket(self._media_context, zmq.SUB, self._config.host, self._keys)
         media.setsockopt(zmq.RCVHWM, MEDIA_HWM)
         media.setsockopt(zmq.RCVBUF, MEDIA_RCVBUF)
         if port:
@@ -292,6 +293,7 @@ class SessionLink:
         self._close_state()
         self._close_control()
         self._context.destroy(linger=0)
+        self._media_context.destroy(linger=0)
 
 
 class MediaFeedSocket:

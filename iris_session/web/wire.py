@@ -45,6 +45,12 @@ _LENGTH: Final = 4
 _MAX_FRAMES: Final = 255
 _ENVELOPE_ELEMENTS: Final = 4
 
+# Of the frames of a WebSocket: opcode of a binary message (0: it goes on), marks of its end and of long lengths.
+_BINARY: Final = 2
+_FINAL: Final = 0x80
+_LENGTH_16: Final = 126
+_LENGTH_64: Final = 127
+
 
 class ForgedNameError(ProtocolError):
     """A client behind a gateway has set `on_behalf_of` itself."""
@@ -117,6 +123,19 @@ def encode_frames(channel: int, frames: Sequence[Bytes]) -> bytes:
         raise ValueError(f"a message has 1 to {_MAX_FRAMES} frames, not {len(frames)}")
     lengths = [len(frame) for frame in frames]
     return b"".join((struct.pack(f"<BB{len(frames)}I", channel, len(frames), *lengths), *frames))
+
+
+def make_fragment(message: bytes, begin: int, end: int) -> bytes:
+    """Return a part of a binary message of a server as a WebSocket frame (RFC 6455, sections 5.2 and 5.4)."""
+    length = end - begin
+    first = (0 if begin else _BINARY) | (_FINAL if end == len(message) else 0)
+    if length < _LENGTH_16:
+        head = struct.pack(">BB", first, length)
+    elif length < 2**16:
+        head = struct.pack(">BBH", first, _LENGTH_16, length)
+    else:
+        head = struct.pack(">BBQ", first, _LENGTH_64, length)
+    return head + memoryview(message)[begin:end]
 
 
 def decode_frames(data: Bytes) -> tuple[int, list[memoryview]]:

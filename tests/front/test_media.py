@@ -19,7 +19,7 @@ from iris_session.front.media.proxy import MediaProxy
 from iris_session.front.media.scheduler import MediaSubscriber
 from iris_session.link import FrontLimits
 from iris_session.link.media_source import MediaSource
-from iris_session.link.sockets import watch_tcp
+from iris_session.link.sockets import IO_THREADS, watch_tcp
 from iris_session.protocol.client_messages import Heartbeat
 from iris_session.protocol.codec import decode_media_header, encode_media_frames
 from iris_session.protocol.limits import MAX_MEDIA_FRAME_BYTES
@@ -31,6 +31,7 @@ from tests.front.harness import N_BODIES, FrontSession, RawClient
 from tests.front.lab import Lab, Open
 
 Curve = tuple[bytes, bytes, bytes]
+SECOND = 1_000_000_000
 
 
 class Viewer:
@@ -505,6 +506,74 @@ def test_published_frame_is_sent_as_it_was_when_published(tmp_path: Path) -> Non
         assert front.poll(30_000)
         assert set(front.recv_multipart()[1]) == {ord("a")}
     source.close()
+
+
+class InProcess:
+    """A proxy in this process, on plain loopback, whose time stands still: nothing ends by silence."""
+
+    def __init__(self, folder: Path) -> None:
+        limits, self.endpoint = FrontLimits(), f"ipc://{folder}/media"
+        self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(IO_THREADS)
+        out, local, remote = (self.context.socket(kind) for kind in (zmq.XPUB, zmq.PULL, zmq.PULL))
+        out.setsockopt(zmq.XPUB_MANUAL, 1)
+        out.bind_to_random_port("tcp://127.0.0.1")
+        local.bind(self.endpoint)
+        self.port = remote.bind_to_random_port("tcp://127.0.0.1")
+        guards = [
+            ChannelGuard(watch_tcp(one, name), limits, ChannelBounds(8, 1 << 20), curve=False)
+            for one, name in ((out, "out"), (remote, "in"))
+        ]
+        self.proxy = MediaProxy(out, *guards, local, remote, lambda: SECOND, encrypted=False)
+        self.proxy.start()
+
+    def source(self) -> zmq.Socket[bytes]:
+        source = self.context.socket(zmq.PUSH)
+        source.linger = 0
+        source.connect(f"tcp://127.0.0.1:{self.port}")
+        return source
+
+    def until(self, condition: Callable[[], bool], what: str) -> None:
+        deadline = time.monotonic() + 30.0
+        while not condition():
+            assert time.monotonic() < deadline, what
+            time.sleep(0.002)
+
+    def sends(self, source: zmq.Socket[bytes], data: bytes) -> bool:
+        """Send a frame. Return whether it became the newest one of the stream."""
+        drops = self.count_drops()
+        source.send_multipart(encode_media_frames("depth", data, 0, 1, "bytes"))
+        self.until(lambda: self.newest() == data or self.count_drops() > drops, "taken or refused")
+        return self.newest() == data
+
+    def newest(self) -> bytes:
+        with self.proxy.lock:
+            return b"".join(bytes(one.frame) for one in self.proxy.scheduler.list_newest(("bytes",)))
+
+    def count_drops(self) -> int:
+        with self.proxy.lock:
+            return self.proxy.scheduler.drops.get("media_stream_taken", 0)
+
+    def close(self) -> None:
+        self.proxy.close()
+        self.context.destroy(linger=0)
+
+
+def test_stream_has_one_source_and_the_next_one_at_once_when_that_has_ended(tmp_path: Path) -> None:
+    rig = InProcess(tmp_path)
+    first, second, local = rig.source(), rig.source(), MediaSource(rig.endpoint)
+    assert rig.sends(first, b"1")
+    assert not rig.sends(second, b"2")
+    assert rig.sends(first, b"3")
+    local.publish("depth", b"4", 0, 1, "bytes")
+    rig.until(lambda: rig.count_drops() == 2, "the session itself is another source")
+    first.close()
+    rig.until(lambda: rig.sends(second, b"5"), "the second source has it")
+    assert rig.sends(second, b"6")
+    third = rig.source()
+    assert not rig.sends(third, b"7")
+    for one in (second, third, local):
+        one.close()
+    rig.close()
 
 
 def test_fault_of_the_thread_loses_pending_work_and_is_logged_once(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 
 import pytest
 from hypothesis import given, settings
@@ -40,7 +41,9 @@ class Link:
         self.grants: list[tuple[int, BudgetGrant]] = []
         self._taken = (0, 0)
 
-    def play(self, seconds: float, rates: Rates = CLOUD, limit: float = 0.0) -> BudgetGrant:
+    def play(
+        self, seconds: float, rates: Rates = CLOUD, limit: float = 0.0, newest: Mapping[str, int] | None = None
+    ) -> BudgetGrant:
         """Return the last grant of that time, with a report every second and a decision every quarter."""
         for _ in range(int(seconds * 4)):
             self.now_ns += STEP_NS
@@ -53,7 +56,7 @@ class Link:
             if self.now_ns % SECOND == 0 and self.capacity:
                 report = StateReport(self.age_ms + 1e3 * self.waiting / self.capacity, 0.0)
             due = 15 if sent else 0
-            look = LinkMeasure(report, round(due * taken / sent) if sent else 0, due, limit)
+            look = LinkMeasure(report, round(due * taken / sent) if sent else 0, due, limit, newest or {})
             self.grants.append((self.now_ns, self.controller.update(7, look, rates, self.now_ns)))
         return self.grants[-1][1]
 
@@ -158,6 +161,61 @@ def test_new_stream_starts_low_on_a_full_link() -> None:
     controller = link.controller
     controller.remove(7)
     assert controller.update(7, LinkMeasure(None), BOTH, link.now_ns).levels == {"cloud": 0, "cloth": 0}
+
+
+MAPS = {**CLOUD, "map": (0.0, 0.0, 0.0), "plan": (0.0, 0.0, 0.0)}
+MAP_BYTES = {"map": 400_000, "plan": 400_000}
+
+
+@pytest.mark.parametrize("limit", [0.0, 2 * MBIT])
+def test_stream_at_rest_is_given_on_a_full_link_within_half_a_second(limit: float) -> None:
+    link = Link(8)
+    link.play(5)
+    link.play(2, limit=limit)
+    cloud = link.grants[-1][1].levels["cloud"]
+    assert cloud > 0
+    link.play(0.5, MAPS, limit)
+    assert link.grants[-1][1].levels == {"cloud": cloud, "map": 0, "plan": 0}
+
+
+def test_single_frames_are_given_as_fast_as_the_budget_carries_them() -> None:
+    link = Link(8)
+    link.play(5)
+    budget = link.grants[-1][1].bytes_per_s
+    link.play(0.5, MAPS, newest=MAP_BYTES)
+    given = link.grants[-1][0]
+    assert [link.grants[-1][1].levels[stream] for stream in ("map", "plan")] == [0, NONE_LEVEL]
+    link.play(2, MAPS, newest=MAP_BYTES)
+    later = next(now for now, grant in link.grants if grant.levels.get("plan") == 0)
+    assert 0.0 <= (later - given) / SECOND - MAP_BYTES["map"] / budget <= 0.25
+
+
+def test_single_frame_is_no_new_normal_of_the_link() -> None:
+    """It makes state late while it is under way, and nothing else is there that could be lowered."""
+    controller = BudgetController()
+    rest = {"map": (0.0, 0.0, 0.0)}
+    newest = {"map": 100_000_000}
+
+    def play(begin: int, seconds: int, age_ms: float, rates: Rates = rest) -> BudgetGrant:
+        for n in range(begin * 4, (begin + seconds) * 4):
+            report = StateReport(age_ms, 0.0) if n % 4 == 0 else None
+            grant = controller.update(1, LinkMeasure(report, 15, 15, newest=newest), rates, n * STEP_NS)
+        return grant
+
+    play(0, 5, 10.0, CLOUD)
+    assert play(5, 1, 300.0, CLOUD).levels["cloud"] > 0
+    play(6, 1, 10.0, CLOUD)
+    assert play(7, 1, 10.0, {**CLOUD, **rest}).levels["map"] == 0
+    play(8, 8, 300.0)
+    assert play(16, 2, 300.0, {**CLOUD, **rest}).levels["cloud"] == NONE_LEVEL
+
+
+def test_dead_link_gets_no_stream_at_rest() -> None:
+    link = Link(8)
+    link.play(5)
+    link.capacity = 0.0
+    link.play(6)
+    assert set(link.play(2, MAPS, newest=MAP_BYTES).levels.values()) == {NONE_LEVEL}
 
 
 def test_most_expensive_stream_is_lowered_first() -> None:

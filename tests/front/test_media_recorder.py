@@ -143,6 +143,46 @@ def test_descriptions_go_when_they_change_and_the_end_of_a_stream(rig: Rig) -> N
     assert rig.drops() == {}
 
 
+@pytest.mark.parametrize("other", ["jpeg", "bytes"])
+def test_stream_ends_in_the_encoding_that_it_changes_from(rig: Rig, other: str) -> None:
+    rig.push("room", b"cloud")
+    rig.tick()
+    for n in range(20):  # three changes in each period
+        rig.now_ns += PERIOD_NS // 3 + 1
+        rig.push("room", b"%d" % n, other if n % 2 == 0 else "cloud")
+        rig.tick()
+    ends = [header for header, info in rig.infos if info is None]
+    assert [header.budget_class for header in ends] == ["none"] * len(ends)
+    assert [header.encoding for header in ends][:2] == (["cloud", "jpeg"] if other == "jpeg" else ["cloud", "cloud"])
+    shown = [header.encoding for header, _ in rig.got]
+    assert 5 <= len(shown) <= 7, "no more than at the rate"
+    assert set(shown) == {"cloud", other} - {"bytes"}
+    assert len(ends) in (len(shown), len(shown) - 1)
+    assert rig.drops() == {}
+
+
+def test_new_encoding_waits_for_the_end_of_the_one_before(rig: Rig) -> None:
+    rig.push("room", bytes(1_000_000))
+    rig.tick()
+    for _ in range(20):
+        rig.push("block", bytes(1_000_000))
+        rig.tick(take=False)
+        rig.now_ns += PERIOD_NS
+    rig.push("room", b"picture", "jpeg")
+    rig.tick(take=False)
+    assert "room" not in {header.stream for header, _ in rig.got[1:]}
+    found: list[tuple[str, str]] = []
+
+    def takes() -> bool:
+        while rig.socket.poll(0):
+            header = decode_media_header(rig.socket.recv_multipart()[0])
+            found.append((header.stream, header.encoding))
+        return ("room", "jpeg") in found
+
+    rig.wait(takes)
+    assert [one for one in found if one[0] == "room"] == [("room", "cloud"), ("room", "jpeg")]
+
+
 def test_only_clouds_and_pictures_go(rig: Rig) -> None:
     for encoding in ("bytes", "deformable", "cloud", "jpeg", "of tomorrow"):
         rig.push(encoding.replace(" ", "-"), encoding=encoding)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import sys
+from collections.abc import Callable, Mapping
+from types import FrameType
 from typing import Any
 
 import msgspec
@@ -11,6 +13,7 @@ import pytest
 
 from iris_session.front.media.budget import NONE_LEVEL, SECOND
 from iris_session.front.media.scheduler import (
+    LOCAL,
     MAX_DETAIL,
     MAX_TITLE,
     STUCK_BYTES,
@@ -234,6 +237,45 @@ def test_streams_and_subscriptions_are_bounded() -> None:
     assert wire.push(stream="another")
 
 
+def count_lines(action: Callable[[], object]) -> int:
+    """Return how many lines an action runs."""
+    lines, before = 0, sys.gettrace()
+
+    def trace(_frame: FrameType, event: str, _argument: object) -> Any:
+        nonlocal lines
+        lines += event == "line"
+        return trace
+
+    sys.settrace(trace)
+    try:
+        action()
+    finally:
+        sys.settrace(before)
+    return lines
+
+
+def test_work_for_one_client_or_stream_does_not_grow_with_the_others() -> None:
+    """The front's main thread waits for the first two, for every client, four times a second."""
+    wire = Wire()
+    wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
+
+    def count() -> list[int]:
+        wire.push()
+        actions = (lambda: wire.hub.list_subscriptions(ANN), lambda: wire.hub.read_counters(ANN), wire.push)
+        return [count_lines(action) for action in actions]
+
+    alone = count()
+    others = range(100, 130)
+    wire.hub.set_subscribers({n: MediaSubscriber("", {}) for n in others} | {ANN: MediaSubscriber("a", {})}, SECOND)
+    for number in others:
+        for n in range(MAX_STREAMS):
+            assert wire.hub.subscribe(number, f"s{n}", "", number, SECOND)
+    assert count() == alone
+    wire.allow()
+    assert all(wire.hub.list_subscriptions(number) == [] for number in others)
+    assert wire.hub.list_subscriptions(ANN) == ["cloud"]
+
+
 def test_stream_belongs_to_its_source_while_it_sends() -> None:
     wire = Wire()
     assert wire.push(source="camera-1")
@@ -243,6 +285,41 @@ def test_stream_belongs_to_its_source_while_it_sends() -> None:
     assert wire.push(source="camera-2")
     wire.hub.stop_sources({"camera-2"})
     assert wire.hub.read_streams() == {}
+
+
+def test_stream_belongs_to_one_connection_of_its_key() -> None:
+    """On plain loopback all sources have the key "", and two processes may have the key of one user."""
+    wire = Wire()
+    wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
+
+    def push(connection: int | None, info: StreamInfo | None = None) -> bool:
+        push = MediaPush("cloud", 3, wire.now_ns, info=info)
+        return wire.hub.push(push, [b"%d" % (connection or 0)], "", wire.now_ns, connection)
+
+    room = StreamInfo("Room")
+    assert push(11, room)
+    assert [push(12), push(None), push(LOCAL), push(11)] == [False, False, False, True]
+    assert wire.hub.pop_drops()[0] == {"media_stream_taken": 3}
+    assert wire.hub.read_streams()["cloud"].refused_ns == wire.now_ns
+    wire.hub.release_streams(12)
+    assert not push(12)
+    wire.hub.release_streams(11)
+    assert push(None), "frames of the one that has ended may come after its end"
+    assert push(12)
+    assert wire.hub.read_streams()["cloud"].info == room, "a source that has connected again is the same one"
+    assert not push(11)
+    wire.now_ns += 4 * SECOND
+    assert push(11)
+    assert not push(12)
+
+
+def test_another_key_waits_when_a_source_has_ended() -> None:
+    wire = Wire()
+    push = MediaPush("cloud", 3, 0)
+    assert wire.hub.push(push, [b"x"], "camera-1", wire.now_ns, 11)
+    wire.hub.release_streams(11)
+    assert not wire.hub.push(push, [b"x"], "camera-2", wire.now_ns, 12)
+    assert wire.hub.push(push, [b"x"], "camera-1", wire.now_ns, 13)
 
 
 def test_rates_cover_the_last_seconds() -> None:
@@ -278,7 +355,31 @@ def test_a_link_that_has_room_again_gets_the_newest_frame() -> None:
     assert [head.budget_class for head, _ in wire.got[ANN]] == ["quarter"]
     wire.allow(ann=0)  # it has that frame
     wire.hub.flush(wire.send, wire.now_ns)
+    wire.allow(ann=NONE_LEVEL)
+    wire.allow(ann=0)
+    wire.hub.flush(wire.send, wire.now_ns)
     assert len(wire.got[ANN]) == 1
+
+
+def test_last_frame_of_a_stream_comes_with_a_better_level() -> None:
+    wire = Wire(ann=5)
+    wire.hub.subscribe(ANN, "cloud", "a", 1, wire.now_ns)
+    while not wire.got[ANN]:
+        wire.push()
+    wire.push()
+    assert len(wire.got[ANN]) == 1
+    wire.allow(ann=0)
+    wire.hub.flush(wire.send, wire.now_ns)
+    assert [head.seq - wire.got[ANN][0][0].seq for head, _ in wire.got[ANN]] == [0, 1]
+
+
+def test_client_that_has_connected_again_gets_the_newest_frame_again() -> None:
+    wire = Wire()
+    wire.push()
+    for reader in (1, 2, 2):
+        wire.hub.subscribe(ANN, "cloud", "a", reader, wire.now_ns)
+        wire.hub.flush(wire.send, wire.now_ns)
+    assert len(wire.got[ANN]) == 2
 
 
 def test_subscribing_over_and_over_gets_no_frame_each_time() -> None:
@@ -296,6 +397,29 @@ def test_subscribing_over_and_over_gets_no_frame_each_time() -> None:
     before = len(wire.got[ANN])
     wire.push()
     assert len(wire.got[ANN]) == before + 1  # frames after it come as ever
+
+
+def test_stream_at_rest_comes_later_to_who_subscribed_over_and_over() -> None:
+    wire = Wire()
+    for n in range(3):
+        wire.push(stream=f"s{n}")
+    for _ in range(2 * MAX_STREAMS):
+        wire.hub.subscribe(ANN, "cloud", "a", 1, wire.now_ns)
+        wire.push()
+        wire.hub.unsubscribe(ANN, "cloud", 1)
+        wire.hub.subscribe(ANN, "cloud", "a", 1, wire.now_ns)
+        wire.hub.flush(wire.send, wire.now_ns)
+        wire.hub.unsubscribe(ANN, "cloud", 1)
+    wire.got[ANN].clear()
+    for n in range(3):
+        wire.hub.subscribe(ANN, f"s{n}", "a", 1, wire.now_ns)
+    wire.hub.unsubscribe(ANN, "s1", 1)
+    assert not wire.hub.flush(wire.send, wire.now_ns)
+    assert wire.got[ANN] == []
+    for _ in range(40):
+        wire.now_ns += 50 * MS
+        wire.hub.flush(wire.send, wire.now_ns)
+    assert [header.stream for header, _ in wire.got[ANN]] == ["s0", "s2"]
 
 
 def test_restarted_front_numbers_frames_above_its_predecessor() -> None:
@@ -417,6 +541,30 @@ def test_stream_is_stale_without_the_frames_that_it_means_to_have(hz: float, lat
     assert wire.hub.read_streams()["cloud"].is_stale(last + MS) == (late_ns is not None), "an info is no frame"
     describe(wire, None, "", b"x")
     assert not wire.hub.read_streams()["cloud"].is_stale(last + MS)
+
+
+def test_stream_at_rest_is_stale_while_its_frame_is_missing() -> None:
+    """Its source does not know that a front was restarted or had to release the frame."""
+    wire = Wire()
+
+    def is_stale() -> bool:
+        wire.now_ns += SECOND + MS
+        return wire.hub.read_streams()["cloud"].is_stale(wire.now_ns)
+
+    describe(wire, StreamInfo("Room"))
+    assert is_stale()
+    wire.push(frames={"full": b""})
+    assert not is_stale()
+    wire.hub.release_frames(wire.now_ns)
+    assert is_stale()
+    wire.push()
+    assert not is_stale()
+    wire.hub.reset()
+    assert is_stale()
+    wire.push()
+    wire.hub.subscribe(ANN, "cloud", "a", 1, wire.now_ns)
+    wire.hub.flush(wire.send, wire.now_ns)
+    assert len(wire.got[ANN]) == 1
 
 
 def test_topics() -> None:

@@ -118,6 +118,21 @@ def test_report_names_the_fault() -> None:
     assert (report.fault, report.detail) == ("no_depth", "covered")
 
 
+def test_two_sources_of_one_stream_are_reported_while_they_are() -> None:
+    room = Room()
+    room.push()
+    room.tick()
+    assert room.service.list_warnings(room.now_ns) == ()
+    push = MediaPush("room", 1, room.now_ns)
+    assert not room.proxy.scheduler.push(push, [b"x"], "", room.now_ns, 12)
+    room.tick()
+    assert room.drops.by_reason["media_stream_taken"] == 1
+    (text,) = room.service.list_warnings(room.now_ns)
+    assert "'room'" in text
+    room.tick(16)
+    assert room.service.list_warnings(room.now_ns) == ()
+
+
 def test_changes_with_every_frame_are_sent_at_a_bounded_rate_and_the_last_one_is() -> None:
     room = Room()
     sent = 0

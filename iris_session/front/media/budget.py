@@ -3,7 +3,8 @@
 On a congested link the age of state rises first, because media and state share the link. So the controller judges by
 the state that a client reports, and by the frames that its media connection does not take. Levels are lowered quickly,
 to less than what came through. They are raised one step at a time, and after every step that failed the next one comes
-later.
+later. Streams at rest cost nothing, and always have their full level; single frames of theirs are given one after the
+other, as fast as the budget carries them.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from iris_session.protocol.media import CLASSES
@@ -75,12 +77,14 @@ class LinkMeasure(NamedTuple):
         delivered: Media frames that its connection took since then.
         due: Media frames that were due.
         limit: Bytes per second that the client wants at most, 0 for no limit.
+        newest: Bytes of the newest frame by stream.
     """
 
     report: StateReport | None
     delivered: int = 0
     due: int = 0
     limit: float = 0.0
+    newest: Mapping[str, int] = MappingProxyType({})
 
 
 class BudgetGrant(NamedTuple):
@@ -139,6 +143,7 @@ class _ClientBudget:
         self.raise_after_ns = RAISE_NS
         self.failed = math.inf  # cost of the levels that failed
         self.blameless_since_ns = -1  # since when there is congestion without any media
+        self.single_until_ns = -1  # until when single frames of streams at rest are under way
 
 
 class BudgetController:
@@ -157,6 +162,7 @@ class BudgetController:
         if state is None:
             state = self._clients[client] = _ClientBudget()
         limit = measure.limit or math.inf
+        resting = [stream for stream in sorted(rates) if stream in state.levels and not rates[stream][0]]
         self._sync_streams(state, rates)
         reason = self._find_congestion(state, measure, now_ns)
         present = compute_cost(rates, state.levels)
@@ -166,7 +172,8 @@ class BudgetController:
             state.blameless_since_ns = -1
             self._lower_levels(state, rates, LOWER_TO * present * state.delivered_share, reason, now_ns)
         elif reason:
-            self._relearn_best(state, now_ns)
+            if now_ns >= state.single_until_ns:
+                self._relearn_best(state, now_ns)
         else:
             state.blameless_since_ns = -1
             self._raise_levels(state, rates, limit, now_ns)
@@ -174,6 +181,8 @@ class BudgetController:
         if compute_cost(rates, state.levels) > min(SLACK * state.budget, LIMIT_SLACK * limit):
             state.levels = select_levels(rates, allowed)
             state.reason = state.reason if state.budget <= limit else "the client asked for no more"
+        if not reason:
+            self._give_singles(state, resting, measure.newest, allowed, now_ns)
         bound = 0.0 if math.isinf(allowed) else allowed
         return BudgetGrant(dict(state.levels), bound, state.reason if bound or any(state.levels.values()) else "")
 
@@ -225,6 +234,15 @@ class BudgetController:
         """Start a new stream with its full level, or with none while the client's budget is limited."""
         first = 0 if math.isinf(state.budget) else NONE_LEVEL
         state.levels = {stream: state.levels.get(stream, first) for stream in sorted(rates)}
+
+    def _give_singles(
+        self, state: _ClientBudget, resting: Sequence[str], newest: Mapping[str, int], bytes_per_s: float, now_ns: int
+    ) -> None:
+        """Give streams at rest their full level. A single frame counts as under way while the budget carries it."""
+        for stream in resting:
+            if state.levels[stream] and bytes_per_s > 0.0 and now_ns >= state.single_until_ns:
+                state.levels[stream] = 0
+                state.single_until_ns = now_ns + round(newest.get(stream, 0) / bytes_per_s * SECOND)
 
     def _lower_levels(self, state: _ClientBudget, rates: Rates, bytes_per_s: float, reason: str, now_ns: int) -> None:
         if now_ns - state.raised_ns <= PROBE_NS:

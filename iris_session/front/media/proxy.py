@@ -17,7 +17,7 @@ import zmq
 
 from iris_session.front.channel_guard import MAX_COUNTED_MESSAGES, ChannelFlood, ChannelGuard
 from iris_session.front.media.recorder import MediaRecorder
-from iris_session.front.media.scheduler import MediaScheduler
+from iris_session.front.media.scheduler import LOCAL, MediaScheduler
 from iris_session.front.memory_guard import PendingConnection
 from iris_session.protocol.codec import decode_media_push
 from iris_session.protocol.errors import ProtocolError
@@ -167,11 +167,12 @@ class MediaProxy:
 
     def _read_connection_events(self) -> None:
         now_ns = self._now_ns()
-        self._source_guard.read_events(now_ns)
-        changed = self._subscriber_guard.read_events(now_ns)
-        if changed:
+        sources, readers = self._source_guard.read_events(now_ns), self._subscriber_guard.read_events(now_ns)
+        if sources or readers:
             with self.lock:
-                for descriptor in changed:
+                for descriptor in sources:
+                    self.scheduler.release_streams(descriptor)
+                for descriptor in readers:
                     self.scheduler.remove_reader(descriptor)
 
     def _count_reasons(self, reasons: Iterable[str]) -> None:
@@ -253,7 +254,7 @@ class MediaProxy:
             if socket is self._remote:
                 self._handle_remote_frames(frames, lengths)
             else:
-                self._push_frames(frames, "")
+                self._push_frames(frames, "", LOCAL)
 
     def _handle_remote_frames(self, frames: list[zmq.Frame], lengths: list[int]) -> None:
         user = self._read_user_id(frames[0])
@@ -263,14 +264,15 @@ class MediaProxy:
                 self.scheduler.count_drop("media_source_refused" if user in self.refused else "media_source_undecided")
                 if user not in self.refused and len(self.undecided) < MAX_UNDECIDED:
                     self.undecided.add(user)
-        self._source_guard.read_events(self._now_ns())
-        cut = self._source_guard.record_message(_read_descriptor(frames[0]), user, lengths, counts=int(not allowed))
+        self._read_connection_events()
+        descriptor = _read_descriptor(frames[0])
+        cut = self._source_guard.record_message(descriptor, user, lengths, counts=int(not allowed))
         with self.lock:
             self._count_reasons((cut,))
         if allowed:
-            self._push_frames(frames, user)
+            self._push_frames(frames, user, descriptor if self._source_guard.has_connection(descriptor) else None)
 
-    def _push_frames(self, frames: list[zmq.Frame], user: str) -> None:
+    def _push_frames(self, frames: list[zmq.Frame], user: str, connection: int | None) -> None:
         try:
             push = decode_media_push(frames[0].buffer)
         except ProtocolError:
@@ -279,7 +281,7 @@ class MediaProxy:
             if push is None:
                 self.scheduler.count_drop("media_malformed")
             else:
-                self.scheduler.push(push, frames[1:], user, self._now_ns())
+                self.scheduler.push(push, frames[1:], user, self._now_ns(), connection)
 
 
 def _read_descriptor(frame: zmq.Frame) -> int:

@@ -5,7 +5,7 @@ nothing. A frame that is due stays due, and is replaced by newer ones, until the
 the chosen rate is counted by reason (`MediaScheduler.drops`) and logged once.
 
 A message has three parts: a `MediaHeader`, the frame, and the `StreamInfo` as JSON, empty while it is as before. Class
-`none` says that there is no frame; without an info, that the stream has ended.
+`none` says that there is no frame; without an info, that the stream has ended, or goes on in another encoding.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ _ADVICE: Final = {
 class _Stream:
     """Progress of one stream.
 
-    `seq`, `info`: of the newest frame that was sent, -1 and `None` for none. `due_ns`: time of the next one.
-    `missing_ns`: time at which a frame that waits for room counts as missing; 0 while none waits.
+    `seq`, `info`: of the newest frame that was sent, -1 and `None` for none, in `encoding`. `due_ns`: time of the next
+    one. `missing_ns`: time at which a frame that waits for room counts as missing; 0 while none waits.
     """
 
     __slots__ = ("due_ns", "encoding", "info", "missing_ns", "seq")
@@ -55,11 +55,11 @@ class _Stream:
         self.encoding = encoding
         self.restart(now_ns)
 
-    def restart(self, now_ns: int) -> None:
-        """Begin anew: for another recorder."""
+    def restart(self, due_ns: int) -> None:
+        """Begin anew: for another recorder, or after an end."""
         self.seq = -1
         self.info: StreamInfo | None = None
-        self.due_ns = now_ns
+        self.due_ns = due_ns
         self.missing_ns = 0
 
     def is_new_info(self, info: StreamInfo) -> bool:
@@ -96,10 +96,12 @@ class MediaRecorder:
     def tick(self, scheduler: MediaScheduler, now_ns: int) -> None:
         """Send the frames that are due, as far as there is room, the one that waits for longest first."""
         self._read_connection_events(now_ns)
+        self._end_streams(scheduler, now_ns)
         newest = scheduler.list_newest(FILE_SHARE)
         for one in newest:
-            self._streams.setdefault(one.stream, _Stream(one.push.encoding, now_ns)).encoding = one.push.encoding
-        self._end_streams(scheduler, now_ns)
+            stream = self._streams.setdefault(one.stream, _Stream(one.push.encoding, now_ns))
+            if stream.seq < 0:
+                stream.encoding = one.push.encoding
         due = [one for one in newest if self._is_due(one, now_ns)]
         due.sort(key=lambda one: self._streams[one.stream].due_ns)
         for place, one in enumerate(due):
@@ -127,15 +129,20 @@ class MediaRecorder:
                     stream.restart(now_ns)
 
     def _end_streams(self, scheduler: MediaScheduler, now_ns: int) -> None:
-        """Tell the recorder of streams that have ended, as soon as there is room."""
-        for name in [name for name in self._streams if not scheduler.has_stream(name)]:
-            stream = self._streams[name]
+        """Tell the recorder of ended streams as soon as there is room. One that comes again keeps the rate."""
+        for name, stream in list(self._streams.items()):
+            if scheduler.has_stream(name, stream.encoding):
+                continue
             header = MediaHeader(name, BudgetClass.NONE, 0, 0, now_ns, now_ns, stream.encoding, received_ns=now_ns)
-            if stream.seq < 0 or self._send(header, b"", b""):
+            if stream.seq >= 0 and self._send(header, b"", b""):
+                stream.restart(stream.due_ns)
+            if stream.seq < 0 and now_ns >= stream.due_ns:
                 del self._streams[name]
 
     def _is_due(self, one: NewestFrame, now_ns: int) -> bool:
         stream = self._streams[one.stream]
+        if one.push.encoding != stream.encoding:  # the recorder does not know of the end yet
+            return False
         return now_ns >= stream.due_ns and (one.seq != stream.seq or stream.is_new_info(one.info))
 
     def _send_newest(self, one: NewestFrame, now_ns: int) -> str:

@@ -28,7 +28,7 @@ from iris_session.protocol.media import (
 )
 from iris_session.protocol.names import MediaEncoding
 
-#: A stream without frames for `TAKEOVER_NS` may be taken over by another source; after `EXPIRE_NS` it is removed.
+#: A stream may be taken over by another source when nothing came for `TAKEOVER_NS`; it is removed after `EXPIRE_NS`.
 TAKEOVER_NS: Final = 3 * SECOND
 EXPIRE_NS: Final = 60 * SECOND
 #: A reader without room for frames of this size holds much: closing it frees memory. One of smaller frames is slow.
@@ -42,8 +42,11 @@ NEWEST_PER_S: Final = 2.0
 MAX_TITLE: Final = 64
 MAX_DETAIL: Final = 256
 #: A stream of `StreamInfo.hz` without a frame for so long is stale: the longer of a time, and of a number of frames.
+#: One at rest is while it has none, for the first time.
 STALE_NS: Final = SECOND
 STALE_FRAMES: Final = 3.0
+#: The connection of this machine's session itself; others are descriptors of TCP connections.
+LOCAL: Final = -1
 #: `send(topic, header, frame)`: returns false if that connection has no room.
 Send = Callable[[bytes, bytes, Any], bool]
 
@@ -75,7 +78,9 @@ class DeliveryCounters(NamedTuple):
 
 class StreamStats(NamedTuple):
     """Measurements of a stream. `rates`: bytes per second by level. `hz`: frames per second. `encoding`:
-    of the newest frame, which was received at `received_ns`. `info`: as of its source, with texts cut to length."""
+    of the newest frame, which was received at `received_ns`. `info`: as of its source, with texts cut to length.
+    `frame_bytes`: of the newest frame, class `full`; `None` before the first one, and when it had to be released.
+    `refused_ns`: when something of another source was refused last, `None` for never."""
 
     rates: tuple[float, ...]
     hz: float
@@ -84,11 +89,15 @@ class StreamStats(NamedTuple):
     encoding: str
     received_ns: int
     info: StreamInfo = StreamInfo()
+    frame_bytes: int | None = None
+    refused_ns: int | None = None
 
     def is_stale(self, now_ns: int) -> bool:
-        """Return whether the newest frame is too old for the rate that the source means to hold."""
+        """Return whether the newest frame is too old for the rate that the source means to hold, or missing."""
         hz = self.info.hz
-        return hz > 0.0 and now_ns - self.received_ns > max(STALE_NS, STALE_FRAMES / hz * SECOND)
+        if hz > 0.0:
+            return now_ns - self.received_ns > max(STALE_NS, STALE_FRAMES / hz * SECOND)
+        return self.frame_bytes is None and now_ns - self.received_ns > STALE_NS
 
 
 class NewestFrame(NamedTuple):
@@ -103,12 +112,13 @@ class NewestFrame(NamedTuple):
 
 
 class _Subscription:
-    """One connection's subscription to one stream."""
+    """One connection's subscription to one stream. `seq`: of the frame that its readers got last, -1 for none."""
 
-    __slots__ = ("bytes", "delivered", "dropped", "due", "pending", "readers")
+    __slots__ = ("bytes", "delivered", "dropped", "due", "pending", "readers", "seq")
 
     def __init__(self) -> None:
         self.pending = False
+        self.seq = -1
         self.readers: set[int] = set()  # descriptors
         self.due = self.delivered = self.dropped = self.bytes = 0
 
@@ -119,11 +129,14 @@ class _Subscription:
 
 class _Stream:
     """One stream and its newest frame, received at `received_ns`; before the first one, when the stream began.
-    `heard_ns`: of the newest message. `level_bytes`: bytes that each level would have had so far.
+    `source`, `connection`: key and connection that it belongs to; `None` when that has ended. `heard_ns`: of the newest
+    message. `level_bytes`: bytes that each level would have had so far.
     """
 
-    def __init__(self, source: str, seq: int, now_ns: int) -> None:
+    def __init__(self, source: str, connection: int | None, seq: int, now_ns: int) -> None:
         self.source = source
+        self.connection = connection
+        self.refused_ns: int | None = None
         self.seq = seq
         self.received_ns = self.heard_ns = now_ns
         self.info = StreamInfo()
@@ -161,9 +174,12 @@ class MediaScheduler:
         self._streams: dict[str, _Stream] = {}
         self._subscribers: dict[int, MediaSubscriber] = {}
         self._subscriptions: dict[tuple[int, str], _Subscription] = {}
+        self._by_number: dict[int, set[str]] = {}  # subscribed streams by connection
+        self._by_stream: dict[str, dict[int, _Subscription]] = {}  # the same by stream and connection
         self._by_reader: dict[int, set[tuple[int, str]]] = {}  # by descriptor
         self._ended_counters: dict[int, DeliveryCounters] = {}  # of subscriptions that have ended
         self._newest_buckets: dict[int, TokenBucket] = {}
+        self._delayed: dict[int, dict[str, None]] = {}  # streams by connection that wait for its bucket
         self._pending: deque[tuple[int, str]] = deque()
         self._paused_until_ns = 0
         self._stuck: set[int] = set()
@@ -173,16 +189,19 @@ class MediaScheduler:
     # --- subscriptions -----------------------------------------------------------------------------------------------
 
     def set_subscribers(self, listeners: Mapping[int, MediaSubscriber], now_ns: int) -> None:
-        """Set the connections that may subscribe, and their levels from now on."""
-        stopped = [key for key in self._subscriptions if self._find_level(*key) >= NONE_LEVEL]
+        """Set the connections that may subscribe, and their levels from now on. Who gets more gets the newest frame: it
+        may be the last one, and have been left out."""
+        before = {key: self._find_level(*key) for key in self._subscriptions}
         self._subscribers = dict(listeners)
-        for key in [key for key in self._subscriptions if key[0] not in self._subscribers]:
-            del self._subscriptions[key]
-        for known in (self._ended_counters, self._newest_buckets):
+        for number in [number for number in self._by_number if number not in self._subscribers]:
+            for stream in self.list_subscriptions(number):
+                self._remove_subscription(number, stream)
+        for known in (self._ended_counters, self._newest_buckets, self._delayed):
             for number in [number for number in known if number not in self._subscribers]:
                 del known[number]
-        for key in stopped:
-            self._offer_newest(key, now_ns)
+        for key, level in before.items():
+            if self._find_level(*key) < level:
+                self._offer_newest(key, now_ns)
 
     def subscribe(self, number: int, stream: str, user_id: str, reader: int, now_ns: int) -> bool:
         """Subscribe a connection to a stream, and mark the newest frame due: the next one of a stream at rest may come
@@ -195,10 +214,15 @@ class MediaScheduler:
         if listener is None or listener.user_id != user_id:
             self._count_drop("media_refused")
             return False
-        if (number, stream) not in self._subscriptions and len(self.list_subscriptions(number)) >= MAX_STREAMS:
-            self._count_drop("media_subscriptions_full")
-            return False
-        self._subscriptions.setdefault((number, stream), _Subscription()).readers.add(reader)
+        subscription = self._subscriptions.get((number, stream))
+        if subscription is None:
+            if len(self._by_number.get(number, ())) >= MAX_STREAMS:
+                self._count_drop("media_subscriptions_full")
+                return False
+            subscription = self._add_subscription(number, stream)
+        if reader not in subscription.readers:
+            subscription.readers.add(reader)
+            subscription.seq = -1  # a client that has connected again may have lost what it had
         self._by_reader.setdefault(reader, set()).add((number, stream))
         self._offer_newest((number, stream), now_ns)
         return True
@@ -211,7 +235,7 @@ class MediaScheduler:
             return
         subscription.readers.remove(reader)
         if not subscription.readers:
-            del self._subscriptions[number, stream]
+            self._remove_subscription(number, stream)
             self._ended_counters[number] = self._ended_counters.get(number, DeliveryCounters()).combine(
                 subscription.counters
             )
@@ -223,21 +247,22 @@ class MediaScheduler:
 
     def list_subscriptions(self, number: int) -> list[str]:
         """Return the streams that a connection subscribed to."""
-        return sorted(stream for owner, stream in self._subscriptions if owner == number)
+        return sorted(self._by_number.get(number, ()))
 
     def read_counters(self, number: int) -> DeliveryCounters:
         """Return the counters of all subscriptions of a connection."""
         total = self._ended_counters.get(number, DeliveryCounters())
-        for (owner, _), subscription in self._subscriptions.items():
-            if owner == number:
-                total = total.combine(subscription.counters)
+        for stream in self._by_number.get(number, ()):
+            total = total.combine(self._subscriptions[number, stream].counters)
         return total
 
     # --- frames ------------------------------------------------------------------------------------------------------
 
-    def push(self, push: MediaPush, frames: Sequence[Any], source: str, now_ns: int) -> bool:
+    def push(
+        self, push: MediaPush, frames: Sequence[Any], source: str, now_ns: int, connection: int | None = LOCAL
+    ) -> bool:
         """Store a frame of a source as the newest of its stream, and its info. Return false if it was dropped and
-        counted.
+        counted. `source`, `connection`: its key, and its connection, `None` for one that has ended meanwhile.
         """
         levels = [CLASSES.index(name) for name in push.classes if name in CLASSES[:-1]]
         fits = len(frames) == len(levels) == len(push.classes) == len(set(levels))
@@ -248,7 +273,7 @@ class MediaScheduler:
         if now_ns < self._paused_until_ns:
             self._count_drop("media_memory")
             return False
-        stream = self._find_stream(push.stream, source, now_ns)
+        stream = self._find_stream(push.stream, source, connection, now_ns)
         if stream is None:
             return False
         stream.heard_ns, stream.encoding = now_ns, push.encoding
@@ -263,13 +288,13 @@ class MediaScheduler:
         for level in range(NONE_LEVEL):
             frame, due = stream.select_frame(level)
             stream.level_bytes[level] += len(frame) if due else 0
-        for key, subscription in self._subscriptions.items():
-            if key[1] == push.stream:
-                self._mark_due(key, subscription, stream)
+        for number, subscription in self._by_stream.get(push.stream, {}).items():
+            self._mark_due((number, push.stream), subscription, stream)
         return True
 
     def flush(self, send: Send, now_ns: int) -> bool:
         """Send due frames to connections with room. Return whether some are still pending."""
+        self._offer_delayed(now_ns)
         for _ in range(len(self._pending)):
             key = self._pending.popleft()
             subscription = self._subscriptions.get(key)
@@ -297,9 +322,18 @@ class MediaScheduler:
         for name in sorted(self._streams):
             stream = self._streams[name]
             rates, hz = stream.compute_rates()
-            subscribers = sum(wanted == name for _, wanted in self._subscriptions)
-            source, encoding, received_ns, info = stream.source, stream.encoding, stream.received_ns, stream.info
-            found[name] = StreamStats(rates, hz, source, subscribers, encoding, received_ns, info)
+            subscribers = len(self._by_stream.get(name, ()))
+            found[name] = StreamStats(
+                rates,
+                hz,
+                stream.source,
+                subscribers,
+                stream.encoding,
+                stream.received_ns,
+                stream.info,
+                len(stream.frames[0]) if stream.frames else None,
+                stream.refused_ns,
+            )
         return found
 
     def list_newest(self, encodings: Container[str]) -> list[NewestFrame]:
@@ -310,9 +344,10 @@ class MediaScheduler:
             if stream.push is not None and stream.push.encoding in encodings
         ]
 
-    def has_stream(self, name: str) -> bool:
-        """Return whether a stream is there: with a frame, or without."""
-        return name in self._streams
+    def has_stream(self, name: str, encoding: str) -> bool:
+        """Return whether a stream is there whose newest frame, if it has one, has this encoding."""
+        stream = self._streams.get(name)
+        return stream is not None and (stream.push is None or stream.push.encoding == encoding)
 
     def release_frames(self, until_ns: int) -> bool:
         """Release every frame, and drop frames until then. Return whether there were any."""
@@ -356,6 +391,12 @@ class MediaScheduler:
         """Count a frame that was dropped before it came here."""
         self._count_drop(reason)
 
+    def release_streams(self, connection: int) -> None:
+        """Let the streams of a connection that has ended be taken over by the next one of the same key."""
+        for stream in self._streams.values():
+            if stream.connection == connection:
+                stream.connection = None
+
     def stop_sources(self, gone: Iterable[str]) -> None:
         """Remove the streams of sources that may not hand in frames any more."""
         ended = set(gone)
@@ -364,20 +405,40 @@ class MediaScheduler:
 
     # --- helpers -----------------------------------------------------------------------------------------------------
 
-    def _find_stream(self, name: str, source: str, now_ns: int) -> _Stream | None:
+    def _add_subscription(self, number: int, stream: str) -> _Subscription:
+        subscription = self._subscriptions[number, stream] = _Subscription()
+        self._by_number.setdefault(number, set()).add(stream)
+        self._by_stream.setdefault(stream, {})[number] = subscription
+        return subscription
+
+    def _remove_subscription(self, number: int, stream: str) -> None:
+        del self._subscriptions[number, stream]
+        streams, numbers = self._by_number[number], self._by_stream[stream]
+        streams.remove(stream)
+        del numbers[number]
+        if not streams:
+            del self._by_number[number]
+        if not numbers:
+            del self._by_stream[stream]
+
+    def _find_stream(self, name: str, source: str, connection: int | None, now_ns: int) -> _Stream | None:
         stream = self._streams.get(name)
         if stream is None:
             if len(self._streams) >= MAX_STREAMS:
                 self._count_drop("media_streams_full")
                 return None
             # A restarted front numbers above its predecessor: no stream has a thousand frames a second.
-            stream = self._streams[name] = _Stream(source, now_ns // MILLISECOND, now_ns)
-        elif stream.source != source:
-            if now_ns - stream.heard_ns < TAKEOVER_NS:
+            stream = self._streams[name] = _Stream(source, connection, now_ns // MILLISECOND, now_ns)
+        elif (stream.source, stream.connection) != (source, connection):
+            has_ended = stream.source == source and stream.connection is None
+            if not has_ended and now_ns - stream.heard_ns < TAKEOVER_NS:
+                stream.refused_ns = now_ns
                 self._count_drop("media_stream_taken")
                 return None
-            stream.source, stream.info, stream.received_ns = source, StreamInfo(), now_ns
-            stream.push, stream.frames = None, {}
+            if stream.source != source:
+                stream.source, stream.info, stream.received_ns = source, StreamInfo(), now_ns
+                stream.push, stream.frames = None, {}
+            stream.connection = connection
         return stream
 
     def _take_info(self, stream: _Stream, info: StreamInfo) -> None:
@@ -391,17 +452,38 @@ class MediaScheduler:
         listener = self._subscribers.get(number)
         return NONE_LEVEL if listener is None else listener.levels.get(stream, listener.default_level)
 
-    def _offer_newest(self, key: tuple[int, str], now_ns: int) -> None:
-        """Mark the newest frame of a stream due for a subscription that has not had it."""
+    def _needs_newest(self, key: tuple[int, str]) -> bool:
+        """Return whether a subscription has not had the newest frame of its stream, and is not about to get it."""
         subscription, stream = self._subscriptions.get(key), self._streams.get(key[1])
         if subscription is None or stream is None or not stream.frames or subscription.pending:
-            return
-        if self._find_level(*key) >= NONE_LEVEL:
+            return False
+        return subscription.seq != stream.seq and self._find_level(*key) < NONE_LEVEL
+
+    def _offer_newest(self, key: tuple[int, str], now_ns: int) -> None:
+        """Mark the newest frame of a stream due for a subscription that has not had it: now, or when its connection may
+        have another."""
+        if not self._needs_newest(key):
             return
         bucket = self._newest_buckets.setdefault(key[0], TokenBucket(NEWEST_PER_S, MAX_STREAMS, now_ns))
-        if not bucket.take(now_ns):
+        if bucket.take(now_ns):
+            self._mark_newest(key)
+        else:
+            self._delayed.setdefault(key[0], {})[key[1]] = None
             self._count_drop("media_newest_rate")
-            return
+
+    def _offer_delayed(self, now_ns: int) -> None:
+        for number, streams in list(self._delayed.items()):
+            for stream in list(streams):
+                if self._needs_newest((number, stream)):
+                    if not self._newest_buckets[number].take(now_ns):
+                        break
+                    self._mark_newest((number, stream))
+                del streams[stream]
+            if not streams:
+                del self._delayed[number]
+
+    def _mark_newest(self, key: tuple[int, str]) -> None:
+        subscription = self._subscriptions[key]
         subscription.due += 1
         subscription.pending = True
         self._pending.append(key)
@@ -441,6 +523,7 @@ class MediaScheduler:
         topic = make_topic(number, name) + LEVELS[level].encode()
         if not send(topic, encode_media_header(header), frame):
             return False
+        subscription.seq = stream.seq
         subscription.delivered += 1
         subscription.bytes += len(topic) + len(frame)
         return True

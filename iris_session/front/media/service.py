@@ -37,6 +37,8 @@ MIN_EXPECTED_FRAMES: Final = 20
 #: its own with every frame.
 DESCRIPTIONS_PER_S: Final = 1.0
 DESCRIPTION_BURST: Final = 4
+#: Two sources of one stream are reported for so long after something was refused.
+REFUSED_NS: Final = 3 * SECOND
 #: Refused keys that are remembered.
 MAX_REFUSED: Final = 256
 #: Sources that a warning names.
@@ -129,6 +131,14 @@ class MediaService:
             for name, facts in self._stats.items()
         )
 
+    def list_warnings(self, now_ns: int) -> tuple[str, ...]:
+        """Return a warning for every stream that two sources send."""
+        return tuple(
+            f"another source sends the stream {name!r}, too, and is refused: give it a stream of another name"
+            for name, facts in self._stats.items()
+            if facts.refused_ns is not None and now_ns - facts.refused_ns < REFUSED_NS
+        )
+
     def report_participant(self, number: int) -> dict[str, Any]:
         """Return the media fields of a `ParticipantReport`."""
         state = self._states.get(number)
@@ -187,8 +197,10 @@ class MediaService:
             fresh = StateReport(report.age_ms_p50, self._missed_share(state, report))
         state.report = report or state.report
         limit = max(0.0, state.report.media_limit_mbit_per_s) * MBIT if state.report is not None else 0.0
-        measure = LinkMeasure(fresh, tally.delivered - before.delivered, tally.due - before.due, limit)
-        rates = {stream: self._stats[stream].rates for stream in state.streams if stream in self._stats}
+        streams = {stream: self._stats[stream] for stream in state.streams if stream in self._stats}
+        newest = {stream: facts.frame_bytes or 0 for stream, facts in streams.items()}
+        measure = LinkMeasure(fresh, tally.delivered - before.delivered, tally.due - before.due, limit, newest)
+        rates = {stream: facts.rates for stream, facts in streams.items()}
         if self._controller is not None:
             state.grant = self._controller.update(number, measure, rates, now_ns)
 

@@ -25,6 +25,8 @@ import { type EventLevel, eventWords } from "./words.ts";
 const MAX_EVENTS = 300;
 /** Behind the session's newest frame: more than frames need on their way. */
 const BEHIND_MS = 2000;
+/** Frames of a stream, one of which comes here at least, by class (docs/protocol.md). In class `none` none comes. */
+const FRAMES_BETWEEN: Readonly<Record<string, number>> = { half: 2, quarter: 32 };
 
 export interface LogEntry {
   seq: number;
@@ -202,7 +204,9 @@ export class PageState {
     const received_ms = this.newest.get(stream)?.received_ms ?? 0;
     const report = this.status?.media.find((one) => one.stream === stream);
     if (received_ms === 0 || !this.status || !report) return false;
-    return this.status.session_time / 1e6 - report.age_ms - received_ms > BEHIND_MS;
+    const budgetClass = this.budget?.streams.find((one) => one.stream === stream)?.budget_class ?? "";
+    const between_ms = report.hz > 0 ? (1000 * (FRAMES_BETWEEN[budgetClass] ?? 0)) / report.hz : 0;
+    return this.status.session_time / 1e6 - report.age_ms - received_ms > BEHIND_MS + between_ms;
   }
 
   /** Forget the frames of streams that are not shown any more. */

@@ -45,6 +45,8 @@ class Cloud {
   drawn = 0;
   points = 0;
   private buffer = new InterleavedBuffer(new Uint16Array(0), 4);
+  /** The newest one, all of its points: another number of them may be drawn before the next one comes. */
+  private frame: CloudFrame | null = null;
 
   constructor(name: string) {
     const material = new ShaderMaterial({
@@ -63,7 +65,9 @@ class Cloud {
   }
 
   /** Show a frame: as many of its points as may be drawn, which are a fair sample of all. */
-  show({ points, origin, step_m, voxel_m }: CloudFrame, maxPoints: number): void {
+  show(frame: CloudFrame, maxPoints: number): void {
+    const { points, origin, step_m, voxel_m } = frame;
+    this.frame = frame;
     const count = Math.min(points.length / 4, maxPoints);
     const { object } = this;
     if (this.buffer.array.length < 4 * count) this.grow(Math.ceil(SPARE * count));
@@ -78,6 +82,11 @@ class Cloud {
     object.material.uniforms.edge!.value = (voxel_m || POINT_M) * Math.sqrt(points.length / 4 / Math.max(count, 1));
     this.drawn = count;
     this.points = points.length / 4;
+  }
+
+  /** Show as many points of the same frame as may be drawn now. */
+  limit(maxPoints: number): void {
+    if (this.frame && this.drawn !== Math.min(this.points, maxPoints)) this.show(this.frame, maxPoints);
   }
 
   /** Draw darker and greyer, as what shows what was or what is wrong. Returns whether that is new. */
@@ -135,9 +144,10 @@ export class CloudViews {
       cloud = new Cloud(stream);
       this.clouds.set(stream, cloud);
       this.group.add(cloud.object);
+      this.share();
     }
     cloud.setDimmed(this.doubtful.includes(stream));
-    cloud.show(frame, Math.floor(this.maxPoints / this.clouds.size));
+    cloud.show(frame, this.maxShare);
     this.isChanged = true;
   }
 
@@ -155,6 +165,7 @@ export class CloudViews {
       this.clouds.delete(name);
       this.isChanged = true;
     }
+    this.share();
   }
 
   /** Return whether something changed since the last call. */
@@ -162,5 +173,15 @@ export class CloudViews {
     const { isChanged } = this;
     this.isChanged = false;
     return isChanged;
+  }
+
+  /** Points of each cloud that this device draws now. */
+  private get maxShare(): number {
+    return Math.floor(this.maxPoints / this.clouds.size);
+  }
+
+  /** Share the points among the clouds that there are now. */
+  private share(): void {
+    for (const cloud of this.clouds.values()) cloud.limit(this.maxShare);
   }
 }

@@ -1,5 +1,5 @@
 // Pictures of the scene's cameras, beside what the person looks at: each is drawn into a texture of its own at a limited
-// rate, without people and anchors, and copied onto the canvas where its panel is.
+// rate, without people, anchors and point clouds, and copied onto the canvas where its panel is.
 
 import {
   LinearFilter,
@@ -71,8 +71,8 @@ export class CameraPictures {
     for (const picture of this.pictures) picture.isOutdated = true;
   }
 
-  /** Draw the picture that is due the longest, if any. Returns whether one was drawn: the canvas is outdated then. */
-  drawDue(root: Scene, overlay: Object3D, scene: SceneView | null, now_ms: number): boolean {
+  /** Draw the picture that is due the longest, if any, without `hidden`. Returns whether one was drawn: the canvas is outdated then. */
+  drawDue(root: Scene, hidden: readonly Object3D[], scene: SceneView | null, now_ms: number): boolean {
     const due = this.pictures
       .filter((one) => one.isOutdated && now_ms - one.drawn_ms >= this.period_ms && scene?.spec.cameras[one.index])
       .sort((a, b) => a.drawn_ms - b.drawn_ms)[0];
@@ -81,14 +81,15 @@ export class CameraPictures {
     if (!camera) return false;
     due.target.setSize(WIDTH, Math.round(WIDTH / aspectOf(scene.spec.cameras[due.index]!)));
     const { shadowMap } = this.renderer;
-    const [wasShown, wasUpdated] = [overlay.visible, shadowMap.autoUpdate];
-    overlay.visible = false;
+    const wasUpdated = shadowMap.autoUpdate;
+    const shown = hidden.filter((object) => object.visible);
+    for (const object of shown) object.visible = false;
     shadowMap.autoUpdate = false; // those of the last frame serve
     this.renderer.setRenderTarget(due.target);
     this.renderer.render(root, camera);
     this.renderer.setRenderTarget(null);
     shadowMap.autoUpdate = wasUpdated;
-    overlay.visible = wasShown;
+    for (const object of shown) object.visible = true;
     due.drawn_ms = now_ms;
     due.isOutdated = false;
     return true;

@@ -289,13 +289,14 @@ export class View {
       this.moveBodies(session_ms),
       this.moveDeformables(session_ms),
       this.avatars.update(session_ms),
-      this.clouds.popChanged(),
       this.viewpoint.update(this.scene),
     ].some(Boolean);
     const now = nowMs();
+    if (this.clouds.popChanged()) this.framesToDraw = FRAMES_AFTER_CHANGE; // pictures are without them
     if (isChanged) this.touch();
     const isOnScreen = !this.renderer.xr.isPresenting;
-    if (isOnScreen && this.pictures.drawDue(this.root, this.overlay, this.scene, now)) this.framesToDraw = Math.max(1, this.framesToDraw);
+    const hidden = [this.overlay, this.clouds.group];
+    if (isOnScreen && this.pictures.drawDue(this.root, hidden, this.scene, now)) this.framesToDraw = Math.max(1, this.framesToDraw);
     const isLoading = this.scene !== null && this.sceneCount > 0 && now - this.lastDrawn_ms > IDLE_MS;
     if (this.framesToDraw <= 0 && !isLoading && !isPresenting) return;
     this.framesToDraw -= 1;

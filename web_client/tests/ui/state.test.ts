@@ -10,8 +10,8 @@ const port: WorkerPort = { postMessage: () => undefined, onmessage: null };
 const say = (update: object): unknown => port.onmessage?.({ data: update as FromWorker } as MessageEvent<FromWorker>);
 const sayFrame = (received_ms: number): unknown => say({ type: "cloud", stream: "room", cloud: {}, capture_ms: received_ms - 50, received_ms });
 /** Report at `session_ms` that the newest frame of the session is `age_ms` old. */
-const sayStatus = (session_ms: number, age_ms: number): unknown =>
-  say({ type: "status", status: { session_time: 1e6 * session_ms, media: [{ stream: "room", age_ms }] } });
+const sayStatus = (session_ms: number, age_ms: number, hz = 0): unknown =>
+  say({ type: "status", status: { session_time: 1e6 * session_ms, media: [{ stream: "room", age_ms, hz }] } });
 
 let state: PageState;
 
@@ -31,6 +31,20 @@ test("a page is behind when the session has had a newer frame for more than two 
   expect(state.isBehind("room")).toBe(true);
   sayFrame(12_100);
   expect(state.isBehind("room")).toBe(false);
+});
+
+test("a page that gets few frames is behind when more than these are missing", () => {
+  sayFrame(10_000);
+  const isBehindAfter = (ms: number, budget_class: string): boolean => {
+    say({ type: "budget", budget: { streams: [{ stream: "room", budget_class }] } });
+    sayStatus(10_000 + ms, 0, 10);
+    return state.isBehind("room");
+  };
+  expect(isBehindAfter(5100, "quarter")).toBe(false); // every 32nd of 10 frames a second
+  expect(isBehindAfter(5300, "quarter")).toBe(true);
+  expect(isBehindAfter(2100, "half")).toBe(false);
+  expect(isBehindAfter(2300, "half")).toBe(true);
+  for (const budgetClass of ["full", "none"]) expect(isBehindAfter(2100, budgetClass)).toBe(true);
 });
 
 test("a cloud at rest is not behind, however old it is, and neither is a session that does not tell", () => {

@@ -51,6 +51,22 @@ test("a device draws as many points as it can, of all clouds together", () => {
   expect(views.drawn).toEqual(new Map([["left", 10], ["right", 10]]));
 });
 
+test("clouds at rest share what the device draws, and what is left has more", () => {
+  const views = new CloudViews(24);
+  const { hex, positions } = findFrame("on a table/full");
+  const readEdge = (name: string): number => (views.group.getObjectByName(name) as Points<BufferGeometry, ShaderMaterial>).material.uniforms.edge!.value as number;
+  views.setWanted(["a", "b", "c"]);
+  for (const stream of ["a", "b", "c"]) views.show(stream, decodeCloud(fromHex(hex)));
+  expect(views.drawn).toEqual(new Map([["a", 8], ["b", 8], ["c", 8]]));
+  expect(readEdge("a")).toBe(readEdge("c"));
+  const edge = readEdge("a");
+  views.setWanted(["a"]);
+  expect(views.drawn).toEqual(new Map([["a", 24]]));
+  expect(readEdge("a")).toBeCloseTo(edge / Math.sqrt(3), 9);
+  const places = readPlaces(views, "a");
+  for (const [i, place] of places.entries()) for (const axis of [0, 1, 2]) expect(place[axis]).toBeCloseTo(positions[i]![axis]!, 5);
+});
+
 test("a cloud that is not wanted any more is gone, also when a frame of it was on its way", () => {
   const views = new CloudViews(20);
   views.setWanted(["room"]);
