@@ -72,11 +72,12 @@ def run_export(arguments: argparse.Namespace) -> int:
     """Write the tables, and print a line for each."""
     import msgspec
 
-    from iris_session.replay.export import TABLES, ExportOptions, export_recording
-    from iris_session.replay.recorded_session import SessionRecording
     from iris_session.system.extras import require_package
 
     require_package("rerun", "reading recordings")
+    from iris_session.replay.export import TABLES, ExportOptions, export_recording
+    from iris_session.replay.recorded_session import SessionRecording
+
     options = ExportOptions(
         arguments.hz,
         tuple(arguments.table) or TABLES,
