@@ -15,8 +15,9 @@ from iris_session.protocol.names import Device
 from iris_session.protocol.server_messages import PresenceItem
 from iris_session.recording import paths
 from iris_session.recording.messages import StateFrame
-from iris_session.recording.picture import Moment, escape_entity_part, set_moment
+from iris_session.recording.picture import escape_entity_part
 from iris_session.recording.story import FREE, Rgb, SessionStory
+from iris_session.recording.timelines import Moment, set_moment
 
 #: A device without a pose for so long is not drawn: it is not tracked any more [ns].
 STALE_NS: Final = 250_000_000

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
 import msgspec
-import numpy as np
 import rerun as rr
 
 from anchors.pose import PoseTuple
@@ -22,10 +21,9 @@ from iris_session.recording import paths, scene_geometry
 from iris_session.recording.deformables import DrawnDeformable
 from iris_session.recording.messages import SceneAssets
 from iris_session.recording.scene_geometry import SceneReader, VisualShape
+from iris_session.recording.timelines import Moment, set_moment
 from iris_session.scene import SceneBuildError
 
-#: Step, tick, simulated time [ns], session time [ns].
-Moment = tuple[int, int, int, int]
 #: Maximum number of entities named in an error line about entities that cannot be drawn.
 NAMED: Final = 5
 #: Errors that keep a scene or a part of it from being drawn. Recording continues: the journal matters more.
@@ -250,15 +248,6 @@ def build_colour(kind: str, rgba: scene_geometry.Rgba8) -> Any:
         scene_geometry.CAPSULE: rr.Capsules3D,
     }
     return primitives[kind].from_fields(colors=[rgba])
-
-
-def set_moment(recording: rr.RecordingStream, moment: Moment) -> None:
-    """Set the times of what is logged next, on all timelines."""
-    step, tick, sim_ns, session_ns = moment
-    recording.set_time(paths.STEP, sequence=step)
-    recording.set_time(paths.TICK, sequence=tick)
-    recording.set_time(paths.SIM_TIME, duration=np.timedelta64(sim_ns, "ns"))
-    recording.set_time(paths.SESSION_TIME, duration=np.timedelta64(session_ns, "ns"))
 
 
 def escape_entity_part(name: str) -> str:

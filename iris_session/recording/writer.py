@@ -7,21 +7,17 @@ plain columns beside it. `RrdStream` appends the bytes, `describe_...` make the 
 
 from __future__ import annotations
 
-import os
-import zlib
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import msgspec
 import numpy as np
 import pyarrow as pa  # type: ignore[import-untyped]
 import rerun as rr
-import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from iris_session.protocol.common import Applied
@@ -29,6 +25,7 @@ from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.server_messages import BodyInfo, Event, ParticipantLeft, SceneChanged
 from iris_session.protocol.specs import RobotSpec
 from iris_session.recording import paths, scene_geometry
+from iris_session.recording.blueprint import build_blueprint, place_eye
 from iris_session.recording.errors import WriteError
 from iris_session.recording.journal import SessionHeader, seal_blob
 from iris_session.recording.media import MediaDrawer
@@ -46,19 +43,24 @@ from iris_session.recording.messages import (
     encode_scene,
 )
 from iris_session.recording.people import Base, PeoplePicture
-from iris_session.recording.picture import Moment, ScenePicture, SceneSource, escape_entity_part
-from iris_session.recording.rrd_file import END_MESSAGE, FILE_HEAD, MAGIC, Mark, end_of_messages
-from iris_session.recording.story import CRITICAL, ERROR, FREE, INFO, WARN, LaneChange, LogLine, Rgb, SessionStory
+from iris_session.recording.picture import ScenePicture, SceneSource, escape_entity_part
+from iris_session.recording.rrd_stream import (
+    RrdStream,
+    bytes_column,
+    duration_index,
+    list_column,
+    matrix_column,
+    scalar_column,
+    sequence_index,
+)
+from iris_session.recording.story import FREE, WARN, LaneChange, LogLine, Rgb, SessionStory
+from iris_session.recording.timelines import Moment, get_session_time, to_time_columns
 from iris_session.streams.errors import StreamError
 
 #: Interval of latencies, a chunk per robot: once a second is enough, as `/state` holds what they are computed from.
 LATENCIES_NS = 1_000_000_000
 #: Number of newest states whose times are kept for vertices that arrive later: 4 s at 60 Hz.
 KNOWN_MOMENTS = 256
-#: Eye of the 3D view: offset from the centre of the bodies, in halves of the diagonal of their box; least half [m].
-EYE = 1.45 * np.array((0.25, -1.75, 0.95))
-MIN_SIZE_M = 0.3
-BACKGROUND = (205, 214, 224)
 #: Maximum number of lanes whose colours are known to be in the file: participants that come and go have one each.
 MAX_LANES = 4096
 #: Maximum number of pending vertex frames whose states are not in the file yet.
@@ -273,7 +275,7 @@ class RrdWriter:
             bytes_column("presence", [_encode(s.presence) for s in states]),
             bytes_column("applied", [_encode(s.applied) for s in states]),
         ]
-        self._send_columns(paths.STATE, _time_columns(times), columns)
+        self._send_columns(paths.STATE, to_time_columns(times), columns)
         self._note_latencies(states)
         if poses.shape[1] == len(self._bodies):  # a new recorder also gets pending states of the scene before
             self._write_transforms(states, poses, seen)
@@ -329,7 +331,7 @@ class RrdWriter:
             bending = self._picture.deformables[stream]
             moments = np.array([moment for moment, _ in taken], np.int64).T
             self._send_columns(
-                bending.entity, _time_columns(moments), [*bending.build_columns([row for _, row in taken])]
+                bending.entity, to_time_columns(moments), [*bending.build_columns([row for _, row in taken])]
             )
 
     def _send_blueprint(self) -> None:
@@ -389,7 +391,7 @@ class RrdWriter:
             child_frame=names,
             parent_frame=[scene_geometry.WORLD] * len(names),
         )
-        self._send_columns(paths.TRANSFORMS, _time_columns(times[:, frame]), [*columns])
+        self._send_columns(paths.TRANSFORMS, to_time_columns(times[:, frame]), [*columns])
 
     def _write_events(self, events: list[Event], told: list[tuple[LogLine, list[LaneChange]]]) -> None:
         if not events:
@@ -461,187 +463,12 @@ class RrdWriter:
     def _to_times(self, steps: list[int], session_times: list[int]) -> list[Any]:
         """Return the times of rows that have no tick: it is that of the newest state before them."""
         moments = [self._find_moment(*times) for times in zip(steps, session_times, strict=True)]
-        return _time_columns(np.array(moments, np.int64).T)
+        return to_time_columns(np.array(moments, np.int64).T)
 
     def _find_moment(self, step: int, session_ns: int) -> Moment:
         known = self._known or ((0, 0, 0, 0),)
-        _, tick, sim_ns, _ = known[max(0, bisect_right(known, session_ns, key=_get_session_time) - 1)]
+        _, tick, sim_ns, _ = known[max(0, bisect_right(known, session_ns, key=get_session_time) - 1)]
         return step, tick, sim_ns, session_ns
-
-
-def _get_session_time(moment: Moment) -> int:
-    return moment[3]
-
-
-def _time_columns(times: NDArray[np.int64]) -> list[Any]:
-    """Return the time columns. `times` (4, rows): step, tick, sim_time [ns], session_time [ns]."""
-    step, tick, sim_ns, session_ns = times
-    return [
-        sequence_index(paths.STEP, step),
-        sequence_index(paths.TICK, tick),
-        duration_index(paths.SIM_TIME, sim_ns),
-        duration_index(paths.SESSION_TIME, session_ns),
-    ]
-
-
-def place_eye(positions: NDArray[np.float64]) -> Any:
-    """Return the eye that sees bodies at `positions` (n, 3) [m] from the front and above; `None` without any."""
-    known = positions[np.isfinite(positions).all(axis=1)]
-    if not len(known):
-        return None
-    low, high = np.percentile(known, (1.0, 99.0), axis=0)  # a few bodies may be parked far away
-    centre = (low + high) / 2.0
-    size_m = max(float(np.linalg.norm(high - low)) / 2.0, MIN_SIZE_M)
-    return rrb.EyeControls3D(position=centre + size_m * EYE, look_target=centre, eye_up=(0.0, 0.0, 1.0))
-
-
-def build_blueprint(eye: Any, pictures: Sequence[str] = ()) -> Any:
-    """Return the arrangement of views. `eye`: where the scene is seen from, `None`: the viewer chooses.
-
-    `pictures`: streams of pictures, each with a view of its own.
-    """
-    hidden = ("/journal/**", paths.SAMPLES, f"{paths.PICTURES}/**", f"{paths.LANES}/**", f"{paths.METRICS}/**")
-    scene = rrb.Spatial3DView(
-        origin="/",
-        name="Scene",
-        contents=["+ /**", *(f"- {entity}" for entity in hidden)],
-        background=BACKGROUND,
-        line_grid=False,
-        eye_controls=eye,
-    )
-    lanes = rrb.StateTimelineView(origin=paths.LANES, name="Who does what")
-    log = rrb.TextLogView(
-        origin="/",
-        name="What happened",
-        contents=[f"+ {paths.EVENTS}/**", f"+ {paths.DENIALS}"],
-        columns=rrb.TextLogColumns(timeline_columns=[paths.SESSION_TIME], text_log_columns=["loglevel", "body"]),
-        rows=rrb.TextLogRows(filter_by_log_level=[INFO, WARN, ERROR, CRITICAL]),
-    )
-    about = rrb.TextDocumentView(origin=paths.INFO, name="About")
-    plots = rrb.TimeSeriesView(origin=paths.METRICS, name="Delays [ms]")
-    images = [rrb.Spatial2DView(origin=f"{paths.PICTURES}/{name}", name=name) for name in pictures]
-    side = rrb.Vertical(rrb.Tabs(log, about), *([rrb.Grid(*images)] if images else ()), plots)
-    return rrb.Blueprint(
-        rrb.Horizontal(rrb.Vertical(scene, lanes, row_shares=[5, 3]), side, column_shares=[5, 3]),
-        rrb.TimePanel(state="collapsed", timeline=paths.SESSION_TIME, play_state="paused"),
-        collapse_panels=True,
-    )
-
-
-# --- file -------------------------------------------------------------------------------------------------------------
-#
-# Rerun encodes the messages, `RrdStream` appends them to the file.
-#
-# Rerun's own file sink keeps some 4 KB in memory per chunk, for a footer with an index: 0.1-0.2 MiB/s of a session.
-# Here the encoded bytes are read from the stream at every write, without the data for a footer; so memory does not
-# grow, and an error of the disk is raised here. `rerun rrd optimize` makes a copy with such an index.
-
-#: The stream's own batcher never acts: the writer sends whole columns, and `write` collects them.
-_BATCHER: Final = rr.ChunkBatcherConfig(flush_tick=3600.0, flush_num_bytes=1 << 30)
-
-
-class RrdStream:
-    """A new file. Data logged to `recording` is in it after `write`.
-
-    All methods may raise `OSError` (the disk), `RuntimeError` and `ValueError` (Rerun).
-    """
-
-    def __init__(self, path: str, application: str, recording_id: str) -> None:
-        self.recording = rr.RecordingStream(application, recording_id=recording_id, batcher_config=_BATCHER)
-        self._encoded = self.recording.binary_stream()
-        self._file: Any = open(path, "wb", buffering=0)  # noqa: SIM115 - closed by `close`
-        self.size = 0  # bytes in the file
-        self._marked = 0  # bytes of the file that marks cover
-        self._crc = 0  # of the bytes after them
-
-    def write(self, timeout_s: float) -> None:
-        """Append the data logged since the last call, all or nothing, and hand it to the operating system."""
-        data = self._encoded.read(flush=True, flush_timeout_sec=timeout_s)
-        if not data:
-            return
-        if data[: len(MAGIC)] != MAGIC:
-            raise ValueError("this version of Rerun encodes its messages in another way")
-        self._append(memoryview(data)[FILE_HEAD if self.size else 0 : end_of_messages(data)])
-
-    def mark(self) -> Mark:
-        """Return the CRC-32 of all bytes since the last mark, so that any later change of them is found."""
-        mark = Mark(self._marked, self.size, self._crc)
-        self._marked, self._crc = self.size, 0
-        return mark
-
-    def close(self) -> None:
-        """End the file after the last `write` with the message that marks its end."""
-        self._append(memoryview(END_MESSAGE))
-        self._file.close()
-        self.recording.disconnect()
-
-    def _append(self, data: memoryview) -> None:
-        rest = data
-        try:
-            while rest:
-                rest = rest[self._file.write(rest) :]
-        except OSError:
-            with suppress(OSError):  # half a message would confuse readers
-                os.ftruncate(self._file.fileno(), self.size)
-            self._file.close()
-            raise
-        self.size += len(data)
-        self._crc = zlib.crc32(data, self._crc)
-
-
-# --- Arrow columns for `rerun.send_columns`, built without a Python object per value where rows are many --------------
-
-
-class ArrowColumn:
-    """One component column: `values` is an Arrow list array with one list per row."""
-
-    def __init__(self, name: str, values: Any) -> None:
-        self._descriptor = rr.ComponentDescriptor(name)
-        self._values = values
-
-    def component_descriptor(self) -> Any:
-        """Return the name of the component in the file."""
-        return self._descriptor
-
-    def as_arrow_array(self) -> Any:
-        """Return the rows."""
-        return self._values
-
-
-def scalar_column(name: str, values: Any, kind: Any) -> ArrowColumn:
-    """Return a column of one value of Arrow type `kind` per row."""
-    array = pa.array(values, kind)
-    return ArrowColumn(name, pa.ListArray.from_arrays(pa.array(np.arange(len(array) + 1, dtype=np.int32)), array))
-
-
-def bytes_column(name: str, values: Iterable[bytes]) -> ArrowColumn:
-    """Return a column of one byte string per row."""
-    return scalar_column(name, list(values), pa.binary())
-
-
-def list_column(name: str, values: Sequence[Sequence[int]], kind: Any) -> ArrowColumn:
-    """Return a column of a list of integers per row."""
-    flat = [item for row in values for item in row]
-    offsets = np.zeros(len(values) + 1, np.int32)
-    np.cumsum([len(row) for row in values], out=offsets[1:])
-    return ArrowColumn(name, pa.ListArray.from_arrays(pa.array(offsets), pa.array(flat, kind)))
-
-
-def matrix_column(name: str, values: NDArray[np.float64]) -> ArrowColumn:
-    """Return a column of a list of float64 per row of `values` (rows, items)."""
-    rows, items = values.shape
-    offsets = np.arange(rows + 1, dtype=np.int32) * items
-    return ArrowColumn(name, pa.ListArray.from_arrays(pa.array(offsets), pa.array(values.ravel())))
-
-
-def sequence_index(timeline: str, values: Any) -> Any:
-    """Return an integer index."""
-    return rr.TimeColumn(timeline, sequence=np.asarray(values, np.int64))
-
-
-def duration_index(timeline: str, values: Any) -> Any:
-    """Return an index of durations from integer nanoseconds, exactly."""
-    return rr.TimeColumn(timeline, duration=np.asarray(values, np.int64).view("timedelta64[ns]"))
 
 
 # --- text for the viewer ----------------------------------------------------------------------------------------------

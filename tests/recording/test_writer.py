@@ -37,6 +37,7 @@ from iris_session.protocol.server_messages import (
 from iris_session.protocol.specs import RobotSpec
 from iris_session.recording import Recording, SessionHeader, pack_model
 from iris_session.recording import scene_geometry as scene
+from iris_session.recording.blueprint import place_eye
 from iris_session.recording.messages import (
     Batch,
     DenialRecord,
@@ -49,7 +50,7 @@ from iris_session.recording.messages import (
 from iris_session.recording.paths import part_path
 from iris_session.recording.picture import build_components
 from iris_session.recording.scene_geometry import VisualShape
-from iris_session.recording.writer import RrdWriter, place_eye
+from iris_session.recording.writer import RrdWriter
 from iris_session.scene import AssetStore
 from iris_session.scene.mujoco_scene import parse_mujoco
 from tests.recording.support import XML, column, journal, make_header, read

@@ -1,0 +1,62 @@
+"""Arrangement of views that a recording opens with in the Rerun viewer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from iris_session.recording import paths
+from iris_session.recording.story import CRITICAL, ERROR, INFO, WARN
+
+#: Eye of the 3D view: offset from the centre of the bodies, in halves of the diagonal of their box; least half [m].
+EYE: Final = 1.45 * np.array((0.25, -1.75, 0.95))
+MIN_SIZE_M: Final = 0.3
+BACKGROUND: Final = (205, 214, 224)
+
+
+def place_eye(positions: NDArray[np.float64]) -> Any:
+    """Return the eye that sees bodies at `positions` (n, 3) [m] from the front and above; `None` without any."""
+    known = positions[np.isfinite(positions).all(axis=1)]
+    if not len(known):
+        return None
+    low, high = np.percentile(known, (1.0, 99.0), axis=0)  # a few bodies may be parked far away
+    centre = (low + high) / 2.0
+    size_m = max(float(np.linalg.norm(high - low)) / 2.0, MIN_SIZE_M)
+    return rrb.EyeControls3D(position=centre + size_m * EYE, look_target=centre, eye_up=(0.0, 0.0, 1.0))
+
+
+def build_blueprint(eye: Any, pictures: Sequence[str] = ()) -> Any:
+    """Return the arrangement of views. `eye`: where the scene is seen from, `None`: the viewer chooses.
+
+    `pictures`: streams of pictures, each with a view of its own.
+    """
+    hidden = ("/journal/**", paths.SAMPLES, f"{paths.PICTURES}/**", f"{paths.LANES}/**", f"{paths.METRICS}/**")
+    scene = rrb.Spatial3DView(
+        origin="/",
+        name="Scene",
+        contents=["+ /**", *(f"- {entity}" for entity in hidden)],
+        background=BACKGROUND,
+        line_grid=False,
+        eye_controls=eye,
+    )
+    lanes = rrb.StateTimelineView(origin=paths.LANES, name="Who does what")
+    log = rrb.TextLogView(
+        origin="/",
+        name="What happened",
+        contents=[f"+ {paths.EVENTS}/**", f"+ {paths.DENIALS}"],
+        columns=rrb.TextLogColumns(timeline_columns=[paths.SESSION_TIME], text_log_columns=["loglevel", "body"]),
+        rows=rrb.TextLogRows(filter_by_log_level=[INFO, WARN, ERROR, CRITICAL]),
+    )
+    about = rrb.TextDocumentView(origin=paths.INFO, name="About")
+    plots = rrb.TimeSeriesView(origin=paths.METRICS, name="Delays [ms]")
+    images = [rrb.Spatial2DView(origin=f"{paths.PICTURES}/{name}", name=name) for name in pictures]
+    side = rrb.Vertical(rrb.Tabs(log, about), *([rrb.Grid(*images)] if images else ()), plots)
+    return rrb.Blueprint(
+        rrb.Horizontal(rrb.Vertical(scene, lanes, row_shares=[5, 3]), side, column_shares=[5, 3]),
+        rrb.TimePanel(state="collapsed", timeline=paths.SESSION_TIME, play_state="paused"),
+        collapse_panels=True,
+    )

@@ -1,0 +1,40 @@
+"""Times of what a recording shows: the timelines of the viewer, and how rows get their places on them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from iris_session.recording import paths
+from iris_session.recording.rrd_stream import duration_index, sequence_index
+
+#: Step, tick, simulated time [ns], session time [ns].
+Moment = tuple[int, int, int, int]
+
+
+def set_moment(recording: rr.RecordingStream, moment: Moment) -> None:
+    """Set the times of what is logged next, on all timelines."""
+    step, tick, sim_ns, session_ns = moment
+    recording.set_time(paths.STEP, sequence=step)
+    recording.set_time(paths.TICK, sequence=tick)
+    recording.set_time(paths.SIM_TIME, duration=np.timedelta64(sim_ns, "ns"))
+    recording.set_time(paths.SESSION_TIME, duration=np.timedelta64(session_ns, "ns"))
+
+
+def get_session_time(moment: Moment) -> int:
+    """Return the session time of a moment [ns]."""
+    return moment[3]
+
+
+def to_time_columns(times: NDArray[np.int64]) -> list[Any]:
+    """Return the time columns. `times` (4, rows): step, tick, sim_time [ns], session_time [ns]."""
+    step, tick, sim_ns, session_ns = times
+    return [
+        sequence_index(paths.STEP, step),
+        sequence_index(paths.TICK, tick),
+        duration_index(paths.SIM_TIME, sim_ns),
+        duration_index(paths.SESSION_TIME, session_ns),
+    ]
