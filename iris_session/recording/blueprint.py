@@ -10,6 +10,8 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from iris_session.recording import paths
+from iris_session.recording.messages import RobotLabels
+from iris_session.recording.plots import GRIPPER, JOINTS, TIP_SPEED, get_robot_entity
 from iris_session.recording.story import CRITICAL, ERROR, INFO, WARN
 
 #: Eye of the 3D view: offset from the centre of the bodies, in halves of the diagonal of their box; least half [m].
@@ -29,10 +31,10 @@ def place_eye(positions: NDArray[np.float64]) -> Any:
     return rrb.EyeControls3D(position=centre + size_m * EYE, look_target=centre, eye_up=(0.0, 0.0, 1.0))
 
 
-def build_blueprint(eye: Any, pictures: Sequence[str] = ()) -> Any:
+def build_blueprint(eye: Any, pictures: Sequence[str] = (), robots: Sequence[RobotLabels] = ()) -> Any:
     """Return the arrangement of views. `eye`: where the scene is seen from, `None`: the viewer chooses.
 
-    `pictures`: streams of pictures, each with a view of its own.
+    `pictures`: streams of pictures, each with a view of its own. `robots`: those with plots, a tab for each.
     """
     hidden = ("/journal/**", paths.SAMPLES, f"{paths.PICTURES}/**", f"{paths.LANES}/**", f"{paths.METRICS}/**")
     scene = rrb.Spatial3DView(
@@ -54,9 +56,18 @@ def build_blueprint(eye: Any, pictures: Sequence[str] = ()) -> Any:
     about = rrb.TextDocumentView(origin=paths.INFO, name="About")
     plots = rrb.TimeSeriesView(origin=paths.METRICS, name="Delays [ms]")
     images = [rrb.Spatial2DView(origin=f"{paths.PICTURES}/{name}", name=name) for name in pictures]
-    side = rrb.Vertical(rrb.Tabs(log, about), *([rrb.Grid(*images)] if images else ()), plots)
+    motion = [rrb.Tabs(*(_build_robot_views(robot) for robot in robots))] if robots else []
+    side = rrb.Vertical(rrb.Tabs(log, about), *([rrb.Grid(*images)] if images else ()), *motion, plots)
     return rrb.Blueprint(
         rrb.Horizontal(rrb.Vertical(scene, lanes, row_shares=[5, 3]), side, column_shares=[5, 3]),
         rrb.TimePanel(state="collapsed", timeline=paths.SESSION_TIME, play_state="paused"),
         collapse_panels=True,
     )
+
+
+def _build_robot_views(robot: RobotLabels) -> Any:
+    """Return the plots of a robot, one above the other: joints, gripper, tip."""
+    entity = get_robot_entity(robot.name)
+    parts = ((JOINTS, "joints"), (GRIPPER, "gripper"), (TIP_SPEED, "speed of the tip"))
+    views = [rrb.TimeSeriesView(origin=f"{entity}/{part}", name=f"{robot.name}: {name}") for part, name in parts]
+    return rrb.Vertical(*views, row_shares=[3, 1, 1], name=robot.name)

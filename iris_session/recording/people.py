@@ -16,6 +16,7 @@ from iris_session.protocol.server_messages import PresenceItem
 from iris_session.recording import paths
 from iris_session.recording.messages import StateFrame
 from iris_session.recording.picture import escape_entity_part
+from iris_session.recording.plots import get_robot_entity
 from iris_session.recording.story import FREE, Rgb, SessionStory
 from iris_session.recording.timelines import Moment, set_moment
 
@@ -80,7 +81,7 @@ class PeoplePicture:
         label = f"{robot}: {holder}" if holder else robot
         point = rr.Points3D([base.position], colors=[colour], radii=[0.01], labels=[label], show_labels=True)
         set_moment(self._rec, moment)
-        self._rec.log(f"{paths.ROBOTS}/{escape_entity_part(robot)}", rr.CoordinateFrame(base.frame), point, strict=True)
+        self._rec.log(get_robot_entity(robot), rr.CoordinateFrame(base.frame), point, strict=True)
         self._rec.reset_time()
 
     def draw(self, states: Sequence[StateFrame], moments: Sequence[Moment]) -> list[DeviceRow]:

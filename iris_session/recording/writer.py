@@ -44,6 +44,7 @@ from iris_session.recording.messages import (
 )
 from iris_session.recording.people import Base, PeoplePicture
 from iris_session.recording.picture import ScenePicture, SceneSource, escape_entity_part
+from iris_session.recording.plots import RobotPlots
 from iris_session.recording.rrd_stream import (
     RrdStream,
     bytes_column,
@@ -57,8 +58,8 @@ from iris_session.recording.story import FREE, WARN, LaneChange, LogLine, Rgb, S
 from iris_session.recording.timelines import Moment, get_session_time, to_time_columns
 from iris_session.streams.errors import StreamError
 
-#: Interval of latencies, a chunk per robot: once a second is enough, as `/state` holds what they are computed from.
-LATENCIES_NS = 1_000_000_000
+#: Interval of chunks of plots: once a second is enough, as `/state` holds what they are computed from.
+PLOTS_NS = 1_000_000_000
 #: Number of newest states whose times are kept for vertices that arrive later: 4 s at 60 Hz.
 KNOWN_MOMENTS = 256
 #: Maximum number of lanes whose colours are known to be in the file: participants that come and go have one each.
@@ -100,7 +101,8 @@ class RrdWriter:
         self._clock = (0, 0)  # tick and sim_time [ns] of the newest state, for what has neither
         self._applied: dict[str, Applied] = {}
         self._latencies: list[MetricRecord] = []
-        self._latencies_due_ns = 0
+        self._plots = RobotPlots(self._rec)
+        self._plots_due_ns = 0
         is_first = paths.split_part(self.path)[1] == 1
         self._story = SessionStory(is_first=is_first)
         self._people = PeoplePicture(self._rec, self._story, is_first=is_first)
@@ -177,8 +179,8 @@ class RrdWriter:
 
     def close(self) -> None:
         """Write the rest and the end mark, and close the file. Raises `WriteError`."""
-        self._write_latencies()
         self.flush()
+        self._write_plots()
         self._picture.draw((-1, 0, 0, 0))  # without a state the scene is drawn nevertheless
         if not self._arranged:
             self._send_blueprint()
@@ -242,6 +244,10 @@ class RrdWriter:
             self._send_columns(
                 paths.MODELS, times, [bytes_column("scene", [seal_blob(encode_scene(s)) for s in scenes])]
             )
+        if assets and assets[-1].robots != self._plots.robots:
+            self._write_plots()
+            self._plots.set_robots(assets[-1].robots)
+            self._arranged = False
         for loaded in scenes:
             self._set_bodies(loaded.bodies)
             self._last_step = loaded.step if loaded.session_time else self._last_step
@@ -265,7 +271,7 @@ class RrdWriter:
         times = np.array(moments, np.int64).T
         seen = self._draw_scene(moments[0], times)
         if not self._arranged:
-            if poses.shape[1] == len(self._bodies):
+            if self._eye is None and poses.shape[1] == len(self._bodies):
                 self._eye = place_eye(poses[0, self._moving if len(self._moving) else slice(None), :3])
                 self._people.label_robots(self._find_bases(poses[0]), tuple(seen[:, 0].tolist()))
             self._send_blueprint()
@@ -277,6 +283,10 @@ class RrdWriter:
         ]
         self._send_columns(paths.STATE, to_time_columns(times), columns)
         self._note_latencies(states)
+        self._plots.add(states, times)
+        if states[-1].session_time >= self._plots_due_ns:
+            self._plots_due_ns = states[-1].session_time + PLOTS_NS
+            self._write_plots()
         if poses.shape[1] == len(self._bodies):  # a new recorder also gets pending states of the scene before
             self._write_transforms(states, poses, seen)
         self._clock = moments[-1][1:3]
@@ -336,7 +346,7 @@ class RrdWriter:
 
     def _send_blueprint(self) -> None:
         self._arranged = True
-        self._rec.send_blueprint(build_blueprint(self._eye, self._drawer.pictures))
+        self._rec.send_blueprint(build_blueprint(self._eye, self._drawer.pictures, self._plots.robots))
 
     def _write_media(self) -> None:
         """Draw clouds and pictures; a stream of pictures that is new gets a view."""
@@ -351,8 +361,7 @@ class RrdWriter:
             self._send_blueprint()
 
     def _note_latencies(self, states: list[StateFrame]) -> None:
-        """Record latencies for the plots, written once a second: from the capture of a sample to its step, per
-        robot."""
+        """Collect latencies for the plots: from the capture of a sample to its step, per robot."""
         for state in states:
             for applied in state.applied:
                 if self._applied.get(applied.robot) != applied:
@@ -360,13 +369,12 @@ class RrdWriter:
                     name = f"input_to_step_ms/{applied.robot}"
                     latency_ms = (applied.step_ns - applied.capture_ns) / 1e6
                     self._latencies.append(MetricRecord(state.step, state.session_time, name, latency_ms))
-        if states[-1].session_time >= self._latencies_due_ns:
-            self._latencies_due_ns = states[-1].session_time + LATENCIES_NS
-            self._write_latencies()
 
-    def _write_latencies(self) -> None:
+    def _write_plots(self) -> None:
+        """Write the plots collected so far."""
         latencies, self._latencies = self._latencies, []
         self._write_metrics(latencies)
+        self._plots.write()
 
     def _write_transforms(self, states: list[StateFrame], poses: NDArray[np.float64], times: NDArray[np.int64]) -> None:
         """Write a row per body that changed in a frame, and per device of a participant that has a new pose."""

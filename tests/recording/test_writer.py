@@ -43,6 +43,7 @@ from iris_session.recording.messages import (
     DenialRecord,
     HoldRecord,
     MetricRecord,
+    RobotLabels,
     SceneAssets,
     SceneModel,
     StateFrame,
@@ -66,6 +67,11 @@ def frame(step: int, poses: np.ndarray, presence: tuple[PresenceItem, ...] = ())
 def times(batches: list[Any]) -> list[int]:
     """Return the session times of the rows of an entity [ns]."""
     return [value.value for batch in batches for value in batch.column("session_time")]
+
+
+def select(batches: list[Any], component: str) -> list[Any]:
+    """Return the batches that have a component."""
+    return [batch for batch in batches if component in batch.schema.names]
 
 
 def test_transforms_are_the_poses_of_moving_bodies_when_they_change(tmp_path: Path) -> None:
@@ -507,3 +513,28 @@ def test_changed_model_is_not_used(tmp_path: Path) -> None:
         with pytest.raises(LookupError):
             recording.model(cup.model_hash)
         assert any("checksum" in line for line in recording.damage)
+
+
+def test_joints_grippers_and_tips_of_robots_are_plotted(tmp_path: Path) -> None:
+    """Values of a robot of two joints and a gripper, and of one without joints and gripper."""
+    path = tmp_path / "w.rrd"
+    robots = (RobotLabels("left", "base", ("hinge", "rail"), ("rad", "m")), RobotLabels("free", "base"))
+    writer = RrdWriter(path, "id")
+    writer.write_header(SessionHeader("s", "n", "closed", 2_000_000))
+    writer.add(Batch(assets=[SceneAssets(robots=robots)]))
+    tips = [((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), ((0.0, 0.0, 0.032), (1.0, 1.0, 1.0))]
+    values = [np.array([0.5 + i, 0.25, 0.75, np.nan, *np.ravel(tips[i])]).tobytes() for i in range(2)]
+    states = [msgspec.structs.replace(frame(8 * i, np.zeros((0, 7))), robots=values[i]) for i in range(2)]
+    other = msgspec.structs.replace(frame(16, np.zeros((0, 7))), robots=values[0][8:])  # of another scene
+    writer.add(Batch(states=[*states, other]))
+    writer.close()
+    found = read(path)
+    joints = found["/robots/left/joints"]
+    assert column(select(joints, "SeriesLines:names"), "SeriesLines:names") == [["hinge [rad]", "rail [m]"]]
+    rows = select(joints, "Scalars:scalars")
+    assert column(rows, "Scalars:scalars") == [[0.5, 0.25], [1.5, 0.25]]
+    assert times(rows) == [state.session_time for state in states]
+    assert column(select(found["/robots/left/gripper"], "Scalars:scalars"), "Scalars:scalars") == [[0.75], [0.75]]
+    speeds = column(select(found["/robots/left/tip_speed"], "Scalars:scalars"), "Scalars:scalars")
+    assert speeds == [[pytest.approx(2.0)]], "32 mm in 16 ms; nothing is known of the first"
+    assert sorted(entity for entity in found if "free" in entity) == ["/robots/free/tip_speed"]

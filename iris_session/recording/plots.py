@@ -1,0 +1,98 @@
+"""Plots of a recording: joints, grippers and tips of robots, each a series with a name and a unit.
+
+Rows are collected and written together, a chunk per entity: a chunk of ten numbers is mostly its schema.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from iris_session.recording import paths
+from iris_session.recording.messages import RobotLabels, StateFrame
+from iris_session.recording.picture import escape_entity_part
+from iris_session.recording.timelines import to_time_columns
+
+JOINTS = "joints"
+GRIPPER = "gripper"
+TIP_SPEED = "tip_speed"
+
+
+class RobotPlots:
+    """Joints, opening of the gripper and speed of the tip of every robot of the present scene."""
+
+    def __init__(self, recording: rr.RecordingStream) -> None:
+        self._rec = recording
+        self.robots: tuple[RobotLabels, ...] = ()
+        self._named: set[str] = set()
+        self._times: list[NDArray[np.int64]] = []
+        self._values: list[NDArray[np.float64]] = []
+        self._last: tuple[float, NDArray[np.float64]] | None = None  # simulated time [s], tips (n_robots, 3) [m]
+
+    def set_robots(self, robots: tuple[RobotLabels, ...]) -> None:
+        """Set the robots of the states that follow; write those before them first."""
+        self.robots = robots
+        self._named.clear()
+        self._last = None
+
+    def add(self, states: Sequence[StateFrame], times: NDArray[np.int64]) -> None:
+        """Collect the values of states. `times`: see `to_time_columns`. States of other robots are left out."""
+        n = sum(len(robot.joints) for robot in self.robots)
+        size = n + 4 * len(self.robots)
+        taken = [i for i, state in enumerate(states) if size and len(state.robots) == 8 * size]
+        if not taken:
+            return
+        values = np.array([np.frombuffer(states[i].robots, np.float64) for i in taken])
+        rows = np.empty((len(taken), n + 2 * len(self.robots)))
+        rows[:, : n + len(self.robots)] = values[:, : n + len(self.robots)]
+        for row, i, tips in zip(rows, taken, values[:, n + len(self.robots) :], strict=True):
+            row[n + len(self.robots) :] = self._measure_speeds(states[i].sim_time, tips.reshape(-1, 3))
+        self._times.append(times[:, taken])
+        self._values.append(rows)
+
+    def _measure_speeds(self, time_s: float, tips: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the speed of each tip since the state before [m/s], NaN while time stands still or went back."""
+        before, self._last = self._last, (time_s, tips)
+        elapsed_s = 0.0 if before is None else time_s - before[0]
+        if before is None or elapsed_s <= 0.0:
+            return np.full(len(tips), np.nan)
+        return np.asarray(np.linalg.norm(tips - before[1], axis=1) / elapsed_s)
+
+    def write(self) -> None:
+        """Write what was collected."""
+        if not self._times:
+            return
+        times, values = np.concatenate(self._times, axis=1), np.concatenate(self._values)
+        self._times.clear()
+        self._values.clear()
+        at, n = 0, values.shape[1] - 2 * len(self.robots)
+        for i, robot in enumerate(self.robots):
+            of = ", ".join(("", robot.name))
+            labels = [f"{name} [{unit}]" for name, unit in zip(robot.joints, robot.units, strict=True)]
+            self._send(robot, JOINTS, labels, times, values[:, at : at + len(labels)])
+            at += len(labels)
+            self._send(robot, GRIPPER, [f"opening{of} [0 to 1]"], times, values[:, [n + i]])
+            self._send(robot, TIP_SPEED, [f"tip speed{of} [m/s]"], times, values[:, [n + len(self.robots) + i]])
+
+    def _send(
+        self, robot: RobotLabels, name: str, labels: list[str], times: NDArray[np.int64], values: NDArray[np.float64]
+    ) -> None:
+        known = np.isfinite(values).all(axis=1)
+        if not labels or not known.any():
+            return
+        entity = f"{get_robot_entity(robot.name)}/{name}"
+        if entity not in self._named:
+            self._named.add(entity)
+            self._rec.log(entity, rr.SeriesLines(names=labels), static=True, strict=True)
+        columns = rr.Scalars.columns(scalars=values[known].ravel()).partition([len(labels)] * int(known.sum()))
+        times_known: list[Any] = to_time_columns(times[:, known])
+        rr.send_columns(entity, times_known, [*columns], recording=self._rec, strict=True)
+
+
+def get_robot_entity(robot: str) -> str:
+    """Return the entity of a robot: its label, and below it what is plotted of it."""
+    return f"{paths.ROBOTS}/{escape_entity_part(robot)}"
