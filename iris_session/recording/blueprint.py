@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
+import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from iris_session.recording import paths
 from iris_session.recording.messages import RobotLabels
-from iris_session.recording.plots import GRIPPER, JOINTS, TIP_SPEED, get_robot_entity
+from iris_session.recording.plots import GRIPPER, JOINTS, KINDS, TIP_SPEED, get_robot_entity
 from iris_session.recording.story import CRITICAL, ERROR, INFO, WARN
 
 #: Eye of the 3D view: offset from the centre of the bodies, in halves of the diagonal of their box; least half [m].
@@ -54,7 +55,7 @@ def build_blueprint(eye: Any, pictures: Sequence[str] = (), robots: Sequence[Rob
         rows=rrb.TextLogRows(filter_by_log_level=[INFO, WARN, ERROR, CRITICAL]),
     )
     about = rrb.TextDocumentView(origin=paths.INFO, name="About")
-    plots = rrb.TimeSeriesView(origin=paths.METRICS, name="Delays [ms]")
+    plots = rrb.Tabs(*(_build_plot(f"{paths.METRICS}/{kind}", known.view) for kind, known in KINDS.items()))
     images = [rrb.Spatial2DView(origin=f"{paths.PICTURES}/{name}", name=name) for name in pictures]
     motion = [rrb.Tabs(*(_build_robot_views(robot) for robot in robots))] if robots else []
     side = rrb.Vertical(rrb.Tabs(log, about), *([rrb.Grid(*images)] if images else ()), *motion, plots)
@@ -69,5 +70,11 @@ def _build_robot_views(robot: RobotLabels) -> Any:
     """Return the plots of a robot, one above the other: joints, gripper, tip."""
     entity = get_robot_entity(robot.name)
     parts = ((JOINTS, "joints"), (GRIPPER, "gripper"), (TIP_SPEED, "speed of the tip"))
-    views = [rrb.TimeSeriesView(origin=f"{entity}/{part}", name=f"{robot.name}: {name}") for part, name in parts]
+    views = [_build_plot(f"{entity}/{part}", f"{robot.name}: {name}") for part, name in parts]
     return rrb.Vertical(*views, row_shares=[3, 1, 1], name=robot.name)
+
+
+def _build_plot(entity: str, name: str) -> Any:
+    """Return a plot that shows the whole session at first."""
+    whole = rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
+    return rrb.TimeSeriesView(origin=entity, name=name, axis_x=rrb.TimeAxis(view_range=whole))

@@ -1,12 +1,13 @@
-"""Plots of a recording: joints, grippers and tips of robots, each a series with a name and a unit.
+"""Plots of a recording: what is measured of robots, delays, errors and counts, each a series with name and unit.
 
 Rows are collected and written together, a chunk per entity: a chunk of ten numbers is mostly its schema.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -15,11 +16,95 @@ from numpy.typing import NDArray
 from iris_session.recording import paths
 from iris_session.recording.messages import RobotLabels, StateFrame
 from iris_session.recording.picture import escape_entity_part
-from iris_session.recording.timelines import to_time_columns
+from iris_session.recording.story import SessionStory
+from iris_session.recording.timelines import Moment, to_time_columns
 
-JOINTS = "joints"
-GRIPPER = "gripper"
-TIP_SPEED = "tip_speed"
+JOINTS: Final = "joints"
+GRIPPER: Final = "gripper"
+TIP_SPEED: Final = "tip_speed"
+
+
+class MetricKind(NamedTuple):
+    """A kind of metric, with a view of its own. `label`: of the series of one robot or person, `{}`. `of_people`: it
+    is of persons, in their colours, and holds until it changes.
+    """
+
+    view: str
+    label: str
+    of_people: bool = False
+
+
+INPUT_TO_STEP: Final = "input_to_step_ms"
+ALIGNMENT: Final = "alignment_mm"
+STATE_AGE: Final = "state_age_ms"
+REJECTED: Final = "rejected_samples"
+#: By the first part of the name of a metric; what is in no kind has no view.
+KINDS: Final = {
+    INPUT_TO_STEP: MetricKind("Delays [ms]", "input to step, {} [ms]"),
+    "lateness_ms": MetricKind("Lateness [ms]", "lateness of ticks [ms]"),
+    STATE_AGE: MetricKind("Age of state [ms]", "{}, 99 % of the states [ms]", of_people=True),
+    ALIGNMENT: MetricKind("Alignment error [mm]", "{}, at the robot, 95 % [mm]", of_people=True),
+    REJECTED: MetricKind("Rejected samples", "{}, since joining", of_people=True),
+}
+#: Metrics that keep their value until the next one.
+HELD: Final = (ALIGNMENT, REJECTED)
+#: Maximum number of metrics that are known to have a name in the file.
+MAX_NAMED: Final = 4096
+
+
+class MetricPlots:
+    """Metrics: one entity for each, below the entity of its kind."""
+
+    def __init__(self, recording: rr.RecordingStream, story: SessionStory) -> None:
+        self._rec = recording
+        self._story = story
+        self._named: set[str] = set()
+        self._rows: dict[str, list[tuple[Moment, float]]] = {}
+        self._held: dict[str, float] = {}
+
+    def add(self, kind: str, subject: str, value: float, moment: Moment) -> None:
+        """Collect a value. `subject`: id of a robot or participant, empty for a metric of the session."""
+        if not math.isfinite(value):
+            return
+        entity = f"{paths.METRICS}/{kind}" + (f"/{escape_entity_part(subject)}" if subject else "")
+        if kind in HELD:
+            if self._held.get(entity) == value:
+                return
+            self._held[entity] = value
+        if entity not in self._named:
+            self._name(entity, kind, subject)
+        self._rows.setdefault(entity, []).append((moment, value))
+
+    def end(self, kind: str, subject: str, moment: Moment) -> None:
+        """End the line of a value that was held until now."""
+        entity = f"{paths.METRICS}/{kind}/{escape_entity_part(subject)}"
+        if entity in self._held:
+            self._rows.setdefault(entity, []).append((moment, self._held.pop(entity)))
+
+    def _name(self, entity: str, kind: str, subject: str) -> None:
+        if len(self._named) >= MAX_NAMED:
+            self._named.clear()
+        self._named.add(entity)
+        known = KINDS.get(kind)
+        if known is None:
+            return
+        name = self._story.find_person(subject).name if known.of_people else subject
+        colours = [self._story.find_colour(subject)] if known.of_people else None
+        steps = rr.components.InterpolationMode.StepAfter if kind in HELD else None
+        series = rr.SeriesLines(names=[known.label.format(name)], colors=colours, interpolation_mode=steps)
+        self._rec.log(entity, series, static=True, strict=True)
+
+    def write(self, now: Moment) -> None:
+        """Write what was collected. Values that are held reach until `now`."""
+        for entity, value in self._held.items():
+            rows = self._rows.setdefault(entity, [])
+            if not rows or rows[-1][0] < now:
+                rows.append((now, value))
+        collected, self._rows = self._rows, {}
+        for entity, rows in collected.items():
+            times = to_time_columns(np.array([moment for moment, _ in rows], np.int64).T)
+            columns = rr.Scalars.columns(scalars=[value for _, value in rows])
+            rr.send_columns(entity, times, [*columns], recording=self._rec, strict=True)
 
 
 class RobotPlots:

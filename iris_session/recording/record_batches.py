@@ -196,6 +196,9 @@ def decode_samples(batch: Any) -> Iterator[RawSample]:
 
 def decode_scalars(batch: Any) -> Iterator[Scalar]:
     """Yield values of plots."""
+    batch = _select_rows(batch, "Scalars:scalars")  # others name the series
+    if not batch.num_rows:
+        return iter(())
     columns = (read_index(batch, paths.SESSION_TIME), read_values(batch, "Scalars:scalars"))
     return (Scalar(get_entity(batch), *row) for row in zip(*columns, strict=True))
 
@@ -304,7 +307,12 @@ def _read_stream(batch: Any) -> str:
 
 def _select_frames(batch: Any) -> Any:
     """Return the rows of a stream that have a frame; the others clear the picture when the stream ends."""
-    return batch.filter(batch.column("seq").is_valid()) if "seq" in batch.schema.names else batch.slice(0, 0)
+    return _select_rows(batch, "seq")
+
+
+def _select_rows(batch: Any, column: str) -> Any:
+    """Return the rows that have a value in a column."""
+    return batch.filter(batch.column(column).is_valid()) if column in batch.schema.names else batch.slice(0, 0)
 
 
 def _read_times(batch: Any) -> list[list[int]]:

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -22,7 +22,16 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.common import Applied
 from iris_session.protocol.errors import ProtocolError
-from iris_session.protocol.server_messages import BodyInfo, Event, ParticipantLeft, SceneChanged
+from iris_session.protocol.server_messages import (
+    AlignmentChanged,
+    BodyInfo,
+    Event,
+    ParticipantChanged,
+    ParticipantJoined,
+    ParticipantLeft,
+    SamplesRejected,
+    SceneChanged,
+)
 from iris_session.protocol.specs import RobotSpec
 from iris_session.recording import paths, scene_geometry
 from iris_session.recording.blueprint import build_blueprint, place_eye
@@ -44,7 +53,7 @@ from iris_session.recording.messages import (
 )
 from iris_session.recording.people import Base, PeoplePicture
 from iris_session.recording.picture import ScenePicture, SceneSource, escape_entity_part
-from iris_session.recording.plots import RobotPlots
+from iris_session.recording.plots import ALIGNMENT, INPUT_TO_STEP, REJECTED, STATE_AGE, MetricPlots, RobotPlots
 from iris_session.recording.rrd_stream import (
     RrdStream,
     bytes_column,
@@ -54,7 +63,7 @@ from iris_session.recording.rrd_stream import (
     scalar_column,
     sequence_index,
 )
-from iris_session.recording.story import FREE, WARN, LaneChange, LogLine, Rgb, SessionStory
+from iris_session.recording.story import FREE, WARN, LaneChange, LogLine, Rgb, SessionStory, StatedErrors
 from iris_session.recording.timelines import Moment, get_session_time, to_time_columns
 from iris_session.streams.errors import StreamError
 
@@ -67,6 +76,20 @@ MAX_LANES = 4096
 #: Maximum number of pending vertex frames whose states are not in the file yet.
 MAX_PENDING_VERTICES = 256
 _encode = msgspec.msgpack.Encoder().encode
+
+
+class _Told(NamedTuple):
+    """An event as the picture tells it, and what is then in force of its participant, if it has one."""
+
+    line: LogLine
+    changes: list[LaneChange]
+    participant: str
+    errors: StatedErrors | None
+    rejected: int
+
+
+#: Events after which the alignment or the rejected samples of a participant may be others.
+_PERSONAL: Final = (AlignmentChanged, ParticipantJoined, ParticipantChanged, ParticipantLeft, SamplesRejected)
 
 
 class RrdWriter:
@@ -84,6 +107,7 @@ class RrdWriter:
         self._picture = ScenePicture(self._rec)
         self._pending = Batch()
         self._samples: list[tuple[int, int, bytes]] = []
+        self._reports: list[tuple[str, int, float]] = []
         self._vertices: deque[VertexFrame] = deque()
         self.vertices_refused = 0
         self._media: list[Sequence[bytes]] = []
@@ -100,11 +124,11 @@ class RrdWriter:
         self._begins_ns: int | None = None  # session time of the first row
         self._clock = (0, 0)  # tick and sim_time [ns] of the newest state, for what has neither
         self._applied: dict[str, Applied] = {}
-        self._latencies: list[MetricRecord] = []
-        self._plots = RobotPlots(self._rec)
-        self._plots_due_ns = 0
         is_first = paths.split_part(self.path)[1] == 1
         self._story = SessionStory(is_first=is_first)
+        self._plots = RobotPlots(self._rec)
+        self._metrics = MetricPlots(self._rec, self._story)
+        self._plots_due_ns = 0
         self._people = PeoplePicture(self._rec, self._story, is_first=is_first)
         self._lane_colours: dict[str, dict[str, Rgb]] = {}
         self._eye: Any = None
@@ -143,6 +167,10 @@ class RrdWriter:
         """Collect one raw message of a client, as received."""
         self._samples.append((connection, receive_ns, data))
 
+    def add_report(self, participant: str, receive_ns: int, age_ms: float) -> None:
+        """Collect a report of a client: the age [ms] below which 99 % of the states of a second reached it."""
+        self._reports.append((participant, receive_ns, age_ms))
+
     def add_vertices(self, frame: VertexFrame) -> None:
         """Collect a frame of a deformable. If too many are pending, the oldest is dropped."""
         if len(self._vertices) >= MAX_PENDING_VERTICES:
@@ -158,16 +186,21 @@ class RrdWriter:
         """Write everything collected. Raises `WriteError`; the file is then valid up to an earlier flush."""
         batch, self._pending = self._pending, Batch()
         samples, self._samples = self._samples, []
+        reports, self._reports = self._reports, []
         try:
             self._write_rows(batch)
             self._write_keyframes(batch)
-            told = [self._story.add(event) for event in batch.events]  # names and roles are known when people appear
+            told = [self._tell(event) for event in batch.events]  # names and roles are known when people appear
             for _, states in groupby(batch.states, key=lambda state: len(state.poses)):
                 self._write_states(list(states))
             self._write_events(batch.events, told)
             self._write_holds(batch.holds)
             self._write_denials(batch.denials)
-            self._write_metrics(batch.metrics)
+            self._add_metrics(batch.metrics)
+            self._add_reports(reports)
+            if self._known and self._known[-1][3] >= self._plots_due_ns:
+                self._plots_due_ns = self._known[-1][3] + PLOTS_NS
+                self._write_plots()
             self._write_samples(samples)
             self._write_vertices()
             self._write_media()
@@ -282,15 +315,12 @@ class RrdWriter:
             bytes_column("applied", [_encode(s.applied) for s in states]),
         ]
         self._send_columns(paths.STATE, to_time_columns(times), columns)
-        self._note_latencies(states)
-        self._plots.add(states, times)
-        if states[-1].session_time >= self._plots_due_ns:
-            self._plots_due_ns = states[-1].session_time + PLOTS_NS
-            self._write_plots()
         if poses.shape[1] == len(self._bodies):  # a new recorder also gets pending states of the scene before
             self._write_transforms(states, poses, seen)
         self._clock = moments[-1][1:3]
         self._known.extend(moments)
+        self._note_latencies(states)
+        self._plots.add(states, times)
 
     def _draw_scene(self, first: Moment, times: NDArray[np.int64]) -> NDArray[np.int64]:
         """Draw the scene if it is new. Return the times of the states as the picture has them.
@@ -366,15 +396,14 @@ class RrdWriter:
             for applied in state.applied:
                 if self._applied.get(applied.robot) != applied:
                     self._applied[applied.robot] = applied
-                    name = f"input_to_step_ms/{applied.robot}"
                     latency_ms = (applied.step_ns - applied.capture_ns) / 1e6
-                    self._latencies.append(MetricRecord(state.step, state.session_time, name, latency_ms))
+                    moment = self._find_moment(state.step, state.session_time)
+                    self._metrics.add(INPUT_TO_STEP, applied.robot, latency_ms, moment)
 
     def _write_plots(self) -> None:
         """Write the plots collected so far."""
-        latencies, self._latencies = self._latencies, []
-        self._write_metrics(latencies)
         self._plots.write()
+        self._metrics.write(self._known[-1] if self._known else self._find_moment(0, 0))
 
     def _write_transforms(self, states: list[StateFrame], poses: NDArray[np.float64], times: NDArray[np.int64]) -> None:
         """Write a row per body that changed in a frame, and per device of a participant that has a new pose."""
@@ -401,21 +430,44 @@ class RrdWriter:
         )
         self._send_columns(paths.TRANSFORMS, to_time_columns(times[:, frame]), [*columns])
 
-    def _write_events(self, events: list[Event], told: list[tuple[LogLine, list[LaneChange]]]) -> None:
+    def _write_events(self, events: list[Event], told: list[_Told]) -> None:
         if not events:
             return
         changes = []
-        for event, (_, changed) in zip(events, told, strict=True):
-            changes += [(event.step, event.session_time, change) for change in changed]
+        for event, one in zip(events, told, strict=True):
+            changes += [(event.step, event.session_time, change) for change in one.changes]
+            if one.participant:
+                self._plot_person(event, one)
             if isinstance(event.body, ParticipantLeft) and not event.body.grace:
                 self._people.remove(event.body.participant, self._find_moment(event.step, event.session_time))
             elif isinstance(event.body, SceneChanged) and event.body.cause == "new_scene":
                 self._people.label_robots({}, self._find_moment(event.step, event.session_time))
-        text = rr.TextLog.columns(text=[line.text for line, _ in told], level=[line.level for line, _ in told])
+        text = rr.TextLog.columns(text=[one.line.text for one in told], level=[one.line.level for one in told])
         columns = [*text, bytes_column("event", [_encode(event) for event in events])]
         times = self._to_times([e.step for e in events], [e.session_time for e in events])
         self._send_columns(paths.EVENTS, times, columns)
         self._write_lanes(changes)
+
+    def _tell(self, event: Event) -> _Told:
+        line, changes = self._story.add(event)
+        body: Any = event.body
+        participant = ""
+        if isinstance(body, _PERSONAL):
+            participant = body.participant if isinstance(body.participant, str) else body.participant.id
+        errors, rejected = self._story.errors.get(participant), self._story.rejected.get(participant, 0)
+        return _Told(line, changes, participant, errors, rejected)
+
+    def _plot_person(self, event: Event, told: _Told) -> None:
+        """Plot the stated error and the rejected samples of the participant of an event."""
+        moment = self._find_moment(event.step, event.session_time)
+        if told.errors is not None:
+            self._metrics.add(ALIGNMENT, told.participant, told.errors.at_robot_m * 1e3, moment)
+        else:
+            self._metrics.end(ALIGNMENT, told.participant, moment)
+        if told.rejected:
+            self._metrics.add(REJECTED, told.participant, told.rejected, moment)
+        else:
+            self._metrics.end(REJECTED, told.participant, moment)
 
     def _write_holds(self, holds: list[HoldRecord]) -> None:
         changes = [(h.step, h.session_time, c) for h in holds for c in self._story.add_hold(h.robot, h.reason)]
@@ -450,14 +502,15 @@ class RrdWriter:
         times = self._to_times([d.step for d in denials], [d.session_time for d in denials])
         self._send_columns(paths.DENIALS, times, columns)
 
-    def _write_metrics(self, metrics: list[MetricRecord]) -> None:
-        by_name: dict[str, list[MetricRecord]] = {}
+    def _add_metrics(self, metrics: list[MetricRecord]) -> None:
         for record in metrics:
-            by_name.setdefault(record.name, []).append(record)
-        for name, records in by_name.items():
-            times = self._to_times([r.step for r in records], [r.session_time for r in records])
-            values = rr.Scalars.columns(scalars=[r.value for r in records])
-            self._send_columns(f"{paths.METRICS}/{name}", times, [*values])
+            kind, _, subject = record.name.partition("/")
+            self._metrics.add(kind, subject, record.value, self._find_moment(record.step, record.session_time))
+
+    def _add_reports(self, reports: list[tuple[str, int, float]]) -> None:
+        for participant, receive_ns, age_ms in reports:
+            step = self._known[-1][0] if self._known else 0
+            self._metrics.add(STATE_AGE, participant, age_ms, self._find_moment(step, receive_ns))
 
     def _write_samples(self, samples: list[tuple[int, int, bytes]]) -> None:
         if not samples:

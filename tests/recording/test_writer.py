@@ -12,7 +12,7 @@ import pytest
 
 from anchors.pose import apply
 from iris_session.physics.load import compute_scene_hash, encode_model
-from iris_session.protocol.common import Applied, Denial, Lease, Pose
+from iris_session.protocol.common import Alignment, Applied, Denial, Lease, Pose
 from iris_session.protocol.scene import (
     AddVisual,
     Geometry,
@@ -25,6 +25,7 @@ from iris_session.protocol.scene import (
     encode_scene,
 )
 from iris_session.protocol.server_messages import (
+    AlignmentChanged,
     BodyInfo,
     EStopChanged,
     Event,
@@ -33,6 +34,7 @@ from iris_session.protocol.server_messages import (
     ParticipantJoined,
     ParticipantLeft,
     PresenceItem,
+    SamplesRejected,
 )
 from iris_session.protocol.specs import RobotSpec
 from iris_session.recording import Recording, SessionHeader, pack_model
@@ -169,7 +171,9 @@ def test_latencies_of_applied_samples_are_plotted_once_each(tmp_path: Path) -> N
     ]
     writer.add(Batch(states=states))
     writer.close()
-    assert column(read(path)["/metrics/input_to_step_ms/left"], "Scalars:scalars") == [[5.0], [3.0]]
+    plot = read(path)["/metrics/input_to_step_ms/left"]
+    assert column(select(plot, "Scalars:scalars"), "Scalars:scalars") == [[5.0], [3.0]]
+    assert column(select(plot, "SeriesLines:names"), "SeriesLines:names") == [["input to step, left [ms]"]]
 
 
 def joined(participant: str, name: str, role: str = "operator") -> Event:
@@ -538,3 +542,40 @@ def test_joints_grippers_and_tips_of_robots_are_plotted(tmp_path: Path) -> None:
     speeds = column(select(found["/robots/left/tip_speed"], "Scalars:scalars"), "Scalars:scalars")
     assert speeds == [[pytest.approx(2.0)]], "32 mm in 16 ms; nothing is known of the first"
     assert sorted(entity for entity in found if "free" in entity) == ["/robots/free/tip_speed"]
+
+
+def test_errors_of_alignments_and_rejected_samples_are_plotted_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    writer.write_header(SessionHeader("s", "n", "closed", 2_000_000))
+    pose = Pose((0.0, 0.0, 0.0), IDENTITY_Q)
+    stated = [Alignment(i, "measured", pose, 0, (), error / 2, error) for i, error in ((1, 0.004), (2, 0.002))]
+    bodies = [
+        *(AlignmentChanged("p1", one) for one in stated),
+        AlignmentChanged("p2", msgspec.structs.replace(stated[0], offset=True)),
+        *(SamplesRejected("p1", device, "stale", n) for device, n in (("head", 2), ("hand/left", 1), ("head", 5))),
+        ParticipantLeft("p1", "bye"),
+    ]
+    events = [Event(2 + i, 10 * i, 100 * i, body) for i, body in enumerate(bodies)]
+    writer.add(Batch(events=[joined("p1", "Ada"), *events], states=[frame(0, np.zeros((0, 7)))]))
+    writer.add_report("p1", 50, 3.5)
+    writer.close()
+    found = read(path)
+    plots = {kind: found[f"/metrics/{kind}/p1"] for kind in ("alignment_mm", "rejected_samples", "state_age_ms")}
+    values = {kind: select(batches, "Scalars:scalars") for kind, batches in plots.items()}
+    assert column(values["alignment_mm"], "Scalars:scalars") == [[4.0], [2.0], [2.0]]
+    assert times(values["alignment_mm"]) == [0, 100, 600], "until Ada left"
+    assert column(values["rejected_samples"], "Scalars:scalars") == [[2.0], [3.0], [6.0], [6.0]]
+    assert (column(values["state_age_ms"], "Scalars:scalars"), times(values["state_age_ms"])) == ([[3.5]], [50])
+    names = [column(select(batches, "SeriesLines:names"), "SeriesLines:names") for batches in plots.values()]
+    assert names == [
+        [["Ada, at the robot, 95 % [mm]"]],
+        [["Ada, since joining"]],
+        [["Ada, 99 % of the states [ms]"]],
+    ]
+    assert not any("p2" in entity for entity in found if entity.startswith("/metrics")), (
+        "an offset voids the stated error"
+    )
+    with Recording.open(path, warn=False) as recording:
+        assert recording.metrics()["alignment_mm/p1"][1].tolist() == [4.0, 2.0, 2.0]
+        assert recording.damage == []
