@@ -13,7 +13,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from iris_session.protocol.scene import Deformable
-from iris_session.recording.scene_geometry import WORLD, Pixels, Rgba8, to_rgba8
+from iris_session.recording.scene_geometry import Pixels, Rgba8, to_rgba8
 from iris_session.scene import AssetDecodeError
 from iris_session.scene.arrays import require_array
 from iris_session.scene.mesh_processing import normalise
@@ -59,7 +59,7 @@ class DrawnDeformable:
 
     def build_components(self) -> list[Any]:
         """Return the Rerun components that do not change, and the vertices at rest."""
-        return [rr.CoordinateFrame(WORLD), self._form.build_components(self._rest, self._colour, self._radius)]
+        return [self._form.build_components(self._rest, self._colour, self._radius)]
 
     def decode_frame(self, frame: bytes) -> Floats | None:
         """Decode a frame of the stream: vertices (n, 3) [m], `None` if unchanged. Raises `StreamError`."""

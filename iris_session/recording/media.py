@@ -19,7 +19,6 @@ from iris_session.protocol.codec import decode_media_header
 from iris_session.protocol.media import MAX_IMAGE_SIZE, MAX_STREAMS, MediaHeader, StreamInfo, is_stream_name
 from iris_session.protocol.names import AssetEncoding, BudgetClass, MediaEncoding
 from iris_session.recording import paths
-from iris_session.recording.scene_geometry import WORLD
 from iris_session.scene import AssetDecodeError
 from iris_session.scene.images import read_stated_size
 from iris_session.streams.cloud import CloudFrame, decode_cloud
@@ -78,7 +77,6 @@ class MediaDrawer:
             paths.CLOUDS,
             header,
             _make_times(header),
-            rr.CoordinateFrame(WORLD),
             rr.Points3D(cloud.positions, colors=cloud.colors, radii=[radius]),
             rr.AnyValues(
                 error_m=pa.array([cloud.error_m], pa.float64()), voxel_m=pa.array([cloud.voxel_m], pa.float64())

@@ -27,7 +27,6 @@ PRESENCE: Final = "/presence"
 LANES: Final = "/lanes"
 #: Labels of robots.
 ROBOTS: Final = "/robots"
-TRANSFORMS: Final = "/tf"
 #: Point clouds and pictures of cameras, an entity per stream.
 CLOUDS: Final = "/clouds"
 PICTURES: Final = "/pictures"

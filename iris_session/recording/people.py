@@ -1,7 +1,7 @@
 """Picture of participants in a recording: heads and hands at the poses that the session had of them, names at robots.
 
-A device is drawn in a frame of its own, whose motion is rows of `/tf`. It appears with its first pose, and is cleared
-when its participant leaves or no pose came for `STALE_NS`. Nothing is static, as Rerun shows static data at all times.
+A device is drawn at an entity of its own, which `motion` moves. It appears with its first pose, and is cleared when
+its participant leaves or no pose came for `STALE_NS`. Nothing is static, as Rerun shows static data at all times.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from iris_session.protocol.server_messages import PresenceItem
 from iris_session.recording import paths
 from iris_session.recording.messages import StateFrame
 from iris_session.recording.picture import escape_entity_part
-from iris_session.recording.plots import get_robot_entity
 from iris_session.recording.story import FREE, Rgb, SessionStory
 from iris_session.recording.timelines import Moment, set_moment
 
@@ -34,14 +33,14 @@ class DeviceRow(NamedTuple):
     """Pose of a device at a state. `state`: its index. `pose`: `x y z qw qx qy qz`."""
 
     state: int
-    frame: str
+    entity: str
     pose: tuple[float, ...]
 
 
 class Base(NamedTuple):
-    """Base of a robot, where its label is. `position`: in `frame` [m]."""
+    """Base of a robot, where its label is. `position`: at `entity` [m]."""
 
-    frame: str
+    entity: str
     position: tuple[float, float, float]
 
 
@@ -81,7 +80,7 @@ class PeoplePicture:
         label = f"{robot}: {holder}" if holder else robot
         point = rr.Points3D([base.position], colors=[colour], radii=[0.01], labels=[label], show_labels=True)
         set_moment(self._rec, moment)
-        self._rec.log(get_robot_entity(robot), rr.CoordinateFrame(base.frame), point, strict=True)
+        self._rec.log(base.entity, point, strict=True)
         self._rec.reset_time()
 
     def draw(self, states: Sequence[StateFrame], moments: Sequence[Moment]) -> list[DeviceRow]:
@@ -97,7 +96,7 @@ class PeoplePicture:
                 if shown is None or shown.label != label:
                     self._draw_device(key, label, moment)
                 self._shown[key] = _Shown(item, state.session_time, label)
-                rows.append(DeviceRow(i, _frame(key), (*item.pose.p, *item.pose.q)))
+                rows.append(DeviceRow(i, _entity(key), (*item.pose.p, *item.pose.q)))
             for key in [key for key, shown in self._shown.items() if state.session_time - shown.seen_ns > STALE_NS]:
                 self._clear(key, moment)
         return rows
@@ -116,18 +115,18 @@ class PeoplePicture:
     def _draw_device(self, key: _Key, label: str, moment: Moment) -> None:
         """Draw a box for a head, with an arrow in the direction of view, and a ball for a hand."""
         colours = [self._story.find_colour(key[0])]
-        frame, solid = rr.CoordinateFrame(_frame(key)), rr.components.FillMode.Solid
+        solid = rr.components.FillMode.Solid
         set_moment(self._rec, moment)
         if key[1] == Device.HEAD:
             box: Any = rr.Boxes3D(
                 half_sizes=[HEAD_HALF_M], colors=colours, labels=[label], show_labels=True, fill_mode=solid
             )
             arrow = rr.Arrows3D(vectors=[(VIEW_M, 0.0, 0.0)], colors=colours, radii=[0.008])
-            self._rec.log(_entity(key), frame, box, strict=True)
-            self._rec.log(f"{_entity(key)}/view", frame, arrow, strict=True)
+            self._rec.log(_entity(key), box, strict=True)
+            self._rec.log(f"{_entity(key)}/view", arrow, strict=True)
         else:
             ball = rr.Ellipsoids3D(half_sizes=[HAND_HALF_M], colors=colours, fill_mode=solid)
-            self._rec.log(_entity(key), frame, ball, strict=True)
+            self._rec.log(_entity(key), ball, strict=True)
         self._rec.reset_time()
 
     def _clear(self, key: _Key, moment: Moment) -> None:
@@ -137,9 +136,6 @@ class PeoplePicture:
         self._rec.reset_time()
 
 
-def _frame(key: _Key) -> str:
-    return f"presence/{key[0]}/{key[1]}"
-
-
 def _entity(key: _Key) -> str:
-    return f"{paths.PRESENCE}/{escape_entity_part(key[0])}/{escape_entity_part(key[1])}"
+    participant, device = key
+    return "/".join((paths.PRESENCE, *map(escape_entity_part, (participant, *device.split("/")))))

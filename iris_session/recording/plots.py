@@ -94,8 +94,8 @@ class MetricPlots:
         series = rr.SeriesLines(names=[known.label.format(name)], colors=colours, interpolation_mode=steps)
         self._rec.log(entity, series, static=True, strict=True)
 
-    def write(self, now: Moment) -> None:
-        """Write what was collected. Values that are held reach until `now`."""
+    def write(self, now: Moment) -> int:
+        """Write what was collected. Values that are held reach until `now`. Return the number of chunks."""
         for entity, value in self._held.items():
             rows = self._rows.setdefault(entity, [])
             if not rows or rows[-1][0] < now:
@@ -105,6 +105,7 @@ class MetricPlots:
             times = to_time_columns(np.array([moment for moment, _ in rows], np.int64).T)
             columns = rr.Scalars.columns(scalars=[value for _, value in rows])
             rr.send_columns(entity, times, [*columns], recording=self._rec, strict=True)
+        return len(collected)
 
 
 class RobotPlots:
@@ -147,10 +148,10 @@ class RobotPlots:
             return np.full(len(tips), np.nan)
         return np.asarray(np.linalg.norm(tips - before[1], axis=1) / elapsed_s)
 
-    def write(self) -> None:
-        """Write what was collected."""
+    def write(self) -> int:
+        """Write what was collected. Return the number of chunks."""
         if not self._times:
-            return
+            return 0
         times, values = np.concatenate(self._times, axis=1), np.concatenate(self._values)
         self._times.clear()
         self._values.clear()
@@ -162,6 +163,7 @@ class RobotPlots:
             at += len(labels)
             self._send(robot, GRIPPER, [f"opening{of} [0 to 1]"], times, values[:, [n + i]])
             self._send(robot, TIP_SPEED, [f"tip speed{of} [m/s]"], times, values[:, [n + len(self.robots) + i]])
+        return 3 * len(self.robots)
 
     def _send(
         self, robot: RobotLabels, name: str, labels: list[str], times: NDArray[np.int64], values: NDArray[np.float64]

@@ -190,7 +190,9 @@ def decode_models(batch: Any) -> Iterator[SceneModel]:
 
 def decode_samples(batch: Any) -> Iterator[RawSample]:
     """Yield raw messages."""
-    columns = (read_values(batch, "connection"), read_index(batch, paths.SESSION_TIME), read_values(batch, "data"))
+    is_exact = "receive_ns" in batch.schema.names  # since rows of one time are shown 1 ns apart
+    received = read_values(batch, "receive_ns") if is_exact else read_index(batch, paths.SESSION_TIME)
+    columns = (read_values(batch, "connection"), received, read_values(batch, "data"))
     return (RawSample(*row) for row in zip(*columns, strict=True))
 
 

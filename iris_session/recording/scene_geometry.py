@@ -1,6 +1,6 @@
-"""Geometry of a scene specification for the Rerun viewer: visuals as primitives and meshes, fixed in named frames.
+"""Geometry of a scene specification for the Rerun viewer: visuals as primitives and meshes, fixed in frames.
 
-A frame is `world` or the name of a streamed body that moves; the recording moves frames, never geometry. If no assets
+A frame is `world` or the name of a streamed body that moves; the recording moves bodies, never geometry. If no assets
 are shared, the specification is made from the recorded model, here and not in the process that runs physics.
 """
 
@@ -20,8 +20,9 @@ from iris_session.protocol.common import Pose
 from iris_session.protocol.names import ArrayKind, AssetEncoding, GeometryKind, TextureKind
 from iris_session.protocol.scene import Deformable, Geometry, Rgba, SceneSpec, Visual, decode_scene
 from iris_session.protocol.server_messages import BodyInfo
+from iris_session.protocol.specs import RobotSpec
 from iris_session.recording.journal import unpack_model
-from iris_session.recording.messages import SceneAssets
+from iris_session.recording.messages import RobotLabels, SceneAssets
 from iris_session.scene import AssetStore, EncodeOptions, MeshArrays, decode_arrays, decode_image, decode_mesh
 from iris_session.scene.cube_maps import Atlas, CubeMapReader, bake_cube_map, direction_scale
 from iris_session.scene.shapes import (
@@ -225,6 +226,17 @@ def place_bodies(spec: SceneSpec, bodies: Sequence[BodyInfo]) -> dict[int, BodyP
             found[body.id] = BodyPlacement(WORLD, _tuple(body.T_world_body))
         else:
             found[body.id] = BodyPlacement(above.frame, compose(above.T, _tuple(body.T_parent_body)))
+    return found
+
+
+def assign_robots(spec: SceneSpec, robots: Sequence[RobotSpec | RobotLabels]) -> dict[int, str]:
+    """Return the robot of each body at or below the base of one, by id."""
+    bases = {robot.base_body: robot.name for robot in robots}
+    found: dict[int, str] = {}
+    for body in spec.bodies:  # parents before their children
+        robot = bases.get(body.name) or found.get(body.parent)
+        if robot:
+            found[body.id] = robot
     return found
 
 

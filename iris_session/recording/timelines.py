@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Final
 
 import numpy as np
 import rerun as rr
@@ -11,6 +12,10 @@ from numpy.typing import NDArray
 from iris_session.recording import paths
 from iris_session.recording.rrd_stream import duration_index, sequence_index
 
+#: Rows that are so much earlier than the newest one of their entity are in no row of others [ns].
+SPREAD_NS: Final = 100_000
+#: Maximum number of entities whose newest time is known.
+MAX_ENTITIES: Final = 4096
 #: Step, tick, simulated time [ns], session time [ns].
 Moment = tuple[int, int, int, int]
 
@@ -38,3 +43,26 @@ def to_time_columns(times: NDArray[np.int64]) -> list[Any]:
         duration_index(paths.SIM_TIME, sim_ns),
         duration_index(paths.SESSION_TIME, session_ns),
     ]
+
+
+class RowTimes:
+    """Times of rows that may come at one time: in an entity, Rerun's dataframes have one row per time.
+
+    Rows of one entity and session time are shown 1 ns apart. Exact times are in the data of the rows.
+    """
+
+    def __init__(self) -> None:
+        self._last: dict[str, int] = {}
+
+    def spread(self, entity: str, session_times: Sequence[int]) -> list[int]:
+        """Return the session times [ns] of new rows of an entity, no two of which are equal."""
+        if len(self._last) >= MAX_ENTITIES:
+            self._last.clear()
+        last = self._last.get(entity, -SPREAD_NS)
+        spread = []
+        for exact_ns in session_times:
+            shown_ns = last + 1 if last - SPREAD_NS < exact_ns <= last else exact_ns
+            last = max(last, shown_ns)
+            spread.append(shown_ns)
+        self._last[entity] = last
+        return spread

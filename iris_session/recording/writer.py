@@ -1,8 +1,8 @@
 """Write one part of a recording into a Rerun file: journal and raw data exactly, and a picture of the session.
 
-Moving bodies and devices of participants are rows of `/tf` (one transform per body and change, named frames as in ROS);
-geometry is fixed in those frames, except vertices of deformables. Exact float64 poses, raw samples and the journal are
-plain columns beside it. `RrdStream` appends the bytes, `describe_...` make the lines that the viewer shows.
+Moving bodies and devices of participants have an entity each, with a transform per change and geometry below it. No two
+rows of an entity have one time, so that Rerun's dataframes have them all. Exact float64 poses, raw samples and the
+journal are plain columns beside the picture. `describe_...` make the texts that the viewer shows.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from iris_session.protocol.server_messages import (
     SceneChanged,
 )
 from iris_session.protocol.specs import RobotSpec
-from iris_session.recording import paths, scene_geometry
+from iris_session.recording import paths
 from iris_session.recording.blueprint import build_blueprint, place_eye
 from iris_session.recording.errors import WriteError
 from iris_session.recording.journal import SessionHeader, seal_blob
@@ -44,6 +44,7 @@ from iris_session.recording.messages import (
     EndMark,
     HoldRecord,
     MetricRecord,
+    RobotLabels,
     SceneAssets,
     SceneModel,
     StateFrame,
@@ -51,9 +52,18 @@ from iris_session.recording.messages import (
     encode_header,
     encode_scene,
 )
+from iris_session.recording.motion import MotionRows
 from iris_session.recording.people import Base, PeoplePicture
 from iris_session.recording.picture import ScenePicture, SceneSource, escape_entity_part
-from iris_session.recording.plots import ALIGNMENT, INPUT_TO_STEP, REJECTED, STATE_AGE, MetricPlots, RobotPlots
+from iris_session.recording.plots import (
+    ALIGNMENT,
+    INPUT_TO_STEP,
+    REJECTED,
+    STATE_AGE,
+    MetricPlots,
+    RobotPlots,
+    get_robot_entity,
+)
 from iris_session.recording.rrd_stream import (
     RrdStream,
     bytes_column,
@@ -64,11 +74,16 @@ from iris_session.recording.rrd_stream import (
     sequence_index,
 )
 from iris_session.recording.story import FREE, WARN, LaneChange, LogLine, Rgb, SessionStory, StatedErrors
-from iris_session.recording.timelines import Moment, get_session_time, to_time_columns
+from iris_session.recording.timelines import Moment, RowTimes, get_session_time, to_time_columns
 from iris_session.streams.errors import StreamError
 
-#: Interval of chunks of plots: once a second is enough, as `/state` holds what they are computed from.
-PLOTS_NS = 1_000_000_000
+#: Chunks of the picture per second, each mostly its schema, and the shortest and longest time between two of an entity
+#: [ns]. Until then a kill of the recorder takes the newest motion from the picture; `/state` has it.
+CHUNKS_PER_S: Final = 8
+MIN_PERIOD_NS: Final = 1_000_000_000
+MAX_PERIOD_NS: Final = 8_000_000_000
+#: Difference of a pose from the one drawn that is not seen, [m] and in the quaternion: bodies at rest jitter by less.
+UNSEEN: Final = np.array([2e-5] * 3 + [5e-5] * 4)
 #: Number of newest states whose times are kept for vertices that arrive later: 4 s at 60 Hz.
 KNOWN_MOMENTS = 256
 #: Maximum number of lanes whose colours are known to be in the file: participants that come and go have one each.
@@ -104,7 +119,10 @@ class RrdWriter:
         self.path = str(path)
         self._stream = RrdStream(self.path, paths.APPLICATION, recording_id)
         self._rec = self._stream.recording
-        self._picture = ScenePicture(self._rec)
+        is_first = paths.split_part(self.path)[1] == 1
+        self._picture = ScenePicture(self._rec, is_first=is_first)
+        self._motion = MotionRows(self._rec)
+        self._times = RowTimes()
         self._pending = Batch()
         self._samples: list[tuple[int, int, bytes]] = []
         self._reports: list[tuple[str, int, float]] = []
@@ -118,17 +136,16 @@ class RrdWriter:
         self._bodies: tuple[BodyInfo, ...] = ()
         self._moving: NDArray[np.intp] = np.empty(0, np.intp)
         self._frames: list[str] = []
-        self._robots: tuple[RobotSpec, ...] = ()
-        self._last_poses: NDArray[np.float64] | None = None
+        self._robots: Sequence[RobotSpec | RobotLabels] = ()
+        self._shown_poses: NDArray[np.float64] | None = None
         self._newest_row = (-1, b"")
         self._begins_ns: int | None = None  # session time of the first row
         self._clock = (0, 0)  # tick and sim_time [ns] of the newest state, for what has neither
         self._applied: dict[str, Applied] = {}
-        is_first = paths.split_part(self.path)[1] == 1
         self._story = SessionStory(is_first=is_first)
         self._plots = RobotPlots(self._rec)
         self._metrics = MetricPlots(self._rec, self._story)
-        self._plots_due_ns = 0
+        self._collected_due_ns = 0
         self._people = PeoplePicture(self._rec, self._story, is_first=is_first)
         self._lane_colours: dict[str, dict[str, Rgb]] = {}
         self._eye: Any = None
@@ -141,17 +158,14 @@ class RrdWriter:
         self._log_static(paths.INFO, rr.TextDocument(describe_session(header), media_type="text/markdown"))
         self._set_bodies(header.bodies)
         self._robots = header.robots
-        root = rr.Transform3D(parent_frame="tf#/", child_frame=scene_geometry.WORLD)  # tf#/: frame of the root entity
-        self._log_static(paths.TRANSFORMS + "_static", root)
         self._log_static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-        if header.model:
-            self._picture.set_scene(SceneSource(header.model, header.bodies))
+        self._picture.set_scene(SceneSource(header.model, header.bodies, robots=header.robots))
 
     def _set_bodies(self, bodies: tuple[BodyInfo, ...]) -> None:
         self._bodies = bodies
         self._moving = np.array([i for i, body in enumerate(bodies) if body.moving], np.intp)
         self._frames = [bodies[i].name for i in self._moving]
-        self._last_poses = None
+        self._shown_poses = None
 
     def add(self, batch: Batch) -> None:
         """Collect one batch of the authority. States of one flush are of one scene."""
@@ -198,9 +212,8 @@ class RrdWriter:
             self._write_denials(batch.denials)
             self._add_metrics(batch.metrics)
             self._add_reports(reports)
-            if self._known and self._known[-1][3] >= self._plots_due_ns:
-                self._plots_due_ns = self._known[-1][3] + PLOTS_NS
-                self._write_plots()
+            if self._known and self._known[-1][3] >= self._collected_due_ns:
+                self._collected_due_ns = self._known[-1][3] + self._write_collected()
             self._write_samples(samples)
             self._write_vertices()
             self._write_media()
@@ -213,7 +226,7 @@ class RrdWriter:
     def close(self) -> None:
         """Write the rest and the end mark, and close the file. Raises `WriteError`."""
         self.flush()
-        self._write_plots()
+        self._write_collected()
         self._picture.draw((-1, 0, 0, 0))  # without a state the scene is drawn nevertheless
         if not self._arranged:
             self._send_blueprint()
@@ -278,13 +291,14 @@ class RrdWriter:
                 paths.MODELS, times, [bytes_column("scene", [seal_blob(encode_scene(s)) for s in scenes])]
             )
         if assets and assets[-1].robots != self._plots.robots:
-            self._write_plots()
+            self._write_collected()
             self._plots.set_robots(assets[-1].robots)
             self._arranged = False
         for loaded in scenes:
             self._set_bodies(loaded.bodies)
             self._last_step = loaded.step if loaded.session_time else self._last_step
-            source = SceneSource(loaded.model, loaded.bodies, *assets[-1:])
+            self._robots = assets[-1].robots if assets else ()
+            source = SceneSource(loaded.model, loaded.bodies, *assets[-1:], robots=self._robots)
             self._picture.replace_scene(source, (loaded.step, *self._clock, loaded.session_time))
         for patch in () if scenes else assets:
             self._picture.patch_scene(patch, (patch.step, *self._clock, patch.session_time))
@@ -342,9 +356,9 @@ class RrdWriter:
         known = {body.name: (body, pose) for body, pose in zip(self._bodies, poses, strict=True)}
         found = {robot.name: known[robot.base_body] for robot in self._robots if robot.base_body in known}
         return {
-            name: Base(body.name, (0.0, 0.0, 0.0))
+            name: Base(f"{self._picture.find_entity(body.name)}/label", (0.0, 0.0, 0.0))
             if body.moving
-            else Base(scene_geometry.WORLD, tuple(pose[:3].tolist()))
+            else Base(get_robot_entity(name), tuple(pose[:3].tolist()))
             for name, (body, pose) in found.items()
         }
 
@@ -400,35 +414,30 @@ class RrdWriter:
                     moment = self._find_moment(state.step, state.session_time)
                     self._metrics.add(INPUT_TO_STEP, applied.robot, latency_ms, moment)
 
-    def _write_plots(self) -> None:
-        """Write the plots collected so far."""
-        self._plots.write()
-        self._metrics.write(self._known[-1] if self._known else self._find_moment(0, 0))
+    def _write_collected(self) -> int:
+        """Write motion and plots collected so far. Return the time until they are due again [ns]."""
+        n = self._motion.write() + self._plots.write()
+        n += self._metrics.write(self._known[-1] if self._known else self._find_moment(0, 0))
+        return min(MAX_PERIOD_NS, max(MIN_PERIOD_NS, n * 1_000_000_000 // CHUNKS_PER_S))
 
     def _write_transforms(self, states: list[StateFrame], poses: NDArray[np.float64], times: NDArray[np.int64]) -> None:
-        """Write a row per body that changed in a frame, and per device of a participant that has a new pose."""
+        """Collect a row per body that moved visibly, and per device of a participant that has a new pose."""
         moving = poses[:, self._moving]
-        before = np.empty_like(moving)
-        before[1:] = moving[:-1]
-        before[0] = np.nan if self._last_poses is None else self._last_poses
-        self._last_poses = moving[-1].copy()
-        frame, body = np.nonzero((moving != before).any(axis=2))
+        shown = np.full(moving.shape[1:], np.nan) if self._shown_poses is None else self._shown_poses
+        moved = np.empty(moving.shape[:2], np.bool_)
+        for now, rows in zip(moving, moved, strict=True):
+            np.logical_not((np.abs(now - shown) < UNSEEN).all(axis=1), out=rows)
+            shown[rows] = now[rows]
+        self._shown_poses = shown
+        frame, body = np.nonzero(moved)
         values = moving[frame, body]
-        names = [self._frames[i] for i in body]
+        entities = [self._picture.find_entity(name) for name in self._frames]
+        self._motion.add(entities, body, times[:, frame], values)
         people = self._people.draw(states, [tuple(moment) for moment in times.T.tolist()])
-        if people:
-            frame = np.concatenate([frame, np.array([row.state for row in people], np.intp)])
-            values = np.concatenate([values, np.array([row.pose for row in people], np.float64)])
-            names += [row.frame for row in people]
-        if not names:
-            return
-        columns = rr.Transform3D.columns(
-            translation=values[:, :3],
-            quaternion=values[:, [4, 5, 6, 3]],
-            child_frame=names,
-            parent_frame=[scene_geometry.WORLD] * len(names),
-        )
-        self._send_columns(paths.TRANSFORMS, to_time_columns(times[:, frame]), [*columns])
+        entities = list(dict.fromkeys(row.entity for row in people))
+        which = np.array([entities.index(row.entity) for row in people], np.intp)
+        frame = np.array([row.state for row in people], np.intp)
+        self._motion.add(entities, which, times[:, frame], np.array([row.pose for row in people], np.float64))
 
     def _write_events(self, events: list[Event], told: list[_Told]) -> None:
         if not events:
@@ -444,7 +453,7 @@ class RrdWriter:
                 self._people.label_robots({}, self._find_moment(event.step, event.session_time))
         text = rr.TextLog.columns(text=[one.line.text for one in told], level=[one.line.level for one in told])
         columns = [*text, bytes_column("event", [_encode(event) for event in events])]
-        times = self._to_times([e.step for e in events], [e.session_time for e in events])
+        times = self._to_times(paths.EVENTS, [e.step for e in events], [e.session_time for e in events])
         self._send_columns(paths.EVENTS, times, columns)
         self._write_lanes(changes)
 
@@ -490,7 +499,7 @@ class RrdWriter:
                     self._lane_colours.clear()
                 self._lane_colours[entity] = colours
                 self._log_static(entity, rr.StateConfiguration(values=[*colours], colors=[*colours.values()]))
-            times = self._to_times([step for step, _, _ in rows], [now_ns for _, now_ns, _ in rows])
+            times = self._to_times(entity, [step for step, _, _ in rows], [now_ns for _, now_ns, _ in rows])
             self._send_columns(entity, times, [*rr.StateChange.columns(state=[row.state for _, _, row in rows])])
 
     def _write_denials(self, denials: list[DenialRecord]) -> None:
@@ -499,7 +508,7 @@ class RrdWriter:
         lines = [describe_denial(record) for record in denials]
         text = rr.TextLog.columns(text=[line.text for line in lines], level=[line.level for line in lines])
         columns = [*text, bytes_column("denial", [_encode(record) for record in denials])]
-        times = self._to_times([d.step for d in denials], [d.session_time for d in denials])
+        times = self._to_times(paths.DENIALS, [d.step for d in denials], [d.session_time for d in denials])
         self._send_columns(paths.DENIALS, times, columns)
 
     def _add_metrics(self, metrics: list[MetricRecord]) -> None:
@@ -517,14 +526,18 @@ class RrdWriter:
             return
         columns = [
             scalar_column("connection", [s[0] for s in samples], pa.int64()),
+            scalar_column("receive_ns", [s[1] for s in samples], pa.int64()),
             bytes_column("data", [s[2] for s in samples]),
         ]
-        self._send_columns(paths.SAMPLES, [duration_index(paths.SESSION_TIME, [s[1] for s in samples])], columns)
+        times = self._times.spread(paths.SAMPLES, [s[1] for s in samples])
+        self._send_columns(paths.SAMPLES, [duration_index(paths.SESSION_TIME, times)], columns)
 
-    def _to_times(self, steps: list[int], session_times: list[int]) -> list[Any]:
+    def _to_times(self, entity: str, steps: list[int], session_times: list[int]) -> list[Any]:
         """Return the times of rows that have no tick: it is that of the newest state before them."""
         moments = [self._find_moment(*times) for times in zip(steps, session_times, strict=True)]
-        return to_time_columns(np.array(moments, np.int64).T)
+        times = np.array(moments, np.int64).T
+        times[3] = self._times.spread(entity, session_times)
+        return to_time_columns(times)
 
     def _find_moment(self, step: int, session_ns: int) -> Moment:
         known = self._known or ((0, 0, 0, 0),)

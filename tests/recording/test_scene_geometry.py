@@ -214,7 +214,7 @@ def test_vertex_colours_are_drawn(tmp_path: Path) -> None:
     spec = builder.build(store).spec
     reader = scene.SceneReader(spec, store, [])
     drawn = [
-        build_components(reader.read_shape(visual), scene.to_rgba8(visual.rgba), *reader.place_visual(visual))[-1]
+        build_components(reader.read_shape(visual), scene.to_rgba8(visual.rgba), reader.place_visual(visual)[1])[-1]
         for visual in spec.visuals
     ]
     packed = (colors.astype(np.uint32) * [1 << 24, 1 << 16, 1 << 8, 1]).sum(axis=1)

@@ -88,21 +88,19 @@ def test_transforms_are_the_poses_of_moving_bodies_when_they_change(tmp_path: Pa
     moved = poses.copy()
     moved[0] = (1, 2, 3, 0.5, -0.5, 0.5, 0.5)
     moved[1, 0] = 5.0
-    writer.add(Batch(states=[frame(8, poses), frame(16, moved)]))
+    jittered, crept = moved.copy(), moved.copy()
+    jittered[2, :] += 1e-5
+    crept[2, 0] += 2.5e-5
+    writer.add(Batch(states=[frame(8, poses), frame(16, moved), frame(24, jittered), frame(32, crept)]))
     writer.close()
     found = read(path)
-    tf = found["/tf"]
-    assert column(tf, "Transform3D:child_frame") == [["a/b c"], ["d"], ["a/b c"]]
-    assert set(map(tuple, column(tf, "Transform3D:parent_frame"))) == {("world",)}
-    assert column(tf, "Transform3D:translation")[-1] == [[1.0, 2.0, 3.0]]
-    assert column(tf, "Transform3D:quaternion")[-1] == [[-0.5, 0.5, 0.5, 0.5]], "Rerun has x y z w"
-    assert column(tf, "step") == [0, 0, 16]
-    assert column(tf, "tick") == [1, 1, 17]
-    assert [v.value for v in tf[-1].column("session_time")] == [32_000_007]
-    assert column(found["/state"], "sim_time_s") == [[0.0], [0.016], [0.032]]
-    root = found["/tf_static"]
-    assert column(root, "Transform3D:parent_frame") == [["tf#/"]]
-    assert column(root, "Transform3D:child_frame") == [["world"]]
+    moving, still = found["/scene/1/bodies/a\\/b\\ c"], found["/scene/1/bodies/d"]
+    assert column(moving, "Transform3D:translation") == [[[0.0, 0.0, 0.0]], [[1.0, 2.0, 3.0]]]
+    assert column(moving, "Transform3D:quaternion")[-1] == [[-0.5, 0.5, 0.5, 0.5]], "Rerun has x y z w"
+    assert (column(moving, "step"), column(still, "step")) == ([0, 16], [0, 32]), "no jitter"
+    assert times(moving) == [7, 32_000_007]
+    assert column(found["/state"], "sim_time_s") == [[0.002 * 8 * i] for i in range(5)]
+    assert not any("fixed" in entity for entity in found)
 
 
 def test_static_geometry_is_written_once_per_frame(tmp_path: Path) -> None:
@@ -113,12 +111,11 @@ def test_static_geometry_is_written_once_per_frame(tmp_path: Path) -> None:
     writer.add(Batch(states=[frame(5, np.zeros((len(header.bodies), 7)))]))
     writer.close()
     found = read(path)
-    ball = found["/scene/1/ball/g\\/ball"]
-    assert column(ball, "CoordinateFrame:frame") == [["ball"]]
+    ball = found["/scene/1/bodies/ball/g\\/ball"]
     assert column(ball, "Ellipsoids3D:half_sizes") == [[[pytest.approx(0.1)] * 3]]
     assert column(ball, "step") == [5], "from the first state on, and once"
     assert column(ball, "tick") == [0], "which begins again with a reset"
-    assert column(found["/scene/1/arm\\/link\\ 1/visual_2"], "Capsules3D:lengths") == [[pytest.approx(0.4)]]
+    assert column(found["/scene/1/bodies/arm\\/link\\ 1/visual_2"], "Capsules3D:lengths") == [[pytest.approx(0.4)]]
     assert not any("post" in entity for entity in found), "group 3 is not visible"
     assert "small" in column(found["/session"], "TextDocument:text")[0][0]
 
@@ -136,9 +133,9 @@ def test_picture_begins_with_the_first_row(tmp_path: Path) -> None:
     found = read(path)
     (row,) = times(found["/journal/rows"])
     assert row < state.session_time
-    assert set(times(found["/scene/1/ball/g\\/ball"])) == {row}
-    moving = sum(body.moving for body in header.bodies)
-    assert times(found["/tf"]) == [row] * moving + [batch.states[1].session_time] * moving
+    assert set(times(found["/scene/1/bodies/ball/g\\/ball"])) == {row}
+    for body in ("ball", "arm\\/link\\ 1", "tip"):
+        assert times(found[f"/scene/1/bodies/{body}"]) == [row, batch.states[1].session_time]
     assert min(min(times(chunks)) for chunks in found.values() if "session_time" in chunks[0].schema.names) == row
     assert times(found["/state"])[0] == state.session_time, "data have their own times"
 
@@ -148,12 +145,12 @@ def test_scene_without_a_state_is_drawn(tmp_path: Path) -> None:
     writer = RrdWriter(path, "id")
     writer.write_header(make_header())
     writer.close()
-    assert column(read(path)["/scene/1/ball/g\\/ball"], "step") == [-1]
+    assert column(read(path)["/scene/1/bodies/ball/g\\/ball"], "step") == [-1]
 
 
 def test_capsules_begin_at_one_end_in_rerun_and_are_centred_in_mujoco() -> None:
     q = (0.8, 0.2, -0.4, 0.4)
-    poses = build_components(VisualShape(scene.CAPSULE, (0.1, 0.1, 0.25)), (1, 2, 3, 4), "b", ((1.0, 2.0, 3.0), q))[1]
+    poses = build_components(VisualShape(scene.CAPSULE, (0.1, 0.1, 0.25)), (1, 2, 3, 4), ((1.0, 2.0, 3.0), q))[0]
     start = tuple(poses.translations.as_arrow_array().to_pylist()[0])
     end = apply((start, q), (0.0, 0.0, 0.5))
     assert [(a + b) / 2 for a, b in zip(start, end, strict=True)] == pytest.approx((1.0, 2.0, 3.0))
@@ -193,13 +190,13 @@ def test_participants_are_drawn_once_and_move_with_their_captures(tmp_path: Path
     writer.add(Batch(states=states, events=[joined("p 1", "Ada")]))
     writer.close()
     found = read(path)
-    assert column(found["/tf"], "Transform3D:child_frame") == [["presence/p 1/head"]] * 2
-    assert column(found["/tf"], "step") == [0, 16]
-    assert column(found["/presence/p\\ 1/head"], "CoordinateFrame:frame") == [["presence/p 1/head"]]
-    assert column(found["/presence/p\\ 1/head"], "Boxes3D:labels") == [["Ada · operator"]]
-    assert times(found["/presence/p\\ 1/head"]) == [7], (
-        "with the first pose: a frame without one is an error in the viewer"
+    head = found["/presence/p\\ 1/head"]
+    poses, looks = select(head, "Transform3D:translation"), select(head, "Boxes3D:labels")
+    assert (column(poses, "Transform3D:translation"), column(poses, "step")) == (
+        [[[pytest.approx(0.1), 0.0, pytest.approx(1.6)]], [[pytest.approx(0.3), 0.0, pytest.approx(1.6)]]],
+        [0, 16],
     )
+    assert (column(looks, "Boxes3D:labels"), times(looks)) == ([["Ada · operator"]], [7])
     assert column(found["/presence/p\\ 1/head/view"], "Arrows3D:vectors") == [[[pytest.approx(0.3), 0.0, 0.0]]]
 
 
@@ -220,12 +217,12 @@ def test_participants_are_cleared_when_they_leave_or_have_no_pose(tmp_path: Path
     writer.add(Batch(states=states, events=[joined("p1", "Ada"), left, away]))
     writer.close()
     found = read(path)
-    hands = found["/presence/p1/hand\\/left"]
-    cleared = [batch for batch in hands if any("Clear" in name for name in batch.schema.names)]
-    assert times(cleared) == [260 * ms + 7], "the first state 0.25 s after its pose"
-    assert sorted(times(hands)) == [7, 260 * ms + 7, 280 * ms + 7], "and it is drawn again with the next"
-    assert times(found["/presence/p1/head"]) == [7], "who is disconnected stays until poses are old"
-    assert sorted(times(found["/presence/p2/head"])) == [7, 282 * ms]
+    hands, clear = found["/presence/p1/hand/left"], "Clear:is_recursive"
+    assert times(select(hands, clear)) == [260 * ms + 7], "the first state 0.25 s after its pose"
+    drawn = select(hands, "Ellipsoids3D:half_sizes")
+    assert times(drawn) == [7, 280 * ms + 7], "and it is drawn again with the next"
+    assert not select(found["/presence/p1/head"], clear), "who is disconnected stays until poses are old"
+    assert times(select(found["/presence/p2/head"], clear)) == [282 * ms]
     looks = [[b for b in found[f"/presence/{who}/head"] if "Boxes3D:colors" in b.schema.names] for who in ("p1", "p2")]
     assert column(looks[0], "Boxes3D:colors") != column(looks[1], "Boxes3D:colors")
 
@@ -266,7 +263,7 @@ def test_robots_are_labelled_by_their_holders(tmp_path: Path) -> None:
     assert column(found["/robots/left"], "Points3D:labels") == [["left"], ["left: Ada"]]
     assert column(found["/robots/left"], "Points3D:positions") == [[[1.0, 2.0, 3.0]]] * 2
     assert times(found["/robots/left"]) == [7, 8_000_100]
-    assert column(found["/robots/cart"], "CoordinateFrame:frame") == [["wheels"]]
+    assert column(found["/scene/1/bodies/wheels/label"], "Points3D:labels") == [["cart"]], "which moves with it"
     later = read(Path(part_path(str(path), 2)))
     assert column(later["/robots/left"], "Points3D:labels") == [["left: Ada"]], "its robots had holders before"
 
@@ -361,15 +358,14 @@ def test_new_scene_is_drawn_from_its_step_and_its_model_is_stored(tmp_path: Path
     writer.add(Batch(scenes=[cup], states=[frame(16, second)]))
     writer.close()
     found = read(path)
-    was = found["/scene/1/ball/g\\/ball"]
+    was = found["/scene/1/bodies/ball/g\\/ball"]
     assert column(was, "step") == [0]
     assert column(was, "Ellipsoids3D:half_sizes") == [[[pytest.approx(0.1)] * 3]]
     assert column(found["/scene/1"], "step") == [8]
     assert column(found["/scene/1"], "Clear:is_recursive") == [[True]]
-    box = found["/scene/2/cup/g"][0]
+    box = found["/scene/2/bodies/cup/g"][0]
     assert column([box], "step") == [8]
-    assert column([box], "CoordinateFrame:frame") == [["cup"]]
-    assert column(found["/tf"], "Transform3D:child_frame")[-1] == ["cup"]
+    assert column(found["/scene/2/bodies/cup"], "Transform3D:translation") == [[[1.0, 2.0, 3.0]]]
     with Recording.open(path, warn=False) as recording:
         assert [state.poses.shape for state in recording.states()] == [first.shape, first.shape, (1, 7)]
         assert [state.bodies for state in recording.states()] == [header.bodies, header.bodies, cup.bodies]
@@ -401,6 +397,12 @@ def shared(store: AssetStore, model: mujoco.MjModel, **changes: Any) -> tuple[Sc
     return spec, SceneAssets(-1, 0, str(store.root), store.put(encode_scene(spec)))
 
 
+def drawn_visuals(path: Path) -> dict[str, list[Any]]:
+    """Return the batches of the visuals of scenes."""
+    found = {entity: select(batches, "InstancePoses3D:translations") for entity, batches in read(path).items()}
+    return {entity: batches for entity, batches in found.items() if batches}
+
+
 def begun(path: Path, assets: SceneAssets) -> tuple[RrdWriter, Any]:
     """Begin a file of the small session, with one state at step 0."""
     writer, header = RrdWriter(path, "id"), make_header()
@@ -421,11 +423,14 @@ def test_shared_specification_is_drawn_instead_of_the_model(tmp_path: Path) -> N
     _, assets = shared(store, mujoco.MjModel.from_xml_string(XML), visuals=(post, *twins))
     writer, _ = begun(tmp_path / "w.rrd", assets)
     writer.close()
-    found = {entity: batches for entity, batches in read(tmp_path / "w.rrd").items() if entity.startswith("/scene")}
-    assert sorted(found) == ["/scene/1/ball/twin", "/scene/1/ball/twin\\ \\(2\\)", "/scene/1/post/post"]
-    assert column(found["/scene/1/post/post"], "CoordinateFrame:frame") == [["world"]]
-    assert column(found["/scene/1/post/post"], "InstancePoses3D:translations") == [[[1.0, 1.0, 0.5]]]
-    assert column(found["/scene/1/post/post"], "Boxes3D:colors") == [[0xFF0000FF]]
+    found = drawn_visuals(tmp_path / "w.rrd")
+    assert sorted(found) == [
+        "/scene/1/bodies/ball/twin",
+        "/scene/1/bodies/ball/twin\\ \\(2\\)",
+        "/scene/1/bodies/post/post",
+    ]
+    assert column(found["/scene/1/bodies/post/post"], "InstancePoses3D:translations") == [[[1.0, 1.0, 0.5]]]
+    assert column(found["/scene/1/bodies/post/post"], "Boxes3D:colors") == [[0xFF0000FF]]
 
 
 def test_patch_changes_the_picture_from_its_step(tmp_path: Path) -> None:
@@ -448,28 +453,32 @@ def test_patch_changes_the_picture_from_its_step(tmp_path: Path) -> None:
         writer.add(Batch(states=[frame(10 * i, poses)]))
     writer.close()
     found = read(tmp_path / "w.rrd")
-    ball = found["/scene/1/ball/g\\/ball"]
+    ball = found["/scene/1/bodies/ball/g\\/ball"]
 
     def told(entity: str, name: str) -> list[tuple[int, Any]]:
         batches = [batch for batch in found[entity] if name in batch.schema.names]
         pairs = zip(column(batches, "step"), column(batches, name), strict=True)
         return [(step, value) for step, value in pairs if value is not None]
 
-    assert [step for step, _ in told("/scene/1/ball/g\\/ball", "Ellipsoids3D:half_sizes")] == [0], "the form once"
+    assert [step for step, _ in told("/scene/1/bodies/ball/g\\/ball", "Ellipsoids3D:half_sizes")] == [0], (
+        "the form once"
+    )
     assert column(ball, "step") == [0, 10, 20, 30]
-    assert told("/scene/1/ball/g\\/ball", "Ellipsoids3D:colors")[1:] == [
+    assert told("/scene/1/bodies/ball/g\\/ball", "Ellipsoids3D:colors")[1:] == [
         (10, [0xFF0000FF]),
         (20, [0xFF000000]),
         (30, [0x0000FFFF]),
     ]
-    hidden = told("/scene/1/ball/g\\/ball", "InstancePoses3D:scales")
+    hidden = told("/scene/1/bodies/ball/g\\/ball", "InstancePoses3D:scales")
     assert hidden == [(20, [[0.0, 0.0, 0.0]])]
-    shown = told("/scene/1/ball/g\\/ball", "InstancePoses3D:translations")
+    shown = told("/scene/1/bodies/ball/g\\/ball", "InstancePoses3D:translations")
     assert [step for step, _ in shown] == [0, 20, 30], "a pose without a scale has its full size again"
-    assert told("/scene/1/tip/visual_4", "InstancePoses3D:translations")[-1] == (10, [[0.5, 0.0, 0.0]])
-    assert told("/scene/1/ball/arrow", "Cylinders3D:lengths") == [(10, [pytest.approx(0.2)])]
-    assert [step for step, _ in told("/scene/1/ball/arrow", "Clear:is_recursive")] == [20]
-    assert [step for step, _ in told("/scene/1/post/visual_6", "Boxes3D:half_sizes")] == [20], "hidden until then"
+    assert told("/scene/1/bodies/tip/visual_4", "InstancePoses3D:translations")[-1] == (10, [[0.5, 0.0, 0.0]])
+    assert told("/scene/1/bodies/ball/arrow", "Cylinders3D:lengths") == [(10, [pytest.approx(0.2)])]
+    assert [step for step, _ in told("/scene/1/bodies/ball/arrow", "Clear:is_recursive")] == [20]
+    assert [step for step, _ in told("/scene/1/bodies/post/visual_6", "Boxes3D:half_sizes")] == [20], (
+        "hidden until then"
+    )
 
 
 def test_patch_before_the_first_state_is_the_initial_look(tmp_path: Path) -> None:
@@ -481,7 +490,7 @@ def test_patch_before_the_first_state_is_the_initial_look(tmp_path: Path) -> Non
     writer.add(Batch(assets=[assets]))
     writer.add(Batch(assets=[SceneAssets(3, 9, str(store.root), address)]))
     writer.close()
-    assert column(read(tmp_path / "w.rrd")["/scene/1/ball/g\\/ball"], "Ellipsoids3D:colors") == [[0xFF0000FF]]
+    assert column(read(tmp_path / "w.rrd")["/scene/1/bodies/ball/g\\/ball"], "Ellipsoids3D:colors") == [[0xFF0000FF]]
 
 
 def test_missing_assets_are_reported_and_others_written(tmp_path: Path) -> None:
@@ -495,7 +504,7 @@ def test_missing_assets_are_reported_and_others_written(tmp_path: Path) -> None:
     (text,) = column(found["/events/recorder"], "TextLog:text")
     assert "more cannot be drawn" in text[0]
     assert gone in text[0]
-    drawn = sum(entity.startswith("/scene") for entity in found)
+    drawn = len(drawn_visuals(tmp_path / "w.rrd"))
     whole = sum(visual.rgba[3] > 0 and visual.group < 3 for visual in spec.visuals)
     lost = sum(visual.geometry.mesh == 0 for visual in spec.visuals)
     assert (drawn, lost > 5) == (whole - lost, True)
@@ -579,3 +588,58 @@ def test_errors_of_alignments_and_rejected_samples_are_plotted_by_name(tmp_path:
     with Recording.open(path, warn=False) as recording:
         assert recording.metrics()["alignment_mm/p1"][1].tolist() == [4.0, 2.0, 2.0]
         assert recording.damage == []
+
+
+def test_links_are_below_their_robots(tmp_path: Path) -> None:
+    """The arm of the small session as a robot; names of links and visuals are without that of the robot."""
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    header = msgspec.structs.replace(make_header(), robots=(RobotSpec("arm", (), (), "site", "arm/link 1"),))
+    writer.write_header(header)
+    writer.add(Batch(states=[frame(0, np.zeros((len(header.bodies), 7)))]))
+    writer.close()
+    moved = {entity for entity, batches in read(path).items() if select(batches, "Transform3D:translation")}
+    assert moved == {"/scene/1/robots/arm/link\\ 1", "/scene/1/robots/arm/tip", "/scene/1/bodies/ball"}
+    parents = tuple(f"{entity}/" for entity in (*moved, "/scene/1/world"))
+    assert all(entity.startswith(parents) for entity in drawn_visuals(path))
+
+
+def test_no_two_rows_of_an_entity_have_one_time(tmp_path: Path) -> None:
+    """Events, denials, raw messages and changes of a lane of one step: dataframes have a row per entity and time."""
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    header = make_header()
+    writer.write_header(header)
+    stops = [Event(i + 2, 4, 8_000_000, EStopChanged(i % 2 == 0, "p1", "", 1)) for i in range(3)]
+    denied = DenialRecord(4, 8_000_000, 3, Denial("held", "left is held"))
+    poses = np.zeros((len(header.bodies), 7))
+    heads = [PresenceItem("p1", device, Pose((0, 0, 0), IDENTITY_Q), 5) for device in ("head", "hand/left")]
+    states = [frame(0, poses, tuple(heads)), frame(8, poses + 1.0, tuple(heads))]
+    for _ in range(3):
+        writer.add_sample(3, 8_000_000, b"x")
+    writer.add(Batch(events=[joined("p1", "Ada"), *stops], denials=[denied] * 2, states=states))
+    writer.close()
+    for entity, batches in read(path).items():
+        for name in {
+            name for batch in batches for name in batch.schema.names if ":" in name or name in ("data", "event")
+        }:
+            rows = [batch for batch in select(batches, name) if "session_time" in batch.schema.names]
+            assert len(times(rows)) == len(set(times(rows))), f"{entity} {name}"
+    assert times(read(path)["/events"]) == [1, 8_000_000, 8_000_001, 8_000_002]
+    with Recording.open(path, warn=False) as recording:
+        assert [sample.receive_ns for sample in recording.samples()] == [8_000_000] * 3
+        assert [event.session_time for event in recording.events()] == [1] + [8_000_000] * 3
+        assert len(list(recording.denials())) == 2
+
+
+def test_later_part_clears_the_picture_of_the_one_before(tmp_path: Path) -> None:
+    """Scene and people that part 1 showed at its end are not shown beside those of part 2."""
+    path = Path(part_path(str(tmp_path / "w.rrd"), 2))
+    writer = RrdWriter(path, "id")
+    header = make_header()
+    writer.write_header(header)
+    writer.add(Batch(states=[frame(5, np.zeros((len(header.bodies), 7)))]))
+    writer.close()
+    found = read(path)
+    for entity in ("/scene", "/presence"):
+        assert column(select(found[entity], "Clear:is_recursive"), "step") == [5]
