@@ -27,6 +27,7 @@ PRESENCE: Final = "/presence"
 LANES: Final = "/lanes"
 #: Labels of robots.
 ROBOTS: Final = "/robots"
+ANCHORS: Final = "/anchors"
 #: Point clouds and pictures of cameras, an entity per stream.
 CLOUDS: Final = "/clouds"
 PICTURES: Final = "/pictures"

@@ -1,4 +1,5 @@
-"""Picture of participants in a recording: heads and hands at the poses that the session had of them, names at robots.
+"""Picture of participants in a recording: heads and hands at the poses that the session had of them, names at robots,
+and the anchors that headsets are aligned to.
 
 A device is drawn at an entity of its own, which `motion` moves. It appears with its first pose, and is cleared when
 its participant leaves or no pose came for `STALE_NS`. Nothing is static, as Rerun shows static data at all times.
@@ -11,6 +12,7 @@ from typing import Any, Final, NamedTuple
 
 import rerun as rr
 
+from iris_session.protocol.common import Pose
 from iris_session.protocol.names import Device
 from iris_session.protocol.server_messages import PresenceItem
 from iris_session.recording import paths
@@ -25,6 +27,9 @@ STALE_NS: Final = 250_000_000
 HEAD_HALF_M: Final = (0.06, 0.09, 0.05)
 HAND_HALF_M: Final = (0.05, 0.03, 0.03)
 VIEW_M: Final = 0.3
+#: Length of the axes of an anchor [m], and the colour of its error.
+AXES_M: Final = 0.1
+ERROR_COLOUR: Final = (220, 60, 60, 120)
 
 _Key = tuple[str, str]  # participant, device
 
@@ -133,6 +138,63 @@ class PeoplePicture:
         del self._shown[key]
         set_moment(self._rec, moment)
         self._rec.log(_entity(key), rr.Clear(recursive=True), strict=True)
+        self._rec.reset_time()
+
+
+class AnchorPicture:
+    """Anchors: axes at `T_world_anchor`, a label, and the stated error of the alignments to them as a ball.
+
+    The error is that of the person whose alignment is worst: 95 % of the positions at the anchor are within it.
+    """
+
+    def __init__(self, recording: rr.RecordingStream) -> None:
+        self._rec = recording
+        self._poses: dict[str, Pose] = {}
+        self._error_m = 0.0
+        self._drawn = False
+
+    def set_anchors(self, poses: Mapping[str, Pose]) -> None:
+        """Set the anchors that `draw` will draw."""
+        self._poses = dict(poses)
+
+    def draw(self, moment: Moment) -> None:
+        """Draw all anchors, once."""
+        if not self._drawn:
+            self._drawn = True
+            for anchor, pose in self._poses.items():
+                self._draw_axes(anchor, pose, moment)
+                self._draw_error(anchor, moment)
+
+    def move(self, anchor: str, pose: Pose, moment: Moment) -> None:
+        """Move an anchor."""
+        self._poses[anchor] = pose
+        if self._drawn:
+            self._draw_axes(anchor, pose, moment)
+
+    def set_error(self, error_m: float, moment: Moment) -> None:
+        """Set the stated error [m], 0 if none is."""
+        if error_m != self._error_m:
+            self._error_m = error_m
+            for anchor in self._poses if self._drawn else ():
+                self._draw_error(anchor, moment)
+
+    def _draw_axes(self, anchor: str, pose: Pose, moment: Moment) -> None:
+        w, x, y, z = pose.q
+        set_moment(self._rec, moment)
+        transform = rr.Transform3D(translation=pose.p, quaternion=rr.Quaternion(xyzw=[x, y, z, w]))
+        entity = f"{paths.ANCHORS}/{escape_entity_part(anchor)}"
+        self._rec.log(entity, transform, rr.TransformAxes3D(AXES_M), strict=True)
+        self._rec.reset_time()
+
+    def _draw_error(self, anchor: str, moment: Moment) -> None:
+        label = f"{anchor}: {self._error_m * 1e3:.1f} mm (95 %)" if self._error_m else anchor
+        parts: list[Any] = [rr.Points3D([(0.0, 0.0, 0.0)], radii=[0.003], labels=[label], show_labels=True)]
+        solid = rr.components.FillMode.Solid
+        size = [self._error_m] * 3
+        parts.append(rr.Ellipsoids3D(half_sizes=[size], colors=[ERROR_COLOUR], fill_mode=solid))
+        set_moment(self._rec, moment)
+        for part, component in zip(("label", "error"), parts, strict=True):
+            self._rec.log(f"{paths.ANCHORS}/{escape_entity_part(anchor)}/{part}", component, strict=True)
         self._rec.reset_time()
 
 

@@ -24,6 +24,7 @@ from iris_session.protocol.common import Applied
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.server_messages import (
     AlignmentChanged,
+    AnchorMoved,
     BodyInfo,
     Event,
     ParticipantChanged,
@@ -53,7 +54,7 @@ from iris_session.recording.messages import (
     encode_scene,
 )
 from iris_session.recording.motion import MotionRows
-from iris_session.recording.people import Base, PeoplePicture
+from iris_session.recording.people import AnchorPicture, Base, PeoplePicture
 from iris_session.recording.picture import ScenePicture, SceneSource, escape_entity_part
 from iris_session.recording.plots import (
     ALIGNMENT,
@@ -94,13 +95,14 @@ _encode = msgspec.msgpack.Encoder().encode
 
 
 class _Told(NamedTuple):
-    """An event as the picture tells it, and what is then in force of its participant, if it has one."""
+    """An event as the picture tells it, and what is then in force of its participant, if it has one, and of all."""
 
     line: LogLine
     changes: list[LaneChange]
     participant: str
     errors: StatedErrors | None
     rejected: int
+    worst_at_anchor_m: float
 
 
 #: Events after which the alignment or the rejected samples of a participant may be others.
@@ -146,6 +148,7 @@ class RrdWriter:
         self._plots = RobotPlots(self._rec)
         self._metrics = MetricPlots(self._rec, self._story)
         self._collected_due_ns = 0
+        self._anchors = AnchorPicture(self._rec)
         self._people = PeoplePicture(self._rec, self._story, is_first=is_first)
         self._lane_colours: dict[str, dict[str, Rgb]] = {}
         self._eye: Any = None
@@ -159,6 +162,7 @@ class RrdWriter:
         self._set_bodies(header.bodies)
         self._robots = header.robots
         self._log_static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        self._anchors.set_anchors(header.anchors)
         self._picture.set_scene(SceneSource(header.model, header.bodies, robots=header.robots))
 
     def _set_bodies(self, bodies: tuple[BodyInfo, ...]) -> None:
@@ -345,6 +349,7 @@ class RrdWriter:
         if self._begins_ns is not None and not self._known:
             session_ns = min(session_ns, self._begins_ns)
         moment = (step, 0, min(0, sim_ns), session_ns)  # a reset begins ticks and simulated time again
+        self._anchors.draw(moment)
         if not self._picture.draw(moment):
             return times
         seen = times.copy()
@@ -447,8 +452,12 @@ class RrdWriter:
             changes += [(event.step, event.session_time, change) for change in one.changes]
             if one.participant:
                 self._plot_person(event, one)
+                self._anchors.set_error(one.worst_at_anchor_m, self._find_moment(event.step, event.session_time))
             if isinstance(event.body, ParticipantLeft) and not event.body.grace:
                 self._people.remove(event.body.participant, self._find_moment(event.step, event.session_time))
+            elif isinstance(event.body, AnchorMoved):
+                moment = self._find_moment(event.step, event.session_time)
+                self._anchors.move(event.body.anchor_id, event.body.T_world_anchor, moment)
             elif isinstance(event.body, SceneChanged) and event.body.cause == "new_scene":
                 self._people.label_robots({}, self._find_moment(event.step, event.session_time))
         text = rr.TextLog.columns(text=[one.line.text for one in told], level=[one.line.level for one in told])
@@ -464,7 +473,8 @@ class RrdWriter:
         if isinstance(body, _PERSONAL):
             participant = body.participant if isinstance(body.participant, str) else body.participant.id
         errors, rejected = self._story.errors.get(participant), self._story.rejected.get(participant, 0)
-        return _Told(line, changes, participant, errors, rejected)
+        worst_m = max((one.at_anchor_m for one in self._story.errors.values()), default=0.0)
+        return _Told(line, changes, participant, errors, rejected, worst_m)
 
     def _plot_person(self, event: Event, told: _Told) -> None:
         """Plot the stated error and the rejected samples of the participant of an event."""

@@ -26,6 +26,7 @@ from iris_session.protocol.scene import (
 )
 from iris_session.protocol.server_messages import (
     AlignmentChanged,
+    AnchorMoved,
     BodyInfo,
     EStopChanged,
     Event,
@@ -643,3 +644,33 @@ def test_later_part_clears_the_picture_of_the_one_before(tmp_path: Path) -> None
     found = read(path)
     for entity in ("/scene", "/presence"):
         assert column(select(found[entity], "Clear:is_recursive"), "step") == [5]
+
+
+def test_anchors_have_axes_and_the_worst_stated_error(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    sheet = Pose((1.0, 2.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    writer.write_header(SessionHeader("s", "n", "closed", 2_000_000, anchors={"sheet 1": sheet}))
+    aligned = [
+        AlignmentChanged(who, Alignment(1, "measured", sheet, 0, (), error_m, 0.1))
+        for who, error_m in (("p1", 0.002), ("p2", 0.005))
+    ]
+    bodies = (
+        *aligned,
+        AnchorMoved("sheet 1", msgspec.structs.replace(sheet, p=(3.0, 0.0, 0.0))),
+        ParticipantLeft("p2", ""),
+    )
+    events = [Event(i + 1, i, 100 * i, body) for i, body in enumerate(bodies, 1)]
+    writer.add(Batch(events=events, states=[frame(0, np.zeros((0, 7)))]))
+    writer.close()
+    found = read(path)
+    assert column(found["/anchors/sheet\\ 1"], "Transform3D:translation") == [[[1.0, 2.0, 0.0]], [[3.0, 0.0, 0.0]]]
+    assert column(found["/anchors/sheet\\ 1"], "Transform3D:quaternion")[0] == [[0.0, 0.0, 1.0, 0.0]]
+    assert column(found["/anchors/sheet\\ 1/label"], "Points3D:labels") == [
+        ["sheet 1"],
+        ["sheet 1: 2.0 mm (95 %)"],
+        ["sheet 1: 5.0 mm (95 %)"],
+        ["sheet 1: 2.0 mm (95 %)"],
+    ]
+    sizes = column(found["/anchors/sheet\\ 1/error"], "Ellipsoids3D:half_sizes")
+    assert [size[0][0] for size in sizes] == pytest.approx([0.0, 0.002, 0.005, 0.002])
