@@ -140,6 +140,7 @@ class RecorderFeed:
         self._batch = Batch()
         self._batch_since = 0
         self._now = (0, 0)  # step and session time of the newest row
+        self._sim_time = self._sim_before = 0.0  # of the newest state, and before the last reset [s]
         self._last_status_ns = 0
         #: Session time since the last status of a recorder that has something to write: it may hang.
         self.silence_ns = 0
@@ -225,7 +226,13 @@ class RecorderFeed:
         the last state with it. `robots`: see `StateFrame`."""
         presence = tuple(self._presence.values())
         self._presence.clear()
-        frame = StateFrame(step, tick, sim_time, session_time, poses.tobytes(), presence, tuple(applied), robots)
+        if sim_time < self._sim_time:
+            self._sim_before += self._sim_time
+        self._sim_time = sim_time
+        applied = tuple(applied)
+        frame = StateFrame(
+            step, tick, sim_time, session_time, poses.tobytes(), presence, applied, robots, self._sim_before
+        )
         self._add(self._batch.states, frame)
 
     def add_decision(self, step: int, session_time: int, decision: Decision) -> None:

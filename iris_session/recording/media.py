@@ -2,7 +2,7 @@
 
 A point is kept as float32 and whole bytes, which `decode_cloud` makes without rounding, so the frame itself is not kept
 beside it. An image is kept as it came. What a stream is, its `StreamInfo`, is in an entity of its own. Rows are at the
-time of capture on `session_time` alone: a camera sees the room, which has no simulated time.
+time of capture on `session_time` and `wall_time` alone: a camera sees the room, which has no simulated time.
 """
 
 from __future__ import annotations
@@ -31,11 +31,15 @@ _FOLDERS: Final = {MediaEncoding.CLOUD: paths.CLOUDS, MediaEncoding.JPEG: paths.
 
 
 class MediaDrawer:
-    """Log clouds and pictures to a recording. `pictures`: streams of pictures so far, at most `MAX_STREAMS`."""
+    """Log clouds and pictures to a recording.
+
+    `pictures`: streams of pictures so far, at most `MAX_STREAMS`. `origin_utc_ns`: see `SessionHeader`.
+    """
 
     def __init__(self, recording: Any) -> None:
         self._rec = recording
         self.pictures: list[str] = []
+        self.origin_utc_ns = 0
 
     def draw(self, message: Sequence[bytes]) -> None:
         """Log a message of `front.media.recorder`: a frame, a description, or both, or the end of a stream.
@@ -94,6 +98,7 @@ class MediaDrawer:
         # Times that cannot be, before the session or after the receipt, would stretch the time line.
         at_ns = max(0, min(header.capture_ns, header.received_ns))
         self._rec.set_time(paths.SESSION_TIME, duration=np.timedelta64(at_ns, "ns"))
+        self._rec.set_time(paths.WALL_TIME, timestamp=np.datetime64(at_ns + self.origin_utc_ns, "ns"))
         self._rec.log(f"{folder}/{header.stream}", *components, strict=True)
         self._rec.reset_time()
 

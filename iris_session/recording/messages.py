@@ -61,6 +61,7 @@ class StateFrame(msgspec.Struct, frozen=True, array_like=True):
     """Rigid state at one moment. `poses`: float64 (n_bodies, 7) C-contiguous, `x y z qw qx qy qz`, world frame.
 
     `robots`: measured values of the robots as in `physics.world.RobotSignals.read`, described by `SceneAssets.robots`.
+    `sim_before`: simulated time before the last reset [s].
     """
 
     step: Count
@@ -71,6 +72,7 @@ class StateFrame(msgspec.Struct, frozen=True, array_like=True):
     presence: tuple[PresenceItem, ...] = ()
     applied: tuple[Applied, ...] = ()
     robots: bytes = b""
+    sim_before: float = 0.0
 
 
 class DenialRecord(msgspec.Struct, frozen=True, array_like=True):

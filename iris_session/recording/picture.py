@@ -107,7 +107,7 @@ class ScenePicture:
         self._entities.clear()
         self._robots.clear()
         self.deformables.clear()
-        self.since_ns = moment[3]
+        self.since_ns = moment.session_ns
         set_moment(self._rec, moment)
         if self._number == 1 and not self._is_first:
             for drawn in (paths.SCENE, paths.PRESENCE):  # as the part before left it

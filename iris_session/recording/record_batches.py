@@ -168,7 +168,7 @@ def decode_states(batch: Any) -> Iterator[RecordedState]:
     poses = [p.reshape(-1, 7) for p in np.split(np.asarray(lists.flatten(), np.float64), ends[:-1])]
     columns = zip(
         read_index(batch, paths.STEP),
-        read_index(batch, paths.TICK),
+        _read_ticks(batch),
         read_values(batch, "sim_time_s"),
         read_index(batch, paths.SESSION_TIME),
         poses,
@@ -328,6 +328,12 @@ def _read_points(row: Any) -> NDArray[np.float32]:
 def _read_colors(row: Any) -> NDArray[np.uint8]:
     """Return red, green, blue and alpha, which Rerun has in one number, red in its highest byte."""
     return np.asarray(row.values, ">u4").view(np.uint8).reshape(-1, 4)
+
+
+def _read_ticks(batch: Any) -> list[int]:
+    """Return the ticks of states: a timeline in files of earlier versions."""
+    is_data = batch.schema.field("tick").type.num_fields > 0  # a list
+    return read_values(batch, "tick") if is_data else read_index(batch, "tick")
 
 
 def _read_plants(batch: Any) -> list[bytes]:

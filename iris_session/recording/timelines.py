@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -16,32 +16,42 @@ from iris_session.recording.rrd_stream import duration_index, sequence_index
 SPREAD_NS: Final = 100_000
 #: Maximum number of entities whose newest time is known.
 MAX_ENTITIES: Final = 4096
-#: Step, tick, simulated time [ns], session time [ns].
-Moment = tuple[int, int, int, int]
+
+
+class Moment(NamedTuple):
+    """A place on all timelines.
+
+    `sim_ns`: simulated time since the session began, resets included [ns]. `session_ns`: session time [ns]. `wall_ns`:
+    the same since 1970-01-01 UTC [ns].
+    """
+
+    step: int
+    sim_ns: int
+    session_ns: int
+    wall_ns: int
 
 
 def set_moment(recording: rr.RecordingStream, moment: Moment) -> None:
     """Set the times of what is logged next, on all timelines."""
-    step, tick, sim_ns, session_ns = moment
-    recording.set_time(paths.STEP, sequence=step)
-    recording.set_time(paths.TICK, sequence=tick)
-    recording.set_time(paths.SIM_TIME, duration=np.timedelta64(sim_ns, "ns"))
-    recording.set_time(paths.SESSION_TIME, duration=np.timedelta64(session_ns, "ns"))
+    recording.set_time(paths.STEP, sequence=moment.step)
+    recording.set_time(paths.SIM_TIME, duration=np.timedelta64(moment.sim_ns, "ns"))
+    recording.set_time(paths.SESSION_TIME, duration=np.timedelta64(moment.session_ns, "ns"))
+    recording.set_time(paths.WALL_TIME, timestamp=np.datetime64(moment.wall_ns, "ns"))
 
 
 def get_session_time(moment: Moment) -> int:
     """Return the session time of a moment [ns]."""
-    return moment[3]
+    return moment.session_ns
 
 
 def to_time_columns(times: NDArray[np.int64]) -> list[Any]:
-    """Return the time columns. `times` (4, rows): step, tick, sim_time [ns], session_time [ns]."""
-    step, tick, sim_ns, session_ns = times
+    """Return the time columns. `times` (4, rows): the fields of `Moment`."""
+    step, sim_ns, session_ns, wall_ns = times
     return [
         sequence_index(paths.STEP, step),
-        sequence_index(paths.TICK, tick),
         duration_index(paths.SIM_TIME, sim_ns),
         duration_index(paths.SESSION_TIME, session_ns),
+        rr.TimeColumn(paths.WALL_TIME, timestamp=np.ascontiguousarray(wall_ns).view("datetime64[ns]")),
     ]
 
 

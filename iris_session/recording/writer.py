@@ -142,7 +142,7 @@ class RrdWriter:
         self._shown_poses: NDArray[np.float64] | None = None
         self._newest_row = (-1, b"")
         self._begins_ns: int | None = None  # session time of the first row
-        self._clock = (0, 0)  # tick and sim_time [ns] of the newest state, for what has neither
+        self._origin_utc_ns = 0
         self._applied: dict[str, Applied] = {}
         self._story = SessionStory(is_first=is_first)
         self._plots = RobotPlots(self._rec)
@@ -162,6 +162,7 @@ class RrdWriter:
         self._set_bodies(header.bodies)
         self._robots = header.robots
         self._log_static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        self._origin_utc_ns = self._drawer.origin_utc_ns = header.origin_utc_ns
         self._anchors.set_anchors(header.anchors)
         self._picture.set_scene(SceneSource(header.model, header.bodies, robots=header.robots))
 
@@ -216,8 +217,8 @@ class RrdWriter:
             self._write_denials(batch.denials)
             self._add_metrics(batch.metrics)
             self._add_reports(reports)
-            if self._known and self._known[-1][3] >= self._collected_due_ns:
-                self._collected_due_ns = self._known[-1][3] + self._write_collected()
+            if self._known and self._known[-1].session_ns >= self._collected_due_ns:
+                self._collected_due_ns = self._known[-1].session_ns + self._write_collected()
             self._write_samples(samples)
             self._write_vertices()
             self._write_media()
@@ -231,7 +232,7 @@ class RrdWriter:
         """Write the rest and the end mark, and close the file. Raises `WriteError`."""
         self.flush()
         self._write_collected()
-        self._picture.draw((-1, 0, 0, 0))  # without a state the scene is drawn nevertheless
+        self._picture.draw(self._find_moment(-1, 0))  # without a state the scene is drawn nevertheless
         if not self._arranged:
             self._send_blueprint()
         self.flush()
@@ -303,9 +304,9 @@ class RrdWriter:
             self._last_step = loaded.step if loaded.session_time else self._last_step
             self._robots = assets[-1].robots if assets else ()
             source = SceneSource(loaded.model, loaded.bodies, *assets[-1:], robots=self._robots)
-            self._picture.replace_scene(source, (loaded.step, *self._clock, loaded.session_time))
+            self._picture.replace_scene(source, self._find_moment(loaded.step, loaded.session_time))
         for patch in () if scenes else assets:
-            self._picture.patch_scene(patch, (patch.step, *self._clock, patch.session_time))
+            self._picture.patch_scene(patch, self._find_moment(patch.step, patch.session_time))
 
     def _write_keyframes(self, batch: Batch) -> None:
         frames = batch.keyframes
@@ -318,16 +319,17 @@ class RrdWriter:
         if not states:
             return
         poses = np.stack([np.frombuffer(s.poses, np.float64).reshape(-1, 7) for s in states])
-        moments = [(s.step, s.tick, round(s.sim_time * 1e9), s.session_time) for s in states]
+        moments = [self._make_moment(s.step, round((s.sim_before + s.sim_time) * 1e9), s.session_time) for s in states]
         times = np.array(moments, np.int64).T
         seen = self._draw_scene(moments[0], times)
         if not self._arranged:
             if self._eye is None and poses.shape[1] == len(self._bodies):
                 self._eye = place_eye(poses[0, self._moving if len(self._moving) else slice(None), :3])
-                self._people.label_robots(self._find_bases(poses[0]), tuple(seen[:, 0].tolist()))
+                self._people.label_robots(self._find_bases(poses[0]), Moment(*seen[:, 0].tolist()))
             self._send_blueprint()
         columns = [
             matrix_column("poses", poses.reshape(len(states), -1)),
+            scalar_column("tick", [s.tick for s in states], pa.int64()),
             scalar_column("sim_time_s", [s.sim_time for s in states], pa.float64()),
             bytes_column("presence", [_encode(s.presence) for s in states]),
             bytes_column("applied", [_encode(s.applied) for s in states]),
@@ -335,7 +337,6 @@ class RrdWriter:
         self._send_columns(paths.STATE, to_time_columns(times), columns)
         if poses.shape[1] == len(self._bodies):  # a new recorder also gets pending states of the scene before
             self._write_transforms(states, poses, seen)
-        self._clock = moments[-1][1:3]
         self._known.extend(moments)
         self._note_latencies(states)
         self._plots.add(states, times)
@@ -345,10 +346,9 @@ class RrdWriter:
 
         The picture begins with the first row, not with the state after it: the viewer opens at the first moment.
         """
-        step, _, sim_ns, session_ns = first
+        moment = first
         if self._begins_ns is not None and not self._known:
-            session_ns = min(session_ns, self._begins_ns)
-        moment = (step, 0, min(0, sim_ns), session_ns)  # a reset begins ticks and simulated time again
+            moment = self._make_moment(first.step, first.sim_ns, min(first.session_ns, self._begins_ns))
         self._anchors.draw(moment)
         if not self._picture.draw(moment):
             return times
@@ -369,7 +369,7 @@ class RrdWriter:
 
     def _write_vertices(self) -> None:
         """Write vertices whose states are in the file. Frames of another scene than the drawn one are refused."""
-        times = [moment[3] for moment in self._known]
+        times = [moment.session_ns for moment in self._known]
         rows: dict[str, list[tuple[Moment, Any]]] = {}
         while self._vertices and times and self._vertices[0].session_time <= times[-1]:
             frame = self._vertices.popleft()
@@ -379,13 +379,14 @@ class RrdWriter:
                 continue
             try:
                 # The state of a step is later than its row, by the duration of the step, so times cannot be compared.
-                late = at < 0 or frame.session_time < self._picture.since_ns or self._known[at][0] <= self._last_step
+                late = at < 0 or frame.session_time < self._picture.since_ns or self._known[at].step <= self._last_step
                 vertices = None if late else bending.decode_frame(frame.frame)
             except StreamError:
                 late, vertices = True, None
             self.vertices_refused += late
             if vertices is not None:
-                rows.setdefault(frame.stream, []).append(((*self._known[at][:3], frame.session_time), vertices))
+                moment = self._make_moment(self._known[at].step, self._known[at].sim_ns, frame.session_time)
+                rows.setdefault(frame.stream, []).append((moment, vertices))
         for stream, taken in rows.items():
             bending = self._picture.deformables[stream]
             moments = np.array([moment for moment, _ in taken], np.int64).T
@@ -438,7 +439,7 @@ class RrdWriter:
         values = moving[frame, body]
         entities = [self._picture.find_entity(name) for name in self._frames]
         self._motion.add(entities, body, times[:, frame], values)
-        people = self._people.draw(states, [tuple(moment) for moment in times.T.tolist()])
+        people = self._people.draw(states, [Moment(*moment) for moment in times.T.tolist()])
         entities = list(dict.fromkeys(row.entity for row in people))
         which = np.array([entities.index(row.entity) for row in people], np.intp)
         frame = np.array([row.state for row in people], np.intp)
@@ -528,7 +529,7 @@ class RrdWriter:
 
     def _add_reports(self, reports: list[tuple[str, int, float]]) -> None:
         for participant, receive_ns, age_ms in reports:
-            step = self._known[-1][0] if self._known else 0
+            step = self._known[-1].step if self._known else 0
             self._metrics.add(STATE_AGE, participant, age_ms, self._find_moment(step, receive_ns))
 
     def _write_samples(self, samples: list[tuple[int, int, bytes]]) -> None:
@@ -543,16 +544,21 @@ class RrdWriter:
         self._send_columns(paths.SAMPLES, [duration_index(paths.SESSION_TIME, times)], columns)
 
     def _to_times(self, entity: str, steps: list[int], session_times: list[int]) -> list[Any]:
-        """Return the times of rows that have no tick: it is that of the newest state before them."""
+        """Return the times of rows, each of which has the simulated time of the newest state before it."""
         moments = [self._find_moment(*times) for times in zip(steps, session_times, strict=True)]
         times = np.array(moments, np.int64).T
-        times[3] = self._times.spread(entity, session_times)
+        times[2] = self._times.spread(entity, session_times)
+        times[3] = times[2] + self._origin_utc_ns
         return to_time_columns(times)
 
     def _find_moment(self, step: int, session_ns: int) -> Moment:
-        known = self._known or ((0, 0, 0, 0),)
-        _, tick, sim_ns, _ = known[max(0, bisect_right(known, session_ns, key=get_session_time) - 1)]
-        return step, tick, sim_ns, session_ns
+        """Return the moment of a step: the simulated time is that of the newest state before it."""
+        known = self._known
+        at = max(0, bisect_right(known, session_ns, key=get_session_time) - 1)
+        return self._make_moment(step, known[at].sim_ns if known else 0, session_ns)
+
+    def _make_moment(self, step: int, sim_ns: int, session_ns: int) -> Moment:
+        return Moment(step, sim_ns, session_ns, session_ns + self._origin_utc_ns)
 
 
 # --- text for the viewer ----------------------------------------------------------------------------------------------

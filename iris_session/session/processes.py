@@ -13,6 +13,7 @@ import importlib.util
 import logging
 import math
 import secrets
+import time
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
@@ -309,6 +310,7 @@ class SessionProcesses:
             boot_id=read_boot_id(),
             anchors=self._config.anchor_poses(),
             settings=make_settings(self._config),
+            origin_utc_ns=time.time_ns() - time.monotonic_ns() + self._origin_ns,
         )
 
     def supervise(self, stepper: Stepper) -> None:

@@ -95,7 +95,6 @@ def test_topology_is_written_once_and_vertices_as_they_move(world: World) -> Non
     assert sorted(positions) == [0, 8, 16]
     for step, expected in ((0, first), (8, first), (16, then)):
         assert np.linalg.norm(np.array(positions[step]) - expected, axis=1).max() <= BOUND_M + 1e-6
-    assert sorted(column(cloth, "tick")) == [0, 9, 17], "the ticks of the states"
     times = [value.value for batch in cloth for value in batch.column("session_time")]
     assert sorted(times) == [7, 16_000_007, 32_000_007]
     assert world.writer.vertices_refused == 0

@@ -115,7 +115,6 @@ def test_static_geometry_is_written_once_per_frame(tmp_path: Path) -> None:
     ball = found["/scene/1/bodies/ball/g\\/ball"]
     assert column(ball, "Ellipsoids3D:half_sizes") == [[[pytest.approx(0.1)] * 3]]
     assert column(ball, "step") == [5], "from the first state on, and once"
-    assert column(ball, "tick") == [0], "which begins again with a reset"
     assert column(found["/scene/1/bodies/arm\\/link\\ 1/visual_2"], "Capsules3D:lengths") == [[pytest.approx(0.4)]]
     assert not any("post" in entity for entity in found), "group 3 is not visible"
     assert "small" in column(found["/session"], "TextDocument:text")[0][0]
@@ -269,14 +268,27 @@ def test_robots_are_labelled_by_their_holders(tmp_path: Path) -> None:
     assert column(later["/robots/left"], "Points3D:labels") == [["left: Ada"]], "its robots had holders before"
 
 
-def test_rows_have_the_simulated_time_of_the_state_before_them(tmp_path: Path) -> None:
+def test_timelines_grow_over_resets_and_have_the_time_of_day(tmp_path: Path) -> None:
+    """Rows without a simulated time have that of the state before them."""
     path = tmp_path / "w.rrd"
     writer = RrdWriter(path, "id")
-    writer.write_header(SessionHeader("s", "n", "closed", 2_000_000))
-    states = [frame(step, np.zeros((0, 7))) for step in (0, 8, 16)]
-    writer.add(Batch(states=states, metrics=[MetricRecord(9, states[1].session_time, "late_ms", 1.0)]))
+    origin = 1_700_000_000 * 10**9
+    writer.write_header(SessionHeader("s", "n", "closed", 2_000_000, origin_utc_ns=origin))
+    none = np.zeros((0, 7))
+    states = [
+        frame(0, none),
+        frame(8, none),
+        msgspec.structs.replace(frame(16, none), sim_time=0.004, sim_before=0.016),
+    ]
+    writer.add(Batch(states=states, metrics=[MetricRecord(17, states[2].session_time + 5, "late_ms", 1.0)]))
     writer.close()
-    assert column(read(path)["/metrics/late_ms"], "tick") == [9]
+    found = read(path)
+    assert [value.value for value in found["/state"][0].column("sim_time")] == [0, 16_000_000, 20_000_000]
+    (late,) = found["/metrics/late_ms"]
+    assert (late.column("sim_time")[0].value, late.column("step")[0].as_py()) == (20_000_000, 17)
+    assert late.column("wall_time")[0].value == origin + states[2].session_time + 5
+    with Recording.open(path, warn=False) as recording:
+        assert [(state.tick, state.sim_time) for state in recording.states()] == [(1, 0.0), (9, 0.016), (17, 0.004)]
 
 
 def test_events_and_denials_are_text_lines(tmp_path: Path) -> None:
