@@ -133,6 +133,7 @@ class SessionStory:
 
     `is_first`: the file is no later part of a recording, in whose lanes something may be in force from the start.
     `errors`: stated errors of the alignments in force, by participant. `rejected`: samples rejected since joining.
+    `roles`: of everyone so far, by name. `handovers`, `episodes`: numbers so far.
     """
 
     def __init__(self, *, is_first: bool = True) -> None:
@@ -144,6 +145,9 @@ class SessionStory:
         self._changes: list[LaneChange] = []
         self.errors: dict[str, StatedErrors] = {}
         self.rejected: dict[str, int] = {}
+        self.roles: dict[str, str] = {}
+        self.handovers = 0
+        self._episodes: set[int] = set()
         self._rejected: dict[tuple[str, str, str], int] = {}
 
     def add(self, event: Event) -> tuple[LogLine, list[LaneChange]]:
@@ -161,6 +165,10 @@ class SessionStory:
         """Take over participants that joined before this file began."""
         for info in people:
             self._learn(info)
+
+    @property
+    def episodes(self) -> int:
+        return len(self._episodes)
 
     def find_person(self, participant: str) -> Person:
         """Return a participant; of one that is not known, the id is the name."""
@@ -183,6 +191,8 @@ class SessionStory:
         while len(self._people) >= MAX_PEOPLE:
             del self._people[next(iter(self._people))]
         self._people[info.id] = Person(info.name, info.role, info.worn)
+        if len(self.roles) < MAX_PEOPLE or info.name in self.roles:
+            self.roles[info.name] = info.role
         return before
 
     def _set(self, lane: tuple[str, ...], state: str, colours: Mapping[str, Rgb] | None = None) -> None:
@@ -270,6 +280,7 @@ class SessionStory:
                 return LogLine(INFO, text + (f": {reason}" if reason else ""))
             case EpisodeChanged(number=number, state=state, label=label, participant=who):
                 running = state == "running"
+                self._episodes.add(number)
                 self._set(("episode",), f"episode {number}" if running else state, _EPISODE)
                 text = f"episode {number}: {'begins' if running else state}"
                 return LogLine(INFO, f"{text}{f', {label}' if label else ''} ({self._name(who)})")
@@ -361,6 +372,7 @@ class SessionStory:
         return LogLine(DEBUG, f"{waits} ({cause})")
 
     def _describe_handover(self, body: Handover) -> LogLine:
+        self.handovers += 1
         giver, receiver = body.giver_participant, body.receiver_participant
         if giver and receiver and giver != receiver:
             passed = f"{self._name(giver)} to {self._name(receiver)}"

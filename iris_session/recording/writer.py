@@ -37,7 +37,7 @@ from iris_session.protocol.specs import RobotSpec
 from iris_session.recording import paths
 from iris_session.recording.blueprint import build_blueprint, place_eye
 from iris_session.recording.errors import WriteError
-from iris_session.recording.journal import SessionHeader, seal_blob
+from iris_session.recording.journal import CLOSED, SessionHeader, seal_blob
 from iris_session.recording.media import MediaDrawer
 from iris_session.recording.messages import (
     Batch,
@@ -142,7 +142,9 @@ class RrdWriter:
         self._shown_poses: NDArray[np.float64] | None = None
         self._newest_row = (-1, b"")
         self._begins_ns: int | None = None  # session time of the first row
+        self._newest_ns = 0
         self._origin_utc_ns = 0
+        self._header: SessionHeader | None = None
         self._applied: dict[str, Applied] = {}
         self._story = SessionStory(is_first=is_first)
         self._plots = RobotPlots(self._rec)
@@ -158,6 +160,7 @@ class RrdWriter:
         """Write the header and the scene. Must be called before the first flush with data."""
         self._rec.send_recording_name(header.session_name)
         self._log_static(paths.HEADER, rr.AnyValues(blob=pa.array([seal_blob(encode_header(header))], pa.binary())))
+        self._header = header
         self._log_static(paths.INFO, rr.TextDocument(describe_session(header), media_type="text/markdown"))
         self._set_bodies(header.bodies)
         self._robots = header.robots
@@ -235,6 +238,7 @@ class RrdWriter:
         self._picture.draw(self._find_moment(-1, 0))  # without a state the scene is drawn nevertheless
         if not self._arranged:
             self._send_blueprint()
+        self._describe_result()
         self.flush()
         self._write_mark()
         mark = EndMark(*self._newest_row)
@@ -244,6 +248,24 @@ class RrdWriter:
             self._stream.close()
         except OSError as error:
             raise self._to_error(error) from error
+
+    def _describe_result(self) -> None:
+        """Say what the session was, in the text and as properties: those of a folder of files are a table."""
+        header, story = self._header, self._story
+        if header is None:
+            return
+        duration_s = 0.0 if self._begins_ns is None else (self._newest_ns - self._begins_ns) * 1e-9
+        text = describe_session(header, story, duration_s)
+        self._log_static(paths.INFO, rr.TextDocument(text, media_type="text/markdown"))
+        properties = rr.AnyValues(
+            people=list(story.roles) or None,
+            robots=[robot.name for robot in header.robots] or None,
+            handovers=story.handovers,
+            episodes=story.episodes,
+            duration_s=duration_s,
+            verify_class=header.recording_class,
+        )
+        self._rec.send_property("session", properties)
 
     def _to_error(self, error: Exception) -> WriteError:
         said = (isinstance(error, OSError) and error.strerror) or " ".join(str(error).split())
@@ -285,6 +307,7 @@ class RrdWriter:
         ]
         self._send_columns(paths.ROWS, times, columns)
         self._newest_row = (rows[-1].step, rows[-1].chain)
+        self._newest_ns = rows[-1].now_ns
         if self._begins_ns is None:
             self._begins_ns = rows[0].now_ns
 
@@ -575,14 +598,21 @@ def describe_denial(record: DenialRecord) -> LogLine:
     return LogLine(WARN, "; ".join(parts))
 
 
-def describe_session(header: SessionHeader) -> str:
-    """Return a Markdown page about the recording."""
+def describe_session(header: SessionHeader, story: SessionStory | None = None, duration_s: float = 0.0) -> str:
+    """Return a Markdown page about the recording. `story`: at its end; `None`: it begins."""
     versions = "\n".join(f"| {name} | {value} |" for name, value in header.versions.items())
-    return (
-        f"# {header.session_name}\n\n"
-        f"Session `{header.session_id}`, class **{header.recording_class}**, {header.created_utc}\n\n"
+    parts = [f"# {header.session_name}"]
+    if story is not None:
+        people = ", ".join(f"**{name}** ({role})" for name, role in story.roles.items()) or "No one joined"
+        counts = f"{duration_s:.1f} s, handovers: {story.handovers}, episodes: {story.episodes}"
+        parts.append(f"{people}. {counts}.")
+    parts += [
         f"Robots: {', '.join(r.name for r in header.robots) or 'none'}. "
         f"Objects: {', '.join(o.name for o in header.objects) or 'none'}. "
-        f"Bodies: {len(header.bodies)}. Tick: {header.tick_period_ns / 1e6:g} ms.\n\n"
-        f"| library | version |\n|---|---|\n{versions}\n"
-    )
+        f"Bodies: {len(header.bodies)}. Tick: {header.tick_period_ns / 1e6:g} ms.",
+        f"Recorded {header.created_utc}, class **{header.recording_class}**: `iris-session verify FILE` simulates "
+        + ("it again." if header.recording_class == CLOSED else "decisions and control again."),
+        f"Session `{header.session_id}`",
+        f"| library | version |\n|---|---|\n{versions}\n",
+    ]
+    return "\n\n".join(parts)

@@ -13,7 +13,7 @@ import pytest
 from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.recording import SessionHeader, pack_model
-from iris_session.recording.deformables import DrawnDeformable
+from iris_session.recording.deformables import DARK, DrawnDeformable, build_checker
 from iris_session.recording.messages import Batch, SceneAssets, SceneModel, VertexFrame
 from iris_session.recording.writer import MAX_PENDING_VERTICES, RrdWriter
 from iris_session.scene import AssetDecodeError, AssetStore, decode_arrays
@@ -216,6 +216,17 @@ def test_vertices_without_states_are_bounded(world: World) -> None:
         world.writer.add_vertices(VertexFrame("flex-0", 8_000_000 + i, b""))
     assert world.writer.vertices_refused == 5
     assert len(told(world.read()[CLOTH], "Mesh3D:vertex_positions")) == 1
+
+
+def test_surfaces_without_a_texture_have_a_checker_pattern() -> None:
+    """Fields of two by two vertices on a cloth of a metre that is not at the origin."""
+    x, y = np.meshgrid(np.linspace(3.0, 4.0, 20), np.linspace(-1.0, 0.0, 20))
+    grey = build_checker(np.stack([x, y, 0.7 + 0 * x], axis=-1).reshape(-1, 3).astype(np.float32))
+    fields = grey[:, 0].reshape(20, 20)
+    assert set(fields.ravel().tolist()) == {255, DARK}
+    assert fields[0, :6].tolist() == [255, 255, DARK, DARK, 255, 255]
+    assert fields[2, :6].tolist() == [DARK, DARK, 255, 255, DARK, DARK]
+    assert build_checker(np.zeros((0, 3), np.float32)).shape == (0, 3)
 
 
 def test_vertices_are_split_where_texture_coordinates_differ(world: World) -> None:

@@ -28,8 +28,10 @@ from iris_session.protocol.server_messages import (
     AlignmentChanged,
     AnchorMoved,
     BodyInfo,
+    EpisodeChanged,
     EStopChanged,
     Event,
+    Handover,
     LeaseChanged,
     ParticipantInfo,
     ParticipantJoined,
@@ -686,3 +688,26 @@ def test_anchors_have_axes_and_the_worst_stated_error(tmp_path: Path) -> None:
     ]
     sizes = column(found["/anchors/sheet\\ 1/error"], "Ellipsoids3D:half_sizes")
     assert [size[0][0] for size in sizes] == pytest.approx([0.0, 0.002, 0.005, 0.002])
+
+
+def test_result_is_in_properties_and_text(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    header, batch = journal(3)
+    writer = RrdWriter(path, "id")
+    writer.write_header(msgspec.structs.replace(header, robots=(RobotSpec("left", (), (), "site", "tip"),)))
+    passed = Handover("cup", "left", "right", "p1", "p2", 5)
+    episodes = [EpisodeChanged(1, state, "p1") for state in ("running", "success")]
+    batch.events = [
+        joined("p1", "Ada"),
+        joined("p2", "Bob"),
+        *(Event(i, 1, i, body) for i, body in enumerate((passed, *episodes), 3)),
+    ]
+    writer.add(batch)
+    writer.close()
+    found = read(path)
+    (result,) = found["/__properties/session"]
+    names = ("people", "robots", "handovers", "episodes", "duration_s", "verify_class")
+    values = [result.column(name)[0].as_py() for name in names]
+    assert values == [["Ada", "Bob"], ["left"], [1], [1], [pytest.approx(0.004)], ["closed"]]
+    page = column(found["/session"], "TextDocument:text")[-1][0]
+    assert "**Ada** (operator), **Bob** (operator). 0.0 s, handovers: 1" in page
