@@ -56,9 +56,11 @@ def build_blueprint(eye: Any, pictures: Sequence[str] = (), robots: Sequence[Rob
     )
     about = rrb.TextDocumentView(origin=paths.INFO, name="About")
     plots = rrb.Tabs(*(_build_plot(f"{paths.METRICS}/{kind}", known.view) for kind, known in KINDS.items()))
-    images = [rrb.Spatial2DView(origin=f"{paths.PICTURES}/{name}", name=name) for name in pictures]
+    views = (rrb.Spatial2DView(origin=f"{paths.PICTURES}/{name}", name=name) for name in pictures)
+    images = [rrb.Grid(*views)] if pictures else []
     motion = [rrb.Tabs(*(_build_robot_views(robot) for robot in robots))] if robots else []
-    side = rrb.Vertical(rrb.Tabs(log, about), *([rrb.Grid(*images)] if images else ()), *motion, plots)
+    parts = [(3, rrb.Tabs(log, about)), *((3, grid) for grid in images), *((4, tabs) for tabs in motion), (3, plots)]
+    side = rrb.Vertical(*(part for _, part in parts), row_shares=[share for share, _ in parts])
     return rrb.Blueprint(
         rrb.Horizontal(rrb.Vertical(scene, lanes, row_shares=[5, 3]), side, column_shares=[5, 3]),
         rrb.TimePanel(state="collapsed", timeline=paths.SESSION_TIME, play_state="paused"),
@@ -67,14 +69,19 @@ def build_blueprint(eye: Any, pictures: Sequence[str] = (), robots: Sequence[Rob
 
 
 def _build_robot_views(robot: RobotLabels) -> Any:
-    """Return the plots of a robot, one above the other: joints, gripper, tip."""
+    """Return the plots of a robot: joints, and below them gripper and tip."""
     entity = get_robot_entity(robot.name)
-    parts = ((JOINTS, "joints"), (GRIPPER, "gripper"), (TIP_SPEED, "speed of the tip"))
-    views = [_build_plot(f"{entity}/{part}", f"{robot.name}: {name}") for part, name in parts]
-    return rrb.Vertical(*views, row_shares=[3, 1, 1], name=robot.name)
+    names = ((JOINTS, "joints"), (GRIPPER, "gripper"), (TIP_SPEED, "tip [m/s]"))
+    joints, *others = (_build_plot(f"{entity}/{part}", f"{robot.name}: {name}", part == JOINTS) for part, name in names)
+    return rrb.Vertical(joints, rrb.Horizontal(*others), row_shares=[3, 2], name=robot.name)
 
 
-def _build_plot(entity: str, name: str) -> Any:
+def _build_plot(entity: str, name: str, has_legend: bool = True) -> Any:
     """Return a plot that shows the whole session at first."""
     whole = rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
-    return rrb.TimeSeriesView(origin=entity, name=name, axis_x=rrb.TimeAxis(view_range=whole))
+    return rrb.TimeSeriesView(
+        origin=entity,
+        name=name,
+        axis_x=rrb.TimeAxis(view_range=whole),
+        plot_legend=rrb.PlotLegend(visible=has_legend),
+    )

@@ -188,7 +188,8 @@ class AnchorPicture:
 
     def _draw_error(self, anchor: str, moment: Moment) -> None:
         label = f"{anchor}: {self._error_m * 1e3:.1f} mm (95 %)" if self._error_m else anchor
-        parts: list[Any] = [rr.Points3D([(0.0, 0.0, 0.0)], radii=[0.003], labels=[label], show_labels=True)]
+        point = rr.Points3D([(0.0, 0.0, 0.0)], colors=[ERROR_COLOUR], radii=[0.003], labels=[label], show_labels=True)
+        parts: list[Any] = [point]
         solid = rr.components.FillMode.Solid
         size = [self._error_m] * 3
         parts.append(rr.Ellipsoids3D(half_sizes=[size], colors=[ERROR_COLOUR], fill_mode=solid))

@@ -46,6 +46,17 @@ KINDS: Final = {
     ALIGNMENT: MetricKind("Alignment error [mm]", "{}, at the robot, 95 % [mm]", of_people=True),
     REJECTED: MetricKind("Rejected samples", "{}, since joining", of_people=True),
 }
+#: Colours of the joints of a robot in their order (Tol 2021, "muted", lightened for a dark background).
+COLOURS: Final = (
+    (136, 204, 238),
+    (221, 204, 119),
+    (68, 170, 153),
+    (204, 102, 119),
+    (153, 153, 255),
+    (170, 210, 90),
+    (220, 130, 200),
+    (240, 160, 90),
+)
 #: Metrics that keep their value until the next one.
 HELD: Final = (ALIGNMENT, REJECTED)
 #: Maximum number of metrics that are known to have a name in the file.
@@ -158,7 +169,8 @@ class RobotPlots:
         at, n = 0, values.shape[1] - 2 * len(self.robots)
         for i, robot in enumerate(self.robots):
             of = ", ".join(("", robot.name))
-            labels = [f"{name} [{unit}]" for name, unit in zip(robot.joints, robot.units, strict=True)]
+            names = [name.removeprefix(f"{robot.name}/") for name in robot.joints]
+            labels = [f"{name} [{unit}]" for name, unit in zip(names, robot.units, strict=True)]
             self._send(robot, JOINTS, labels, times, values[:, at : at + len(labels)])
             at += len(labels)
             self._send(robot, GRIPPER, [f"opening{of} [0 to 1]"], times, values[:, [n + i]])
@@ -174,7 +186,8 @@ class RobotPlots:
         entity = f"{get_robot_entity(robot.name)}/{name}"
         if entity not in self._named:
             self._named.add(entity)
-            self._rec.log(entity, rr.SeriesLines(names=labels), static=True, strict=True)
+            colours = [COLOURS[i % len(COLOURS)] for i in range(len(labels))]
+            self._rec.log(entity, rr.SeriesLines(names=labels, colors=colours), static=True, strict=True)
         columns = rr.Scalars.columns(scalars=values[known].ravel()).partition([len(labels)] * int(known.sum()))
         times_known: list[Any] = to_time_columns(times[:, known])
         rr.send_columns(entity, times_known, [*columns], recording=self._rec, strict=True)

@@ -326,7 +326,7 @@ class RrdWriter:
             self._set_bodies(loaded.bodies)
             self._last_step = loaded.step if loaded.session_time else self._last_step
             self._robots = assets[-1].robots if assets else ()
-            source = SceneSource(loaded.model, loaded.bodies, *assets[-1:], robots=self._robots)
+            source = SceneSource(loaded.model, loaded.bodies, assets[-1] if assets else SceneAssets(), self._robots)
             self._picture.replace_scene(source, self._find_moment(loaded.step, loaded.session_time))
         for patch in () if scenes else assets:
             self._picture.patch_scene(patch, self._find_moment(patch.step, patch.session_time))

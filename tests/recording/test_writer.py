@@ -31,6 +31,7 @@ from iris_session.protocol.server_messages import (
     EpisodeChanged,
     EStopChanged,
     Event,
+    EventKind,
     Handover,
     LeaseChanged,
     ParticipantInfo,
@@ -546,7 +547,7 @@ def test_changed_model_is_not_used(tmp_path: Path) -> None:
 def test_joints_grippers_and_tips_of_robots_are_plotted(tmp_path: Path) -> None:
     """Values of a robot of two joints and a gripper, and of one without joints and gripper."""
     path = tmp_path / "w.rrd"
-    robots = (RobotLabels("left", "base", ("hinge", "rail"), ("rad", "m")), RobotLabels("free", "base"))
+    robots = (RobotLabels("left", "base", ("left/hinge", "rail"), ("rad", "m")), RobotLabels("free", "base"))
     writer = RrdWriter(path, "id")
     writer.write_header(SessionHeader("s", "n", "closed", 2_000_000))
     writer.add(Batch(assets=[SceneAssets(robots=robots)]))
@@ -574,7 +575,7 @@ def test_errors_of_alignments_and_rejected_samples_are_plotted_by_name(tmp_path:
     writer.write_header(SessionHeader("s", "n", "closed", 2_000_000))
     pose = Pose((0.0, 0.0, 0.0), IDENTITY_Q)
     stated = [Alignment(i, "measured", pose, 0, (), error / 2, error) for i, error in ((1, 0.004), (2, 0.002))]
-    bodies = [
+    bodies: list[EventKind] = [
         *(AlignmentChanged("p1", one) for one in stated),
         AlignmentChanged("p2", msgspec.structs.replace(stated[0], offset=True)),
         *(SamplesRejected("p1", device, "stale", n) for device, n in (("head", 2), ("hand/left", 1), ("head", 5))),
@@ -669,11 +670,8 @@ def test_anchors_have_axes_and_the_worst_stated_error(tmp_path: Path) -> None:
         AlignmentChanged(who, Alignment(1, "measured", sheet, 0, (), error_m, 0.1))
         for who, error_m in (("p1", 0.002), ("p2", 0.005))
     ]
-    bodies = (
-        *aligned,
-        AnchorMoved("sheet 1", msgspec.structs.replace(sheet, p=(3.0, 0.0, 0.0))),
-        ParticipantLeft("p2", ""),
-    )
+    moved = AnchorMoved("sheet 1", msgspec.structs.replace(sheet, p=(3.0, 0.0, 0.0)))
+    bodies: list[EventKind] = [*aligned, moved, ParticipantLeft("p2", "")]
     events = [Event(i + 1, i, 100 * i, body) for i, body in enumerate(bodies, 1)]
     writer.add(Batch(events=events, states=[frame(0, np.zeros((0, 7)))]))
     writer.close()
@@ -697,10 +695,11 @@ def test_result_is_in_properties_and_text(tmp_path: Path) -> None:
     writer.write_header(msgspec.structs.replace(header, robots=(RobotSpec("left", (), (), "site", "tip"),)))
     passed = Handover("cup", "left", "right", "p1", "p2", 5)
     episodes = [EpisodeChanged(1, state, "p1") for state in ("running", "success")]
+    bodies: list[EventKind] = [passed, *episodes]
     batch.events = [
         joined("p1", "Ada"),
         joined("p2", "Bob"),
-        *(Event(i, 1, i, body) for i, body in enumerate((passed, *episodes), 3)),
+        *(Event(i, 1, i, body) for i, body in enumerate(bodies, 3)),
     ]
     writer.add(batch)
     writer.close()
