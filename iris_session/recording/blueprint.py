@@ -46,7 +46,9 @@ def build_blueprint(eye: Any, pictures: Sequence[str] = (), robots: Sequence[Rob
         line_grid=False,
         eye_controls=eye,
     )
-    lanes = rrb.StateTimelineView(origin=paths.LANES, name="Who does what")
+    lanes = rrb.StateTimelineView(
+        origin=paths.LANES, name="Who does what", time_view=rrb.TimeAxis(view_range=_make_whole_range())
+    )
     log = rrb.TextLogView(
         origin="/",
         name="What happened",
@@ -78,10 +80,13 @@ def _build_robot_views(robot: RobotLabels) -> Any:
 
 def _build_plot(entity: str, name: str, has_legend: bool = True) -> Any:
     """Return a plot that shows the whole session at first."""
-    whole = rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
     return rrb.TimeSeriesView(
         origin=entity,
         name=name,
-        axis_x=rrb.TimeAxis(view_range=whole),
+        axis_x=rrb.TimeAxis(view_range=_make_whole_range()),
         plot_legend=rrb.PlotLegend(visible=has_legend),
     )
+
+
+def _make_whole_range() -> Any:
+    return rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())

@@ -22,7 +22,7 @@ from iris_session.streams.deformable_topology import DeformableTopology
 from iris_session.streams.errors import StreamError
 
 #: Fields of the checker pattern along the longest side of a surface, and the grey of the dark ones.
-CHECKERS: Final = 10
+CHECKERS: Final = 6
 DARK: Final = 165
 
 Floats = NDArray[np.float32]

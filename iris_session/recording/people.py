@@ -27,8 +27,9 @@ STALE_NS: Final = 250_000_000
 HEAD_HALF_M: Final = (0.06, 0.09, 0.05)
 HAND_HALF_M: Final = (0.05, 0.03, 0.03)
 VIEW_M: Final = 0.3
-#: Length of the axes of an anchor [m], and the colour of its error.
+#: Length of the axes of an anchor [m], and the colours of its label and error.
 AXES_M: Final = 0.1
+LABEL_COLOUR: Final = (255, 150, 150)
 ERROR_COLOUR: Final = (220, 60, 60, 120)
 
 _Key = tuple[str, str]  # participant, device
@@ -188,7 +189,7 @@ class AnchorPicture:
 
     def _draw_error(self, anchor: str, moment: Moment) -> None:
         label = f"{anchor}: {self._error_m * 1e3:.1f} mm (95 %)" if self._error_m else anchor
-        point = rr.Points3D([(0.0, 0.0, 0.0)], colors=[ERROR_COLOUR], radii=[0.003], labels=[label], show_labels=True)
+        point = rr.Points3D([(0.0, 0.0, 0.0)], colors=[LABEL_COLOUR], radii=[0.003], labels=[label], show_labels=True)
         parts: list[Any] = [point]
         solid = rr.components.FillMode.Solid
         size = [self._error_m] * 3

@@ -152,6 +152,7 @@ class RrdWriter:
         self._collected_due_ns = 0
         self._anchors = AnchorPicture(self._rec)
         self._people = PeoplePicture(self._rec, self._story, is_first=is_first)
+        self._lanes: dict[str, list[tuple[Moment, LaneChange]]] = {}
         self._lane_colours: dict[str, dict[str, Rgb]] = {}
         self._eye: Any = None
         self._arranged = False
@@ -216,7 +217,7 @@ class RrdWriter:
             for _, states in groupby(batch.states, key=lambda state: len(state.poses)):
                 self._write_states(list(states))
             self._write_events(batch.events, told)
-            self._write_holds(batch.holds)
+            self._add_holds(batch.holds)
             self._write_denials(batch.denials)
             self._add_metrics(batch.metrics)
             self._add_reports(reports)
@@ -444,8 +445,8 @@ class RrdWriter:
                     self._metrics.add(INPUT_TO_STEP, applied.robot, latency_ms, moment)
 
     def _write_collected(self) -> int:
-        """Write motion and plots collected so far. Return the time until they are due again [ns]."""
-        n = self._motion.write() + self._plots.write()
+        """Write motion, plots and lanes collected so far. Return the time until they are due again [ns]."""
+        n = self._motion.write() + self._plots.write() + self._write_lanes()
         n += self._metrics.write(self._known[-1] if self._known else self._find_moment(0, 0))
         return min(MAX_PERIOD_NS, max(MIN_PERIOD_NS, n * 1_000_000_000 // CHUNKS_PER_S))
 
@@ -488,7 +489,7 @@ class RrdWriter:
         columns = [*text, bytes_column("event", [_encode(event) for event in events])]
         times = self._to_times(paths.EVENTS, [e.step for e in events], [e.session_time for e in events])
         self._send_columns(paths.EVENTS, times, columns)
-        self._write_lanes(changes)
+        self._add_lanes(changes)
 
     def _tell(self, event: Event) -> _Told:
         line, changes = self._story.add(event)
@@ -512,29 +513,33 @@ class RrdWriter:
         else:
             self._metrics.end(REJECTED, told.participant, moment)
 
-    def _write_holds(self, holds: list[HoldRecord]) -> None:
+    def _add_holds(self, holds: list[HoldRecord]) -> None:
         changes = [(h.step, h.session_time, c) for h in holds for c in self._story.add_hold(h.robot, h.reason)]
-        self._write_lanes(changes)
+        self._add_lanes(changes)
 
-    def _write_lanes(self, changes: list[tuple[int, int, LaneChange]]) -> None:
-        """Write changed lanes, and the colours of their states when those are new."""
-        by_lane: dict[str, list[tuple[int, int, LaneChange]]] = {}
-        for change in changes:
-            entity = "/".join((paths.LANES, *map(escape_entity_part, change[2].lane)))
-            by_lane.setdefault(entity, []).append(change)
-            folder, name, *kind = (*change[2].lane, "")
+    def _add_lanes(self, changes: list[tuple[int, int, LaneChange]]) -> None:
+        """Collect changed lanes; label robots by their holders."""
+        for step, now_ns, change in changes:
+            moment = self._find_moment(step, now_ns)
+            entity = "/".join((paths.LANES, *map(escape_entity_part, change.lane)))
+            self._lanes.setdefault(entity, []).append((moment, change))
+            folder, name, *kind = (*change.lane, "")
             if folder == "robots" and kind[0] == "holder":
-                state, colours = change[2].state, change[2].colours
-                self._people.label_robot(name, state, colours.get(state, FREE), self._find_moment(*change[:2]))
-        for entity, rows in by_lane.items():
-            colours = {state: colour for *_, change in rows for state, colour in change.colours.items()}
+                self._people.label_robot(name, change.state, change.colours.get(change.state, FREE), moment)
+
+    def _write_lanes(self) -> int:
+        """Write changed lanes, and the colours of their states when those are new. Return the number of chunks."""
+        lanes, self._lanes = self._lanes, {}
+        for entity, rows in lanes.items():
+            colours = {state: colour for _, change in rows for state, colour in change.colours.items()}
             if colours and self._lane_colours.get(entity) != colours:
                 if len(self._lane_colours) >= MAX_LANES:
                     self._lane_colours.clear()
                 self._lane_colours[entity] = colours
                 self._log_static(entity, rr.StateConfiguration(values=[*colours], colors=[*colours.values()]))
-            times = self._to_times(entity, [step for step, _, _ in rows], [now_ns for _, now_ns, _ in rows])
-            self._send_columns(entity, times, [*rr.StateChange.columns(state=[row.state for _, _, row in rows])])
+            times = self._spread(entity, [moment for moment, _ in rows])
+            self._send_columns(entity, times, [*rr.StateChange.columns(state=[change.state for _, change in rows])])
+        return len(lanes)
 
     def _write_denials(self, denials: list[DenialRecord]) -> None:
         if not denials:
@@ -568,9 +573,12 @@ class RrdWriter:
 
     def _to_times(self, entity: str, steps: list[int], session_times: list[int]) -> list[Any]:
         """Return the times of rows, each of which has the simulated time of the newest state before it."""
-        moments = [self._find_moment(*times) for times in zip(steps, session_times, strict=True)]
+        return self._spread(entity, [self._find_moment(*times) for times in zip(steps, session_times, strict=True)])
+
+    def _spread(self, entity: str, moments: Sequence[Moment]) -> list[Any]:
+        """Return the times of rows of an entity, no two of which are equal."""
         times = np.array(moments, np.int64).T
-        times[2] = self._times.spread(entity, session_times)
+        times[2] = self._times.spread(entity, times[2].tolist())
         times[3] = times[2] + self._origin_utc_ns
         return to_time_columns(times)
 

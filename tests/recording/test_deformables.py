@@ -13,7 +13,7 @@ import pytest
 from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.recording import SessionHeader, pack_model
-from iris_session.recording.deformables import DARK, DrawnDeformable, build_checker
+from iris_session.recording.deformables import CHECKERS, DARK, DrawnDeformable, build_checker
 from iris_session.recording.messages import Batch, SceneAssets, SceneModel, VertexFrame
 from iris_session.recording.writer import MAX_PENDING_VERTICES, RrdWriter
 from iris_session.scene import AssetDecodeError, AssetStore, decode_arrays
@@ -220,9 +220,10 @@ def test_vertices_without_states_are_bounded(world: World) -> None:
 
 def test_surfaces_without_a_texture_have_a_checker_pattern() -> None:
     """Fields of two by two vertices on a cloth of a metre that is not at the origin."""
-    x, y = np.meshgrid(np.linspace(3.0, 4.0, 20), np.linspace(-1.0, 0.0, 20))
+    n = 2 * CHECKERS
+    x, y = np.meshgrid(np.linspace(3.0, 4.0, n), np.linspace(-1.0, 0.0, n))
     grey = build_checker(np.stack([x, y, 0.7 + 0 * x], axis=-1).reshape(-1, 3).astype(np.float32))
-    fields = grey[:, 0].reshape(20, 20)
+    fields = grey[:, 0].reshape(n, n)
     assert set(fields.ravel().tolist()) == {255, DARK}
     assert fields[0, :6].tolist() == [255, 255, DARK, DARK, 255, 255]
     assert fields[2, :6].tolist() == [DARK, DARK, 255, 255, DARK, DARK]
