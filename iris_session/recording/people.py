@@ -1,7 +1,7 @@
 """Picture of participants in a recording: heads and hands at the poses that the session had of them, names at robots,
 and the anchors that headsets are aligned to.
 
-A device is drawn at an entity of its own, which `motion` moves. It appears with its first pose, and is cleared when
+A device is drawn at an entity of its own, which `MotionRows` moves. It appears with its first pose, and is cleared when
 its participant leaves or no pose came for `STALE_NS`. Nothing is static, as Rerun shows static data at all times.
 """
 

@@ -1,4 +1,4 @@
-"""Picture of the scene in a recording: an entity per body, which `motion` moves in the world, its geometry below it.
+"""Picture of the scene in a recording: an entity per body, which `MotionRows` moves, its geometry below it.
 
 Below `/scene/<number>` are `robots/<robot>/<link>`, `bodies/<body>`, and `world` for what has no body. None of it is
 static, because Rerun shows static data at all times: scenes replace one another, patches change the look of visuals,
@@ -13,7 +13,9 @@ from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
 import msgspec
+import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
 from anchors.pose import PoseTuple
 from iris_session.protocol.scene import SceneSpec, Visual
@@ -23,7 +25,7 @@ from iris_session.recording import paths, scene_geometry
 from iris_session.recording.deformables import DrawnDeformable
 from iris_session.recording.messages import RobotLabels, SceneAssets
 from iris_session.recording.scene_geometry import SceneReader, VisualShape
-from iris_session.recording.timelines import Moment, set_moment
+from iris_session.recording.timelines import Moment, set_moment, to_time_columns
 from iris_session.scene import SceneBuildError
 
 #: Maximum number of entities named in an error line about entities that cannot be drawn.
@@ -246,6 +248,59 @@ class ScenePicture:
         entity = f"{parent}/{escape_entity_part(name)}"
         self._names[entity] += 1
         return entity if self._names[entity] == 1 else self._number_entity(parent, f"{name} ({self._names[entity]})")
+
+
+class MotionRows:
+    """Poses of bodies and devices in the world that are not written yet, each at an entity of its own.
+
+    Rerun's dataframes have one row per entity and time, and a chunk of few rows is mostly its schema: so rows are
+    collected and written together, a chunk per entity.
+    """
+
+    def __init__(self, recording: rr.RecordingStream) -> None:
+        self._rec = recording
+        self._indices: dict[str, int] = {}
+        self._parts: list[tuple[NDArray[np.intp], NDArray[np.int64], NDArray[np.float64]]] = []
+
+    def add(
+        self,
+        entities: Sequence[str],
+        which: NDArray[np.intp],
+        times: NDArray[np.int64],
+        poses: NDArray[np.float64],
+    ) -> None:
+        """Collect rows.
+
+        Args:
+            entities: Entities that the rows are of, each once.
+            which: Index of the entity of each row, shape (n,).
+            times: See `to_time_columns`, one column per row.
+            poses: `x y z qw qx qy qz` ([m], unit quaternion), world frame, shape (n, 7).
+        """
+        if not len(which):
+            return
+        indices = np.array([self._indices.setdefault(entity, len(self._indices)) for entity in entities], np.intp)
+        self._parts.append((indices[which], times, poses))
+
+    def write(self) -> int:
+        """Write what was collected. Return the number of chunks."""
+        if not self._parts:
+            return 0
+        which = np.concatenate([part[0] for part in self._parts])
+        order = np.argsort(which, kind="stable")
+        times = np.concatenate([part[1] for part in self._parts], axis=1)[:, order]
+        poses = np.concatenate([part[2] for part in self._parts])[order].astype(np.float32)
+        ends = np.cumsum(np.bincount(which, minlength=len(self._indices))).tolist()
+        for entity, begin, end in zip(self._indices, [0, *ends], ends, strict=False):
+            if begin < end:
+                rows = poses[begin:end]
+                columns = rr.Transform3D.columns(translation=rows[:, :3], quaternion=rows[:, [4, 5, 6, 3]])
+                times_of = to_time_columns(times[:, begin:end])
+                rr.send_columns(entity, times_of, [*columns], recording=self._rec, strict=True)
+        n = len(self._indices)
+        self._indices.clear()
+        self._parts.clear()
+        return n
 
 
 def build_components(form: VisualShape, rgba: scene_geometry.Rgba8, T_frame_visual: PoseTuple) -> list[Any]:

@@ -55,7 +55,7 @@ def to_time_columns(times: NDArray[np.int64]) -> list[Any]:
     ]
 
 
-class RowTimes:
+class UniqueTimes:
     """Times of rows that may come at one time: in an entity, Rerun's dataframes have one row per time.
 
     Rows of one entity and session time are shown 1 ns apart. Exact times are in the data of the rows.

@@ -53,9 +53,8 @@ from iris_session.recording.messages import (
     encode_header,
     encode_scene,
 )
-from iris_session.recording.motion import MotionRows
 from iris_session.recording.people import AnchorPicture, Base, PeoplePicture
-from iris_session.recording.picture import ScenePicture, SceneSource, escape_entity_part
+from iris_session.recording.picture import MotionRows, ScenePicture, SceneSource, escape_entity_part
 from iris_session.recording.plots import (
     ALIGNMENT,
     INPUT_TO_STEP,
@@ -75,7 +74,7 @@ from iris_session.recording.rrd_stream import (
     sequence_index,
 )
 from iris_session.recording.story import FREE, WARN, LaneChange, LogLine, Rgb, SessionStory, StatedErrors
-from iris_session.recording.timelines import Moment, RowTimes, get_session_time, to_time_columns
+from iris_session.recording.timelines import Moment, UniqueTimes, get_session_time, to_time_columns
 from iris_session.streams.errors import StreamError
 
 #: Chunks of the picture per second, each mostly its schema, and the shortest and longest time between two of an entity
@@ -124,7 +123,7 @@ class RrdWriter:
         is_first = paths.split_part(self.path)[1] == 1
         self._picture = ScenePicture(self._rec, is_first=is_first)
         self._motion = MotionRows(self._rec)
-        self._times = RowTimes()
+        self._times = UniqueTimes()
         self._pending = Batch()
         self._samples: list[tuple[int, int, bytes]] = []
         self._reports: list[tuple[str, int, float]] = []
