@@ -235,6 +235,7 @@ class Intake:
             return
         if isinstance(message, ClientReport):
             self._status.record_report(connection, message, now_ns)
+            self._raw.send_report(connection, now_ns, message)
             return
         if isinstance(message, Samples):
             self._handle_samples(connection, envelope.connection_epoch, message, now_ns)

@@ -17,6 +17,7 @@ from iris_session.front.connections import FrontConnection
 from iris_session.protocol.client_messages import Observation, Sample
 from iris_session.protocol.limits import Drops, KeyedBuckets, TokenBucket
 from iris_session.protocol.names import Role, SampleKind
+from iris_session.protocol.status import ClientReport
 
 log = logging.getLogger(__name__)
 
@@ -58,6 +59,7 @@ _encode = msgspec.msgpack.Encoder().encode
 class RawFeed:
     """Forward samples and observations to the recorder: batches of `[connection, receive_ns, message bytes]`.
 
+    A report on the delivery of states comes as `[participant, report]` in place of a message.
     Never blocks. Without an endpoint nothing is forwarded. Messages are encoded again, not forwarded as received: so
     the recording holds nothing that the schema does not have, however large or deep a client made it. A `Service`.
     """
@@ -80,9 +82,15 @@ class RawFeed:
 
     def send(self, connection: FrontConnection, receive_ns: int, message: Sample | Observation) -> None:
         """Forward one message, unless it is above a share."""
-        if self._socket is None:
-            return
-        data = _encode(message)
+        if self._socket is not None:
+            self._send(connection, receive_ns, _encode(message))
+
+    def send_report(self, connection: FrontConnection, receive_ns: int, report: ClientReport) -> None:
+        """Forward the report of a participant, unless it is above a share."""
+        if self._socket is not None and connection.participant_id:
+            self._send(connection, receive_ns, _encode((connection.participant_id, report)))
+
+    def _send(self, connection: FrontConnection, receive_ns: int, data: bytes) -> None:
         shares = self._observer_shares if connection.role == Role.OBSERVER else self._shares
         if not shares.take(connection.key_id, receive_ns, len(data)):
             self._leave_out(KEY_SHARE, connection, 1)

@@ -107,6 +107,8 @@ class World:
         #: Rows of `xpos` to stream: a slice unless flexes lie between the bodies, which is much cheaper to copy.
         self._rows: Any = slice(ids[0], ids[0] + len(ids)) if whole else np.array(ids, np.int64)
         self.robot_infos = tuple(_robot_info(model, spec) for spec in robots)
+        #: Measured values of the robots, for recordings.
+        self.robot_signals = RobotSignals(model, robots)
         self.tick_period_ns = self._view.tick_period_ns
         #: BLAKE2b of the model bytes, 32 hex characters.
         self.scene_hash = compute_scene_hash(encode_model(model))
@@ -276,6 +278,60 @@ class World:
     def _raise_diverged(self, error: mujoco.FatalError) -> NoReturn:
         self.diverged = one_line(error)
         raise SimulationDivergedError(self._tick, float(self.data.time), self.diverged) from error
+
+
+class RobotSignals:
+    """Measured values of the robots of one model: joints, openings of grippers, positions of tips.
+
+    `units`: of the joints of each robot, `rad` or `m`.
+    """
+
+    def __init__(self, model: mujoco.MjModel, robots: Sequence[RobotSpec]) -> None:
+        def find(kind: str, names: Sequence[str], robot: RobotSpec) -> list[int]:
+            return [find_element_id(model, kind, name, f"robot {robot.name!r}: ") for name in names]
+
+        joints = [find("joint", robot.joints, robot) for robot in robots]
+        slide = int(mujoco.mjtJoint.mjJNT_SLIDE)
+        self.units = tuple(tuple("m" if int(model.jnt_type[j]) == slide else "rad" for j in one) for one in joints)
+        self._qpos = np.array([int(model.jnt_qposadr[j]) for one in joints for j in one], np.int64)
+        self._sites = np.array([site for robot in robots for site in find("site", [robot.site], robot)], np.int64)
+        laws = [
+            (i, actuator, *law)
+            for i, robot in enumerate(robots)
+            for actuator in find("actuator", [robot.gripper_actuator] if robot.gripper_actuator else [], robot)
+            if (law := _opening_law(model, actuator, robot)) is not None
+        ]
+        self._grippers = np.array([law[:2] for law in laws], np.int64).reshape(-1, 2).T
+        self._scale, self._offset = np.array([law[2:] for law in laws]).reshape(-1, 2).T
+        n = len(robots)
+        self._values: NDArray[np.float64] = np.full(len(self._qpos) + 4 * n, np.nan)
+        self._openings = self._values[len(self._qpos) : len(self._qpos) + n]
+
+    def read(self, data: Any) -> bytes:
+        """Return the values of the present state as float64, empty without robots.
+
+        In this order: the joints of all robots [rad or m]; the opening of the gripper of each robot, 0 closed and 1
+        open, NaN without one that is controlled by position; the position of each tip, x y z [m], world frame.
+        """
+        values = self._values
+        values[: len(self._qpos)] = data.qpos[self._qpos]
+        if len(self._scale):
+            self._openings[self._grippers[0]] = data.actuator_length[self._grippers[1]] * self._scale + self._offset
+        values[len(self._qpos) + len(self._sites) :] = data.site_xpos[self._sites].ravel()
+        return values.tobytes()
+
+
+def _opening_law(model: mujoco.MjModel, actuator: int, robot: RobotSpec) -> tuple[float, float] | None:
+    """Return scale and offset from the length of a position actuator to the opening; `None` for other actuators.
+
+    The length is that at which the actuator rests for some `ctrl`; the opening is where that lies between `ctrl` closed
+    and open.
+    """
+    gain, (constant, slope) = float(model.actuator_gainprm[actuator, 0]), model.actuator_biasprm[actuator, :2].tolist()
+    span = robot.gripper_open - robot.gripper_closed
+    if int(model.actuator_biastype[actuator]) != int(mujoco.mjtBias.mjBIAS_AFFINE) or not gain * slope * span:
+        return None
+    return -slope / (gain * span), (-constant / gain - robot.gripper_closed) / span
 
 
 def _require_exact(model: mujoco.MjModel) -> None:

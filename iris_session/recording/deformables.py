@@ -1,25 +1,29 @@
 """Deformables in the picture of a recording: topology once, then vertices with every frame received.
 
 Cloths and surfaces of soft bodies are meshes, ropes are lines. The viewer shades by normals but computes none, so they
-are in the file beside the positions.
+are in the file beside the positions. A surface without a texture has a checker pattern, by which folds are seen.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
 from iris_session.protocol.scene import Deformable
-from iris_session.recording.scene_geometry import WORLD, Pixels, Rgba8, to_rgba8
+from iris_session.recording.scene_geometry import Pixels, Rgba8, to_rgba8
 from iris_session.scene import AssetDecodeError
 from iris_session.scene.arrays import require_array
 from iris_session.scene.mesh_processing import normalise
 from iris_session.streams.deformable import DeformableDecoder
 from iris_session.streams.deformable_topology import DeformableTopology
 from iris_session.streams.errors import StreamError
+
+#: Fields of the checker pattern along the longest side of a surface, and the grey of the dark ones.
+CHECKERS: Final = 6
+DARK: Final = 165
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
@@ -59,7 +63,7 @@ class DrawnDeformable:
 
     def build_components(self) -> list[Any]:
         """Return the Rerun components that do not change, and the vertices at rest."""
-        return [rr.CoordinateFrame(WORLD), self._form.build_components(self._rest, self._colour, self._radius)]
+        return [self._form.build_components(self._rest, self._colour, self._radius)]
 
     def decode_frame(self, frame: bytes) -> Floats | None:
         """Decode a frame of the stream: vertices (n, 3) [m], `None` if unchanged. Raises `StreamError`."""
@@ -72,6 +76,15 @@ class DrawnDeformable:
     def build_columns(self, rows: list[Floats]) -> Any:
         """Return the columns for `rerun.send_columns`, one row per result of `decode_frame`."""
         return self._form.build_columns(np.stack(rows))
+
+
+def build_checker(rest: Floats) -> NDArray[np.uint8]:
+    """Return colours of vertices (n, 3) in a checker pattern of their rest positions, by which folds are seen."""
+    low = rest.min(axis=0, initial=np.inf)
+    size = float(np.ptp(rest, axis=0).max(initial=0.0)) if len(rest) else 0.0
+    cell = np.floor((rest - low) / (size / CHECKERS or 1.0) + 1e-3).astype(np.int64)
+    grey = np.where(cell.sum(axis=1) % 2, DARK, 255).astype(np.uint8)
+    return np.repeat(grey[:, None], 3, axis=1)
 
 
 class _Lines:
@@ -108,12 +121,14 @@ class _Surface:
 
     def build_components(self, rest: Floats, rgba: Rgba8, radius: float) -> Any:
         position, normal = self._arranged(rest)
+        colours = {} if self._source is not None else {"vertex_colors": build_checker(rest)}
         worn = {} if self._source is None else {"vertex_texcoords": self._uv, "albedo_texture": self._texture}
         return rr.Mesh3D(
             vertex_positions=position,
             vertex_normals=normal,
             triangle_indices=self._drawn.astype(np.uint32),
             albedo_factor=rgba,
+            **colours,
             **worn,
         )
 

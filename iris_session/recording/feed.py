@@ -43,6 +43,7 @@ from iris_session.recording.messages import (
     HoldRecord,
     MetricRecord,
     RecorderStatus,
+    RobotLabels,
     SceneAssets,
     SceneModel,
     StateFrame,
@@ -130,6 +131,7 @@ class RecorderFeed:
         self._vertex_limit = VertexRateLimit()
         self._header = b""
         self._scene = Batch()  # the newest `SceneModel`, and the assets of the picture
+        self._robots: tuple[RobotLabels, ...] = ()
         self._next = 0
         self._window: deque[tuple[int, bytes]] = deque()
         self._instance = 0
@@ -138,6 +140,7 @@ class RecorderFeed:
         self._batch = Batch()
         self._batch_since = 0
         self._now = (0, 0)  # step and session time of the newest row
+        self._sim_time = self._sim_before = 0.0  # of the newest state, and before the last reset [s]
         self._last_status_ns = 0
         #: Session time since the last status of a recorder that has something to write: it may hang.
         self.silence_ns = 0
@@ -152,10 +155,13 @@ class RecorderFeed:
         """True once there is room again after rows were dropped: verification can continue from the next keyframe."""
         return self._lost and not self._spill and 2 * self.stats.window_bytes <= self._window_limit
 
-    def send_header(self, header: SessionHeader, root: str = "", scene_hash: str = "") -> None:
-        """Send the header of the session, once, before the first row. `root`, `scene_hash`: see `SceneAssets`."""
+    def send_header(
+        self, header: SessionHeader, root: str = "", scene_hash: str = "", robots: tuple[RobotLabels, ...] = ()
+    ) -> None:
+        """Send the header of the session, once, before the first row. The others: see `SceneAssets`."""
         self._header = messages.encode_header(header)
-        self._scene.assets = [SceneAssets(-1, 0, root, scene_hash)]
+        self._robots = robots
+        self._scene.assets = [SceneAssets(-1, 0, root, scene_hash, robots)]
         self._transfer()
 
     def send_scene(
@@ -165,16 +171,18 @@ class RecorderFeed:
         bodies: tuple[BodyInfo, ...],
         root: str = "",
         scene_hash: str = "",
+        robots: tuple[RobotLabels, ...] = (),
     ) -> None:
-        """Send the model of a scene, before the row that loads it. Later states are of its `bodies`."""
+        """Send the model of a scene, before the row that loads it. Later states are of its `bodies` and `robots`."""
         self._vertex_limit.reset()
+        self._robots = robots
         self._holds.clear()
         scene = SceneModel(*self._now, model_hash, packed_model, bodies)
-        self._send_scene_data(Batch(scenes=[scene], assets=[SceneAssets(*self._now, root, scene_hash)]))
+        self._send_scene_data(Batch(scenes=[scene], assets=[SceneAssets(*self._now, root, scene_hash, robots)]))
 
     def send_patch(self, root: str, scene_hash: str) -> None:
         """Send a patched specification of the present scene, before the row that patches it."""
-        assets = [SceneAssets(*self._now, root, scene_hash)]
+        assets = [SceneAssets(*self._now, root, scene_hash, self._robots)]
         self._send_scene_data(Batch(scenes=self._scene.scenes, assets=assets), Batch(assets=assets))
 
     def _send_scene_data(self, known: Batch, news: Batch | None = None) -> None:
@@ -212,12 +220,19 @@ class RecorderFeed:
         session_time: int,
         poses: NDArray[np.float64],
         applied: Sequence[Applied] = (),
+        robots: bytes = b"",
     ) -> None:
         """Add world poses (n_bodies, 7) `x y z qw qx qy qz` of the header's bodies, at the state rate; presence since
-        the last state with it."""
+        the last state with it. `robots`: see `StateFrame`."""
         presence = tuple(self._presence.values())
         self._presence.clear()
-        frame = StateFrame(step, tick, sim_time, session_time, poses.tobytes(), presence, tuple(applied))
+        if sim_time < self._sim_time:
+            self._sim_before += self._sim_time
+        self._sim_time = sim_time
+        applied = tuple(applied)
+        frame = StateFrame(
+            step, tick, sim_time, session_time, poses.tobytes(), presence, applied, robots, self._sim_before
+        )
         self._add(self._batch.states, frame)
 
     def add_decision(self, step: int, session_time: int, decision: Decision) -> None:

@@ -78,7 +78,8 @@ class SessionHeader(msgspec.Struct, frozen=True):
     `versions`: of Python, the libraries and the platform, see `environment.py`. `continues`: the recording that this
     one continues, None for the first of a session. `origin_ns`, `boot_id`: session time zero on CLOCK_MONOTONIC, and
     the boot of the machine that this clock belongs to. `anchors`: `T_world_anchor` of each sheet that headsets are
-    aligned to. `settings`: None if not recorded.
+    aligned to. `settings`: None if not recorded. `origin_utc_ns`: session time zero since 1970-01-01 UTC [ns], by the
+    clock of the machine when the recording began; 0 if not recorded.
     """
 
     session_id: Name
@@ -99,6 +100,7 @@ class SessionHeader(msgspec.Struct, frozen=True):
     boot_id: str = ""
     anchors: dict[str, Pose] = {}
     settings: Settings | None = None
+    origin_utc_ns: int = 0
 
     @property
     def begins_after(self) -> int:

@@ -2,7 +2,7 @@
 
 A point is kept as float32 and whole bytes, which `decode_cloud` makes without rounding, so the frame itself is not kept
 beside it. An image is kept as it came. What a stream is, its `StreamInfo`, is in an entity of its own. Rows are at the
-time of capture on `session_time` alone: a camera sees the room, which has no simulated time.
+time of capture on `session_time` and `wall_time` alone: a camera sees the room, which has no simulated time.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from iris_session.protocol.codec import decode_media_header
 from iris_session.protocol.media import MAX_IMAGE_SIZE, MAX_STREAMS, MediaHeader, StreamInfo, is_stream_name
 from iris_session.protocol.names import AssetEncoding, BudgetClass, MediaEncoding
 from iris_session.recording import paths
-from iris_session.recording.scene_geometry import WORLD
 from iris_session.scene import AssetDecodeError
 from iris_session.scene.images import read_stated_size
 from iris_session.streams.cloud import CloudFrame, decode_cloud
@@ -32,11 +31,15 @@ _FOLDERS: Final = {MediaEncoding.CLOUD: paths.CLOUDS, MediaEncoding.JPEG: paths.
 
 
 class MediaDrawer:
-    """Log clouds and pictures to a recording. `pictures`: streams of pictures so far, at most `MAX_STREAMS`."""
+    """Log clouds and pictures to a recording.
+
+    `pictures`: streams of pictures so far, at most `MAX_STREAMS`. `origin_utc_ns`: see `SessionHeader`.
+    """
 
     def __init__(self, recording: Any) -> None:
         self._rec = recording
         self.pictures: list[str] = []
+        self.origin_utc_ns = 0
 
     def draw(self, message: Sequence[bytes]) -> None:
         """Log a message of `front.media.recorder`: a frame, a description, or both, or the end of a stream.
@@ -78,7 +81,6 @@ class MediaDrawer:
             paths.CLOUDS,
             header,
             _make_times(header),
-            rr.CoordinateFrame(WORLD),
             rr.Points3D(cloud.positions, colors=cloud.colors, radii=[radius]),
             rr.AnyValues(
                 error_m=pa.array([cloud.error_m], pa.float64()), voxel_m=pa.array([cloud.voxel_m], pa.float64())
@@ -96,6 +98,7 @@ class MediaDrawer:
         # Times that cannot be, before the session or after the receipt, would stretch the time line.
         at_ns = max(0, min(header.capture_ns, header.received_ns))
         self._rec.set_time(paths.SESSION_TIME, duration=np.timedelta64(at_ns, "ns"))
+        self._rec.set_time(paths.WALL_TIME, timestamp=np.datetime64(at_ns + self.origin_utc_ns, "ns"))
         self._rec.log(f"{folder}/{header.stream}", *components, strict=True)
         self._rec.reset_time()
 

@@ -58,7 +58,11 @@ FRAME: Final = struct.Struct("<cQ")  # kind, batch number
 
 
 class StateFrame(msgspec.Struct, frozen=True, array_like=True):
-    """Rigid state at one moment. `poses`: float64 (n_bodies, 7) C-contiguous, `x y z qw qx qy qz`, world frame."""
+    """Rigid state at one moment. `poses`: float64 (n_bodies, 7) C-contiguous, `x y z qw qx qy qz`, world frame.
+
+    `robots`: measured values of the robots as in `physics.world.RobotSignals.read`, described by `SceneAssets.robots`.
+    `sim_before`: simulated time before the last reset [s].
+    """
 
     step: Count
     tick: Count
@@ -67,6 +71,8 @@ class StateFrame(msgspec.Struct, frozen=True, array_like=True):
     poses: bytes
     presence: tuple[PresenceItem, ...] = ()
     applied: tuple[Applied, ...] = ()
+    robots: bytes = b""
+    sim_before: float = 0.0
 
 
 class DenialRecord(msgspec.Struct, frozen=True, array_like=True):
@@ -101,17 +107,27 @@ class SceneModel(msgspec.Struct, frozen=True, array_like=True):
     bodies: tuple[BodyInfo, ...] = ()
 
 
+class RobotLabels(msgspec.Struct, frozen=True, array_like=True):
+    """Names of the values of one robot in `StateFrame.robots`. `units`: of the joints, `rad` or `m`."""
+
+    name: Name
+    base_body: Name
+    joints: tuple[Name, ...] = ()
+    units: tuple[Name, ...] = ()
+
+
 class SceneAssets(msgspec.Struct, frozen=True, array_like=True):
     """Assets of the picture, valid from about `step`.
 
     `root`: folder of the asset store; `scene_hash`: asset that is the specification. If empty, no assets are shared
-    and the picture is made from the model.
+    and the picture is made from the model. `robots`: robots of the scene.
     """
 
     step: int = -1
     session_time: Nanoseconds = 0
     root: str = ""
     scene_hash: str = ""
+    robots: tuple[RobotLabels, ...] = ()
 
 
 class HoldRecord(msgspec.Struct, frozen=True, array_like=True):

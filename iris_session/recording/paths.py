@@ -30,7 +30,7 @@ PRESENCE: Final = "/presence"
 LANES: Final = "/lanes"
 #: Labels of robots.
 ROBOTS: Final = "/robots"
-TRANSFORMS: Final = "/tf"
+ANCHORS: Final = "/anchors"
 #: Point clouds and pictures of cameras, an entity per stream.
 CLOUDS: Final = "/clouds"
 PICTURES: Final = "/pictures"
@@ -41,9 +41,9 @@ _RESUME: Final = re.compile(r"(?P<stem>.*)\.resume(?P<number>[1-9][0-9]*)(?P<suf
 _PART: Final = re.compile(r"(?P<stem>.*)\.part(?P<part>[1-9][0-9]*)(?P<suffix>\.[^./]*)?", re.DOTALL)
 
 STEP: Final = "step"
-TICK: Final = "tick"
 SIM_TIME: Final = "sim_time"
 SESSION_TIME: Final = "session_time"
+WALL_TIME: Final = "wall_time"
 
 
 def split_part(path: str) -> tuple[str, int]:

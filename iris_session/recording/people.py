@@ -1,7 +1,8 @@
-"""Picture of participants in a recording: heads and hands at the poses that the session had of them, names at robots.
+"""Picture of participants in a recording: heads and hands at the poses that the session had of them, names at robots,
+and the anchors that headsets are aligned to.
 
-A device is drawn in a frame of its own, whose motion is rows of `/tf`. It appears with its first pose, and is cleared
-when its participant leaves or no pose came for `STALE_NS`. Nothing is static, as Rerun shows static data at all times.
+A device is drawn at an entity of its own, which `MotionRows` moves. It appears with its first pose, and is cleared when
+its participant leaves or no pose came for `STALE_NS`. Nothing is static, as Rerun shows static data at all times.
 """
 
 from __future__ import annotations
@@ -11,12 +12,14 @@ from typing import Any, Final, NamedTuple
 
 import rerun as rr
 
+from iris_session.protocol.common import Pose
 from iris_session.protocol.names import Device
 from iris_session.protocol.server_messages import PresenceItem
 from iris_session.recording import paths
 from iris_session.recording.messages import StateFrame
-from iris_session.recording.picture import Moment, escape_entity_part, set_moment
+from iris_session.recording.picture import escape_entity_part
 from iris_session.recording.story import FREE, Rgb, SessionStory
+from iris_session.recording.timelines import Moment, set_moment
 
 #: A device without a pose for so long is not drawn: it is not tracked any more [ns].
 STALE_NS: Final = 250_000_000
@@ -24,6 +27,10 @@ STALE_NS: Final = 250_000_000
 HEAD_HALF_M: Final = (0.06, 0.09, 0.05)
 HAND_HALF_M: Final = (0.05, 0.03, 0.03)
 VIEW_M: Final = 0.3
+#: Length of the axes of an anchor [m], and the colours of its label and error.
+AXES_M: Final = 0.1
+LABEL_COLOUR: Final = (255, 150, 150)
+ERROR_COLOUR: Final = (220, 60, 60, 120)
 
 _Key = tuple[str, str]  # participant, device
 
@@ -32,14 +39,14 @@ class DeviceRow(NamedTuple):
     """Pose of a device at a state. `state`: its index. `pose`: `x y z qw qx qy qz`."""
 
     state: int
-    frame: str
+    entity: str
     pose: tuple[float, ...]
 
 
 class Base(NamedTuple):
-    """Base of a robot, where its label is. `position`: in `frame` [m]."""
+    """Base of a robot, where its label is. `position`: at `entity` [m]."""
 
-    frame: str
+    entity: str
     position: tuple[float, float, float]
 
 
@@ -79,7 +86,7 @@ class PeoplePicture:
         label = f"{robot}: {holder}" if holder else robot
         point = rr.Points3D([base.position], colors=[colour], radii=[0.01], labels=[label], show_labels=True)
         set_moment(self._rec, moment)
-        self._rec.log(f"{paths.ROBOTS}/{escape_entity_part(robot)}", rr.CoordinateFrame(base.frame), point, strict=True)
+        self._rec.log(base.entity, point, strict=True)
         self._rec.reset_time()
 
     def draw(self, states: Sequence[StateFrame], moments: Sequence[Moment]) -> list[DeviceRow]:
@@ -95,7 +102,7 @@ class PeoplePicture:
                 if shown is None or shown.label != label:
                     self._draw_device(key, label, moment)
                 self._shown[key] = _Shown(item, state.session_time, label)
-                rows.append(DeviceRow(i, _frame(key), (*item.pose.p, *item.pose.q)))
+                rows.append(DeviceRow(i, _entity(key), (*item.pose.p, *item.pose.q)))
             for key in [key for key, shown in self._shown.items() if state.session_time - shown.seen_ns > STALE_NS]:
                 self._clear(key, moment)
         return rows
@@ -114,18 +121,18 @@ class PeoplePicture:
     def _draw_device(self, key: _Key, label: str, moment: Moment) -> None:
         """Draw a box for a head, with an arrow in the direction of view, and a ball for a hand."""
         colours = [self._story.find_colour(key[0])]
-        frame, solid = rr.CoordinateFrame(_frame(key)), rr.components.FillMode.Solid
+        solid = rr.components.FillMode.Solid
         set_moment(self._rec, moment)
         if key[1] == Device.HEAD:
             box: Any = rr.Boxes3D(
                 half_sizes=[HEAD_HALF_M], colors=colours, labels=[label], show_labels=True, fill_mode=solid
             )
             arrow = rr.Arrows3D(vectors=[(VIEW_M, 0.0, 0.0)], colors=colours, radii=[0.008])
-            self._rec.log(_entity(key), frame, box, strict=True)
-            self._rec.log(f"{_entity(key)}/view", frame, arrow, strict=True)
+            self._rec.log(_entity(key), box, strict=True)
+            self._rec.log(f"{_entity(key)}/view", arrow, strict=True)
         else:
             ball = rr.Ellipsoids3D(half_sizes=[HAND_HALF_M], colors=colours, fill_mode=solid)
-            self._rec.log(_entity(key), frame, ball, strict=True)
+            self._rec.log(_entity(key), ball, strict=True)
         self._rec.reset_time()
 
     def _clear(self, key: _Key, moment: Moment) -> None:
@@ -135,9 +142,64 @@ class PeoplePicture:
         self._rec.reset_time()
 
 
-def _frame(key: _Key) -> str:
-    return f"presence/{key[0]}/{key[1]}"
+class AnchorPicture:
+    """Anchors: axes at `T_world_anchor`, a label, and the stated error of the alignments to them as a ball.
+
+    The error is that of the person whose alignment is worst: 95 % of the positions at the anchor are within it.
+    """
+
+    def __init__(self, recording: rr.RecordingStream) -> None:
+        self._rec = recording
+        self._poses: dict[str, Pose] = {}
+        self._error_m = 0.0
+        self._drawn = False
+
+    def set_anchors(self, poses: Mapping[str, Pose]) -> None:
+        """Set the anchors that `draw` will draw."""
+        self._poses = dict(poses)
+
+    def draw(self, moment: Moment) -> None:
+        """Draw all anchors, once."""
+        if not self._drawn:
+            self._drawn = True
+            for anchor, pose in self._poses.items():
+                self._draw_axes(anchor, pose, moment)
+                self._draw_error(anchor, moment)
+
+    def move(self, anchor: str, pose: Pose, moment: Moment) -> None:
+        """Move an anchor."""
+        self._poses[anchor] = pose
+        if self._drawn:
+            self._draw_axes(anchor, pose, moment)
+
+    def set_error(self, error_m: float, moment: Moment) -> None:
+        """Set the stated error [m], 0 if none is."""
+        if error_m != self._error_m:
+            self._error_m = error_m
+            for anchor in self._poses if self._drawn else ():
+                self._draw_error(anchor, moment)
+
+    def _draw_axes(self, anchor: str, pose: Pose, moment: Moment) -> None:
+        w, x, y, z = pose.q
+        set_moment(self._rec, moment)
+        transform = rr.Transform3D(translation=pose.p, quaternion=rr.Quaternion(xyzw=[x, y, z, w]))
+        entity = f"{paths.ANCHORS}/{escape_entity_part(anchor)}"
+        self._rec.log(entity, transform, rr.TransformAxes3D(AXES_M), strict=True)
+        self._rec.reset_time()
+
+    def _draw_error(self, anchor: str, moment: Moment) -> None:
+        label = f"{anchor}: {self._error_m * 1e3:.1f} mm (95 %)" if self._error_m else anchor
+        point = rr.Points3D([(0.0, 0.0, 0.0)], colors=[LABEL_COLOUR], radii=[0.003], labels=[label], show_labels=True)
+        parts: list[Any] = [point]
+        solid = rr.components.FillMode.Solid
+        size = [self._error_m] * 3
+        parts.append(rr.Ellipsoids3D(half_sizes=[size], colors=[ERROR_COLOUR], fill_mode=solid))
+        set_moment(self._rec, moment)
+        for part, component in zip(("label", "error"), parts, strict=True):
+            self._rec.log(f"{paths.ANCHORS}/{escape_entity_part(anchor)}/{part}", component, strict=True)
+        self._rec.reset_time()
 
 
 def _entity(key: _Key) -> str:
-    return f"{paths.PRESENCE}/{escape_entity_part(key[0])}/{escape_entity_part(key[1])}"
+    participant, device = key
+    return "/".join((paths.PRESENCE, *map(escape_entity_part, (participant, *device.split("/")))))

@@ -1,7 +1,8 @@
-"""Picture of the scene in a recording: geometry in named frames, each valid from a moment on.
+"""Picture of the scene in a recording: an entity per body, which `MotionRows` moves, its geometry below it.
 
-None of it is logged as static, because Rerun shows static data at all times: scenes replace one another, patches change
-the look of visuals, and deformables move. A scene is drawn at its first state, below `/scene/<number>`.
+Below `/scene/<number>` are `robots/<robot>/<link>`, `bodies/<body>`, and `world` for what has no body. None of it is
+static, because Rerun shows static data at all times: scenes replace one another, patches change the look of visuals,
+and deformables move. A scene is drawn at its first state.
 """
 
 from __future__ import annotations
@@ -14,18 +15,19 @@ from typing import Any, Final, NamedTuple
 import msgspec
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
 from anchors.pose import PoseTuple
 from iris_session.protocol.scene import SceneSpec, Visual
 from iris_session.protocol.server_messages import BodyInfo
+from iris_session.protocol.specs import RobotSpec
 from iris_session.recording import paths, scene_geometry
 from iris_session.recording.deformables import DrawnDeformable
-from iris_session.recording.messages import SceneAssets
+from iris_session.recording.messages import RobotLabels, SceneAssets
 from iris_session.recording.scene_geometry import SceneReader, VisualShape
+from iris_session.recording.timelines import Moment, set_moment, to_time_columns
 from iris_session.scene import SceneBuildError
 
-#: Step, tick, simulated time [ns], session time [ns].
-Moment = tuple[int, int, int, int]
 #: Maximum number of entities named in an error line about entities that cannot be drawn.
 NAMED: Final = 5
 #: Errors that keep a scene or a part of it from being drawn. Recording continues: the journal matters more.
@@ -38,6 +40,7 @@ class SceneSource(NamedTuple):
     packed_model: bytes
     bodies: Sequence[BodyInfo]
     assets: SceneAssets = SceneAssets()
+    robots: Sequence[RobotSpec | RobotLabels] = ()
 
 
 class _Drawn(NamedTuple):
@@ -51,16 +54,19 @@ class _Drawn(NamedTuple):
 
 
 class ScenePicture:
-    """Geometry of the scenes of one file.
+    """Geometry of the scenes of one file. `is_first`: the file is no later part, which begins where others end.
 
     `deformables`: deformables of the present scene, by stream. `since_ns`: session time [ns] from which the present
     scene is drawn.
     """
 
-    def __init__(self, recording: rr.RecordingStream) -> None:
+    def __init__(self, recording: rr.RecordingStream, *, is_first: bool = True) -> None:
         self._rec = recording
         self._rec.set_log_time_enabled(False)
+        self._is_first = is_first
         self._number = 0
+        self._entities: dict[str, str] = {}
+        self._robots: dict[int, str] = {}
         self._source: SceneSource | None = None
         self._waits = False
         self._visuals: dict[int, _Drawn] = {}
@@ -100,12 +106,33 @@ class ScenePicture:
         self._number += 1
         self._visuals.clear()
         self._names.clear()
+        self._entities.clear()
+        self._robots.clear()
         self.deformables.clear()
-        self.since_ns = moment[3]
+        self.since_ns = moment.session_ns
         set_moment(self._rec, moment)
+        if self._number == 1 and not self._is_first:
+            for drawn in (paths.SCENE, paths.PRESENCE):  # as the part before left it
+                self._rec.log(drawn, rr.Clear(recursive=True), strict=True)
         self._with_scene(self._draw_all)
         self._rec.reset_time()
         return True
+
+    def find_entity(self, body: str) -> str:
+        """Return the entity of a body of the present scene, by its name."""
+        assert self._source is not None
+        if not self._entities:
+            taken: set[str] = set()
+            for info in self._source.bodies:
+                robot = self._robots.get(info.id, "")
+                name = info.name.removeprefix(f"{robot}/") if robot else info.name
+                folder = f"{self._folder}/robots/{escape_entity_part(robot)}" if robot else f"{self._folder}/bodies"
+                entity = f"{folder}/{escape_entity_part(name)}"
+                if entity in taken:
+                    entity = f"{folder}/{escape_entity_part(info.name)}"
+                taken.add(entity)
+                self._entities[info.name] = entity
+        return self._entities[body]
 
     @property
     def _folder(self) -> str:
@@ -114,6 +141,8 @@ class ScenePicture:
     def _with_scene(self, work: Any) -> None:
         """Call `work(spec, reader)` on the present scene; log errors where the viewer shows them."""
         assert self._source is not None
+        if not (self._source.packed_model or self._source.assets.root):
+            return
         self._failed = []
         try:
             with scene_geometry.open_scene(self._source.assets, self._source.packed_model) as (spec, store):
@@ -128,12 +157,15 @@ class ScenePicture:
         self._rec.log(f"{paths.EVENTS}/recorder", rr.TextLog(text, level="ERROR"), strict=True)
 
     def _draw_all(self, spec: SceneSpec, reader: SceneReader) -> None:
+        assert self._source is not None
+        self._robots = scene_geometry.assign_robots(spec, self._source.robots)
+        self._entities.clear()
         for visual in spec.visuals:
             if reader.is_shown(visual):
                 self._draw(reader, visual)
         for deformable in spec.deformables:
             if reader.is_shown(deformable):
-                entity = self._entity(scene_geometry.WORLD, deformable.name or deformable.stream)
+                entity = self._number_entity(self._world, deformable.name or deformable.stream)
                 try:
                     texture = reader.read_texture(deformable.material)
                     bending = DrawnDeformable(entity, deformable, reader.read_arrays(deformable), texture)
@@ -156,18 +188,17 @@ class ScenePicture:
 
     def _draw(self, reader: SceneReader, visual: Visual) -> None:
         assert self._source is not None
-        body = next((body.name for body in self._source.bodies if body.id == visual.body), scene_geometry.WORLD)
-        entity = self._entity(body, visual.name or f"visual_{visual.id}")
+        frame, T_frame_visual = reader.place_visual(visual)
+        entity = self._number_entity(self._find_parent(visual.body, frame), self._shorten(visual))
         try:
             form = reader.read_shape(visual)
         except _NOT_DRAWN as error:
             self._failed.append(f"{entity} ({error})")
             return
-        frame, T_frame_visual = reader.place_visual(visual)
         self._visuals[visual.id] = _Drawn(visual, entity, form.kind, form.tint, shown=True)
         self._rec.log(
             entity,
-            *build_components(form, scene_geometry.to_rgba8(visual.rgba, form.tint), frame, T_frame_visual),
+            *build_components(form, scene_geometry.to_rgba8(visual.rgba, form.tint), T_frame_visual),
             strict=True,
         )
 
@@ -194,15 +225,86 @@ class ScenePicture:
     def _clear(self, visual: int) -> None:
         self._rec.log(self._visuals.pop(visual).entity, rr.Clear(recursive=False), strict=True)
 
-    def _entity(self, body: str, name: str) -> str:
-        """Return a unique entity path for an element of the scene."""
-        entity = f"{self._folder}/{escape_entity_part(body)}/{escape_entity_part(name)}"
+    @property
+    def _world(self) -> str:
+        return f"{self._folder}/{scene_geometry.WORLD}"
+
+    def _find_parent(self, body: int, frame: str) -> str:
+        """Return the entity below which the geometry of a body is. `frame`: the body that moves it, or the world."""
+        assert self._source is not None
+        name = next((info.name for info in self._source.bodies if info.id == body), "")
+        if frame == scene_geometry.WORLD:
+            return self.find_entity(name) if name else self._world
+        parent = self.find_entity(frame)
+        return parent if name in ("", frame) else f"{parent}/{escape_entity_part(name)}"
+
+    def _shorten(self, visual: Visual) -> str:
+        """Return the name of a visual without that of its robot."""
+        robot = self._robots.get(visual.body, "")
+        return (visual.name.removeprefix(f"{robot}/") if robot else visual.name) or f"visual_{visual.id}"
+
+    def _number_entity(self, parent: str, name: str) -> str:
+        """Return a unique entity for an element of the scene."""
+        entity = f"{parent}/{escape_entity_part(name)}"
         self._names[entity] += 1
-        return entity if self._names[entity] == 1 else self._entity(body, f"{name} ({self._names[entity]})")
+        return entity if self._names[entity] == 1 else self._number_entity(parent, f"{name} ({self._names[entity]})")
 
 
-def build_components(form: VisualShape, rgba: scene_geometry.Rgba8, frame: str, T_frame_visual: PoseTuple) -> list[Any]:
-    """Return the Rerun components of one visual: its frame, its pose in that frame, and its shape."""
+class MotionRows:
+    """Poses of bodies and devices in the world that are not written yet, each at an entity of its own.
+
+    Rerun's dataframes have one row per entity and time, and a chunk of few rows is mostly its schema: so rows are
+    collected and written together, a chunk per entity.
+    """
+
+    def __init__(self, recording: rr.RecordingStream) -> None:
+        self._rec = recording
+        self._indices: dict[str, int] = {}
+        self._parts: list[tuple[NDArray[np.intp], NDArray[np.int64], NDArray[np.float64]]] = []
+
+    def add(
+        self,
+        entities: Sequence[str],
+        which: NDArray[np.intp],
+        times: NDArray[np.int64],
+        poses: NDArray[np.float64],
+    ) -> None:
+        """Collect rows.
+
+        Args:
+            entities: Entities that the rows are of, each once.
+            which: Index of the entity of each row, shape (n,).
+            times: See `to_time_columns`, one column per row.
+            poses: `x y z qw qx qy qz` ([m], unit quaternion), world frame, shape (n, 7).
+        """
+        if not len(which):
+            return
+        indices = np.array([self._indices.setdefault(entity, len(self._indices)) for entity in entities], np.intp)
+        self._parts.append((indices[which], times, poses))
+
+    def write(self) -> int:
+        """Write what was collected. Return the number of chunks."""
+        if not self._parts:
+            return 0
+        which = np.concatenate([part[0] for part in self._parts])
+        order = np.argsort(which, kind="stable")
+        times = np.concatenate([part[1] for part in self._parts], axis=1)[:, order]
+        poses = np.concatenate([part[2] for part in self._parts])[order].astype(np.float32)
+        ends = np.cumsum(np.bincount(which, minlength=len(self._indices))).tolist()
+        for entity, begin, end in zip(self._indices, [0, *ends], ends, strict=False):
+            if begin < end:
+                rows = poses[begin:end]
+                columns = rr.Transform3D.columns(translation=rows[:, :3], quaternion=rows[:, [4, 5, 6, 3]])
+                times_of = to_time_columns(times[:, begin:end])
+                rr.send_columns(entity, times_of, [*columns], recording=self._rec, strict=True)
+        n = len(self._indices)
+        self._indices.clear()
+        self._parts.clear()
+        return n
+
+
+def build_components(form: VisualShape, rgba: scene_geometry.Rgba8, T_frame_visual: PoseTuple) -> list[Any]:
+    """Return the Rerun components of one visual: its pose at its entity, and its shape."""
     drawn: Any
     solid = rr.components.FillMode.Solid
     radius, _, half = form.size
@@ -225,7 +327,7 @@ def build_components(form: VisualShape, rgba: scene_geometry.Rgba8, frame: str, 
             albedo_texture=form.texture,
             albedo_factor=rgba,
         )
-    return [rr.CoordinateFrame(frame), build_pose(form.kind, half, T_frame_visual), drawn]
+    return [build_pose(form.kind, half, T_frame_visual), drawn]
 
 
 def build_pose(kind: str, half: float, T_frame_visual: PoseTuple, *, shown: bool = True) -> Any:
@@ -250,15 +352,6 @@ def build_colour(kind: str, rgba: scene_geometry.Rgba8) -> Any:
         scene_geometry.CAPSULE: rr.Capsules3D,
     }
     return primitives[kind].from_fields(colors=[rgba])
-
-
-def set_moment(recording: rr.RecordingStream, moment: Moment) -> None:
-    """Set the times of what is logged next, on all timelines."""
-    step, tick, sim_ns, session_ns = moment
-    recording.set_time(paths.STEP, sequence=step)
-    recording.set_time(paths.TICK, sequence=tick)
-    recording.set_time(paths.SIM_TIME, duration=np.timedelta64(sim_ns, "ns"))
-    recording.set_time(paths.SESSION_TIME, duration=np.timedelta64(session_ns, "ns"))
 
 
 def escape_entity_part(name: str) -> str:

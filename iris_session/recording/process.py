@@ -22,6 +22,8 @@ from typing import Final
 import msgspec
 import zmq
 
+from iris_session.protocol.common import Name
+from iris_session.protocol.status import ClientReport
 from iris_session.recording.errors import RecorderError, WriteError
 from iris_session.recording.footer import start_indexing
 from iris_session.recording.journal import SessionHeader
@@ -72,6 +74,9 @@ SLOW_FLUSH_S: Final = 0.3
 TRIAL_BYTES: Final = 128 << 10
 
 _decode_samples = msgspec.msgpack.Decoder(list[tuple[int, int, bytes]]).decode
+#: First byte of a report in place of a message: an array of two, where messages are maps.
+_REPORT: Final = b"\x92"
+_decode_report = msgspec.msgpack.Decoder(tuple[Name, ClientReport]).decode
 
 
 class RecorderLoop:
@@ -291,8 +296,22 @@ class RecorderLoop:
         if self._is_short:
             self._samples_left_out += len(samples)
             return
-        for sample in samples:
-            self._writer.add_sample(*sample)
+        for connection, receive_ns, message in samples:
+            if message[:1] == _REPORT:
+                self._process_report(receive_ns, message)
+            else:
+                self._writer.add_sample(connection, receive_ns, message)
+
+    def _process_report(self, receive_ns: int, data: bytes) -> None:
+        """Process what a participant says of the states that reach it; for the plots, no raw message."""
+        self._samples -= 1
+        try:
+            participant, report = _decode_report(data)
+        except msgspec.DecodeError:
+            self._refused += 1
+            return
+        if report.delivered and report.age_ms_p99 > 0.0:  # 0: all frames were sent again, and have no age
+            self._writer.add_report(participant, receive_ns, report.age_ms_p99)
 
     def _send_status(self, written: int) -> None:
         self._disk_free = get_free_bytes(Path(self._writer.path))

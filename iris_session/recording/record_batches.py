@@ -168,7 +168,7 @@ def decode_states(batch: Any) -> Iterator[RecordedState]:
     poses = [p.reshape(-1, 7) for p in np.split(np.asarray(lists.flatten(), np.float64), ends[:-1])]
     columns = zip(
         read_index(batch, paths.STEP),
-        read_index(batch, paths.TICK),
+        _read_ticks(batch),
         read_values(batch, "sim_time_s"),
         read_index(batch, paths.SESSION_TIME),
         poses,
@@ -190,12 +190,17 @@ def decode_models(batch: Any) -> Iterator[SceneModel]:
 
 def decode_samples(batch: Any) -> Iterator[RawSample]:
     """Yield raw messages."""
-    columns = (read_values(batch, "connection"), read_index(batch, paths.SESSION_TIME), read_values(batch, "data"))
+    is_exact = "receive_ns" in batch.schema.names  # since rows of one time are shown 1 ns apart
+    received = read_values(batch, "receive_ns") if is_exact else read_index(batch, paths.SESSION_TIME)
+    columns = (read_values(batch, "connection"), received, read_values(batch, "data"))
     return (RawSample(*row) for row in zip(*columns, strict=True))
 
 
 def decode_scalars(batch: Any) -> Iterator[Scalar]:
     """Yield values of plots."""
+    batch = _select_rows(batch, "Scalars:scalars")  # others name the series
+    if not batch.num_rows:
+        return iter(())
     columns = (read_index(batch, paths.SESSION_TIME), read_values(batch, "Scalars:scalars"))
     return (Scalar(get_entity(batch), *row) for row in zip(*columns, strict=True))
 
@@ -304,7 +309,12 @@ def _read_stream(batch: Any) -> str:
 
 def _select_frames(batch: Any) -> Any:
     """Return the rows of a stream that have a frame; the others clear the picture when the stream ends."""
-    return batch.filter(batch.column("seq").is_valid()) if "seq" in batch.schema.names else batch.slice(0, 0)
+    return _select_rows(batch, "seq")
+
+
+def _select_rows(batch: Any, column: str) -> Any:
+    """Return the rows that have a value in a column."""
+    return batch.filter(batch.column(column).is_valid()) if column in batch.schema.names else batch.slice(0, 0)
 
 
 def _read_times(batch: Any) -> list[list[int]]:
@@ -318,6 +328,12 @@ def _read_points(row: Any) -> NDArray[np.float32]:
 def _read_colors(row: Any) -> NDArray[np.uint8]:
     """Return red, green, blue and alpha, which Rerun has in one number, red in its highest byte."""
     return np.asarray(row.values, ">u4").view(np.uint8).reshape(-1, 4)
+
+
+def _read_ticks(batch: Any) -> list[int]:
+    """Return the ticks of states: a timeline in files of earlier versions."""
+    is_data = batch.schema.field("tick").type.num_fields > 0  # a list
+    return read_values(batch, "tick") if is_data else read_index(batch, "tick")
 
 
 def _read_plants(batch: Any) -> list[bytes]:

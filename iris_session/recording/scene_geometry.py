@@ -1,6 +1,6 @@
-"""Geometry of a scene specification for the Rerun viewer: visuals as primitives and meshes, fixed in named frames.
+"""Geometry of a scene specification for the Rerun viewer: visuals as primitives and meshes, fixed in frames.
 
-A frame is `world` or the name of a streamed body that moves; the recording moves frames, never geometry. If no assets
+A frame is `world` or the name of a streamed body that moves; the recording moves bodies, never geometry. If no assets
 are shared, the specification is made from the recorded model, here and not in the process that runs physics.
 """
 
@@ -9,19 +9,20 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.pose import IDENTITY_POSE, PoseTuple, compose
+from anchors.pose import IDENTITY_POSE, PoseTuple, apply, compose, inverse
 from iris_session.protocol.common import Pose
 from iris_session.protocol.names import ArrayKind, AssetEncoding, GeometryKind, TextureKind
 from iris_session.protocol.scene import Deformable, Geometry, Rgba, SceneSpec, Visual, decode_scene
 from iris_session.protocol.server_messages import BodyInfo
+from iris_session.protocol.specs import RobotSpec
 from iris_session.recording.journal import unpack_model
-from iris_session.recording.messages import SceneAssets
+from iris_session.recording.messages import RobotLabels, SceneAssets
 from iris_session.scene import AssetStore, EncodeOptions, MeshArrays, decode_arrays, decode_image, decode_mesh
 from iris_session.scene.cube_maps import Atlas, CubeMapReader, bake_cube_map, direction_scale
 from iris_session.scene.shapes import (
@@ -32,9 +33,9 @@ from iris_session.scene.shapes import (
 )
 
 WORLD: Final = "world"
-#: Half edge [m] at which an infinite plane is drawn, and half its drawn thickness.
-INFINITE_PLANE_M: Final = 10.0
-PLANE_HALF_THICKNESS_M: Final = 0.0005
+#: Distance [m] to which a plane is drawn beyond the moving bodies: a camera that is reset in the viewer has all that is
+#: drawn in sight.
+PLANE_MARGIN_M: Final = 3.0
 #: Maximum side [px] of the texture level that is used: each texture is in the file once per visual that has it. For
 #: cube maps it is the side of a face: six faces lie in one image, which is then no larger.
 TEXTURE_SIDE: Final = 512
@@ -42,6 +43,12 @@ CUBE_SIDE: Final = 128
 #: A mesh of more triangles gets the mean colour of its cube map: cutting a million triangles takes seconds and a
 #: gigabyte, which would delay the recorder.
 MOST_BAKED: Final = 50_000
+
+#: A mesh is drawn at the first level of fewer vertices, if it has one: finer ones are several times as large and are
+#: not seen.
+ENOUGH_VERTICES: Final = 8_000
+#: A cylinder of a larger diameter or length is drawn as a mesh: Rerun's own have few sides [m].
+SMALL_CYLINDER_M: Final = 0.3
 
 BOX: Final = "box"
 ELLIPSOID: Final = "ellipsoid"
@@ -122,10 +129,11 @@ class SceneReader:
         self._spec = spec
         self._store = store
         self._places = place_bodies(spec, bodies)
+        self._moving = [body.T_world_body.p for body in spec.bodies if body.moving] or [(0.0, 0.0, 0.0)]
         self._meshes: dict[tuple[int, int], MeshArrays] = {}
         self._textures: dict[int, Pixels | None] = {}
         self._cubes = CubeMapReader(spec, store, CUBE_SIDE)
-        self._baked: dict[tuple[Geometry, int], MeshArrays] = {}
+        self._baked: dict[tuple[Geometry, int, int], MeshArrays] = {}
 
     def is_shown(self, thing: Visual | Deformable) -> bool:
         """Return whether it is drawn: not fully transparent, and in a visible group."""
@@ -145,10 +153,12 @@ class SceneReader:
         mesh = self._mesh(geometry)
         if atlas is not None and mesh is not None and mesh.triangles > MOST_BAKED:
             return VisualShape(MESH, mesh=mesh, tint=_mean_colour(atlas.pixels))
-        if mesh is None and texture is not None:
-            mesh = build_primitive(_ended(geometry))
+        if geometry.kind == GeometryKind.PLANE:
+            mesh = self._crop_plane(visual)
+        elif mesh is None and (texture is not None or _is_large_cylinder(geometry)):
+            mesh = build_primitive(geometry)
         if mesh is None:
-            return VisualShape(_FORMS.get(geometry.kind, BOX), _half_sizes(geometry), tint=tint)
+            return VisualShape(_FORMS.get(geometry.kind, BOX), geometry.size, tint=tint)
         if texture is None:
             return VisualShape(MESH, mesh=mesh, tint=tint)
         if atlas is not None:
@@ -157,8 +167,24 @@ class SceneReader:
             mesh = add_texture_coordinates(mesh, geometry, self._spec.materials[visual.material])
         return VisualShape(MESH, mesh=mesh, uv=mesh.uv, texture=texture)
 
+    def _crop_plane(self, visual: Visual) -> MeshArrays | None:
+        """Return the part of a plane that is near the scene, all of it if none is; an infinite one ends there."""
+        frame, T_frame_plane = self.place_visual(visual)
+        mesh = build_primitive(visual.geometry)
+        if mesh is None:
+            return None
+        to_plane = inverse(T_frame_plane) if frame == WORLD else IDENTITY_POSE
+        points = np.array([apply(to_plane, p) for p in self._moving] if frame == WORLD else [(0.0, 0.0, 0.0)])
+        near = np.percentile(points, (1.0, 99.0), axis=0)  # a few bodies may be parked far away
+        low, high = near[0, :2] - PLANE_MARGIN_M, near[1, :2] + PLANE_MARGIN_M
+        position = mesh.position.copy()
+        position[:, :2] = np.clip(position[:, :2], low, high)
+        is_near = bool((np.ptp(position[:, :2], axis=0) > 0.0).all())
+        return replace(mesh, position=position) if is_near else mesh
+
     def _with_atlas(self, mesh: MeshArrays, visual: Visual, atlas: Atlas) -> MeshArrays:
-        key = visual.geometry, visual.material
+        plane = visual.id if visual.geometry.kind == GeometryKind.PLANE else -1  # cut out by the place of the visual
+        key = visual.geometry, visual.material, plane
         if key not in self._baked:
             scale = direction_scale(self._spec, visual.geometry, visual.material)
             self._baked[key] = bake_cube_map(mesh, visual.geometry, scale, atlas)
@@ -190,7 +216,9 @@ class SceneReader:
 
     def _read_mesh(self, mesh: int, hfield: int) -> MeshArrays:
         if mesh >= 0:
-            return decode_mesh(self._store.get(self._spec.meshes[mesh].levels[0].address))
+            levels = self._spec.meshes[mesh].levels
+            level = next((one for one in levels if one.vertices < ENOUGH_VERTICES), levels[-1])
+            return decode_mesh(self._store.get(level.address))
         field = self._spec.hfields[hfield]
         return build_height_field(field, decode_arrays(self._store.get(field.address), ArrayKind.GRID)["elevation"])
 
@@ -228,6 +256,17 @@ def place_bodies(spec: SceneSpec, bodies: Sequence[BodyInfo]) -> dict[int, BodyP
     return found
 
 
+def assign_robots(spec: SceneSpec, robots: Sequence[RobotSpec | RobotLabels]) -> dict[int, str]:
+    """Return the robot of each body at or below the base of one, by id."""
+    bases = {robot.base_body: robot.name for robot in robots}
+    found: dict[int, str] = {}
+    for body in spec.bodies:  # parents before their children
+        robot = bases.get(body.name) or found.get(body.parent)
+        if robot:
+            found[body.id] = robot
+    return found
+
+
 def to_rgba8(rgba: Rgba, tint: tuple[float, float, float] = _WHITE) -> Rgba8:
     """Convert a colour (0 to 1) to Rerun's range 0 to 255, multiplied by `tint`."""
     r, g, b, a = (min(255, max(0, round(v * t * 255.0))) for v, t in zip(rgba, (*tint, 1.0), strict=True))
@@ -238,14 +277,6 @@ def _tuple(pose: Pose) -> PoseTuple:
     return pose.p, pose.q
 
 
-def _ended(geometry: Geometry) -> Geometry:
-    """Return the geometry with the drawn size of an infinite plane."""
-    if geometry.kind != GeometryKind.PLANE:
-        return geometry
-    x, y, z = geometry.size
-    return msgspec.structs.replace(geometry, size=(x or INFINITE_PLANE_M, y or INFINITE_PLANE_M, z))
-
-
-def _half_sizes(geometry: Geometry) -> tuple[float, float, float]:
-    x, y, z = _ended(geometry).size
-    return (x, y, PLANE_HALF_THICKNESS_M) if geometry.kind == GeometryKind.PLANE else (x, y, z)
+def _is_large_cylinder(geometry: Geometry) -> bool:
+    radius, _, half = geometry.size
+    return geometry.kind == GeometryKind.CYLINDER and 2.0 * max(radius, half) > SMALL_CYLINDER_M

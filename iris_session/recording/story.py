@@ -113,6 +113,13 @@ class LaneChange(NamedTuple):
     colours: Mapping[str, Rgb]
 
 
+class StatedErrors(NamedTuple):
+    """Errors of a measured alignment, 95 % of them below these [m]: at the anchor, and at the robot."""
+
+    at_anchor_m: float
+    at_robot_m: float
+
+
 class Person(NamedTuple):
     """A participant as the picture shows it."""
 
@@ -125,6 +132,8 @@ class SessionStory:
     """State of a session as far as its events tell it. Give it every event, in order.
 
     `is_first`: the file is no later part of a recording, in whose lanes something may be in force from the start.
+    `errors`: stated errors of the alignments in force, by participant. `rejected`: samples rejected since joining.
+    `roles`: of everyone so far, by name. `handovers`, `episodes`: numbers so far.
     """
 
     def __init__(self, *, is_first: bool = True) -> None:
@@ -134,6 +143,12 @@ class SessionStory:
         self._lanes: dict[tuple[str, ...], str] = {}  # those in which something is in force
         self._colours: dict[tuple[str, ...], dict[str, Rgb]] = {}  # of lanes of participants
         self._changes: list[LaneChange] = []
+        self.errors: dict[str, StatedErrors] = {}
+        self.rejected: dict[str, int] = {}
+        self.roles: dict[str, str] = {}
+        self.handovers = 0
+        self._episodes: set[int] = set()
+        self._rejected: dict[tuple[str, str, str], int] = {}
 
     def add(self, event: Event) -> tuple[LogLine, list[LaneChange]]:
         """Return the line of an event, and the lanes that it changes."""
@@ -150,6 +165,10 @@ class SessionStory:
         """Take over participants that joined before this file began."""
         for info in people:
             self._learn(info)
+
+    @property
+    def episodes(self) -> int:
+        return len(self._episodes)
 
     def find_person(self, participant: str) -> Person:
         """Return a participant; of one that is not known, the id is the name."""
@@ -172,6 +191,8 @@ class SessionStory:
         while len(self._people) >= MAX_PEOPLE:
             del self._people[next(iter(self._people))]
         self._people[info.id] = Person(info.name, info.role, info.worn)
+        if len(self.roles) < MAX_PEOPLE or info.name in self.roles:
+            self.roles[info.name] = info.role
         return before
 
     def _set(self, lane: tuple[str, ...], state: str, colours: Mapping[str, Rgb] | None = None) -> None:
@@ -197,6 +218,9 @@ class SessionStory:
     def _set_alignment(self, participant: str, alignment: Alignment | None) -> None:
         kind = AlignmentKind.NONE if alignment is None else alignment.kind
         state = "" if kind == AlignmentKind.NONE else kind
+        self.errors.pop(participant, None)
+        if alignment is not None and kind == AlignmentKind.MEASURED and not alignment.offset:
+            self.errors[participant] = StatedErrors(alignment.error_at_anchor_m, alignment.error_at_robot_m)
         self._set(("alignment", self._name(participant)), state, _ALIGNMENT)
 
     def _describe(self, body: EventKind) -> LogLine:
@@ -211,6 +235,7 @@ class SessionStory:
                 if grace:
                     return LogLine(WARN, f"{self._name(who)} is disconnected ({reason})")
                 self._set_alignment(who, None)
+                self._forget_rejected(who)
                 return LogLine(INFO, f"{self._name(who)} leaves ({reason})")
             case LeaseChanged():
                 return self._describe_lease(body)
@@ -255,6 +280,7 @@ class SessionStory:
                 return LogLine(INFO, text + (f": {reason}" if reason else ""))
             case EpisodeChanged(number=number, state=state, label=label, participant=who):
                 running = state == "running"
+                self._episodes.add(number)
                 self._set(("episode",), f"episode {number}" if running else state, _EPISODE)
                 text = f"episode {number}: {'begins' if running else state}"
                 return LogLine(INFO, f"{text}{f', {label}' if label else ''} ({self._name(who)})")
@@ -288,6 +314,8 @@ class SessionStory:
                 text = f"{self._name(a)} and {self._name(b)} see {anchor} {error_m * 1e3:.1f} mm apart"
                 return LogLine(DEBUG, f"{text}, 95 % of such pairs are below {expected_m * 1e3:.1f} mm")
             case SamplesRejected(participant=who, device=device, reason=reason, count=count):
+                self.rejected[who] = self.rejected.get(who, 0) + count - self._rejected.get((who, device, reason), 0)
+                self._rejected[who, device, reason] = count
                 text = f"{self._name(who)}'s {_to_device(device)}: {count} samples rejected ({_to_words(reason)})"
                 return LogLine(DEBUG, text)
             case MarkerAdded(participant=who, text=text):
@@ -304,6 +332,11 @@ class SessionStory:
             case _:
                 fields = msgspec.to_builtins(body)
                 return LogLine(INFO, f"{_to_words(fields.pop('event'))}: {_join_fields(fields)}")
+
+    def _forget_rejected(self, participant: str) -> None:
+        self.rejected.pop(participant, None)
+        for key in [key for key in self._rejected if key[0] == participant]:
+            del self._rejected[key]
 
     def _describe_change(self, info: ParticipantInfo) -> LogLine:
         before = self._people.get(info.id, Person(info.name, info.role, info.worn))
@@ -339,6 +372,7 @@ class SessionStory:
         return LogLine(DEBUG, f"{waits} ({cause})")
 
     def _describe_handover(self, body: Handover) -> LogLine:
+        self.handovers += 1
         giver, receiver = body.giver_participant, body.receiver_participant
         if giver and receiver and giver != receiver:
             passed = f"{self._name(giver)} to {self._name(receiver)}"

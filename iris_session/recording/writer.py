@@ -1,36 +1,43 @@
 """Write one part of a recording into a Rerun file: journal and raw data exactly, and a picture of the session.
 
-Moving bodies and devices of participants are rows of `/tf` (one transform per body and change, named frames as in ROS);
-geometry is fixed in those frames, except vertices of deformables. Exact float64 poses, raw samples and the journal are
-plain columns beside it. `RrdStream` appends the bytes, `describe_...` make the lines that the viewer shows.
+Moving bodies and devices of participants have an entity each, with a transform per change and geometry below it. No two
+rows of an entity have one time, so that Rerun's dataframes have them all. Exact float64 poses, raw samples and the
+journal are plain columns beside the picture. `describe_...` make the texts that the viewer shows.
 """
 
 from __future__ import annotations
 
-import os
-import zlib
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import msgspec
 import numpy as np
 import pyarrow as pa  # type: ignore[import-untyped]
 import rerun as rr
-import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from iris_session.protocol.common import Applied
 from iris_session.protocol.errors import ProtocolError
-from iris_session.protocol.server_messages import BodyInfo, Event, ParticipantLeft, SceneChanged
+from iris_session.protocol.server_messages import (
+    AlignmentChanged,
+    AnchorMoved,
+    BodyInfo,
+    Event,
+    ParticipantChanged,
+    ParticipantJoined,
+    ParticipantLeft,
+    SamplesRejected,
+    SceneChanged,
+)
 from iris_session.protocol.specs import RobotSpec
-from iris_session.recording import paths, scene_geometry
+from iris_session.recording import paths
+from iris_session.recording.blueprint import build_blueprint, place_eye
 from iris_session.recording.errors import WriteError
-from iris_session.recording.journal import SessionHeader, seal_blob
+from iris_session.recording.journal import CLOSED, SessionHeader, seal_blob
 from iris_session.recording.media import MediaDrawer
 from iris_session.recording.messages import (
     Batch,
@@ -38,6 +45,7 @@ from iris_session.recording.messages import (
     EndMark,
     HoldRecord,
     MetricRecord,
+    RobotLabels,
     SceneAssets,
     SceneModel,
     StateFrame,
@@ -45,25 +53,59 @@ from iris_session.recording.messages import (
     encode_header,
     encode_scene,
 )
-from iris_session.recording.people import Base, PeoplePicture
-from iris_session.recording.picture import Moment, ScenePicture, SceneSource, escape_entity_part
-from iris_session.recording.rrd_file import END_MESSAGE, FILE_HEAD, MAGIC, Mark, end_of_messages
-from iris_session.recording.story import CRITICAL, ERROR, FREE, INFO, WARN, LaneChange, LogLine, Rgb, SessionStory
+from iris_session.recording.people import AnchorPicture, Base, PeoplePicture
+from iris_session.recording.picture import MotionRows, ScenePicture, SceneSource, escape_entity_part
+from iris_session.recording.plots import (
+    ALIGNMENT,
+    INPUT_TO_STEP,
+    REJECTED,
+    STATE_AGE,
+    MetricPlots,
+    RobotPlots,
+    get_robot_entity,
+)
+from iris_session.recording.rrd_stream import (
+    RrdStream,
+    bytes_column,
+    duration_index,
+    list_column,
+    matrix_column,
+    scalar_column,
+    sequence_index,
+)
+from iris_session.recording.story import FREE, WARN, LaneChange, LogLine, Rgb, SessionStory, StatedErrors
+from iris_session.recording.timelines import Moment, UniqueTimes, get_session_time, to_time_columns
 from iris_session.streams.errors import StreamError
 
-#: Interval of latencies, a chunk per robot: once a second is enough, as `/state` holds what they are computed from.
-LATENCIES_NS = 1_000_000_000
+#: Chunks of the picture per second, each mostly its schema, and the shortest and longest time between two of an entity
+#: [ns]. Until then a kill of the recorder takes the newest motion from the picture; `/state` has it.
+CHUNKS_PER_S: Final = 8
+MIN_PERIOD_NS: Final = 1_000_000_000
+MAX_PERIOD_NS: Final = 8_000_000_000
+#: Difference of a pose from the one drawn that is not seen, [m] and in the quaternion: bodies at rest jitter by less.
+UNSEEN: Final = np.array([2e-5] * 3 + [5e-5] * 4)
 #: Number of newest states whose times are kept for vertices that arrive later: 4 s at 60 Hz.
 KNOWN_MOMENTS = 256
-#: Eye of the 3D view: offset from the centre of the bodies, in halves of the diagonal of their box; least half [m].
-EYE = 1.45 * np.array((0.25, -1.75, 0.95))
-MIN_SIZE_M = 0.3
-BACKGROUND = (205, 214, 224)
 #: Maximum number of lanes whose colours are known to be in the file: participants that come and go have one each.
 MAX_LANES = 4096
 #: Maximum number of pending vertex frames whose states are not in the file yet.
 MAX_PENDING_VERTICES = 256
 _encode = msgspec.msgpack.Encoder().encode
+
+
+class _Told(NamedTuple):
+    """An event as the picture tells it, and what is then in force of its participant, if it has one, and of all."""
+
+    line: LogLine
+    changes: list[LaneChange]
+    participant: str
+    errors: StatedErrors | None
+    rejected: int
+    worst_at_anchor_m: float
+
+
+#: Events after which the alignment or the rejected samples of a participant may be others.
+_PERSONAL: Final = (AlignmentChanged, ParticipantJoined, ParticipantChanged, ParticipantLeft, SamplesRejected)
 
 
 class RrdWriter:
@@ -78,9 +120,13 @@ class RrdWriter:
         self.path = str(path)
         self._stream = RrdStream(self.path, paths.APPLICATION, recording_id)
         self._rec = self._stream.recording
-        self._picture = ScenePicture(self._rec)
+        is_first = paths.split_part(self.path)[1] == 1
+        self._picture = ScenePicture(self._rec, is_first=is_first)
+        self._motion = MotionRows(self._rec)
+        self._times = UniqueTimes()
         self._pending = Batch()
         self._samples: list[tuple[int, int, bytes]] = []
+        self._reports: list[tuple[str, int, float]] = []
         self._vertices: deque[VertexFrame] = deque()
         self.vertices_refused = 0
         self._media: list[Sequence[bytes]] = []
@@ -91,17 +137,21 @@ class RrdWriter:
         self._bodies: tuple[BodyInfo, ...] = ()
         self._moving: NDArray[np.intp] = np.empty(0, np.intp)
         self._frames: list[str] = []
-        self._robots: tuple[RobotSpec, ...] = ()
-        self._last_poses: NDArray[np.float64] | None = None
+        self._robots: Sequence[RobotSpec | RobotLabels] = ()
+        self._shown_poses: NDArray[np.float64] | None = None
         self._newest_row = (-1, b"")
         self._begins_ns: int | None = None  # session time of the first row
-        self._clock = (0, 0)  # tick and sim_time [ns] of the newest state, for what has neither
+        self._newest_ns = 0
+        self._origin_utc_ns = 0
+        self._header: SessionHeader | None = None
         self._applied: dict[str, Applied] = {}
-        self._latencies: list[MetricRecord] = []
-        self._latencies_due_ns = 0
-        is_first = paths.split_part(self.path)[1] == 1
         self._story = SessionStory(is_first=is_first)
+        self._plots = RobotPlots(self._rec)
+        self._metrics = MetricPlots(self._rec, self._story)
+        self._collected_due_ns = 0
+        self._anchors = AnchorPicture(self._rec)
         self._people = PeoplePicture(self._rec, self._story, is_first=is_first)
+        self._lanes: dict[str, list[tuple[Moment, LaneChange]]] = {}
         self._lane_colours: dict[str, dict[str, Rgb]] = {}
         self._eye: Any = None
         self._arranged = False
@@ -110,20 +160,20 @@ class RrdWriter:
         """Write the header and the scene. Must be called before the first flush with data."""
         self._rec.send_recording_name(header.session_name)
         self._log_static(paths.HEADER, rr.AnyValues(blob=pa.array([seal_blob(encode_header(header))], pa.binary())))
+        self._header = header
         self._log_static(paths.INFO, rr.TextDocument(describe_session(header), media_type="text/markdown"))
         self._set_bodies(header.bodies)
         self._robots = header.robots
-        root = rr.Transform3D(parent_frame="tf#/", child_frame=scene_geometry.WORLD)  # tf#/: frame of the root entity
-        self._log_static(paths.TRANSFORMS + "_static", root)
         self._log_static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-        if header.model:
-            self._picture.set_scene(SceneSource(header.model, header.bodies))
+        self._origin_utc_ns = self._drawer.origin_utc_ns = header.origin_utc_ns
+        self._anchors.set_anchors(header.anchors)
+        self._picture.set_scene(SceneSource(header.model, header.bodies, robots=header.robots))
 
     def _set_bodies(self, bodies: tuple[BodyInfo, ...]) -> None:
         self._bodies = bodies
         self._moving = np.array([i for i, body in enumerate(bodies) if body.moving], np.intp)
         self._frames = [bodies[i].name for i in self._moving]
-        self._last_poses = None
+        self._shown_poses = None
 
     def add(self, batch: Batch) -> None:
         """Collect one batch of the authority. States of one flush are of one scene."""
@@ -138,6 +188,10 @@ class RrdWriter:
     def add_sample(self, connection: int, receive_ns: int, data: bytes) -> None:
         """Collect one raw message of a client, as received."""
         self._samples.append((connection, receive_ns, data))
+
+    def add_report(self, participant: str, receive_ns: int, age_ms: float) -> None:
+        """Collect a report of a client: the age [ms] below which 99 % of the states of a second reached it."""
+        self._reports.append((participant, receive_ns, age_ms))
 
     def add_vertices(self, frame: VertexFrame) -> None:
         """Collect a frame of a deformable. If too many are pending, the oldest is dropped."""
@@ -154,16 +208,20 @@ class RrdWriter:
         """Write everything collected. Raises `WriteError`; the file is then valid up to an earlier flush."""
         batch, self._pending = self._pending, Batch()
         samples, self._samples = self._samples, []
+        reports, self._reports = self._reports, []
         try:
             self._write_rows(batch)
             self._write_keyframes(batch)
-            told = [self._story.add(event) for event in batch.events]  # names and roles are known when people appear
+            told = [self._tell(event) for event in batch.events]  # names and roles are known when people appear
             for _, states in groupby(batch.states, key=lambda state: len(state.poses)):
                 self._write_states(list(states))
             self._write_events(batch.events, told)
-            self._write_holds(batch.holds)
+            self._add_holds(batch.holds)
             self._write_denials(batch.denials)
-            self._write_metrics(batch.metrics)
+            self._add_metrics(batch.metrics)
+            self._add_reports(reports)
+            if self._known and self._known[-1].session_ns >= self._collected_due_ns:
+                self._collected_due_ns = self._known[-1].session_ns + self._write_collected()
             self._write_samples(samples)
             self._write_vertices()
             self._write_media()
@@ -175,11 +233,12 @@ class RrdWriter:
 
     def close(self) -> None:
         """Write the rest and the end mark, and close the file. Raises `WriteError`."""
-        self._write_latencies()
         self.flush()
-        self._picture.draw((-1, 0, 0, 0))  # without a state the scene is drawn nevertheless
+        self._write_collected()
+        self._picture.draw(self._find_moment(-1, 0))  # without a state the scene is drawn nevertheless
         if not self._arranged:
             self._send_blueprint()
+        self._describe_result()
         self.flush()
         self._write_mark()
         mark = EndMark(*self._newest_row)
@@ -189,6 +248,24 @@ class RrdWriter:
             self._stream.close()
         except OSError as error:
             raise self._to_error(error) from error
+
+    def _describe_result(self) -> None:
+        """Say what the session was, in the text and as properties: those of a folder of files are a table."""
+        header, story = self._header, self._story
+        if header is None:
+            return
+        duration_s = 0.0 if self._begins_ns is None else (self._newest_ns - self._begins_ns) * 1e-9
+        text = describe_session(header, story, duration_s)
+        self._log_static(paths.INFO, rr.TextDocument(text, media_type="text/markdown"))
+        properties = rr.AnyValues(
+            people=list(story.roles) or None,
+            robots=[robot.name for robot in header.robots] or None,
+            handovers=story.handovers,
+            episodes=story.episodes,
+            duration_s=duration_s,
+            verify_class=header.recording_class,
+        )
+        self._rec.send_property("session", properties)
 
     def _to_error(self, error: Exception) -> WriteError:
         said = (isinstance(error, OSError) and error.strerror) or " ".join(str(error).split())
@@ -230,6 +307,7 @@ class RrdWriter:
         ]
         self._send_columns(paths.ROWS, times, columns)
         self._newest_row = (rows[-1].step, rows[-1].chain)
+        self._newest_ns = rows[-1].now_ns
         if self._begins_ns is None:
             self._begins_ns = rows[0].now_ns
 
@@ -240,13 +318,18 @@ class RrdWriter:
             self._send_columns(
                 paths.MODELS, times, [bytes_column("scene", [seal_blob(encode_scene(s)) for s in scenes])]
             )
+        if assets and assets[-1].robots != self._plots.robots:
+            self._write_collected()
+            self._plots.set_robots(assets[-1].robots)
+            self._arranged = False
         for loaded in scenes:
             self._set_bodies(loaded.bodies)
             self._last_step = loaded.step if loaded.session_time else self._last_step
-            source = SceneSource(loaded.model, loaded.bodies, *assets[-1:])
-            self._picture.replace_scene(source, (loaded.step, *self._clock, loaded.session_time))
+            self._robots = assets[-1].robots if assets else ()
+            source = SceneSource(loaded.model, loaded.bodies, assets[-1] if assets else SceneAssets(), self._robots)
+            self._picture.replace_scene(source, self._find_moment(loaded.step, loaded.session_time))
         for patch in () if scenes else assets:
-            self._picture.patch_scene(patch, (patch.step, *self._clock, patch.session_time))
+            self._picture.patch_scene(patch, self._find_moment(patch.step, patch.session_time))
 
     def _write_keyframes(self, batch: Batch) -> None:
         frames = batch.keyframes
@@ -259,36 +342,37 @@ class RrdWriter:
         if not states:
             return
         poses = np.stack([np.frombuffer(s.poses, np.float64).reshape(-1, 7) for s in states])
-        moments = [(s.step, s.tick, round(s.sim_time * 1e9), s.session_time) for s in states]
+        moments = [self._make_moment(s.step, round((s.sim_before + s.sim_time) * 1e9), s.session_time) for s in states]
         times = np.array(moments, np.int64).T
         seen = self._draw_scene(moments[0], times)
         if not self._arranged:
-            if poses.shape[1] == len(self._bodies):
+            if self._eye is None and poses.shape[1] == len(self._bodies):
                 self._eye = place_eye(poses[0, self._moving if len(self._moving) else slice(None), :3])
-                self._people.label_robots(self._find_bases(poses[0]), tuple(seen[:, 0].tolist()))
+                self._people.label_robots(self._find_bases(poses[0]), Moment(*seen[:, 0].tolist()))
             self._send_blueprint()
         columns = [
             matrix_column("poses", poses.reshape(len(states), -1)),
+            scalar_column("tick", [s.tick for s in states], pa.int64()),
             scalar_column("sim_time_s", [s.sim_time for s in states], pa.float64()),
             bytes_column("presence", [_encode(s.presence) for s in states]),
             bytes_column("applied", [_encode(s.applied) for s in states]),
         ]
-        self._send_columns(paths.STATE, _time_columns(times), columns)
-        self._note_latencies(states)
+        self._send_columns(paths.STATE, to_time_columns(times), columns)
         if poses.shape[1] == len(self._bodies):  # a new recorder also gets pending states of the scene before
             self._write_transforms(states, poses, seen)
-        self._clock = moments[-1][1:3]
         self._known.extend(moments)
+        self._note_latencies(states)
+        self._plots.add(states, times)
 
     def _draw_scene(self, first: Moment, times: NDArray[np.int64]) -> NDArray[np.int64]:
         """Draw the scene if it is new. Return the times of the states as the picture has them.
 
         The picture begins with the first row, not with the state after it: the viewer opens at the first moment.
         """
-        step, _, sim_ns, session_ns = first
+        moment = first
         if self._begins_ns is not None and not self._known:
-            session_ns = min(session_ns, self._begins_ns)
-        moment = (step, 0, min(0, sim_ns), session_ns)  # a reset begins ticks and simulated time again
+            moment = self._make_moment(first.step, first.sim_ns, min(first.session_ns, self._begins_ns))
+        self._anchors.draw(moment)
         if not self._picture.draw(moment):
             return times
         seen = times.copy()
@@ -300,15 +384,15 @@ class RrdWriter:
         known = {body.name: (body, pose) for body, pose in zip(self._bodies, poses, strict=True)}
         found = {robot.name: known[robot.base_body] for robot in self._robots if robot.base_body in known}
         return {
-            name: Base(body.name, (0.0, 0.0, 0.0))
+            name: Base(f"{self._picture.find_entity(body.name)}/label", (0.0, 0.0, 0.0))
             if body.moving
-            else Base(scene_geometry.WORLD, tuple(pose[:3].tolist()))
+            else Base(get_robot_entity(name), tuple(pose[:3].tolist()))
             for name, (body, pose) in found.items()
         }
 
     def _write_vertices(self) -> None:
         """Write vertices whose states are in the file. Frames of another scene than the drawn one are refused."""
-        times = [moment[3] for moment in self._known]
+        times = [moment.session_ns for moment in self._known]
         rows: dict[str, list[tuple[Moment, Any]]] = {}
         while self._vertices and times and self._vertices[0].session_time <= times[-1]:
             frame = self._vertices.popleft()
@@ -318,23 +402,24 @@ class RrdWriter:
                 continue
             try:
                 # The state of a step is later than its row, by the duration of the step, so times cannot be compared.
-                late = at < 0 or frame.session_time < self._picture.since_ns or self._known[at][0] <= self._last_step
+                late = at < 0 or frame.session_time < self._picture.since_ns or self._known[at].step <= self._last_step
                 vertices = None if late else bending.decode_frame(frame.frame)
             except StreamError:
                 late, vertices = True, None
             self.vertices_refused += late
             if vertices is not None:
-                rows.setdefault(frame.stream, []).append(((*self._known[at][:3], frame.session_time), vertices))
+                moment = self._make_moment(self._known[at].step, self._known[at].sim_ns, frame.session_time)
+                rows.setdefault(frame.stream, []).append((moment, vertices))
         for stream, taken in rows.items():
             bending = self._picture.deformables[stream]
             moments = np.array([moment for moment, _ in taken], np.int64).T
             self._send_columns(
-                bending.entity, _time_columns(moments), [*bending.build_columns([row for _, row in taken])]
+                bending.entity, to_time_columns(moments), [*bending.build_columns([row for _, row in taken])]
             )
 
     def _send_blueprint(self) -> None:
         self._arranged = True
-        self._rec.send_blueprint(build_blueprint(self._eye, self._drawer.pictures))
+        self._rec.send_blueprint(build_blueprint(self._eye, self._drawer.pictures, self._plots.robots))
 
     def _write_media(self) -> None:
         """Draw clouds and pictures; a stream of pictures that is new gets a view."""
@@ -349,87 +434,111 @@ class RrdWriter:
             self._send_blueprint()
 
     def _note_latencies(self, states: list[StateFrame]) -> None:
-        """Record latencies for the plots, written once a second: from the capture of a sample to its step, per
-        robot."""
+        """Collect latencies for the plots: from the capture of a sample to its step, per robot."""
         for state in states:
             for applied in state.applied:
                 if self._applied.get(applied.robot) != applied:
                     self._applied[applied.robot] = applied
-                    name = f"input_to_step_ms/{applied.robot}"
                     latency_ms = (applied.step_ns - applied.capture_ns) / 1e6
-                    self._latencies.append(MetricRecord(state.step, state.session_time, name, latency_ms))
-        if states[-1].session_time >= self._latencies_due_ns:
-            self._latencies_due_ns = states[-1].session_time + LATENCIES_NS
-            self._write_latencies()
+                    moment = self._find_moment(state.step, state.session_time)
+                    self._metrics.add(INPUT_TO_STEP, applied.robot, latency_ms, moment)
 
-    def _write_latencies(self) -> None:
-        latencies, self._latencies = self._latencies, []
-        self._write_metrics(latencies)
+    def _write_collected(self) -> int:
+        """Write motion, plots and lanes collected so far. Return the time until they are due again [ns]."""
+        n = self._motion.write() + self._plots.write() + self._write_lanes()
+        n += self._metrics.write(self._known[-1] if self._known else self._find_moment(0, 0))
+        return min(MAX_PERIOD_NS, max(MIN_PERIOD_NS, n * 1_000_000_000 // CHUNKS_PER_S))
 
     def _write_transforms(self, states: list[StateFrame], poses: NDArray[np.float64], times: NDArray[np.int64]) -> None:
-        """Write a row per body that changed in a frame, and per device of a participant that has a new pose."""
+        """Collect a row per body that moved visibly, and per device of a participant that has a new pose."""
         moving = poses[:, self._moving]
-        before = np.empty_like(moving)
-        before[1:] = moving[:-1]
-        before[0] = np.nan if self._last_poses is None else self._last_poses
-        self._last_poses = moving[-1].copy()
-        frame, body = np.nonzero((moving != before).any(axis=2))
+        shown = np.full(moving.shape[1:], np.nan) if self._shown_poses is None else self._shown_poses
+        moved = np.empty(moving.shape[:2], np.bool_)
+        for now, rows in zip(moving, moved, strict=True):
+            np.logical_not((np.abs(now - shown) < UNSEEN).all(axis=1), out=rows)
+            shown[rows] = now[rows]
+        self._shown_poses = shown
+        frame, body = np.nonzero(moved)
         values = moving[frame, body]
-        names = [self._frames[i] for i in body]
-        people = self._people.draw(states, [tuple(moment) for moment in times.T.tolist()])
-        if people:
-            frame = np.concatenate([frame, np.array([row.state for row in people], np.intp)])
-            values = np.concatenate([values, np.array([row.pose for row in people], np.float64)])
-            names += [row.frame for row in people]
-        if not names:
-            return
-        columns = rr.Transform3D.columns(
-            translation=values[:, :3],
-            quaternion=values[:, [4, 5, 6, 3]],
-            child_frame=names,
-            parent_frame=[scene_geometry.WORLD] * len(names),
-        )
-        self._send_columns(paths.TRANSFORMS, _time_columns(times[:, frame]), [*columns])
+        entities = [self._picture.find_entity(name) for name in self._frames]
+        self._motion.add(entities, body, times[:, frame], values)
+        people = self._people.draw(states, [Moment(*moment) for moment in times.T.tolist()])
+        entities = list(dict.fromkeys(row.entity for row in people))
+        which = np.array([entities.index(row.entity) for row in people], np.intp)
+        frame = np.array([row.state for row in people], np.intp)
+        self._motion.add(entities, which, times[:, frame], np.array([row.pose for row in people], np.float64))
 
-    def _write_events(self, events: list[Event], told: list[tuple[LogLine, list[LaneChange]]]) -> None:
+    def _write_events(self, events: list[Event], told: list[_Told]) -> None:
         if not events:
             return
         changes = []
-        for event, (_, changed) in zip(events, told, strict=True):
-            changes += [(event.step, event.session_time, change) for change in changed]
+        for event, one in zip(events, told, strict=True):
+            changes += [(event.step, event.session_time, change) for change in one.changes]
+            if one.participant:
+                self._plot_person(event, one)
+                self._anchors.set_error(one.worst_at_anchor_m, self._find_moment(event.step, event.session_time))
             if isinstance(event.body, ParticipantLeft) and not event.body.grace:
                 self._people.remove(event.body.participant, self._find_moment(event.step, event.session_time))
+            elif isinstance(event.body, AnchorMoved):
+                moment = self._find_moment(event.step, event.session_time)
+                self._anchors.move(event.body.anchor_id, event.body.T_world_anchor, moment)
             elif isinstance(event.body, SceneChanged) and event.body.cause == "new_scene":
                 self._people.label_robots({}, self._find_moment(event.step, event.session_time))
-        text = rr.TextLog.columns(text=[line.text for line, _ in told], level=[line.level for line, _ in told])
+        text = rr.TextLog.columns(text=[one.line.text for one in told], level=[one.line.level for one in told])
         columns = [*text, bytes_column("event", [_encode(event) for event in events])]
-        times = self._to_times([e.step for e in events], [e.session_time for e in events])
+        times = self._to_times(paths.EVENTS, [e.step for e in events], [e.session_time for e in events])
         self._send_columns(paths.EVENTS, times, columns)
-        self._write_lanes(changes)
+        self._add_lanes(changes)
 
-    def _write_holds(self, holds: list[HoldRecord]) -> None:
+    def _tell(self, event: Event) -> _Told:
+        line, changes = self._story.add(event)
+        body: Any = event.body
+        participant = ""
+        if isinstance(body, _PERSONAL):
+            participant = body.participant if isinstance(body.participant, str) else body.participant.id
+        errors, rejected = self._story.errors.get(participant), self._story.rejected.get(participant, 0)
+        worst_m = max((one.at_anchor_m for one in self._story.errors.values()), default=0.0)
+        return _Told(line, changes, participant, errors, rejected, worst_m)
+
+    def _plot_person(self, event: Event, told: _Told) -> None:
+        """Plot the stated error and the rejected samples of the participant of an event."""
+        moment = self._find_moment(event.step, event.session_time)
+        if told.errors is not None:
+            self._metrics.add(ALIGNMENT, told.participant, told.errors.at_robot_m * 1e3, moment)
+        else:
+            self._metrics.end(ALIGNMENT, told.participant, moment)
+        if told.rejected:
+            self._metrics.add(REJECTED, told.participant, told.rejected, moment)
+        else:
+            self._metrics.end(REJECTED, told.participant, moment)
+
+    def _add_holds(self, holds: list[HoldRecord]) -> None:
         changes = [(h.step, h.session_time, c) for h in holds for c in self._story.add_hold(h.robot, h.reason)]
-        self._write_lanes(changes)
+        self._add_lanes(changes)
 
-    def _write_lanes(self, changes: list[tuple[int, int, LaneChange]]) -> None:
-        """Write changed lanes, and the colours of their states when those are new."""
-        by_lane: dict[str, list[tuple[int, int, LaneChange]]] = {}
-        for change in changes:
-            entity = "/".join((paths.LANES, *map(escape_entity_part, change[2].lane)))
-            by_lane.setdefault(entity, []).append(change)
-            folder, name, *kind = (*change[2].lane, "")
+    def _add_lanes(self, changes: list[tuple[int, int, LaneChange]]) -> None:
+        """Collect changed lanes; label robots by their holders."""
+        for step, now_ns, change in changes:
+            moment = self._find_moment(step, now_ns)
+            entity = "/".join((paths.LANES, *map(escape_entity_part, change.lane)))
+            self._lanes.setdefault(entity, []).append((moment, change))
+            folder, name, *kind = (*change.lane, "")
             if folder == "robots" and kind[0] == "holder":
-                state, colours = change[2].state, change[2].colours
-                self._people.label_robot(name, state, colours.get(state, FREE), self._find_moment(*change[:2]))
-        for entity, rows in by_lane.items():
-            colours = {state: colour for *_, change in rows for state, colour in change.colours.items()}
+                self._people.label_robot(name, change.state, change.colours.get(change.state, FREE), moment)
+
+    def _write_lanes(self) -> int:
+        """Write changed lanes, and the colours of their states when those are new. Return the number of chunks."""
+        lanes, self._lanes = self._lanes, {}
+        for entity, rows in lanes.items():
+            colours = {state: colour for _, change in rows for state, colour in change.colours.items()}
             if colours and self._lane_colours.get(entity) != colours:
                 if len(self._lane_colours) >= MAX_LANES:
                     self._lane_colours.clear()
                 self._lane_colours[entity] = colours
                 self._log_static(entity, rr.StateConfiguration(values=[*colours], colors=[*colours.values()]))
-            times = self._to_times([step for step, _, _ in rows], [now_ns for _, now_ns, _ in rows])
-            self._send_columns(entity, times, [*rr.StateChange.columns(state=[row.state for _, _, row in rows])])
+            times = self._spread(entity, [moment for moment, _ in rows])
+            self._send_columns(entity, times, [*rr.StateChange.columns(state=[change.state for _, change in rows])])
+        return len(lanes)
 
     def _write_denials(self, denials: list[DenialRecord]) -> None:
         if not denials:
@@ -437,211 +546,49 @@ class RrdWriter:
         lines = [describe_denial(record) for record in denials]
         text = rr.TextLog.columns(text=[line.text for line in lines], level=[line.level for line in lines])
         columns = [*text, bytes_column("denial", [_encode(record) for record in denials])]
-        times = self._to_times([d.step for d in denials], [d.session_time for d in denials])
+        times = self._to_times(paths.DENIALS, [d.step for d in denials], [d.session_time for d in denials])
         self._send_columns(paths.DENIALS, times, columns)
 
-    def _write_metrics(self, metrics: list[MetricRecord]) -> None:
-        by_name: dict[str, list[MetricRecord]] = {}
+    def _add_metrics(self, metrics: list[MetricRecord]) -> None:
         for record in metrics:
-            by_name.setdefault(record.name, []).append(record)
-        for name, records in by_name.items():
-            times = self._to_times([r.step for r in records], [r.session_time for r in records])
-            values = rr.Scalars.columns(scalars=[r.value for r in records])
-            self._send_columns(f"{paths.METRICS}/{name}", times, [*values])
+            kind, _, subject = record.name.partition("/")
+            self._metrics.add(kind, subject, record.value, self._find_moment(record.step, record.session_time))
+
+    def _add_reports(self, reports: list[tuple[str, int, float]]) -> None:
+        for participant, receive_ns, age_ms in reports:
+            step = self._known[-1].step if self._known else 0
+            self._metrics.add(STATE_AGE, participant, age_ms, self._find_moment(step, receive_ns))
 
     def _write_samples(self, samples: list[tuple[int, int, bytes]]) -> None:
         if not samples:
             return
         columns = [
             scalar_column("connection", [s[0] for s in samples], pa.int64()),
+            scalar_column("receive_ns", [s[1] for s in samples], pa.int64()),
             bytes_column("data", [s[2] for s in samples]),
         ]
-        self._send_columns(paths.SAMPLES, [duration_index(paths.SESSION_TIME, [s[1] for s in samples])], columns)
+        times = self._times.spread(paths.SAMPLES, [s[1] for s in samples])
+        self._send_columns(paths.SAMPLES, [duration_index(paths.SESSION_TIME, times)], columns)
 
-    def _to_times(self, steps: list[int], session_times: list[int]) -> list[Any]:
-        """Return the times of rows that have no tick: it is that of the newest state before them."""
-        moments = [self._find_moment(*times) for times in zip(steps, session_times, strict=True)]
-        return _time_columns(np.array(moments, np.int64).T)
+    def _to_times(self, entity: str, steps: list[int], session_times: list[int]) -> list[Any]:
+        """Return the times of rows, each of which has the simulated time of the newest state before it."""
+        return self._spread(entity, [self._find_moment(*times) for times in zip(steps, session_times, strict=True)])
+
+    def _spread(self, entity: str, moments: Sequence[Moment]) -> list[Any]:
+        """Return the times of rows of an entity, no two of which are equal."""
+        times = np.array(moments, np.int64).T
+        times[2] = self._times.spread(entity, times[2].tolist())
+        times[3] = times[2] + self._origin_utc_ns
+        return to_time_columns(times)
 
     def _find_moment(self, step: int, session_ns: int) -> Moment:
-        known = self._known or ((0, 0, 0, 0),)
-        _, tick, sim_ns, _ = known[max(0, bisect_right(known, session_ns, key=_get_session_time) - 1)]
-        return step, tick, sim_ns, session_ns
+        """Return the moment of a step: the simulated time is that of the newest state before it."""
+        known = self._known
+        at = max(0, bisect_right(known, session_ns, key=get_session_time) - 1)
+        return self._make_moment(step, known[at].sim_ns if known else 0, session_ns)
 
-
-def _get_session_time(moment: Moment) -> int:
-    return moment[3]
-
-
-def _time_columns(times: NDArray[np.int64]) -> list[Any]:
-    """Return the time columns. `times` (4, rows): step, tick, sim_time [ns], session_time [ns]."""
-    step, tick, sim_ns, session_ns = times
-    return [
-        sequence_index(paths.STEP, step),
-        sequence_index(paths.TICK, tick),
-        duration_index(paths.SIM_TIME, sim_ns),
-        duration_index(paths.SESSION_TIME, session_ns),
-    ]
-
-
-def place_eye(positions: NDArray[np.float64]) -> Any:
-    """Return the eye that sees bodies at `positions` (n, 3) [m] from the front and above; `None` without any."""
-    known = positions[np.isfinite(positions).all(axis=1)]
-    if not len(known):
-        return None
-    low, high = np.percentile(known, (1.0, 99.0), axis=0)  # a few bodies may be parked far away
-    centre = (low + high) / 2.0
-    size_m = max(float(np.linalg.norm(high - low)) / 2.0, MIN_SIZE_M)
-    return rrb.EyeControls3D(position=centre + size_m * EYE, look_target=centre, eye_up=(0.0, 0.0, 1.0))
-
-
-def build_blueprint(eye: Any, pictures: Sequence[str] = ()) -> Any:
-    """Return the arrangement of views. `eye`: where the scene is seen from, `None`: the viewer chooses.
-
-    `pictures`: streams of pictures, each with a view of its own.
-    """
-    hidden = ("/journal/**", paths.SAMPLES, f"{paths.PICTURES}/**", f"{paths.LANES}/**", f"{paths.METRICS}/**")
-    scene = rrb.Spatial3DView(
-        origin="/",
-        name="Scene",
-        contents=["+ /**", *(f"- {entity}" for entity in hidden)],
-        background=BACKGROUND,
-        line_grid=False,
-        eye_controls=eye,
-    )
-    lanes = rrb.StateTimelineView(origin=paths.LANES, name="Who does what")
-    log = rrb.TextLogView(
-        origin="/",
-        name="What happened",
-        contents=[f"+ {paths.EVENTS}/**", f"+ {paths.DENIALS}"],
-        columns=rrb.TextLogColumns(timeline_columns=[paths.SESSION_TIME], text_log_columns=["loglevel", "body"]),
-        rows=rrb.TextLogRows(filter_by_log_level=[INFO, WARN, ERROR, CRITICAL]),
-    )
-    about = rrb.TextDocumentView(origin=paths.INFO, name="About")
-    plots = rrb.TimeSeriesView(origin=paths.METRICS, name="Delays [ms]")
-    images = [rrb.Spatial2DView(origin=f"{paths.PICTURES}/{name}", name=name) for name in pictures]
-    side = rrb.Vertical(rrb.Tabs(log, about), *([rrb.Grid(*images)] if images else ()), plots)
-    return rrb.Blueprint(
-        rrb.Horizontal(rrb.Vertical(scene, lanes, row_shares=[5, 3]), side, column_shares=[5, 3]),
-        rrb.TimePanel(state="collapsed", timeline=paths.SESSION_TIME, play_state="paused"),
-        collapse_panels=True,
-    )
-
-
-# --- file -------------------------------------------------------------------------------------------------------------
-#
-# Rerun encodes the messages, `RrdStream` appends them to the file.
-#
-# Rerun's own file sink keeps some 4 KB in memory per chunk, for a footer with an index: 0.1-0.2 MiB/s of a session.
-# Here the encoded bytes are read from the stream at every write, without the data for a footer; so memory does not
-# grow, and an error of the disk is raised here. `rerun rrd optimize` makes a copy with such an index.
-
-#: The stream's own batcher never acts: the writer sends whole columns, and `write` collects them.
-_BATCHER: Final = rr.ChunkBatcherConfig(flush_tick=3600.0, flush_num_bytes=1 << 30)
-
-
-class RrdStream:
-    """A new file. Data logged to `recording` is in it after `write`.
-
-    All methods may raise `OSError` (the disk), `RuntimeError` and `ValueError` (Rerun).
-    """
-
-    def __init__(self, path: str, application: str, recording_id: str) -> None:
-        self.recording = rr.RecordingStream(application, recording_id=recording_id, batcher_config=_BATCHER)
-        self._encoded = self.recording.binary_stream()
-        self._file: Any = open(path, "wb", buffering=0)  # noqa: SIM115 - closed by `close`
-        self.size = 0  # bytes in the file
-        self._marked = 0  # bytes of the file that marks cover
-        self._crc = 0  # of the bytes after them
-
-    def write(self, timeout_s: float) -> None:
-        """Append the data logged since the last call, all or nothing, and hand it to the operating system."""
-        data = self._encoded.read(flush=True, flush_timeout_sec=timeout_s)
-        if not data:
-            return
-        if data[: len(MAGIC)] != MAGIC:
-            raise ValueError("this version of Rerun encodes its messages in another way")
-        self._append(memoryview(data)[FILE_HEAD if self.size else 0 : end_of_messages(data)])
-
-    def mark(self) -> Mark:
-        """Return the CRC-32 of all bytes since the last mark, so that any later change of them is found."""
-        mark = Mark(self._marked, self.size, self._crc)
-        self._marked, self._crc = self.size, 0
-        return mark
-
-    def close(self) -> None:
-        """End the file after the last `write` with the message that marks its end."""
-        self._append(memoryview(END_MESSAGE))
-        self._file.close()
-        self.recording.disconnect()
-
-    def _append(self, data: memoryview) -> None:
-        rest = data
-        try:
-            while rest:
-                rest = rest[self._file.write(rest) :]
-        except OSError:
-            with suppress(OSError):  # half a message would confuse readers
-                os.ftruncate(self._file.fileno(), self.size)
-            self._file.close()
-            raise
-        self.size += len(data)
-        self._crc = zlib.crc32(data, self._crc)
-
-
-# --- Arrow columns for `rerun.send_columns`, built without a Python object per value where rows are many --------------
-
-
-class ArrowColumn:
-    """One component column: `values` is an Arrow list array with one list per row."""
-
-    def __init__(self, name: str, values: Any) -> None:
-        self._descriptor = rr.ComponentDescriptor(name)
-        self._values = values
-
-    def component_descriptor(self) -> Any:
-        """Return the name of the component in the file."""
-        return self._descriptor
-
-    def as_arrow_array(self) -> Any:
-        """Return the rows."""
-        return self._values
-
-
-def scalar_column(name: str, values: Any, kind: Any) -> ArrowColumn:
-    """Return a column of one value of Arrow type `kind` per row."""
-    array = pa.array(values, kind)
-    return ArrowColumn(name, pa.ListArray.from_arrays(pa.array(np.arange(len(array) + 1, dtype=np.int32)), array))
-
-
-def bytes_column(name: str, values: Iterable[bytes]) -> ArrowColumn:
-    """Return a column of one byte string per row."""
-    return scalar_column(name, list(values), pa.binary())
-
-
-def list_column(name: str, values: Sequence[Sequence[int]], kind: Any) -> ArrowColumn:
-    """Return a column of a list of integers per row."""
-    flat = [item for row in values for item in row]
-    offsets = np.zeros(len(values) + 1, np.int32)
-    np.cumsum([len(row) for row in values], out=offsets[1:])
-    return ArrowColumn(name, pa.ListArray.from_arrays(pa.array(offsets), pa.array(flat, kind)))
-
-
-def matrix_column(name: str, values: NDArray[np.float64]) -> ArrowColumn:
-    """Return a column of a list of float64 per row of `values` (rows, items)."""
-    rows, items = values.shape
-    offsets = np.arange(rows + 1, dtype=np.int32) * items
-    return ArrowColumn(name, pa.ListArray.from_arrays(pa.array(offsets), pa.array(values.ravel())))
-
-
-def sequence_index(timeline: str, values: Any) -> Any:
-    """Return an integer index."""
-    return rr.TimeColumn(timeline, sequence=np.asarray(values, np.int64))
-
-
-def duration_index(timeline: str, values: Any) -> Any:
-    """Return an index of durations from integer nanoseconds, exactly."""
-    return rr.TimeColumn(timeline, duration=np.asarray(values, np.int64).view("timedelta64[ns]"))
+    def _make_moment(self, step: int, sim_ns: int, session_ns: int) -> Moment:
+        return Moment(step, sim_ns, session_ns, session_ns + self._origin_utc_ns)
 
 
 # --- text for the viewer ----------------------------------------------------------------------------------------------
@@ -658,14 +605,21 @@ def describe_denial(record: DenialRecord) -> LogLine:
     return LogLine(WARN, "; ".join(parts))
 
 
-def describe_session(header: SessionHeader) -> str:
-    """Return a Markdown page about the recording."""
+def describe_session(header: SessionHeader, story: SessionStory | None = None, duration_s: float = 0.0) -> str:
+    """Return a Markdown page about the recording. `story`: at its end; `None`: it begins."""
     versions = "\n".join(f"| {name} | {value} |" for name, value in header.versions.items())
-    return (
-        f"# {header.session_name}\n\n"
-        f"Session `{header.session_id}`, class **{header.recording_class}**, {header.created_utc}\n\n"
+    parts = [f"# {header.session_name}"]
+    if story is not None:
+        people = ", ".join(f"**{name}** ({role})" for name, role in story.roles.items()) or "No one joined"
+        counts = f"{duration_s:.1f} s, handovers: {story.handovers}, episodes: {story.episodes}"
+        parts.append(f"{people}. {counts}.")
+    parts += [
         f"Robots: {', '.join(r.name for r in header.robots) or 'none'}. "
         f"Objects: {', '.join(o.name for o in header.objects) or 'none'}. "
-        f"Bodies: {len(header.bodies)}. Tick: {header.tick_period_ns / 1e6:g} ms.\n\n"
-        f"| library | version |\n|---|---|\n{versions}\n"
-    )
+        f"Bodies: {len(header.bodies)}. Tick: {header.tick_period_ns / 1e6:g} ms.",
+        f"Recorded {header.created_utc}, class **{header.recording_class}**: `iris-session verify FILE` simulates "
+        + ("it again." if header.recording_class == CLOSED else "decisions and control again."),
+        f"Session `{header.session_id}`",
+        f"| library | version |\n|---|---|\n{versions}\n",
+    ]
+    return "\n\n".join(parts)

@@ -13,6 +13,7 @@ import importlib.util
 import logging
 import math
 import secrets
+import time
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
@@ -52,7 +53,7 @@ from iris_session.session.resume import (
 )
 from iris_session.session.shared_scene import SharedScenes
 from iris_session.session.status import ProcessStatus, StatusReporter
-from iris_session.session.stepper import NextPatch, NextScene, ResumedFrom, Stepper
+from iris_session.session.stepper import NextPatch, NextScene, ResumedFrom, Stepper, label_robots
 from iris_session.session.supervision import RecorderSupervisor, RestartTimer, make_recorder_report, try_restart
 from iris_session.session.unique_name import NameFinder
 from iris_session.session.web_page import WebPage, open_web_page
@@ -259,7 +260,8 @@ class SessionProcesses:
         if self.feed is not None:
             header = self._make_header(core, OPEN if user_owned else CLOSED)
             shown = self.scenes.newest
-            self.feed.send_header(header, *(() if shown is None else (shown.info.asset_root, shown.info.scene_hash)))
+            assets = ("", "") if shown is None else (shown.info.asset_root, shown.info.scene_hash)
+            self.feed.send_header(header, *assets, label_robots(core.scene.robots, core.world))
             chain = header_root(header)
         keyframe_ns = round(self._config.keyframe_s * 1e9)
         past = self._past
@@ -308,6 +310,7 @@ class SessionProcesses:
             boot_id=read_boot_id(),
             anchors=self._config.anchor_poses(),
             settings=make_settings(self._config),
+            origin_utc_ns=time.time_ns() - time.monotonic_ns() + self._origin_ns,
         )
 
     def supervise(self, stepper: Stepper) -> None:

@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from iris_session.physics import World
 from iris_session.protocol.client_messages import Control, Episode, EStop, GetSnapshot, Marker
 from iris_session.protocol.common import MAX_TEXT, Applied, Pose
 from iris_session.protocol.entries import (
@@ -32,8 +33,10 @@ from iris_session.protocol.entries import (
 )
 from iris_session.protocol.names import ControlAction, DenialReason, EpisodeAction, LateCause
 from iris_session.protocol.server_messages import BodyInfo, Reply, StateHeader
+from iris_session.protocol.specs import RobotSpec
 from iris_session.protocol.steps import Decision
 from iris_session.recording.journal import CRASHED, JournalRow, Keyframe, make_row
+from iris_session.recording.messages import RobotLabels
 from iris_session.session.core import Plant, SessionCore, StepOutcome, ignore_lap
 from iris_session.session.deformables import DeformableSourceMesh
 from iris_session.session.errors import OwnershipError
@@ -77,6 +80,7 @@ class RecorderPort(Protocol):
         bodies: tuple[BodyInfo, ...],
         root: str = "",
         scene_hash: str = "",
+        robots: tuple[RobotLabels, ...] = (),
     ) -> None: ...
 
     def send_patch(self, root: str, scene_hash: str) -> None: ...
@@ -95,6 +99,7 @@ class RecorderPort(Protocol):
         session_time: int,
         poses: NDArray[np.float64],
         applied: Sequence[Applied] = (),
+        robots: bytes = b"",
     ) -> None: ...
 
     def add_decision(self, step: int, session_time: int, decision: Decision) -> None: ...
@@ -336,7 +341,8 @@ class Stepper:
             bodies = scene.plant.world.bodies
             self._poses = np.zeros((len(bodies), 7))
             if self.recorder is not None:
-                self.recorder.send_scene(scene.model_hash, scene.packed_model, bodies, *assets)
+                robots = label_robots(scene.plant.scene.robots, scene.plant.world)
+                self.recorder.send_scene(scene.model_hash, scene.packed_model, bodies, *assets, robots)
             messages = (scene.plant.scene, GetSnapshot())  # the ledger gets the new leases as a client does
         for callback in self.on_scene:
             callback(scene)
@@ -402,7 +408,8 @@ class Stepper:
         if self.on_state is not None:
             self.on_state(header, self._poses)
         if self.recorder is not None:
-            self.recorder.add_state(self._newest_step, tick, sim_time, end_ns, self._poses, applied)
+            robots = world.robot_signals.read(world.data)
+            self.recorder.add_state(self._newest_step, tick, sim_time, end_ns, self._poses, applied, robots)
             self.recorder.add_metric(self._newest_step, end_ns, "lateness_ms", self.lateness_ns * 1e-6)
             self.lateness_ns = 0
 
@@ -435,6 +442,12 @@ class Stepper:
         step = self.step_count if self.last is not None else self.step_count - 1
         frame = Keyframe(step, state.plant, state.authority, state.controller, state.status)
         self.recorder.add_keyframe(frame, self._chain)
+
+
+def label_robots(robots: Sequence[RobotSpec], world: World) -> tuple[RobotLabels, ...]:
+    """Return the names of the values that `world.robot_signals` reads."""
+    units = world.robot_signals.units
+    return tuple(RobotLabels(r.name, r.base_body, r.joints, u) for r, u in zip(robots, units, strict=True))
 
 
 def normalize_message(message: EntryMessage) -> EntryMessage:

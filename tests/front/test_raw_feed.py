@@ -35,6 +35,7 @@ from iris_session.front.raw_feed import (
 from iris_session.protocol.client_messages import Hello, Sample
 from iris_session.protocol.common import Pose, Target
 from iris_session.protocol.limits import Drops
+from iris_session.protocol.status import ClientReport
 
 SECOND = 1_000_000_000
 POSE = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
@@ -71,6 +72,19 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
     rig = Rig(tmp_path)
     yield rig
     rig.context.destroy(linger=0)
+
+
+def test_reports_of_participants_go_with_the_samples(rig: Rig) -> None:
+    ann, stranger = connection(1, "ann"), connection(2, "stranger")
+    ann.participant_id = "p1"
+    report = ClientReport(1.5, 2.5, delivered=60)
+    for one in (ann, stranger):
+        rig.feed.send_report(one, 7, report)
+    rig.feed.tick(SECOND)
+    ((number, receive_ns, data),) = rig.receive()
+    assert (number, receive_ns) == (1, 7)
+    assert data[0] == 0x92, "which no message begins with"
+    assert msgspec.msgpack.decode(data, type=tuple[str, ClientReport]) == ("p1", report)
 
 
 def test_samples_go_in_batches(rig: Rig) -> None:

@@ -24,9 +24,9 @@ from iris_session.physics import (
     find_objects,
     find_robots,
 )
-from iris_session.physics.world import STATE
+from iris_session.physics.world import STATE, RobotSignals
 from iris_session.protocol.server_messages import BodyInfo
-from iris_session.protocol.specs import ObjectSpec
+from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from tests.physics.models import clutter, model
 
 INTEGRATORS = [n.removeprefix("mjINT_") for n in dir(mujoco.mjtIntegrator) if n.startswith("mjINT_")]
@@ -454,3 +454,30 @@ def test_states_are_given_to_mujoco_as_arrays_that_it_may_write(monkeypatch: pyt
     assert np.array_equal(data.qpos, world.data.qpos)
     world.restore_state(state)
     world.restore(world.snapshot())
+
+
+def test_robot_signals_are_joints_openings_and_tips() -> None:
+    """Openings of a position actuator with a gain, and of a motor, which has no position to open to."""
+    gripper = '<general name="{0}" joint="{0}" gainprm="2" biastype="affine" biasprm="1 -400"/>'
+    arms = "".join(
+        f'<body name="{n}"><joint name="{n}/turn"/><geom size=".1"/><site name="{n}/tip" pos="0 0 .3"/>'
+        f'<body><joint name="{n}/grip" type="slide"/><geom size=".1"/></body></body>'
+        for n in ("a", "b")
+    )
+    motors = f'<actuator>{gripper.format("a/grip")}<motor name="b/grip" joint="b/grip"/></actuator>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{arms}</worldbody>{motors}</mujoco>")
+    robots = [
+        RobotSpec(n, (f"{n}/turn",), (), f"{n}/tip", n, f"{n}/grip", gripper_open=10.0, gripper_closed=0.0)
+        for n in ("a", "b")
+    ]
+    signals = RobotSignals(model, robots)
+    data = mujoco.MjData(model)
+    data.qpos[:] = (0.5, 0.03, -0.5, 0.01)
+    mujoco.mj_forward(model, data)
+    values = np.frombuffer(signals.read(data))
+    assert values[:2].tolist() == [0.5, -0.5]
+    assert values[2] == pytest.approx((400 * 0.03 - 1) / 2 / 10), "ctrl at which it would rest here, as a share"
+    assert np.isnan(values[3])
+    assert values[4:].reshape(2, 3) == pytest.approx(data.site_xpos)
+    assert signals.units == (("rad",), ("rad",))
+    assert RobotSignals(model, []).read(data) == b""

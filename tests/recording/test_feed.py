@@ -32,6 +32,7 @@ from iris_session.recording.messages import (
     HEADER,
     Batch,
     RecorderStatus,
+    RobotLabels,
     SceneAssets,
     SceneModel,
     decode_batch,
@@ -269,12 +270,13 @@ def test_states_events_and_denials_are_sent_with_the_rows(feed: RecorderFeed, pl
     denial = Denial("held", "left is held", "ask", "left", "p2", "Ada")
     replies = (OutgoingMessage(4, Reply(1, False, denial)), OutgoingMessage(5, Reply(2, True)))
     feed.add_decision(3, 70, Decision(commands=(), outgoing=replies, presence=(head,)))
-    feed.add_state(3, 9, 0.1, 70, np.arange(21.0).reshape(3, 7))
+    feed.add_state(3, 9, 0.1, 70, np.arange(21.0).reshape(3, 7), (), b"measured")
     feed.add_metric(3, 70, "late_ms", 2.5)
     feed.add_keyframe(Keyframe(2, b"p", b"a", b"c"), ROOT)
     batch = decode_batch(played[0].take(1)[0][2])
     assert [(d.connection, d.denial) for d in batch.denials] == [(4, denial)]
     assert batch.states[0].presence == (head,)
+    assert batch.states[0].robots == b"measured"
     assert np.frombuffer(batch.states[0].poses).tolist() == list(range(21))
     assert batch.metrics[0].value == 2.5
     assert check_keyframe(batch.keyframes[0]) == ""
@@ -360,6 +362,16 @@ def test_lists_are_bounded_without_steps(feed: RecorderFeed) -> None:
     assert feed.stats.dropped_items == 10
 
 
+def test_states_have_the_simulated_time_before_the_last_reset(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
+    played[0].say(feed, 1, -1, -1)
+    played[0].take(1)
+    for step, time_s in enumerate((0.5, 2.0, 0.0, 0.5, 0.25)):
+        feed.add_state(step, step, time_s, step, np.zeros((0, 7)))
+    feed.flush()
+    states = decode_batch(played[0].take(1)[0][2]).states
+    assert [state.sim_before for state in states] == [0.0, 0.0, 2.0, 2.0, 2.5]
+
+
 def test_scene_precedes_its_row_and_is_repeated_for_a_new_recorder(
     played: tuple[PlayedRecorder, str, Path], feed: RecorderFeed
 ) -> None:
@@ -369,12 +381,13 @@ def test_scene_precedes_its_row_and_is_repeated_for_a_new_recorder(
     assert [decode_batch(frame) for frame in recorder.more] == [Batch(assets=[SceneAssets()])]
     steps(feed, 0, 3)
     bodies = (BodyInfo(1, "cup", moving=True),)
-    feed.send_scene("hash", b"packed", bodies, "/store", "ab")
+    robots = (RobotLabels("left", "base", ("hinge",), ("rad",)),)
+    feed.send_scene("hash", b"packed", bodies, "/store", "ab", robots)
     steps(feed, 3, BATCH_ROWS)
     before, scene, after = (decode_batch(body) for _, _, body in recorder.take(3))
     assert [row.step for row in before.rows] == [0, 1, 2]
     assert (scene.scenes, scene.rows) == ([SceneModel(2, 4_000_000, "hash", b"packed", bodies)], [])
-    assert scene.assets == [SceneAssets(2, 4_000_000, "/store", "ab")]
+    assert scene.assets == [SceneAssets(2, 4_000_000, "/store", "ab", robots)]
     assert after.rows[0].step == 3
     recorder.say(feed, 1, 3, 2)
     recorder.say(feed, 2, -1, -1)  # everything is in the file of the one before
@@ -383,7 +396,7 @@ def test_scene_precedes_its_row_and_is_repeated_for_a_new_recorder(
     assert [decode_batch(frame) for frame in recorder.more] == known
     feed.send_patch("/store", "cd")
     (patch,) = (decode_batch(body) for _, _, body in recorder.take(1))
-    assert (patch.scenes, patch.assets) == ([], [SceneAssets(12, 24_000_000, "/store", "cd")])
+    assert (patch.scenes, patch.assets) == ([], [SceneAssets(12, 24_000_000, "/store", "cd", robots)])
     recorder.say(feed, 3, -1, -1)
     recorder.take(1)
     assert [decode_batch(frame) for frame in recorder.more] == [Batch(scenes=scene.scenes, assets=patch.assets)]

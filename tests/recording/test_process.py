@@ -18,6 +18,7 @@ import pytest
 import zmq
 
 from iris_session.protocol.names import ArrayKind
+from iris_session.protocol.status import ClientReport
 from iris_session.recording import RecorderError, RecorderProcess, Recording, RecordingLock, verify
 from iris_session.recording import process as process_module
 from iris_session.recording.feed import BATCH_NS
@@ -112,6 +113,21 @@ def test_raw_samples_are_left_out_while_the_disk_is_nearly_full(
     loop._disk_free, loop._flush_s = 0, 2 * process_module.SLOW_FLUSH_S  # a slow disk, of unknown size
     loop._process_samples(batch)
     assert loop._samples_left_out == 6
+    loop._syncer.stop()
+    loop._writer.close()
+    loop._context.destroy(linger=0)
+
+
+def test_reports_of_clients_are_plotted_and_no_raw_samples(tmp_path: Path) -> None:
+    config = RecorderConfig(
+        str(tmp_path / "session.rrd"), 1, "r", f"ipc://{tmp_path}/f", f"ipc://{tmp_path}/s", 0, os.getpid(), ""
+    )
+    loop = process_module.RecorderLoop(config)
+    reports = [ClientReport(1.0, 2.5, delivered=60), ClientReport(0.0, 0.0, delivered=60), ClientReport(1.0, 2.0, 0)]
+    batch = [(7, 5 + i, msgspec.msgpack.encode(("p1", report))) for i, report in enumerate(reports)]
+    loop._process_samples(msgspec.msgpack.encode([*batch, (7, 9, b"\x92 damaged"), (7, 9, b"\x80")]))
+    assert loop._writer._reports == [("p1", 5, 2.5)], "of frames that were sent again the age is not known"
+    assert (loop._samples, loop._refused) == (1, 1)
     loop._syncer.stop()
     loop._writer.close()
     loop._context.destroy(linger=0)

@@ -21,8 +21,9 @@ from iris_session.recording import (
 )
 from iris_session.recording.journal import FORMAT, VERIFIERS
 from iris_session.recording.paths import part_path
+from iris_session.recording.rrd_stream import bytes_column, duration_index, sequence_index
 from iris_session.recording.verify import _Run
-from iris_session.recording.writer import RrdWriter, bytes_column, duration_index, sequence_index
+from iris_session.recording.writer import RrdWriter
 from tests.recording.support import SmallCore, journal, write
 
 

@@ -41,14 +41,16 @@ def test_the_small_scene(tmp_path: Path) -> None:
     assert sorted(visuals) == [0, 1, 2, 3, 4, 5], "group 3 is not visible"
     forms = {i: reader.read_shape(visual) for i, visual in visuals.items()}
     assert [forms[i].kind for i in sorted(forms)] == [
-        scene.BOX,
+        scene.MESH,
         scene.ELLIPSOID,
         scene.CAPSULE,
         scene.CYLINDER,
         scene.BOX,
         scene.ELLIPSOID,
     ]
-    assert forms[0].size == (10.0, 10.0, scene.PLANE_HALF_THICKNESS_M)
+    floor = forms[0].mesh
+    assert floor is not None
+    assert np.ptp(floor.position, axis=0) == pytest.approx((0.4 + 6.0, 1.0 + 6.0, 0.0), rel=0.01), "3 m around bodies"
     assert forms[2].size == pytest.approx((0.04, 0.04, 0.2))
     assert scene.to_rgba8(visuals[0].rgba) == (204, 204, 204, 255)
     assert [reader.place_visual(visuals[i])[0] for i in range(6)] == [
@@ -165,7 +167,8 @@ def test_every_shape_has_its_texture(tmp_path: Path) -> None:
         else:
             assert (form.texture, form.uv) == (None, None)
         is_mesh = visual.geometry.mesh >= 0 or visual.geometry.hfield >= 0
-        assert (form.kind == scene.MESH) == (is_mesh or worn)
+        is_large = visual.geometry.kind in ("plane", "cylinder")
+        assert (form.kind == scene.MESH) == (is_mesh or worn or is_large)
     assert len(looks) >= len(SHAPES) * len(LOOKS)
 
 
@@ -214,7 +217,7 @@ def test_vertex_colours_are_drawn(tmp_path: Path) -> None:
     spec = builder.build(store).spec
     reader = scene.SceneReader(spec, store, [])
     drawn = [
-        build_components(reader.read_shape(visual), scene.to_rgba8(visual.rgba), *reader.place_visual(visual))[-1]
+        build_components(reader.read_shape(visual), scene.to_rgba8(visual.rgba), reader.place_visual(visual)[1])[-1]
         for visual in spec.visuals
     ]
     packed = (colors.astype(np.uint32) * [1 << 24, 1 << 16, 1 << 8, 1]).sum(axis=1)
@@ -258,3 +261,55 @@ def test_unreadable_specification_is_reported(
     missing = SceneAssets(0, 0, str(tmp_path), "0" * 64) if assets else SceneAssets()
     with pytest.raises(error), scene.open_scene(missing, model):
         pass
+
+
+def test_planes_end_near_the_scene_and_keep_their_texture(tmp_path: Path) -> None:
+    """One infinite, one of 40 m, both turned and far from the bodies; a small one far away stays whole."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><asset><texture name="t" type="2d" builtin="checker" rgb1="1 0 0" width="8" height="8"/>
+        <material name="m" texture="t" texrepeat="3 5"/></asset><worldbody>
+        <geom type="plane" size="0 0 .1" pos="20 0 0" euler="0 0 90" material="m"/>
+        <geom type="plane" size="40 40 .1" pos="20 0 0" material="m"/><geom type="plane" size="1 1 .1" pos="90 0 0"/>
+        <body pos="30 1 1"><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
+    )
+    store = AssetStore(tmp_path)
+    spec = parse_mujoco(model, store).spec
+    reader = scene.SceneReader(spec, store, infos(model))
+    for visual, expected in zip(
+        spec.visuals, (((27, -2), (33, 4)), ((27, -2), (33, 4)), ((89, -1), (91, 1))), strict=False
+    ):
+        form = reader.read_shape(visual)
+        assert form.mesh is not None
+        _, T_world_plane = reader.place_visual(visual)
+        points = np.array([apply(T_world_plane, tuple(p)) for p in form.mesh.position.tolist()])
+        assert np.array([points.min(axis=0), points.max(axis=0)])[:, :2] == pytest.approx(np.array(expected), abs=1e-4)
+        if form.uv is not None:  # in the finite one, half of it per repetition
+            per_metre = np.ptp(form.uv, axis=0) / np.ptp(form.mesh.position, axis=0)[:2]
+            size = visual.geometry.size[0] or 1.0
+            assert per_metre == pytest.approx(np.array((3, 5)) / 2 / size, rel=1e-4)
+
+
+def test_fine_meshes_are_drawn_at_a_coarser_level(tmp_path: Path) -> None:
+    builder, store = SceneBuilder(), AssetStore(tmp_path)
+    builder.add_mesh(vertices=[[0, 0, 0], [1, 0, 0], [0, 1, 0]], triangles=[[0, 1, 2]])
+    builder.add_mesh(vertices=[[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], triangles=[[0, 1, 2], [0, 2, 3]])
+    spec = builder.build(store).spec
+    coarse, fine = (mesh.levels[0] for mesh in spec.meshes)
+    for vertices, drawn in ((scene.ENOUGH_VERTICES - 1, 4), (scene.ENOUGH_VERTICES, 3)):
+        levels = (msgspec.structs.replace(fine, vertices=vertices), coarse)
+        mesh = msgspec.structs.replace(spec.meshes[1], levels=levels)
+        changed = msgspec.structs.replace(spec, meshes=(spec.meshes[0], mesh))
+        form = scene.SceneReader(changed, store, []).read_shape(changed.visuals[1])
+        assert form.mesh is not None
+        assert form.mesh.vertices == drawn
+
+
+def test_large_cylinders_are_round(tmp_path: Path) -> None:
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><geom type="cylinder" size=".05 .14"/><geom type="cylinder" size=".05 .16"/>
+        <geom type="cylinder" size=".16 .01"/></worldbody></mujoco>"""
+    )
+    store = AssetStore(tmp_path)
+    spec = parse_mujoco(model, store).spec
+    kinds = [scene.SceneReader(spec, store, []).read_shape(visual).kind for visual in spec.visuals]
+    assert kinds == [scene.CYLINDER, scene.MESH, scene.MESH]

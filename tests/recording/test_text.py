@@ -219,6 +219,9 @@ def test_session_page_names_class_and_versions() -> None:
     page = describe_session(make_header("open", {"mujoco": "4.0.0"}))
     assert "**open**" in page
     assert "| mujoco | 4.0.0 |" in page
+    story = ann_and_bob()
+    page = describe_session(make_header(), story, 25.04)
+    assert "**ann** (operator), **bob** (operator). 25.0 s, handovers: 0, episodes: 0." in page
 
 
 def test_versions_here_equal_versions_here() -> None:

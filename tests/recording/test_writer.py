@@ -12,7 +12,7 @@ import pytest
 
 from anchors.pose import apply
 from iris_session.physics.load import compute_scene_hash, encode_model
-from iris_session.protocol.common import Applied, Denial, Lease, Pose
+from iris_session.protocol.common import Alignment, Applied, Denial, Lease, Pose
 from iris_session.protocol.scene import (
     AddVisual,
     Geometry,
@@ -25,23 +25,31 @@ from iris_session.protocol.scene import (
     encode_scene,
 )
 from iris_session.protocol.server_messages import (
+    AlignmentChanged,
+    AnchorMoved,
     BodyInfo,
+    EpisodeChanged,
     EStopChanged,
     Event,
+    EventKind,
+    Handover,
     LeaseChanged,
     ParticipantInfo,
     ParticipantJoined,
     ParticipantLeft,
     PresenceItem,
+    SamplesRejected,
 )
 from iris_session.protocol.specs import RobotSpec
 from iris_session.recording import Recording, SessionHeader, pack_model
 from iris_session.recording import scene_geometry as scene
+from iris_session.recording.blueprint import place_eye
 from iris_session.recording.messages import (
     Batch,
     DenialRecord,
     HoldRecord,
     MetricRecord,
+    RobotLabels,
     SceneAssets,
     SceneModel,
     StateFrame,
@@ -49,7 +57,7 @@ from iris_session.recording.messages import (
 from iris_session.recording.paths import part_path
 from iris_session.recording.picture import build_components
 from iris_session.recording.scene_geometry import VisualShape
-from iris_session.recording.writer import RrdWriter, place_eye
+from iris_session.recording.writer import RrdWriter
 from iris_session.scene import AssetStore
 from iris_session.scene.mujoco_scene import parse_mujoco
 from tests.recording.support import XML, column, journal, make_header, read
@@ -67,6 +75,11 @@ def times(batches: list[Any]) -> list[int]:
     return [value.value for batch in batches for value in batch.column("session_time")]
 
 
+def select(batches: list[Any], component: str) -> list[Any]:
+    """Return the batches that have a component."""
+    return [batch for batch in batches if component in batch.schema.names]
+
+
 def test_transforms_are_the_poses_of_moving_bodies_when_they_change(tmp_path: Path) -> None:
     path = tmp_path / "w.rrd"
     bodies = (BodyInfo(1, "a/b c", True), BodyInfo(2, "fixed", False), BodyInfo(3, "d", True))
@@ -79,21 +92,19 @@ def test_transforms_are_the_poses_of_moving_bodies_when_they_change(tmp_path: Pa
     moved = poses.copy()
     moved[0] = (1, 2, 3, 0.5, -0.5, 0.5, 0.5)
     moved[1, 0] = 5.0
-    writer.add(Batch(states=[frame(8, poses), frame(16, moved)]))
+    jittered, crept = moved.copy(), moved.copy()
+    jittered[2, :] += 1e-5
+    crept[2, 0] += 2.5e-5
+    writer.add(Batch(states=[frame(8, poses), frame(16, moved), frame(24, jittered), frame(32, crept)]))
     writer.close()
     found = read(path)
-    tf = found["/tf"]
-    assert column(tf, "Transform3D:child_frame") == [["a/b c"], ["d"], ["a/b c"]]
-    assert set(map(tuple, column(tf, "Transform3D:parent_frame"))) == {("world",)}
-    assert column(tf, "Transform3D:translation")[-1] == [[1.0, 2.0, 3.0]]
-    assert column(tf, "Transform3D:quaternion")[-1] == [[-0.5, 0.5, 0.5, 0.5]], "Rerun has x y z w"
-    assert column(tf, "step") == [0, 0, 16]
-    assert column(tf, "tick") == [1, 1, 17]
-    assert [v.value for v in tf[-1].column("session_time")] == [32_000_007]
-    assert column(found["/state"], "sim_time_s") == [[0.0], [0.016], [0.032]]
-    root = found["/tf_static"]
-    assert column(root, "Transform3D:parent_frame") == [["tf#/"]]
-    assert column(root, "Transform3D:child_frame") == [["world"]]
+    moving, still = found["/scene/1/bodies/a\\/b\\ c"], found["/scene/1/bodies/d"]
+    assert column(moving, "Transform3D:translation") == [[[0.0, 0.0, 0.0]], [[1.0, 2.0, 3.0]]]
+    assert column(moving, "Transform3D:quaternion")[-1] == [[-0.5, 0.5, 0.5, 0.5]], "Rerun has x y z w"
+    assert (column(moving, "step"), column(still, "step")) == ([0, 16], [0, 32]), "no jitter"
+    assert times(moving) == [7, 32_000_007]
+    assert column(found["/state"], "sim_time_s") == [[0.002 * 8 * i] for i in range(5)]
+    assert not any("fixed" in entity for entity in found)
 
 
 def test_static_geometry_is_written_once_per_frame(tmp_path: Path) -> None:
@@ -104,12 +115,10 @@ def test_static_geometry_is_written_once_per_frame(tmp_path: Path) -> None:
     writer.add(Batch(states=[frame(5, np.zeros((len(header.bodies), 7)))]))
     writer.close()
     found = read(path)
-    ball = found["/scene/1/ball/g\\/ball"]
-    assert column(ball, "CoordinateFrame:frame") == [["ball"]]
+    ball = found["/scene/1/bodies/ball/g\\/ball"]
     assert column(ball, "Ellipsoids3D:half_sizes") == [[[pytest.approx(0.1)] * 3]]
     assert column(ball, "step") == [5], "from the first state on, and once"
-    assert column(ball, "tick") == [0], "which begins again with a reset"
-    assert column(found["/scene/1/arm\\/link\\ 1/visual_2"], "Capsules3D:lengths") == [[pytest.approx(0.4)]]
+    assert column(found["/scene/1/bodies/arm\\/link\\ 1/visual_2"], "Capsules3D:lengths") == [[pytest.approx(0.4)]]
     assert not any("post" in entity for entity in found), "group 3 is not visible"
     assert "small" in column(found["/session"], "TextDocument:text")[0][0]
 
@@ -127,9 +136,9 @@ def test_picture_begins_with_the_first_row(tmp_path: Path) -> None:
     found = read(path)
     (row,) = times(found["/journal/rows"])
     assert row < state.session_time
-    assert set(times(found["/scene/1/ball/g\\/ball"])) == {row}
-    moving = sum(body.moving for body in header.bodies)
-    assert times(found["/tf"]) == [row] * moving + [batch.states[1].session_time] * moving
+    assert set(times(found["/scene/1/bodies/ball/g\\/ball"])) == {row}
+    for body in ("ball", "arm\\/link\\ 1", "tip"):
+        assert times(found[f"/scene/1/bodies/{body}"]) == [row, batch.states[1].session_time]
     assert min(min(times(chunks)) for chunks in found.values() if "session_time" in chunks[0].schema.names) == row
     assert times(found["/state"])[0] == state.session_time, "data have their own times"
 
@@ -139,12 +148,12 @@ def test_scene_without_a_state_is_drawn(tmp_path: Path) -> None:
     writer = RrdWriter(path, "id")
     writer.write_header(make_header())
     writer.close()
-    assert column(read(path)["/scene/1/ball/g\\/ball"], "step") == [-1]
+    assert column(read(path)["/scene/1/bodies/ball/g\\/ball"], "step") == [-1]
 
 
 def test_capsules_begin_at_one_end_in_rerun_and_are_centred_in_mujoco() -> None:
     q = (0.8, 0.2, -0.4, 0.4)
-    poses = build_components(VisualShape(scene.CAPSULE, (0.1, 0.1, 0.25)), (1, 2, 3, 4), "b", ((1.0, 2.0, 3.0), q))[1]
+    poses = build_components(VisualShape(scene.CAPSULE, (0.1, 0.1, 0.25)), (1, 2, 3, 4), ((1.0, 2.0, 3.0), q))[0]
     start = tuple(poses.translations.as_arrow_array().to_pylist()[0])
     end = apply((start, q), (0.0, 0.0, 0.5))
     assert [(a + b) / 2 for a, b in zip(start, end, strict=True)] == pytest.approx((1.0, 2.0, 3.0))
@@ -162,7 +171,9 @@ def test_latencies_of_applied_samples_are_plotted_once_each(tmp_path: Path) -> N
     ]
     writer.add(Batch(states=states))
     writer.close()
-    assert column(read(path)["/metrics/input_to_step_ms/left"], "Scalars:scalars") == [[5.0], [3.0]]
+    plot = read(path)["/metrics/input_to_step_ms/left"]
+    assert column(select(plot, "Scalars:scalars"), "Scalars:scalars") == [[5.0], [3.0]]
+    assert column(select(plot, "SeriesLines:names"), "SeriesLines:names") == [["input to step, left [ms]"]]
 
 
 def joined(participant: str, name: str, role: str = "operator") -> Event:
@@ -182,13 +193,13 @@ def test_participants_are_drawn_once_and_move_with_their_captures(tmp_path: Path
     writer.add(Batch(states=states, events=[joined("p 1", "Ada")]))
     writer.close()
     found = read(path)
-    assert column(found["/tf"], "Transform3D:child_frame") == [["presence/p 1/head"]] * 2
-    assert column(found["/tf"], "step") == [0, 16]
-    assert column(found["/presence/p\\ 1/head"], "CoordinateFrame:frame") == [["presence/p 1/head"]]
-    assert column(found["/presence/p\\ 1/head"], "Boxes3D:labels") == [["Ada · operator"]]
-    assert times(found["/presence/p\\ 1/head"]) == [7], (
-        "with the first pose: a frame without one is an error in the viewer"
+    head = found["/presence/p\\ 1/head"]
+    poses, looks = select(head, "Transform3D:translation"), select(head, "Boxes3D:labels")
+    assert (column(poses, "Transform3D:translation"), column(poses, "step")) == (
+        [[[pytest.approx(0.1), 0.0, pytest.approx(1.6)]], [[pytest.approx(0.3), 0.0, pytest.approx(1.6)]]],
+        [0, 16],
     )
+    assert (column(looks, "Boxes3D:labels"), times(looks)) == ([["Ada · operator"]], [7])
     assert column(found["/presence/p\\ 1/head/view"], "Arrows3D:vectors") == [[[pytest.approx(0.3), 0.0, 0.0]]]
 
 
@@ -209,12 +220,12 @@ def test_participants_are_cleared_when_they_leave_or_have_no_pose(tmp_path: Path
     writer.add(Batch(states=states, events=[joined("p1", "Ada"), left, away]))
     writer.close()
     found = read(path)
-    hands = found["/presence/p1/hand\\/left"]
-    cleared = [batch for batch in hands if any("Clear" in name for name in batch.schema.names)]
-    assert times(cleared) == [260 * ms + 7], "the first state 0.25 s after its pose"
-    assert sorted(times(hands)) == [7, 260 * ms + 7, 280 * ms + 7], "and it is drawn again with the next"
-    assert times(found["/presence/p1/head"]) == [7], "who is disconnected stays until poses are old"
-    assert sorted(times(found["/presence/p2/head"])) == [7, 282 * ms]
+    hands, clear = found["/presence/p1/hand/left"], "Clear:is_recursive"
+    assert times(select(hands, clear)) == [260 * ms + 7], "the first state 0.25 s after its pose"
+    drawn = select(hands, "Ellipsoids3D:half_sizes")
+    assert times(drawn) == [7, 280 * ms + 7], "and it is drawn again with the next"
+    assert not select(found["/presence/p1/head"], clear), "who is disconnected stays until poses are old"
+    assert times(select(found["/presence/p2/head"], clear)) == [282 * ms]
     looks = [[b for b in found[f"/presence/{who}/head"] if "Boxes3D:colors" in b.schema.names] for who in ("p1", "p2")]
     assert column(looks[0], "Boxes3D:colors") != column(looks[1], "Boxes3D:colors")
 
@@ -255,19 +266,32 @@ def test_robots_are_labelled_by_their_holders(tmp_path: Path) -> None:
     assert column(found["/robots/left"], "Points3D:labels") == [["left"], ["left: Ada"]]
     assert column(found["/robots/left"], "Points3D:positions") == [[[1.0, 2.0, 3.0]]] * 2
     assert times(found["/robots/left"]) == [7, 8_000_100]
-    assert column(found["/robots/cart"], "CoordinateFrame:frame") == [["wheels"]]
+    assert column(found["/scene/1/bodies/wheels/label"], "Points3D:labels") == [["cart"]], "which moves with it"
     later = read(Path(part_path(str(path), 2)))
     assert column(later["/robots/left"], "Points3D:labels") == [["left: Ada"]], "its robots had holders before"
 
 
-def test_rows_have_the_simulated_time_of_the_state_before_them(tmp_path: Path) -> None:
+def test_timelines_grow_over_resets_and_have_the_time_of_day(tmp_path: Path) -> None:
+    """Rows without a simulated time have that of the state before them."""
     path = tmp_path / "w.rrd"
     writer = RrdWriter(path, "id")
-    writer.write_header(SessionHeader("s", "n", "closed", 2_000_000))
-    states = [frame(step, np.zeros((0, 7))) for step in (0, 8, 16)]
-    writer.add(Batch(states=states, metrics=[MetricRecord(9, states[1].session_time, "late_ms", 1.0)]))
+    origin = 1_700_000_000 * 10**9
+    writer.write_header(SessionHeader("s", "n", "closed", 2_000_000, origin_utc_ns=origin))
+    none = np.zeros((0, 7))
+    states = [
+        frame(0, none),
+        frame(8, none),
+        msgspec.structs.replace(frame(16, none), sim_time=0.004, sim_before=0.016),
+    ]
+    writer.add(Batch(states=states, metrics=[MetricRecord(17, states[2].session_time + 5, "late_ms", 1.0)]))
     writer.close()
-    assert column(read(path)["/metrics/late_ms"], "tick") == [9]
+    found = read(path)
+    assert [value.value for value in found["/state"][0].column("sim_time")] == [0, 16_000_000, 20_000_000]
+    (late,) = found["/metrics/late_ms"]
+    assert (late.column("sim_time")[0].value, late.column("step")[0].as_py()) == (20_000_000, 17)
+    assert late.column("wall_time")[0].value == origin + states[2].session_time + 5
+    with Recording.open(path, warn=False) as recording:
+        assert [(state.tick, state.sim_time) for state in recording.states()] == [(1, 0.0), (9, 0.016), (17, 0.004)]
 
 
 def test_events_and_denials_are_text_lines(tmp_path: Path) -> None:
@@ -350,15 +374,14 @@ def test_new_scene_is_drawn_from_its_step_and_its_model_is_stored(tmp_path: Path
     writer.add(Batch(scenes=[cup], states=[frame(16, second)]))
     writer.close()
     found = read(path)
-    was = found["/scene/1/ball/g\\/ball"]
+    was = found["/scene/1/bodies/ball/g\\/ball"]
     assert column(was, "step") == [0]
     assert column(was, "Ellipsoids3D:half_sizes") == [[[pytest.approx(0.1)] * 3]]
     assert column(found["/scene/1"], "step") == [8]
     assert column(found["/scene/1"], "Clear:is_recursive") == [[True]]
-    box = found["/scene/2/cup/g"][0]
+    box = found["/scene/2/bodies/cup/g"][0]
     assert column([box], "step") == [8]
-    assert column([box], "CoordinateFrame:frame") == [["cup"]]
-    assert column(found["/tf"], "Transform3D:child_frame")[-1] == ["cup"]
+    assert column(found["/scene/2/bodies/cup"], "Transform3D:translation") == [[[1.0, 2.0, 3.0]]]
     with Recording.open(path, warn=False) as recording:
         assert [state.poses.shape for state in recording.states()] == [first.shape, first.shape, (1, 7)]
         assert [state.bodies for state in recording.states()] == [header.bodies, header.bodies, cup.bodies]
@@ -390,6 +413,12 @@ def shared(store: AssetStore, model: mujoco.MjModel, **changes: Any) -> tuple[Sc
     return spec, SceneAssets(-1, 0, str(store.root), store.put(encode_scene(spec)))
 
 
+def drawn_visuals(path: Path) -> dict[str, list[Any]]:
+    """Return the batches of the visuals of scenes."""
+    found = {entity: select(batches, "InstancePoses3D:translations") for entity, batches in read(path).items()}
+    return {entity: batches for entity, batches in found.items() if batches}
+
+
 def begun(path: Path, assets: SceneAssets) -> tuple[RrdWriter, Any]:
     """Begin a file of the small session, with one state at step 0."""
     writer, header = RrdWriter(path, "id"), make_header()
@@ -410,11 +439,14 @@ def test_shared_specification_is_drawn_instead_of_the_model(tmp_path: Path) -> N
     _, assets = shared(store, mujoco.MjModel.from_xml_string(XML), visuals=(post, *twins))
     writer, _ = begun(tmp_path / "w.rrd", assets)
     writer.close()
-    found = {entity: batches for entity, batches in read(tmp_path / "w.rrd").items() if entity.startswith("/scene")}
-    assert sorted(found) == ["/scene/1/ball/twin", "/scene/1/ball/twin\\ \\(2\\)", "/scene/1/post/post"]
-    assert column(found["/scene/1/post/post"], "CoordinateFrame:frame") == [["world"]]
-    assert column(found["/scene/1/post/post"], "InstancePoses3D:translations") == [[[1.0, 1.0, 0.5]]]
-    assert column(found["/scene/1/post/post"], "Boxes3D:colors") == [[0xFF0000FF]]
+    found = drawn_visuals(tmp_path / "w.rrd")
+    assert sorted(found) == [
+        "/scene/1/bodies/ball/twin",
+        "/scene/1/bodies/ball/twin\\ \\(2\\)",
+        "/scene/1/bodies/post/post",
+    ]
+    assert column(found["/scene/1/bodies/post/post"], "InstancePoses3D:translations") == [[[1.0, 1.0, 0.5]]]
+    assert column(found["/scene/1/bodies/post/post"], "Boxes3D:colors") == [[0xFF0000FF]]
 
 
 def test_patch_changes_the_picture_from_its_step(tmp_path: Path) -> None:
@@ -437,28 +469,32 @@ def test_patch_changes_the_picture_from_its_step(tmp_path: Path) -> None:
         writer.add(Batch(states=[frame(10 * i, poses)]))
     writer.close()
     found = read(tmp_path / "w.rrd")
-    ball = found["/scene/1/ball/g\\/ball"]
+    ball = found["/scene/1/bodies/ball/g\\/ball"]
 
     def told(entity: str, name: str) -> list[tuple[int, Any]]:
         batches = [batch for batch in found[entity] if name in batch.schema.names]
         pairs = zip(column(batches, "step"), column(batches, name), strict=True)
         return [(step, value) for step, value in pairs if value is not None]
 
-    assert [step for step, _ in told("/scene/1/ball/g\\/ball", "Ellipsoids3D:half_sizes")] == [0], "the form once"
+    assert [step for step, _ in told("/scene/1/bodies/ball/g\\/ball", "Ellipsoids3D:half_sizes")] == [0], (
+        "the form once"
+    )
     assert column(ball, "step") == [0, 10, 20, 30]
-    assert told("/scene/1/ball/g\\/ball", "Ellipsoids3D:colors")[1:] == [
+    assert told("/scene/1/bodies/ball/g\\/ball", "Ellipsoids3D:colors")[1:] == [
         (10, [0xFF0000FF]),
         (20, [0xFF000000]),
         (30, [0x0000FFFF]),
     ]
-    hidden = told("/scene/1/ball/g\\/ball", "InstancePoses3D:scales")
+    hidden = told("/scene/1/bodies/ball/g\\/ball", "InstancePoses3D:scales")
     assert hidden == [(20, [[0.0, 0.0, 0.0]])]
-    shown = told("/scene/1/ball/g\\/ball", "InstancePoses3D:translations")
+    shown = told("/scene/1/bodies/ball/g\\/ball", "InstancePoses3D:translations")
     assert [step for step, _ in shown] == [0, 20, 30], "a pose without a scale has its full size again"
-    assert told("/scene/1/tip/visual_4", "InstancePoses3D:translations")[-1] == (10, [[0.5, 0.0, 0.0]])
-    assert told("/scene/1/ball/arrow", "Cylinders3D:lengths") == [(10, [pytest.approx(0.2)])]
-    assert [step for step, _ in told("/scene/1/ball/arrow", "Clear:is_recursive")] == [20]
-    assert [step for step, _ in told("/scene/1/post/visual_6", "Boxes3D:half_sizes")] == [20], "hidden until then"
+    assert told("/scene/1/bodies/tip/visual_4", "InstancePoses3D:translations")[-1] == (10, [[0.5, 0.0, 0.0]])
+    assert told("/scene/1/bodies/ball/arrow", "Cylinders3D:lengths") == [(10, [pytest.approx(0.2)])]
+    assert [step for step, _ in told("/scene/1/bodies/ball/arrow", "Clear:is_recursive")] == [20]
+    assert [step for step, _ in told("/scene/1/bodies/post/visual_6", "Boxes3D:half_sizes")] == [20], (
+        "hidden until then"
+    )
 
 
 def test_patch_before_the_first_state_is_the_initial_look(tmp_path: Path) -> None:
@@ -470,7 +506,7 @@ def test_patch_before_the_first_state_is_the_initial_look(tmp_path: Path) -> Non
     writer.add(Batch(assets=[assets]))
     writer.add(Batch(assets=[SceneAssets(3, 9, str(store.root), address)]))
     writer.close()
-    assert column(read(tmp_path / "w.rrd")["/scene/1/ball/g\\/ball"], "Ellipsoids3D:colors") == [[0xFF0000FF]]
+    assert column(read(tmp_path / "w.rrd")["/scene/1/bodies/ball/g\\/ball"], "Ellipsoids3D:colors") == [[0xFF0000FF]]
 
 
 def test_missing_assets_are_reported_and_others_written(tmp_path: Path) -> None:
@@ -484,7 +520,7 @@ def test_missing_assets_are_reported_and_others_written(tmp_path: Path) -> None:
     (text,) = column(found["/events/recorder"], "TextLog:text")
     assert "more cannot be drawn" in text[0]
     assert gone in text[0]
-    drawn = sum(entity.startswith("/scene") for entity in found)
+    drawn = len(drawn_visuals(tmp_path / "w.rrd"))
     whole = sum(visual.rgba[3] > 0 and visual.group < 3 for visual in spec.visuals)
     lost = sum(visual.geometry.mesh == 0 for visual in spec.visuals)
     assert (drawn, lost > 5) == (whole - lost, True)
@@ -506,3 +542,171 @@ def test_changed_model_is_not_used(tmp_path: Path) -> None:
         with pytest.raises(LookupError):
             recording.model(cup.model_hash)
         assert any("checksum" in line for line in recording.damage)
+
+
+def test_joints_grippers_and_tips_of_robots_are_plotted(tmp_path: Path) -> None:
+    """Values of a robot of two joints and a gripper, and of one without joints and gripper."""
+    path = tmp_path / "w.rrd"
+    robots = (RobotLabels("left", "base", ("left/hinge", "rail"), ("rad", "m")), RobotLabels("free", "base"))
+    writer = RrdWriter(path, "id")
+    writer.write_header(SessionHeader("s", "n", "closed", 2_000_000))
+    writer.add(Batch(assets=[SceneAssets(robots=robots)]))
+    tips = [((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), ((0.0, 0.0, 0.032), (1.0, 1.0, 1.0))]
+    values = [np.array([0.5 + i, 0.25, 0.75, np.nan, *np.ravel(tips[i])]).tobytes() for i in range(2)]
+    states = [msgspec.structs.replace(frame(8 * i, np.zeros((0, 7))), robots=values[i]) for i in range(2)]
+    other = msgspec.structs.replace(frame(16, np.zeros((0, 7))), robots=values[0][8:])  # of another scene
+    writer.add(Batch(states=[*states, other]))
+    writer.close()
+    found = read(path)
+    joints = found["/robots/left/joints"]
+    assert column(select(joints, "SeriesLines:names"), "SeriesLines:names") == [["hinge [rad]", "rail [m]"]]
+    rows = select(joints, "Scalars:scalars")
+    assert column(rows, "Scalars:scalars") == [[0.5, 0.25], [1.5, 0.25]]
+    assert times(rows) == [state.session_time for state in states]
+    assert column(select(found["/robots/left/gripper"], "Scalars:scalars"), "Scalars:scalars") == [[0.75], [0.75]]
+    speeds = column(select(found["/robots/left/tip_speed"], "Scalars:scalars"), "Scalars:scalars")
+    assert speeds == [[pytest.approx(2.0)]], "32 mm in 16 ms; nothing is known of the first"
+    assert sorted(entity for entity in found if "free" in entity) == ["/robots/free/tip_speed"]
+
+
+def test_errors_of_alignments_and_rejected_samples_are_plotted_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    writer.write_header(SessionHeader("s", "n", "closed", 2_000_000))
+    pose = Pose((0.0, 0.0, 0.0), IDENTITY_Q)
+    stated = [Alignment(i, "measured", pose, 0, (), error / 2, error) for i, error in ((1, 0.004), (2, 0.002))]
+    bodies: list[EventKind] = [
+        *(AlignmentChanged("p1", one) for one in stated),
+        AlignmentChanged("p2", msgspec.structs.replace(stated[0], offset=True)),
+        *(SamplesRejected("p1", device, "stale", n) for device, n in (("head", 2), ("hand/left", 1), ("head", 5))),
+        ParticipantLeft("p1", "bye"),
+    ]
+    events = [Event(2 + i, 10 * i, 100 * i, body) for i, body in enumerate(bodies)]
+    writer.add(Batch(events=[joined("p1", "Ada"), *events], states=[frame(0, np.zeros((0, 7)))]))
+    writer.add_report("p1", 50, 3.5)
+    writer.close()
+    found = read(path)
+    plots = {kind: found[f"/metrics/{kind}/p1"] for kind in ("alignment_mm", "rejected_samples", "state_age_ms")}
+    values = {kind: select(batches, "Scalars:scalars") for kind, batches in plots.items()}
+    assert column(values["alignment_mm"], "Scalars:scalars") == [[4.0], [2.0], [2.0]]
+    assert times(values["alignment_mm"]) == [0, 100, 600], "until Ada left"
+    assert column(values["rejected_samples"], "Scalars:scalars") == [[2.0], [3.0], [6.0], [6.0]]
+    assert (column(values["state_age_ms"], "Scalars:scalars"), times(values["state_age_ms"])) == ([[3.5]], [50])
+    names = [column(select(batches, "SeriesLines:names"), "SeriesLines:names") for batches in plots.values()]
+    assert names == [
+        [["Ada, at the robot, 95 % [mm]"]],
+        [["Ada, since joining"]],
+        [["Ada, 99 % of the states [ms]"]],
+    ]
+    assert not any("p2" in entity for entity in found if entity.startswith("/metrics")), (
+        "an offset voids the stated error"
+    )
+    with Recording.open(path, warn=False) as recording:
+        assert recording.metrics()["alignment_mm/p1"][1].tolist() == [4.0, 2.0, 2.0]
+        assert recording.damage == []
+
+
+def test_links_are_below_their_robots(tmp_path: Path) -> None:
+    """The arm of the small session as a robot; names of links and visuals are without that of the robot."""
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    header = msgspec.structs.replace(make_header(), robots=(RobotSpec("arm", (), (), "site", "arm/link 1"),))
+    writer.write_header(header)
+    writer.add(Batch(states=[frame(0, np.zeros((len(header.bodies), 7)))]))
+    writer.close()
+    moved = {entity for entity, batches in read(path).items() if select(batches, "Transform3D:translation")}
+    assert moved == {"/scene/1/robots/arm/link\\ 1", "/scene/1/robots/arm/tip", "/scene/1/bodies/ball"}
+    parents = tuple(f"{entity}/" for entity in (*moved, "/scene/1/world"))
+    assert all(entity.startswith(parents) for entity in drawn_visuals(path))
+
+
+def test_no_two_rows_of_an_entity_have_one_time(tmp_path: Path) -> None:
+    """Events, denials, raw messages and changes of a lane of one step: dataframes have a row per entity and time."""
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    header = make_header()
+    writer.write_header(header)
+    stops = [Event(i + 2, 4, 8_000_000, EStopChanged(i % 2 == 0, "p1", "", 1)) for i in range(3)]
+    denied = DenialRecord(4, 8_000_000, 3, Denial("held", "left is held"))
+    poses = np.zeros((len(header.bodies), 7))
+    heads = [PresenceItem("p1", device, Pose((0, 0, 0), IDENTITY_Q), 5) for device in ("head", "hand/left")]
+    states = [frame(0, poses, tuple(heads)), frame(8, poses + 1.0, tuple(heads))]
+    for _ in range(3):
+        writer.add_sample(3, 8_000_000, b"x")
+    writer.add(Batch(events=[joined("p1", "Ada"), *stops], denials=[denied] * 2, states=states))
+    writer.close()
+    for entity, batches in read(path).items():
+        for name in {
+            name for batch in batches for name in batch.schema.names if ":" in name or name in ("data", "event")
+        }:
+            rows = [batch for batch in select(batches, name) if "session_time" in batch.schema.names]
+            assert len(times(rows)) == len(set(times(rows))), f"{entity} {name}"
+    assert times(read(path)["/events"]) == [1, 8_000_000, 8_000_001, 8_000_002]
+    with Recording.open(path, warn=False) as recording:
+        assert [sample.receive_ns for sample in recording.samples()] == [8_000_000] * 3
+        assert [event.session_time for event in recording.events()] == [1] + [8_000_000] * 3
+        assert len(list(recording.denials())) == 2
+
+
+def test_later_part_clears_the_picture_of_the_one_before(tmp_path: Path) -> None:
+    """Scene and people that part 1 showed at its end are not shown beside those of part 2."""
+    path = Path(part_path(str(tmp_path / "w.rrd"), 2))
+    writer = RrdWriter(path, "id")
+    header = make_header()
+    writer.write_header(header)
+    writer.add(Batch(states=[frame(5, np.zeros((len(header.bodies), 7)))]))
+    writer.close()
+    found = read(path)
+    for entity in ("/scene", "/presence"):
+        assert column(select(found[entity], "Clear:is_recursive"), "step") == [5]
+
+
+def test_anchors_have_axes_and_the_worst_stated_error(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    sheet = Pose((1.0, 2.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    writer.write_header(SessionHeader("s", "n", "closed", 2_000_000, anchors={"sheet 1": sheet}))
+    aligned = [
+        AlignmentChanged(who, Alignment(1, "measured", sheet, 0, (), error_m, 0.1))
+        for who, error_m in (("p1", 0.002), ("p2", 0.005))
+    ]
+    moved = AnchorMoved("sheet 1", msgspec.structs.replace(sheet, p=(3.0, 0.0, 0.0)))
+    bodies: list[EventKind] = [*aligned, moved, ParticipantLeft("p2", "")]
+    events = [Event(i + 1, i, 100 * i, body) for i, body in enumerate(bodies, 1)]
+    writer.add(Batch(events=events, states=[frame(0, np.zeros((0, 7)))]))
+    writer.close()
+    found = read(path)
+    assert column(found["/anchors/sheet\\ 1"], "Transform3D:translation") == [[[1.0, 2.0, 0.0]], [[3.0, 0.0, 0.0]]]
+    assert column(found["/anchors/sheet\\ 1"], "Transform3D:quaternion")[0] == [[0.0, 0.0, 1.0, 0.0]]
+    assert column(found["/anchors/sheet\\ 1/label"], "Points3D:labels") == [
+        ["sheet 1"],
+        ["sheet 1: 2.0 mm (95 %)"],
+        ["sheet 1: 5.0 mm (95 %)"],
+        ["sheet 1: 2.0 mm (95 %)"],
+    ]
+    sizes = column(found["/anchors/sheet\\ 1/error"], "Ellipsoids3D:half_sizes")
+    assert [size[0][0] for size in sizes] == pytest.approx([0.0, 0.002, 0.005, 0.002])
+
+
+def test_result_is_in_properties_and_text(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    header, batch = journal(3)
+    writer = RrdWriter(path, "id")
+    writer.write_header(msgspec.structs.replace(header, robots=(RobotSpec("left", (), (), "site", "tip"),)))
+    passed = Handover("cup", "left", "right", "p1", "p2", 5)
+    episodes = [EpisodeChanged(1, state, "p1") for state in ("running", "success")]
+    bodies: list[EventKind] = [passed, *episodes]
+    batch.events = [
+        joined("p1", "Ada"),
+        joined("p2", "Bob"),
+        *(Event(i, 1, i, body) for i, body in enumerate(bodies, 3)),
+    ]
+    writer.add(batch)
+    writer.close()
+    found = read(path)
+    (result,) = found["/__properties/session"]
+    names = ("people", "robots", "handovers", "episodes", "duration_s", "verify_class")
+    values = [result.column(name)[0].as_py() for name in names]
+    assert values == [["Ada", "Bob"], ["left"], [1], [1], [pytest.approx(0.004)], ["closed"]]
+    page = column(found["/session"], "TextDocument:text")[-1][0]
+    assert "**Ada** (operator), **Bob** (operator). 0.0 s, handovers: 1" in page

@@ -67,6 +67,7 @@ class Recorder:
         session_time: int,
         poses: NDArray[np.float64],
         applied: Sequence[Applied] = (),
+        robots: bytes = b"",
     ) -> None: ...
 
     def add_metric(self, step: int, session_time: int, name: str, value: float) -> None: ...

@@ -464,6 +464,7 @@ class Journal:
         session_time: int,
         poses: NDArray[np.float64],
         applied: Sequence[Applied] = (),
+        robots: bytes = b"",
     ) -> None:
         pass
 

@@ -17,6 +17,7 @@ from iris_session.protocol.entries import HOST, Entry, ExternalReset, PhysicsDiv
 from iris_session.protocol.server_messages import BodyInfo, Gap, StateHeader
 from iris_session.protocol.steps import Decision
 from iris_session.recording.journal import CRASHED, JournalRow, Keyframe, check_row
+from iris_session.recording.messages import RobotLabels
 from iris_session.session.errors import OwnershipError
 from iris_session.session.stepper import MAX_HOST_ENTRIES, RESERVED_HOST_ENTRIES, Stepper
 from tests.session.play import TICK_NS, entries, make_core
@@ -68,6 +69,7 @@ class Recorder:
         bodies: tuple[BodyInfo, ...],
         root: str = "",
         scene_hash: str = "",
+        robots: tuple[RobotLabels, ...] = (),
     ) -> None:
         assert packed_model
         assert bodies
@@ -95,6 +97,7 @@ class Recorder:
         session_time: int,
         poses: NDArray[np.float64],
         applied: Sequence[Applied] = (),
+        robots: bytes = b"",
     ) -> None:
         self.states += 1
         self.state_times.append(session_time)
