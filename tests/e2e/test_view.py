@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import subprocess
 import sys
+import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,8 +16,9 @@ from pathlib import Path
 import psutil
 import pytest
 
+from iris_session.recording.rrd_file import scan_file
 from tests.e2e.session_process import assert_all_end, list_descendants
-from tests.recording.support import journal, write
+from tests.recording.support import journal, wait_until, write
 
 DEADLINE_S = 60.0
 
@@ -26,16 +29,19 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @contextmanager
-def viewed(path: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Start the command; yield it and the address that it prints."""
-    command = [sys.executable, "-m", "iris_session.cli.main", "view", str(path), "--web", "--no-open"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+def viewed(*arguments: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Start a command that shows a page; yield it and the address that it prints."""
+    command = [sys.executable, "-m", "iris_session.cli.main", *map(str, arguments)]
+    environment = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
+    ) as process:
         assert process.stdout is not None
         lines = []
         try:
             for line in process.stdout:
                 lines.append(line)
-                if found := re.search(r"in a browser on this machine: (http://\S+)", line):
+                if found := re.search(r"in a browser on this machine: (http://127\S+/\?url=\S+)", line):
                     yield process, found[1]
                     return
             pytest.fail("".join(lines))
@@ -45,7 +51,7 @@ def viewed(path: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
 
 @pytest.mark.e2e
 def test_page_is_served_on_this_machine_only_until_ctrl_c(recording: Path) -> None:
-    with viewed(recording) as (process, address):
+    with viewed("view", recording, "--web", "--no-open") as (process, address):
         with urllib.request.urlopen(address, timeout=DEADLINE_S) as answer:
             page = answer.read().decode()
         assert "re_viewer" in page
@@ -66,7 +72,7 @@ def test_page_is_served_on_this_machine_only_until_ctrl_c(recording: Path) -> No
 
 @pytest.mark.e2e
 def test_viewer_that_is_killed_ends_the_command(recording: Path) -> None:
-    with viewed(recording) as (process, _):
+    with viewed("view", recording, "--web", "--no-open") as (process, _):
         (viewer,) = list_descendants(process.pid)
         viewer.kill()
         assert process.wait(DEADLINE_S) == 1
@@ -76,8 +82,33 @@ def test_viewer_that_is_killed_ends_the_command(recording: Path) -> None:
 
 @pytest.mark.e2e
 def test_terminated_command_ends_the_viewer(recording: Path) -> None:
-    with viewed(recording) as (process, _):
+    with viewed("view", recording, "--web", "--no-open") as (process, _):
         viewers = list_descendants(process.pid)
         process.terminate()
         assert process.wait(DEADLINE_S) == 0
         assert_all_end(viewers)
+
+
+def is_answered(address: str) -> bool:
+    try:
+        urllib.request.urlopen(address, timeout=DEADLINE_S).close()
+    except urllib.error.URLError:
+        return False
+    return True
+
+
+@pytest.mark.e2e
+def test_serve_shows_its_recording_while_it_is_written(tmp_path: Path) -> None:
+    """The viewer and the process that feeds it end with the session."""
+    path = tmp_path / "session.rrd"
+    ports = ("--control-port", "0", "--state-port", "0", "--no-beacon", "--no-web")
+    with viewed("serve", "handover", *ports, "--record", path, "--view") as (process, address):
+        wait_until(lambda: is_answered(address), DEADLINE_S)
+        children = list_descendants(process.pid)
+        wait_until(lambda: any("live_feed" in " ".join(p.cmdline()) for p in list_descendants(process.pid)), DEADLINE_S)
+        children += list_descendants(process.pid)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(DEADLINE_S) == 0
+        assert_all_end(children)
+        assert not is_answered(address)
+    wait_until(lambda: scan_file(path).indexed, DEADLINE_S)
