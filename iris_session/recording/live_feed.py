@@ -4,6 +4,9 @@ It reads whole messages from the end of the file and hands them to Rerun's clien
 viewers: one that does not read makes this process wait, and what it has not got is in the file. Then the next part
 follows. The process ends with the session, or with the process that started it.
 
+The recorder writes rows of motion every few seconds, and exact states several times a second: of these the newest one
+is drawn beside what the file has.
+
 The viewer opens on the newest moment, where a recording opens at the first: the arrangement of views is sent with
 another play state.
 """
@@ -34,6 +37,7 @@ from iris_session.recording.rrd_file import (
     MAGIC,
     RECORDING,
     find_store_id,
+    read_chunks,
     read_message,
     read_message_head,
     scan_file,
@@ -121,6 +125,7 @@ class LiveFeed:
         self._tail = MessageTail(path)
         self._url = url
         self._client: Any = None
+        self._motion = LiveMotion()
         self._infos: dict[bytes, bytes] = {}  # by id of the store: what every batch begins with
 
     def poll(self) -> int:
@@ -153,12 +158,58 @@ class LiveFeed:
             # Rerun's importer sends messages under their own ids; this one is the same, so that no other one appears.
             own_id = next(iter(self._infos), b"").decode()
             self._client = rr.RecordingStream(paths.APPLICATION, recording_id=own_id)
+            self._client.set_log_time_enabled(False)
             self._client.connect_grpc(self._url)
         self._client.log_file_from_contents(paths.FIRST_FILE, data)
+        self._motion.draw(self._client, data)
         while True:
             with suppress(RuntimeError):
                 self._client.flush(timeout_sec=SEND_S)
                 return
+
+
+class LiveMotion:
+    """Poses of bodies and devices at the newest state of a recording that is being written."""
+
+    def __init__(self) -> None:
+        self._entities: list[str] = []
+
+    def draw(self, client: Any, data: bytes) -> None:
+        """Draw the newest state in the bytes of a file, if one is in them."""
+        from iris_session.recording import record_batches
+        from iris_session.recording.people import get_device_entity
+        from iris_session.recording.timelines import Moment, set_moment
+
+        newest = None
+        with tempfile.NamedTemporaryFile(suffix=".rrd") as file, suppress(NotARecordingError):
+            file.write(data)
+            file.flush()
+            for chunk in read_chunks(file.name, (paths.STATE, paths.STATE_ENTITIES)):
+                batch = chunk.to_record_batch()
+                if chunk.entity_path == paths.STATE_ENTITIES:
+                    self._entities = batch.column("bodies")[-1].as_py()
+                else:
+                    newest = batch.slice(batch.num_rows - 1)
+        if newest is None:
+            return
+        (state,) = record_batches.decode_states(newest)
+        (sim_ns,), (wall_ns,) = (record_batches.read_index(newest, name) for name in (paths.SIM_TIME, paths.WALL_TIME))
+        set_moment(client, Moment(state.step, sim_ns, state.session_time, wall_ns))
+        if len(state.poses) == len(self._entities):
+            for entity, pose in zip(self._entities, state.poses.tolist(), strict=True):
+                if entity:
+                    _draw_pose(client, entity, pose)
+        for item in state.presence:
+            _draw_pose(client, get_device_entity(item.participant, item.device), [*item.pose.p, *item.pose.q])
+        client.reset_time()
+
+
+def _draw_pose(client: Any, entity: str, pose: list[float]) -> None:
+    """Log a pose `x y z qw qx qy qz`."""
+    import rerun as rr
+
+    x, y, z, qw, *q = pose
+    client.log(entity, rr.Transform3D(translation=(x, y, z), quaternion=rr.Quaternion(xyzw=[*q, qw])))
 
 
 def _make_following(blueprint: bytes) -> bytes:

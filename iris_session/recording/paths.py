@@ -20,6 +20,8 @@ MODELS: Final = "/journal/models"
 MARKS: Final = "/journal/marks"
 END: Final = "/journal/end"
 STATE: Final = "/state"
+#: Entities of the bodies in the order of the poses in `/state`, empty for those that do not move.
+STATE_ENTITIES: Final = "/state/entities"
 SAMPLES: Final = "/samples"
 EVENTS: Final = "/events"
 DENIALS: Final = "/denials"

@@ -102,7 +102,7 @@ class PeoplePicture:
                 if shown is None or shown.label != label:
                     self._draw_device(key, label, moment)
                 self._shown[key] = _Shown(item, state.session_time, label)
-                rows.append(DeviceRow(i, _entity(key), (*item.pose.p, *item.pose.q)))
+                rows.append(DeviceRow(i, get_device_entity(*key), (*item.pose.p, *item.pose.q)))
             for key in [key for key, shown in self._shown.items() if state.session_time - shown.seen_ns > STALE_NS]:
                 self._clear(key, moment)
         return rows
@@ -128,17 +128,17 @@ class PeoplePicture:
                 half_sizes=[HEAD_HALF_M], colors=colours, labels=[label], show_labels=True, fill_mode=solid
             )
             arrow = rr.Arrows3D(vectors=[(VIEW_M, 0.0, 0.0)], colors=colours, radii=[0.008])
-            self._rec.log(_entity(key), box, strict=True)
-            self._rec.log(f"{_entity(key)}/view", arrow, strict=True)
+            self._rec.log(get_device_entity(*key), box, strict=True)
+            self._rec.log(f"{get_device_entity(*key)}/view", arrow, strict=True)
         else:
             ball = rr.Ellipsoids3D(half_sizes=[HAND_HALF_M], colors=colours, fill_mode=solid)
-            self._rec.log(_entity(key), ball, strict=True)
+            self._rec.log(get_device_entity(*key), ball, strict=True)
         self._rec.reset_time()
 
     def _clear(self, key: _Key, moment: Moment) -> None:
         del self._shown[key]
         set_moment(self._rec, moment)
-        self._rec.log(_entity(key), rr.Clear(recursive=True), strict=True)
+        self._rec.log(get_device_entity(*key), rr.Clear(recursive=True), strict=True)
         self._rec.reset_time()
 
 
@@ -200,6 +200,6 @@ class AnchorPicture:
         self._rec.reset_time()
 
 
-def _entity(key: _Key) -> str:
-    participant, device = key
+def get_device_entity(participant: str, device: str) -> str:
+    """Return the entity of a device."""
     return "/".join((paths.PRESENCE, *map(escape_entity_part, (participant, *device.split("/")))))

@@ -110,6 +110,11 @@ def list_column(name: str, values: Sequence[Sequence[int]], kind: Any) -> ArrowC
     return ArrowColumn(name, pa.ListArray.from_arrays(pa.array(offsets), pa.array(flat, kind)))
 
 
+def text_list_column(name: str, values: Sequence[str]) -> ArrowColumn:
+    """Return a column of one row with a list of texts."""
+    return ArrowColumn(name, pa.array([list(values)], pa.list_(pa.string())))
+
+
 def matrix_column(name: str, values: NDArray[np.float64]) -> ArrowColumn:
     """Return a column of a list of float64 per row of `values` (rows, items)."""
     rows, items = values.shape

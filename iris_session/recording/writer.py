@@ -72,6 +72,7 @@ from iris_session.recording.rrd_stream import (
     matrix_column,
     scalar_column,
     sequence_index,
+    text_list_column,
 )
 from iris_session.recording.story import FREE, WARN, LaneChange, LogLine, Rgb, SessionStory, StatedErrors
 from iris_session.recording.timelines import Moment, UniqueTimes, get_session_time, to_time_columns
@@ -375,6 +376,12 @@ class RrdWriter:
         self._anchors.draw(moment)
         if not self._picture.draw(moment):
             return times
+        entities = [self._picture.find_entity(body.name) if body.moving else "" for body in self._bodies]
+        self._send_columns(
+            paths.STATE_ENTITIES,
+            to_time_columns(np.array([moment], np.int64).T),
+            [text_list_column("bodies", entities)],
+        )
         seen = times.copy()
         seen[:, 0] = moment
         return seen

@@ -9,19 +9,24 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 
+from iris_session.protocol.common import Pose
+from iris_session.protocol.server_messages import PresenceItem
 from iris_session.recording import NotARecordingError, live_feed
 from iris_session.recording.live_feed import LiveFeed, MessageTail
 from iris_session.recording.lock import RecordingLock
+from iris_session.recording.messages import Batch, StateFrame
 from iris_session.recording.rerun_tool import find_rerun, make_environment
 from iris_session.recording.rrd_file import KIND_END, read_message, scan_file
+from iris_session.recording.writer import RrdWriter
 from iris_session.system.process import ChildProcess
-from tests.recording.support import column, journal, read, wait_until, write
+from tests.recording.support import column, journal, make_header, read, wait_until, write
 
 STEPS = 60
 
@@ -94,28 +99,61 @@ def steps_received(path: Path) -> list[int]:
         return []
 
 
-def test_viewer_gets_everything_and_follows(closed: Path, tmp_path: Path) -> None:
+def play_states(path: Path) -> list[tuple[bytes, list[int]]]:
+    """Return row ids and play states of the blueprint in a file that is being written."""
     from rerun.chunk import RrdReader
 
+    with warnings.catch_warnings(), suppress(OSError, ValueError, RuntimeError):
+        warnings.simplefilter("ignore")  # there is no index
+        reader = RrdReader(str(path))
+        (blueprint,) = reader.blueprints()
+        assert len(reader.recordings()) == 1
+        batches = [chunk.to_record_batch() for chunk in reader.stream(store=blueprint)]
+        found = [batch for batch in batches if "TimePanelBlueprint:play_state" in batch.schema.names]
+        ids = column(found, "rerun.controls.RowId")
+        return [*zip(ids, column(found, "TimePanelBlueprint:play_state"), strict=True)]
+    return []
+
+
+def test_viewer_gets_everything_and_follows(closed: Path, tmp_path: Path) -> None:
     got = tmp_path / "got.rrd"
     with receiver(got) as (_, url):
         feed = LiveFeed(str(closed), url)
         while feed.poll():
             pass
         feed.close()
-        wait_until(lambda: steps_received(got) == list(range(STEPS)))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the server has been killed: it wrote no index
-        reader = RrdReader(str(got))
-    assert len(reader.recordings()) == 1
-    (blueprint,) = reader.blueprints()
-    states = [
-        (batch.column("rerun.controls.RowId")[0].as_py(), batch.column("TimePanelBlueprint:play_state")[0].as_py())
-        for batch in (chunk.to_record_batch() for chunk in reader.stream(store=blueprint))
-        if "TimePanelBlueprint:play_state" in batch.schema.names
-    ]
-    assert len(states) == 2
-    assert max(states)[1] == [3], "following, in place of paused"
+        wait_until(lambda: steps_received(got) == list(range(STEPS)) and len(play_states(got)) == 2)
+    assert max(play_states(got))[1] == [3], "following, in place of paused"
+
+
+def test_newest_state_is_drawn_before_its_motion_is_in_the_file(tmp_path: Path) -> None:
+    got, path = tmp_path / "got.rrd", tmp_path / "session.rrd"
+    header = make_header()
+    poses = np.zeros((len(header.bodies), 7))
+    head = PresenceItem("p1", "hand/left", Pose((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0)), 5)
+    writer = RrdWriter(path, "id")
+    writer.write_header(header)
+    with receiver(got) as (_, url):
+        feed = LiveFeed(str(path), url)
+        for step in (0, 8, 16):
+            state = StateFrame(step, step, step / 500, step * 2_000_000, (poses + step).tobytes(), (head,))
+            writer.add(Batch(states=[state]))
+            writer.flush()
+            feed.poll()
+        wait_until(lambda: steps_moved(got) == [0, 8, 16])
+        feed.close()
+    assert steps_moved(path) == [0], "the rest is due later"
+    hands = [b for b in read(got)["/presence/p1/hand/left"] if "Transform3D:translation" in b.schema.names]
+    assert {tuple(p) for (p,) in column(hands, "Transform3D:translation")} == {(0.0, 0.0, 1.0)}
+    writer.close()
+
+
+def steps_moved(path: Path) -> list[int]:
+    try:
+        batches = read(path)["/scene/1/bodies/ball"]
+        return sorted(set(column([b for b in batches if "Transform3D:translation" in b.schema.names], "step")))
+    except (OSError, LookupError, ValueError):
+        return []
 
 
 def test_viewer_that_stands_still_makes_only_the_feed_wait(closed: Path, tmp_path: Path) -> None:
