@@ -26,6 +26,7 @@ ALLOWED = {
     "iris_session/assets/store.py": "which files were used longest ago, as the file system stamps them",
     "iris_session/web/certificate.py": "when a certificate begins and ends, which is wall time by definition",
     "iris_session/bench/web_tab.py": "when a browser, which has no other clock in common, has seen a click",
+    "iris_session/cli/view.py": "when a recording was written last, as the file system stamps it, for people",
     "iris_session/session/config.py": "name of a default folder",
     "iris_session/session/processes.py": "when a recording was made, for people",
 }
