@@ -124,6 +124,7 @@ def _append(file: BinaryIO, size: int, index: bytes) -> bool:
     try:
         # One call: a reader, or a kill, finds the old end or the new one.
         is_whole = os.pwrite(descriptor, index, end) == len(index)
+        os.utime(descriptor, ns=(now.st_atime_ns, now.st_mtime_ns))  # what was recorded is as old as before
         os.fsync(descriptor)
     except OSError:
         is_whole = False

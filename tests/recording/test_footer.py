@@ -56,6 +56,13 @@ def test_index_follows_the_messages_as_they_were(closed: Path, indexed: Path) ->
     assert indexed.read_bytes() == data
 
 
+def test_time_of_a_file_is_that_of_its_recording(path: Path) -> None:
+    """So a copy that was made before is still that of the recording."""
+    before = path.stat()
+    assert add_index(path)
+    assert path.stat().st_mtime_ns == before.st_mtime_ns
+
+
 def test_indexed_file_reads_and_verifies_like_before(closed: Path, indexed: Path) -> None:
     with Recording.open(closed) as before, Recording.open(indexed) as after:
         assert list(after.rows()) == list(before.rows())
