@@ -1,7 +1,8 @@
 """Add Rerun's index, the footer, to a closed file: `python -m iris_session.recording.footer FILE`.
 
-With an index, Rerun's viewer opens a file at once and loads what it shows; without, it reads all of it first, and says
-meanwhile that loading has failed. The recorder writes none, because it would have to keep some 4 KB of every chunk.
+With an index, Rerun's viewer loads what it shows; without, it reads all of a file first, and says meanwhile that
+loading has failed. The recorder writes none, because it would have to keep some 4 KB of every chunk. The chunks stay
+small and many: of a long session the copy of `view_copy.py` opens several times faster.
 
 `rerun rrd filter` writes the messages of a file as they are, with an index behind them. That output is compared with
 the file byte by byte, and only then is the empty end message replaced by one with the index: everything before it stays
