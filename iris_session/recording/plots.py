@@ -72,6 +72,7 @@ class MetricPlots:
         self._named: set[str] = set()
         self._rows: dict[str, list[tuple[Moment, float]]] = {}
         self._held: dict[str, float] = {}
+        self._held_until_ns = -1
 
     def add(self, kind: str, subject: str, value: float, moment: Moment) -> None:
         """Collect a value. `subject`: id of a robot or participant, empty for a metric of the session."""
@@ -84,7 +85,10 @@ class MetricPlots:
             self._held[entity] = value
         if entity not in self._named:
             self._name(entity, kind, subject)
-        self._rows.setdefault(entity, []).append((moment, value))
+        rows = self._rows.setdefault(entity, [])
+        if kind in HELD and rows and rows[-1][0].session_ns == moment.session_ns:
+            rows.pop()  # the newest of one step is in force
+        rows.append((moment, value))
 
     def end(self, kind: str, subject: str, moment: Moment) -> None:
         """End the line of a value that was held until now."""
@@ -107,10 +111,11 @@ class MetricPlots:
 
     def write(self, now: Moment) -> int:
         """Write what was collected. Values that are held reach until `now`. Return the number of chunks."""
-        for entity, value in self._held.items():
+        for entity, value in self._held.items() if now.session_ns > self._held_until_ns else ():
             rows = self._rows.setdefault(entity, [])
-            if not rows or rows[-1][0] < now:
+            if not rows or rows[-1][0].session_ns < now.session_ns:
                 rows.append((now, value))
+        self._held_until_ns = max(now.session_ns, self._held_until_ns)
         collected, self._rows = self._rows, {}
         for entity, rows in collected.items():
             times = to_time_columns(np.array([moment for moment, _ in rows], np.int64).T)
