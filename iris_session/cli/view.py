@@ -82,6 +82,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     if not 0 <= arguments.port < 65535:
         raise CommandError(f"--port {arguments.port} is not a port: give 1 to 65534")
+    taken = [port for port in (arguments.port, arguments.port + 1) if arguments.port and _is_open(port)]
+    if taken:  # Rerun would send the recording to a viewer that listens there
+        raise CommandError(f"something listens on port {taken[0]} already: give another one, or leave --port out")
     tool = find_rerun()
     path = choose_recording(arguments.path)
     if arguments.live:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import socket
 from pathlib import Path
 
 import pytest
@@ -71,6 +72,15 @@ def test_unusable_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixtur
         assert out == ""
         assert err.count("\n") == 1
         assert why in err
+
+
+def test_port_of_another_program_is_refused(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        for given in (port, port - 1):  # the page gets its data from the next one
+            assert main(["view", str(path), "--port", str(given)]) == 2
+            assert f"port {port} already" in capsys.readouterr().err
+    assert not list(path.parent.glob("*.view.rrd")), "before the copy is made"
 
 
 def test_viewer_that_fails_is_a_line(

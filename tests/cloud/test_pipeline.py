@@ -105,7 +105,7 @@ def test_a_frame_that_is_too_old_to_be_joined_is_left_out_alone_and_counted() ->
 
 
 class Sight(NamedTuple):
-    """What clouds showed from the second second on: times at which they were taken [ms], by their cameras."""
+    """Clouds that were taken after the first second: the time [ms] and the cameras of each."""
 
     clouds: list[tuple[float, frozenset[str]]]
     pipeline: CloudPipeline
