@@ -280,6 +280,14 @@ class World:
         raise SimulationDivergedError(self._tick, float(self.data.time), self.diverged) from error
 
 
+#: Dynamics with which `ctrl` is a position: none, and filters of it.
+FOLLOWS: Final = (
+    int(mujoco.mjtDyn.mjDYN_NONE),
+    int(mujoco.mjtDyn.mjDYN_FILTER),
+    int(mujoco.mjtDyn.mjDYN_FILTEREXACT),
+)
+
+
 class RobotSignals:
     """Measured values of the robots of one model: joints, openings of grippers, positions of tips.
 
@@ -299,7 +307,7 @@ class RobotSignals:
             (i, actuator, *law)
             for i, robot in enumerate(robots)
             for actuator in find("actuator", [robot.gripper_actuator] if robot.gripper_actuator else [], robot)
-            if (law := _opening_law(model, actuator, robot)) is not None
+            if (law := find_opening_law(model, actuator, robot)) is not None
         ]
         self._grippers = np.array([law[:2] for law in laws], np.int64).reshape(-1, 2).T
         self._scale, self._offset = np.array([law[2:] for law in laws]).reshape(-1, 2).T
@@ -321,15 +329,21 @@ class RobotSignals:
         return values.tobytes()
 
 
-def _opening_law(model: mujoco.MjModel, actuator: int, robot: RobotSpec) -> tuple[float, float] | None:
+def find_opening_law(model: mujoco.MjModel, actuator: int, robot: RobotSpec) -> tuple[float, float] | None:
     """Return scale and offset from the length of a position actuator to the opening; `None` for other actuators.
 
     The length is that at which the actuator rests for some `ctrl`; the opening is where that lies between `ctrl` closed
-    and open.
+    and open: 0 closed, 1 open.
     """
     gain, (constant, slope) = float(model.actuator_gainprm[actuator, 0]), model.actuator_biasprm[actuator, :2].tolist()
     span = robot.gripper_open - robot.gripper_closed
-    if int(model.actuator_biastype[actuator]) != int(mujoco.mjtBias.mjBIAS_AFFINE) or not gain * slope * span:
+    is_position = (
+        int(model.actuator_gaintype[actuator]) == int(mujoco.mjtGain.mjGAIN_FIXED)
+        and int(model.actuator_biastype[actuator]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
+        and int(model.actuator_dyntype[actuator]) in FOLLOWS
+        and 0.0 not in (gain, slope, span)
+    )
+    if not is_position:
         return None
     return -slope / (gain * span), (-constant / gain - robot.gripper_closed) / span
 

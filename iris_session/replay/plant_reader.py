@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from iris_session.physics.contacts import ContactTables
 from iris_session.physics.names import find_element_id
 from iris_session.physics.tree import KinematicTree
-from iris_session.physics.world import STATE
+from iris_session.physics.world import STATE, find_opening_law
 from iris_session.protocol.common import Pose
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
@@ -38,15 +38,6 @@ GRIPPER: Final = "gripper"
 CONTACT_FORCE: Final = "contact_force"
 POSES: Final = "pose"
 CTRL: Final = "ctrl"
-
-_FIXED: Final = int(mujoco.mjtGain.mjGAIN_FIXED)
-_AFFINE: Final = int(mujoco.mjtBias.mjBIAS_AFFINE)
-#: Dynamics with which `ctrl` is a position: none, and filters of it.
-_FOLLOWS: Final = (
-    int(mujoco.mjtDyn.mjDYN_NONE),
-    int(mujoco.mjtDyn.mjDYN_FILTER),
-    int(mujoco.mjtDyn.mjDYN_FILTEREXACT),
-)
 
 
 class Quantity(NamedTuple):
@@ -135,25 +126,9 @@ class PlantReader:
         It is where a position actuator is now, in units of its `ctrl`, between the values that close and open it. Other
         actuators do not say where they are, and give NaN.
         """
-        model, actuator = self._model, find_element_id(self._model, "actuator", spec.gripper_actuator)
-        gain = float(model.actuator_gainprm[actuator, 0])
-        offset, slope = (float(b) for b in model.actuator_biasprm[actuator, :2])
-        span = spec.gripper_open - spec.gripper_closed
-        is_position = (
-            int(model.actuator_gaintype[actuator]) == _FIXED
-            and int(model.actuator_biastype[actuator]) == _AFFINE
-            and int(model.actuator_dyntype[actuator]) in _FOLLOWS
-            and 0.0 not in (gain, slope, span)
-        )
-        if not is_position:
-            return lambda: (math.nan,)
-
-        def read() -> Sequence[float]:
-            # force = gain * ctrl + offset + slope * length + damping; it is zero at rest at this ctrl.
-            ctrl = -(offset + slope * float(self._data.actuator_length[actuator])) / gain
-            return ((ctrl - spec.gripper_closed) / span,)
-
-        return read
+        actuator, data = find_element_id(self._model, "actuator", spec.gripper_actuator), self._data
+        scale, offset = find_opening_law(self._model, actuator, spec) or (math.nan, math.nan)
+        return lambda: (scale * float(data.actuator_length[actuator]) + offset,)
 
     def _solve_forces(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Return the forces on grippers and objects [N], solved once per state."""
