@@ -349,10 +349,11 @@ class Recording:
         marks: dict[int, list[rrd_file.Mark]] = {}
         for part, mark in self._items(paths.MARKS, record_batches.decode_marks):
             marks.setdefault(part, []).append(mark)
+        closed = {part for part, _ in self._items(paths.END, record_batches.decode_ends)}
         return [
             f"{os.path.basename(self.files[part])}: {line}"
             for part, noted in marks.items()
-            for line in rrd_file.changed_spans(self.files[part], noted)
+            for line in rrd_file.changed_spans(self.files[part], noted, part in closed)
         ]
 
     def close(self) -> None:

@@ -376,13 +376,16 @@ _DATA: Final = b"data"
 def group_spans(batches: Iterable[Any]) -> Iterator[list[Any]]:
     """Group record batches of any entities into spans: all pieces of some rows of one entity.
 
-    Mostly a span is one batch, as it was written. Spans of an entity come in the order of its rows.
+    Mostly a span is one batch, as it was written. Spans of an entity come in the order of its rows. A batch that
+    follows itself counts once: a closed file ends with two copies of the same messages.
     """
     waiting: dict[str, list[Any]] = {}
     for batch in batches:
         if batch.num_rows:
             ordered = _in_order(batch)
             pieces = waiting.setdefault(get_entity(batch), [])
+            if pieces and ordered.equals(pieces[-1]):
+                continue
             yield from _release_before(pieces, ordered.column(ROW_ID)[0])
             pieces.append(ordered)
     yield from filter(None, waiting.values())

@@ -35,6 +35,9 @@ RECORDING: Final = 1
 BLUEPRINT: Final = 2
 #: Upper bound of the bytes at the beginning of a message in which the id of its store stands.
 ID_BYTES: Final = 160
+#: Number of messages that are written twice when a file is closed: the last mark, and the end of the journal.
+CLOSING: Final = 2
+_CHANGED: Final = "bytes {} to {} are not as they were written"
 #: Number of messages tested together; a group that fails is halved until the bad messages are isolated.
 GROUP: Final = 256
 #: Bytes searched at a time for messages after a damaged one.
@@ -141,10 +144,11 @@ def _next_message(file: BinaryIO, begin: int, size: int) -> int | None:
     return None
 
 
-def changed_spans(path: str | Path, marks: Sequence[Mark]) -> list[str]:
+def changed_spans(path: str | Path, marks: Sequence[Mark], closed: bool) -> list[str]:
     """Return a line per span of the file whose bytes differ from the recorder's checksum.
 
-    Empty for a file that another tool has rewritten: in it most marks do not end between messages.
+    `closed`: the recorder closed the file. The result is empty for a file that another tool has rewritten: in it most
+    marks do not end between messages.
     """
     found = scan_file(path)
     ends = {m.offset for m in found.messages} | {found.size}
@@ -157,8 +161,30 @@ def changed_spans(path: str | Path, marks: Sequence[Mark]) -> list[str]:
     with open(path, "rb") as file:
         for mark in marks:
             if not 0 <= mark.begin <= mark.end <= found.size or _crc(file, mark) != mark.crc:
-                out.append(f"bytes {mark.begin} to {mark.end} are not as they were written")
+                out.append(_CHANGED.format(mark.begin, mark.end))
+        if closed:
+            out += _changed_end(file, found, max(mark.end for mark in marks))
     return out
+
+
+def _changed_end(file: BinaryIO, found: Scan, begin: int) -> list[str]:
+    """Compare the two copies of the messages after the last mark, which a recorder writes when it closes the file.
+
+    Earlier versions wrote `CLOSING` messages there, once.
+    """
+    is_ended = found.messages[-1].kind == KIND_END
+    closing = [m for m in found.messages if m.offset >= begin and m.kind != KIND_END]
+    if len(closing) <= CLOSING:
+        return []
+    end = closing[-1].offset + _HEAD.size + closing[-1].length
+    file.seek(begin)
+    copies = file.read(end - begin)
+    first, second = copies[: closing[CLOSING].offset - begin], copies[closing[CLOSING].offset - begin :]
+    # One call wrote both copies and the end message. Bytes of its size that are none were one; others are what a kill
+    # has left of an index. A file that was cut lacks some of the second copy.
+    is_same = first == second and (is_ended or found.size - end != len(END_MESSAGE))
+    is_cut = not is_ended and len(second) < len(first) and first.startswith(second)
+    return [] if is_same or is_cut else [_CHANGED.format(begin, end if is_ended else found.size)]
 
 
 def _crc(file: BinaryIO, mark: Mark) -> int:

@@ -42,12 +42,7 @@ class RrdStream:
 
     def write(self, timeout_s: float) -> None:
         """Append the data logged since the last call, all or nothing, and hand it to the operating system."""
-        data = self._encoded.read(flush=True, flush_timeout_sec=timeout_s)
-        if not data:
-            return
-        if data[: len(MAGIC)] != MAGIC:
-            raise ValueError("this version of Rerun encodes its messages in another way")
-        self._append(memoryview(data)[FILE_HEAD if self.size else 0 : end_of_messages(data)])
+        self._append(self._read(timeout_s))
 
     def mark(self) -> Mark:
         """Return the CRC-32 of all bytes since the last mark, so that any later change of them is found."""
@@ -55,11 +50,24 @@ class RrdStream:
         self._marked, self._crc = self.size, 0
         return mark
 
-    def close(self) -> None:
-        """End the file after the last `write` with the message that marks its end."""
-        self._append(memoryview(END_MESSAGE))
+    def close(self, timeout_s: float) -> None:
+        """Append the data logged since the last `write`, twice, and the message that marks the end of the file.
+
+        The last mark must be in that data: no mark covers it, so its two copies are compared (`changed_spans`).
+        """
+        data = self._read(timeout_s)
+        self._append(memoryview(b"".join((data, data, END_MESSAGE))))
         self._file.close()
         self.recording.disconnect()
+
+    def _read(self, timeout_s: float) -> memoryview:
+        """Return the messages of the data logged since the last call, with the head of the file if it is empty."""
+        data = self._encoded.read(flush=True, flush_timeout_sec=timeout_s) or b""
+        if not data:
+            return memoryview(data)
+        if data[: len(MAGIC)] != MAGIC:
+            raise ValueError("this version of Rerun encodes its messages in another way")
+        return memoryview(data)[FILE_HEAD if self.size else 0 : end_of_messages(data)]
 
     def _append(self, data: memoryview) -> None:
         rest = data

@@ -232,22 +232,21 @@ class RrdWriter:
         except (RuntimeError, ValueError, OSError) as error:
             raise self._to_error(error) from error
 
-    def close(self) -> None:
+    def close(self, timeout_s: float = 10.0) -> None:
         """Write the rest and the end mark, and close the file. Raises `WriteError`."""
-        self.flush()
+        self.flush(timeout_s)
         self._write_collected()
         self._picture.draw(self._find_moment(-1, 0))  # without a state the scene is drawn nevertheless
         if not self._arranged:
             self._send_blueprint()
         self._describe_result()
-        self.flush()
+        self.flush(timeout_s)
         self._write_mark()
         mark = EndMark(*self._newest_row)
         self._log_static(paths.END, rr.AnyValues(end=pa.array([_encode(mark)], pa.binary())))
-        self.flush()
         try:
-            self._stream.close()
-        except OSError as error:
+            self._stream.close(timeout_s)
+        except (RuntimeError, ValueError, OSError) as error:
             raise self._to_error(error) from error
 
     def _describe_result(self) -> None:

@@ -165,7 +165,7 @@ def test_kill_during_the_write_leaves_a_finished_file(indexed: Path, tmp_path: P
     path = tmp_path / "session.rrd"
     data = indexed.read_bytes()
     end = scan_file(indexed).messages[-1].offset
-    for size in (end + 16, end + 5000, len(data) - FILE_TAIL - 1):
+    for size in (end + 17, end + 5000, len(data) - FILE_TAIL - 1):
         path.write_bytes(data[:size])
         report = verify(path, SmallCore)
         assert report.ok, report.line()

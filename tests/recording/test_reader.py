@@ -19,6 +19,7 @@ from iris_session.recording import (
     rrd_file,
     verify,
 )
+from iris_session.recording.footer import add_index
 from iris_session.recording.journal import FORMAT, VERIFIERS
 from iris_session.recording.paths import part_path
 from iris_session.recording.rrd_stream import bytes_column, duration_index, sequence_index
@@ -38,7 +39,7 @@ def test_scan_finds_every_message_of_a_whole_file(path: Path) -> None:
     assert found.messages[-1].kind == rrd_file.KIND_END
 
 
-@pytest.mark.parametrize(("lost_messages", "least"), [(1, 200), (4, 180), (14, 80)])
+@pytest.mark.parametrize(("lost_messages", "least"), [(1, 200), (4, 180), (16, 80)])
 def test_truncated_file_is_read_up_to_its_end(path: Path, lost_messages: int, least: int) -> None:
     """As after a kill within a write: no footer, and half of a message at the end."""
     cut = rrd_file.scan_file(path).messages[-lost_messages]
@@ -75,10 +76,22 @@ def test_damaged_length_hides_one_message(path: Path, monkeypatch: pytest.Monkey
 @pytest.mark.long
 def test_any_flipped_bit_is_found(path: Path) -> None:
     """For every bit of the file only the room's own error is raised, and the file is never reported as ok."""
-    data = path.read_bytes()
     rng = random.Random(4)
-    for _ in range(8):
-        at, bit = rng.randrange(len(data)), rng.randrange(8)
+    check_flipped_bits(path, [(rng.randrange(os.path.getsize(path)), rng.randrange(8)) for _ in range(8)])
+
+
+@pytest.mark.parametrize("indexed", [False, True])
+def test_flipped_bit_after_the_last_checksum_is_found(path: Path, indexed: bool) -> None:
+    assert not indexed or add_index(path)
+    *_, mark, _, end_again, end = rrd_file.scan_file(path).messages
+    rng = random.Random(5)
+    check_flipped_bits(path, [(rng.randrange(mark.offset, end.offset), rng.randrange(8)) for _ in range(4)])
+    check_flipped_bits(path, [(end_again.offset, 0), (end_again.offset + 8, 4), (end.offset, 1), (end.offset + 8, 3)])
+
+
+def check_flipped_bits(path: Path, places: list[tuple[int, int]]) -> None:
+    data = path.read_bytes()
+    for at, bit in places:
         damaged = bytearray(data)
         damaged[at] ^= 1 << bit
         path.write_bytes(damaged)
@@ -87,6 +100,8 @@ def test_any_flipped_bit_is_found(path: Path) -> None:
         except NotARecordingError:
             continue
         assert not report.ok, f"bit {bit} of byte {at}"
+    path.write_bytes(data)
+    assert verify(path, SmallCore).ok
 
 
 def test_damaged_message_is_skipped(path: Path) -> None:
@@ -206,7 +221,7 @@ def test_missing_part_is_found(tmp_path: Path) -> None:
 
 
 def test_file_truncated_between_writes_is_not_finished(path: Path) -> None:
-    message = rrd_file.scan_file(path).messages[-14]
+    message = rrd_file.scan_file(path).messages[-16]
     os.truncate(path, message.offset)
     report = verify(path, SmallCore)
     assert (report.ok, report.finished, report.cuts) == (True, False, [])
@@ -236,7 +251,7 @@ def test_undecodable_content_is_one_line_with_its_place(tmp_path: Path) -> None:
     for entity, column in PLACES.items():
         writer._send_columns(entity, times, [bytes_column(column, [b"\xc1 nothing"])])
     writer.flush()
-    writer._stream.close()
+    writer._stream.close(10.0)
     report = verify(path, SmallCore)
     assert (report.ok, report.steps) == (False, 60)
     for entity in PLACES:
@@ -247,7 +262,7 @@ def test_undecodable_content_is_one_line_with_its_place(tmp_path: Path) -> None:
 
 def test_invalid_byte_count_of_a_mark_is_found(path: Path) -> None:
     marks = [rrd_file.Mark(-5, 2**62, 0), rrd_file.Mark(12, rrd_file.scan_file(path).size, 0)]
-    assert [line.partition(" are")[0] for line in rrd_file.changed_spans(path, marks)] == [
+    assert [line.partition(" are")[0] for line in rrd_file.changed_spans(path, marks, True)] == [
         f"bytes {mark.begin} to {mark.end}" for mark in marks
     ]
 
