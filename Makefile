@@ -74,13 +74,17 @@ check: install-dev
 # What decides; the rest talks to sockets, disks and people.
 CORE := iris_session/authority/*,iris_session/protocol/*,iris_session/control/*
 
+# Tests start some hundreds of short processes, each of which would compile the package again.
+export PYTHONDONTWRITEBYTECODE :=
+
 # Tests at once, and which. Two leave a third of two cores unused, since tests wait for processes; sessions in real time
 # need that third.
 JOBS ?= 3
 JOBS_E2E ?= 2
 T ?= tests
 
-# Tracing for coverage makes the unit tests take half as long again; without it there is no coverage to report.
+# Without FULL=1, tests that take more than some seconds are left out: a run on two cores is short enough to be made
+# before every commit. Continuous integration runs all, and traces for coverage, which takes half as long again.
 FULL ?=
 KINDS := $(if $(FULL),,and not long)
 UNIT = $(BIN)/python -m pytest -q -m "not e2e $(KINDS)" -n $(JOBS) --dist worksteal $(if $(FULL),--cov --cov-report=)

@@ -82,6 +82,8 @@ BLOCKS = tuple(block for page in PAGES for block in blocks(page))
 #: A block with a lab address needs keys, and is run by `test_key_files_of_the_network_page_work`.
 LAB_ADDRESS = "192.168.0.10"
 PYTHON = tuple(block for block in BLOCKS if block.language == "python" and LAB_ADDRESS not in block.text)
+#: Pages whose blocks run always; those of the others, with `make test FULL=1`.
+FIRST_PAGES = ("README.md", "tutorial.md")
 SHELL = tuple(block for block in BLOCKS if block.language == "bash")
 
 
@@ -150,7 +152,13 @@ def run_python(tmp_path: Path) -> Callable[..., str]:
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("block", PYTHON, ids=lambda block: block.name)
+@pytest.mark.parametrize(
+    "block",
+    [
+        pytest.param(block, id=block.name, marks=[] if block.name.startswith(FIRST_PAGES) else pytest.mark.long)
+        for block in PYTHON
+    ],
+)
 def test_python_block_runs(block: Block, run_python: Callable[..., str], request: pytest.FixtureRequest) -> None:
     text, has_deformables = block.text, "Deformables(client)" in block.text
     if ADDRESS in text:
@@ -214,6 +222,7 @@ def test_join_code_of_the_network_page_works(tmp_path: Path, run_python: Callabl
         _emulate(["emulate", address], tmp_path)  # the same user's key is on the list now
 
 
+@pytest.mark.long
 @pytest.mark.e2e
 @pytest.mark.parametrize("name", LOOPS)
 def test_example_of_a_user_loop_is_joined_until_it_ends(name: str, tmp_path: Path) -> None:
@@ -251,6 +260,7 @@ def test_policy_example_moves_its_robot(serve: str, run_python: Callable[..., st
     assert int(moved[1]) > 20
 
 
+@pytest.mark.long
 @pytest.mark.e2e
 def test_recording_examples_run(tmp_path: Path, run_python: Callable[..., str]) -> None:
     path = tmp_path / "session.rrd"
@@ -262,6 +272,7 @@ def test_recording_examples_run(tmp_path: Path, run_python: Callable[..., str]) 
     assert re.search(r"hammer: [1-9]\d* frames, travelled 0\.\d+ m", output), output
 
 
+@pytest.mark.long
 @pytest.mark.e2e
 def test_recording_example_reads_published_worlds(tmp_path: Path, run_python: Callable[..., str]) -> None:
     path, scene = tmp_path / "session.rrd", SceneBuilder("bench")

@@ -34,6 +34,7 @@ def run_bench(folder: Path, *arguments: str) -> dict[str, Any]:
     return result
 
 
+@pytest.mark.long
 @pytest.mark.e2e
 def test_report_of_clouds(tmp_path: Path) -> None:
     result = run_bench(tmp_path, "cloud", "--points", "40000", "--seconds", "1.5", "--cameras", "2")

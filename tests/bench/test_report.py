@@ -50,6 +50,7 @@ def _check(result: dict[str, Any], name: str, keys: set[str]) -> None:
     assert result["bars"]
 
 
+@pytest.mark.long
 @pytest.mark.e2e
 @pytest.mark.parametrize("crypto", ["--plain", "--curve"])
 def test_state(tmp_path: Path, crypto: str) -> None:
@@ -64,6 +65,7 @@ def test_state(tmp_path: Path, crypto: str) -> None:
     assert 0.0 < got["age_ms_p50"] <= got["age_ms_p95"] <= got["age_ms_p99"]
 
 
+@pytest.mark.long
 @pytest.mark.e2e
 def test_input(tmp_path: Path) -> None:
     result = _bench(tmp_path, "input", "--operators", "1", "--robots", "1", "--observers", "1", "--seconds", "3")

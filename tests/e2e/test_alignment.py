@@ -174,6 +174,7 @@ def test_four_headsets_stay_aligned_through_bump_recentring_and_drift(
     table.scenario.server.finish()
 
 
+@pytest.mark.long
 def test_unaligned_headset_gets_a_notice_and_moves_nothing(start_table: Callable[..., AlignmentScenario]) -> None:
     """A policy and a desktop operator need no alignment."""
     table = start_table(HEADSETS[0])

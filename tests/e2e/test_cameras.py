@@ -201,6 +201,7 @@ def test_clouds_of_two_processes_reach_who_joins_late(
     assert_all_end(children)
 
 
+@pytest.mark.long
 def test_a_killed_process_comes_back_and_is_announced(
     serve: Callable[..., SessionProcess], watch: Callable[..., Client], camera_file: Path
 ) -> None:
@@ -224,6 +225,7 @@ def test_a_killed_process_comes_back_and_is_announced(
     assert ann.status().restarts["cameras"] == 1
 
 
+@pytest.mark.long
 def test_a_process_that_hangs_is_named(
     serve: Callable[..., SessionProcess], watch: Callable[..., Client], camera_file: Path
 ) -> None:
@@ -253,6 +255,7 @@ def test_a_process_that_hangs_is_named(
     wait_until(lambda: not is_stale(), "it is not stale any more")
 
 
+@pytest.mark.long
 def test_faults_of_frames_are_named_and_end_with_them(
     serve: Callable[..., SessionProcess], watch: Callable[..., Client], tmp_path: Path
 ) -> None:
@@ -275,6 +278,7 @@ def test_faults_of_frames_are_named_and_end_with_them(
     wait_for_fault(ann, "dark", "")
 
 
+@pytest.mark.long
 def test_a_camera_that_sees_robots_and_no_sheet_is_found_when_it_is_bumped(
     serve: Callable[..., SessionProcess], watch: Callable[..., Client], tmp_path: Path
 ) -> None:
@@ -327,6 +331,7 @@ def test_files_that_cannot_be_used_end_serve_before_it_starts(tmp_path: Path, ca
         assert errors.count("\n") == 1
 
 
+@pytest.mark.long
 def test_a_killed_session_leaves_no_camera_behind(serve: Callable[..., SessionProcess], camera_file: Path) -> None:
     server = serve("handover", "--camera", str(camera_file))
     wait_until(lambda: find_cameras(server), "the camera process runs")
@@ -355,6 +360,7 @@ def run_camera(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]
         process.wait()
 
 
+@pytest.mark.long
 def test_a_camera_by_hand_at_an_encrypted_session_until_its_key_is_revoked(
     serve: Callable[..., SessionProcess],
     watch: Callable[..., Client],
@@ -405,6 +411,7 @@ def test_a_camera_by_hand_at_an_encrypted_session_until_its_key_is_revoked(
         assert last.info.camera.position == (0.0, 0.0, 1.0)
 
 
+@pytest.mark.long
 def test_a_camera_by_hand_ends_by_ctrl_c_and_waits_for_its_session(
     serve: Callable[..., SessionProcess],
     watch: Callable[..., Client],

@@ -45,6 +45,7 @@ def ann(shared_session: SessionProcess) -> Iterator[Client]:
         yield client
 
 
+@pytest.mark.long
 def test_a_session_is_found_by_its_name(shared_session: SessionProcess) -> None:
     name = re.search(r"session '([^']+)' on", shared_session.output)
     assert name, shared_session.output
@@ -194,6 +195,7 @@ def test_keys_of_the_terminal_stop_and_clear(tmp_path: Path) -> None:
     os.close(terminal)
 
 
+@pytest.mark.long
 def test_background_session_does_not_read_the_terminal(tmp_path: Path) -> None:
     """A process of a background group that reads its terminal would be stopped by the system."""
     parent, terminal = pty.openpty()

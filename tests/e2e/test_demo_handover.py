@@ -96,6 +96,7 @@ def demo(tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
         process.wait()
 
 
+@pytest.mark.long
 def test_timeout_fails_and_lists_the_problems(tmp_path: Path) -> None:
     done = run_command("demo", "handover", "--json", "--timeout", "4", cwd=tmp_path)
     assert done.returncode == 1, done.stderr

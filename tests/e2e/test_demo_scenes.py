@@ -53,6 +53,7 @@ def test_two_operators_stow_two_soft_bodies(tmp_path: Path) -> None:
     assert sorted((goal["deformable"], goal["goal"]) for goal in goals) == [("mint", "stowed"), ("rose", "stowed")]
 
 
+@pytest.mark.long
 def test_two_operators_fold_a_cloth(tmp_path: Path) -> None:
     goals = run_demo(tmp_path, "cloth", max_takes=3)["goals"]  # on a busy machine, one fold in some ten fails
     assert [(goal["deformable"], goal["goal"]) for goal in goals] == [("cloth", "folded")]

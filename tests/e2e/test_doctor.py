@@ -104,6 +104,7 @@ def test_no_listener() -> None:
     assert found.failed() == {"tcp"}
 
 
+@pytest.mark.long
 def test_listener_that_never_answers() -> None:
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
@@ -169,6 +170,7 @@ def home(tmp_path: Path) -> Path:
     return tmp_path / "home"
 
 
+@pytest.mark.long
 def test_key_that_is_not_on_the_allow_list(encrypted: SessionProcess, home: Path) -> None:
     found = run_doctor(encrypted.address, home=home)
     found.assert_names("key", "iris-session pair")
@@ -181,6 +183,7 @@ def test_wrong_join_code(encrypted: SessionProcess, home: Path) -> None:
     assert found.failed() == {"code"}
 
 
+@pytest.mark.long
 def test_role_that_the_key_does_not_allow(encrypted: SessionProcess, home: Path) -> None:
     KeyHome().clients.allow_key("looker", KeyHome(home).load_identity().public, ("observer",))
     found = run_doctor(encrypted.address, "--role", "director", home=home)
@@ -276,6 +279,7 @@ class Forwarder:
             one.close()
 
 
+@pytest.mark.long
 def test_firewall_that_opens_only_the_control_port(plain: SessionProcess) -> None:
     port = int(plain.address.rsplit(":", 1)[1])
     with contextlib.closing(Forwarder(port)):
@@ -410,6 +414,7 @@ HOG = "import os\nos.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\nwhile
 MANY_LATE_TICKS = 50
 
 
+@pytest.mark.long
 def test_late_ticks_name_their_cause(tmp_path: Path) -> None:
     """Other programs occupy the processor of the session."""
     with contextlib.ExitStack() as stack:
@@ -453,6 +458,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", "--lazy", str(folder)], check=True)  # processes that are about to end may still use it
 
 
+@pytest.mark.long
 def test_full_disk(small_disk: Path, tmp_path: Path) -> None:
     recording = small_disk / "session.rrd"
     server = SessionProcess(tmp_path, recording, make_serve_command("arm", recording))

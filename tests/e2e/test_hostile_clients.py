@@ -70,6 +70,7 @@ class RawClient:
         self.socket.close(linger=0)
 
 
+@pytest.mark.long
 def test_thousand_connections_without_hello_are_closed(shared_session: SessionProcess) -> None:
     with Client(shared_session.address, role="observer", name="Eve").connect(DEADLINE_S) as eve:
         silent = [socket.create_connection(get_endpoint(shared_session)) for _ in range(1000)]
@@ -129,6 +130,7 @@ def test_malformed_messages_are_answered_with_a_fault(shared_session: SessionPro
     Client(shared_session.address, role="observer").connect(DEADLINE_S).close()
 
 
+@pytest.mark.long
 def test_replayed_hello_does_not_take_over(shared_session: SessionProcess) -> None:
     secret = os.urandom(16)
     first = RawClient(shared_session)
@@ -281,6 +283,7 @@ def party(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TwoClients]:
         kill_all([server])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", [*FLOOD_NAMES, "frames"])
 def test_flood_is_cut_reported_and_disturbs_no_other_client(party: TwoClients, kind: str) -> None:
     scenario, n_floods = party.scenario, party.count_floods()

@@ -49,6 +49,7 @@ def pair(machine: Machine) -> dict[str, Any]:
     return shown
 
 
+@pytest.mark.long
 def test_other_machine_finds_pairs_joins_and_rejoins(network: Network, lab: ServedSession) -> None:
     started = time.monotonic()
     server, headset = network.server, network.headset
@@ -68,6 +69,7 @@ def test_other_machine_finds_pairs_joins_and_rejoins(network: Network, lab: Serv
     )
 
 
+@pytest.mark.long
 def test_pairing_uri_is_sufficient_where_broadcasts_are_blocked(network: Network, lab: ServedSession) -> None:
     other_user = Machine(
         network.headset.name, network.headset.interface, network.headset.address, network.headset.folder / "other"
@@ -86,6 +88,7 @@ def test_pairing_uri_is_sufficient_where_broadcasts_are_blocked(network: Network
         network.allow_broadcasts()
 
 
+@pytest.mark.long
 def test_second_session_of_the_same_name_or_ports_is_renamed_or_refused(network: Network, lab: ServedSession) -> None:
     server, headset = network.server, network.headset
     same = server.run_command("serve", "handover", "--no-record", "--interface", server.interface, "--name", "lab-1")
@@ -142,6 +145,7 @@ def test_unknown_interface_error_lists_the_interfaces(network: Network) -> None:
     assert f"{network.server.interface} (10.77.1.1)" in done.stderr
 
 
+@pytest.mark.long
 def test_session_on_ipv6_without_beacon(tmp_path: Path) -> None:
     machine = Machine("", "lo", "::1", tmp_path)
     try:

@@ -172,6 +172,7 @@ def test_blackout_of_five_seconds(linked: LinkScenario) -> None:
     scenario.server.finish()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", ["cut", "reset"])
 def test_connection_cut_during_a_snapshot(linked: LinkScenario, tmp_path: Path, how: str) -> None:
     """After three cuts in a row the client joins once and has the whole state."""
@@ -205,6 +206,7 @@ def test_connection_cut_during_a_snapshot(linked: LinkScenario, tmp_path: Path, 
     scenario.server.finish()
 
 
+@pytest.mark.long
 def test_change_of_network_keeps_identity_and_lease(linked: LinkScenario) -> None:
     """The headset's address changes, and the session does not learn that the old connections ended."""
     scenario, watcher = linked.scenario, linked.watcher
@@ -234,6 +236,7 @@ def test_change_of_network_keeps_identity_and_lease(linked: LinkScenario) -> Non
     scenario.server.finish()
 
 
+@pytest.mark.long
 def test_latency_and_jitter_within_bounds_keep_engagement(linked: LinkScenario, tmp_path: Path) -> None:
     scenario, watcher = linked.scenario, linked.watcher
     linked.start_proxy(profile=write_profile(tmp_path, delay_ms=40.0, jitter_ms=15.0))

@@ -152,6 +152,7 @@ def test_fingertip_may_look_and_is_denied_to_drive_until_a_tip_is_calibrated(sce
     scenario.server.finish()
 
 
+@pytest.mark.long
 def test_kept_place_comes_back_for_looking_and_a_touch_confirms_it(scenario: Scenario) -> None:
     dan = Toucher(scenario, "dan", RIGHT)
     found = dan.turn_in_a_hole()

@@ -122,6 +122,7 @@ def test_late_client_has_the_same_state(scenario: Scenario) -> None:
     scenario.run_until(are_poses_equal, "the late client has the same poses")
 
 
+@pytest.mark.long
 def test_recentring_in_motion_does_not_move_the_robot(
     scenario: Scenario, emulate: Callable[..., subprocess.Popen[bytes]]
 ) -> None:
@@ -183,6 +184,7 @@ def send_invalid_pose(scenario: Scenario, hand: Hand, pose: PoseTuple) -> PoseTu
     return before
 
 
+@pytest.mark.long
 def test_invalid_pose_ends_the_engagement_and_moves_nothing(scenario: Scenario) -> None:
     """Each pose is sent by another client."""
     watcher = scenario.join("watcher", "observer")
@@ -329,6 +331,7 @@ def sweep_hand(scenario: Scenario, hand: Hand, metres: float, scale: float) -> N
     assert distance(hand.tip[0], start) == pytest.approx(expected, abs=2e-3)
 
 
+@pytest.mark.long
 def test_scaled_robot_moves_a_fifth_as_far_as_the_hand(own_scenario: Scenario) -> None:
     scenario = own_scenario
     ann, bob = scenario.join("ann"), scenario.join("bob")

@@ -72,6 +72,7 @@ def test_killed_recorder_continues_in_a_next_part(scenario: Scenario, driving: H
     assert report["gaps"] == []
 
 
+@pytest.mark.long
 def test_killed_authority_leaves_a_finished_recording_and_no_process(scenario: Scenario, driving: Hand) -> None:
     """The front notifies clients and ends; the recorder finishes the file, which verifies up to its end."""
     scenario.run_for(1.0)
@@ -91,6 +92,7 @@ def test_killed_authority_leaves_a_finished_recording_and_no_process(scenario: S
     assert report["last_step"] >= tick - 1 - BATCH_ROWS, "steps that the client saw are in the file, except one batch"
 
 
+@pytest.mark.long
 def test_suspended_authority_is_reported_as_stalled(scenario: Scenario, driving: Hand) -> None:
     """The front reports `stalled`, leases stay, and robots hold until the clutch is opened and closed."""
     ann = driving.client
@@ -112,6 +114,7 @@ def test_suspended_authority_is_reported_as_stalled(scenario: Scenario, driving:
     scenario.server.finish()
 
 
+@pytest.mark.long
 def test_front_and_recorder_killed_at_once(scenario: Scenario, driving: Hand) -> None:
     for child in scenario.server.children().values():
         child.kill()

@@ -96,6 +96,7 @@ def check_more(scenario: Scenario, observers: list[CheckingObserver], more: int 
     scenario.run_until(enough, "all observers receive the moving world")
 
 
+@pytest.mark.long
 def test_observers_receive_poses_and_vertices_of_a_world_without_mujoco(scenario: Scenario, tmp_path: Path) -> None:
     composed = publisher_program.build_scene(tmp_path).build(AssetStore(tmp_path / "store"))
     stream = composed.deformables["cloth"].stream

@@ -15,6 +15,7 @@ from tests.e2e.session_process import SessionProcess, wait_until
 pytestmark = pytest.mark.e2e
 
 
+@pytest.mark.long
 def test_clouds_and_pictures_of_a_source_are_recorded(serve: Callable[..., SessionProcess]) -> None:
     """At rest, so each once in a part: a new recorder gets them again."""
     server = serve("handover", "--record-clouds", "10Hz")
@@ -42,6 +43,7 @@ def test_clouds_and_pictures_of_a_source_are_recorded(serve: Callable[..., Sessi
     assert cloud.received_ns > 0
 
 
+@pytest.mark.long
 def test_no_clouds_are_recorded_with_off(serve: Callable[..., SessionProcess]) -> None:
     server = serve("handover", "--record-clouds", "off")
     frame = encode_cloud(np.zeros((10, 3)), np.zeros((10, 3), np.uint8))["full"]

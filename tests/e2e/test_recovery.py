@@ -116,6 +116,7 @@ def test_headset_that_sleeps_resumes_its_lease(
     assert watcher.mirror.leases["left"].holder == me
 
 
+@pytest.mark.long
 def test_app_that_hangs_but_sends_heartbeats(serve: Callable[..., SessionProcess]) -> None:
     """Without samples its robot holds and its lease stays; in mode takeover another client may acquire the robot."""
     scenario = Scenario(serve("handover", "--mode", "takeover"))
@@ -229,6 +230,7 @@ def garbage(scenario: Scenario) -> Iterator[list[int]]:
     thread.join()
 
 
+@pytest.mark.long
 def test_garbage_on_every_port_disturbs_no_client(scenario: Scenario, driving: Hand, garbage: list[int]) -> None:
     """The service port of the reference implementation dies of three malformed frames."""
     import zmq
@@ -252,6 +254,7 @@ def test_garbage_on_every_port_disturbs_no_client(scenario: Scenario, driving: H
 # --- the machine ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_suspended_machine_keeps_leases(scenario: Scenario, driving: Hand) -> None:
     """All processes of the session are suspended: a gap, then clients continue with their leases."""
     ann = driving.client
@@ -281,6 +284,7 @@ time.time_ns = lambda: _time_ns() + (-1) ** next(_n) * 31_500_000_000_000_000
 """
 
 
+@pytest.mark.long
 def test_wall_clock_jumps_change_nothing(
     serve: Callable[..., SessionProcess], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -144,6 +144,7 @@ def get_session_id(client: Client) -> str:
     return client.connection.welcome.session_id
 
 
+@pytest.mark.long
 def test_resume_after_a_power_cut_continues_at_the_last_readable_row(
     scenario: Scenario, driving: Hand, resume: Resume
 ) -> None:
@@ -171,6 +172,7 @@ def test_resume_after_a_power_cut_continues_at_the_last_readable_row(
     assert run_verify(scenario.server.recording)["cuts"]
 
 
+@pytest.mark.long
 def test_invalid_resume_is_one_line(scenario: Scenario) -> None:
     folder = scenario.server.folder
     cases: tuple[tuple[list[str], str], ...] = (
@@ -186,6 +188,7 @@ def test_invalid_resume_is_one_line(scenario: Scenario) -> None:
         assert expected in line
 
 
+@pytest.mark.long
 def test_encrypted_session_resumes_encrypted_with_the_same_keys(
     serve: Callable[..., SessionProcess], resume: Resume, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

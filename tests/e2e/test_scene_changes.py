@@ -142,6 +142,7 @@ def test_operators_continue_in_another_scene_and_it_replays(scenario: Scenario) 
     assert drawn == {"1", "2", "3"}, "the recording shows all three scenes"
 
 
+@pytest.mark.long
 def test_session_killed_in_its_second_scene_resumes_in_it(scenario: Scenario, tmp_path: Path) -> None:
     ann = scenario.join("ann")
     command_scene(scenario, "three")

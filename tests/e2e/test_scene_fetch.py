@@ -94,6 +94,7 @@ def test_client_has_specification_meshes_and_moving_deformables(scenario: Scenar
     assert min(lowest) < 1.2, "the recording shows the same"
 
 
+@pytest.mark.long
 def test_cached_assets_are_not_fetched_again_and_a_new_front_serves_them(scenario: Scenario, tmp_path: Path) -> None:
     ann, bob = scenario.join("ann", role="observer"), scenario.join("bob", role="observer")
     spec = fetch_all(scenario, ann, tmp_path / "cache")

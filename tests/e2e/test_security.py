@@ -177,6 +177,7 @@ def test_device_pairs_with_a_single_use_code_and_joins_in_its_role(
     lab.server.finish()
 
 
+@pytest.mark.long
 def test_wrong_and_expired_join_codes_are_refused(
     lab: EncryptedScenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -55,6 +55,7 @@ def interrupt(server: SessionProcess) -> None:
     assert_all_end(children)
 
 
+@pytest.mark.long
 def test_ctrl_c_while_one_client_joins_and_another_drives(
     scenario: Scenario, driving: Hand, emulate: Callable[..., subprocess.Popen[bytes]]
 ) -> None:
@@ -78,6 +79,7 @@ def test_ctrl_c_while_paused(scenario: Scenario) -> None:
     assert scenario.server.verify()["finished"]
 
 
+@pytest.mark.long
 def test_ctrl_c_while_the_recorder_hangs(scenario: Scenario, driving: Hand) -> None:
     """Rows that the recorder did not receive are lost, which is reported; the rest verifies."""
     scenario.run_for(0.5)
@@ -109,6 +111,7 @@ def test_second_interrupt_at_once_ends_without_traceback(tmp_path: Path) -> None
     assert process.returncode in (0, 130)  # 0: both signals arrived as one
 
 
+@pytest.mark.long
 def test_blocked_output_does_not_delay_the_end(tmp_path: Path) -> None:
     """Standard output is a full pipe without a reader."""
     read, write = os.pipe()
@@ -135,6 +138,7 @@ def test_blocked_output_does_not_delay_the_end(tmp_path: Path) -> None:
     assert process.returncode == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("after_s", [0.1, 3.0, 12.0])
 def test_interrupted_benchmark_ends_without_traceback(tmp_path: Path, after_s: float) -> None:
     """Ctrl-C in a terminal reaches all processes of the group: those that import, wait, and measure."""

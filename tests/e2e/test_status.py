@@ -46,6 +46,7 @@ def test_status_without_a_session_is_one_line(tmp_path: Path) -> None:
     assert len(done.stderr.splitlines()) == 1
 
 
+@pytest.mark.long
 def test_status_as_metrics(shared_session: SessionProcess) -> None:
     metrics = run_command("status", shared_session.address, "--prometheus", cwd=shared_session.folder).stdout
     assert 'iris_session_robot_held{robot="right",holder=""} 0' in metrics

@@ -55,6 +55,7 @@ def join_observer(scenario: Scenario, name: str, address: str, cache: Path) -> C
     return client.connect(DEADLINE_S)
 
 
+@pytest.mark.long
 def test_fetch_survives_slow_link_cut_and_killed_front(
     serving: Scenario, data: dict[str, bytes], tmp_path: Path
 ) -> None:
@@ -131,6 +132,7 @@ class Watcher:
         return self.feed.budget_class
 
 
+@pytest.mark.long
 def test_slow_link_gets_less_media_and_fresh_state(publishing: Scenario, tmp_path: Path) -> None:
     scenario, address = publishing, publishing.server.address
     ann, bob = (Watcher(scenario, name, address) for name in ("ann", "bob"))

@@ -172,6 +172,7 @@ def end_script(scenario: Scenario) -> None:
     assert report["steps"] > 10
 
 
+@pytest.mark.long
 def test_script_that_calls_begin_and_end_tick(script: Callable[[str], Scenario]) -> None:
     scenario = script(TICKS)
     drive_left_robot(scenario)
@@ -217,6 +218,7 @@ def test_policy_drives_until_a_participant_engages_and_after_the_release(script:
     end_script(scenario)
 
 
+@pytest.mark.long
 def test_attached_script_without_close_ends_in_order(script: Callable[[str], Scenario]) -> None:
     scenario = script(LAST_LINE)
     drive_left_robot(scenario)
@@ -230,6 +232,7 @@ def test_attached_script_without_close_ends_in_order(script: Callable[[str], Sce
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("body", [TICKS, ATTACH], ids=["ticks", "attach"])
 def test_loop_that_blocks_for_five_seconds(script: Callable[[str], Scenario], body: str) -> None:
     """Leases, heartbeats and the e-stop work meanwhile; afterwards the robot holds until the clutch was opened."""
@@ -280,6 +283,7 @@ def is_blocked(scenario: Scenario, client: Client) -> bool:
     return client.scene.state is not None and client.scene.state.header.tick == tick
 
 
+@pytest.mark.long
 def test_reset_by_the_script_begins_a_scene_epoch(script: Callable[[str], Scenario]) -> None:
     """The robot holds where the reset put it; old samples are rejected; the clutch must be opened and closed."""
     scenario = script(TICKS)

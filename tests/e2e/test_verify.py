@@ -135,6 +135,7 @@ class Leader:
         return (float(x), float(y), float(z)), (1.0, 0.0, 0.0, 0.0)
 
 
+@pytest.mark.long
 def test_follower_ramps_to_a_distant_leader_and_then_follows(scenario: Scenario) -> None:
     """Kinesthetic teaching: 0.5 rad of distance at the start cause no jump; then the arm follows within centimetres."""
     client = scenario.join("teacher", "leader")

@@ -263,6 +263,7 @@ def test_media_need_a_ticket(page: str) -> None:
     run(work())
 
 
+@pytest.mark.long
 def test_media_reach_the_browser_that_wishes_for_them(serve: Serve) -> None:
     page = page_of(serve("cloth"))
 
@@ -324,6 +325,7 @@ def test_a_reader_that_stops_gets_the_newest_afterwards(page: str) -> None:
     run(work())
 
 
+@pytest.mark.long
 def test_a_reader_that_never_reads_is_closed(page: str) -> None:
     async def work() -> None:
         async with browsers(page, "ann") as (ann,), open_http(receive_bytes=2048) as http:
@@ -345,6 +347,7 @@ def test_a_reader_that_never_reads_is_closed(page: str) -> None:
     run(work())
 
 
+@pytest.mark.long
 def test_killed_gateway_comes_back_and_leases_stay(serve: Serve) -> None:
     server = serve()
     page = page_of(server)
@@ -495,6 +498,7 @@ def test_a_browser_pairs_by_the_printed_link_and_is_revoked(
     run(work())
 
 
+@pytest.mark.long
 def test_a_gateway_by_hand_fetches_an_asset_once_for_all(
     serve: Serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

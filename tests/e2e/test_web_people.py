@@ -185,6 +185,7 @@ def test_person_behind_gateways(lab: Lab) -> None:
     assert lab.server.finish()["ok"]
 
 
+@pytest.mark.long
 def test_grace_period_ends(lab: Lab) -> None:
     first, _ = lab.gateways
     secret = os.urandom(32)

@@ -222,6 +222,7 @@ def test_the_sum_of_unfinished_messages_is_bounded(open_session: OpenSession) ->
         one.socket.close()
 
 
+@pytest.mark.long
 def test_a_source_that_floods_waits_before_it_may_connect_again_and_others_do_not(lab: Lab) -> None:
     """Behind one address, as of a gateway or NAT: the honest camera hands in all the time."""
     keys = {name: lab.allowed(name, "camera", "observer")[0] for name in ("honest", "mallory")}

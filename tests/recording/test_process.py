@@ -408,6 +408,7 @@ def test_full_disk_is_reported_and_the_next_part_continues(tmp_path: Path) -> No
     assert report.ok, report.line()
 
 
+@pytest.mark.long
 def test_part_that_cannot_be_begun_leaves_no_file(tmp_path: Path) -> None:
     """While the disk is full each attempt uses the same number, and nothing is missing afterwards."""
     path = tmp_path / "session.rrd"

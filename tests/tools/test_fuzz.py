@@ -48,6 +48,7 @@ def test_hostile_peers_do_not_stop_the_front(target: str, inputs: int) -> None:
     assert result.inputs == inputs
 
 
+@pytest.mark.long
 @pytest.mark.e2e
 def test_hostile_browsers_do_not_stop_the_gateway() -> None:
     """WebSocket messages, bytes of WebSockets and requests at a real gateway of a real session."""
