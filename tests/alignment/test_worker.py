@@ -132,6 +132,7 @@ def test_estimates_in_a_thread_arrive_as_proposals() -> None:
     lab.service.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("is_moved", [False, True])
 def test_cross_check_is_computed_beside_the_loop_and_void_when_its_sheet_was_moved(is_moved: bool) -> None:
     lab, held = Lab(), HeldWorker()

@@ -73,6 +73,7 @@ def test_one_pose_is_the_product_of_the_chain() -> None:
     assert quat_angle(at[1], T_BASE_CAMERA[1]) < 1e-7
 
 
+@pytest.mark.long
 def test_stated_covariance_matches_the_errors() -> None:
     """Mahalanobis distance over 30 calibrations: mean 6 with 6 degrees of freedom, within 4 standard deviations."""
     distances = []
@@ -109,6 +110,7 @@ def test_camera_on_the_hand() -> None:
     assert distance(solved.T_base_camera[0], T_base_sheet[0]) < 1e-7
 
 
+@pytest.mark.long
 def test_covariance_of_the_inverse_matches_inverted_samples() -> None:
     rng = np.random.default_rng(11)
     root = np.diag([1e-3, 2e-3, 4e-3, 2e-3, 5e-3, 1e-3])

@@ -168,6 +168,7 @@ def test_size_needs_its_unit(capsys: pytest.CaptureFixture[str]) -> None:
 # --- calibrate-camera ---
 
 
+@pytest.mark.long
 def test_sheet_on_the_hand_is_calibrated(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     poses, out = _csv(tmp_path / "poses.csv", _hand()), tmp_path / "camera.toml"
     result = _calibrate(capsys, folder, "--poses", poses, "--out", out)
@@ -223,6 +224,7 @@ def test_cameras_that_see_a_sheet_on_the_table(
     assert "T_base_camera of left" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_underdetermined_calibration_is_refused(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

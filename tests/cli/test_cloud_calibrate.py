@@ -136,6 +136,7 @@ def _read_ply(path: Path) -> NDArray[Any]:
     return rows
 
 
+@pytest.mark.long
 def test_points_lie_on_the_surface_after_calibration_by_a_sheet(
     room: Room, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -90,6 +90,7 @@ def make_monitor(error_m: float = 0.010) -> MoveMonitor:
     return MoveMonitor(CAMERA, [TABLE, SHELF], error_m=error_m)
 
 
+@pytest.mark.long
 def test_a_bump_of_3_cm_is_found_within_a_second_and_cleared_when_it_is_undone(pages: dict[str, Page]) -> None:
     monitor, now_ns = make_monitor(), 0
     bumped = compose(CALIBRATED, BUMP)

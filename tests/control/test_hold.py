@@ -178,6 +178,7 @@ def test_a_free_arm_stops_from_where_it_is_measured(kind: str) -> None:
     assert np.abs(rig.data.qvel[:3]).max() < 0.05
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("load", [0.0, -15.0])
 @pytest.mark.parametrize("kind", KINDS)
 def test_holds_that_begin_again_and_again_do_not_make_the_arm_creep_down(kind: str, load: float) -> None:

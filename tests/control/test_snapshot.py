@@ -98,6 +98,7 @@ def play(rig: Rig, journal: list[tuple[Decision, int]], restart_every: int = 0) 
     return seen
 
 
+@pytest.mark.long
 @settings(max_examples=6, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 40))
 def test_restoring_into_a_fresh_controller_is_invisible(model: mujoco.MjModel, seed: int, every: int) -> None:

@@ -88,6 +88,7 @@ def run_camera(server: SessionProcess) -> Iterator[Camera]:
         camera.stop()
 
 
+@pytest.mark.long
 def test_a_cloud_at_rest_reaches_who_joins_later(
     serve: Callable[..., SessionProcess], open_page: Callable[..., Page], tmp_path: Path
 ) -> None:
@@ -174,6 +175,7 @@ def test_a_camera_is_seen_in_the_page_and_said_to_be_faulty_and_stale(
         assert page.errors == []
 
 
+@pytest.mark.long
 def test_in_ar_what_is_for_remote_people_is_not_subscribed_unless_chosen(
     serve: Callable[..., SessionProcess], open_page: Callable[..., Page]
 ) -> None:
@@ -210,6 +212,7 @@ def test_in_ar_what_is_for_remote_people_is_not_subscribed_unless_chosen(
         assert page.errors == []
 
 
+@pytest.mark.long
 def test_a_camera_is_a_panel_in_the_headset_while_it_is_chosen(
     serve: Callable[..., SessionProcess], open_page: Callable[..., Page], tmp_path: Path
 ) -> None:

@@ -44,6 +44,7 @@ def count_in_box(points: Floats, low: tuple[float, float, float], high: tuple[fl
     return int(((points > low) & (points < high)).all(axis=1).sum())
 
 
+@pytest.mark.long
 def test_depth_cameras_show_the_room_of_a_handover(tmp_path: Path) -> None:
     done = run_command("demo", "cloud", *DEMO_OPTIONS, cwd=tmp_path, timeout_s=DEMO_S)
     assert done.stdout, done.stderr[-3000:]

@@ -121,6 +121,7 @@ def test_the_page_draws_what_mujoco_draws(
     assert page.errors == []
 
 
+@pytest.mark.long
 def test_a_cloth_that_is_folded_moves_in_the_page(
     serve: Callable[..., SessionProcess], open_page: Callable[..., Page], emulate: Callable[..., object]
 ) -> None:
@@ -188,6 +189,7 @@ def test_estop_holds_all_robots(scenario: Scenario, open_page: Callable[..., Pag
     scenario.run_until(lambda: not hand.client.mirror.estop, "the e-stop is cleared")
 
 
+@pytest.mark.long
 def test_the_estop_button_stops_robots(scenario: Scenario, open_page: Callable[..., Page]) -> None:
     """From the click to the event and to the pose at another client: measured and printed, with a generous bound."""
     page = open_page(scenario.server, "stopper")
@@ -233,6 +235,7 @@ def focus_by_tab(page: Page, name: str) -> None:
     raise AssertionError(f"{name} is not reached by Tab")
 
 
+@pytest.mark.long
 def test_the_keyboard_alone_is_enough(scenario: Scenario, open_page: Callable[..., Page]) -> None:
     page = open_page(scenario.server, "keys")
     focus_by_tab(page, "Take: left")
@@ -364,6 +367,7 @@ def test_a_reload_resumes_with_the_lease(scenario: Scenario, open_page: Callable
 BACKGROUND_S: Final = float(os.environ.get("IRIS_BACKGROUND_S", "6"))
 
 
+@pytest.mark.long
 def test_a_tab_in_the_background_keeps_its_robot(scenario: Scenario, open_page: Callable[..., Page]) -> None:
     """Browsers run timers and frames of such a tab rarely or not at all. Its worker keeps the connection."""
     page = open_page(scenario.server, "background")
@@ -434,6 +438,7 @@ def test_all_come_back_with_their_robots(serve: Callable[..., SessionProcess], o
     asyncio.run(asyncio.wait_for(work(), 3 * DEADLINE_S))
 
 
+@pytest.mark.long
 def test_the_end_of_the_session_is_shown(own_scenario: Scenario, browser: Browser) -> None:
     page = browser.open("ending", printed_address(own_scenario.server))
     page.wait_until_ready()

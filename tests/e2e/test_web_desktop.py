@@ -164,6 +164,7 @@ def test_keys_move_the_end_effector(scenario: Scenario, driver: Page) -> None:
     assert driver.errors == []
 
 
+@pytest.mark.long
 def test_a_window_without_focus_stops_the_robot(scenario: Scenario, driver: Page) -> None:
     """It stops although the keys are still pressed, and goes on when the dead-man is pressed anew."""
     tip = Tip(scenario)
@@ -180,6 +181,7 @@ def test_a_window_without_focus_stops_the_robot(scenario: Scenario, driver: Page
     driver.let_go("Shift")
 
 
+@pytest.mark.long
 def test_a_lost_lease_ends_driving(scenario: Scenario, driver: Page) -> None:
     tip = Tip(scenario)
     drive_forward(driver, tip, 0.03)
@@ -193,6 +195,7 @@ def test_a_lost_lease_ends_driving(scenario: Scenario, driver: Page) -> None:
     driver.let_go("Shift")
 
 
+@pytest.mark.long
 def test_the_estop_key_is_the_same_while_driving(scenario: Scenario, driver: Page) -> None:
     tip = Tip(scenario)
     drive_forward(driver, tip, 0.02)
@@ -214,6 +217,7 @@ def test_the_estop_key_is_the_same_while_driving(scenario: Scenario, driver: Pag
     driver.let_go("Shift")
 
 
+@pytest.mark.long
 def test_bodies_that_rest_stay_where_they_are_when_the_scene_is_patched(scenario: Scenario, driver: Page) -> None:
     tip = Tip(scenario)
     drive_forward(driver, tip, 0.05)
@@ -225,6 +229,7 @@ def test_bodies_that_rest_stay_where_they_are_when_the_scene_is_patched(scenario
     driver.wait(f"{FARTHEST_BODY} < 1e-3")
 
 
+@pytest.mark.long
 def test_the_estop_key_presses_no_button_while_driving(driver: Page) -> None:
     assert driver.evaluate("document.activeElement.id") == "scene", "keys are for the robot once it is driven"
     driver.evaluate("document.querySelector('.drive button').focus()")
@@ -233,6 +238,7 @@ def test_the_estop_key_presses_no_button_while_driving(driver: Page) -> None:
     assert not driver.evaluate("document.querySelector('.drive').hidden")
 
 
+@pytest.mark.long
 def test_the_mouse_drags_the_end_effector(scenario: Scenario, driver: Page) -> None:
     """Half a millimetre for a pixel: to the right along +X, and no farther when the button is let go."""
     tip = Tip(scenario)
@@ -246,6 +252,7 @@ def test_the_mouse_drags_the_end_effector(scenario: Scenario, driver: Page) -> N
     assert words(driver).startswith("Held. Hold left Shift")
 
 
+@pytest.mark.long
 def test_a_gamepad_drives_until_it_is_unplugged_and_again_once_let_go(scenario: Scenario, driver: Page) -> None:
     """The pad is one that the test makes: the page was never tried with a real one."""
     tip = Tip(scenario)
@@ -299,6 +306,7 @@ def read_panel(page: Page, camera: str, path: Path) -> NDArray[np.uint8]:
     return np.asarray(cut.resize((160, 120)))
 
 
+@pytest.mark.long
 def test_a_panel_shows_what_its_camera_sees(
     close_scenario: Scenario, open_page: Callable[..., Page], tmp_path: Path
 ) -> None:
@@ -320,6 +328,7 @@ def test_a_panel_shows_what_its_camera_sees(
     assert page.errors == []
 
 
+@pytest.mark.long
 def test_a_gripper_that_leaves_a_picture_is_warned_of(close_scenario: Scenario, open_page: Callable[..., Page]) -> None:
     outside = "document.querySelector('[data-camera=close] .outside').textContent"
     page = open_page(close_scenario.server, "cameras")

@@ -192,6 +192,7 @@ def shown(alignment: Alignment) -> dict[str, Any]:
     return {"at_anchor_mm": 1e3 * alignment.error_at_anchor_m, "at_robot_mm": 1e3 * alignment.error_at_robot_m}
 
 
+@pytest.mark.long
 def test_marks_align_and_a_touch_confirms_the_kept_place_after_a_reload(quest: MarkedQuest) -> None:
     """Calibrate the tip, touch four marks, drive; reload in an episode, and touch one mark."""
     host, person = quest.host, quest.person.id

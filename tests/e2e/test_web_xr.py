@@ -85,6 +85,7 @@ def test_a_robot_is_driven_in_ar(quest: EmulatedQuest) -> None:
     assert quest.page.errors == []
 
 
+@pytest.mark.long
 def test_a_lease_goes_into_vr_and_back(quest: EmulatedQuest) -> None:
     """The connection is resumed, not replaced; hiding and recentring hold; a director in VR is placed when it asks."""
     host = quest.host
@@ -133,6 +134,7 @@ def test_a_lease_goes_into_vr_and_back(quest: EmulatedQuest) -> None:
     assert quest.page.errors == []
 
 
+@pytest.mark.long
 def test_a_request_for_the_robot_is_answered_in_the_headset(quest: EmulatedQuest) -> None:
     """Ben asks and is refused, asks again and gets it; then the headset asks, and waits for Ben's consent."""
     host, ben, person = quest.host, quest.scenario.join("ben"), quest.person.id
@@ -193,6 +195,7 @@ TOUCH: Final = """(({ reading, wristStop }, away) => {
 })"""
 
 
+@pytest.mark.long
 def test_bare_hands_stop_at_the_wrist(quest: EmulatedQuest) -> None:
     host, person = quest.host, quest.person.id
     quest.evaluate("quest.primaryInputMode = 'hand'")
@@ -209,6 +212,7 @@ def test_bare_hands_stop_at_the_wrist(quest: EmulatedQuest) -> None:
     assert quest.page.errors == []
 
 
+@pytest.mark.long
 def test_without_a_headset_the_page_says_so(scenario: Scenario, open_page: Callable[..., Page]) -> None:
     page = open_page(scenario.server, "screen")
     page.wait("document.querySelector('.headset').innerText.includes('No headset')")

@@ -66,6 +66,7 @@ def test_idle_operators_hand_nothing_over() -> None:
     assert distance(before, rig.world.view().object_pose("hammer").p) < 1e-3
 
 
+@pytest.mark.long
 def test_handover_finishes_after_an_emergency_stop() -> None:
     """While stopped the clutch is open; afterwards the operators engage again and finish."""
     rig = handover(4)
@@ -83,6 +84,7 @@ def test_handover_finishes_after_an_emergency_stop() -> None:
     assert verdict(rig, "left", "right") == ""
 
 
+@pytest.mark.long
 def test_operator_without_a_lease_waits() -> None:
     rig = handover(5)
     rig.views["left"].lease = None
@@ -93,6 +95,7 @@ def test_operator_without_a_lease_waits() -> None:
     assert verdict(rig, "left", "right") == ""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("phase", ["approach", "release"])
 def test_giver_clutches_again_after_a_lost_engagement(phase: str) -> None:
     """The session ends the engagement after a gap in the samples."""
@@ -129,6 +132,7 @@ def test_giver_retries_when_the_object_moved_before_the_grasp() -> None:
     assert rig.behaviours["left"].attempts == 2  # type: ignore[attr-defined]
 
 
+@pytest.mark.long
 def test_giver_picks_up_a_dropped_object() -> None:
     """The pads lose their grip for a moment in the air; the giver grasps the object from the table again."""
     rig = handover(9)
@@ -176,6 +180,7 @@ def test_missing_scene_names_are_reported() -> None:
     assert missing.split(", ") == ["object1", "third/finger_left", "third/finger_right", "third/base", "tip third"]
 
 
+@pytest.mark.long
 def test_wander_stays_near_and_cycles_the_clutch() -> None:
     rig = Rig({"left": Wander("left", seed=3), "right": Wander("right", seed=4)}, seed=12)
     home = rig.world.view().tip_pose("left").p
@@ -193,6 +198,7 @@ def test_wander_stays_near_and_cycles_the_clutch() -> None:
     assert rig.fastest_hand < 0.5
 
 
+@pytest.mark.long
 def test_same_seed_gives_the_same_handover() -> None:
     """Operators use no clock and no hidden randomness."""
     first, second = handover(13), handover(13)

@@ -72,6 +72,7 @@ def test_moving_bodies_come_first_and_are_numbered_in_order(tmp_path: Path, stor
     assert spec.textures[spec.environment.skybox].height == 2
 
 
+@pytest.mark.long
 def test_every_process_builds_the_same_scene(tmp_path: Path) -> None:
     code = (
         "import sys; from pathlib import Path; from iris_session.scene import AssetStore; "

@@ -106,6 +106,7 @@ def table() -> trimesh.Trimesh:
     return trimesh.util.concatenate(legs)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("thin", [table, lambda: cable(1_500)], ids=["legs of a table", "cable"])
 @pytest.mark.parametrize("triangles", [4_000, 1_000])
 def test_long_and_thin_parts_are_kept(thin: Callable[[], trimesh.Trimesh], triangles: int) -> None:

@@ -298,6 +298,7 @@ class Environment:
         return "observation"
 
 
+@pytest.mark.long
 def test_an_environment_is_followed_to_the_model_that_it_builds_at_a_reset(tmp_path: Path) -> None:
     environment = Environment()
     config = SessionConfig(control_port=0, state_port=0, record=tmp_path / "session.rrd", realtime=False)

@@ -21,6 +21,7 @@ from tests.session.replay_stress import play, replay, replay_elsewhere
 ENCODE = msgspec.msgpack.Encoder().encode
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("seed", "open_loop"), [(2, False), (3, True)])
 def test_any_snapshot_continues_bit_for_bit_in_another_process(seed: int, open_loop: bool) -> None:
     stress = play(seed, 700, open_loop=open_loop)

@@ -44,6 +44,7 @@ def module_traps(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.long
 def test_session_imports_nothing_from_the_working_folder(module_traps: Path) -> None:
     """With its front, recorder and display, started as the installed command is."""
     done = subprocess.run(
