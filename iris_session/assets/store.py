@@ -34,7 +34,7 @@ import threading
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Final
+from typing import BinaryIO, Final
 
 from filelock import FileLock, Timeout
 
@@ -221,6 +221,16 @@ class AssetStore:
             return map_file(self.path(address))[0]
         except OSError as error:
             raise self._missing_error(address) from error
+
+    def open_file(self, address: str) -> tuple[BinaryIO, int]:
+        """Open an asset to be read in pieces, not hashed. Return its file, to be closed by the caller, and its size.
+
+        Raises:
+            OSError: The store does not have it, or its file cannot be read.
+            ValueError: `address` is not 64 lower-case hex digits.
+        """
+        descriptor, status = _open_regular_file(self.path(address))
+        return os.fdopen(descriptor, "rb"), status.st_size
 
     # --- writing ------------------------------------------------------------------------------------------------------
 
@@ -600,20 +610,27 @@ def map_file(path: Path) -> tuple[memoryview, os.stat_result]:
         FileNotFoundError: It is missing, or no regular file.
         OSError: It cannot be read.
     """
+    descriptor, status = _open_regular_file(path)
+    try:
+        size = status.st_size
+        return memoryview(mmap.mmap(descriptor, size, access=mmap.ACCESS_READ) if size else b""), status
+    finally:
+        os.close(descriptor)
+
+
+def _open_regular_file(path: Path) -> tuple[int, os.stat_result]:
+    """Open a file to be read. Return descriptor and status. Raises as `map_file`."""
     try:
         descriptor = os.open(path, os.O_RDONLY | _OPEN_FLAGS)
     except OSError as error:
         if error.errno == errno.ELOOP:
             raise _not_regular_error(path) from error
         raise
-    try:
-        status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode):
-            raise _not_regular_error(path)
-        size = status.st_size
-        return memoryview(mmap.mmap(descriptor, size, access=mmap.ACCESS_READ) if size else b""), status
-    finally:
+    status = os.fstat(descriptor)
+    if not stat.S_ISREG(status.st_mode):
         os.close(descriptor)
+        raise _not_regular_error(path)
+    return descriptor, status
 
 
 def _not_regular_error(path: Path) -> FileNotFoundError:

@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from iris_session.demo.named_scenes import NamedScene
 
 
+#: Bytes of each unit of a size.
+_BYTES: Final = {
+    f"{letter}{i}b": base**n for n, letter in enumerate("kmgt", 1) for i, base in (("", 1000), ("i", 1024))
+}
 #: Timeout of the test whether a session is reachable [s].
 CONNECT_S: Final = 2.0
 
@@ -100,6 +104,19 @@ def parse_cloud_rate(text: str) -> float:
             f"{text!r} is not a rate: give {MIN_CLOUDS_HZ:g} to {MAX_CLOUDS_HZ:g} a second, for example 2Hz, or off"
         )
     return hz
+
+
+def parse_budget(text: str) -> int:
+    """Parse `--record-budget` [bytes]. The unit is required, so that 20 cannot mean 20 bytes."""
+    from iris_session.recording.budget import MIN_BUDGET_BYTES
+
+    match = re.fullmatch(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)\s*([kmgt]i?b)", text.strip().lower())
+    n_bytes = round(float(match[1]) * _BYTES[match[2]]) if match else 0
+    if n_bytes < MIN_BUDGET_BYTES:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a size for a recording: give {MIN_BUDGET_BYTES // 10**6}MB or more, for example 20GB"
+        )
+    return n_bytes
 
 
 def parse_port_base(text: str) -> int:
@@ -224,6 +241,20 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
         default=None,
         metavar="RATE",
         help="frames per second of each point cloud and picture in the recording, or off (default: 2Hz)",
+    )
+    group.add_argument(
+        "--record-assets",
+        choices=("none", "scene", "all"),
+        default=None,
+        help="what of the scenes goes into the recording: what the best level of detail needs (scene), all levels, or "
+        "nothing (default: scene)",
+    )
+    group.add_argument(
+        "--record-budget",
+        type=parse_budget,
+        default=None,
+        metavar="SIZE",
+        help="size that the recording may have, such as 20GB; the session goes on without one then (default: no limit)",
     )
     group.add_argument(
         "--curve-clients", default="", metavar="DIR", help="public certificates to admit, instead of the allow-list"

@@ -14,6 +14,7 @@ from iris_session.cli.common import CommandError, add_json_option, print_json, t
 from iris_session.cli.progress import ReadingProgress
 
 if TYPE_CHECKING:
+    from iris_session.recording.recorded_assets import AssetsSummary
     from iris_session.recording.summary import PersonSummary, RecordingSummary, StopSummary, StreamSummary
 
 #: Lines of one kind that are printed; `--json` has all.
@@ -198,6 +199,7 @@ def _format_lines(summary: RecordingSummary) -> Iterator[str]:
         yield from _format_list("scene", [f"{one.cause} at {one.at_s:.2f} s" for one in summary.scene_changes])
     if summary.streams:
         yield from _format_list("streams", [_format_stream(stream) for stream in summary.streams])
+    yield from _format_list("assets", _format_assets(summary.assets))
     yield from _format_list("drops", [*_format_drops(summary)])
     yield from _format_list("damage", summary.damage)
     if summary.notes:
@@ -255,6 +257,15 @@ def _format_stream(stream: StreamSummary) -> str:
     frames = _count(stream.frames, "frame")
     lasted = _format_duration(stream.duration_s)
     return f"{stream.name}{title}: {stream.encoding}, {frames} in {lasted}, {stream.hz:.1f} Hz{fault}"
+
+
+def _format_assets(assets: AssetsSummary) -> list[str]:
+    if not assets.recorded:
+        return ["none: made by an earlier version, or the session shared no scene"]
+    if assets.recorded == "none":
+        return [f"none (--record-assets none), hashes of {_count(assets.scenes, 'scene')}"]
+    head = f"{assets.recorded}: {assets.present:,} of {assets.expected:,} of {_count(assets.scenes, 'scene')}"
+    return [f"{head}, {assets.bytes / 1e6:.1f} MB", *(f"left out: {line}" for line in assets.left_out)]
 
 
 def _format_drops(summary: RecordingSummary) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""`iris-session recording export`: a recording as tables, for pandas, NumPy, MATLAB or a spreadsheet."""
+"""`iris-session recording export`: a recording as tables, for pandas, NumPy, MATLAB or a spreadsheet; its assets."""
 
 from __future__ import annotations
 
@@ -9,35 +9,42 @@ import time
 from pathlib import Path
 from typing import Final
 
-from iris_session.cli.common import add_json_option, print_json, to_printable
+from iris_session.cli.common import CommandError, add_json_option, print_json, to_printable
 
 #: Least time between two lines of progress [s].
 PROGRESS_PERIOD_S: Final = 0.2
 DEFAULT_HZ: Final = 100.0
+#: What `--to` may be: formats of tables, and the other thing that is exported.
+FORMATS: Final = ("csv", "parquet", "npz")
+ASSETS: Final = "assets"
+#: Lines about assets that are printed; `--json` has all.
+MOST_LINES: Final = 20
 
 
 def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the action `export` of `recording`."""
     parser = actions.add_parser(
         "export",
-        help="write joints, poses, forces, commands, samples and events as tables",
+        help="write joints, poses, forces, commands, samples and events as tables, or what its scenes are drawn of",
         description="Write a recording as tables: one per robot (joints, end effector, gripper, contact force), per "
         "object (pose, contact force) and of the commands of each robot, one of raw samples, one of events. Rows are "
         "steps of the session as they were: of class closed it is simulated again and compared bit for bit, of class "
-        "open the states are in the recording. Exit status 1 if something is damaged or missing.",
+        "open the states are in the recording. Or write the assets of its scenes: specifications, meshes, textures, "
+        "each in a file named by its hash, and scenes.json. Exit status 1 if something is damaged or missing.",
         epilog="examples:\n"
         "  iris-session recording export session.rrd --to parquet -o tables\n"
         "  iris-session recording export session.rrd --to csv -o tables --hz 30 --robot left --table robots\n"
-        "  iris-session recording export session.rrd --to npz -o tables --hz 500    every step at 500 Hz",
+        "  iris-session recording export session.rrd --to npz -o tables --hz 500    every step at 500 Hz\n"
+        "  iris-session recording export session.rrd --to assets -o scene-files",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or its folder")
-    parser.add_argument("--to", required=True, choices=("csv", "parquet", "npz"), help="format of the tables")
-    parser.add_argument("-o", "--out", required=True, type=Path, metavar="FOLDER", help="folder for the tables")
+    parser.add_argument("--to", required=True, choices=(*FORMATS, ASSETS), help="format of the tables, or assets")
+    parser.add_argument("-o", "--out", required=True, type=Path, metavar="FOLDER", help="folder for the files")
     parser.add_argument(
         "--hz",
         type=parse_hz,
-        default=DEFAULT_HZ,
+        default=None,
         metavar="RATE",
         help="rows per second of robots, objects and commands; at the rate of the session, every step (default: 100)",
     )
@@ -50,9 +57,7 @@ def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
         choices=("robots", "objects", "commands", "samples", "events"),
         help="only tables of this kind; repeatable",
     )
-    parser.add_argument(
-        "--force", action="store_true", help="write into a folder that is not empty, replace its tables"
-    )
+    parser.add_argument("--force", action="store_true", help="write into a folder that is not empty, replace its files")
     add_json_option(parser)
     parser.set_defaults(run=run_export)
 
@@ -69,17 +74,19 @@ def parse_hz(text: str) -> float:
 
 
 def run_export(arguments: argparse.Namespace) -> int:
-    """Write the tables, and print a line for each."""
+    """Write the tables, and print a line for each, or write the assets."""
     import msgspec
 
     from iris_session.system.extras import require_package
 
     require_package("rerun", "reading recordings")
+    if arguments.to == ASSETS:
+        return _export_assets(arguments)
     from iris_session.replay.export import TABLES, ExportOptions, export_recording
     from iris_session.replay.recorded_session import SessionRecording
 
     options = ExportOptions(
-        arguments.hz,
+        DEFAULT_HZ if arguments.hz is None else arguments.hz,
         tuple(arguments.table) or TABLES,
         tuple(arguments.robot),
         tuple(arguments.object),
@@ -96,10 +103,43 @@ def run_export(arguments: argparse.Namespace) -> int:
     else:
         for table in report.tables:
             print(to_printable(f"{arguments.out / table.file}: {table.rows:,} rows, {table.columns} columns"))
-    problems = [f"steps {first} to {last} are left out" for first, last in report.left_out] + list(report.damage)
+    return _report_damage(
+        arguments.path,
+        [*(f"steps {first} to {last} are left out" for first, last in report.left_out), *report.damage],
+    )
+
+
+def _export_assets(arguments: argparse.Namespace) -> int:
+    """Write the assets of the scenes, and print what was written."""
+    import msgspec
+
+    from iris_session.recording import Recording
+    from iris_session.recording.asset_export import export_assets
+
+    given = [f"--{name}" for name in ("hz", "robot", "object", "table") if getattr(arguments, name)]
+    if given:
+        raise CommandError(f"{', '.join(given)} choose tables: leave them out with --to {ASSETS}")
+    progress = _Progress(arguments.path)
+    try:
+        with Recording.open(arguments.path, warn=False) as recording:
+            report = export_assets(recording, arguments.out, force=arguments.force, progress=progress.show)
+    finally:
+        progress.end()
+    if arguments.json:
+        print_json(msgspec.to_builtins(report))
+    else:
+        size = f"{report.assets:,} assets, {report.bytes / 1e6:.1f} MB, scenes: {report.scenes:,}"
+        print(to_printable(f"{report.folder}: {size}"))
+        for line in report.left_out[:MOST_LINES]:
+            print(to_printable(f"  not recorded: {line}"))
+    return _report_damage(arguments.path, list(report.damage))
+
+
+def _report_damage(path: Path, problems: list[str]) -> int:
+    """Print the first problem of a recording. Return the exit status."""
     if problems:
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        print(to_printable(f"iris-session: {arguments.path} is damaged: {problems[0]}{more}"), file=sys.stderr)
+        print(to_printable(f"iris-session: {path} is damaged: {problems[0]}{more}"), file=sys.stderr)
     return 1 if problems else 0
 
 

@@ -105,6 +105,8 @@ def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConf
 
     if arguments.view and arguments.no_record:
         raise CommandError("--view shows the recording: leave --no-record out")
+    if arguments.no_record and (arguments.record_assets or arguments.record_budget):
+        raise CommandError("--record-assets and --record-budget are for a recording: leave --no-record out")
     defaults = SessionConfig()
     assigned = parse_assignments(getattr(arguments, "assign", []))
     policy = arguments.assignment or (AssignmentPolicy.CONFIG if assigned else None)
@@ -129,6 +131,8 @@ def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConf
         state_port=state if base or arguments.state_port is None else arguments.state_port,
         record=False if arguments.no_record else arguments.record or True,
         record_clouds_hz=defaults.record_clouds_hz if arguments.record_clouds is None else arguments.record_clouds,
+        record_assets=defaults.record_assets if arguments.record_assets is None else arguments.record_assets,
+        record_budget_bytes=arguments.record_budget or 0,
         curve=arguments.curve,
         curve_key=arguments.curve_key,
         curve_clients=arguments.curve_clients,

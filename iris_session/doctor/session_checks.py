@@ -301,6 +301,10 @@ def check_recorder(report: StatusReport) -> Finding:
     if one.state == "hangs":
         why = "it has accepted nothing for five seconds: its disk or network drive does not answer"
         return failed("recorder", f"the recorder hangs; {text}{waiting}{lost}", why, "check that disk")
+    if one.state == "ended":
+        return warning(
+            "recorder", f"{one.text}; {one.path}", "", "record with a larger --record-budget, or without one"
+        )
     if one.state in ("dead", "failed"):
         text = f"the recorder ended, nothing is written now; {text}{waiting}{lost}"
         return failed("recorder", text, one.text, "fix the cause; the recorder restarts by itself")

@@ -30,6 +30,7 @@ from iris_session.recording.observations import (
 )
 from iris_session.recording.reader import Recording
 from iris_session.recording.record_batches import RawSample, RecordedCloud, RecordedImage, RecordedState, RecordedStream
+from iris_session.recording.recorded_assets import RecordedScene
 from iris_session.recording.summary import RecordingSummary, summarise
 from iris_session.recording.supervise import RecorderProcess
 from iris_session.recording.verify import Core, Problem, VerifyReport, verify
@@ -58,6 +59,7 @@ __all__ = [
     "RawSample",
     "RecordedCloud",
     "RecordedImage",
+    "RecordedScene",
     "read_alignment_history",
     "AlignmentHistory",
     "RecordedObservation",

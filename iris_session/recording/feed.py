@@ -76,7 +76,8 @@ class FeedStats(msgspec.Struct):
     """Counters of one feed.
 
     `dropped_rows`: rows missing in the recording; `dropped_items`: states, events and other items missing;
-    `dropped_vertices`: frames missing in the picture; `recorder`: the last status of the recorder.
+    `dropped_vertices`: frames missing in the picture; `recorder`: the last status of the recorder. What comes after the
+    budget of the recording is used up is in none of them.
     """
 
     rows: int = 0
@@ -149,6 +150,7 @@ class RecorderFeed:
         #: Reason to hold by robot; `None`: the file does not have it.
         self._holds: dict[str, str | None] = {}
         self._people: dict[str, ParticipantInfo] = {}
+        self._ended = False  # nothing more is recorded: the budget is used up
 
     @property
     def wants_keyframe(self) -> bool:
@@ -267,8 +269,10 @@ class RecorderFeed:
 
         Frames beyond `VertexRateLimit` are left out, and frames that do not fit into the queue are dropped.
         """
-        if self._vertices is None or not self._vertex_limit.admit_frame(
-            stream, read_header(frame).n_vertices, session_time
+        if (
+            self._ended
+            or self._vertices is None
+            or not self._vertex_limit.admit_frame(stream, read_header(frame).n_vertices, session_time)
         ):
             return
         try:
@@ -284,6 +288,10 @@ class RecorderFeed:
 
     def flush(self) -> None:
         """Number the pending batch and send what the window allows. Never blocks."""
+        if self._ended:
+            self._batch = Batch(dropped_rows=self.stats.dropped_rows)
+            self._transfer()
+            return
         batch = self._batch
         lists: tuple[list[Any], ...] = (batch.states, batch.events, batch.denials, batch.metrics, batch.keyframes)
         lists += (batch.scenes, batch.assets, batch.holds)
@@ -328,6 +336,7 @@ class RecorderFeed:
             now = (self.stats.recorder, cpu_s())
             silent = 0 if now != said else silent + 1
             said = now
+        self._transfer()  # it may have ended with a last status
         self._complete = not self._window and not self._spill
         if self._spill:
             self._drop(self._spill.rows, self._spill.others, "the session ended before the recorder could take it all")
@@ -402,7 +411,10 @@ class RecorderFeed:
             self._vertex_limit.reset()
         while self._window and self._window[0][0] <= status.written:
             self.stats.window_bytes -= len(self._window.popleft()[1])
-        if status.expecting < 0 and self._header and self._header_sent_to != self._instance and not status.fault:
+        if status.ended:
+            self._end()
+        is_able = not status.fault and not status.ended
+        if status.expecting < 0 and self._header and self._header_sent_to != self._instance and is_able:
             self._header_sent_to = self._instance
             first = self._window[0][0] if self._window else self._next
             self._scene.people = list(self._people.values())
@@ -411,6 +423,13 @@ class RecorderFeed:
             self._socket.send_multipart(head, zmq.NOBLOCK)
             for number, body in self._window:
                 self._socket.send_multipart((messages.FRAME.pack(messages.BATCH, number), body), zmq.NOBLOCK)
+
+    def _end(self) -> None:
+        """Discard what waits, and all that comes: the recorder has closed the last file."""
+        self._ended, self._lost, self._gap_rows, self.silence_ns = True, False, 0, 0
+        self._window.clear()
+        self.stats.window_bytes = 0
+        self._spill.close()
 
 
 _HEAD: Final = struct.Struct("<III")  # bytes of the record, rows in it, other items in it

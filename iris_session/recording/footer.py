@@ -1,4 +1,4 @@
-"""Add Rerun's index, the footer, to a closed file: `python -m iris_session.recording.footer FILE`.
+"""Add Rerun's index, the footer, to a closed file: `python -m iris_session.recording.footer FILE MAX_BYTES`.
 
 With an index, Rerun's viewer loads what it shows; without, it reads all of a file first, and says meanwhile that
 loading has failed. The recorder writes none, because it would have to keep some 4 KB of every chunk. The chunks stay
@@ -33,6 +33,8 @@ from iris_session.system.process import DEVNULL, ChildProcess
 #: Memory that `rerun rrd filter` takes for each message, and the share of the free memory that it may take.
 MESSAGE_BYTES: Final = 20_000
 MEMORY_SHARE: Final = 0.25
+#: Bytes by which an index grows with each message, at most; it begins with 0.1 to 0.7 MB, by the number of entities.
+INDEX_BYTES: Final = 400
 #: Free bytes of the disk that are left to the next session.
 RESERVE_BYTES: Final = 512 << 20
 #: A file up to this size takes half a second. On a busy machine an idle process would never get to it.
@@ -40,18 +42,27 @@ SHORT_BYTES: Final = 8 << 20
 _READ_BYTES: Final = 1 << 20
 
 
-def start_indexing(path: str) -> ChildProcess:
-    """Start the process that adds an index to a closed file. It outlives this one. Raises `OSError`."""
+def start_indexing(path: str, max_bytes: int = 0) -> ChildProcess:
+    """Start the process that adds an index to a closed file. It outlives this one. Raises `OSError`.
+
+    `max_bytes`: bytes that the file may have with it; 0: any number.
+    """
     return ChildProcess(
-        "iris_session.recording.footer", [path], config=b"", stdout=DEVNULL, stderr=DEVNULL, own_session=True
+        "iris_session.recording.footer",
+        [path, str(max_bytes)],
+        config=b"",
+        stdout=DEVNULL,
+        stderr=DEVNULL,
+        own_session=True,
     )
 
 
-def add_index(path: str | Path) -> bool:
+def add_index(path: str | Path, max_bytes: int = 0) -> bool:
     """Add an index to a file that its recorder has closed.
 
     Args:
         path: The file. It is left as it is if it was not closed or is damaged, or if memory or disk are short.
+        max_bytes: Bytes that it may have with the index; 0: any number.
 
     Returns:
         Whether the file has an index now.
@@ -71,7 +82,8 @@ def add_index(path: str | Path) -> bool:
         return False
     with open(path, "r+b", buffering=0) as file:
         index = _make_index(path, file, found.size - len(END_MESSAGE))
-        return bool(index) and _append(file, found.size, index)
+        fits = not max_bytes or found.size + len(index) <= max_bytes
+        return bool(index) and fits and _append(file, found.size, index)
 
 
 def _make_index(path: str | Path, file: BinaryIO, end: int) -> bytes:
@@ -137,13 +149,13 @@ def _append(file: BinaryIO, size: int, index: bytes) -> bool:
 
 def main() -> int:
     """Add an index to the file of the command line, a large one when the processor has nothing else to do."""
-    path = sys.argv[1]
+    path, max_bytes = sys.argv[1], int(sys.argv[2])
     try:
         os.nice(LOW_PRIORITY_NICE)
         if hasattr(os, "SCHED_IDLE") and os.path.getsize(path) > SHORT_BYTES:
             with suppress(OSError):
                 os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-        return 0 if add_index(path) else 1
+        return 0 if add_index(path, max_bytes) else 1
     except (OSError, ImportError, RecordingError):
         return 1
 

@@ -58,7 +58,7 @@ class Settings(msgspec.Struct, frozen=True):
     `state_hz`: rate of state frames [Hz]. `keyframe_s`: interval of keyframes [s]. `realtime`: a real-time priority was
     requested. `adapt_media`: slow links receive fewer media frames. `anchor_sizes`: edge of the printed sheets [m].
     `anchor_marks`: positions of their marks in the anchor frame [m]. `record_clouds_hz`: rate of point clouds and
-    pictures in the recording [Hz].
+    pictures in the recording [Hz]. `record_assets`, `record_budget_bytes`: as in `SessionConfig`.
     """
 
     state_hz: float
@@ -68,6 +68,8 @@ class Settings(msgspec.Struct, frozen=True):
     anchor_sizes: dict[str, float] = {}
     anchor_marks: dict[str, dict[str, tuple[float, float, float]]] = {}
     record_clouds_hz: float = 2.0
+    record_assets: str = "scene"
+    record_budget_bytes: int = 0
 
 
 class SessionHeader(msgspec.Struct, frozen=True):

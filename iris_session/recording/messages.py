@@ -31,7 +31,8 @@ class RecorderConfig(msgspec.Struct, frozen=True):
     `path`: the recording; `part`: number of the file to write, which must not exist. Endpoints: `ipc://` sockets that
     the recorder binds; without `vertices_endpoint` deformables are drawn at rest, without `media_endpoint` no point
     clouds and pictures are recorded. `origin_ns`: session time zero on CLOCK_MONOTONIC. `parent`: id of the parent
-    process; the recorder ends after it, once the file is finished.
+    process; the recorder ends after it, once the file is finished. `record_assets`: see `recorded_assets.py`.
+    `budget_bytes`: see `budget.py`.
     """
 
     path: str
@@ -43,13 +44,19 @@ class RecorderConfig(msgspec.Struct, frozen=True):
     parent: int
     vertices_endpoint: str = ""
     media_endpoint: str = ""
+    record_assets: str = "none"
+    budget_bytes: int = 0
 
 
 class EndMark(msgspec.Struct, frozen=True, array_like=True):
-    """Mark at the end of a closed file: `step` and `chain` of its newest row."""
+    """Mark at the end of a closed file: `step` and `chain` of its newest row.
+
+    `reason`: why it ended before the session, one line for people; empty if it did not.
+    """
 
     step: int
     chain: bytes
+    reason: str = ""
 
 
 HEADER: Final = b"H"
@@ -195,7 +202,9 @@ class RecorderStatus(msgspec.Struct, frozen=True, array_like=True):
     decode, or are of another scene. `fault`: one line if the file can no longer be written; the process then ends.
     `disk_free`: free bytes on its disk, at least 1; 0 if unknown. `samples_left_out`: raw messages that are not in the
     file, because time and room of the disk were left to the journal. `media_refused`: frames of point clouds and
-    pictures that do not decode.
+    pictures that do not decode. `assets_left_out`: assets of the scenes that are not in the file. `budget`,
+    `budget_left`: bytes that the recording may have, and that are left of them; 0, 0: any number. `ended`: the budget
+    is used up, the file is closed and the process ends: nothing more is recorded.
     """
 
     instance: int
@@ -211,6 +220,10 @@ class RecorderStatus(msgspec.Struct, frozen=True, array_like=True):
     vertices_refused: int = 0
     samples_left_out: int = 0
     media_refused: int = 0
+    assets_left_out: int = 0
+    budget: int = 0
+    budget_left: int = 0
+    ended: bool = False
 
 
 encode_batch = msgspec.msgpack.Encoder().encode

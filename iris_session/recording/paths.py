@@ -38,6 +38,10 @@ CLOUDS: Final = "/clouds"
 PICTURES: Final = "/pictures"
 #: Their descriptions.
 STREAMS: Final = "/streams"
+#: What clients draw the scenes of: the scenes, pieces of their assets, and assets that could not be recorded.
+ASSET_SCENES: Final = "/assets/scenes"
+ASSETS: Final = "/assets/data"
+ASSET_FAULTS: Final = "/assets/faults"
 
 _RESUME: Final = re.compile(r"(?P<stem>.*)\.resume(?P<number>[1-9][0-9]*)(?P<suffix>\.[^./]*)?", re.DOTALL)
 _PART: Final = re.compile(r"(?P<stem>.*)\.part(?P<part>[1-9][0-9]*)(?P<suffix>\.[^./]*)?", re.DOTALL)

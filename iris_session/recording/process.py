@@ -4,7 +4,7 @@ Receives batches from the authority and raw samples from the front, and writes t
 times a second, so that killing any process loses at most 0.25 s. The journal comes first: raw samples are left out, and
 counted, while the disk is slow or nearly full, and vertices and media when time is short. Prints `ready` or
 `failed: <one line>` on standard output. Ends on SIGTERM, or when its parent process has ended, after writing everything
-that was received; SIGINT is left to the parent.
+that was received, and when the budget of the recording is used up; SIGINT is left to the parent.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ import zmq
 
 from iris_session.protocol.common import Name
 from iris_session.protocol.status import ClientReport
+from iris_session.recording.asset_queue import AssetQueue
+from iris_session.recording.budget import RecordingBudget, describe_used_budget
 from iris_session.recording.errors import RecorderError, WriteError
 from iris_session.recording.footer import start_indexing
 from iris_session.recording.journal import SessionHeader
@@ -73,6 +75,13 @@ SLOW_FLUSH_S: Final = 0.3
 #: Bytes written to test a new file. A file begins with about 22 KB, mostly the blueprint.
 TRIAL_BYTES: Final = 128 << 10
 
+#: Bytes of assets in a write: at most, at least, and what the disk takes in `ASSETS_S`.
+MAX_ASSETS_BYTES: Final = 1 << 20
+MIN_ASSETS_BYTES: Final = 64 << 10
+ASSETS_S: Final = 0.02
+#: Time for the rest of the assets when the session ends.
+ASSETS_AT_END_S: Final = 3.0
+
 _decode_samples = msgspec.msgpack.Decoder(list[tuple[int, int, bytes]]).decode
 #: First byte of a report in place of a message: an array of two, where messages are maps.
 _REPORT: Final = b"\x92"
@@ -90,6 +99,7 @@ class RecorderLoop:
         vertices = config.vertices_endpoint
         self._vertices = self._bind(zmq.PULL, vertices, DRAIN_VERTICES) if vertices else None
         self._media = self._bind(zmq.PULL, config.media_endpoint, DRAIN_MEDIA) if config.media_endpoint else None
+        self._budget = RecordingBudget(config.budget_bytes, config.path, config.part)
         self._begin_part()
         if os.path.exists(config.path):  # the first file may have been moved away
             try:
@@ -108,6 +118,10 @@ class RecorderLoop:
         self._disk_free = get_free_bytes(Path(self._writer.path))
         self._flush_s = 0.0  # duration of the last write
         self._refused = 0
+        self._unwritten_bytes = 0  # of the journal, since the last write
+        self._assets_bytes = MAX_ASSETS_BYTES  # of assets in the next write
+        self._is_used_up = False  # the budget
+        self._ended = False
         self._fault = ""
         self._stopping = False
 
@@ -117,14 +131,15 @@ class RecorderLoop:
         try:
             self._send_status(-1)
             self._loop()
-            self._drain_all()
-            self._writer.close()
+            if not self._is_used_up:
+                self._drain_all()
+            self._close_file()
             self._send_status(self._received)
             if self._header is None:
                 self._remove()
             else:
                 with suppress(OSError):  # without an index the file opens more slowly
-                    self._indexing = start_indexing(self._writer.path)
+                    self._indexing = start_indexing(self._writer.path, self._budget.max_bytes)
         except WriteError as error:
             self._fault = str(error)
             self._send_status(-1)
@@ -136,6 +151,18 @@ class RecorderLoop:
             if os.getppid() != self._config.parent:  # the parent was killed: it cannot remove the folder
                 shutil.rmtree(Path(self._config.feed_endpoint.removeprefix("ipc://")).parent, ignore_errors=True)
         return 0
+
+    def _close_file(self) -> None:
+        """Write the assets that wait, as far as time and room permit, and close the file."""
+        until = time.monotonic() + ASSETS_AT_END_S
+        self._writer.assets.is_ending = True
+        while self._writer.assets and time.monotonic() < until and not self._is_used_up and not self._is_short:
+            before = self._writer.size
+            self._writer.write_assets(MAX_ASSETS_BYTES)
+            if self._writer.size == before:
+                break  # there was no step
+        self._writer.close(reason=describe_used_budget(self._budget.total_bytes) if self._is_used_up else "")
+        self._ended = self._is_used_up
 
     def _give_up_as_orphan(self) -> None:
         """Exit the process when its parent has ended and the file cannot be written (runs in a thread)."""
@@ -167,7 +194,8 @@ class RecorderLoop:
         path = part_path(self._config.path, self._config.part)
         self._made_folder = claim_file(Path(path))
         try:
-            self._writer = RrdWriter(path, self._config.recording_id)
+            assets = AssetQueue(self._config.record_assets, self._budget.assets_bytes)
+            self._writer = RrdWriter(path, self._config.recording_id, assets)
             self._writer.flush()
             self._syncer = _Syncer(path)
         except WriteError:
@@ -189,15 +217,16 @@ class RecorderLoop:
 
     def _loop(self) -> None:
         flush_at = status_at = 0.0
-        while not self._stopping and os.getppid() == self._config.parent:
+        while not self._stopping and not self._is_used_up and os.getppid() == self._config.parent:
             time.sleep(DRAIN_S)
             n = self._drain()
             now = time.monotonic()
             if now >= flush_at:
                 flush_at = now + FLUSH_S
-                self._writer.flush()
+                self._flush()
                 self._flush_s = time.monotonic() - now
                 self._syncer.check()
+                self._write_assets()
                 self._lag_ns = time.monotonic_ns() - self._config.origin_ns - self._newest_ns
                 if n or now >= status_at:
                     status_at = now + STATUS_S
@@ -209,9 +238,22 @@ class RecorderLoop:
         while time.monotonic() < min(until, quiet_at):
             if self._drain():
                 quiet_at = time.monotonic() + QUIET_S
-                self._writer.flush()
+                self._flush()
                 self._send_status(self._received)
             time.sleep(DRAIN_S)
+
+    def _flush(self) -> None:
+        self._writer.flush()
+        self._unwritten_bytes = 0
+
+    def _write_assets(self) -> None:
+        """Write assets after the journal, as many as the disk takes in a moment: no row waits for them longer."""
+        if not self._writer.assets or self._is_short:
+            return
+        began, before = time.monotonic(), self._writer.size
+        self._writer.write_assets(self._assets_bytes)
+        bytes_per_s = (self._writer.size - before) / max(1e-6, time.monotonic() - began)
+        self._assets_bytes = max(MIN_ASSETS_BYTES, min(MAX_ASSETS_BYTES, round(bytes_per_s * ASSETS_S)))
 
     def _drain(self) -> int:
         n = 0
@@ -235,7 +277,9 @@ class RecorderLoop:
     @property
     def _is_short(self) -> bool:
         """True while time or room of the disk are left to the journal."""
-        return self._flush_s > SLOW_FLUSH_S or 0 < self._disk_free < JOURNAL_RESERVE_BYTES
+        if self._flush_s > SLOW_FLUSH_S or 0 < self._disk_free < JOURNAL_RESERVE_BYTES:
+            return True
+        return self._budget.is_short(self._writer.size_with_index)
 
     def _drain_vertices(self) -> None:
         if self._vertices is None:
@@ -270,7 +314,11 @@ class RecorderLoop:
                 self._writer.add(decode_batch(known))
             self._expecting = number
             self._received = number - 1
-        elif kind == BATCH and number == self._expecting:
+        elif kind == BATCH and number == self._expecting and not self._is_used_up:
+            self._unwritten_bytes += len(frames[1])
+            if self._budget.is_used_up(self._writer.size_with_index + self._unwritten_bytes):
+                self._is_used_up = True
+                return
             batch = self._decode(frames[1])
             if batch.rows:
                 self._newest_ns = batch.rows[-1].now_ns
@@ -329,6 +377,10 @@ class RecorderLoop:
             self._writer.vertices_refused,
             self._samples_left_out,
             self._writer.media_refused,
+            self._writer.assets.left_out,
+            self._budget.total_bytes,
+            self._budget.count_left(self._writer.size_with_index),
+            self._ended,
         )
         with suppress(zmq.Again):
             self._feed.send(encode_status(status), zmq.NOBLOCK)
@@ -416,11 +468,27 @@ def get_free_bytes(path: Path) -> int:
     return max(1, free.f_bavail * free.f_frsize)
 
 
+def report_used_budget(config: RecorderConfig) -> int:
+    """Say that nothing more is recorded, and begin no file: the recorder before was killed as it was to say so."""
+    print("ready", flush=True)
+    with zmq.Context() as context, context.socket(zmq.DEALER) as feed:
+        feed.setsockopt(zmq.LINGER, 500)
+        feed.setsockopt(zmq.SNDTIMEO, round(FINISH_S * 1e3))
+        feed.bind(config.feed_endpoint)
+        with suppress(zmq.Again):
+            feed.send(
+                encode_status(RecorderStatus(time.monotonic_ns(), -1, -1, budget=config.budget_bytes, ended=True))
+            )
+    return 0
+
+
 def main() -> int:
     """Run the recorder process."""
     configure_logging()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     config = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=RecorderConfig)
+    if RecordingBudget(config.budget_bytes, config.path, config.part).is_used_up(0):
+        return report_used_budget(config)
     try:
         recorder = RecorderLoop(config)
     except (RecorderError, WriteError) as error:

@@ -52,8 +52,27 @@ from iris_session.recording.record_batches import (
     group_spans,
     join_pieces,
 )
+from iris_session.recording.recorded_assets import (
+    AssetCollector,
+    AssetFault,
+    AssetJoiner,
+    AssetPiece,
+    RecordedScene,
+)
 from iris_session.system.extras import require_package
 
+#: Items of `Recording.outline`.
+OutlineItem = (
+    Event
+    | DenialRecord
+    | RowTimes
+    | FrameTime
+    | RecordedStream
+    | DrawnVertices
+    | RecordedScene
+    | AssetPiece
+    | AssetFault
+)
 _T = TypeVar("_T")
 _Frame = TypeVar("_Frame", RecordedCloud, RecordedImage)
 #: Maximum number of lines in `damage`: a file may be damaged in any number of places.
@@ -61,7 +80,9 @@ MOST_DAMAGE: Final = 200
 MORE_DAMAGE: Final = "and more of it is damaged than is listed here"
 #: Entities of the picture that are fixed to the world, deformables among them, in the first scenes of a part.
 _DRAWN: Final = tuple(f"{paths.SCENE}/{n}/world/**" for n in range(1, 17))
+_ASSETS: Final = (paths.ASSET_SCENES, paths.ASSETS, paths.ASSET_FAULTS)
 _OUTLINE: Final = (
+    *_ASSETS,
     *(paths.EVENTS, paths.DENIALS, paths.ROWS, *_DRAWN),
     *(f"{folder}/**" for folder in (paths.CLOUDS, paths.PICTURES, paths.STREAMS)),
 )
@@ -118,6 +139,8 @@ class Recording:
             self.notes.append(f"{name} holds {n} recordings: only {one} is read; make a file of each of the others")
         self._find_missing(files)
         self.end = ends.get(len(self.files) - 1)
+        if self.end is not None and self.end.reason:
+            self.notes.append(f"{self.end.reason[:200]}; the session may have gone on")
 
     @property
     def finished(self) -> bool:
@@ -254,6 +277,47 @@ class Recording:
                 return unpack_model(scene.model)
         raise LookupError(f"the recording does not hold the model {model_hash[:12]} of a scene that was loaded")
 
+    def scenes(self) -> Iterator[RecordedScene]:
+        """Yield the scenes of the session, patched ones too, each with the hash of its specification, in order.
+
+        Of patches that follow each other within a second, the last is there. Empty for files of versions that did not
+        record them, and for sessions that share no scene.
+
+        Raises:
+            NotARecordingError: A file can no longer be read.
+        """
+        return self._unique(paths.ASSET_SCENES, record_batches.decode_asset_scenes, lambda scene: scene)
+
+    def assets(self) -> Iterator[tuple[str, bytes]]:
+        """Yield hash and bytes of the assets of the scenes that are whole, each once, in one pass over the files.
+
+        Raises:
+            NotARecordingError: A file can no longer be read.
+        """
+        joiner = AssetJoiner()
+        for _, piece in self._items(paths.ASSETS, record_batches.decode_asset_pieces):
+            data = joiner.add(piece)
+            if data is not None:
+                yield piece.address, data
+
+    def asset(self, address: str) -> bytes:
+        """Return an asset of a scene: a specification, a mesh, a texture.
+
+        Args:
+            address: Its SHA-256, as 64 hex digits: that of a scene, or one that is named in its specification.
+
+        Returns:
+            Its bytes, which have this hash.
+
+        Raises:
+            LookupError: The recording does not have it, or not whole.
+            NotARecordingError: A file can no longer be read.
+        """
+        for found, data in self.assets():
+            if found == address:
+                return data
+        raise LookupError(f"the recording does not hold the asset {address[:12]} as it was written")
+
     def events(self) -> Iterator[Event]:
         """Yield the events of the shared history in order of `event_seq`, each once."""
         return self._unique(paths.EVENTS, record_batches.decode_events, lambda event: event.event_seq)
@@ -323,13 +387,14 @@ class Recording:
             values.append(scalar.value)
         return {name: (np.array(t, np.int64), np.array(v, np.float64)) for name, (t, v) in found.items()}
 
-    def outline(self) -> Iterator[Event | DenialRecord | RowTimes | FrameTime | RecordedStream | DrawnVertices]:
+    def outline(self) -> Iterator[OutlineItem]:
         """Yield what a summary needs, in one pass over the files; a pass takes most of the time of any reading.
 
         Returns:
             Iterator over events and denials, each once; times of the rows of the journal, where steps that two parts
-            hold come twice; numbers and times of the frames of clouds and pictures, each once; their descriptions; and
-            how often the vertices of elements of the picture are in the files. Those of one kind are in order.
+            hold come twice; numbers and times of the frames of clouds and pictures, each once; their descriptions; how
+            often the vertices of elements of the picture are in the files; and scenes, pieces of assets, and assets
+            that could not be recorded. Those of one kind are in order.
 
         Raises:
             NotARecordingError: A file can no longer be read.
@@ -538,6 +603,25 @@ class Recording:
                     del self.files[i], self._readable[i]
 
 
+def check_assets(recording: Recording) -> AssetCollector:
+    """Return what is there of the assets of the scenes, and what is damaged.
+
+    Raises:
+        NotARecordingError: A file can no longer be read.
+    """
+    collector = AssetCollector()
+    for _, item in recording._unique(_ASSETS, _outline_decoder(), lambda pair: pair[0]):
+        collector.add(item)
+    return collector
+
+
+_DECODE_ASSETS: Final[dict[str, Callable[[Any], Iterator[Any]]]] = {
+    paths.ASSET_SCENES: record_batches.decode_asset_scenes,
+    paths.ASSETS: record_batches.decode_asset_pieces,
+    paths.ASSET_FAULTS: record_batches.decode_asset_faults,
+}
+
+
 def _outline_decoder() -> Callable[[Any], Iterator[tuple[Hashable, Any]]]:
     """Return a decoder of the entities of an outline: key of what counts once, and item."""
     decode_denials = record_batches.numbered_denial_decoder()
@@ -554,6 +638,9 @@ def _outline_decoder() -> Callable[[Any], Iterator[tuple[Hashable, Any]]]:
             )
         elif entity.startswith((paths.CLOUDS + "/", paths.PICTURES + "/")):
             yield from (((entity, one.seq), one) for one in record_batches.decode_frame_times(batch))
+        elif entity in _DECODE_ASSETS:
+            rows = batch.column(record_batches.ROW_ID).to_pylist()
+            yield from (((entity, row), one) for row, one in zip(rows, _DECODE_ASSETS[entity](batch), strict=True))
         else:
             first = batch.column(record_batches.ROW_ID)[0].as_py()
             read = record_batches.decode_row_times if entity == paths.ROWS else record_batches.decode_drawn_vertices

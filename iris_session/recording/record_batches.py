@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from iris_session.protocol.assets import is_address
 from iris_session.protocol.common import Applied
 from iris_session.protocol.media import StreamInfo
 from iris_session.protocol.names import MediaEncoding
@@ -20,6 +21,7 @@ from iris_session.protocol.server_messages import BodyInfo, Event, PresenceItem
 from iris_session.recording import paths
 from iris_session.recording.journal import JournalRow, Keyframe, open_blob
 from iris_session.recording.messages import DenialRecord, EndMark, SceneModel, decode_scene
+from iris_session.recording.recorded_assets import RECORD_ASSETS, AssetFault, AssetPiece, RecordedScene, check_piece
 from iris_session.recording.rrd_file import Mark
 
 #: Errors of decoding bytes that mean something else; the last one is Arrow's, for types that it cannot convert.
@@ -234,6 +236,29 @@ def decode_streams(batch: Any) -> Iterator[RecordedStream]:
     columns = (read_index(batch, paths.SESSION_TIME), read_values(batch, "encoding"), read_values(batch, "info"))
     for at_ns, encoding, info in zip(*columns, strict=True):
         yield RecordedStream(_read_stream(batch), at_ns, encoding, _decode_info(info) if info else None)
+
+
+def decode_asset_scenes(batch: Any) -> Iterator[RecordedScene]:
+    """Yield the scenes of a session."""
+    names = ("scene_step", "scene_ns", "hash", "recorded")
+    for row in zip(*(read_values(batch, name) for name in names), strict=True):
+        scene = RecordedScene(*row)
+        if not is_address(scene.hash) or scene.recorded not in RECORD_ASSETS:
+            raise ValueError(f"a scene {scene.hash[:80]!r} with the assets {scene.recorded[:80]!r}")
+        yield scene
+
+
+def decode_asset_pieces(batch: Any) -> Iterator[AssetPiece]:
+    """Yield pieces of assets."""
+    names = ("address", "offset", "total", "is_scene", "data")
+    for row in zip(*(read_values(batch, name) for name in names), strict=True):
+        yield check_piece(AssetPiece(*row))
+
+
+def decode_asset_faults(batch: Any) -> Iterator[AssetFault]:
+    """Yield assets that could not be recorded."""
+    for row in zip(read_values(batch, "address"), read_values(batch, "text"), strict=True):
+        yield AssetFault(*row)
 
 
 def decode_row_times(batch: Any) -> RowTimes:

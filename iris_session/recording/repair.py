@@ -94,7 +94,8 @@ def repair(
         for item in recording.outline():
             builder.add(item)
         changed = recording.changed_spans()
-        damage = (*recording.missing, *recording.damage, *builder.list_gaps(recording.end), *changed)
+        lost = builder.assets.list_problems(finished=recording.finished)
+        damage = (*recording.missing, *recording.damage, *builder.list_gaps(recording.end), *changed, *lost)
         lost_bytes = sum(map(_count_lost_bytes, recording.files, recording.readable_files))
         lost_bytes += sum(map(os.path.getsize, recording.unreadable_files))
         lost_steps, lost_s = builder.count_lost_steps(recording.end)

@@ -107,14 +107,18 @@ def scan_file(path: str | Path) -> Scan:
     return Scan(found, holes, min(at, size), size, at < size and not ended, ended and found[-1].length > 0)
 
 
-def end_of_messages(data: bytes) -> int:
-    """Return the offset of the end message in the bytes of a file. Raises `ValueError` if there is none."""
-    at = FILE_HEAD
+def find_end(data: bytes) -> tuple[int, int]:
+    """Return the offset of the end message in the bytes of a file, and the number of messages before it.
+
+    Raises `ValueError` if there is none.
+    """
+    at, n = FILE_HEAD, 0
     while at + _HEAD.size <= len(data):
         kind, length = _HEAD.unpack_from(data, at)
         if kind == KIND_END:
-            return at
+            return at, n
         at += _HEAD.size + length
+        n += 1
     raise ValueError("a Rerun file without an end")
 
 

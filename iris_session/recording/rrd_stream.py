@@ -20,7 +20,7 @@ import pyarrow as pa  # type: ignore[import-untyped]
 import rerun as rr
 from numpy.typing import NDArray
 
-from iris_session.recording.rrd_file import END_MESSAGE, FILE_HEAD, MAGIC, Mark, end_of_messages
+from iris_session.recording.rrd_file import END_MESSAGE, FILE_HEAD, MAGIC, Mark, find_end
 
 #: The stream's own batcher never acts: the writer sends whole columns, and `write` collects them.
 _BATCHER: Final = rr.ChunkBatcherConfig(flush_tick=3600.0, flush_num_bytes=1 << 30)
@@ -37,6 +37,7 @@ class RrdStream:
         self._encoded = self.recording.binary_stream()
         self._file: Any = open(path, "wb", buffering=0)  # noqa: SIM115 - closed by `close`
         self.size = 0  # bytes in the file
+        self.messages = 0  # in the file
         self._marked = 0  # bytes of the file that marks cover
         self._crc = 0  # of the bytes after them
 
@@ -67,7 +68,9 @@ class RrdStream:
             return memoryview(data)
         if data[: len(MAGIC)] != MAGIC:
             raise ValueError("this version of Rerun encodes its messages in another way")
-        return memoryview(data)[FILE_HEAD if self.size else 0 : end_of_messages(data)]
+        end, n_messages = find_end(data)
+        self.messages += n_messages
+        return memoryview(data)[FILE_HEAD if self.size else 0 : end]
 
     def _append(self, data: memoryview) -> None:
         rest = data

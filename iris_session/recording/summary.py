@@ -42,6 +42,7 @@ from iris_session.recording.lock import describe_writers
 from iris_session.recording.messages import DenialRecord, EndMark
 from iris_session.recording.reader import Recording
 from iris_session.recording.record_batches import DrawnVertices, FrameTime, RecordedStream, RowTimes
+from iris_session.recording.recorded_assets import AssetCollector, AssetFault, AssetPiece, AssetsSummary, RecordedScene
 
 #: Maximum number of lines about missing steps, and about missing events: a file may have any number of gaps.
 MOST_GAPS: Final = 100
@@ -197,6 +198,7 @@ class RecordingSummary(msgspec.Struct, frozen=True):
     drops: DropSummary
     damage: tuple[str, ...]
     notes: tuple[str, ...]
+    assets: AssetsSummary = AssetsSummary()
 
 
 def summarise(recording: Recording, progress: Callable[[int, int], None] | None = None) -> RecordingSummary:
@@ -220,7 +222,8 @@ def summarise(recording: Recording, progress: Callable[[int, int], None] | None 
         if progress is not None and isinstance(item, RowTimes):
             progress(builder.steps, total)
     changed = recording.changed_spans()
-    damage = (*recording.missing, *recording.damage, *builder.list_gaps(end), *changed)
+    lost = builder.assets.list_problems(finished=recording.finished)
+    damage = (*recording.missing, *recording.damage, *builder.list_gaps(end), *changed, *lost)
     past = header.continues
     return RecordingSummary(
         path=recording.files[0],
@@ -252,6 +255,7 @@ def summarise(recording: Recording, progress: Callable[[int, int], None] | None 
         drops=builder.make_drops(),
         damage=damage,
         notes=tuple(recording.notes),
+        assets=builder.assets.summarise(),
     )
 
 
@@ -322,6 +326,7 @@ class SummaryBuilder:
         stops: E-stops in order.
         pauses: In order.
         scene_changes: In order.
+        assets: Those of the scenes.
     """
 
     def __init__(self, begins_after: int = -1, *, resumed: bool = False) -> None:
@@ -331,6 +336,7 @@ class SummaryBuilder:
         self.stops: list[_Stop] = []
         self.pauses: list[_Stop] = []
         self.scene_changes: list[SceneChangeSummary] = []
+        self.assets = AssetCollector()
         self._last_step = begins_after
         self._step_ns: int | None = None  # session time of that step
         self._step_gaps: list[str] = []
@@ -361,6 +367,8 @@ class SummaryBuilder:
             self._describe_stream(item)
         elif isinstance(item, DrawnVertices):
             self._vertices[item.entity] += item.n
+        elif isinstance(item, RecordedScene | AssetPiece | AssetFault):
+            self.assets.add(item)
 
     def _add_rows(self, rows: RowTimes) -> None:
         new = rows.steps > self._last_step  # a part repeats steps of the one before

@@ -15,6 +15,7 @@ import psutil
 from iris_session.recording.errors import RecorderError
 from iris_session.recording.messages import FAULT_PREFIX, RecorderConfig
 from iris_session.recording.paths import part_path
+from iris_session.recording.recorded_assets import NONE
 from iris_session.system.process import PIPE, ChildProcess
 
 #: Time limit of a start. It takes half a second on an idle machine.
@@ -30,10 +31,13 @@ class RecorderProcess:
     begins the next part (`session.part2.rrd`); the feed sends it everything that was not written.
     """
 
-    def __init__(self, path: str | Path, origin_ns: int) -> None:
+    def __init__(self, path: str | Path, origin_ns: int, *, record_assets: str = NONE, budget_bytes: int = 0) -> None:
+        """Set what is recorded; nothing is started or written yet. See `RecorderConfig`."""
         self.path = str(path)
         self.part = 0
         self._origin_ns = origin_ns
+        self._record_assets = record_assets
+        self._budget_bytes = budget_bytes
         # The path of a Unix socket has at most 107 bytes: some TMPDIR are too long for one.
         short = len(os.fsencode(tempfile.gettempdir())) <= LONGEST_FOLDER
         self._folder = tempfile.mkdtemp(prefix="iris-rec-", dir=None if short else "/tmp")
@@ -133,6 +137,8 @@ class RecorderProcess:
             os.getpid(),
             self.vertices_endpoint,
             self.media_endpoint,
+            self._record_assets,
+            self._budget_bytes,
         )
         # RERUN=off in a user's shell would silence the stream. Nothing is drawn here: MuJoCo need not load OpenGL.
         environment = {"RERUN": "on", "RUST_LOG": "error", "MUJOCO_GL": "disable"}

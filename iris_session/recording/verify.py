@@ -34,7 +34,7 @@ from iris_session.recording.journal import (
 )
 from iris_session.recording.lock import describe_writers
 from iris_session.recording.messages import EndMark
-from iris_session.recording.reader import Recording
+from iris_session.recording.reader import Recording, check_assets
 
 #: Maximum number of problems listed in a report; further ones are only counted.
 MAX_PROBLEMS: Final = 20
@@ -195,6 +195,7 @@ def verify(
             progress(total, total)
         run.end(recording.end)
         changed = recording.changed_spans()
+        lost = check_assets(recording).list_problems(finished=recording.finished)
         report.finished = recording.finished
         report.last_step = run.last_step
         report.writers = list(recording.writers)
@@ -215,6 +216,8 @@ def verify(
             run.add_problem(Problem(run.last_step, "unreadable", "file", line))
         for line in changed:
             run.add_problem(Problem(run.last_step, "changed", "file", line))
+        for line in lost:
+            run.add_problem(Problem(run.last_step, "changed", "asset", line))
     report.wall_s = round(time.perf_counter() - began, 3)
     report.ok = not report.problems and report.steps > 0 and not report.unverified_steps
     return report

@@ -35,8 +35,10 @@ from iris_session.protocol.server_messages import (
 )
 from iris_session.protocol.specs import RobotSpec
 from iris_session.recording import paths
+from iris_session.recording.asset_queue import AssetQueue, AssetRows
 from iris_session.recording.blueprint import build_blueprint, place_eye
 from iris_session.recording.errors import WriteError
+from iris_session.recording.footer import INDEX_BYTES
 from iris_session.recording.journal import CLOSED, SessionHeader, seal_blob
 from iris_session.recording.media import MediaDrawer
 from iris_session.recording.messages import (
@@ -114,11 +116,12 @@ class RrdWriter:
 
     `add`, `add_sample`, `add_vertices` and `add_media` only collect; `flush` writes and returns when the operating
     system has the bytes. `vertices_refused`: number of vertex frames that are not in the picture. `media_refused`:
-    number of frames of point clouds and pictures that do not decode.
+    number of frames of point clouds and pictures that do not decode. `assets`: what `write_assets` writes.
     """
 
-    def __init__(self, path: str | Path, recording_id: str) -> None:
+    def __init__(self, path: str | Path, recording_id: str, assets: AssetQueue | None = None) -> None:
         self.path = str(path)
+        self.assets = AssetQueue() if assets is None else assets
         self._stream = RrdStream(self.path, paths.APPLICATION, recording_id)
         self._rec = self._stream.recording
         is_first = paths.split_part(self.path)[1] == 1
@@ -154,6 +157,7 @@ class RrdWriter:
         self._people = PeoplePicture(self._rec, self._story, is_first=is_first)
         self._lanes: dict[str, list[tuple[Moment, LaneChange]]] = {}
         self._lane_colours: dict[str, dict[str, Rgb]] = {}
+        self._has_scene = False  # the assets of a scene were given
         self._eye: Any = None
         self._arranged = False
 
@@ -232,9 +236,58 @@ class RrdWriter:
         except (RuntimeError, ValueError, OSError) as error:
             raise self._to_error(error) from error
 
-    def close(self, timeout_s: float = 10.0) -> None:
-        """Write the rest and the end mark, and close the file. Raises `WriteError`."""
+    def write_assets(self, max_bytes: int, timeout_s: float = 10.0) -> None:
+        """Write the next assets, after the first row: no time in the file is before the first picture.
+
+        Raises `WriteError`.
+        """
+        if self.assets and self._begins_ns is not None:
+            self._write_asset_rows(self.assets.read(self._newest_ns, max_bytes), timeout_s)
+
+    def _write_asset_rows(self, rows: AssetRows, timeout_s: float) -> None:
+        scenes, pieces, faults = rows
+        try:
+            if scenes:
+                columns = [
+                    scalar_column("scene_step", [one.step for one in scenes], pa.int64()),
+                    scalar_column("scene_ns", [one.session_time for one in scenes], pa.int64()),
+                    scalar_column("hash", [one.hash for one in scenes], pa.string()),
+                    scalar_column("recorded", [one.recorded for one in scenes], pa.string()),
+                ]
+                self._send_now(paths.ASSET_SCENES, len(scenes), columns)
+            if pieces:
+                columns = [
+                    scalar_column("address", [one.address for one in pieces], pa.string()),
+                    scalar_column("offset", [one.offset for one in pieces], pa.int64()),
+                    scalar_column("total", [one.total for one in pieces], pa.int64()),
+                    scalar_column("is_scene", [one.is_scene for one in pieces], pa.bool_()),
+                    bytes_column("data", [one.data for one in pieces]),
+                ]
+                self._send_now(paths.ASSETS, len(pieces), columns)
+            if faults:
+                columns = [
+                    scalar_column("address", [one.address for one in faults], pa.string()),
+                    scalar_column("text", [one.text for one in faults], pa.string()),
+                ]
+                self._send_now(paths.ASSET_FAULTS, len(faults), columns)
+            self._stream.write(timeout_s)
+        except (RuntimeError, ValueError, OSError) as error:
+            raise self._to_error(error) from error
+
+    def _send_now(self, entity: str, n: int, columns: Sequence[Any]) -> None:
+        """Write rows at the time of the newest row of the journal."""
+        times = self._times.spread(entity, [self._newest_ns] * n)
+        self._send_columns(entity, [duration_index(paths.SESSION_TIME, times)], columns)
+
+    def close(self, timeout_s: float = 10.0, reason: str = "") -> None:
+        """Write the rest and the end mark, and close the file. `reason`: why before the session ends, for the mark.
+
+        Assets that still wait are noted as missing. Raises `WriteError`.
+        """
         self.flush(timeout_s)
+        self._write_asset_rows(self.assets.close(reason or "the session ended before it was written"), timeout_s)
+        if reason:
+            self._rec.log(f"{paths.EVENTS}/recorder", rr.TextLog(reason, level=WARN), strict=True)
         self._write_collected()
         self._picture.draw(self._find_moment(-1, 0))  # without a state the scene is drawn nevertheless
         if not self._arranged:
@@ -242,7 +295,7 @@ class RrdWriter:
         self._describe_result()
         self.flush(timeout_s)
         self._write_mark()
-        mark = EndMark(*self._newest_row)
+        mark = EndMark(*self._newest_row, reason)
         self._log_static(paths.END, rr.AnyValues(end=pa.array([_encode(mark)], pa.binary())))
         try:
             self._stream.close(timeout_s)
@@ -275,6 +328,11 @@ class RrdWriter:
     def size(self) -> int:
         """Bytes in the file so far."""
         return self._stream.size
+
+    @property
+    def size_with_index(self) -> int:
+        """Bytes that the file would have if it was closed now and got its index."""
+        return self._stream.size + self._stream.messages * INDEX_BYTES
 
     def _write_mark(self) -> None:
         times = [sequence_index(paths.STEP, [self._newest_row[0]])]
@@ -328,6 +386,9 @@ class RrdWriter:
             self._robots = assets[-1].robots if assets else ()
             source = SceneSource(loaded.model, loaded.bodies, assets[-1] if assets else SceneAssets(), self._robots)
             self._picture.replace_scene(source, self._find_moment(loaded.step, loaded.session_time))
+        for one in assets:
+            self.assets.add_scene(one, is_patch=not scenes and self._has_scene)
+            self._has_scene = True
         for patch in () if scenes else assets:
             self._picture.patch_scene(patch, self._find_moment(patch.step, patch.session_time))
 

@@ -27,6 +27,8 @@ from iris_session.protocol.common import Pose
 from iris_session.protocol.discovery import DISCOVERY_PORT
 from iris_session.protocol.server_messages import MAX_MARKS
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.recording.budget import MIN_BUDGET_BYTES
+from iris_session.recording.recorded_assets import RECORD_ASSETS, SCENE
 from iris_session.session.errors import ConfigError, short_repr
 
 #: A printed sheet lying at the near edge of the demo table; `T_world_anchor` of anchor id "table".
@@ -56,6 +58,11 @@ class SessionConfig:
             False records nothing.
         record_clouds_hz: Frames per second of each point cloud and picture that go into the recording, 0 to 60 [Hz];
             0: none.
+        record_assets: What of the scenes goes into the recording, so that it can be shown where their files are not:
+            `scene` is what a client at the best level of detail needs, `all` has all levels, `none` the hash only.
+        record_budget_bytes: Bytes that the recording may have, at least 16,000,000; 0: as many as the disk. As they
+            come to an end, raw samples, media and assets are left out first; then the recording ends, and the session
+            goes on. A resumed session has the budget anew.
         anchors: `T_world_anchor` by anchor id, as `((x, y, z), (w, x, y, z))` [m].
         anchor_sizes: Edge of the printed sheets [m] that are to be checked for a misprint. The default sheet has 0.16.
         anchor_errors: Stated p95 of the position error of anchors [m], which clients show.
@@ -94,6 +101,8 @@ class SessionConfig:
     state_hz: float = 60.0
     record: bool | str | Path = True
     record_clouds_hz: float = 2.0
+    record_assets: str = SCENE
+    record_budget_bytes: int = 0
     anchors: Mapping[str, PoseTuple] = field(default_factory=lambda: DEFAULT_ANCHORS)
     anchor_sizes: Mapping[str, float] = field(default_factory=dict)
     anchor_errors: Mapping[str, float] = field(default_factory=dict)
@@ -142,6 +151,13 @@ class SessionConfig:
             raise ConfigError(
                 f"record_clouds_hz {self.record_clouds_hz} is out of range: {MIN_CLOUDS_HZ:g} to {MAX_CLOUDS_HZ:g}, "
                 "or 0 to record no clouds and pictures"
+            )
+        if self.record_assets not in RECORD_ASSETS:
+            raise ConfigError(f"record_assets {self.record_assets!r:.80} is none of {', '.join(RECORD_ASSETS)}")
+        if self.record_budget_bytes and self.record_budget_bytes < MIN_BUDGET_BYTES:
+            raise ConfigError(
+                f"record_budget_bytes {self.record_budget_bytes} is too small: give {MIN_BUDGET_BYTES} or more, or 0 "
+                "for no budget"
             )
 
     def anchor_poses(self) -> dict[str, Pose]:

@@ -146,9 +146,15 @@ class SessionProcesses:
         others = NameFinder(self._config.beacon_port)
         try:
             if self.recording is not None:
-                self.recorder = RecorderProcess(self.recording, self._origin_ns)
+                self.recorder = RecorderProcess(
+                    self.recording,
+                    self._origin_ns,
+                    record_assets=self._config.record_assets,
+                    budget_bytes=self._config.record_budget_bytes,
+                )
                 self.recorder.start()
                 self.supervisor = RecorderSupervisor(self.recorder)
+                self.reporter.warning_sources.append(self.supervisor.budget.list_warnings)
                 self.feed = RecorderFeed(
                     self.recorder.feed_endpoint,
                     self.recording.parent,
@@ -326,7 +332,7 @@ class SessionProcesses:
             outcome = try_restart(self.front.restart, FrontError)
             self._announce(stepper, f"the front process {fault} and {outcome}")
         if self.supervisor is not None and self.feed is not None:
-            for text in self.supervisor.poll(now_ns, self.feed.silence_ns):
+            for text in self.supervisor.poll(now_ns, self.feed.silence_ns, self.feed.stats.recorder):
                 self._announce(stepper, text)
         if self.web is not None:
             for text in self.web.poll(now_ns):
@@ -384,6 +390,7 @@ class SessionProcesses:
             drops["recorded_vertices"] = self.feed.stats.dropped_vertices + refused
             drops["recorded_samples"] = 0 if last is None else last.samples_left_out
             drops["recorded_media"] = 0 if last is None else last.media_refused
+            drops["recorded_assets"] = 0 if last is None else last.assets_left_out
         if self.web is not None:
             drops |= self.web.drops
         if self.cameras is not None:
@@ -458,4 +465,6 @@ def make_settings(config: SessionConfig) -> Settings:
         anchor_sizes=config.sheet_sizes(),
         anchor_marks=config.mark_positions(),
         record_clouds_hz=config.record_clouds_hz,
+        record_assets=config.record_assets,
+        record_budget_bytes=config.record_budget_bytes,
     )

@@ -13,6 +13,8 @@ from typing import Final, Protocol
 from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.status import RecorderReport
 from iris_session.recording import RecorderFeed, RecorderProcess, RecordingError
+from iris_session.recording.budget import LOW_SHARE, describe_used_budget
+from iris_session.recording.messages import RecorderStatus
 from iris_session.system.backoff import Backoff
 
 RESTART_DELAYS_NS: Final = (0, 500_000_000, 1_000_000_000, 2_000_000_000, 5_000_000_000)
@@ -61,6 +63,43 @@ class Recorder(Protocol):
     def close(self, timeout_s: float) -> bool: ...
 
 
+class BudgetWatch:
+    """Announces that the budget of a recording comes to its end, and that it is used up, once each.
+
+    Attributes:
+        is_used_up: The file is closed, and nothing more is recorded.
+        text: One line for people once it comes to its end; empty before, and without a budget.
+    """
+
+    def __init__(self) -> None:
+        self.is_used_up = False
+        self.text = ""
+
+    def poll(self, status: RecorderStatus | None) -> list[str]:
+        """Return what is to be announced after a report of the recorder, a line each."""
+        if status is None or not status.budget or self.is_used_up:
+            return []
+        if status.ended:
+            self.is_used_up = True
+            self.text = describe_used_budget(status.budget)
+            return [f"{self.text}; the session goes on without it"]
+        if status.budget_left >= LOW_SHARE * status.budget:
+            return []
+        is_new = not self.text
+        self.text = (
+            f"{status.budget_left / 1e6:,.1f} of {status.budget / 1e6:,.0f} MB are left of the recording's budget"
+        )
+        return (
+            [f"{self.text}: what the journal does not need is left out first, then the recording ends"]
+            if is_new
+            else []
+        )
+
+    def list_warnings(self) -> list[str]:
+        """Return the warning for status reports, if there is one."""
+        return [self.text] if self.text else []
+
+
 class RecorderSupervisor:
     """Restarts one recorder. All but the thread's work belongs to the tick loop, which never waits here.
 
@@ -68,6 +107,7 @@ class RecorderSupervisor:
         alive: As of the last `poll`.
         hangs: The recorder has not reported for `HANGING_NS` though it has something to write.
         failure: Why it ended, until its successor has written for a while.
+        budget: What is left of the budget of the recording.
     """
 
     def __init__(self, recorder: Recorder) -> None:
@@ -80,19 +120,24 @@ class RecorderSupervisor:
         self.alive = True
         self.hangs = False
         self.failure = ""
+        self.budget = BudgetWatch()
 
     @property
     def restarts(self) -> int:
         return self._timer.restarts
 
-    def poll(self, now_ns: int, silence_ns: int) -> list[str]:
+    def poll(self, now_ns: int, silence_ns: int, status: RecorderStatus | None = None) -> list[str]:
         """Restart the recorder when it is dead and it is time to; return what is to be announced, a line each.
 
         Args:
             now_ns: Session time.
             silence_ns: How long it has not reported though it has something to write.
+            status: Its last report. One that has used up the budget is not restarted.
         """
-        announcements = []
+        announcements = self.budget.poll(status)
+        if self.budget.is_used_up:
+            self.failure, self.hangs = "", False
+            return announcements
         if self._thread is not None and not self._thread.is_alive():
             self._thread = None
             if self._result is not None:
@@ -150,7 +195,9 @@ def make_recorder_report(
     last = stats.recorder
     fault = supervisor.failure or ("" if last is None else last.fault)
     state = "running"
-    if fault:
+    if supervisor.budget.is_used_up:
+        state, fault = "ended", supervisor.budget.text
+    elif fault:
         state = "failed"
     elif not supervisor.alive:
         state = "dead"

@@ -12,6 +12,7 @@ import pytest
 from iris_session.cli import progress
 from iris_session.cli.main import main
 from iris_session.cli.recording import MOST_LINES, find_recordings, format_line, format_summary
+from iris_session.recording.recorded_assets import AssetsSummary
 from iris_session.recording.summary import (
     AlignmentSummary,
     DropSummary,
@@ -62,6 +63,7 @@ SUMMARY = RecordingSummary(
     drops=DropSummary({"stale": 12}, {"held": 1}, 7, 1, 0.3),
     damage=tuple(f"bytes {i} are gone" for i in range(MOST_LINES + 5)),
     notes=(),
+    assets=AssetsSummary("scene", 1, 12, 11, 4_200_000, ("asset 7777 (mesh arm): it cannot be read",)),
 )
 
 
@@ -83,6 +85,8 @@ def test_a_summary_is_lines_for_people() -> None:
         "  e-stops    at 4.00 s by a connection that had not joined (hand in the way), for 1.0 s",
         "             at 9.00 s by ann, to the end",
         "  streams    room (Room): cloud, 48 frames in 24.0 s, 2.0 Hz; FAULT stuck",
+        "  assets     scene: 11 of 12 of 1 scene, 4.2 MB",
+        "             left out: asset 7777 (mesh arm): it cannot be read",
         "             7 steps did not fit into the recording",
         "  damage     bytes 0 are gone",
         "             and 5 more: --json has all",
@@ -101,6 +105,7 @@ def test_inspect_shows_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture
     assert err == ""
     assert "ann (operator, head, hand/left): 0.4 s, there at the end; held left for 0.4 s" in out
     assert "  damage     none" in out
+    assert "  assets     none: made by an earlier version, or the session shared no scene" in out
     assert main(["recording", "inspect", str(path), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert sorted(result) == sorted(RecordingSummary.__struct_fields__)

@@ -9,6 +9,10 @@ from pathlib import Path
 import pytest
 
 from iris_session.cli.main import main
+from iris_session.protocol.scene import decode_scene
+from iris_session.recording.recorded_assets import list_recorded_assets
+from iris_session.scene import AssetStore
+from tests.recording.test_recorded_assets import Shared, record
 from tests.replay.support import Played, play
 
 
@@ -84,3 +88,49 @@ def test_a_rate_that_is_none_is_refused(hz: str, tmp_path: Path, capsys: pytest.
     with pytest.raises(SystemExit):
         main(["recording", "export", "session.rrd", "--to", "csv", "-o", str(tmp_path / "tables"), f"--hz={hz}"])
     assert "is not a rate: give rows per second above 0" in capsys.readouterr().err
+
+
+def test_assets_are_files_by_hash(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shared = Shared(tmp_path / "store")
+    path = record(tmp_path / "session.rrd", shared)
+    out = tmp_path / "scene-files"
+    command = ["recording", "export", str(path), "--to", "assets", "-o", str(out)]
+    assert main([*command, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    wanted = {shared.scene_hash, *list_recorded_assets(shared.spec, "scene")}
+    assert (report["scenes"], report["assets"], report["damage"]) == (1, len(wanted), [])
+    (scene,) = json.loads((out / "scenes.json").read_text())["scenes"]
+    assert scene == {"step": -1, "time_s": 0.0, "hash": shared.scene_hash}
+    copied = AssetStore(out)
+    assert decode_scene(copied.get(scene["hash"])) == shared.spec
+    assert {address: copied.get(address) for address in wanted} == {a: shared.store.get(a) for a in wanted}
+    assert main(command) == 2
+    assert capsys.readouterr().err == f"iris-session: the folder {out} is not empty: give another one, or --force\n"
+    assert main([*command, "--force"]) == 0
+    assert capsys.readouterr().out == f"{out}: {len(wanted)} assets, {report['bytes'] / 1e6:.1f} MB, scenes: 1\n"
+    assert main([*command, "--force", "--robot", "left"]) == 2
+    assert "--robot choose tables: leave them out with --to assets" in capsys.readouterr().err
+
+
+def test_export_of_assets_without_any_is_one_line(
+    played: Played, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "scene-files"
+    assert main(["recording", "export", str(played.path), "--to", "assets", "-o", str(out)]) == 2
+    err = capsys.readouterr().err
+    assert err == f"iris-session: {played.path} holds no assets: it has no word of them\n"
+    assert not out.exists()
+
+
+def test_damaged_asset_is_a_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shared = Shared(tmp_path / "store")
+    path = record(tmp_path / "session.rrd", shared)
+    address = shared.spec.meshes[0].levels[0].address
+    data = bytearray(path.read_bytes())
+    data[data.find(shared.store.get(address)[-40:])] ^= 1
+    path.write_bytes(data)
+    out = tmp_path / "scene-files"
+    assert main(["recording", "export", str(path), "--to", "assets", "-o", str(out)]) == 1
+    assert f"asset {address[:12]} (mesh" in capsys.readouterr().err
+    assert not AssetStore(out).path(address).exists()
+    assert AssetStore(out).path(shared.scene_hash).exists()

@@ -97,3 +97,29 @@ def test_rate_of_recorded_clouds() -> None:
     for text in ("fast", "-1", "61", "nan", "Hz"):
         with pytest.raises(SystemExit):
             options("--record-clouds", text)
+
+
+def test_assets_of_recordings() -> None:
+    assert make_session_config(options("--record-assets", "all"), "x").record_assets == "all"
+    assert make_session_config(options(), "x").record_assets == "scene"
+    with pytest.raises(SystemExit):
+        options("--record-assets", "some")
+
+
+def test_budget_of_recordings(capsys: pytest.CaptureFixture[str]) -> None:
+    for text, n_bytes in (
+        ("20GB", 20 * 10**9),
+        ("1.5 GiB", 3 << 29),
+        ("16mb", 16 * 10**6),
+        ("2TB", 2 * 10**12),
+        ("20000kib", 20_480_000),
+    ):
+        assert make_session_config(options("--record-budget", text), "x").record_budget_bytes == n_bytes
+    assert make_session_config(options(), "x").record_budget_bytes == 0
+    for text in ("0", "0GB", "-1GB", "15MB", "20", "20 elephants", "nanGB", "1e3GB", "9" * 400 + "GB"):
+        with pytest.raises(SystemExit) as ended:
+            options(f"--record-budget={text}")
+        assert ended.value.code == 2
+        assert "is not a size for a recording: give 16MB or more, for example 20GB\n" in capsys.readouterr().err
+    with pytest.raises(CommandError, match="leave --no-record out"):
+        make_session_config(options("--no-record", "--record-budget", "1GB"), "x")

@@ -261,6 +261,11 @@ def test_recorder_state_is_reported(state: str, text: str) -> None:
     assert_only(report, "recorder", "failed", text)
 
 
+def test_used_up_budget_is_a_warning() -> None:
+    recorder = change(WELL.recorder, state="ended", text="recording ended: budget of 16 MB is used up")
+    assert_only(change(WELL, recorder=recorder), "recorder", "warning", "recording ended: budget")
+
+
 def test_lost_rows_are_reported() -> None:
     assert_only(change(WELL, recorder=change(WELL.recorder, lost_rows=12)), "recorder", "warning", "12 rows lost")
 

@@ -15,6 +15,8 @@ from iris_session.client import Client
 from iris_session.client.deformables import Deformables
 from iris_session.protocol.scene import decode_scene, list_assets
 from iris_session.protocol.server_messages import SceneChanged
+from iris_session.recording import Recording
+from iris_session.scene import decode_mesh
 from iris_session.session.deformables import BOUND_M
 from iris_session.streams.rigid import MAX_POSITION_ERROR_M, MAX_ROTATION_ERROR_RAD
 from tests.e2e import publisher_program
@@ -151,5 +153,10 @@ def test_served_mesh_file_is_shown_without_moving_bodies(tmp_path: Path, serve: 
         assert ann.scene.state.poses.shape == (0, 7), "nothing moves"
         assert "without robots" in server.output
         assert server.finish()["ok"]
+        with Recording.open(server.recording) as recording:  # shows the scene without the mesh file
+            (scene,) = recording.scenes()
+            spec = decode_scene(recording.asset(scene.hash))
+            assert spec.visuals == (visual,)
+            assert decode_mesh(recording.asset(spec.meshes[0].levels[0].address)).triangles > 0
     finally:
         scenario.close()

@@ -226,6 +226,9 @@ def test_patch_is_the_same_for_present_and_late_clients_and_after_resume(scenari
         assert resumed.finish()["ok"]
         for part in (scenario.server.folder / "session.rrd", resumed_file):
             assert "/scene/1/world/lamp" in read(part), "the recording shows the patch"
+        with Recording.open(resumed_file) as recording:
+            assert [scene.hash for scene in recording.scenes()] == [changes[-1].scene_hash]
+            assert decode_scene(recording.asset(changes[-1].scene_hash)) == after
     finally:
         kill_all([resumed])
 

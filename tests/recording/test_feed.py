@@ -451,3 +451,19 @@ def test_unread_vertices_are_dropped_and_counted_and_the_journal_continues(
     steps(feed, 0, BATCH_ROWS)
     assert numbers(decode_batch(recorder.take(2)[1][2])) == list(range(BATCH_ROWS))
     feed.close(0.0)
+
+
+def test_nothing_waits_after_the_budget_is_used_up(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
+    played[0].say(feed, 1, -1, -1)
+    steps(feed, 0, 30)
+    played[0].take(4)
+    for instance, expecting in ((1, 3), (2, -1)):  # also from a recorder that finds it used up
+        played[0].socket.send(encode_status(RecorderStatus(instance, expecting, 0, budget=10**8, ended=True)))
+        assert feed._socket.poll(5000)
+        feed.flush()
+        steps(feed, 30, 200)
+        feed.send_patch("/assets", "hash")
+        assert (feed.stats.window_bytes, feed.stats.dropped_rows, feed.take_gap()) == (0, 0, 0)
+        assert (feed.wants_keyframe, feed.silence_ns) == (False, 0)
+        assert played[0].is_quiet(), "not even the header"
+    assert feed.close()

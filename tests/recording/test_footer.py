@@ -196,3 +196,11 @@ def test_recorder_adds_the_index_after_it_has_ended(tmp_path: Path) -> None:
     report = verify(path, SmallCore)
     assert report.ok, report.line()
     assert (report.steps, report.finished) == (60, True)
+
+
+def test_index_keeps_to_the_bytes_that_the_file_may_have(indexed: Path, path: Path) -> None:
+    before, size = path.read_bytes(), indexed.stat().st_size
+    assert not add_index(path, size - 5000)  # an index is not always equally long
+    assert path.read_bytes() == before
+    assert add_index(path, size + 5000)
+    assert path.stat().st_size <= size + 5000

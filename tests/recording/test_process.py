@@ -18,13 +18,23 @@ import pytest
 import zmq
 
 from iris_session.protocol.names import ArrayKind
+from iris_session.protocol.scene import list_assets
 from iris_session.protocol.status import ClientReport
-from iris_session.recording import RecorderError, RecorderProcess, Recording, RecordingLock, verify
+from iris_session.recording import (
+    RecorderError,
+    RecorderFeed,
+    RecorderProcess,
+    Recording,
+    RecordingLock,
+    summarise,
+    verify,
+)
 from iris_session.recording import process as process_module
 from iris_session.recording.feed import BATCH_NS
 from iris_session.recording.messages import RecorderConfig
 from iris_session.recording.paths import part_path
 from iris_session.recording.process import DRAIN_S, FLUSH_S
+from iris_session.recording.recorded_assets import ALL, list_recorded_assets
 from iris_session.scene import AssetStore, decode_arrays
 from iris_session.scene.mujoco_assets import read_flex_mesh
 from iris_session.scene.mujoco_scene import parse_mujoco
@@ -39,6 +49,7 @@ from tests.recording.support import (
     recorder,
     wait_until,
 )
+from tests.recording.test_recorded_assets import Shared
 from tests.scene.models import flexes
 
 pytestmark = pytest.mark.e2e
@@ -433,6 +444,78 @@ def test_part_that_cannot_be_begun_leaves_no_file(tmp_path: Path) -> None:
     report = verify(path, SmallCore)
     assert report.ok, report.line()
     assert (report.steps, report.parts, report.notes) == (100, 2, [])
+
+
+def test_assets_follow_the_journal_and_each_part_has_them(tmp_path: Path) -> None:
+    path = tmp_path / "session.rrd"
+    shared = Shared(tmp_path / "store")
+    lost = max(list_recorded_assets(shared.spec, ALL), key=shared.store.size)
+    data = shared.store.path(lost).read_bytes()
+    shared.store.path(lost).unlink()
+    process = RecorderProcess(path, time.monotonic_ns(), record_assets=ALL)
+    process.start()
+    feed = RecorderFeed(process.feed_endpoint, tmp_path)
+    try:
+        session = SmallSession(feed)
+        feed.send_patch(str(shared.store.root), shared.scene_hash)
+        session.take(50)
+        wait_until(lambda: _status(feed).assets_left_out == 1)
+        os.kill(process.pid, signal.SIGKILL)
+        wait_until(lambda: not process.alive)
+        shared.store.path(lost).write_bytes(data)
+        process.restart()
+        session.take(50)
+        assert feed.close(20.0)
+        assert process.close()
+        assert feed.stats.recorder is not None
+        assert feed.stats.recorder.assets_left_out == 0
+    finally:
+        feed.close(0.0)
+        process.close()
+    report = verify(path, SmallCore)
+    assert report.ok, report.line()
+    with Recording.open(path) as recording:
+        assert set(dict(recording.assets())) == {shared.scene_hash, *list_assets(shared.spec)}
+        assert summarise(recording).assets.left_out == ()
+    part2 = Path(part_path(str(path), 2))
+    with Recording.open(part2, warn=False) as recording:
+        assert len(dict(recording.assets())) == len({shared.scene_hash, *list_assets(shared.spec)})
+
+
+def test_assets_are_written_as_the_disk_takes_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    loop = process_module.RecorderLoop(
+        RecorderConfig(
+            str(tmp_path / "session.rrd"), 1, "r", f"ipc://{tmp_path}/f", f"ipc://{tmp_path}/s", 0, os.getpid(), ""
+        )
+    )
+    shared = Shared(tmp_path / "store")
+    loop._writer.assets.add_scene(shared.assets, is_patch=False)
+    now_s, bytes_per_s, asked = 0.0, 5e6, []
+    monkeypatch.setattr(process_module.time, "monotonic", lambda: now_s)
+
+    def write(max_bytes: int) -> None:
+        nonlocal now_s
+        asked.append(max_bytes)
+        now_s += max_bytes / bytes_per_s
+        loop._writer._stream.size += max_bytes
+
+    monkeypatch.setattr(loop._writer, "write_assets", write)
+    loop._write_assets()
+    loop._write_assets()
+    bytes_per_s = 1e3
+    loop._write_assets()
+    loop._write_assets()
+    bytes_per_s = 1e12
+    loop._write_assets()
+    loop._write_assets()
+    loop._flush_s = 2 * process_module.SLOW_FLUSH_S
+    loop._write_assets()
+    least, most = process_module.MIN_ASSETS_BYTES, process_module.MAX_ASSETS_BYTES
+    assert asked == [most, 100_000, 100_000, least, least, most], "20 ms, and none while the disk is slow"
+    monkeypatch.undo()
+    loop._syncer.stop()
+    loop._writer.close()
+    loop._context.destroy(linger=0)
 
 
 def _no_memory(*_: object, **__: object) -> None:

@@ -32,6 +32,9 @@ from iris_session.protocol.specs import RobotSpec
         ({"record_clouds_hz": 61.0}, "record_clouds_hz 61.0 is out of range: 0.01 to 60, or 0"),
         ({"record_clouds_hz": -1.0}, "record_clouds_hz -1.0"),
         ({"record_clouds_hz": float("nan")}, "record_clouds_hz nan"),
+        ({"record_assets": "some"}, "record_assets 'some' is none of none, scene, all"),
+        ({"record_budget_bytes": 15_999_999}, "record_budget_bytes 15999999 is too small: give 16000000 or more, or 0"),
+        ({"record_budget_bytes": -1}, "record_budget_bytes -1 is too small"),
     ],
 )
 def test_values_out_of_range(settings: dict[str, Any], expected: str) -> None:

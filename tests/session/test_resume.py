@@ -360,6 +360,8 @@ def test_note_of_a_resumed_session_has_its_settings() -> None:
         anchors={"wall": ((1.0, 0.0, 1.0), IDENTITY_QUAT)},
         anchor_sizes={"wall": 0.2},
         record_clouds_hz=5.0,
+        record_assets="all",
+        record_budget_bytes=20_000_000,
     )
     noted = make_settings(config)
     assert {name: getattr(config, name) for name in noted.__struct_fields__} == msgspec.structs.asdict(noted)

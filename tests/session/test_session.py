@@ -24,12 +24,16 @@ from iris_session.protocol.client_messages import Control
 from iris_session.protocol.scene import AddVisual, RemoveVisual, SetVisual, encode_scene
 from iris_session.protocol.server_messages import EStopChanged, Gap, MarkerAdded, PauseChanged, SceneChanged
 from iris_session.protocol.status import StatusReport
+from iris_session.recording.rrd_file import scan_file
 from iris_session.scene import AssetStore
 from iris_session.session import owner
 from iris_session.session.core import read_plant_state
 from iris_session.session.stepper import MAX_HOST_ENTRIES
 from iris_session.session.verification import verify_recording
+from tests.session.loops import wait_for
 
+#: Some seconds of the handover scene, for which nobody joins.
+BUDGET_BYTES = 2_400_000
 QUIET = SessionConfig(control_port=0, state_port=0, record=False, realtime=False)
 
 
@@ -341,3 +345,38 @@ def test_one_command_mends_a_diverged_session(session: Session, command: str) ->
     getattr(session, command)()
     session.run(until=lambda: not session.status().paused and session.status().tick > 5, seconds=30.0)
     assert (session.status().paused, session.status().pause_reason) == (False, "")
+
+
+@pytest.mark.long
+def test_session_goes_on_after_the_budget_of_its_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("iris_session.session.config.MIN_BUDGET_BYTES", 1)
+    path = tmp_path / "session.rrd"
+    config = SessionConfig(
+        control_port=0, state_port=0, record=path, realtime=False, record_budget_bytes=BUDGET_BYTES, name="small"
+    )
+    with Session(scene_path("handover"), config=config) as session:
+        processes = session._processes
+        assert processes is not None
+        session.run(until=lambda: processes.make_status().recorder.state == "ended")
+        steps = session.stepper.step_count
+        session.run(seconds=1.0)  # restarts would be announced within it
+        status, report = session.status(), _make_report(session)
+        assert session.stepper.step_count > steps
+        announced = [body.text for body in _bodies(session) if isinstance(body, MarkerAdded)]
+    assert session.recording_fault == ""
+    assert report.recorder is not None
+    assert (report.recorder.state, report.recorder.lost_rows, report.recorder.spilled_bytes) == ("ended", 0, 0)
+    assert (status.restarts, status.drops.get("journal_rows", 0)) == ({"front": 0, "recorder": 0}, 0)
+    ended = "recording ended: budget of 2 MB is used up"
+    assert report.recorder.text == ended
+    assert ended in report.warnings
+    left, end = announced
+    assert "MB are left of the recording's budget" in left
+    assert end == f"{ended}; the session goes on without it"
+    assert sorted(one.name for one in tmp_path.iterdir() if one.suffix == ".rrd") == ["session.rrd"]
+    verified = verify_recording(path)
+    assert verified.ok, verified.line()
+    assert verified.finished
+    assert 0 < verified.steps < steps
+    wait_for(lambda: scan_file(path).indexed)
+    assert path.stat().st_size <= BUDGET_BYTES

@@ -159,13 +159,17 @@ def test_new_front_gets_the_current_anchors() -> None:
     assert told == [{"table": moved}, "restarted"]
 
 
-def processes(alive: bool = True, hangs: bool = False, failure: str = "", fault: str = "") -> Any:
+def processes(
+    alive: bool = True, hangs: bool = False, failure: str = "", fault: str = "", budget: str = "", ended: bool = False
+) -> Any:
     """Return feed, recorder and supervisor."""
     said = RecorderStatus(1, 0, 0, bytes=1000, fault=fault, disk_free=5000)
     return (
         SimpleNamespace(stats=FeedStats(dropped_rows=2, spilled_bytes=30, recorder=said)),
         SimpleNamespace(path="/data/session.rrd"),
-        SimpleNamespace(alive=alive, hangs=hangs, failure=failure),
+        SimpleNamespace(
+            alive=alive, hangs=hangs, failure=failure, budget=SimpleNamespace(is_used_up=ended, text=budget)
+        ),
     )
 
 
@@ -177,6 +181,7 @@ def processes(alive: bool = True, hangs: bool = False, failure: str = "", fault:
         ({"alive": False}, "dead", ""),
         ({"alive": False, "failure": "no space left"}, "failed", "no space left"),
         ({"fault": "cannot be written"}, "failed", "cannot be written"),
+        ({"alive": False, "budget": "recording ended: budget", "ended": True}, "ended", "recording ended: budget"),
         ({"hangs": True, "failure": "no space left"}, "failed", "no space left"),  # dies again and again
     ],
 )

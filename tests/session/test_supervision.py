@@ -8,10 +8,12 @@ from collections.abc import Callable
 from itertools import pairwise
 
 from iris_session.recording import RecordingError
+from iris_session.recording.messages import RecorderStatus
 from iris_session.session.supervision import (
     HANGING_NS,
     HEALTHY_NS,
     RESTART_DELAYS_NS,
+    BudgetWatch,
     RecorderSupervisor,
     RestartTimer,
 )
@@ -150,3 +152,35 @@ def test_close_does_not_wait_for_a_hanging_disk() -> None:
     recorder.disk.set()
     assert recorder.closed.wait(30.0), "nobody would look after the successor that is started now"
     assert not recorder.alive
+
+
+def _left(n_bytes: int, *, ended: bool = False) -> RecorderStatus:
+    return RecorderStatus(1, 5, 4, budget=100_000_000, budget_left=n_bytes, ended=ended)
+
+
+def test_end_of_a_budget_is_announced_before_and_when_it_comes() -> None:
+    watch = BudgetWatch()
+    assert watch.poll(None) == watch.poll(RecorderStatus(1, 5, 4)) == watch.poll(_left(20_000_000)) == []
+    assert watch.list_warnings() == []
+    (told,) = watch.poll(_left(19_900_000))
+    assert told.startswith("19.9 of 100 MB are left of the recording's budget")
+    assert watch.poll(_left(12_300_000)) == [], "once"
+    assert watch.list_warnings() == ["12.3 of 100 MB are left of the recording's budget"]
+    assert not watch.is_used_up
+    (told,) = watch.poll(_left(0, ended=True))
+    assert told.startswith("recording ended: budget of 100 MB is used up")
+    assert watch.poll(_left(0, ended=True)) == []
+    assert watch.is_used_up
+
+
+def test_recorder_that_has_used_its_budget_is_not_restarted() -> None:
+    recorder = Recorder()
+    recorder.disk.set()
+    supervisor = RecorderSupervisor(recorder)
+    assert len(supervisor.poll(SECOND, 0, _left(0, ended=True))) == 1
+    recorder.alive = False
+    for i in range(2 * HANGING_NS // (50 * MS)):
+        assert supervisor.poll(2 * SECOND + i * 50 * MS, HANGING_NS + 1) == []
+    assert supervisor.restarts == 0
+    assert not recorder.alive
+    assert (supervisor.failure, supervisor.hangs) == ("", False)

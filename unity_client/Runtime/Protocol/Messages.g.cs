@@ -2415,8 +2415,9 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// State of the recorder: off (nothing is recorded), running, hangs (silent for 5 s), dead (being replaced)
-    /// or failed (the file cannot be written). disk_free_bytes 0: not known. text: its last message, for people.
+    /// State of the recorder: off (nothing is recorded), running, hangs (silent for 5 s), dead (being replaced),
+    /// failed (the file cannot be written) or ended (its budget is used up). disk_free_bytes 0: not known. text:
+    /// its last message, for people.
     /// </summary>
     public sealed class RecorderReport : WireValue
     {

@@ -86,6 +86,7 @@ export function makeRecordingPanel(state: PageState, actions: Actions): Panel {
         hangs: "hangs",
         dead: "is being replaced",
         failed: "failed: the file cannot be written",
+        ended: "ended: its budget is used up",
       };
       facts.set("State", recorder ? (names[recorder.state] ?? recorder.state) : "–");
       facts.set("File", recorder?.path || "–");
