@@ -6,7 +6,7 @@ import { h, KeyedList, type Row, setText } from "./dom.ts";
 import { makeSection, type Panel } from "./panel.ts";
 import type { PageState } from "./state.ts";
 import type { Stream, StreamChoices } from "./stream_choices.ts";
-import { budgetWords, formatCount, streamAgeWords, streamStateWords } from "./words.ts";
+import { budgetWords, formatCount, isDoubtful, streamAgeWords, streamStateWords } from "./words.ts";
 
 /** What the view tells of the clouds that it draws. */
 export interface DrawnClouds {
@@ -21,13 +21,14 @@ export function makeStreamsPanel(state: PageState, client: WorkerClient, choices
   const empty = h("p", { class: "empty" }, "This session has no streams.");
   const reason = h("p", { class: "note" });
   const section = makeSection("streams", "Streams", h("div", {}, list, empty, reason), { open: false });
-  const isDoubtful = (one: Stream): boolean => describeState(one, state) !== "";
+  const hasProblem = (one: Stream): boolean => describeState(one, state) !== "";
   let sent = "";
   const send = (): void => {
     const streams = state.budget?.streams ?? [];
     const wanted = choices.listWanted(streams, state.mode);
     state.forgetFrames((stream) => !wanted.includes(stream));
-    clouds?.setWanted(wanted, streams.filter(isDoubtful).map(({ stream }) => stream));
+    const dimmed = streams.filter((one) => isDoubtful(one, state.isBehind(one.stream)));
+    clouds?.setWanted(wanted, dimmed.map(({ stream }) => stream));
     const key = `${state.welcome?.connection_epoch ?? 0} ${JSON.stringify(wanted)}`;
     if (key === sent || !state.isReady) return;
     sent = key;
@@ -39,9 +40,9 @@ export function makeStreamsPanel(state: PageState, client: WorkerClient, choices
     update: () => {
       const streams = state.budget?.streams ?? [];
       rows.update(streams, (one) => one.stream);
-      const doubtful = streams.filter(isDoubtful).length;
-      section.setCount(streams.length === 0 ? "" : `${streams.length}${doubtful > 0 ? ` · ${doubtful} with a problem` : ""}`);
-      section.element.classList.toggle("doubtful", doubtful > 0);
+      const problems = streams.filter(hasProblem).length;
+      section.setCount(streams.length === 0 ? "" : `${streams.length}${problems > 0 ? ` · ${problems} with a problem` : ""}`);
+      section.element.classList.toggle("doubtful", problems > 0);
       setText(reason, state.budget?.reason ?? "");
       send();
     },

@@ -2,7 +2,7 @@
 
 import type { Filled } from "../core/api.ts";
 import type * as wire from "../protocol/messages.g.ts";
-import { BudgetClass } from "../protocol/messages.g.ts";
+import { BudgetClass, StreamFault } from "../protocol/messages.g.ts";
 
 const HOLD_REASONS: Record<string, string> = {
   no_lease: "no participant has its lease",
@@ -136,6 +136,11 @@ export function streamStateWords(stream: { stale: boolean; fault: string; budget
     stream.fault ? streamFaultWords(stream.fault) : "",
   ];
   return parts.filter((part) => part !== "").join(", ");
+}
+
+/** Return whether what is drawn of a stream shows what was, or what is wrong. A slow source is right, only less often. */
+export function isDoubtful(stream: { stale: boolean; fault: string; budget_class: string }, isBehind: boolean): boolean {
+  return streamStateWords({ ...stream, fault: stream.fault === StreamFault.SLOW ? "" : stream.fault }, isBehind) !== "";
 }
 
 /** Return a whole number with groups of digits, such as `50,000`. */

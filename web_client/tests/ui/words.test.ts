@@ -1,6 +1,6 @@
 import { expect, test } from "vitest";
 
-import { denialWords, eventWords, formatBytes, formatCount, formatMillimetres, formatSessionTime, streamAgeWords, streamStateWords } from "../../src/ui/words.ts";
+import { denialWords, eventWords, formatBytes, formatCount, formatMillimetres, formatSessionTime, isDoubtful, streamAgeWords, streamStateWords } from "../../src/ui/words.ts";
 
 const nameOf = (id: string): string => ({ p1: "ann", p2: "ben" })[id] ?? "";
 type Body = Parameters<typeof eventWords>[0];
@@ -41,6 +41,14 @@ test("a stream that is stale or faulty says so in words, also for a fault of ano
   expect(streamStateWords({ ...good, budget_class: "none" }, true)).toBe("paused: the link is too slow");
   expect(streamStateWords({ ...good, budget_class: "none" }, false)).toBe(""); // a cloud at rest is still right
   expect(streamStateWords(good, true)).toBe("newer frames do not come here");
+});
+
+test("a cloud of a slow source is drawn as it is, one that is stale or wrong is dimmed", () => {
+  const slow = { stale: false, fault: "slow", budget_class: "full" };
+  expect(isDoubtful(slow, false)).toBe(false);
+  expect(isDoubtful({ ...slow, stale: true }, false)).toBe(true);
+  expect(isDoubtful(slow, true)).toBe(true);
+  expect(isDoubtful({ ...slow, fault: "moved" }, false)).toBe(true);
 });
 
 test("ages of streams grow from milliseconds to hours", () => {
