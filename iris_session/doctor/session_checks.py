@@ -14,6 +14,8 @@ from iris_session.protocol.status import ParticipantReport, RobotReport, StatusR
 
 #: Roles that need a robot, and an alignment if they have a headset. Directors need neither.
 DRIVERS: Final = Role.DRIVING - {Role.DIRECTOR}
+#: Roles of programs without a headset.
+PROGRAMS: Final = frozenset({Role.AGENT, Role.GATEWAY, Role.RECORDER, Role.CAMERA, Role.SOURCE})
 SILENT_NS: Final = 1_000_000_000
 #: The front calls a session stalled after a fifth of this, which a busy machine can cause.
 STALLED_NS: Final = 500_000_000
@@ -54,6 +56,9 @@ HOLD_ADVICE: Final = {
     HoldReason.REJECTED: "a sample was rejected: see `rejected`; open and close the clutch",
     HoldReason.DISCONNECTED: "its holder is disconnected; the lease is kept for a grace period",
 }
+
+HEADSET_ADVICE: Final = "check that headset: is the app in front, is it worn, how good is its Wi-Fi?"
+PROGRAM_ADVICE: Final = "check that program: does it run, and does its machine have processor time left for it?"
 
 
 def check_session_report(report: StatusReport, own_id: str = "") -> list[Finding]:
@@ -211,15 +216,16 @@ def check_clients(people: tuple[ParticipantReport, ...]) -> Finding:
     """Report clients that do not keep up or are disconnected."""
     bad: list[str] = []
     worst: list[str] = []
+    advice: dict[str, None] = {}
     for p in people:
         problems = list(_list_client_problems(p))
         if problems:
+            advice[PROGRAM_ADVICE if p.role in PROGRAMS else HEADSET_ADVICE] = None
             (worst if not p.connected or p.heard_ns > SILENT_NS else bad).append(f"{p.name}: {', '.join(problems)}")
     if not bad and not worst:
         return ok("clients", f"{len(people)} connected, all keep up" if people else "no other participants")
     why = "the application is stopped or too slow, or its network is"
-    advice = "check that headset: is the app in front, is it worn, how good is its Wi-Fi?"
-    return (failed if worst else warning)("clients", "; ".join(worst + bad), why, advice)
+    return (failed if worst else warning)("clients", "; ".join(worst + bad), why, "; ".join(advice))
 
 
 def _list_client_problems(p: ParticipantReport) -> Iterator[str]:

@@ -22,7 +22,7 @@ from iris_session.doctor.session_checks import (
     measure_stages,
 )
 from iris_session.protocol.common import Pose
-from iris_session.protocol.names import HoldReason, LateCause
+from iris_session.protocol.names import HoldReason, LateCause, Role
 from iris_session.protocol.status import (
     AlignmentReport,
     AnchorReport,
@@ -216,6 +216,13 @@ def test_open_clutch_is_not_a_problem() -> None:
 )
 def test_slow_clients_are_reported(fields: dict[str, object], state: str, text: str) -> None:
     assert_only(with_ann(**fields), "clients", state, "ann: ", text)
+
+
+def test_advice_for_a_slow_program_is_not_that_for_a_headset() -> None:
+    camera = problems(with_ann(role=Role.CAMERA, missed_share=0.4))["clients"]
+    assert "processor time" in camera.advice
+    assert "headset" not in camera.advice
+    assert "is it worn" in problems(with_ann(missed_share=0.4))["clients"].advice
 
 
 def test_data_age_names_slow_stage() -> None:
