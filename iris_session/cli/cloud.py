@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import math
 import signal
 import sys
 import threading
@@ -142,12 +143,12 @@ def run_file(arguments: argparse.Namespace) -> int:
         role=Role.CAMERA,
         name=settings.stream,
     )
-    until = None if arguments.seconds is None else time.monotonic() + arguments.seconds
+    seconds = math.inf if arguments.seconds is None else arguments.seconds
     printer = _ReportPrinter(as_json=arguments.json)
     with _catch_signals() as ending, _name_unexpected_error(settings):
-        fault = run_cameras(
-            settings, client, printer, lambda: ending.is_set() or (until is not None and time.monotonic() >= until)
-        )
+        fault = run_cameras(settings, client, printer, lambda: ending.is_set() or printer.passed_s >= seconds)
+        if not (fault or printer.was_connected or ending.is_set()):
+            fault = f"no session admitted the cameras within {seconds:g} s: {arguments.address or arguments.session}"
     printer.end()
     if fault:
         print(f"iris-session: {fault}", file=sys.stderr)
@@ -185,15 +186,25 @@ def _name_unexpected_error(settings: CloudSettings) -> Iterator[None]:
 class _ReportPrinter:
     """Prints reports: on a terminal one line that is written over, elsewhere lines when something has changed."""
 
+    was_connected = False
+
     def __init__(self, *, as_json: bool) -> None:
+        self._first_at = math.inf
         self._as_json = as_json
         self._is_terminal = sys.stdout.isatty()
         self._faults = ""
         self._at = -QUIET_S
 
+    @property
+    def passed_s(self) -> float:
+        """Time since the first report [s], 0 before it: the filter is being prepared, which can take seconds."""
+        return max(0.0, time.monotonic() - self._first_at)
+
     def __call__(self, report: CameraReport) -> None:
         import msgspec
 
+        self._first_at = min(self._first_at, time.monotonic())
+        self.was_connected |= report.connected
         if self._as_json:
             print_json(msgspec.to_builtins(report))
             return
@@ -321,6 +332,10 @@ def _format_inspection(settings: CloudSettings, report: CameraReport) -> Iterato
         yield to_printable(f"camera {name}: {one.hz:.1f} frames per second, {state}")
     if report.warning:
         yield to_printable(report.warning)
+    if not report.points:
+        yield f"cloud {report.stream}: no points came"
+        yield from _format_drops(report)
+        return
     points = f"{report.points:,} points of {100.0 * report.voxel_m:.1f} cm"
     budget = f"budget {settings.points:,}, cells from {100.0 * settings.voxel_m:.1f} cm"
     yield f"cloud {report.stream}: {report.hz:.1f} Hz, {points} ({budget})"
@@ -329,6 +344,10 @@ def _format_inspection(settings: CloudSettings, report: CameraReport) -> Iterato
     if report.stages_ms:
         stages = ", ".join(f"{stage} {ms:.1f}" for stage, ms in report.stages_ms.items())
         yield f"  stages [ms]: {stages}; from capture to the last byte {report.age_ms:.0f}"
+    yield from _format_drops(report)
+
+
+def _format_drops(report: CameraReport) -> Iterator[str]:
     if report.drops:
         yield f"  left out: {', '.join(f'{reason} {n}' for reason, n in sorted(report.drops.items()))}"
 

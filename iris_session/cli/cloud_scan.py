@@ -116,6 +116,8 @@ def scan_cameras(settings: CloudSettings, voxels: VoxelFilter, seconds: float, *
     with ExitStack() as stack:
         opened = [(camera, stack.enter_context(open_camera(camera))) for camera in settings.cameras]
         rays = {camera.name: make_rays(source.camera) for camera, source in opened}
+        print_progress("preparing the filter: the first time takes some seconds", as_json=as_json)
+        voxels.warm_up()  # not part of the time to collect
         start = time.monotonic()
         while opened and (passed := time.monotonic() - start) < seconds:
             for camera, source in tuple(opened):

@@ -42,6 +42,12 @@ _Size = Annotated[int, Meta(ge=16, le=MAX_IMAGE_SIZE)]
 _UNIT_TOLERANCE: Final = 1e-3
 #: Sources whose `path` is a file or folder; of the others it names a device.
 _READ_FROM_DISK: Final = ("folder", "rerun", "mcap")
+#: What to do about a file that does not exist, by its kind.
+_MISSING: Final = {
+    "camera file": "; `iris-session cloud example` prints one",
+    "calibration": "; `iris-session cloud calibrate` or `iris-session anchors calibrate-camera` writes it with --out, "
+    "or give a pose",
+}
 _T = TypeVar("_T")
 
 
@@ -439,7 +445,8 @@ def _read_text(path: Path, kind: str) -> str:
         return path.read_text(encoding="utf-8")
     except (OSError, ValueError) as error:  # not UTF-8, or a path with a null byte
         said = getattr(error, "strerror", None) or str(error)
-        raise CameraFileError(f"{kind} {path} cannot be read: {said}") from error
+        hint = _MISSING.get(kind, "") if isinstance(error, FileNotFoundError) else ""
+        raise CameraFileError(f"{kind} {path} cannot be read: {said}{hint}") from error
 
 
 def _name_file(path: Path, error: ValueError) -> str:

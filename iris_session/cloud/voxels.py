@@ -203,6 +203,13 @@ class VoxelFilter:
         depth, color = np.ascontiguousarray(depth), np.ascontiguousarray(color)
         self.overflow += self._table.add_depth(_Picture(depth, color, rays, cells, depth_scale_m, chosen, box))
 
+    def warm_up(self) -> None:
+        """Let numba compile what a filter needs, or load it: the first time takes seconds. Removes all points."""
+        depth, color = np.full((4, 4), 1000, np.uint16), np.zeros((4, 4, 3), np.uint8)
+        self.add_depth(depth, color, make_rays(CameraModel(4, 4, 4.0, 4.0, 2.0, 2.0)), np.eye(4))
+        self.collect(min_points=1, min_around=1)
+        self.clear()
+
     @property
     def n_cells(self) -> int:
         """Number of cells with points, outliers among them."""

@@ -14,7 +14,6 @@ from collections.abc import Callable, Mapping
 from typing import Final, Protocol
 
 import msgspec
-import numpy as np
 
 from anchors.camera import CameraModel, pose_from_matrix
 from iris_session.cloud.camera_file import CameraSettings, CloudSettings
@@ -33,7 +32,7 @@ from iris_session.cloud.pipeline import (
 )
 from iris_session.cloud.reader import NewFrame, SourceReader
 from iris_session.cloud.sources.playback import DEFAULT_HZ
-from iris_session.cloud.voxels import Colors, DepthLimits, Floats, VoxelFilter, choose_max_cells, make_rays
+from iris_session.cloud.voxels import Colors, DepthLimits, Floats, VoxelFilter, choose_max_cells
 from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.media import StreamCamera, StreamInfo, find_info_problem
 from iris_session.protocol.names import MediaEncoding, StreamFault
@@ -439,9 +438,7 @@ def make_pipeline_camera(settings: CloudSettings, camera: CameraSettings) -> Pip
 def make_warm_filter(settings: CloudSettings) -> VoxelFilter:
     """Return a filter that is compiled: the first picture would take seconds, in which nothing is reported."""
     voxels = VoxelFilter(settings.voxel_m, max_cells=choose_max_cells(settings.points))
-    depth, color = np.full((4, 4), 1000, np.uint16), np.zeros((4, 4, 3), np.uint8)
-    voxels.add_depth(depth, color, make_rays(CameraModel(4, 4, 4.0, 4.0, 2.0, 2.0)), np.eye(4))
-    voxels.collect(min_points=1, min_around=1)
+    voxels.warm_up()
     return voxels
 
 

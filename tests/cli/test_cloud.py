@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import json
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,8 @@ from iris_session.cli.cloud import format_faults, format_report
 from iris_session.cli.main import main
 from iris_session.cloud.camera_file import load_camera_file
 from iris_session.cloud.config import CameraReport, SourceReport
+from iris_session.cloud.process import OnReport
+from iris_session.cloud.voxels import VoxelFilter
 from iris_session.protocol.names import StreamFault
 from iris_session.system.files import Replacement
 
@@ -69,7 +73,9 @@ def test_a_fault_is_shown_and_is_the_exit_status(camera_file: Path, capsys: pyte
     for path in camera_file.parent.glob("*.depth.png"):
         cv2.imwrite(str(path), np.zeros((60, 80), np.uint16))
     assert main(["cloud", "inspect", str(camera_file), "--seconds", "1"]) == 1
-    assert "no_depth: no pixel has a depth" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert "no_depth: no pixel has a depth" in text
+    assert "cloud room: no points came" in text
 
 
 @pytest.mark.parametrize("action", [["inspect"], ["run", "--address", "127.0.0.1:1"]])
@@ -79,6 +85,7 @@ def test_a_file_that_cannot_be_used_is_one_line(
     assert main(["cloud", action[0], str(tmp_path / "missing.toml"), *action[1:]]) == 2
     error = capsys.readouterr().err
     assert "missing.toml" in error
+    assert "`iris-session cloud example` prints one" in error
     assert error.count("\n") == 1
 
 
@@ -105,6 +112,45 @@ def test_a_scan_that_cannot_be_written_leaves_the_file_as_it_was(
     assert "room.ply cannot be written: No space left on device" in capsys.readouterr().err
     assert out.read_bytes() == b"the scan of yesterday"
     assert sorted(camera_file.parent.iterdir()) == before
+
+
+def test_preparing_the_filter_is_not_part_of_a_scan(
+    camera_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepared: list[VoxelFilter] = []
+
+    def prepare(voxels: VoxelFilter) -> None:
+        prepared.append(voxels)
+        time.sleep(0.6)
+
+    monkeypatch.setattr(VoxelFilter, "warm_up", prepare)
+    out = camera_file.parent / "room.ply"
+    assert main(["cloud", "scan", str(camera_file), "--seconds", "0.5", "--json", "-o", str(out)]) == 0
+    assert len(prepared) == 1
+    assert json.loads(capsys.readouterr().out)["frames"]["front"] > 0
+
+
+def test_cameras_that_no_session_admitted_are_a_fault(
+    camera_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    connected = False
+
+    def run(_settings: object, client: Any, on_report: OnReport, is_ending: Callable[[], bool]) -> str:
+        client.close()
+        time.sleep(0.2)  # the filter is prepared: not part of the time to run
+        assert not is_ending()
+        while not is_ending():
+            on_report(CameraReport("room", connected=connected))
+            time.sleep(0.01)
+        return ""
+
+    monkeypatch.setattr("iris_session.cloud.process.run_cameras", run)
+    monkeypatch.setattr("iris_session.cli.cloud.check_session_reachable", lambda _: None)
+    command = ["cloud", "run", str(camera_file), "--address", "127.0.0.1:1", "--seconds", "0.1"]
+    assert main(command) == 1
+    assert "no session admitted the cameras within 0.1 s: 127.0.0.1:1" in capsys.readouterr().err
+    connected = True
+    assert main(command) == 0
 
 
 def test_no_session_is_one_line(camera_file: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -226,6 +226,13 @@ def test_the_edge_of_cells_meets_the_budget_and_then_stays() -> None:
         assert edges[-1] == 0.005 or area_m2 / edges[-1] ** 2 >= 0.5 * 10_000
 
 
+@backends
+def test_a_filter_that_was_prepared_is_empty(use_numba: bool) -> None:
+    voxels = VoxelFilter(0.02, use_numba=use_numba)
+    voxels.warm_up()
+    assert (voxels.n_cells, voxels.overflow, voxels.voxel_m) == (0, 0, 0.02)
+
+
 def test_without_numba_numpy_filters_and_says_so() -> None:
     code = (
         "import sys, logging; sys.modules['numba'] = None; logging.basicConfig(stream=sys.stdout)\n"
