@@ -101,6 +101,8 @@ def run(arguments: argparse.Namespace) -> int:
         with live_viewer(session.recording, out) if arguments.view else nullcontext(), view.open() as update:
             yield update
 
+    if play.cameras:
+        print("preparing the cameras: the first time takes some seconds", file=out, flush=True)
     result = run_demo(play, config, arguments.timeout, show, profile, arguments.seed)
     if arguments.json:
         print_json(msgspec.to_builtins(result))

@@ -55,8 +55,8 @@ STREAMS_S: Final = 20.0
 #: those of a busy computer.
 SILENT_S: Final = 5.0
 LATE_FAULTS: Final = ("", StreamFault.SLOW, StreamFault.SOURCE, StreamFault.POSE)
-#: Time to find out whether cameras can be drawn here, on a busy machine [s].
-DRAW_S: Final = 60.0
+#: Time to find out whether cameras can be drawn here, and to compile the filter of their points, on a busy machine [s].
+DRAW_S: Final = 120.0
 #: Operators per process, when there are more than two; observers per process.
 WORKERS_PER_PROCESS: Final = 2
 OBSERVERS_PER_PROCESS: Final = 4

@@ -23,6 +23,7 @@ from anchors.pose import PoseTuple
 from iris_session.cloud.camera_file import CameraSettings, CloudSettings
 from iris_session.cloud.frames import DepthFrame, SourceError
 from iris_session.cloud.sources.playback import DEFAULT_HZ, SECOND
+from iris_session.cloud.voxels import VoxelFilter
 
 Floats = npt.NDArray[np.float64]
 _MAX_GEOMS: Final = 10_000
@@ -227,14 +228,16 @@ def _to_rotations(quaternions: Floats) -> Floats:
 def main() -> int:
     """Open the drawn cameras of a camera file and close them again: in a process that has nothing else to lose.
 
-    The file is on standard input, as `CloudSettings` in MessagePack. Why a camera cannot be drawn goes to standard
-    output, on one line, with exit status 1.
+    Then let the filter of their points be compiled: beside a session, at low priority, that takes much longer. The file
+    is on standard input, as `CloudSettings` in MessagePack. Why a camera cannot be drawn goes to standard output, on
+    one line, with exit status 1.
     """
     settings = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=CloudSettings)
     try:
         for camera in settings.cameras:
             if camera.source == "mujoco":
                 MujocoCamera(camera, time.monotonic_ns).close()
+        VoxelFilter(settings.voxel_m).warm_up()
     except SourceError as error:
         print(error)
         return 1
