@@ -40,6 +40,11 @@ FIRST_FRAME_S: Final = 10.0
 STREAMS_S: Final = 5.0
 #: Without a terminal, a line of `run` that is like the one before is printed this often [s].
 QUIET_S: Final = 10.0
+#: Meaning of what is left out as a rule, which `doctor` does not speak of.
+_DROPS: Final = {
+    "camera_superseded": "frames for which newer ones came in time",
+    "camera_budget": "points above the budget",
+}
 log = logging.getLogger(__name__)
 
 
@@ -316,7 +321,7 @@ def _inspect_file(arguments: argparse.Namespace, path: Path) -> int:
     if arguments.json:
         print_json({"ok": is_well, **msgspec.to_builtins(report)})
     else:
-        print("\n".join(_format_inspection(settings, report)))
+        print("\n".join(format_inspection(settings, report)))
     return 0 if is_well else 1
 
 
@@ -326,7 +331,8 @@ def _run_worker(worker: CloudWorker, seconds: float, is_done: Any) -> None:
         worker.poll(0.05)
 
 
-def _format_inspection(settings: CloudSettings, report: CameraReport) -> Iterator[str]:
+def format_inspection(settings: CloudSettings, report: CameraReport) -> Iterator[str]:
+    """Return what a camera file gives, in lines."""
     for name, one in report.cameras.items():
         state = f"{one.fault}: {one.detail}" if one.fault else "well"
         yield to_printable(f"camera {name}: {one.hz:.1f} frames per second, {state}")
@@ -349,7 +355,11 @@ def _format_inspection(settings: CloudSettings, report: CameraReport) -> Iterato
 
 def _format_drops(report: CameraReport) -> Iterator[str]:
     if report.drops:
-        yield f"  left out: {', '.join(f'{reason} {n}' for reason, n in sorted(report.drops.items()))}"
+        from iris_session.doctor.drop_explanations import EXPLANATIONS
+
+        meanings = {**EXPLANATIONS, **_DROPS}
+        parts = (f"{reason} {n} ({meanings[f'camera_{reason}']})" for reason, n in sorted(report.drops.items()))
+        yield f"  left out: {', '.join(parts)}"
 
 
 def _inspect_session(arguments: argparse.Namespace) -> int:

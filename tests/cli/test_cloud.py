@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from iris_session.cli.cloud import format_faults, format_report
+from iris_session.cli.cloud import format_faults, format_inspection, format_report
 from iris_session.cli.main import main
 from iris_session.cloud.camera_file import load_camera_file
 from iris_session.cloud.config import CameraReport, SourceReport
@@ -196,3 +196,11 @@ def test_a_report_is_one_line() -> None:
     faulty = CameraReport("room", True, cameras={"front": fault, "back": SourceReport(30.0)})
     assert format_faults(faulty) == "front: frozen (the same picture for 3 s\N{REPLACEMENT CHARACTER}[2J)"
     assert format_report(faulty).endswith(format_faults(faulty))
+
+
+def test_all_that_cameras_leave_out_is_explained(camera_file: Path) -> None:
+    reasons = ["superseded", "pose", "join", "cells", "budget", "unusable", "failed", "send"]
+    report = CameraReport("room", drops=dict.fromkeys(reasons, 2))
+    text = "\n".join(format_inspection(load_camera_file(camera_file), report))
+    for reason in reasons:
+        assert f"{reason} 2 (" in text
