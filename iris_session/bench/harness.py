@@ -80,6 +80,7 @@ class Measurement:
         drops: Drops by reason.
         late_causes: Late ticks of the last ten seconds by cause.
         begin_ns: Session time of its beginning.
+        recorder_cpu_share: Processor time of the recorder as a share of one core; 0 without a recording.
     """
 
     seconds: float
@@ -94,6 +95,7 @@ class Measurement:
     drops: dict[str, int] = field(default_factory=dict)
     late_causes: dict[str, int] = field(default_factory=dict)
     begin_ns: int = 0
+    recorder_cpu_share: float = 0.0
 
 
 class ClientProcess:
@@ -153,6 +155,22 @@ class BenchRun:
     proxy: ImpairmentProcess | None
 
 
+def make_session_config(
+    *, assets: bool | Path = False, record: bool | Path = False, curve: bool = False
+) -> SessionConfig:
+    """Return the configuration of a measured session. Arguments: as of `measure`."""
+    return SessionConfig(
+        name="bench",
+        control_port=0,
+        state_port=0,
+        record=record,
+        assets=assets,
+        # The tracking frames of the emulated operators are the world.
+        authority=AuthorityConfig(unaligned=(*UNALIGNED, Role.OPERATOR)),
+        curve=curve,
+    )
+
+
 #: Seconds after the beginning of the window, and a function to call then; it must be fast.
 Action = tuple[float, Callable[[BenchRun], None]]
 
@@ -170,6 +188,7 @@ def measure(
     keep_poses: bool = False,
     curve: bool = False,
     assets: bool | Path = False,
+    record: bool | Path = False,
     module: str = CLIENTS,
     make_job: Callable[..., Job] = Job,
     on_tick: Callable[[Session], None] = lambda _: None,
@@ -189,6 +208,7 @@ def measure(
         keep_poses: Keep the true poses of every published tick.
         curve: Encrypt and authenticate.
         assets: Store of the scene's assets; False: clients get poses only.
+        record: File of the recording; False: none.
         module: Module that client processes run.
         make_job: Constructor of their jobs.
         on_tick: Called after every tick, warm-up included.
@@ -198,16 +218,7 @@ def measure(
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iris-bench-")))
         people = [spec.name for group in browsers for spec in group]
         keys = stack.enter_context(_open_key_home(folder / "keys", people)) if curve else None
-        config = SessionConfig(
-            name="bench",
-            control_port=0,
-            state_port=0,
-            record=False,
-            assets=assets,
-            # The tracking frames of the emulated operators are the world.
-            authority=AuthorityConfig(unaligned=(*UNALIGNED, Role.OPERATOR)),
-            curve=curve,
-        )
+        config = make_session_config(assets=assets, record=record, curve=curve)
         session = stack.enter_context(Session(model, config=config))
         proxy = None
         if links:
@@ -272,7 +283,7 @@ def _run_session(
 
     session.run(until=until)
     _raise_if_stopped(session)
-    stats, cpu_share = meter.result()
+    stats, cpu_share, recorder_cpu_share = meter.result()
     session.run(seconds=30.0, until=_limit_rate(0.05, session.clock, lambda: not any(p.running for p in processes)))
     _raise_if_stopped(session)
     received = {key: [s for s in samples if begin <= s[1] < end] for key, samples in received.items()}
@@ -292,6 +303,7 @@ def _run_session(
         status.drops,
         meter.late_causes,
         begin,
+        recorder_cpu_share,
     )
 
 
@@ -327,7 +339,7 @@ class _Meter:
     def __init__(self, session: Session, begin_ns: int, end_ns: int) -> None:
         self._session, self._begin_ns, self._end_ns = session, begin_ns, end_ns
         self._processes = [psutil.Process(pid) for pid in (os.getpid(), session.processes.front_pid)]
-        self._readings: list[tuple[PacerStats, float]] = []
+        self._readings: list[tuple[PacerStats, float, float]] = []
         self.late_causes: dict[str, int] = {}
 
     def is_window_over(self) -> bool:
@@ -338,19 +350,24 @@ class _Meter:
             self.late_causes = {} if times is None else times.count_late_causes()
             stats = self._session.lateness(anew=not self._readings)
             assert stats is not None
-            self._readings.append((stats, sum(p.cpu_times().user + p.cpu_times().system for p in self._processes)))
+            recorder = self._session.processes.recorder
+            cpu_s = sum(p.cpu_times().user + p.cpu_times().system for p in self._processes)
+            self._readings.append((stats, cpu_s, 0.0 if recorder is None else recorder.cpu_s))
         return len(self._readings) == 2
 
-    def result(self) -> tuple[PacerStats, float]:
-        """Return the tick statistics of the window, and the CPU of authority and front as a share of one core."""
+    def result(self) -> tuple[PacerStats, float, float]:
+        """Return the tick statistics of the window, and the CPU of authority and front, and of the recorder, as shares
+        of one core.
+        """
         if len(self._readings) < 2:
             raise BenchError("the session ended before the window was over")
-        (before, cpu0), (after, cpu1) = self._readings
+        (before, cpu0, recorder0), (after, cpu1, recorder1) = self._readings
+        window_s = (self._end_ns - self._begin_ns) * 1e-9
         ticks, late = after.ticks - before.ticks, after.late - before.late
         stats = after._replace(
             ticks=ticks, finished=after.finished - before.finished, late=late, late_share=late / max(1, ticks)
         )
-        return stats, (cpu1 - cpu0) / ((self._end_ns - self._begin_ns) * 1e-9)
+        return stats, (cpu1 - cpu0) / window_s, (recorder1 - recorder0) / window_s
 
 
 def _are_all_ready(waiting: list[ClientProcess]) -> bool:

@@ -32,6 +32,8 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iris-session bench cloud-stream --points 50000 --hz 60 --check\n"
         "  iris-session bench join --check\n"
         "  iris-session bench stop --check\n"
+        "  iris-session bench record --check\n"
+        "  iris-session bench record --seconds 20 --kills 4\n"
         "  iris-session bench web --clients 8 --curve --check\n"
         "  iris-session bench web --seconds 300",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -48,6 +50,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
             "cloud-stream",
             "join",
             "stop",
+            "record",
             "web",
         ),
     )
@@ -93,7 +96,12 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     parser.add_argument("--no-tab", action="store_true", help="web: no real browser, even where one is installed")
     parser.add_argument(
-        "--seconds", type=parse_seconds, help="measured part (default: 20; slow-client: 50; web: 65; stop: 1)"
+        "--seconds",
+        type=parse_seconds,
+        help="measured part (default: 20; slow-client: 50; record: 60; web: 65; stop: 1)",
+    )
+    parser.add_argument(
+        "--kills", type=int, default=21, help="record: kills of recorder, authority and both (default: %(default)s)"
     )
     parser.add_argument(
         "--profile",
@@ -161,6 +169,10 @@ def _check_sizes(arguments: argparse.Namespace) -> None:
         limits = {}
         if arguments.curve or arguments.profile:
             raise CommandError("bench stop cannot be combined with --curve or --profile: it uses no network")
+    elif arguments.bench == "record":
+        limits = {"kills": (1, 1000)}
+        if arguments.curve or arguments.profile:
+            raise CommandError("bench record cannot be combined with --curve or --profile: its bars are for loopback")
     elif arguments.bench == "web":
         # A tab, one that is disturbed and one that is not; a gateway has three quarters of all connections.
         limits = {"clients": (3, 48), "vertices": (16, 10_000)}
@@ -189,6 +201,10 @@ def _run_benchmark(arguments: argparse.Namespace, progress: Callable[[str], None
         from iris_session.bench.stop import run_stop
 
         return run_stop(min(arguments.seconds or 1.0, 60.0), progress)
+    if arguments.bench == "record":
+        from iris_session.bench.record import run_record
+
+        return run_record(arguments.seconds or 60.0, arguments.kills, arguments.seed, progress)
     if arguments.bench == "join":
         from iris_session.bench.join import run_join
 

@@ -19,6 +19,8 @@ from iris_session.cli.main import main
         (["slow-client", "--clients", "2"], "slow-client needs"),
         (["join", "--assets-mb", "0.5"], "--assets-mb 0.5: "),
         (["join", "--curve"], "--curve"),
+        (["record", "--kills", "0"], "--kills 0: "),
+        (["record", "--curve"], "--curve"),
         (["web", "--clients", "49"], "--clients 49: "),
         (["web", "--clients", "2"], "--clients 2: "),
         (["web", "--profile", "busy-wifi"], "--profile"),

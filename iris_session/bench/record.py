@@ -1,0 +1,353 @@
+"""`bench record`: what recording costs a session, how large its file is, and what kills take from it.
+
+Two operators drive two arms among bodies that fly, at 500 Hz, in sessions with and without a recording in turn. Then
+recorder, authority and both are killed (SIGKILL) in sessions of other processes, and what is left is read.
+
+A loss is the session time from the newest row of the journal in the file to the kill. After a kill of the recorder
+alone the session goes on in the next part, which has the rows that the first one lacks; the loss of that kill is what
+would be missing if the session had ended with it.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, NamedTuple, Self
+
+import msgspec
+import numpy as np
+import psutil
+
+from iris_session.bench.clients import ClientJob, Job
+from iris_session.bench.harness import ClientProcess, Measurement, group_clients, measure
+from iris_session.bench.record_naive import write_naive_log
+from iris_session.bench.record_session import BODIES, OPERATORS, Listening, SessionJob, make_record_scene
+from iris_session.bench.report import BenchError, BenchReport, make_bar
+from iris_session.demo.scenes.generators import arm_names
+from iris_session.recording import NotARecordingError, Recording, paths
+from iris_session.recording.paths import part_path
+from iris_session.recording.rrd_file import scan_file
+from iris_session.system.process import PIPE, ChildProcess
+
+#: Rounds with a recording, and as many without; and the shortest of them.
+ROUNDS: Final = 3
+SHORTEST_S: Final = 2.0
+MAX_CPU_SHARE: Final = 0.05
+MAX_LOSS_S: Final = 0.25
+MAX_SIZE_RATIO: Final = 1.5
+RECORDER, AUTHORITY, BOTH = "recorder", "authority", "both"
+#: Kills in their order. A session survives that of its recorder, so it has one of the others, too.
+KINDS: Final = (RECORDER, AUTHORITY, RECORDER, BOTH)
+#: From the first rows in a file to the kill, drawn at random [s]: at any place between two writes.
+KILL_AFTER_S: Final = (0.5, 1.0)
+#: Number of times that a file has grown when it has the rows that were waiting for it.
+GROWN: Final = 3
+POLL_S: Final = 0.02
+START_S: Final = 60.0
+END_S: Final = 30.0
+_SESSION: Final = "iris_session.bench.record_session"
+_RECORDER: Final = "iris_session.recording.process"
+
+
+class Round(NamedTuple):
+    """Measurements of one round."""
+
+    recorded: bool
+    late: int
+    ticks: int
+    recorder_cpu_share: float
+
+
+class Kill(NamedTuple):
+    """A kill: what was killed, and the session time before it that is in no file [s]."""
+
+    kind: str
+    loss_s: float
+
+
+class FileSize(NamedTuple):
+    """Size of a recording and of the naive log of its values [bytes], and their session time [s]."""
+
+    recorded: int
+    naive: int
+    duration_s: float
+
+
+def run_record(
+    seconds: float = 60.0,
+    kills: int = 21,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda _: None,
+) -> BenchReport:
+    """Measure a session of two operators and 50 bodies with and without a recording, and kill recorded sessions.
+
+    Args:
+        seconds: Measured time of all rounds together.
+        kills: Number of kills.
+        seed: Random seed of motion and kills.
+        progress: Called with short texts.
+    """
+    rounds = max(1, min(ROUNDS, int(seconds / (2.0 * SHORTEST_S))))
+    length_s = max(SHORTEST_S, seconds / (2.0 * rounds))
+    with tempfile.TemporaryDirectory(prefix="iris-bench-", ignore_cleanup_errors=True) as name:
+        folder = Path(name)
+        measured: list[Round] = []
+        scheduling, drops = "", dict[str, int]()
+        for i in range(2 * rounds):
+            recorded = i % 4 in (0, 3)  # in turn, and neither is always the first
+            path = folder / f"round{i}.rrd"
+            kind = "with" if recorded else "without"
+            got = _measure_round(path if recorded else False, length_s, seed, _prefix(progress, i, 2 * rounds, kind))
+            measured.append(Round(recorded, got.stats.late, got.stats.ticks, got.recorder_cpu_share))
+            scheduling = got.scheduling
+            drops |= got.drops if recorded else {}
+            if recorded:
+                _wait_for_index(path)
+        progress("writing the same values as a naive log")
+        sizes = [
+            measure_size(folder / f"round{i}.rrd", folder / "naive.rrd") for i in range(2 * rounds) if i % 4 in (0, 3)
+        ]
+        losses, missing = _kill_sessions(folder, kills, seed, progress)
+    results = summarize_rounds(measured) | summarize_sizes(sizes) | summarize_kills(losses)
+    results |= {"kill_rows_missing": missing, "scheduling": scheduling, "drops": drops}
+    params = {"operators": OPERATORS, "bodies": BODIES, "seconds": 2 * rounds * length_s, "rounds": rounds}
+    return BenchReport("record", params | {"kills": kills, "seed": seed}, results, tuple(make_record_bars(results)))
+
+
+def _prefix(progress: Callable[[str], None], i: int, n: int, kind: str) -> Callable[[str], None]:
+    return lambda text: progress(f"round {i + 1} of {n}, {kind} recording: {text}")
+
+
+def _make_operators() -> list[ClientJob]:
+    return [ClientJob(f"operator{i}", "operator", arm, samples=True) for i, arm in enumerate(arm_names(OPERATORS))]
+
+
+def _measure_round(record: Path | bool, seconds: float, seed: int, progress: Callable[[str], None]) -> Measurement:
+    model = make_record_scene(seed).compile()
+    return measure(model, group_clients(_make_operators()), seconds, record=record, seed=seed, progress=progress)
+
+
+def _wait_for_index(path: Path) -> None:
+    """Wait until a finished recording has its index: the next round is measured without the process that adds it."""
+    until = time.monotonic() + END_S
+    while time.monotonic() < until and not scan_file(path).indexed:
+        time.sleep(POLL_S)
+
+
+# --- results ----------------------------------------------------------------------------------------------------------
+
+
+def measure_size(path: Path, naive: Path) -> FileSize:
+    """Compare the size of a recording with that of a naive log of its values, which is written to `naive`."""
+    with Recording.open(path) as recording:
+        times = [row.now_ns for row in recording.rows()]
+        if len(times) < 2:
+            raise BenchError("a recording has no rows")
+        return FileSize(path.stat().st_size, write_naive_log(recording, naive), (times[-1] - times[0]) * 1e-9)
+
+
+def summarize_rounds(rounds: Sequence[Round]) -> dict[str, Any]:
+    """Return the processor time of the recorder, and late ticks with and without it.
+
+    The spread of the rounds is the difference of the largest and the smallest.
+    """
+    shares = [one.recorder_cpu_share for one in rounds if one.recorded]
+    results: dict[str, Any] = {
+        "writer_cpu_share": round(float(np.mean(shares)), 4),
+        "writer_cpu_share_runs": _number(shares, 4),
+    }
+    for label, recorded in (("on", True), ("off", False)):
+        of = [one for one in rounds if one.recorded is recorded]
+        late = [one.late / max(1, one.ticks) for one in of]
+        results[f"late_tick_share_{label}"] = round(sum(o.late for o in of) / max(1, sum(o.ticks for o in of)), 6)
+        results[f"late_tick_share_{label}_runs"] = _number(late, 6)
+        results[f"late_tick_share_{label}_spread"] = round(max(late) - min(late), 6)
+    return results
+
+
+def summarize_sizes(sizes: Sequence[FileSize]) -> dict[str, Any]:
+    """Return the size of recordings per minute, beside that of naive logs."""
+    duration_s = sum(size.duration_s for size in sizes)
+    recorded, naive = sum(size.recorded for size in sizes), sum(size.naive for size in sizes)
+    return {
+        "mb_per_min": round(recorded * 60e-6 / duration_s, 2),
+        "naive_mb_per_min": round(naive * 60e-6 / duration_s, 2),
+        "size_ratio": round(recorded / naive, 3),
+    }
+
+
+def summarize_kills(kills: Sequence[Kill]) -> dict[str, Any]:
+    """Return what kills take from the files, of all and by kind."""
+    losses = [kill.loss_s for kill in kills]
+    results: dict[str, Any] = {
+        "kills": {kind: sum(k.kind == kind for k in kills) for kind in (RECORDER, AUTHORITY, BOTH)}
+    }
+    for label, percentile in (("p50", 50), ("p95", 95), ("max", 100)):
+        results[f"kill_loss_s_{label}"] = round(float(np.percentile(losses, percentile)), 4)
+    largest = {kind: [k.loss_s for k in kills if k.kind == kind] for kind in (RECORDER, AUTHORITY, BOTH)}
+    results["kill_loss_s_max_by_kind"] = {kind: round(max(of), 4) for kind, of in largest.items() if of}
+    return results
+
+
+def make_record_bars(results: dict[str, Any]) -> list[Any]:
+    """Return the bars. Those with a recording are compared with those without it, and their spread."""
+    late = round(results["late_tick_share_off"] + results["late_tick_share_off_spread"], 6)
+    return [
+        make_bar(results, "writer_cpu_share", "<=", MAX_CPU_SHARE),
+        make_bar(results, "late_tick_share_on", "<=", late),
+        make_bar(results, "size_ratio", "<=", MAX_SIZE_RATIO),
+        make_bar(results, "kill_loss_s_max", "<=", MAX_LOSS_S),
+        make_bar(results, "kill_rows_missing", "<=", 0),
+    ]
+
+
+def _number(values: Sequence[float], digits: int) -> dict[str, float]:
+    return {str(i + 1): round(value, digits) for i, value in enumerate(values)}
+
+
+# --- kills ------------------------------------------------------------------------------------------------------------
+
+
+def _kill_sessions(folder: Path, kills: int, seed: int, progress: Callable[[str], None]) -> tuple[list[Kill], int]:
+    """Kill sessions one after the other. Return the kills, and the rows missing between others in what is left."""
+    random_of = random.Random(seed)
+    losses: list[Kill] = []
+    missing = 0
+    kinds = [KINDS[i % len(KINDS)] for i in range(kills)]
+    for i in range(0, kills, 2):
+        pair = kinds[i : i + 2]
+        progress(f"kill {i + 1} of {kills}: {', then '.join(pair)}")
+        path = folder / f"killed{i}" / paths.FIRST_FILE
+        with RecordedSession(path, seed) as session:
+            killed = [(kind, session.kill(kind, random_of.uniform(*KILL_AFTER_S))) for kind in pair]
+        lost, gaps = read_losses(path, killed)
+        losses += lost
+        missing += gaps
+    return losses, missing
+
+
+def read_losses(path: Path, kills: Sequence[tuple[str, int]]) -> tuple[list[Kill], int]:
+    """Read what kills have left of a recording.
+
+    Args:
+        path: Its first file.
+        kills: What was killed, and the session time of the kill [ns], in order.
+
+    Returns:
+        The kills with their losses, and the number of rows that are missing between others.
+    """
+    losses = []
+    for part, (kind, at_ns) in enumerate(kills, 1):
+        try:
+            # The part alone: those after it have what it lacks.
+            with Recording([part_path(str(path), part)]) as recording:
+                newest_ns = max((row.now_ns for row in recording.rows()), default=0)
+        except NotARecordingError as error:
+            raise BenchError(f"nothing can be read of what a kill has left: {error}") from None
+        losses.append(Kill(kind, max(0.0, (at_ns - newest_ns) * 1e-9)))
+    with Recording.open(path, warn=False) as recording:
+        steps = [row.step for row in recording.rows()]
+        gaps = (steps[-1] + 1 - len(set(steps))) if steps else 0
+    return losses, gaps
+
+
+class RecordedSession:
+    """A session with its operators in other processes, all of which end with this context.
+
+    Args:
+        path: First file of its recording.
+        seed: Random seed of the motion.
+    """
+
+    def __init__(self, path: Path, seed: int) -> None:
+        self._path = path
+        self._part = 1
+        self._started: list[psutil.Process] = []
+        with ExitStack() as stack:
+            self._session = ChildProcess(_SESSION, stdout=PIPE, own_group=True)
+            stack.callback(self._end)
+            self._session.write(msgspec.json.encode(SessionJob(str(path), seed)) + b"\n")
+            try:
+                listening = msgspec.json.decode(self._session.read_line(START_S), type=Listening)
+            except (EOFError, TimeoutError) as error:
+                raise BenchError(f"a session that is to be killed did not start: {error}") from None
+            self._origin_ns = listening.origin_ns
+            job = Job(listening.address, listening.origin_ns, "", tuple(_make_operators()))
+            self._operators = ClientProcess(job)
+            stack.callback(self._operators.kill)
+            _wait_until(self._operators.is_ready, START_S, "the operators did not join")
+            self._stack = stack.pop_all()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+    def kill(self, kind: str, after_s: float) -> int:
+        """Kill processes some time after the newest part of the recording is being written.
+
+        Args:
+            kind: `RECORDER`, `AUTHORITY` or `BOTH`.
+            after_s: Seconds to wait.
+
+        Returns:
+            The session time of the kill [ns].
+        """
+        self._wait_for_rows()
+        time.sleep(after_s)
+        recorder = self._find_recorder()
+        victims = {RECORDER: [recorder], AUTHORITY: [self._session.pid], BOTH: [recorder, self._session.pid]}[kind]
+        if 0 in victims:
+            raise BenchError("the recorder ended before it was killed")
+        now_ns = time.monotonic_ns()
+        for pid in victims:
+            os.kill(pid, signal.SIGKILL)
+        self._part += kind == RECORDER
+        return now_ns - self._origin_ns
+
+    def _wait_for_rows(self) -> None:
+        file, sizes = part_path(str(self._path), self._part), {0}
+
+        def grew() -> bool:
+            with suppress(OSError):
+                sizes.add(os.path.getsize(file))
+            return len(sizes) > GROWN
+
+        _wait_until(grew, START_S, f"{os.path.basename(file)} does not grow")
+        self._started = psutil.Process(self._session.pid).children(recursive=True)
+
+    def _find_recorder(self) -> int:
+        """Return the process id of the recorder, 0 if there is none."""
+        for process in self._started:
+            with suppress(psutil.Error):
+                if _RECORDER in process.cmdline():
+                    return int(process.pid)
+        return 0
+
+    def _end(self) -> None:
+        """End the session, and wait for its processes: a recorder whose session was killed writes the rest first."""
+        with suppress(psutil.Error):
+            self._started = psutil.Process(self._session.pid).children(recursive=True) or self._started
+        self._session.close(terminate_s=END_S)
+        _, alive = psutil.wait_procs(self._started, timeout=END_S)
+        for process in alive:
+            with suppress(psutil.Error):
+                process.kill()
+
+
+def _wait_until(condition: Callable[[], bool], timeout_s: float, failure: str) -> None:
+    until = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > until:
+            raise BenchError(f"{failure} within {timeout_s:g} s")
+        time.sleep(POLL_S)
