@@ -59,6 +59,13 @@ class EndMark(msgspec.Struct, frozen=True, array_like=True):
     reason: str = ""
 
 
+class HeaderCopy(msgspec.Struct, frozen=True, array_like=True):
+    """Copy of a header without its model, which is most of it. `root`: `header_root` of the whole header."""
+
+    root: bytes
+    header: SessionHeader
+
+
 HEADER: Final = b"H"
 BATCH: Final = b"B"
 FRAME: Final = struct.Struct("<cQ")  # kind, batch number
@@ -235,6 +242,8 @@ encode_vertices = msgspec.msgpack.Encoder().encode
 decode_vertices = make_decoder(VertexFrame)
 encode_header = msgspec.msgpack.Encoder().encode
 decode_header = make_decoder(SessionHeader)
+encode_header_copy = msgspec.msgpack.Encoder().encode
+decode_header_copy = make_decoder(HeaderCopy)
 encode_status = msgspec.msgpack.Encoder().encode
 decode_status = make_decoder(RecorderStatus)
 

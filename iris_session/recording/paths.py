@@ -13,6 +13,8 @@ SUFFIX: Final = ".rrd"
 VIEW_SUFFIX: Final = ".view.rrd"
 
 HEADER: Final = "/session/header"
+#: The header without the model, for files whose header is damaged.
+HEADER_COPY: Final = "/session/header/copy"
 INFO: Final = "/session"
 ROWS: Final = "/journal/rows"
 KEYFRAMES: Final = "/journal/keyframes"

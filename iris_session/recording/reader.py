@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import tempfile
 import warnings
+import zlib
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator, Sequence
@@ -18,6 +19,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self, TypeVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,7 +37,7 @@ from iris_session.recording.journal import (
     unpack_model,
 )
 from iris_session.recording.lock import describe_writers, find_writers
-from iris_session.recording.messages import DenialRecord, decode_header
+from iris_session.recording.messages import DenialRecord, decode_header, decode_header_copy
 from iris_session.recording.probe import Prober
 from iris_session.recording.record_batches import (
     UNREADABLE,
@@ -561,37 +563,71 @@ class Recording:
             elif after > before + 2:
                 self.missing.append(f"{first} to {last} are missing")
 
-    def _headers(self) -> Iterator[tuple[int, Any]]:
+    def _headers(self, entity: str = paths.HEADER) -> Iterator[tuple[int, Any]]:
         """Yield part number and header of each part that has one: a chunk near its beginning, so reading is short."""
         for i, path in enumerate(self._readable):
-            chunk = next(rrd_file.read_chunks(path, paths.HEADER), None)
+            chunk = next(rrd_file.read_chunks(path, entity), None)
             if chunk is not None:
                 yield i, chunk.to_record_batch()
 
     def _header(self, path: str) -> SessionHeader:
+        changed: tuple[SessionHeader, bytes] | None = None
+        fault = ""
         for _, batch in self._headers():
             try:
                 blob, intact = open_blob(record_batches.read_values(batch, "blob")[0])
                 header = decode_header(blob)
             except UNREADABLE as error:
-                raise NotARecordingError(f"the header of {path} is damaged: {_format_error(error)}") from error
-            if header.format != FORMAT and intact:
+                fault = fault or _format_error(error)
+                continue
+            if not intact:
+                changed = changed or (header, blob_root(blob))
+                continue
+            if header.format != FORMAT:
                 had = f"{path} was recorded in format {header.format} on {header.created_utc[:10] or 'an unknown day'}"
                 right = VERIFIERS.get(header.format, "the one that made it")
                 raise NotARecordingError(
                     f"{had}, this iris-session reads format {FORMAT}: verify or resume it with {right}"
                 )
             self.root = blob_root(blob)
-            if intact:
-                self._leave_out_others()
-            else:
-                self._harmed("header: its bytes were changed (checksum)")
+            self._leave_out_others()
             return header
+        found = self._restore_header(changed)
+        if found is not None:
+            return found
+        if fault:
+            raise NotARecordingError(f"the header of {path} is damaged: {fault}")
         if self.writers:
             raise NotARecordingError(f"{path} {describe_writers(self.writers)}, and holds nothing to read yet")
         said = self.damage + self.notes
         why = f" ({said[0]})" if said else " (nothing was recorded, or it is not ours)"
         raise NotARecordingError(f"{path} holds no session header{why}: give the .rrd file of a session")
+
+    def _restore_header(self, changed: tuple[SessionHeader, bytes] | None) -> SessionHeader | None:
+        """Return the header from its copy, with the model of `changed`, the header whose bytes were changed, if that
+        is whole. Without a copy, as in files of earlier versions, return `changed`. `changed` has its own root, too.
+        """
+        for _, batch in self._headers(paths.HEADER_COPY):
+            with suppress(*UNREADABLE):
+                blob, intact = open_blob(record_batches.read_values(batch, "blob")[0])
+                copy = decode_header_copy(blob)
+                if not intact or copy.header.format != FORMAT:
+                    continue
+                self.root = copy.root
+                model = b"" if changed is None else changed[0].model
+                try:
+                    unpack_model(model)
+                    lost = ""
+                except zlib.error:
+                    model, lost = b"", ", which has no model: the session cannot be simulated again"
+                self._harmed(f"header: damaged, and read from its copy{lost}")
+                self._leave_out_others()
+                return msgspec.structs.replace(copy.header, model=model)
+        if changed is None:
+            return None
+        header, self.root = changed
+        self._harmed("header: its bytes were changed (checksum)")
+        return header
 
     def _leave_out_others(self) -> None:
         """Leave out parts with another header: files of another session that were moved into this folder."""

@@ -231,10 +231,12 @@ def salvage(path: str | Path, copy: str | Path, prober: Prober) -> list[str]:
     messages = [m for m in found.messages if m.kind != KIND_END]
     infos = [m for m in messages if m.kind == KIND_STORE_INFO]
     with open(path, "rb") as file, tempfile.TemporaryDirectory() as folder:
-        trial = _Trial(file, infos, Path(folder) / "trial.rrd", prober)
-        if not infos or not trial.passes([]):
+        # A recorder's file has the first of them twice: one that is damaged is left out like any other message.
+        bad = _Trial(file, [], Path(folder) / "trial.rrd", prober).bad_ones(infos)
+        infos = [m for m in infos if m not in bad]
+        if not infos:
             raise NotARecordingError(f"{path} holds no recording that can be read")
-        bad: list[RrdMessage] = []
+        trial = _Trial(file, infos, Path(folder) / "trial.rrd", prober)
         others = [m for m in messages if m.kind != KIND_STORE_INFO]
         for i in range(0, len(others), GROUP):
             bad += trial.bad_ones(others[i : i + GROUP])

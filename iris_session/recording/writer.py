@@ -39,12 +39,13 @@ from iris_session.recording.asset_queue import AssetQueue, AssetRows
 from iris_session.recording.blueprint import build_blueprint, place_eye
 from iris_session.recording.errors import WriteError
 from iris_session.recording.footer import INDEX_BYTES
-from iris_session.recording.journal import CLOSED, SessionHeader, seal_blob
+from iris_session.recording.journal import CLOSED, SessionHeader, blob_root, seal_blob
 from iris_session.recording.media import MediaDrawer
 from iris_session.recording.messages import (
     Batch,
     DenialRecord,
     EndMark,
+    HeaderCopy,
     HoldRecord,
     MetricRecord,
     RobotLabels,
@@ -53,6 +54,7 @@ from iris_session.recording.messages import (
     StateFrame,
     VertexFrame,
     encode_header,
+    encode_header_copy,
     encode_scene,
 )
 from iris_session.recording.people import AnchorPicture, Base, PeoplePicture
@@ -164,7 +166,10 @@ class RrdWriter:
     def write_header(self, header: SessionHeader) -> None:
         """Write the header and the scene. Must be called before the first flush with data."""
         self._rec.send_recording_name(header.session_name)
-        self._log_static(paths.HEADER, rr.AnyValues(blob=pa.array([seal_blob(encode_header(header))], pa.binary())))
+        blob = encode_header(header)
+        copy = encode_header_copy(HeaderCopy(blob_root(blob), msgspec.structs.replace(header, model=b"")))
+        for entity, content in ((paths.HEADER, blob), (paths.HEADER_COPY, copy)):
+            self._log_static(entity, rr.AnyValues(blob=pa.array([seal_blob(content)], pa.binary())))
         self._header = header
         self._log_static(paths.INFO, rr.TextDocument(describe_session(header), media_type="text/markdown"))
         self._set_bodies(header.bodies)

@@ -4,108 +4,33 @@ from __future__ import annotations
 
 import random
 import shutil
-import subprocess
-from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
 
+import msgspec
 import pytest
 
-from iris_session.recording import NotARecordingError, Recording, paths, verify
+from iris_session.recording import NotARecordingError, Recording, header_root, verify
 from iris_session.recording.errors import RecorderError
+from iris_session.recording.journal import seal_blob
 from iris_session.recording.lock import RecordingLock
 from iris_session.recording.paths import part_path
 from iris_session.recording.repair import RepairReport, repair
-from iris_session.recording.rerun_tool import INDEX, find_rerun, rewrite
-from iris_session.recording.rrd_file import KIND_END, read_message, scan_file
-from iris_session.recording.summary import summarise
+from iris_session.recording.rrd_file import KIND_STORE_INFO, scan_file
+from tests.recording.damage import STEPS, Original, check_cut, check_repair, flip_bits, make_original
 from tests.recording.support import SmallCore, journal, write
-
-STEPS = 60
-
-
-class Original(NamedTuple):
-    """A whole file. `unmarked`: messages without the recorder's checksums. `n_header`: messages up to its header."""
-
-    path: Path
-    unmarked: frozenset[bytes]
-    n_header: int
 
 
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> Original:
-    folder = tmp_path_factory.mktemp("original")
-    path = write(folder / "session.rrd", *journal(STEPS), rows_per_chunk=6)
-    with open(folder / "unmarked.rrd", "wb") as file:
-        rewrite(INDEX, [str(path)], file, options=("--drop-entity", paths.MARKS))
-    return Original(path, frozenset(list_messages(folder / "unmarked.rrd")), count_header_messages(path, folder))
-
-
-def count_header_messages(path: Path, folder: Path) -> int:
-    cut = folder / "cut.rrd"
-    for n, message in enumerate(scan_file(path).messages):
-        cut.write_bytes(path.read_bytes()[: message.offset])
-        with suppress(NotARecordingError), Recording.open(cut):
-            return n
-    raise AssertionError("no header")
-
-
-def list_messages(path: Path) -> list[bytes]:
-    with open(path, "rb") as file:
-        return [read_message(file, m) for m in scan_file(path).messages if m.kind != KIND_END]
-
-
-def has_index(path: Path) -> bool:
-    done = subprocess.run([find_rerun(), "rrd", "verify", path], capture_output=True, check=False)
-    return done.returncode == 0
-
-
-def check_repair(original: Original, damaged: bytes, fault: int, folder: Path) -> str:
-    """Repair a file with a fault in byte `fault`; return what became of it: `whole`, `damaged` or `none`."""
-    path, output = folder / "damaged.rrd", folder / "repaired.rrd"
-    path.write_bytes(damaged)
-    messages = scan_file(original.path).messages
-    n_before = sum(m.offset + 16 + m.length <= fault and m.kind != KIND_END for m in messages)
-    expected = list_messages(original.path)[:n_before]
-    if n_before < original.n_header:
-        with suppress(NotARecordingError):  # without a header it is no recording
-            repair(path, output, overwrite=True)
-        return "none"
-    report = repair(path, output, overwrite=True)
-    assert path.read_bytes() == damaged
-    assert scan_file(output).indexed
-    # A changed name of a component decodes, and is kept and reported, though Rerun does not know it.
-    assert has_index(output) or report.damage, f"byte {fault}"
-    kept = list_messages(output)
-    if report.damage:
-        expected = [data for data in expected if data in original.unmarked]
-        kept = [data for data in kept if data in set(expected)]
-    assert kept[: len(expected)] == expected, f"byte {fault}"
-    with Recording.open(path, warn=False) as recording:
-        summary = summarise(recording)
-    assert summary.ok == report.ok, f"byte {fault}"
-    assert set(report.damage) == set(summary.damage)
-    return "whole" if report.ok else "damaged"
+    return make_original(tmp_path_factory.mktemp("original"))
 
 
 def truncate(original: Original, folder: Path, n: int) -> None:
     """Cut the file around the beginning of `n` messages, in their heads and bodies."""
-    rng, data = random.Random(3), original.path.read_bytes()
-    messages = scan_file(original.path).messages
-    for message in rng.sample(messages, min(len(messages), n)):
+    rng = random.Random(3)
+    for message in rng.sample(original.messages, min(len(original.messages), n)):
         at = message.offset + rng.choice((0, 1, 8, 15, 16, 17, 16 + message.length // 2))
-        assert check_repair(original, data[:at], at, folder) != "damaged", "a cut is no damage"
-
-
-def flip_bits(original: Original, folder: Path, n: int, seed: int) -> None:
-    data, rng = original.path.read_bytes(), random.Random(seed)
-    outcomes = []
-    for _ in range(n):
-        at = rng.randrange(len(data))
-        damaged = bytearray(data)
-        damaged[at] ^= 1 << rng.randrange(8)
-        outcomes.append(check_repair(original, bytes(damaged), at, folder))
-    assert outcomes.count("damaged") > n // 2
+        assert check_cut(original, at, folder) != "damaged", "a cut is no damage"
 
 
 def test_truncated_file_is_repaired_up_to_its_last_whole_message(original: Original, tmp_path: Path) -> None:
@@ -113,7 +38,7 @@ def test_truncated_file_is_repaired_up_to_its_last_whole_message(original: Origi
 
 
 def test_flipped_bits_cost_one_message(original: Original, tmp_path: Path) -> None:
-    flip_bits(original, tmp_path, 6, 1)
+    assert [*flip_bits(original, tmp_path, 6, 1)].count("damaged") > 3
 
 
 @pytest.mark.long
@@ -123,7 +48,7 @@ def test_truncation_in_every_message(original: Original, tmp_path: Path) -> None
 
 @pytest.mark.long
 def test_many_flipped_bits(original: Original, tmp_path: Path) -> None:
-    flip_bits(original, tmp_path, 60, 2)
+    assert [*flip_bits(original, tmp_path, 60, 2)].count("damaged") > 30
 
 
 def test_cut_file_keeps_its_checksums(original: Original, tmp_path: Path) -> None:
@@ -141,6 +66,55 @@ def test_cut_file_keeps_its_checksums(original: Original, tmp_path: Path) -> Non
     output.write_bytes(data)
     with Recording.open(output, warn=False) as recording:
         assert recording.damage or recording.changed_spans()
+
+
+def test_header_is_read_from_its_copy(original: Original, tmp_path: Path) -> None:
+    """The model is only in the header, so that the rest is not simulated."""
+    victim = original.messages[original.n_header - 1]
+    data = bytearray(original.path.read_bytes())
+    data[victim.offset + 300 : victim.offset + victim.length] = bytes(victim.length - 300)
+    assert check_repair(original, bytes(data), victim.offset + 300, tmp_path) == "damaged"
+    with Recording.open(original.path) as whole, Recording.open(tmp_path / "repaired.rrd", warn=False) as repaired:
+        assert repaired.header == msgspec.structs.replace(whole.header, model=b"")
+        assert repaired.root == whole.root
+        assert list(repaired.rows()) == list(whole.rows())
+        assert repaired.damage == [
+            "header: damaged, and read from its copy, which has no model: the session cannot be simulated again"
+        ]
+    report = verify(tmp_path / "repaired.rrd", None)
+    assert report.steps == STEPS
+    assert [problem.field for problem in report.problems] == ["file"]
+
+
+def test_model_of_a_changed_header_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    header, batch = journal(STEPS)
+
+    def seal(blob: bytes) -> bytes:
+        return seal_blob(blob).replace(b"small", b"smalm") if header.model in blob else seal_blob(blob)
+
+    monkeypatch.setattr("iris_session.recording.writer.seal_blob", seal)
+    path = write(tmp_path / "session.rrd", header, batch)
+    with Recording.open(path, warn=False) as recording:
+        assert recording.header == header
+        assert recording.root == header_root(header)
+        assert recording.damage == ["header: damaged, and read from its copy"]
+    found = verify(path, SmallCore)
+    assert (found.steps, found.unverified_steps, found.ok) == (STEPS, 0, False)
+
+
+def test_one_of_two_descriptions_of_the_store_is_enough(original: Original, tmp_path: Path) -> None:
+    first, second, *_ = (m for m in original.messages if m.kind == KIND_STORE_INFO)
+    data = bytearray(original.path.read_bytes())
+    data[first.offset + 40 : first.offset + 60] = bytes(20)
+    path = tmp_path / "session.rrd"
+    path.write_bytes(data)
+    report = repair(path, tmp_path / "repaired.rrd")
+    assert (report.steps, report.lost_steps) == (STEPS, 0)
+    assert any(f"at byte {first.offset} is damaged" in line for line in report.damage)
+    data[second.offset + 40 : second.offset + 60] = bytes(20)
+    path.write_bytes(data)
+    with pytest.raises(NotARecordingError):
+        repair(path, tmp_path / "repaired.rrd", overwrite=True)
 
 
 def destroy_rows(original: Path, path: Path, first: int) -> None:
