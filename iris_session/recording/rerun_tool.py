@@ -131,6 +131,13 @@ def _send_files(files: Sequence[str], pipe: IO[bytes], progress: Callable[[int],
     progress(done)
 
 
+def read_recording_id(path: str | Path) -> str:
+    """Return the id of the recording in a file; empty if it cannot be found."""
+    messages = scan_file(path).messages
+    with open(path, "rb") as file:
+        return _find_recording_id(file, messages).decode(errors="replace")
+
+
 def _find_recording_id(file: BinaryIO, messages: Sequence[RrdMessage]) -> bytes:
     """Return the id of the recording in a file; empty if it cannot be found."""
     infos = (read_message(file, message) for message in messages if message.kind == KIND_STORE_INFO)

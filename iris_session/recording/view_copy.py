@@ -19,6 +19,7 @@ import psutil
 
 from iris_session.recording import paths, rrd_file
 from iris_session.recording.errors import NotARecordingError
+from iris_session.recording.lost_motion import open_with_lost_motion
 from iris_session.recording.reader import Recording
 from iris_session.recording.rerun_tool import INDEX, OPTIMIZE, rewrite
 from iris_session.system.files import Replacement
@@ -95,7 +96,8 @@ def open_view_file(path: Path, progress: Callable[[int, int], None] | None = Non
     with ExitStack() as temporary:
         with ExitStack() as opened:
             recordings, damage, notes = _open_recordings(files, opened)
-            sources = [source for recording in recordings for source in recording.readable_files]
+            parts = [part for recording in recordings for part in recording.readable_files]
+            sources = opened.enter_context(open_with_lost_motion(parts))
             read = tuple(Path(file) for recording in recordings for file in recording.files)
             kept = True
             try:

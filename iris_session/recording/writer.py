@@ -83,7 +83,7 @@ from iris_session.recording.timelines import Moment, UniqueTimes, get_session_ti
 from iris_session.streams.errors import StreamError
 
 #: Chunks of the picture per second, each mostly its schema, and the shortest and longest time between two of an entity
-#: [ns]. Until then a kill of the recorder takes the newest motion from the picture; `/state` has it.
+#: [ns]. Until then a kill of the recorder takes the newest plots and motion; motion is made anew (`lost_motion.py`).
 CHUNKS_PER_S: Final = 8
 MIN_PERIOD_NS: Final = 1_000_000_000
 MAX_PERIOD_NS: Final = 8_000_000_000
@@ -230,6 +230,7 @@ class RrdWriter:
             self._write_denials(batch.denials)
             self._add_metrics(batch.metrics)
             self._add_reports(reports)
+            self._write_lanes()
             if self._known and self._known[-1].session_ns >= self._collected_due_ns:
                 self._collected_due_ns = self._known[-1].session_ns + self._write_collected()
             self._write_samples(samples)
@@ -516,8 +517,8 @@ class RrdWriter:
                     self._metrics.add(INPUT_TO_STEP, applied.robot, latency_ms, moment)
 
     def _write_collected(self) -> int:
-        """Write motion, plots and lanes collected so far. Return the time until they are due again [ns]."""
-        n = self._motion.write() + self._plots.write() + self._write_lanes()
+        """Write motion and plots collected so far. Return the time until they are due again [ns]."""
+        n = self._motion.write() + self._plots.write()
         n += self._metrics.write(self._known[-1] if self._known else self._find_moment(0, 0))
         return min(MAX_PERIOD_NS, max(MIN_PERIOD_NS, n * 1_000_000_000 // CHUNKS_PER_S))
 
@@ -598,8 +599,8 @@ class RrdWriter:
             if folder == "robots" and kind[0] == "holder":
                 self._people.label_robot(name, change.state, change.colours.get(change.state, FREE), moment)
 
-    def _write_lanes(self) -> int:
-        """Write changed lanes, and the colours of their states when those are new. Return the number of chunks."""
+    def _write_lanes(self) -> None:
+        """Write changed lanes, and the colours of their states when those are new."""
         lanes, self._lanes = self._lanes, {}
         for entity, rows in lanes.items():
             colours = {state: colour for _, change in rows for state, colour in change.colours.items()}
@@ -610,7 +611,6 @@ class RrdWriter:
                 self._log_static(entity, rr.StateConfiguration(values=[*colours], colors=[*colours.values()]))
             times = self._spread(entity, [moment for moment, _ in rows])
             self._send_columns(entity, times, [*rr.StateChange.columns(state=[change.state for _, change in rows])])
-        return len(lanes)
 
     def _write_denials(self, denials: list[DenialRecord]) -> None:
         if not denials:
