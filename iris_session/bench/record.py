@@ -28,7 +28,7 @@ import psutil
 from iris_session.bench.clients import ClientJob, Job
 from iris_session.bench.harness import ClientProcess, Measurement, group_clients, measure
 from iris_session.bench.record_naive import write_naive_log
-from iris_session.bench.record_session import BODIES, OPERATORS, Listening, SessionJob, make_record_scene
+from iris_session.bench.record_session import BODIES, OPERATORS, BenchSession, SessionJob, make_record_scene
 from iris_session.bench.report import BenchError, BenchReport, make_bar
 from iris_session.demo.scenes.generators import arm_names
 from iris_session.recording import NotARecordingError, Recording, paths
@@ -275,7 +275,7 @@ class RecordedSession:
             stack.callback(self._end)
             self._session.write(msgspec.json.encode(SessionJob(str(path), seed)) + b"\n")
             try:
-                listening = msgspec.json.decode(self._session.read_line(START_S), type=Listening)
+                listening = msgspec.json.decode(self._session.read_line(START_S), type=BenchSession)
             except (EOFError, TimeoutError) as error:
                 raise BenchError(f"a session that is to be killed did not start: {error}") from None
             self._origin_ns = listening.origin_ns

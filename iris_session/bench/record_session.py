@@ -42,8 +42,8 @@ class SessionJob(msgspec.Struct, frozen=True):
     seed: int
 
 
-class Listening(msgspec.Struct, frozen=True):
-    """The session listens. `origin_ns`: session time zero on CLOCK_MONOTONIC."""
+class BenchSession(msgspec.Struct, frozen=True):
+    """A session that listens. `origin_ns`: session time zero on CLOCK_MONOTONIC."""
 
     address: str
     origin_ns: int
@@ -75,7 +75,7 @@ def main() -> None:
         with Session(
             make_record_scene(job.seed).compile(), config=make_session_config(record=Path(job.path))
         ) as session:
-            out.write(msgspec.json.encode(Listening(session.address, session.origin_ns)) + b"\n")
+            out.write(msgspec.json.encode(BenchSession(session.address, session.origin_ns)) + b"\n")
             session.run()
 
 
