@@ -10,6 +10,7 @@ from __future__ import annotations
 import zlib
 from collections import Counter
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
 import msgspec
@@ -28,6 +29,8 @@ from iris_session.recording.scene_geometry import SceneReader, VisualShape
 from iris_session.recording.timelines import Moment, set_moment, to_time_columns
 from iris_session.scene import SceneBuildError
 
+#: Number of escaped names that are kept: Rerun takes longer for one than the recorder for all else of a row.
+MAX_ESCAPED: Final = 8192
 #: Maximum number of entities named in an error line about entities that cannot be drawn.
 NAMED: Final = 5
 #: Errors that keep a scene or a part of it from being drawn. Recording continues: the journal matters more.
@@ -354,6 +357,7 @@ def build_colour(kind: str, rgba: scene_geometry.Rgba8) -> Any:
     return primitives[kind].from_fields(colors=[rgba])
 
 
+@lru_cache(maxsize=MAX_ESCAPED)
 def escape_entity_part(name: str) -> str:
     """Escape `name` as one part of an entity path (names may hold slashes and spaces)."""
     return str(rr.escape_entity_path_part(name))
