@@ -21,7 +21,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from tests.recording.damage import Original, check_cut, check_scan, flip_bits, make_original
+from tests.recording.damage import Original, check_cut, check_scans, flip_bits, make_original
 
 PROGRESS_S = 2.0
 
@@ -40,11 +40,11 @@ class Progress:
 
 def cut_everywhere(original: Original, folder: Path, progress: Progress) -> int:
     """Cut the file after every byte from its first message on. Return the number of cuts."""
-    size = original.path.stat().st_size
-    for n_bytes in range(original.messages[0].offset, size):
-        check_scan(original, n_bytes, folder)
-        progress.show(f"cut after {n_bytes} of {size} bytes")
-    return size - original.messages[0].offset
+    n = 0
+    for left in check_scans(original, folder):
+        n += 1
+        progress.show(f"cut {n} times, {left} bytes left")
+    return n
 
 
 def repair_cuts(original: Original, folder: Path, per_message: int, progress: Progress) -> Counter[str]:
@@ -69,7 +69,7 @@ def repair_flips(original: Original, folder: Path, n: int, seed: int, progress: 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--flips", type=int, default=1000, help="number of flipped bits (%(default)s)")
-    parser.add_argument("--cuts", type=int, default=4, help="repaired cuts per message (%(default)s)")
+    parser.add_argument("--cuts", type=int, default=4, help="repaired cuts per message; 0: no cuts (%(default)s)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
@@ -81,8 +81,8 @@ def main() -> int:
             found = {
                 "bytes": original.path.stat().st_size,
                 "messages": len(original.messages),
-                "cuts": cut_everywhere(original, folder, progress),
-                "repaired_cuts": repair_cuts(original, folder, options.cuts, progress),
+                "cuts": cut_everywhere(original, folder, progress) if options.cuts else 0,
+                "repaired_cuts": repair_cuts(original, folder, options.cuts, progress) if options.cuts else {},
                 "repaired_flips": repair_flips(original, folder, options.flips, options.seed, progress),
                 "seconds": round(time.monotonic() - began, 1),
             }
