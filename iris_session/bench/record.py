@@ -45,10 +45,8 @@ MAX_SIZE_RATIO: Final = 1.5
 RECORDER, AUTHORITY, BOTH = "recorder", "authority", "both"
 #: Kills in their order. A session survives that of its recorder, so it has one of the others, too.
 KINDS: Final = (RECORDER, AUTHORITY, RECORDER, BOTH)
-#: From the first rows in a file to the kill, drawn at random [s]: at any place between two writes.
+#: From the moment that a recorder is up to date to the kill, drawn at random [s]: at any place between two writes.
 KILL_AFTER_S: Final = (0.5, 1.0)
-#: Number of times that a file has grown when it has the rows that were waiting for it.
-GROWN: Final = 3
 POLL_S: Final = 0.02
 START_S: Final = 60.0
 END_S: Final = 30.0
@@ -267,8 +265,6 @@ class RecordedSession:
     """
 
     def __init__(self, path: Path, seed: int) -> None:
-        self._path = path
-        self._part = 1
         self._started: list[psutil.Process] = []
         with ExitStack() as stack:
             self._session = ChildProcess(_SESSION, stdout=PIPE, own_group=True)
@@ -294,7 +290,7 @@ class RecordedSession:
         self._stack.close()
 
     def kill(self, kind: str, after_s: float) -> int:
-        """Kill processes some time after the newest part of the recording is being written.
+        """Kill processes some time after the recorder has caught up.
 
         Args:
             kind: `RECORDER`, `AUTHORITY` or `BOTH`.
@@ -312,18 +308,14 @@ class RecordedSession:
         now_ns = time.monotonic_ns()
         for pid in victims:
             os.kill(pid, signal.SIGKILL)
-        self._part += kind == RECORDER
         return now_ns - self._origin_ns
 
     def _wait_for_rows(self) -> None:
-        file, sizes = part_path(str(self._path), self._part), {0}
-
-        def grew() -> bool:
-            with suppress(OSError):
-                sizes.add(os.path.getsize(file))
-            return len(sizes) > GROWN
-
-        _wait_until(grew, START_S, f"{os.path.basename(file)} does not grow")
+        """Wait until the recorder has written the rows that waited for it."""
+        try:
+            self._session.read_line(START_S)
+        except (EOFError, TimeoutError) as error:
+            raise BenchError(f"the recorder of a session that is to be killed is not up to date: {error}") from None
         self._started = psutil.Process(self._session.pid).children(recursive=True)
 
     def _find_recorder(self) -> int:

@@ -2,14 +2,15 @@
 
     python -m iris_session.bench.record_session
 
-Reads its job from standard input, prints one JSON line when it listens, and runs until SIGTERM or the end of its
-parent.
+Reads its job from standard input, prints one JSON line when it listens, then `written` whenever a new recorder has
+written the rows that waited for it, and runs until SIGTERM or the end of its parent.
 """
 
 from __future__ import annotations
 
 import signal
 import sys
+from io import RawIOBase
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,6 +33,9 @@ from iris_session.system.process import die_with_parent, take_stdout
 #: Moving bodies: those that fly, and ten of each of the two arms.
 BODIES: Final = 50
 OPERATORS: Final = 2
+POLL_NS: Final = 20_000_000
+#: Age of the newest row at its write [ns] from which on a recorder has caught up.
+CURRENT_NS: Final = 250_000_000
 _FREE: Final = BODIES - 10 * OPERATORS
 
 
@@ -67,6 +71,27 @@ def make_record_scene(seed: int) -> Any:
     return spec
 
 
+class _Reporter:
+    """Says when a recorder has caught up."""
+
+    def __init__(self, session: Session, out: RawIOBase) -> None:
+        self._session, self._out = session, out
+        self._due_ns = 0
+        self._known = 0
+
+    def poll(self) -> bool:
+        """Report a recorder that is new, now and then. Return False, for `Session.run(until=...)`."""
+        feed, now_ns = self._session.processes.feed, self._session.clock()
+        if now_ns < self._due_ns or feed is None:
+            return False
+        self._due_ns = now_ns + POLL_NS
+        last = feed.stats.recorder
+        if last is not None and last.instance != self._known and last.written >= 0 and 0 < last.lag_ns < CURRENT_NS:
+            self._known = last.instance
+            self._out.write(b"written\n")
+        return False
+
+
 def main() -> None:
     """Run the session."""
     die_with_parent(signal.SIGTERM)
@@ -76,7 +101,7 @@ def main() -> None:
             make_record_scene(job.seed).compile(), config=make_session_config(record=Path(job.path))
         ) as session:
             out.write(msgspec.json.encode(BenchSession(session.address, session.origin_ns)) + b"\n")
-            session.run()
+            session.run(until=_Reporter(session, out).poll)
 
 
 if __name__ == "__main__":

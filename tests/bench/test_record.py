@@ -99,6 +99,7 @@ def test_naive_log_has_every_pose_of_moving_bodies(tmp_path: Path) -> None:
     assert scene > 3
 
 
+@pytest.mark.long
 @pytest.mark.e2e
 def test_record(tmp_path: Path) -> None:
     result = _bench(tmp_path, "record", "--seconds", "4", "--kills", "4")
