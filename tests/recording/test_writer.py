@@ -534,7 +534,8 @@ def test_changed_model_is_not_used(tmp_path: Path) -> None:
     writer.add(Batch(scenes=[cup]))
     writer.close()
     data = bytearray(path.read_bytes())
-    at = data.find(cup.model_hash.encode())
+    name = cup.model_hash.encode()  # compression may have shortened it by some bytes that were there before
+    at = max(data.find(name[i : i + 8]) for i in range(len(name) - 7))
     assert at > 0, "the journal is not compressed"
     data[at] ^= 1
     path.write_bytes(data)
