@@ -63,7 +63,10 @@ demo: install $(PAGE)
 screenshots: install-dev $(PAGE)
 	@folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && \
 	$(BIN)/iris-session demo handover --record "$$folder/session.rrd" && \
-	MUJOCO_GL=egl $(BIN)/python tools/render_recording.py "$$folder/session.rrd" docs/img/handover.gif --size 720 430
+	at=$$($(BIN)/iris-session recording inspect "$$folder/session.rrd" --json | \
+	  $(BIN)/python -c 'import json, sys; print(int(json.load(sys.stdin)["handovers"][0]["at_s"]))') && \
+	$(BIN)/iris-session recording render "$$folder/session.rrd" -o docs/img/handover.gif --force --people \
+	  --from $$((at > 7 ? at - 7 : 0)) --to $$((at + 3)) --speed 2 --fps 12 --size 720x430
 	@PYTHONPATH=. $(BIN)/python tools/page_screenshots.py docs/img
 
 check: install-dev

@@ -182,20 +182,19 @@ def list_times(arguments: argparse.Namespace, timeline: Timeline) -> Sequence[in
     Raises:
         CommandError: The recording has no such times, or an animation of all of them is too large.
     """
-    begin_ns, end_ns = timeline.begin_ns, timeline.end_ns
-    for option, seconds in (("--from", arguments.begin), ("--to", arguments.end), ("--at", arguments.at)):
-        # Times are printed with two digits, rounded.
-        if seconds is not None and not begin_ns / _SECOND - 0.01 <= seconds <= end_ns / _SECOND + 0.01:
+    first_s, last_s = timeline.begin_ns / _SECOND, timeline.end_ns / _SECOND
+    begin_s = first_s if arguments.begin is None else arguments.begin
+    end_s = last_s if arguments.end is None else arguments.end
+    if begin_s > end_s:
+        raise CommandError(f"--from {begin_s:g} is after the end, {end_s:.2f} s: give an earlier one, or a later --to")
+    # Printed times are rounded to 0.01 s.
+    for option, begin, end in (("--at", arguments.at, arguments.at), ("--from and --to", begin_s, end_s)):
+        if begin is not None and (begin > last_s + 0.01 or end < first_s - 0.01):
             raise CommandError(
-                f"{option} {seconds:g} is not in the recording: it goes from {begin_ns / _SECOND:.2f} s to "
-                f"{end_ns / _SECOND:.2f} s"
+                f"{option}: the recording has nothing there, it goes from {first_s:.2f} s to {last_s:.2f} s"
             )
-    if arguments.begin is not None:
-        begin_ns = max(begin_ns, round(arguments.begin * _SECOND))
-    if arguments.end is not None:
-        end_ns = min(end_ns, round(arguments.end * _SECOND))
-    if end_ns < begin_ns:
-        raise CommandError(f"--from {arguments.begin:g} is after the end, {end_ns / _SECOND:g} s: exchange them")
+    begin_ns = max(timeline.begin_ns, round(begin_s * _SECOND))
+    end_ns = max(begin_ns, min(timeline.end_ns, round(end_s * _SECOND)))
     if arguments.out.suffix.lower() == PICTURE:
         at_ns = (begin_ns + end_ns) // 2 if arguments.at is None else round(arguments.at * _SECOND)
         return (min(max(at_ns, timeline.begin_ns), timeline.end_ns),)
