@@ -294,8 +294,7 @@ def _list_reports(viewer: HeadlessViewer, when: str) -> Iterator[str]:
 
 def _look_at_tabs(viewer: HeadlessViewer) -> Iterator[str]:
     """Show every tab once, and yield what the views in them report."""
-    blueprint = viewer.call("rerun_get_blueprint", recording={})
-    entities = blueprint.get("blueprint", blueprint)
+    entities = json.loads(viewer.call("rerun_get_blueprint", recording={})["json"])
     containers = {
         path: one["ContainerBlueprint"]["contents"]
         for path, one in entities.items()

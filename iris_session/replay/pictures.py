@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from iris_session.protocol.common import Pose
 from iris_session.protocol.names import Device
 from iris_session.protocol.scene import AddMaterial, AddVisual, Material, PatchOp, RemoveVisual, SetVisual, Visual
 from iris_session.protocol.server_messages import BodyInfo, PresenceItem, SceneChanged
@@ -37,6 +38,9 @@ EYE: Final = (0.25, -1.75, 0.95)
 FILLED: Final = 0.9
 #: The least half size of what is shown [m].
 MIN_HALF_M: Final = 0.1
+#: Moments at which the places of bodies are read for it, and poses in all.
+MOMENTS: Final = 500
+MOST_POSES: Final = 20_000
 #: Geoms besides those of the model: marks of MuJoCo, added visuals, people.
 MORE_GEOMS: Final = 10_000
 #: Presence older than this is not drawn: its device is not tracked any more [ns].
@@ -49,6 +53,8 @@ _SHAPES: Final = {
     kind: getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
     for kind in ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
 }
+#: Signs of the corners of a box, shape (8, 3).
+_CORNERS: Final = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 _VISOR: Final = (0.10, 0.10, 0.12)
 #: Shapes of a head (x forward) and of a hand: half extents [m], offset in the device's frame [m], whether a visor.
 _HEAD: Final = (
@@ -193,8 +199,6 @@ class RecordingPictures:
             while time_ns is not None and image is not None and time_ns < step.session_time:
                 yield image  # steps before this one are left out
                 time_ns = next(waiting, None)
-            if time_ns is None:
-                return
             next_ns = self._timeline.get_next_ns(step.step)
             is_drawn = False
             while time_ns is not None and (next_ns is None or time_ns < next_ns):
@@ -202,6 +206,8 @@ class RecordingPictures:
                     image, is_drawn = self._draw_core(self._replay.core, time_ns), True
                 yield image
                 time_ns = next(waiting, None)
+            if time_ns is None:
+                return
         if image is None:
             raise PictureError(
                 f"{self._recording.files[0]}: no step can be taken again from {times_ns[0] * 1e-9:.2f} s on"
@@ -228,7 +234,7 @@ class RecordingPictures:
             )
         camera = self._find_camera(model, is_required=is_first)
         if camera is None:
-            view = self._views.get(core.world.bodies) or _Reach.at_rest(core)
+            view = self._views.get(core.world.bodies) or _Reach(core.world.bodies)
             camera = view.make_camera(core, self._options.width / self._options.height)
         return _Artist(model, camera, self._options, self.notes)
 
@@ -258,41 +264,39 @@ class RecordingPictures:
 # --- the default view -------------------------------------------------------------------------------------------------
 
 
-class _Reach(NamedTuple):
-    """Where bodies were in a span of time: `low`, `high`, shape (n, 3) [m], world frame, by `BodyInfo.id` in `ids`."""
+class _Reach:
+    """Where the moving bodies of a scene were in a span of time.
 
-    ids: list[int]
-    low: Floats
-    high: Floats
+    `poses`: in the world at each moment, shape (n, 7), `x y z qw qx qy qz`, [m]. Without any: where they are now.
+    """
 
-    @classmethod
-    def at_rest(cls, core: SessionCore) -> _Reach:
-        """Return where the bodies of a core are now."""
-        ids = [body.id for body in core.world.bodies if body.moving]
-        now = core.world.data.xpos[ids]
-        return cls(ids, now, now)
+    def __init__(self, bodies: Sequence[BodyInfo]) -> None:
+        self.rows = [i for i, body in enumerate(bodies) if body.moving]
+        self.ids = [bodies[i].id for i in self.rows]
+        self.poses: list[Floats] = []
 
     def make_camera(self, core: SessionCore, aspect: float) -> mujoco.MjvCamera:
         """Return a camera that sees all of it in a picture of that `aspect`, width by height."""
         camera = mujoco.MjvCamera()
         model, data = core.world.model, core.world.data
         mujoco.mjv_defaultFreeCamera(model, camera)
-        radius = np.array([_measure_body(model, body) for body in self.ids]).reshape(-1, 1)
-        low, high = self.low - radius, self.high + radius
+        poses = np.array(self.poses or [np.hstack([data.xpos[self.ids], data.xquat[self.ids]])])
+        corners = np.array([_list_corners(model, body) for body in self.ids]).reshape(1, -1, 8, 3)
+        at = (poses[..., None, :3] + _rotate(poses[..., None, 3:], corners)).reshape(-1, 3)
         if model.nflex:
-            low, high = np.vstack([low, data.flexvert_xpos]), np.vstack([high, data.flexvert_xpos])
-        known = np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1)
-        if not known.any():
+            at = np.vstack([at, data.flexvert_xpos])
+        at = at[np.isfinite(at).all(axis=1)]
+        if not len(at):
             return camera
-        box = _limit(low[known], high[known])
-        centre, half = box.mean(axis=0), np.maximum((box[1] - box[0]) / 2.0, MIN_HALF_M)
+        low, high = _limit(at)
+        centre, half = (low + high) / 2.0, np.maximum((high - low) / 2.0, MIN_HALF_M)
         forward = -np.array(EYE) / np.linalg.norm(EYE)
         right = np.cross(forward, (0.0, 0.0, 1.0))
         right /= np.linalg.norm(right)
         axes = np.array([right, np.cross(right, forward), forward])
-        corners = half * np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T @ axes.T  # right, up, depth
+        seen = half * _CORNERS @ axes.T  # of the corners of the box: to the right, upward, away
         slope = math.tan(math.radians(model.vis.global_.fovy) / 2.0) * FILLED
-        needed = np.maximum(np.abs(corners[:, 0]) / aspect, np.abs(corners[:, 1])) / slope - corners[:, 2]
+        needed = np.maximum(np.abs(seen[:, 0]) / aspect, np.abs(seen[:, 1])) / slope - seen[:, 2]
         camera.lookat, camera.distance = centre, float(needed.max())
         camera.azimuth = math.degrees(math.atan2(forward[1], forward[0]))
         camera.elevation = math.degrees(math.asin(forward[2]))
@@ -300,41 +304,53 @@ class _Reach(NamedTuple):
         return camera
 
 
-def _limit(low: Floats, high: Floats) -> Floats:
-    """Return the box around boxes, shape (2, 3). Those that are far from the others, which fell off, do not count."""
-    middle = (low + high) / 2.0
-    near, far = np.percentile(middle, (10.0, 90.0), axis=0)
+def _limit(at: Floats) -> tuple[Floats, Floats]:
+    """Return the low and the high corner of a box around points, but for those far away, of bodies that fell off."""
+    near, far = np.percentile(at, (5.0, 95.0), axis=0)
     reach = max(2.0 * float(np.linalg.norm(far - near)), 10.0 * MIN_HALF_M)
-    return np.array([np.maximum(low.min(axis=0), near - reach), np.minimum(high.max(axis=0), far + reach)])
+    return np.maximum(at.min(axis=0), near - reach), np.minimum(at.max(axis=0), far + reach)
 
 
-def _measure_body(model: mujoco.MjModel, body: int) -> float:
-    """Return the radius of a sphere around a body's frame that holds its shown geoms [m]."""
+def _list_corners(model: mujoco.MjModel, body: int) -> Floats:
+    """Return the corners of a box around the shown geoms of a body, in its frame, shape (8, 3) [m]."""
     first = int(model.body_geomadr[body])
-    geoms = range(first, first + int(model.body_geomnum[body]))
-    shown = [g for g in geoms if model.geom_group[g] < 3]
-    return max((float(np.linalg.norm(model.geom_pos[g])) + float(model.geom_rbound[g]) for g in shown), default=0.0)
+    geoms = [
+        g
+        for g in range(first, first + int(model.body_geomnum[body]))
+        if model.geom_group[g] < 3 and model.geom_type[g] != mujoco.mjtGeom.mjGEOM_PLANE
+    ]
+    if not geoms:
+        return np.zeros((8, 3))
+    boxes = model.geom_aabb[geoms]  # centre and half sides, in the frame of the geom
+    corners = boxes[:, None, :3] + boxes[:, None, 3:] * _CORNERS
+    at = model.geom_pos[geoms][:, None] + _rotate(model.geom_quat[geoms][:, None], corners)
+    low, high = at.min(axis=(0, 1)), at.max(axis=(0, 1))
+    found: Floats = (low + high) / 2.0 + (high - low) / 2.0 * _CORNERS
+    return found
+
+
+def _rotate(q: Floats, p: Floats) -> Floats:
+    """Rotate points (..., 3) by unit quaternions (..., 4)."""
+    twice = 2.0 * np.cross(q[..., 1:], p)
+    rotated: Floats = p + q[..., :1] * twice + np.cross(q[..., 1:], twice)
+    return rotated
 
 
 def _read_reach(recording: Recording, begin_ns: int, end_ns: int) -> dict[tuple[BodyInfo, ...], _Reach]:
-    """Return where the moving bodies of each scene were in a span of time, as the recorded states have it."""
+    """Return the moving bodies of each scene in a span of time, at some moments, as the recorded states have them."""
     found: dict[tuple[BodyInfo, ...], _Reach] = {}
     bodies: tuple[BodyInfo, ...] = ()
-    rows: list[int] = []
+    due_ns = begin_ns
     for state in recording.states():
         if state.session_time > end_ns:
             break
-        if state.session_time < begin_ns:
-            continue
         if state.bodies is not bodies:  # the same object in all states of a scene
-            bodies = state.bodies
-            rows = [i for i, body in enumerate(bodies) if body.moving]
-        at = state.poses[rows, :3]
-        if (reach := found.get(bodies)) is None:
-            found[bodies] = _Reach([bodies[i].id for i in rows], at.copy(), at.copy())
-        else:
-            np.minimum(reach.low, at, out=reach.low)
-            np.maximum(reach.high, at, out=reach.high)
+            bodies, due_ns = state.bodies, max(begin_ns, state.session_time)
+        if state.session_time >= due_ns:
+            reach = found.setdefault(bodies, _Reach(bodies))
+            reach.poses.append(state.poses[reach.rows])
+            moments = max(1, min(MOMENTS, MOST_POSES // max(1, len(reach.rows))))
+            due_ns = state.session_time + (end_ns - begin_ns) // moments
     return found
 
 
@@ -394,7 +410,7 @@ class _Look:
     def __init__(self, original: mujoco.MjModel, drawn: mujoco.MjModel) -> None:
         self._original, self._drawn = original, drawn
         self._patches: tuple[PatchOp, ...] = ()
-        self._moved: dict[int, tuple[Floats, Floats]] = {}
+        self._moved: dict[int, Pose] = {}
         self._added: list[tuple[Visual, Material | None]] = []
 
     def apply(self, patches: Sequence[PatchOp]) -> list[str]:
@@ -432,20 +448,19 @@ class _Look:
         if op.material is not None:
             drawn.geom_matid[op.visual] = op.material if op.material < drawn.nmat else -1
         if op.T_body_visual is not None:
-            self._moved[op.visual] = np.array(op.T_body_visual.p), np.array(op.T_body_visual.q)
+            self._moved[op.visual] = op.T_body_visual
 
     def decorate(self, scene: mujoco.MjvScene, data: Any) -> None:
         """Move and add geoms of a scene that shows `data`."""
         for geom in scene.geoms[: scene.ngeom] if self._moved else ():
             if geom.objtype == _GEOM and geom.objid in self._moved:
-                p_world, R_world = _to_world(
-                    data, int(self._original.geom_bodyid[geom.objid]), *self._moved[geom.objid]
-                )
-                geom.pos[:], geom.mat[:] = p_world, R_world
+                body = int(self._original.geom_bodyid[geom.objid])
+                p_world, R_world = _to_world(data, body, self._moved[geom.objid])
+                geom.pos[:], geom.mat[:] = p_world, R_world.reshape(3, 3)
         for visual, material in self._added:
             if visual.body >= self._original.nbody or not 0 <= visual.group < 3 or visual.rgba[3] == 0.0:
                 continue
-            p_world, R_world = _to_world(data, visual.body, np.array(visual.T_body_visual.p), visual.T_body_visual.q)
+            p_world, R_world = _to_world(data, visual.body, visual.T_body_visual)
             geom = _add_geom(scene, visual.geometry.kind, visual.geometry.size, p_world, R_world, visual.rgba)
             if visual.geometry.mesh >= 0:
                 geom.dataid = 2 * visual.geometry.mesh  # of a mesh, odd numbers are hulls
@@ -454,12 +469,12 @@ class _Look:
                 geom.shininess, geom.reflectance = material.shininess, material.reflectance
 
 
-def _to_world(data: Any, body: int, p_body: Floats, q_body: Sequence[float] | Floats) -> tuple[Floats, Floats]:
-    """Return position [m] and rotation (3, 3) in the world of a pose in the frame of a body."""
-    rotation: Floats = np.empty(9)
-    mujoco.mju_quat2Mat(rotation, np.array(q_body, np.float64))
-    R_world = data.xmat[body].reshape(3, 3)
-    return data.xpos[body] + R_world @ p_body, R_world @ rotation.reshape(3, 3)
+def _to_world(data: Any, body: int, pose: Pose) -> tuple[Floats, Floats]:
+    """Return position [m] and rotation (9,) in the world of a pose in the frame of a body."""
+    p_world: Floats = np.empty(3)
+    R_world: Floats = np.empty(9)
+    mujoco.mj_local2Global(data, p_world, R_world, np.array(pose.p), np.array(pose.q), body, 0)
+    return p_world, R_world
 
 
 def _add_geom(
