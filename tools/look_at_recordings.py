@@ -20,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, NamedTuple, Self
@@ -29,7 +29,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from iris_session.recording.paths import STATE_ENTITIES
 from iris_session.recording.rerun_tool import find_rerun, make_environment
+from iris_session.recording.rrd_file import read_chunks
 from iris_session.recording.view_copy import open_view_file
 
 HOST: Final = "127.0.0.1"
@@ -46,8 +48,6 @@ DIFFERENT: Final = 12
 #: Least share of the pixels that show something, and of the width that the bodies that move take.
 LEAST_FILLED: Final = 0.05
 LEAST_WIDTH: Final = 0.4
-#: Entities of bodies that move: links of robots, and other bodies.
-MOVING: Final = re.compile(r"/scene/\d+/(robots|bodies)/")
 
 Image = NDArray[np.uint8]
 
@@ -245,7 +245,7 @@ def look_at(path: Path, pictures: Path | None = None) -> Look:
     with open_view_file(path) as shown:
         problems = list(check_file(shown.path))
         with HeadlessViewer(shown.path) as viewer:
-            return _look(viewer, path, pictures, problems)
+            return _look(viewer, path, shown.path, pictures, problems)
 
 
 def check_file(path: Path) -> Iterator[str]:
@@ -256,7 +256,7 @@ def check_file(path: Path) -> Iterator[str]:
         yield f"rerun rrd verify: {' '.join((done.stderr or done.stdout).split())[-300:]}"
 
 
-def _look(viewer: HeadlessViewer, path: Path, pictures: Path | None, problems: list[str]) -> Look:
+def _look(viewer: HeadlessViewer, path: Path, shown: Path, pictures: Path | None, problems: list[str]) -> Look:
     state = viewer.wait_until_loaded()
     timeline = next(t for t in state["recordings"][0]["timelines"] if t["timeline"]["name"] == SESSION_TIME)
     begin_ns, end_ns = (int(timeline["time_range"][end]) for end in ("start", "end"))
@@ -277,7 +277,7 @@ def _look(viewer: HeadlessViewer, path: Path, pictures: Path | None, problems: l
     assert first is not None
     problems += _look_at_tabs(viewer)
     viewer.set_time(begin_ns)
-    filled, width = _measure(viewer, scene, first)
+    filled, width = _measure(viewer, scene, list_moving(shown), first)
     if filled < LEAST_FILLED:
         problems.append(f"the 3D picture is empty at the first time: {filled:.1%} of it show something")
     if width < LEAST_WIDTH:
@@ -311,20 +311,25 @@ def _look_at_tabs(viewer: HeadlessViewer) -> Iterator[str]:
         yield from _list_reports(viewer, f"in tab {i + 1}")
 
 
-def _measure(viewer: HeadlessViewer, scene: str, first: Image) -> tuple[float, float]:
+def _measure(viewer: HeadlessViewer, scene: str, moving: Sequence[str], first: Image) -> tuple[float, float]:
     """Return the share of the pixels that show something, and of the width that bodies that move take."""
-    schema = viewer.call("rerun_get_recording_schema", with_archetypes=False, with_components=False)
-    moving = sorted(
-        {found[0] for found in map(MOVING.match, re.findall(r"/scene/[^\"]+", json.dumps(schema))) if found}
-    )
     contents = f"/view/{scene}/ViewContents"
     viewer.set_blueprint({contents: {"ViewContents": {"query": ["- /**"]}}})
     empty = viewer.take_picture(scene)
-    viewer.set_blueprint({contents: {"ViewContents": {"query": [f"+ {folder}**" for folder in moving] or ["- /**"]}}})
+    viewer.set_blueprint({contents: {"ViewContents": {"query": [f"+ {entity}/**" for entity in moving] or ["- /**"]}}})
     bodies = viewer.take_picture(scene)
     columns = np.flatnonzero(_differs(bodies, empty).sum(axis=0) > 1)
     width = (columns[-1] - columns[0] + 1) / empty.shape[1] if len(columns) else 0.0
     return float(_differs(first, empty).mean()), float(width)
+
+
+def list_moving(path: Path) -> list[str]:
+    """Return the entities of the bodies that move."""
+    found: set[str] = set()
+    for chunk in read_chunks(str(path), (STATE_ENTITIES,)):
+        for names in chunk.to_record_batch().column("bodies").to_pylist():
+            found.update(filter(None, names))
+    return sorted(found)
 
 
 def _differs(image: Image, other: Image) -> NDArray[np.bool_]:
