@@ -61,7 +61,7 @@ class ViewerError(Exception):
 
 
 class Look(NamedTuple):
-    """What was seen of a recording.
+    """Result of looking at a recording.
 
     `filled`: share of the pixels of the 3D view that show something at the first time. `width`: share of its width that
     the bodies that move take then. `problems`: one line each; empty if all is well.

@@ -72,7 +72,7 @@ class PictureError(RecordingError):
 
 
 class PictureOptions(NamedTuple):
-    """What a picture shows.
+    """Size and content of a picture.
 
     `camera`: name or number of a camera of the model; empty for a view of all bodies that move. `people`: draw heads
     and hands of participants, in their colours of the Rerun viewer.
@@ -265,7 +265,7 @@ class RecordingPictures:
 
 
 class _Reach:
-    """Where the moving bodies of a scene were in a span of time.
+    """Places of the moving bodies of a scene in a span of time.
 
     `poses`: in the world at each moment, shape (n, 7), `x y z qw qx qy qz`, [m]. Without any: where they are now.
     """
