@@ -39,7 +39,7 @@ SIZE: Final = "1600x1000"
 START_S: Final = 60.0
 #: Until a file is read, and until the picture of a time is complete [s]: drawn in software on a busy machine.
 LOAD_S: Final = 120.0
-SETTLE_S: Final = 60.0
+SETTLE_S: Final = 120.0
 #: Frames that the viewer draws between two looks.
 FRAMES: Final = 3
 SESSION_TIME: Final = "session_time"
@@ -202,7 +202,10 @@ class HeadlessViewer:
 
         def settle() -> bool:
             path = Path(self._folder.name, "picture.png")
-            self.call("rerun_save_screenshot", file_path=str(path), max_size=0, **options)
+            try:
+                self.call("rerun_save_screenshot", file_path=str(path), max_size=0, **options)
+            except ViewerError:  # on a busy machine it is not drawn within the time that the viewer allows
+                return False
             last.append(np.asarray(cv2.imread(str(path)), np.uint8))
             return len(last) > 1 and last[-1].shape == last[-2].shape and bool((last[-1] == last[-2]).all())
 
