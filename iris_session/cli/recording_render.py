@@ -7,10 +7,11 @@ import math
 import re
 import sys
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final
 
-from iris_session.cli.common import CommandError, add_json_option, print_json, to_printable
+from iris_session.cli.common import CommandError, add_json_option, ending_as_interrupts, print_json, to_printable
 from iris_session.cli.progress import ProgressLine
 from iris_session.system.files import Replacement
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 VIDEO: Final = ".mp4"
 ANIMATION: Final = ".gif"
 PICTURE: Final = ".png"
-DEFAULT_SIZE: Final = (1280, 720)
+DEFAULT_SIZE: Final = (960, 540)
 MIN_SIDE: Final = 16
 MAX_SIDE: Final = 8192
 DEFAULT_FPS: Final = 30.0
@@ -58,7 +59,7 @@ def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     )
     parser.add_argument("--list-cameras", action="store_true", help="print the cameras of the scene, and draw nothing")
     parser.add_argument(
-        "--size", type=parse_size, default=DEFAULT_SIZE, metavar="WxH", help="pixels (default: 1280x720)"
+        "--size", type=parse_size, default=DEFAULT_SIZE, metavar="WxH", help="pixels (default: 960x540)"
     )
     parser.add_argument(
         "--fps", type=parse_positive, default=DEFAULT_FPS, metavar="N", help="pictures per second (default: 30)"
@@ -127,7 +128,11 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     out = _check_output(arguments)
     width, height = arguments.size
-    with ProgressLine(arguments.path) as progress, Recording.open(arguments.path, warn=False) as recording:
+    with (
+        ending_as_interrupts(),
+        ProgressLine(arguments.path) as progress,
+        Recording.open(arguments.path, warn=False) as recording,
+    ):
         progress.show("reading")
         timeline = Timeline(recording)
         times_ns = list_times(arguments, timeline)
@@ -246,8 +251,12 @@ def _write_video(path: Path, images: Iterator[Image], n_images: int, size: tuple
             "this OpenCV writes no video: pip install opencv-python-headless, which brings its codecs, or give a .gif"
         )
     try:
-        for image in images:
-            writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+        with ThreadPoolExecutor(1) as encoder:  # a picture is encoded while the next one is drawn
+            encoded: Future[None] | None = None
+            for image in images:
+                if encoded is not None:
+                    encoded.result()
+                encoded = encoder.submit(writer.write, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     finally:
         writer.release()
     written = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)  # the writer says nothing about a full disk

@@ -20,14 +20,14 @@ from iris_session.cli import recording_render
 from iris_session.cli.main import main
 from iris_session.recording import Recording
 from iris_session.replay.pictures import Image, PictureOptions, RecordingPictures, Timeline
-from tests.replay.support import Played, play, step_ns
+from tests.replay.support import Played, make_drawn_core, play, step_ns
 
 SIZE = ("--size", "160x120")
 
 
 @pytest.fixture(scope="module")
 def played(tmp_path_factory: pytest.TempPathFactory) -> Played:
-    made = play(tmp_path_factory.mktemp("played") / "session.rrd", 60)
+    made = play(tmp_path_factory.mktemp("played") / "session.rrd", 60, core=make_drawn_core())
     made.write()
     return made
 
@@ -94,7 +94,7 @@ def test_an_animation_has_its_times(played: Played, tmp_path: Path) -> None:
     assert render(played.path, out, "--from", "0", "--to", "0.1", "--fps", "10", "--speed", "0.2") == 0
     with Pillow.open(out) as animation:
         durations = [frame.info["duration"] for frame in ImageSequence.Iterator(animation)]  # of equal ones the sum
-        assert len(durations) > 2
+        assert len(durations) >= 2
         assert sum(durations) == 5 * 100
         assert animation.info["loop"] == 0
 
@@ -153,7 +153,7 @@ def test_options_that_are_none_are_refused(option: str, line: str, capsys: pytes
 
 
 def test_damage_is_said_and_is_a_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    gap = play(tmp_path / "session.rrd", 45)
+    gap = play(tmp_path / "session.rrd", 45, core=make_drawn_core())
     del gap.batch.rows[30]
     path = gap.write()
     assert render(path, tmp_path / "x.mp4", "--fps", "100") == 1

@@ -28,7 +28,7 @@ from tests.models import robot_models
 from tools.look_at_recordings import MissingViewerError, check_file, look_at
 
 __all__ = ["robot_models"]
-pytestmark = [pytest.mark.e2e, pytest.mark.timeout(DEMO_S + 120.0)]
+pytestmark = [pytest.mark.e2e, pytest.mark.long, pytest.mark.timeout(DEMO_S + 120.0)]
 
 
 def assert_looks_right(path: Path) -> None:
@@ -142,7 +142,6 @@ def test_session_that_was_cut_in_a_message_is_seen_without_errors(sessions: Sess
     assert_looks_right(path)
 
 
-@pytest.mark.long
 @pytest.mark.usefixtures("robot_models")
 @pytest.mark.parametrize("demo", ["handover", "aloha", "iiwa", "soft", "cloth"])
 def test_demos_are_seen_without_errors(demo: str, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from iris_session.authority import AuthorityConfig
 from iris_session.control import ControlConfig
 from iris_session.demo.scenes import n_arms_scene, scene_path
-from iris_session.physics import decode_model, find_objects, find_robots, load_model
+from iris_session.physics import decode_model, find_objects, find_robots
 from iris_session.physics.carrier import Carrier
 from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.protocol.common import Pose
@@ -35,8 +35,8 @@ from iris_session.replay.pictures import (
     open_gl,
 )
 from iris_session.session.core import CoreConfig, SessionCore
-from tests.replay.support import KEYFRAME_STEPS, Played, damaged, play, scene_model, step_ns
-from tests.session.play import host, make_core
+from tests.replay.support import KEYFRAME_STEPS, Played, damaged, make_drawn_core, play, scene_model, step_ns
+from tests.session.play import host
 
 STEPS = 70
 WIDTH, HEIGHT = 160, 120
@@ -45,7 +45,7 @@ SMALL = PictureOptions(WIDTH, HEIGHT, "operator")
 
 @pytest.fixture(scope="module")
 def played(tmp_path_factory: pytest.TempPathFactory) -> Played:
-    made = play(tmp_path_factory.mktemp("played") / "session.rrd", STEPS)
+    made = play(tmp_path_factory.mktemp("played") / "session.rrd", STEPS, core=make_drawn_core())
     made.write()
     return made
 
@@ -111,7 +111,8 @@ def assert_same(found: Sequence[Image], expected: Sequence[Image]) -> None:
 
 @pytest.mark.parametrize("recording_class", ["closed", OPEN])
 def test_pictures_are_those_of_mujoco(recording_class: str, tmp_path: Path, reference: Reference) -> None:
-    played = play(tmp_path / "session.rrd", STEPS, recording_class=recording_class)
+    core = make_drawn_core(user_owned_loop=recording_class == OPEN)
+    played = play(tmp_path / "session.rrd", STEPS, recording_class=recording_class, core=core)
     steps = [0, 30, STEPS - 1]
     found = draw(played.write(), steps)
     assert_same(found, [reference(played.core.world.model, played.qpos[step]) for step in steps])
@@ -119,7 +120,7 @@ def test_pictures_are_those_of_mujoco(recording_class: str, tmp_path: Path, refe
 
 
 def test_deformables_are_those_of_mujoco(tmp_path: Path, reference: Reference) -> None:
-    core = make_core(load_model(scene_path("cloth")))
+    core = make_drawn_core("cloth")
     played = play(tmp_path / "session.rrd", 45, core=core, make_entries=lambda step: [])
     steps = [0, 44]
     found = draw(played.write(), steps)
@@ -133,7 +134,7 @@ def test_scene_that_was_loaded_later_is_drawn(tmp_path: Path, reference: Referen
     at = 45
     arms = n_arms_scene(3, objects=3).compile()
     scene = SceneLoaded(compute_scene_hash(encode_model(arms)), find_robots(arms), find_objects(arms))
-    first = make_core()
+    first = make_drawn_core()
     core = SessionCore(first.world.model, first.config, lambda _: decode_model(bytes(encode_model(arms))))
 
     def change(step: int) -> Sequence[Entry]:
@@ -158,9 +159,11 @@ def test_scene_that_was_loaded_later_is_drawn(tmp_path: Path, reference: Referen
 
 def patched(tmp_path: Path, *ops: Any) -> Played:
     patch = ScenePatched(ops, "0" * 64)
-    made = play(
-        tmp_path / "session.rrd", 30, make_entries=lambda step: [host(step_ns(step), patch)] if step == 10 else []
-    )
+
+    def make_entries(step: int) -> Sequence[Entry]:
+        return [host(step_ns(step), patch)] if step == 10 else []
+
+    made = play(tmp_path / "session.rrd", 30, core=make_drawn_core(), make_entries=make_entries)
     made.write()
     return made
 
@@ -172,7 +175,7 @@ def ball(number: int, kind: str = "sphere", mesh: int = -1, group: int = 0) -> V
 
 
 def test_patched_visuals_are_drawn(tmp_path: Path, reference: Reference) -> None:
-    model = copy.copy(make_core().world.model)
+    model = copy.copy(make_drawn_core().world.model)
     grip, board, table = (model.geom(name).id for name in ("hammer_grip", "board", "table_top"))
     moved = Pose((0.0, 0.0, 0.1), (0.0, 1.0, 0.0, 0.0))
     played = patched(
@@ -198,7 +201,8 @@ def test_added_visuals_are_drawn_and_those_with_meshes_of_their_own_are_noted(
         type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(0.1, 0.1, 0.1), pos=(0.0, -0.2, 0.2), rgba=(1.0, 0.0, 0.0, 1.0)
     )
     with_ball = spec.compile()
-    n = make_core().world.model.ngeom
+    with_ball.vis.quality.shadowsize, with_ball.vis.quality.offsamples = 64, 0
+    n = with_ball.ngeom - 1
     played = patched(tmp_path, AddVisual(ball(n)), AddVisual(ball(n + 1, "mesh", 7)), AddVisual(ball(n + 2, group=4)))
     found, made = draw_times(played.path, [step_ns(29)])
     assert_same(found, [reference(with_ball, played.qpos[29])])
@@ -230,7 +234,7 @@ def test_a_picture_shows_the_newest_step_at_its_time(played: Played) -> None:
 
 
 def test_the_last_picture_stays_where_steps_are_left_out(tmp_path: Path) -> None:
-    gap = play(tmp_path / "session.rrd", STEPS)
+    gap = play(tmp_path / "session.rrd", STEPS, core=make_drawn_core())
     intact = draw(gap.write(), [24, 45])
     gap.path.unlink()
     gap.batch.rows[25] = damaged(gap.batch.rows[25])
