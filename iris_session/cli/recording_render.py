@@ -250,13 +250,17 @@ def _write_video(path: Path, images: Iterator[Image], n_images: int, size: tuple
         raise CommandError(
             "this OpenCV writes no video: pip install opencv-python-headless, which brings its codecs, or give a .gif"
         )
+
+    def encode(image: Image) -> None:
+        writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+
     try:
         with ThreadPoolExecutor(1) as encoder:  # a picture is encoded while the next one is drawn
             encoded: Future[None] | None = None
             for image in images:
                 if encoded is not None:
                     encoded.result()
-                encoded = encoder.submit(writer.write, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+                encoded = encoder.submit(encode, image)
     finally:
         writer.release()
     written = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)  # the writer says nothing about a full disk

@@ -43,6 +43,8 @@ MOMENTS: Final = 500
 MOST_POSES: Final = 20_000
 #: Geoms besides those of the model: marks of MuJoCo, added visuals, people.
 MORE_GEOMS: Final = 10_000
+#: Half side of a box around a head or a hand [m].
+PERSON_M: Final = 0.12
 #: Presence older than this is not drawn: its device is not tracked any more [ns].
 PRESENCE_NS: Final = 250_000_000
 #: A group of geoms that MuJoCo does not show by default.
@@ -191,7 +193,8 @@ class RecordingPictures:
             ReplayError: A step gives another result here than in the recording.
         """
         if not self._options.camera:
-            self._views = _read_reach(self._recording, times_ns[0], times_ns[-1])
+            people = self._options.people
+            self._views = _read_reach(self._recording, times_ns[0], times_ns[-1], with_people=people)
         waiting = iter(times_ns)
         time_ns = next(waiting, None)
         image: Image | None = None
@@ -268,12 +271,14 @@ class _Reach:
     """Places of the moving bodies of a scene in a span of time.
 
     `poses`: in the world at each moment, shape (n, 7), `x y z qw qx qy qz`, [m]. Without any: where they are now.
+    `people`: corners of boxes around heads and hands, each of shape (8, 3) [m].
     """
 
     def __init__(self, bodies: Sequence[BodyInfo]) -> None:
         self.rows = [i for i, body in enumerate(bodies) if body.moving]
         self.ids = [bodies[i].id for i in self.rows]
         self.poses: list[Floats] = []
+        self.people: list[Floats] = []
 
     def make_camera(self, core: SessionCore, aspect: float) -> mujoco.MjvCamera:
         """Return a camera that sees all of it in a picture of that `aspect`, width by height."""
@@ -283,18 +288,18 @@ class _Reach:
         poses = np.array(self.poses or [np.hstack([data.xpos[self.ids], data.xquat[self.ids]])])
         corners = np.array([_list_corners(model, body) for body in self.ids]).reshape(1, -1, 8, 3)
         at = (poses[..., None, :3] + _rotate(poses[..., None, 3:], corners)).reshape(-1, 3)
-        if model.nflex:
-            at = np.vstack([at, data.flexvert_xpos])
+        at = np.vstack([at, *self.people, *([data.flexvert_xpos] if model.nflex else ())])
         at = at[np.isfinite(at).all(axis=1)]
         if not len(at):
             return camera
         low, high = _limit(at)
-        centre, half = (low + high) / 2.0, np.maximum((high - low) / 2.0, MIN_HALF_M)
+        centre = (low + high) / 2.0
+        at = np.vstack([np.clip(at, low, high), centre + MIN_HALF_M * _CORNERS])
         forward = -np.array(EYE) / np.linalg.norm(EYE)
         right = np.cross(forward, (0.0, 0.0, 1.0))
         right /= np.linalg.norm(right)
         axes = np.array([right, np.cross(right, forward), forward])
-        seen = half * _CORNERS @ axes.T  # of the corners of the box: to the right, upward, away
+        seen = (at - centre) @ axes.T  # to the right, upward, away
         slope = math.tan(math.radians(model.vis.global_.fovy) / 2.0) * FILLED
         needed = np.maximum(np.abs(seen[:, 0]) / aspect, np.abs(seen[:, 1])) / slope - seen[:, 2]
         camera.lookat, camera.distance = centre, float(needed.max())
@@ -336,7 +341,9 @@ def _rotate(q: Floats, p: Floats) -> Floats:
     return rotated
 
 
-def _read_reach(recording: Recording, begin_ns: int, end_ns: int) -> dict[tuple[BodyInfo, ...], _Reach]:
+def _read_reach(
+    recording: Recording, begin_ns: int, end_ns: int, *, with_people: bool
+) -> dict[tuple[BodyInfo, ...], _Reach]:
     """Return the moving bodies of each scene in a span of time, at some moments, as the recorded states have them."""
     found: dict[tuple[BodyInfo, ...], _Reach] = {}
     bodies: tuple[BodyInfo, ...] = ()
@@ -349,6 +356,7 @@ def _read_reach(recording: Recording, begin_ns: int, end_ns: int) -> dict[tuple[
         if state.session_time >= due_ns:
             reach = found.setdefault(bodies, _Reach(bodies))
             reach.poses.append(state.poses[reach.rows])
+            reach.people += [np.array(one.pose.p) + PERSON_M * _CORNERS for one in state.presence if with_people]
             moments = max(1, min(MOMENTS, MOST_POSES // max(1, len(reach.rows))))
             due_ns = state.session_time + (end_ns - begin_ns) // moments
     return found
