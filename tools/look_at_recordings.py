@@ -29,6 +29,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from iris_session.recording.blueprint import BACKGROUND
 from iris_session.recording.paths import STATE_ENTITIES
 from iris_session.recording.rerun_tool import find_rerun, make_environment
 from iris_session.recording.rrd_file import read_chunks
@@ -40,8 +41,9 @@ START_S: Final = 60.0
 #: Until a file is read, and until the picture of a time is complete [s]: drawn in software on a busy machine.
 LOAD_S: Final = 120.0
 SETTLE_S: Final = 120.0
-#: Frames that the viewer draws between two looks.
+#: Frames that the viewer draws between two looks, and equal pictures in a row of one that is complete.
 FRAMES: Final = 3
+EQUAL: Final = 3
 SESSION_TIME: Final = "session_time"
 #: Of 255: a pixel that differs by more shows something.
 DIFFERENT: Final = 12
@@ -195,8 +197,11 @@ class HeadlessViewer:
         """Change some fields of the arrangement of views."""
         self.call("rerun_set_blueprint", json=json.dumps(changes), recording={}, mode="partial")
 
-    def take_picture(self, view: str = "") -> Image:
-        """Return the picture of a view, or of the whole window, when it does not change any more: (h, w, 3), BGR."""
+    def take_picture(self, view: str = "", is_ready: Callable[[Image], bool] = lambda image: True) -> Image:
+        """Return the picture of a view, or of the whole window, when it does not change any more: (h, w, 3), BGR.
+
+        `is_ready`: whether a picture may be complete; data are read while others are drawn.
+        """
         options = {"view_id": view} if view else {}
         last: list[Image] = []
 
@@ -206,11 +211,14 @@ class HeadlessViewer:
                 self.call("rerun_save_screenshot", file_path=str(path), max_size=0, **options)
             except ViewerError:  # on a busy machine it is not drawn within the time that the viewer allows
                 return False
-            last.append(np.asarray(cv2.imread(str(path)), np.uint8))
-            return len(last) > 1 and last[-1].shape == last[-2].shape and bool((last[-1] == last[-2]).all())
+            image = np.asarray(cv2.imread(str(path)), np.uint8)
+            if last and (last[-1].shape != image.shape or (last[-1] != image).any()):
+                last.clear()
+            last.append(image)
+            return len(last) >= EQUAL and is_ready(image)
 
         self.call("wait_for", min_steps=FRAMES, timeout_secs=30)
-        self._wait(settle, SETTLE_S, "the picture stays the same")
+        self._wait(settle, SETTLE_S, "the picture is complete")
         return last[-1]
 
     def close(self) -> None:
@@ -270,9 +278,9 @@ def _look(viewer: HeadlessViewer, path: Path, shown: Path, pictures: Path | None
     for name, time_ns in (("first", begin_ns), ("middle", (begin_ns + end_ns) // 2), ("last", end_ns)):
         if time_ns != begin_ns:  # it opens at the first
             viewer.set_time(time_ns)
-        picture = viewer.take_picture()
         if first is None:
-            first = viewer.take_picture(scene)
+            first = _take_first(viewer, scene)
+        picture = viewer.take_picture()
         if pictures is not None:
             pictures.mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(pictures / f"{name}.png"), picture)
@@ -280,7 +288,8 @@ def _look(viewer: HeadlessViewer, path: Path, shown: Path, pictures: Path | None
     assert first is not None
     problems += _look_at_tabs(viewer)
     viewer.set_time(begin_ns)
-    filled, width = _measure(viewer, scene, list_moving(shown), first)
+    filled = float(_find_shown(first).mean())
+    width = _measure_width(viewer, scene, list_moving(shown), first)
     if filled < LEAST_FILLED:
         problems.append(f"the 3D picture is empty at the first time: {filled:.1%} of it show something")
     if width < LEAST_WIDTH:
@@ -314,16 +323,23 @@ def _look_at_tabs(viewer: HeadlessViewer) -> Iterator[str]:
         yield from _list_reports(viewer, f"in tab {i + 1}")
 
 
-def _measure(viewer: HeadlessViewer, scene: str, moving: Sequence[str], first: Image) -> tuple[float, float]:
-    """Return the share of the pixels that show something, and of the width that bodies that move take."""
-    contents = f"/view/{scene}/ViewContents"
-    viewer.set_blueprint({contents: {"ViewContents": {"query": ["- /**"]}}})
-    empty = viewer.take_picture(scene)
-    viewer.set_blueprint({contents: {"ViewContents": {"query": [f"+ {entity}/**" for entity in moving] or ["- /**"]}}})
-    bodies = viewer.take_picture(scene)
-    columns = np.flatnonzero(_differs(bodies, empty).sum(axis=0) > 1)
-    width = (columns[-1] - columns[0] + 1) / empty.shape[1] if len(columns) else 0.0
-    return float(_differs(first, empty).mean()), float(width)
+def _take_first(viewer: HeadlessViewer, scene: str) -> Image:
+    """Return the 3D picture when it shows something, or an empty one if it does not."""
+    try:
+        return viewer.take_picture(scene, lambda image: float(_find_shown(image).mean()) >= LEAST_FILLED)
+    except ViewerError:
+        return viewer.take_picture(scene)
+
+
+def _measure_width(viewer: HeadlessViewer, scene: str, moving: Sequence[str], first: Image) -> float:
+    """Return the share of the width of the 3D view that bodies that move take, by hiding all others."""
+    if not moving:
+        return 0.0
+    query = [f"+ {entity}/**" for entity in moving]
+    viewer.set_blueprint({f"/view/{scene}/ViewContents": {"ViewContents": {"query": query}}})
+    bodies = viewer.take_picture(scene, lambda image: image.shape == first.shape and bool((image != first).any()))
+    columns = np.flatnonzero(_find_shown(bodies).sum(axis=0) > 1)
+    return float(columns[-1] - columns[0] + 1) / bodies.shape[1] if len(columns) else 0.0
 
 
 def list_moving(path: Path) -> list[str]:
@@ -335,9 +351,9 @@ def list_moving(path: Path) -> list[str]:
     return sorted(found)
 
 
-def _differs(image: Image, other: Image) -> NDArray[np.bool_]:
-    """Return where two pictures differ, shape (height, width)."""
-    found: NDArray[np.bool_] = np.abs(image.astype(np.int16) - other).max(axis=2) > DIFFERENT
+def _find_shown(image: Image) -> NDArray[np.bool_]:
+    """Return where a 3D picture shows something, shape (height, width)."""
+    found: NDArray[np.bool_] = np.abs(image.astype(np.int16) - BACKGROUND[::-1]).max(axis=2) > DIFFERENT
     return found
 
 
