@@ -44,6 +44,8 @@ SETTLE_S: Final = 120.0
 #: Frames that the viewer draws between two looks, and equal pictures in a row of one that is complete.
 FRAMES: Final = 3
 EQUAL: Final = 3
+#: Frames that a tab is shown for.
+TAB_FRAMES: Final = 10
 SESSION_TIME: Final = "session_time"
 #: Of 255: a pixel that differs by more shows something.
 DIFFERENT: Final = 12
@@ -128,10 +130,10 @@ class HeadlessViewer:
                 return
 
     def _raise_ended(self) -> None:
-        words = " ".join(self._words.read_text(errors="replace").split())[-600:]
-        if re.search(r"adapter|vulkan|wgpu|graphics", words, re.IGNORECASE):
-            raise MissingViewerError(f"no Vulkan for Rerun's viewer (Debian: mesa-vulkan-drivers): {words}")
-        raise ViewerError(f"the viewer ended: {words}")
+        words = " ".join(self._words.read_text(errors="replace").split())
+        if found := re.search(r"[^.:]{0,80}(adapter|vulkan|wgpu|render context)[^.:]{0,80}", words, re.IGNORECASE):
+            raise MissingViewerError(f"no Vulkan for Rerun's viewer (Debian: mesa-vulkan-drivers): {found[0].strip()}")
+        raise ViewerError(f"the viewer ended: {words[:600]}")
 
     def _send(self, message: Mapping[str, Any]) -> None:
         assert self._control.stdin is not None
@@ -319,7 +321,7 @@ def _look_at_tabs(viewer: HeadlessViewer) -> Iterator[str]:
             if i < len(contents)
         }
         viewer.set_blueprint(chosen)
-        viewer.take_picture()
+        viewer.call("wait_for", min_steps=TAB_FRAMES, timeout_secs=30)
         yield from _list_reports(viewer, f"in tab {i + 1}")
 
 
