@@ -59,11 +59,16 @@ install-dev: $(VENV)/.installed-dev
 demo: install $(PAGE)
 	@$(BIN)/iris-session demo handover
 
-# OpenGL without a display (Debian: libegl1 libgl1-mesa-dri), and a browser (Debian: chromium).
+# OpenGL and Vulkan without a display (Debian: libegl1 libgl1-mesa-dri mesa-vulkan-drivers), a browser (chromium).
 screenshots: install-dev $(PAGE)
 	@folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && \
 	$(BIN)/iris-session demo handover --record "$$folder/session.rrd" && \
-	MUJOCO_GL=egl $(BIN)/python tools/render_recording.py "$$folder/session.rrd" docs/img/handover.gif --size 720 430
+	at=$$($(BIN)/iris-session recording inspect "$$folder/session.rrd" --json | \
+	  $(BIN)/python -c 'import json, sys; print(int(json.load(sys.stdin)["handovers"][0]["at_s"]))') && \
+	$(BIN)/iris-session recording render "$$folder/session.rrd" -o docs/img/handover.gif --force --people \
+	  --from $$((at > 7 ? at - 7 : 0)) --to $$((at + 3)) --speed 2 --fps 12 --size 720x430 && \
+	PYTHONPATH=. $(BIN)/python tools/look_at_recordings.py "$$folder/session.rrd" --pictures "$$folder" && \
+	cp "$$folder/middle.png" docs/img/viewer.png
 	@PYTHONPATH=. $(BIN)/python tools/page_screenshots.py docs/img
 
 check: install-dev
@@ -103,9 +108,10 @@ test-unit: install-dev
 
 # Emulated people need their share of the cores in time, or they drop what they hold: not beside all the others.
 DEMOS := tests/e2e/test_demo_scenes.py tests/e2e/test_demo_handover.py
-# A browser that draws in software takes both cores, drawn cameras one: their tests run after those with real time.
+# A browser or viewer that draws in software takes both cores, drawn cameras one: their tests run after those with real
+# time.
 BROWSER := tests/e2e/test_web.py tests/e2e/test_web_xr.py tests/e2e/test_web_marks.py tests/e2e/test_web_desktop.py \
-  tests/e2e/test_clouds.py tests/e2e/test_demo_cloud.py tests/bench/test_web.py
+  tests/e2e/test_clouds.py tests/e2e/test_demo_cloud.py tests/e2e/test_looks.py tests/bench/test_web.py
 test-e2e: install-dev $(PAGE)
 ifeq ($(T),tests)
 	$(E2E) --dist load $(DEMOS)

@@ -6,9 +6,11 @@ import argparse
 import json
 import math
 import re
+import signal
 import socket
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -44,6 +46,17 @@ def write_file(path: Path, content: bytes | str) -> None:
         write_output(path, content.encode() if isinstance(content, str) else content)
     except OSError as error:
         raise CommandError(f"{path} cannot be written: {error.strerror}") from error
+
+
+@contextmanager
+def ending_as_interrupts() -> Iterator[None]:
+    """Take SIGTERM and a closed terminal as Ctrl-C, so that nothing is left behind."""
+    before = {number: signal.signal(number, signal.default_int_handler) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def list_expected_errors() -> tuple[type[Exception], ...]:

@@ -54,6 +54,7 @@ _EPILOG = """examples:
   iris-session verify sessions/*/session.rrd re-simulate a recording and compare it bit for bit
   iris-session recording inspect sessions    what recordings hold: who, what, how long, damage
   iris-session recording export session.rrd --to csv -o tables
+  iris-session recording render session.rrd -o session.mp4
   iris-session bench state --check           measure the state stream and compare it with its bars
 """
 
@@ -94,7 +95,7 @@ def _run_command(argv: list[str] | None) -> int:
     try:
         configure_logging()
         arguments = build_parser().parse_args(join_negative_poses(sys.argv[1:] if argv is None else argv))
-        os.environ.setdefault("MUJOCO_GL", "disable")  # no command draws: MuJoCo need not load OpenGL, in no process
+        os.environ.setdefault("MUJOCO_GL", "disable")  # MuJoCo need not load OpenGL: what draws loads it by itself
         if LEVEL_VARIABLE not in os.environ:
             # `serve` and `demo` show restarts, gaps and overruns as events. The log would repeat them, from the thread
             # that takes steps, which must not wait for a terminal.

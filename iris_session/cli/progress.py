@@ -1,4 +1,4 @@
-"""Progress of reading a recording, as a line in a terminal."""
+"""Progress of work on a recording, as a line in a terminal."""
 
 from __future__ import annotations
 
@@ -59,3 +59,27 @@ class ReadingProgress:
 
     def __exit__(self, *_: object) -> None:
         self.end()
+
+
+class ProgressLine:
+    """A line on standard error, where that is a terminal, that says how far the work on a file is."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = to_printable(str(path))
+        self._shows = sys.stderr.isatty()
+        self._shown = False
+        self._due_s = 0.0
+
+    def show(self, text: str) -> None:
+        """Show a text in place of the last one."""
+        if self._shows and time.monotonic() >= self._due_s:
+            self._due_s = time.monotonic() + PROGRESS_PERIOD_S
+            self._shown = True
+            print(f"\r\x1b[K{self._path}: {text}", end="", file=sys.stderr, flush=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._shown:
+            print(file=sys.stderr)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from iris_session.cli import recording_export, recording_repair
+from iris_session.cli import recording_export, recording_render, recording_repair
 from iris_session.cli.common import CommandError, add_json_option, print_json, to_printable
 from iris_session.cli.progress import ReadingProgress
 
@@ -30,12 +30,13 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     """Add the command `recording`."""
     parser = commands.add_parser(
         "recording",
-        help="show what a recording holds, export it as tables, repair it",
-        description="Show what a recording holds, export it as tables, or repair it.",
+        help="show what a recording holds, export it as tables, make a film of it, repair it",
+        description="Show what a recording holds, export it as tables, make a film or a picture of it, or repair it.",
         epilog="examples:\n"
         "  iris-session recording inspect sessions/20261121T093000.000000Z-handover/session.rrd\n"
         "  iris-session recording inspect sessions\n"
         "  iris-session recording export session.rrd --to csv -o tables\n"
+        "  iris-session recording render session.rrd -o session.mp4\n"
         "  iris-session recording repair session.rrd -o repaired.rrd",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -56,6 +57,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     add_json_option(inspect)
     inspect.set_defaults(run=run_inspect)
     recording_export.register(actions)
+    recording_render.register(actions)
     recording_repair.register(actions)
 
 

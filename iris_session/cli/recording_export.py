@@ -5,14 +5,12 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-import time
 from pathlib import Path
 from typing import Final
 
 from iris_session.cli.common import CommandError, add_json_option, print_json, to_printable
+from iris_session.cli.progress import ProgressLine
 
-#: Least time between two lines of progress [s].
-PROGRESS_PERIOD_S: Final = 0.2
 DEFAULT_HZ: Final = 100.0
 #: What `--to` may be: formats of tables, and the other thing that is exported.
 FORMATS: Final = ("csv", "parquet", "npz")
@@ -92,12 +90,8 @@ def run_export(arguments: argparse.Namespace) -> int:
         tuple(arguments.object),
         arguments.force,
     )
-    progress = _Progress(arguments.path)
-    try:
-        with SessionRecording.open(arguments.path, warn=False) as recording:
-            report = export_recording(recording, arguments.out, arguments.to, options, progress.show)
-    finally:
-        progress.end()
+    with ProgressLine(arguments.path) as progress, SessionRecording.open(arguments.path, warn=False) as recording:
+        report = export_recording(recording, arguments.out, arguments.to, options, progress.show)
     if arguments.json:
         print_json(msgspec.to_builtins(report))
     else:
@@ -119,12 +113,8 @@ def _export_assets(arguments: argparse.Namespace) -> int:
     given = [f"--{name}" for name in ("hz", "robot", "object", "table") if getattr(arguments, name)]
     if given:
         raise CommandError(f"{', '.join(given)} choose tables: leave them out with --to {ASSETS}")
-    progress = _Progress(arguments.path)
-    try:
-        with Recording.open(arguments.path, warn=False) as recording:
-            report = export_assets(recording, arguments.out, force=arguments.force, progress=progress.show)
-    finally:
-        progress.end()
+    with ProgressLine(arguments.path) as progress, Recording.open(arguments.path, warn=False) as recording:
+        report = export_assets(recording, arguments.out, force=arguments.force, progress=progress.show)
     if arguments.json:
         print_json(msgspec.to_builtins(report))
     else:
@@ -141,25 +131,3 @@ def _report_damage(path: Path, problems: list[str]) -> int:
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         print(to_printable(f"iris-session: {path} is damaged: {problems[0]}{more}"), file=sys.stderr)
     return 1 if problems else 0
-
-
-class _Progress:
-    """A line on standard error that says how far an export is, where that is a terminal."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = to_printable(str(path))
-        self._shows = sys.stderr.isatty()
-        self._shown = False
-        self._due_s = 0.0
-
-    def show(self, text: str) -> None:
-        """Show a text in place of the last one."""
-        if self._shows and time.monotonic() >= self._due_s:
-            self._due_s = time.monotonic() + PROGRESS_PERIOD_S
-            self._shown = True
-            print(f"\r\x1b[K{self._path}: {text}", end="", file=sys.stderr, flush=True)
-
-    def end(self) -> None:
-        """End the line."""
-        if self._shown:
-            print(file=sys.stderr)

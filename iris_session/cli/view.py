@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, TextIO
 from urllib.parse import quote
 
-from iris_session.cli.common import CommandError, to_printable
+from iris_session.cli.common import CommandError, ending_as_interrupts, to_printable
 from iris_session.cli.progress import ReadingProgress
 from iris_session.cli.recording import find_recordings
 
@@ -89,7 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
     path = choose_recording(arguments.path)
     if arguments.live:
         return _show_live(tool, arguments, path)
-    with _ending_as_interrupts(), ReadingProgress(path) as progress, open_view_file(path, progress.show_bytes) as view:
+    with ending_as_interrupts(), ReadingProgress(path) as progress, open_view_file(path, progress.show_bytes) as view:
         progress.end()
         _print_file(view)
         if arguments.no_open and not arguments.web:
@@ -107,7 +106,7 @@ def _show_live(tool: str, arguments: argparse.Namespace, path: Path) -> int:
         raise CommandError(f"no session is writing {path}: leave --live out")
     os.nice(LIVE_NICE)  # the session comes first
     print(f"follows {to_printable(str(path))} until the session ends", flush=True)
-    with _ending_as_interrupts():
+    with ending_as_interrupts():
         return _show(tool, arguments, None, path)
 
 
@@ -246,17 +245,6 @@ def _wait(process: subprocess.Popen[bytes]) -> int:
     if status:
         raise CommandError(f"Rerun's viewer ended with exit status {status}: its messages are above", 1)
     return 0
-
-
-@contextmanager
-def _ending_as_interrupts() -> Iterator[None]:
-    """Take SIGTERM and a closed terminal as Ctrl-C, so that nothing is left behind."""
-    before = {number: signal.signal(number, signal.default_int_handler) for number in (signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextmanager

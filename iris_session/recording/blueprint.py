@@ -15,8 +15,10 @@ from iris_session.recording.messages import RobotLabels
 from iris_session.recording.plots import GRIPPER, JOINTS, KINDS, TIP_SPEED, get_robot_entity
 from iris_session.recording.story import CRITICAL, ERROR, INFO, WARN
 
-#: Eye of the 3D view: offset from the centre of the bodies, in halves of the diagonal of their box; least half [m].
-EYE: Final = 1.45 * np.array((0.25, -1.75, 0.95))
+#: Eye of the 3D view, from the point that it looks at; this point, from the centre of the box of the bodies: below, so
+#: that people in front of them are seen too. Both in halves of the diagonal of the box, which is at least so long [m].
+EYE: Final = 1.27 * np.array((0.25, -1.75, 0.95))
+BELOW: Final = np.array((0.0, 0.0, -0.15))
 MIN_SIZE_M: Final = 0.3
 BACKGROUND: Final = (205, 214, 224)
 
@@ -29,7 +31,8 @@ def place_eye(positions: NDArray[np.float64]) -> Any:
     low, high = np.percentile(known, (1.0, 99.0), axis=0)  # a few bodies may be parked far away
     centre = (low + high) / 2.0
     size_m = max(float(np.linalg.norm(high - low)) / 2.0, MIN_SIZE_M)
-    return rrb.EyeControls3D(position=centre + size_m * EYE, look_target=centre, eye_up=(0.0, 0.0, 1.0))
+    target = centre + size_m * BELOW
+    return rrb.EyeControls3D(position=target + size_m * EYE, look_target=target, eye_up=(0.0, 0.0, 1.0))
 
 
 def build_blueprint(eye: Any, pictures: Sequence[str] = (), robots: Sequence[RobotLabels] = ()) -> Any:

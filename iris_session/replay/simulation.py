@@ -83,8 +83,11 @@ class Replay:
     def core(self) -> SessionCore:
         return self._replay.core
 
-    def steps(self) -> Iterator[ReplayedStep]:
+    def steps(self, after: int | None = None) -> Iterator[ReplayedStep]:
         """Take the steps again, and yield each.
+
+        Args:
+            after: Begin at the newest keyframe up to this step; None begins at the first step.
 
         Raises:
             ReplayError: A step cannot be taken again, or gives another result here.
@@ -94,7 +97,10 @@ class Replay:
         last, follows = header.begins_after, header.continues is None
         total = 0 if end is None else max(0, end.step - header.begins_after)
         keyframes = _KeyframeFinder(self._recording)
-        for done, row in enumerate(self._recording.rows()):
+        if after is not None and (newest := keyframes.find_newest(after)) is not None and newest.step > last:
+            self._restore(newest)
+            total, last, follows = max(0, total - (newest.step - last)), newest.step, True
+        for done, row in enumerate(self._recording.rows(last if after is not None else None)):
             if done % PROGRESS_STEPS == 0:
                 self._progress(done, total)
             if check_fields(row) is not None:  # its number may be what was changed
@@ -180,6 +186,15 @@ class _KeyframeFinder:
         while self._next is not None and (self._next.step < step or check_keyframe(self._next)):
             self._next = next(self._keyframes, None)
         return self._next if self._next is not None and self._next.step == step else None
+
+    def find_newest(self, step: int) -> Keyframe | None:
+        """Return the newest keyframe up to `step`, if there is one."""
+        found = None
+        while self._next is not None and self._next.step <= step:
+            if not check_keyframe(self._next):
+                found = self._next
+            self._next = next(self._keyframes, None)
+        return found
 
 
 class StepSelector:

@@ -30,12 +30,14 @@ class Replacement:
         self._durable = durable
         # The umask belongs to all threads, so the system applies it: it is not read by changing it for a moment.
         mode = 0o666 if permissions is None else 0o600
-        descriptor, self._temporary = _create_file(path.parent, f".{path.name[:100]}-", suffix, mode)
+        #: Where the new content is until `commit`, for libraries that write to a path.
+        self.temporary: Path
+        descriptor, self.temporary = _create_file(path.parent, f".{path.name[:100]}-", suffix, mode)
         self._is_pending = True
         self.file: BinaryIO = os.fdopen(descriptor, "wb")
         if permissions is not None and permissions != 0o600:
             try:
-                os.chmod(self._temporary, permissions)
+                os.chmod(self.temporary, permissions)
             except BaseException:
                 self.discard()
                 raise
@@ -56,7 +58,7 @@ class Replacement:
         """
         try:
             self.finish()
-            os.replace(self._temporary, self.path)
+            os.replace(self.temporary, self.path)
             self._is_pending = False
         except BaseException:
             self.discard()
@@ -69,7 +71,7 @@ class Replacement:
         self._is_pending = False
         with suppress(OSError):
             self.file.close()
-        self._temporary.unlink(missing_ok=True)
+        self.temporary.unlink(missing_ok=True)
 
     def __enter__(self) -> Self:
         return self

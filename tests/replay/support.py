@@ -11,7 +11,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.physics.load import encode_model
+from iris_session.demo.scenes import scene_path
+from iris_session.physics.load import encode_model, load_model
 from iris_session.protocol.entries import Entry
 from iris_session.recording import CLOSED, OPEN, Continues, JournalRow, Keyframe, SessionHeader, header_root, make_row
 from iris_session.recording.journal import pack_model, seal_keyframe
@@ -64,6 +65,13 @@ class Played:
             writer.add(Batch(rows=[row], keyframes=after, events=events, scenes=loaded))
         writer.close()
         return self.path
+
+
+def make_drawn_core(scene: str = "handover", **authority: object) -> SessionCore:
+    """Make a core of a scene that is drawn quickly in software: with coarse shadows, without smooth edges."""
+    model = load_model(scene_path(scene))
+    model.vis.quality.shadowsize, model.vis.quality.offsamples = 64, 0
+    return make_core(model, **authority)
 
 
 def make_header(core: SessionCore, recording_class: str, continues: Continues | None = None) -> SessionHeader:

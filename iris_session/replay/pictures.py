@@ -1,0 +1,531 @@
+"""Pictures of a recording: the state of a replayed step, drawn by MuJoCo's own renderer, without a display.
+
+A picture shows the newest step at its time, exactly as MuJoCo draws that state: nothing is interpolated. Patches of the
+scene are drawn as far as MuJoCo can: see `_Look`. Not here: encoding and files (`cli.recording_render`).
+"""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import math
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from types import TracebackType
+from typing import Any, Final, NamedTuple, Self
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.protocol.common import Pose
+from iris_session.protocol.names import Device
+from iris_session.protocol.scene import AddMaterial, AddVisual, Material, PatchOp, RemoveVisual, SetVisual, Visual
+from iris_session.protocol.server_messages import BodyInfo, PresenceItem, SceneChanged
+from iris_session.recording import Recording, RecordingError
+from iris_session.recording.record_batches import RowTimes
+from iris_session.recording.story import SessionStory
+from iris_session.replay.simulation import Replay
+from iris_session.session.core import SessionCore
+
+Image = NDArray[np.uint8]
+Floats = NDArray[np.float64]
+
+#: Direction of the default view, from the bodies to the eye: in front and above, as in the Rerun viewer.
+EYE: Final = (0.25, -1.75, 0.95)
+#: Share of the picture's height and width that the bodies take at most.
+FILLED: Final = 0.9
+#: The least half size of what is shown [m].
+MIN_HALF_M: Final = 0.1
+#: Moments at which the places of bodies are read for it, and poses in all.
+MOMENTS: Final = 500
+MOST_POSES: Final = 20_000
+#: Geoms besides those of the model: marks of MuJoCo, added visuals, people.
+MORE_GEOMS: Final = 10_000
+#: Half side of a box around a head or a hand [m].
+PERSON_M: Final = 0.12
+#: Presence older than this is not drawn: its device is not tracked any more [ns].
+PRESENCE_NS: Final = 250_000_000
+#: A group of geoms that MuJoCo does not show by default.
+HIDDEN_GROUP: Final = mujoco.mjNGROUP - 1
+
+_GEOM: Final = int(mujoco.mjtObj.mjOBJ_GEOM)
+_SHAPES: Final = {
+    kind: getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
+    for kind in ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
+}
+#: Signs of the corners of a box, shape (8, 3).
+_CORNERS: Final = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+_VISOR: Final = (0.10, 0.10, 0.12)
+#: Shapes of a head (x forward) and of a hand: half extents [m], offset in the device's frame [m], whether a visor.
+_HEAD: Final = (
+    ("ellipsoid", (0.085, 0.07, 0.10), (-0.06, 0.0, 0.0), False),
+    ("box", (0.035, 0.065, 0.04), (0.01, 0.0, 0.01), True),
+)
+_HAND: Final = (
+    ("ellipsoid", (0.05, 0.04, 0.025), (0.0, 0.0, 0.0), False),
+    ("ellipsoid", (0.018, 0.018, 0.06), (0.0, 0.0, -0.03), False),
+)
+
+
+class PictureError(RecordingError):
+    """The recording cannot be drawn, or not here."""
+
+
+class PictureOptions(NamedTuple):
+    """Size and content of a picture.
+
+    `camera`: name or number of a camera of the model; empty for a view of all bodies that move. `people`: draw heads
+    and hands of participants, in their colours of the Rerun viewer.
+    """
+
+    width: int = 1280
+    height: int = 720
+    camera: str = ""
+    people: bool = False
+
+
+class Timeline:
+    """Steps of a recording by session time.
+
+    `begin_ns`, `end_ns`: of the first and last step in the file [ns]. Raises `PictureError` if there is none.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        rows = [item for item in recording.outline() if isinstance(item, RowTimes)]
+        steps = np.concatenate([row.steps for row in rows]) if rows else np.empty(0, np.int64)
+        if not len(steps):
+            raise PictureError(f"{recording.files[0]} has no step: there is nothing to draw")
+        self._steps, first = np.unique(steps, return_index=True)  # a part repeats steps of the one before
+        self._times: NDArray[np.int64] = np.concatenate([row.session_times for row in rows])[first]
+        self.begin_ns, self.end_ns = int(self._times[0]), int(self._times[-1])
+
+    def find_step(self, time_ns: int) -> int:
+        """Return the newest step at a time."""
+        return int(self._steps[max(0, int(np.searchsorted(self._times, time_ns, side="right")) - 1)])
+
+    def get_next_ns(self, step: int) -> int | None:
+        """Return the time of the step after `step`, `None` after the last."""
+        after = int(np.searchsorted(self._steps, step, side="right"))
+        return int(self._times[after]) if after < len(self._times) else None
+
+
+def list_cameras(recording: Recording) -> tuple[str, ...]:
+    """Return the names of the cameras of a recording's first scene; one without a name has its number."""
+    return _list_cameras(Replay(recording).core.world.model)
+
+
+def _list_cameras(model: mujoco.MjModel) -> tuple[str, ...]:
+    return tuple(model.camera(i).name or str(i) for i in range(model.ncam))
+
+
+def open_gl(width: int, height: int) -> Any:
+    """Return a current OpenGL context. On Linux it is EGL, which needs no display, unless `MUJOCO_GL` names another.
+
+    Raises:
+        PictureError: There is no OpenGL here.
+    """
+    wanted = os.environ.get("MUJOCO_GL", "").lower()
+    backend = wanted if wanted in ("osmesa", "glfw") else "egl"
+    name = f"mujoco.{backend}" if sys.platform == "linux" else "mujoco.gl_context"
+    try:
+        context = importlib.import_module(name).GLContext(width, height)
+        context.make_current()
+    except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
+        said = " ".join(str(error).split())
+        raise PictureError(
+            f"no OpenGL here ({said}): install libegl1 and Mesa's driver (Debian: libegl1 libgl1-mesa-dri), or "
+            "libosmesa6 with MUJOCO_GL=osmesa"
+        ) from error
+    return context
+
+
+class RecordingPictures:
+    """Pictures of an open recording, drawn while its session is replayed.
+
+    Args:
+        recording: The recording.
+        timeline: Its steps.
+        options: What is shown.
+
+    Attributes:
+        notes: What is not drawn as it was, one line each.
+        left_out: First and last step of each range that is missing or damaged.
+
+    Raises:
+        PictureError: The recording has no model to draw, or there is no OpenGL here.
+    """
+
+    def __init__(self, recording: Recording, timeline: Timeline, options: PictureOptions) -> None:
+        self._recording, self._timeline, self._options = recording, timeline, options
+        patched = any(isinstance(one.body, SceneChanged) and one.body.cause == "patch" for one in recording.events())
+        self._replay = Replay(recording, with_control=patched)  # patches are state of the authority
+        self._artist: _Artist | None = None
+        self._views: dict[tuple[BodyInfo, ...], _Reach] = {}
+        self._people = _PeopleTrack(recording) if options.people else None
+        self._gl: Any = None
+        self.notes: list[str] = []
+
+    @property
+    def left_out(self) -> list[tuple[int, int]]:
+        return self._replay.left_out
+
+    def __enter__(self) -> Self:
+        self._gl = open_gl(self._options.width, self._options.height)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._artist is not None:
+            self._artist.close()
+            self._artist = None
+        self._gl.free()
+
+    def draw(self, times_ns: Sequence[int]) -> Iterator[Image]:
+        """Yield a picture for each of `times_ns`, ascending session times [ns]: uint8, shape (height, width, 3), RGB.
+
+        A picture may be yielded again; do not change it. Where steps are left out, the last one before them is shown.
+
+        Raises:
+            PictureError: The first scene has no such camera, or a scene has nothing to draw.
+            ReplayError: A step gives another result here than in the recording.
+        """
+        if not self._options.camera:
+            people = self._options.people
+            self._views = _read_reach(self._recording, times_ns[0], times_ns[-1], with_people=people)
+        waiting = iter(times_ns)
+        time_ns = next(waiting, None)
+        image: Image | None = None
+        for step in self._replay.steps(self._timeline.find_step(times_ns[0]) - 1):
+            while time_ns is not None and image is not None and time_ns < step.session_time:
+                yield image  # steps before this one are left out
+                time_ns = next(waiting, None)
+            next_ns = self._timeline.get_next_ns(step.step)
+            is_drawn = False
+            while time_ns is not None and (next_ns is None or time_ns < next_ns):
+                if image is None or not is_drawn or self._people is not None:
+                    image, is_drawn = self._draw_core(self._replay.core, time_ns), True
+                yield image
+                time_ns = next(waiting, None)
+            if time_ns is None:
+                return
+        if image is None:
+            raise PictureError(
+                f"{self._recording.files[0]}: no step can be taken again from {times_ns[0] * 1e-9:.2f} s on"
+            )
+        while time_ns is not None:
+            yield image
+            time_ns = next(waiting, None)
+
+    def _draw_core(self, core: SessionCore, time_ns: int) -> Image:
+        """Return a picture of a core as it is now."""
+        if self._artist is None or self._artist.core_model is not core.world.model:
+            self._artist = self._make_artist(core)
+        people = self._people.advance(time_ns) if self._people is not None else ()
+        return self._artist.draw(core.world.data, core.authority.patches, people)
+
+    def _make_artist(self, core: SessionCore) -> _Artist:
+        model, is_first = core.world.model, self._artist is None
+        if self._artist is not None:
+            self._artist.close()
+        if not (model.ngeom or model.nflex or model.nskin):
+            raise PictureError(
+                f"{self._recording.files[0]} is of a published world, whose shapes MuJoCo does not have: "
+                "`iris-session view` shows it"
+            )
+        camera = self._find_camera(model, is_required=is_first)
+        if camera is None:
+            view = self._views.get(core.world.bodies) or _Reach(core.world.bodies)
+            camera = view.make_camera(core, self._options.width / self._options.height)
+        return _Artist(model, camera, self._options, self.notes)
+
+    def _find_camera(self, model: mujoco.MjModel, *, is_required: bool) -> mujoco.MjvCamera | None:
+        """Return the camera of the options in a model; `None` for the view of all that moves."""
+        wanted = self._options.camera
+        if not wanted:
+            return None
+        names = _list_cameras(model)
+        number = names.index(wanted) if wanted in names else int(wanted) if wanted.isdecimal() else -1
+        if not 0 <= number < model.ncam:
+            there_are = ", ".join(map(repr, names)) or "none: leave --camera out"
+            text = f"there is no camera {wanted!r} in the scene, there are {there_are}"
+            if is_required:
+                raise PictureError(text)
+            self._add_note(f"in a scene that was loaded later {text}: the view of all that moves is drawn")
+            return None
+        camera = mujoco.MjvCamera()
+        camera.type, camera.fixedcamid = int(mujoco.mjtCamera.mjCAMERA_FIXED), number
+        return camera
+
+    def _add_note(self, text: str) -> None:
+        if text not in self.notes:
+            self.notes.append(text)
+
+
+# --- the default view -------------------------------------------------------------------------------------------------
+
+
+class _Reach:
+    """Places of the moving bodies of a scene in a span of time.
+
+    `poses`: in the world at each moment, shape (n, 7), `x y z qw qx qy qz`, [m]. Without any: where they are now.
+    `people`: corners of boxes around heads and hands, each of shape (8, 3) [m].
+    """
+
+    def __init__(self, bodies: Sequence[BodyInfo]) -> None:
+        self.rows = [i for i, body in enumerate(bodies) if body.moving]
+        self.ids = [bodies[i].id for i in self.rows]
+        self.poses: list[Floats] = []
+        self.people: list[Floats] = []
+
+    def make_camera(self, core: SessionCore, aspect: float) -> mujoco.MjvCamera:
+        """Return a camera that sees all of it in a picture of that `aspect`, width by height."""
+        camera = mujoco.MjvCamera()
+        model, data = core.world.model, core.world.data
+        mujoco.mjv_defaultFreeCamera(model, camera)
+        poses = np.array(self.poses or [np.hstack([data.xpos[self.ids], data.xquat[self.ids]])])
+        corners = np.array([_list_corners(model, body) for body in self.ids]).reshape(1, -1, 8, 3)
+        at = (poses[..., None, :3] + _rotate(poses[..., None, 3:], corners)).reshape(-1, 3)
+        at = np.vstack([at, *self.people, *([data.flexvert_xpos] if model.nflex else ())])
+        at = at[np.isfinite(at).all(axis=1)]
+        if not len(at):
+            return camera
+        low, high = _limit(at)
+        centre = (low + high) / 2.0
+        at = np.vstack([np.clip(at, low, high), centre + MIN_HALF_M * _CORNERS])
+        forward = -np.array(EYE) / np.linalg.norm(EYE)
+        right = np.cross(forward, (0.0, 0.0, 1.0))
+        right /= np.linalg.norm(right)
+        axes = np.array([right, np.cross(right, forward), forward])
+        seen = (at - centre) @ axes.T  # to the right, upward, away
+        slope = math.tan(math.radians(model.vis.global_.fovy) / 2.0) * FILLED
+        needed = np.maximum(np.abs(seen[:, 0]) / aspect, np.abs(seen[:, 1])) / slope - seen[:, 2]
+        camera.lookat, camera.distance = centre, float(needed.max())
+        camera.azimuth = math.degrees(math.atan2(forward[1], forward[0]))
+        camera.elevation = math.degrees(math.asin(forward[2]))
+        camera.orthographic = 0
+        return camera
+
+
+def _limit(at: Floats) -> tuple[Floats, Floats]:
+    """Return the low and the high corner of a box around points, but for those far away, of bodies that fell off."""
+    near, far = np.percentile(at, (5.0, 95.0), axis=0)
+    reach = max(2.0 * float(np.linalg.norm(far - near)), 10.0 * MIN_HALF_M)
+    return np.maximum(at.min(axis=0), near - reach), np.minimum(at.max(axis=0), far + reach)
+
+
+def _list_corners(model: mujoco.MjModel, body: int) -> Floats:
+    """Return the corners of a box around the shown geoms of a body, in its frame, shape (8, 3) [m]."""
+    first = int(model.body_geomadr[body])
+    geoms = [
+        g
+        for g in range(first, first + int(model.body_geomnum[body]))
+        if model.geom_group[g] < 3 and model.geom_type[g] != mujoco.mjtGeom.mjGEOM_PLANE
+    ]
+    if not geoms:
+        return np.zeros((8, 3))
+    boxes = model.geom_aabb[geoms]  # centre and half sides, in the frame of the geom
+    corners = boxes[:, None, :3] + boxes[:, None, 3:] * _CORNERS
+    at = model.geom_pos[geoms][:, None] + _rotate(model.geom_quat[geoms][:, None], corners)
+    low, high = at.min(axis=(0, 1)), at.max(axis=(0, 1))
+    found: Floats = (low + high) / 2.0 + (high - low) / 2.0 * _CORNERS
+    return found
+
+
+def _rotate(q: Floats, p: Floats) -> Floats:
+    """Rotate points (..., 3) by unit quaternions (..., 4)."""
+    twice = 2.0 * np.cross(q[..., 1:], p)
+    rotated: Floats = p + q[..., :1] * twice + np.cross(q[..., 1:], twice)
+    return rotated
+
+
+def _read_reach(
+    recording: Recording, begin_ns: int, end_ns: int, *, with_people: bool
+) -> dict[tuple[BodyInfo, ...], _Reach]:
+    """Return the moving bodies of each scene in a span of time, at some moments, as the recorded states have them."""
+    found: dict[tuple[BodyInfo, ...], _Reach] = {}
+    bodies: tuple[BodyInfo, ...] = ()
+    due_ns = begin_ns
+    for state in recording.states():
+        if state.session_time > end_ns:
+            break
+        if state.bodies is not bodies:  # the same object in all states of a scene
+            bodies, due_ns = state.bodies, max(begin_ns, state.session_time)
+        if state.session_time >= due_ns:
+            reach = found.setdefault(bodies, _Reach(bodies))
+            reach.poses.append(state.poses[reach.rows])
+            reach.people += [np.array(one.pose.p) + PERSON_M * _CORNERS for one in state.presence if with_people]
+            moments = max(1, min(MOMENTS, MOST_POSES // max(1, len(reach.rows))))
+            due_ns = state.session_time + (end_ns - begin_ns) // moments
+    return found
+
+
+# --- drawing ----------------------------------------------------------------------------------------------------------
+
+
+class _Artist:
+    """Draws the states of one model into the current OpenGL context."""
+
+    def __init__(
+        self, model: mujoco.MjModel, camera: mujoco.MjvCamera, options: PictureOptions, notes: list[str]
+    ) -> None:
+        self.core_model = model  # that of the simulation, which must not be changed
+        self._model = copy.copy(model)
+        self._camera, self._notes = camera, notes
+        self._size = options.width, options.height
+        self._model.vis.global_.offwidth, self._model.vis.global_.offheight = self._size
+        self._look = _Look(model, self._model)
+        self._option = mujoco.MjvOption()
+        self._scene = mujoco.MjvScene(self._model, MORE_GEOMS + model.ngeom)
+        try:
+            self._context = mujoco.MjrContext(self._model, int(mujoco.mjtFontScale.mjFONTSCALE_150))
+        except mujoco.FatalError as error:
+            width, height = self._size
+            raise PictureError(f"no picture of {width} x {height} can be drawn here: {error}") from error
+        mujoco.mjr_setBuffer(int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN), self._context)
+
+    def draw(self, data: Any, patches: Sequence[PatchOp], people: Sequence[_Figure]) -> Image:
+        """Return a picture of a state."""
+        for note in self._look.apply(patches):
+            if note not in self._notes:
+                self._notes.append(note)
+        mujoco.mjv_updateScene(
+            self._model, data, self._option, None, self._camera, int(mujoco.mjtCatBit.mjCAT_ALL), self._scene
+        )
+        self._look.decorate(self._scene, data)
+        for figure in people:
+            figure.draw(self._scene)
+        width, height = self._size
+        area = mujoco.MjrRect(0, 0, width, height)
+        image = np.empty((height, width, 3), np.uint8)
+        mujoco.mjr_render(area, self._scene, self._context)
+        mujoco.mjr_readPixels(image, None, area, self._context)
+        return np.ascontiguousarray(image[::-1])  # OpenGL's first row is the lowest
+
+    def close(self) -> None:
+        """Release what the model holds in the context."""
+        self._context.free()
+
+
+class _Look:
+    """Patches of a scene, as changes of a model that is only drawn, and as geoms that are added to each picture.
+
+    Patches are made for clients. MuJoCo lacks meshes and textures that they bring along: such visuals are left out.
+    """
+
+    def __init__(self, original: mujoco.MjModel, drawn: mujoco.MjModel) -> None:
+        self._original, self._drawn = original, drawn
+        self._patches: tuple[PatchOp, ...] = ()
+        self._moved: dict[int, Pose] = {}
+        self._added: list[tuple[Visual, Material | None]] = []
+
+    def apply(self, patches: Sequence[PatchOp]) -> list[str]:
+        """Make the patches those of the next pictures. Return what cannot be drawn, a line each."""
+        if patches is self._patches:
+            return []
+        self._patches = tuple(patches)
+        drawn, original = self._drawn, self._original
+        for field in ("geom_rgba", "geom_group", "geom_matid"):
+            getattr(drawn, field)[:] = getattr(original, field)
+        self._moved, self._added, notes = {}, [], []
+        materials: list[Material] = []
+        for op in patches:
+            if isinstance(op, AddMaterial):
+                materials.append(op.material)
+            elif isinstance(op, AddVisual):
+                visual = op.visual
+                if visual.geometry.kind not in _SHAPES or visual.geometry.mesh >= original.nmesh:
+                    notes.append("shapes that a patch brought along are not drawn: `iris-session view` shows them")
+                    continue
+                new = visual.material - original.nmat
+                self._added.append((visual, materials[new] if 0 <= new < len(materials) else None))
+            elif isinstance(op, RemoveVisual) and op.visual < original.ngeom:
+                drawn.geom_group[op.visual] = HIDDEN_GROUP
+            elif isinstance(op, SetVisual) and op.visual < original.ngeom:
+                self._set(op)
+        return notes
+
+    def _set(self, op: SetVisual) -> None:
+        drawn = self._drawn
+        if op.rgba is not None:
+            drawn.geom_rgba[op.visual] = op.rgba
+        if op.group is not None:
+            drawn.geom_group[op.visual] = min(max(op.group, 0), HIDDEN_GROUP)
+        if op.material is not None:
+            drawn.geom_matid[op.visual] = op.material if op.material < drawn.nmat else -1
+        if op.T_body_visual is not None:
+            self._moved[op.visual] = op.T_body_visual
+
+    def decorate(self, scene: mujoco.MjvScene, data: Any) -> None:
+        """Move and add geoms of a scene that shows `data`."""
+        for geom in scene.geoms[: scene.ngeom] if self._moved else ():
+            if geom.objtype == _GEOM and geom.objid in self._moved:
+                body = int(self._original.geom_bodyid[geom.objid])
+                p_world, R_world = _to_world(data, body, self._moved[geom.objid])
+                geom.pos[:], geom.mat[:] = p_world, R_world.reshape(3, 3)
+        for visual, material in self._added:
+            if visual.body >= self._original.nbody or not 0 <= visual.group < 3 or visual.rgba[3] == 0.0:
+                continue
+            p_world, R_world = _to_world(data, visual.body, visual.T_body_visual)
+            geom = _add_geom(scene, visual.geometry.kind, visual.geometry.size, p_world, R_world, visual.rgba)
+            if visual.geometry.mesh >= 0:
+                geom.dataid = 2 * visual.geometry.mesh  # of a mesh, odd numbers are hulls
+            if material is not None:
+                geom.emission, geom.specular = material.emission, material.specular
+                geom.shininess, geom.reflectance = material.shininess, material.reflectance
+
+
+def _to_world(data: Any, body: int, pose: Pose) -> tuple[Floats, Floats]:
+    """Return position [m] and rotation (9,) in the world of a pose in the frame of a body."""
+    p_world: Floats = np.empty(3)
+    R_world: Floats = np.empty(9)
+    mujoco.mj_local2Global(data, p_world, R_world, np.array(pose.p), np.array(pose.q), body, 0)
+    return p_world, R_world
+
+
+def _add_geom(
+    scene: mujoco.MjvScene, kind: str, size: Sequence[float], p: Floats, rotation: Floats, rgba: Sequence[float]
+) -> Any:
+    """Add a geom to a scene, and return it."""
+    if scene.ngeom >= scene.maxgeom:
+        raise PictureError(f"a scene of more than {scene.maxgeom} shapes")
+    geom: Any = scene.geoms[scene.ngeom]
+    mujoco.mjv_initGeom(geom, _SHAPES[kind], np.array(size), p, rotation.reshape(9), np.array(rgba, np.float32))
+    scene.ngeom += 1
+    return geom
+
+
+class _Figure(NamedTuple):
+    """Head or hand of a participant. `colour`: RGB, 0..1."""
+
+    item: PresenceItem
+    colour: tuple[float, ...]
+
+    def draw(self, scene: mujoco.MjvScene) -> None:
+        """Add it to a scene."""
+        rotation: Floats = np.empty(9)
+        mujoco.mju_quat2Mat(rotation, np.array(self.item.pose.q))
+        matrix = rotation.reshape(3, 3)
+        for kind, size, offset, is_visor in _HEAD if self.item.device == Device.HEAD else _HAND:
+            p_world = np.array(self.item.pose.p) + matrix @ np.array(offset)
+            _add_geom(scene, kind, size, p_world, matrix, (*(_VISOR if is_visor else self.colour), 1.0))
+
+
+class _PeopleTrack:
+    """The newest pose of every head and hand, at ascending times."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._states = recording.states()
+        self._ahead = next(self._states, None)
+        self._newest: dict[tuple[str, str], PresenceItem] = {}
+        self._story = SessionStory()
+
+    def advance(self, time_ns: int) -> list[_Figure]:
+        """Return the heads and hands at `time_ns`."""
+        while self._ahead is not None and self._ahead.session_time <= time_ns:
+            self._newest.update({(item.participant, item.device): item for item in self._ahead.presence})
+            self._ahead = next(self._states, None)
+        shown = [item for item in self._newest.values() if item.capture_ns > time_ns - PRESENCE_NS]
+        return [_Figure(one, tuple(c / 255.0 for c in self._story.find_colour(one.participant))) for one in shown]

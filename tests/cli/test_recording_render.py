@@ -1,0 +1,227 @@
+"""`recording render`: files that play and hold what was drawn, and one line for what cannot be done."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image as Pillow
+from PIL import ImageSequence
+
+from iris_session.cli import recording_render
+from iris_session.cli.main import main
+from iris_session.recording import Recording
+from iris_session.replay.pictures import Image, PictureOptions, RecordingPictures, Timeline
+from tests.replay.support import Played, make_drawn_core, play, step_ns
+
+SIZE = ("--size", "160x120")
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory: pytest.TempPathFactory) -> Played:
+    made = play(tmp_path_factory.mktemp("played") / "session.rrd", 60, core=make_drawn_core())
+    made.write()
+    return made
+
+
+def render(path: Path, out: Path, *options: str) -> int:
+    return main(["recording", "render", str(path), "-o", str(out), *SIZE, *options])
+
+
+def draw(played: Played, times_ns: Sequence[int], camera: str = "operator") -> list[Image]:
+    with (
+        Recording.open(played.path) as recording,
+        RecordingPictures(recording, Timeline(recording), PictureOptions(160, 120, camera)) as made,
+    ):
+        return list(made.draw(times_ns))
+
+
+def test_a_video_holds_the_pictures_in_order(
+    played: Played, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "session.mp4"
+    assert render(played.path, out, "--camera", "operator", "--fps", "100", "--json") == 0
+    shown = capsys.readouterr()
+    assert shown.err == ""
+    begin_ns, end_ns = step_ns(0), step_ns(59)
+    times = range(begin_ns, end_ns + 1, 10_000_000)
+    assert json.loads(shown.out) == {
+        "file": str(out),
+        "pictures": len(times),
+        "begin_s": times[0] * 1e-9,
+        "end_s": pytest.approx(times[-1] * 1e-9),
+        "codec": "VP9",
+        "width": 160,
+        "height": 120,
+        "bytes": out.stat().st_size,
+        "notes": [],
+        "problems": [],
+    }
+    video = cv2.VideoCapture(str(out))
+    assert video.get(cv2.CAP_PROP_FPS) == 100.0
+    drawn = draw(played, times)
+    for image in drawn:
+        found, frame = video.read()
+        assert found
+        assert np.abs(frame[..., ::-1].astype(int) - image).mean() < 4.0, "as a lossy codec has it"
+    assert not video.read()[0]
+    assert os.listdir(tmp_path) == ["session.mp4"]
+
+
+def test_a_picture_is_exactly_what_was_drawn(
+    played: Played, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "one.png"
+    assert render(played.path.parent, out, "--at", "0.1s", "--camera", "side") == 0
+    assert capsys.readouterr().out.startswith(f"{out}: the picture of 0.10 s, 160 x 120, PNG, ")
+    (drawn,) = draw(played, [100_000_000], "side")
+    assert cv2.imread(str(out))[..., ::-1].tobytes() == drawn.tobytes()
+    assert render(played.path, out) == 2
+    assert capsys.readouterr().err == f"iris-session: {out} exists: give another file, or --force\n"
+    assert render(played.path, out, "--force") == 0
+
+
+def test_an_animation_has_its_times(played: Played, tmp_path: Path) -> None:
+    out = tmp_path / "session.gif"
+    assert render(played.path, out, "--from", "0", "--to", "0.1", "--fps", "10", "--speed", "0.2") == 0
+    with Pillow.open(out) as animation:
+        durations = [frame.info["duration"] for frame in ImageSequence.Iterator(animation)]  # of equal ones the sum
+        assert len(durations) >= 2
+        assert sum(durations) == 5 * 100
+        assert animation.info["loop"] == 0
+
+
+def test_cameras_are_listed(played: Played, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["recording", "render", str(played.path), "--list-cameras"]) == 0
+    assert capsys.readouterr().out == "operator\nside\n"
+    assert main(["recording", "render", str(played.path), "--list-cameras", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"cameras": ["operator", "side"]}
+
+
+@pytest.mark.parametrize(
+    ("out", "options", "line"),
+    [
+        ("x.avi", (), "is of a kind that is not written: give -o FILE.mp4, FILE.gif or FILE.png"),
+        ("none/x.mp4", (), "does not exist: make it, or give another one"),
+        ("x.mp4", ("--camera", "top"), "there is no camera 'top' in the scene, there are 'operator', 'side'"),
+        ("x.mp4", ("--size", "161x120"), "--size 161x120: a video needs even numbers"),
+        ("x.mp4", ("--at", "0.1"), "--at is for one picture (.png): give --from and --to"),
+        ("x.mp4", ("--from", "9"), "--from 9 is after the end, 0.12 s: give an earlier one, or a later --to"),
+        ("x.mp4", ("--from", "0.1", "--to", "0.05"), "after the end, 0.05 s: give an earlier one, or a later --to"),
+        ("x.mp4", ("--from", "3", "--to", "4"), "nothing there, it goes from 0.00 s to 0.12 s"),
+        ("x.png", ("--at", "3"), "--at: the recording has nothing there, it goes from 0.00 s to 0.12 s"),
+        (
+            "x.gif",
+            ("--speed", "0.01", "--size", "1280x720"),
+            "is too large: give --from and --to, a smaller --size or --fps, or a .mp4",
+        ),
+    ],
+)
+def test_what_cannot_be_drawn_is_one_line(
+    played: Played, tmp_path: Path, capsys: pytest.CaptureFixture[str], out: str, options: Sequence[str], line: str
+) -> None:
+    assert render(played.path, tmp_path / out, *options) == 2
+    err = capsys.readouterr().err
+    assert err.endswith(f"{line}\n")
+    assert err.count("\n") == 1
+    assert not os.listdir(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("option", "line"),
+    [
+        ("--size=big", "'big' is not a size: give WIDTHxHEIGHT"),
+        ("--size=8x9000", "'8x9000' is not a size"),
+        ("--fps=0", "'0' is not a rate: give a number from 0.001 to 1000"),
+        ("--speed=nan", "'nan' is not a rate"),
+        ("--from=-1", "'-1' is not a session time: give seconds from 0"),
+        ("--at=noon", "'noon' is not a session time"),
+    ],
+)
+def test_options_that_are_none_are_refused(option: str, line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["recording", "render", "session.rrd", "-o", "x.mp4", option])
+    assert line in capsys.readouterr().err
+
+
+def test_damage_is_said_and_is_a_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    gap = play(tmp_path / "session.rrd", 45, core=make_drawn_core())
+    del gap.batch.rows[30]
+    path = gap.write()
+    assert render(path, tmp_path / "x.mp4", "--fps", "100") == 1
+    assert capsys.readouterr().err == f"iris-session: {path} is damaged: steps 30 to 39 are left out\n"
+    assert (tmp_path / "x.mp4").stat().st_size > 0
+
+
+@pytest.mark.parametrize("kind", [".mp4", ".gif"])
+def test_ctrl_c_leaves_the_old_file_and_nothing_else(
+    kind: str, played: Played, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / f"x{kind}"
+    out.write_text("old")
+    inside: list[list[str]] = []
+
+    def interrupt(self: Any, times_ns: Sequence[int]) -> Iterator[Image]:
+        yield np.zeros((120, 160, 3), np.uint8)
+        inside.append(os.listdir(tmp_path))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(RecordingPictures, "draw", interrupt)
+    assert render(played.path, out, "--force", "--fps", "100") == 130
+    assert len(inside[0]) == 2, "it is written beside the old one"
+    assert os.listdir(tmp_path) == [out.name]
+    assert out.read_text() == "old"
+
+
+def test_pictures_that_did_not_reach_the_disk_are_noticed(
+    played: Played, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(RecordingPictures, "draw", lambda self, times: iter([np.zeros((120, 160, 3), np.uint8)]))
+    out = tmp_path / "x.mp4"
+    assert render(played.path, out, "--fps", "100") == 2
+    assert "cannot be written: 1 of 12 pictures are in it: is the disk full?" in capsys.readouterr().err
+    assert not os.listdir(tmp_path)
+
+
+def test_progress_is_shown_in_a_terminal(
+    played: Played, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("iris_session.cli.progress.PROGRESS_PERIOD_S", 0.0)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    assert render(played.path, tmp_path / "x.mp4", "--fps", "100") == 0
+    err = capsys.readouterr().err
+    assert "session.rrd: reading" in err
+    assert "session.rrd: picture 12 of 12" in err
+    assert err.endswith("\n")
+
+
+def test_a_machine_without_opengl_is_one_line(played: Played, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "iris_session.cli.main", "recording", "render", str(played.path), "-o", "x.mp4"]
+    environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
+    environment["__EGL_VENDOR_LIBRARY_FILENAMES"] = str(tmp_path / "missing.json")  # libEGL finds no driver
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("iris-session: no OpenGL here (")
+    assert "libegl1 libgl1-mesa-dri" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not os.listdir(tmp_path)
+
+
+def test_codecs_that_are_missing_are_named(
+    played: Played, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(recording_render, "_CODECS", {"none": "none", "mp4v": "MPEG-4"})
+    assert render(played.path, tmp_path / "x.mp4", "--fps", "100") == 0
+    shown = capsys.readouterr()
+    assert "160 x 120, MPEG-4, " in shown.out
+    monkeypatch.setattr(recording_render, "_CODECS", {"none": "none"})
+    assert render(played.path, tmp_path / "y.mp4") == 2
+    assert "this OpenCV writes no video" in capsys.readouterr().err
