@@ -51,7 +51,7 @@ def test_newest_session_of_a_folder_is_chosen(
 
 def test_damage_is_named(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = bytearray(path.read_bytes())
-    victim = scan_file(path).messages[-8]
+    victim = scan_file(path).messages[-10]
     data[victim.offset + 60 : victim.offset + victim.length] = bytes(victim.length - 60)
     path.write_bytes(data)
     assert main(["view", str(path), "--no-open"]) == 0
@@ -107,10 +107,10 @@ def test_repair_says_what_is_lost(path: Path, tmp_path: Path, capsys: pytest.Cap
     assert err == ""
     assert main(["recording", "repair", str(path), "-o", str(output)]) == 2
     assert "--force" in capsys.readouterr().err
-    victim = scan_file(path).messages[-8]
+    victim = scan_file(path).messages[-10]
     data = bytearray(path.read_bytes())
     data[victim.offset + 60 : victim.offset + victim.length] = bytes(victim.length - 60)
-    path.write_bytes(data[: scan_file(path).messages[-2].offset + 3])
+    path.write_bytes(data[: scan_file(path).messages[-4].offset + 3])  # in the first mark of the end
     assert main(["recording", "repair", str(path), "-o", str(output), "--force"]) == 1
     out = capsys.readouterr().out
     assert f"{victim.length + 16 + 3:,} bytes that cannot be read; what may have followed the last step" in out
