@@ -108,15 +108,15 @@ test-unit: install-dev
 
 # Emulated people need their share of the cores in time, or they drop what they hold: not beside all the others.
 DEMOS := tests/e2e/test_demo_scenes.py tests/e2e/test_demo_handover.py
-# A browser or viewer that draws in software takes both cores, drawn cameras one: their tests run after those with real
-# time.
-BROWSER := tests/e2e/test_web.py tests/e2e/test_web_xr.py tests/e2e/test_web_marks.py tests/e2e/test_web_desktop.py \
+# A browser that draws in software takes both cores, drawn cameras one, and the doctor finds fault with a busy machine:
+# their tests run one by one, after those with real time.
+ALONE := tests/e2e/test_doctor.py tests/e2e/test_web.py tests/e2e/test_web_xr.py tests/e2e/test_web_marks.py tests/e2e/test_web_desktop.py \
   tests/e2e/test_clouds.py tests/e2e/test_demo_cloud.py tests/e2e/test_looks.py tests/bench/test_web.py
 test-e2e: install-dev $(PAGE)
 ifeq ($(T),tests)
 	$(E2E) --dist load $(DEMOS)
-	$(E2E) $(addprefix --ignore=,$(DEMOS) $(BROWSER)) $(T)
-	$(E2E) -n 1 $(BROWSER)
+	$(E2E) $(addprefix --ignore=,$(DEMOS) $(ALONE)) $(T)
+	$(E2E) -n 1 $(ALONE)
 else
 	$(E2E) $(T)
 endif

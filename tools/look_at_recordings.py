@@ -206,21 +206,31 @@ class HeadlessViewer:
         """
         options = {"view_id": view} if view else {}
         last: list[Image] = []
+        found = {"refused": 0, "changed": 0, "not ready": 0}
 
         def settle() -> bool:
             path = Path(self._folder.name, "picture.png")
             try:
                 self.call("rerun_save_screenshot", file_path=str(path), max_size=0, **options)
             except ViewerError:  # on a busy machine it is not drawn within the time that the viewer allows
+                found["refused"] += 1
                 return False
             image = np.asarray(cv2.imread(str(path)), np.uint8)
             if last and (last[-1].shape != image.shape or (last[-1] != image).any()):
+                found["changed"] += 1
                 last.clear()
             last.append(image)
-            return len(last) >= EQUAL and is_ready(image)
+            if len(last) >= EQUAL and not is_ready(image):
+                found["not ready"] += 1
+                return False
+            return len(last) >= EQUAL
 
         self.call("wait_for", min_steps=FRAMES, timeout_secs=30)
-        self._wait(settle, SETTLE_S, "the picture is complete")
+        try:
+            self._wait(settle, SETTLE_S, "the picture is complete")
+        except ViewerError as error:
+            counts = ", ".join(f"{n} {kind}" for kind, n in found.items())
+            raise ViewerError(f"{error} (pictures of {view or 'the window'}: {counts})") from error
         return last[-1]
 
     def close(self) -> None:

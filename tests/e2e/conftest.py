@@ -31,7 +31,7 @@ SHUTDOWN_S: Final = 10.0
 #: Those that compute most lie between those that wait most.
 LONGEST: Final = (
     "test_resume.py", "test_joining.py", "test_docs.py", "test_recovery.py", "test_alignment.py",
-    "test_operators.py", "test_doctor.py", "test_user_loop.py", "test_process_failures.py", "test_soak.py",
+    "test_operators.py", "test_user_loop.py", "test_process_failures.py", "test_soak.py",
     "test_process.py", "test_links.py", "test_shutdown.py", "test_security.py", "test_scene_changes.py",
     "test_hostile_clients.py",
 )  # fmt: skip

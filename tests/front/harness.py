@@ -179,8 +179,9 @@ class FrontSession:
     def send_state(self, poses: np.ndarray, epoch: int = 1) -> None:
         self.process.link.send_state(StateHeader(epoch, 0, self.step, 0.0, self.process.link.now_ns, 0, 0, 0), poses)
 
-    def wait_drops(self, reason: str) -> int:
-        self.pump(lambda: reason in self.process.link.status.drops, f"drops for {reason}")
+    def wait_drops(self, reason: str, least: int = 1) -> int:
+        """Wait for a status with at least so many drops: those that happened come in the next ones."""
+        self.pump(lambda: self.process.link.status.drops.get(reason, 0) >= least, f"{least} drops for {reason}")
         return self.process.link.status.drops[reason]
 
     def close(self) -> None:

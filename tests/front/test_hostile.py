@@ -207,7 +207,7 @@ def test_client_that_reads_nothing_is_disconnected_as_slow(open_session: OpenSes
     session.pump(lost, "loss of the slow client")
     (loss,) = [e for e in session.entries if isinstance(e.message, Lost)]
     assert (loss.connection, loss.message) == (2, Lost("slow"))
-    assert session.wait_drops("send_queue_full") >= 16
+    assert session.wait_drops("send_queue_full", 16) >= 16
     honest.wait_for(Event, 10)
     seqs = [event.event_seq for event in honest.got(Event)]
     assert seqs == list(range(1, len(seqs) + 1))
