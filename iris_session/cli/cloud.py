@@ -153,7 +153,8 @@ def run_file(arguments: argparse.Namespace) -> int:
     with _catch_signals() as ending, _name_unexpected_error(settings):
         fault = run_cameras(settings, client, printer, lambda: ending.is_set() or printer.passed_s >= seconds)
         if not (fault or printer.was_connected or ending.is_set()):
-            fault = f"no session admitted the cameras within {seconds:g} s: {arguments.address or arguments.session}"
+            where = arguments.address or arguments.session or "of this machine"
+            fault = f"no session admitted the cameras within {seconds:g} s: {where}"
     printer.end()
     if fault:
         print(f"iris-session: {fault}", file=sys.stderr)

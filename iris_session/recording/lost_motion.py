@@ -8,7 +8,7 @@ get the rows from these states.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.server_messages import PresenceItem
 from iris_session.recording import paths, record_batches
+from iris_session.recording.errors import RecorderError
 from iris_session.recording.people import get_device_entity
 from iris_session.recording.picture import MotionRows
 from iris_session.recording.record_batches import UNREADABLE, RecordedState, read_index
@@ -32,12 +33,19 @@ _WRITE_S: Final = 10.0
 
 @contextmanager
 def open_with_lost_motion(files: Sequence[str]) -> Iterator[list[str]]:
-    """Yield readable files of a session, each followed by a temporary one with the motion that it lacks, if any."""
-    with TemporaryDirectory(prefix="iris-motion-") as folder:
-        found: list[str] = []
-        for i, file in enumerate(files):
-            motion = Path(folder, f"{i}{paths.SUFFIX}")
-            found += [file, str(motion)] if write_lost_motion(file, motion) else [file]
+    """Yield readable files of a session, each followed by a temporary one with the motion that it lacks, if any.
+
+    Raises `RecorderError` if a temporary file cannot be written.
+    """
+    with ExitStack() as stack:
+        try:
+            folder = stack.enter_context(TemporaryDirectory(prefix="iris-motion-"))
+            found: list[str] = []
+            for i, file in enumerate(files):
+                motion = Path(folder, f"{i}{paths.SUFFIX}")
+                found += [file, str(motion)] if write_lost_motion(file, motion) else [file]
+        except OSError as error:
+            raise RecorderError(f"a temporary file cannot be written: {error.strerror or error}") from error
         yield found
 
 

@@ -420,7 +420,7 @@ class Recording:
         return [
             f"{os.path.basename(self.files[part])}: {line}"
             for part, noted in marks.items()
-            for line in rrd_file.changed_spans(self.files[part], noted, part in closed)
+            for line in rrd_file.changed_spans(self.files[part], noted, closed=part in closed)
         ]
 
     def close(self) -> None:

@@ -148,7 +148,7 @@ def _next_message(file: BinaryIO, begin: int, size: int) -> int | None:
     return None
 
 
-def changed_spans(path: str | Path, marks: Sequence[Mark], closed: bool) -> list[str]:
+def changed_spans(path: str | Path, marks: Sequence[Mark], *, closed: bool) -> list[str]:
     """Return a line per span of the file whose bytes differ from the recorder's checksum.
 
     `closed`: the recorder closed the file. The result is empty for a file that another tool has rewritten: in it most

@@ -18,7 +18,7 @@ import msgspec
 import psutil
 
 from iris_session.recording import paths, rrd_file
-from iris_session.recording.errors import NotARecordingError
+from iris_session.recording.errors import NotARecordingError, RecorderError
 from iris_session.recording.lost_motion import open_with_lost_motion
 from iris_session.recording.reader import Recording
 from iris_session.recording.rerun_tool import INDEX, OPTIMIZE, rewrite
@@ -73,6 +73,7 @@ def open_view_file(path: Path, progress: Callable[[int, int], None] | None = Non
 
     Raises:
         NotARecordingError: `path` does not exist, or nothing of the session can be read.
+        RecorderError: No copy can be written, not even a temporary one.
         RerunToolError: Rerun cannot make the copy.
         ImportError: Rerun is not installed.
     """
@@ -104,9 +105,12 @@ def open_view_file(path: Path, progress: Callable[[int, int], None] | None = Non
                 _write_copy(copy, sources, newest_ns, progress)
             except OSError as error:
                 notes.append(f"{copy} cannot be written ({error.strerror or error}): the copy is temporary")
-                folder = temporary.enter_context(tempfile.TemporaryDirectory(prefix="iris-view-"))
-                copy, kept = Path(folder, copy.name), False
-                _write_copy(copy, sources, newest_ns, progress)
+                try:
+                    folder = temporary.enter_context(tempfile.TemporaryDirectory(prefix="iris-view-"))
+                    copy, kept = Path(folder, copy.name), False
+                    _write_copy(copy, sources, newest_ns, progress)
+                except OSError as second:
+                    raise RecorderError(f"{notes[-1]}, but cannot be written: {second.strerror or second}") from second
         yield ViewFile(copy, session, read, made=True, kept=kept, damage=tuple(damage), notes=tuple(notes))
 
 

@@ -1,4 +1,4 @@
-"""What a person sees who opens a recording in Rerun's viewer: `tools/look_at_recordings.py` looks at real sessions."""
+"""Recordings of real sessions in Rerun's viewer, checked by `tools/look_at_recordings.py`."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def start(folder: Path) -> SessionProcess:
 
 
 def play_eventful(scenario: Scenario) -> None:
-    """E-stop, takeover, somebody who leaves, patch, reset, and a second scene."""
+    """Play an e-stop, a takeover, an operator that leaves, a patch, a reset, and a second scene."""
     server = scenario.server
 
     def command(scene: str, answer: str) -> None:
@@ -68,7 +68,7 @@ def play_eventful(scenario: Scenario) -> None:
     director = scenario.join("dora", "director")
     hand = scenario.drive("ann", "left", (0.0, 0.03, 0.0))
     scenario.run_for(0.5)
-    hand.client.estop("somebody is near")
+    hand.client.estop("a person is near")
     scenario.run_until(lambda: director.mirror.estop, "the e-stop")
     director.clear_estop()
     scenario.run_until(lambda: not director.mirror.estop, "the end of the e-stop")

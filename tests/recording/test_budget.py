@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import msgspec
@@ -81,14 +83,24 @@ def get_written(session: SmallSession) -> int:
     return -1 if status is None else status.written
 
 
+@contextmanager
+def record_small_session(path: Path) -> Iterator[tuple[SmallSession, RecorderProcess]]:
+    """Start a recorder with the budget, and a session that it records."""
+    process = RecorderProcess(path, time.monotonic_ns(), budget_bytes=BUDGET)
+    process.start()
+    feed = RecorderFeed(process.feed_endpoint, path.parent)
+    try:
+        yield SmallSession(feed), process
+    finally:
+        feed.close(0.0)
+        process.close()
+
+
 @pytest.mark.e2e
 def test_recorder_closes_its_file_and_the_session_goes_on(tmp_path: Path) -> None:
     path = tmp_path / "session.rrd"
-    process = RecorderProcess(path, time.monotonic_ns(), budget_bytes=BUDGET)
-    process.start()
-    feed = RecorderFeed(process.feed_endpoint, tmp_path)
-    session = SmallSession(feed)
-    try:
+    with record_small_session(path) as (session, process):
+        feed = session.feed
         wait_until(lambda: get_written(session) and not process.alive, 60.0)
         assert process.failure == "", "it has ended in order"
         session.take(500)
@@ -96,9 +108,6 @@ def test_recorder_closes_its_file_and_the_session_goes_on(tmp_path: Path) -> Non
         session.take(500)
         assert feed.stats.dropped_rows == feed.stats.window_bytes == 0
         assert feed.close()
-    finally:
-        feed.close(0.0)
-        process.close()
     report = verify(path, SmallCore)
     assert report.ok, report.line()
     assert report.finished
@@ -114,11 +123,8 @@ def test_recorder_closes_its_file_and_the_session_goes_on(tmp_path: Path) -> Non
 @pytest.mark.e2e
 def test_recorder_that_was_killed_at_the_end_gets_no_further_part(tmp_path: Path) -> None:
     path = tmp_path / "session.rrd"
-    process = RecorderProcess(path, time.monotonic_ns(), budget_bytes=BUDGET)
-    process.start()
-    feed = RecorderFeed(process.feed_endpoint, tmp_path)
-    session = SmallSession(feed)
-    try:
+    with record_small_session(path) as (session, process):
+        feed = session.feed
         wait_until(lambda: get_written(session) > 5)
         os.kill(process.pid, signal.SIGKILL)
         wait_until(lambda: not process.alive)
@@ -128,7 +134,4 @@ def test_recorder_that_was_killed_at_the_end_gets_no_further_part(tmp_path: Path
         wait_until(lambda: get_written(session) < 0 and is_ended(feed))
         wait_until(lambda: not process.alive)
         assert process.failure == ""
-    finally:
-        feed.close(0.0)
-        process.close()
     assert sorted(one.name for one in tmp_path.iterdir()) == ["session.rrd"]

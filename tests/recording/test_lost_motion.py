@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import math
+import os
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +13,8 @@ import pytest
 
 from iris_session.protocol.common import Pose
 from iris_session.protocol.server_messages import PresenceItem
+from iris_session.recording import view_copy
+from iris_session.recording.errors import RecorderError
 from iris_session.recording.lost_motion import open_with_lost_motion, write_lost_motion
 from iris_session.recording.messages import Batch, StateFrame
 from iris_session.recording.paths import part_path
@@ -91,6 +96,26 @@ def test_part_lacks_what_came_after_its_last_motion(tmp_path: Path, n: int, lack
     path = tmp_path / "killed.rrd"
     killed = write_file(path, make_states(n), closed=False)
     assert write_lost_motion(str(path), tmp_path / "motion.rrd") == lacking
+    killed.close()
+
+
+def test_full_disk_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "session.rrd"
+    killed = write_file(path, make_states(20), closed=False)
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(view_copy, "_write_copy", refuse)
+        with (
+            pytest.raises(RecorderError, match=r"view\.rrd .* temporary, but cannot .*: No space"),
+            open_view_file(path),
+        ):
+            pass
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
+    with pytest.raises(RecorderError, match="temporary file cannot be written: No such file"), open_view_file(path):
+        pass
     killed.close()
 
 

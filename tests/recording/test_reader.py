@@ -262,7 +262,7 @@ def test_undecodable_content_is_one_line_with_its_place(tmp_path: Path) -> None:
 
 def test_invalid_byte_count_of_a_mark_is_found(path: Path) -> None:
     marks = [rrd_file.Mark(-5, 2**62, 0), rrd_file.Mark(12, rrd_file.scan_file(path).size, 0)]
-    assert [line.partition(" are")[0] for line in rrd_file.changed_spans(path, marks, True)] == [
+    assert [line.partition(" are")[0] for line in rrd_file.changed_spans(path, marks, closed=True)] == [
         f"bytes {mark.begin} to {mark.end}" for mark in marks
     ]
 

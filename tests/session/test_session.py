@@ -32,7 +32,7 @@ from iris_session.session.stepper import MAX_HOST_ENTRIES
 from iris_session.session.verification import verify_recording
 from tests.session.loops import wait_for
 
-#: Some seconds of the handover scene, for which nobody joins.
+#: Enough for some seconds of the handover scene without participants.
 BUDGET_BYTES = 2_400_000
 QUIET = SessionConfig(control_port=0, state_port=0, record=False, realtime=False)
 
