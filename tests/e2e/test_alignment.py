@@ -191,6 +191,7 @@ def test_unaligned_headset_gets_a_notice_and_moves_nothing(start_table: Callable
     scenario.clients.append(eve)
     eve.connect(DEADLINE_S)
     eve.acquire(["arm5"])
+    scenario.run_until(lambda: eve.scene.tip_pose("arm5") is not None, "eve sees arm5")
     before = eve.scene.tip_pose("arm5")
     assert before is not None
     hand = scenario.add_hand(eve, "arm5")
