@@ -51,15 +51,16 @@ WARN: Final = "WARN"
 ERROR: Final = "ERROR"
 CRITICAL: Final = "CRITICAL"
 
-#: Colours of participants in the order of joining (Okabe and Ito 2008).
+#: Colours of participants in the order of joining, after Okabe and Ito (2008): those of the page, in
+#: `web_client/src/view/avatars.ts`.
 PALETTE: Final[tuple[Rgb, ...]] = (
-    (86, 180, 233),
+    (61, 155, 233),
     (230, 159, 0),
-    (0, 158, 115),
-    (204, 121, 167),
+    (0, 179, 136),
+    (214, 115, 171),
     (240, 228, 66),
+    (86, 180, 233),
     (213, 94, 0),
-    (0, 114, 178),
 )
 _GREEN: Final = (95, 160, 95)
 _BLUE: Final = (86, 140, 200)

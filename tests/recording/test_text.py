@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import get_args
 
 import msgspec
@@ -41,7 +42,7 @@ from iris_session.protocol.server_messages import (
 )
 from iris_session.recording import environment as versions
 from iris_session.recording.messages import DenialRecord
-from iris_session.recording.story import LogLine, SessionStory
+from iris_session.recording.story import PALETTE, LogLine, SessionStory
 from iris_session.recording.writer import describe_denial, describe_session
 from tests.recording.support import make_header
 
@@ -208,6 +209,12 @@ def test_colours_follow_the_order_of_joining() -> None:
     assert len({story.find_colour(f"p{i}") for i in range(1, 8)}) == 7
     assert story.find_colour("p8") == story.find_colour("p1")
     assert story.find_colour("host") == story.find_colour("host")
+
+
+def test_colours_are_those_of_the_page() -> None:
+    text = (Path(__file__).parents[2] / "web_client/src/view/avatars.ts").read_text()
+    (listed,) = re.findall(r"PARTICIPANT_COLORS = \[(.*?)\]", text)
+    assert [bytes.fromhex(one) for one in re.findall(r"#(\w{6})", listed)] == [bytes(colour) for colour in PALETTE]
 
 
 def test_denial_text_has_holder_and_advice() -> None:
