@@ -108,9 +108,10 @@ test-unit: install-dev
 
 # Emulated people need their share of the cores in time, or they drop what they hold: not beside all the others.
 DEMOS := tests/e2e/test_demo_scenes.py tests/e2e/test_demo_handover.py
-# A browser that draws in software takes both cores, drawn cameras one; the doctor finds fault with a busy machine;
-# the sessions of the docs tests take what others need in time: these run one by one, after those with real time.
-ALONE := tests/test_docs.py tests/e2e/test_doctor.py tests/e2e/test_web.py tests/e2e/test_web_xr.py tests/e2e/test_web_marks.py tests/e2e/test_web_desktop.py \
+# A browser that draws in software takes both cores, drawn cameras one; the doctor finds fault with a busy machine; four
+# emulated headsets that see drift and bumps, or the many sessions of the docs tests, take what others need in time:
+# these run one by one, after those with real time.
+ALONE := tests/test_docs.py tests/e2e/test_alignment.py tests/e2e/test_doctor.py tests/e2e/test_web.py tests/e2e/test_web_xr.py tests/e2e/test_web_marks.py tests/e2e/test_web_desktop.py \
   tests/e2e/test_clouds.py tests/e2e/test_demo_cloud.py tests/e2e/test_looks.py tests/bench/test_web.py
 test-e2e: install-dev $(PAGE)
 ifeq ($(T),tests)
