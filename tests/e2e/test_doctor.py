@@ -463,12 +463,10 @@ def test_full_disk(small_disk: Path, tmp_path: Path) -> None:
     recording = small_disk / "session.rrd"
     server = SessionProcess(tmp_path, recording, make_serve_command("arm", recording))
     filler = small_disk / "other-data"
-    filler.write_bytes(b"")
     try:
-        with filler.open("wb") as file, contextlib.suppress(OSError):
+        with filler.open("wb", buffering=0) as file, contextlib.suppress(OSError):
             while True:
                 file.write(bytes(1 << 16))
-                file.flush()
         found = run_doctor(server.address)
         found.assert_names("disk", "GB")
         assert found.status == 1
