@@ -141,7 +141,7 @@ class RecorderFeed:
         self._batch = Batch()
         self._batch_since = 0
         self._now = (0, 0)  # step and session time of the newest row
-        self._sim_time = self._sim_before = 0.0  # of the newest state, and before the last reset [s]
+        self._sim_time = self._sim_before = 0.0  # of the newest state, and what resets have set it back by [s]
         self._last_status_ns = 0
         #: Session time since the last status of a recorder that has something to write: it may hang.
         self.silence_ns = 0
@@ -229,7 +229,7 @@ class RecorderFeed:
         presence = tuple(self._presence.values())
         self._presence.clear()
         if sim_time < self._sim_time:
-            self._sim_before += self._sim_time
+            self._sim_before += self._sim_time - sim_time
         self._sim_time = sim_time
         applied = tuple(applied)
         frame = StateFrame(

@@ -75,7 +75,7 @@ class StateFrame(msgspec.Struct, frozen=True, array_like=True):
     """Rigid state at one moment. `poses`: float64 (n_bodies, 7) C-contiguous, `x y z qw qx qy qz`, world frame.
 
     `robots`: measured values of the robots as in `physics.world.RobotSignals.read`, described by `SceneAssets.robots`.
-    `sim_before`: simulated time before the last reset [s].
+    `sim_before`: by how much resets have set simulated time back, all together [s].
     """
 
     step: Count

@@ -95,6 +95,9 @@ KNOWN_MOMENTS = 256
 MAX_LANES = 4096
 #: Maximum number of pending vertex frames whose states are not in the file yet.
 MAX_PENDING_VERTICES = 256
+#: Largest simulated time that is shown [s], 285 years: it has 63 bits of nanoseconds, and a user's loop may count it in
+#: any unit. The exact one is in `/state`.
+LONGEST_S: Final = 9e9
 _encode = msgspec.msgpack.Encoder().encode
 
 
@@ -409,7 +412,7 @@ class RrdWriter:
         if not states:
             return
         poses = np.stack([np.frombuffer(s.poses, np.float64).reshape(-1, 7) for s in states])
-        moments = [self._make_moment(s.step, round((s.sim_before + s.sim_time) * 1e9), s.session_time) for s in states]
+        moments = [self._make_moment(s.step, _to_sim_ns(s), s.session_time) for s in states]
         times = np.array(moments, np.int64).T
         seen = self._draw_scene(moments[0], times)
         if not self._arranged:
@@ -661,6 +664,11 @@ class RrdWriter:
 
     def _make_moment(self, step: int, sim_ns: int, session_ns: int) -> Moment:
         return Moment(step, sim_ns, session_ns, session_ns + self._origin_utc_ns)
+
+
+def _to_sim_ns(state: StateFrame) -> int:
+    """Return the simulated time of a state since the session began, resets included [ns]."""
+    return round(max(-LONGEST_S, min(state.sim_before + state.sim_time, LONGEST_S)) * 1e9)
 
 
 # --- text for the viewer ----------------------------------------------------------------------------------------------

@@ -362,14 +362,15 @@ def test_lists_are_bounded_without_steps(feed: RecorderFeed) -> None:
     assert feed.stats.dropped_items == 10
 
 
-def test_states_have_the_simulated_time_before_the_last_reset(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
+def test_simulated_time_goes_on_over_resets(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
+    """Also that of a publisher whose time is the time of day, and who plays a log again and again."""
     played[0].say(feed, 1, -1, -1)
     played[0].take(1)
-    for step, time_s in enumerate((0.5, 2.0, 0.0, 0.5, 0.25)):
+    for step, time_s in enumerate((0.5, 2.0, 0.0, 0.5, 0.25, 1.7e9, 1.7e9 + 1.0, 1.7e9, 1.7e9 + 1.0, 1.7e9)):
         feed.add_state(step, step, time_s, step, np.zeros((0, 7)))
     feed.flush()
     states = decode_batch(played[0].take(1)[0][2]).states
-    assert [state.sim_before for state in states] == [0.0, 0.0, 2.0, 2.0, 2.5]
+    assert [state.sim_before for state in states] == [0.0, 0.0, 2.0, 2.0, *[2.25] * 3, *[3.25] * 2, 4.25]
 
 
 def test_scene_precedes_its_row_and_is_repeated_for_a_new_recorder(

@@ -294,6 +294,16 @@ def test_timelines_grow_over_resets_and_have_the_time_of_day(tmp_path: Path) -> 
         assert [(state.tick, state.sim_time) for state in recording.states()] == [(1, 0.0), (9, 0.016), (17, 0.004)]
 
 
+@pytest.mark.parametrize("time_s", [1.7e12, -1.7e12, 1e300])
+def test_time_in_another_unit_does_not_end_the_recorder(tmp_path: Path, time_s: float) -> None:
+    writer = RrdWriter(tmp_path / "w.rrd", "id")
+    writer.write_header(SessionHeader("s", "n", "open", 2_000_000))
+    writer.add(Batch(states=[msgspec.structs.replace(frame(8, np.zeros((0, 7))), sim_time=time_s)]))
+    writer.close()
+    with Recording.open(tmp_path / "w.rrd", warn=False) as recording:
+        assert [state.sim_time for state in recording.states()] == [time_s]
+
+
 def test_events_and_denials_are_text_lines(tmp_path: Path) -> None:
     path = tmp_path / "w.rrd"
     writer = RrdWriter(path, "id")
