@@ -84,5 +84,5 @@ def export_assets(
         write_output(root / SCENES_FILE, json.dumps({"scenes": scenes}, indent=1).encode())
     except OSError as error:
         raise AssetExportError(f"{root} cannot be written: {error.strerror or error}") from error
-    damage = (*recording.missing, *recording.damage, *found.list_problems(finished=recording.finished))
+    damage = (*recording.missing, *recording.damage, *found.list_problems(finished=recording.all_closed))
     return AssetExport(str(root), len(scenes), n, n_bytes, damage, summary.left_out)

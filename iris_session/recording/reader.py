@@ -107,6 +107,8 @@ class Recording:
         root: Chain value (16 bytes) before the first row.
         end: Step and chain of the newest row as noted when the last part was closed; None if its recorder was killed
             or a part is missing at the end.
+        all_closed: Every part was closed by its recorder, so that nothing can be missing within. Not known of a copy by
+            Rerun's tools, which may be of parts that were not.
         damage: One line per place that could not be read, at most `MOST_DAMAGE`. Reading on may add lines.
         missing: One line per missing part, or range of parts.
         notes: One line per empty part and per file that holds more than one recording.
@@ -141,6 +143,8 @@ class Recording:
             self.notes.append(f"{name} holds {n} recordings: only {one} is read; make a file of each of the others")
         self._find_missing(files)
         self.end = ends.get(len(self.files) - 1)
+        copied = self._rewritten and not self.damage  # a damaged file of a recorder counts as rewritten, too
+        self.all_closed = len(ends) == len(self.files) and not copied
         if self.end is not None and self.end.reason:
             self.notes.append(f"{self.end.reason[:200]}; the session may have gone on")
 

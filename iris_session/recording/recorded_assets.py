@@ -157,7 +157,7 @@ class AssetCollector:
     def __init__(self) -> None:
         self._joiner = AssetJoiner()
         self._scenes: dict[str, str] = {}  # what was to be recorded, by hash
-        self._n_scenes = 0
+        self._changes: set[RecordedScene] = set()
         self._names: dict[str, dict[str, str]] = {SCENE: {}, ALL: {}}
         self._faults: dict[str, str] = {}
 
@@ -168,8 +168,8 @@ class AssetCollector:
             if data is not None and item.is_scene:
                 self._read_scene(data)
         elif isinstance(item, RecordedScene):
-            self._n_scenes += 1
-            if len(self._scenes) < MOST_ASSETS:
+            if len(self._changes) < MOST_ASSETS:
+                self._changes.add(item)
                 self._scenes[item.hash] = item.recorded
         elif len(self._faults) < MOST_ASSETS:
             self._faults[item.address] = item.text
@@ -199,13 +199,14 @@ class AssetCollector:
             f"{_describe(expected, address)}: {text}" for address, text in self._faults.items() if address not in whole
         )
         recorded = next((kind for kind in reversed(RECORD_ASSETS) if kind in self._scenes.values()), "")
-        return AssetsSummary(recorded, self._n_scenes, len(expected), len(present), sum(present), left_out)
+        return AssetsSummary(recorded, len(self._changes), len(expected), len(present), sum(present), left_out)
 
     def list_problems(self, *, finished: bool) -> list[str]:
         """Return a line per asset that is damaged or missing, without those that could not be recorded.
 
         Args:
-            finished: The recorder closed the last file; otherwise assets may have been left to be written.
+            finished: Recorders closed all files. One that was killed may have left assets to be written, and the next
+                one gets the newest scene only.
         """
         self._joiner.end()
         expected, broken = self._list_expected(), self._joiner.broken

@@ -99,7 +99,7 @@ def repair(
         for item in recording.outline():
             builder.add(item)
         changed = recording.changed_spans()
-        lost = builder.assets.list_problems(finished=recording.finished)
+        lost = builder.assets.list_problems(finished=recording.all_closed)
         damage = (*recording.missing, *recording.damage, *builder.list_gaps(recording.end), *changed, *lost)
         lost_bytes = sum(map(_count_lost_bytes, recording.files, recording.readable_files))
         lost_bytes += sum(map(os.path.getsize, recording.unreadable_files))

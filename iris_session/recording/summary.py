@@ -222,7 +222,7 @@ def summarise(recording: Recording, progress: Callable[[int, int], None] | None 
         if progress is not None and isinstance(item, RowTimes):
             progress(builder.steps, total)
     changed = recording.changed_spans()
-    lost = builder.assets.list_problems(finished=recording.finished)
+    lost = builder.assets.list_problems(finished=recording.all_closed)
     damage = (*recording.missing, *recording.damage, *builder.list_gaps(end), *changed, *lost)
     past = header.continues
     return RecordingSummary(

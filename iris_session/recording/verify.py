@@ -195,7 +195,7 @@ def verify(
             progress(total, total)
         run.end(recording.end)
         changed = recording.changed_spans()
-        lost = check_assets(recording).list_problems(finished=recording.finished)
+        lost = check_assets(recording).list_problems(finished=recording.all_closed)
         report.finished = recording.finished
         report.last_step = run.last_step
         report.writers = list(recording.writers)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import pytest
 from iris_session.protocol.scene import SceneSpec, decode_scene, list_assets
 from iris_session.recording import Recording, rrd_file, summarise, verify
 from iris_session.recording.asset_queue import AssetQueue
+from iris_session.recording.footer import add_index
 from iris_session.recording.messages import Batch, SceneAssets
 from iris_session.recording.paths import part_path
 from iris_session.recording.reader import check_assets
@@ -142,14 +144,19 @@ def test_file_of_an_earlier_version_has_none(tmp_path: Path) -> None:
     assert (summary.ok, summary.assets.recorded, summary.assets.present) == (True, "", 0)
 
 
-def test_changed_byte_of_an_asset_is_found_and_named(whole: Path, shared: Shared, tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_indexed", [False, True])
+def test_changed_byte_of_an_asset_is_found_and_named(
+    whole: Path, shared: Shared, tmp_path: Path, is_indexed: bool
+) -> None:
+    path = Path(shutil.copy(whole, tmp_path))
+    if is_indexed:
+        assert add_index(path)
     mesh = shared.spec.meshes[0]
     address = mesh.levels[0].address
-    data = bytearray(whole.read_bytes())
+    data = bytearray(path.read_bytes())
     at = data.find(shared.store.get(address)[-40:])
     assert at > 0
     data[at + 20] ^= 1
-    path = tmp_path / "session.rrd"
     path.write_bytes(data)
     report = verify(path, SmallCore)
     assert not report.ok
@@ -208,7 +215,26 @@ def test_part_that_was_killed_is_completed_by_the_next(shared: Shared, tmp_path:
         summary = found.summarise()
         assert summary.present == summary.expected == len(dict(recording.assets()))
         assert [scene.hash for scene in recording.scenes()] == [shared.scene_hash], "each part has it"
-        assert summary.scenes == 2
+        assert summary.scenes == 1
+
+
+def test_assets_of_an_earlier_scene_that_a_kill_has_taken_are_no_damage(shared: Shared, tmp_path: Path) -> None:
+    """The next recorder gets the newest scene only."""
+    path = record(tmp_path / "session.rrd", shared)
+    offsets = list(_asset_messages(path))
+    path.write_bytes(path.read_bytes()[: offsets[len(offsets) // 2]])
+    header, batch = journal(STEPS)
+    writer = RrdWriter(part_path(str(path), 2), "id", AssetQueue(SCENE))
+    writer.write_header(header)
+    writer.add(batch)
+    writer.close()
+    report = verify(path, SmallCore)
+    assert report.ok, report.line()
+    assert report.finished
+    assert repair(path, tmp_path / "repaired.rrd").ok
+    assert verify(tmp_path / "repaired.rrd", SmallCore).ok
+    with Recording.open(path) as recording:
+        assert summarise(recording).assets.present < summarise(recording).assets.expected
 
 
 @pytest.mark.parametrize("options", [(), ("--split-size-ratio", "1"), ("--max-rows", "2")])
