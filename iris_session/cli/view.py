@@ -123,7 +123,7 @@ def choose_recording(path: Path) -> Path:
     from iris_session.recording.paths import split_part, split_resume
 
     sessions: dict[str, list[Path]] = {}
-    for file in find_recordings(path, lambda error: print(f"iris-session: {error}", file=sys.stderr)):
+    for file in find_recordings(path, lambda error: print(to_printable(f"iris-session: {error}"), file=sys.stderr)):
         sessions.setdefault(split_resume(split_part(str(file))[0])[0], []).append(file)
     if not sessions:
         raise CommandError(f"there is no recording below the folder {path}: give a .rrd that `serve` or `demo` wrote")
@@ -138,7 +138,13 @@ def choose_recording(path: Path) -> Path:
 
 
 def _find_newest_s(files: Sequence[Path]) -> float:
-    return max(file.stat().st_mtime for file in files)
+    return max(map(_read_time_s, files))
+
+
+def _read_time_s(file: Path) -> float:
+    with suppress(OSError):  # removed meanwhile, or a link to nothing
+        return file.stat().st_mtime
+    return 0.0
 
 
 def _format_time(seconds: float) -> str:

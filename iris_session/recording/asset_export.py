@@ -76,7 +76,8 @@ def export_assets(
         if not force and root.exists() and any(root.iterdir()):
             raise AssetExportError(f"the folder {root} is not empty: give another one, or --force")
         store, n, n_bytes = AssetStore(root, _NO_LIMIT), 0, 0
-        for _, data in recording.assets():
+        for address, data in recording.assets():
+            store.find(address)  # removes a damaged file of an earlier export, which `put` would take for the asset
             store.put(data)
             n, n_bytes = n + 1, n_bytes + len(data)
             progress(f"{n:,} assets, {n_bytes / 1e6:.1f} MB")

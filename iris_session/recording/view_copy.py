@@ -54,7 +54,7 @@ def list_session_files(path: Path) -> list[Path]:
     first = _split_name(path.name)[0]
     found = ((*_split_name(one.name), one) for one in path.parent.iterdir() if one.name.endswith(paths.SUFFIX))
     ordered = sorted((number, part, one) for stem, number, part, one in found if stem == first)
-    return [one for _, _, one in ordered if not paths.is_view_copy(one.name)]
+    return [one for _, _, one in ordered if one.is_file() and not paths.is_view_copy(one.name)]
 
 
 def _split_name(name: str) -> tuple[str, int, int]:

@@ -106,7 +106,10 @@ def test_assets_are_files_by_hash(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert {address: copied.get(address) for address in wanted} == {a: shared.store.get(a) for a in wanted}
     assert main(command) == 2
     assert capsys.readouterr().err == f"iris-session: the folder {out} is not empty: give another one, or --force\n"
+    damaged = AssetStore(out).path(scene["hash"])
+    damaged.write_bytes(bytes(damaged.stat().st_size))
     assert main([*command, "--force"]) == 0
+    assert AssetStore(out).get(scene["hash"]) == shared.store.get(scene["hash"]), "files that are there are replaced"
     assert capsys.readouterr().out == f"{out}: {len(wanted)} assets, {report['bytes'] / 1e6:.1f} MB, scenes: 1\n"
     assert main([*command, "--force", "--robot", "left"]) == 2
     assert "--robot choose tables: leave them out with --to assets" in capsys.readouterr().err

@@ -49,6 +49,18 @@ def test_newest_session_of_a_folder_is_chosen(
     assert capsys.readouterr().out.splitlines()[1].startswith("uses the copy sessions/b/session.view.rrd (")
 
 
+def test_links_to_nothing_hide_no_session(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("session.part2.rrd", "other.rrd"):
+        (path.parent / name).symlink_to("nowhere")
+    assert main(["view", str(path.parent), "--no-open"]) == 0
+    out, err = capsys.readouterr()
+    assert f"shows session.rrd of {path.parent}" in out
+    assert err == ""
+    path.unlink()
+    assert main(["view", str(path.parent), "--no-open"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
 def test_damage_is_named(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = bytearray(path.read_bytes())
     victim = scan_file(path).messages[-10]
