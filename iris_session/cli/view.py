@@ -7,6 +7,7 @@ import os
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, nullcontext, suppress
@@ -31,6 +32,8 @@ POLL_S: Final = 0.05
 MIN_MEMORY: Final = 1 << 30
 #: Added to the nice value of a viewer beside a session that runs.
 LIVE_NICE: Final = 10
+#: Bytes of the messages of a viewer that has failed.
+MOST_WORDS: Final = 10_000
 #: Other sessions of a folder that are listed.
 MOST_LISTED: Final = 20
 
@@ -212,34 +215,36 @@ def _fed(recording: Path, port: int) -> Iterator[None]:
     from iris_session.system.process import ChildProcess
 
     url = f"rerun+http://{HOST}:{port}/proxy"
-    # Rerun's client reports that a viewer was closed.
-    feed = ChildProcess(
-        "iris_session.recording.live_feed",
-        [str(recording.absolute()), url],
-        environment={"RUST_LOG": "off"},
-        own_group=True,
-    )
-    with feed:
-        yield
+    with tempfile.TemporaryDirectory(prefix="iris-live-") as folder:  # for its files: it is killed at any moment
+        feed = ChildProcess(
+            "iris_session.recording.live_feed",
+            [str(recording.absolute()), url],
+            environment={"RUST_LOG": "off", "TMPDIR": folder},  # Rerun's client reports that a viewer was closed
+            own_group=True,
+        )
+        with feed:
+            yield
 
 
 @contextmanager
 def live_viewer(recording: Path | None, out: TextIO) -> Iterator[None]:
     """Show a recording in a viewer while the block runs, by `iris-session view --live` in a process of its own."""
-    from iris_session.system.process import DEVNULL, PIPE, ChildProcess
+    from iris_session.system.process import DEVNULL, ChildProcess
 
     port = _find_free_port()
     if not _has_display():
         print(f"the recording, in a browser on this machine: {format_page_address(port)}", file=out, flush=True)
     command = ["view", str(recording), "--live", "--port", str(port)]
-    # In a group of its own, so that Ctrl-C ends the session first.
-    viewer = ChildProcess("iris_session.cli.main", command, stdout=DEVNULL, stderr=PIPE, own_group=True)
-    try:
-        yield
-        if viewer.exit_status:
-            print(viewer.read_stderr().strip(), file=sys.stderr)
-    finally:
-        viewer.close(terminate_s=END_S + 1.0)
+    with tempfile.TemporaryFile() as words:  # no pipe: Rerun's viewer has it too, and may outlive the command
+        # In a group of its own, so that Ctrl-C ends the session first.
+        viewer = ChildProcess("iris_session.cli.main", command, stdout=DEVNULL, stderr=words, own_group=True)
+        try:
+            yield
+            if viewer.exit_status:
+                words.seek(0)
+                print(words.read(MOST_WORDS).decode(errors="replace").strip(), file=sys.stderr)
+        finally:
+            viewer.close(terminate_s=END_S + 1.0)
 
 
 def _wait(process: subprocess.Popen[bytes]) -> int:
