@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from iris_session.cli import recording_export, recording_render, recording_repair
-from iris_session.cli.common import CommandError, add_json_option, print_json, to_printable
+from iris_session.cli.common import CommandError, add_json_option, ending_as_interrupts, print_json, to_printable
 from iris_session.cli.progress import ReadingProgress
 
 if TYPE_CHECKING:
@@ -71,9 +71,10 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     if not os.path.exists(path):
         raise CommandError(f"{path} does not exist: give a recording (session{SUFFIX}), or a folder with recordings")
     require_package("rerun", "reading recordings")
-    if path.is_dir():
-        return _inspect_folder(path, as_json=arguments.json)
-    summary = _summarise_file(path)
+    with ending_as_interrupts():
+        if path.is_dir():
+            return _inspect_folder(path, as_json=arguments.json)
+        summary = _summarise_file(path)
     if arguments.json:
         print_json(msgspec.to_builtins(summary))
     else:

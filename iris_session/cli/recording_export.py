@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Final
 
-from iris_session.cli.common import CommandError, add_json_option, print_json, to_printable
+from iris_session.cli.common import CommandError, add_json_option, ending_as_interrupts, print_json, to_printable
 from iris_session.cli.progress import ProgressLine
 
 DEFAULT_HZ: Final = 100.0
@@ -90,7 +90,11 @@ def run_export(arguments: argparse.Namespace) -> int:
         tuple(arguments.object),
         arguments.force,
     )
-    with ProgressLine(arguments.path) as progress, SessionRecording.open(arguments.path, warn=False) as recording:
+    with (
+        ending_as_interrupts(),
+        ProgressLine(arguments.path) as progress,
+        SessionRecording.open(arguments.path, warn=False) as recording,
+    ):
         report = export_recording(recording, arguments.out, arguments.to, options, progress.show)
     if arguments.json:
         print_json(msgspec.to_builtins(report))
@@ -113,7 +117,11 @@ def _export_assets(arguments: argparse.Namespace) -> int:
     given = [f"--{name}" for name in ("hz", "robot", "object", "table") if getattr(arguments, name)]
     if given:
         raise CommandError(f"{', '.join(given)} choose tables: leave them out with --to {ASSETS}")
-    with ProgressLine(arguments.path) as progress, Recording.open(arguments.path, warn=False) as recording:
+    with (
+        ending_as_interrupts(),
+        ProgressLine(arguments.path) as progress,
+        Recording.open(arguments.path, warn=False) as recording,
+    ):
         report = export_assets(recording, arguments.out, force=arguments.force, progress=progress.show)
     if arguments.json:
         print_json(msgspec.to_builtins(report))

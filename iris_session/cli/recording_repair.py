@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from iris_session.cli.common import CommandError, add_json_option, print_json, to_printable
+from iris_session.cli.common import CommandError, add_json_option, ending_as_interrupts, print_json, to_printable
 from iris_session.cli.progress import ReadingProgress
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     path: Path = arguments.path
     if not path.exists():
         raise CommandError(f"{path} does not exist: give a recording (session.rrd), or its folder")
-    with ReadingProgress(path) as progress:
+    with ending_as_interrupts(), ReadingProgress(path) as progress:
         report = repair(path, arguments.out, overwrite=arguments.force, progress=progress.show_bytes)
     if arguments.json:
         print_json(msgspec.to_builtins(report))

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from iris_session.cli.common import add_json_option, print_json
+from iris_session.cli.common import add_json_option, ending_as_interrupts, print_json, to_printable
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -38,16 +38,18 @@ def run(arguments: argparse.Namespace) -> int:
     for path in arguments.files:
 
         def show(done: int, total: int, path: Path = path) -> None:
-            print(f"\r{path}: step {done} of {total}", end="" if done < total else "\n", file=sys.stderr)
+            text = to_printable(f"{path}: step {done} of {total}")
+            print(f"\r{text}", end="" if done < total else "\n", file=sys.stderr)
 
         try:
-            report = verify_recording(path, show if progress else None)
+            with ending_as_interrupts():
+                report = verify_recording(path, show if progress else None)
         except RecordingError as error:  # an unusable file must not hide the others
             report = VerifyReport(str(path), problems=[Problem(-1, "unreadable", "file", str(error))])
-            print(f"iris-session: {error}", file=sys.stderr)
+            print(to_printable(f"iris-session: {error}"), file=sys.stderr)
         else:
             if not arguments.json:
-                print(f"{path}: {report.line()}")
+                print(to_printable(f"{path}: {report.line()}"))
         reports.append(report)
     ok = all(report.ok for report in reports)
     if arguments.json:

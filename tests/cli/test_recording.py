@@ -5,13 +5,17 @@ from __future__ import annotations
 import errno
 import json
 import os
+import signal
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import pytest
 
 from iris_session.cli import progress
-from iris_session.cli.main import main
+from iris_session.cli.main import INTERRUPTED, main
 from iris_session.cli.recording import MOST_LINES, find_recordings, format_line, format_summary
+from iris_session.recording import reader
 from iris_session.recording.recorded_assets import AssetsSummary
 from iris_session.recording.summary import (
     AlignmentSummary,
@@ -166,6 +170,53 @@ def test_what_is_no_recording_is_one_line(
     assert expected in err
     assert str(path) in err
     assert ": give " in err
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("recording", "inspect"),
+        ("recording", "repair", "-o", "repaired.rrd"),
+        ("recording", "export", "-o", "tables", "--to", "csv"),
+        ("recording", "export", "-o", "files", "--to", "assets"),
+        ("verify",),
+    ],
+)
+def test_end_from_outside_is_taken_as_ctrl_c(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...], number: signal.Signals
+) -> None:
+    """A copy of a damaged recording may be as large as that."""
+    path = write(tmp_path / "session.rrd", *journal(5))
+
+    def refuse(*_: object) -> None:
+        raise AssertionError(f"{number.name} ends the command at once")
+
+    def find_writers(_: object) -> list[int]:
+        os.kill(os.getpid(), number)
+        return []
+
+    monkeypatch.setattr(reader, "find_writers", find_writers)
+    monkeypatch.chdir(tmp_path)
+    before = signal.signal(number, refuse), signal.getsignal(signal.SIGINT)
+    try:
+        assert main([*command, str(path)]) == INTERRUPTED
+    finally:
+        signal.signal(number, before[0])
+        signal.signal(signal.SIGINT, before[1])
+
+
+def test_text_of_a_file_controls_no_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    header, batch = journal(5)
+    fields: tuple[dict[str, Any], ...] = ({"versions": {"\x1b[2J": "1"}}, {"format": 3, "created_utc": "\x1b[2J"})
+    for i, changes in enumerate(fields):
+        path = write(tmp_path / f"{i}.rrd", msgspec.structs.replace(header, **changes), batch)
+        for command in (("verify",), ("recording", "inspect")):
+            main([*command, str(path)])
+    out, err = capsys.readouterr()
+    assert "\N{REPLACEMENT CHARACTER}[2J" in out
+    assert "\N{REPLACEMENT CHARACTER}[2J" in err
+    assert "\x1b" not in out + err
 
 
 def test_a_folder_without_recordings_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
