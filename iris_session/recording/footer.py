@@ -27,7 +27,7 @@ import psutil
 from iris_session.recording.errors import RecordingError
 from iris_session.recording.rerun_tool import INDEX, find_rerun, make_environment
 from iris_session.recording.rrd_file import END_MESSAGE, FILE_TAIL, FOOT, KIND_END, read_message_head, scan_file
-from iris_session.system.priority import LOW_PRIORITY_NICE
+from iris_session.system.priority import LAST_NICE, LOW_PRIORITY_NICE
 from iris_session.system.process import DEVNULL, ChildProcess
 
 #: Memory that `rerun rrd filter` takes for each message, and the share of the free memory that it may take.
@@ -152,6 +152,8 @@ def main() -> int:
     path, max_bytes = sys.argv[1], int(sys.argv[2])
     try:
         os.nice(LOW_PRIORITY_NICE)
+        with suppress(OSError):  # Linux may share the processor among sessions first, and this one is of its own
+            Path("/proc/self/autogroup").write_text(str(LAST_NICE), encoding="ascii")
         if hasattr(os, "SCHED_IDLE") and os.path.getsize(path) > SHORT_BYTES:
             with suppress(OSError):
                 os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))

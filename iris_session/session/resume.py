@@ -37,7 +37,7 @@ from iris_session.physics import (
     find_robots,
     load_model,
 )
-from iris_session.protocol.common import Pose
+from iris_session.protocol.common import MAX_TEXT, Pose
 from iris_session.protocol.discovery import DISCOVERY_PORT
 from iris_session.protocol.entries import decode_entries
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
@@ -226,6 +226,8 @@ class PastSession:
         if stopped.text:
             problems.append(stopped.text)
         self.now_ns = self.core.authority.now_ns
+        if recording.end is not None and recording.end.reason:
+            problems.append(f"{recording.end.reason[:MAX_TEXT]}: what came after {self.now_ns * 1e-9:.1f} s is not in it")
         self.notes += [f"{self.file}: {line}" for line in (*problems, *recording.damage, *recording.missing)]
 
     def _restore_clock_and_note(self, first: Path) -> None:

@@ -22,7 +22,7 @@ TICK_PRIORITY: Final = 5
 #: Added to the nice value of a thread at low priority: a tenth of the weight. Not less, as threads of Python hold its
 #: lock for moments, and every other thread then waits for them.
 LOW_PRIORITY_NICE: Final = 10
-_LAST_NICE: Final = 19
+LAST_NICE: Final = 19
 #: A thread that was started has its name within this time, on a busy machine, too [s].
 NAMED_WITHIN_S: Final = 1.0
 
@@ -49,7 +49,7 @@ def lower_named_thread_priority(name: str) -> None:
 
 
 def _lower_priority(native_id: int) -> None:
-    nice = min(_LAST_NICE, os.getpriority(os.PRIO_PROCESS, native_id) + LOW_PRIORITY_NICE)
+    nice = min(LAST_NICE, os.getpriority(os.PRIO_PROCESS, native_id) + LOW_PRIORITY_NICE)
     os.setpriority(os.PRIO_PROCESS, native_id, nice)
 
 

@@ -209,7 +209,7 @@ def journal(steps: int, recording_class: str = CLOSED, keyframe_steps: int = 50)
     return header, batch
 
 
-def write(path: Path, header: SessionHeader, batch: Batch, rows_per_chunk: int = 20) -> Path:
+def write(path: Path, header: SessionHeader, batch: Batch, rows_per_chunk: int = 20, *, reason: str = "") -> Path:
     """Write a finished file with this content."""
     writer = RrdWriter(path, "id")
     writer.write_header(header)
@@ -219,7 +219,7 @@ def write(path: Path, header: SessionHeader, batch: Batch, rows_per_chunk: int =
         batch.keyframes = [k for k in batch.keyframes if k not in keyframes]
         writer.add(Batch(rows=batch.rows[i : i + rows_per_chunk], keyframes=keyframes))
         writer.flush()
-    writer.close()
+    writer.close(reason=reason)
     return path
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from iris_session.recording import NotARecordingError, Recording, footer, rrd_file, verify
-from iris_session.recording.footer import add_index
+from iris_session.recording.footer import add_index, start_indexing
 from iris_session.recording.rerun_tool import find_rerun
 from iris_session.recording.rrd_file import END_MESSAGE, FILE_TAIL, scan_file
 from tests.recording.support import SmallCore, journal, recorder, wait_until, write
@@ -136,6 +136,17 @@ def test_full_disk_leaves_the_file_as_it_was(path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(os, "pwrite", refuse)
     assert not add_index(path)
     assert path.read_bytes() == before
+
+
+def test_its_session_comes_after_all_others(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where Linux shares the processor among sessions, the priority of a process counts only in its own."""
+    groups, found = Path("/proc/self/autogroup"), tmp_path / "found"
+    tool = tmp_path / "tool"
+    tool.write_text(f"#!/bin/sh\ncat {groups} > {found}\nexit 3\n")
+    tool.chmod(0o755)
+    monkeypatch.setenv("RERUN_CLI_PATH", str(tool))
+    assert start_indexing(str(path)).wait(60.0) == 1
+    assert found.read_text().endswith(" nice 19\n") is groups.exists()
 
 
 @pytest.mark.parametrize(("name", "value"), [("RESERVE_BYTES", 1 << 60), ("MEMORY_SHARE", 0.0)])

@@ -33,6 +33,7 @@ from iris_session.recording import (
     JournalRow,
     Keyframe,
     RecorderError,
+    Recording,
     RecordingInUseError,
     RecordingLock,
     SessionHeader,
@@ -138,6 +139,17 @@ def test_resumed_state_is_that_after_the_last_row(session: Path) -> None:
     assert past.header.session_id == "s1"
     assert len(past.notes) == 1
     assert "resume.tokens" in past.notes[0]
+    past.close()
+
+
+def test_end_of_a_budget_is_said(session: Path, tmp_path: Path) -> None:
+    """The session went on without a recording: its robots are set back to where they were."""
+    with Recording.open(session) as recording:
+        content = recording.header, Batch(rows=[*recording.rows()], keyframes=[*recording.keyframes()])
+    past = PastSession(write(tmp_path / "other.rrd", *content, reason="recording ended: budget is used up"))
+    assert past.step == STEPS - 1
+    end = f"what came after {LAST_NS * 1e-9:.1f} s is not in it"
+    assert f"other.rrd: recording ended: budget is used up: {end}" in past.notes
     past.close()
 
 
