@@ -107,7 +107,7 @@ def _read_states(
         batch: Any = chunk.to_record_batch()
         with suppress(*UNREADABLE):  # what is damaged is left out
             if chunk.entity_path == paths.STATE_ENTITIES:
-                entities = batch.column("bodies")[-1].as_py()
+                entities = [str(entity or "") for entity in batch.column("bodies")[-1].as_py()]
             elif max(read_index(batch, paths.SESSION_TIME)) <= after_ns:
                 before = [batch]
             else:

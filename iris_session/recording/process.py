@@ -429,9 +429,9 @@ def claim_file(path: Path) -> bool:
 
     Raises `RecorderError`: permission denied, no space, or the file exists.
     """
-    if path.exists():
+    if os.path.exists(path):
         raise RecorderError(f"{path} exists, and recordings are never overwritten: choose another file")
-    made_folder = not path.parent.exists()
+    made_folder = not os.path.exists(path.parent)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         _try_to_write(path)

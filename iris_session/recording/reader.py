@@ -13,7 +13,7 @@ import zlib
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
@@ -514,9 +514,10 @@ class Recording:
 
     def _is_of_recorder(self, path: str, found: rrd_file.Scan) -> bool:
         """Return whether a readable file with an index is a recorder's: one of its last marks is where it says."""
-        last, copy = found.messages[-LAST_MESSAGES:], self._make_copy_path(path)
+        last = found.messages[-LAST_MESSAGES:]
         infos = [m for m in found.messages[:-LAST_MESSAGES] if m.kind == rrd_file.KIND_STORE_INFO]
-        rrd_file.copy_messages(path, [*infos, *(m for m in last if m.kind != rrd_file.KIND_END)], copy)
+        with self._copying(path) as copy:
+            rrd_file.copy_messages(path, [*infos, *(m for m in last if m.kind != rrd_file.KIND_END)], copy)
         places = {m.offset for m in last}
         with suppress(*UNREADABLE, NotARecordingError):
             for chunk in rrd_file.read_chunks(copy, paths.MARKS):
@@ -526,28 +527,27 @@ class Recording:
 
     def _copied(self, path: str, n_bytes: int) -> str:
         """Copy the whole messages of a part that is being written: they stay the same while it is read."""
-        copy = self._make_copy_path(path)
-        with open(path, "rb") as source, open(copy, "wb") as target:
+        with self._copying(path) as copy, open(path, "rb") as source, open(copy, "wb") as target:
             while n_bytes > 0 and (data := source.read(min(n_bytes, 1 << 20))):
                 target.write(data)
                 n_bytes -= len(data)
         return copy
 
-    def _make_copy_path(self, path: str) -> str:
-        if self._folder is None:
-            self._folder = tempfile.TemporaryDirectory(prefix="iris-recording-")
-        return os.path.join(self._folder.name, os.path.basename(path))
+    @contextmanager
+    def _copying(self, path: str) -> Iterator[str]:
+        """Yield the path of a temporary copy. Raises `NotARecordingError` if it cannot be written."""
+        try:
+            if self._folder is None:
+                self._folder = tempfile.TemporaryDirectory(prefix="iris-recording-")
+            yield os.path.join(self._folder.name, os.path.basename(path))
+        except OSError as error:
+            said = f"a temporary copy of {os.path.basename(path)} cannot be written: {error.strerror or error}"
+            raise NotARecordingError(said) from error
 
     def _salvaged(self, path: str, prober: Prober) -> str:
-        copy = self._make_copy_path(path)
-        name = os.path.basename(path)
-        try:
-            self._harmed(*(f"{name}: {line}" for line in rrd_file.salvage(path, copy, prober)))
-        except OSError as error:
-            said = error.strerror or error
-            raise NotARecordingError(
-                f"{name} is damaged, and cannot be copied to {os.path.dirname(copy)}: {said}"
-            ) from error
+        with self._copying(path) as copy:
+            damage = rrd_file.salvage(path, copy, prober)
+        self._harmed(*(f"{os.path.basename(path)}: {line}" for line in damage))
         return copy
 
     def _harmed(self, *lines: str) -> None:
@@ -601,7 +601,7 @@ class Recording:
             return found
         if fault:
             raise NotARecordingError(f"the header of {path} is damaged: {fault}")
-        if self.writers:
+        if self.writers and not self.unreadable_files:
             raise NotARecordingError(f"{path} {describe_writers(self.writers)}, and holds nothing to read yet")
         said = self.damage + self.notes
         why = f" ({said[0]})" if said else " (nothing was recorded, or it is not ours)"

@@ -83,7 +83,7 @@ def repair(
         if recording.writers:
             raise RecorderError(f"{recording.files[0]} {describe_writers(recording.writers)}: repair it afterwards")
         target = Path(output)
-        _check_output(target, recording.files, overwrite=overwrite)
+        _check_output(target, [*recording.files, *recording.unreadable_files], overwrite=overwrite)
         damaged = [*recording.damage]
         is_prefix = not damaged and len(recording.files) == 1
         try:

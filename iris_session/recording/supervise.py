@@ -158,10 +158,12 @@ class RecorderProcess:
         process = self._process
         assert process is not None
         try:
-            line = process.read_line(START_S).decode(errors="replace").strip()
-        except (TimeoutError, EOFError):
-            line = ""
-        return line or f"the recorder did not start within {START_S:g} s: {_reason(self._log) or 'no message'}"
+            return process.read_line(START_S).decode(errors="replace").strip()
+        except TimeoutError:
+            what = f"did not start within {START_S:g} s"
+        except EOFError:
+            what = "ended as it started"
+        return f"the recorder {what}: {_reason(self._log) or 'no message'}"
 
     def _end(self, timeout_s: float) -> bool:
         process, self._process = self._process, None

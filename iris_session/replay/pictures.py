@@ -353,7 +353,7 @@ def _read_reach(
             break
         if state.bodies is not bodies:  # the same object in all states of a scene
             bodies, due_ns = state.bodies, max(begin_ns, state.session_time)
-        if state.session_time >= due_ns:
+        if state.session_time >= due_ns and len(state.poses) == len(bodies):  # a file may hold any number
             reach = found.setdefault(bodies, _Reach(bodies))
             reach.poses.append(state.poses[reach.rows])
             reach.people += [np.array(one.pose.p) + PERSON_M * _CORNERS for one in state.presence if with_people]

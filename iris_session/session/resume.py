@@ -227,7 +227,8 @@ class PastSession:
             problems.append(stopped.text)
         self.now_ns = self.core.authority.now_ns
         if recording.end is not None and recording.end.reason:
-            problems.append(f"{recording.end.reason[:MAX_TEXT]}: what came after {self.now_ns * 1e-9:.1f} s is not in it")
+            reason = recording.end.reason[:MAX_TEXT]
+            problems.append(f"{reason}: what came after {self.now_ns * 1e-9:.1f} s is not in it")
         self.notes += [f"{self.file}: {line}" for line in (*problems, *recording.damage, *recording.missing)]
 
     def _restore_clock_and_note(self, first: Path) -> None:

@@ -9,6 +9,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa  # type: ignore[import-untyped]
 import pytest
 
 from iris_session.protocol.common import Pose
@@ -19,6 +20,7 @@ from iris_session.recording.lost_motion import open_with_lost_motion, write_lost
 from iris_session.recording.messages import Batch, StateFrame
 from iris_session.recording.paths import part_path
 from iris_session.recording.repair import repair
+from iris_session.recording.rrd_stream import ArrowColumn
 from iris_session.recording.view_copy import open_view_file
 from iris_session.recording.writer import MIN_PERIOD_NS, RrdWriter
 from tests.recording.support import column, journal, make_header, read
@@ -96,6 +98,16 @@ def test_part_lacks_what_came_after_its_last_motion(tmp_path: Path, n: int, lack
     path = tmp_path / "killed.rrd"
     killed = write_file(path, make_states(n), closed=False)
     assert write_lost_motion(str(path), tmp_path / "motion.rrd") == lacking
+    killed.close()
+
+
+def test_damaged_names_of_bodies_leave_out_their_motion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    nothing = ArrowColumn("bodies", pa.array([None], pa.list_(pa.string())))
+    monkeypatch.setattr("iris_session.recording.writer.text_list_column", lambda *_: nothing)
+    path = tmp_path / "session.rrd"
+    killed = write_file(path, make_states(20), closed=False)
+    assert write_lost_motion(str(path), tmp_path / "motion.rrd") == 15
+    assert list(list_motion(tmp_path / "motion.rrd")) == ["/presence/p1/head"]
     killed.close()
 
 

@@ -27,6 +27,7 @@ from iris_session.recording import (
     Recording,
     RecordingLock,
     summarise,
+    supervise,
     verify,
 )
 from iris_session.recording import process as process_module
@@ -39,6 +40,7 @@ from iris_session.scene import AssetStore, decode_arrays
 from iris_session.scene.mujoco_assets import read_flex_mesh
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.streams.deformable import DeformableEncoder
+from iris_session.system.process import ChildProcess
 from tests.recording.support import (
     TICK_NS,
     SmallCore,
@@ -387,6 +389,17 @@ def test_existing_file_is_never_overwritten(tmp_path: Path) -> None:
         process.start()
     assert path.read_bytes() == b"something of yours"
     assert not process.alive
+
+
+def test_recorder_that_ends_as_it_starts_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(supervise, "ChildProcess", lambda _, **options: ChildProcess("iris_session.none", **options))
+    with pytest.raises(RecorderError, match=r"the recorder ended as it started: .*No module named iris_session\.none"):
+        RecorderProcess(tmp_path / "session.rrd", 0).start()
+
+
+def test_name_that_is_too_long_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(RecorderError, match=r"cannot record to .*: File name too long"):
+        process_module.claim_file(tmp_path / ("x" * 300))
 
 
 def test_unwritable_path_is_one_line(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import tempfile
 from pathlib import Path
 
 import msgspec
@@ -13,6 +14,7 @@ from iris_session.recording import (
     Continues,
     NotARecordingError,
     Recording,
+    RecordingLock,
     VerifyReport,
     paths,
     reader,
@@ -192,6 +194,22 @@ def test_file_removed_during_reading_is_an_error(path: Path) -> None:
 def test_a_file_may_have_any_name(path: Path, name: str) -> None:
     with Recording.open(path.rename(path.with_name(name))) as recording:
         assert (recording.damage, recording.finished) == ([], True)
+
+
+@pytest.mark.parametrize("state", ["written", "damaged", "indexed"])
+def test_full_temporary_disk_is_one_line_that_says_so(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: str
+) -> None:
+    lock = RecordingLock(path, shared=True) if state == "written" else None
+    if state == "damaged":
+        os.truncate(path, path.stat().st_size - 20)
+    elif state == "indexed":
+        assert add_index(path)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
+    with pytest.raises(NotARecordingError, match=r"temporary copy of session\.rrd cannot be written: No such file"):
+        Recording.open(path)
+    if lock is not None:
+        lock.release()
 
 
 def test_missing_part_is_found(tmp_path: Path) -> None:

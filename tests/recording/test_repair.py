@@ -51,6 +51,15 @@ def test_many_flipped_bits(original: Original, tmp_path: Path) -> None:
     assert [*flip_bits(original, tmp_path, 60, 2)].count("damaged") > 30
 
 
+def test_part_that_cannot_be_read_is_not_replaced(original: Original, tmp_path: Path) -> None:
+    path = Path(shutil.copy(original.path, tmp_path / "session.rrd"))
+    part = Path(part_path(str(path), 2))
+    part.write_bytes(b"damaged")
+    with pytest.raises(RecorderError, match="is the recording itself"):
+        repair(path, part, overwrite=True)
+    assert part.read_bytes() == b"damaged"
+
+
 def test_cut_file_keeps_its_checksums(original: Original, tmp_path: Path) -> None:
     path, output = tmp_path / "session.rrd", tmp_path / "repaired.rrd"
     path.write_bytes(original.path.read_bytes()[: scan_file(original.path).messages[-4].offset + 20])
