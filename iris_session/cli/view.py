@@ -102,15 +102,30 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _show_live(tool: str, arguments: argparse.Namespace, path: Path) -> int:
-    from iris_session.recording.lock import find_writers
-    from iris_session.recording.paths import split_part
-
-    if not find_writers(split_part(str(path))[0]):
-        raise CommandError(f"no session is writing {path}: leave --live out")
+    path = find_live(path)
     os.nice(LIVE_NICE)  # the session comes first
     print(f"follows {to_printable(str(path))} until the session ends", flush=True)
     with ending_as_interrupts():
         return _show(tool, arguments, None, path)
+
+
+def find_live(path: Path) -> Path:
+    """Return the first file of the recording that is being written, of the session that a file belongs to.
+
+    Raises:
+        CommandError: There is none.
+    """
+    from iris_session.recording.lock import find_writers
+    from iris_session.recording.paths import split_part
+    from iris_session.recording.view_copy import list_session_files
+
+    files: list[Path] = []
+    with suppress(OSError):  # the folder is gone
+        files = list_session_files(path)
+    live = next((file for file in files if find_writers(split_part(str(file))[0])), None)
+    if live is None:
+        raise CommandError(f"no session is writing {path}: leave --live out")
+    return live
 
 
 def choose_recording(path: Path) -> Path:

@@ -162,12 +162,13 @@ class FrontSockets:
 
 
 class LinkState:
-    """State of the link to the authority, written by `Downlink` (the first four), `Front` (stalls) and `Uplink`.
+    """State of the link to the authority, written by `Downlink` (the first five), `Front` (stalls) and `Uplink`.
 
     Attributes:
         heard_ns: Session time of its last message, 0 before the first.
         acknowledged: Batches that it acknowledged since the start.
         report: Its newest half of the status report, encoded; empty before the first.
+        is_recorded: The recording has not ended before the session.
         ended: The session has ended.
         stalled: It does not step.
         stalls: How often it stalled.
@@ -178,6 +179,7 @@ class LinkState:
         self.heard_ns = 0
         self.acknowledged = 0
         self.report = b""
+        self.is_recorded = True
         self.ended = False
         self.stalled = False
         self.stalls = 0

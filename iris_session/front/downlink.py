@@ -29,11 +29,21 @@ from iris_session.protocol.server_messages import (
     ServerMessage,
     Snapshot,
 )
+from iris_session.protocol.status import RecorderReport
 from iris_session.protocol.steps import OutgoingMessage
 
 _MAX_MESSAGES: Final = 64  # read at once
 #: Reasons by which a director ends a participation: the client does not join again by itself after them.
 REMOVALS: Final = ("removed", "revoked")
+
+
+class _ReportPart(msgspec.Struct):
+    """The part of a `StatusReport` that the front acts on."""
+
+    recorder: RecorderReport = RecorderReport()
+
+
+_decode_part = msgspec.msgpack.Decoder(_ReportPart).decode
 
 
 class Downlink:
@@ -106,6 +116,7 @@ class Downlink:
             self._assets.sync_clients()  # before a client hears of the scene
         elif kind == link.REPORT:
             self._authority.report = frames[1]
+            self._authority.is_recorded = _decode_part(frames[1]).recorder.state != "ended"
         elif kind == link.END:
             self._authority.ended = True
 

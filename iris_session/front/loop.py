@@ -87,7 +87,8 @@ class Front:
         status = StatusService(context, media, assets, alignment)
         admission = Admission(context, (media, assets))
         pairing = PairingService(context)
-        raw = RawFeed(sockets.context, context.config.recorder_endpoint, context.drops)
+        endpoint, authority = context.config.recorder_endpoint, context.authority
+        raw = RawFeed(sockets.context, endpoint, context.drops, lambda: authority.is_recorded)
         self._intake = Intake(context, admission, pairing, status, alignment, raw)
         self._disconnects = DisconnectHandler(context, sockets.control.monitor, admission, status, alignment)
         revocation = RevocationService(context, self._disconnects, self._reopen_state)

@@ -8,6 +8,7 @@ out is counted (`Drops`) and logged. Observers drive nothing: `PresenceLimiter` 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from typing import Final
 
 import msgspec
@@ -60,12 +61,20 @@ class RawFeed:
     """Forward samples and observations to the recorder: batches of `[connection, receive_ns, message bytes]`.
 
     A report on the delivery of states comes as `[participant, report]` in place of a message.
-    Never blocks. Without an endpoint nothing is forwarded. Messages are encoded again, not forwarded as received: so
-    the recording holds nothing that the schema does not have, however large or deep a client made it. A `Service`.
+    Never blocks. Without an endpoint, or while `is_recorded` says no, nothing is forwarded. Messages are encoded again,
+    not forwarded as received: so the recording holds nothing that the schema does not have, however large or deep a
+    client made it. A `Service`.
     """
 
-    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, drops: Drops) -> None:
+    def __init__(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoint: str,
+        drops: Drops,
+        is_recorded: Callable[[], bool] = lambda: True,
+    ) -> None:
         self._drops = drops
+        self._is_recorded = is_recorded
         self._shares = KeyedBuckets(KEY_BYTES_PER_S, BURST_S * KEY_BYTES_PER_S, MAX_KEYS)
         self._observer_shares = KeyedBuckets(OBSERVER_BYTES_PER_S, BURST_S * OBSERVER_BYTES_PER_S, MAX_KEYS)
         self._total = TokenBucket(TOTAL_BYTES_PER_S, BURST_S * TOTAL_BYTES_PER_S)
@@ -91,6 +100,8 @@ class RawFeed:
             self._send(connection, receive_ns, _encode((connection.participant_id, report)))
 
     def _send(self, connection: FrontConnection, receive_ns: int, data: bytes) -> None:
+        if not self._is_recorded():
+            return
         shares = self._observer_shares if connection.role == Role.OBSERVER else self._shares
         if not shares.take(connection.key_id, receive_ns, len(data)):
             self._leave_out(KEY_SHARE, connection, 1)

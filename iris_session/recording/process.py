@@ -311,7 +311,7 @@ class RecorderLoop:
             self._header = decode_header(frames[1])
             self._writer.write_header(self._header)
             for known in frames[2:]:
-                self._writer.add(decode_batch(known))
+                self._writer.add(self._decode(known))
             self._expecting = number
             self._received = number - 1
         elif kind == BATCH and number == self._expecting and not self._is_used_up:

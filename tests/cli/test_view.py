@@ -17,7 +17,8 @@ from typing import Any, Self
 import pytest
 
 from iris_session.cli.main import main
-from iris_session.cli.view import _fed, live_viewer
+from iris_session.cli.view import _fed, find_live, live_viewer
+from iris_session.recording.lock import RecordingLock
 from iris_session.recording.repair import RepairReport
 from iris_session.recording.rrd_file import scan_file
 from iris_session.system import process
@@ -56,6 +57,20 @@ def test_newest_session_of_a_folder_is_chosen(
     assert err == ""
     assert main(["view", "sessions/b", "--no-open"]) == 0
     assert capsys.readouterr().out.splitlines()[1].startswith("uses the copy sessions/b/session.view.rrd (")
+
+
+def test_recording_that_is_being_written_is_found_among_resumed_ones(
+    path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    others = [path.with_name(f"session.resume{number}.rrd") for number in (2, 3)]
+    for other in others:
+        shutil.copy(path, other)
+    for live in (path, *others):
+        lock = RecordingLock(live, shared=True)
+        assert {find_live(one) for one in (path, *others)} == {live}
+        lock.release()
+    assert main(["view", str(path.parent), "--live"]) == 2
+    assert "no session is writing" in capsys.readouterr().err
 
 
 def test_links_to_nothing_hide_no_session(path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,6 +15,7 @@ from iris_session.front.state_publisher import RECENT_NS, StatePublisher
 from iris_session.link import messages as link
 from iris_session.link.config import SceneInfo
 from iris_session.protocol.server_messages import BodyInfo, Event, MarkerAdded, SceneChanged, StateHeader
+from iris_session.protocol.status import RecorderReport, StatusReport
 from tests.front.fakes import make_alignment, make_context
 
 
@@ -73,6 +74,14 @@ def test_only_the_newest_pending_state_is_published(rig: LinkRig) -> None:
     rig.state(4)
     rig.downlink.drain()
     assert [h.state_seq for h in rig.headers()] == [1, 2]
+
+
+def test_end_of_a_recording_is_known_from_the_report(rig: LinkRig) -> None:
+    for state, is_recorded in (("running", True), ("ended", False), ("off", True)):
+        report = StatusReport(0, "", "", 0, recorder=RecorderReport(state))
+        rig.socket.send_multipart((link.REPORT, link.encoder.encode(report)))
+        rig.downlink.drain()
+        assert rig.authority.is_recorded is is_recorded
 
 
 def test_state_precedes_other_pending_messages(rig: LinkRig) -> None:

@@ -148,6 +148,16 @@ def test_recorder_that_does_not_read_costs_bounded_memory(rig: Rig, monkeypatch:
     feed._socket.close(linger=0)  # type: ignore[union-attr]
 
 
+def test_after_the_end_of_a_recording_nothing_is_missing(rig: Rig) -> None:
+    feed = RawFeed(rig.context, "inproc://nobody-reads", rig.drops, lambda: False)
+    for _ in range(2 * BURST_S * KEY_BYTES_PER_S // LARGE_BYTES):
+        feed.send(connection(1, "ann"), 0, LARGE)
+    feed.tick(0)
+    feed.close()
+    assert rig.drops.by_reason == {}
+    feed._socket.close(linger=0)  # type: ignore[union-attr]
+
+
 def test_feed_without_recorder_counts_nothing() -> None:
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     drops = Drops()

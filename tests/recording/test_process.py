@@ -19,6 +19,7 @@ import zmq
 
 from iris_session.protocol.names import ArrayKind
 from iris_session.protocol.scene import list_assets
+from iris_session.protocol.server_messages import ParticipantInfo
 from iris_session.protocol.status import ClientReport
 from iris_session.recording import (
     RecorderError,
@@ -32,7 +33,7 @@ from iris_session.recording import (
 )
 from iris_session.recording import process as process_module
 from iris_session.recording.feed import BATCH_NS
-from iris_session.recording.messages import RecorderConfig
+from iris_session.recording.messages import FRAME, HEADER, Batch, RecorderConfig, encode_batch, encode_header
 from iris_session.recording.paths import part_path
 from iris_session.recording.process import DRAIN_S, FLUSH_S
 from iris_session.recording.recorded_assets import ALL, list_recorded_assets
@@ -46,6 +47,7 @@ from tests.recording.support import (
     SmallCore,
     SmallSession,
     column,
+    make_header,
     read,
     record,
     recorder,
@@ -141,6 +143,20 @@ def test_reports_of_clients_are_plotted_and_no_raw_samples(tmp_path: Path) -> No
     loop._process_samples(msgspec.msgpack.encode([*batch, (7, 9, b"\x92 damaged"), (7, 9, b"\x80")]))
     assert loop._writer._reports == [("p1", 5, 2.5)], "of frames that were sent again the age is not known"
     assert (loop._samples, loop._refused) == (1, 1)
+    loop._syncer.stop()
+    loop._writer.close()
+    loop._context.destroy(linger=0)
+
+
+def test_name_of_a_participant_that_breaks_a_limit_is_left_out(tmp_path: Path) -> None:
+    """Each later recorder gets the same."""
+    config = RecorderConfig(
+        str(tmp_path / "session.rrd"), 1, "r", f"ipc://{tmp_path}/f", f"ipc://{tmp_path}/s", 0, os.getpid(), ""
+    )
+    loop = process_module.RecorderLoop(config)
+    known = encode_batch(Batch(people=[ParticipantInfo("p1", "n" * 100, "operator", True)]))
+    loop._process_message([FRAME.pack(HEADER, 7), encode_header(make_header()), known])
+    assert (loop._expecting, loop._refused) == (7, 1)
     loop._syncer.stop()
     loop._writer.close()
     loop._context.destroy(linger=0)
