@@ -32,7 +32,8 @@ class RecorderConfig(msgspec.Struct, frozen=True):
     the recorder binds; without `vertices_endpoint` deformables are drawn at rest, without `media_endpoint` no point
     clouds and pictures are recorded. `origin_ns`: session time zero on CLOCK_MONOTONIC. `parent`: id of the parent
     process; the recorder ends after it, once the file is finished. `record_assets`: see `recorded_assets.py`.
-    `budget_bytes`: see `budget.py`.
+    `budget_bytes`: see `budget.py`. `journal_only`: an error in the picture has ended the recorder before, and would
+    come again: of batches only what verification needs is written, and no media.
     """
 
     path: str
@@ -46,6 +47,7 @@ class RecorderConfig(msgspec.Struct, frozen=True):
     media_endpoint: str = ""
     record_assets: str = "none"
     budget_bytes: int = 0
+    journal_only: bool = False
 
 
 class EndMark(msgspec.Struct, frozen=True, array_like=True):

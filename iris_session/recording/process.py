@@ -66,6 +66,9 @@ QUIET_S: Final = 0.1
 FINISH_S: Final = 10.0
 #: An orphaned recorder whose file does not grow for this long exits: a write to a hung disk never returns.
 ORPHAN_S: Final = 20.0
+#: Exit statuses. An error that nothing catches is 1 (`supervise.CRASHED`).
+NOT_BEGUN: Final = 2
+NOT_WRITTEN: Final = 3
 ORPHANED: Final = 4
 MIN_FREE_BYTES: Final = 16 << 20
 #: Free bytes that are left to the journal: hours of it. Below, raw samples and vertices are left out.
@@ -144,7 +147,7 @@ class RecorderLoop:
             self._fault = str(error)
             self._send_status(-1)
             sys.stderr.write(f"{FAULT_PREFIX}{self._fault}\n")
-            return 3
+            return NOT_WRITTEN
         finally:
             self._syncer.stop()
             self._context.destroy(linger=500)
@@ -268,7 +271,7 @@ class RecorderLoop:
                 break
             m += 1
             self._process_samples(data)
-        if n < DRAIN_MESSAGES and m < DRAIN_SAMPLES and not self._is_short:
+        if n < DRAIN_MESSAGES and m < DRAIN_SAMPLES and not (self._is_short or self._config.journal_only):
             # Else behind with more important data: vertices and media are dropped at their source.
             self._drain_vertices()
             self._drain_media()
@@ -327,12 +330,12 @@ class RecorderLoop:
             self._expecting = number + 1
 
     def _decode(self, body: bytes) -> Batch:
-        """Decode a batch, or only its journal if the rest is invalid: a restarted recorder would get the same batch."""
-        try:
-            return decode_batch(body)
-        except msgspec.ValidationError:
-            self._refused += 1
-            return decode_journal(body)
+        """Decode a batch, or only its journal if the rest is invalid or has ended a recorder: each next one gets it."""
+        if not self._config.journal_only:
+            with suppress(msgspec.ValidationError):
+                return decode_batch(body)
+        self._refused += 1
+        return decode_journal(body)
 
     def _process_samples(self, data: bytes) -> None:
         try:
@@ -494,7 +497,7 @@ def main() -> int:
     except (RecorderError, WriteError) as error:
         print(f"failed: {error}", flush=True)
         sys.stderr.write(f"{FAULT_PREFIX}{error}\n")
-        return 1
+        return NOT_BEGUN
     signal.signal(signal.SIGTERM, lambda *_: recorder.stop())
     print("ready", flush=True)
     return recorder.run()

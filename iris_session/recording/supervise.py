@@ -20,6 +20,8 @@ from iris_session.system.process import PIPE, ChildProcess
 
 #: Time limit of a start. It takes half a second on an idle machine.
 START_S: Final = 60.0
+#: Exit status of Python after an error that nothing has caught.
+CRASHED: Final = 1
 #: Maximum length [bytes] of the folder for temporary files; the rest is for our folder and socket names.
 LONGEST_FOLDER: Final = 75
 
@@ -38,6 +40,7 @@ class RecorderProcess:
         self._origin_ns = origin_ns
         self._record_assets = record_assets
         self._budget_bytes = budget_bytes
+        self._journal_only = False
         # The path of a Unix socket has at most 107 bytes: some TMPDIR are too long for one.
         short = len(os.fsencode(tempfile.gettempdir())) <= LONGEST_FOLDER
         self._folder = tempfile.mkdtemp(prefix="iris-rec-", dir=None if short else "/tmp")
@@ -86,7 +89,8 @@ class RecorderProcess:
         if self._process is None or not (code := self._process.exit_status):
             return ""
         how = f"killed by signal {-code}" if code < 0 else f"exit status {code}"
-        return f"the recorder ended ({how}): {_reason(self._log) or 'no message'}"
+        left_out = " (the next one leaves out the picture)" if code == CRASHED else ""
+        return f"the recorder ended ({how}): {_reason(self._log) or 'no message'}{left_out}"
 
     def start(self) -> None:
         """Begin the recording and wait until the recorder writes.
@@ -107,18 +111,19 @@ class RecorderProcess:
     def restart(self) -> None:
         """Begin the next part without waiting for it: check `alive` and `failure` later, as after a crash.
 
+        After an error in our own code or Rerun's, which would come again, it writes only what verification needs.
         Raises `RecorderError` if the process or its log cannot be created; it may be tried again.
         """
-        self._end(0.0)
+        self._journal_only |= self._end(0.0) == CRASHED
         while os.path.exists(part_path(self.path, self.part)):
             self.part += 1
         self._spawn()
 
     def close(self, timeout_s: float = 10.0) -> bool:
         """Finish the file. Return whether the process ended cleanly by itself. Close feed and front before."""
-        clean = self._end(timeout_s)
+        status = self._end(timeout_s)
         shutil.rmtree(self._folder, ignore_errors=True)
-        return clean
+        return status == 0
 
     def _spawn(self) -> None:
         try:
@@ -139,6 +144,7 @@ class RecorderProcess:
             self.media_endpoint,
             self._record_assets,
             self._budget_bytes,
+            self._journal_only,
         )
         # RERUN=off in a user's shell would silence the stream. Nothing is drawn here: MuJoCo need not load OpenGL.
         environment = {"RERUN": "on", "RUST_LOG": "error", "MUJOCO_GL": "disable"}
@@ -165,11 +171,10 @@ class RecorderProcess:
             what = "ended as it started"
         return f"the recorder {what}: {_reason(self._log) or 'no message'}"
 
-    def _end(self, timeout_s: float) -> bool:
+    def _end(self, timeout_s: float) -> int:
+        """End the process. Return its exit status, 0 if there was none."""
         process, self._process = self._process, None
-        if process is None:
-            return True
-        return process.close(terminate_s=timeout_s) == 0
+        return 0 if process is None else process.close(terminate_s=timeout_s)
 
 
 def _reason(log: Path) -> str:

@@ -222,28 +222,25 @@ class RrdWriter:
         batch, self._pending = self._pending, Batch()
         samples, self._samples = self._samples, []
         reports, self._reports = self._reports, []
-        try:
-            self._write_rows(batch)
-            self._write_keyframes(batch)
-            told = [self._tell(event) for event in batch.events]  # names and roles are known when people appear
-            for _, states in groupby(batch.states, key=lambda state: len(state.poses)):
-                self._write_states(list(states))
-            self._write_events(batch.events, told)
-            self._add_holds(batch.holds)
-            self._write_denials(batch.denials)
-            self._add_metrics(batch.metrics)
-            self._add_reports(reports)
-            self._write_lanes()
-            if self._known and self._known[-1].session_ns >= self._collected_due_ns:
-                self._collected_due_ns = self._known[-1].session_ns + self._write_collected()
-            self._write_samples(samples)
-            self._write_vertices()
-            self._write_media()
-            self._stream.write(timeout_s)
-            if batch.keyframes:
-                self._write_mark()
-        except (RuntimeError, ValueError, OSError) as error:
-            raise self._to_error(error) from error
+        self._write_rows(batch)
+        self._write_keyframes(batch)
+        told = [self._tell(event) for event in batch.events]  # names and roles are known when people appear
+        for _, states in groupby(batch.states, key=lambda state: len(state.poses)):
+            self._write_states(list(states))
+        self._write_events(batch.events, told)
+        self._add_holds(batch.holds)
+        self._write_denials(batch.denials)
+        self._add_metrics(batch.metrics)
+        self._add_reports(reports)
+        self._write_lanes()
+        if self._known and self._known[-1].session_ns >= self._collected_due_ns:
+            self._collected_due_ns = self._known[-1].session_ns + self._write_collected()
+        self._write_samples(samples)
+        self._write_vertices()
+        self._write_media()
+        self._write_stream(timeout_s)
+        if batch.keyframes:
+            self._write_mark()
 
     def write_assets(self, max_bytes: int, timeout_s: float = 10.0) -> None:
         """Write the next assets, after the first row: no time in the file is before the first picture.
@@ -255,30 +252,33 @@ class RrdWriter:
 
     def _write_asset_rows(self, rows: AssetRows, timeout_s: float) -> None:
         scenes, pieces, faults = rows
+        if scenes:
+            columns = [
+                scalar_column("scene_step", [one.step for one in scenes], pa.int64()),
+                scalar_column("scene_ns", [one.session_time for one in scenes], pa.int64()),
+                scalar_column("hash", [one.hash for one in scenes], pa.string()),
+                scalar_column("recorded", [one.recorded for one in scenes], pa.string()),
+            ]
+            self._send_now(paths.ASSET_SCENES, len(scenes), columns)
+        if pieces:
+            columns = [
+                scalar_column("address", [one.address for one in pieces], pa.string()),
+                scalar_column("offset", [one.offset for one in pieces], pa.int64()),
+                scalar_column("total", [one.total for one in pieces], pa.int64()),
+                scalar_column("is_scene", [one.is_scene for one in pieces], pa.bool_()),
+                bytes_column("data", [one.data for one in pieces]),
+            ]
+            self._send_now(paths.ASSETS, len(pieces), columns)
+        if faults:
+            columns = [
+                scalar_column("address", [one.address for one in faults], pa.string()),
+                scalar_column("text", [one.text for one in faults], pa.string()),
+            ]
+            self._send_now(paths.ASSET_FAULTS, len(faults), columns)
+        self._write_stream(timeout_s)
+
+    def _write_stream(self, timeout_s: float) -> None:
         try:
-            if scenes:
-                columns = [
-                    scalar_column("scene_step", [one.step for one in scenes], pa.int64()),
-                    scalar_column("scene_ns", [one.session_time for one in scenes], pa.int64()),
-                    scalar_column("hash", [one.hash for one in scenes], pa.string()),
-                    scalar_column("recorded", [one.recorded for one in scenes], pa.string()),
-                ]
-                self._send_now(paths.ASSET_SCENES, len(scenes), columns)
-            if pieces:
-                columns = [
-                    scalar_column("address", [one.address for one in pieces], pa.string()),
-                    scalar_column("offset", [one.offset for one in pieces], pa.int64()),
-                    scalar_column("total", [one.total for one in pieces], pa.int64()),
-                    scalar_column("is_scene", [one.is_scene for one in pieces], pa.bool_()),
-                    bytes_column("data", [one.data for one in pieces]),
-                ]
-                self._send_now(paths.ASSETS, len(pieces), columns)
-            if faults:
-                columns = [
-                    scalar_column("address", [one.address for one in faults], pa.string()),
-                    scalar_column("text", [one.text for one in faults], pa.string()),
-                ]
-                self._send_now(paths.ASSET_FAULTS, len(faults), columns)
             self._stream.write(timeout_s)
         except (RuntimeError, ValueError, OSError) as error:
             raise self._to_error(error) from error

@@ -222,6 +222,29 @@ def test_killed_recorder_loses_no_row(tmp_path: Path) -> None:
     assert report.ok, report.line()
 
 
+def test_error_in_the_picture_leaves_out_the_picture(tmp_path: Path) -> None:
+    """Each later recorder gets what has ended the one before."""
+    path = tmp_path / "session.rrd"
+    with recorder(path) as (process, feed):
+        session = SmallSession(feed)
+        session.take(50)
+        feed.add_state(50, 50, 0.1, 51 * TICK_NS, np.zeros(5))  # no poses
+        session.take(50)
+        wait_until(lambda: not process.alive)
+        assert "exit status 1" in process.failure
+        assert process.failure.endswith(
+            "ValueError: cannot reshape array of size 5 into shape (7) (the next one leaves out the picture)"
+        )
+        process.restart()
+        session.take(50)
+        assert feed.close(20.0)
+        assert process.close()
+        assert feed.stats.recorders == 2
+    report = verify(path, SmallCore)
+    assert report.ok, report.line()
+    assert (report.parts, report.steps, report.finished) == (2, 150, True)
+
+
 def test_failed_start_of_a_recorder_is_retried_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "session.rrd"
     with recorder(path) as (process, feed):
