@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.recording.blueprint import BACKGROUND
+from iris_session.recording.errors import RecordingError
 from iris_session.recording.paths import STATE_ENTITIES
 from iris_session.recording.rerun_tool import find_rerun, make_environment
 from iris_session.recording.rrd_file import read_chunks
@@ -385,6 +386,10 @@ def main() -> int:
         except MissingViewerError as error:
             print(error, file=sys.stderr)
             return 2
+        except (RecordingError, ViewerError) as error:
+            print(f"{path}: {error}", file=sys.stderr)
+            status = 1
+            continue
         print(f"{path}: {look.filled:.0%} of the 3D picture show something, bodies that move fill {look.width:.0%}")
         for problem in look.problems:
             print(f"  {problem}")

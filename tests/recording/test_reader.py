@@ -285,6 +285,19 @@ def test_invalid_byte_count_of_a_mark_is_found(path: Path) -> None:
     ]
 
 
+def test_marks_that_overlap_are_not_all_computed(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    size = path.stat().st_size
+    computed: list[rrd_file.Mark] = []
+
+    def compute(_: object, mark: rrd_file.Mark) -> int:
+        computed.append(mark)
+        return 7
+
+    monkeypatch.setattr(rrd_file, "_crc", compute)
+    changed = rrd_file.changed_spans(path, [rrd_file.Mark(0, size, 7)] * 1000, closed=False)
+    assert (len(computed), len(changed)) == (2, 998)
+
+
 def test_header_without_continued_file_is_a_problem(path: Path) -> None:
     with Recording.open(path) as recording:
         for name in ("", "..", "../session.rrd", "a\0b", "x" * 300):
