@@ -383,7 +383,11 @@ class RecorderFeed:
         self.stats.bytes += len(body)
         self.stats.window_bytes += len(body)
         if self._instance and self._header_sent_to == self._instance:
-            self._socket.send_multipart((messages.FRAME.pack(messages.BATCH, number), body), zmq.NOBLOCK)
+            self._send(messages.BATCH, number, body)
+
+    def _send(self, kind: bytes, number: int, *bodies: bytes) -> None:
+        """Send a message. A model may have tens of megabytes: to copy it would take several ticks."""
+        self._socket.send_multipart((messages.FRAME.pack(kind, number), *bodies), zmq.NOBLOCK, copy=False)
 
     def _transfer(self) -> None:
         while int(self._socket.get(zmq.EVENTS)) & zmq.POLLIN:
@@ -418,11 +422,9 @@ class RecorderFeed:
             self._header_sent_to = self._instance
             first = self._window[0][0] if self._window else self._next
             self._scene.people = list(self._people.values())
-            known = messages.encode_batch(self._scene)
-            head = (messages.FRAME.pack(messages.HEADER, first), self._header, known)
-            self._socket.send_multipart(head, zmq.NOBLOCK)
+            self._send(messages.HEADER, first, self._header, messages.encode_batch(self._scene))
             for number, body in self._window:
-                self._socket.send_multipart((messages.FRAME.pack(messages.BATCH, number), body), zmq.NOBLOCK)
+                self._send(messages.BATCH, number, body)
 
     def _end(self) -> None:
         """Discard what waits, and all that comes: the recorder has closed the last file."""
