@@ -361,7 +361,8 @@ class RecorderFeed:
             self.stats.dropped_items += 1
 
     def _enqueue(self, body: bytes, rows: int, others: int) -> None:
-        if not self._spill and self.stats.window_bytes + len(body) <= self._window_limit:
+        # A batch may be above the limit, so that a large model is not written to a disk here.
+        if not self._spill and self.stats.window_bytes < self._window_limit:
             self._send_batch(body)
         elif self._spill.push(body, rows, others):
             self.stats.spilled_batches += 1

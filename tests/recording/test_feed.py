@@ -388,6 +388,20 @@ def test_models_are_not_copied_by_the_thread_that_takes_steps(played, tmp_path: 
     feed.close(0.0)
 
 
+def test_a_large_model_is_not_spilled_by_the_thread_that_takes_steps(played, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    recorder, endpoint, _ = played
+    feed = RecorderFeed(endpoint, tmp_path, window_bytes=1 << 20)
+    feed.send_header(make_header())
+    recorder.say(feed, 1, -1, -1)
+    steps(feed, 0, 10)
+    feed.send_scene("hash", os.urandom(2 << 20), ())
+    assert (feed.stats.spilled_batches, feed.stats.batches) == (0, 2)
+    steps(feed, 10, 10)
+    assert feed.stats.spilled_batches == 1, "what comes next waits on the disk"
+    assert [number for _, number, _ in recorder.take(3)] == [0, 0, 1]
+    feed.close(0.0)
+
+
 def test_lists_are_bounded_without_steps(feed: RecorderFeed) -> None:
     for i in range(BATCH_ITEMS + 10):
         feed.add_metric(i, i, "m", i)
