@@ -247,7 +247,7 @@ def test_states_that_last_are_lanes(tmp_path: Path) -> None:
     assert times(states) == [30, 90]
     (look,) = [batch for batch in lane if "session_time" not in batch.schema.names]
     assert column([look], "StateConfiguration:values") == [["Ada"]]
-    assert column([look], "StateConfiguration:colors") == [[0x56B4E9FF]]
+    assert column([look], "StateConfiguration:colors") == [[0x3D9BE9FF]]
     assert column(found["/lanes/robots/left\\/1/hold"], "StateChange:state") == [["clutch open"], [""]]
 
 
