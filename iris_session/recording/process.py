@@ -82,8 +82,8 @@ TRIAL_BYTES: Final = 128 << 10
 MAX_ASSETS_BYTES: Final = 1 << 20
 MIN_ASSETS_BYTES: Final = 64 << 10
 ASSETS_S: Final = 0.02
-#: Time for the rest of the assets when the session ends.
-ASSETS_AT_END_S: Final = 3.0
+#: Time for the rest of the assets when the session ends: all ends within 2 s after Ctrl-C (docs/recovery.md).
+ASSETS_AT_END_S: Final = 1.5
 
 _decode_samples = msgspec.msgpack.Decoder(list[tuple[int, int, bytes]]).decode
 #: First byte of a report in place of a message: an array of two, where messages are maps.
