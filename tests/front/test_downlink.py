@@ -32,7 +32,8 @@ class LinkRig:
         front = make_context(self, lambda: 77, publisher=publisher)
         self.drops, self.publisher, self.authority = front.drops, publisher, front.authority
         unused: Any = None
-        self.downlink = Downlink(front, near, unused, unused, unused, make_alignment(front), self)  # type: ignore[arg-type]
+        services: Any = make_alignment(front), self, unused
+        self.downlink = Downlink(front, near, unused, unused, unused, *services)
 
     def sync_clients(self) -> None:
         """In place of the asset service."""
