@@ -22,7 +22,7 @@ RESTART_DELAYS_NS: Final = (0, SECOND // 2, SECOND, 2 * SECOND, 5 * SECOND, 30 *
 #: A process that lived this long counts as healthy again.
 HEALTHY_NS: Final = 30 * SECOND
 #: A process that starts is given so long for each report: it imports, and compiles what it needs in one go, without a
-#: chance to report. That takes seconds of processor time, of which a busy machine gives one at low priority a tenth.
+#: chance to report. The filter of clouds takes 5 s of processor time, of which a busy machine gives a tenth.
 START_NS: Final = 120 * SECOND
 log = logging.getLogger(__name__)
 
