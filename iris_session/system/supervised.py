@@ -9,6 +9,7 @@ import logging
 import signal
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Final, Generic, Protocol, TypeVar
 
 import msgspec
@@ -156,7 +157,7 @@ class SupervisedProcess(Generic[Report]):
                 self._process.send_signal(signal.SIGKILL)
             return []
         self.fault = self.report.fault
-        how = f"ended: {self.fault}" if self.fault else self._hang or f"ended with status {self._process.exit_status}"
+        how = f"ended: {self.fault}" if self.fault else self._hang or _describe_exit(self._process.exit_status)
         self._process.close()
         self._process, self._hang = None, ""
         self._earlier_drops, self.report = self.drops, self._type()
@@ -213,3 +214,10 @@ class SupervisedProcess(Generic[Report]):
                 self._has_warned = True
                 continue
             self.heard_ns = now_ns
+
+
+def _describe_exit(status: int | None) -> str:
+    text = f"ended with status {status}"
+    with suppress(ValueError):  # no signal
+        text += f" ({signal.Signals(-(status or 0)).name})"
+    return text

@@ -125,7 +125,7 @@ def test_a_process_that_ends_is_started_again_and_announced() -> None:
     lab = start()
     lab.children[0].report(drops={"a": 3})
     lab.children[0].exit_status = -9
-    assert lab.poll(1.0) == ["the helper ended with status -9; it is started again"]
+    assert lab.poll(1.0) == ["the helper ended with status -9 (SIGKILL); it is started again"]
     assert lab.process.failure
     assert lab.children[0].closed
     assert lab.poll(0.001) == []
