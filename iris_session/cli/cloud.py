@@ -131,7 +131,7 @@ def _register_inspect(actions: argparse._SubParsersAction[argparse.ArgumentParse
 
 
 def run_file(arguments: argparse.Namespace) -> int:
-    """Publish a camera file until Ctrl-C. Exit status 1 if the session does not admit us."""
+    """Publish a camera file until Ctrl-C. Exit status 1 if the session does not admit us, or has such a stream."""
     from iris_session.client import Client
     from iris_session.cloud.camera_file import load_camera_file
     from iris_session.cloud.process import run_cameras
@@ -157,7 +157,7 @@ def run_file(arguments: argparse.Namespace) -> int:
             fault = f"no session admitted the cameras within {seconds:g} s: {where}"
     printer.end()
     if fault:
-        print(f"iris-session: {fault}", file=sys.stderr)
+        print(f"iris-session: {to_printable(fault)}", file=sys.stderr)
     return 1 if fault else 0
 
 

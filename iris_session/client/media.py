@@ -120,7 +120,8 @@ class ClientMedia:
     ) -> bool:
         """Publish a frame of a stream, in role `camera` or `source`.
 
-        Publish that of a stream at rest again at least every 10 s: a session may have lost it.
+        Publish that of a stream at rest again at least every 10 s: a session may have lost it. A stream has one source:
+        what you publish under the name of another one's is refused, and `taken_by` of it in `delivery` names that one.
 
         Args:
             stream: Name of the stream.
@@ -141,8 +142,11 @@ class ClientMedia:
             raise NotConnectedError(self._connection.describe())
         now_ns = self._session_now_ns()
         capture_ns, epoch = now_ns if capture_ns is None else capture_ns, self._connection.mirror.scene_epoch
+        number = welcome.connection_epoch
         try:
-            message = encode_media_frames(stream, frames, capture_ns, epoch, encoding, info=info, sent_ns=now_ns)
+            message = encode_media_frames(
+                stream, frames, capture_ns, epoch, encoding, info=info, sent_ns=now_ns, connection_epoch=number
+            )
         except ValueError as error:
             raise InvalidMessageError(str(error)) from None
         with self._lock:

@@ -283,6 +283,10 @@ class _Reader:
             )
 
     def _check_source(self, camera: CameraSettings, index: int) -> None:
+        model = camera.intrinsics
+        if model is not None and max(model.width, model.height) > MAX_IMAGE_SIZE:
+            wrong = f"intrinsics are of {model.width} x {model.height} pixels"
+            raise self._error("intrinsics", f"{wrong}: at most {MAX_IMAGE_SIZE} x {MAX_IMAGE_SIZE} are possible", index)
         if camera.source == "mujoco":
             for key in ("model", "camera"):
                 if not getattr(camera, key):

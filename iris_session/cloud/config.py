@@ -20,6 +20,7 @@ class CameraStart(msgspec.Struct, frozen=True):
         server_key, public_key, secret_key: CURVE keys as Z85 text, of the session and of the process; empty for a
             session without encryption.
         parent_pid: The process ends with this one; 0: by a signal only.
+        known_fault: Why the process before this one ended. The same is not logged again.
     """
 
     settings: CloudSettings
@@ -29,6 +30,7 @@ class CameraStart(msgspec.Struct, frozen=True):
     public_key: str = ""
     secret_key: str = ""
     parent_pid: int = 0
+    known_fault: str = ""
 
 
 class SourceReport(msgspec.Struct, frozen=True):
@@ -62,6 +64,7 @@ class CameraReport(msgspec.Struct, frozen=True):
         cameras: State of each source by name of the camera.
         fault: Why the process ends, empty while all is well.
         warning: One line for people about what the cloud lacks, empty for nothing.
+        starting: No cloud was made yet: packages are imported, the filter is compiled, devices are opened.
     """
 
     stream: str = ""
@@ -77,3 +80,4 @@ class CameraReport(msgspec.Struct, frozen=True):
     cameras: dict[str, SourceReport] = {}
     fault: str = ""
     warning: str = ""
+    starting: bool = False

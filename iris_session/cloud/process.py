@@ -42,6 +42,7 @@ from iris_session.cloud.worker import CloudWorker
 from iris_session.link.discovery import host_port
 from iris_session.protocol.media import StreamInfo
 from iris_session.protocol.names import Role
+from iris_session.protocol.status import DeliveryBudget
 from iris_session.scene.budget import Budget
 from iris_session.system.backoff import Backoff
 from iris_session.system.extras import MissingExtraError, require_package
@@ -271,25 +272,29 @@ def run_cameras(
             remover=robots if settings.remove_robots else None,
             watch=_make_watch(client, robots),
         )
-        on_report(CameraReport(settings.stream))
+        on_report(CameraReport(settings.stream, starting=True))
 
         def report(one: CameraReport) -> None:
             warning = "; ".join(filter(None, (one.warning, robots.warning)))
-            on_report(msgspec.structs.replace(one, warning=warning))
+            on_report(msgspec.structs.replace(one, warning=warning, starting=worker.cloud is None))
 
         try:
-            _work(worker, client, report, is_ending)
+            return _work(settings, worker, client, report, is_ending)
         finally:
             worker.close()
     except ClientError as error:
         return str(error)
     finally:
         client.close()
-    return ""
 
 
-def _work(worker: CloudWorker, client: Client, on_report: OnReport, is_ending: Callable[[], bool]) -> None:
-    """Publish until the end. Raises `ClientError` when the session refuses the client."""
+def _work(
+    settings: CloudSettings, worker: CloudWorker, client: Client, on_report: OnReport, is_ending: Callable[[], bool]
+) -> str:
+    """Publish until the end. Return why it ends by itself: another source has one of the streams.
+
+    Raises `ClientError` when the session refuses the client.
+    """
     session_id = ""
     report_at = time.monotonic() + REPORT_S
     while not is_ending():
@@ -303,9 +308,25 @@ def _work(worker: CloudWorker, client: Client, on_report: OnReport, is_ending: C
             session_id = welcome.session_id
         if connected:
             worker.poll(POLL_S)
+            if fault := find_taken_stream(settings, client.media.delivery):
+                return fault
         if time.monotonic() >= report_at:
             report_at = time.monotonic() + REPORT_S
             on_report(worker.make_report(connected=connected))
+    return ""
+
+
+def find_taken_stream(settings: CloudSettings, delivery: DeliveryBudget | None) -> str:
+    """Return one line for people about a stream of a camera file that another source has, empty while there is none."""
+    ours = settings.list_streams()
+    for one in () if delivery is None else delivery.streams:
+        if one.taken_by and one.stream in ours:
+            key = "stream" if one.stream == settings.stream else "name"
+            return (
+                f"the stream {one.stream!r} has another source already, {one.taken_by}: write another `{key} =` into "
+                "the camera file, or end that source"
+            )
+    return ""
 
 
 def _make_watch(client: Client, robots: SessionRobots) -> MoveWatch | None:
@@ -365,13 +386,16 @@ def main() -> int:
 
     gc.collect()
     gc.freeze()
+    # Before the filter is compiled: on a busy machine that takes as long again as what was imported by now.
+    write_report(reports, CameraReport(start.settings.stream, starting=True))
     try:
         fault = run_cameras(start.settings, make_client(start), partial(write_report, reports), is_ending)
     except (ClientError, MissingExtraError) as error:
         fault = str(error)
     except Exception as error:
         fault = describe_error(error)
-        log.exception("the camera process of %r ends", start.settings.stream)
+        if fault != start.known_fault:  # else once for every restart
+            log.exception("the camera process of %r ends", start.settings.stream)
     if fault:
         write_report(reports, CameraReport(start.settings.stream, fault=fault))
     # A driver that hangs in a thread would keep the interpreter from ending.

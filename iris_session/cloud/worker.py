@@ -28,6 +28,7 @@ from iris_session.cloud.pipeline import (
     CloudPipeline,
     PipelineCamera,
     PipelineSettings,
+    PlacedFrame,
     PointRemover,
 )
 from iris_session.cloud.reader import NewFrame, SourceReader
@@ -315,13 +316,7 @@ class CloudWorker:
             return False
         self._failures.pop(self._stream.name, None)
         self.poses = {name: one.T_world_camera for name, one in frames.items()}
-        if self._watch is not None:
-            for name, (frame, pose) in frames.items():
-                error_mm = self._cameras[name].error_mm
-                error_m = UNKNOWN_ERROR_M if error_mm is None else error_mm / 1000.0
-                model, scale_m = self._models[name]
-                body = self._cameras[name].body if frame.T_world_camera is None else ""
-                self._watch.offer(name, WatchedFrame(frame, model, scale_m, pose, error_m, body))
+        self._offer_to_watch(frames)
         self._note_stage("read", max(self._readers[name].read_ms for name in frames))
         for stage, duration_ms in cloud.stages_ms.items():
             self._note_stage(stage, duration_ms)
@@ -331,6 +326,21 @@ class CloudWorker:
         self._clouds += 1
         self._age_ms += (self._outlet.now_ns() - cloud.capture_ns) / MILLISECOND
         return True
+
+    def _offer_to_watch(self, frames: Mapping[str, PlacedFrame]) -> None:
+        if self._watch is None:
+            return
+        try:
+            for name, (frame, pose) in frames.items():
+                error_mm = self._cameras[name].error_mm
+                error_m = UNKNOWN_ERROR_M if error_mm is None else error_mm / 1000.0
+                model, scale_m = self._models[name]
+                body = self._cameras[name].body if frame.T_world_camera is None else ""
+                self._watch.offer(name, WatchedFrame(frame, model, scale_m, pose, error_m, body))
+        except Exception as error:  # of OpenCV that cannot be imported: the clouds go on
+            log.warning("cameras that are moved are not found: %s", describe_error(error))
+            self._watch.close()
+            self._watch = None
 
     def _note_failure(self, stream: _Stream, error: Exception) -> None:
         """Note that a frame could not be made: that ends neither this process nor the other streams."""

@@ -38,7 +38,7 @@ ADDED_FIELDS: Final[dict[type[msgspec.Struct], tuple[str, ...]]] = {
     Pair: ("identity",),
     Snapshot: ("anchors",),
     MediaHeader: ("sent_ns", "received_ns"),
-    MediaPush: ("info", "sent_ns"),
+    MediaPush: ("info", "sent_ns", "connection_epoch"),
 }
 #: Structs that are a message of their own, without an envelope.
 VERSIONED = (AssetRequest, AssetChunk, AssetRefused)

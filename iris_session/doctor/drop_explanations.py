@@ -74,6 +74,7 @@ EXPLANATIONS: Final[Mapping[str, str]] = {
     "media_newest_rate": "newest frames sent later to clients that subscribe over and over",
     "media_info_malformed": "descriptions of media streams with values out of range; their frames were taken",
     "media_stream_taken": "media of a source under the name of a stream that another one sends",
+    "media_source_left": "last frames of media sources that have left the session",
     "media_source_refused": "media of keys without the role camera or source",
     "media_flood": "connections to media closed because they sent more than was read, or what is no subscription",
     "media_order_lost": "connections to media closed, to subscribe again, since another sent what is no subscription",

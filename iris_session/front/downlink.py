@@ -13,6 +13,7 @@ from iris_session.front.asset_service import AssetService
 from iris_session.front.connections import encode_message
 from iris_session.front.context import FrontContext
 from iris_session.front.disconnects import DisconnectHandler
+from iris_session.front.media.service import MediaService
 from iris_session.front.revocation import RevocationService
 from iris_session.link import messages as link
 from iris_session.link.sockets import readable
@@ -58,6 +59,7 @@ class Downlink:
         revocation: RevocationService,
         alignment: AlignmentService,
         assets: AssetService,
+        media: MediaService,
     ) -> None:
         self._socket = socket
         self._config = context.config
@@ -72,6 +74,7 @@ class Downlink:
         self._revocation = revocation
         self._alignment = alignment
         self._assets = assets
+        self._media = media
 
     def drain(self) -> None:
         """Handle pending messages. Of several states only the newest is published: more would fill the subscribers'
@@ -134,6 +137,7 @@ class Downlink:
             self._alignment.process_event(event.body)
             if isinstance(event.body, ParticipantLeft) and not event.body.grace:
                 self._admission.expire_tokens(event.body.participant)
+                self._media.end_sources(event.body.participant)
             elif isinstance(event.body, ParticipantChanged):
                 self._update_role(event.body.participant)
         for outgoing in snapshots:

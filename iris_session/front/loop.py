@@ -92,7 +92,9 @@ class Front:
         self._intake = Intake(context, admission, pairing, status, alignment, raw)
         self._disconnects = DisconnectHandler(context, sockets.control.monitor, admission, status, alignment)
         revocation = RevocationService(context, self._disconnects, self._reopen_state)
-        self._downlink = Downlink(context, sockets.link, admission, self._disconnects, revocation, alignment, assets)
+        self._downlink = Downlink(
+            context, sockets.link, admission, self._disconnects, revocation, alignment, assets, media
+        )
         self._uplink = Uplink(context, sockets.link)
         self._authenticator = sockets.authenticator
         if self._authenticator is not None:

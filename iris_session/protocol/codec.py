@@ -254,6 +254,7 @@ def encode_media_frames(
     *,
     info: StreamInfo | None = None,
     sent_ns: int = 0,
+    connection_epoch: int = 0,
 ) -> list[bytes]:
     """Return all frames of a source's message. `frames`: of class `full`, or by class; none with an `info` alone.
     Raises `ValueError`.
@@ -275,7 +276,8 @@ def encode_media_frames(
         # An array may be counted in rows, or lie in memory in pieces, which a socket refuses with half a message sent.
         payloads.append(data if isinstance(data, bytes) else view.tobytes())
     try:
-        push = MediaPush(stream, scene_epoch, operator.index(capture_ns), tuple(by_class), encoding, info, sent_ns)
+        capture_ns = operator.index(capture_ns)
+        push = MediaPush(stream, scene_epoch, capture_ns, tuple(by_class), encoding, info, sent_ns, connection_epoch)
         header = encode_media_push(push)
         checked = decode_media_push(header).info
     except (TypeError, OverflowError, ProtocolError) as error:  # a time, an encoding or an info that is none

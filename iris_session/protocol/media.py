@@ -67,6 +67,7 @@ class StreamBudget(msgspec.Struct, frozen=True):
     """One media stream, and the class that a client gets. `mbit_per_s`: of that class, as measured. `encoding`: of its
     newest frame, so that a client knows what it would get before it subscribes. `title`, `audience`, `camera`, `fault`,
     `detail`: of its newest `StreamInfo`. `stale`: no frame came for so long that the newest one shows what was.
+    `taken_by`: what this client sends under the name is refused, because the stream is of that source; else empty.
     """
 
     stream: Name
@@ -79,6 +80,7 @@ class StreamBudget(msgspec.Struct, frozen=True):
     fault: Name = ""
     detail: Text = ""
     stale: bool = False
+    taken_by: Text = ""
 
 
 class MediaHeader(msgspec.Struct, frozen=True, array_like=True):
@@ -107,7 +109,8 @@ class MediaPush(msgspec.Struct, frozen=True, array_like=True):
 
     `classes`: `full`, and any of `half` and `quarter` that the source has in a coarser form; none in a message that has
     an `info` and no frame. `info`: of the stream, with its first frames, when it changes, and once a second; null: as
-    before. `sent_ns`: when the source passed the message to its socket, session time; 0: not known.
+    before. `sent_ns`: when the source passed the message to its socket, session time; 0: not known. `connection_epoch`:
+    of the sender's `Welcome`, by which the session knows whose stream it is; 0: not known.
     """
 
     stream: Name
@@ -117,6 +120,7 @@ class MediaPush(msgspec.Struct, frozen=True, array_like=True):
     encoding: Name = MediaEncoding.BYTES
     info: StreamInfo | None = None
     sent_ns: Nanoseconds = 0
+    connection_epoch: Count = 0
 
 
 def find_info_problem(info: StreamInfo) -> str:

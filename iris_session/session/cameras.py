@@ -28,10 +28,13 @@ from iris_session.system.process import PIPE, ChildProcess
 from iris_session.system.supervised import SupervisedProcess
 
 SECOND: Final = 1_000_000_000
-#: A process that does not report for this long is ended; it reports once a second.
+#: A process that has made a cloud and then does not report for this long is ended; it reports once a second. One that
+#: starts is given longer.
 HANG_NS: Final = 10 * SECOND
 #: A silence that is reported.
 SILENT_NS: Final = 3 * SECOND
+#: A start that is reported: alone on a machine it takes a second or two, the first one ten.
+SLOW_START_NS: Final = 10 * SECOND
 #: Time for the processes to leave their devices at the end.
 EXIT_S: Final = 1.0
 #: Of the drops of a camera process, those that a session reports: frames that are replaced by newer ones, as at every
@@ -81,9 +84,16 @@ class SessionCameras:
             )
             title = f"the camera process of {settings.stream!r}"
             self._processes[settings.stream] = SupervisedProcess(
-                title, partial(_spawn, start), CameraReport, hang_ns=HANG_NS
+                title,
+                partial(self._spawn, start),
+                CameraReport,
+                hang_ns=HANG_NS,
+                is_starting=lambda report: report.starting,
             )
         return [f"cameras: {', '.join(self._processes)}"] if self._processes else []
+
+    def _spawn(self, start: CameraStart) -> ChildProcess:
+        return _spawn(msgspec.structs.replace(start, known_fault=self._processes[start.settings.stream].fault))
 
     def poll(self, now_ns: int) -> list[str]:
         """Start what was not started, and what has ended; return what is to be announced, a line each. Never waits."""
@@ -100,11 +110,13 @@ class SessionCameras:
         """Return warnings for the status about processes that cannot say themselves what is wrong."""
         found = []
         for stream, process in self._processes.items():
-            silent = process.pid and process.heard_ns is not None and self._now_ns - process.heard_ns > SILENT_NS
+            silent_ns, starts = self._now_ns - process.last_ns, process.is_starting
             if process.failure:
                 found.append(process.failure)
-            elif silent:
-                found.append(f"the camera process of {stream!r} hangs: it is ended after {HANG_NS // SECOND} s")
+            elif process.pid and silent_ns > (SLOW_START_NS if starts else SILENT_NS):
+                state = "starts, which takes long on a busy machine" if starts else "hangs"
+                limit_s = process.limit_ns // SECOND
+                found.append(f"the camera process of {stream!r} {state}: it is ended after {limit_s} s")
             elif process.report.warning:
                 found.append(f"cameras of {stream!r}: {process.report.warning}")
         return found

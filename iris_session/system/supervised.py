@@ -9,6 +9,7 @@ import logging
 import signal
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Final, Generic, Protocol, TypeVar
 
 import msgspec
@@ -17,11 +18,13 @@ from iris_session.system.backoff import Backoff
 from iris_session.system.process import ChildProcess
 
 SECOND: Final = 1_000_000_000
-RESTART_DELAYS_NS: Final = (0, SECOND // 2, SECOND, 2 * SECOND, 5 * SECOND)
+#: The last one repeats: what a start takes, a second of processor time or two, is then a few percent.
+RESTART_DELAYS_NS: Final = (0, SECOND // 2, SECOND, 2 * SECOND, 5 * SECOND, 30 * SECOND)
 #: A process that lived this long counts as healthy again.
 HEALTHY_NS: Final = 30 * SECOND
-#: A process that has not reported yet is given longer: on a busy machine it imports and compiles for tens of seconds.
-START_NS: Final = 60 * SECOND
+#: A process that starts is given so long for each report: it imports, and compiles what it needs in one go, without a
+#: chance to report. The filter of clouds takes 5 s of processor time, of which a busy machine gives a tenth.
+START_NS: Final = 120 * SECOND
 log = logging.getLogger(__name__)
 
 
@@ -45,25 +48,35 @@ class SupervisedProcess(Generic[Report]):
         title: Name for people, as `the web gateway`.
         spawn: Starts the process. Called in a thread; what it raises is announced.
         report_type: Type of the reports; without arguments it is that of a process that has not reported.
-        hang_ns: A process that has reported before and then does not for this long is ended; 0: never.
+        hang_ns: A process that has started and then does not report for this long is ended; 0: none ever is.
+        is_starting: Whether a process still starts, by a report of it; by default it has started with the first one.
 
     Attributes:
         report: The newest report of the process.
         heard_ns: Time of `poll` at which it came, `None` before the first.
+        fault: Why the process before this one ended, as it said; empty where it said nothing, or there was none.
         restarts: How often it was restarted.
     """
 
     def __init__(
-        self, title: str, spawn: Callable[[], ChildProcess], report_type: type[Report], *, hang_ns: int = 0
+        self,
+        title: str,
+        spawn: Callable[[], ChildProcess],
+        report_type: type[Report],
+        *,
+        hang_ns: int = 0,
+        is_starting: Callable[[Report], bool] = lambda _: False,
     ) -> None:
         self._title = title
         self._spawn = spawn
         self._type = report_type
         self._hang_ns = hang_ns
+        self._is_starting = is_starting
         self._process: ChildProcess | None = None
         self._thread: threading.Thread | None = None
         self._backoff = Backoff(RESTART_DELAYS_NS)
         self._started_ns = self._due_ns = 0
+        self.fault = ""
         self._failure = self._hang = self._announced = ""
         self._was_started = self._closed = self._has_warned = False
         self._earlier_drops: dict[str, int] = {}
@@ -83,8 +96,23 @@ class SupervisedProcess(Generic[Report]):
 
     @property
     def failure(self) -> str:
-        """One line for people about why there is no process; empty while there is one."""
-        return "" if self.pid else self._announced
+        """One line for people about why there is no process, or why one after the other has ended; else empty."""
+        return self._announced if not self.pid or self._backoff.failures > 1 else ""
+
+    @property
+    def last_ns(self) -> int:
+        """Time of the last report, or of the start."""
+        return self._started_ns if self.heard_ns is None else self.heard_ns
+
+    @property
+    def is_starting(self) -> bool:
+        """True until a report says that the process has started."""
+        return self.heard_ns is None or self._is_starting(self.report)
+
+    @property
+    def limit_ns(self) -> int:
+        """The process is ended when it does not report for so long."""
+        return START_NS if self.is_starting else self._hang_ns
 
     @property
     def drops(self) -> dict[str, int]:
@@ -119,20 +147,21 @@ class SupervisedProcess(Generic[Report]):
                 self.start(now_ns)
             return []
         self._read_reports(self._process, now_ns)
+        # One that reports all the time has to have done so: it may have hung since it was started.
+        if (self.last_ns if self._hang_ns else now_ns) - self._started_ns > HEALTHY_NS:
+            self._backoff.reset()
+            self._announced = ""
         if self._process.is_running:
-            limit_ns = START_NS if self.heard_ns is None else self._hang_ns
-            if self._hang_ns and now_ns - (self.heard_ns or self._started_ns) > limit_ns:
-                self._hang = f"did not report for {limit_ns / SECOND:g} s and was ended"
+            if self._hang_ns and now_ns - self.last_ns > self.limit_ns:
+                self._hang = f"did not report for {self.limit_ns / SECOND:g} s and was ended"
                 self._process.send_signal(signal.SIGKILL)
             return []
-        fault = self.report.fault or self._hang or f"ended with status {self._process.exit_status}"
+        self.fault = self.report.fault
+        how = f"ended: {self.fault}" if self.fault else self._hang or _describe_exit(self._process.exit_status)
         self._process.close()
         self._process, self._hang = None, ""
         self._earlier_drops, self.report = self.drops, self._type()
-        if now_ns - self._started_ns > HEALTHY_NS:
-            self._backoff.reset()
-            self._announced = ""
-        return self._announce(f"{self._title} {fault}; it is started again", now_ns)
+        return self._announce(f"{self._title} {how}; it is started again", now_ns)
 
     def terminate(self) -> None:
         """Ask the process to end: several end at the same time before each is closed."""
@@ -185,3 +214,10 @@ class SupervisedProcess(Generic[Report]):
                 self._has_warned = True
                 continue
             self.heard_ns = now_ns
+
+
+def _describe_exit(status: int | None) -> str:
+    text = f"ended with status {status}"
+    with suppress(ValueError):  # no signal
+        text += f" ({signal.Signals(-(status or 0)).name})"
+    return text

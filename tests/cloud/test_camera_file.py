@@ -171,6 +171,8 @@ def test_a_wrong_value_is_named_with_its_line(tmp_path: Path, line: str, key: st
         ("farthest_m = 0.0", "farthest_m", 16),
         ("depth_scale_m = 1.0", "depth_scale_m", 16),
         ("width = 4", "width", 16),
+        ("height = 4097", "height", 16),
+        ("intrinsics = { width = 640, height = 4097, fx = 9.0, fy = 1.0, cx = 1.0, cy = 1.0 }", "intrinsics", 16),
         ("calibration = 'calibration.toml'", "pose", 15),
         ("intrinsics = 'nowhere.toml'", "intrinsics", 16),
         ("intrinsics = { width = 640 }", "height", 9),

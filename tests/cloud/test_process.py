@@ -15,8 +15,10 @@ import pytest
 from iris_session.client.errors import InvalidMessageError, NotConnectedError
 from iris_session.cloud import process
 from iris_session.cloud.config import CameraReport, CameraStart
-from iris_session.cloud.process import FETCH_AGAIN_NS, BodyHistory, SessionOutlet, SessionRobots
+from iris_session.cloud.process import FETCH_AGAIN_NS, BodyHistory, SessionOutlet, SessionRobots, find_taken_stream
 from iris_session.cloud.voxels import PointSet
+from iris_session.protocol.media import StreamBudget
+from iris_session.protocol.status import DeliveryBudget
 from tests.cloud.camera_settings import make_settings
 
 MS = 1_000_000
@@ -146,12 +148,16 @@ def test_an_error_that_nobody_expected_is_reported() -> None:
         "process.run_cameras = fail\n"
         "process.main()\n"
     )
-    start = msgspec.msgpack.encode(CameraStart(make_settings("front")))
-    ended = subprocess.run([sys.executable, "-c", program], input=start, capture_output=True, check=False)
-    assert ended.returncode == 1
-    report = msgspec.json.decode(ended.stdout, type=CameraReport)
-    assert (report.stream, report.fault) == ("room", r"KeyError: 'no such\ncell'")
-    assert ended.stderr.count(b"Traceback") == 1
+    start = CameraStart(make_settings("front"))
+    known = msgspec.structs.replace(start, known_fault=r"KeyError: 'no such\ncell'")
+    for one, tracebacks in ((start, 1), (known, 0)):  # once, and not with every restart
+        data = msgspec.msgpack.encode(one)
+        ended = subprocess.run([sys.executable, "-c", program], input=data, capture_output=True, check=False)
+        assert ended.returncode == 1
+        begun, report = (msgspec.json.decode(line, type=CameraReport) for line in ended.stdout.splitlines())
+        assert (begun.stream, begun.starting, begun.fault) == ("room", True, "")
+        assert (report.stream, report.fault) == ("room", known.known_fault)
+        assert ended.stderr.count(b"Traceback") == tracebacks
 
 
 def test_points_on_robots_go_once_their_shapes_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -306,3 +312,17 @@ def test_a_frame_that_cannot_be_sent_is_dropped(error: Exception) -> None:
     outlet = SessionOutlet(client)
     assert not outlet.publish("room", b"", 0, "cloud", None)
     assert not outlet.publish("room", b"", 0, "cloud", None)
+
+
+def test_a_stream_that_another_source_has_is_named_with_the_key_to_change() -> None:
+    settings = make_settings("front", picture_hz=5.0)
+    assert find_taken_stream(settings, None) == ""
+    free, taken = StreamBudget("room"), StreamBudget("room", taken_by="camera 'lab' at 10.0.0.8")
+    picture = msgspec.structs.replace(taken, stream="room-front")
+    other = msgspec.structs.replace(taken, stream="hall")
+    assert find_taken_stream(settings, DeliveryBudget("full", streams=(free, other))) == ""
+    assert find_taken_stream(settings, DeliveryBudget("full", streams=(other, taken))) == (
+        "the stream 'room' has another source already, camera 'lab' at 10.0.0.8: write another `stream =` into the "
+        "camera file, or end that source"
+    )
+    assert "another `name =` into" in find_taken_stream(settings, DeliveryBudget("full", streams=(free, picture)))

@@ -47,6 +47,8 @@ WIDTH, HEIGHT = 160, 120
 INTRINSICS = f"{{width = {WIDTH}, height = {HEIGHT}, fx = 146.0, fy = 146.0, cx = 79.5, cy = 59.5}}"
 POSE = "{position_m = [0.0, 0.0, 1.0], quaternion_wxyz = [0.5, -0.5, 0.5, -0.5]}"
 HZ = 5.0
+#: A stream ends with its source within so long, on a busy machine too; by silence it would after a minute.
+ENDED_S = 20.0
 #: A room with a camera in it, for rendered frames.
 ROOM = """<mujoco><worldbody><light pos="0 0 3"/><geom type="plane" size="3 3 .1" rgba=".4 .6 .4 1"/>
 <geom type="box" size=".2 .2 .2" pos="1 0 .2" rgba=".8 .2 .2 1"/>
@@ -436,8 +438,23 @@ def test_a_camera_by_hand_ends_by_ctrl_c_and_waits_for_its_session(
         assert re.search("age [0-9]+ ms, median: " + ", ".join(f"{one} -?[0-9.]+" for one in some) + "\n", text), text
     server.children()["front.main"].kill()
     wait_for_frames(ann, "room", 2)
+    again = run_command("cloud", "run", str(camera_file), "--address", server.address, cwd=tmp_path)
+    assert again.returncode == 1
+    assert again.stderr == (
+        "iris-session: the stream 'room' has another source already, camera 'room' at 127.0.0.1: write another "
+        "`stream =` into the camera file, or end that source\n"
+    )
+    ann.sleep(0.5)  # a status is asked for rarely
+    assert ann.status().drops["media_stream_taken"] > 0
+    wait_for_frames(ann, "room", 2)
     process.send_signal(signal.SIGINT)
     assert process.wait(DEADLINE_S) == 0
     text = (tmp_path / "camera.out").read_text()
     assert "Traceback" not in text
     assert "room: " in text
+
+    def has_ended() -> bool:
+        ann.sleep(0.1)
+        return find_stream(ann, "room") is None and find_stream(ann, "room-front") is None
+
+    wait_until(has_ended, "its streams end with it, and not by silence", ENDED_S)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -14,7 +15,14 @@ from iris_session.front.downlink import Downlink
 from iris_session.front.state_publisher import RECENT_NS, StatePublisher
 from iris_session.link import messages as link
 from iris_session.link.config import SceneInfo
-from iris_session.protocol.server_messages import BodyInfo, Event, MarkerAdded, SceneChanged, StateHeader
+from iris_session.protocol.server_messages import (
+    BodyInfo,
+    Event,
+    MarkerAdded,
+    ParticipantLeft,
+    SceneChanged,
+    StateHeader,
+)
 from iris_session.protocol.status import RecorderReport, StatusReport
 from tests.front.fakes import make_alignment, make_context
 
@@ -32,12 +40,18 @@ class LinkRig:
         publisher = StatePublisher(self, scene(1), lambda: 77)  # type: ignore[arg-type]
         front = make_context(self, lambda: 77, publisher=publisher)
         self.drops, self.publisher, self.authority = front.drops, publisher, front.authority
+        self.left: list[str] = []  # participants whose streams have ended
         unused: Any = None
-        self.downlink = Downlink(front, near, unused, unused, unused, make_alignment(front), self)  # type: ignore[arg-type]
+        services: Any = SimpleNamespace(expire_tokens=lambda _: None), unused, unused, make_alignment(front), self, self
+        self.downlink = Downlink(front, near, *services)
 
     def sync_clients(self) -> None:
         """In place of the asset service."""
         self.heard_of.append(self.publisher.scene.scene_hash)
+
+    def end_sources(self, participant_id: str) -> None:
+        """In place of the media service."""
+        self.left.append(participant_id)
 
     def send_multipart(self, frames: tuple[bytes, ...]) -> None:
         self.published.append(frames)
@@ -112,6 +126,14 @@ def test_new_scene_is_set_in_the_front_before_clients_are_notified(rig: LinkRig)
     rig.scene(2)
     rig.downlink.drain()
     assert rig.heard_of == ["scene1", "to everybody", "scene2"]
+
+
+def test_media_of_a_participant_end_when_it_has_left_for_good(rig: LinkRig) -> None:
+    bodies = ParticipantLeft("p1", "closed", grace=True), ParticipantLeft("p2", "bye", grace=False)
+    events = tuple(Event(n, 1, 0, body) for n, body in enumerate(bodies))
+    rig.socket.send_multipart((link.DECIDED, link.encoder.encode(link.Decided(1, events=events))))
+    rig.downlink.drain()
+    assert rig.left == ["p2"]
 
 
 def test_keyframe_before_the_first_state_has_the_poses_of_the_scene(rig: LinkRig) -> None:

@@ -313,6 +313,54 @@ def test_stream_belongs_to_one_connection_of_its_key() -> None:
     assert not push(12)
 
 
+def test_who_sends_in_vain_is_known_once_the_owner_has_sent_again() -> None:
+    wire = Wire()
+
+    def push(sender: int, source: str, connection: int, after_ns: int = MS) -> bool:
+        wire.now_ns += after_ns
+        push = MediaPush("cloud", 3, wire.now_ns, connection_epoch=sender)
+        return wire.hub.push(push, [b"x"], source, wire.now_ns, connection)
+
+    assert push(ANN, "a", 11)
+    assert not push(BOB, "b", 12)
+    assert wire.hub.list_refused(wire.now_ns) == set(), "ann may just have ended"
+    assert push(ANN, "a", 11)
+    assert wire.hub.list_refused(wire.now_ns) == {(BOB, "cloud")}
+    assert wire.hub.read_streams()["cloud"].sender == ANN
+    assert wire.hub.list_refused(wire.now_ns + 4 * SECOND) == set(), "bob has given up"
+    assert push(BOB, "b", 12, 4 * SECOND)
+    assert wire.hub.read_streams()["cloud"].sender == BOB
+    assert wire.hub.list_refused(wire.now_ns) == set()
+    assert not push(ANN, "a", 11)
+    assert push(BOB, "b", 12)
+    assert wire.hub.list_refused(wire.now_ns) == {(ANN, "cloud")}
+    wire.hub.set_subscribers({}, wire.now_ns)
+    assert wire.hub.list_refused(wire.now_ns) == set()
+    wire.hub.set_subscribers({ANN: MediaSubscriber("b", {})}, wire.now_ns)
+    wire.hub.release_streams(12)
+    assert push(ANN, "b", 13), "now it is one of the same key"
+    assert wire.hub.list_refused(wire.now_ns) == set()
+    assert push(BOB, "b", 13)
+    assert wire.hub.read_streams()["cloud"].sender == 0, "a number that is not of its key is nobody's"
+
+
+def test_streams_of_a_sender_that_has_left_end_and_do_not_come_back() -> None:
+    wire = Wire()
+
+    def push(stream: str, sender: int) -> bool:
+        push = MediaPush(stream, 3, wire.now_ns, connection_epoch=sender)
+        return wire.hub.push(push, [b"x"], "a" if sender == ANN else "b", wire.now_ns, sender)
+
+    assert push("cloud", ANN)
+    assert push("cloud-front", ANN)
+    assert push("other", BOB)
+    wire.hub.end_sender(ANN)
+    assert set(wire.hub.read_streams()) == {"other"}
+    assert not push("cloud", ANN), "it was on its way"
+    assert wire.hub.pop_drops()[0] == {"media_source_left": 1}
+    assert push("cloud", BOB)
+
+
 def test_another_key_waits_when_a_source_has_ended() -> None:
     wire = Wire()
     push = MediaPush("cloud", 3, 0)

@@ -45,25 +45,41 @@ class Room:
 
     def __init__(self) -> None:
         self.now_ns = 5 * SECOND
-        self.budgets: list[DeliveryBudget] = []
+        self.budgets: list[DeliveryBudget] = []  # of ann
+        self.others: dict[int, DeliveryBudget] = {}  # the newest one of each other client
         self.proxy = FakeProxy()
         context = make_context(self, lambda: self.now_ns, FrontConfig(adapt_media=False))
-        client = FrontConnection(7, Route(b"ann"), Peer(1, ""), ("127.0.0.1", 1), "", Hello("observer", "ann"), 0)
-        client.admitted = True
-        context.connections.add(client)
+        self.connections = context.connections
+        self.join(7, Hello("observer", "ann"))
         proxy: Any = self.proxy
         self.service = MediaService(context, proxy, IngestBackoff())
         self.drops = context.drops
 
+    def join(self, number: int, hello: Hello) -> FrontConnection:
+        """Admit a client."""
+        peer = Peer(number, "")
+        client = FrontConnection(number, Route(hello.name.encode()), peer, (f"10.0.0.{number}", 1), "", hello, 0)
+        client.admitted, client.participant_id = True, f"p{number}"
+        self.connections.add(client)
+        return client
+
     def send_to_route(self) -> None: ...
 
-    def send(self, _connection: FrontConnection, message: DeliveryBudget) -> bool:
-        self.budgets.append(message)
+    def send(self, connection: FrontConnection, message: DeliveryBudget) -> bool:
+        if connection.number == 7:
+            self.budgets.append(message)
+        else:
+            self.others[connection.number] = message
         return True
 
     def push(self, stream: str = "room", info: StreamInfo | None = ROOM, encoding: str = "cloud") -> None:
         push = MediaPush(stream, 1, self.now_ns, encoding=encoding, info=info)
         assert self.proxy.scheduler.push(push, [b"x"], "", self.now_ns)
+
+    def push_from(self, number: int, stream: str = "room") -> bool:
+        """Push a frame by a client's own connection to media ingest. Return whether it was taken."""
+        push = MediaPush(stream, 1, self.now_ns, encoding="cloud", info=ROOM, connection_epoch=number)
+        return self.proxy.scheduler.push(push, [b"x"], "", self.now_ns, 100 + number)
 
     def tick(self, periods: int = 1) -> int:
         """Return how many budgets were sent."""
@@ -131,6 +147,56 @@ def test_two_sources_of_one_stream_are_reported_while_they_are() -> None:
     assert "'room'" in text
     room.tick(16)
     assert room.service.list_warnings(room.now_ns) == ()
+
+
+def test_who_sends_in_vain_gets_to_know_who_has_the_stream() -> None:
+    room = Room()
+    room.join(8, Hello("camera", "room"))
+    room.join(9, Hello("camera", "hall"))
+    room.tick()
+    for _ in range(5):
+        assert room.push_from(8)
+        assert not room.push_from(9)
+        room.tick()
+    (told,) = room.others[9].streams
+    assert told.taken_by == "camera 'room' at 10.0.0.8"
+    assert room.find().taken_by == ""
+    assert room.others[8].streams[0].taken_by == ""
+    assert room.drops.by_reason["media_stream_taken"] == 5
+    assert room.service.report_streams()[0].source == "room"
+    room.tick(16)
+    assert room.others[9].streams[0].taken_by == "", "it sends no more"
+
+
+def test_a_stream_of_the_session_itself_is_named_to_who_sends_in_vain() -> None:
+    room = Room()
+    room.join(9, Hello("source", "hall"))
+    room.tick()
+    for _ in range(5):
+        room.push()
+        assert not room.push_from(9)
+        room.tick()
+    assert room.others[9].streams[0].taken_by == "the session itself"
+
+
+def test_streams_end_with_the_participant_and_not_with_its_connection() -> None:
+    room = Room()
+    camera, other = room.join(8, Hello("camera", "room")), room.join(9, Hello("camera", "hall"))
+    room.tick()
+    for number, stream in ((8, "room"), (9, "hall")):
+        assert room.push_from(number, stream)
+    room.tick()
+    room.connections.remove(camera)
+    room.proxy.scheduler.release_streams(108)
+    room.tick(8)
+    assert room.find("room").stale, "it may come back"
+    room.service.end_sources(camera.participant_id)
+    room.tick()
+    assert [one.stream for one in room.budgets[-1].streams] == ["hall"]
+    room.service.end_sources(other.participant_id)  # while its connection is there
+    room.tick()
+    assert room.budgets[-1].streams == ()
+    assert room.service.report_streams() == ()
 
 
 def test_changes_with_every_frame_are_sent_at_a_bounded_rate_and_the_last_one_is() -> None:

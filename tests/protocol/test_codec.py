@@ -350,9 +350,10 @@ def test_media_info_of_any_allowed_length_is_encoded() -> None:
     text = "\N{ROBOT FACE}" * 512
     camera = _camera(body=text[:64], distortion=(0.1,) * 8)
     info = StreamInfo(text, text[:64], camera, 30.0, text[:64], text)
-    header, _ = codec.encode_media_frames("x" * 48, b"", 2**62, 2**62, text[:64], info=info, sent_ns=2**62)
+    largest = {"info": info, "sent_ns": 2**62, "connection_epoch": 2**62}
+    header, _ = codec.encode_media_frames("x" * 48, b"", 2**62, 2**62, text[:64], **largest)  # type: ignore[arg-type]
     push = codec.decode_media_push(header)
-    assert (push.info, push.sent_ns) == (info, 2**62)
+    assert (push.info, push.sent_ns, push.connection_epoch) == (info, 2**62, 2**62)
 
 
 def test_media_arrays_are_encoded_in_row_order() -> None:

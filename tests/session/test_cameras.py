@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from iris_session.cloud.config import CameraReport, CameraStart
 from iris_session.link import Ports
 from iris_session.session import cameras as session_cameras
-from iris_session.session.cameras import SILENT_NS, SessionCameras, load_camera_files
+from iris_session.session.cameras import SILENT_NS, SLOW_START_NS, SessionCameras, load_camera_files
 from iris_session.session.config import ConfigError, SessionConfig
 from iris_session.session.errors import StartError
 from iris_session.system.process import ChildProcess
@@ -99,6 +100,26 @@ def test_warnings_name_what_the_processes_cannot_say(tmp_path: Path, monkeypatch
     assert cameras.list_warnings() == []
 
 
+def test_a_successor_is_told_what_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[CameraStart] = []
+
+    def spawn(start: CameraStart) -> ChildProcess:
+        started.append(start)
+        raise OSError("no memory")
+
+    monkeypatch.setattr(session_cameras, "_spawn", spawn)
+    cameras = SessionCameras(SessionConfig(cameras=(write_file(tmp_path, "room"),)))
+    cameras.start(Ports("127.0.0.1", 1, 2))
+    process = cameras._processes["room"]
+    for fault in ("", "ImportError: libGL.so.1"):
+        process.fault = fault
+        process.start(SECOND)
+        assert process._thread is not None
+        process._thread.join()
+    assert [one.known_fault for one in started] == ["", "ImportError: libGL.so.1"]
+    cameras.close()
+
+
 def test_a_process_that_is_silent_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cameras = SessionCameras(SessionConfig(cameras=(write_file(tmp_path, "room"),)))
     cameras.start(Ports("127.0.0.1", 1, 2))
@@ -110,3 +131,8 @@ def test_a_process_that_is_silent_is_a_warning(tmp_path: Path, monkeypatch: pyte
     assert cameras.list_warnings() == []
     cameras.poll(SILENT_NS + 1)
     assert cameras.list_warnings() == ["the camera process of 'room' hangs: it is ended after 10 s"]
+    process.report = CameraReport("room", starting=True)
+    assert cameras.list_warnings() == []
+    cameras.poll(SLOW_START_NS + 1)
+    (text,) = cameras.list_warnings()
+    assert text == "the camera process of 'room' starts, which takes long on a busy machine: it is ended after 120 s"

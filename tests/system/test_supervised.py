@@ -5,12 +5,13 @@ from __future__ import annotations
 import signal
 import threading
 import time
+from typing import Any
 
 import msgspec
 import pytest
 
 from iris_session.system.process import ChildProcess
-from iris_session.system.supervised import HEALTHY_NS, SECOND, START_NS, SupervisedProcess
+from iris_session.system.supervised import HEALTHY_NS, RESTART_DELAYS_NS, SECOND, START_NS, SupervisedProcess
 
 DEADLINE_S = 60.0
 
@@ -18,6 +19,7 @@ DEADLINE_S = 60.0
 class Report(msgspec.Struct, frozen=True):
     drops: dict[str, int] = {}
     fault: str = ""
+    starting: bool = False
     n: int = 0
 
 
@@ -64,7 +66,7 @@ def wait_for_spawn() -> None:
 class Lab:
     """A supervised process and the children that were started for it."""
 
-    def __init__(self, **options: int) -> None:
+    def __init__(self, **options: Any) -> None:
         self.children: list[Child] = []
         self.error: Exception | None = None
         self.process = SupervisedProcess("the helper", self._spawn, Report, **options)
@@ -87,7 +89,7 @@ class Lab:
         return found + self.process.poll(self.now_ns)
 
 
-def start(**options: int) -> Lab:
+def start(**options: Any) -> Lab:
     lab = Lab(**options)
     assert not lab.process.is_started
     lab.process.start(0)
@@ -123,7 +125,7 @@ def test_a_process_that_ends_is_started_again_and_announced() -> None:
     lab = start()
     lab.children[0].report(drops={"a": 3})
     lab.children[0].exit_status = -9
-    assert lab.poll(1.0) == ["the helper ended with status -9; it is started again"]
+    assert lab.poll(1.0) == ["the helper ended with status -9 (SIGKILL); it is started again"]
     assert lab.process.failure
     assert lab.children[0].closed
     assert lab.poll(0.001) == []
@@ -139,7 +141,8 @@ def test_its_own_account_of_why_it_ends_comes_first() -> None:
     lab = start()
     lab.children[0].report(fault="is not admitted")
     lab.children[0].exit_status = 1
-    assert lab.poll(1.0) == ["the helper is not admitted; it is started again"]
+    assert lab.poll(1.0) == ["the helper ended: is not admitted; it is started again"]
+    assert lab.process.fault == "is not admitted"
 
 
 def test_what_happens_again_and_again_is_announced_once_after_growing_delays() -> None:
@@ -153,15 +156,31 @@ def test_what_happens_again_and_again_is_announced_once_after_growing_delays() -
             lab.poll(0.05)
         times.append(lab.now_ns)
     assert announced == ["the helper ended with status 1; it is started again"]
+    assert lab.process.failure == announced[0], "also while the next one tries"
     delays = [round((b - a) / SECOND, 1) for a, b in zip([0, *times], times, strict=False)]
     assert delays[0] < 0.2
     assert delays == sorted(delays)
     assert delays[-1] >= 1.0
     lab.poll(HEALTHY_NS / SECOND + 1.0)
+    assert lab.process.failure == ""
     lab.children[-1].exit_status = 1
     assert len(lab.poll()) == 1, "it was healthy for a while"
     lab.poll(0.001)
     assert len(lab.children) == 6, "so it is started at once"
+
+
+def test_one_that_fails_for_ever_is_tried_at_the_longest_delay_for_ever() -> None:
+    lab = start()
+    announced = []
+    for _ in range(20):  # minutes
+        for _ in range(120):
+            lab.children[-1].report(fault="ImportError: libGL.so.1: no such file")
+            lab.children[-1].exit_status = 1
+            announced += lab.poll(0.5)
+    assert announced == ["the helper ended: ImportError: libGL.so.1: no such file; it is started again"]
+    assert lab.process.failure == announced[0]
+    starts = len(lab.children)
+    assert 20 * 60 / 31 < starts < 20 * 60 / 29 + len(RESTART_DELAYS_NS)
 
 
 def test_a_process_that_cannot_be_started_is_tried_again() -> None:
@@ -178,7 +197,7 @@ def test_a_process_that_cannot_be_started_is_tried_again() -> None:
 
 def test_a_process_that_hangs_is_ended_but_not_while_it_starts() -> None:
     lab = start(hang_ns=5 * SECOND)
-    assert lab.poll(60.0) == []
+    assert lab.poll(START_NS / SECOND) == []
     lab.children[0].report()
     assert lab.poll() == []
     assert lab.poll(4.9) == []
@@ -187,11 +206,41 @@ def test_a_process_that_hangs_is_ended_but_not_while_it_starts() -> None:
     assert announced == ["the helper did not report for 5 s and was ended; it is started again"]
 
 
+def test_each_part_of_a_slow_start_may_take_long() -> None:
+    lab = start(hang_ns=5 * SECOND, is_starting=lambda report: report.starting)
+    for _ in range(3):
+        assert lab.process.is_starting
+        assert lab.poll(START_NS / SECOND - 1.0) == []
+        lab.children[0].report(starting=True)
+        assert lab.poll() == []
+    assert lab.process.limit_ns == START_NS
+    lab.children[0].report()
+    assert lab.poll() == []
+    assert (lab.process.is_starting, lab.process.limit_ns) == (False, 5 * SECOND)
+    assert len(lab.poll(5.1)) == 1, "it has started, and hangs"
+
+
+def test_a_process_that_hangs_while_it_starts_is_ended() -> None:
+    lab = start(hang_ns=5 * SECOND, is_starting=lambda report: report.starting)
+    lab.children[0].report(starting=True)
+    lab.poll(2.0)
+    assert lab.poll(START_NS / SECOND) == []
+    announced = lab.poll(0.1)
+    assert lab.children[0].signals == [signal.SIGKILL]
+    assert announced == ["the helper did not report for 120 s and was ended; it is started again"]
+    lab.poll(0.001)
+    assert lab.poll(START_NS / SECOND + 0.1) == [], "it is no healthier for having lived long"
+    assert lab.children[1].signals == [signal.SIGKILL]
+    lab.poll(1.0)
+    assert len(lab.children) == 3
+    assert lab.process.failure == announced[0]
+
+
 def test_a_process_that_never_reports_is_ended() -> None:
     lab = start(hang_ns=5 * SECOND)
     announced = lab.poll(START_NS / SECOND + 0.1)
     assert lab.children[0].signals == [signal.SIGKILL]
-    assert announced == ["the helper did not report for 60 s and was ended; it is started again"]
+    assert announced == ["the helper did not report for 120 s and was ended; it is started again"]
     quiet = start()  # without such a limit
     assert quiet.poll(1000.0) == []
     assert quiet.children[0].signals == []

@@ -47,6 +47,8 @@ STALE_NS: Final = SECOND
 STALE_FRAMES: Final = 3.0
 #: The connection of this machine's session itself; others are descriptors of TCP connections.
 LOCAL: Final = -1
+#: Participants that have left, whose last frames may still be under way. More do not leave within their time.
+MAX_LEFT: Final = 256
 #: `send(topic, header, frame)`: returns false if that connection has no room.
 Send = Callable[[bytes, bytes, Any], bool]
 
@@ -80,7 +82,8 @@ class StreamStats(NamedTuple):
     """Measurements of a stream. `rates`: bytes per second by level. `hz`: frames per second. `encoding`:
     of the newest frame, which was received at `received_ns`. `info`: as of its source, with texts cut to length.
     `frame_bytes`: of the newest frame, class `full`; `None` before the first one, and when it had to be released.
-    `refused_ns`: when something of another source was refused last, `None` for never."""
+    `refused_ns`: when something of another source was refused last, `None` for never. `sender`: connection number of
+    its source, `LOCAL` for the session itself, 0 where it is not known."""
 
     rates: tuple[float, ...]
     hz: float
@@ -91,6 +94,7 @@ class StreamStats(NamedTuple):
     info: StreamInfo = StreamInfo()
     frame_bytes: int | None = None
     refused_ns: int | None = None
+    sender: int = 0
 
     def is_stale(self, now_ns: int) -> bool:
         """Return whether the newest frame is too old for the rate that the source means to hold, or missing."""
@@ -129,13 +133,14 @@ class _Subscription:
 
 class _Stream:
     """One stream and its newest frame, received at `received_ns`; before the first one, when the stream began.
-    `source`, `connection`: key and connection that it belongs to; `None` when that has ended. `heard_ns`: of the newest
-    message. `level_bytes`: bytes that each level would have had so far.
+    `source`, `connection`: key and connection that it belongs to; `None` when that has ended. `sender`: as in
+    `StreamStats`. `heard_ns`: of the newest message. `level_bytes`: bytes that each level would have had so far.
     """
 
     def __init__(self, source: str, connection: int | None, seq: int, now_ns: int) -> None:
         self.source = source
         self.connection = connection
+        self.sender = 0
         self.refused_ns: int | None = None
         self.seq = seq
         self.received_ns = self.heard_ns = now_ns
@@ -182,6 +187,8 @@ class MediaScheduler:
         self._delayed: dict[int, dict[str, None]] = {}  # streams by connection that wait for its bucket
         self._pending: deque[tuple[int, str]] = deque()
         self._paused_until_ns = 0
+        self._refused: dict[tuple[int, str], tuple[int, int]] = {}  # by sender and stream: since when, and when last
+        self._left: deque[int] = deque(maxlen=MAX_LEFT)
         self._stuck: set[int] = set()
         self.drops: dict[str, int] = {}
         self.superseded: dict[int, int] = {}
@@ -199,6 +206,7 @@ class MediaScheduler:
         for known in (self._ended_counters, self._newest_buckets, self._delayed):
             for number in [number for number in known if number not in self._subscribers]:
                 del known[number]
+        self._refused = {key: times for key, times in self._refused.items() if key[0] in self._subscribers}
         for key, level in before.items():
             if self._find_level(*key) < level:
                 self._offer_newest(key, now_ns)
@@ -273,7 +281,11 @@ class MediaScheduler:
         if now_ns < self._paused_until_ns:
             self._count_drop("media_memory")
             return False
-        stream = self._find_stream(push.stream, source, connection, now_ns)
+        if push.connection_epoch in self._left:
+            self._count_drop("media_source_left")
+            return False
+        sender = LOCAL if connection == LOCAL else self._find_sender(push.connection_epoch, source)
+        stream = self._find_stream(push.stream, source, connection, sender, now_ns)
         if stream is None:
             return False
         stream.heard_ns, stream.encoding = now_ns, push.encoding
@@ -333,8 +345,20 @@ class MediaScheduler:
                 stream.info,
                 len(stream.frames[0]) if stream.frames else None,
                 stream.refused_ns,
+                stream.sender,
             )
         return found
+
+    def list_refused(self, now_ns: int) -> set[tuple[int, str]]:
+        """Return the senders whose frames are refused now, each with the stream that another source has.
+
+        Only where that one has sent something since: a source that has just ended is waited for.
+        """
+        return {
+            (number, name)
+            for (number, name), (since_ns, last_ns) in self._refused.items()
+            if name in self._streams and self._streams[name].heard_ns > since_ns and now_ns - last_ns < TAKEOVER_NS
+        }
 
     def list_newest(self, encodings: Container[str]) -> list[NewestFrame]:
         """Return the newest frame of every stream that has one in one of `encodings`."""
@@ -397,6 +421,12 @@ class MediaScheduler:
             if stream.connection == connection:
                 stream.connection = None
 
+    def end_sender(self, number: int) -> None:
+        """Remove the streams of a participant that has left, by its connection number, and drop what still comes."""
+        self._left.append(number)
+        for name in [name for name, stream in self._streams.items() if stream.sender == number]:
+            del self._streams[name]
+
     def stop_sources(self, gone: Iterable[str]) -> None:
         """Remove the streams of sources that may not hand in frames any more."""
         ended = set(gone)
@@ -421,7 +451,12 @@ class MediaScheduler:
         if not numbers:
             del self._by_stream[stream]
 
-    def _find_stream(self, name: str, source: str, connection: int | None, now_ns: int) -> _Stream | None:
+    def _find_sender(self, number: int, source: str) -> int:
+        """Return the connection number that a source states, 0 if that connection has another key."""
+        connection = self._subscribers.get(number)
+        return number if connection is not None and connection.user_id == source else 0
+
+    def _find_stream(self, name: str, source: str, connection: int | None, sender: int, now_ns: int) -> _Stream | None:
         stream = self._streams.get(name)
         if stream is None:
             if len(self._streams) >= MAX_STREAMS:
@@ -434,11 +469,16 @@ class MediaScheduler:
             if not has_ended and now_ns - stream.heard_ns < TAKEOVER_NS:
                 stream.refused_ns = now_ns
                 self._count_drop("media_stream_taken")
+                if sender > 0:
+                    since_ns, last_ns = self._refused.get((sender, name), (now_ns, now_ns))
+                    self._refused[sender, name] = since_ns if now_ns - last_ns < TAKEOVER_NS else now_ns, now_ns
                 return None
             if stream.source != source:
                 stream.source, stream.info, stream.received_ns = source, StreamInfo(), now_ns
                 stream.push, stream.frames = None, {}
             stream.connection = connection
+        stream.sender = sender
+        self._refused.pop((sender, name), None)
         return stream
 
     def _take_info(self, stream: _Stream, info: StreamInfo) -> None:

@@ -10,6 +10,7 @@ from typing import Any, Final
 import msgspec
 
 from iris_session.front.channel_guard import ChannelFlood
+from iris_session.front.connections import FrontConnection
 from iris_session.front.context import FrontContext
 from iris_session.front.key_budgets import IngestBackoff
 from iris_session.front.media.budget import (
@@ -23,7 +24,7 @@ from iris_session.front.media.budget import (
     StateReport,
 )
 from iris_session.front.media.proxy import MediaProxy
-from iris_session.front.media.scheduler import DeliveryCounters, MediaSubscriber, StreamStats
+from iris_session.front.media.scheduler import LOCAL, DeliveryCounters, MediaSubscriber, StreamStats
 from iris_session.protocol.limits import TokenBucket
 from iris_session.protocol.media import StreamBudget
 from iris_session.protocol.names import BudgetClass
@@ -78,6 +79,8 @@ class MediaService:
         self._described: dict[str, StreamBudget] = {}  # as every client gets it, but for class and rate
         self._description_bucket = TokenBucket(DESCRIPTIONS_PER_S, DESCRIPTION_BURST, context.now_ns())
         self._names: dict[str, str] = {}  # of sources, by key
+        self._senders: dict[int, FrontConnection] = {}  # of streams, by number, also of those that are lost
+        self._refused: set[tuple[int, str]] = set()  # connection numbers, with the stream that another source has
         self._next_ns = 0
         self._connections_changed = False  # since the last tick
         proxy.start()
@@ -105,6 +108,13 @@ class MediaService:
             self._sync_table(here)
             self._publish_levels()
 
+    def end_sources(self, participant_id: str) -> None:
+        """Remove the streams of a participant that has left. One that lost its connection has left after its grace."""
+        known = self._senders | self._connections.by_number
+        with self._proxy.lock:
+            for number in [number for number, one in known.items() if one.participant_id == participant_id]:
+                self._proxy.scheduler.end_sender(number)
+
     def close(self) -> None:
         self._proxy.close()
 
@@ -118,7 +128,7 @@ class MediaService:
                 name,
                 facts.hz,
                 facts.rates[0] / MBIT,
-                self._names.get(facts.source, ""),
+                self._name_source(facts),
                 facts.subscribers,
                 facts.encoding,
                 (now_ns - facts.received_ns) / MILLISECOND,
@@ -167,10 +177,12 @@ class MediaService:
         with proxy.lock:
             proxy.scheduler.sample_rates(now_ns)
             self._stats = proxy.scheduler.read_streams()
+            self._refused = proxy.scheduler.list_refused(now_ns)
             reasons, superseded = proxy.scheduler.pop_drops()
             wanted = {number: proxy.scheduler.list_subscriptions(number) for number in self._states}
             tallies = {number: proxy.scheduler.read_counters(number) for number in self._states}
         self._decide_sources(again=True)
+        self._note_senders()
         for reason, count in reasons.items():
             self._drops.count(reason, n=count)
         for number, count in superseded.items():
@@ -182,6 +194,27 @@ class MediaService:
             self._update_client(number, state, tallies[number], now_ns)
         self._describe_streams(now_ns)
         self._publish_levels()
+
+    def _note_senders(self) -> None:
+        """Keep who sends each stream: after its connection is lost, until it has left."""
+        numbers = {facts.sender for facts in self._stats.values()}
+        known = self._senders | self._connections.by_number
+        self._senders = {number: known[number] for number in numbers if number in known}
+
+    def _name_source(self, facts: StreamStats) -> str:
+        """Return the name of the source of a stream: of its key, else of the participant that sends it."""
+        sender = self._senders.get(facts.sender)
+        return self._names.get(facts.source, "") or ("" if sender is None else sender.hello.name)
+
+    def _describe_owner(self, stream: str) -> str:
+        """Return who has a stream, for those whose frames are refused."""
+        facts = self._stats[stream]
+        if facts.sender == LOCAL:
+            return "the session itself"
+        sender = self._senders.get(facts.sender)
+        if sender is None:
+            return "another source"
+        return f"{sender.role} {self._name_source(facts)!r} at {sender.address[0]}"
 
     def _describe_streams(self, now_ns: int) -> None:
         """Update the descriptions of streams: at once of new ones, of others as often as the rate allows."""
@@ -269,10 +302,18 @@ class MediaService:
         rate = 0.0 if facts is None or level >= NONE_LEVEL else facts.rates[level]
         return msgspec.structs.replace(described, budget_class=LEVELS[level], mbit_per_s=round(rate / MBIT, 3))
 
+    def _mark_taken(self, number: int, one: StreamBudget) -> StreamBudget:
+        """Return the budget of a stream for a client, with who has the stream when this client sends to it in vain."""
+        if (number, one.stream) not in self._refused or one.stream not in self._stats:
+            return one
+        return msgspec.structs.replace(one, taken_by=self._describe_owner(one.stream))
+
     def _send_budgets(self) -> None:
         """Send budgets that have changed, other than in their rates."""
         for number, state in self._states.items():
             streams = tuple(self._grade_stream(state, described) for described in self._described.values())
+            if self._refused:
+                streams = tuple(self._mark_taken(number, one) for one in streams)
             grant = state.grant
             shown = tuple(msgspec.structs.replace(one, mbit_per_s=0.0) for one in streams)
             content = (shown, _lowest_class(state), grant.reason)

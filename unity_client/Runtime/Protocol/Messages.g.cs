@@ -1857,6 +1857,7 @@ namespace IrisSession.Protocol
     /// One media stream, and the class that a client gets. mbit_per_s: of that class, as measured. encoding: of its
     /// newest frame, so that a client knows what it would get before it subscribes. title, audience, camera, fault,
     /// detail: of its newest StreamInfo. stale: no frame came for so long that the newest one shows what was.
+    /// taken_by: what this client sends under the name is refused, because the stream is of that source; else empty.
     /// </summary>
     public sealed class StreamBudget : WireValue
     {
@@ -1870,6 +1871,7 @@ namespace IrisSession.Protocol
         public string Fault = "";
         public string Detail = "";
         public bool Stale = false;
+        public string TakenBy = "";
 
         public static StreamBudget Read(WireReader reader)
         {
@@ -1889,6 +1891,7 @@ namespace IrisSession.Protocol
                     case "fault": value.Fault = reader.ReadString(64); break;
                     case "detail": value.Detail = reader.ReadString(512); break;
                     case "stale": value.Stale = reader.ReadBool(); break;
+                    case "taken_by": value.TakenBy = reader.ReadString(512); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -1898,7 +1901,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(10);
+            writer.WriteMapHeader(11);
             writer.Write("stream");
             writer.Write(Stream);
             writer.Write("budget_class");
@@ -1919,6 +1922,8 @@ namespace IrisSession.Protocol
             writer.Write(Detail);
             writer.Write("stale");
             writer.Write(Stale);
+            writer.Write("taken_by");
+            writer.Write(TakenBy);
         }
     }
 
@@ -6327,7 +6332,8 @@ namespace IrisSession.Protocol
     ///
     /// classes: full, and any of half and quarter that the source has in a coarser form; none in a message that has
     /// an info and no frame. info: of the stream, with its first frames, when it changes, and once a second; null: as
-    /// before. sent_ns: when the source passed the message to its socket, session time; 0: not known.
+    /// before. sent_ns: when the source passed the message to its socket, session time; 0: not known. connection_epoch:
+    /// of the sender's Welcome, by which the session knows whose stream it is; 0: not known.
     /// </summary>
     public sealed class MediaPush : WireValue
     {
@@ -6338,6 +6344,7 @@ namespace IrisSession.Protocol
         public string Encoding = "bytes";
         public StreamInfo Info = null;
         public long SentNs = 0;
+        public long ConnectionEpoch = 0;
 
         public static MediaPush Read(WireReader reader)
         {
@@ -6351,13 +6358,14 @@ namespace IrisSession.Protocol
             if (n > 4) value.Encoding = reader.ReadString(64);
             if (n > 5) value.Info = reader.TryReadNil() ? null : StreamInfo.Read(reader);
             if (n > 6) value.SentNs = reader.ReadLong(long.MinValue, long.MaxValue);
-            for (int i = 7; i < n; i++) reader.Skip();
+            if (n > 7) value.ConnectionEpoch = reader.ReadLong(0, long.MaxValue);
+            for (int i = 8; i < n; i++) reader.Skip();
             return value;
         }
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteArrayHeader(7);
+            writer.WriteArrayHeader(8);
             writer.Write(Stream);
             writer.Write(SceneEpoch);
             writer.Write(CaptureNs);
@@ -6365,6 +6373,7 @@ namespace IrisSession.Protocol
             writer.Write(Encoding);
             writer.Write(Info);
             writer.Write(SentNs);
+            writer.Write(ConnectionEpoch);
         }
     }
 

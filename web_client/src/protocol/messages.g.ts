@@ -653,6 +653,7 @@ export interface StreamInfo {
  * One media stream, and the class that a client gets. `mbit_per_s`: of that class, as measured. `encoding`: of its
  * newest frame, so that a client knows what it would get before it subscribes. `title`, `audience`, `camera`, `fault`,
  * `detail`: of its newest `StreamInfo`. `stale`: no frame came for so long that the newest one shows what was.
+ * `taken_by`: what this client sends under the name is refused, because the stream is of that source; else empty.
  */
 export interface StreamBudget {
   stream: string;
@@ -665,6 +666,7 @@ export interface StreamBudget {
   fault?: StreamFault;
   detail?: string;
   stale?: boolean;
+  taken_by?: string;
 }
 
 /** Observations of one anchor by a headset: their number in this run, and the age of the newest. */
@@ -1736,7 +1738,8 @@ export type MediaHeader = [
  *
  * `classes`: `full`, and any of `half` and `quarter` that the source has in a coarser form; none in a message that has
  * an `info` and no frame. `info`: of the stream, with its first frames, when it changes, and once a second; null: as
- * before. `sent_ns`: when the source passed the message to its socket, session time; 0: not known.
+ * before. `sent_ns`: when the source passed the message to its socket, session time; 0: not known. `connection_epoch`:
+ * of the sender's `Welcome`, by which the session knows whose stream it is; 0: not known.
  */
 export type MediaPush = [
   stream: string,
@@ -1746,6 +1749,7 @@ export type MediaPush = [
   encoding?: MediaEncoding,
   info?: StreamInfo | null,
   sent_ns?: number,
+  connection_epoch?: number,
 ];
 
 /**
@@ -2384,6 +2388,7 @@ export const VALUE_DEFAULTS = {
     fault: "",
     detail: "",
     stale: false,
+    taken_by: "",
   },
   AlignmentReport: {
     version: 0,

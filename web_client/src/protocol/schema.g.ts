@@ -218,6 +218,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["fault", ["str", 64, ""], [""]],
       ["detail", ["str", 512, ""], [""]],
       ["stale", ["bool"], [false]],
+      ["taken_by", ["str", 512, ""], [""]],
     ],
   },
   AnchorSeen: {
@@ -1190,6 +1191,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["encoding", ["str", 64, ""], ["bytes"]],
       ["info", ["null", ["struct", "StreamInfo"]], [null]],
       ["sent_ns", ["int", null, null], [0]],
+      ["connection_epoch", ["int", 0, null], [0]],
     ],
   },
   AssetRequest: {

@@ -36,7 +36,7 @@ export function makeStage(state: PageState, actions: { pair: () => void; retry: 
   camera.addEventListener("change", () => view?.viewpoint.choose(Number(camera.value)));
   const home = button("Whole scene", () => {
     if (!view?.scene) return;
-    view.viewpoint.frame(view.scene);
+    view.viewpoint.frame(view.scene, view.clouds.getBounds());
     camera.value = "-1";
   }, { class: "small" });
   const names = h("input", { type: "checkbox", attributes: { checked: "" } });

@@ -1,9 +1,10 @@
 // From where the scene is seen: a free camera that mouse, fingers and keys move, or a camera of the scene.
 
-import { Matrix4, OrthographicCamera, PerspectiveCamera, Quaternion, Vector3 } from "three";
+import { type Box3, Matrix4, OrthographicCamera, PerspectiveCamera, Quaternion, Vector3 } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 
 import { T_THREE_WORLD } from "./axes.ts";
+import { findBall, SHOWN_SHARE } from "./framing.ts";
 import { directFollower, placeFollower, tracks, watches, restRotation } from "./lighting.ts";
 import type { SceneView } from "./scene_view.ts";
 import type { Camera } from "./spec.ts";
@@ -63,13 +64,14 @@ export class Viewpoint {
 
   private isOrthographic = false;
 
-  /** Look at a scene as a whole. */
-  frame(view: SceneView): void {
-    const { center, extent, zfar } = view.spec.environment;
-    this.free.far = Math.max(200, zfar * extent);
+  /** Look at a scene as a whole, with what is drawn `beside` it: a box in the session's world. */
+  frame({ spec }: Pick<SceneView, "spec">, beside: Box3): void {
+    const { center, radius } = findBall(spec.environment, beside);
+    const extent = radius / SHOWN_SHARE;
+    this.free.far = Math.max(200, spec.environment.zfar * extent);
     // Narrow pictures, as on phones, are seen from farther away.
-    const distance = (2 * Math.max(extent, 0.2)) / Math.min(1, this.aspect);
-    this.setFree({ lookat: center, azimuth: 145, elevation: -22, distance });
+    const distance = (2 * extent) / Math.min(1, this.aspect);
+    this.setFree({ lookat: center.toArray(), azimuth: 145, elevation: -22, distance });
   }
 
   /** Choose a camera of the scene by its index, or the free one (-1). */

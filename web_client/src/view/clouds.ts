@@ -1,12 +1,14 @@
 // Point clouds: the points of a frame go to the graphics card as they came, and are placed and coloured there.
 
 import {
+  Box3,
   BufferGeometry,
   DynamicDrawUsage,
   InterleavedBuffer,
   InterleavedBufferAttribute,
   Points,
   ShaderMaterial,
+  Vector3,
   Vector4,
 } from "three";
 
@@ -89,6 +91,16 @@ class Cloud {
     if (this.frame && this.drawn !== Math.min(this.points, maxPoints)) this.show(this.frame, maxPoints);
   }
 
+  /** Make a box hold every point that is drawn, in the session's world. */
+  expand(box: Box3): void {
+    if (!this.frame) return;
+    const { points, origin, step_m } = this.frame;
+    const [first, point] = [new Vector3(...origin), new Vector3()];
+    for (let i = 0; i < 4 * this.drawn; i += 4) {
+      box.expandByPoint(point.fromArray(points, i).add(first).multiplyScalar(step_m));
+    }
+  }
+
   /** Draw darker and greyer, as what shows what was or what is wrong. Returns whether that is new. */
   setDimmed(isDimmed: boolean): boolean {
     const { dimmed } = this.object.material.uniforms;
@@ -134,6 +146,13 @@ export class CloudViews {
   /** Return how many points the newest frame of a stream has and how many of them are drawn; undefined: it is not drawn. */
   getPoints(stream: string): { drawn: number; points: number } | undefined {
     return this.clouds.get(stream);
+  }
+
+  /** Return the box around all points that are drawn [m], in the session's world; empty without any. */
+  getBounds(): Box3 {
+    const box = new Box3();
+    for (const cloud of this.clouds.values()) cloud.expand(box);
+    return box;
   }
 
   /** Show a frame of a stream instead of the one before. One that is not wanted was on its way. */

@@ -1,4 +1,7 @@
-// What of the scene is inside the picture of a camera, and of whose gripper a camera takes notice. Pure.
+// What of the scene is inside the picture of a camera, of whose gripper a camera takes notice, and what the free camera
+// shows of all that is drawn. Pure.
+
+import { type Box3, Sphere, Vector3 } from "three";
 
 /** A lens: vertical field of view [deg], or the height of what an orthographic camera sees [m]. */
 export interface Lens {
@@ -10,6 +13,10 @@ export interface Lens {
 
 /** Width / height of pictures without a stated size. */
 const DEFAULT_ASPECT = 4 / 3;
+/** A scene of one small part is seen from no nearer. */
+const LEAST_EXTENT_M = 0.2;
+/** Radius that is shown, as a share of the extent: MuJoCo's viewer is at first two extents away, at 45 degrees. */
+export const SHOWN_SHARE = 2 * Math.sin(Math.PI / 8);
 
 /** Return width / height of the pictures of a camera. */
 export function aspectOf({ resolution: [width, height] }: Pick<Lens, "resolution">): number {
@@ -28,6 +35,16 @@ export function isInPicture(p_camera: readonly [number, number, number], lens: L
   const halfHeight = lens.orthographic ? lens.fovy / 2 : depth * Math.tan((lens.fovy * Math.PI) / 360);
   const reach = halfHeight * (1 - margin);
   return depth > 0 && Math.abs(y) <= reach && Math.abs(x) <= reach * aspectOf(lens);
+}
+
+/**
+ * Return the ball that a picture of the whole scene shows, by the `center` and `extent` of the scene [m], and what is
+ * drawn beside it. `beside`: box in the session's world; where it is empty or inside, the ball is that of the scene.
+ */
+export function findBall(environment: { center: readonly [number, number, number]; extent: number }, beside: Box3): Sphere {
+  const extent = Math.max(environment.extent, LEAST_EXTENT_M);
+  const ball = new Sphere(new Vector3(...environment.center), SHOWN_SHARE * extent);
+  return beside.isEmpty() ? ball : ball.union(beside.getBoundingSphere(new Sphere()));
 }
 
 /**

@@ -243,7 +243,7 @@ export class View {
     this.sceneCount += 1;
     this.assets.keepOnly(listAddresses(spec));
     const isSameRoom = before !== null && before.spec.name === spec.name && before.spec.bodies.length === spec.bodies.length;
-    if (!isSameRoom) this.viewpoint.frame(scene);
+    if (!isSameRoom) this.viewpoint.frame(scene, this.clouds.getBounds());
     const swap = (): void => {
       before?.dispose();
       if (this.scene !== scene) return;

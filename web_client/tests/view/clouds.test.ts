@@ -92,6 +92,24 @@ test("a cloud that is stale or faulty is dimmed, until it is not", () => {
   expect(views.popChanged()).toBe(true);
 });
 
+test("the box around all that is drawn holds every point of every cloud, and is empty without any", () => {
+  const views = new CloudViews(1000);
+  views.setWanted(["table", "room", "nothing"]);
+  expect(views.getBounds().isEmpty()).toBe(true);
+  views.show("nothing", decodeCloud(fromHex(findFrame("no point/full").hex)));
+  expect(views.getBounds().isEmpty()).toBe(true);
+  const shown = { table: findFrame("on a table/full"), room: findFrame("a room/full") };
+  for (const [stream, { hex }] of Object.entries(shown)) views.show(stream, decodeCloud(fromHex(hex)));
+  const all = Object.values(shown).flatMap(({ positions }) => positions);
+  const { min, max } = views.getBounds();
+  for (const [axis, name] of (["x", "y", "z"] as const).entries()) {
+    expect(min[name]).toBeCloseTo(Math.min(...all.map((point) => point[axis]!)), 5);
+    expect(max[name]).toBeCloseTo(Math.max(...all.map((point) => point[axis]!)), 5);
+  }
+  views.setWanted([]);
+  expect(views.getBounds().isEmpty()).toBe(true);
+});
+
 test("a cloud tells how many of its points are drawn", () => {
   const views = new CloudViews(20);
   views.setWanted(["room"]);

@@ -1,6 +1,7 @@
+import { Box3, Vector3 } from "three";
 import { describe, expect, it } from "vitest";
 
-import { aspectOf, isInPicture, type Lens, listWatched } from "../../src/view/framing.ts";
+import { aspectOf, findBall, isInPicture, type Lens, listWatched, SHOWN_SHARE } from "../../src/view/framing.ts";
 
 const LENS: Lens = { fovy: 90, orthographic: false, resolution: [200, 100] };
 
@@ -36,6 +37,29 @@ describe("isInPicture", () => {
   it("takes pictures without a stated size as 4 : 3", () => {
     expect(aspectOf({ resolution: [1, 1] })).toBeCloseTo(4 / 3);
     expect(aspectOf({ resolution: [640, 360] })).toBeCloseTo(16 / 9);
+  });
+});
+
+describe("findBall", () => {
+  const scene = { center: [1, 0, 0] as const, extent: 2 };
+  const box = (low: number[], high: number[]): Box3 => new Box3(new Vector3(...low), new Vector3(...high));
+
+  it("is the scene's where nothing is drawn beside it, or only inside", () => {
+    for (const beside of [new Box3(), box([0.5, -1, -1], [1.5, 1, 1])]) {
+      const { center, radius } = findBall(scene, beside);
+      expect([center.toArray(), radius]).toEqual([[1, 0, 0], 2 * SHOWN_SHARE]);
+    }
+    expect(findBall({ ...scene, extent: 0.01 }, new Box3()).radius).toBe(0.2 * SHOWN_SHARE);
+  });
+
+  it("holds the scene and a cloud that reaches beyond it", () => {
+    const beside = box([-6, -3, 0], [-2, 3, 3]);
+    const ball = findBall(scene, beside);
+    for (const corner of [beside.min, beside.max, new Vector3(1 + 2 * SHOWN_SHARE, 0, 0)]) {
+      expect(ball.center.distanceTo(corner)).toBeLessThanOrEqual(ball.radius + 1e-9);
+    }
+    expect(ball.radius).toBeLessThan(8);
+    expect(ball.center.x).toBeLessThan(0);
   });
 });
 
