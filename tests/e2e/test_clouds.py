@@ -59,12 +59,13 @@ class Camera:
     def __init__(self, address: str) -> None:
         self.fault = self.detail = ""
         self.extra: list[bytes] = []
+        self.silent = False  # publishes nothing, but stays
         self._ends = threading.Event()
         self._thread = threading.Thread(target=self._run, args=(address,))
         self._thread.start()
 
     def stop(self) -> None:
-        """Publish nothing more."""
+        """Leave the session."""
         self._ends.set()
         self._thread.join()
 
@@ -73,6 +74,8 @@ class Camera:
         with Client(address, role="source", name="camera") as source:
             while not self._ends.wait(1.0 / HZ):
                 source.poll()
+                if self.silent:
+                    continue
                 info = StreamInfo("The <b>room</b>", "remote", None, HZ, self.fault, self.detail)
                 source.media.publish("room", wall, encoding="cloud", info=info)
                 info = StreamInfo("Front camera", "remote", None, HZ, self.fault, self.detail)
@@ -163,7 +166,7 @@ def test_a_camera_is_seen_in_the_page_and_said_to_be_faulty_and_stale(
         camera.detail = camera.fault = ""
         wait_until(lambda: measure_share(page, GREEN, tmp_path / "mended.png") > 0.03, "the picture is good again")
 
-        camera.stop()
+        camera.silent = True
         page.wait(f"{panel}.innerText.includes('stale') && {panel}.classList.contains('bad')")
         page.wait("document.querySelector('#panel-streams .count').textContent === '2 · 2 with a problem'")
         wait_until(lambda: measure_share(page, PINK, tmp_path / "stale.png") < 0.001, "the stale cloud is dimmed")
@@ -172,6 +175,8 @@ def test_a_camera_is_seen_in_the_page_and_said_to_be_faulty_and_stale(
         page.evaluate("document.querySelector('#panel-streams [data-stream=front] input').click()")
         page.wait(f"{panel} === null")
         wait_until(lambda: count_subscribers() == 0, "a closed panel is not subscribed to")
+        camera.stop()
+        page.wait("irisSession.state.budget.streams.length === 0 && irisSession.view.clouds.drawn.size === 0")
         assert page.errors == []
 
 
@@ -281,7 +286,7 @@ def test_a_camera_is_a_panel_in_the_headset_while_it_is_chosen(
         wait_until(lambda: count_subscribers() == 0, "nothing is subscribed to unless it is chosen")
         press("picture front", f"{panel} !== undefined")
         wait_until(sees_picture, "it is seen when it is chosen")
-        camera.stop()
+        camera.silent = True
         page.wait(f"{panel}.label.shown.includes('stale')")
         wait_until(lambda: not sees_picture(), "a stale picture is dimmed")
         press("picture front", f"{panel} === undefined")
