@@ -41,7 +41,7 @@ REMOVALS: Final = ("removed", "revoked")
 class _ReportPart(msgspec.Struct):
     """The part of a `StatusReport` that the front acts on."""
 
-    recorder: RecorderReport = RecorderReport()
+    recorder: RecorderReport | None = None
 
 
 _decode_part = msgspec.msgpack.Decoder(_ReportPart).decode
@@ -119,7 +119,8 @@ class Downlink:
             self._assets.sync_clients()  # before a client hears of the scene
         elif kind == link.REPORT:
             self._authority.report = frames[1]
-            self._authority.is_recorded = _decode_part(frames[1]).recorder.state != "ended"
+            recorder = _decode_part(frames[1]).recorder
+            self._authority.is_recorded = recorder is None or recorder.state != "ended"
         elif kind == link.END:
             self._authority.ended = True
 

@@ -91,8 +91,8 @@ def test_only_the_newest_pending_state_is_published(rig: LinkRig) -> None:
 
 
 def test_end_of_a_recording_is_known_from_the_report(rig: LinkRig) -> None:
-    for state, is_recorded in (("running", True), ("ended", False), ("off", True)):
-        report = StatusReport(0, "", "", 0, recorder=RecorderReport(state))
+    for recorder, is_recorded in ((RecorderReport("running"), True), (RecorderReport("ended"), False), (None, True)):
+        report = StatusReport(0, "", "", 0, recorder=recorder)
         rig.socket.send_multipart((link.REPORT, link.encoder.encode(report)))
         rig.downlink.drain()
         assert rig.authority.is_recorded is is_recorded
