@@ -496,7 +496,7 @@ class Recording:
                 return
             if found.cut:
                 self.cuts.append(f"{os.path.basename(path)}: ends in the middle of a write, at byte {found.good_bytes}")
-            whole = found.good_bytes == found.size and not found.holes and prober.is_readable(path)
+            whole = found.good_bytes == found.size and not found.holes and _is_readable(path, found.size, prober)
             readable = path if whole else self._salvaged(path, prober)
         except NotARecordingError as error:
             self._harmed(str(error))
@@ -687,6 +687,11 @@ def _outline_decoder() -> Callable[[Any], Iterator[tuple[Hashable, Any]]]:
             yield (entity, first), read(batch)
 
     return decode
+
+
+def _is_readable(path: str, size: int, prober: Prober) -> bool:
+    """Return whether a file that had `size` bytes decodes. One that got its index while it was read is read again."""
+    return prober.is_readable(path) or (rrd_file.get_size(path) != size and prober.is_readable(path))
 
 
 def _format_error(error: Exception) -> str:

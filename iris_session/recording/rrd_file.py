@@ -205,20 +205,38 @@ def _crc(file: BinaryIO, mark: Mark) -> int:
 def read_chunks(path: str | Path, entities: str | Sequence[str]) -> Iterator[Any]:
     """Yield the chunks of one entity or several in the order of the file. The file must be readable, see `Prober`.
 
-    `/clouds/**` stands for all entities below `/clouds`.
+    `/clouds/**` stands for all entities below `/clouds`. An index (`footer.py`) may be added meanwhile.
 
     Raises `NotARecordingError` if the file can no longer be read.
     """
     from rerun.chunk import RrdReader
 
+    done: set[str] = set()
+    while True:
+        size, taken = get_size(path), set(done)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # a file without a footer is normal: the recorder may have been killed
+                stream = RrdReader(str(path)).stream().filter(content=entities)
+            for chunk in stream:
+                if chunk.id not in done:
+                    taken.add(chunk.id)
+                    yield chunk
+        except (OSError, RuntimeError, ValueError) as error:
+            if get_size(path) == size:
+                said = " ".join(str(error).split())
+                raise NotARecordingError(f"{path} can no longer be read: {said}") from error
+            done = taken  # the index was added meanwhile: read on
+        else:
+            return
+
+
+def get_size(path: str | Path) -> int:
+    """Return the bytes of a file, -1 if it is gone."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a file without a footer is normal here: the recorder may have been killed
-            stream = RrdReader(str(path)).stream().filter(content=entities)
-        yield from stream
-    except (OSError, RuntimeError, ValueError) as error:
-        said = " ".join(str(error).split())
-        raise NotARecordingError(f"{path} can no longer be read: {said}") from error
+        return os.path.getsize(path)
+    except OSError:
+        return -1
 
 
 def salvage(path: str | Path, copy: str | Path, prober: Prober) -> list[str]:

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import os
 import random
 import shutil
 import subprocess
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+import rerun.chunk
 
 from iris_session.recording import NotARecordingError, Recording, footer, rrd_file, verify
 from iris_session.recording.footer import add_index, start_indexing
+from iris_session.recording.probe import Prober
 from iris_session.recording.rerun_tool import find_rerun
 from iris_session.recording.rrd_file import END_MESSAGE, FILE_TAIL, scan_file
 from tests.recording.support import SmallCore, journal, recorder, wait_until, write
@@ -192,6 +198,37 @@ def test_file_may_get_its_index_while_it_is_scanned(
     path.write_bytes(data)
     found = rrd_file.scan_file(path)
     assert (found.cut, found.indexed, found.good_bytes, found.size) == (False, True, len(data), len(data))
+
+
+def test_file_may_get_its_index_while_its_chunks_are_read(
+    closed: Path, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rerun reads the size of a file first, and then finds an end message that is longer than the file."""
+    expected = [chunk.id for chunk in rrd_file.read_chunks(closed, "/**")]
+
+    def open_reader(name: str, real: Callable[[str], Any] = rerun.chunk.RrdReader) -> Any:
+        stream = real(name).stream()
+
+        def read(content: str) -> Iterator[Any]:
+            yield from itertools.islice(stream.filter(content=content), 3)
+            assert add_index(path)
+            raise RuntimeError("Message payload exceeds file size")
+
+        return SimpleNamespace(stream=lambda: stream if has_index(path) else SimpleNamespace(filter=read))
+
+    monkeypatch.setattr(rerun.chunk, "RrdReader", open_reader)
+    assert sorted(chunk.id for chunk in rrd_file.read_chunks(path, "/**")) == sorted(expected)
+
+
+def test_file_may_get_its_index_while_it_is_opened(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def answer(prober: Prober, name: str) -> bool:
+        monkeypatch.undo()
+        return not add_index(name)
+
+    monkeypatch.setattr(Prober, "is_readable", answer)
+    with Recording.open(path) as recording:
+        assert has_index(path)
+        assert (recording.damage, len(list(recording.rows()))) == ([], STEPS)
 
 
 def test_recorder_adds_the_index_after_it_has_ended(tmp_path: Path) -> None:

@@ -230,7 +230,7 @@ def test_error_in_the_picture_leaves_out_the_picture(tmp_path: Path) -> None:
         session.take(50)
         feed.add_state(50, 50, 0.1, 51 * TICK_NS, np.zeros(5))  # no poses
         session.take(50)
-        wait_until(lambda: not process.alive)
+        wait_until(lambda: feed.flush() is None and not process.alive)  # sends once the recorder is ready
         assert "exit status 1" in process.failure
         assert process.failure.endswith(
             "ValueError: cannot reshape array of size 5 into shape (7) (the next one leaves out the picture)"
