@@ -341,7 +341,7 @@ def test_who_sends_in_vain_is_known_once_the_owner_has_sent_again() -> None:
     assert push(ANN, "b", 13), "now it is one of the same key"
     assert wire.hub.list_refused(wire.now_ns) == set()
     assert push(BOB, "b", 13)
-    assert wire.hub.read_streams()["cloud"].sender == 0, "a number that is not of its key is nobody's"
+    assert wire.hub.read_streams()["cloud"].sender == 0, "a number of another key names no sender"
 
 
 def test_streams_of_a_sender_that_has_left_end_and_do_not_come_back() -> None:

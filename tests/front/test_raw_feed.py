@@ -137,7 +137,7 @@ def test_all_keys_together_are_bounded(rig: Rig) -> None:
 
 def test_recorder_that_does_not_read_costs_bounded_memory(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(raw_feed, "BATCHES_IN_TRANSIT", 4)
-    feed = RawFeed(rig.context, "inproc://nobody-reads", rig.drops)
+    feed = RawFeed(rig.context, "inproc://unread", rig.drops)
     ann = connection(1, "ann")
     n = 20 * BATCH_BYTES // LARGE_BYTES
     for _ in range(n):
@@ -149,7 +149,7 @@ def test_recorder_that_does_not_read_costs_bounded_memory(rig: Rig, monkeypatch:
 
 
 def test_after_the_end_of_a_recording_nothing_is_missing(rig: Rig) -> None:
-    feed = RawFeed(rig.context, "inproc://nobody-reads", rig.drops, lambda: False)
+    feed = RawFeed(rig.context, "inproc://unread", rig.drops, lambda: False)
     for _ in range(2 * BURST_S * KEY_BYTES_PER_S // LARGE_BYTES):
         feed.send(connection(1, "ann"), 0, LARGE)
     feed.tick(0)

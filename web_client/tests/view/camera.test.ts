@@ -7,7 +7,7 @@ import { T_THREE_WORLD } from "../../src/view/axes.ts";
 import { Viewpoint } from "../../src/view/camera.ts";
 import type { SceneView } from "../../src/view/scene_view.ts";
 
-/** A canvas that listens to nobody. */
+/** A canvas without listeners. */
 function makeCanvas(): HTMLCanvasElement {
   const deaf = { addEventListener: () => undefined, removeEventListener: () => undefined };
   return { ...deaf, style: {}, ownerDocument: deaf, getRootNode: () => deaf } as unknown as HTMLCanvasElement;
