@@ -69,6 +69,14 @@ def _isolate_keys_and_assets(tmp_path_factory: pytest.TempPathFactory) -> Iterat
         yield
 
 
+@pytest.fixture(autouse=True)
+def _check_priority_is_kept() -> Iterator[None]:
+    """Fail when a test has lowered the priority of this process: later tests, and what they start, would starve."""
+    before = os.getpriority(os.PRIO_PROCESS, 0)
+    yield
+    assert os.getpriority(os.PRIO_PROCESS, 0) == before
+
+
 @pytest.fixture
 def untraced() -> Iterator[None]:
     """Disable coverage for long runs of physics and control: it doubles their time, and no bound needs it."""

@@ -23,6 +23,12 @@ from iris_session.protocol.names import StreamFault
 from iris_session.system.files import Replacement
 
 
+@pytest.fixture(autouse=True)
+def _keep_priority(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`cloud run` lowers the priority of its process, here that of all tests."""
+    monkeypatch.setattr("iris_session.system.priority.lower_thread_priority", lambda: None)
+
+
 @pytest.fixture
 def camera_file(tmp_path: Path) -> Path:
     """A camera file of pictures of a wall with noise."""

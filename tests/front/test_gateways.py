@@ -177,10 +177,9 @@ def test_subscribers_reconnect_only_when_a_subscribed_key_is_revoked(lab: Lab, w
 def test_what_a_client_behind_a_gateway_sends_counts_as_its_own(lab: Lab) -> None:
     gateway = Gateway(lab, "gateway", "operator")
     gateway.enter("tab1", "operator")
-    before = len(gateway.client.got(ProtocolFault))
     unknown = b"\x94\x01\x00\xa4tab1\x81\xa4type\xa7unknown"
     gateway.client.socket.send(unknown)
-    gateway.client.wait_for(ProtocolFault, before + 1)
+    gateway.client.wait_for(ProtocolFault)
     assert gateway.faults()["tab1"].code == FaultCode.MALFORMED
     gateway.client.socket.send(unknown.replace(b"tab1", b"tab2"))
     gateway.client.wait_for(Refused)
