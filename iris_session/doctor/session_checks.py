@@ -316,6 +316,9 @@ def check_recorder(report: StatusReport) -> Finding:
         return failed("recorder", text, one.text, "fix the cause; the recorder restarts by itself")
     if one.lost_rows:
         return warning("recorder", f"{text}{lost}", one.text, "verification goes on after the gap")
+    if one.text:
+        advice = "nothing is lost for verification; report the error that the log and the recording name"
+        return warning("recorder", f"{text}{waiting}", one.text, advice)
     return ok("recorder", f"{text}{waiting}")
 
 

@@ -40,7 +40,8 @@ class RecorderProcess:
         self._origin_ns = origin_ns
         self._record_assets = record_assets
         self._budget_bytes = budget_bytes
-        self._journal_only = False
+        #: An error in drawing has ended a recorder: parts since then have no picture.
+        self.journal_only = False
         # The path of a Unix socket has at most 107 bytes: some TMPDIR are too long for one.
         short = len(os.fsencode(tempfile.gettempdir())) <= LONGEST_FOLDER
         self._folder = tempfile.mkdtemp(prefix="iris-rec-", dir=None if short else "/tmp")
@@ -114,7 +115,7 @@ class RecorderProcess:
         After an error in our own code or Rerun's, which would come again, it writes only what verification needs.
         Raises `RecorderError` if the process or its log cannot be created; it may be tried again.
         """
-        self._journal_only |= self._end(0.0) == CRASHED
+        self.journal_only |= self._end(0.0) == CRASHED
         while os.path.exists(part_path(self.path, self.part)):
             self.part += 1
         self._spawn()
@@ -144,7 +145,7 @@ class RecorderProcess:
             self.media_endpoint,
             self._record_assets,
             self._budget_bytes,
-            self._journal_only,
+            self.journal_only,
         )
         # RERUN=off in a user's shell would silence the stream. Nothing is drawn here: MuJoCo need not load OpenGL.
         environment = {"RERUN": "on", "RUST_LOG": "error", "MUJOCO_GL": "disable"}

@@ -24,6 +24,8 @@ HEALTHY_NS: Final = 30_000_000_000
 HANGING_NS: Final = 5_000_000_000
 #: Time at the end for a successor that is just being started: a process more, unless the disk hangs.
 CLOSING_S: Final = 5.0
+#: Why a recording that goes on has no picture.
+NO_PICTURE: Final = "the picture is not recorded: an error in drawing has ended the recorder before"
 
 
 class RestartTimer:
@@ -203,7 +205,7 @@ def make_recorder_report(
         state = "dead"
     elif supervisor.hangs:
         state = "hangs"
-    fault = fault or stats.spill_fault
+    fault = fault or stats.spill_fault or (NO_PICTURE if recorder.journal_only else "")
     return RecorderReport(
         state,
         recorder.path[-MAX_TEXT:],

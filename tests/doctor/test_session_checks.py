@@ -268,6 +268,11 @@ def test_recorder_state_is_reported(state: str, text: str) -> None:
     assert_only(report, "recorder", "failed", text)
 
 
+def test_recording_without_a_picture_is_a_warning() -> None:
+    report = change(WELL, recorder=change(WELL.recorder, text="the picture is not recorded"))
+    assert_only(report, "recorder", "warning", "the picture is not recorded")
+
+
 def test_used_up_budget_is_a_warning() -> None:
     recorder = change(WELL.recorder, state="ended", text="recording ended: budget of 16 MB is used up")
     assert_only(change(WELL, recorder=recorder), "recorder", "warning", "recording ended: budget")

@@ -235,7 +235,9 @@ def test_error_in_the_picture_leaves_out_the_picture(tmp_path: Path) -> None:
         assert process.failure.endswith(
             "ValueError: cannot reshape array of size 5 into shape (7) (the next one leaves out the picture)"
         )
+        assert not process.journal_only
         process.restart()
+        assert process.journal_only
         session.take(50)
         assert feed.close(20.0)
         assert process.close()

@@ -29,7 +29,7 @@ from iris_session.session.status import (
     make_robot_reports,
 )
 from iris_session.session.stepper import Stepper
-from iris_session.session.supervision import make_recorder_report
+from iris_session.session.supervision import NO_PICTURE, make_recorder_report
 from tests.session.play import TICK_NS, entries, host, make_core
 from tests.session.test_stepper import Front
 
@@ -160,13 +160,19 @@ def test_new_front_gets_the_current_anchors() -> None:
 
 
 def processes(
-    alive: bool = True, hangs: bool = False, failure: str = "", fault: str = "", budget: str = "", ended: bool = False
+    alive: bool = True,
+    hangs: bool = False,
+    failure: str = "",
+    fault: str = "",
+    budget: str = "",
+    ended: bool = False,
+    journal_only: bool = False,
 ) -> Any:
     """Return feed, recorder and supervisor."""
     said = RecorderStatus(1, 0, 0, bytes=1000, fault=fault, disk_free=5000)
     return (
         SimpleNamespace(stats=FeedStats(dropped_rows=2, spilled_bytes=30, recorder=said)),
-        SimpleNamespace(path="/data/session.rrd"),
+        SimpleNamespace(path="/data/session.rrd", journal_only=journal_only),
         SimpleNamespace(
             alive=alive, hangs=hangs, failure=failure, budget=SimpleNamespace(is_used_up=ended, text=budget)
         ),
@@ -182,6 +188,7 @@ def processes(
         ({"alive": False, "failure": "no space left"}, "failed", "no space left"),
         ({"fault": "cannot be written"}, "failed", "cannot be written"),
         ({"alive": False, "budget": "recording ended: budget", "ended": True}, "ended", "recording ended: budget"),
+        ({"journal_only": True}, "running", NO_PICTURE),
         ({"hangs": True, "failure": "no space left"}, "failed", "no space left"),  # dies again and again
     ],
 )

@@ -93,7 +93,7 @@ export function makeRecordingPanel(state: PageState, actions: Actions): Panel {
       facts.set("Written", recorder ? formatBytes(recorder.bytes_written) : "–");
       facts.set("Disk free", recorder && recorder.disk_free_bytes > 0 ? formatBytes(recorder.disk_free_bytes) : "–");
       facts.set("Lost", recorder ? `${recorder.lost_rows} steps` : "–");
-      const text = recorder && recorder.state !== "running" ? recorder.text : "";
+      const text = recorder?.text ?? "";
       setText(words, text);
       words.hidden = text === "";
       section.setCount(recorder?.state === "running" ? "running" : (recorder?.state ?? ""));
