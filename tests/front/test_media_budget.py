@@ -98,6 +98,25 @@ def test_cloud_on_a_link_that_becomes_slow_is_coarser_or_rarer_but_goes_on(mbit:
     assert NONE_LEVEL not in held
 
 
+def find_lowered(delivered: list[int]) -> int | None:
+    """Return the measure after which the level is lowered. `delivered`: of 15 due frames, each quarter of a second."""
+    controller = BudgetController()
+    for i, n in enumerate([15] * 8 + delivered):
+        if controller.update(1, LinkMeasure(None, n, 15), CLOUD, i * STEP_NS).levels["cloud"]:
+            return i - 8
+    return None
+
+
+def test_measures_of_a_link_that_is_a_fifth_too_slow_are_uneven() -> None:
+    assert find_lowered([14, 11, 13, 11]) == 2
+    assert find_lowered([13, 12, 12]) == 1
+
+
+def test_one_pause_and_single_missed_frames_keep_the_level() -> None:
+    assert find_lowered([0, 15, 15, 15]) is None
+    assert find_lowered([14, 9, 14, 15, 13, 13, 13]) is None
+
+
 def test_level_rises_when_the_link_recovers() -> None:
     link = Link(6)
     link.play(20)

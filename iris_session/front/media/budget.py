@@ -33,9 +33,11 @@ RISE_MS: Final = 80.0
 RISE_MISSED: Final = 0.6
 #: Reports of which the best counts: a minute.
 MAX_REPORTS: Final = 60
-#: Share of due frames that a connection did not take, in two measures in a row, from which on the link counts as full:
-#: 3 of the 15 frames of a measure at 60 Hz.
+#: Share of due frames that a connection did not take, over two measures in a row, from which on the link counts as
+#: full: 5 of the 30 frames at 60 Hz.
 BLOCKED: Final = 0.15
+#: Each of the two has missed so much, 2 of 15 frames: one pause of a client is no reason.
+BLOCKED_EACH: Final = 0.1
 #: After a change, frames that are under way still have to arrive.
 SETTLE_NS: Final = 500 * MILLISECOND
 #: Reports do not count for so long after a level was lowered: queues on the way have to drain, beside the media that
@@ -137,7 +139,8 @@ class _ClientBudget:
         self.missed: deque[float] = deque(maxlen=MAX_REPORTS)
         self.reported_ns = -1
         self.complaint = ""  # what the newest report complains about
-        self.blocked = 0  # measures in a row
+        self.missing = 0.0  # share of due frames that were not delivered, in the newest measure
+        self.is_blocked = False
         self.delivered_share = 1.0  # smoothed share of due frames that were delivered
         self.changed_ns = self.lowered_ns = self.raised_ns = self.congested_ns = -SILENT_NS
         self.raise_after_ns = RAISE_NS
@@ -195,13 +198,14 @@ class BudgetController:
         if measure.due:
             share = measure.delivered / measure.due
             state.delivered_share = (state.delivered_share + share) / 2  # buffers take some first
-            state.blocked = state.blocked + 1 if 1.0 - share > BLOCKED else 0
+            before, state.missing = state.missing, 1.0 - share
+            state.is_blocked = min(before, state.missing) > BLOCKED_EACH and before + state.missing > 2 * BLOCKED
         if state.reported_ns >= 0 and now_ns - state.reported_ns > SILENT_NS:
             state.delivered_share = 0.0
             return "the client has not reported for 3 s"
         if now_ns - state.changed_ns < SETTLE_NS:
             return ""
-        if state.blocked >= 2:
+        if state.is_blocked:
             return "the link does not take all media"
         return state.complaint
 
@@ -252,7 +256,7 @@ class BudgetController:
         state.levels = {stream: max(level, state.levels[stream]) for stream, level in levels.items()}
         state.budget, state.reason = bytes_per_s, reason
         state.changed_ns = state.lowered_ns = now_ns
-        state.blocked, state.complaint = 0, ""
+        state.missing, state.is_blocked, state.complaint = 0.0, False, ""
 
     def _raise_levels(self, state: _ClientBudget, rates: Rates, limit: float, now_ns: int) -> None:
         calm_ns = now_ns - max(state.changed_ns, state.congested_ns)
