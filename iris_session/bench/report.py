@@ -9,10 +9,13 @@ from importlib.metadata import version
 from typing import Any, Final
 
 import msgspec
+import psutil
 
 VERSION: Final = 1
 #: Parameter `bars` of a benchmark over an impaired link.
 NO_BARS: Final = "none: the figures include the link"
+#: Share of stolen time from which the figures are worse for it.
+WORTH_TELLING: Final = 0.01
 _OPERATORS: Final = {
     "<=": lambda value, bound: value <= bound,
     ">=": lambda value, bound: value >= bound,
@@ -41,7 +44,10 @@ def make_bar(results: dict[str, Any], key: str, op: str, bound: float) -> Bar:
 
 
 class BenchReport(msgspec.Struct, frozen=True):
-    """Report that `iris-session bench NAME --json` prints."""
+    """Report that `iris-session bench NAME --json` prints.
+
+    `stolen_share`: share of the processors' time that other virtual machines took meanwhile, if the system tells.
+    """
 
     name: str
     params: dict[str, Any]
@@ -49,6 +55,7 @@ class BenchReport(msgspec.Struct, frozen=True):
     bars: tuple[Bar, ...]
     reference: dict[str, float] | None = None
     version: int = VERSION
+    stolen_share: float = 0.0
 
     @property
     def ok(self) -> bool:
@@ -60,7 +67,7 @@ class BenchReport(msgspec.Struct, frozen=True):
         return {
             "name": self.name,
             "version": self.version,
-            "machine": describe_machine(),
+            "machine": describe_machine() | {"stolen_share": round(self.stolen_share, 4)},
             "params": self.params,
             "results": _replace_infinite(self.results),
             "reference": self.reference,
@@ -80,7 +87,15 @@ class BenchReport(msgspec.Struct, frozen=True):
         if self.reference:
             rows.append("reference, in the same run:")
             rows += [f"  {key:<{width}}  {value}" for key, value in self.reference.items()]
+        if self.stolen_share > WORTH_TELLING:
+            rows.append(f"other virtual machines took {self.stolen_share:.1%} of the processors' time meanwhile")
         return "\n".join(rows)
+
+
+def read_stolen_time() -> tuple[float, float]:
+    """Return the time that other virtual machines took from the processors, and all time of these [s]."""
+    times = psutil.cpu_times()
+    return getattr(times, "steal", 0.0), sum(times)
 
 
 def flatten(results: dict[str, Any]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from iris_session.bench.report import BenchReport, make_bar
@@ -40,7 +41,7 @@ def _bench(folder: Path, *arguments: str) -> dict[str, Any]:
 def _check(result: dict[str, Any], name: str, keys: set[str]) -> None:
     assert list(result) == ["name", "version", "machine", "params", "results", "reference", "bars"]
     assert result["name"] == name
-    assert set(result["machine"]) == {"cpus", "memory_gb", "python", "mujoco"}
+    assert set(result["machine"]) == {"cpus", "memory_gb", "python", "mujoco", "stolen_share"}
     assert keys <= set(result["results"])
     for key in keys - {"rejected"}:
         assert math.isfinite(result["results"][key]), key
@@ -122,6 +123,13 @@ def test_bar_is_kept_or_missed(value: float, ok: bool) -> None:
     report = _report(value)
     assert report.ok is ok
     assert ("MISSED" in report.format()) is not ok
+
+
+def test_time_taken_by_other_machines_is_told() -> None:
+    report = msgspec.structs.replace(_report(1.0), stolen_share=0.1234567)
+    assert "12.3%" in report.format()
+    assert report.as_dict()["machine"]["stolen_share"] == 0.1235
+    assert "other virtual machines" not in _report(1.0).format()
 
 
 def test_infinite_values_are_null() -> None:
