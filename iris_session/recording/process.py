@@ -73,8 +73,9 @@ ORPHANED: Final = 4
 MIN_FREE_BYTES: Final = 16 << 20
 #: Free bytes that are left to the journal: hours of it. Below, raw samples and vertices are left out.
 JOURNAL_RESERVE_BYTES: Final = 256 << 20
-#: A write that takes longer shows a disk that cannot keep up: raw samples are left out until one is shorter.
-SLOW_FLUSH_S: Final = 0.3
+#: A write that takes longer shows a disk that cannot keep up: raw samples are left out until one is shorter. Drawing a
+#: scene or a busy processor makes a flush long, but not this.
+SLOW_WRITE_S: Final = 0.3
 #: Bytes written to test a new file. A file begins with about 22 KB, mostly the blueprint.
 TRIAL_BYTES: Final = 128 << 10
 
@@ -119,7 +120,7 @@ class RecorderLoop:
         self._samples = 0
         self._samples_left_out = 0
         self._disk_free = get_free_bytes(Path(self._writer.path))
-        self._flush_s = 0.0  # duration of the last write
+        self._write_s = 0.0  # duration of the last write of a flush
         self._refused = 0
         self._unwritten_bytes = 0  # of the journal, since the last write
         self._assets_bytes = MAX_ASSETS_BYTES  # of assets in the next write
@@ -227,7 +228,7 @@ class RecorderLoop:
             if now >= flush_at:
                 flush_at = now + FLUSH_S
                 self._flush()
-                self._flush_s = time.monotonic() - now
+                self._write_s = self._writer.write_s
                 self._syncer.check()
                 self._write_assets()
                 self._lag_ns = time.monotonic_ns() - self._config.origin_ns - self._newest_ns
@@ -280,7 +281,7 @@ class RecorderLoop:
     @property
     def _is_short(self) -> bool:
         """True while time or room of the disk are left to the journal."""
-        if self._flush_s > SLOW_FLUSH_S or 0 < self._disk_free < JOURNAL_RESERVE_BYTES:
+        if self._write_s > SLOW_WRITE_S or 0 < self._disk_free < JOURNAL_RESERVE_BYTES:
             return True
         return self._budget.is_short(self._writer.size_with_index)
 

@@ -10,6 +10,7 @@ Columns are Arrow arrays for `rerun.send_columns`, built without a Python object
 from __future__ import annotations
 
 import os
+import time
 import zlib
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -38,6 +39,7 @@ class RrdStream:
         self._file: Any = open(path, "wb", buffering=0)  # noqa: SIM115 - closed by `close`
         self.size = 0  # bytes in the file
         self.messages = 0  # in the file
+        self.write_s = 0.0  # time that the system took for the bytes of the last write
         self._marked = 0  # bytes of the file that marks cover
         self._crc = 0  # of the bytes after them
 
@@ -73,7 +75,7 @@ class RrdStream:
         return memoryview(data)[FILE_HEAD if self.size else 0 : end]
 
     def _append(self, data: memoryview) -> None:
-        rest = data
+        rest, began = data, time.monotonic()
         try:
             while rest:
                 rest = rest[self._file.write(rest) :]
@@ -82,6 +84,7 @@ class RrdStream:
                 os.ftruncate(self._file.fileno(), self.size)
             self._file.close()
             raise
+        self.write_s = time.monotonic() - began
         self.size += len(data)
         self._crc = zlib.crc32(data, self._crc)
 

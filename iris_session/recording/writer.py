@@ -339,6 +339,11 @@ class RrdWriter:
         return self._stream.size
 
     @property
+    def write_s(self) -> float:
+        """Time that the system took for the bytes of the last write [s], without that to encode them."""
+        return self._stream.write_s
+
+    @property
     def size_with_index(self) -> int:
         """Bytes that the file would have if it was closed now and got its index."""
         return self._stream.size + self._stream.messages * INDEX_BYTES

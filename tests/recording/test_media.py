@@ -232,10 +232,10 @@ def test_the_recorder_reads_media_only_while_nothing_more_important_waits(tmp_pa
         front.connect(endpoint)
         front.send_multipart(message("room", make_frame(5)))
         assert loop._media.poll(20_000)
-        loop._flush_s = 2 * process_module.SLOW_FLUSH_S
+        loop._write_s = 2 * process_module.SLOW_WRITE_S
         loop._drain()
         assert loop._writer._media == []
-        loop._flush_s = 0.0
+        loop._write_s = 0.0
         loop._drain()
         assert len(loop._writer._media) == 1
     loop._syncer.stop()

@@ -9,8 +9,11 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -112,20 +115,48 @@ def test_raw_samples_of_the_front(tmp_path: Path) -> None:
     assert samples[7].data == bytes([7, 255])
 
 
+@pytest.mark.parametrize("slow", ["disk", "processor"])
+def test_raw_samples_are_left_out_only_when_the_disk_is_slow(slow: str, tmp_path: Path) -> None:
+    loop = process_module.RecorderLoop(make_loop_config(tmp_path))
+    stream: Any = loop._writer._stream
+    target, name = (stream._file, "write") if slow == "disk" else (stream, "_read")
+    work = getattr(target, name)
+
+    def work_slowly(*given: Any) -> Any:
+        time.sleep(1.5 * process_module.SLOW_WRITE_S)
+        return work(*given)
+
+    if slow == "disk":
+        stream._file = SimpleNamespace(write=work_slowly, close=stream._file.close)
+    else:
+        stream._read = work_slowly
+    loop._writer.add_sample(1, 5, b"x")
+    threading.Timer(0.2, loop.stop).start()
+    loop._loop()
+    loop._process_samples(msgspec.msgpack.encode([(1, 5, b"x")] * 3))
+    assert loop._samples_left_out == (3 if slow == "disk" else 0)
+    loop._context.destroy(linger=0)
+    loop._syncer.stop()
+    loop._writer.close()
+
+
+def make_loop_config(folder: Path) -> RecorderConfig:
+    return RecorderConfig(
+        str(folder / "session.rrd"), 1, "r", f"ipc://{folder}/f", f"ipc://{folder}/s", 0, os.getppid()
+    )
+
+
 def test_raw_samples_are_left_out_while_the_disk_is_nearly_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = RecorderConfig(
-        str(tmp_path / "session.rrd"), 1, "r", f"ipc://{tmp_path}/f", f"ipc://{tmp_path}/s", 0, os.getpid(), ""
-    )
-    loop = process_module.RecorderLoop(config)
+    loop = process_module.RecorderLoop(make_loop_config(tmp_path))
     batch = msgspec.msgpack.encode([(1, 5, b"x")] * 3)
     loop._process_samples(batch)
     monkeypatch.setattr(process_module, "get_free_bytes", lambda _path: process_module.JOURNAL_RESERVE_BYTES - 1)
     loop._send_status(-1)
     loop._process_samples(batch)
     assert (loop._samples, loop._samples_left_out, len(loop._writer._samples)) == (6, 3, 3)
-    loop._disk_free, loop._flush_s = 0, 2 * process_module.SLOW_FLUSH_S  # a slow disk, of unknown size
+    loop._disk_free, loop._write_s = 0, 2 * process_module.SLOW_WRITE_S  # a slow disk, of unknown size
     loop._process_samples(batch)
     assert loop._samples_left_out == 6
     loop._syncer.stop()
@@ -562,7 +593,7 @@ def test_assets_are_written_as_the_disk_takes_them(tmp_path: Path, monkeypatch: 
     bytes_per_s = 1e12
     loop._write_assets()
     loop._write_assets()
-    loop._flush_s = 2 * process_module.SLOW_FLUSH_S
+    loop._write_s = 2 * process_module.SLOW_WRITE_S
     loop._write_assets()
     least, most = process_module.MIN_ASSETS_BYTES, process_module.MAX_ASSETS_BYTES
     assert asked == [most, 100_000, 100_000, least, least, most], "20 ms, and none while the disk is slow"
