@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import atexit
 import json
+import math
 import os
+import resource
 import select
 import sys
+import time
 import warnings
 from contextlib import suppress
 from pathlib import Path
@@ -23,6 +26,12 @@ from iris_session.system.process import DEVNULL, PIPE, ChildProcess
 
 READABLE: Final = "readable"
 RECORDINGS: Final = "recordings"
+#: Address space for reading a file: as much, and a multiple of the size of the file [bytes].
+MEMORY_BYTES: Final = 2 << 30
+MEMORY_TIMES: Final = 4
+#: Processor time for reading a file: as much [s], and the time at this speed, a twentieth of the usual one [bytes/s].
+CPU_S: Final = 30.0
+CPU_BYTES_PER_S: Final = 1e6
 #: A child without a question for this long ends.
 IDLE_S: Final = 5.0
 
@@ -120,9 +129,26 @@ class Prober:
             child.end()
 
 
+def _bound(path: str) -> None:
+    """Bound memory and processor time of the next answer: damaged messages may claim any size when decompressed.
+
+    Beyond a bound this process dies, and the file is not readable. Where the system does not tell or bound, nothing is.
+    """
+    with suppress(OSError, ValueError, AttributeError):
+        size = os.path.getsize(path)
+        with open("/proc/self/statm", "rb") as file:
+            used = int(file.read().split()[0]) * resource.getpagesize()
+        memory = used + MEMORY_BYTES + MEMORY_TIMES * size
+        cpu_s = math.ceil(time.process_time() + CPU_S + size / CPU_BYTES_PER_S)
+        for kind, bound in ((resource.RLIMIT_AS, memory), (resource.RLIMIT_CPU, cpu_s)):
+            hard = resource.getrlimit(kind)[1]
+            resource.setrlimit(kind, (bound if hard == resource.RLIM_INFINITY else min(bound, hard), hard))
+
+
 def _answer(what: str, path: str) -> int:
     from rerun.chunk import RrdReader
 
+    _bound(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a missing footer is normal: the recorder may have been killed

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 import warnings
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
@@ -36,6 +38,23 @@ def asked() -> list[psutil.Process]:
             if "iris_session.recording.probe" in process.cmdline():
                 found.append(process)
     return found
+
+
+def test_message_that_claims_a_terabyte_is_not_readable(tmp_path: Path) -> None:
+    """One flipped bit in the length of a batch of columns: Arrow zeroes as many bytes, page by page."""
+    path, most = tmp_path / "session.rrd", 0
+    path.write_bytes((Path(__file__).parent / "claims_a_terabyte.rrd").read_bytes())
+    with Prober() as prober, ThreadPoolExecutor() as pool:
+        answer = pool.submit(prober.is_readable, path)
+        while not answer.done():
+            for child in asked():
+                with suppress(psutil.NoSuchProcess):
+                    most = max(most, child.memory_info().rss)
+                    if most > 3 << 30:
+                        child.kill()
+            time.sleep(0.01)
+        assert not answer.result()
+    assert 0 < most < 1 << 30
 
 
 @pytest.mark.long
