@@ -105,6 +105,10 @@ def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConf
 
     if arguments.view and arguments.no_record:
         raise CommandError("--view shows the recording: leave --no-record out")
+    if arguments.no_record and arguments.record:
+        raise CommandError("--record and --no-record contradict each other: leave one out")
+    if arguments.record and not arguments.record.endswith(".rrd"):
+        raise CommandError(f"--record {arguments.record}: a recording is one file: give a name that ends in .rrd")
     if arguments.no_record and (arguments.record_assets or arguments.record_budget):
         raise CommandError("--record-assets and --record-budget are for a recording: leave --no-record out")
     defaults = SessionConfig()

@@ -55,4 +55,4 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json({"ok": ok, "files": [report.as_dict() for report in reports]})
     unreadable = all(p.kind == "unreadable" and p.step < 0 for report in reports for p in report.problems)
-    return 0 if ok else 2 if unreadable and len(reports) == 1 else 1
+    return 0 if ok else 2 if unreadable else 1

@@ -93,10 +93,11 @@ def run(arguments: argparse.Namespace) -> int:
         return _show_live(tool, arguments, path)
     with ending_as_interrupts(), ReadingProgress(path) as progress, open_view_file(path, progress.show_bytes) as view:
         progress.end()
+        only_copies = arguments.no_open and not arguments.web
+        if only_copies and not view.kept:
+            raise CommandError(f"{view.session.parent} cannot be written: there is nowhere to keep the copy", 1)
         _print_file(view)
-        if arguments.no_open and not arguments.web:
-            if not view.kept:
-                raise CommandError(f"{view.session.parent} cannot be written: there is nowhere to keep the copy", 1)
+        if only_copies:
             return 0
         return _show(tool, arguments, view.path)
 

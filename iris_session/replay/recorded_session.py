@@ -90,6 +90,21 @@ class CommandSeries(NamedTuple):
         """Session time of each row [s], shape (n,)."""
         return self.session_time_ns.astype(np.float64) * 1e-9
 
+    def to_dict(self) -> dict[str, NDArray[Any]]:
+        """Return all columns by name, each of shape (n,), with the names that they have in exported tables."""
+        columns: dict[str, NDArray[Any]] = {
+            "step": self.steps,
+            "session_time_ns": self.session_time_ns,
+            "sim_time_s": self.sim_time_s,
+            "kind": self.kinds,
+            "hold_reason": self.hold_reasons,
+            "participant": self.participants,
+            "device": self.devices,
+            "gripper": self.gripper,
+            "scale": self.scale,
+        }
+        return columns | {f"ctrl/{name}": self.values[:, i] for i, name in enumerate(self.names)}
+
 
 class RecordedRobot:
     """Numbers of one robot of a recording, from `Recording.robot`.

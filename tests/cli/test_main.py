@@ -230,10 +230,20 @@ def test_duration_must_be_positive(seconds: str, capsys: pytest.CaptureFixture[s
     assert "duration" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("options", "said"), [(["a.txt"], "ends in .rrd"), (["a.rrd", "--no-record"], "contradict each other")]
+)
+def test_recording_that_could_not_be_made_is_refused(
+    options: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["serve", "handover", "--record", *options]) == 2
+    assert said in capsys.readouterr().err
+
+
 def test_file_that_is_no_recording_does_not_hide_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("a.rrd", "b.rrd"):
         (tmp_path / name).write_text("not a recording")
-    assert main(["verify", str(tmp_path / "a.rrd"), str(tmp_path / "b.rrd")]) == 1
+    assert main(["verify", str(tmp_path / "a.rrd"), str(tmp_path / "b.rrd")]) == 2
     errors = capsys.readouterr().err
     assert "a.rrd" in errors
     assert "b.rrd" in errors

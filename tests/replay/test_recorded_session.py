@@ -139,6 +139,9 @@ def test_commands_name_who_drives_and_what_the_actuators_got(closed: Played) -> 
     actuators = [closed.core.world.model.actuator(name).id for name in left.names]
     assert left.values.tobytes() == np.array(closed.ctrl)[:, actuators].tobytes()
     assert set(left.kinds[56:]) == {"pose"}
+    columns = left.to_dict()
+    assert {len(column) for column in columns.values()} == {len(left.steps)}
+    assert {"step", "kind", "gripper", *(f"ctrl/{name}" for name in left.names)} <= columns.keys()
     assert set(left.kinds[:50]) == {"hold"}
     assert list(dict.fromkeys(left.hold_reasons[:56])) == ["no_lease", "no_sample", "clutch_open"]
     assert set(left.participants[56:]) == {"p1"}
