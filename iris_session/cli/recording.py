@@ -279,6 +279,9 @@ def _format_drops(summary: RecordingSummary) -> Iterator[str]:
         yield f"denied requests: {_format_counts(drops.denials)}"
     if drops.lost_steps:
         yield f"{_count(drops.lost_steps, 'step')} did not fit into the recording"
+    if drops.samples_left_out:
+        what = _count(drops.samples_left_out, "raw sample")
+        yield f"{what} not recorded (disk slow or nearly full, or the budget); the journal is whole"
     if drops.stalls:
         yield f"no step {_count(drops.stalls, 'time')}, for {_format_duration(drops.stalled_s)} in all"
 

@@ -53,12 +53,14 @@ class RecorderConfig(msgspec.Struct, frozen=True):
 class EndMark(msgspec.Struct, frozen=True, array_like=True):
     """Mark at the end of a closed file: `step` and `chain` of its newest row.
 
-    `reason`: why it ended before the session, one line for people; empty if it did not.
+    `reason`: why it ended before the session, one line for people; empty if it did not. `samples_left_out`: number of
+    raw messages of clients that the file lacks.
     """
 
     step: int
     chain: bytes
     reason: str = ""
+    samples_left_out: int = 0
 
 
 class HeaderCopy(msgspec.Struct, frozen=True, array_like=True):

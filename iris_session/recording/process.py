@@ -165,7 +165,8 @@ class RecorderLoop:
             self._writer.write_assets(MAX_ASSETS_BYTES)
             if self._writer.size == before:
                 break  # there was no step
-        self._writer.close(reason=describe_used_budget(self._budget.total_bytes) if self._is_used_up else "")
+        reason = describe_used_budget(self._budget.total_bytes) if self._is_used_up else ""
+        self._writer.close(reason=reason, samples_left_out=self._samples_left_out)
         self._ended = self._is_used_up
 
     def _give_up_as_orphan(self) -> None:

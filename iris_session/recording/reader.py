@@ -107,6 +107,8 @@ class Recording:
         root: Chain value (16 bytes) before the first row.
         end: Step and chain of the newest row as noted when the last part was closed; None if its recorder was killed
             or a part is missing at the end.
+        samples_left_out: Number of raw messages of clients that parts which were closed lack: their disk was slow or
+            nearly full, or their budget nearly used up. The journal has what the session used of them.
         all_closed: Every part was closed by its recorder, so that nothing can be missing within. Not known of a copy by
             Rerun's tools, which may be of parts that were not.
         damage: One line per place that could not be read, at most `MOST_DAMAGE`. Reading on may add lines.
@@ -143,6 +145,7 @@ class Recording:
             self.notes.append(f"{name} holds {n} recordings: only {one} is read; make a file of each of the others")
         self._find_missing(files)
         self.end = ends.get(len(self.files) - 1)
+        self.samples_left_out = sum(end.samples_left_out for end in ends.values())
         copied = self._rewritten and not self.damage  # a damaged file of a recorder counts as rewritten, too
         self.all_closed = len(ends) == len(self.files) and not copied
         if self.end is not None and self.end.reason:

@@ -148,7 +148,7 @@ class DropSummary(msgspec.Struct, frozen=True):
 
     `rejected_samples`: by `RejectReason`. `denials`: by `DenialReason`. `lost_steps`: steps that did not fit into the
     recording. `stalls`, `stalled_s`: times without a step. `down_s`: from the recording that this one continues to its
-    first step.
+    first step. `samples_left_out`: raw messages of clients that were not recorded.
     """
 
     rejected_samples: dict[str, int] = {}
@@ -157,6 +157,7 @@ class DropSummary(msgspec.Struct, frozen=True):
     stalls: int = 0
     stalled_s: float = 0.0
     down_s: float = 0.0
+    samples_left_out: int = 0
 
 
 class RecordingSummary(msgspec.Struct, frozen=True):
@@ -252,7 +253,7 @@ def summarise(recording: Recording, progress: Callable[[int, int], None] | None 
         pauses=builder.list_stops(builder.pauses),
         scene_changes=tuple(builder.scene_changes),
         streams=builder.list_streams(),
-        drops=builder.make_drops(),
+        drops=builder.make_drops(recording.samples_left_out),
         damage=damage,
         notes=tuple(recording.notes),
         assets=builder.assets.summarise(),
@@ -597,7 +598,7 @@ class SummaryBuilder:
         found = (_WORLD_ELEMENT.fullmatch(entity) for entity, n in self._vertices.items() if n > redrawn)
         return tuple(dict.fromkeys(re.sub(r"\\(.)", r"\1", one["name"]) for one in found if one))
 
-    def make_drops(self) -> DropSummary:
+    def make_drops(self, samples_left_out: int = 0) -> DropSummary:
         """Return what was dropped and denied."""
         rejected = (self._unattributed, *(person.rejected for person in self._people.values()))
         stalls = [gap for gap in self._gaps if gap.kind == "stalled"]
@@ -608,6 +609,7 @@ class SummaryBuilder:
             len(stalls),
             _to_s(sum(gap.duration_ns for gap in stalls)),
             _to_s(sum(gap.duration_ns for gap in self._gaps if gap.kind == "resumed")),
+            samples_left_out,
         )
 
 

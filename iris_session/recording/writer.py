@@ -288,8 +288,10 @@ class RrdWriter:
         times = self._times.spread(entity, [self._newest_ns] * n)
         self._send_columns(entity, [duration_index(paths.SESSION_TIME, times)], columns)
 
-    def close(self, timeout_s: float = 10.0, reason: str = "") -> None:
-        """Write the rest and the end mark, and close the file. `reason`: why before the session ends, for the mark.
+    def close(self, timeout_s: float = 10.0, reason: str = "", samples_left_out: int = 0) -> None:
+        """Write the rest and the end mark, and close the file.
+
+        For the mark: `reason`, why before the session ends; `samples_left_out`, number of raw messages.
 
         Assets that still wait are noted as missing. Raises `WriteError`.
         """
@@ -304,7 +306,7 @@ class RrdWriter:
         self._describe_result()
         self.flush(timeout_s)
         self._write_mark()
-        mark = EndMark(*self._newest_row, reason)
+        mark = EndMark(*self._newest_row, reason, samples_left_out)
         self._log_static(paths.END, rr.AnyValues(end=pa.array([_encode(mark)], pa.binary())))
         try:
             self._stream.close(timeout_s)

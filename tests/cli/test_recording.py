@@ -64,7 +64,7 @@ SUMMARY = RecordingSummary(
     pauses=(),
     scene_changes=(),
     streams=(StreamSummary("room", "cloud", "Room", 48, 24.0, 1.96, "stuck"),),
-    drops=DropSummary({"stale": 12}, {"held": 1}, 7, 1, 0.3),
+    drops=DropSummary({"stale": 12}, {"held": 1}, 7, 1, 0.3, samples_left_out=90),
     damage=tuple(f"bytes {i} are gone" for i in range(MOST_LINES + 5)),
     notes=(),
     assets=AssetsSummary("scene", 1, 12, 11, 4_200_000, ("asset 7777 (mesh arm): it cannot be read",)),
@@ -92,6 +92,7 @@ def test_a_summary_is_lines_for_people() -> None:
         "  assets     scene: 11 of 12 of 1 scene, 4.2 MB",
         "             left out: asset 7777 (mesh arm): it cannot be read",
         "             7 steps did not fit into the recording",
+        "             90 raw samples not recorded (disk slow or nearly full, or the budget); the journal is whole",
         "  damage     bytes 0 are gone",
         "             and 5 more: --json has all",
     ):

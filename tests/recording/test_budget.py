@@ -19,7 +19,7 @@ from iris_session.recording.feed import RecorderFeed
 from iris_session.recording.messages import RecorderConfig
 from iris_session.recording.paths import part_path
 from iris_session.recording.supervise import RecorderProcess
-from tests.recording.support import SmallCore, SmallSession, wait_until
+from tests.recording.support import SmallCore, SmallSession, make_header, wait_until
 
 BUDGET = 1_500_000
 
@@ -66,9 +66,12 @@ def test_raw_samples_are_left_out_first(tmp_path: Path) -> None:
     assert not loop._budget.is_used_up(loop._writer.size_with_index)
     loop._process_samples(batch)
     assert (loop._samples_left_out, len(loop._writer._samples)) == (3, 3)
+    loop._writer.write_header(make_header())
+    loop._close_file()
     loop._syncer.stop()
-    loop._writer.close()
     loop._context.destroy(linger=0)
+    with Recording.open(tmp_path / "session.rrd") as recording:
+        assert recording.samples_left_out == summarise(recording).drops.samples_left_out == 3
 
 
 def is_ended(feed: RecorderFeed) -> bool:
