@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 from importlib.metadata import version
+from typing import NoReturn
 
 from iris_session.cli import (
     INTERRUPTED,
@@ -66,9 +67,16 @@ _MODULES = (
 )  # fmt: skip
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line, as all others; `--help` has the usage."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="iris-session",
         description="Share one robot scene between several people in XR headsets.",
         epilog=_EPILOG,

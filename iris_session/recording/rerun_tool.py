@@ -6,6 +6,7 @@ and progress can be shown. It is a process of its own: Rerun's decoder may abort
 
 from __future__ import annotations
 
+import errno
 import importlib.util
 import os
 import struct
@@ -83,7 +84,7 @@ def rewrite(
 
     Raises:
         RerunToolError: The tool failed.
-        NotARecordingError, OSError: A file cannot be read.
+        NotARecordingError, OSError: A file cannot be read, or there is no room for `output`.
         MissingExtraError: Rerun is not installed.
     """
     total = sum(os.path.getsize(file) for file in files)
@@ -106,7 +107,10 @@ def rewrite(
             process.wait()
             raise
         if status:
-            raise RerunToolError(f"`rerun rrd {verb}` failed: {_read_words(words, status)}")
+            said = _read_words(words, status)
+            if os.strerror(errno.ENOSPC) in said:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            raise RerunToolError(f"`rerun rrd {verb}` failed: {said}")
 
 
 def _send_files(files: Sequence[str], pipe: IO[bytes], progress: Callable[[int], None]) -> None:

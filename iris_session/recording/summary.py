@@ -273,7 +273,8 @@ def _describe_ending(recording: Recording, end_ns: int) -> str:
     if recording.finished:
         return ""
     cuts = "".join(f"; {cut}" for cut in recording.cuts)
-    return f"not closed after {_to_s(end_ns):g} s: what may have followed is missing, 0.25 s after a kill{cuts}"
+    lost = "at most 0.25 s if its recorder was killed, more if the file was cut"
+    return f"not closed after {_to_s(end_ns):g} s: what may have followed is missing, {lost}{cuts}"
 
 
 @dataclass

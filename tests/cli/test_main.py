@@ -67,7 +67,10 @@ def test_invalid_command_line_exits_with_2(arguments: list[str], capsys: pytest.
     with pytest.raises(SystemExit) as ended:
         main(arguments)
     assert ended.value.code == 2
-    assert "usage: iris-session" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert said.startswith("iris-session")
+    assert "--help" in said
+    assert said.count("\n") == 1
 
 
 def test_robots_prints_toml_that_serve_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -41,7 +41,7 @@ SUMMARY = RecordingSummary(
     format=4,
     recording_class="closed",
     finished=False,
-    ending="not closed after 25 s: what may have followed is missing, 0.25 s after a kill",
+    ending="not closed after 25 s: what may have followed is missing",
     begin_s=1.0,
     duration_s=125.0,
     steps=12_345,
@@ -76,7 +76,7 @@ def test_a_summary_is_lines_for_people() -> None:
     for line in (
         "lab  2026-11-25 16:28:51 UTC  2 min 5 s",
         "  file       s/session.rrd, 7.1 MB, format 4, 2 parts: session.rrd, session.part2.rrd",
-        "  end        not closed after 25 s: what may have followed is missing, 0.25 s after a kill; 12,345 steps",
+        "  end        not closed after 25 s: what may have followed is missing; 12,345 steps",
         "  objects    none",
         "  deforming  cloth",
         "  people     ann (operator, head, hand/left): 24.0 s, joined 2 times, there at the end; held left for 20.0 s; "
