@@ -120,6 +120,6 @@ def test_budget_of_recordings(capsys: pytest.CaptureFixture[str]) -> None:
         with pytest.raises(SystemExit) as ended:
             options(f"--record-budget={text}")
         assert ended.value.code == 2
-        assert "is not a size for a recording: give 16MB or more, for example 20GB\n" in capsys.readouterr().err
+        assert "is not a size for a recording: give 16MB or more, for example 20GB" in capsys.readouterr().err
     with pytest.raises(CommandError, match="leave --no-record out"):
         make_session_config(options("--no-record", "--record-budget", "1GB"), "x")

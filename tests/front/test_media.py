@@ -63,6 +63,8 @@ class Stage:
         self.viewers: list[Viewer] = []
         self.size = 500
         self.publishing = True
+        self.period_s = 0.0  # at least, between two frames
+        self._published_s = 0.0
         self._here: list[RawClient] = []
         self._beat_s = 0.0
         self._once, session.once = session.once, self._step  # type: ignore[method-assign,assignment]
@@ -73,7 +75,8 @@ class Stage:
             self._beat_s = time.monotonic()
             for client in self._here:
                 client.send(Heartbeat(True))
-        if self.publishing:
+        if self.publishing and time.monotonic() >= self._published_s + self.period_s:
+            self._published_s = time.monotonic()
             now_ns = self.session.process.link.now_ns
             self.session.process.publish_media("cloud", b"c" * self.size, now_ns, 1, "bytes")
 
@@ -134,7 +137,7 @@ def test_subscriber_gets_the_newest_frames(media: Stage) -> None:
 
 
 def test_status_lists_streams_of_each_client(media: Stage) -> None:
-    session = media.session
+    session, media.period_s = media.session, 0.02  # frames that come faster than they are read lower the class
     ann = media.joined(session.client())
     viewer = media.viewer(ann)
     media.until(lambda: viewer.take() >= 5, "media")
