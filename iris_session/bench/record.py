@@ -27,7 +27,7 @@ import psutil
 
 from iris_session.bench.clients import ClientJob, Job
 from iris_session.bench.harness import ClientProcess, Measurement, group_clients, measure
-from iris_session.bench.record_naive import write_columnar_log, write_naive_log
+from iris_session.bench.record_naive import write_naive_log
 from iris_session.bench.record_session import BODIES, OPERATORS, BenchSession, SessionJob, make_record_scene
 from iris_session.bench.report import BenchError, BenchReport, make_bar
 from iris_session.demo.scenes.generators import arm_names
@@ -71,11 +71,10 @@ class Kill(NamedTuple):
 
 
 class FileSize(NamedTuple):
-    """Size of a recording, and of a naive and a columnar log of its values [bytes], and their session time [s]."""
+    """Size of a recording and of the naive log of its values [bytes], and their session time [s]."""
 
     recorded: int
     naive: int
-    columnar: int
     duration_s: float
 
 
@@ -109,8 +108,10 @@ def run_record(
             drops |= got.drops if recorded else {}
             if recorded:
                 _wait_for_index(path)
-        progress("writing the same values as a naive log, and as columns")
-        sizes = [measure_size(folder / f"round{i}.rrd", folder) for i in range(2 * rounds) if i % 4 in (0, 3)]
+        progress("writing the same values as a naive log")
+        sizes = [
+            measure_size(folder / f"round{i}.rrd", folder / "naive.rrd") for i in range(2 * rounds) if i % 4 in (0, 3)
+        ]
         losses, missing = _kill_sessions(folder, kills, seed, progress)
     results = summarize_rounds(measured) | summarize_sizes(sizes) | summarize_kills(losses)
     results |= {"kill_rows_missing": missing, "scheduling": scheduling, "drops": drops}
@@ -141,15 +142,13 @@ def _wait_for_index(path: Path) -> None:
 # --- results ----------------------------------------------------------------------------------------------------------
 
 
-def measure_size(path: Path, folder: Path) -> FileSize:
-    """Compare the size of a recording with that of logs of its values, which are written into `folder`."""
+def measure_size(path: Path, naive: Path) -> FileSize:
+    """Compare the size of a recording with that of a naive log of its values, which is written to `naive`."""
     with Recording.open(path) as recording:
         times = [row.now_ns for row in recording.rows()]
         if len(times) < 2:
             raise BenchError("a recording has no rows")
-        naive = write_naive_log(recording, folder / "naive.rrd")
-        columnar = write_columnar_log(recording, folder / "columnar.rrd")
-        return FileSize(path.stat().st_size, naive, columnar, (times[-1] - times[0]) * 1e-9)
+        return FileSize(path.stat().st_size, write_naive_log(recording, naive), (times[-1] - times[0]) * 1e-9)
 
 
 def summarize_rounds(rounds: Sequence[Round]) -> dict[str, Any]:
@@ -172,14 +171,13 @@ def summarize_rounds(rounds: Sequence[Round]) -> dict[str, Any]:
 
 
 def summarize_sizes(sizes: Sequence[FileSize]) -> dict[str, Any]:
-    """Return the size of recordings per minute, beside that of naive and columnar logs."""
-    recorded, naive, columnar, duration_s = (sum(values) for values in zip(*sizes, strict=True))
+    """Return the size of recordings per minute, beside that of naive logs."""
+    duration_s = sum(size.duration_s for size in sizes)
+    recorded, naive = sum(size.recorded for size in sizes), sum(size.naive for size in sizes)
     return {
         "mb_per_min": round(recorded * 60e-6 / duration_s, 2),
         "naive_mb_per_min": round(naive * 60e-6 / duration_s, 2),
-        "columnar_mb_per_min": round(columnar * 60e-6 / duration_s, 2),
         "size_ratio": round(recorded / naive, 3),
-        "size_ratio_columnar": round(recorded / columnar, 3),
     }
 
 

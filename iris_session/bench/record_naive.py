@@ -1,9 +1,7 @@
-"""References of `bench record`: what Rerun's own calls make of the same values, without a journal and raw messages.
+"""Reference of `bench record`: what Rerun's own calls make of the same values, without a journal and raw messages.
 
-One entity per body, device and series, one row per state, on the four timelines of a recording; the geometry of the
-scene is in the file once. A naive log is made by `rerun.log` for every value, as fast as it goes: its chunks are
-longer, and it is smaller, than one in real time. A columnar log is made by `rerun.send_columns` in long batches, which
-a program can do only after the values are there.
+One entity per body, device and series, one row per state, on the four timelines of a recording; `rerun.send_columns`
+in batches, which is the smallest of the usual ways to log. The geometry of the scene is in the file once.
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ from iris_session.recording import RecordedState, Recording, paths
 from iris_session.recording.picture import ScenePicture, SceneSource, escape_entity_part
 from iris_session.recording.record_batches import read_index
 from iris_session.recording.rrd_file import read_chunks
-from iris_session.recording.timelines import Moment, set_moment, to_time_columns
+from iris_session.recording.timelines import Moment, to_time_columns
 
 #: Length of a batch. Rerun's own batches are much shorter, and a chunk is mostly its schema.
 BATCH_S: Final = 8.0
@@ -31,27 +29,17 @@ _Rows = dict[str, list[tuple[Moment, list[float]]]]
 
 
 def write_naive_log(recording: Recording, output: Path) -> int:
-    """Log every value of a recording to `output` by itself. Return its size [bytes]."""
-    log, poses = _open_log(recording, output), _list_poses(recording)
-    rows = [(moment, entity, values, True) for entity, moment, values in poses]
-    rows += [(moment, entity, values, False) for entity, moment, values in _list_scalars(recording)]
-    rows.sort(key=lambda row: row[0].session_ns)
-    last = None
-    for moment, entity, values, is_pose in rows:
-        if moment != last:
-            set_moment(log, moment)
-            last = moment
-        if is_pose:
-            log.log(entity, rr.Transform3D(translation=values[:3], quaternion=[*values[4:], values[3]]))
-        else:
-            log.log(entity, rr.Scalars(values))
-    return _close_log(log, recording, output)
-
-
-def write_columnar_log(recording: Recording, output: Path) -> int:
-    """Write the values of a recording to `output` in batches of columns. Return its size [bytes]."""
-    log = _open_log(recording, output)
-    for rows in _split(_list_poses(recording)):
+    """Log the values of a recording to `output`. Return its size [bytes]."""
+    log = rr.RecordingStream("naive", recording_id="naive")
+    log.set_log_time_enabled(False)
+    log.save(output)
+    states = list(recording.states())
+    if states:
+        header, first = recording.header, _make_moment(states[0], recording.header.origin_utc_ns)
+        picture = ScenePicture(log)
+        picture.set_scene(SceneSource(header.model, header.bodies, robots=header.robots))
+        picture.draw(first)
+    for rows in _split(_list_poses(states, recording.header.origin_utc_ns)):
         for entity, taken in rows.items():
             poses = np.array([pose for _, pose in taken], np.float32)
             columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=poses[:, [4, 5, 6, 3]])
@@ -61,25 +49,6 @@ def write_columnar_log(recording: Recording, output: Path) -> int:
             values = np.array([row for _, row in taken], np.float64)
             columns = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
             _send(log, entity, [moment for moment, _ in taken], columns)
-    return _close_log(log, recording, output)
-
-
-def _open_log(recording: Recording, output: Path) -> rr.RecordingStream:
-    """Open a log that holds the geometry of the scene."""
-    log = rr.RecordingStream("naive", recording_id="naive")
-    log.set_log_time_enabled(False)
-    log.save(output)
-    state = next(recording.states(), None)
-    if state is not None:
-        header, first = recording.header, _make_moment(state, recording.header.origin_utc_ns)
-        picture = ScenePicture(log)
-        picture.set_scene(SceneSource(header.model, header.bodies, robots=header.robots))
-        picture.draw(first)
-    return log
-
-
-def _close_log(log: rr.RecordingStream, recording: Recording, output: Path) -> int:
-    """Log the events, and end. Return the size [bytes]."""
     for event in recording.events():
         log.set_time(paths.SESSION_TIME, duration=np.timedelta64(event.session_time, "ns"))
         log.log("events", rr.TextLog(repr(event.body)))
@@ -87,10 +56,10 @@ def _close_log(log: rr.RecordingStream, recording: Recording, output: Path) -> i
     return output.stat().st_size
 
 
-def _list_poses(recording: Recording) -> Iterator[tuple[str, Moment, list[float]]]:
+def _list_poses(states: list[RecordedState], origin_utc_ns: int) -> Iterator[tuple[str, Moment, list[float]]]:
     """Yield entity, time and pose (`x y z qw qx qy qz`) of every moving body and device at every state."""
-    for state in recording.states():
-        moment = _make_moment(state, recording.header.origin_utc_ns)
+    for state in states:
+        moment = _make_moment(state, origin_utc_ns)
         for body, pose in zip(state.bodies, state.poses.tolist(), strict=True):
             if body.moving:
                 yield f"bodies/{escape_entity_part(body.name)}", moment, pose

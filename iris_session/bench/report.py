@@ -14,8 +14,8 @@ import psutil
 VERSION: Final = 1
 #: Parameter `bars` of a benchmark over an impaired link.
 NO_BARS: Final = "none: the figures include the link"
-#: Share of stolen time from which the figures are worse for it.
-WORTH_TELLING: Final = 0.01
+#: Stolen share below which the text of a report does not mention it.
+MIN_STOLEN_SHARE: Final = 0.01
 _OPERATORS: Final = {
     "<=": lambda value, bound: value <= bound,
     ">=": lambda value, bound: value >= bound,
@@ -46,7 +46,7 @@ def make_bar(results: dict[str, Any], key: str, op: str, bound: float) -> Bar:
 class BenchReport(msgspec.Struct, frozen=True):
     """Report that `iris-session bench NAME --json` prints.
 
-    `stolen_share`: share of the processors' time that other virtual machines took meanwhile, if the system tells.
+    `stolen_share`: share of processor time that other virtual machines used meanwhile, 0 where that is not known.
     """
 
     name: str
@@ -87,13 +87,13 @@ class BenchReport(msgspec.Struct, frozen=True):
         if self.reference:
             rows.append("reference, in the same run:")
             rows += [f"  {key:<{width}}  {value}" for key, value in self.reference.items()]
-        if self.stolen_share > WORTH_TELLING:
-            rows.append(f"other virtual machines took {self.stolen_share:.1%} of the processors' time meanwhile")
+        if self.stolen_share > MIN_STOLEN_SHARE:
+            rows.append(f"other virtual machines used {self.stolen_share:.1%} of the processor time meanwhile")
         return "\n".join(rows)
 
 
 def read_stolen_time() -> tuple[float, float]:
-    """Return the time that other virtual machines took from the processors, and all time of these [s]."""
+    """Return the processor time that other virtual machines used, and all processor time [s]."""
     times = psutil.cpu_times()
     return getattr(times, "steal", 0.0), sum(times)
 

@@ -317,7 +317,7 @@ def check_recorder(report: StatusReport) -> Finding:
     if one.lost_rows:
         return warning("recorder", f"{text}{lost}", one.text, "verification goes on after the gap")
     if one.text:
-        advice = "nothing is lost for verification; report the error that the log and the recording name"
+        advice = "the journal goes on, and verifies; the session's log and the recording's markers have the cause"
         return warning("recorder", f"{text}{waiting}", one.text, advice)
     return ok("recorder", f"{text}{waiting}")
 

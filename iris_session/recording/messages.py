@@ -54,13 +54,13 @@ class EndMark(msgspec.Struct, frozen=True, array_like=True):
     """Mark at the end of a closed file: `step` and `chain` of its newest row.
 
     `reason`: why it ended before the session, one line for people; empty if it did not. `samples_left_out`: number of
-    raw messages of clients that the file lacks.
+    raw messages of clients that the recorder did not write; those that the front left out are not counted.
     """
 
     step: int
     chain: bytes
     reason: str = ""
-    samples_left_out: int = 0
+    samples_left_out: Count = 0
 
 
 class HeaderCopy(msgspec.Struct, frozen=True, array_like=True):

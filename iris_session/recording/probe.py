@@ -132,7 +132,7 @@ class Prober:
 def _bound(path: str) -> None:
     """Bound memory and processor time of the next answer: damaged messages may claim any size when decompressed.
 
-    Beyond a bound this process dies, and the file is not readable. Where the system does not tell or bound, nothing is.
+    Beyond a bound this process dies, and the file is not readable. Systems without /proc have no bounds.
     """
     with suppress(OSError, ValueError, AttributeError):
         size = os.path.getsize(path)

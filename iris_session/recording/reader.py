@@ -107,8 +107,9 @@ class Recording:
         root: Chain value (16 bytes) before the first row.
         end: Step and chain of the newest row as noted when the last part was closed; None if its recorder was killed
             or a part is missing at the end.
-        samples_left_out: Number of raw messages of clients that parts which were closed lack: their disk was slow or
-            nearly full, or their budget nearly used up. The journal has what the session used of them.
+        samples_left_out: Number of raw messages of clients that the recorder did not write, of parts that were closed:
+            the disk was slow or nearly full, or the budget nearly used up. Those that the front left out before are
+            only in the session's status. The journal has what the session used of them.
         all_closed: Every part was closed by its recorder, so that nothing can be missing within. Not known of a copy by
             Rerun's tools, which may be of parts that were not.
         damage: One line per place that could not be read, at most `MOST_DAMAGE`. Reading on may add lines.

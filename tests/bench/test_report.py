@@ -125,7 +125,7 @@ def test_bar_is_kept_or_missed(value: float, ok: bool) -> None:
     assert ("MISSED" in report.format()) is not ok
 
 
-def test_time_taken_by_other_machines_is_told() -> None:
+def test_stolen_processor_time_is_reported() -> None:
     report = msgspec.structs.replace(_report(1.0), stolen_share=0.1234567)
     assert "12.3%" in report.format()
     assert report.as_dict()["machine"]["stolen_share"] == 0.1235

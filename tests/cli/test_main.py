@@ -210,6 +210,7 @@ def test_serve_prints_json_and_its_recording_verifies(tmp_path: Path, capfd: pyt
     report = json.loads(capfd.readouterr().out)
     assert report["ok"] is True
     assert report["files"][0]["steps"] == result["tick"]
+    assert main(["verify", str(recording), str(tmp_path / "none.rrd")]) == 2
 
 
 def test_closed_pipe_prints_no_traceback(tmp_path: Path) -> None:

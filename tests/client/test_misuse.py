@@ -38,11 +38,16 @@ def test_any_estop_reason_fits_the_protocol(reason: object) -> None:
     assert len(message.reason) <= 512
 
 
+def assert_no_faults(client: Client) -> None:
+    """Check that the front found no fault; stalls are of a busy machine."""
+    assert client.connection.counters.faults.keys() <= {FaultCode.STALLED, FaultCode.RECOVERED}
+
+
 def test_estop_with_a_numeric_reason_stops(session: LiveSession, join: Join) -> None:
     ann = join()
     ann.estop(5)
     assert ann.wait_for(lambda c: c.mirror.estop)
-    assert FaultCode.MALFORMED not in ann.connection.counters.faults
+    assert_no_faults(ann)
 
 
 def test_invalid_requests_raise_at_once_and_name_the_field(session: LiveSession, join: Join) -> None:
@@ -95,7 +100,7 @@ def test_invalid_samples_raise_at_once_and_name_the_field(session: LiveSession, 
         assert "\n" not in str(raised.value)
     ann.marker("after")
     assert not session.messages_of(Sample)
-    assert FaultCode.MALFORMED not in ann.connection.counters.faults
+    assert_no_faults(ann)
 
 
 def test_arrays_and_numpy_scalars_are_accepted(session: LiveSession, join: Join) -> None:
@@ -113,7 +118,7 @@ def test_arrays_and_numpy_scalars_are_accepted(session: LiveSession, join: Join)
     assert taken.pose is not None
     assert taken.pose.p == pytest.approx(HERE[0])
     assert (taken.clutch, taken.gripper, taken.buttons) == (True, 0.5, 3)
-    assert FaultCode.MALFORMED not in ann.connection.counters.faults
+    assert_no_faults(ann)
 
 
 def test_kind_of_sample_follows_from_its_arguments(session: LiveSession, join: Join) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import random
 import shutil
 from pathlib import Path
@@ -15,6 +16,7 @@ from iris_session.recording.journal import seal_blob
 from iris_session.recording.lock import RecordingLock
 from iris_session.recording.paths import part_path
 from iris_session.recording.repair import RepairReport, repair
+from iris_session.recording.rerun_tool import INDEX, rewrite
 from iris_session.recording.rrd_file import KIND_STORE_INFO, scan_file
 from tests.recording.damage import STEPS, Original, check_cut, check_repair, flip_bits, make_original
 from tests.recording.support import SmallCore, journal, write
@@ -199,3 +201,10 @@ def test_running_session_is_not_repaired(original: Original, tmp_path: Path) -> 
             repair(path, tmp_path / "repaired.rrd")
     finally:
         lock.release()
+
+
+def test_full_disk_is_an_error_of_the_system(tmp_path: Path) -> None:
+    path = write(tmp_path / "session.rrd", *journal(STEPS))
+    with open("/dev/full", "wb") as full, pytest.raises(OSError, match="No space left") as raised:
+        rewrite(INDEX, [str(path)], full)
+    assert raised.value.errno == errno.ENOSPC
