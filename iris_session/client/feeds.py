@@ -22,7 +22,7 @@ from iris_session.streams.errors import StreamError
 
 @dataclass(frozen=True, slots=True)
 class MediaFrame:
-    """One frame. `age_ns`: from its capture until it was passed to the application [ns]."""
+    """One frame. `age_ns`: from its capture until it was passed to the application [ns], by the estimated clock."""
 
     header: MediaHeader
     data: bytes
