@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -87,6 +87,7 @@ def _inspect_folder(folder: Path, *, as_json: bool) -> int:
     import msgspec
 
     from iris_session.recording import RecordingError
+    from iris_session.recording.folders import find_recordings
 
     rows: list[dict[str, object]] = []
 
@@ -113,23 +114,6 @@ def _inspect_folder(folder: Path, *, as_json: bool) -> int:
     if as_json:
         print_json({"ok": ok, "recordings": rows})
     return 0 if ok else 1
-
-
-def find_recordings(folder: Path, on_error: Callable[[OSError], None]) -> list[Path]:
-    """Return the first file of every recording in a folder and the folders below it, in the order of their names.
-
-    `on_error`: called for every folder that cannot be read.
-    """
-    from iris_session.recording.paths import is_view_copy, split_part
-
-    first: dict[str, tuple[int, Path]] = {}
-    for where, _, names in os.walk(folder, onerror=on_error):
-        for name in names:
-            base, part = split_part(os.path.join(where, name))
-            is_recording = name.endswith(SUFFIX) and not is_view_copy(name)
-            if is_recording and (base not in first or part < first[base][0]):
-                first[base] = part, Path(where, name)
-    return [first[base][1] for base in sorted(first)]
 
 
 def _summarise_file(path: Path) -> RecordingSummary:

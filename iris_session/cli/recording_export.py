@@ -36,7 +36,7 @@ def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
         "  iris-session recording export session.rrd --to assets -o scene-files",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or its folder")
+    parser.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or the folder of one session")
     parser.add_argument("--to", required=True, choices=(*FORMATS, ASSETS), help="format of the tables, or assets")
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="FOLDER", help="folder for the files")
     parser.add_argument(

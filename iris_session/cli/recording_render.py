@@ -52,7 +52,7 @@ def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
         "  iris-session recording render session.rrd --list-cameras",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or its folder")
+    parser.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or the folder of one session")
     parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="the file to write: .mp4, .gif or .png")
     parser.add_argument(
         "--camera", default="", metavar="NAME", help="camera of the model (default: a view of all bodies that move)"

@@ -29,7 +29,7 @@ def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
         "  iris-session recording repair session.rrd -o repaired.rrd --force --json",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    repair.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or its folder")
+    repair.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or the folder of one session")
     repair.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="the file to write")
     repair.add_argument("--force", action="store_true", help="replace FILE if it exists")
     add_json_option(repair)

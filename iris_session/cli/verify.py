@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
-from iris_session.cli.common import add_json_option, ending_as_interrupts, print_json, to_printable
+from iris_session.cli.common import CommandError, add_json_option, ending_as_interrupts, print_json, to_printable
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -17,10 +18,12 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         description="Re-simulate recordings. Exit status 0 only if every step of every file is identical.",
         epilog="examples:\n"
         "  iris-session verify sessions/*/session.rrd\n"
-        "  iris-session verify sessions/20261121T093000.000000Z-handover    the recording in a folder",
+        "  iris-session verify sessions             every recording in a folder and below it",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("files", nargs="+", type=Path, metavar="RECORDING", help="a .rrd, or its folder")
+    parser.add_argument(
+        "files", nargs="+", type=Path, metavar="RECORDING", help="a .rrd, or a folder with recordings below it"
+    )
     add_json_option(parser)
     parser.set_defaults(run=run)
 
@@ -35,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     reports = []
     progress = sys.stderr.isatty()
-    for path in arguments.files:
+    for path in list_files(arguments.files):
 
         def show(done: int, total: int, path: Path = path) -> None:
             text = to_printable(f"{path}: step {done} of {total}")
@@ -56,3 +59,23 @@ def run(arguments: argparse.Namespace) -> int:
         print_json({"ok": ok, "files": [report.as_dict() for report in reports]})
     unreadable = all(p.kind == "unreadable" and p.step < 0 for report in reports for p in report.problems)
     return 0 if ok else 2 if unreadable else 1
+
+
+def list_files(given: Sequence[Path]) -> list[Path]:
+    """Return the recordings to verify: in place of a folder, all in and below it.
+
+    Raises:
+        CommandError: There is none in a folder, or one below it cannot be read.
+    """
+    from iris_session.recording.folders import find_recordings
+
+    def refuse(error: OSError) -> None:
+        raise CommandError(f"{error.filename} cannot be read: {error.strerror}")
+
+    files: list[Path] = []
+    for path in given:
+        found = find_recordings(path, refuse) if path.is_dir() else [path]
+        if not found:
+            raise CommandError(f"there is no recording below the folder {path}: give a .rrd that `serve` wrote")
+        files += found
+    return files

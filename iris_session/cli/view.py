@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TextIO
@@ -17,11 +17,11 @@ from urllib.parse import quote
 
 from iris_session.cli.common import CommandError, ending_as_interrupts, to_printable
 from iris_session.cli.progress import ReadingProgress
-from iris_session.cli.recording import find_recordings
 
 if TYPE_CHECKING:
     from iris_session.recording.view_copy import ViewFile
 
+DEFAULT_FOLDER: Final = Path("sessions")
 HOST: Final = "127.0.0.1"
 #: A viewer that has not begun to listen by then has failed [s]. It takes a second on an idle machine.
 START_S: Final = 60.0
@@ -58,9 +58,9 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "path",
         nargs="?",
         type=Path,
-        default=Path("sessions"),
         metavar="RECORDING",
-        help="a .rrd of a session, or a folder: the newest session in or below it (default: %(default)s)",
+        help="a .rrd of a session, or a folder: the newest session in or below it (default: the folder sessions; with "
+        "--live the session that this machine records)",
     )
     parser.add_argument("--web", action="store_true", help="in a browser; the default where there is no display")
     parser.add_argument(
@@ -88,9 +88,9 @@ def run(arguments: argparse.Namespace) -> int:
     if taken:  # Rerun would send the recording to a viewer that listens there
         raise CommandError(f"something listens on port {taken[0]} already: give another one, or leave --port out")
     tool = find_rerun()
-    path = choose_recording(arguments.path)
     if arguments.live:
-        return _show_live(tool, arguments, path)
+        return _show_live(tool, arguments, find_live(arguments.path))
+    path = choose_recording(arguments.path or DEFAULT_FOLDER)
     with ending_as_interrupts(), ReadingProgress(path) as progress, open_view_file(path, progress.show_bytes) as view:
         progress.end()
         only_copies = arguments.no_open and not arguments.web
@@ -103,30 +103,36 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _show_live(tool: str, arguments: argparse.Namespace, path: Path) -> int:
-    path = find_live(path)
     os.nice(LIVE_NICE)  # the session comes first
     print(f"follows {to_printable(str(path))} until the session ends", flush=True)
     with ending_as_interrupts():
         return _show(tool, arguments, None, path)
 
 
-def find_live(path: Path) -> Path:
-    """Return the first file of the recording that is being written, of the session that a file belongs to.
+def find_live(path: Path | None) -> Path:
+    """Return the first file of a recording that is being written: of a session, in or below a folder, or any.
 
     Raises:
         CommandError: There is none.
     """
-    from iris_session.recording.lock import find_writers
-    from iris_session.recording.paths import split_part
-    from iris_session.recording.view_copy import list_session_files
+    from iris_session.recording.lock import list_written
 
-    files: list[Path] = []
-    with suppress(OSError):  # the folder is gone
-        files = list_session_files(path)
-    live = next((file for file in files if find_writers(split_part(str(file))[0])), None)
-    if live is None:
-        raise CommandError(f"no session is writing {path}: leave --live out")
-    return live
+    live = [Path(file) for file in list_written()]
+    belonging = [file for file in live if path is None or _belongs(file.resolve(), path.resolve())]
+    if not belonging:
+        what = "no session that is recorded runs on this machine" if path is None else f"no session writes {path}"
+        elsewhere = f"; this one is being written: {live[0]}" if live else ""
+        raise CommandError(f"{what}{elsewhere or ': leave --live out to see one that has ended'}")
+    return belonging[0]
+
+
+def _belongs(file: Path, path: Path) -> bool:
+    """Return whether a recording is of the session that `path` is a file of, or lies in or below the folder `path`."""
+    from iris_session.recording.folders import split_file_name
+
+    if path.is_dir():
+        return path in file.parents
+    return file.parent == path.parent and split_file_name(file.name)[0] == split_file_name(path.name)[0]
 
 
 def choose_recording(path: Path) -> Path:
@@ -139,31 +145,19 @@ def choose_recording(path: Path) -> Path:
         if not path.exists():
             raise CommandError(f"{path} does not exist: give a recording (session.rrd), or a folder with recordings")
         return path
-    from iris_session.recording.paths import split_part, split_resume
+    from iris_session.recording.folders import find_newest_s, find_recordings, group_by_session
 
-    sessions: dict[str, list[Path]] = {}
-    for file in find_recordings(path, lambda error: print(to_printable(f"iris-session: {error}"), file=sys.stderr)):
-        sessions.setdefault(split_resume(split_part(str(file))[0])[0], []).append(file)
-    if not sessions:
+    found = find_recordings(path, lambda error: print(to_printable(f"iris-session: {error}"), file=sys.stderr))
+    if not found:
         raise CommandError(f"there is no recording below the folder {path}: give a .rrd that `serve` or `demo` wrote")
-    newest = sorted(sessions.values(), key=_find_newest_s, reverse=True)
+    newest = group_by_session(found)
     if len(newest) > 1:
         print(f"{len(newest)} sessions below {to_printable(str(path))}, the newest is shown; the others:")
         for files in newest[1 : MOST_LISTED + 1]:
-            print(f"  {_format_time(_find_newest_s(files))}  {to_printable(str(files[0]))}")
+            print(f"  {_format_time(find_newest_s(files))}  {to_printable(str(files[0]))}")
         if len(newest) > MOST_LISTED + 1:
             print(f"  and {len(newest) - MOST_LISTED - 1} more")
     return newest[0][0]
-
-
-def _find_newest_s(files: Sequence[Path]) -> float:
-    return max(map(_read_time_s, files))
-
-
-def _read_time_s(file: Path) -> float:
-    with suppress(OSError):  # removed meanwhile, or a link to nothing
-        return file.stat().st_mtime
-    return 0.0
 
 
 def _format_time(seconds: float) -> str:

@@ -14,6 +14,7 @@ from contextlib import suppress
 from typing import Final
 
 from iris_session.recording.errors import RecorderError
+from iris_session.recording.paths import SUFFIX
 
 #: Time in which a recorder whose session was killed can write its data and end.
 PATIENCE_S: Final = 15.0
@@ -79,6 +80,18 @@ def find_writers(path: str | os.PathLike[str]) -> list[int]:
     return [pid for pid, kind in _list_holders(file) if kind == "READ"]
 
 
+def list_written() -> list[str]:
+    """Return the first files of recordings that are being written, newest first. Only those that the system lists."""
+    found: dict[str, float] = {}
+    for pid in {pid for pid, kind, _ in _read_locks() if kind == "READ"}:
+        for number in _list_open(pid):
+            with suppress(OSError):
+                path = os.readlink(f"/proc/{pid}/fd/{number}")
+                if path.endswith(SUFFIX) and pid in find_writers(path):
+                    found[path] = os.stat(path).st_mtime
+    return sorted(found, key=lambda path: found[path], reverse=True)
+
+
 def describe_writers(pids: list[int]) -> str:
     """Return a phrase such as `is being written by process 12`."""
     return f"is being written by {_format_processes(pids)}"
@@ -100,29 +113,34 @@ def _list_holders(file: os.stat_result) -> list[tuple[int, str]]:
 
     The device in `/proc/locks` is not always that of `stat`, so a process counts if it has the file open.
     """
+    found = {(pid, kind) for pid, kind, inode in _read_locks() if inode == file.st_ino}
+    return sorted((pid, kind) for pid, kind in found if _has_open(pid, file))
+
+
+def _read_locks() -> list[tuple[int, str, int]]:
+    """Return process, kind (`READ`, `WRITE`) and inode of each lock of this kind that the system lists."""
     try:
         with open("/proc/locks", encoding="ascii", errors="replace") as locks:
             lines = [line.split() for line in locks]
     except OSError:
         return []
-    found = [(int(words[4]), words[3]) for words in lines if words[1] == "FLOCK" and _is_lock_on(words[5], file)]
-    return sorted({(pid, kind) for pid, kind in found if pid > 0 and _has_open(pid, file)})
-
-
-def _is_lock_on(lock: str, file: os.stat_result) -> bool:
-    return lock.rpartition(":")[2] == str(file.st_ino)
+    found = [(int(words[4]), words[3], int(words[5].rpartition(":")[2])) for words in lines if words[1] == "FLOCK"]
+    return [(pid, kind, inode) for pid, kind, inode in found if pid > 0]
 
 
 def _has_open(pid: int, file: os.stat_result) -> bool:
-    try:
-        names = os.listdir(f"/proc/{pid}/fd")
-    except OSError:
-        return False
-    for name in names:
+    for number in _list_open(pid):
         with suppress(OSError):
-            if os.path.samestat(os.stat(f"/proc/{pid}/fd/{name}"), file):
+            if os.path.samestat(os.stat(f"/proc/{pid}/fd/{number}"), file):
                 return True
     return False
+
+
+def _list_open(pid: int) -> list[str]:
+    try:
+        return os.listdir(f"/proc/{pid}/fd")
+    except OSError:
+        return []
 
 
 def _format_processes(pids: list[int]) -> str:

@@ -50,17 +50,23 @@ class RecorderConfig(msgspec.Struct, frozen=True):
     journal_only: bool = False
 
 
+#: Description of `EndMark.is_abrupt`.
+ABRUPT: Final = "session ended abruptly: its process was killed or crashed"
+
+
 class EndMark(msgspec.Struct, frozen=True, array_like=True):
     """Mark at the end of a closed file: `step` and `chain` of its newest row.
 
     `reason`: why it ended before the session, one line for people; empty if it did not. `samples_left_out`: number of
     raw messages of clients that the recorder did not write; those that the front left out are not counted.
+    `is_abrupt`: the session's process was killed or crashed, and the recorder closed the file by itself.
     """
 
     step: int
     chain: bytes
     reason: str = ""
     samples_left_out: Count = 0
+    is_abrupt: bool = False
 
 
 class HeaderCopy(msgspec.Struct, frozen=True, array_like=True):

@@ -166,7 +166,8 @@ class RecorderLoop:
             if self._writer.size == before:
                 break  # there was no step
         reason = describe_used_budget(self._budget.total_bytes) if self._is_used_up else ""
-        self._writer.close(reason=reason, samples_left_out=self._samples_left_out)
+        is_abrupt = not self._stopping and os.getppid() != self._config.parent
+        self._writer.close(reason=reason, samples_left_out=self._samples_left_out, is_abrupt=is_abrupt)
         self._ended = self._is_used_up
 
     def _give_up_as_orphan(self) -> None:

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from iris_session.protocol.server_messages import Event
 from iris_session.recording import paths, record_batches, rrd_file
 from iris_session.recording.errors import NotARecordingError
+from iris_session.recording.folders import find_session_in
 from iris_session.recording.journal import (
     FORMAT,
     VERIFIERS,
@@ -183,11 +184,7 @@ class Recording:
         """
         first = str(path)
         if os.path.isdir(first):
-            first = os.path.join(first, paths.FIRST_FILE)
-            if not os.path.isfile(first):
-                raise NotARecordingError(
-                    f"there is no {paths.FIRST_FILE} in the folder {path}: give the first file of the recording"
-                )
+            first = str(find_session_in(Path(path)))
         if not os.path.isfile(first):
             raise NotARecordingError(f"there is no recording {first}")
         if paths.is_view_copy(first):
@@ -254,7 +251,8 @@ class Recording:
         Returns:
             Iterator over states: `poses` (n_bodies, 7) float64, `x y z qw qx qy qz` ([m], unit quaternion), world
             frame, in the order of the state's own `bodies`, which change when a scene is loaded; presence of the
-            participants and the applied samples with them.
+            participants and the applied samples with them. Of class open the poses are exact; of class closed, where
+            the simulation gives the exact ones, they were rounded to float32 (0.1 um at 1 m).
 
         Raises:
             NotARecordingError: A file can no longer be read.

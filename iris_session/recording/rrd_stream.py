@@ -129,8 +129,8 @@ def text_list_column(name: str, values: Sequence[str]) -> ArrowColumn:
     return ArrowColumn(name, pa.array([list(values)], pa.list_(pa.string())))
 
 
-def matrix_column(name: str, values: NDArray[np.float64]) -> ArrowColumn:
-    """Return a column of a list of float64 per row of `values` (rows, items)."""
+def matrix_column(name: str, values: NDArray[np.floating[Any]]) -> ArrowColumn:
+    """Return a column of a list of numbers per row of `values` (rows, items)."""
     rows, items = values.shape
     offsets = np.arange(rows + 1, dtype=np.int32) * items
     return ArrowColumn(name, pa.ListArray.from_arrays(pa.array(offsets), pa.array(values.ravel())))

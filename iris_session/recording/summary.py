@@ -39,7 +39,7 @@ from iris_session.protocol.server_messages import (
     SceneChanged,
 )
 from iris_session.recording.lock import describe_writers
-from iris_session.recording.messages import DenialRecord, EndMark
+from iris_session.recording.messages import ABRUPT, DenialRecord, EndMark
 from iris_session.recording.reader import Recording
 from iris_session.recording.record_batches import DrawnVertices, FrameTime, RecordedStream, RowTimes
 from iris_session.recording.recorded_assets import AssetCollector, AssetFault, AssetPiece, AssetsSummary, RecordedScene
@@ -226,6 +226,7 @@ def summarise(recording: Recording, progress: Callable[[int, int], None] | None 
     lost = builder.assets.list_problems(finished=recording.all_closed)
     damage = (*recording.missing, *recording.damage, *builder.list_gaps(end), *changed, *lost)
     past = header.continues
+    ending = _describe_ending(recording, builder.end_ns)
     return RecordingSummary(
         path=recording.files[0],
         ok=not damage,
@@ -237,7 +238,7 @@ def summarise(recording: Recording, progress: Callable[[int, int], None] | None 
         format=header.format,
         recording_class=header.recording_class,
         finished=recording.finished,
-        ending=_describe_ending(recording, builder.end_ns),
+        ending=ending,
         begin_s=_to_s(builder.begin_ns),
         duration_s=_to_s(builder.end_ns - builder.begin_ns),
         steps=builder.steps,
@@ -267,11 +268,11 @@ def _read_size(file: str) -> int:
 
 
 def _describe_ending(recording: Recording, end_ns: int) -> str:
-    """Return one line about an end that is not that of a closed file, empty for a closed one."""
+    """Return one line about an end that is not that of a session, empty for one that is."""
     if recording.writers:
         return f"{describe_writers(recording.writers)}: read as far as {_to_s(end_ns):g} s"
-    if recording.finished:
-        return ""
+    if recording.end is not None:
+        return recording.end.reason[:200] or (ABRUPT if recording.end.is_abrupt else "")
     cuts = "".join(f"; {cut}" for cut in recording.cuts)
     lost = "at most 0.25 s if its recorder was killed, more if the file was cut"
     return f"not closed after {_to_s(end_ns):g} s: what may have followed is missing, {lost}{cuts}"

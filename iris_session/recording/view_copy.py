@@ -19,6 +19,7 @@ import psutil
 
 from iris_session.recording import paths, rrd_file
 from iris_session.recording.errors import NotARecordingError, RecorderError
+from iris_session.recording.folders import list_session_files, split_file_name
 from iris_session.recording.lost_motion import open_with_lost_motion
 from iris_session.recording.reader import Recording
 from iris_session.recording.rerun_tool import INDEX, OPTIMIZE, rewrite
@@ -49,20 +50,6 @@ class ViewFile(msgspec.Struct, frozen=True):
     notes: tuple[str, ...] = ()
 
 
-def list_session_files(path: Path) -> list[Path]:
-    """Return the files of the session that a file belongs to: those of resumed recordings and all parts, in order."""
-    first = _split_name(path.name)[0]
-    found = ((*_split_name(one.name), one) for one in path.parent.iterdir() if one.name.endswith(paths.SUFFIX))
-    ordered = sorted((number, part, one) for stem, number, part, one in found if stem == first)
-    return [one for _, _, one in ordered if one.is_file() and not paths.is_view_copy(one.name)]
-
-
-def _split_name(name: str) -> tuple[str, int, int]:
-    """Return the first file of a session, the number of a resumed recording, and that of the part of it."""
-    recording, part = paths.split_part(name)
-    return *paths.split_resume(recording), part
-
-
 @contextmanager
 def open_view_file(path: Path, progress: Callable[[int, int], None] | None = None) -> Iterator[ViewFile]:
     """Yield a file that the viewer opens at once: the copy beside the session, a temporary one, or the file itself.
@@ -85,7 +72,7 @@ def open_view_file(path: Path, progress: Callable[[int, int], None] | None = Non
         raise NotARecordingError(f"{path.parent} cannot be read: {error.strerror or error}") from error
     if not files:
         raise NotARecordingError(f"{path} is no recording: give a session{paths.SUFFIX}")
-    session = path.with_name(_split_name(path.name)[0])
+    session = path.with_name(split_file_name(path.name)[0])
     copy = Path(paths.view_path(str(session)))
     newest_ns = max(file.stat().st_mtime_ns for file in files)
     if _opens_at_once(files):
@@ -126,7 +113,7 @@ def _open_recordings(files: Sequence[Path], stack: ExitStack) -> tuple[list[Reco
     """Open the recordings of a session. Return those that can be read, what is damaged, and what is unusual."""
     first: dict[int, Path] = {}
     for file in files:
-        first.setdefault(_split_name(file.name)[1], file)
+        first.setdefault(split_file_name(file.name)[1], file)
     recordings: list[Recording] = []
     damage: list[str] = []
     notes: list[str] = []

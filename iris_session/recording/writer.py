@@ -42,6 +42,7 @@ from iris_session.recording.footer import INDEX_BYTES
 from iris_session.recording.journal import CLOSED, SessionHeader, blob_root, seal_blob
 from iris_session.recording.media import MediaDrawer
 from iris_session.recording.messages import (
+    ABRUPT,
     Batch,
     DenialRecord,
     EndMark,
@@ -148,6 +149,7 @@ class RrdWriter:
         self._frames: list[str] = []
         self._robots: Sequence[RobotSpec | RobotLabels] = ()
         self._shown_poses: NDArray[np.float64] | None = None
+        self._pose_type: type[np.floating[Any]] = np.float64
         self._newest_row = (-1, b"")
         self._begins_ns: int | None = None  # session time of the first row
         self._newest_ns = 0
@@ -174,6 +176,8 @@ class RrdWriter:
         for entity, content in ((paths.HEADER, blob), (paths.HEADER_COPY, copy)):
             self._log_static(entity, rr.AnyValues(blob=pa.array([seal_blob(content)], pa.binary())))
         self._header = header
+        if header.recording_class == CLOSED:  # the simulation gives the exact poses
+            self._pose_type = np.float32
         self._log_static(paths.INFO, rr.TextDocument(describe_session(header), media_type="text/markdown"))
         self._set_bodies(header.bodies)
         self._robots = header.robots
@@ -288,17 +292,21 @@ class RrdWriter:
         times = self._times.spread(entity, [self._newest_ns] * n)
         self._send_columns(entity, [duration_index(paths.SESSION_TIME, times)], columns)
 
-    def close(self, timeout_s: float = 10.0, reason: str = "", samples_left_out: int = 0) -> None:
+    def close(
+        self, timeout_s: float = 10.0, reason: str = "", samples_left_out: int = 0, *, is_abrupt: bool = False
+    ) -> None:
         """Write the rest and the end mark, and close the file.
 
-        For the mark: `reason`, why before the session ends; `samples_left_out`, number of raw messages.
+        For the mark: `reason`, why before the session ends; `samples_left_out`, number of raw messages; `is_abrupt`,
+        the session was killed.
 
         Assets that still wait are noted as missing. Raises `WriteError`.
         """
         self.flush(timeout_s)
         self._write_asset_rows(self.assets.close(reason or "the session ended before it was written"), timeout_s)
-        if reason:
-            self._rec.log(f"{paths.EVENTS}/recorder", rr.TextLog(reason, level=WARN), strict=True)
+        text = reason or (ABRUPT if is_abrupt else "")
+        if text:
+            self._rec.log(f"{paths.EVENTS}/recorder", rr.TextLog(text, level=WARN), strict=True)
         self._write_collected()
         self._picture.draw(self._find_moment(-1, 0))  # without a state the scene is drawn nevertheless
         if not self._arranged:
@@ -306,7 +314,7 @@ class RrdWriter:
         self._describe_result()
         self.flush(timeout_s)
         self._write_mark()
-        mark = EndMark(*self._newest_row, reason, samples_left_out)
+        mark = EndMark(*self._newest_row, reason, samples_left_out, is_abrupt)
         self._log_static(paths.END, rr.AnyValues(end=pa.array([_encode(mark)], pa.binary())))
         try:
             self._stream.close(timeout_s)
@@ -428,7 +436,7 @@ class RrdWriter:
                 self._people.label_robots(self._find_bases(poses[0]), Moment(*seen[:, 0].tolist()))
             self._send_blueprint()
         columns = [
-            matrix_column("poses", poses.reshape(len(states), -1)),
+            matrix_column("poses", poses.reshape(len(states), -1).astype(self._pose_type)),
             scalar_column("tick", [s.tick for s in states], pa.int64()),
             scalar_column("sim_time_s", [s.sim_time for s in states], pa.float64()),
             bytes_column("presence", [_encode(s.presence) for s in states]),

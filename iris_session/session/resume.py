@@ -55,6 +55,7 @@ from iris_session.recording import (
     unpack_model,
 )
 from iris_session.recording.environment import read_boot_id, use_one_blas_thread
+from iris_session.recording.folders import find_session_in
 from iris_session.recording.journal import CRASHED, check_keyframe
 from iris_session.recording.lock import PATIENCE_S
 from iris_session.recording.paths import resume_path, split_part, split_resume
@@ -87,7 +88,7 @@ class PastSession:
     """A session restored from its recording.
 
     Args:
-        path: Any file of the recording, or the folder of `session.rrd`.
+        path: Any file of the recording, or its folder.
         patience_s: Time for the recorder of a session that was killed to finish its file [s].
 
     Attributes:
@@ -309,9 +310,12 @@ class ReplayStop(msgspec.Struct, frozen=True):
 
 
 def find_first_file(path: Path) -> Path:
-    """Return the first file of the session that `path` belongs to: any file of it, or the folder of `session.rrd`."""
+    """Return the first file of the session that `path` belongs to: any file of it, or its folder."""
     if path.is_dir():
-        path = path / "session.rrd"
+        try:
+            path = find_session_in(path)
+        except NotARecordingError as error:
+            raise ResumeError(str(error)) from error
     first = Path(split_resume(split_part(str(path))[0])[0])
     if not any(True for _ in list_recordings(first)):
         raise ResumeError(f"there is no recording {path}: give a session.rrd, or the folder it is in")

@@ -247,10 +247,14 @@ def test_recording_that_could_not_be_made_is_refused(
 def test_file_that_is_no_recording_does_not_hide_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("a.rrd", "b.rrd"):
         (tmp_path / name).write_text("not a recording")
-    assert main(["verify", str(tmp_path / "a.rrd"), str(tmp_path / "b.rrd")]) == 2
-    errors = capsys.readouterr().err
-    assert "a.rrd" in errors
-    assert "b.rrd" in errors
+    for given in ([tmp_path / "a.rrd", tmp_path / "b.rrd"], [tmp_path]):
+        assert main(["verify", *map(str, given)]) == 2
+        errors = capsys.readouterr().err
+        assert "a.rrd" in errors
+        assert "b.rrd" in errors
+    (tmp_path / "empty").mkdir()
+    assert main(["verify", str(tmp_path / "empty")]) == 2
+    assert "no recording below" in capsys.readouterr().err
 
 
 SCRIPT = """

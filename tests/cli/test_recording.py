@@ -14,8 +14,9 @@ import pytest
 
 from iris_session.cli import progress
 from iris_session.cli.main import INTERRUPTED, main
-from iris_session.cli.recording import MOST_LINES, find_recordings, format_line, format_summary
+from iris_session.cli.recording import MOST_LINES, format_line, format_summary
 from iris_session.recording import reader
+from iris_session.recording.folders import find_recordings
 from iris_session.recording.recorded_assets import AssetsSummary
 from iris_session.recording.summary import (
     AlignmentSummary,

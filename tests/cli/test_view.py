@@ -70,7 +70,7 @@ def test_recording_that_is_being_written_is_found_among_resumed_ones(
         assert {find_live(one) for one in (path, *others)} == {live}
         lock.release()
     assert main(["view", str(path.parent), "--live"]) == 2
-    assert "no session is writing" in capsys.readouterr().err
+    assert "no session writes" in capsys.readouterr().err
 
 
 def test_links_to_nothing_hide_no_session(path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -119,7 +119,7 @@ def test_recorder_closes_its_file_and_the_session_goes_on(tmp_path: Path) -> Non
         assert len(recording.files) == 1
         summary = summarise(recording)
     assert summary.ok
-    assert any("recording ended: budget of 2 MB is used up" in note for note in summary.notes)
+    assert summary.ending.startswith("recording ended: budget of 2 MB is used up")
     assert path.stat().st_size <= BUDGET
 
 

@@ -83,11 +83,14 @@ def test_holder_of_the_same_inode_elsewhere_is_not_named(others: Holders, tmp_pa
     beside = tmp_path / "other.rrd"
     beside.write_bytes(b"another")
     with beside.open("rb") as file, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lock, "_is_lock_on", lambda _lock, _file: True)
-        # This process has the file open, and may hold a lock of another test.
-        assert holder not in dict(lock._list_holders(os.fstat(file.fileno())))
-        with others.path.open("rb") as of_it:
-            assert (holder, "READ") in lock._list_holders(os.fstat(of_it.fileno()))
+        patch.setattr(lock, "_read_locks", lambda: [(holder, "READ", os.fstat(file.fileno()).st_ino)])
+        assert lock._list_holders(os.fstat(file.fileno())) == []
+
+
+def test_recordings_that_are_written_are_listed(others: Holders) -> None:
+    assert str(others.path) not in lock.list_written()
+    others.hold("shared")
+    assert str(others.path) in lock.list_written()
 
 
 def test_unknown_holder_is_not_named(others: Holders, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -74,7 +74,7 @@ def test_recording_roundtrip_is_exact(tmp_path: Path) -> None:
         assert [k.step for k in recording.keyframes()] == [-1, 99, 199, 299]
         states = list(recording.states())
         assert len(states) == len(session.poses)
-        assert all(np.array_equal(s.poses, p) for s, p in zip(states, session.poses, strict=True))
+        assert all(np.array_equal(s.poses, p.astype(np.float32)) for s, p in zip(states, session.poses, strict=True))
         assert states[-1].presence[0].participant == "p1"
         assert [event.body.text for event in recording.events()] == [f"event {50 * i}" for i in range(6)]
         times, values = recording.metrics()["late_ms"]
@@ -345,6 +345,9 @@ def test_file_is_finished_when_the_parent_dies(tmp_path: Path) -> None:
     with Recording.open(path) as recording:
         assert recording.finished
         assert [row.step for row in recording.rows()] == list(range(200))
+        summary = summarise(recording)
+    assert summary.ok
+    assert "killed" in summary.ending, "a file that was closed by its recorder alone does not pass for a whole session"
 
 
 def test_session_that_never_began_leaves_no_file(tmp_path: Path) -> None:

@@ -178,8 +178,11 @@ def test_part_of_another_session_is_reported_and_skipped(path: Path) -> None:
 def test_a_folder_stands_for_the_recording_in_it(path: Path, tmp_path: Path) -> None:
     with Recording.open(path.parent) as recording:
         assert recording.files == [str(path)]
+    renamed = path.rename(path.with_name("handover.rrd"))
+    with Recording.open(path.parent) as recording:
+        assert recording.files == [str(renamed)]
     (tmp_path / "empty").mkdir()
-    with pytest.raises(NotARecordingError, match=r"no session\.rrd in the folder"):
+    with pytest.raises(NotARecordingError, match="no recording below the folder"):
         Recording.open(tmp_path / "empty")
 
 

@@ -11,14 +11,14 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from iris_session.cli.recording import find_recordings
 from iris_session.recording import NotARecordingError, Recording, view_copy
+from iris_session.recording.folders import find_recordings, list_session_files
 from iris_session.recording.footer import add_index
 from iris_session.recording.journal import Continues
 from iris_session.recording.lock import RecordingLock
 from iris_session.recording.rerun_tool import RerunToolError, find_rerun
 from iris_session.recording.rrd_file import scan_file
-from iris_session.recording.view_copy import list_session_files, open_view_file
+from iris_session.recording.view_copy import open_view_file
 from iris_session.recording.writer import RrdWriter
 from iris_session.system.files import Replacement
 from tests.recording.support import column, journal, read, write

@@ -41,7 +41,7 @@ from iris_session.protocol.server_messages import (
     SamplesRejected,
 )
 from iris_session.protocol.specs import RobotSpec
-from iris_session.recording import Recording, SessionHeader, pack_model
+from iris_session.recording import CLOSED, OPEN, Recording, SessionHeader, pack_model
 from iris_session.recording import scene_geometry as scene
 from iris_session.recording.blueprint import place_eye
 from iris_session.recording.messages import (
@@ -78,6 +78,21 @@ def times(batches: list[Any]) -> list[int]:
 def select(batches: list[Any], component: str) -> list[Any]:
     """Return the batches that have a component."""
     return [batch for batch in batches if component in batch.schema.names]
+
+
+@pytest.mark.parametrize(("recording_class", "kind"), [(OPEN, np.float64), (CLOSED, np.float32)])
+def test_poses_are_exact_where_no_simulation_gives_them(tmp_path: Path, recording_class: str, kind: type) -> None:
+    path = tmp_path / "session.rrd"
+    writer = RrdWriter(path, "r")
+    header = make_header(recording_class)
+    writer.write_header(header)
+    poses = np.random.default_rng(1).normal(size=(len(header.bodies), 7))
+    writer.add(Batch(states=[frame(0, poses)]))
+    writer.close()
+    with Recording.open(path, warn=False) as recording:
+        (state,) = recording.states()
+    assert state.poses.dtype == np.float64
+    assert np.array_equal(state.poses, poses.astype(kind))
 
 
 def test_transforms_are_the_poses_of_moving_bodies_when_they_change(tmp_path: Path) -> None:

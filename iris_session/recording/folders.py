@@ -1,0 +1,85 @@
+"""Recordings in folders: the files of a session, and the recordings below a folder."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+from iris_session.recording import paths
+from iris_session.recording.errors import NotARecordingError
+
+#: Sessions that an error names.
+MOST_NAMED: Final = 3
+
+
+def split_file_name(name: str) -> tuple[str, int, int]:
+    """Return the first file of a session, the number of a resumed recording, and that of the part of it."""
+    recording, part = paths.split_part(name)
+    return *paths.split_resume(recording), part
+
+
+def list_session_files(path: Path) -> list[Path]:
+    """Return the files of the session that a file belongs to: those of resumed recordings and all parts, in order."""
+    first = split_file_name(path.name)[0]
+    found = ((*split_file_name(one.name), one) for one in path.parent.iterdir() if one.name.endswith(paths.SUFFIX))
+    ordered = sorted((number, part, one) for stem, number, part, one in found if stem == first)
+    return [one for _, _, one in ordered if one.is_file() and not paths.is_view_copy(one.name)]
+
+
+def find_recordings(folder: Path, on_error: Callable[[OSError], None]) -> list[Path]:
+    """Return the first file of every recording in a folder and the folders below it, in the order of their names.
+
+    `on_error`: called for every folder that cannot be read.
+    """
+    first: dict[str, tuple[int, Path]] = {}
+    for where, _, names in os.walk(folder, onerror=on_error):
+        for name in names:
+            base, part = paths.split_part(os.path.join(where, name))
+            is_recording = name.endswith(paths.SUFFIX) and not paths.is_view_copy(name)
+            if is_recording and (base not in first or part < first[base][0]):
+                first[base] = part, Path(where, name)
+    return [first[base][1] for base in sorted(first)]
+
+
+def group_by_session(files: Sequence[Path]) -> list[list[Path]]:
+    """Return recordings in groups of one session each, in order; the newest session is first."""
+    sessions: dict[Path, list[Path]] = {}
+    for file in sorted(files, key=lambda file: split_file_name(file.name)):
+        sessions.setdefault(file.with_name(split_file_name(file.name)[0]), []).append(file)
+    return sorted(sessions.values(), key=find_newest_s, reverse=True)
+
+
+def find_newest_s(files: Sequence[Path]) -> float:
+    """Return when the newest of some files was changed last [s since 1970]."""
+    return max(map(_read_time_s, files))
+
+
+def _read_time_s(file: Path) -> float:
+    with suppress(OSError):  # removed meanwhile, or a link to nothing
+        return file.stat().st_mtime
+    return 0.0
+
+
+def find_session_in(folder: Path) -> Path:
+    """Return the first recording of the session in a folder: `session.rrd`, or that of the only session there.
+
+    Raises:
+        NotARecordingError: There is none, or there are several; the message says which files to give.
+    """
+    first = folder / paths.FIRST_FILE
+    if first.is_file():
+        return first
+    found = find_recordings(folder, lambda _: None)
+    if not found:
+        raise NotARecordingError(f"there is no recording below the folder {folder}: give a .rrd that `serve` wrote")
+    here = group_by_session([file for file in found if file.parent == folder])
+    if len(here) == 1:
+        return here[0][0]
+    several = here or group_by_session(found)
+    what = f"holds {len(here)} sessions" if here else "holds no recording itself, only folders below it do"
+    names = ", ".join(str(files[0]) for files in several[:MOST_NAMED])
+    more = f" (and {len(several) - MOST_NAMED} more)" if len(several) > MOST_NAMED else ""
+    raise NotARecordingError(f"the folder {folder} {what}: give one, newest first: {names}{more}")
