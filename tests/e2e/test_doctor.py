@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -18,6 +19,7 @@ import psutil
 import pytest
 
 from iris_session.client import Client
+from iris_session.demo.scenes import scene_path
 from iris_session.protocol.codec import encode_introduction
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.names import LateCause
@@ -208,12 +210,21 @@ SESSION_NAME = f"doctor-{os.getpid()}"
 # --- session and participants ----------------------------------------------------------------------------------------
 
 
+def make_slow_scene(folder: Path) -> Path:
+    """Return the scene of the handover at 100 Hz: a host that is busy for some ms makes no tick late."""
+    for file in (scene_path("handover"), scene_path("arm")):
+        text, n = re.subn(r'timestep="[\d.]+"', 'timestep="0.01"', file.read_text())
+        assert n == 1, file
+        (folder / file.name).write_text(text)
+    return folder / "handover.xml"
+
+
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SessionProcess]:
     folder = tmp_path_factory.mktemp("plain")
     recording = folder / "session.rrd"
     options = ("--name", SESSION_NAME, "--host", "127.0.0.1")
-    server = SessionProcess(folder, recording, make_serve_command("handover", recording, *options))
+    server = SessionProcess(folder, recording, make_serve_command(str(make_slow_scene(folder)), recording, *options))
     yield server
     server.stop()
 
