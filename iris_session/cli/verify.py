@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from iris_session.cli.common import CommandError, add_json_option, ending_as_interrupts, print_json, to_printable
@@ -36,9 +36,14 @@ def run(arguments: argparse.Namespace) -> int:
     require_package("rerun", "verifying recordings")
     from iris_session.session.verification import verify_recording
 
-    reports = []
+    reports: list[VerifyReport] = []
     progress = sys.stderr.isatty()
-    for path in list_files(arguments.files):
+
+    def refuse(path: str, why: str) -> None:  # must not hide the others
+        reports.append(VerifyReport(path, problems=[Problem(-1, "unreadable", "file", why)]))
+        print(to_printable(f"iris-session: {why}"), file=sys.stderr)
+
+    for path in list_files(arguments.files, lambda error: refuse(str(error.filename), str(error))):
 
         def show(done: int, total: int, path: Path = path) -> None:
             text = to_printable(f"{path}: step {done} of {total}")
@@ -47,12 +52,11 @@ def run(arguments: argparse.Namespace) -> int:
         try:
             with ending_as_interrupts():
                 report = verify_recording(path, show if progress else None)
-        except RecordingError as error:  # an unusable file must not hide the others
-            report = VerifyReport(str(path), problems=[Problem(-1, "unreadable", "file", str(error))])
-            print(to_printable(f"iris-session: {error}"), file=sys.stderr)
-        else:
-            if not arguments.json:
-                print(to_printable(f"{path}: {report.line()}"))
+        except RecordingError as error:
+            refuse(str(path), str(error))
+            continue
+        if not arguments.json:
+            print(to_printable(f"{path}: {report.line()}"))
         reports.append(report)
     ok = all(report.ok for report in reports)
     if arguments.json:
@@ -61,20 +65,19 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if ok else 2 if unreadable else 1
 
 
-def list_files(given: Sequence[Path]) -> list[Path]:
+def list_files(given: Sequence[Path], on_error: Callable[[OSError], None]) -> list[Path]:
     """Return the recordings to verify: in place of a folder, all in and below it.
 
+    `on_error`: called for every folder that cannot be read.
+
     Raises:
-        CommandError: There is none in a folder, or one below it cannot be read.
+        CommandError: There is none in a folder.
     """
     from iris_session.recording.folders import find_recordings
 
-    def refuse(error: OSError) -> None:
-        raise CommandError(f"{error.filename} cannot be read: {error.strerror}")
-
     files: list[Path] = []
     for path in given:
-        found = find_recordings(path, refuse) if path.is_dir() else [path]
+        found = find_recordings(path, on_error) if path.is_dir() else [path]
         if not found:
             raise CommandError(f"there is no recording below the folder {path}: give a .rrd that `serve` wrote")
         files += found

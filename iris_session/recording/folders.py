@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -34,14 +34,20 @@ def find_recordings(folder: Path, on_error: Callable[[OSError], None]) -> list[P
 
     `on_error`: called for every folder that cannot be read.
     """
+    walk = os.walk(folder, onerror=on_error)
+    found = [file for where, _, names in walk for file in _select_first_parts(Path(where), names)]
+    return sorted(found, key=lambda file: paths.split_part(str(file))[0])
+
+
+def _select_first_parts(folder: Path, names: Iterable[str]) -> list[Path]:
+    """Return those files of a folder that are the first parts of recordings, or the first of those that are left."""
     first: dict[str, tuple[int, Path]] = {}
-    for where, _, names in os.walk(folder, onerror=on_error):
-        for name in names:
-            base, part = paths.split_part(os.path.join(where, name))
-            is_recording = name.endswith(paths.SUFFIX) and not paths.is_view_copy(name)
-            if is_recording and (base not in first or part < first[base][0]):
-                first[base] = part, Path(where, name)
-    return [first[base][1] for base in sorted(first)]
+    for name in names:
+        base, part = paths.split_part(name)
+        is_recording = name.endswith(paths.SUFFIX) and not paths.is_view_copy(name)
+        if is_recording and (base not in first or part < first[base][0]):
+            first[base] = part, folder / name
+    return [file for _, file in first.values()]
 
 
 def group_by_session(files: Sequence[Path]) -> list[list[Path]]:
@@ -72,13 +78,15 @@ def find_session_in(folder: Path) -> Path:
     first = folder / paths.FIRST_FILE
     if first.is_file():
         return first
-    found = find_recordings(folder, lambda _: None)
-    if not found:
-        raise NotARecordingError(f"there is no recording below the folder {folder}: give a .rrd that `serve` wrote")
-    here = group_by_session([file for file in found if file.parent == folder])
+    try:
+        here = group_by_session(_select_first_parts(folder, os.listdir(folder)))
+    except OSError as error:
+        raise NotARecordingError(f"the folder {folder} cannot be read: {error.strerror or error}") from error
     if len(here) == 1:
         return here[0][0]
-    several = here or group_by_session(found)
+    several = here or group_by_session(find_recordings(folder, lambda _: None))
+    if not several:
+        raise NotARecordingError(f"there is no recording below the folder {folder}: give a .rrd that `serve` wrote")
     what = f"holds {len(here)} sessions" if here else "holds no recording itself, only folders below it do"
     names = ", ".join(str(files[0]) for files in several[:MOST_NAMED])
     more = f" (and {len(several) - MOST_NAMED} more)" if len(several) > MOST_NAMED else ""

@@ -83,12 +83,12 @@ def find_writers(path: str | os.PathLike[str]) -> list[int]:
 def list_written() -> list[str]:
     """Return the first files of recordings that are being written, newest first. Only those that the system lists."""
     found: dict[str, float] = {}
-    for pid in {pid for pid, kind, _ in _read_locks() if kind == "READ"}:
+    for pid, _, inode in (lock for lock in _read_locks() if lock[1] == "READ"):
         for number in _list_open(pid):
             with suppress(OSError):
-                path = os.readlink(f"/proc/{pid}/fd/{number}")
-                if path.endswith(SUFFIX) and pid in find_writers(path):
-                    found[path] = os.stat(path).st_mtime
+                file, path = os.stat(f"/proc/{pid}/fd/{number}"), os.readlink(f"/proc/{pid}/fd/{number}")
+                if file.st_ino == inode and path.endswith(SUFFIX):
+                    found[path] = file.st_mtime
     return sorted(found, key=lambda path: found[path], reverse=True)
 
 

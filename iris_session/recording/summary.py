@@ -163,11 +163,12 @@ class DropSummary(msgspec.Struct, frozen=True):
 class RecordingSummary(msgspec.Struct, frozen=True):
     """Content of a recording.
 
-    `ok`: nothing is damaged or missing inside; `finished` and `ending` say whether the end is there. `files`: the parts
-    that were read; `bytes`: of them. `recording_class`: `closed` or `open`. `created_utc`: when the recording began.
-    `begin_s`: session time of the first step; `duration_s`: to the last step or event. `continues`: file that a resumed
-    session continues. `deformables`: those that moved. `scene_changes`: resets among them. `damage`: one line per place
-    that is damaged or missing. `notes`: what else is unusual.
+    `ok`: nothing is damaged or missing inside; `finished`: the recorder closed the file; `ending`: in what way it is
+    not the end of the session, empty if it is. `files`: the parts that were read; `bytes`: of them. `recording_class`:
+    `closed` or `open`. `created_utc`: when the recording began. `begin_s`: session time of the first step;
+    `duration_s`: to the last step or event. `continues`: file that a resumed session continues. `deformables`: those
+    that moved. `scene_changes`: resets among them. `damage`: one line per place that is damaged or missing. `notes`:
+    what else is unusual.
     """
 
     path: str
@@ -226,7 +227,6 @@ def summarise(recording: Recording, progress: Callable[[int, int], None] | None 
     lost = builder.assets.list_problems(finished=recording.all_closed)
     damage = (*recording.missing, *recording.damage, *builder.list_gaps(end), *changed, *lost)
     past = header.continues
-    ending = _describe_ending(recording, builder.end_ns)
     return RecordingSummary(
         path=recording.files[0],
         ok=not damage,
@@ -238,7 +238,7 @@ def summarise(recording: Recording, progress: Callable[[int, int], None] | None 
         format=header.format,
         recording_class=header.recording_class,
         finished=recording.finished,
-        ending=ending,
+        ending=_describe_ending(recording, builder.end_ns),
         begin_s=_to_s(builder.begin_ns),
         duration_s=_to_s(builder.end_ns - builder.begin_ns),
         steps=builder.steps,

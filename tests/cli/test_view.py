@@ -16,6 +16,7 @@ from typing import Any, Self
 
 import pytest
 
+from iris_session.cli.common import CommandError
 from iris_session.cli.main import main
 from iris_session.cli.view import _fed, find_live, live_viewer
 from iris_session.recording.lock import RecordingLock
@@ -67,7 +68,10 @@ def test_recording_that_is_being_written_is_found_among_resumed_ones(
         shutil.copy(path, other)
     for live in (path, *others):
         lock = RecordingLock(live, shared=True)
-        assert {find_live(one) for one in (path, *others)} == {live}
+        assert {find_live(one) for one in (path, *others, path.parent)} == {live}
+        assert find_live(None).suffix == ".rrd"  # this one, or that of another test
+        with pytest.raises(CommandError, match="is being written: /"):
+            find_live(path.parent / "other" / path.name)
         lock.release()
     assert main(["view", str(path.parent), "--live"]) == 2
     assert "no session writes" in capsys.readouterr().err

@@ -51,5 +51,5 @@ def test_other_folders_name_what_to_give(tmp_path: Path, names: tuple[str, ...])
     with pytest.raises(NotARecordingError) as refused:
         find_session_in(tmp_path)
     assert str(refused.value).endswith(", ".join(map(str, made)))
-    with pytest.raises(NotARecordingError, match="no recording"):
+    with pytest.raises(NotARecordingError, match="cannot be read"):
         find_session_in(tmp_path / "missing")

@@ -85,6 +85,8 @@ def test_holder_of_the_same_inode_elsewhere_is_not_named(others: Holders, tmp_pa
     with beside.open("rb") as file, pytest.MonkeyPatch.context() as patch:
         patch.setattr(lock, "_read_locks", lambda: [(holder, "READ", os.fstat(file.fileno()).st_ino)])
         assert lock._list_holders(os.fstat(file.fileno())) == []
+    with others.path.open("rb") as of_it:
+        assert (holder, "READ") in lock._list_holders(os.fstat(of_it.fileno()))
 
 
 def test_recordings_that_are_written_are_listed(others: Holders) -> None:
