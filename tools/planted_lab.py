@@ -20,6 +20,7 @@ from typing import Any, Final
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the namespaces are those of the tests
 
 from tests.network_namespaces import Namespace, connect
+from tests.slow_scene import write_slow_scene
 
 COMMAND: Final = (sys.executable, "-m", "iris_session.cli.main")
 DEADLINE_S: Final = 60.0
@@ -94,8 +95,9 @@ class Machine(Namespace):
             stop(process)
 
     def serve(self, *arguments: str, keys: str = "keys") -> subprocess.Popen[bytes]:
-        """Start a session."""
-        return self.start(*COMMAND, "serve", "handover", *arguments, ready_line=r"on \S+:\d+,", keys=keys)
+        """Start a session with a slow loop: how busy this machine is must not look like a fault."""
+        scene = str(write_slow_scene(self.folder))
+        return self.start(*COMMAND, "serve", scene, *arguments, ready_line=r"on \S+:\d+,", keys=keys)
 
     @contextlib.contextmanager
     def firewall(self, *rules: str) -> Iterator[None]:

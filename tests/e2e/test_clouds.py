@@ -98,6 +98,7 @@ def test_a_cloud_at_rest_reaches_who_joins_later(
     server = serve("handover")
     frames = make_wall(PINK)
     with Client(server.address, role="source", name="camera") as source:
+        source.start()  # else it would be silent while the page is waited for
         info = StreamInfo("The room", "all", StreamCamera(640, 480, 585.0, 585.0, 319.5, 239.5))
         wait_until(
             lambda: source.media.publish("room", frames, encoding="cloud", info=info), "the source has a connection"
@@ -187,6 +188,7 @@ def test_in_ar_what_is_for_remote_people_is_not_subscribed_unless_chosen(
     server = serve("handover")
     drawn = "JSON.stringify([...irisSession.view.clouds.drawn.keys()].sort())"
     with Client(server.address, role="source", name="camera") as source:
+        source.start()  # else it would be silent while the page is waited for
         wall = make_wall(PINK)
 
         def publish(stream: str, audience: str) -> bool:

@@ -23,6 +23,7 @@ def test_clouds_and_pictures_of_a_source_are_recorded(serve: Callable[..., Sessi
     frames = encode_cloud(positions, np.full((5000, 3), 200, np.uint8), voxel_m=0.02, error_m=0.01)
     picture = b"\xff\xd8\xff\xc0\x00\x11\x08\x00\x02\x00\x03 of 3 x 2 pixels"
     with Client(server.address, role="source", name="camera") as source:
+        source.start()  # else it would be silent while the file is waited for
         publish(source, "room", frames, 1_000_000_007, "cloud")
         publish(source, "room-front", picture, 1_000_000_009, "jpeg")
         wait_until(lambda: holds_both(server.recording), "both are in the file")
