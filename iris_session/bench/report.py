@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 import platform
+import time
+from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from typing import Any, Final
 
@@ -16,6 +19,11 @@ VERSION: Final = 1
 NO_BARS: Final = "none: the figures include the link"
 #: Stolen share below which the text of a report does not mention it.
 MIN_STOLEN_SHARE: Final = 0.01
+#: Parallel speed above which the text of a report does not mention it: threads of one core share it.
+MAX_PARALLEL_SPEED: Final = 0.8
+#: Duration of one measurement of speed [s], and bytes that are hashed at once.
+SPEED_S: Final = 0.2
+SPEED_BLOCK: Final = bytes(65_536)
 _OPERATORS: Final = {
     "<=": lambda value, bound: value <= bound,
     ">=": lambda value, bound: value >= bound,
@@ -47,6 +55,7 @@ class BenchReport(msgspec.Struct, frozen=True):
     """Report that `iris-session bench NAME --json` prints.
 
     `stolen_share`: share of processor time that other virtual machines used meanwhile, 0 where that is not known.
+    `parallel_speed`: see `measure_parallel_speed`, the lower of the values before and after.
     """
 
     name: str
@@ -56,6 +65,7 @@ class BenchReport(msgspec.Struct, frozen=True):
     reference: dict[str, float] | None = None
     version: int = VERSION
     stolen_share: float = 0.0
+    parallel_speed: float = 1.0
 
     @property
     def ok(self) -> bool:
@@ -67,7 +77,8 @@ class BenchReport(msgspec.Struct, frozen=True):
         return {
             "name": self.name,
             "version": self.version,
-            "machine": describe_machine() | {"stolen_share": round(self.stolen_share, 4)},
+            "machine": describe_machine()
+            | {"stolen_share": round(self.stolen_share, 4), "parallel_speed": round(self.parallel_speed, 2)},
             "params": self.params,
             "results": _replace_infinite(self.results),
             "reference": self.reference,
@@ -89,6 +100,8 @@ class BenchReport(msgspec.Struct, frozen=True):
             rows += [f"  {key:<{width}}  {value}" for key, value in self.reference.items()]
         if self.stolen_share > MIN_STOLEN_SHARE:
             rows.append(f"other virtual machines used {self.stolen_share:.1%} of the processor time meanwhile")
+        if self.parallel_speed < MAX_PARALLEL_SPEED:
+            rows.append(f"with all processors in use, a thread is {self.parallel_speed:.2f} times as fast as alone")
         return "\n".join(rows)
 
 
@@ -96,6 +109,29 @@ def read_stolen_time() -> tuple[float, float]:
     """Return the processor time that other virtual machines used, and all processor time [s]."""
     times = psutil.cpu_times()
     return getattr(times, "steal", 0.0), sum(times)
+
+
+def measure_parallel_speed() -> float:
+    """Return how fast a thread is while all processors are in use, as a share of its speed alone.
+
+    Well below 1 where processors share a core, and where others use the machine, also in ways that the kernel of a
+    virtual machine does not see: figures of such a run are too high.
+    """
+    n = os.cpu_count() or 1
+    with ThreadPoolExecutor(n) as pool:
+        [alone] = pool.map(_count_hashes, [SPEED_S])
+        together = list(pool.map(_count_hashes, [SPEED_S] * n))
+    return min(1.0, sum(together) / n / alone)
+
+
+def _count_hashes(seconds: float) -> int:
+    """Return how many blocks are hashed in that time; hashing does not hold the interpreter lock."""
+    until = time.perf_counter() + seconds
+    count = 1
+    while time.perf_counter() < until:
+        hashlib.blake2b(SPEED_BLOCK)
+        count += 1
+    return count
 
 
 def flatten(results: dict[str, Any]) -> dict[str, Any]:

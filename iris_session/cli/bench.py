@@ -128,7 +128,7 @@ def run(arguments: argparse.Namespace) -> int:
     def progress(text: str) -> None:
         print(f"bench {arguments.bench}: {text}", file=sys.stderr, flush=True)
 
-    from iris_session.bench.report import BenchError, read_stolen_time
+    from iris_session.bench.report import BenchError, measure_parallel_speed, read_stolen_time
 
     if arguments.clients is None:
         arguments.clients = {"deformable": 4, "cloud-stream": 4, "join": 4, "web": 8}.get(arguments.bench, 16)
@@ -139,6 +139,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise CommandError(f"--clients {arguments.clients}: bench slow-client needs 3 or more, two of which are slow")
     if arguments.profile:
         load_profile(arguments.profile)  # fails before anything is started
+    speed = measure_parallel_speed()
     stolen_s, all_s = read_stolen_time()
     try:
         report = _run_benchmark(arguments, progress)
@@ -146,7 +147,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise CommandError(str(error), 1) from error
     stolen_after_s, all_after_s = read_stolen_time()
     share = (stolen_after_s - stolen_s) / max(all_after_s - all_s, 1e-9)
-    report = msgspec.structs.replace(report, stolen_share=share)
+    speed = min(speed, measure_parallel_speed())
+    report = msgspec.structs.replace(report, stolen_share=share, parallel_speed=speed)
     if arguments.json:
         print_json(report.as_dict())
     else:

@@ -36,6 +36,8 @@ MAX_VOXEL_M: Final = 10.0
 MIN_ERROR_M: Final = 1e-6
 MAX_ERROR_M: Final = 1e6
 _LAST_NODE: Final = 0xFFFF
+#: Numbers that are decoded at once, four of each point.
+_BLOCK: Final = 1024
 #: format u8, flags u8, exponent i8, reserved u8, points u32, origin 3 x i32, error and voxel f32 [m], reserved u32.
 _HEADER: Final = struct.Struct("<BBbBI3iffI")
 HEADER_BYTES: Final = _HEADER.size
@@ -149,13 +151,16 @@ def encode_cloud(
 def decode_cloud(payload: bytes | memoryview) -> CloudFrame:
     """Decode a frame. Raises `StreamError`."""
     header = read_header(payload)
-    points = np.frombuffer(payload, POINT, header.n_points, HEADER_BYTES)
-    step = np.float32(2.0**header.exponent)
-    rows = np.empty((3, header.n_points), np.float32)
-    for axis, origin in enumerate(header.origin):
-        np.multiply(points["node"][:, axis], step, out=rows[axis])
-        rows[axis] += np.float32(origin) * step
-    return CloudFrame(rows.T, unpack_colors(points["color"]), header.error_m, header.voxel_m)
+    n = 4 * header.n_points
+    # Whole points at once, colours too: a row of numbers is several times faster than a column. All sums are exact.
+    values = np.empty(-(-n // _BLOCK) * _BLOCK, np.float32)
+    values[:n], values[n:] = np.frombuffer(payload, "<u2", n, HEADER_BYTES), 0.0
+    blocks = values.reshape(-1, _BLOCK)
+    blocks += np.tile(np.array([*header.origin, 0], np.float32), _BLOCK // 4)
+    blocks *= np.float32(2.0**header.exponent)
+    packed = (np.frombuffer(payload, "<i8", header.n_points, HEADER_BYTES) >> 48) & 0xFFFF
+    positions = values[:n].reshape(-1, 4)[:, :3]
+    return CloudFrame(positions, unpack_colors(packed), header.error_m, header.voxel_m)
 
 
 def read_header(payload: bytes | memoryview) -> CloudHeader:
@@ -195,9 +200,9 @@ def pack_colors(colors: Bytes) -> npt.NDArray[np.uint16]:
     return np.asarray(red | green | blue, np.uint16)
 
 
-def unpack_colors(packed: npt.NDArray[np.uint16]) -> Bytes:
+def unpack_colors(packed: npt.NDArray[np.integer]) -> Bytes:
     """Return colours (n, 4) of 16 bits: red, green, blue, 255."""
-    return _RGBA.take(packed.astype(np.intp)).view(np.uint8).reshape(-1, 4)
+    return _RGBA.take(packed, mode="clip").view(np.uint8).reshape(-1, 4)
 
 
 def _make_color_tables() -> tuple[tuple[npt.NDArray[np.uint16], ...], npt.NDArray[np.uint32]]:

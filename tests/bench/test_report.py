@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from iris_session.bench.report import BenchReport, make_bar
+from iris_session.bench.report import BenchReport, make_bar, measure_parallel_speed
 from iris_session.cli.main import main
 
 STATE_KEYS = {
@@ -41,7 +41,7 @@ def _bench(folder: Path, *arguments: str) -> dict[str, Any]:
 def _check(result: dict[str, Any], name: str, keys: set[str]) -> None:
     assert list(result) == ["name", "version", "machine", "params", "results", "reference", "bars"]
     assert result["name"] == name
-    assert set(result["machine"]) == {"cpus", "memory_gb", "python", "mujoco", "stolen_share"}
+    assert set(result["machine"]) == {"cpus", "memory_gb", "python", "mujoco", "stolen_share", "parallel_speed"}
     assert keys <= set(result["results"])
     for key in keys - {"rejected"}:
         assert math.isfinite(result["results"][key]), key
@@ -130,6 +130,14 @@ def test_stolen_processor_time_is_reported() -> None:
     assert "12.3%" in report.format()
     assert report.as_dict()["machine"]["stolen_share"] == 0.1235
     assert "other virtual machines" not in _report(1.0).format()
+
+
+def test_speed_with_all_processors_in_use_is_reported() -> None:
+    report = msgspec.structs.replace(_report(1.0), parallel_speed=0.456)
+    assert "0.46 times" in report.format()
+    assert report.as_dict()["machine"]["parallel_speed"] == 0.46
+    assert "times as fast" not in _report(1.0).format()
+    assert 0.0 < measure_parallel_speed() <= 1.0
 
 
 def test_infinite_values_are_null() -> None:
