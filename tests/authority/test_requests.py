@@ -585,6 +585,14 @@ def test_open_clutches_far_apart_are_no_idle_time() -> None:
     assert t.last(Intervention).active
 
 
+def test_an_open_clutch_and_then_silence_is_no_idle_time() -> None:
+    t, agent, human = intervened()
+    human.sends("left", tracked=False)
+    human.sends("left")
+    drive_on(t, agent, 10 * SECOND, human)
+    assert t.last(Intervention).active
+
+
 def test_a_director_gives_the_robot_of_a_lost_human_back() -> None:
     t, agent, human = intervened()
     boss = t.join("director")

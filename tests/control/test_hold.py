@@ -223,9 +223,10 @@ def test_a_held_arm_yields_to_a_strong_push_and_stays_there() -> None:
     assert rig.data.qpos[0] - start > moved - 0.3
 
 
-def test_a_user_loop_with_many_ticks_a_round_is_not_slowed_down() -> None:
+@pytest.mark.parametrize("kind", ["position", "gravity_pd"])
+def test_a_user_loop_with_many_ticks_a_round_is_not_slowed_down(kind: str) -> None:
     """20 ticks of control on one measured state: the bound widens with the age of the measurement."""
-    one, twenty = wall("position"), wall("position")
+    one, twenty = wall(kind), wall(kind)
     for rig, n in ((one, 1), (twenty, 20)):
         remove_wall(rig.data)
         drive(rig, 0.0, 21)

@@ -429,6 +429,21 @@ def test_a_long_topic_ends_its_connection_at_once(state_rig: StateSocketRig) -> 
     state_rig.turns(lambda: "flood_cut" in state_rig.drops.by_reason, "its end")
 
 
+def test_what_a_subscriber_that_is_cut_off_has_sent_besides_is_discarded(
+    state_rig: StateSocketRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    discarded: list[bool] = []
+
+    def close(descriptor: int, peer: tuple[str, int], *, discard: bool = False) -> bool:
+        discarded.append(discard)
+        return close_tcp(descriptor, peer, discard=discard)
+
+    monkeypatch.setattr(connection_guard, "close_tcp", close)
+    count_topic(state_rig, [b"x" * (MAX_TOPIC_BYTES + 1)])
+    state_rig.turns(lambda: "flood_cut" in state_rig.drops.by_reason, "its end")
+    assert discarded == [True]
+
+
 def test_every_beginning_of_a_topic_may_be_subscribed_to(state_rig: StateSocketRig) -> None:
     ann = state_rig.subscriber()
     for topic in (b"", b"r", b"rigid", b"pres", b"presence"):

@@ -10,7 +10,16 @@ import pytest
 import zmq
 
 from iris_session.front.connections import Peer
-from iris_session.front.key_budgets import FORGET_NS, HandshakeLimiter, IngestBackoff
+from iris_session.front.key_budgets import (
+    FORGET_NS,
+    KEY_BYTES,
+    KEY_MESSAGES,
+    HandshakeLimiter,
+    IngestBackoff,
+    KeyBudget,
+)
+from iris_session.front.raw_feed import BURST_S, PRESENCE_HZ, REQUEST_BYTES_PER_S, REQUEST_SHARE
+from iris_session.link import FrontLimits, SceneInfo
 from iris_session.protocol.client_messages import (
     Acquire,
     EStop,
@@ -25,7 +34,7 @@ from iris_session.protocol.common import IDENTITY, Target
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.limits import Drops, KeyLimits
 from iris_session.protocol.names import DenialReason
-from iris_session.protocol.server_messages import ProtocolFault, Refused, Reply
+from iris_session.protocol.server_messages import BodyInfo, ProtocolFault, Refused, Reply
 from iris_session.security.zap import ZAP_ASSETS, ZAP_CONTROL, ZAP_INGEST, ZAP_MEDIA, ZAP_STATE
 from tests.front.intake_rig import HELLO, IntakeRig
 
@@ -171,6 +180,35 @@ def test_a_clutch_that_opens_always_passes(rig: IntakeRig) -> None:
     assert 100 <= closings <= (80 + 10 * 20) // 2 + 1
 
 
+def test_of_the_samples_of_an_observer_those_for_displays_reach_the_authority(rig: IntakeRig) -> None:
+    kept = Counter[str]()
+    for i, role in enumerate(("observer", "operator")):
+        peer, route = Peer(100 + i, ""), b"%d" % i
+        epoch = rig.join(peer, route=route, secret=route * 16).connection_epoch
+        rig.clients.by_number[epoch].role = role
+        for seq in range(600):
+            rig.now_ns += SECOND // 600
+            rig.take(msgspec.structs.replace(SAMPLE, seq=seq + 1), peer, epoch, route=route)
+            kept[role] += len(rig.entries())
+    assert kept["operator"] == 600
+    assert 0 < kept["observer"] <= PRESENCE_HZ + 2
+
+
+def test_the_bytes_of_an_observers_requests_are_limited(rig: IntakeRig) -> None:
+    kept = Counter[str]()
+    marker = Marker(1, "\U0001f600" * 512)
+    for i, role in enumerate(("observer", "operator")):
+        peer, route = Peer(100 + i, ""), b"%d" % i
+        epoch = rig.join(peer, route=route, secret=route * 16).connection_epoch
+        rig.clients.by_number[epoch].role = role
+        for _ in range(40):
+            rig.take(marker, peer, epoch, route=route)
+        kept[role] = sum(isinstance(entry.message, Marker) for entry in rig.entries())
+    assert kept["operator"] == 40
+    assert 0 < kept["observer"] <= BURST_S * REQUEST_BYTES_PER_S // (4 * 512)
+    assert rig.drops.by_reason[REQUEST_SHARE] == 40 - kept["observer"]
+
+
 def test_snapshots_of_a_large_scene_cost_more(rig: IntakeRig) -> None:
     hog, kept = KeyRig(rig, 8), Counter[type]()
     for i in range(100):
@@ -179,6 +217,19 @@ def test_snapshots_of_a_large_scene_cost_more(rig: IntakeRig) -> None:
             hog.send(c, GetSnapshot(i + 1))
         collect(rig, kept)
     assert kept[GetSnapshot] <= 800 / 20 + 10 * 200 / 20 + 1
+
+
+def test_a_snapshot_of_a_scene_of_many_bodies_costs_more_than_that_of_an_empty_one(rig: IntakeRig) -> None:
+    counts = []
+    for i, n_bodies in enumerate((0, 5000)):
+        hog, kept = KeyRig(rig, 8, b"%d" % i * 16, 100 * (i + 1)), Counter[type]()
+        rig.intake._publisher.scene = SceneInfo("", bodies=(BodyInfo(1, "part", True),) * n_bodies)
+        for c in range(8):
+            for _ in range(8):
+                hog.send(c, GetSnapshot(1))
+        collect(rig, kept)
+        counts.append(kept[GetSnapshot])
+    assert counts == [800 // 20, 800 // (20 + 5000 // 50)]
 
 
 def test_one_key_joins_a_few_times_a_second(rig: IntakeRig) -> None:
@@ -255,6 +306,29 @@ def test_each_of_many_behind_a_gateway_is_limited_and_all_together(rig: IntakeRi
     budget = (80 + 10 * 20) // 2 + 1  # each time is two events
     assert max(put_on.values()) <= budget
     assert sum(put_on.values()) <= 8 * budget
+
+
+def test_a_gateway_is_not_limited_as_one_key_for_those_behind_it(rig: IntakeRig) -> None:
+    rig.join(role="gateway")
+    for i in range(8):
+        rig.now_ns += SECOND
+        rig.take(Hello("observer", f"p{i}", secret=b"%d" % i * 16), behalf=f"p{i}")
+        (entry,) = rig.entries()
+        rig.clients.by_number[entry.connection].admitted = True
+        for _ in range(30):
+            rig.take(Marker(1, "x"), epoch=entry.connection, behalf=f"p{i}")
+        assert len(rig.entries()) == 30
+    assert rig.drops.by_reason == {}
+
+
+@pytest.mark.parametrize("kind", ["messages", "bytes"])
+def test_all_behind_a_gateway_send_together_what_eight_keys_may(kind: str) -> None:
+    limits = FrontLimits()
+    gateway = KeyBudget(limits, is_gateway=True)
+    people = [KeyBudget(limits, parent=gateway) for _ in range(12)]
+    n_messages, n_bytes = (limits.key.message_burst, 1) if kind == "messages" else (1, limits.key.byte_burst)
+    taken = [one.take_message(0, n_messages, n_bytes) for one in people]
+    assert taken == [""] * 8 + [KEY_MESSAGES if kind == "messages" else KEY_BYTES] * 4
 
 
 def test_handshakes_of_a_key_are_limited_for_each_channel() -> None:

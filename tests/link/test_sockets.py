@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import time
 from contextlib import ExitStack
 
@@ -10,7 +11,7 @@ import zmq
 
 from iris_session.link import sockets
 from iris_session.link.config import FrontConfig, FrontLimits
-from iris_session.link.sockets import FILE_DESCRIPTORS, RESERVED_DESCRIPTORS, fit_limits
+from iris_session.link.sockets import FILE_DESCRIPTORS, RESERVED_DESCRIPTORS, close_tcp, fit_limits
 
 
 def test_stalled_subscriber_is_cut_off_and_others_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -59,3 +60,16 @@ def test_limits_fit_into_the_descriptors_of_the_system(descriptors: int) -> None
         used = 5 * fitted.strangers + 3 * fitted.subscribers + fitted.sources + fitted.connections
         assert used + RESERVED_DESCRIPTORS <= descriptors
     assert min(fitted.strangers, fitted.subscribers, fitted.sources) > 0
+
+
+@pytest.mark.parametrize("discard", [True, False])
+def test_what_is_unread_of_a_connection_that_is_closed_is_discarded_on_request(discard: bool) -> None:
+    with ExitStack() as stack:
+        listener = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+        theirs = stack.enter_context(socket.create_connection(listener.getsockname()))
+        ours, peer = listener.accept()
+        stack.enter_context(ours)
+        theirs.sendall(bytes(1000))
+        assert len(ours.recv(1000, socket.MSG_PEEK | socket.MSG_WAITALL)) == 1000
+        assert close_tcp(ours.fileno(), peer, discard=discard)
+        assert len(ours.recv(1000)) == (0 if discard else 1000)

@@ -89,6 +89,18 @@ def test_observers_and_a_holder_that_has_not_engaged_change_nothing(rig: Rig) ->
     assert rig.loop.driven == ()
 
 
+def test_for_control_a_robot_that_its_owner_moves_stands_where_it_is_measured(rig: Rig) -> None:
+    controller, robot = rig.stepper.core.controller, rig.stepper.core.config.robots[0]
+    rig.round()
+    rig.data.qpos[rig.joints()] += 0.3
+    twin = mujoco.MjData(rig.model)
+    mujoco.mj_copyData(twin, rig.model, rig.data)
+    mujoco.mj_forward(rig.model, twin)
+    rig.round()
+    assert controller.get_targets()[robot.name].p == pytest.approx(twin.site(robot.site).xpos, abs=1e-6)
+    assert controller.get_status()[0].limits == ()
+
+
 def test_engaging_begins_at_the_present_ctrl_and_the_policy_is_out(rig: Rig) -> None:
     agent = Agent(rig)
     rig.round()
