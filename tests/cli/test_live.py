@@ -89,6 +89,15 @@ def test_table_shows_offline_participants_and_emergency_stop() -> None:
         assert part in text
 
 
+def test_table_gives_the_reason_for_which_physics_stands_still() -> None:
+    from rich.console import Console
+
+    console = Console(file=io.StringIO(), width=140)
+    console.print(_render_table("lab", {**STATUS, "paused": True, "pause_reason": "NaN in QPOS at DOF 3"}, []))
+    assert isinstance(console.file, io.StringIO)
+    assert "NaN in QPOS at DOF 3" in console.file.getvalue()
+
+
 def test_display_process_prints_events_and_ignores_truncated_lines() -> None:
     lines = b'{"status": {}, "events": ["one"]}\n{"status": {}, "ev\n{"status": {}, "events": ["two"]}\n'
     done = subprocess.run(

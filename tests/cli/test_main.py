@@ -257,6 +257,15 @@ def test_file_that_is_no_recording_does_not_hide_others(tmp_path: Path, capsys: 
     assert "no recording below" in capsys.readouterr().err
 
 
+def test_verify_takes_every_recording_below_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [tmp_path / "monday" / "session.rrd", tmp_path / "tuesday" / "session.rrd"]
+    for file in files:
+        file.parent.mkdir()
+        file.write_text("not a recording")
+    assert main(["verify", "--json", str(tmp_path)]) == 2
+    assert [one["path"] for one in json.loads(capsys.readouterr().out)["files"]] == [str(file) for file in files]
+
+
 SCRIPT = """
 import sys
 from iris_session.cli.main import main

@@ -272,6 +272,35 @@ def test_pairing_waits_while_the_list_is_missing(rig: PairingRig) -> None:
     assert set(rig.home.clients.read()) == {ann.fingerprint, bob.fingerprint}
 
 
+def test_no_pairing_writes_a_list_that_is_missing(rig: PairingRig) -> None:
+    ann = KeyPair.generate()
+    rig.home.clients.allow_key("bob", KeyPair.generate().public)
+    rig.keyring.reload_if_changed()
+    code, _ = rig.home.join_codes.create(rig.server)
+    (rig.home.path / "clients.json").rename(rig.home.path / "clients.json~")
+    rig.asks(ann, rig.proof(code, ann))
+    rig.turn()
+    rig.keyring.close()  # whatever was begun is over
+    rig.turn()
+    assert rig.answers(ann) == []
+    assert not (rig.home.path / "clients.json").exists()
+
+
+def test_revocation_by_a_director_waits_for_a_list_that_is_missing(rig: PairingRig) -> None:
+    """Else the key would be listed again, for the next session, when an editor has put the list back."""
+    own = KeyPair.generate()
+    rig.home.clients.allow_key("ann", own.public)
+    rig.keyring.reload_if_changed()
+    away = (rig.home.path / "clients.json").rename(rig.home.path / "clients.json~")
+    rig.revocation.revoke(own.fingerprint, rig.now_ns)
+    rig.turn()
+    rig.keyring.close()  # whatever was begun is over
+    rig.turn()
+    away.rename(rig.home.path / "clients.json")
+    turns(rig.turn, lambda: own.fingerprint not in rig.keyring.pending_revocations)
+    assert rig.home.clients.read() == {}
+
+
 def test_attempts_of_one_key_with_one_code_are_answered_alike(rig: PairingRig) -> None:
     """Several programs of one user pair at the same time, as emulated headsets do."""
     own = KeyPair.generate()
