@@ -30,6 +30,7 @@ from iris_session.protocol.server_messages import (
     AlignmentAlarmed,
     AlignmentChanged,
     AlignmentRun,
+    AnchorInfo,
     AnchorMoved,
     EventKind,
     ParticipantChanged,
@@ -161,6 +162,7 @@ class AlignmentService:
         self._in_force: dict[str, Alignment] = {}  # by participant, also of those who may reconnect
         self._stopped: dict[str, None] = {}  # participants whose run was stopped
         self._tips: dict[str, dict[str, tuple[float, ...]]] = {}  # covariance by participant and device
+        self._has_snapshot = False
 
     def __len__(self) -> int:
         return len(self._states)
@@ -296,8 +298,12 @@ class AlignmentService:
             self._stopped.pop(event.participant, None)
             self._tips.pop(event.participant, None)
 
-    def process_snapshot(self, participants: Iterable[ParticipantInfo]) -> None:
-        """Apply the participants of a snapshot: a restarted front has received no events."""
+    def process_snapshot(self, participants: Iterable[ParticipantInfo], anchors: Iterable[AnchorInfo]) -> None:
+        """Apply participants of a snapshot, and anchors of the first: a restarted front has received no events."""
+        for anchor in () if self._has_snapshot else anchors:
+            if self.anchors.get(anchor.id) != (anchor.T_world_anchor.p, anchor.T_world_anchor.q):
+                self._move_anchor(anchor.id, anchor.T_world_anchor)  # while the front was being replaced
+        self._has_snapshot = True
         for participant in participants:
             if participant.alignment is not None and participant.id not in self._in_force:
                 self._set_alignment(participant.id, participant.alignment)

@@ -83,7 +83,7 @@ def _describe_unaligned(ctx: Context, role: str, key_id: str, devices: tuple[str
     """Return why a participant without an alignment may not have this role with its declared devices, or an empty
     string.
     """
-    worn = [d for d in devices if d in HAND_DEVICES]
+    worn = [d for d in dict.fromkeys(devices) if d in HAND_DEVICES]
     if role not in Role.DRIVING or not worn:
         return ""
     if any(alignment.may_be_unaligned(ctx, role, key_id, device) for device in devices):

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 #: Time until a terminal is looked at again while another program has it [s].
 BACKGROUND_S: Final = 0.5
 ESTOP_KEY: Final = " "
+_LOCAL_MODES: Final = 3  # in what `tcgetattr` returns
 
 
 class KeyBinding:
@@ -83,12 +84,18 @@ def _follow_keys(fd: int, wake: int, keys: Mapping[str, KeyBinding]) -> None:
     ready.register(wake)
     while True:
         ready.register(fd, select.POLLIN)
-        if any(one == wake for one, _ in ready.poll()):
+        found = [one for one, _ in ready.poll(int(BACKGROUND_S * 1e3))]
+        if wake in found:
             return
         if not _owns_terminal(fd):  # sent to the background (Ctrl-Z, bg)
             ready.unregister(fd)
             if ready.poll(int(BACKGROUND_S * 1e3)):
                 return
+            continue
+        with suppress(termios.error):
+            if termios.tcgetattr(fd)[_LOCAL_MODES] & termios.ICANON:  # a shell has had the terminal meanwhile
+                tty.setcbreak(fd)
+        if fd not in found:
             continue
         with suppress(OSError):
             typed = os.read(fd, 64)

@@ -212,11 +212,10 @@ def run_demo(
     # Ctrl-C requests an immediate end; `iris-session verify` has all the time it needs.
     verified, verification = (None, "not verified: interrupted") if interrupted else _verify_recording(recording)
     problems = judge.list_problems()
-    if interrupted:
-        problems = ["interrupted before its end"]
-    elif problems or not demo.goals:
+    if problems or not demo.goals:
         problems = _list_problems(demo, reports, handovers, timeout_s) + problems
-    problems += ([] if interrupted else camera_problems) + ([verification] if verified is False else [])
+    problems = ["interrupted before its end"] if interrupted else [*problems, *camera_problems]
+    problems += filter(None, (session.recording_fault, verification if verified is False else ""))
     return DemoResult(
         ok=not problems and len(reports) == len(demo.headsets),
         demo=demo.name,

@@ -55,7 +55,7 @@ def check_scheduling() -> Finding:
         return ok("scheduling", "real-time priority is permitted: other programs do not delay ticks")
     if len(os.sched_getaffinity(0)) < 2:
         return warning("scheduling", "one processor only: no real-time priority, which would starve the network")
-    advice = "add a line `@realtime - rtprio 20` to /etc/security/limits.d, see docs/network.md"
+    advice = "add a line `@robotics - rtprio 10` to /etc/security/limits.d, see docs/network.md"
     return warning("scheduling", "no real-time priority: other programs can delay ticks", "", advice)
 
 

@@ -45,7 +45,7 @@ def check_beacon(session: str, address: Address | None) -> tuple[Finding, list[F
                     break  # the wanted session is heard; a search by name goes on, as two may have the name
             found, ignored = listener.poll_sessions(), dict(listener.ignored)
     except DiscoveryError as error:
-        return warning("beacon", str(error)), []
+        return (failed if session else warning)("beacon", str(error)), []
     heard = ", ".join(f"{one.name} ({one.address})" for one in found) or "none"
     if session:
         named = [one for one in found if one.name == session]

@@ -171,7 +171,7 @@ class Downlink:
             return
         if isinstance(message, Snapshot):
             # The front adds what only it knows: the scene, the poses of the newest state frame, the sizes of anchors.
-            self._alignment.process_snapshot(message.participants)
+            self._alignment.process_snapshot(message.participants, message.anchors)
             state_seq, poses = self._publisher.read_keyframe()
             scene = self._publisher.scene
             filled = msgspec.structs.replace(

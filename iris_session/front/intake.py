@@ -326,7 +326,8 @@ class Intake:
         if closes and not self._take_edge(connection, now_ns):
             return False
         if sample.device in connection.clutches or len(connection.clutches) < _MAX_DEVICES:
-            connection.clutches[sample.device] = sample.clutch
+            # Closed without targets it drives nothing: the edge comes with them.
+            connection.clutches[sample.device] = sample.clutch and bool(sample.targets)
         return True
 
     def _send_denial(self, connection: FrontConnection, message: ClientMessage, text: str, now_ns: int) -> bool:

@@ -26,6 +26,8 @@ from iris_session.system.process import ChildProcess
 
 #: Longest path of a folder that leaves room for the names of folder and socket in it [bytes].
 LONGEST_FOLDER: Final = 75
+#: Time for a front to listen [s].
+START_S: Final = 60.0
 #: A front sends something at least every `messages.BEAT_NS`, even when busy; one that is silent for so long hangs.
 HANGING_NS: Final = 1_500_000_000
 #: The same for a front that the system does not schedule.
@@ -56,6 +58,7 @@ class FrontProcess:
         self._config = msgspec.structs.replace(config, media_endpoint=self.media_endpoint)
         self._generation = 0
         self._process: ChildProcess | None = None
+        self._spawned_s = 0.0
         self._replacing: threading.Thread | None = None
         self._failure: FrontError | None = None
         self._source = MediaSource(self.media_endpoint)
@@ -84,7 +87,9 @@ class FrontProcess:
         """Reason to replace the front, empty while it works."""
         process = self._process
         if process is None or not process.is_running:
-            return "ended"
+            return f"ended ({self.link.failure})" if self.link.failure else "ended"
+        if self.link.ports is None and time.monotonic() - self._spawned_s > START_S:
+            return f"did not listen within {START_S:g} s"
         if self.link.overrun:
             return "read nothing any more"
         return "" if not self._is_hanging(process.pid) else f"said nothing for {self.link.silence_ns * 1e-9:.1f} s"
@@ -101,7 +106,7 @@ class FrontProcess:
     def restarts(self) -> int:
         return max(0, self._generation - 1)
 
-    def start(self, timeout_s: float = 60.0) -> Ports:
+    def start(self, timeout_s: float = START_S) -> Ports:
         """Start the front and wait until it listens.
 
         Raises:
@@ -185,6 +190,7 @@ class FrontProcess:
         return FrontStart(self._config, self._scene, endpoint, os.getpid(), self.link.handback)
 
     def _spawn(self, start: FrontStart) -> ChildProcess:
+        self._spawned_s = time.monotonic()
         try:
             return ChildProcess("iris_session.front.main", config=msgspec.msgpack.encode(start), own_session=True)
         except OSError as error:

@@ -73,6 +73,14 @@ class Lease(msgspec.Struct, frozen=True):
     scale: float = 1.0
 
 
+def cut_texts(message: msgspec.Struct, *fields: str) -> None:
+    """Cut fields of a message to the length of a `Text`: a longer one makes its receiver refuse the whole message."""
+    for field in fields:
+        text = getattr(message, field)
+        if len(text) > MAX_TEXT:
+            msgspec.structs.force_setattr(message, field, text[: MAX_TEXT - 3] + "...")
+
+
 class Denial(msgspec.Struct, frozen=True):
     """A typed denial: the reason (`DenialReason`), the holder of the target, and advice.
 
@@ -87,11 +95,8 @@ class Denial(msgspec.Struct, frozen=True):
     holder_name: Name = ""
 
     def __post_init__(self) -> None:
-        # A scene may have hundreds of names: a longer text would make the client refuse the whole reply.
-        for field in ("message", "advice"):
-            text = getattr(self, field)
-            if len(text) > MAX_TEXT:
-                msgspec.structs.force_setattr(self, field, text[: MAX_TEXT - 3] + "...")
+        # A scene may have hundreds of names.
+        cut_texts(self, "message", "advice")
 
 
 class Alignment(msgspec.Struct, frozen=True):

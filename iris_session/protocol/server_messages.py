@@ -25,6 +25,7 @@ from iris_session.protocol.common import (
     Proof,
     Text,
     Vec3,
+    cut_texts,
 )
 from iris_session.protocol.names import PROTOCOL_VERSION
 from iris_session.protocol.status import DeliveryBudget, StatusReport
@@ -72,6 +73,9 @@ class Refused(Message, frozen=True, tag="refused"):
     message: Text
     advice: Text = ""
     supported_versions: tuple[int, ...] = (PROTOCOL_VERSION,)
+
+    def __post_init__(self) -> None:
+        cut_texts(self, "message", "advice")  # they name what a client has sent
 
 
 class ProtocolFault(Message, frozen=True, tag="protocol_fault"):

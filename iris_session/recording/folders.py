@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from iris_session.recording import paths
-from iris_session.recording.errors import NotARecordingError
+from iris_session.recording.errors import NotARecordingError, RecorderError
 
 #: Sessions that an error names.
 MOST_NAMED: Final = 3
@@ -27,6 +27,23 @@ def list_session_files(path: Path) -> list[Path]:
     found = ((*split_file_name(one.name), one) for one in path.parent.iterdir() if one.name.endswith(paths.SUFFIX))
     ordered = sorted((number, part, one) for stem, number, part, one in found if stem == first)
     return [one for _, _, one in ordered if one.is_file() and not paths.is_view_copy(one.name)]
+
+
+def check_new_recording(path: Path) -> None:
+    """Check that a new session may be recorded to a file: that readers would take it and all others for what they are.
+
+    Raises:
+        RecorderError: Its name is that of a part, a resumed recording or a copy for the viewer, or files of another
+            session have the same name.
+    """
+    if split_file_name(path.name) != (path.name, 1, 1) or paths.is_view_copy(path.name):
+        text = "names with .part, .resume and .view are those of files that belong to a recording"
+        raise RecorderError(f"cannot record to {path}: {text}: choose another name")
+    with suppress(OSError):  # no such folder, or one that cannot be read: the recorder says so
+        if others := [one.name for one in list_session_files(path) if one != path]:
+            raise RecorderError(
+                f"cannot record to {path}: {others[0]} of another session is there: choose another name"
+            )
 
 
 def find_recordings(folder: Path, on_error: Callable[[OSError], None]) -> list[Path]:

@@ -33,6 +33,7 @@ from iris_session.recording.lock import RecordingLock
 from iris_session.recording.messages import (
     BATCH,
     FAULT_PREFIX,
+    FINISH_SIGNAL,
     FRAME,
     HEADER,
     Batch,
@@ -138,6 +139,7 @@ class RecorderLoop:
             if not self._is_used_up:
                 self._drain_all()
             self._close_file()
+            self._syncer.sync()
             self._send_status(self._received)
             if self._header is None:
                 self._remove()
@@ -411,6 +413,16 @@ class _Syncer:
         if self._fault:
             raise WriteError(self._fault)
 
+    def sync(self) -> None:
+        """Sync the file now. Raises `WriteError` as `check` does."""
+        try:
+            os.fsync(self._fd)
+            removed = os.fstat(self._fd).st_nlink == 0
+        except OSError as error:
+            raise WriteError(f"the recording cannot be made durable: {error.strerror}") from error
+        if removed:
+            raise WriteError(f"{self._path} was removed while it was being written")
+
     def stop(self) -> None:
         self._ended.set()
         self._thread.join(timeout=5.0)
@@ -421,12 +433,9 @@ class _Syncer:
     def _run(self) -> None:
         while not self._ended.wait(SYNC_S):
             try:
-                os.fsync(self._fd)
-                if os.fstat(self._fd).st_nlink == 0:
-                    self._fault = f"{self._path} was removed while it was being written"
-                    return
-            except OSError as error:
-                self._fault = f"the recording cannot be made durable: {error.strerror}"
+                self.sync()
+            except WriteError as error:
+                self._fault = str(error)
                 return
 
 
@@ -491,7 +500,10 @@ def report_used_budget(config: RecorderConfig) -> int:
 def main() -> int:
     """Run the recorder process."""
     configure_logging()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # A service manager, or one that frees memory, sends SIGTERM to all processes: the session ends this one when its
+    # last row is here, and a file that ends before is not called finished.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     config = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=RecorderConfig)
     if RecordingBudget(config.budget_bytes, config.path, config.part).is_used_up(0):
         return report_used_budget(config)
@@ -501,7 +513,7 @@ def main() -> int:
         print(f"failed: {error}", flush=True)
         sys.stderr.write(f"{FAULT_PREFIX}{error}\n")
         return NOT_BEGUN
-    signal.signal(signal.SIGTERM, lambda *_: recorder.stop())
+    signal.signal(FINISH_SIGNAL, lambda *_: recorder.stop())
     print("ready", flush=True)
     return recorder.run()
 

@@ -182,9 +182,11 @@ class Recording:
                 recorded in another format; the message is one line.
             ImportError: Rerun is not installed; the message names the extra.
         """
-        first = str(path)
+        first = os.path.normpath(path)
         if os.path.isdir(first):
-            first = str(find_session_in(Path(path)))
+            first = str(find_session_in(Path(first)))
+        if os.path.islink(first):
+            first = os.path.realpath(first)  # later parts are beside the file, not beside the link
         if not os.path.isfile(first):
             raise NotARecordingError(f"there is no recording {first}")
         if paths.is_view_copy(first):

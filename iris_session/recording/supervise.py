@@ -13,7 +13,7 @@ import msgspec
 import psutil
 
 from iris_session.recording.errors import RecorderError
-from iris_session.recording.messages import FAULT_PREFIX, RecorderConfig
+from iris_session.recording.messages import FAULT_PREFIX, FINISH_SIGNAL, RecorderConfig
 from iris_session.recording.paths import part_path
 from iris_session.recording.recorded_assets import NONE
 from iris_session.system.process import PIPE, ChildProcess
@@ -175,7 +175,11 @@ class RecorderProcess:
     def _end(self, timeout_s: float) -> int:
         """End the process. Return its exit status, 0 if there was none."""
         process, self._process = self._process, None
-        return 0 if process is None else process.close(terminate_s=timeout_s)
+        if process is None:
+            return 0
+        if timeout_s:
+            process.send_signal(FINISH_SIGNAL)
+        return process.close(exit_s=timeout_s)
 
 
 def _reason(log: Path) -> str:

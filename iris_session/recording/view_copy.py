@@ -89,7 +89,8 @@ def open_view_file(path: Path, progress: Callable[[int, int], None] | None = Non
             read = tuple(Path(file) for recording in recordings for file in recording.files)
             kept = True
             try:
-                _write_copy(copy, sources, newest_ns, progress)
+                # One of a damaged session is made again next time: who looks then is to hear of the damage, too.
+                _write_copy(copy, sources, 0 if damage else newest_ns, progress)
             except OSError as error:
                 notes.append(f"{copy} cannot be written ({error.strerror or error}): the copy is temporary")
                 try:

@@ -5,11 +5,12 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Self
@@ -292,7 +293,10 @@ class Owner:
 
 @contextmanager
 def stop_on_signals(stop: threading.Event) -> Iterator[None]:
-    """Set `stop` on SIGINT and SIGTERM; a SIGINT after that raises `KeyboardInterrupt`. Main thread only."""
+    """Set `stop` on SIGINT, SIGTERM and SIGHUP; a SIGINT after that raises `KeyboardInterrupt`. Main thread only.
+
+    SIGHUP: the terminal was closed, or the connection to it. Where it is ignored (`nohup`), it stays so.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -300,11 +304,24 @@ def stop_on_signals(stop: threading.Event) -> Iterator[None]:
     def on_signal(number: int, _: FrameType | None) -> None:
         if stop.is_set() and number == signal.SIGINT:
             raise KeyboardInterrupt  # the second Ctrl-C interrupts at once
+        if number == signal.SIGHUP:
+            _leave_terminal()
         stop.set()
 
-    previous = {s: signal.signal(s, on_signal) for s in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    previous = {s: signal.signal(s, on_signal) for s in numbers}
     try:
         yield
     finally:
         for s, handler in previous.items():
             signal.signal(s, handler)
+
+
+def _leave_terminal() -> None:
+    """Write no more to a terminal that was closed: every write to it would be an error."""
+    with suppress(OSError), open(os.devnull, "wb") as nowhere:
+        for stream in (1, 2):
+            if os.isatty(stream):
+                os.dup2(nowhere.fileno(), stream)

@@ -37,6 +37,7 @@ from iris_session.recording import (
 )
 from iris_session.recording.environment import describe_environment, read_boot_id
 from iris_session.recording.feed import SILENCE_S
+from iris_session.recording.folders import check_new_recording
 from iris_session.scene.composed import ComposedScene
 from iris_session.session.cameras import SessionCameras
 from iris_session.session.config import SessionConfig
@@ -146,6 +147,8 @@ class SessionProcesses:
         others = NameFinder(self._config.beacon_port)
         try:
             if self.recording is not None:
+                if self._past is None:
+                    check_new_recording(self.recording)
                 self.recorder = RecorderProcess(
                     self.recording,
                     self._origin_ns,

@@ -142,7 +142,12 @@ class Session(Owner):
                 raise OwnershipError("mjcb_control is set, for every data of this process: write ctrl before mj_step")
             core = self._make_core(user_owned=False)
             processes = SessionProcesses(self.config, core, self.origin_ns, self._past)
-            processes.start()
+            try:
+                processes.start()
+            except BaseException:
+                if self._past is not None:
+                    self._past.close()  # else nobody could resume it until this process ends
+                raise
             self._processes = processes
 
     def close(self) -> bool:
@@ -160,13 +165,15 @@ class Session(Owner):
             self._attachment.close()
             atexit.unregister(self.close)
             self._attachment = None
-        if self._user_loop is not None:
-            self._user_loop.close()
-        if self._processes is not None:
-            self.recording_fault = self._processes.close()
-            self._recording, self._processes = self._processes.recording, None
-        if self._past is not None:
-            self._past.close()
+        try:
+            if self._user_loop is not None:
+                self._user_loop.close()
+        finally:
+            if self._processes is not None:
+                self.recording_fault = self._processes.close()
+                self._recording, self._processes = self._processes.recording, None
+            if self._past is not None:
+                self._past.close()
         return not self.recording_fault
 
     # --- our loop ----------------------------------------------------------------------------------------------------

@@ -231,7 +231,10 @@ class Stepper:
             ValueError: A value that the protocol does not allow.
             OwnershipError: The queue is full; an e-stop is accepted all the same.
         """
-        if len(self._host) >= MAX_HOST_ENTRIES and not isinstance(message, EStop):
+        is_full = len(self._host) >= MAX_HOST_ENTRIES
+        if is_full and isinstance(message, EStop) and any(isinstance(one, EStop) for one in self._host.copy()):
+            return  # one that waits stops everything
+        if is_full and not isinstance(message, EStop):
             raise OwnershipError(f"queue of inputs full ({MAX_HOST_ENTRIES} wait for one step): is the loop running?")
         self.post_own(message)
 

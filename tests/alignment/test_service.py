@@ -16,6 +16,7 @@ from iris_session.protocol.entries import AlignmentAlarm, AlignmentProposal, Cro
 from iris_session.protocol.server_messages import (
     AlignmentAlarmed,
     AlignmentRun,
+    AnchorInfo,
     AnchorMoved,
     ParticipantChanged,
     ParticipantInfo,
@@ -468,11 +469,21 @@ def test_restarted_front_restores_alignment_in_force_from_a_snapshot() -> None:
     bob = fresh.wearer()
     bob.frame = ann.frame
     alignment = lab.service._in_force["p1"]
-    fresh.service.process_snapshot([ParticipantInfo("p1", "Ann", "operator", True, alignment=alignment)])
+    fresh.service.process_snapshot([ParticipantInfo("p1", "Ann", "operator", True, alignment=alignment)], ())
     bob.report_observations(bob.place(), 1)
     in_force = fresh.service._states[1].monitor.in_force
     assert in_force is not None
     assert in_force.T_world_tracking[0] == got.T_world_tracking.p
+
+
+def test_anchor_that_was_moved_while_the_front_was_replaced_is_taken_from_the_first_snapshot() -> None:
+    lab = Lab()
+    name, (p, q) = next(iter(lab.service.anchors.items()))
+    lab.service.process_snapshot((), [AnchorInfo(name, Pose((p[0] + 1.0, p[1], p[2]), q))])
+    assert lab.service.anchors[name] == ((p[0] + 1.0, p[1], p[2]), q)
+    # Later ones may be older than an event that has come.
+    lab.service.process_snapshot((), [AnchorInfo(name, Pose(p, q))])
+    assert lab.service.anchors[name] == ((p[0] + 1.0, p[1], p[2]), q)
 
 
 # --- bounds and hostile input ----------------------------------------------------------------------------------------

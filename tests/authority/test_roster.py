@@ -8,6 +8,7 @@ import pytest
 
 from iris_session.authority import AuthorityConfig
 from iris_session.protocol.client_messages import Acquire, Align, Bye, GetSnapshot, Heartbeat, Release
+from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.entries import Entry, FrontRestarted, Join, Lost, SessionResumed
 from iris_session.protocol.server_messages import (
     AlignmentRun,
@@ -67,6 +68,16 @@ def test_refused_joins(fields: dict[str, Any], code: str) -> None:
     t.join(**fields)
     assert refused(t) == code
     assert t.decision.admitted == ()
+
+
+def test_refusal_that_lists_what_was_sent_can_be_read() -> None:
+    """One that is too long would cost everybody the whole step."""
+    t = Table()
+    t.join(alignment="not_needed", devices=(*("controller/right",) * 32, "head"))
+    (message,) = [o.message for o in t.decision.outgoing if isinstance(o.message, Refused)]
+    assert message.message.count("controller/right") == 1
+    long = Refused("full", "x" * 1000, "y" * 1000)
+    assert (len(long.message), len(long.advice)) == (MAX_TEXT, MAX_TEXT)
 
 
 def test_a_connection_joins_once() -> None:

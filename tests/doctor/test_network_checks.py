@@ -14,7 +14,7 @@ from iris_session.client.address import Address
 from iris_session.doctor import network_checks
 from iris_session.doctor.findings import failed, ok
 from iris_session.doctor.runner import run_checks
-from iris_session.link.discovery import FoundSession
+from iris_session.link.discovery import DiscoveryError, FoundSession
 from iris_session.protocol.codec import encode_introduction
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.names import PROTOCOL_VERSION
@@ -231,6 +231,18 @@ def test_beacon_is_compared_with_the_address(
     found, _ = network_checks.check_beacon(name, None)
     assert found.state == state
     assert text in found.text
+
+
+@pytest.mark.parametrize(("name", "state"), [("lab", "failed"), ("", "warning")])
+def test_port_that_cannot_be_opened_is_a_failure_where_a_name_must_be_found(
+    monkeypatch: pytest.MonkeyPatch, name: str, state: str
+) -> None:
+    def fail() -> None:
+        raise DiscoveryError("port 7720 is in use")
+
+    monkeypatch.setattr(network_checks, "BeaconListener", fail)
+    found, heard = network_checks.check_beacon(name, None)
+    assert (found.state, heard) == (state, [])
 
 
 def test_other_sessions_on_the_network_are_suggested() -> None:

@@ -184,6 +184,10 @@ def test_keys_of_the_terminal_stop_and_clear(tmp_path: Path) -> None:
         wait_until(lambda: b"E-STOP" in read_screen(), "the e-stop is shown")
         os.write(parent, b"c")
         wait_until(lambda: b"running" in read_screen().rpartition(b"E-STOP")[2], "it is cleared")
+        termios.tcsetattr(terminal, termios.TCSANOW, before)  # as a shell does after Ctrl-Z
+        wait_until(lambda: not termios.tcgetattr(terminal)[3] & termios.ICANON, "keys count without Enter again")
+        os.write(parent, b" ")
+        wait_until(lambda: b"E-STOP" in read_screen().rpartition(b"running")[2], "the e-stop is shown again")
         os.write(parent, b"\x03")
         wait_until(lambda: read_screen() is not None and process.poll() is not None, "the session ends")
     finally:

@@ -30,7 +30,7 @@ SERVE = [*COMMAND, "serve", "handover", "--no-beacon", *FREE_PORTS]
 END_S = 30.0
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_signal_ends_the_session_in_order(serve: Callable[..., SessionProcess], number: signal.Signals) -> None:
     server = serve("handover", "--json")
     scenario = Scenario(server)
@@ -41,6 +41,22 @@ def test_signal_ends_the_session_in_order(serve: Callable[..., SessionProcess], 
     assert server.process.wait() == 0, server.output
     assert_all_end(children)
     scenario.run_until(lambda: not ann.connection.is_joined, "ann has disconnected")
+    scenario.close()
+    assert server.verify()["finished"]
+
+
+@pytest.mark.long
+def test_sigterm_to_all_processes_ends_the_session_in_order(serve: Callable[..., SessionProcess]) -> None:
+    """As service managers send it."""
+    server = serve("handover", "--json")
+    scenario = Scenario(server)
+    scenario.join("ann", "observer")
+    children = list_descendants(server.process.pid)
+    for process in (*children, server.process):
+        process.send_signal(signal.SIGTERM)
+    wait_until(lambda: server.process.poll() is not None, "the session ends")
+    assert server.process.wait() == 0, server.output
+    assert_all_end(children)
     scenario.close()
     assert server.verify()["finished"]
 

@@ -180,6 +180,21 @@ def test_a_clutch_that_opens_always_passes(rig: IntakeRig) -> None:
     assert 100 <= closings <= (80 + 10 * 20) // 2 + 1
 
 
+def test_a_clutch_that_closes_without_a_target_is_no_way_around_the_budget(rig: IntakeRig) -> None:
+    hog, targets = KeyRig(rig, 1), (Target("left", 1),)
+    closed, closings = False, 0
+    for i in range(1500):
+        rig.now_ns += 10 * MS
+        held = targets if i % 3 != 1 else ()
+        hog.send(0, msgspec.structs.replace(SAMPLE, seq=i, targets=held, clutch=i % 3 != 0))
+        for entry in rig.entries():
+            if isinstance(entry.message, Sample):
+                drives = entry.message.clutch and bool(entry.message.targets)
+                closings += drives and not closed
+                closed = drives
+    assert 100 <= closings <= (80 + 15 * 20) // 2 + 1
+
+
 def test_of_the_samples_of_an_observer_those_for_displays_reach_the_authority(rig: IntakeRig) -> None:
     kept = Counter[str]()
     for i, role in enumerate(("observer", "operator")):

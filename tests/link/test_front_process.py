@@ -206,6 +206,24 @@ def test_crashed_front_is_replaced_on_the_same_ports_and_tokens_stay_valid(sessi
     assert welcome.connection_epoch == 2
 
 
+def test_front_that_cannot_listen_again_says_why(session: FrontSession) -> None:
+    address = session.host, session.ports.control
+    os.kill(session.process.pid, signal.SIGKILL)
+    wait(lambda: not session.process.alive, "crash")
+    with socket.socket() as other:
+        other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        other.bind(address)
+        other.listen()
+        session.process.restart()
+
+        def is_over() -> bool:
+            session.process.link.receive()
+            return not session.process.alive
+
+        wait(is_over, "failure")
+        assert f"port {address[1]}" in session.process.fault
+
+
 def test_failed_start_of_a_front_is_retried(session: FrontSession, monkeypatch: pytest.MonkeyPatch) -> None:
     os.kill(session.process.pid, signal.SIGKILL)
     wait(lambda: not session.process.alive, "crash")

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from iris_session.recording.errors import NotARecordingError
-from iris_session.recording.folders import find_recordings, find_session_in, group_by_session
+from iris_session.recording.errors import NotARecordingError, RecorderError
+from iris_session.recording.folders import check_new_recording, find_recordings, find_session_in, group_by_session
 
 
 def make_files(folder: Path, *names: str) -> list[Path]:
@@ -53,3 +53,23 @@ def test_other_folders_name_what_to_give(tmp_path: Path, names: tuple[str, ...])
     assert str(refused.value).endswith(", ".join(map(str, made)))
     with pytest.raises(NotARecordingError, match="cannot be read"):
         find_session_in(tmp_path / "missing")
+
+
+@pytest.mark.parametrize(
+    ("name", "there"),
+    [
+        ("pour.view.rrd", ()),
+        ("pour.part1.rrd", ()),
+        ("pour.resume2.rrd", ()),
+        ("pour.rrd", ("pour.part2.rrd",)),
+        ("pour.rrd", ("pour.resume2.rrd",)),
+    ],
+)
+def test_no_session_begins_under_a_name_that_belongs_to_another(
+    tmp_path: Path, name: str, there: tuple[str, ...]
+) -> None:
+    make_files(tmp_path, "other.rrd", "pour2.part2.rrd", *there)
+    with pytest.raises(RecorderError, match="choose another name"):
+        check_new_recording(tmp_path / name)
+    check_new_recording(tmp_path / "pour3.rrd")
+    check_new_recording(tmp_path / "missing" / "pour.rrd")

@@ -364,11 +364,13 @@ def test_folder_too_long_for_a_socket_is_not_used(monkeypatch: pytest.MonkeyPatc
     assert list(folder.iterdir()) == []
 
 
-def test_ctrl_c_does_not_end_the_recorder(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_only_the_session_ends_its_recorder(tmp_path: Path, number: signal.Signals) -> None:
+    """Of Ctrl-C and of a service manager's SIGTERM every process hears, and a file that ends early is not finished."""
     path = tmp_path / "session.rrd"
     with recorder(path) as (process, feed):
         session = SmallSession(feed)
-        os.kill(process.pid, signal.SIGINT)
+        os.kill(process.pid, number)
         session.take(100)
         assert feed.close()
         assert process.close()
@@ -439,6 +441,15 @@ def test_removed_file_is_reported_and_a_new_part_begun(tmp_path: Path) -> None:
     assert not report.ok
     assert report.gaps[0][0] == 0
     assert report.last_step == 199
+
+
+def test_file_that_is_removed_at_the_end_is_no_clean_end(tmp_path: Path) -> None:
+    path = tmp_path / "session.rrd"
+    with recorder(path) as (process, feed):
+        SmallSession(feed).take(50)
+        assert feed.close()
+        path.unlink()
+        assert not process.close()
 
 
 def test_no_part_is_begun_while_another_session_continues_the_recording(tmp_path: Path) -> None:

@@ -226,6 +226,12 @@ def test_missing_part_is_found(tmp_path: Path) -> None:
     assert report.ok, report.line()
     assert report.finished
     assert "session.part3.rrd" in report.line()
+    (tmp_path / "elsewhere").mkdir()
+    link = tmp_path / "elsewhere" / "latest.rrd"
+    link.symlink_to(files[0])
+    for path in (f"{tmp_path}//session.rrd", f"{tmp_path}/./session.rrd", link):
+        with Recording.open(path) as recording:
+            assert recording.count_rows() == 200, path
     files[1].unlink()
     with pytest.warns(UserWarning, match="part2"):
         recording = Recording.open(files[0])

@@ -125,6 +125,9 @@ def test_damaged_parts_are_left_out_and_named(tmp_path: Path) -> None:
         assert len(view.damage) == 2
         assert "part2" in view.damage[0]
         assert "resume2" in view.damage[1]
+        damage = view.damage
+    with open_view_file(tmp_path / "session.rrd") as again:
+        assert again.damage == damage
 
 
 def test_copy_is_no_recording(path: Path) -> None:

@@ -614,6 +614,62 @@ describe("assets and media", () => {
     bench.post({ type: "want_streams", streams: [] });
     expect(bench.socket.readyState).toBe(3);
   });
+
+  describe("a ticket", () => {
+    const sentTicket = (): unknown => (decodeValue(bench.socket.sent[0]!.frames[0] as Uint8Array) as Message)["ticket"];
+    const say = (name: string): void => (bench.sockets[0] as FakeSocket).deliver(5, ticket(name));
+
+    beforeEach(async () => {
+      await bench.join();
+      say("t1");
+      bench.post({ type: "want_streams", streams: ["cloth"] });
+      bench.say({ type: "delivery_budget", budget_class: "full" });
+      bench.socket.open();
+    });
+
+    test("that comes before the one before it is refused is used at once", () => {
+      say("t2");
+      expect(bench.sockets).toHaveLength(2);
+      bench.socket.end(4003);
+      expect(bench.sockets).toHaveLength(3);
+      bench.socket.open();
+      expect(sentTicket()).toBe("t2");
+      bench.socket.end(4003);
+      bench.pass(6000);
+      expect(bench.sockets).toHaveLength(3);
+    });
+
+    test("that comes too late for the gateway is sent again after a pause", () => {
+      bench.socket.end(1013);
+      expect(bench.sockets).toHaveLength(2);
+      bench.pass(200);
+      expect(bench.sockets).toHaveLength(3);
+      bench.socket.open();
+      expect(sentTicket()).toBe("t1");
+      bench.socket.end(1013);
+      bench.pass(200);
+      expect(bench.sockets).toHaveLength(3);
+      bench.pass(200);
+      expect(bench.sockets).toHaveLength(4);
+    });
+
+    test.each(["a lost connection", "entering a headset"])("of the connection before is not used after %s", (reason) => {
+      if (reason === "a lost connection") (bench.sockets[0] as FakeSocket).end(1006);
+      else bench.post({ type: "rejoin", devices: ["head"], alignment: "measured" });
+      bench.pass(500);
+      const session = bench.socket;
+      expect(session.url).toMatch(/session$/);
+      session.open();
+      bench.welcome(2);
+      bench.snapshot("none", 2);
+      bench.say({ type: "delivery_budget", budget_class: "full" }, 2);
+      expect(bench.socket.url).toBe(session.url);
+      session.deliver(5, ticket("t2"));
+      expect(bench.socket.url).toMatch(/media$/);
+      bench.socket.open();
+      expect(sentTicket()).toBe("t2");
+    });
+  });
 });
 
 describe("clouds and pictures", () => {

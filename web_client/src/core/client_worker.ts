@@ -300,6 +300,7 @@ export class ClientWorker {
 
   private openSocket(connection: ClientConnection): void {
     this.dropSocket();
+    this.media.close(); // the ticket ends with the socket of the session
     this.socketGeneration = connection.generation;
     this.failRequests("the connection was lost before the session answered");
     const url = toSocketUrl(this.options?.base_url ?? "", "/v1/session");

@@ -93,7 +93,7 @@ export class MediaLink {
     this.frames.finish(stream);
   }
 
-  /** Close the socket and forget ticket and wishes. */
+  /** Close the socket and forget the ticket: they belong to a connection that is gone. */
   close(): void {
     this.closeSocket();
     this.ticket = "";
@@ -107,18 +107,20 @@ export class MediaLink {
   }
 
   private open(): void {
+    const { ticket } = this;
     const socket = this.environment.openSocket(this.url, SUBPROTOCOL);
     socket.binaryType = "arraybuffer";
     this.socket = socket;
     socket.onopen = () => {
-      socket.send(encodeTicket(this.ticket));
+      socket.send(encodeTicket(ticket));
       socket.send(encodeWishes(this.wishes));
     };
     socket.onmessage = (event) => this.onMessage(event.data);
     socket.onclose = ({ code }) => {
       this.closeSocket();
       if (code === CloseCode.NOT_ALLOWED) {
-        this.ticket = ""; // the next one comes with the next welcome, or before this one expires
+        if (this.ticket === ticket) this.ticket = ""; // the next one comes with the next welcome, or before this one expires
+        this.update();
         return;
       }
       this.cancelTimer = this.environment.setTimer(this.pauseMs, () => {

@@ -84,6 +84,8 @@ export class PageState {
   consents: ConsentAsked[] = [];
   rtt_ms = Number.NaN;
   private sessionOffset_ms = Number.NaN;
+  /** The alignment is void if it is to this tracking frame or one before. */
+  private voidEpoch = Number.NaN;
   /** Times of the newest cloud or picture of a stream, while it is subscribed to. */
   private readonly newest = new Map<string, { capture_ms: number; received_ms: number }>();
   /** Names of participants that left, for events about them. */
@@ -106,6 +108,7 @@ export class PageState {
     client.on("session", (update) => {
       for (const { id, name } of update.participants) this.formerNames.set(id, name);
       this.session = update;
+      if (!this.self?.alignment) this.voidEpoch = Number.NaN; // the numbers may begin again
       this.touch();
     });
     client.on("welcome", ({ welcome }) => {
@@ -163,6 +166,17 @@ export class PageState {
 
   get self(): ParticipantInfo | undefined {
     return this.participant(this.selfId);
+  }
+
+  /** Own alignment, null for none and for one to a tracking frame that is gone. */
+  get alignment(): ParticipantInfo["alignment"] {
+    const alignment = this.self?.alignment ?? null;
+    return alignment !== null && alignment.tracking_epoch <= this.voidEpoch ? null : alignment;
+  }
+
+  /** The tracking frame has jumped: the alignment is void, whether or not the session can be told now. */
+  voidAlignment(): void {
+    this.voidEpoch = this.self?.alignment?.tracking_epoch ?? Number.NaN;
   }
 
   /** Role of this page in the session, empty before it has joined. */

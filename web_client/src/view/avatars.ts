@@ -96,7 +96,8 @@ export class Avatars {
   update(session_ms: number): boolean {
     let isMoved = false;
     for (const [key, avatar] of this.devices) {
-      if (session_ms - avatar.newest_ms > STALE_MS) {
+      // What is far ahead is of a session before, whose clock was another one.
+      if (Math.abs(session_ms - avatar.newest_ms) > STALE_MS) {
         this.remove(key);
         isMoved = true;
         continue;

@@ -87,6 +87,7 @@ export class View {
   readonly device: Device;
   readonly pictures: CameraPictures;
   readonly clouds: CloudViews;
+  /** What is in the picture. */
   scene: SceneView | null = null;
   /** Frames drawn since the page began. */
   drawn = 0;
@@ -113,6 +114,8 @@ export class View {
   private lastFrame_ms = 0;
   private drawnSinceReport = 0;
   private sceneCount = 0;
+  /** A changed scene that is not in the picture yet. */
+  private next: SceneView | null = null;
   private headset: HeadsetStage | null = null;
 
   constructor(
@@ -231,35 +234,41 @@ export class View {
   }
 
   private setScene(spec: SceneSpec): void {
-    const before = this.scene;
+    const shown = this.scene;
     const scene = new SceneView(spec, this.assets, {
       budget: this.device.budget,
       shadows: this.device.shadows,
       anisotropy: Math.min(8, this.renderer.capabilities.getMaxAnisotropy()),
       onProblem: this.events.onProblem,
     });
-    this.scene = scene;
-    this.poses = new Float32Array(0); // its bodies lie as they did at first, until they are moved
+    this.next?.dispose();
+    this.next = scene;
     this.sceneCount += 1;
     this.assets.keepOnly(listAddresses(spec));
-    const isSameRoom = before !== null && before.spec.name === spec.name && before.spec.bodies.length === spec.bodies.length;
-    if (!isSameRoom) this.viewpoint.frame(scene, this.clouds.getBounds());
-    const swap = (): void => {
-      before?.dispose();
-      if (this.scene !== scene) return;
-      this.root.add(scene.world);
-      this.touch();
-    };
+    const isSameRoom = shown !== null && shown.spec.name === spec.name && shown.spec.bodies.length === spec.bodies.length;
     // A changed scene appears when it is complete; the first one as it comes.
-    if (isSameRoom) void scene.complete.then(swap);
-    else swap();
+    if (!isSameRoom) {
+      this.viewpoint.frame(scene, this.clouds.getBounds());
+      this.showNext(scene);
+    }
     void scene.complete.then(() => {
+      if (this.next === scene) this.showNext(scene);
       if (this.scene !== scene) return;
       if (scene.sky) this.root.add(scene.sky);
       this.root.background = new Color(scene.sky ? BACKGROUND : NO_SKY);
       this.touch();
     });
-    this.events.onScene(spec);
+  }
+
+  /** Replace the scene in the picture by the next one. */
+  private showNext(scene: SceneView): void {
+    this.scene?.dispose();
+    this.scene = scene;
+    this.next = null;
+    this.poses = new Float32Array(0); // its bodies lie as they did at first, until they are moved
+    this.root.add(scene.world);
+    this.touch();
+    this.events.onScene(scene.spec);
   }
 
   private takeFrame(frame: FrameUpdate): void {

@@ -102,6 +102,7 @@ export class Headset {
   /** The tracking frame jumps: what was aligned to it is void. */
   onReset(): void {
     this.client.post({ type: "tracking_jump" });
+    this.state.voidAlignment();
     this.marks.touching.reset();
   }
 
@@ -165,17 +166,14 @@ export class Headset {
 
   // --- place ----------------------------------------------------------------------------------------------------------
 
-  private get alignment(): NonNullable<PageState["self"]>["alignment"] | undefined {
-    return this.state.self?.alignment;
-  }
-
   private get isAligned(): boolean {
-    return isPlaced(this.alignment);
+    return isPlaced(this.state.alignment);
   }
 
   /** Return `T_world_tracking`, null: the scene has no place. */
   private findPlace(): wire.Pose | null {
-    const { alignment, state } = this;
+    const { state } = this;
+    const { alignment } = state;
     if (alignment && this.isAligned) return alignment.T_world_tracking;
     if (this.isTransparent || !state.spec) return null;
     this.defaultPlace ??= placeBeforeScene(state.spec.environment, this.view.viewpoint.axes.forward);
@@ -310,8 +308,8 @@ export class Headset {
   // --- panels ---------------------------------------------------------------------------------------------------------
 
   private updatePanels(reading: FrameReading): void {
-    const { state, alignment } = this;
-    const { session, phase } = state;
+    const { state } = this;
+    const { session, phase, alignment } = state;
     const report = state.status?.participants.find(({ id }) => id === state.selfId)?.alignment_report;
     this.props.isRaised = this.marks.isActive;
     const steps = this.marks.describe(reading.capture_ms);

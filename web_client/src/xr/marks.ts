@@ -84,7 +84,7 @@ export class Marks {
 
   /** Return the lines of the panel before the eyes. */
   describe(now_ms: number): string[] {
-    return this.touching.describe({ alignment: this.state.self?.alignment }, now_ms, this.memory);
+    return this.touching.describe(this.state, now_ms, this.memory);
   }
 
   /** Take what the session says. */
@@ -116,7 +116,7 @@ export class Marks {
     const { state } = this;
     const anchor = this.findSheet();
     const isReady = state.isReady && (state.self?.devices.includes("head") ?? false);
-    return { anchor, alignment: state.self?.alignment, isReady, isOffered: this.isTransparent && this.store !== null, busy };
+    return { anchor, alignment: state.alignment, isReady, isOffered: this.isTransparent && this.store !== null, busy };
   }
 
   private findSheet(): AnchorPlace | null {

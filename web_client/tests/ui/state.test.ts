@@ -67,3 +67,18 @@ test("a frame has an age until its stream is forgotten", () => {
   say({ type: "budget", budget: { streams: [] } });
   expect(state.ageOf("room")).toBeUndefined();
 });
+
+test("an alignment is void once the tracking frame has jumped, until the session has none or one to the new frame", () => {
+  const align = (alignment: object | null): unknown => {
+    say({ type: "session", participant_id: "p1", participants: [{ id: "p1", name: "ann", alignment }] });
+    return state.alignment;
+  };
+  const old = { kind: "measured", version: 1, tracking_epoch: 0 };
+  expect(align(old)).toEqual(old);
+  state.voidAlignment();
+  expect([align(old), align({ ...old, version: 2 })]).toEqual([null, null]);
+  const next = { ...old, tracking_epoch: 1 };
+  expect(align(next)).toEqual(next);
+  state.voidAlignment();
+  expect([align(next), align(null), align(old)]).toEqual([null, null, old]); // the last one is of another session
+});

@@ -11,7 +11,7 @@ import { StreamChoices } from "../../src/ui/stream_choices.ts";
 import type { View } from "../../src/view/view.ts";
 import type { ConsentPanel } from "../../src/xr/consents.ts";
 import type { Hands } from "../../src/xr/hands.ts";
-import { Headset } from "../../src/xr/headset.ts";
+import { Headset, type Mode } from "../../src/xr/headset.ts";
 import type { Marks } from "../../src/xr/marks.ts";
 import { STOP_BUTTONS } from "../../src/xr/reading.ts";
 
@@ -37,6 +37,7 @@ let requests: { type: string }[];
 let stops: number;
 let isGranted: boolean;
 let headset: Headset;
+let enter: (mode: Mode) => Headset;
 afterEach(() => void vi.useRealTimers());
 beforeEach(() => {
   vi.useFakeTimers({ toFake: ["performance"] });
@@ -55,7 +56,8 @@ beforeEach(() => {
     estop: () => (stops += 1),
   } as unknown as Actions;
   const view = { viewpoint: { axes: { forward: [1, 0, 0] } }, scene: { bodies: new Map([[1, new Group()]]) } } as unknown as View;
-  headset = new Headset(session as unknown as XRSession, "immersive-vr", view, state, client, new StreamChoices(() => [], () => true), actions);
+  enter = (mode) => new Headset(session as unknown as XRSession, mode, view, state, client, new StreamChoices(() => [], () => true), actions);
+  headset = enter("immersive-vr");
 });
 
 function setSession(self: object, robots: readonly string[] = [], holder = "p1"): void {
@@ -118,6 +120,23 @@ test("a director in VR is placed when it asks for that, as often as it is not al
   setSession({ role: "operator" });
   tap();
   expect(requests.length).toBe(2);
+});
+
+test("a recentre leaves the scene without a place until it is aligned to the new tracking frame, also without a connection", () => {
+  const align = (version: number, tracking_epoch: number): boolean => {
+    setSession({ alignment: { version, kind: "measured", tracking_epoch, T_world_tracking: [[0, 0, 0], [1, 0, 0, 0]] } });
+    show();
+    return headset.showsScene;
+  };
+  headset = enter("immersive-ar");
+  expect(align(3, 0)).toBe(true);
+  state.phase = { ...state.phase, phase: "waiting" };
+  headset.onReset();
+  expect(posted.at(-1)).toEqual({ type: "tracking_jump" });
+  show();
+  expect(headset.showsScene).toBe(false);
+  expect(align(4, 0)).toBe(false); // it was on its way
+  expect(align(5, 1)).toBe(true);
 });
 
 test("a button of the e-stop stops, whatever the controller's pose is", () => {
