@@ -250,10 +250,12 @@ def test_host_entries_are_bounded(rig: Rig) -> None:
     with pytest.raises(OwnershipError, match="loop"):
         rig.stepper.post(Marker(0, "one more"))
     rig.stepper.post_own(ExternalReset())  # a reset that a script's loop has seen, whatever else that script says
-    for _ in range(RESERVED_HOST_ENTRIES - 1):
-        rig.stepper.post(EStop("somebody shouts"))
+    for _ in range(2 * RESERVED_HOST_ENTRIES):
+        rig.stepper.post(EStop("somebody shouts"))  # the first waits, and stops as well as all of them
+    for _ in range(RESERVED_HOST_ENTRIES - 2):
+        rig.stepper.post_own(ExternalReset())
     with pytest.raises(RuntimeError, match="loop"):
-        rig.stepper.post(EStop("one more"))
+        rig.stepper.post_own(ExternalReset())
     rig.steps(1)
     assert rig.stepper.last is not None
     assert rig.stepper.last.decision.estop
