@@ -76,7 +76,7 @@ class Admission:
         return Entry(connection.number, connection.number, now_ns, join)
 
     def _accept(self, route: Route, peer: Peer, hello: Hello, now_ns: int) -> tuple[FrontConnection, Join]:
-        if not self._allow_hello(route, peer, now_ns):
+        if not self._allow_hello(route, peer, hello, now_ns):
             raise _RefusedError(RefusalCode.RATE, "too many hellos at once", "try again in a second")
         gateway = self._require_gateway(route, peer, now_ns)
         key_id = self._make_key_id(peer, hello, gateway)
@@ -120,13 +120,15 @@ class Admission:
         )
         return connection, join
 
-    def _allow_hello(self, route: Route, peer: Peer, now_ns: int) -> bool:
+    def _allow_hello(self, route: Route, peer: Peer, hello: Hello, now_ns: int) -> bool:
         """Return whether the hello is within the limits of its TCP connection, of its key, and of all. The
-        first does not apply to a gateway's, which speaks for many participants."""
+        first does not apply to a gateway's, which speaks for many participants; behind it the secret is the key."""
         if not route.on_behalf_of:
             rates = self._rates.setdefault(peer.descriptor, RateLimiter())
             if not rates.allow(Hello, now_ns):
                 return False
+        elif self.find_gateway(route.routing_id, peer) is not None:
+            return self._hellos.allow(compute_fingerprint(hello.secret, b"iris-secret"), now_ns)
         return self._hellos.allow(peer.user_id or peer_of(peer.descriptor)[0], now_ns)
 
     def _take_budget(self, key_id: str, hello: Hello, gateway: FrontConnection | None, now_ns: int) -> KeyBudget:

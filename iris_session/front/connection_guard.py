@@ -241,8 +241,9 @@ def select_share_evictions(
 class HelloRateLimiter:
     """Limit hellos per source and in total.
 
-    A source is an allowed key, or an address in a session without keys. Each source has a few hellos of its own, so a
-    new client is admitted independently of other clients. Beyond them it uses those that all sources share.
+    A source is an allowed key, an address in a session without keys, or behind a gateway a secret. Each source has a
+    few hellos of its own, so a new client is admitted independently of other clients. Beyond them it uses those that
+    all sources share.
     """
 
     def __init__(self, limits: FrontLimits) -> None:
@@ -481,7 +482,7 @@ class ConnectionGuard:
 
         Returns:
             Whether there were too many, so that the TCP connection was closed. That of a gateway stays open for the
-            others behind it; then only the connection ends.
+            others behind it; then only the connection ends. Too many of strangers behind it are only reported.
         """
         tcp = self._tcp.find(peer.descriptor) or self._tcp.add(peer.descriptor, now_ns)
         if connection is not None:
@@ -502,6 +503,8 @@ class ConnectionGuard:
         ):
             return True  # it is about to be disconnected
         self.report_flood(tcp.address[0], detail, now_ns, connection)
+        if connection is not None and detail == BEFORE_HELLO and self._connections.list_behind(connection):
+            return False  # of strangers: it would end those who have joined
         if connection is not None and connection.gateway:
             self._drops.count("flood_cut")
             remember(self._banned, connection.key_id, now_ns + BAN_NS)

@@ -135,7 +135,7 @@ class Intake:
             if entry is not None:
                 self._coalescer.offer(entry)
             else:
-                self._count_rejection(peer, None, now_ns)
+                self._count_stranger(route, peer, now_ns)
         elif route.on_behalf_of and self._admission.find_gateway(route.routing_id, peer) is None:
             self._admission.report_forged_gateway(route, peer, now_ns)
             self._count_rejection(peer, None, now_ns)
@@ -143,8 +143,7 @@ class Intake:
         elif isinstance(message, Disconnected):
             self._handle_disconnected(route, peer, message, connection, now_ns)
         elif connection is None:
-            # Behind a gateway, one that has not said hello must not use up what the gateway may send before hello.
-            self._count_rejection(peer, self._admission.find_gateway(route.routing_id, peer), now_ns)
+            self._count_stranger(route, peer, now_ns)
             text = "this connection has not said hello: say hello (again)"
             self._send_fault(route, None, FaultCode.HELLO, text, now_ns)
         else:
@@ -370,6 +369,11 @@ class Intake:
         """Count a rejected message. Too many of them end the connection, and close its TCP connection."""
         if self._guard.rate_limit(peer, connection, detail, now_ns) and connection is not None:
             self._outbox.failed.setdefault(connection.number, "flood")
+
+    def _count_stranger(self, route: Route, peer: Peer, now_ns: int) -> None:
+        """Count a rejected message without a connection: behind a gateway it must not use up what the gateway may send
+        before hello."""
+        self._count_rejection(peer, self._admission.find_gateway(route.routing_id, peer), now_ns)
 
     def _count_flood(self, connection: FrontConnection, tag: str, now_ns: int) -> None:
         """Count a message above a rate limit, and report a client that is above it for seconds."""

@@ -27,7 +27,7 @@ class FrontLimits(msgspec.Struct, frozen=True):
     Attributes:
         connections: Participants' connections at most.
         hellos_per_second, hello_burst: Rate limit of `hello`, all peers together.
-        hellos_per_source, hello_source_burst: Rate limit of `hello` for each key.
+        hellos_per_source, hello_source_burst: Rate limit of `hello` for each key, behind a gateway for each secret.
         pending_messages, pending_urgent, pending_devices: Entries queued for the authority, per connection.
         pending_samples: Samples queued for the authority, per device.
         batch_entries: Entries of one batch to the authority.

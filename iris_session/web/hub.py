@@ -47,8 +47,9 @@ _SMALL: Final = 256
 #: Faults after which a connection is over for the session.
 _ENDING_FAULTS: Final = frozenset({FaultCode.DROPPED, FaultCode.REVOKED, FaultCode.HELLO, FaultCode.SESSION_ENDED})
 _BYE: Final = "bye"
+_HELLO: Final = "hello"
 _PAIR: Final = "pair"
-#: Networks whose pairing attempts are counted.
+#: Networks whose pairing attempts and messages without a `welcome` are counted.
 MAX_NETWORKS: Final = 1024
 #: Answers to malformed messages of one browser.
 _FAULTS_PER_S, _FAULT_BURST = 2.0, 5
@@ -63,7 +64,9 @@ class HubLimits(msgspec.Struct, frozen=True):
         messages_per_s, message_burst: Messages of one browser.
         bytes_per_s, byte_burst: Their bytes.
         pair_per_s, pair_burst: Pairing attempts of one network; the session counts wrong ones against the gateway.
-        early_per_s, early_burst: Messages without a `welcome`: the session counts those against the gateway.
+        early_per_s, early_burst: Messages without a `welcome`, and hellos, of one network: the session counts those
+            against the gateway.
+        early_shared_per_s, early_shared_burst: More of them, which all networks share.
         queued_messages, queued_bytes: Control messages that wait for one browser; a snapshot has at most 32 MB.
         total_bytes: Control messages that wait for all browsers together.
         join_ns: Time until the session has welcomed a browser.
@@ -78,8 +81,10 @@ class HubLimits(msgspec.Struct, frozen=True):
     byte_burst: int = 8 << 20
     pair_per_s: float = 20 / 600
     pair_burst: int = 20
-    early_per_s: float = 10.0
-    early_burst: int = 200
+    early_per_s: float = 2.0
+    early_burst: int = 20
+    early_shared_per_s: float = 100.0
+    early_shared_burst: int = 400
     queued_messages: int = 1024
     queued_bytes: int = 48 << 20
     total_bytes: int = 128 << 20
@@ -100,7 +105,7 @@ class Browser:
 
     Attributes:
         name: What the gateway calls it in `on_behalf_of`.
-        address: Of its peer.
+        address: Of its peer; of IPv6 its network.
         epoch: Connection epoch of its present `welcome`, 0 without one: then it gets no state, media and assets.
         has_budget: The session has sent its delivery budget, so that it may subscribe to media.
         outgoing: Control messages that wait, oldest first.
@@ -112,7 +117,7 @@ class Browser:
 
     def __init__(self, name: str, address: str, limits: HubLimits, now_ns: int) -> None:
         self.name = name
-        self.address = address
+        self.address = find_network(address)
         self.epoch = 0
         self.has_budget = False
         self.outgoing: deque[bytes] = deque()
@@ -129,7 +134,6 @@ class Browser:
         self.ticket_ns = 0
         self.messages = TokenBucket(limits.messages_per_s, limits.message_burst, now_ns)
         self.bytes = TokenBucket(limits.bytes_per_s, limits.byte_burst, now_ns)
-        self.early = TokenBucket(limits.early_per_s, limits.early_burst, now_ns)
         self.faults = TokenBucket(_FAULTS_PER_S, _FAULT_BURST, now_ns)
 
     @property
@@ -159,6 +163,8 @@ class Hub:
         self.drops = Drops() if drops is None else drops
         self._browsers: dict[str, Browser] = {}
         self._pairs = KeyedBuckets(self.limits.pair_per_s, self.limits.pair_burst, MAX_NETWORKS)
+        self._early = KeyedBuckets(self.limits.early_per_s, self.limits.early_burst, MAX_NETWORKS)
+        self._early_shared = TokenBucket(self.limits.early_shared_per_s, self.limits.early_shared_burst)
         self._tickets: dict[bytes, tuple[Browser, int]] = {}  # with the time at which each expires
 
     def __len__(self) -> int:
@@ -237,12 +243,10 @@ class Hub:
         if browser.closing is not None:
             return None
         browser.heard_ns = now_ns
-        if (
-            not browser.messages.take(now_ns)
-            or not browser.bytes.take(now_ns, len(data))
-            or (not browser.epoch and not browser.early.take(now_ns))
-        ):
+        if not browser.messages.take(now_ns) or not browser.bytes.take(now_ns, len(data)):
             self._reject(browser, CLOSE_LIMIT, "web_flood", "more messages than a client may send: send less")
+            return None
+        if not browser.epoch and not self._take_early(browser, now_ns):
             return None
         try:
             channel, frames = decode_frames(data)
@@ -259,6 +263,14 @@ class Hub:
             return None
         return envelope if self._check_message(browser, frames[0], now_ns) else None
 
+    def _take_early(self, browser: Browser, now_ns: int) -> bool:
+        """Return whether a message that the session may count against the gateway is within the limits of its network.
+        What is above closes the browser's WebSocket."""
+        if self._early.take(browser.address, now_ns) or self._early_shared.take(now_ns):
+            return True
+        self._reject(browser, CLOSE_LIMIT, "web_flood", "too many messages before the welcome: come again")
+        return False
+
     def _check_message(self, browser: Browser, envelope: memoryview, now_ns: int) -> bool:
         """Return whether a message is for the session. What is not MessagePack is answered as the session would.
 
@@ -272,7 +284,9 @@ class Hub:
                 fault = ServerEnvelope(PROTOCOL_VERSION, browser.epoch, ProtocolFault(error.code, str(error)))
                 self._queue(browser, encode_frames(CONTROL, (encode_server(fault),)))
             return False
-        if kind == _PAIR and not self._pairs.take(find_network(browser.address), now_ns):
+        if kind == _HELLO and browser.epoch and not self._take_early(browser, now_ns):
+            return False
+        if kind == _PAIR and not self._pairs.take(browser.address, now_ns):
             text = "too many pairing attempts from this address: wait a minute"
             self._reject(browser, CLOSE_LIMIT, "web_pair_rate", text)
             return False
@@ -317,19 +331,20 @@ class Hub:
             browser.said_hello = False
 
     def _queue(self, browser: Browser, message: bytes) -> None:
-        """Queue a control message. A browser for which too much waits does not read: its WebSocket is closed."""
+        """Queue a control message. A browser for which too much waits does not read: its WebSocket is closed. When too
+        much waits for all together, it is that for which most waits."""
         limits = self.limits
-        total = sum(other.queued_bytes for other in self._browsers.values()) if len(message) > _SMALL else 0
-        if (
-            len(browser.outgoing) >= limits.queued_messages
-            or browser.queued_bytes + len(message) > limits.queued_bytes
-            or total + len(message) > limits.total_bytes
-        ):
-            self._reject(browser, CLOSE_TOO_SLOW, "web_too_slow", "control messages are not read")
-            return
         browser.outgoing.append(message)
         browser.queued_bytes += len(message)
+        if len(browser.outgoing) > limits.queued_messages or browser.queued_bytes > limits.queued_bytes:
+            self._reject_slow(browser)
+        elif len(message) > _SMALL:
+            while sum(other.queued_bytes for other in self._browsers.values()) > limits.total_bytes:
+                self._reject_slow(max(self._browsers.values(), key=lambda other: other.queued_bytes))
         browser.wake()
+
+    def _reject_slow(self, browser: Browser) -> None:
+        self._reject(browser, CLOSE_TOO_SLOW, "web_too_slow", "control messages are not read")
 
     def publish(self, frames: Sequence[Bytes]) -> None:
         """Set the newest message of a topic of the state channel for every admitted browser."""

@@ -1,8 +1,9 @@
 """TCP connections of the gateway: accepted within limits, with TLS, and closed when they do nothing.
 
 aiohttp has no limit of connections, and none of the time in which a request must come. So connections are accepted
-here, counted per address, and given to aiohttp behind a protocol of our own (`WatchedProtocol`), which notes their end.
-A connection is a stranger until a request of it has a ticket, or the session has welcomed its browser.
+here, counted per address (of IPv6, per network), and given to aiohttp behind a protocol of our own (`WatchedProtocol`),
+which notes their end. A connection is a stranger until a request of it has a ticket, or the session has welcomed its
+browser. Only few of a browser are none.
 """
 
 from __future__ import annotations
@@ -16,13 +17,15 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from iris_session.protocol.limits import Drops, KeyedBuckets
+from iris_session.protocol.limits import Drops, KeyedBuckets, find_network
 from iris_session.web.sockets import limit_unsent
 
 #: Connections in all, and strangers among them in all and of one address; above it the oldest are evicted.
 MAX_CONNECTIONS: Final = 512
 MAX_STRANGERS: Final = 256
 MAX_STRANGERS_PER_ADDRESS: Final = 128
+#: Connections of one browser that are no strangers. It has two WebSockets, and 16 assets at once.
+MAX_TRUSTED_PER_BROWSER: Final = 24
 #: Of one address: handshakes of TLS, which cost a millisecond each, and requests. The page has some ten files.
 HANDSHAKES_PER_S, HANDSHAKE_BURST = 20.0, 120
 REQUESTS_PER_S, REQUEST_BURST = 200.0, 1000
@@ -42,16 +45,22 @@ _PATH: Final = re.compile(rb"[A-Z]{3,7} (/[A-Za-z0-9._~!$&'()*+,;=:@%/?-]{0,500}
 
 
 class Connection:
-    """One TCP connection. `requests`: under way now; `trusted`: it is no stranger."""
+    """One TCP connection.
 
-    __slots__ = ("address", "close", "idle_since", "requests", "trusted")
+    Attributes:
+        address: Of its peer; of IPv6 its network.
+        requests: Under way now.
+        browser: Name of the browser that it belongs to, empty for a stranger.
+    """
+
+    __slots__ = ("address", "browser", "close", "idle_since", "requests")
 
     def __init__(self, address: str, now: float, close: Callable[[], None]) -> None:
-        self.address = address
+        self.address = find_network(address)
         self.close = close
         self.idle_since = now
         self.requests = 0
-        self.trusted = False
+        self.browser = ""
 
 
 class ConnectionLimiter:
@@ -67,20 +76,32 @@ class ConnectionLimiter:
     def add(self, connection: Connection) -> list[Connection]:
         """Add a connection. Return those to close so that the limits hold, perhaps this one itself."""
         self._connections[connection] = None
-        strangers = [one for one in self._connections if not one.trusted]
-        by_address: dict[str, list[Connection]] = {}
-        for one in strangers:
-            by_address.setdefault(one.address, []).append(one)
+        strangers: dict[str, list[Connection]] = {}  # by address
+        idle: dict[str, list[Connection]] = {}  # those of browsers without a request, by browser
+        for one in self._connections:
+            if not one.browser:
+                strangers.setdefault(one.address, []).append(one)
+            elif not one.requests:
+                idle.setdefault(one.browser, []).append(one)
         evicted: list[Connection] = []
-        theirs = by_address[connection.address]
+        theirs = strangers[connection.address]
         if len(theirs) > MAX_STRANGERS_PER_ADDRESS:
             evicted.append(theirs[0])
             self._drops.count("web_connections_per_address")
-        elif len(strangers) > MAX_STRANGERS or len(self._connections) > MAX_CONNECTIONS:
-            most = max(by_address.values(), key=len)
-            evicted.append(most[0])
+        elif sum(map(len, strangers.values())) > MAX_STRANGERS:
+            evicted.append(max(strangers.values(), key=len)[0])
+            self._drops.count("web_connections")
+        elif len(self._connections) > MAX_CONNECTIONS:
+            evicted.append(max((*idle.values(), *strangers.values()), key=len)[0])
             self._drops.count("web_connections")
         return evicted
+
+    def trust(self, connection: Connection, browser: str) -> None:
+        """Note that a connection belongs to a browser. It stays a stranger when that has many others."""
+        if connection.browser:
+            return
+        if sum(one.browser == browser for one in self._connections) < MAX_TRUSTED_PER_BROWSER:
+            connection.browser = browser
 
     def remove(self, connection: Connection) -> None:
         """Remove a connection that is closed."""
@@ -166,6 +187,17 @@ class Listener:
         """Return the connection of a peer, as `peername` of its transport is."""
         return self._by_peer.get(peer[:2]) if isinstance(peer, tuple) else None
 
+    def trust(self, connection: Connection, browser: str) -> None:
+        """Note that a connection belongs to a browser, by the name of that."""
+        self._limiter.trust(connection, browser)
+
+    def allow_handshake(self, address: str) -> bool:
+        """Return whether an address may make one more handshake of TLS now."""
+        if self._handshakes.take(find_network(address), time.monotonic_ns()):
+            return True
+        self._drops.count("web_handshake_rate")
+        return False
+
     def allow_request(self, connection: Connection) -> bool:
         """Return whether the address of a connection may make one more request now."""
         if self._requests.take(connection.address, time.monotonic_ns()):
@@ -194,8 +226,7 @@ class Listener:
                 self._drops.count("web_accept")
                 await asyncio.sleep(_ACCEPT_PAUSE_S)
                 continue
-            if self._tls is not None and not self._handshakes.take(str(peer[0]), time.monotonic_ns()):
-                self._drops.count("web_handshake_rate")
+            if self._tls is not None and not self.allow_handshake(str(peer[0])):
                 sock.close()
                 continue
             self._start(self._serve(sock, (str(peer[0]), int(peer[1]))))

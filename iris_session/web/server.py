@@ -31,6 +31,7 @@ from iris_session.web.wire import (
     CLOSE_NOT_ALLOWED,
     CLOSE_RESTART,
     CLOSE_TOO_SLOW,
+    CLOSE_TRY_AGAIN,
     GATEWAY,
     MAX_CLIENT_MESSAGE,
     MEDIA,
@@ -273,6 +274,10 @@ class WebServer:
             return None
         return self._listener.find(transport.get_extra_info("peername"))
 
+    def _trust(self, connection: Connection | None, browser: Browser) -> None:
+        if connection is not None and self._listener is not None:
+            self._listener.trust(connection, browser.name)
+
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Check where a request comes from, and turn every error into an answer."""
@@ -351,13 +356,11 @@ class WebServer:
             raise web.HTTPUnauthorized(reason="no valid ticket")
         if not is_address(address):
             raise web.HTTPNotFound
-        connection = self._find_connection(request)
-        if connection is not None:
-            connection.trusted = True
         n = self._loads.get(browser.name, 0)
         if n >= ASSETS_PER_BROWSER or sum(self._loads.values()) >= ASSETS_IN_ALL:
             self._drops.count("web_assets_at_once")
             raise web.HTTPTooManyRequests(reason="too many assets at once")
+        self._trust(self._find_connection(request), browser)
         self._loads[browser.name] = n + 1
         try:
             return await self._send_asset(request, address, browser)
@@ -466,8 +469,8 @@ class WebServer:
         hub = self._hub
         while browser.closing is None:
             await writer.wait()
-            if connection is not None and browser.is_admitted:
-                connection.trusted = True
+            if browser.is_admitted:
+                self._trust(connection, browser)
             while browser.closing is None:
                 message = hub.take_message(browser)
                 if message is None and browser.latest and writer.has_room(STATE_WINDOW):
@@ -499,13 +502,16 @@ class WebServer:
     async def _serve_media(self, request: web.Request) -> web.StreamResponse:
         socket = await self._open_socket(request)
         writer = SocketWriter(socket, request)
-        browser = await self._receive_ticket(socket)
+        try:
+            browser = await self._receive_ticket(socket)
+        except TimeoutError:
+            self._drops.count("web_ticket")
+            await writer.close(Closing(CLOSE_TRY_AGAIN, "no ticket has come in time: come again"))
+            return socket
         if browser is None:
             await writer.close(Closing(CLOSE_NOT_ALLOWED, "the first message must be a valid ticket"))
             return socket
-        connection = self._find_connection(request)
-        if connection is not None:
-            connection.trusted = True
+        self._trust(self._find_connection(request), browser)
         before, self._media[browser.name] = self._media.get(browser.name), writer
         if before is not None:
             await before.close(Closing(CLOSE_LIMIT, "another media socket of this participant was opened"))
@@ -523,14 +529,15 @@ class WebServer:
         return socket
 
     async def _receive_ticket(self, socket: web.WebSocketResponse) -> Browser | None:
+        """Return the browser whose ticket comes first, `None` for one that is not valid. Raises `TimeoutError`."""
+        async with asyncio.timeout(TICKET_S):
+            message = await socket.receive()
         try:
-            async with asyncio.timeout(TICKET_S):
-                message = await socket.receive()
             if message.type != WSMsgType.BINARY:
                 return None
             channel, frames = decode_frames(message.data)
             ticket = decode_gateway_message(frames[0])
-        except (TimeoutError, ProtocolError):
+        except ProtocolError:
             self._drops.count("web_ticket")
             return None
         if channel != GATEWAY or not isinstance(ticket, Ticket):

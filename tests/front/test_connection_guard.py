@@ -13,6 +13,7 @@ import zmq
 
 from iris_session.front import connection_guard
 from iris_session.front.connection_guard import (
+    BEFORE_HELLO,
     CHECK_PERIOD_NS,
     EARLY_BURST,
     FLOOD_CONNECTIONS_PER_S,
@@ -27,8 +28,10 @@ from iris_session.front.connection_guard import (
     select_evictions,
     select_share_evictions,
 )
+from iris_session.front.connections import FrontConnection, Route
 from iris_session.link.config import SECOND, FrontConfig, FrontLimits
 from iris_session.link.sockets import bound_port, close_tcp, open_state, peer_of, tcp_counts, watch_tcp
+from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.limits import Drops
 from tests.front.control_rig import LIMITS, ControlSocketRig, is_closed
@@ -105,6 +108,23 @@ def test_flood_is_cut_off_reported_and_banned_for_a_time(rig: ControlSocketRig) 
     rig.look(4 * SECOND)
     assert not rig.guard.is_banned("key1", rig.now_ns)
     assert rig.guard.list_warnings(rig.now_ns + 60 * SECOND) == ()
+
+
+def test_strangers_behind_a_gateway_do_not_end_those_who_have_joined(rig: ControlSocketRig) -> None:
+    peer, theirs = rig.open()
+    gateway = rig.hello(peer)
+    ann = FrontConnection(
+        2, Route(b"1", "ann"), peer, gateway.address, "key2", Hello("operator", "Ann"), gateway.number
+    )
+    rig.clients.add(ann)
+    assert not any(
+        rig.guard.rate_limit(peer, gateway, BEFORE_HELLO, rig.now_ns) for _ in range(2 * LIMITS.excess_burst)
+    )
+    assert not is_closed(theirs)
+    assert {flood.detail for flood in rig.audits} == {BEFORE_HELLO}, "it is reported"
+    rig.clients.remove(ann)
+    assert rig.guard.rate_limit(peer, gateway, BEFORE_HELLO, rig.now_ns)
+    assert is_closed(theirs)
 
 
 def test_reconnecting_flooders_are_limited_more_each_time(rig: ControlSocketRig) -> None:

@@ -219,6 +219,26 @@ def test_key_that_exhausts_its_hellos_does_not_block_others(rig: IntakeRig) -> N
     assert rig.join(Peer(5, "key-of-ann")).participant_id == "p1"
 
 
+def test_strangers_behind_a_gateway_use_up_no_hellos_of_others(rig: IntakeRig) -> None:
+    rig.join(Peer(5, "key-of-gateway"), role="gateway")
+    for i in range(500):
+        rig.take(Hello("operator", "Eve", secret=b"short"), Peer(5, "key-of-gateway"), behalf=f"tab{i % 8}")
+    refused = rig.last()
+    assert isinstance(refused, Refused)
+    assert refused.code == "rate"
+    rig.take(HELLO, Peer(5, "key-of-gateway"), behalf="ann")
+    assert [e.message.name for e in rig.entries() if isinstance(e.message, Join)] == ["Ann"]
+
+
+def test_names_that_are_no_gateways_have_no_hellos_of_their_own(rig: IntakeRig) -> None:
+    for i in range(200):
+        rig.take(Hello("operator", "Eve", secret=b"%016d" % i), Peer(6, "key-of-eve"), behalf=f"tab{i}")
+    codes = [message.code for _, message, _ in rig.sent if isinstance(message, Refused)]
+    limits = rig.limits
+    assert codes.count("gateway_only") == limits.hello_source_burst + limits.hello_burst
+    assert codes[-1] == "rate"
+
+
 def test_excess_for_seconds_is_reported_as_a_flood(rig: IntakeRig) -> None:
     epoch = rig.join().connection_epoch
 

@@ -151,6 +151,23 @@ def test_a_flood_of_one_behind_a_gateway_ends_only_its_participant(open_session:
     session.wait_entries(Marker, connection=ann)
 
 
+def test_refused_hellos_behind_a_gateway_end_no_one(open_session: OpenSession) -> None:
+    session = open_session(silence_ns=600_000_000_000)
+    gateway = session.client()
+    gateway.join("gateway", "Gate")
+    gateway.send(Hello("observer", "Ann", secret=os.urandom(16)), "Ann")
+    gateway.wait_for(Welcome, 2)
+    ann = gateway.got(Welcome)[-1].connection_epoch
+    for i in range(8 * 200):
+        gateway.send(Hello("observer", "Mallory", secret=b"short"), f"tab{i % 8}")
+        if i % 100 == 0:
+            session.once()
+    gateway.send(Marker(7, "still here"), "Ann", ann)
+    session.wait_entries(Marker, connection=ann)
+    assert session.wait_drops("hello_rate") > 1000
+    assert "flood_cut" not in session.process.link.status.drops
+
+
 # --- e-stops ---
 
 

@@ -17,8 +17,12 @@ PAIR = wire.encode_frames(wire.CONTROL, [encode_client(wrap_message(Pair("ann", 
 HEARTBEAT = wire.encode_frames(wire.CONTROL, [encode_client(wrap_message(Heartbeat(), 5))])
 
 
-def open_browser(hub: Hub, n: int = 1, now_ns: int = 0) -> Browser:
-    browser = hub.open_browser(n.to_bytes(6, "big"), "10.0.0.1", now_ns)
+def open_browser(hub: Hub, n: int = 1) -> Browser:
+    return open_from(hub, n, "10.0.0.1")
+
+
+def open_from(hub: Hub, n: int, address: str) -> Browser:
+    browser = hub.open_browser(n.to_bytes(6, "big"), address, 0)
     assert browser is not None
     return browser
 
@@ -96,26 +100,33 @@ def test_floods_close_their_sender() -> None:
 
 
 def test_a_browser_without_a_welcome_may_say_little() -> None:
-    hub = Hub(HubLimits(early_per_s=1.0, early_burst=3))
-    browser, joined = open_browser(hub, 1), open_browser(hub, 2)
+    hub = Hub(HubLimits(early_burst=2, early_shared_burst=1))
+    browser, joined = open_from(hub, 1, "10.0.0.1"), open_from(hub, 2, "10.0.0.2")
     assert [hub.receive(browser, HELLO, 0) is not None for _ in range(4)] == [True] * 3 + [False]
     assert browser.closing is not None
     welcome(hub, joined)
     assert all(hub.receive(joined, HEARTBEAT, 0) for _ in range(100))
+    assert [hub.receive(joined, HELLO, 0) is not None for _ in range(2)] == [True, False], "nor many hellos later"
+
+
+def test_many_sockets_of_a_network_say_no_more_before_the_welcome_than_one() -> None:
+    hub = Hub()
+    n_sent = 0
+    for n in range(96):
+        browser = open_from(hub, n, f"2001:db8::{n:x}")
+        for _ in range(200):
+            n_sent += hub.receive(browser, HELLO, 0) is not None
+    assert n_sent == hub.limits.early_burst + hub.limits.early_shared_burst
+    honest = open_from(hub, 200, "10.0.0.9")
+    assert hub.receive(honest, HELLO, 0) is not None, "one of another network joins meanwhile"
 
 
 def test_pairing_attempts_of_one_network_are_limited() -> None:
     hub = Hub()
-
-    def open_from(n: int, address: str) -> Browser:
-        browser = hub.open_browser(n.to_bytes(6, "big"), address, 0)
-        assert browser is not None
-        return browser
-
-    first, typing = [open_from(n, f"2001:db8::{n}") for n in range(2)], open_from(2, "10.0.0.1")
+    first, typing = [open_from(hub, n, f"2001:db8::{n}") for n in range(2)], open_from(hub, 2, "10.0.0.1")
     assert all(hub.receive(first[n % 2], PAIR, 0) for n in range(20))
     assert all(hub.receive(typing, PAIR, n) for n in range(6)), "a person who mistypes a code"
-    third = open_from(3, "2001:db8::3")
+    third = open_from(hub, 3, "2001:db8::3")
     assert hub.receive(third, HELLO, 0) is not None
     assert hub.receive(third, PAIR, 0) is None
     assert third.closing is not None
@@ -243,8 +254,10 @@ def test_a_browser_that_reads_no_control_messages_is_closed() -> None:
     answer(hub, bob, ProtocolFault("rate", "text"), 5, bytes(9000))
     assert bob.closing is None
     cid = open_browser(hub, 3)
-    answer(hub, cid, ProtocolFault("rate", "text"), 5, bytes(9000))
-    assert cid.closing is not None, "too much waits for all together"
+    answer(hub, cid, ProtocolFault("rate", "text"), 5, bytes(7000))
+    assert bob.closing is not None, "too much waits for all together, and most for this one"
+    assert cid.closing is None
+    assert len(take(hub, cid)) == 1
     assert hub.drops.by_reason == {"web_too_slow": 2}
 
 
@@ -302,6 +315,14 @@ def test_a_full_hub_makes_room_only_by_those_that_have_not_joined() -> None:
         welcome(hub, browser)
     assert hub.open_browser(b"\0\0\0\0\0\x09", "", 0) is None
     assert hub.drops.by_reason == {"web_evicted": 3, "web_full": 1}
+
+
+def test_addresses_of_one_network_make_room_for_others() -> None:
+    hub = Hub(HubLimits(browsers=4))
+    lone = open_from(hub, 1, "10.0.0.2")
+    flood = [open_from(hub, n, f"2001:db8::{n}") for n in range(2, 9)]
+    assert lone.closing is None
+    assert [one.closing is None for one in flood] == [False] * 4 + [True] * 3
 
 
 def test_media_wait_for_the_budget() -> None:

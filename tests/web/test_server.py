@@ -1,15 +1,19 @@
-"""Large messages on a WebSocket of the gateway: whole for the browser, and in pieces for the loop."""
+"""WebSockets of the gateway: large messages, whole for the browser and in pieces for the loop; late tickets."""
 
 from __future__ import annotations
 
 import asyncio
 import random
 from collections.abc import Awaitable, Callable
+from typing import Any
 
 import pytest
-from aiohttp import ClientSession, web
+from aiohttp import ClientSession, WSMsgType, web
 
-from iris_session.web.server import MEDIA_PIECE, SocketWriter
+from iris_session.web import server, wire
+from iris_session.web.hub import Hub
+from iris_session.web.page import HostCheck, PageFiles
+from iris_session.web.server import MEDIA_PIECE, SocketWriter, WebServer
 
 
 @pytest.mark.parametrize("length", [1, 125, 126, MEDIA_PIECE - 1, MEDIA_PIECE, MEDIA_PIECE + 1, 40 * MEDIA_PIECE + 200])
@@ -32,6 +36,34 @@ def test_message_ends_with_its_socket() -> None:
         return await sending
 
     assert asyncio.run(serve_one(act)) == (None, False)
+
+
+@pytest.mark.parametrize(("first", "code"), [(None, 1013), (wire.encode_gateway_message(wire.Ticket("x")), 4003)])
+def test_late_ticket_is_no_wrong_one(monkeypatch: pytest.MonkeyPatch, first: bytes | None, code: int) -> None:
+    monkeypatch.setattr(server, "TICKET_S", 0.05 if first is None else 60.0)
+    unused: Any = None
+    hub = Hub()
+
+    async def open_media() -> object:
+        serving = WebServer(hub, unused, unused, HostCheck((), secure=False), PageFiles())
+        listening = await asyncio.get_running_loop().create_server(await serving.start(), "127.0.0.1", 0)
+        page = f"http://127.0.0.1:{listening.sockets[0].getsockname()[1]}/"
+        try:
+            async with (
+                ClientSession() as session,
+                session.ws_connect(f"{page}v1/media", protocols=[wire.SUBPROTOCOL]) as media,
+            ):
+                if first is not None:
+                    await media.send_bytes(first)
+                message = await media.receive(30.0)
+                assert message.type == WSMsgType.CLOSE
+                return message.data
+        finally:
+            listening.close()
+            await serving.close()
+
+    assert asyncio.run(open_media()) == code
+    assert hub.drops.by_reason == {"web_ticket": 1}
 
 
 async def send_beside_another(message: bytes) -> tuple[bytes, int]:
