@@ -146,7 +146,7 @@ class Session(Owner):
                 processes.start()
             except BaseException:
                 if self._past is not None:
-                    self._past.close()  # else nobody could resume it until this process ends
+                    self._past.close()  # else no other process could resume it until this one ends
                 raise
             self._processes = processes
 
