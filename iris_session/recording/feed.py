@@ -1,4 +1,4 @@
-"""Feed of the recorder: send journal rows, states and events of the authority without ever blocking a step.
+"""Feed of the recorder: send journal rows, states and events of the authority, without a step that waits for it.
 
 Batches of about 20 ms are numbered and kept until the recorder acknowledges that they are in the file: first in a
 window in memory, beyond it in a spill file. A restarted recorder receives everything that was not acknowledged. Rows
