@@ -32,7 +32,11 @@ END_S = 30.0
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_signal_ends_the_session_in_order(serve: Callable[..., SessionProcess], number: signal.Signals) -> None:
-    server = serve("handover", "--json")
+    before = signal.signal(number, signal.SIG_DFL)  # where these tests run under nohup, sessions ignore SIGHUP too
+    try:
+        server = serve("handover", "--json")
+    finally:
+        signal.signal(number, before)
     scenario = Scenario(server)
     ann = scenario.join("ann", "observer")
     children = list_descendants(server.process.pid)
