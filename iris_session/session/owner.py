@@ -84,9 +84,10 @@ class Owner:
 
     @contextmanager
     def signals(self) -> Iterator[None]:
-        """Make Ctrl-C and SIGTERM inside the context set `stopping` and end `run()`, also before it. Main thread only.
+        """Make Ctrl-C, SIGTERM and SIGHUP set `stopping` and end `run()` inside the context, also before it.
 
-        A second Ctrl-C raises `KeyboardInterrupt`. In another thread the context does nothing.
+        SIGHUP stays ignored where it was (`nohup`). A second Ctrl-C raises `KeyboardInterrupt`. In another thread than
+        the main one the context does nothing.
         """
         with stop_on_signals(self._stop):
             yield

@@ -233,7 +233,7 @@ class Stepper:
         """
         is_full = len(self._host) >= MAX_HOST_ENTRIES
         if is_full and isinstance(message, EStop) and any(isinstance(one, EStop) for one in self._host.copy()):
-            return  # one that waits stops everything
+            return  # an e-stop waits already
         if is_full and not isinstance(message, EStop):
             raise OwnershipError(f"queue of inputs full ({MAX_HOST_ENTRIES} wait for one step): is the loop running?")
         self.post_own(message)

@@ -251,7 +251,7 @@ def test_host_entries_are_bounded(rig: Rig) -> None:
         rig.stepper.post(Marker(0, "one more"))
     rig.stepper.post_own(ExternalReset())  # a reset that a script's loop has seen, whatever else that script says
     for _ in range(2 * RESERVED_HOST_ENTRIES):
-        rig.stepper.post(EStop("somebody shouts"))  # the first waits, and stops as well as all of them
+        rig.stepper.post(EStop("a hand is in the way"))  # one that waits is enough
     for _ in range(RESERVED_HOST_ENTRIES - 2):
         rig.stepper.post_own(ExternalReset())
     with pytest.raises(RuntimeError, match="loop"):

@@ -34,7 +34,7 @@ test("a hand that is not reported any more disappears", () => {
   expect(draw(11_600)).toEqual([]);
 });
 
-test("a session that begins again shows nobody of the one before, and who is there under the same id", () => {
+test("after a restart of the session its participants are shown, and none of the session before, also under the same id", () => {
   say(1, 3_600_000);
   expect(draw(3_600_000)).toEqual([1]);
   say(2, 900); // the clock of the page is still that of the session before
