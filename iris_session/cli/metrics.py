@@ -109,7 +109,7 @@ def _list_recorder_metrics(r: StatusReport) -> Iterator[Metric]:
     yield _make_metric("recorder_bytes", "gauge", "Size of the newest file.", one.bytes_written)
     yield _make_metric("recorder_lost_rows_total", "counter", "Steps missing in the recording.", one.lost_rows)
     yield _make_metric(
-        "recorder_waiting_bytes", "gauge", "Bytes spilled to disk, waiting for the recorder.", one.spilled_bytes
+        "recorder_waiting_bytes", "gauge", "Bytes in memory that wait for the recorder.", one.spilled_bytes
     )
     if one.disk_free_bytes:
         yield _make_metric("recorder_disk_free_bytes", "gauge", "Free space for the recording.", one.disk_free_bytes)

@@ -303,7 +303,7 @@ def check_recorder(report: StatusReport) -> Finding:
         return ok("recorder", "nothing is recorded")
     text = f"{one.path}: {one.bytes_written / 1e6:.1f} MB"
     lost = f", {one.lost_rows} rows lost" if one.lost_rows else ""
-    waiting = f", {one.spilled_bytes / 1e6:.1f} MB wait on the disk" if one.spilled_bytes else ""
+    waiting = f", {one.spilled_bytes / 1e6:.1f} MB wait in memory" if one.spilled_bytes else ""
     if one.state == "hangs":
         why = "it has accepted nothing for five seconds: its disk or network drive does not answer"
         return failed("recorder", f"the recorder hangs; {text}{waiting}{lost}", why, "check that disk")

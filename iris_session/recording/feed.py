@@ -1,9 +1,9 @@
 """Feed of the recorder: send journal rows, states and events of the authority, without a step that waits for it.
 
-Batches of about 20 ms are numbered and kept until the recorder acknowledges that they are in the file: first in a
-window in memory, beyond it in a spill file. A restarted recorder receives everything that was not acknowledged. Rows
-are dropped only if memory and spill file are both full, states and metrics before: they are counted and reported by
-`take_gap`.
+Batches of about 20 ms are numbered and kept in memory until the recorder acknowledges that they are in the file: the
+first of them, the window, are sent, the others wait in the backlog. A restarted recorder receives everything that was
+not acknowledged. Rows are dropped only if the backlog is full, states and metrics before: they are counted and reported
+by `take_gap`. No step waits for a disk, so nothing here is kept on one.
 
 Vertices of deformables are for the picture only. They have a socket of their own and are not stored: frames that do not
 fit into its queue are dropped and counted, so they cost the journal nothing.
@@ -12,11 +12,8 @@ fit into its queue are dropped and counted, so they cost the journal nothing.
 from __future__ import annotations
 
 import math
-import os
-import struct
 from collections import deque
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import msgspec
@@ -55,12 +52,13 @@ _T = TypeVar("_T")
 
 BATCH_ROWS: Final = 10
 BATCH_NS: Final = 20_000_000
-#: Memory for batches that are not in the file yet. 2 operators, 50 bodies: about 0.5 MB/s, so 30 s.
+#: Memory for batches that are sent and not in the file yet, and for those that wait. 2 operators and 50 bodies make
+#: about 0.5 MB/s, so 30 s and 17 minutes.
 WINDOW_BYTES: Final = 16 << 20
-SPILL_BYTES: Final = 2 << 30
-#: Maximum number of records read back from the spill file per flush: 4 batches of 20 ms, so that a flush stays short.
-UNSPILL_BATCHES: Final = 4
-#: Share of the spill file above which only what verification needs is kept: rows, keyframes, scenes.
+BACKLOG_BYTES: Final = 512 << 20
+#: Maximum number of batches of the backlog that are sent per flush, so that it stays short: four times what is new.
+BACKLOG_BATCHES: Final = 4
+#: Share of the backlog above which only what verification needs is kept: rows, keyframes, scenes.
 JOURNAL_SHARE: Final = 0.75
 #: Maximum time without a status while closing. A recorder that writes sends one every half second.
 SILENCE_S: Final = 1.0
@@ -75,7 +73,8 @@ VERTEX_FRAMES: Final = 32
 class FeedStats(msgspec.Struct):
     """Counters of one feed.
 
-    `dropped_rows`: rows missing in the recording; `dropped_items`: states, events and other items missing;
+    `waiting_batches`, `waiting_bytes`: the backlog. `dropped_rows`: rows missing in the recording; `drop_reason`: why
+    the last ones; `dropped_items`: states, events and other items missing;
     `dropped_vertices`: frames missing in the picture; `recorder`: the last status of the recorder. What comes after the
     budget of the recording is used up is in none of them.
     """
@@ -84,14 +83,13 @@ class FeedStats(msgspec.Struct):
     batches: int = 0
     bytes: int = 0
     window_bytes: int = 0
-    spilled_batches: int = 0
-    waiting_in_spill: int = 0
-    spilled_bytes: int = 0
+    waiting_batches: int = 0
+    waiting_bytes: int = 0
     dropped_rows: int = 0
     dropped_items: int = 0
     dropped_vertices: int = 0
     recorders: int = 0
-    spill_fault: str = ""
+    drop_reason: str = ""
     recorder: RecorderStatus | None = None
 
 
@@ -105,17 +103,15 @@ class RecorderFeed:
     def __init__(
         self,
         endpoint: str,
-        spill_dir: str | Path,
         window_bytes: int = WINDOW_BYTES,
-        spill_bytes: int = SPILL_BYTES,
+        backlog_bytes: int = BACKLOG_BYTES,
         vertices_endpoint: str = "",
     ) -> None:
         self.stats = FeedStats()
         self._lost = False
         self._complete = False
         self._window_limit = window_bytes
-        self._spill_limit = spill_bytes
-        self._spill = SpillFile(Path(spill_dir) / f"feed-{os.getpid()}.spill", spill_bytes)
+        self._backlog = Backlog(backlog_bytes)
         self._context = zmq.Context(io_threads=1)
         self._socket = self._context.socket(zmq.DEALER)
         # Unlimited marks: the window is the bound, and a refused send would be a second one to account for.
@@ -155,7 +151,7 @@ class RecorderFeed:
     @property
     def wants_keyframe(self) -> bool:
         """True once there is room again after rows were dropped: verification can continue from the next keyframe."""
-        return self._lost and not self._spill and 2 * self.stats.window_bytes <= self._window_limit
+        return self._lost and not self._backlog and 2 * self.stats.window_bytes <= self._window_limit
 
     def send_header(
         self, header: SessionHeader, root: str = "", scene_hash: str = "", robots: tuple[RobotLabels, ...] = ()
@@ -295,7 +291,7 @@ class RecorderFeed:
         batch = self._batch
         lists: tuple[list[Any], ...] = (batch.states, batch.events, batch.denials, batch.metrics, batch.keyframes)
         lists += (batch.scenes, batch.assets, batch.holds)
-        if self._spill.pending_bytes > JOURNAL_SHARE * self._spill_limit:
+        if self._backlog.bytes > JOURNAL_SHARE * self._backlog.limit_bytes:
             self._leave_out_picture(batch)
         if batch.rows or any(lists):
             self._batch = Batch(dropped_rows=self.stats.dropped_rows)
@@ -329,7 +325,7 @@ class RecorderFeed:
         self.flush()
         waits = max(1, round(timeout_s / 0.02))
         silent, said = 0, (self.stats.recorder, cpu_s())
-        while waits and silent < silence_s / 0.02 and alive() and self._header and (self._window or self._spill):
+        while waits and silent < silence_s / 0.02 and alive() and self._header and (self._window or self._backlog):
             self._socket.poll(20)
             self._transfer()
             waits -= 1
@@ -337,10 +333,11 @@ class RecorderFeed:
             silent = 0 if now != said else silent + 1
             said = now
         self._transfer()  # it may have ended with a last status
-        self._complete = not self._window and not self._spill
-        if self._spill:
-            self._drop(self._spill.rows, self._spill.others, "the session ended before the recorder could take it all")
-        self._spill.close()
+        self._complete = not self._window and not self._backlog
+        if self._backlog:
+            why = "the session ended before the recorder could take it all"
+            self._drop(self._backlog.rows, self._backlog.others, why)
+            self._backlog.clear()
         if self._vertices is not None:
             self._vertices.close(0)
         self._socket.close(0)
@@ -361,18 +358,16 @@ class RecorderFeed:
             self.stats.dropped_items += 1
 
     def _enqueue(self, body: bytes, rows: int, others: int) -> None:
-        # A batch may be above the limit, so that a large model is not written to a disk here.
-        if not self._spill and self.stats.window_bytes < self._window_limit:
+        if not self._backlog and self.stats.window_bytes < self._window_limit:  # a large model may exceed it
             self._send_batch(body)
-        elif self._spill.push(body, rows, others):
-            self.stats.spilled_batches += 1
-        else:
-            self._drop(rows, others, self._spill.fault)
+        elif not self._backlog.push(body, rows, others):
+            limit = self._backlog.limit_bytes >> 20
+            self._drop(rows, others, f"the recorder is behind, and {limit} MiB wait for it, the limit")
 
     def _drop(self, rows: int, others: int, why: str) -> None:
         self.stats.dropped_rows += rows
         self.stats.dropped_items += others
-        self.stats.spill_fault = why
+        self.stats.drop_reason = why
         self._gap_rows += rows
         self._lost = True
         self._batch.dropped_rows = self.stats.dropped_rows
@@ -393,19 +388,11 @@ class RecorderFeed:
     def _transfer(self) -> None:
         while int(self._socket.get(zmq.EVENTS)) & zmq.POLLIN:
             self._process_status(messages.decode_status(self._socket.recv(zmq.NOBLOCK)))
-        for _ in range(UNSPILL_BATCHES):
-            if not self._spill or self.stats.window_bytes >= self._window_limit:
+        for _ in range(BACKLOG_BATCHES):
+            if not self._backlog or self.stats.window_bytes >= self._window_limit:
                 break
-            try:
-                record = self._spill.pop()
-            except OSError as error:  # a disk that fails must not end the session
-                self._drop(self._spill.rows, self._spill.others, f"the spill file cannot be read: {error}")
-                self._spill.close()
-                break
-            if record is not None:
-                self._send_batch(record[0])
-        self.stats.waiting_in_spill = len(self._spill)
-        self.stats.spilled_bytes = self._spill.pending_bytes
+            self._send_batch(self._backlog.pop())
+        self.stats.waiting_batches, self.stats.waiting_bytes = len(self._backlog), self._backlog.bytes
 
     def _process_status(self, status: RecorderStatus) -> None:
         self.stats.recorder = status
@@ -432,106 +419,46 @@ class RecorderFeed:
         self._ended, self._lost, self._gap_rows, self.silence_ns = True, False, 0, 0
         self._window.clear()
         self.stats.window_bytes = 0
-        self._spill.close()
+        self._backlog.clear()
 
 
-_HEAD: Final = struct.Struct("<III")  # bytes of the record, rows in it, other items in it
+class Backlog:
+    """Batches that wait for the recorder, first in, first out, at most `limit_bytes`.
 
-
-class SpillFile:
-    """A bounded first-in first-out queue of byte records in a file, at most `limit_bytes` on disk.
-
-    The file has no name in its folder, so the system frees it when the process ends, even if killed. `rows`, `others`:
-    number of journal rows and other items in the queue. `fault`: why the last `push` failed.
+    `bytes`, `rows`, `others`: size of them all, and number of journal rows and other items in them.
     """
 
-    def __init__(self, path: Path, limit_bytes: int) -> None:
-        self._path = path
-        self._limit = limit_bytes
-        self._fd = -1
-        self._read_at = 0
-        self._write_at = 0
-        self._wrap_at = -1  # where reading continues at the beginning of the file; -1: nowhere
-        self.records = 0
-        self.rows = 0
-        self.others = 0
-        self.fault = ""
+    def __init__(self, limit_bytes: int) -> None:
+        self.limit_bytes = limit_bytes
+        self._batches: deque[tuple[bytes, int, int]] = deque()
+        self.bytes = self.rows = self.others = 0
 
     def __len__(self) -> int:
-        return self.records
+        return len(self._batches)
 
-    @property
-    def pending_bytes(self) -> int:
-        """Bytes of all records in the queue."""
-        wrapped = self._wrap_at if self._wrap_at >= 0 else 0
-        return self._write_at - self._read_at + wrapped
-
-    def push(self, data: bytes, rows: int, others: int = 0) -> bool:
-        """Append a record of `rows` journal rows and `others` other items; false if the disk or the limit refuses
-        it."""
-        record = _HEAD.pack(len(data), rows, others) + data
-        at = self._find_room(len(record))
-        if at < 0:
-            self.fault = f"the spill file {self._path} holds its limit of {self._limit >> 20} MiB"
+    def push(self, body: bytes, rows: int, others: int) -> bool:
+        """Append a batch of `rows` journal rows and `others` other items; false if there is no room for it."""
+        if self.bytes + len(body) > self.limit_bytes:
             return False
-        try:
-            if self._fd < 0:
-                self._path.unlink(missing_ok=True)
-                flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC  # never through a link of another user
-                self._fd = os.open(self._path, flags, 0o600)
-                self._path.unlink()  # no other process reads it, and a killed session leaves nothing behind
-            written = os.pwrite(self._fd, record, at)
-        except OSError as error:
-            self.fault = f"the spill file {self._path} cannot be written: {error.strerror}"
-            return False
-        if written != len(record):  # the disk is full: the next push writes over the partial record
-            self.fault = f"the spill file {self._path} cannot be written: no space left"
-            return False
-        if at < self._write_at:
-            self._wrap_at = self._write_at
-        self._write_at = at + len(record)
-        self.records += 1
-        self.rows += rows
-        self.others += others
+        self._batches.append((body, rows, others))
+        self._count(len(body), rows, others)
         return True
 
-    def pop(self) -> tuple[bytes, int] | None:
-        """Remove and return the oldest record as `(data, rows)`, `None` if empty. Raises `OSError` if it cannot be
-        read."""
-        if not self.records:
-            return None
-        length, rows, others = _HEAD.unpack(self._read(_HEAD.size, self._read_at))
-        data = self._read(length, self._read_at + _HEAD.size)
-        self._read_at += _HEAD.size + length
-        if self._read_at == self._wrap_at:
-            self._read_at, self._wrap_at = 0, -1
-        self.records -= 1
-        self.rows -= rows
-        self.others -= others
-        if not self.records:
-            self.close()
-        return data, rows
+    def pop(self) -> bytes:
+        """Remove and return the oldest batch. Raises `IndexError` if there is none."""
+        body, rows, others = self._batches.popleft()
+        self._count(-len(body), -rows, -others)
+        return body
 
-    def _find_room(self, length: int) -> int:
-        """Return the offset for a record of this length: behind the newest, or where records were read; -1 if full."""
-        if self._wrap_at >= 0 or self._write_at + length <= self._limit:
-            end = self._read_at - 1 if self._wrap_at >= 0 else self._limit
-            return self._write_at if self._write_at + length <= end else -1
-        return 0 if length < self._read_at else -1
+    def clear(self) -> None:
+        """Remove all batches."""
+        self._batches.clear()
+        self.bytes = self.rows = self.others = 0
 
-    def _read(self, n: int, at: int) -> bytes:
-        data = os.pread(self._fd, n, at)
-        if len(data) != n:
-            raise OSError(f"the spill file holds {len(data)} of {n} bytes at {at}")
-        return data
-
-    def close(self) -> None:
-        """Remove the file and its records."""
-        if self._fd >= 0:
-            os.close(self._fd)
-            self._fd = -1
-        self._wrap_at = -1
-        self._read_at = self._write_at = self.records = self.rows = self.others = 0
+    def _count(self, n_bytes: int, rows: int, others: int) -> None:
+        self.bytes += n_bytes
+        self.rows += rows
+        self.others += others
 
 
 #: Minimum time between frames of one deformable: 20 a second look smooth, if all deformables together fit.

@@ -158,11 +158,7 @@ class SessionProcesses:
                 self.recorder.start()
                 self.supervisor = RecorderSupervisor(self.recorder)
                 self.reporter.warning_sources.append(self.supervisor.budget.list_warnings)
-                self.feed = RecorderFeed(
-                    self.recorder.feed_endpoint,
-                    self.recording.parent,
-                    vertices_endpoint=self.recorder.vertices_endpoint,
-                )
+                self.feed = RecorderFeed(self.recorder.feed_endpoint, vertices_endpoint=self.recorder.vertices_endpoint)
                 self._in_use = RecordingLock(self.recording, shared=True)
                 if not self._core.config.authority.user_owned_loop:  # others cannot be resumed
                     self._note_writer = ResumeNoteWriter(find_note_path(self.recording))
@@ -444,7 +440,7 @@ class SessionProcesses:
                 fault = recorder.failure or "the recorder did not write all of it in time"
                 fault = f"the end of the recording is missing: {fault}"
             elif feed.stats.dropped_rows:
-                fault = f"{feed.stats.dropped_rows} steps are missing in the recording: {feed.stats.spill_fault}"
+                fault = f"{feed.stats.dropped_rows} steps are missing in the recording: {feed.stats.drop_reason}"
         # A recorder that hangs has had its time: everything is to end within two seconds.
         if recorder is not None and not recorder.close(FINISH_S if is_accepted else HANGING_EXIT_S) and not fault:
             fault = "the recorder did not end in order: the end of the recording may be missing"

@@ -154,7 +154,7 @@ class RecorderSupervisor:
                 self._thread.start()
         hangs = silence_ns > HANGING_NS
         if hangs and not self.hangs:
-            announcements.append("the recorder hangs: pending rows are spilled to the disk")
+            announcements.append("the recorder hangs: its rows wait in memory")
         self.hangs = hangs
         if self.failure and self.alive and now_ns - self._failed_ns > HANGING_NS and not hangs:
             self.failure = ""  # its successor writes
@@ -205,13 +205,13 @@ def make_recorder_report(
         state = "dead"
     elif supervisor.hangs:
         state = "hangs"
-    fault = fault or stats.spill_fault or (NO_PICTURE if recorder.journal_only else "")
+    fault = fault or stats.drop_reason or (NO_PICTURE if recorder.journal_only else "")
     return RecorderReport(
         state,
         recorder.path[-MAX_TEXT:],
         0 if last is None else last.bytes,
         0 if last is None else last.disk_free,
         stats.dropped_rows,
-        stats.spilled_bytes,
+        stats.waiting_bytes,
         fault[:MAX_TEXT],
     )

@@ -165,7 +165,7 @@ def recorder(path: Path) -> Iterator[tuple[RecorderProcess, RecorderFeed]]:
     feed: RecorderFeed | None = None
     try:
         process.start()
-        feed = RecorderFeed(process.feed_endpoint, path.parent, vertices_endpoint=process.vertices_endpoint)
+        feed = RecorderFeed(process.feed_endpoint, vertices_endpoint=process.vertices_endpoint)
         yield process, feed
     finally:
         if feed is not None:

@@ -91,7 +91,7 @@ def record_small_session(path: Path) -> Iterator[tuple[SmallSession, RecorderPro
     """Start a recorder with the budget, and a session that it records."""
     process = RecorderProcess(path, time.monotonic_ns(), budget_bytes=BUDGET)
     process.start()
-    feed = RecorderFeed(process.feed_endpoint, path.parent)
+    feed = RecorderFeed(process.feed_endpoint)
     try:
         yield SmallSession(feed), process
     finally:

@@ -1,4 +1,4 @@
-"""The feed against a recorder emulated by the test: order, repetition, spill and loss."""
+"""The feed against a recorder emulated by the test: order, repetition, backlog and loss."""
 
 from __future__ import annotations
 
@@ -76,16 +76,16 @@ class PlayedRecorder:
 
 
 @pytest.fixture
-def played(tmp_path: Path) -> Iterator[tuple[PlayedRecorder, str, Path]]:
+def played(tmp_path: Path) -> Iterator[tuple[PlayedRecorder, str]]:
     endpoint = f"ipc://{tmp_path}/f"
     recorder = PlayedRecorder(endpoint)
-    yield recorder, endpoint, tmp_path
+    yield recorder, endpoint
     recorder.context.destroy(linger=0)
 
 
 @pytest.fixture
-def feed(played: tuple[PlayedRecorder, str, Path]) -> Iterator[RecorderFeed]:
-    feed = RecorderFeed(played[1], played[2])
+def feed(played: tuple[PlayedRecorder, str]) -> Iterator[RecorderFeed]:
+    feed = RecorderFeed(played[1])
     feed.send_header(make_header())
     yield feed
     feed.close(0.0)
@@ -140,12 +140,14 @@ def test_acknowledged_rows_are_removed_and_a_new_recorder_gets_the_others(feed: 
     assert feed.close(0.0)
 
 
-def test_full_window_spills_and_is_read_back_in_order(played) -> None:  # type: ignore[no-untyped-def]
-    recorder, endpoint, folder = played
-    feed = RecorderFeed(endpoint, folder, window_bytes=2000)
+def test_what_exceeds_the_window_waits_and_is_sent_in_order(played) -> None:  # type: ignore[no-untyped-def]
+    recorder, endpoint = played
+    feed = RecorderFeed(endpoint, window_bytes=2000)
     feed.send_header(make_header())
     steps(feed, 0, 300)
-    assert feed.stats.spilled_batches > 10
+    assert feed.stats.waiting_batches > 10
+    assert 0 < feed.stats.waiting_bytes == feed._backlog.bytes
+    assert feed.stats.window_bytes < 4000, "one batch more than the limit"
     assert feed.stats.dropped_rows == 0
     recorder.say(feed, 1, -1, -1)
     got: list[int] = []
@@ -157,19 +159,18 @@ def test_full_window_spills_and_is_read_back_in_order(played) -> None:  # type: 
             written = number
         recorder.say(feed, 1, written + 1, written)
     assert got == list(range(300))
-    assert feed.stats.waiting_in_spill == 0
-    assert list(folder.glob("*.spill")) == []
+    assert (feed.stats.waiting_batches, feed.stats.waiting_bytes, feed._backlog.rows) == (0, 0, 0)
     assert feed.close(0.0)
 
 
-def test_full_spill_drops_rows_counts_and_reports_them(played) -> None:  # type: ignore[no-untyped-def]
-    recorder, endpoint, folder = played
-    feed = RecorderFeed(endpoint, folder, window_bytes=3000, spill_bytes=3000)
+def test_full_backlog_drops_rows_counts_and_reports_them(played) -> None:  # type: ignore[no-untyped-def]
+    recorder, endpoint = played
+    feed = RecorderFeed(endpoint, window_bytes=3000, backlog_bytes=3000)
     feed.send_header(make_header())
     steps(feed, 0, 500)
     lost = feed.stats.dropped_rows
     assert 0 < lost < 500
-    assert "limit" in feed.stats.spill_fault
+    assert "limit" in feed.stats.drop_reason
     assert feed.take_gap() == lost
     assert feed.take_gap() == 0
     assert not feed.wants_keyframe, "a snapshot costs time and there is no room for it"
@@ -187,10 +188,10 @@ def test_full_spill_drops_rows_counts_and_reports_them(played) -> None:  # type:
     assert not feed.close(0.0)
 
 
-def test_the_rest_of_a_nearly_full_spill_is_for_the_journal(played) -> None:  # type: ignore[no-untyped-def]
-    _, endpoint, folder = played
+def test_the_rest_of_a_nearly_full_backlog_is_for_the_journal(played) -> None:  # type: ignore[no-untyped-def]
+    _, endpoint = played
     limit = 60_000
-    feed = RecorderFeed(endpoint, folder, window_bytes=2000, spill_bytes=limit)
+    feed = RecorderFeed(endpoint, window_bytes=2000, backlog_bytes=limit)
     feed.send_header(make_header())
     for step in range(1000):
         feed.add_state(step, step, 0.1, 70, np.arange(21.0).reshape(3, 7))
@@ -199,19 +200,19 @@ def test_the_rest_of_a_nearly_full_spill_is_for_the_journal(played) -> None:  # 
             break
     assert feed.stats.dropped_items > 0
     assert feed.stats.dropped_rows == 0
-    assert JOURNAL_SHARE * limit < feed._spill.pending_bytes < limit
+    assert JOURNAL_SHARE * limit < feed._backlog.bytes < limit
     feed.close(0.0)
 
 
 def test_rows_not_received_before_the_end_are_counted(played) -> None:  # type: ignore[no-untyped-def]
-    _, endpoint, folder = played
-    feed = RecorderFeed(endpoint, folder, window_bytes=2000)
+    _, endpoint = played
+    feed = RecorderFeed(endpoint, window_bytes=2000)
     feed.send_header(make_header())
     steps(feed, 0, 300)
-    waiting = feed._spill.rows
+    waiting = feed._backlog.rows
     assert not feed.close(0.0)
     assert feed.stats.dropped_rows == waiting > 0
-    assert "ended before" in feed.stats.spill_fault
+    assert "ended before" in feed.stats.drop_reason
     assert not feed.close(0.0), "asked again"
 
 
@@ -244,24 +245,6 @@ def test_silence_of_a_busy_recorder_is_measured(feed: RecorderFeed, played) -> N
     played[0].say(feed, 1, 20, 19)
     feed.add_row(make_row(ROOT, 200, 60_000_000_000, 0, [], b"d" * 16))  # the session itself stood still
     assert feed.silence_ns == 0
-
-
-def test_unreadable_spill_file_is_a_gap(played) -> None:  # type: ignore[no-untyped-def]
-    recorder, endpoint, folder = played
-    feed = RecorderFeed(endpoint, folder, window_bytes=2000)
-    feed.send_header(make_header())
-    steps(feed, 0, 300)
-    waiting = feed._spill.rows
-    os.ftruncate(feed._spill._fd, 10)
-    recorder.say(feed, 1, -1, -1)
-    recorder.take(1)
-    while feed.stats.window_bytes:
-        _, number, _ = recorder.take(1)[0]
-        recorder.say(feed, 1, number + 1, number)
-    assert feed.take_gap() == feed.stats.dropped_rows == waiting > 0
-    assert "cannot be read" in feed.stats.spill_fault
-    assert feed.wants_keyframe
-    feed.close(0.0)
 
 
 def test_states_events_and_denials_are_sent_with_the_rows(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
@@ -320,8 +303,8 @@ def test_changed_reasons_to_hold_are_sent_once(feed: RecorderFeed, played) -> No
 
 def test_reasons_to_hold_that_were_left_out_are_sent_again(played) -> None:  # type: ignore[no-untyped-def]
     """Else a lane of the picture would show the reason before for as long as the robot holds."""
-    _, endpoint, folder = played
-    feed = RecorderFeed(endpoint, folder, window_bytes=2000, spill_bytes=60_000)
+    _, endpoint = played
+    feed = RecorderFeed(endpoint, window_bytes=2000, backlog_bytes=60_000)
     feed.send_header(make_header())
     held = Decision(commands=(Command("left", "hold", "stale"),))
     feed.add_decision(0, 0, Decision(commands=(Command("left", "hold", "no_sample"),)))
@@ -373,8 +356,8 @@ class _Spy:
 
 
 def test_models_are_not_copied_by_the_thread_that_takes_steps(played, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    recorder, endpoint, _ = played
-    feed = RecorderFeed(endpoint, tmp_path)
+    recorder, endpoint = played
+    feed = RecorderFeed(endpoint)
     spy = _Spy(feed._socket)
     feed._socket = spy  # type: ignore[assignment]
     feed.send_header(msgspec.structs.replace(make_header(), model=os.urandom(1 << 20)))
@@ -388,16 +371,16 @@ def test_models_are_not_copied_by_the_thread_that_takes_steps(played, tmp_path: 
     feed.close(0.0)
 
 
-def test_a_large_model_is_not_spilled_by_the_thread_that_takes_steps(played, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    recorder, endpoint, _ = played
-    feed = RecorderFeed(endpoint, tmp_path, window_bytes=1 << 20)
+def test_a_model_larger_than_the_window_is_sent(played) -> None:  # type: ignore[no-untyped-def]
+    recorder, endpoint = played
+    feed = RecorderFeed(endpoint, window_bytes=1 << 20, backlog_bytes=1 << 20)
     feed.send_header(make_header())
     recorder.say(feed, 1, -1, -1)
     steps(feed, 0, 10)
     feed.send_scene("hash", os.urandom(2 << 20), ())
-    assert (feed.stats.spilled_batches, feed.stats.batches) == (0, 2)
+    assert (feed.stats.waiting_batches, feed.stats.batches) == (0, 2)
     steps(feed, 10, 10)
-    assert feed.stats.spilled_batches == 1, "what comes next waits on the disk"
+    assert feed.stats.waiting_batches == 1
     assert [number for _, number, _ in recorder.take(3)] == [0, 0, 1]
     feed.close(0.0)
 
@@ -420,7 +403,7 @@ def test_simulated_time_goes_on_over_resets(feed: RecorderFeed, played) -> None:
 
 
 def test_scene_precedes_its_row_and_is_repeated_for_a_new_recorder(
-    played: tuple[PlayedRecorder, str, Path], feed: RecorderFeed
+    played: tuple[PlayedRecorder, str], feed: RecorderFeed
 ) -> None:
     recorder, *_ = played
     recorder.say(feed, 1, -1, -1)
@@ -459,10 +442,10 @@ def square() -> bytes:
 
 
 def test_vertices_have_their_own_socket_and_rate(played, tmp_path: Path, square: bytes) -> None:  # type: ignore[no-untyped-def]
-    recorder, endpoint, folder = played
+    recorder, endpoint = played
     vertices = recorder.context.socket(zmq.PULL)
     vertices.bind(f"ipc://{tmp_path}/v")
-    feed = RecorderFeed(endpoint, folder, vertices_endpoint=f"ipc://{tmp_path}/v")
+    feed = RecorderFeed(endpoint, vertices_endpoint=f"ipc://{tmp_path}/v")
     feed.send_header(make_header())
     for now_ns in (0, 20_000_000, 50_000_000):
         feed.send_vertices("flex-0", square, now_ns)
@@ -488,8 +471,8 @@ def test_unread_vertices_are_dropped_and_counted_and_the_journal_continues(
     tmp_path: Path,
     square: bytes,
 ) -> None:
-    recorder, endpoint, folder = played
-    feed = RecorderFeed(endpoint, folder, vertices_endpoint=f"ipc://{tmp_path}/nobody")
+    recorder, endpoint = played
+    feed = RecorderFeed(endpoint, vertices_endpoint=f"ipc://{tmp_path}/nobody")
     feed.send_header(make_header())
     for i in range(VERTEX_FRAMES + 7):
         feed.send_vertices("flex-0", square, i * 50_000_000)

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -106,7 +105,7 @@ def test_raw_samples_of_the_front(tmp_path: Path) -> None:
                 front.send(msgspec.msgpack.encode([(3, 1000 + j, bytes([j, 255])) for j in (i, i + 1)]))
             front.send(b"\xc1 no message")
             wait_until(lambda: _status(feed).samples == 50 and _status(feed).samples_refused == 1)
-        assert feed.close()
+        assert feed.close(20.0)
         assert process.close()
     with Recording.open(path) as recording:
         samples = list(recording.samples())
@@ -123,6 +122,7 @@ def test_raw_samples_are_left_out_only_when_the_disk_is_slow(slow: str, tmp_path
     work = getattr(target, name)
 
     def work_slowly(*given: Any) -> Any:
+        loop.stop()  # after this flush
         time.sleep(1.5 * process_module.SLOW_WRITE_S)
         return work(*given)
 
@@ -131,7 +131,6 @@ def test_raw_samples_are_left_out_only_when_the_disk_is_slow(slow: str, tmp_path
     else:
         stream._read = work_slowly
     loop._writer.add_sample(1, 5, b"x")
-    threading.Timer(0.2, loop.stop).start()
     loop._loop()
     loop._process_samples(msgspec.msgpack.encode([(1, 5, b"x")] * 3))
     assert loop._samples_left_out == (3 if slow == "disk" else 0)
@@ -372,7 +371,7 @@ def test_only_the_session_ends_its_recorder(tmp_path: Path, number: signal.Signa
         session = SmallSession(feed)
         os.kill(process.pid, number)
         session.take(100)
-        assert feed.close()
+        assert feed.close(20.0)
         assert process.close()
     assert verify(path, SmallCore).ok
 
@@ -447,7 +446,7 @@ def test_file_that_is_removed_at_the_end_is_no_clean_end(tmp_path: Path) -> None
     path = tmp_path / "session.rrd"
     with recorder(path) as (process, feed):
         SmallSession(feed).take(50)
-        assert feed.close()
+        assert feed.close(20.0)
         path.unlink()
         assert not process.close()
 
@@ -553,7 +552,7 @@ def test_assets_follow_the_journal_and_each_part_has_them(tmp_path: Path) -> Non
     shared.store.path(lost).unlink()
     process = RecorderProcess(path, time.monotonic_ns(), record_assets=ALL)
     process.start()
-    feed = RecorderFeed(process.feed_endpoint, tmp_path)
+    feed = RecorderFeed(process.feed_endpoint)
     try:
         session = SmallSession(feed)
         feed.send_patch(str(shared.store.root), shared.scene_hash)

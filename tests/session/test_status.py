@@ -171,7 +171,7 @@ def processes(
     """Return feed, recorder and supervisor."""
     said = RecorderStatus(1, 0, 0, bytes=1000, fault=fault, disk_free=5000)
     return (
-        SimpleNamespace(stats=FeedStats(dropped_rows=2, spilled_bytes=30, recorder=said)),
+        SimpleNamespace(stats=FeedStats(dropped_rows=2, waiting_bytes=30, recorder=said)),
         SimpleNamespace(path="/data/session.rrd", journal_only=journal_only),
         SimpleNamespace(
             alive=alive, hangs=hangs, failure=failure, budget=SimpleNamespace(is_used_up=ended, text=budget)

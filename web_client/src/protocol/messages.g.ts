@@ -791,8 +791,8 @@ export interface RobotReport {
 
 /**
  * State of the recorder: `off` (nothing is recorded), `running`, `hangs` (silent for 5 s), `dead` (being replaced),
- * `failed` (the file cannot be written) or `ended` (its budget is used up). `disk_free_bytes` 0: not known. `text`:
- * its last message, for people.
+ * `failed` (the file cannot be written) or `ended` (its budget is used up). `disk_free_bytes` 0: not known.
+ * `spilled_bytes`: what waits in memory for a recorder that is behind. `text`: its last message, for people.
  */
 export interface RecorderReport {
   state?: string;
