@@ -162,10 +162,11 @@ class FrontSockets:
 
 
 class LinkState:
-    """State of the link to the authority, written by `Downlink` (the first five), `Front` (stalls) and `Uplink`.
+    """State of the link to the authority, written by `Downlink` (the first six), `Front` (stalls) and `Uplink`.
 
     Attributes:
         heard_ns: Session time of its last message, 0 before the first.
+        step: Step of its newest decision, -1 before the first.
         acknowledged: Batches that it acknowledged since the start.
         report: Its newest half of the status report, encoded; empty before the first.
         is_recorded: The recording has not ended before the session.
@@ -177,6 +178,7 @@ class LinkState:
 
     def __init__(self) -> None:
         self.heard_ns = 0
+        self.step = -1
         self.acknowledged = 0
         self.report = b""
         self.is_recorded = True

@@ -112,6 +112,7 @@ class Downlink:
                 self._drops.count("decision_invalid")
                 return
             self._handle_decision(decided)
+            self._authority.step = decided.step
         elif kind == link.PRESENCE:
             self._publisher.publish_presence(self._authority.heard_ns, frames[1])
         elif kind == link.SCENE:

@@ -62,6 +62,9 @@ class RevocationService:
         self._reported_error = ""  # of the allow-list, logged last
         self._state_due_ns = 0  # while the state socket is closed: when its port should have been free
         self._next_check_ns = self._next_seen_ns = 0
+        for mark in self._tokens.revoked_keys:  # the front before ended before it wrote that into the list
+            if self._keyring.find_entry(mark) is not None:
+                self._keyring.pending_revocations[mark] = None
 
     def revoke(self, key_id: str, now_ns: int) -> None:
         """Revoke a key on request of a director: disconnect it, and take it off the list."""

@@ -19,7 +19,7 @@ from iris_session.link.sockets import readable
 from iris_session.protocol.entries import HOST, Entry, FrontRestarted, decode_entries
 from iris_session.protocol.server_messages import ParticipantLeft, PresenceItem, StateHeader
 from iris_session.protocol.status import StatusReport
-from iris_session.protocol.steps import Decision
+from iris_session.protocol.steps import Decision, Dropped
 
 #: Messages read from the front in one `poll`; its credits bound how many can be queued.
 _POLL_BOUND: Final = 64
@@ -32,6 +32,8 @@ PRESENCE_ALONE_NS: Final = 50_000_000
 LOOKED_NS: Final = 100_000_000
 #: State frames are sent at tick times, so their distance varies by a tick.
 PRESENCE_SLACK_NS: Final = 4_000_000
+#: Maximum number of revoked keys of which the front has not said that it knows them.
+_REVOCATIONS: Final = 4096
 
 
 class FrontLink:
@@ -63,6 +65,7 @@ class FrontLink:
         self._received_ns = 0
         self._scene: bytes | None = None
         self.handback = b""
+        self._revocations: dict[str, int] = {}  # keys that the front may not know yet, and the steps that revoked them
         self.state_drops = 0
         self.overrun = False
         # Half of the front's credits are acknowledged at once: fewer wake-ups, and the front never runs out of credit.
@@ -122,13 +125,14 @@ class FrontLink:
                 self._entries += decode_entries(payload)
                 batches += 1
             elif kind == messages.HANDBACK:
-                self.handback = payload
+                self._take_handback(messages.decode_handback(payload))
             elif kind == messages.STATUS:
                 self.status = messages.add_status(self._status_before, messages.decode_status(payload))
             elif kind == messages.READY:
                 self.ports = messages.decode_ports(payload)
                 if self._scene is not None:
                     self._send(messages.SCENE, self._scene)
+                self._repeat_revocations()
             elif kind == messages.FAILED:
                 self.failure = payload.decode()
             if not readable(socket):
@@ -138,6 +142,17 @@ class FrontLink:
             self._send(messages.ACK, bytes((self._taken,)))
             self._taken = 0
 
+    def _take_handback(self, handback: messages.Handback) -> None:
+        self.handback = handback.state
+        self._revocations = {key: step for key, step in self._revocations.items() if step > handback.step}
+
+    def _repeat_revocations(self) -> None:
+        """Revoke keys again at a front that is ready: the one before may have ended before it read that."""
+        if self._revocations:
+            dropped = tuple(Dropped(HOST, "revoked", key) for key in self._revocations)
+            decided = messages.Decided(max(self._revocations.values()), dropped=dropped)
+            self._send(messages.DECIDED, messages.encoder.encode(decided))
+
     def send_decision(self, step: int, decision: Decision) -> None:
         """Send the part of a decision that leaves the process. Call it in every step: it also keeps the link alive."""
         for item in decision.presence:
@@ -146,6 +161,11 @@ class FrontLink:
             if isinstance(event.body, ParticipantLeft):
                 for key in [key for key in self._presence if key[0] == event.body.participant]:
                     del self._presence[key]
+        for dropped in decision.dropped:
+            if dropped.key_id:
+                self._revocations[dropped.key_id] = step
+                if len(self._revocations) > _REVOCATIONS:
+                    del self._revocations[next(iter(self._revocations))]
         if decision.outgoing or decision.events or decision.admitted or decision.dropped:
             decided = messages.Decided(step, decision.admitted, decision.outgoing, decision.events, decision.dropped)
             self._send(messages.DECIDED, messages.encoder.encode(decided))

@@ -21,7 +21,7 @@ from iris_session.protocol.steps import Admitted, Dropped, OutgoingMessage
 READY: Final = b"R"  # Ports
 FAILED: Final = b"F"  # utf-8, one line
 ENTRIES: Final = b"E"  # list[Entry]
-HANDBACK: Final = b"H"  # opaque bytes for the next front, sent before an entry that depends on it
+HANDBACK: Final = b"H"  # Handback, sent before an entry that depends on it
 STATUS: Final = b"S"  # FrontStatus
 BEAT: Final = b"B"  # empty: the front works but has nothing to send; not sent while the authority stands still
 
@@ -49,6 +49,13 @@ class Decided(msgspec.Struct, frozen=True, array_like=True):
     outgoing: tuple[OutgoingMessage, ...] = ()
     events: tuple[Event, ...] = ()
     dropped: tuple[Dropped, ...] = ()
+
+
+class Handback(msgspec.Struct, frozen=True, array_like=True):
+    """What the next front gets. `state`: opaque bytes. `step`: of the newest `Decided` that they are after."""
+
+    step: int
+    state: bytes
 
 
 class FrontStatus(msgspec.Struct, frozen=True):
@@ -84,6 +91,7 @@ def add_status(before: FrontStatus, status: FrontStatus) -> FrontStatus:
 
 encoder: Final = msgspec.msgpack.Encoder()
 decode_decided: Final = make_decoder(Decided)
+decode_handback: Final = make_decoder(Handback)
 decode_status: Final = make_decoder(FrontStatus)
 decode_ports: Final = make_decoder(Ports)
 decode_scene: Final = make_decoder(SceneInfo)

@@ -118,6 +118,11 @@ class ResumeTokens:
         self.changed = self.changed or key_id in self._revoked
         self._revoked.pop(key_id, None)
 
+    @property
+    def revoked_keys(self) -> tuple[str, ...]:
+        """Keys that were revoked in this session and not allowed again since, the latest last."""
+        return tuple(self._revoked)
+
     def is_revoked(self, key_id: str) -> bool:
         """Return True if this key was revoked in this session and not allowed again since."""
         return key_id in self._revoked

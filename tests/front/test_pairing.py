@@ -59,7 +59,8 @@ class PairingRig:
         self.tokens, self.drops = front.tokens, front.drops
         self.pairing = PairingService(front)
         disconnects: Any = None  # no key is connected
-        self.revocation = RevocationService(front, disconnects, lambda: publisher)
+        self.restart_revocation = lambda: RevocationService(front, disconnects, lambda: publisher)
+        self.revocation = self.restart_revocation()
         self.now_ns = 0
 
     def asks(self, own: KeyPair, proof: bytes = b"x" * 32, descriptor: int = 1) -> None:
@@ -382,6 +383,17 @@ def test_revoked_key_may_join_after_pairing_again(rig: PairingRig) -> None:
     assert isinstance(rig.answer(own), Paired)
     rig.turn()
     assert not rig.tokens.is_revoked(own.fingerprint)
+
+
+def test_key_that_a_front_revoked_before_it_was_killed_leaves_the_list(rig: PairingRig) -> None:
+    own, bob = KeyPair.generate(), KeyPair.generate()
+    rig.home.clients.allow_key("ann", own.public)
+    rig.home.clients.allow_key("bob", bob.public)
+    rig.turn()
+    rig.tokens.revoke_key(own.fingerprint)  # the tokens are what the next front gets
+    rig.revocation = rig.restart_revocation()
+    turns(rig.turn, lambda: own.fingerprint not in rig.home.clients.read())
+    assert bob.fingerprint in rig.home.clients.read()
 
 
 def test_exhausted_pairing_attempts_do_not_limit_others(rig: PairingRig) -> None:

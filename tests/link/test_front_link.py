@@ -16,7 +16,7 @@ from iris_session.protocol.client_messages import EStop, Heartbeat, Marker
 from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.entries import Entry, FrontRestarted, encode_entries
 from iris_session.protocol.server_messages import Event, Notice, ParticipantLeft, PresenceItem, StateHeader
-from iris_session.protocol.steps import Command, Decision
+from iris_session.protocol.steps import Command, Decision, Dropped
 
 EVENT = Decision((), events=(Event(1, 1, 0, Notice("info", "x")),))
 
@@ -39,6 +39,9 @@ class Pair:
 
     def say(self, kind: bytes, payload: bytes) -> None:
         self.far.send_multipart((kind, payload))
+
+    def hand_back(self, step: int, state: bytes) -> None:
+        self.say(messages.HANDBACK, msgspec.msgpack.encode(messages.Handback(step, state)))
 
     def ready(self) -> None:
         self.say(messages.READY, msgspec.msgpack.encode(Ports("127.0.0.1", 1, 2)))
@@ -160,7 +163,7 @@ def test_stalled_front_loses_states_but_no_decisions_until_it_is_replaced(
 
 def test_new_front_is_announced_once_and_old_entries_are_dropped(pair: Pair) -> None:
     pair.ready()
-    pair.say(messages.HANDBACK, b"memory")
+    pair.hand_back(0, b"memory")
     pair.say(messages.ENTRIES, batch("old"))
     pair.poll(1)
     pair.far.close()
@@ -173,6 +176,37 @@ def test_new_front_is_announced_once_and_old_entries_are_dropped(pair: Pair) -> 
     pair.ready()
     pair.say(messages.ENTRIES, encode_entries([Entry(2, 2, 5, EStop())]))
     assert pair.poll(1)[0].connection == 2
+
+
+def test_revocations_are_repeated_until_a_front_has_applied_them(pair: Pair) -> None:
+    """Also one that a director asks for while there is no front."""
+
+    def list_revoked() -> list[list[str]]:
+        said = [messages.decode_decided(frames[1]) for frames in pair.heard() if frames[0] == messages.DECIDED]
+        return [[dropped.key_id for dropped in decided.dropped] for decided in said]
+
+    def restart(name: str) -> None:
+        pair.far.close()
+        pair.far = pair.connect(name)
+
+    pair.ready()
+    pair.link.send_decision(5, Decision((), dropped=(Dropped(1, "revoked", "ann"), Dropped(2, "left"))))
+    restart("b")  # which has not read it
+    pair.link.send_decision(6, Decision((), dropped=(Dropped(0, "revoked", "bob"),)))
+    pair.ready()
+    assert list_revoked() == [["ann", "bob"]]
+    pair.hand_back(5, b"tokens")
+    while pair.link.handback != b"tokens":
+        pair.link.poll()
+    restart("c")
+    pair.ready()
+    assert list_revoked() == [["bob"]]
+    pair.hand_back(6, b"newer")
+    while pair.link.handback != b"newer":
+        pair.link.poll()
+    restart("d")
+    pair.ready()
+    assert list_revoked() == []
 
 
 def test_failure_status_and_scene_are_forwarded(pair: Pair) -> None:
@@ -197,7 +231,7 @@ def test_last_messages_of_a_dead_front_are_read(pair: Pair) -> None:
     pair.ready()
     stop = Entry(3, 3, 5, EStop("stop"))
     pair.say(messages.ENTRIES, encode_entries([stop]))
-    pair.say(messages.HANDBACK, b"tokens")
+    pair.hand_back(0, b"tokens")
     assert pair.link._socket is not None
     with pair.link._socket.get_monitor_socket(zmq.EVENT_DISCONNECTED) as monitor:
         pair.far.close(linger=30_000)
