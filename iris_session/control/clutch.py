@@ -4,7 +4,8 @@ leaders.
 At engagement the device pose and the robot's own commanded target are latched; from then on the target moves as the
 device has moved since: translation times `scale`, rotation about the world's axes, applied to the latched orientation.
 One source of full weight is computed from the latch itself, so rounding never accumulates. Several sources (mode
-`shared`) are blended by increments since each one's previous sample, so joining or leaving moves no target.
+`shared`) are blended by increments since each one's previous sample, so joining or leaving moves no target, but that of
+an absolute source that is left alone is the pose that it states.
 
 Leader robots control in joint space: the follower takes the leader's joints, ramped when they are apart.
 """
