@@ -299,7 +299,7 @@ def _run_session(
         truth,
         received,
         {"/".join(key): count for key, count in ledger.rejected.items()},
-        {names[p]: c for c, p in connections.items()},
+        {names[p]: c for p, c in connections.items()},
         status.drops,
         meter.late_causes,
         begin,

@@ -54,7 +54,7 @@ class SessionLedger:
         handovers: The newest handovers, at most `MAX_HANDOVERS`.
         recent: The newest events, at most `RECENT_EVENTS`.
         applied: By robot, the newest sample that moved it.
-        connections: Participant id by connection number.
+        connections: The newest connection number by participant id, until the participant has left.
         rejected: Rejected samples by (participant, device, reason), at most a second old.
     """
 
@@ -64,7 +64,7 @@ class SessionLedger:
         self.handovers: deque[HandoverStatus] = deque(maxlen=MAX_HANDOVERS)
         self.recent: deque[Event] = deque(maxlen=RECENT_EVENTS)
         self.applied: dict[str, Applied] = {}
-        self.connections: dict[int, str] = {}
+        self.connections: dict[str, int] = {}
         self.rejected: dict[tuple[str, str, str], int] = {}
         # Session time since when a participant has its alignment, or lost it to a jump of its tracking frame.
         self._aligned_ns: dict[str, int] = {}
@@ -74,9 +74,7 @@ class SessionLedger:
     def apply_step(self, decision: Decision, status: tuple[ControlStatus, ...]) -> None:
         """Apply the decision and the control status of one step."""
         for admitted in decision.admitted:
-            self.connections[admitted.connection] = admitted.participant_id
-        for dropped in decision.dropped:
-            self.connections.pop(dropped.connection, None)
+            self.connections[admitted.participant_id] = admitted.connection
         for event in decision.events:
             self._note_alignment(event)
             self.mirror.apply_event(event)
@@ -130,6 +128,7 @@ class SessionLedger:
         elif isinstance(body, ParticipantLeft) and not body.grace:
             self._aligned_ns.pop(body.participant, None)
             self._void_ns.pop(body.participant, None)
+            self.connections.pop(body.participant, None)
             self.rejected = {key: n for key, n in self.rejected.items() if key[0] != body.participant}
 
     def names_by_id(self) -> dict[str, str]:

@@ -12,9 +12,9 @@ from iris_session.protocol.client_messages import MoveAnchor, PlaceAlignment, Tr
 from iris_session.protocol.common import IDENTITY, MAX_TEXT, Pose
 from iris_session.protocol.entries import Bye, Entry, Join
 from iris_session.protocol.names import Role
-from iris_session.protocol.server_messages import Event, Handover
+from iris_session.protocol.server_messages import Event, Handover, ParticipantLeft
 from iris_session.protocol.status import AnchorReport, ParticipantReport, RecorderReport
-from iris_session.protocol.steps import Decision
+from iris_session.protocol.steps import Admitted, Decision
 from iris_session.recording.feed import FeedStats
 from iris_session.recording.messages import RecorderStatus
 from iris_session.session.config import SessionConfig
@@ -69,6 +69,15 @@ def test_handovers_of_the_status_are_bounded() -> None:
         ledger.apply_step(Decision(commands=(), events=(Event(n + 1, n, n, handed),)), ())
     assert len(ledger.handovers) == MAX_HANDOVERS
     assert ledger.handovers[-1].object == f"object{MAX_HANDOVERS + 4}"
+
+
+def test_connections_of_a_session_are_the_newest_of_those_who_are_in_it() -> None:
+    ledger = SessionLedger()
+    for connection in range(1, 6):
+        ledger.apply_step(Decision(commands=(), admitted=(Admitted(connection, "p1", "operator", connection > 1),)), ())
+    assert ledger.connections == {"p1": 5}
+    ledger.apply_step(Decision(commands=(), events=(Event(1, 1, 1, ParticipantLeft("p1", "bye")),)), ())
+    assert ledger.connections == {}
 
 
 def test_alignment_has_an_age_and_can_be_void(session: Session) -> None:
