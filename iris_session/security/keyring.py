@@ -30,6 +30,8 @@ from iris_session.system.file_worker import FileWorker
 MEDIA_ROLES: Final = frozenset({Role.CAMERA, Role.SOURCE})
 #: How long the file of the list may be missing: an editor or a network disk replaces it by another in between.
 ABSENCE_NS: Final = 2_000_000_000
+#: Attempts to read a list that is replaced meanwhile; the next check tries again.
+READS: Final = 4
 #: User-Id of a connection whose key is not listed: this prefix and the key in Z85. Never equal to a fingerprint.
 PAIRING_PREFIX: Final = "pair:"
 
@@ -181,15 +183,22 @@ class Keyring:
         """Reload the list if its file has changed. A damaged file changes nothing and is reported.
 
         A file that cannot be opened now (no free descriptor, a network disk) is tried again. A missing one is an empty
-        list after `ABSENCE_NS`, with a warning before.
+        list after `ABSENCE_NS`, with a warning before. One that is replaced while it is read is read again at once: a
+        key that waits for the answer may be in it.
         """
+        for _ in range(READS):
+            if self._reload_once():
+                return
+
+    def _reload_once(self) -> bool:
+        """Reload the list as `reload_if_changed` does; return false if the file was replaced while it was read."""
         signature = self._signature()
         if signature is not None or not self._keys:
             self._missing_ns = None
         elif not self._has_been_missing():
-            return
+            return True
         if signature == self._read_signature:
-            return
+            return True
         try:
             keys = self._read()
         except KeysError as error:
@@ -199,9 +208,9 @@ class Keyring:
                 self._reported = signature, str(error)
                 self._drops.count("allow_list_unreadable")
                 _log.error("allow-list unchanged: %s", error)
-            return
+            return True
         if signature != self._signature():
-            return  # it was replaced or removed while it was read: the next check reads it again
+            return False
         self._read_signature, self._reported = signature, None
         for mark, old in self._keys.items():
             new = keys.get(mark)
@@ -209,6 +218,7 @@ class Keyring:
                 self.removed[mark] = old
         self.added.update((mark, new) for mark, new in keys.items() if mark not in self._keys)
         self._keys = keys
+        return True
 
     def _has_been_missing(self) -> bool:
         """Return whether the file has been missing for `ABSENCE_NS`, and report when it begins."""

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from iris_session.protocol.limits import Drops
-from iris_session.security import KeyHome, KeyPair
+from iris_session.security import AllowedKey, KeyHome, KeyPair
 from iris_session.security.keyring import ABSENCE_NS, Keyring, open_keyring
 
 
@@ -49,6 +49,28 @@ def test_list_that_is_missing_for_a_moment_revokes_nobody(listed: List, caplog: 
     assert not listed.keyring.removed
     assert caplog.text.count("allow-list is missing") == 1
     assert listed.drops.by_reason["allow_list_missing"] == 1
+
+
+@pytest.mark.parametrize("times", [1, 100])
+def test_list_that_is_replaced_while_it_is_read_is_read_again_at_once(listed: List, times: int) -> None:
+    """A client that joins meanwhile, with a key that was just listed, would be refused."""
+    clients, reads = listed.home.clients, 0
+
+    def read_slowly() -> dict[str, AllowedKey]:
+        nonlocal reads
+        reads += 1
+        found = clients.read()
+        if reads <= times:
+            clients.record_last_seen({listed.marks[0]: f"2026-01-01T00:00:{reads:02}Z"})
+        return found
+
+    keyring = Keyring(listed.keyring.key, listed.home, clients.read, lambda: clients.signature, listed.drops)
+    keyring._read = read_slowly
+    late = clients.allow_key("late", KeyPair.generate().public).fingerprint
+    keyring.reload_if_changed()
+    assert (late in keyring.fingerprints) == (times == 1)
+    assert reads < 10, "one that always changes holds up nothing"
+    keyring.close()
 
 
 def test_list_that_stays_missing_revokes_all(listed: List) -> None:
