@@ -127,11 +127,11 @@ def test_preparing_the_filter_is_not_part_of_a_scan(
 
     def prepare(voxels: VoxelFilter) -> None:
         prepared.append(voxels)
-        time.sleep(0.6)
+        time.sleep(2.2)
 
     monkeypatch.setattr(VoxelFilter, "warm_up", prepare)
     out = camera_file.parent / "room.ply"
-    assert main(["cloud", "scan", str(camera_file), "--seconds", "0.5", "--json", "-o", str(out)]) == 0
+    assert main(["cloud", "scan", str(camera_file), "--seconds", "2", "--json", "-o", str(out)]) == 0
     assert len(prepared) == 1
     assert json.loads(capsys.readouterr().out)["frames"]["front"] > 0
 

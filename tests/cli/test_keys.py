@@ -89,11 +89,11 @@ def test_default_address_is_the_own_session(home: KeyHome) -> None:
         RegisteredSession("s1", "lab-1", os.getpid(), ("192.0.2.7",), 7721, home.load_server_key().fingerprint)
     )
     assert find_default_address() == "192.0.2.7:7721"
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        unused = f"127.0.0.1:{free.getsockname()[1]}"
-    with pytest.raises(CommandError) as raised:
-        check_session_reachable(argparse.Namespace(session="", address=unused))
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))  # without listening: no other process gets the port
+        unused = f"127.0.0.1:{closed.getsockname()[1]}"
+        with pytest.raises(CommandError) as raised:
+            check_session_reachable(argparse.Namespace(session="", address=unused))
     assert "your session" not in str(raised.value)
     assert describe_own_sessions().endswith("'lab-1' is at 192.0.2.7:7721")
     home.sessions.add(

@@ -15,6 +15,7 @@ import pytest
 from iris_session.authority.config import UNALIGNED
 from iris_session.cli.main import build_parser, main
 from iris_session.cli.serve import make_session_config
+from tests.loopback import make_loopback_address
 
 COMMANDS = ("demo", "serve", "sessions", "verify", "recording", "emulate", "robots", "bench")
 
@@ -139,19 +140,20 @@ def test_robots_accepts_packaged_scenes(capsys: pytest.CaptureFixture[str]) -> N
 
 
 def test_emulate_fails_without_admission(capsys: pytest.CaptureFixture[str]) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
+    host = make_loopback_address()  # whose ports no other test takes
+    with socket.create_server((host, 0)) as taken:
         port = taken.getsockname()[1]  # a listening socket that is no session
-        assert main(["emulate", f"127.0.0.1:{port}", "--join-timeout", "0.2", "--count", "2"]) == 1
+        assert main(["emulate", f"{host}:{port}", "--join-timeout", "0.2", "--count", "2"]) == 1
         errors = capsys.readouterr().err.splitlines()
         assert [line.split(": ")[:2] for line in errors] == [
             ["iris-session", f"wander{i}-{os.getpid()}"] for i in (1, 2)
         ], "two commands without names have people of different names"
-        assert all(f"127.0.0.1:{port} within 0.2 s" in line for line in errors)
-        assert main(["emulate", f"127.0.0.1:{port}", "--behaviour", "observer", "--seconds", "0.1"]) == 1
-        assert "127.0.0.1" in capsys.readouterr().err
-    assert main(["emulate", f"127.0.0.1:{port}", "--join-timeout", "0.2"]) == 1
+        assert all(f"{host}:{port} within 0.2 s" in line for line in errors)
+        assert main(["emulate", f"{host}:{port}", "--behaviour", "observer", "--seconds", "0.1"]) == 1
+        assert host in capsys.readouterr().err
+    assert main(["emulate", f"{host}:{port}", "--join-timeout", "0.2"]) == 1
     captured = capsys.readouterr()
-    assert "127.0.0.1" in captured.err.splitlines()[-1]
+    assert host in captured.err.splitlines()[-1]
     assert "age p99 -, alignment -" in captured.out
 
 

@@ -7,13 +7,26 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from iris_session.client import Client
-from tests.client.harness import LiveSession
+from iris_session.client import client as client_module
+from tests.client.harness import PATIENCE_NS, LiveSession
+from tests.loopback import make_loopback_address
+
+#: Default of the client's waits in these tests: a busy machine may stop a process for seconds.
+DEADLINE_S = 30.0
+
+
+@pytest.fixture(autouse=True)
+def _wait_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client_module, "DEFAULT_TIMEOUT_S", DEADLINE_S)
+    for waiting in (Client.connect, Client.wait_for, Client.status, Client.request):
+        monkeypatch.setattr(waiting, "__defaults__", (DEADLINE_S,))
 
 
 @pytest.fixture
-def session() -> Iterator[LiveSession]:
-    """Front process and authority on free ports."""
-    live = LiveSession()
+def session(request: pytest.FixtureRequest) -> Iterator[LiveSession]:
+    """Front process and authority on free ports, which they keep when the front is replaced. Parameter: the longest
+    silence of a client [ns]."""
+    live = LiveSession(host=make_loopback_address(), silence_ns=getattr(request, "param", PATIENCE_NS))
     yield live
     live.close()
 

@@ -25,6 +25,8 @@ ROBOTS = ("left", "right")
 BODIES = ("left/hand", "right/hand", "hammer")
 OBJECTS = (ObjectSpec("hammer", "hammer"),)
 PERIOD_S = 0.004
+#: Longest silence of a client, which a busy machine may stop for seconds.
+PATIENCE_NS = 60_000_000_000
 T_BODY_SITE = Pose((0.0, 0.0, 0.1), (1.0, 0.0, 0.0, 0.0))
 
 
@@ -54,13 +56,15 @@ class LiveSession:
     ) -> None:
         self.origin_ns = time.monotonic_ns()
         settings = {"control_port": 0, "state_port": 0, "origin_ns": self.origin_ns, "session_id": "s1", **front}
+        settings.setdefault("silence_ns", PATIENCE_NS)
         shown = msgspec.structs.replace(scene(), asset_root=asset_root, assets=assets, scene_hash=scene_hash)
         self.front = FrontProcess(FrontConfig(**settings), shown)  # type: ignore[arg-type]
         ports = self.front.start()
-        self.address = f"127.0.0.1:{ports.control}"
+        self.address = f"{settings.get('host', '127.0.0.1')}:{ports.control}"
         self.specs = tuple(RobotSpec(name, ("j1",), ("a1",), f"{name}/tip", name) for name in ROBOTS)
         rules = authority or AuthorityConfig()  # people of these tests are in a tracking frame that is the world
-        rules = msgspec.structs.replace(rules, unaligned=(*rules.unaligned, "operator", "director"))
+        unaligned = (*rules.unaligned, "operator", "director")
+        rules = msgspec.structs.replace(rules, unaligned=unaligned, heartbeat_timeout_ns=PATIENCE_NS)
         self.authority = Authority(rules, self.specs, OBJECTS)
         self.view = FixedView(
             tips=dict.fromkeys(ROBOTS, IDENTITY), q=dict.fromkeys(ROBOTS, (0.0,)), objects={"hammer": IDENTITY}

@@ -22,6 +22,7 @@ from iris_session.protocol.names import AssetRefusal
 from tests.assets.test_store import store_part
 from tests.client.harness import LiveSession
 from tests.front.asset_rig import noise, put
+from tests.loopback import make_loopback_address
 
 MIB = 1 << 20
 #: More than may be under way, so that a test can act in the middle.
@@ -55,7 +56,8 @@ def store(tmp_path: Path) -> Store:
 
 @pytest.fixture
 def live(store: Store) -> Iterator[LiveSession]:
-    live = LiveSession(asset_root=str(store.root), assets=(*store.addresses, "0" * 64))
+    host = make_loopback_address()  # whose ports nobody takes while the front is replaced
+    live = LiveSession(host=host, asset_root=str(store.root), assets=(*store.addresses, "0" * 64))
     yield live
     live.close()
 
@@ -283,7 +285,7 @@ class HostileSession:
         self._answers = answers
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(zmq.ROUTER)
-        self.port = self._socket.bind_to_random_port("tcp://127.0.0.1")
+        self.port = self._socket.bind_to_random_port("tcp://0.0.0.0")  # the client takes the host of its session
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()

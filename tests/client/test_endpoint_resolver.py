@@ -26,6 +26,7 @@ from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.server_messages import Paired, Refused, ServerEnvelope
 from iris_session.security import KeyHome, KeyPair
 from tests.client.harness import LiveSession
+from tests.loopback import make_loopback_address
 
 
 class Lab:
@@ -36,6 +37,7 @@ class Lab:
         self.mine = KeyHome(folder / "mine")
         self.name = f"lab-{secrets.token_hex(4)}"
         self.session = LiveSession(
+            host=make_loopback_address(),  # whose ports nobody takes between two sessions
             curve=True,
             key_home=str(folder / "server"),
             session_name=self.name,
@@ -50,7 +52,7 @@ class Lab:
     def join(self, address: str = "", **options: str) -> Client:
         client = Client(address, name="ann", **options)  # type: ignore[arg-type]
         try:
-            return client.connect(10.0)
+            return client.connect(30.0)
         finally:
             if not client.ready:
                 client.close()
@@ -103,7 +105,7 @@ def test_emulated_headsets_pair_again_after_a_revocation(
     host = Address.parse(lab.address)
     uri = pairing_uri(host.host, host.port, lab.server.load_server_key().public, lab.code(), lab.name)
     where = [lab.address, "--code", lab.code()] if form == "code" else [uri]
-    options = ["--behaviour", "observer", "--count", "2", "--seconds", "5", "--join-timeout", "10"]
+    options = ["--behaviour", "observer", "--count", "2", "--seconds", "5", "--join-timeout", "30"]
     assert main(["emulate", *where, *options]) == 0, capsys.readouterr()
     assert [one.key for one in lab.server.clients.read().values()] == [lab.mine.load_identity().public]
 
@@ -153,7 +155,7 @@ def test_two_sessions_of_one_name_need_an_address(lab: Lab) -> None:
 
 def test_unknown_name_lists_the_sessions_heard(lab: Lab) -> None:
     with pytest.raises(NotConnectedError, match=rf"'no-such'.*{lab.name} \({lab.address}\)"):
-        resolve_blocking(parse_connect_request("", "no-such", None, ""), 0.6)
+        resolve_blocking(parse_connect_request("", "no-such", None, ""), 2.0)
     client = Client(session="no-such")
     with pytest.raises(NotConnectedError, match="was not heard"):
         client.connect(0.3)
@@ -269,9 +271,14 @@ def test_client_may_start_before_its_session(lab: Lab) -> None:
         client.wait_for(lambda c: False, 0.5)
         assert not client.ready
         lab.session = LiveSession(
-            curve=True, key_home=str(lab.server.path), control_port=port, session_name="later", session_id="s2"
+            host=Address.parse(lab.address).host,
+            curve=True,
+            key_home=str(lab.server.path),
+            control_port=port,
+            session_name="later",
+            session_id="s2",
         )
-        assert client.wait_for(lambda c: c.ready, 10.0)
+        assert client.wait_for(lambda c: c.ready)
     finally:
         client.close()
 

@@ -139,6 +139,8 @@ def test_a_stream_that_the_session_has_no_more_is_stale() -> None:
 
 def test_cloud_of_a_session(session: LiveSession, join: Callable[..., Client]) -> None:
     camera, ann = join("cam", role="camera"), join("ann")
+    for one in (camera, ann):
+        assert one.wait_for(lambda c: c.clock_error_ns() < 20_000_000, DEADLINE_S)
     room = ann.media.cloud("room")
     assert ann.media.cloud("room") is room
     assert ann.media.subscribe("room") is room.feed

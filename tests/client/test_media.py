@@ -35,6 +35,7 @@ def cloud(session: LiveSession) -> Iterator[threading.Event]:
 @pytest.mark.usefixtures("cloud")
 def test_newest_frame_is_delivered_once(join: Callable[..., Client]) -> None:
     ann = join()
+    assert ann.wait_for(lambda one: one.clock_error_ns() < 20_000_000, DEADLINE_S)
     feed = ann.media.subscribe("cloud")
     assert ann.media.subscribe("cloud") is feed
     assert ann.wait_for(lambda _: feed.received >= 3, DEADLINE_S)

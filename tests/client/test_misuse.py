@@ -20,6 +20,7 @@ from iris_session.protocol.codec import decode_client
 from iris_session.protocol.common import Denial, Pose
 from iris_session.protocol.names import FaultCode, SampleKind
 from iris_session.protocol.server_messages import ProtocolFault
+from tests.client.conftest import DEADLINE_S
 from tests.client.harness import LiveSession
 
 Join = Callable[..., Client]
@@ -71,7 +72,7 @@ def test_invalid_requests_raise_at_once_and_name_the_field(session: LiveSession,
         assert isinstance(raised.value, ClientError)
         assert isinstance(raised.value, ValueError)
         assert "\n" not in str(raised.value)
-    assert time.monotonic() - started < 4.0  # none of them waited for its timeout of 5 s
+    assert time.monotonic() - started < 0.8 * DEADLINE_S  # none of them waited for its timeout
     assert ann.connection.counters.sent - sent < len(calls)
     assert ann.acquire("left")[0].target == "left"
 
@@ -177,7 +178,7 @@ def test_stalled_or_dead_session_is_visible(session: LiveSession, join: Join) ->
     ann.sleep(0.05)
     assert (ann.scene.data_age_ns() or 0) >= before + 50_000_000
     session.pause_steps(False)
-    assert ann.wait_for(lambda c: c.ready and "left" in c.feedback, 10.0)
+    assert ann.wait_for(lambda c: c.ready and "left" in c.feedback)
     assert ann.wait_for(lambda c: (c.scene.data_age_ns() or 10**9) < 200_000_000)
 
 

@@ -9,6 +9,8 @@ import pytest
 
 from iris_session.client import Client, DeniedError, RequestTimeoutError, poll_all
 from iris_session.client import client as client_module
+from iris_session.client import requests as requests_module
+from iris_session.client.requests import CONSENT_TIMEOUT_S
 from iris_session.protocol.client_messages import Acquire, Observation, Withdraw
 from iris_session.protocol.names import DenialReason, Device, EpisodeAction, LeaseMode
 from iris_session.protocol.server_messages import (
@@ -137,7 +139,10 @@ def test_queued_request_is_granted_when_the_lease_ends(session: LiveSession, joi
     assert bob.lease_version("left") is not None
 
 
-def test_who_gives_up_waiting_is_never_granted_the_robot(session: LiveSession, join: Join) -> None:
+def test_who_gives_up_waiting_is_never_granted_the_robot(
+    session: LiveSession, join: Join, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(requests_module, "WITHDRAW_TIMEOUT_S", 30.0)
     ann, bob, carl = join(), join("bob"), join("carl")
     ann.acquire(["left"])
     carl.submit(Acquire(0, ("left",), wait=True))
@@ -179,7 +184,7 @@ def test_acquire_waits_as_long_as_a_holder_may_take_to_consent(
     began = time.monotonic()
     with pytest.raises(RequestTimeoutError):
         bob.acquire(["left"])
-    assert 1.3 <= time.monotonic() - began < 4.0
+    assert 1.3 <= time.monotonic() - began < CONSENT_TIMEOUT_S, "not as long as another session may let one take"
     with pytest.raises(RequestTimeoutError):
         bob.acquire(["right", "left"], timeout_s=0.1)
 
@@ -208,7 +213,8 @@ def test_hand_grasps_an_object(session: LiveSession, join: Join) -> None:
     sample = ann.make_sample(Device.HAND_RIGHT, HERE, objects=["hammer"])
     assert [(t.name, t.kind) for t in sample.targets] == [("hammer", "object")]
     squeeze(ann, False)
-    assert ann.wait_for(lambda c: bool(squeeze(c, True) or bodies(events, ObjectGrasped)))
+    # After a gap, as of a machine that stalls, the clutch must be opened first.
+    assert ann.wait_for(lambda c: bool(squeeze(c, time.monotonic() % 2.0 < 1.8) or bodies(events, ObjectGrasped)))
     ann.release("hammer")
     assert ann.wait_for(lambda c: c.lease_version("hammer") is None)
 

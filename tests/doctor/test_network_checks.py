@@ -86,10 +86,9 @@ def test_other_protocol_version_is_reported(theirs: int, older: str) -> None:
 
 def test_port_base_is_distinguished_from_control_port() -> None:
     """`serve --port-base N` is joined at N + 1; the introduction is at N."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        nothing = Address("127.0.0.1", free.getsockname()[1])
-    assert network_checks.check_port_base(nothing) is None
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))  # without listening: no other process gets the port
+        assert network_checks.check_port_base(Address("127.0.0.1", closed.getsockname()[1])) is None
     with serve_bytes(b"SSH-2.0-OpenSSH_9.2\r\n" + bytes(64)) as above:
         assert network_checks.check_port_base(Address("127.0.0.1", above.port - 1)) is None
     with serve_introduction() as above:
@@ -119,13 +118,13 @@ def test_other_introduction_is_reported() -> None:
 
 
 def test_closed_port_is_reported() -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    found = network_checks.check_tcp(Address("127.0.0.1", port), "127.0.0.1")
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))  # without listening: no other process gets the port
+        port = closed.getsockname()[1]
+        found = network_checks.check_tcp(Address("127.0.0.1", port), "127.0.0.1")
+        introduced, _, _ = network_checks.check_introduction(Address("127.0.0.1", port + 1))
     assert found.failed
     assert "nothing listens" in found.text
-    introduced, _, _ = network_checks.check_introduction(Address("127.0.0.1", port + 1))
     assert introduced.state == "warning"
 
 

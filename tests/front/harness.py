@@ -20,6 +20,7 @@ from iris_session.protocol.steps import Admitted, Decision, OutgoingMessage
 from tests.loopback import make_loopback_address
 
 N_BODIES = 3
+LONG_NS = 600_000_000_000
 STALLS = (FaultCode.STALLED, FaultCode.RECOVERED)
 T = TypeVar("T", bound=Message)
 
@@ -92,6 +93,9 @@ class FrontSession:
             "state_port": 0,
             "origin_ns": time.monotonic_ns(),
             "session_name": "test",
+            # A busy machine stops this process for seconds. Tests of silence and of stalls have their own bounds.
+            "silence_ns": LONG_NS,
+            "stall_ns": LONG_NS,
         }
         self.config = FrontConfig(**{**settings, **config})  # type: ignore[arg-type]
         #: Address of the session's sockets for clients of this machine.
@@ -154,7 +158,7 @@ class FrontSession:
         self.event_seq += 1
         return Event(self.event_seq, self.step, 0, Notice("info", text))
 
-    def pump(self, until: Callable[[], bool], what: str = "condition", timeout_s: float = 30.0) -> None:
+    def pump(self, until: Callable[[], bool], what: str = "condition", timeout_s: float = 60.0) -> None:
         """Take steps until the condition holds."""
         deadline = time.monotonic() + timeout_s
         while not until():

@@ -24,6 +24,7 @@ from iris_session.protocol.codec import decode_beacon, decode_introduction
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.limits import Drops
 from tests.front.harness import FrontSession
+from tests.loopback import make_loopback_address
 
 BEACON = Beacon(1, "s1", "lab-1", "live", "", 7721, 7722, 0, 0, 0, "mark")
 LO = Interface("lo", "127.0.0.1", "127.255.255.255")
@@ -119,7 +120,7 @@ def test_all_listeners_of_the_machine_receive_the_beacon() -> None:
     for _ in range(2):
         listener = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.settimeout(5.0)
+        listener.settimeout(30.0)
         listeners.append(listener)
     with contextlib.closing(listeners[0]), contextlib.closing(listeners[1]):
         listeners[0].bind(("", 0))
@@ -144,7 +145,7 @@ def introducer() -> Iterator[tuple[IntroductionServer, int]]:
 
 
 def read(visitor: socket.socket) -> bytes:
-    visitor.settimeout(5.0)
+    visitor.settimeout(30.0)
     data = b""
     while more := visitor.recv(4096):
         data += more
@@ -197,13 +198,14 @@ def test_two_adjacent_free_ports_are_found() -> None:
 
 
 def test_port_in_use_is_an_error_that_closes_opened_sockets() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as occupied:
+    host = make_loopback_address()  # no other test takes the port meanwhile
+    with socket.create_server((host, 0)) as occupied:
         port = occupied.getsockname()[1]
         with pytest.raises(PortInUseError, match=rf"port {port} \(introduction\)"):
-            open_with_introduction(["127.0.0.1"], port + 1, lambda _: 0)
+            open_with_introduction([host], port + 1, lambda _: 0)
     with pytest.raises(PortInUseError):
-        open_with_introduction(["127.0.0.1"], port + 1, _in_use)
-    for listener in open_listeners(["127.0.0.1"], port):  # it was closed again
+        open_with_introduction([host], port + 1, _in_use)
+    for listener in open_listeners([host], port):  # it was closed again
         listener.close()
     with pytest.raises(FrontError, match=r"203\.0\.113\.9"):
         open_listeners(["203.0.113.9"], 0)

@@ -156,7 +156,7 @@ def test_closed_socket_is_a_disconnect_after_its_last_messages(session: FrontSes
 
 
 def test_silent_client_is_disconnected_and_asked_for_hello(open_session: OpenSession) -> None:
-    session = open_session(silence_ns=200_000_000)
+    session = open_session(silence_ns=1_000_000_000)
     client = session.client()
     client.join()
     (lost,) = session.wait_entries(Lost)
@@ -355,7 +355,7 @@ def test_welcome_for_a_closed_connection_is_ignored(session: FrontSession) -> No
 
 
 def test_silent_gateway_disconnects_its_participants(open_session: OpenSession) -> None:
-    session = open_session(silence_ns=300_000_000)
+    session = open_session(silence_ns=1_000_000_000)
     gateway, other = session.client(), session.client()
     gateway.join("gateway", "Gate")
     gateway.send(Hello("operator", "Web", secret=os.urandom(16)), on_behalf_of="tab1")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import socket as sockets
 import time
+from collections import deque
 from collections.abc import Callable
 
 import msgspec
@@ -48,8 +49,8 @@ def test_garbage_is_answered_with_bounded_faults(session: FrontSession) -> None:
     assert fault.code == "malformed"
     seconds = time.monotonic() - began
     assert len(joined.got(ProtocolFault)) < 10 + 3 * seconds
-    assert session.wait_drops("malformed") > 300
-    assert session.wait_drops("hello_malformed") > 300
+    assert session.wait_drops("malformed", 301) > 300
+    assert session.wait_drops("hello_malformed", 301) > 300
     assert stranger.wait_for(Refused).code == "malformed"
     assert len(stranger.got(Refused)) < 40 + 25 * (time.monotonic() - began)
 
@@ -289,16 +290,17 @@ def test_state_continues_while_one_subscriber_reads_nothing(open_session: OpenSe
     sub = session.subscriber()
     rng = np.random.default_rng(1)
     received = 0
+    drops: deque[int] = deque(maxlen=300)  # after each of the last states: a front that the machine stops drops some
 
     def enough() -> bool:
         nonlocal received
         session.send_state(rng.normal(size=(BODIES, 7)))
+        drops.append(session.process.link.state_drops)
         while sub.poll(0):
             received += sum(map(len, sub.recv_multipart()))
-        return received > 10_000_000
+        return received > 25_000_000 and drops[-1] - drops[0] < len(drops) / 2
 
-    session.pump(enough, "10 MB of state", timeout_s=30.0)
-    assert session.process.link.state_drops < session.step / 2, "the front waited for the stuck one"
+    session.pump(enough, "25 MB of state, the last of which did not wait for the stuck one", timeout_s=120.0)
     for_stuck = 0
     while stuck.poll(200):
         for_stuck += sum(map(len, stuck.recv_multipart()))

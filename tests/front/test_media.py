@@ -81,7 +81,7 @@ class Stage:
             self.session.process.publish_media("cloud", b"c" * self.size, now_ns, 1, "bytes")
 
     def until(self, condition: Callable[[], object], what: str) -> None:
-        self.session.pump(lambda: bool(condition()), what, 30.0)
+        self.session.pump(lambda: bool(condition()), what)
 
     def joined(self, client: RawClient, name: str = "ann") -> RawClient:
         if client.welcome is None:
@@ -97,7 +97,7 @@ class Stage:
         return self.viewers[-1]
 
     def drops(self, reason: str, n: int = 1) -> None:
-        self.session.pump(lambda: self.session.process.link.status.drops.get(reason, 0) >= n, reason, 30.0)
+        self.session.pump(lambda: self.session.process.link.status.drops.get(reason, 0) >= n, reason)
 
     def close(self) -> None:
         for viewer in self.viewers:

@@ -56,18 +56,18 @@ class Rig:
 
     def tick(self, *, take: bool = True) -> None:
         """Pass a tick, and take what was sent."""
-        self.wait(lambda: bool(self.media._socket.getsockopt(zmq.EVENTS) & zmq.POLLOUT)) if take else None
         before = self.list_sent()
+        self.wait(lambda: bool(self.media._socket.getsockopt(zmq.EVENTS) & zmq.POLLOUT)) if take else None
         self.media.tick(self.scheduler, self.now_ns)
-        sent = self.list_sent() != before
-        while take and self.socket.poll(20_000 if sent else 0):
+        sent = len(dict(self.list_sent().items() ^ before.items()))  # streams
+        while take and self.socket.poll(20_000 if sent > 0 else 0):
             head, frame, info = self.socket.recv_multipart()
             header = decode_media_header(head)
             if header.budget_class == "full":
                 self.got.append((header, frame))
             if info or header.budget_class == "none":
                 self.infos.append((header, msgspec.json.decode(info, type=StreamInfo) if info else None))
-            sent = False
+            sent -= 1
 
     def list_sent(self) -> dict[str, tuple[int, StreamInfo | None]]:
         return {name: (stream.seq, stream.info) for name, stream in self.media._streams.items() if stream.seq >= 0}

@@ -60,11 +60,12 @@ class Rig:
         self.recorder.bind(f"ipc://{path}/raw")
         self.feed = RawFeed(self.context, f"ipc://{path}/raw", self.drops)
 
-    def receive(self) -> list[Any]:
-        batches = []
-        while self.recorder.poll(300):
-            batches.append(self.recorder.recv())
-        return [row for batch in batches for row in msgspec.msgpack.decode(batch)]
+    def receive(self, n: int) -> list[Any]:
+        """Wait for so many rows. Return all that have come."""
+        rows: list[Any] = []
+        while self.recorder.poll(30_000 if len(rows) < n else 300):
+            rows += msgspec.msgpack.decode(self.recorder.recv())
+        return rows
 
 
 @pytest.fixture
@@ -81,7 +82,7 @@ def test_reports_of_participants_go_with_the_samples(rig: Rig) -> None:
     for one in (ann, stranger):
         rig.feed.send_report(one, 7, report)
     rig.feed.tick(SECOND)
-    ((number, receive_ns, data),) = rig.receive()
+    ((number, receive_ns, data),) = rig.receive(1)
     assert (number, receive_ns) == (1, 7)
     assert data[0] == 0x92, "which no message begins with"
     assert msgspec.msgpack.decode(data, type=tuple[str, ClientReport]) == ("p1", report)
@@ -92,7 +93,7 @@ def test_samples_go_in_batches(rig: Rig) -> None:
     for i in range(30):
         rig.feed.send(ann, i, msgspec.structs.replace(LARGE, seq=i))
     rig.feed.tick(SECOND)
-    rows = rig.receive()
+    rows = rig.receive(30)
     assert [(number, at) for number, at, _ in rows] == [(1, i) for i in range(30)]
     assert [msgspec.msgpack.decode(data, type=Sample).seq for *_, data in rows] == list(range(30))
 

@@ -73,7 +73,7 @@ def test_code_pairs_one_key_with_the_roles_of_the_code(lab: Lab) -> None:
 def test_wrong_codes_void_the_code_and_are_audited_with_their_count(lab: Lab) -> None:
     eve = KeyPair.generate()
     code, made = lab.home.join_codes.create(lab.server)
-    client = lab.client(eve)
+    client, began = lab.client(eve), time.monotonic()
     for n in range(1, 6):
         answer = lab.refused(client, Pair("eve", b"x" * 32), n)
         assert (answer.code, answer.message) == (RefusalCode.CODE, "this join code is wrong, used or expired")
@@ -85,7 +85,7 @@ def test_wrong_codes_void_the_code_and_are_audited_with_their_count(lab: Lab) ->
     assert len(lab.audits(AuditKind.CODE_EXHAUSTED)) == 1
     refused = lab.audits(AuditKind.CODE_REFUSED, 5)
     assert sum(a.count for a in refused) == 5
-    assert len(refused) <= 3, "at most once a second"
+    assert len(refused) <= 2 + (time.monotonic() - began), "at most once a second"
 
 
 def test_attempts_per_address_are_bounded_for_all_codes(lab: Lab) -> None:
@@ -321,14 +321,16 @@ def test_participants_of_a_gateway_have_the_other_roles_of_its_key(lab: Lab) -> 
 
 
 def test_audits_of_a_flood_are_bounded_and_add_up(lab: Lab) -> None:
-    clients = [lab.client(KeyPair.generate()) for _ in range(5)]
+    clients, began = [lab.client(KeyPair.generate()) for _ in range(5)], time.monotonic()
     for _ in range(40):
         for client in clients:
             client.send(Hello("operator", "Eve"))
     audits = lab.audits(AuditKind.KEY_REFUSED, 200)
     assert sum(a.count for a in audits) == 200
-    assert len(audits) <= 5
-    assert len([m for client in clients for m in client.got(Refused)]) <= 60, "answers to strangers are bounded"
+    seconds = time.monotonic() - began
+    assert len(audits) <= 2 + seconds, "at most once a second"
+    answers = len([m for client in clients for m in client.got(Refused)])
+    assert answers <= 20 + 20 * seconds, "answers to strangers are bounded"
 
 
 def test_damaged_list_keeps_the_previous_keys(lab: Lab) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 import msgspec
@@ -170,10 +171,11 @@ def test_concurrent_requests_get_the_same_report(session: FrontSession) -> None:
 def test_status_requests_are_rate_limited(session: FrontSession) -> None:
     client = session.client()
     client.join()
-    for n in range(LIMITS[GetStatus].burst + 10):
+    limit, began = LIMITS[GetStatus], time.monotonic()
+    for n in range(limit.burst + 10):
         client.send(GetStatus(n + 1))
     assert client.wait_for(ProtocolFault).code == FaultCode.RATE
-    assert len(client.got(StatusReport)) <= LIMITS[GetStatus].burst + 4
+    assert len(client.got(StatusReport)) <= limit.burst + limit.per_second * (time.monotonic() - began)
 
 
 def test_client_can_request_status_before_admission(session: FrontSession) -> None:
@@ -195,7 +197,7 @@ def test_unknown_peers_cannot_request_status(session: FrontSession) -> None:
 
 
 def test_front_reports_a_stalled_authority(open_session: Callable[..., FrontSession]) -> None:
-    session = open_session(stall_ns=50 * MS)
+    session = open_session(stall_ns=500 * MS)
     client = session.client()
     welcome = client.join()
     session.process.link.send_report(half(row(welcome.participant_id)))
@@ -209,7 +211,7 @@ def test_front_reports_a_stalled_authority(open_session: Callable[..., FrontSess
         client.receive()
     (report,) = client.got(StatusReport)
     assert report.stalled
-    assert report.authority_silent_ns > 50 * MS
+    assert report.authority_silent_ns > 500 * MS
 
 
 def test_reason_of_a_disconnect_is_kept(session: FrontSession) -> None:

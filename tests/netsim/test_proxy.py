@@ -322,14 +322,15 @@ def test_roaming_leaves_the_old_connection_open_at_the_server(echo: Echo) -> Non
 
 
 def test_connection_without_a_server_is_closed() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        port = listening.getsockname()[1]
-    with (
-        ImpairmentProcess({LINK: "none"}, [port]),
-        pytest.raises(ConnectionResetError),  # at once, or at first use
-        _connect(LINK, port) as connection,
-    ):
-        connection.recv(1)
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))  # without listening: no other process gets the port
+        port = closed.getsockname()[1]
+        with (
+            ImpairmentProcess({LINK: "none"}, [port]),
+            pytest.raises(ConnectionResetError),  # at once, or at first use
+            _connect(LINK, port) as connection,
+        ):
+            connection.recv(1)
 
 
 DATAGRAMS = 150  # they fit into the server's socket, which is read at the end
@@ -343,7 +344,7 @@ def test_datagrams_are_lost_duplicated_and_reordered(tmp_path: Path) -> None:
             server.bind(("127.0.0.1", 0))
             port = server.getsockname()[1]
             with (
-                ImpairmentProcess({LINK: profile}, [], udp=[port], seed=seed),
+                ImpairmentProcess({LINK: profile}, [], udp=[port], seed=seed) as proxy,
                 socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client,
             ):
                 client.connect((LINK, port))
@@ -352,11 +353,18 @@ def test_datagrams_are_lost_duplicated_and_reordered(tmp_path: Path) -> None:
                     time.sleep(0.0005)  # one by one, as from a sender with a rate
                 server.settimeout(0.5)
                 got: list[int] = []
-                with contextlib.suppress(TimeoutError):
-                    while True:
-                        data, peer = server.recvfrom(100)
-                        got.append(struct.unpack("<I", data)[0])
-                assert got
+                peer: Any = None
+
+                def takes_no_more() -> bool:
+                    nonlocal peer
+                    with contextlib.suppress(TimeoutError):
+                        while True:
+                            data, peer = server.recvfrom(100)
+                            got.append(struct.unpack("<I", data)[0])
+                    lost: int = proxy.execute("stats")["links"][0]["datagrams_lost"]
+                    return len(set(got)) + lost == DATAGRAMS
+
+                _wait_until(takes_no_more, "each datagram has come or is lost")
                 server.sendto(b"down", peer)  # the opposite direction finds its client
                 client.settimeout(0.2)
                 with contextlib.suppress(TimeoutError):  # it may be lost

@@ -183,7 +183,7 @@ def record(path: Path, steps: int, **header: object) -> SmallSession:
     return session
 
 
-def wait_until(condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
+def wait_until(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:
     """Poll `condition` until it holds; fail after `timeout_s`."""
     until = time.monotonic() + timeout_s
     while not condition():

@@ -59,14 +59,14 @@ class PlayedRecorder:
 
     def say(self, feed: RecorderFeed, instance: int, expecting: int, written: int) -> None:
         self.socket.send(encode_status(RecorderStatus(instance, expecting, written)))
-        assert feed._socket.poll(5000), "the status does not arrive"
+        assert feed._socket.poll(30_000), "the status does not arrive"
         feed.flush()
 
     def take(self, n: int) -> list[tuple[bytes, int, bytes]]:
         """Receive the next `n` messages as (kind, number, body)."""
         out = []
         for _ in range(n):
-            assert self.socket.poll(5000), f"only {len(out)} of {n} messages came"
+            assert self.socket.poll(30_000), f"only {len(out)} of {n} messages came"
             head, body, *self.more = self.socket.recv_multipart()
             out.append((*FRAME.unpack(head), body))
         return out
@@ -452,7 +452,7 @@ def test_vertices_have_their_own_socket_and_rate(played, tmp_path: Path, square:
     feed.send_vertices("flex-1", square, 50_000_000)
     taken = []
     while len(taken) < 3:
-        assert vertices.poll(5000)
+        assert vertices.poll(30_000)
         taken.append(decode_vertices(vertices.recv()))
     assert [(frame.stream, frame.session_time, frame.frame) for frame in taken] == [
         ("flex-0", 0, square),
@@ -461,7 +461,7 @@ def test_vertices_have_their_own_socket_and_rate(played, tmp_path: Path, square:
     ]
     recorder.say(feed, 1, -1, -1)  # has seen none of them
     feed.send_vertices("flex-0", square, 60_000_000)
-    assert vertices.poll(5000)
+    assert vertices.poll(30_000)
     vertices.close()
     feed.close(0.0)
 
@@ -489,7 +489,7 @@ def test_nothing_waits_after_the_budget_is_used_up(feed: RecorderFeed, played) -
     played[0].take(4)
     for instance, expecting in ((1, 3), (2, -1)):  # also from a recorder that finds it used up
         played[0].socket.send(encode_status(RecorderStatus(instance, expecting, 0, budget=10**8, ended=True)))
-        assert feed._socket.poll(5000)
+        assert feed._socket.poll(30_000)
         feed.flush()
         steps(feed, 30, 200)
         feed.send_patch("/assets", "hash")

@@ -26,6 +26,7 @@ from iris_session.recording.rerun_tool import find_rerun, make_environment
 from iris_session.recording.rrd_file import KIND_END, read_message, scan_file
 from iris_session.recording.writer import RrdWriter
 from iris_session.system.process import ChildProcess
+from tests.loopback import make_loopback_address
 from tests.recording.support import column, journal, make_header, read, wait_until, write
 
 STEPS = 60
@@ -79,13 +80,14 @@ def test_other_files_are_not_followed(closed: Path, tmp_path: Path) -> None:
 @contextmanager
 def receiver(path: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
     """Start Rerun's server, which writes what it gets to `path`; yield it and its address."""
+    host = make_loopback_address()  # no other test takes the port meanwhile
     with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
+        listener.bind((host, 0))
         port = listener.getsockname()[1]
-    command = [find_rerun(), "--bind", "127.0.0.1", "--port", str(port), "--save", path]
+    command = [find_rerun(), "--bind", host, "--port", str(port), "--save", path]
     server = subprocess.Popen(command, env=make_environment(), stderr=subprocess.DEVNULL)
     try:
-        yield server, f"rerun+http://127.0.0.1:{port}/proxy"
+        yield server, f"rerun+http://{host}:{port}/proxy"
     finally:
         server.send_signal(signal.SIGCONT)
         server.kill()
@@ -175,7 +177,7 @@ def test_viewer_that_stands_still_makes_only_the_feed_wait(closed: Path, tmp_pat
             wait_until(lambda: steps_received(got) == list(range(STEPS)))
             assert feed.is_running, "the session still runs"
             lock.release()
-            assert feed.wait(20.0) == 0
+            assert feed.wait(60.0) == 0
 
 
 def test_feed_ends_with_its_parent_whatever_the_viewer_does(closed: Path) -> None:
@@ -191,5 +193,5 @@ def test_feed_ends_with_its_parent_whatever_the_viewer_does(closed: Path) -> Non
     wait_until(lambda: feed.num_threads() > 3)  # Rerun's client has begun to send, to nothing
     parent.kill()
     parent.communicate()
-    psutil.wait_procs([feed], 20.0)
+    psutil.wait_procs([feed], 60.0)
     assert not feed.is_running() or feed.status() == psutil.STATUS_ZOMBIE
